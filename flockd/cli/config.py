@@ -28,7 +28,7 @@ def add(commands: Commands) -> None:
         "flockd config new scenario my_flight.yaml --drones 3 --mission waypoints",
     )
     parser = commands("config", "Check, show, describe and begin configuration files.", examples)
-    add_commands(parser, (_add_check, _add_show, _add_schema, config_new.add))
+    add_commands(parser, (_add_check, _add_show, _add_schema, _add_card, config_new.add))
 
 
 def _add_check(commands: Commands) -> None:
@@ -53,6 +53,22 @@ def _add_schema(commands: Commands) -> None:
     parser = commands("schema", "Print the JSON schema of a kind of file, for editors and other tools.", examples)
     parser.add_argument("kind", choices=("drone", "scenario", "campaign"), help="of the file")
     parser.set_defaults(run=_schema)
+
+
+def _add_card(commands: Commands) -> None:
+    examples = ("flockd config card my_drone.yaml", "flockd config card /etc/flockd/drone.yaml > card.md")
+    description = "Print the card of a flight day, as Markdown: limits, heights, what each fault does, who does what."
+    parser = commands("card", description, examples)
+    parser.add_argument("file", metavar="FILE", type=Path, help="of a drone")
+    parser.set_defaults(run=_card)
+
+
+def _card(args: argparse.Namespace) -> int:
+    from flockd.core.config import load_real_drone
+    from flockd.ground.flight_card import card
+
+    say(card(load_real_drone(args.file)[0]).rstrip())
+    return ExitCode.DONE
 
 
 def _check(args: argparse.Namespace) -> int:

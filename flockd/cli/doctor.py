@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
+import functools
 import logging
 import os
+import signal
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,9 +19,11 @@ from flockd.core.errors import ExitCode, UsageError
 from flockd.core.printable import printable
 
 if TYPE_CHECKING:
+    from flockd.core.config import DroneConfig
     from flockd.ground.doctor import Finding
 
 SECONDS = 4.0
+BENCH_MINUTES = 10.0
 STYLES = {"FAILURE": "bold red", "WARNING": "yellow", "PASS": "green"}
 """The worst first."""
 
@@ -32,6 +37,7 @@ def add(commands: Commands) -> None:
         "sudo -u flockd flockd doctor --config /etc/flockd/drone.yaml --record /var/lib/flockd",
         "flockd doctor --config config/quadrotor.yaml --only cameras --seconds 30",
         "flockd doctor --config config/simulator.yaml --json",
+        "flockd doctor --config my_drone.yaml --bench",
     )
     description = (
         "Examine a drone on the ground: cameras, models, autopilot, computer, telemetry. Changes nothing: "
@@ -51,6 +57,14 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--only", metavar="CHECK", action="append", choices=CHECKS, help=f"only this one, of {', '.join(CHECKS)}"
     )
+    parser.add_argument(
+        "--bench",
+        action="store_true",
+        help="propellers off: run the whole line, from cameras to commands, send nothing, and report on it",
+    )
+    parser.add_argument(
+        "--minutes", metavar="M", type=positive_number, help=f"how long --bench runs ({BENCH_MINUTES:g})"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     add_force(parser)
     parser.set_defaults(run=_run)
@@ -60,6 +74,10 @@ def _run(args: argparse.Namespace) -> int:
     from flockd.ground.doctor import CHECKS, Level, plan, run_checks
 
     config = load_to_fly(args.config, force=args.force)
+    if args.minutes is not None and not args.bench:
+        raise UsageError("--minutes is for --bench; add it")
+    if args.bench and args.only:
+        raise UsageError("--bench is a run of its own, and --only chooses among the checks; drop one of them")
     if args.unit is not None and not args.unit.is_file():
         raise UsageError(f"{args.unit}: is no file; name the unit with --unit")
     checks = plan(
@@ -72,14 +90,40 @@ def _run(args: argparse.Namespace) -> int:
         only=args.only or CHECKS,
     )
     logging.getLogger("flockd.onboard.autopilot").setLevel(logging.CRITICAL)  # what MAVSDK has to tell, the findings do
-    with progress("examining", "checks") as tell:
-        found = run_checks(checks, tell)
+    if args.bench:
+        found: Mapping[str, Sequence[Finding]] = {"bench": _bench(config, args)}
+    else:
+        with progress("examining", "checks") as tell:
+            found = run_checks(checks, tell)
     if args.json:
         say_json(_as_json(config.name, found))
     else:
         _print(config.name, found)
     failed = any(finding.level is Level.FAILURE for findings in found.values() for finding in findings)
     return ExitCode.CHECK_FAILED if failed else ExitCode.DONE
+
+
+def _bench(config: DroneConfig, args: argparse.Namespace) -> Sequence[Finding]:
+    """Ctrl-C ends it early, with a report of what was seen until then."""
+    from flockd.ground.doctor.bench import bench, judged
+    from flockd.onboard.daemon import event_loop_at, only_instance
+
+    seconds = 60.0 * (args.minutes or BENCH_MINUTES)
+    stop = asyncio.Event()
+
+    async def run() -> Sequence[Finding]:
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, stop.set)
+        with progress("on the bench", "s") as tell:
+            samples = await bench(
+                config, str(args.config), seconds, stop=stop, on_second=lambda done: tell(done, int(seconds))
+            )
+        return tuple(judged(config, samples, seconds))
+
+    event_loop = functools.partial(event_loop_at, config.speed_factor)
+    with only_instance(config.name, os.environ), asyncio.Runner(loop_factory=event_loop) as runner:
+        return runner.run(run())
 
 
 def _as_json(drone: str, found: Mapping[str, Sequence[Finding]]) -> dict[str, object]:

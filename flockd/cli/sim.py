@@ -29,7 +29,7 @@ costs, measured with five drones on a processor without 8-bit instructions, Nove
              to begin; a flight of 10 s with three drones 66 s of processor time; with --perception truth a few
              seconds
   memory     1.1 GB on two processors, and 0.3 GB more for each further one, up to one a drone
-  disk       35 MB for the report and what it is made of
+  disk       31 MB for the report and what it is made of
   --record   another 4.5 MB a drone and simulated second: 2.5 GB for the whole flight
 Try `--duration 10 --drones 3` first. Ctrl-C ends a flight early, with a report of what was flown and exit code 130."""
 OPTIONS = {
@@ -52,6 +52,7 @@ def add(commands: Commands) -> None:
         "flockd sim",
         "flockd sim --duration 20 --wind 3,-1 --speed 1.5 --radius 15 --out out/windy",
         "flockd sim --perception truth --json > truth.json",
+        "flockd sim --perception truth --telemetry --drones 25 --duration 600",
         "flockd sim my_flight.yaml --flow dis --seed 7",
         "flockd sim --record --duration 20",
         "flockd sim --autopilot standin --drones 2 --duration 20",
@@ -110,7 +111,11 @@ def add(commands: Commands) -> None:
         help="fly what the pilots ask for, without their safety gates: to study the flocking law alone",
     )
     parser.add_argument("--force", action="store_true", help="overwrite an earlier flight in that folder")
-    parser.add_argument("--telemetry", action="store_true", help="publish over zenoh while flying")
+    parser.add_argument(
+        "--telemetry",
+        action="store_true",
+        help="publish over zenoh while flying, with pictures, and take orders; with --perception truth in real time",
+    )
     parser.add_argument(
         "--telemetry-at", metavar="ENDPOINT",
         help=f"where --telemetry listens, or where the daemons of --autopilot connect to (default: {ENDPOINT})",
@@ -178,24 +183,24 @@ def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespac
     from flockd.sim.swarm import fly
 
     with ExitStack() as stack:
-        telemetry = None
+        shown = None
         if args.telemetry:
             from flockd.onboard.telemetry.publisher import ZenohTelemetry
             from flockd.sim.repeater import Repeater
+            from flockd.sim.shown_flock import ShownFlock
 
-            zenoh = stack.enter_context(
-                ZenohTelemetry(_plain(scenario.scenario), listen=[args.telemetry_at or ENDPOINT])
-            )
-            for number in range(1, len(scenario.vehicles) + 1):
-                zenoh.show_alive(f"drone{number}")
-            telemetry = stack.enter_context(Repeater(zenoh))
+            endpoint = args.telemetry_at or ENDPOINT
+            zenoh = stack.enter_context(ZenohTelemetry(_plain(scenario.scenario), listen=[endpoint]))
+            shown = ShownFlock(scenario, zenoh, stack.enter_context(Repeater(zenoh)))
+            if not args.quiet:
+                complain(f"the flock is at {endpoint}: `flockd fleet` shows it in a browser and sends it places")
         phases = stack.enter_context(Phases(quiet=args.quiet, verbose=args.verbose))
         flight = fly(
             scenario,
             perception=args.perception,
             swap=args.swap,
             gated=args.gated,
-            telemetry=telemetry,
+            shown=shown,
             recorders=_recorders(scenario, args.swap, directory / RECORDINGS, stack) if args.record else (),
             progress=phases.of("flying", "steps"),
             preparing=phases.of("loading networks and building the world", "parts"),
@@ -254,9 +259,7 @@ def _recorders(
 def _check_options(args: argparse.Namespace) -> None:
     sim_fleet.check_options(args)
     if args.perception == "truth":
-        idle = [
-            option for option in ("flow", "scale", "height", "swap", "telemetry", "record") if getattr(args, option)
-        ]
+        idle = [option for option in ("flow", "scale", "height", "swap", "record") if getattr(args, option)]
         if idle:
             raise UsageError(f"--{idle[0]} has no meaning without networks; drop it or --perception truth")
 

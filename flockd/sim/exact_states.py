@@ -33,6 +33,7 @@ class ExactFlock:
     def __init__(self, scenario: ScenarioConfig, orders: Orders | None = None) -> None:
         drone = scenario.drone
         self._orders = {i: list(of_drone) for i, of_drone in (orders or {}).items()}
+        self._new: Mapping[int, MissionOrder] = {}
         self._law, self._step_s = FlockingLaw(drone.flocking), drone.step_s
         self._pilots = [
             HandPilot(scenario, i) if vehicle.by_hand else Navigator(scenario.drone_of(i).mission, drone.safety.gate)
@@ -45,8 +46,18 @@ class ExactFlock:
         self._avoids = drone.obstacles.enabled
         self._avoidances = [Avoidance(drone.obstacles, drone.safety.gate, drone.step_s) for _ in self._pilots]
 
-    def step(self, time_s: float, positions: FloatArray, velocities: FloatArray) -> Commands:
-        """The commands for drones at (n, 3) m and (n, 3) m/s in NED; called in order of time."""
+    def step(
+        self,
+        time_s: float,
+        positions: FloatArray,
+        velocities: FloatArray,
+        orders: Mapping[int, MissionOrder] | None = None,
+    ) -> Commands:
+        """The commands for drones at (n, 3) m and (n, 3) m/s in NED; called in order of time.
+
+        `orders` are operators' of now, by drone, beside those that were given at the beginning.
+        """
+        self._new = orders or {}
         seen = [true_ranges(self._obstacles, time_s, place) if self._obstacles.solids else None for place in positions]
         known = [self._neighbours(i, time_s, positions, velocities) for i in range(len(positions))]
         found = [self._of(i, time_s, positions, velocities, known[i], ranges) for i, ranges in enumerate(seen)]
@@ -82,7 +93,7 @@ class ExactFlock:
 
     def _newest_order(self, i: int, time_s: float) -> MissionOrder | None:
         """The last one until now that was not flown yet."""
-        waiting, newest = self._orders.get(i, []), None
+        waiting, newest = self._orders.get(i, []), self._new.get(i)
         while waiting and waiting[0][0] <= time_s:
             newest = waiting.pop(0)[1]
         return newest

@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Self
 
 from flockd.core.config.scenario import ScenarioConfig
-from flockd.core.messages import FrameSet, VehicleState
+from flockd.core.messages import FrameSet, MissionOrder, VehicleState
 from flockd.core.side_process import SideProcess
 from flockd.flight.geometry import build_rig
 from flockd.sim.pilots import Pilots, Stepped
@@ -66,14 +66,21 @@ class PilotPool:
             process.wait_until_ready()
 
     def step(
-        self, drone: int, frames: FrameSet, vehicle: VehicleState, truth: RenderTruth, *, pictured: bool
+        self,
+        drone: int,
+        frames: FrameSet,
+        vehicle: VehicleState,
+        truth: RenderTruth,
+        *,
+        pictured: bool,
+        order: MissionOrder | None = None,
     ) -> Future[Stepped]:
         """Steps a drone's pilot, see `Pilots`; the result is there once the drone's process has come to it."""
         place = self.drones.index(drone) % len(self._shares)
         pilots: Callable[..., Stepped] = self._here or self._processes[place].ask
-        order = (drone, frames, vehicle, truth if self._swap else None, pictured)
+        inputs = (drone, frames, vehicle, truth if self._swap else None, pictured, order)
         if not self.on_this_thread:
-            return self._threads[place].submit(pilots, *order)
+            return self._threads[place].submit(pilots, *inputs)
         stepped: Future[Stepped] = Future()
-        stepped.set_result(pilots(*order))
+        stepped.set_result(pilots(*inputs))
         return stepped

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from flockd.core.config.scenario import ScenarioConfig
-from flockd.core.messages import FrameSet, PilotOutput, VehicleState
+from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, VehicleState
 from flockd.flight.perception import Networks, load_networks
 from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.review.flight_log.capture import capture
@@ -43,12 +43,21 @@ class Pilots:
         }
 
     def __call__(
-        self, drone: int, frames: FrameSet, vehicle: VehicleState, truth: RenderTruth | None, pictured: bool
+        self,
+        drone: int,
+        frames: FrameSet,
+        vehicle: VehicleState,
+        truth: RenderTruth | None,
+        pictured: bool,
+        order: MissionOrder | None = None,
     ) -> Stepped:
-        """One step of one drone. ``truth`` is what its frames show, for a swap; ``pictured``: with its key frames."""
+        """One step of one drone, with an operator's order.
+
+        ``truth`` is what its frames show, for a swap; ``pictured``: with its key frames.
+        """
         if truth is not None:
             self._truths[drone].show(truth)
         trace = StepTrace() if pictured else None
-        output = self._pilots[drone].step(frames, vehicle, trace)
+        output = self._pilots[drone].step(frames, vehicle, trace, order)
         seen = [] if trace is None else capture(trace, output, drone)
         return Stepped(output, [frame.at_half_size() for frame in seen])

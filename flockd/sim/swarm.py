@@ -18,7 +18,6 @@ from flockd.core.messages import NO_STATUS, FloatArray
 from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.truth import TrueDrone, Truth
-from flockd.onboard.telemetry import TelemetrySink, publish_step
 from flockd.review.flight_log.builder import FlightLogBuilder
 from flockd.review.flight_log.capture import key_frame_steps
 from flockd.review.flight_log.key_frames import KeyFrame
@@ -31,6 +30,7 @@ from flockd.sim.control_loop import ControlLoop
 from flockd.sim.exact_states import ExactFlock, HandPilot, fly_exact_states, start_yaw, step_times
 from flockd.sim.pilot_pool import PilotPool
 from flockd.sim.pilots import Stepped
+from flockd.sim.shown_flock import RealTime, ShownFlock, orders_of
 from flockd.sim.vehicles import SimulatedAutopilot, Vehicles
 
 _KEY_FRAME_DRONES = 8
@@ -53,7 +53,7 @@ def fly(
     perception: SimulatedPerception = "learned",
     swap: frozenset[str] = frozenset(),
     gated: bool = True,
-    telemetry: TelemetrySink | None = None,
+    shown: ShownFlock | None = None,
     recorders: Sequence[Recorder] = (),
     processes: int | None = None,
     pictured: bool = True,
@@ -69,8 +69,9 @@ def fly(
         perception: `learned` flies from rendered images; `truth` from exact relative states.
         swap: roles of perception that take the truth instead of a network's estimate.
         gated: whether each drone's gate turns what its pilot asks for into setpoints, as in the daemon.
-        telemetry: where every drone's output is published; nothing comes back from there.
-        recorders: one a drone, or none; nothing comes back from there either.
+        shown: where every drone's output is published; operators' orders come from there. A flight on exact states
+            then takes as long as it takes in the air.
+        recorders: one a drone, or none; nothing comes back from there.
         processes: for pilots that see, beside this one, which draws the images; 1: they step in this one; 0: they step,
             and the images are drawn, on the calling thread; None: as many as there are processors, and no more than
             drones.
@@ -95,10 +96,10 @@ def fly(
     with ExitStack() as stack:
         pool = stack.enter_context(PilotPool(scenario, swap, processes)) if perception == "learned" else None
         companion = None
-        pilots: _ExactStatePilots | _VisionPilots = _ExactStatePilots(scenario)
+        pilots: _ExactStatePilots | _VisionPilots = _ExactStatePilots(scenario, shown)
         if pool is not None:
             companion = fly_exact_states(scenario, gated=gated)[1:]
-            pilots = _VisionPilots(scenario, pool, telemetry, recorders, companion, preparing)
+            pilots = _VisionPilots(scenario, pool, shown, recorders, companion, preparing)
         preparing(_PREPARATIONS, _PREPARATIONS)
         try:
             for step, time_s in enumerate(times):
@@ -143,8 +144,8 @@ _PREPARATIONS = 4
 class _ExactStatePilots:
     """The flocking law on the exact states of all drones."""
 
-    def __init__(self, scenario: ScenarioConfig) -> None:
-        self._flock = ExactFlock(scenario)
+    def __init__(self, scenario: ScenarioConfig, shown: ShownFlock | None) -> None:
+        self._flock, self._shown, self._pace = ExactFlock(scenario), shown, RealTime()
         self._by_hand = [vehicle.by_hand for vehicle in scenario.vehicles]
 
     def step(
@@ -152,7 +153,11 @@ class _ExactStatePilots:
     ) -> Commands:
         """Commands for all drones; there are no images."""
         positions, velocities = vehicles.position, vehicles.velocity
-        commands = self._flock.step(time_s, positions, velocities)
+        orders = orders_of(self._shown, range(len(positions)))
+        commands = self._flock.step(time_s, positions, velocities, orders)
+        if self._shown is not None:
+            self._pace.wait(time_s)
+            self._shown.show_exact(step, time_s, vehicles, commands)
         for i in (i for i, by_hand in enumerate(self._by_hand) if not by_hand):
             others = np.arange(len(positions)) != i
             relative = positions[others] - positions[i]
@@ -174,14 +179,14 @@ class _VisionPilots:
         self,
         scenario: ScenarioConfig,
         pool: PilotPool,
-        telemetry: TelemetrySink | None,
+        shown: ShownFlock | None,
         recorders: Sequence[Recorder],
         companion: tuple[FloatArray, FloatArray],
         preparing: Callable[[int, int], None],
     ) -> None:
         self._companion = companion
         preparing(1, _PREPARATIONS)
-        self._telemetry, self._recorders = telemetry, recorders
+        self._shown, self._recorders = shown, recorders
         self._cameras = CameraSimulator(scenario, threads=0 if pool.on_this_thread else None)
         preparing(2, _PREPARATIONS)
         pool.wait_until_ready()
@@ -201,24 +206,29 @@ class _VisionPilots:
         """Commands for all drones. Each steps as soon as its images are drawn."""
         steps = {}
         render_ms = {}
+        orders = orders_of(self._shown, self._drones)
         for i in self._drones:
             begin = time.perf_counter()
             frames, seen = self._cameras.capture(i, step, time_s, vehicles)
             render_ms[i] = 1e3 * (time.perf_counter() - begin)
             state = self._autopilots[i].read(time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i])
             with_pictures = pictured and i in self._drones[:_KEY_FRAME_DRONES]
-            steps[i] = frames, state, self._pool.step(i, frames, state, seen, pictured=with_pictures)
+            steps[i] = (
+                frames,
+                state,
+                self._pool.step(i, frames, state, seen, pictured=with_pictures, order=orders.get(i)),
+            )
         self._stepped = {i: future.result() for i, (_, _, future) in steps.items()}
         truth = self._truth(step, time_s, vehicles)
         for i, stepped in self._stepped.items():
             frames, state, _ = steps[i]
             output = stepped.output
-            if self._telemetry is not None:
-                publish_step(self._telemetry, f"drone{i + 1}", state, output)
+            if self._shown is not None:
+                self._shown.show(i, frames, state, output)
             if self._recorders:
                 recorder = self._recorders[self._drones.index(i)]
                 recorder.drain()  # simulated time stands still, so nothing need ever be dropped
-                recorder.step(frames, state, output, truth)
+                recorder.step(frames, state, output, truth, orders.get(i))
             builder.add_output(step, i, output, state.R_ned_body, {"render": render_ms[i], **output.stages_ms})
         return self._commands(time_s, vehicles)
 

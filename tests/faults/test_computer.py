@@ -99,7 +99,7 @@ async def test_a_network_never_returns(in_the_air: InTheAir, record_property: Re
 
 
 def _is_not_fed(ship: Aboard) -> bool:
-    components = ship.daemon._components
+    components = ship.daemon.components
     return components is not None and components.networks.hopeless
 
 

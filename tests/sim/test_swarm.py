@@ -11,8 +11,10 @@ import pytest
 from flockd.core.config import Overrides, ScenarioConfig, load_scenario
 from flockd.core.data import data_path
 from flockd.onboard.telemetry import TelemetrySink
-from flockd.onboard.telemetry.publisher import ZenohTelemetry
+from flockd.onboard.telemetry.publisher import Ask, NewestImage, ZenohTelemetry
+from flockd.onboard.telemetry.topics import AboutMessage
 from flockd.review.flight_log.log import FlightLog
+from flockd.sim.shown_flock import ShownFlock
 from flockd.sim.start import with_drones
 from flockd.sim.swarm import Flight, fly
 
@@ -26,8 +28,22 @@ def scenario(duration_s: float = 0.5 * STEPS, height: str = "best") -> ScenarioC
     return with_drones(load_scenario(data_path("config") / "paper_flight.yaml", overrides), 2)
 
 
+class Announced:
+    """Where a flock is announced; it keeps what gives the drones' pictures."""
+
+    def __init__(self) -> None:
+        self.images: dict[str, NewestImage] = {}
+
+    def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
+        self.images[drone] = newest_image
+
+
 def flown(telemetry: TelemetrySink) -> FlightLog:
-    return fly(scenario(), telemetry=telemetry, processes=1).log
+    announced = Announced()
+    log = fly(scenario(), shown=ShownFlock(scenario(), announced, telemetry), processes=1).log
+    pictures = [newest("front") for newest in announced.images.values()]
+    assert [picture[:2] for picture in pictures if picture is not None] == [b"\xff\xd8"] * 2, "JPEGs of both"
+    return log
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,12 @@ from flockd.core.config import DroneConfig
 from flockd.core.errors import ConfigError, ConfigProblem, FlockdError
 from flockd.flight.safety import Decision, Event, State
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
+from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.daemon.components import Components
 from flockd.onboard.daemon.control import FLYING
 from flockd.onboard.daemon.operator_commands import OperatorRequests
 from flockd.onboard.daemon.service_manager import ServiceManager
-from flockd.onboard.daemon.startup import open_components
+from flockd.onboard.daemon.startup import Connect, open_components
 from flockd.onboard.daemon.status_messages import notify_service_manager, publish_status
 from flockd.onboard.daemon.watched_networks import InterruptibleNetworks
 from flockd.onboard.sources import open_source
@@ -50,6 +51,7 @@ class Daemon:
         recordings: Path | None,
         service: ServiceManager,
         clock: Callable[[], float] = time.monotonic,
+        connect: Connect = AutopilotLink.connect,
     ) -> None:
         """Checks the configuration; nothing is opened before `run`.
 
@@ -61,6 +63,7 @@ class Daemon:
             recordings: the folder for recordings of flights; None: nothing is recorded.
             service: the service manager, if any.
             clock: monotonic seconds.
+            connect: connects to the autopilot.
 
         Raises ConfigError for a configuration that cannot be flown.
         """
@@ -68,19 +71,20 @@ class Daemon:
         self._source = open_source(config, file, clock=clock)
         self._config, self._file = config, file
         self._load_networks, self._models, self._recordings = load_networks, models, recordings
-        self._service, self._clock = service, clock
+        self._service, self._clock, self._connect = service, clock, connect
         self._operator = OperatorRequests()
         self._stopping = asyncio.Event()
         self._reload: DroneConfig | None = None
-        self._components: Components | None = None
+        self.components: Components | None = None
+        """All parts of the flight, once they are open."""
 
     def waits_for(self) -> str | None:
         """What has to come before it can fly, for people; None once it has all."""
         assert self._config.autopilot is not None
-        if self._components is None:
+        if self.components is None:
             return f"the autopilot at {self._config.autopilot.address}, and for the networks to load"
-        if self._components.pilot_loop.frames is None:
-            faults = [status.fault for status in self._components.source.status().values() if status.fault]
+        if self.components.pilot_loop.frames is None:
+            faults = [status.fault for status in self.components.source.status().values() if status.fault]
             return f"camera frames: {'; '.join(faults) or 'none came yet'}"
         return None
 
@@ -107,8 +111,8 @@ class Daemon:
                 self._service.reloading()
                 self.ask_to_stop()
                 return
-        if self._components is not None:
-            self._components.sinks.event(refusal)
+        if self.components is not None:
+            self.components.sinks.event(refusal)
 
     async def run(self) -> Ending:
         """Flies until it is asked to stop.
@@ -126,17 +130,18 @@ class Daemon:
                 operator=self._operator,
                 on_tick=self._on_tick,
                 clock=self._clock,
+                connect=self._connect,
             )
             components = await self._unless_stopped(start)
             if components is not None:
-                self._components = components
+                self.components = components
                 await self._fly(components)
         return Ending(self._reload)
 
     def _why_not_reload(self) -> str | None:
-        if self._components is None:
+        if self.components is None:
             return None
-        state, status = self._components.control.decision.state, self._components.link.status()
+        state, status = self.components.control.decision.state, self.components.link.status()
         if state in FLYING or status.in_air or status.armed:
             return "the configuration was not read again, because the drone is armed or in the air; land and disarm it"
         return None
@@ -206,7 +211,7 @@ class Daemon:
 
     def _on_tick(self, before: Decision, now: Decision) -> None:
         """Called by the control loop: feeds the watchdog, reports changes of state, begins and ends recordings."""
-        components = self._components
+        components = self.components
         assert components is not None
         if not components.networks.hopeless:
             self._service.alive()

@@ -7,10 +7,11 @@ import time
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from flockd import __version__
 from flockd.core.config import DroneConfig
+from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.secrets import masked
 from flockd.flight.geometry import build_rig
 from flockd.flight.safety import Decision, Gate
@@ -41,6 +42,15 @@ OPEN_S = 10.0
 CLOSE_S = 3.0
 
 
+class Connect(Protocol):
+    """Connects to an autopilot, as `AutopilotLink.connect` does."""
+
+    def __call__(
+        self, parameters: AutopilotParameters, *, clock: Callable[[], float]
+    ) -> Coroutine[Any, Any, AutopilotLink]:
+        """The link."""
+
+
 async def open_components(
     stack: AsyncExitStack,
     config: DroneConfig,
@@ -52,6 +62,7 @@ async def open_components(
     operator: OperatorRequests,
     on_tick: Callable[[Decision, Decision], None],
     clock: Callable[[], float],
+    connect: Connect,
 ) -> Components:
     """Opens and connects all components; ``stack`` closes what was opened, in reverse order.
 
@@ -69,9 +80,7 @@ async def open_components(
     stack.push_async_callback(_close_async, sinks.close)
     await closing.do(OPEN_S, source.start)
     stack.push_async_callback(_close, closing, source.stop)
-    networks, link = await _both(
-        _networks(config, loading, load_networks), AutopilotLink.connect(config.autopilot, clock=clock)
-    )
+    networks, link = await _both(_networks(config, loading, load_networks), connect(config.autopilot, clock=clock))
     stack.push_async_callback(_close_async, link.close)
     gate = Gate(config.safety.gate)
     streamer = SetpointStreamer(

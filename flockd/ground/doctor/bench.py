@@ -1,0 +1,269 @@
+"""The bench: propellers off, the line runs from the cameras to the gate, and nothing is sent that moves a drone."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.core.config import DroneConfig
+from flockd.core.messages import FloatArray, Setpoint
+from flockd.flight.inference.hashes import model_hashes
+from flockd.flight.perception import load_networks
+from flockd.flight.safety import Gate
+from flockd.ground.doctor.finding import Finding, failed, passed, warned
+from flockd.onboard.autopilot.autopilot_status import AutopilotError
+from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
+from flockd.onboard.daemon import Components, Daemon, InterruptibleNetworks, ServiceManager
+from flockd.onboard.deadline import GOLDEN_S, within
+
+SAMPLE_S = 0.5
+STEADY = 0.95
+"""Least share of the steps that were due."""
+GATE_PERIOD_S = 0.05
+
+
+class SilentLink(AutopilotLink):
+    """Hears the autopilot, and asks it for messages; whatever else a daemon would send does not leave it."""
+
+    def send_setpoint(self, setpoint: Setpoint) -> None:
+        """Sends nothing."""
+
+    async def _refused(self) -> None:
+        raise AutopilotError("on the bench nothing is asked of the autopilot")
+
+    request_offboard = hold = land = return_home = arm = take_off = _refused
+
+
+@dataclass(frozen=True)
+class Sample:
+    """How it ran at one moment."""
+
+    time_s: float
+    armed: bool
+    heartbeat_age_s: float
+    steps: int
+    failed: int
+    load: float
+    """What a step takes of the time it has, 95th percentile of the last ones."""
+    loop_lag_s: float
+    temperature_c: float | None
+    camera_age_s: Mapping[str, float]
+    """Since each camera's newest usable frame."""
+    camera_faults: Mapping[str, str]
+    neighbours: int
+    own_motion: bool
+    command: FloatArray | None
+    """(2,) m/s, north and east: what the gate would have let through."""
+
+
+async def bench(
+    config: DroneConfig,
+    file: str,
+    seconds: float,
+    *,
+    stop: asyncio.Event,
+    on_second: Callable[[int], None] = lambda seconds: None,
+    load: Callable[[], InterruptibleNetworks] | None = None,
+    clock: Callable[[], float] = time.monotonic,
+) -> list[Sample]:
+    """Runs the daemon with a link that sends nothing, until the time is over, `stop` is set, or the drone is armed.
+
+    Args:
+        config: the drone's.
+        file: its path, named in errors.
+        seconds: how long, from the first frame on.
+        stop: ends it early.
+        on_second: called with how many seconds are over.
+        load: loads the networks; None: the configured ones.
+        clock: monotonic seconds.
+
+    Raises FlockdError for what cannot be opened.
+    """
+    daemon = Daemon(
+        config,
+        file,
+        load_networks=load or (lambda: load_networks(config.perception, within(GOLDEN_S))),
+        models=model_hashes(config.perception),
+        recordings=None,
+        service=ServiceManager({}),
+        clock=clock,
+        connect=SilentLink.connect,
+    )
+    running = asyncio.create_task(daemon.run())
+    try:
+        return await _sampled(daemon, running, Gate(config.safety.gate), seconds, stop, on_second, clock)
+    finally:
+        daemon.ask_to_stop()
+        await asyncio.wait({running})
+        if not running.cancelled() and (error := running.exception()) is not None:
+            raise error
+
+
+async def _sampled(
+    daemon: Daemon, running: asyncio.Task[object], gate: Gate, seconds: float, stop: asyncio.Event,
+    on_second: Callable[[int], None], clock: Callable[[], float],
+) -> list[Sample]:  # fmt: skip
+    samples: list[Sample] = []
+    began_s = sampled_s = math.inf
+    command: FloatArray | None = None
+    while not running.done() and not stop.is_set():
+        await asyncio.sleep(GATE_PERIOD_S)
+        components, now = daemon.components, clock()
+        if components is None or components.pilot_loop.frames is None:
+            continue
+        if math.isinf(began_s):
+            began_s, sampled_s = now, now - SAMPLE_S
+        setpoint = components.control.rehearsed(gate)
+        command = None if setpoint is None else setpoint.velocity
+        if now - sampled_s >= SAMPLE_S:
+            sampled_s = now
+            samples.append(_sample(components, now - began_s, command))
+            on_second(int(now - began_s))
+            if samples[-1].armed:
+                break
+        if now - began_s >= seconds:
+            break
+    return samples
+
+
+def _sample(components: Components, time_s: float, command: FloatArray | None) -> Sample:
+    loop, status = components.pilot_loop, components.link.status()
+    cameras = components.source.status()
+    output = None if loop.newest is None else loop.newest.output
+    return Sample(
+        time_s=time_s,
+        armed=status.armed,
+        heartbeat_age_s=status.heartbeat_age_s,
+        steps=loop.steps,
+        failed=loop.failed,
+        load=loop.load(),
+        loop_lag_s=components.lag.worst_s(),
+        temperature_c=components.thermometer.hottest_c,
+        camera_age_s={name: camera.age_s for name, camera in cameras.items()},
+        camera_faults={name: camera.fault for name, camera in cameras.items() if camera.fault is not None},
+        neighbours=0 if output is None else sum(one.confirmed for one in output.neighbours),
+        own_motion=output is not None and output.ego_motion is not None,
+        command=command,
+    )
+
+
+def judged(config: DroneConfig, samples: Sequence[Sample], seconds: float) -> Iterator[Finding]:
+    """What the samples of a bench of so many seconds say."""
+    if not samples:
+        yield failed("bench", "no frame came, so that nothing could be run", "run `flockd doctor` first")
+        return
+    ran_s = samples[-1].time_s
+    if samples[-1].armed:
+        yield failed(
+            "bench", f"the drone was armed after {ran_s:.0f} s, which ended it", "leave it disarmed; begin again"
+        )
+    elif ran_s < seconds - 2 * SAMPLE_S:
+        yield warned(
+            "bench", f"ended after {ran_s:.0f} of {seconds:.0f} s", "let it run to its end: heat takes its time"
+        )
+    else:
+        yield passed("bench", f"ran for {ran_s:.0f} s without arming; nothing was sent that moves the drone")
+    yield from _steps(config, samples, ran_s)
+    yield from _cameras(config, samples)
+    yield _lag(config, samples)
+    yield _temperature(config, samples)
+    yield _autopilot(config, samples)
+    yield from _what_it_saw(samples)
+    yield _commands(samples)
+
+
+def _steps(config: DroneConfig, samples: Sequence[Sample], ran_s: float) -> Iterator[Finding]:
+    steps, due = samples[-1].steps, max(ran_s / config.step_s, 1.0)
+    measured = f"{steps} steps, {steps / max(ran_s, config.step_s):.2f} a second of {1 / config.step_s:.2f} configured"
+    lost = samples[-1].failed
+    if lost:
+        yield failed("steps", f"{measured}; {lost} had no result", "read the events above; run `flockd models verify`")
+    elif steps < STEADY * due:
+        yield warned("steps", measured, "give flockd more of the computer, or a longer step_s")
+    else:
+        yield passed("steps", measured)
+    loads = np.array([sample.load for sample in samples if sample.steps])
+    if not len(loads):
+        return
+    measured = f"a step takes {100 * np.median(loads):.0f} % of its time, at worst {100 * loads.max():.0f} %"
+    fix = "stop other programs, cool the computer, use fewer or smaller images, or a longer step_s"
+    if loads.max() > config.safety.max_load:
+        yield failed("load", f"{measured}: it would have handed over to the autopilot", fix)
+    elif loads.max() > config.safety.degraded_load:
+        yield warned("load", f"{measured}: it would have slowed down", fix)
+    else:
+        yield passed("load", measured)
+
+
+def _cameras(config: DroneConfig, samples: Sequence[Sample]) -> Iterator[Finding]:
+    for camera in config.rig.cameras:
+        ages_s = [age for s in samples if math.isfinite(age := s.camera_age_s.get(camera.name, math.inf))]
+        faults = list(dict.fromkeys(s.camera_faults[camera.name] for s in samples if camera.name in s.camera_faults))
+        about = f"camera {camera.name}"
+        measured = (
+            f"newest frame {1e3 * float(np.median(ages_s)):.0f} ms old, at worst {1e3 * max(ages_s):.0f} ms"
+            if ages_s
+            else ""
+        )
+        if faults or not ages_s:
+            fix = "run `flockd doctor --only cameras --seconds 60`; check its cable"
+            yield failed(about, "; ".join(filter(None, (measured, *faults))) or "no frame came", fix)
+        else:
+            yield passed(about, measured)
+
+
+def _lag(config: DroneConfig, samples: Sequence[Sample]) -> Finding:
+    worst_s, limit_s = max(sample.loop_lag_s for sample in samples), config.safety.max_loop_lag_s
+    measured = f"the control loop was late by {1e3 * worst_s:.0f} ms at worst, of {1e3 * limit_s:.0f} ms allowed"
+    fix = "give the service a higher priority, and stop other programs"
+    return failed("control loop", measured, fix) if worst_s > limit_s else passed("control loop", measured)
+
+
+def _temperature(config: DroneConfig, samples: Sequence[Sample]) -> Finding:
+    known = [sample.temperature_c for sample in samples if sample.temperature_c is not None]
+    if not known:
+        return warned(
+            "temperature", "this computer reports none", "load the driver of its thermal sensor, if it has one"
+        )
+    limit_c = config.safety.degraded_temperature_c
+    measured = (
+        f"{known[0]:.0f} °C at the start, {max(known):.0f} at most, {known[-1]:.0f} at the end; limit {limit_c:g}"
+    )
+    fix = "improve its airflow, or add a heat sink"
+    return warned("temperature", measured, fix) if max(known) >= limit_c else passed("temperature", measured)
+
+
+def _autopilot(config: DroneConfig, samples: Sequence[Sample]) -> Finding:
+    assert config.autopilot is not None
+    oldest_s, limit_s = max(sample.heartbeat_age_s for sample in samples), config.autopilot.max_heartbeat_age_s
+    measured = f"heartbeats at most {oldest_s:.1f} s apart, {limit_s:g} s allowed"
+    fix = "check the cable, its baud rate, and what else uses the port"
+    return failed("autopilot", measured, fix) if oldest_s > limit_s else passed("autopilot", measured)
+
+
+def _what_it_saw(samples: Sequence[Sample]) -> Iterator[Finding]:
+    most = max(sample.neighbours for sample in samples)
+    share = sum(sample.neighbours > 0 for sample in samples) / len(samples)
+    measured = (
+        f"{most} {'neighbour' if most == 1 else 'neighbours'} at most, one or more in {100 * share:.0f} % of the time"
+    )
+    fix = "where no drone was to be seen, they are false: look at them with `flockd detect` or `flockd view`"
+    yield warned("neighbours", measured, fix) if most else passed("neighbours", "none were seen")
+    known = sum(sample.own_motion for sample in samples) / len(samples)
+    measured = f"estimated in {100 * known:.0f} % of the time"
+    fix = "the cameras need something with texture to see, and light"
+    yield passed("own motion", measured) if known >= STEADY else warned("own motion", measured, fix)
+
+
+def _commands(samples: Sequence[Sample]) -> Finding:
+    speeds = [float(np.hypot(*sample.command)) for sample in samples if sample.command is not None]
+    if not speeds:
+        return warned("commands", "none was computed", "let it run longer than two steps")
+    return passed(
+        "commands", f"it would have flown at {np.median(speeds):.2f} m/s at the median, {max(speeds):.2f} m/s at most"
+    )

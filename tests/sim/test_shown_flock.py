@@ -1,0 +1,90 @@
+"""A flock on exact states that watchers see as a real one: states, pictures on request, and orders that it flies."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from flockd.core.config import load_scenario
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.data import data_path
+from flockd.onboard.telemetry.publisher import Ask, NewestImage
+from flockd.onboard.telemetry.topics import AboutMessage
+from flockd.sim.shown_flock import RealTime, ShownFlock
+from flockd.sim.start import with_drones
+from flockd.sim.swarm import fly
+
+SECONDS_TO_FAIL = 120.0
+
+
+class Watching:
+    """Announcements and messages, as zenoh would pass them on."""
+
+    def __init__(self) -> None:
+        self.about: dict[str, AboutMessage] = {}
+        self.ask: dict[str, Ask] = {}
+        self.image: dict[str, NewestImage] = {}
+        self.states: dict[str, list[Mapping[str, object]]] = {}
+
+    def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
+        self.about[drone], self.ask[drone], self.image[drone] = about, ask, newest_image
+
+    def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
+        if topic == "state":
+            self.states.setdefault(drone, []).append(message)
+
+    def goto(self, drone: str, north_m: float, east_m: float) -> tuple[bool, str]:
+        answer = self.ask[drone]("goto", json.dumps({"north_m": north_m, "east_m": east_m}).encode())
+        return answer["accepted"], answer["sentence"]
+
+
+def scenario(duration_s: float) -> ScenarioConfig:
+    overrides = {"duration_s": duration_s, "drone.safety.gate.fence_radius_m": 30.0}
+    return with_drones(load_scenario(data_path("config") / "paper_flight.yaml", overrides), 2)
+
+
+def test_a_flock_on_exact_states_is_seen_and_goes_where_it_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RealTime, "wait", lambda self, time_s: None)
+    watching = Watching()
+    flown = scenario(60.0)
+    shown = ShownFlock(flown, watching, watching)
+    assert not watching.goto("drone1", 1.0, 2.0)[0], "not before it knows where it is"
+
+    def order_when_due(done: int, total: int) -> None:
+        if done == 20:
+            assert watching.goto("drone1", -10.0, -12.0) == (
+                True,
+                "goto is being tried; the drone's state shows the result",
+            )
+            assert watching.goto("drone2", -10.0, -12.0)[0]
+            accepted, why = watching.goto("drone1", 100.0, 0.0)
+            assert not accepted
+            assert "fence" in why
+
+    log = fly(flown, perception="truth", shown=shown, progress=order_when_due).log
+    assert set(watching.about) == set(watching.states) == {"drone1", "drone2"}
+    assert watching.about["drone1"]["commands"] == ["goto", "velocity"]
+    assert [state["position_ne"] for state in watching.states["drone2"]] == log.position[:, 1, :2].tolist()
+    assert np.linalg.norm(log.position[-1, :, :2].mean(axis=0) - [-10.0, -12.0]) < 1.0
+    refused = watching.ask["drone1"]("hold", b"")
+    assert (refused["accepted"], refused["sentence"]) == (
+        False, "hold is an autopilot's, and simulated drones have none"
+    )  # fmt: skip
+    began_s = time.monotonic()
+    while (picture := watching.image["drone1"]("front")) is None:
+        assert time.monotonic() - began_s < SECONDS_TO_FAIL, "the world is built when a picture is asked for"
+        time.sleep(0.1)
+    assert picture[:2] == b"\xff\xd8", "a JPEG"
+
+
+def test_real_time_is_waited_for_and_never_caught_up_with() -> None:
+    slept: list[float] = []
+    clock = iter((100.0, 100.0, 100.2, 101.7))
+    pace = RealTime(lambda: next(clock), slept.append)
+    for time_s in (0.0, 0.5, 1.0):
+        pace.wait(time_s)
+    assert slept == pytest.approx([0.0, 0.3, 0.0])
