@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +82,7 @@ _CAUSES = {
 }
 
 
-def causes_text(summary: Json) -> str:
+def causes_text(summary: Mapping[str, Any]) -> str:
     """What gates slowed drones down for, and for how much of the time; a moment may have several causes."""
     return ", ".join(f"{_CAUSES[cause]} {100 * part:.1f} %" for cause, part in summary["slowed_by"].items())
 
