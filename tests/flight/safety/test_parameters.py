@@ -70,10 +70,10 @@ def test_limits_beyond_what_any_multirotor_does_are_refused(key: str, value: flo
 
 def test_a_law_faster_than_the_gate_is_reported_with_both_keys() -> None:
     with pytest.raises(
-        ConfigError, match=r"flocking.max_speed_m_s 6 is above safety.gate.max_speed_m_s.*write 4 or less"
+        ConfigError, match=r"flocking.max_speed_m_s: 6 is above safety.gate.max_speed_m_s.*write 4 or less"
     ):
         load_drone(SIMULATOR, {"flocking.max_speed_m_s": 6.0})
-    with pytest.raises(ConfigError, match=r"above safety.gate.max_speed_m_s.*write 0.3 or less for the trim"):
+    with pytest.raises(ConfigError, match=r"above safety.gate.max_speed_m_s.*write 0.3 or less"):
         load_drone(PX4_SITL, {"flocking.max_speed_m_s": 3.7})
     both = load_drone(SIMULATOR, {"flocking.max_speed_m_s": 6.0, "safety.gate.max_speed_m_s": 6.0})
     assert both.safety.gate.max_speed_m_s == 6.0

@@ -9,7 +9,7 @@ import pytest
 
 from flockd.core.messages import FloatArray, Neighbour, PossibleMotion
 from flockd.flight.safety import Surroundings
-from flockd.flight.safety.surroundings import surroundings
+from flockd.flight.safety.surroundings import BEYOND, surroundings
 
 
 def told(neighbours: list[Neighbour], obstacles: FloatArray) -> Surroundings:
@@ -75,7 +75,7 @@ def test_one_that_may_move_in_two_ways_counts_as_both_each_by_its_probability() 
 def test_a_motion_less_probable_than_its_share_of_the_doubt_does_not_count() -> None:
     """Half of 2.275 % is 1.1375 %."""
     here, still = np.array([6.0, 0.0, 0.0]), np.zeros(3)
-    for share, count in ((0.0113, 1), (0.0115, 2)):
+    for share, count in ((0.0113, 1), (BEYOND / 2, 1), (0.0115, 2)):
         motions = tuple(
             PossibleMotion(probability, here, still, range_sigma_m=0.5, closing_sigma_m_s=1.0)
             for probability in (1 - share, share)
