@@ -225,8 +225,7 @@ def test_no_descriptors_are_left_at_the_start(tmp_path: Path) -> None:
     """One sentence and exit code 69, however few there are; never an abort."""
     config = config_for(free_port(), free_endpoint(), free_endpoint())
     path = tmp_path / "drone.yaml"
-    values = {**config.model_dump(mode="json", exclude_defaults=True), "flocking": {"max_speed_m_s": 2.0}}
-    path.write_text(yaml.safe_dump(values), encoding="utf-8")
+    path.write_text(yaml.safe_dump(config.model_dump(mode="json", exclude_defaults=True)), encoding="utf-8")
     run = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
     for limit, count in ((resource.RLIMIT_NOFILE, 24), (resource.RLIMIT_NOFILE, 40), (resource.RLIMIT_AS, 450 << 20)):
         ended = subprocess.run(

@@ -37,7 +37,7 @@ class Ended:
 def _run(folder: Path, change: Callable[[dict[str, Any]], object]) -> Ended:
     """`flockd run` with a configuration that was spoiled."""
     config = config_for(free_port(), free_endpoint(), free_endpoint())
-    values = {**config.model_dump(mode="json", exclude_defaults=True), "flocking": {"max_speed_m_s": 2.0}}
+    values = config.model_dump(mode="json", exclude_defaults=True)
     change(values)
     path = folder / "drone.yaml"
     path.write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
