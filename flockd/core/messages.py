@@ -285,6 +285,21 @@ class ObstacleRanges:
 
 
 @dataclass(frozen=True, eq=False)
+class PossibleMotion:
+    """What a track may be, by its detections: one hypothesis of how the neighbour moves."""
+
+    probability: float
+    """That it is the true one; those of a neighbour add up to 1."""
+    position: Vector3
+    velocity: Vector3
+    """As of `Neighbour`."""
+    range_sigma_m: float
+    """Standard deviation of the position along the line of sight, ..."""
+    closing_sigma_m_s: float
+    """... and of the velocity."""
+
+
+@dataclass(frozen=True, eq=False)
 class Neighbour:
     """A tracked drone, in level axes that point north, east and down, relative to the own drone."""
 
@@ -303,6 +318,9 @@ class Neighbour:
     confirmed: bool
     existence_probability: float = 1.0
     """Probability that it is a drone and still there; 1 in recordings from before it was estimated."""
+    possible: tuple[PossibleMotion, ...] | None = None
+    """The motions that it may have, the likeliest first, where its detections do not tell yet; the position and
+    velocity above are their mean. None: one, as above."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ from flockd.flight.safety.surroundings import surroundings
 from flockd.review.flight_log.metadata import HandedOver
 from flockd.sim.commands import Commands
 from flockd.sim.handover import Handover
+from flockd.sim.made_up_detections import lost_cameras
 from flockd.sim.slowing import Cause, SlowedTime, causes_of, is_slowed, which_are_drones
 from flockd.sim.supervision import WindSupervisor
 from flockd.sim.vehicles import Vehicles
@@ -47,8 +48,8 @@ class _Drone(NamedTuple):
 class ControlLoop:
     """Flies all drones of a flight from one step of their pilots to the next.
 
-    Each has a gate, and a supervisor that knows of wind, fence and heights: it flies slower, or asks for Hold. A
-    person's drone, and one whose autopilot has taken over, fly without them.
+    Each has a gate, and a supervisor that knows of wind, fence, heights and, with made-up detections, lost cameras:
+    it flies slower, or asks for Hold. A person's drone, and one whose autopilot has taken over, fly without them.
     """
 
     def __init__(self, scenario: ScenarioConfig, *, gated: bool = True) -> None:
@@ -62,6 +63,7 @@ class ControlLoop:
             if gated and not vehicle.by_hand
         }
         self._start_m = [-vehicle.position_m[2] for vehicle in scenario.vehicles]
+        self._scenario = scenario
         self._latency_s = scenario.detections.latency_s if scenario.detections is not None else 0.0
         self._in_force: _Order | None = None
         self.slowed = SlowedTime()
@@ -96,7 +98,7 @@ class ControlLoop:
     def _setpoint(self, i: int, now_s: float, period_s: float, vehicles: Vehicles, order: _Order) -> Setpoint:
         """What the gate of a drone makes of its order now; its supervisor may hand it over instead."""
         drone, here = self._drones[i], vehicles.position[i]
-        decision = drone.supervisor.step(now_s, drone.gate.gusts_m_s, here)
+        decision = drone.supervisor.step(now_s, drone.gate.gusts_m_s, here, blind=self._is_blind(i, now_s))
         if decision.state is State.ASKING:
             self._handover.hold(i, here, vehicles.velocity[i])
             self.handed_over[i] = HandedOver(time_s=now_s, reason=decision.reasons[0].sentence)
@@ -107,6 +109,10 @@ class ControlLoop:
             slowed = is_slowed(request, verdict, drone.gate.drift)
             self.slowed.add(period_s, self._causes(i, request, verdict, vehicles) if slowed else frozenset())
         return verdict.setpoint
+
+    def _is_blind(self, i: int, now_s: float) -> bool:
+        """Whether a camera of a drone that flies on made-up detections is lost."""
+        return self._scenario.detections is not None and bool(lost_cameras(self._scenario, i, now_s))
 
     def _causes(self, i: int, request: Request, verdict: Verdict, vehicles: Vehicles) -> frozenset[Cause]:
         truth = _truth(i, vehicles)

@@ -10,6 +10,7 @@ import numpy as np
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FloatArray, MissionOrder, MissionStatus, Neighbour, ObstacleRanges
 from flockd.flight.flocking import FlockingLaw
+from flockd.flight.flocking.passing import clear_of
 from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
 from flockd.flight.obstacles import Avoidance
@@ -43,6 +44,7 @@ class ExactFlock:
         made_up, n = scenario.detections, len(self._pilots)
         self._tracked = [] if made_up is None else [TrackedNeighbours(scenario, made_up, i) for i in range(n)]
         self._obstacles = obstacles_of(scenario)
+        self._vertical_m = drone.safety.gate.vertical_separation_m
         self._avoids = drone.obstacles.enabled
         self._avoidances = [Avoidance(drone.obstacles, drone.safety.gate, drone.step_s) for _ in self._pilots]
 
@@ -85,6 +87,7 @@ class ExactFlock:
         desired = pilot.pull(guidance)
         if ranges is None or not self._avoids:
             command, acceleration = self._law.command(moving[i], places[:, :2], others, desired, self._step_s)
+            command = clear_of(command, moving[i], places, others, self._law.parameters, self._vertical_m)
         else:
             command, acceleration = self._avoidances[i].command(self._law, moving[i], places, others, desired, ranges)
         yaw_rad = float(self._yaw_rad[i]) if guidance.course_rad is None else guidance.course_rad
@@ -102,7 +105,7 @@ class ExactFlock:
         self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray
     ) -> tuple[Neighbour, ...]:
         if self._tracked:
-            return self._tracked[i].step(time_s, positions, velocities)
+            return self._tracked[i].step(time_s, positions, velocities, float(self._yaw_rad[i]))
         offsets = positions[:, :2] - positions[i, :2]
         seen = np.hypot(offsets[:, 0], offsets[:, 1]) <= self._law.parameters.observation_distance_m
         seen[i] = False

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from flockd.core.config.scenario import DetectionsConfig, ScenarioConfig
-from flockd.core.messages import FloatArray, Neighbour
+from flockd.core.messages import BoolArray, FloatArray, Neighbour
+from flockd.flight.geometry import build_rig, rotation_from_euler
 from flockd.flight.tracking import Measurement, Tracker
 
 _OWN_MOTION_ERROR_M = 0.02
@@ -17,19 +18,32 @@ class TrackedNeighbours:
 
     def __init__(self, scenario: ScenarioConfig, config: DetectionsConfig, drone: int) -> None:
         self._config, self._drone, self._step_s = config, drone, scenario.drone.step_s
+        self._scenario, self._rig = scenario, build_rig(scenario.drone.rig)
         self._tracker = Tracker(scenario.drone.tracking)
         self._random = np.random.default_rng([scenario.seed, drone])
         self._position: FloatArray | None = None
 
-    def step(self, time_s: float, positions: FloatArray, velocities: FloatArray) -> tuple[Neighbour, ...]:
-        """With all drones at (n, 3) m and (n, 3) m/s in NED; called once a step."""
+    def step(
+        self, time_s: float, positions: FloatArray, velocities: FloatArray, yaw_rad: float = 0.0
+    ) -> tuple[Neighbour, ...]:
+        """With all drones at (n, 3) m and (n, 3) m/s in NED, and the drone's own heading; called once a step.
+
+        In the view of a camera that has a fault nobody is detected.
+        """
         here = positions[self._drone]
         if self._position is not None:
             self._tracker.predict(self._step_s, here - self._position, _OWN_MOTION_ERROR_M)
         self._position = here
         offsets = np.delete(positions, self._drone, axis=0) - here
         found = [detection for offset in offsets if (detection := self._detection(offset)) is not None]
-        self._tracker.update(time_s, found, velocities[self._drone])
+        gone, R_ned_body = lost_cameras(self._scenario, self._drone, time_s), rotation_from_euler(0.0, 0.0, yaw_rad)
+
+        def blind(places: FloatArray) -> BoolArray:
+            return self._rig.hidden(places @ R_ned_body, gone)
+
+        if gone:
+            found = [one for one in found if not blind(one.position[None])[0]]
+        self._tracker.update(time_s, found, velocities[self._drone], blind if gone else None)
         return self._tracker.neighbours()
 
     def _detection(self, offset: FloatArray) -> Measurement | None:
@@ -43,3 +57,10 @@ class TrackedNeighbours:
         covariance = across * np.eye(3) + (along - across) * np.outer(bearing, bearing)
         log_range = float(np.log(range_m) + config.range_error * self._random.normal())
         return Measurement(bearing, log_range, covariance, 0.6, 0.95)
+
+
+def lost_cameras(scenario: ScenarioConfig, drone: int, time_s: float) -> frozenset[str]:
+    """The names of one drone's cameras that have a fault at this time."""
+    return frozenset(
+        fault.camera for fault in scenario.faults if fault.drone == drone + 1 and fault.begin_s <= time_s < fault.end_s
+    )

@@ -16,8 +16,9 @@ from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, VehicleSta
 from flockd.flight.geometry import build_rig
 from flockd.flight.mission import order_fault
 from flockd.onboard.daemon.operator_commands import ORDERS
+from flockd.onboard.daemon.order_checks import OrderChecks
 from flockd.onboard.telemetry import TelemetrySink, publish_step
-from flockd.onboard.telemetry.order_messages import parse_order
+from flockd.onboard.telemetry.order_messages import parse_ask, parse_order
 from flockd.onboard.telemetry.preview import Previews
 from flockd.onboard.telemetry.publisher import Ask, NewestImage
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
@@ -28,6 +29,10 @@ from flockd.sim.vehicles import REFERENCE_DEG, Vehicles
 
 class Announcer(Protocol):
     """Where the flock is announced: `flockd.onboard.telemetry.publisher.ZenohTelemetry`."""
+
+    @property
+    def identity(self) -> str:
+        """Of all drones that are announced there."""
 
     def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
         """A drone is alive, and replies to queries."""
@@ -44,6 +49,7 @@ class ShownFlock:
         self._drones = [i for i, vehicle in enumerate(scenario.vehicles) if not vehicle.by_hand]
         self._lock = threading.Lock()
         self._orders: dict[int, MissionOrder] = {}
+        self._checks = {i: OrderChecks(announcer.identity, time.monotonic) for i in self._drones}
         self._states: dict[int, VehicleState] = {}
         self._stepped: dict[int, tuple[FrameSet, PilotOutput]] = {}
         self._drawn: _DrawnOnRequest | None = None
@@ -100,14 +106,17 @@ class ShownFlock:
                 accepted=False, sentence=f"{command} is an autopilot's, and simulated drones have none"
             )
         try:
-            order = parse_order(command, payload)
+            ask = parse_ask(payload)
+            order = parse_order(command, ask["order"])
         except ValueError as error:
             return AnswerMessage(accepted=False, sentence=str(error))
         with self._lock:
             state = self._states.get(drone)
-        fault = order_fault(self._scenario.drone_of(drone), order, state)
+        checks = self._checks[drone]
+        fault = checks.fault(command, ask) or order_fault(self._scenario.drone_of(drone), order, state)
         if fault is not None:
             return AnswerMessage(accepted=False, sentence=fault)
+        checks.take(command, ask)
         with self._lock:
             self._orders[drone] = order
         return AnswerMessage(accepted=True, sentence=f"{command} is being tried; the drone's state shows the result")

@@ -1,4 +1,4 @@
-"""Each simulated drone's supervisor: it knows of wind, fence and heights; all else is well in a simulation."""
+"""Each simulated drone's supervisor: it knows of wind, fence, heights and lost cameras; all else is well."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from flockd.core.messages import FloatArray
 from flockd.flight.safety import OFFBOARD, CameraHealth, Decision, Inputs, Supervisor, outside_fence, outside_heights
 
 _SEES = CameraHealth(age_s=0.0, period_s=1.0, unplugged=False, frozen=False, noisy=False)
+_LOST = replace(_SEES, unplugged=True)
 _WELL = Inputs(
     cameras={"one": _SEES}, dropped_share=0.0, estimate_age_s=0.0, ego_motion_failures=0, network_faults=0,
     inference_stuck=False, load=0.0, temperature_c=None, loop_lag_s=0.0, gusts_m_s=0.0, dead_tasks=(),
@@ -30,11 +31,15 @@ class WindSupervisor:
         for changes in ({"armed": False, "in_air": False, "flight_mode": "hold"}, {"flight_mode": "hold"}, {}):
             self._supervisor.step(-math.inf, replace(_WELL, **changes))
 
-    def step(self, now_s: float, gusts_m_s: float, position: FloatArray) -> Decision:
-        """As of `now_s`, at `position` (3,) m NED from home, carried off its setpoints by `gusts_m_s`."""
+    def step(self, now_s: float, gusts_m_s: float, position: FloatArray, *, blind: bool = False) -> Decision:
+        """As of `now_s`, at `position` (3,) m NED from home, carried off its setpoints by `gusts_m_s`.
+
+        `blind`: one of its cameras is lost.
+        """
         gate = self._parameters.gate
         inputs = replace(
             _WELL,
+            cameras={"one": _SEES, "other": _LOST} if blind else _WELL.cameras,
             gusts_m_s=gusts_m_s,
             outside_fence=outside_fence(gate, position[:2]),
             outside_heights=outside_heights(gate, float(-position[2])),

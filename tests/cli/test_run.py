@@ -264,7 +264,7 @@ def test_it_flies_in_its_layer_and_reads_no_file_again_that_is_outside_the_envel
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     assert main(["run", "--config", str(config), *options]) == 0
     assert (flown[0].mission.height_m, flown[0].flocking.max_speed_m_s) == (7.0, 1.0)
-    told = "flocking.max_speed_m_s: 3.5 m/s is above the 3 m/s"
+    told = "flocking.max_speed_m_s: 3.5 m/s is above the 2 m/s"
     if options:
         assert [drone.flocking.max_speed_m_s for drone in flown] == [1.0, 3.5]
         assert told in capsys.readouterr().err

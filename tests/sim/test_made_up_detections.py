@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flockd.core.config import load_scenario
-from flockd.core.config.scenario import DetectionsConfig, ScenarioConfig
+from flockd.core.config.scenario import CameraFaultConfig, DetectionsConfig, ScenarioConfig
 from flockd.core.errors import ConfigError
 from flockd.sim.commands import Commands
 from flockd.sim.control_loop import ControlLoop
@@ -41,6 +41,34 @@ def test_nobody_is_known_beyond_the_range_nor_when_all_are_missed() -> None:
     assert np.isnan(known(range_m=9.9)).all()
     assert np.isfinite(known(range_m=10.1)[0]).all()
     assert np.isnan(known(missed=1.0)).all()
+
+
+def test_nobody_is_detected_in_the_view_of_a_camera_that_has_a_fault() -> None:
+    """8 m north and 6 m east of a drone that faces north: 37 degrees right of ahead, which the front camera shows."""
+    for camera, yaw_deg, seen in (("front", 0.0, False), ("back", 0.0, True), ("left", 90.0, False)):
+        fault = CameraFaultConfig(drone=1, camera=camera, kind="uniform", begin_s=2.0, end_s=4.0)
+        scenario = ENCOUNTER.model_copy(update={"faults": (fault,)})
+        tracked = TrackedNeighbours(scenario, DetectionsConfig(missed=0.0), 0)
+        others = TrackedNeighbours(scenario, DetectionsConfig(missed=0.0), 1)
+        unseen_s = []
+        for i in range(12):
+            found = tracked.step(0.5 * i, AHEAD, np.zeros((2, 3)), np.radians(yaw_deg))
+            unseen_s.append(max((one.unseen_s for one in found), default=9.0))
+            assert others.step(0.5 * i, AHEAD, np.zeros((2, 3)))[0].unseen_s == 0.0, "of another drone"
+        assert (max(unseen_s[4:8]) == 0.0) == seen
+        assert max(unseen_s[:4]) == max(unseen_s[8:]) == 0.0
+
+
+def test_a_drone_that_lost_a_camera_flies_degraded() -> None:
+    fault = CameraFaultConfig(drone=1, camera="back", kind="uniform", begin_s=0.5, end_s=9.0)
+    scenario = ENCOUNTER.model_copy(update={"faults": (fault,), "detections": DetectionsConfig(latency_s=0.0)})
+    loop, vehicles = ControlLoop(scenario), Vehicles(scenario.vehicles, scenario.vehicle)
+    speeds_m_s = []
+    for time_s in (0.0, 0.5, 1.0, 1.5):
+        loop.fly(time_s, vehicles, replace(Commands.of(2), velocity=np.array([[2.0, 0.0], [-2.0, 0.0]])))
+        speeds_m_s.append(np.abs(vehicles.velocity[:, 0]))
+    np.testing.assert_allclose(speeds_m_s[0], 2.0)
+    np.testing.assert_allclose(speeds_m_s[-1], [scenario.drone.safety.gate.degraded_speed_m_s, 2.0], atol=0.05)
 
 
 def test_the_same_seed_gives_the_same_and_each_drone_its_own() -> None:

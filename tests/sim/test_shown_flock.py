@@ -24,11 +24,14 @@ SECONDS_TO_FAIL = 120.0
 class Watching:
     """Announcements and messages, as zenoh would pass them on."""
 
+    identity = "f10c"
+
     def __init__(self) -> None:
         self.about: dict[str, AboutMessage] = {}
         self.ask: dict[str, Ask] = {}
         self.image: dict[str, NewestImage] = {}
         self.states: dict[str, list[Mapping[str, object]]] = {}
+        self.asked = 0
 
     def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
         self.about[drone], self.ask[drone], self.image[drone] = about, ask, newest_image
@@ -38,7 +41,12 @@ class Watching:
             self.states.setdefault(drone, []).append(message)
 
     def goto(self, drone: str, north_m: float, east_m: float) -> tuple[bool, str]:
-        answer = self.ask[drone]("goto", json.dumps({"north_m": north_m, "east_m": east_m}).encode())
+        self.asked += 1
+        asked = {
+            "operator": "anna", "session": "s", "sequence": self.asked, "time_s": time.monotonic(),
+            "identity": self.identity, "order": {"north_m": north_m, "east_m": east_m},
+        }  # fmt: skip
+        answer = self.ask[drone]("goto", json.dumps(asked).encode())
         return answer["accepted"], answer["sentence"]
 
 

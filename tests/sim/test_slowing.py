@@ -17,10 +17,10 @@ NEAR, FAR, ASIDE = [1.2, 0.0, 0.0], [9.0, 0.0, 0.0], [0.0, 5.0, 0.0]
 ALONE = Surroundings(np.zeros(2), np.zeros(2), 0.0, np.empty((0, 3)), np.empty((0, 2)), 5.0)
 
 
-def _around(*places: list[float], sigma_m: float = 0.0) -> Surroundings:
+def _around(*places: list[float], margin_m: float = 0.0) -> Surroundings:
     n = len(places)
-    offsets, sigmas = np.reshape(np.array(places, dtype=float), (n, 3)), np.full((n, 2), sigma_m)
-    return replace(ALONE, neighbours=offsets, neighbour_velocities=np.zeros((n, 2)), neighbour_sigmas=sigmas)
+    offsets, margins = np.reshape(np.array(places, dtype=float), (n, 3)), np.full((n, 2), margin_m)
+    return replace(ALONE, neighbours=offsets, neighbour_velocities=np.zeros((n, 2)), neighbour_margins=margins)
 
 
 def _causes(
@@ -47,7 +47,7 @@ def test_a_track_without_a_drone_is_a_false_detection() -> None:
 
 
 def test_one_that_would_not_limit_where_it_truly_is_does_so_by_its_uncertainty() -> None:
-    assert _causes(_around([3.0, 0.0, 0.0], sigma_m=1.5), _around([3.0, 0.0, 0.0])) == {Cause.UNCERTAINTY}
+    assert _causes(_around([3.0, 0.0, 0.0], margin_m=3.0), _around([3.0, 0.0, 0.0])) == {Cause.UNCERTAINTY}
 
 
 def test_two_may_limit_at_once() -> None:

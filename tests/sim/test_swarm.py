@@ -31,6 +31,8 @@ def scenario(duration_s: float = 0.5 * STEPS, height: str = "best") -> ScenarioC
 class Announced:
     """Where a flock is announced; it keeps what gives the drones' pictures."""
 
+    identity = "f10c"
+
     def __init__(self) -> None:
         self.images: dict[str, NewestImage] = {}
 

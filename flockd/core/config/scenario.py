@@ -122,7 +122,7 @@ class WorldConfig(Section):
 
 class DetectionsConfig(Section):
     """Detections made up from the truth with independent errors, for flights without images through the drone's own
-    tracker."""
+    tracker. In the view of a camera that has one of `faults` nobody is detected, and the drone flies degraded."""
 
     range_m: Positive = 20.0
     """Farther away nobody is detected."""

@@ -28,8 +28,9 @@ class TrackingParameters(Section):
     """Standard deviation an axis of the velocity of a drone that does not fly with the flock, comes head-on or hovers;
     and of any drone where the own velocity is not known."""
     stranger_probability: Probability = 0.2
-    """That a drone seen for the first time does not fly with the flock. Both hypotheses are followed until detections
-    tell (static multiple models: Bar-Shalom, Li & Kirubarajan 2001, section 11.6.2)."""
+    """That a drone seen for the first time does not fly with the flock; half of it, that it is on a course to meet. The
+    hypotheses are followed until detections tell (static multiple models: Bar-Shalom, Li & Kirubarajan 2001, section
+    11.6.2)."""
     robust_sigma: Positive = 2.5
     """Innovations beyond this many standard deviations count less and less; of those of the motion and measurement
     model 82 % are nearer, of measured velocities 90 % (chi-square with 4 and 3 degrees of freedom)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,6 +63,15 @@ class Rig:
     def pixels_of(self, points_body: FloatArray) -> dict[str, FloatArray]:
         """For each camera the (n, 2) pixels of body points (n, 3); NaN rows where the point is not in its image."""
         return {name: camera.pixels_of_points(points_body) for name, camera in self.cameras.items()}
+
+    def hidden(self, points_body: FloatArray, gone: Set[str]) -> BoolArray:
+        """Mask (n,): which body points (n, 3) only cameras that are `gone` would show."""
+        shown = {name: np.isfinite(uv).all(axis=1) for name, uv in self.pixels_of(points_body).items()}
+        nobody = np.zeros(len(points_body), dtype=np.bool_)
+        of_gone = np.any([nobody, *(mask for name, mask in shown.items() if name in gone)], axis=0)
+        of_others = np.any([nobody, *(mask for name, mask in shown.items() if name not in gone)], axis=0)
+        hidden: BoolArray = of_gone & ~of_others
+        return hidden
 
 
 def build_rig(config: RigConfig) -> Rig:

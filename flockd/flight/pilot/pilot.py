@@ -13,7 +13,6 @@ import numpy as np
 from flockd.core.config.drone import DroneConfig
 from flockd.core.messages import (
     NO_STATUS,
-    BoolArray,
     Detection,
     EgoMotion,
     FloatArray,
@@ -30,6 +29,7 @@ from flockd.core.messages import (
     Wanted,
 )
 from flockd.flight.flocking import FlockingLaw, level_offsets
+from flockd.flight.flocking.passing import clear_of
 from flockd.flight.geometry import build_rig
 from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
@@ -318,15 +318,8 @@ class FlockPilot:
         if not gone:
             return None
 
-        def blind(places: FloatArray) -> BoolArray:
-            pixels = self._rig.pixels_of(places @ observation.vehicle.R_ned_body)  # row by row R^T p: into the body
-            shown = {name: np.isfinite(uv).all(axis=1) for name, uv in pixels.items()}
-            of_gone = np.any([shown[name] for name in gone], axis=0)
-            of_others = np.any([shown[name] for name in observation.cameras], axis=0)
-            hidden: BoolArray = of_gone & ~of_others
-            return hidden
-
-        return blind
+        R_ned_body = observation.vehicle.R_ned_body
+        return lambda places: self._rig.hidden(places @ R_ned_body, gone)  # row by row R^T p: into the body
 
     def _command(
         self,
@@ -358,6 +351,8 @@ class FlockPilot:
             command, acceleration = self._law.command(
                 own, level_offsets(places), velocities, desired, self._config.step_s
             )
+            vertical_m = self._config.safety.gate.vertical_separation_m
+            command = clear_of(command, own, places, velocities, self._law.parameters, vertical_m)
         else:
             command, acceleration = self._avoidance.command(self._law, own, places, velocities, desired, obstacles)
         if self._config.yaw == "course" and guidance.course_rad is not None:

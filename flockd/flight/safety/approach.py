@@ -10,8 +10,6 @@ from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry.level import SAME_SPOT_M
 
-SIGMAS = 2.0
-"""Standard deviations by which an estimate of a neighbour may be wrong towards the dangerous side: 2.3 % are beyond."""
 NOTHING_NEAR = np.empty((0, 2)), np.empty(0)
 """No direction, and no limit."""
 
@@ -21,12 +19,12 @@ def towards_neighbours(
     offsets: FloatArray,
     velocities: FloatArray,
     separation_m: float,
-    sigmas: FloatArray | None = None,
+    margins: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """For each neighbour about at the drone's height its direction, (n, 2), and how fast to fly there, (n,) m/s.
 
-    `offsets` (k, 3) metres NED from the drone, `velocities` (k, 2) m/s over ground, `sigmas` (k, 2) their standard
-    deviations, m and m/s an axis; None: exact. A neighbour may be `SIGMAS` of them nearer and come as much faster.
+    `offsets` (k, 3) metres NED from the drone, `velocities` (k, 2) m/s over ground; `margins` (k, 2) by how much
+    each may be nearer, m, and come faster, m/s; None: exact.
 
     Nearer than the separation: not at all. Farther, so fast that the distance left suffices if both brake, as in
     Shalev-Shwartz et al. 2017, "On a formal model of safe and scalable self-driving cars": with v towards a
@@ -45,9 +43,9 @@ def towards_neighbours(
     goes = (velocities * towards).sum(axis=1)
     comes = -np.minimum(np.maximum(goes, -p.max_speed_m_s), p.max_speed_m_s)
     left_m, soonest = ranges - separation_m, comes
-    if sigmas is not None:
-        left_m = left_m - SIGMAS * sigmas[meets, 0]
-        soonest = np.minimum(comes + SIGMAS * sigmas[meets, 1], p.max_speed_m_s)
+    if margins is not None:
+        left_m = left_m - margins[meets, 0]
+        soonest = np.minimum(comes + margins[meets, 1], p.max_speed_m_s)
     lag = p.braking_m_s2 * p.neighbour_reaction_s
     square = lag**2 + 2 * p.braking_m_s2 * (left_m - soonest * p.neighbour_reaction_s) - soonest * np.abs(soonest)
     most_m_s = np.sqrt(np.maximum(square, lag**2)) - lag

@@ -47,8 +47,8 @@ class Surroundings:
     """Height of the drone, as in `VehicleState`; NaN: not known."""
     obstacles: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     """(m, 2) metres, north and east, relative to the drone: points of obstacles, each the nearest that it may be."""
-    neighbour_sigmas: FloatArray | None = None
-    """(n, 2) standard deviations of the neighbours' positions, m, and velocities, m/s, an axis; None: exact."""
+    neighbour_margins: FloatArray | None = None
+    """(n, 2) by how much each neighbour may be nearer, m, and come faster, m/s; None: exact."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +236,7 @@ class Gate:
         return {
             Objection.FENCE: towards_fence(p, around.position),
             Objection.SEPARATION: towards_neighbours(
-                p, around.neighbours, around.neighbour_velocities, separation_m + carried_m, around.neighbour_sigmas
+                p, around.neighbours, around.neighbour_velocities, separation_m + carried_m, around.neighbour_margins
             ),
             Objection.OBSTACLE: towards_obstacles(
                 around.obstacles, p.obstacle_clearance_m + carried_m, p.braking_m_s2, p.reaction_s

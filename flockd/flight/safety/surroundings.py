@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from statistics import NormalDist
 
 import numpy as np
 
-from flockd.core.messages import FloatArray, Neighbour
+from flockd.core.messages import FloatArray, Neighbour, PossibleMotion
 from flockd.flight.safety.gate import Surroundings
+
+_NORMAL = NormalDist()
+BEYOND = _NORMAL.cdf(-2.0)
+"""Probability that a neighbour is nearer, or comes faster, than it counts: 2.3 %, as two standard deviations."""
 
 
 def surroundings(
@@ -27,20 +32,41 @@ def surroundings(
     where it was: such drones stop before each other, and what has passed is seen behind in the next step.
 
     Caution comes before confirmation: a track limits the speed towards it from its first detection on, by its
-    uncertainty. `moved` (3,) m NED is how far the drone itself flew since then; `position` (2,) m from home, `velocity`
-    (3,) m/s NED, NaN where not known; `obstacles` (m, 2) m from where the drone was then.
+    uncertainty. One that may move in several ways counts once for each, see `_credible`. `moved` (3,) m NED is how far
+    the drone itself flew since then; `position` (2,) m from home, `velocity` (3,) m/s NED, NaN where not known;
+    `obstacles` (m, 2) m from where the drone was then.
     """
-    n = len(neighbours)
+    motions = [motion for one in neighbours for motion in _credible(one)]
+    n = len(motions)
     return Surroundings(
         position=position,
         velocity=velocity[:2],
         yaw_rad=yaw_rad,
-        neighbours=np.reshape([_by_now(one.position, age_s * one.velocity, moved) for one in neighbours], (n, 3)),
-        neighbour_velocities=np.reshape([one.velocity[:2] for one in neighbours], (n, 2)),
-        neighbour_sigmas=np.reshape([(one.position_sigma_m, one.velocity_sigma_m_s) for one in neighbours], (n, 2)),
+        neighbours=np.reshape([_by_now(one.position, age_s * one.velocity, moved) for one, _ in motions], (n, 3)),
+        neighbour_velocities=np.reshape([one.velocity[:2] for one, _ in motions], (n, 2)),
+        neighbour_margins=np.reshape(
+            [(sigmas * one.range_sigma_m, sigmas * one.closing_sigma_m_s) for one, sigmas in motions], (n, 2)
+        ),
         height_m=height_m,
         obstacles=obstacles - moved[:2],
     )
+
+
+def _credible(neighbour: Neighbour) -> Iterator[tuple[PossibleMotion, float]]:
+    """The motions that a neighbour may have, and by how many standard deviations each may be wrong.
+
+    `BEYOND` is shared among them: the less probable one is, the nearer to its mean is what remains of it, and one less
+    probable than its share does not count (Boole's inequality: the neighbour is beyond all with at most `BEYOND`).
+    """
+    possible = neighbour.possible or (
+        PossibleMotion(
+            1.0, neighbour.position, neighbour.velocity, neighbour.position_sigma_m, neighbour.velocity_sigma_m_s
+        ),
+    )
+    share = BEYOND / len(possible)
+    for motion in possible:
+        if motion.probability > share:
+            yield motion, -_NORMAL.inv_cdf(share / motion.probability)
 
 
 def _by_now(place: FloatArray, way: FloatArray, moved: FloatArray) -> FloatArray:

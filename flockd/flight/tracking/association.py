@@ -39,8 +39,8 @@ def assign(
         squared, log_determinant = pair.squared_distance, pair.log_determinant
         if squared <= gate:
             pairs[row, column] = pair
-            costs[row, column] = squared + log_determinant
-            unassigned[row, row] = max(unassigned[row, row], gate + log_determinant)
+            costs[row, column] = squared + log_determinant - 2 * pair.log_prior
+            unassigned[row, row] = max(unassigned[row, row], gate + log_determinant - 2 * pair.log_prior)
     rows, columns = linear_sum_assignment(np.hstack([costs, unassigned]))
     return {
         row: (column, pairs[row, column])

@@ -62,6 +62,8 @@ class Innovation:
     size."""
     covariance: FloatArray
     """(4, 4) of the residual, the prediction's and the measurement's together."""
+    log_prior: float = 0.0
+    """Logarithm of the probability that the prediction is the track's at all, one of several."""
 
     @property
     def squared_distance(self) -> float:
@@ -75,15 +77,18 @@ class Innovation:
 
     @property
     def log_likelihood(self) -> float:
-        """Logarithm of the Gaussian density, per steradian, unit of log range and unit of log size."""
-        return -0.5 * (self.squared_distance + self.log_determinant + 4 * math.log(2 * math.pi))
+        """Logarithm of the Gaussian density, per steradian, unit of log range and unit of log size, times the
+        prior."""
+        return self.log_prior - 0.5 * (self.squared_distance + self.log_determinant + 4 * math.log(2 * math.pi))
 
 
-def initial(measurement: Measurement, velocity: FloatArray, sigma_m_s: float, parameters: TrackingParameters) -> State:
-    """The state after a first detection of a drone that flies at `velocity` (3,) m/s, `sigma_m_s` an axis uncertain."""
+def initial(
+    measurement: Measurement, velocity: FloatArray, covariance_m2_s2: FloatArray, parameters: TrackingParameters
+) -> State:
+    """The state after a first detection of a drone that flies at `velocity` (3,) m/s, uncertain by its covariance."""
     of_place = np.vstack([measurement.range_m * np.eye(3, 4), np.zeros((3, 4)), [0.0, 0.0, 0.0, 1.0]])
     covariance = of_place @ _noise(measurement, parameters) @ of_place.T
-    covariance[3:6, 3:6] = sigma_m_s**2 * np.eye(3)
+    covariance[3:6, 3:6] = covariance_m2_s2
     return _with_velocity(State(_at(measurement, velocity), covariance), measurement, parameters)
 
 

@@ -135,6 +135,7 @@ class Tracker:
                 hits=track.hits,
                 confirmed=track.confirmed,
                 existence_probability=track.existence * track.drone_probability,
+                possible=track.hypotheses.possible,
             )
             for track in self._tracks
         )
@@ -157,7 +158,7 @@ class Tracker:
         track.drone_probability = existence.averaged(
             track.drone_probability, measurement.drone_probability, track.hits, interval_s, self.parameters
         )
-        track.hypotheses = track.hypotheses.updated(measurement, track.hits, self.parameters)
+        track.hypotheses = track.hypotheses.updated(measurement, self.parameters)
         track.last_seen_s = self._time_s
 
     def _begin(self, measurement: Measurement, own_velocity: FloatArray | None) -> _Track:

@@ -239,8 +239,7 @@ def _temperature(config: DroneConfig, samples: Sequence[Sample]) -> Finding:
 
 
 def _autopilot(config: DroneConfig, samples: Sequence[Sample]) -> Finding:
-    assert config.autopilot is not None
-    oldest_s, limit_s = max(sample.heartbeat_age_s for sample in samples), config.autopilot.max_heartbeat_age_s
+    oldest_s, limit_s = max(sample.heartbeat_age_s for sample in samples), config.safety.heartbeat_timeout_s
     measured = f"heartbeats at most {oldest_s:.1f} s apart, {limit_s:g} s allowed"
     fix = "check the cable, its baud rate, and what else uses the port"
     return failed("autopilot", measured, fix) if oldest_s > limit_s else passed("autopilot", measured)

@@ -31,7 +31,7 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "drone.yaml"
 
 
-def _write(file: Path, law: float = 3.0, gate: float = 4.0, more: str = AUTOPILOT) -> str:
+def _write(file: Path, law: float = 2.0, gate: float = 4.0, more: str = AUTOPILOT) -> str:
     file.write_text(
         f"{RIG}flocking:\n  max_speed_m_s: {law}\nsafety:\n  gate:\n    max_speed_m_s: {gate}\n{more}", encoding="utf-8"
     )
@@ -50,8 +50,8 @@ def test_a_speed_outside_the_envelope_is_refused_with_its_line(
 ) -> None:
     assert main([*command, _write(file, law=5.0, gate=6.0)]) == 78
     assert capsys.readouterr().err == (
-        f"{file}:7: flocking.max_speed_m_s: 5 m/s is above the 3 m/s up to which drones were shown to keep apart; "
-        "write 3 or less, or go beyond it with --force\n"
+        f"{file}:7: flocking.max_speed_m_s: 5 m/s is above the 2 m/s up to which drones were shown to keep apart; "
+        "write 2 or less, or go beyond it with --force\n"
         f"{file}:10: safety.gate.max_speed_m_s: 6 m/s is above the 4 m/s up to which drones were shown to keep apart; "
         "write 4 or less, or go beyond it with --force\n"
     )
@@ -69,10 +69,10 @@ def test_a_speed_outside_the_envelope_is_refused_with_its_line(
 def test_force_goes_beyond_it_with_a_warning(
     command: list[str], then: tuple[int, str], file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([*command, _write(file, law=3.1), "--force"]) == then[0]
+    assert main([*command, _write(file, law=2.1), "--force"]) == then[0]
     warning, _, rest = capsys.readouterr().err.partition("\n")
     assert warning == (
-        f"warning: {file}:7: flocking.max_speed_m_s: 3.1 m/s is above the 3 m/s up to which drones were shown to keep "
+        f"warning: {file}:7: flocking.max_speed_m_s: 2.1 m/s is above the 2 m/s up to which drones were shown to keep "
         "apart; --force goes beyond it"
     )
     assert then[1].format(file=file) in rest
@@ -80,16 +80,24 @@ def test_force_goes_beyond_it_with_a_warning(
 
 @pytest.mark.parametrize(
     ("law", "gate", "refused"),
-    [(3.0, 4.0, 0), (3.001, 4.0, 1), (3.0, 4.001, 1), (1.0, 9.0, 1), (3.5, 4.5, 2)],
+    [(2.0, 4.0, 0), (2.001, 4.0, 1), (2.0, 4.001, 1), (1.0, 9.0, 1), (2.5, 4.5, 2)],
 )
 def test_the_envelope_ends_where_the_encounters_did(law: float, gate: float, refused: int, file: Path) -> None:
     _write(file, law, gate)
     assert len(load_real_drone(file)[1]) == refused
 
 
-def test_defaults_and_shipped_drones_are_inside_and_studies_may_go_beyond(file: Path) -> None:
+def test_the_laws_default_is_outside_so_that_the_speed_has_to_be_written(file: Path) -> None:
     file.write_text(RIG + AUTOPILOT, encoding="utf-8")
-    for inside in (file, CONFIG / "quadrotor.yaml", CONFIG / "px4_sitl.yaml", CONFIG / "simulator.yaml"):
+    (problem,) = load_real_drone(file)[1]
+    assert str(problem) == (
+        f"{file}: flocking.max_speed_m_s: is not given, and its default of 3 m/s is above the 2 m/s up to which drones "
+        "were shown to keep apart; write 2 or less, or go beyond it with --force"
+    )
+
+
+def test_shipped_drones_are_inside_and_studies_may_go_beyond(file: Path) -> None:
+    for inside in (CONFIG / "quadrotor.yaml", CONFIG / "px4_sitl.yaml", CONFIG / "simulator.yaml"):
         assert load_real_drone(inside)[1] == []
     assert main(["config", "check", _write(file, law=9.0, gate=9.0, more="")]) == 0, "it has no autopilot to fly"
 
@@ -149,10 +157,10 @@ def test_a_layer_that_cannot_be_flown_is_refused(safety: str, told: str, file: P
 def test_doctor_says_whether_it_is_a_first_flight(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for text, told in (
         ("safety: {first_flight_layer: 3}\n", "on: layer 3, 11 m above the ground at home, 1 m/s at most"),
-        ("", "off: 3 m/s at most"),
+        ("flocking: {max_speed_m_s: 2.0}\n", "off: 2 m/s at most"),
     ):
         file.write_text(RIG + AUTOPILOT + text, encoding="utf-8")
         assert main(["doctor", "--config", str(file), "--only", "limits"]) == 0
         assert f"PASS  first flight  {told}" in capsys.readouterr().out
     assert main(["doctor", "--config", _write(file, law=3.5), "--only", "limits", "--force"]) == 0
-    assert "WARNING  flocking.max_speed_m_s  3.5 m/s is above the 3 m/s" in capsys.readouterr().out
+    assert "WARNING  flocking.max_speed_m_s  3.5 m/s is above the 2 m/s" in capsys.readouterr().out

@@ -551,12 +551,12 @@ def test_towards_one_that_comes_faster_than_both_can_brake_it_does_not_fly() -> 
 
 
 def test_an_uncertain_neighbour_counts_as_nearer_and_faster() -> None:
-    """Two standard deviations: 4 m +- 0.25 m is 3.5 m, and 1 +- 0.5 m/s towards the drone are 2 m/s."""
+    """4 m with a margin of 0.5 m is 3.5 m, and 1 m/s towards the drone with one of 1 m/s are 2 m/s."""
     exact = replace(near([3.5, 0.0, 0.0]), neighbour_velocities=np.array([[-2.0, 0.0]]))
     uncertain = replace(
         near([4.0, 0.0, 0.0]),
         neighbour_velocities=np.array([[-1.0, 0.0]]),
-        neighbour_sigmas=np.array([[0.25, 0.5]]),
+        neighbour_margins=np.array([[0.5, 1.0]]),
     )
     parameters = DRAG_FREE.model_copy(update={"neighbour_reaction_s": 0.2})
     expected = sent(Stream(parameters).second([3.5, 0.0], around=exact)).velocity
@@ -564,7 +564,7 @@ def test_an_uncertain_neighbour_counts_as_nearer_and_faster() -> None:
     np.testing.assert_allclose(sent(Stream(parameters).second([3.5, 0.0], around=uncertain)).velocity, expected)
     # A flock mate that flies ahead is followed by its likeliest velocity: doubt about it holds nobody back.
     ahead = replace(
-        near([4.0, 0.0, 0.0]), neighbour_velocities=np.array([[1.0, 0.0]]), neighbour_sigmas=np.array([[0.1, 0.2]])
+        near([4.0, 0.0, 0.0]), neighbour_velocities=np.array([[1.0, 0.0]]), neighbour_margins=np.array([[0.2, 0.4]])
     )
     np.testing.assert_allclose(sent(Stream(parameters).second([1.0, 0.0], around=ahead)).velocity, [1.0, 0.0])
 

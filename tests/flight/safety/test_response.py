@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -187,7 +188,7 @@ def test_how_strong_gusts_are_is_learnt_in_ten_seconds_and_forgotten_when_anothe
     np.testing.assert_array_equal(observer.drift, [0.0, 0.0])
 
 
-def _sent_in_gusts(asked: FloatArray, **near: FloatArray) -> tuple[FloatArray, float]:
+def _sent_in_gusts(asked: FloatArray, **near: Any) -> tuple[FloatArray, float]:
     """What is sent at rest, with something near, after ten seconds in which the drone was carried off; how strongly."""
     gate = Gate(FREE.model_copy(update={"max_drift_m_s": 0.0, "max_acceleration_m_s2": 1e6}))
     flown([0.0, 0.0], [0.5, 0.0], gate)

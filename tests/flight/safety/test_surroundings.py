@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from flockd.core.messages import FloatArray, Neighbour
+from flockd.core.messages import FloatArray, Neighbour, PossibleMotion
 from flockd.flight.safety import Surroundings
-from flockd.flight.safety.surroundings import surroundings
+from flockd.flight.safety.surroundings import BEYOND, surroundings
 
 
 def told(neighbours: list[Neighbour], obstacles: FloatArray) -> Surroundings:
@@ -46,8 +48,40 @@ def test_neighbours_fly_on_and_the_drone_has_moved() -> None:
     around = told(both, np.empty((0, 2)))
     np.testing.assert_allclose(around.neighbours, [[5.0, 4.0, 3.5], [-1.0, 9.0, 0.0]])
     np.testing.assert_allclose(around.neighbour_velocities, [[2.0, 4.0], [0.0, -2.0]])
-    assert around.neighbour_sigmas is not None
-    np.testing.assert_allclose(around.neighbour_sigmas, [[0.1, 0.2], [0.2, 0.4]])
+    assert around.neighbour_margins is not None  # two standard deviations
+    np.testing.assert_allclose(around.neighbour_margins, [[0.2, 0.4], [0.4, 0.8]])
+
+
+def test_one_that_may_move_in_two_ways_counts_as_both_each_by_its_probability() -> None:
+    """By tables of the normal distribution: 0.0114 of 0.9 and of 0.1 are 0.0126 and 0.1138, beyond 2.238 and 1.207."""
+    mate, comes = (
+        PossibleMotion(
+            share,
+            np.array([6.0, 0.0, 0.0]),
+            np.array([north_m_s, 0.0, 0.0]),
+            range_sigma_m=0.5,
+            closing_sigma_m_s=1.0,
+        )
+        for share, north_m_s in ((0.9, 2.0), (0.1, -4.0))
+    )
+    one = replace(neighbour(1, [6.0, 0.0, 0.0], [1.4, 0.0, 0.0], confirmed=False), possible=(mate, comes))
+    around = told([one], np.empty((0, 2)))
+    np.testing.assert_allclose(around.neighbours, [[6.0, 2.0, 0.5], [3.0, 2.0, 0.5]])
+    np.testing.assert_allclose(around.neighbour_velocities, [[2.0, 0.0], [-4.0, 0.0]])
+    assert around.neighbour_margins is not None
+    np.testing.assert_allclose(around.neighbour_margins, [[1.119, 2.238], [0.603, 1.207]], atol=2e-3)
+
+
+def test_a_motion_less_probable_than_its_share_of_the_doubt_does_not_count() -> None:
+    """Half of 2.275 % is 1.1375 %."""
+    here, still = np.array([6.0, 0.0, 0.0]), np.zeros(3)
+    for share, count in ((0.0113, 1), (BEYOND / 2, 1), (0.0115, 2)):
+        motions = tuple(
+            PossibleMotion(probability, here, still, range_sigma_m=0.5, closing_sigma_m_s=1.0)
+            for probability in (1 - share, share)
+        )
+        one = replace(neighbour(1, [6.0, 0.0, 0.0], [0.0, 0.0, 0.0], confirmed=True), possible=motions)
+        assert len(told([one], np.empty((0, 2))).neighbours) == count
 
 
 @pytest.mark.parametrize(
@@ -86,8 +120,8 @@ def test_obstacles_stand_still() -> None:
 def test_of_nobody_and_nothing_there_are_arrays_all_the_same() -> None:
     around = told([], np.empty((0, 2)))
     assert around.neighbours.shape == (0, 3)
-    assert around.neighbour_sigmas is not None
-    assert around.neighbour_velocities.shape == around.neighbour_sigmas.shape == around.obstacles.shape == (0, 2)
+    assert around.neighbour_margins is not None
+    assert around.neighbour_velocities.shape == around.neighbour_margins.shape == around.obstacles.shape == (0, 2)
 
 
 def test_the_drone_itself_is_where_it_is_now() -> None:

@@ -305,13 +305,57 @@ def test_without_the_own_displacement_tracks_stay_put_and_grow_uncertain() -> No
 
 
 def test_a_new_track_is_a_flock_mates_or_a_strangers() -> None:
-    """A mate at 1 +- 0.7 m/s by 0.8, a stranger at 0 +- 2 m/s by 0.2: north 0.8 m/s, 0.8 * 0.49 + 0.2 * 4 + 0.16."""
+    """A mate at 1 +- 0.7 m/s by 0.8, a stranger at 0 +- 2 m/s by 0.2: north 0.8 m/s, 0.8 * 0.49 + 0.2 * 4 + 0.16.
+
+    Half of the strangers are on a course to meet, and as uncertain across it as a mate.
+    """
     tracker = Tracker(TrackingParameters())
     tracker.update(0.0, [_seen(AHEAD)], CRUISE)
     (neighbour,) = tracker.neighbours()
     np.testing.assert_allclose(neighbour.velocity, [0.8, 0.0, 0.0], atol=1e-12)
-    north, across = 0.8 * 0.49 + 0.2 * 4.0 + 0.8 * 0.2, 0.8 * 0.49 + 0.2 * 4.0
+    north, across = 0.8 * 0.49 + 0.2 * 4.0 + 0.8 * 0.2, 0.9 * 0.49 + 0.1 * 4.0
     assert neighbour.velocity_sigma_m_s == pytest.approx(math.sqrt((north + 2 * across) / 3))
+    assert neighbour.possible is not None
+    mate, meets, stranger = neighbour.possible
+    assert (mate.probability, meets.probability, stranger.probability) == (0.8, 0.1, 0.1)
+    assert (mate.closing_sigma_m_s, meets.closing_sigma_m_s, stranger.closing_sigma_m_s) == (0.7, 2.0, 2.0)
+    np.testing.assert_array_equal(
+        [mate.velocity, meets.velocity, stranger.velocity], [CRUISE, np.zeros(3), np.zeros(3)]
+    )
+
+
+def test_one_on_a_course_to_meet_is_taken_for_no_mate_by_its_constant_bearing() -> None:
+    """Two at right angles, 3 m/s each, meet in 7 s: a bearing that does not change, and ranges 20 % uncertain.
+
+    What ranges say of a mate, which would keep its bearing too, is no proof in the first three seconds.
+    """
+    faster = []
+    own = np.array([3.0, 0.0, 0.0])
+    covariance = np.diag([0.04, 2.5e-5, 2.5e-5])
+    for seed in range(20):
+        tracker, rng = Tracker(TrackingParameters()), np.random.default_rng(seed)
+        for step in range(7):
+            place = (20.0 - 0.5 * step * 3.0 * math.sqrt(2)) * np.array([1.0, -1.0, 0.0]) / math.sqrt(2)
+            if step:
+                tracker.predict(STEP_S, STEP_S * own, 0.02)
+            bearing = place / np.linalg.norm(place)
+            frame = np.column_stack([bearing, [bearing[1], -bearing[0], 0.0], [0.0, 0.0, 1.0]])
+            log_range = math.log(np.linalg.norm(place)) + 0.2 * rng.normal()
+            seen = Measurement(bearing, log_range, frame @ covariance @ frame.T, 0.6)
+            tracker.update(0.5 * step, [seen], own)
+            (neighbour,) = tracker.neighbours()
+            assert neighbour.possible is not None
+            comes_m_s = [-bearing @ one.velocity + 2 * one.closing_sigma_m_s for one in neighbour.possible]
+            faster.append(max(comes_m_s) < 3.0 / math.sqrt(2))
+    assert np.mean(faster) < 0.05
+
+
+def test_a_track_whose_motions_agree_has_one() -> None:
+    tracker, _ = _settled()
+    (neighbour,) = tracker.neighbours()
+    assert neighbour.possible is not None
+    assert [one.probability for one in neighbour.possible] == [1.0]
+    assert neighbour.possible[0].range_sigma_m < 3**0.5 * neighbour.position_sigma_m
 
 
 def test_where_the_own_velocity_is_not_known_all_are_strangers() -> None:

@@ -19,6 +19,7 @@ import zenoh
 from flockd.cli import main
 from flockd.core.config import DroneConfig
 from flockd.core.config.autopilot import AutopilotParameters
+from flockd.core.config.flocking import FlockingParameters
 from flockd.core.config.geometry import GeometryParameters
 from flockd.core.config.mission import MissionParameters
 from flockd.core.config.perception import PerceptionConfig
@@ -168,6 +169,7 @@ def config_for(
         ),
         autopilot=AutopilotParameters(address=f"udpin://127.0.0.1:{port}", **autopilot),
         telemetry=TelemetryParameters(fleet="test", listen=(telemetry,), commands=COMMANDS),
+        flocking=FlockingParameters(max_speed_m_s=2.0),
         mission=MissionParameters(speed_m_s=SPEED_M_S, circle_until_s=0.0),
         own_velocity=own_velocity,
         yaw="hold",
