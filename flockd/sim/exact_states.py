@@ -31,8 +31,9 @@ class ExactFlock:
     The states are exact, or tracked from made-up detections where the scenario has `detections`.
     """
 
-    def __init__(self, scenario: ScenarioConfig, orders: Orders | None = None) -> None:
-        drone = scenario.drone
+    def __init__(self, scenario: ScenarioConfig, orders: Orders | None = None, *, passes: bool = True) -> None:
+        """``passes``: drones keep clear of those that would come too near, as pilots ask for; else the law alone."""
+        drone, self._passes = scenario.drone, passes
         self._orders = {i: list(of_drone) for i, of_drone in (orders or {}).items()}
         self._new: Mapping[int, MissionOrder] = {}
         self._law, self._step_s = FlockingLaw(drone.flocking), drone.step_s
@@ -87,7 +88,8 @@ class ExactFlock:
         desired = pilot.pull(guidance)
         if ranges is None or not self._avoids:
             command, acceleration = self._law.command(moving[i], places[:, :2], others, desired, self._step_s)
-            command = clear_of(command, moving[i], places, others, self._law.parameters, self._vertical_m)
+            if self._passes:
+                command = clear_of(command, moving[i], places, others, self._law.parameters, self._vertical_m)
         else:
             command, acceleration = self._avoidances[i].command(self._law, moving[i], places, others, desired, ranges)
         yaw_rad = float(self._yaw_rad[i]) if guidance.course_rad is None else guidance.course_rad
@@ -161,7 +163,7 @@ def fly_exact_states(
     the true positions and velocities of all.
     """
     times = step_times(scenario)
-    flock, loop = ExactFlock(scenario, orders), ControlLoop(scenario, gated=gated)
+    flock, loop = ExactFlock(scenario, orders, passes=gated), ControlLoop(scenario, gated=gated)
     vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=start_yaw(scenario), seed=scenario.seed)
     positions, velocities = [], []
     for time_s in times:

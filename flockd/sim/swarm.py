@@ -96,7 +96,7 @@ def fly(
     with ExitStack() as stack:
         pool = stack.enter_context(PilotPool(scenario, swap, processes)) if perception == "learned" else None
         companion = None
-        pilots: _ExactStatePilots | _VisionPilots = _ExactStatePilots(scenario, shown)
+        pilots: _ExactStatePilots | _VisionPilots = _ExactStatePilots(scenario, shown, gated=gated)
         if pool is not None:
             companion = fly_exact_states(scenario, gated=gated)[1:]
             pilots = _VisionPilots(scenario, pool, shown, recorders, companion, preparing)
@@ -144,8 +144,8 @@ _PREPARATIONS = 4
 class _ExactStatePilots:
     """The flocking law on the exact states of all drones."""
 
-    def __init__(self, scenario: ScenarioConfig, shown: ShownFlock | None) -> None:
-        self._flock, self._shown, self._pace = ExactFlock(scenario), shown, RealTime()
+    def __init__(self, scenario: ScenarioConfig, shown: ShownFlock | None, *, gated: bool) -> None:
+        self._flock, self._shown, self._pace = ExactFlock(scenario, passes=gated), shown, RealTime()
         self._by_hand = [vehicle.by_hand for vehicle in scenario.vehicles]
 
     def step(

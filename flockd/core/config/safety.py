@@ -46,8 +46,7 @@ class GateParameters(Section):
     obstacle_clearance_m: Annotated[float, Field(ge=0, le=100)] = 0.6
     """From the drone's middle to an obstacle's surface: nearer than this, no velocity towards it."""
     reaction_s: Annotated[float, Field(ge=0, le=5)] = 0.5
-    """From seeing an obstacle until the own drone has begun to brake. In gusts, the distances from obstacles and
-    neighbours grow by how far they carry the drone in this time."""
+    """From seeing an obstacle until the own drone has begun to brake."""
     neighbour_reaction_s: Annotated[float, Field(ge=0, le=5)] = 1.0
     """From a neighbour's change of velocity until the own drone has begun to brake: a step of the pilot, in which the
     change is not seen, how long the step takes, and the drone's response."""

@@ -8,7 +8,6 @@ from flockd.core.config.avoidance import ObstacleParameters
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray, ObstacleRanges
 from flockd.flight.flocking import FlockingLaw, level_offsets
-from flockd.flight.flocking.passing import clear_of
 from flockd.flight.geometry.level import limit_norm
 from flockd.flight.obstacles.local_map import nearest_points
 from flockd.flight.obstacles.steering import Steering
@@ -48,7 +47,6 @@ class Avoidance:
         wanted = limit_norm(velocity + u, law.parameters.max_speed_m_s)
         flock = velocities.mean(axis=0) if len(velocities) else np.zeros(2)
         asked, _ = law.limited(velocity, self.steered(wanted, ranges, flock) - velocity, self._step_s)
-        asked = clear_of(asked, velocity, neighbours, velocities, law.parameters, self._gate.vertical_separation_m)
         safe = self.within(asked, ranges, neighbours, velocities)
         return safe, (safe - velocity) / self._step_s
 

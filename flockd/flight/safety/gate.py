@@ -227,19 +227,16 @@ class Gate:
         return None if last is None or now_s - last.time_s > self._parameters.permission_timeout_s else last
 
     def _space(self, action: Action, around: Surroundings) -> dict[Objection, tuple[FloatArray, FloatArray]]:
-        """Directions (n, 2), and how fast to fly there, (n,) m/s: to the fence, to neighbours and to obstacles.
-
-        From what can be hit the drone keeps away by how far gusts carry it while it reacts, too.
-        """
-        p, carried_m = self._parameters, self.gusts_m_s * self._parameters.reaction_s
+        """Directions (n, 2), and how fast to fly there, (n,) m/s: to the fence, to neighbours and to obstacles."""
+        p = self._parameters
         separation_m = p.min_separation_m if action is Action.FLY else p.degraded_separation_m
         return {
             Objection.FENCE: towards_fence(p, around.position),
             Objection.SEPARATION: towards_neighbours(
-                p, around.neighbours, around.neighbour_velocities, separation_m + carried_m, around.neighbour_margins
+                p, around.neighbours, around.neighbour_velocities, separation_m, around.neighbour_margins
             ),
             Objection.OBSTACLE: towards_obstacles(
-                around.obstacles, p.obstacle_clearance_m + carried_m, p.braking_m_s2, p.reaction_s
+                around.obstacles, p.obstacle_clearance_m, p.braking_m_s2, p.reaction_s
             ),
         }
 

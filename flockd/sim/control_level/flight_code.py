@@ -10,6 +10,7 @@ from flockd.core.config.drone import DroneConfig
 from flockd.core.config.scenario import VehicleConfig
 from flockd.core.messages import FloatArray, ObstacleRanges, Wanted
 from flockd.flight.flocking import FlockingLaw
+from flockd.flight.flocking.passing import clear_of
 from flockd.flight.obstacles import Avoidance, nearest_points
 from flockd.flight.safety import Action, Gate, Permission, Request, Surroundings
 from flockd.sim.control_level import motion
@@ -49,6 +50,12 @@ class FlightCode:
         """The velocity (2,) m/s that drone `i` at `velocity` (2,) asks for among obstacles; see `Avoidance`."""
         level = seen.velocities[:, :2]
         return self._avoidances[i].command(self._law, velocity, seen.offsets, level, desired, ranges)[0]
+
+    def clear(self, velocity: FloatArray, command: FloatArray, seen: Seen) -> FloatArray:
+        """The velocity (2,) m/s that a drone at `velocity` (2,) asks for in open air instead of its `command` (2,)."""
+        law, vertical_m = self._drone.flocking, self._drone.safety.gate.vertical_separation_m
+        near = np.hypot(seen.offsets[:, 0], seen.offsets[:, 1]) <= law.observation_distance_m
+        return clear_of(command, velocity, seen.offsets[near], seen.velocities[near, :2], law, vertical_m)
 
     def fly_gated(
         self, i: int, begin_s: float, states: FloatArray, blown: FloatArray, commands: FloatArray, heights: FloatArray,

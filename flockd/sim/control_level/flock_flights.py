@@ -157,6 +157,8 @@ class FlockFlights:
             seen = self._seen(step, flight, slot, began)
             if ranges is not None:
                 commands[:, drone] = code.around(drone, own[:, drone], seen, desired[:, drone], ranges)
+            else:
+                commands[:, drone] = code.clear(own[:, drone], commands[:, drone].copy(), seen)
             if self._gated:
                 code.fly_gated(drone, time_s, states, self._blown, commands, heights, self._gusts, seen, ranges)
 
