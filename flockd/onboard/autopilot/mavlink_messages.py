@@ -204,8 +204,13 @@ class ReceivedMessages:
             self.heartbeats_lost += lost
 
     def _notice_restart(self, boot_ms: int) -> None:
-        """Its clock begins anew, and with it the numbers of its events; of its checks nothing is known."""
+        """Its clock begins anew, and with it the numbers of its events; of its checks nothing is known.
+
+        While it is armed it cannot have: a stamp from the past is wrong then, or somebody else's.
+        """
         if boot_ms < self._boot_ms - RESTARTED_MS:
+            if int(self._fields("HEARTBEAT").get("base_mode") or 0) & MAV_MODE_FLAG_SAFETY_ARMED:
+                return
             self.restarts += 1
             self.check_events, self.clock = CheckEvents(), ClockSync()
             self._report("the autopilot has started anew")

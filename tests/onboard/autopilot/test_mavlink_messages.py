@@ -156,6 +156,15 @@ def test_the_first_text_of_px4_has_the_id_of_texts_without_chunks_and_is_seen_wh
     assert received.recent_texts(2.0, 10.0) == ["Arming denied: Resolve system health failures first"]
 
 
+def test_a_stamp_from_the_past_is_a_restart_on_the_ground_and_nothing_in_flight() -> None:
+    attitude = [("ATTITUDE_QUATERNION", {"time_boot_ms": stamp}) for stamp in (60_000, 0, 60_020)]
+    armed, disarmed = [("HEARTBEAT", {"base_mode": mode, "custom_mode": 0, "system_status": 4}) for mode in (128, 0)]
+    received, log = _received(armed, *attitude)
+    assert (received.restarts, log) == (0, [])
+    received, log = _received(disarmed, *attitude)
+    assert (received.restarts, log) == (1, ["the autopilot has started anew"])
+
+
 def test_a_text_of_just_one_chunk_is_seen_when_it_does_not_go_on() -> None:
     received, log = _received(_text("a" * 50))
     received.add("SYS_STATUS", {"battery_remaining": 50}, 0.1)
