@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from flockd import __version__
 from flockd.cli import _parser, installing, main
 from flockd.core.errors import ModelError
 
@@ -72,7 +73,8 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
         main(["--version"])
     assert exit_.value.code == 0
     package = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    assert capsys.readouterr().out == f"flockd {package['project']['version']}\n"
+    assert package["project"]["dynamic"] == ["version"], "it stands in flockd/__init__.py alone"
+    assert capsys.readouterr().out == f"flockd {__version__}\n"
 
 
 @pytest.mark.parametrize(

@@ -21,11 +21,11 @@ import subprocess
 import sys
 import tempfile
 import time
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from flockd import __version__
 from tools.release import wheels
 from tools.release.lock import ROOT
 
@@ -76,7 +76,7 @@ def main() -> int:
     parser.add_argument("--arch", required=True, choices=tuple(MACHINES))
     parser.add_argument("--system", default="debian12", choices=tuple(SYSTEMS), help="default: %(default)s")
     parser.add_argument("--out", type=Path, default=Path("dist"), metavar="FOLDER", help="default: %(default)s")
-    parser.add_argument("--version", default=_version(), help="default: that of pyproject.toml, %(default)s")
+    parser.add_argument("--version", default=__version__, help="default: that of flockd/__init__.py, %(default)s")
     arguments = parser.parse_args()
     try:
         file = build(arguments.out, arguments.arch, arguments.system, arguments.version)
@@ -193,11 +193,6 @@ def _set_modes(tree: Path) -> None:
 def _write(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
-
-
-def _version() -> str:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    return str(project["version"])
 
 
 def _maintainer() -> str:

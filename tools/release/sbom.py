@@ -21,6 +21,7 @@ from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from typing import Any
 
+from flockd import __version__
 from flockd.flight.inference import find_manifests, read_manifest
 from tools.release.licences import Licence, declared_packages, licence_of, needed_by, runtime_packages
 from tools.release.lock import LOCK, Pin, pins
@@ -36,11 +37,11 @@ def document() -> Json:
     lock = LOCK.read_bytes()
     run_time = set(runtime_packages())
     locked = [pin for pin in pins(lock.decode()) if pin.name in run_time]
-    itself = {
+    itself: Json = {
         "type": "application",
-        "bom-ref": f"pkg:generic/flockd@{project['version']}",
+        "bom-ref": f"pkg:generic/flockd@{__version__}",
         "name": "flockd",
-        "version": project["version"],
+        "version": __version__,
         "licenses": [{"expression": project["license"]}],
     }
     networks = list(_networks())

@@ -7,9 +7,10 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from flockd.core import services
 from flockd.onboard.telemetry.topics import AskMessage
 
-LATEST_S = 5.0
+LATEST_S = services.ORDER.timeout
 """Older than this an order may surprise whoever gave it. A sender asks for the drone's clock just before."""
 AHEAD_S = 0.5
 """No order comes from later than now; its sender's own clock runs on while the two are on their way."""

@@ -16,7 +16,7 @@ from flockd.onboard.telemetry.topics import AskMessage, OrderMessage
 _OF_GOTO = frozenset({"north_m", "east_m", "latitude_deg", "longitude_deg", "height_m", "speed_m_s"})
 _OF_VELOCITY = frozenset({"velocity_ne", "height_m"})
 _LONGEST = 4096
-LONGEST_NAME = 80
+LONGEST_NAME = 120
 """Of an operator and of a session."""
 
 

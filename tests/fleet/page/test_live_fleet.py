@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from flockd.fleet.drone_queries import MAX_PICTURE_PX, MAX_REPLY_BYTES
 from flockd.fleet.page.live_fleet import LiveFleet
 from flockd.fleet.watcher import FleetWatcher, _heard
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
@@ -17,6 +18,7 @@ from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.sim.free_ports import free_endpoint
 
 PICTURE = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1].tobytes()
+WIDE = cv2.imencode(".jpg", np.zeros((2, MAX_PICTURE_PX + 1, 3), np.uint8))[1].tobytes()
 ABOUT = AboutMessage(version="1.2.3", configuration={"safety": {"gate": {"fence_radius_m": 40.0}}}, commands=["hold"])
 
 
@@ -56,6 +58,20 @@ def test_a_drone_is_shown_with_what_queries_tell_and_answers_for_itself() -> Non
         until(lambda: len(fleet.events(fleet.now_s())) == 3)
         assert [event[1:] for event in fleet.events(0.0)] == [("f/d", f"event {number}") for number in range(3)]
         until(lambda: len(fleet.history()["f/d"]) >= 2)
+
+
+def test_replies_without_end_and_pictures_that_are_none_are_not_taken() -> None:
+    endpoint = free_endpoint()
+    endless = AboutMessage(version="1", configuration={"x": "y" * MAX_REPLY_BYTES}, commands=["hold"])
+    pictures = {"none": b"<script>", "huge": PICTURE + bytes(MAX_REPLY_BYTES), "wide": WIDE, "good": PICTURE}
+    with (
+        FleetWatcher(None, listen=[endpoint], connect=[]) as watcher,
+        ZenohTelemetry("f", listen=[], connect=[endpoint]) as drone,
+    ):
+        drone.announce("d", endless, lambda command, payload: AnswerMessage(accepted=False, sentence=""), pictures.get)
+        until(lambda: watcher.queries.clock("f/d") is not None)
+        assert watcher.queries.about("f/d") is None
+        assert [camera for camera in pictures if watcher.queries.image("f/d", camera) is not None] == ["good"]
 
 
 def test_the_period_of_a_topic_is_of_its_new_messages() -> None:
