@@ -78,8 +78,10 @@ def unusable(path: Path, why: str) -> UsageError:
 
 
 def _bounded(memory: int) -> Callable[[str, tuple[str, ...]], UlogContents]:
-    """In the process: what reads, within this much memory."""
-    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+    """In the process: what reads, within this much memory, or less where it has a limit already."""
+    limits = [limit for limit in resource.getrlimit(resource.RLIMIT_AS) if limit != resource.RLIM_INFINITY]
+    most = min([memory, *limits])
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
     return _contents
 
 

@@ -224,7 +224,8 @@ def test_without_a_height_to_hold_nothing_can_be_sent(height_m: float, action: A
 def test_a_heading_of_more_than_a_whole_turn_is_refused_and_the_last_one_kept(yaw_rad: float) -> None:
     gate, fly = Gate(DRAG_FREE), Permission(Action.FLY, 0.0)
     for whole_turn in (2 * math.pi, -2 * math.pi):
-        assert sent(judge(gate, 0.0, fly, wanted([0.5, 0.0], yaw_rad=whole_turn))).yaw_rad == whole_turn
+        verdict = judge(gate, 0.0, fly, wanted([0.5, 0.0], yaw_rad=whole_turn))
+        assert (sent(verdict).yaw_rad, verdict.objections) == (whole_turn, ())
     verdict = judge(gate, 0.0, fly, wanted([0.5, 0.0], yaw_rad=yaw_rad))
     assert verdict.objections == (Objection.COMMAND_TOO_LARGE,)
     assert sent(verdict).yaw_rad == -2 * math.pi

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import resource
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,6 +31,8 @@ BOOT_S = 900.0
 CLOCK_AT_START_S = 47_000.0
 """The computer's."""
 STEP_S, STEPS = 0.5, 60
+LITTLE_BYTES = 3 << 29
+"""Less than a reader of ULog takes where it may."""
 
 
 def _commanded(time_s: float) -> tuple[float, float]:
@@ -156,6 +161,18 @@ def test_a_changed_byte_that_keeps_its_reader_busy_for_ever_is_one_sentence(tmp_
         UsageError, match=r"log\.ulg: cannot be read within \d+ s, or its memory: it is damaged; name a ULog file"
     ):
         read_ulog(path, patience_s=3.0)
+
+
+def test_a_process_that_has_little_memory_already_reads_a_log_within_that(tmp_path: Path) -> None:
+    """A limit cannot be raised: to ask for more than one has was an error that nobody expected."""
+    path = _ulog(tmp_path / "log.ulg")
+    code = "import sys; from pathlib import Path; from flockd.review.flight_log.ulog import read_ulog; "
+    ended = subprocess.run(
+        [sys.executable, "-c", f"{code}print(len(read_ulog(Path(sys.argv[1])).topics))", str(path)],
+        capture_output=True, text=True, check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (LITTLE_BYTES, LITTLE_BYTES)),
+    )  # fmt: skip
+    assert (ended.returncode, ended.stdout) == (0, "4\n"), ended.stderr
 
 
 def test_a_pipe_is_refused_without_waiting_for_its_writer(tmp_path: Path) -> None:
