@@ -305,7 +305,7 @@ def _ros(folder: Path) -> Check:
         motion = {"linear": {"x": x, "y": y, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": random.choice((0.0, z))}}
         for make, message in ((goal_of, place), (velocity_of, {"header": {"frame_id": frame}, "twist": motion})):
             try:
-                parse_order("goto" if make is goal_of else "velocity", json.dumps(make(message, drone)).encode())
+                parse_order("goto" if make is goal_of else "velocity", {**make(message, drone)})
             except ValueError as error:
                 assert_readable(str(error))
 
