@@ -60,6 +60,14 @@ def history_row(row: Row, time_s: float) -> list[float | None]:
     ]  # fmt: skip
 
 
+def _cameras(drone: Watched, computer: Mapping[str, Any], configuration: Mapping[str, Any]) -> dict[str, str | None]:
+    """What is wrong with each camera; a simulated drone, which has no computer to tell of, has those of its rig."""
+    rig = configuration.get("rig")
+    if "computer" in drone.topics or not isinstance(rig, Mapping):
+        return {name: camera["fault"] for name, camera in computer.get("cameras", {}).items()}
+    return {str(camera.get("name")): None for camera in rig.get("cameras", ()) if isinstance(camera, Mapping)}
+
+
 def _row(drone: Watched, status: Mapping[str, Any], known: Known, now_s: float) -> Row:
     """With everything that is null where it is not known, or too old to be true now."""
 
@@ -95,7 +103,7 @@ def _row(drone: Watched, status: Mapping[str, Any], known: Known, now_s: float) 
         "recording": computer.get("recording"),
         "delay_ms": None if known.delay_s is None else _rounded(1e3 * known.delay_s, 1),
         "clock_s": _rounded(known.clock_s, 3),
-        "cameras": {name: camera["fault"] for name, camera in computer.get("cameras", {}).items()},
+        "cameras": _cameras(drone, computer, configuration),
         "version": None if about is None else about["version"],
         "commands": None if about is None else about["commands"],
         "fence": _fence(configuration),
