@@ -9,6 +9,8 @@
     start
     python -m tools.docs.docs_pictures clip tests/review/replay/crossing.mcap docs/pictures/crossing.webm
 
+    python -m tools.docs.docs_pictures above FLIGHT docs/pictures/circle.webp     # a short clip for the gallery
+
 detected.webp is what `flockd detect` draws; the other pictures in docs/pictures are drawn by hand.
 """
 
@@ -22,7 +24,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from flockd.core.config import load_scenario
 from flockd.core.config.flocking import FlockingParameters
@@ -47,6 +49,8 @@ ARM_M = 0.8
 """Arm of a drone as drawn, larger than it is."""
 COLOURS = 48
 CLIP_SCALE = 0.75
+CLIP_PX, CLIP_FRAMES, CLIP_MS = 320, 80, 100
+OBSTACLE = "#b9a98a"
 WORLD_ROWS = slice(80, 480)
 """Rows of the images of a world, without much sky and ground."""
 
@@ -58,7 +62,7 @@ def main() -> None:
     world = kinds.add_parser("world")
     world.add_argument("scenario", type=Path, help="of `flockd sim`")
     world.add_argument("out", type=Path)
-    for kind in ("flock", "seen"):
+    for kind in ("flock", "seen", "above"):
         of_flight = kinds.add_parser(kind)
         of_flight.add_argument("flight", type=Path, help="folder of a flight of `flockd sim`")
         of_flight.add_argument("out", type=Path)
@@ -69,6 +73,8 @@ def main() -> None:
     args = parser.parse_args()
     if args.kind == "flock":
         save_flock(FlightLog.load(args.flight / LOG_NAME), args.out)
+    elif args.kind == "above":
+        save_above(FlightLog.load(args.flight / LOG_NAME), args.out)
     elif args.kind == "seen":
         save_seen(args.flight / KEY_FRAMES_NAME, args.out)
     elif args.kind == "world":
@@ -98,6 +104,47 @@ def save_world(scenario_file: Path, path: Path) -> None:
     images = np.hstack([frames.frames[name].image for name in ("left", "front", "right")])
     middle = Image.fromarray(images[WORLD_ROWS])
     middle.resize((middle.width * 2 // 3, middle.height * 2 // 3), Image.Resampling.LANCZOS).save(path, quality=78)
+
+
+def save_above(log: FlightLog, path: Path) -> None:
+    """A short animated clip of a flight from above, north up, with obstacles and goals."""
+    steps = np.unique(np.linspace(0, len(log.time_s) - 1, CLIP_FRAMES).astype(int))
+    plan = log.position[..., :2]
+    low, high = plan.reshape(-1, 2).min(axis=0), plan.reshape(-1, 2).max(axis=0)
+    middle, reach_m = (low + high) / 2, 0.56 * float((high - low).max()) + 1.0
+    scale = CLIP_PX / (2 * reach_m)
+
+    def pixels(places: FloatArray) -> list[tuple[float, float]]:
+        off = (places - middle) * scale
+        return [(CLIP_PX / 2 + east, CLIP_PX / 2 - north) for north, east in off]
+
+    frames = []
+    for step in steps:
+        image = Image.new("RGB", (CLIP_PX, CLIP_PX), PAPER)
+        pen = ImageDraw.Draw(image)
+        for north, east, length_m, width_m, heading, *_ in log.obstacles.tolist():
+            if width_m == 0:
+                ((u, v),) = pixels(np.array([[north, east]]))
+                radius = max(length_m * scale, 1.0)
+                pen.ellipse((u - radius, v - radius, u + radius, v + radius), fill=OBSTACLE)
+            else:
+                turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+                corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * [length_m, width_m] @ turn.T
+                pen.polygon(pixels(corners + np.array([north, east])), fill=OBSTACLE)
+        drones = plan.shape[1]
+        for i in range(drones):
+            trail = pixels(plan[max(0, step - 2 * TRAIL_STEPS) : step + 1, i])
+            if len(trail) > 1:
+                pen.line(trail, fill=colour_of(i, drones), width=1)
+            u, v = trail[-1]
+            pen.ellipse((u - 4, v - 4, u + 4, v + 4), fill=colour_of(i, drones))
+        if np.isfinite(log.goal[step]).all():
+            ((u, v),) = pixels(log.goal[step][None])
+            pen.line((u - 5, v - 5, u + 5, v + 5), fill=INK, width=2)
+            pen.line((u - 5, v + 5, u + 5, v - 5), fill=INK, width=2)
+        pen.text((6, CLIP_PX - 16), f"{log.time_s[step]:.0f} s", fill=MUTED)
+        frames.append(image)
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=CLIP_MS, loop=0, quality=60, method=4)
 
 
 def save_flock(log: FlightLog, path: Path) -> None:

@@ -98,7 +98,7 @@ def _row(drone: Watched, status: Mapping[str, Any], known: Known, now_s: float) 
         "recording": computer.get("recording"),
         "delay_ms": None if known.delay_s is None else _rounded(1e3 * known.delay_s, 1),
         "clock_s": _rounded(known.clock_s, 3),
-        "cameras": _cameras(computer),
+        "cameras": _cameras(drone, computer, configuration),
         "version": None if about is None else about["version"],
         "commands": None if about is None else about["commands"],
         "fence": _fence(configuration),
@@ -141,10 +141,16 @@ def _seen(neighbour: Mapping[str, Any]) -> Row:
     }
 
 
-def _cameras(computer: Mapping[str, Any]) -> dict[str, str | None]:
-    """What is wrong with each; those that can be asked for a picture."""
-    cameras = [(name, camera["fault"]) for name, camera in computer.get("cameras", {}).items() if is_name(name)]
-    return dict(cameras[:MAX_CAMERAS])
+def _cameras(drone: Watched, computer: Mapping[str, Any], configuration: Mapping[str, Any]) -> dict[str, str | None]:
+    """What is wrong with each that can be asked for a picture.
+
+    A simulated drone, which has no computer to tell of, has those of its rig.
+    """
+    found = [(name, camera["fault"]) for name, camera in computer.get("cameras", {}).items()]
+    rig = configuration.get("rig")
+    if "computer" not in drone.topics and isinstance(rig, Mapping) and isinstance(rig.get("cameras"), list):
+        found = [(camera.get("name"), None) for camera in rig["cameras"] if isinstance(camera, Mapping)]
+    return dict([(name, fault) for name, fault in found if isinstance(name, str) and is_name(name)][:MAX_CAMERAS])
 
 
 def _vector(values: object, digits: int = 2, *, size: int = 2) -> list[float] | None:
