@@ -162,8 +162,8 @@ def test_a_hundred_thousand_orders_fill_neither_log_nor_recording_and_displace_n
             if number % (per_second // 10) == 0 and states < 2000:
                 sinks.publish("clock", {"time_s": drone.now_s, "number": states})
                 states += 1
-                while sinks._worker._jobs.qsize() > BACKLOG // 2:
-                    time.sleep(0.001)  # its thread has time on a drone
+            while sinks._worker._jobs.qsize() > BACKLOG // 2:
+                time.sleep(0.001)  # its thread has time on a drone
         asyncio.run(sinks.close())
     finally:
         log.removeHandler(handler)

@@ -245,6 +245,7 @@ def test_the_reports_table_has_modes_failsafes_and_messages_by_time(tmp_path: Pa
 
 
 def test_a_bad_file_is_refused_before_anything_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "flight").mkdir()
     (tmp_path / "log.ulg").write_bytes(b"no log")
     assert main(["report", str(tmp_path / "flight"), "--ulog", str(tmp_path / "log.ulg")]) == 2
     assert "log.ulg: does not begin as one; name a ULog file" in capsys.readouterr().err

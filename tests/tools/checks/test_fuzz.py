@@ -27,6 +27,7 @@ INPUTS = {
     "status": 50,
     "commands": 300,
     "frames": 300,
+    "ros": 150,
     "networks": 2,
     "gate": 150,
     "supervisor": 250,
