@@ -14,7 +14,7 @@ from flockd.core.errors import ExitCode
 
 _NOTES = """\
 Without a command it publishes each drone of the fleet in its namespace, as in `ros2 topic echo /drone1/odometry`.
-A sourced ROS 2 is used where there is one; else: pip install 'flockd[ros]'. docs/ros.md lists the topics."""
+A sourced ROS 2 is used where there is one; else: pip install -e '.[ros]'. docs/ros.md lists the topics."""
 
 
 def add(commands: Commands) -> None:

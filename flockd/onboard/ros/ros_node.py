@@ -21,7 +21,7 @@ from flockd.onboard.ros.message_trees import Tree
 
 HERE_ONLY = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 """Environment of a node that only this computer's find: ROS 2 has no rule of its own about who may publish."""
-NOT_INSTALLED = "there is no rclpy; source a ROS 2, or, with Python 3.11 on x86-64 Linux, pip install 'flockd[ros]'"
+NOT_INSTALLED = "there is no rclpy; source a ROS 2, or, with Python 3.11 on x86-64 Linux, pip install -e '.[ros]'"
 _THREADS = 8
 _TRIGGER = "std_srvs/srv/Trigger"
 _ELEMENT = re.compile(r"(?:sequence<)?([a-z0-9_]+/\w+)(?:, \d+)?>?(?:\[\d*\])?")

@@ -113,7 +113,7 @@ class RosDevice(ChildDevice):
     def _failed(self, reason: str) -> CameraError:
         if reason == ros_child.NO_ROS:
             return CameraError(
-                f"{self._name}: {reason}; source a ROS 2, or, with Python 3.11 on x86-64, pip install 'flockd[ros]'"
+                f"{self._name}: {reason}; source a ROS 2, or, with Python 3.11 on x86-64, pip install -e '.[ros]'"
             )
         hint = "name a topic of Image or CompressedImage" if reason.startswith("is of") else "check its environment"
         return CameraError(f"{self._name}: {self._topic} {reason}; {hint}")
