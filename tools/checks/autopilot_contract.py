@@ -31,20 +31,26 @@ from flockd.core.config.safety import SafetyParameters
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.data import data_path
 from flockd.core.errors import FlockdError, UnavailableError
-from flockd.core.messages import Setpoint, Wanted
+from flockd.core.messages import FloatArray, Setpoint, Wanted
 from flockd.flight.safety import Action, Permission, Request, Surroundings, Verdict
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
-from flockd.sim.autopilots import Autopilots, Px4s, SimulatedAutopilots, px4_folder
+from flockd.onboard.sources import clock_at
+from flockd.sim.autopilots import BY_HAND, Autopilots, Px4s, SimulatedAutopilots, px4_folder
 from flockd.sim.free_ports import free_port
 from flockd.sim.ground_station import GroundStation
+from flockd.sim.processes import Program
 from flockd.sim.start import with_drones
 
 HEIGHT_M = 4.0
 NORTH_M_S = 1.0
 START_S = 60.0
 STEP_S, POLL_S = 30.0, 0.01
+STICK_S, STICK_STEP = 0.03, 100
+"""Between two positions of a remote control's sticks, and how far of 1000 they move in that time: fast."""
+REMOTE_CONTROL = {**BY_HAND, "MPC_VEL_MANUAL": "3", "COM_RC_LOSS_T": "5"}
+"""PX4's parameters where one is used; the last for a computer that is slow to send its sticks."""
 HEARTBEAT, EVENT = 0, 410
 ALIKE_S = 2.0
 """Two reactions that differ by no more are alike: flockd promises them within two seconds."""
@@ -55,6 +61,8 @@ KNOWN: Mapping[str, str] = {
     "two events lost": "PX4 tells its checks anew every two seconds at most",
     "take off": "PX4's motors spin up first",
     "restart": "PX4's program takes seconds to start",
+    **dict.fromkeys(("pattern", "the same pattern"), "PX4's simulated vehicle gathers speed more slowly"),
+    "registration": "PX4 tells its checks anew every two seconds at most",
 }
 """Stories that may take longer, and why; answers, texts and modes may not differ."""
 
@@ -79,7 +87,11 @@ class Relay:
         self._near.bind(("127.0.0.1", autopilot_port))
         self._far = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._far.bind(("127.0.0.1", 0))
-        self._flockd, self._autopilot = ("127.0.0.1", flockd_port), ("", 0)
+        self.cut = False
+        """True: nothing passes, either way."""
+        self.companion_port = flockd_port
+        """Of this computer, where the packets of the autopilot go."""
+        self._autopilot = ("", 0)
         self._closing = threading.Event()
         self._threads = [threading.Thread(target=run, daemon=True) for run in (self._inward, self._outward)]
 
@@ -98,8 +110,8 @@ class Relay:
             try:
                 data, self._autopilot = self._near.recvfrom(65536)
                 kept = b"".join(packet for number, packet in _packets(data) if not self.losing(number))
-                if kept:
-                    self._far.sendto(kept, self._flockd)
+                if kept and not self.cut:
+                    self._far.sendto(kept, ("127.0.0.1", self.companion_port))
             except OSError:
                 return
 
@@ -107,7 +119,7 @@ class Relay:
         while not self._closing.is_set():
             try:
                 data, _ = self._far.recvfrom(65536)
-                if self._autopilot[1]:
+                if self._autopilot[1] and not self.cut:
                     self._near.sendto(data, self._autopilot)
             except OSError:
                 return
@@ -130,19 +142,30 @@ class World:
     station: GroundStation
     relay: Relay
     restart: Callable[[], None]
+    stack: ExitStack
+    """Ends what a story starts for those after it."""
+    speed_factor: float
+    clock: Callable[[], float]
+    """Simulated seconds."""
+    wanted: Callable[[], FloatArray] = lambda: _in_circles()  # noqa: PLW0108 - it stands below
+    """The velocity (2,) m/s that flockd's flight asks for."""
+    stick: int = 0
+    """Where a pilot moves the remote control's stick: forward, of 1000."""
+    companion: tuple[int, Program] | None = None
+    """A process that a story has started for a later one, and the port that it listens at."""
     rows: list[Row] = field(default_factory=list)
     reports: list[str] = field(default_factory=list)
     """All that the link has reported."""
 
     async def until(self, condition: Callable[[], bool], what: str, timeout_s: float = STEP_S) -> float:
-        """Seconds until it holds. Raises UnavailableError when it does not in time."""
-        begun = time.monotonic()
+        """Simulated seconds until it holds. Raises UnavailableError when it does not in time."""
+        begun = self.clock()
         while not condition():
-            if time.monotonic() - begun > timeout_s:
+            if self.clock() - begun > timeout_s:
                 raise UnavailableError(f"{what} did not come within {timeout_s:g} s")
             await asyncio.sleep(POLL_S)
             self.reports += self.link.take_reports()
-        return time.monotonic() - begun
+        return self.clock() - begun
 
     async def saw(self, story: str, condition: Callable[[], bool], what: str) -> None:
         """Adds a row once the condition holds, or one that says that it never did."""
@@ -201,13 +224,14 @@ async def on_the_ground(world: World) -> None:
     world.relay.losing = lambda number: number == EVENT and next(losing, False)
     world.streamer.begin()
     checks = link._received.check_events
-    await world.saw("two events lost", lambda: _offboard_possible(link), "requested, and the list is whole")
+    await world.saw("two events lost", lambda: offboard_possible(link), "requested, and the list is whole")
     world.rows.append(Row("two events lost", f"given up: {checks._order.gaps}"))
     world.relay.losing = lambda number: False
     world.streamer.end("by the story")
 
 
-def _offboard_possible(link: AutopilotLink) -> bool:
+def offboard_possible(link: AutopilotLink) -> bool:
+    """The list of checks lets offboard be selected."""
     report = link._received.check_events.report
     return report is not None and bool(report.can_run >> 14 & 1)
 
@@ -284,7 +308,7 @@ async def _setpoints_come_back(world: World) -> None:
     """Sent past the streamer, which sends nothing in a failsafe: the autopilot goes back by itself."""
     begun = time.monotonic()
     while time.monotonic() - begun < 3.0 and not world.mode("offboard")():
-        world.link.send_setpoint(Setpoint(time.monotonic(), np.zeros(2), HEIGHT_M, 0.0))
+        world.link.send_setpoint(Setpoint(world.clock(), np.zeros(2), HEIGHT_M, 0.0))
         await asyncio.sleep(0.05)
     back = world.mode("offboard")()
     what = "back in offboard by itself" if back else "stays in its failsafe"
@@ -320,12 +344,16 @@ async def _stream(station: GroundStation) -> None:
 
 
 async def landing(world: World) -> None:
-    """The end, and a restart."""
+    """The end."""
     link = world.link
     await world.asked("land", link.land)
     await world.saw("land", world.mode("land"), "the mode is land")
     await world.until(lambda: not link.status().armed and link.status().landed_state == "ground", "landed", 60.0)
     world.rows.append(Row("land", f"disarmed on the ground, in mode {link.status().flight_mode}"))
+
+
+async def starting_anew(world: World) -> None:
+    """Its program ends, and begins again."""
     await world.hold()
     world.texts()
     world.restart()
@@ -340,14 +368,34 @@ def _rate(world: World) -> bool:
     return world.link._received.restarts > 0 and not world.link._received.check_events.incomplete
 
 
-STORIES = (on_the_ground, take_off, in_flight, others_interfere, landing)
+@dataclass(frozen=True)
+class Stories:
+    """What is flown, on one autopilot after the other."""
+
+    purpose: str
+    told: tuple[Callable[[World], Awaitable[None]], ...]
+    asks: Mapping[str, str] = field(default_factory=dict)
+    """What somebody else's document asks for in a story."""
+    remote_control: bool = False
+    """A pilot holds one, and its sticks are heard."""
+    max_gap_s: float = AutopilotParameters().max_gap_s
+    """flockd's, between two setpoints."""
+
+
+CONTRACT = Stories(
+    "What flockd sees of the fake autopilot and of PX4 SITL.",
+    (on_the_ground, take_off, in_flight, others_interfere, landing, starting_anew),
+)
 
 
 @asynccontextmanager
-async def _linked(autopilots: Autopilots, stack: ExitStack, restart: Callable[[], None]) -> AsyncIterator[World]:
+async def _linked(
+    stories: Stories, speed_factor: float, autopilots: Autopilots, stack: ExitStack, restart: Callable[[], None]
+) -> AsyncIterator[World]:
+    clock = clock_at(speed_factor)
     ports, flockd_port = autopilots.ports[0], free_port()
     relay = stack.enter_context(Relay(ports.offboard, flockd_port))
-    station = stack.enter_context(GroundStation([ports.truth], time.monotonic))
+    station = stack.enter_context(GroundStation([ports.truth], clock))
     autopilots.start()
     begun = time.monotonic()
     while not station.is_connected(0):
@@ -355,13 +403,15 @@ async def _linked(autopilots: Autopilots, stack: ExitStack, restart: Callable[[]
             raise UnavailableError("the autopilot sends nothing")
         await asyncio.sleep(0.05)
     station.request_messages()
-    parameters = AutopilotParameters(address=f"udpin://127.0.0.1:{flockd_port}")
-    link = await AutopilotLink.connect(parameters, timeout_s=START_S)
-    streamer = SetpointStreamer(link.send_setpoint, link.status, _pass, parameters, SafetyParameters())
+    parameters = AutopilotParameters(address=f"udpin://127.0.0.1:{flockd_port}", max_gap_s=stories.max_gap_s)
+    link = await AutopilotLink.connect(parameters, timeout_s=START_S, clock=clock)
+    streamer = SetpointStreamer(link.send_setpoint, link.status, _pass, parameters, SafetyParameters(), clock=clock)
     streamer.start()
-    tasks = [asyncio.create_task(run) for run in (link.attend(), link.synchronise(), _offer(streamer), _ask(link))]
+    world = World(link, streamer, station, relay, restart, stack, speed_factor, clock)
+    runs = [link.attend(), link.synchronise(), _offer(world), _ask(link)]
+    tasks = [asyncio.create_task(run) for run in (*runs, *([_move_stick(world)] if stories.remote_control else []))]
     try:
-        yield World(link, streamer, station, relay, restart)
+        yield world
     finally:
         for task in tasks:
             task.cancel()
@@ -375,14 +425,28 @@ def _pass(now_s: float, request: Request) -> Verdict:
     return Verdict(Setpoint(now_s, wanted.velocity, HEIGHT_M, 0.0), ())
 
 
-async def _offer(streamer: SetpointStreamer) -> None:
+def _in_circles() -> FloatArray:
+    angle = 0.3 * time.monotonic()
+    return NORTH_M_S * np.array([np.cos(angle), np.sin(angle)])
+
+
+async def _offer(world: World) -> None:
     nowhere = Surroundings(np.zeros(2), np.zeros(2), 0.0, np.empty((0, 3)), np.empty((0, 2)), HEIGHT_M)
     while True:
-        now, angle = time.monotonic(), 0.3 * time.monotonic()
-        wanted = Wanted(NORTH_M_S * np.array([np.cos(angle), np.sin(angle)]), np.zeros(2), 0.0, height_m=HEIGHT_M)
-        streamer.offer(Request(Permission(Action.FLY, now), wanted, now, 0.0, nowhere))
-        streamer.beat()
+        now = world.clock()
+        wanted = Wanted(world.wanted(), np.zeros(2), 0.0, height_m=HEIGHT_M)
+        world.streamer.offer(Request(Permission(Action.FLY, now), wanted, now, 0.0, nowhere))
+        world.streamer.beat()
         await asyncio.sleep(0.05)
+
+
+async def _move_stick(world: World) -> None:
+    """As a remote control sends it, for ever: towards where the pilot wants it."""
+    stick = 0
+    while True:
+        stick += max(-STICK_STEP, min(STICK_STEP, world.stick - stick))
+        world.station.push_sticks(0, forward=stick)
+        await asyncio.sleep(STICK_S)
 
 
 async def _ask(link: AutopilotLink) -> None:
@@ -394,9 +458,11 @@ async def _ask(link: AutopilotLink) -> None:
         await asyncio.sleep(1.0)
 
 
-async def _fly(autopilots: Autopilots, stack: ExitStack, restart: Callable[[], None]) -> list[Row]:
-    async with _linked(autopilots, stack, restart) as world:
-        for story in STORIES:
+async def _fly(
+    stories: Stories, speed_factor: float, autopilots: Autopilots, stack: ExitStack, restart: Callable[[], None]
+) -> list[Row]:
+    async with _linked(stories, speed_factor, autopilots, stack, restart) as world:
+        for story in stories.told:
             try:
                 await story(world)
             except (UnavailableError, AutopilotError) as error:
@@ -411,17 +477,25 @@ def _scenario() -> ScenarioConfig:
 
 
 @contextmanager
-def _fake() -> Iterator[tuple[Autopilots, ExitStack, Callable[[], None]]]:
+def _fake(
+    parameters: Mapping[str, str], speed_factor: float
+) -> Iterator[tuple[Autopilots, ExitStack, Callable[[], None]]]:
     with ExitStack() as stack:
-        fakes = stack.enter_context(SimulatedAutopilots(_scenario(), 1.0, lambda north, _: np.zeros_like(north)))
+        fakes = stack.enter_context(
+            SimulatedAutopilots(_scenario(), speed_factor, lambda north, _: np.zeros_like(north))
+        )
         yield fakes, stack, lambda: fakes.fakes[0].restart()  # noqa: PLW0108 - there is none before it starts
 
 
 @contextmanager
-def _px4() -> Iterator[tuple[Autopilots, ExitStack, Callable[[], None]]]:
+def _px4(
+    parameters: Mapping[str, str], speed_factor: float
+) -> Iterator[tuple[Autopilots, ExitStack, Callable[[], None]]]:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="contract-")))
-        first, again = (Px4s(_scenario(), 1.0, os.environ, folder / name) for name in ("first", "again"))
+        first, again = (
+            Px4s(_scenario(), speed_factor, os.environ, folder / name, parameters) for name in ("first", "again")
+        )
         stack.push(first.__exit__)
         stack.push(again.__exit__)
 
@@ -432,11 +506,11 @@ def _px4() -> Iterator[tuple[Autopilots, ExitStack, Callable[[], None]]]:
         yield first, stack, restart
 
 
-def seen(autopilot: str) -> list[Row]:
+def seen(autopilot: str, stories: Stories = CONTRACT, speed_factor: float = 1.0) -> list[Row]:
     """What flockd sees of one of them. Raises UnavailableError."""
     make = {"fake": _fake, "px4": _px4}[autopilot]
-    with make() as (autopilots, stack, restart):
-        return asyncio.run(_fly(autopilots, stack, restart))
+    with make(REMOTE_CONTROL if stories.remote_control else {}, speed_factor) as (autopilots, stack, restart):
+        return asyncio.run(_fly(stories, speed_factor, autopilots, stack, restart))
 
 
 @dataclass(frozen=True)
@@ -473,16 +547,16 @@ def _told(row: Row | None) -> str:
     return row.what if row.after_s is None else f"{row.what}, after {row.after_s:.1f} s"
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: list[str] | None = None, stories: Stories = CONTRACT) -> int:
     """Prints the table, or JSON; 1 where the two differ without a known reason."""
-    parser = argparse.ArgumentParser(description="What flockd sees of the fake autopilot and of PX4 SITL.")
+    parser = argparse.ArgumentParser(description=stories.purpose)
     parser.add_argument("--autopilot", choices=["both", "fake", "px4"], default="both", help="which (both)")
     parser.add_argument("--json", action="store_true", help="print JSON")
     args = parser.parse_args(arguments)
     try:
         if args.autopilot != "fake":
             px4_folder(os.environ)
-        rows = {one: seen(one) for one in ("fake", "px4") if args.autopilot in {one, "both"}}
+        rows = {one: seen(one, stories) for one in ("fake", "px4") if args.autopilot in {one, "both"}}
     except FlockdError as error:
         print(error, file=sys.stderr)
         return int(error.exit_code)
@@ -497,10 +571,14 @@ def main(arguments: list[str] | None = None) -> int:
     if args.json:
         print(json.dumps([vars(one) for one in comparisons], indent=2))
     else:
-        print("| story | with the fake | with PX4 | |\n|---|---|---|---|")
+        columns = ["story", *(["asked for"] if stories.asks else []), "with the fake", "with PX4", ""]
+        print("| " + " | ".join(columns) + " |\n" + "|---" * len(columns) + "|")
+        story = ""
         for one in comparisons:
             verdict = "alike" if one.alike else f"later: {one.known}" if one.known else "DIFFERS"
-            print(f"| {one.story} | {one.fake} | {one.px4} | {verdict} |")
+            asked = [stories.asks[one.story] if one.story != story else ""] if stories.asks else []
+            story = one.story
+            print("| " + " | ".join([one.story, *asked, one.fake, one.px4, verdict]) + " |")
     return 0 if all(one.alike or one.known for one in comparisons) else 1
 
 

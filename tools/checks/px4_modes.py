@@ -306,8 +306,9 @@ async def _send_setpoints(port: str, speed_factor: float, north_m_s: float) -> N
     clock = clock_at(speed_factor)
     link = await AutopilotLink.connect(AutopilotParameters(address=address), timeout_s=START_S, clock=clock)
     velocity = np.array([north_m_s, 0.0])
+    attending = asyncio.create_task(link.attend())  # it announces flockd, so that the autopilot's texts are sent
     print("streaming", flush=True)
-    while True:
+    while not attending.done():
         link.send_setpoint(Setpoint(clock(), velocity, height_m=HEIGHT_M, yaw_rad=0.0))
         await asyncio.sleep(1.0 / (SETPOINTS_HZ * speed_factor))
 

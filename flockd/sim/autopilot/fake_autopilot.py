@@ -37,7 +37,7 @@ from flockd.sim.autopilot.fake_telemetry import (
     mode_by_number,
 )
 from flockd.sim.autopilot.fake_vehicle import Demand, Motion, MotionState, PointMass
-from flockd.sim.autopilot.sticks import stick_curve
+from flockd.sim.autopilot.sticks import StickOverride, stick_curve
 
 TICK_S = 0.02
 MAX_STEP_S = 0.2
@@ -119,6 +119,7 @@ class FakeAutopilot:
             "MIS_TAKEOFF_ALT": 2.5,
             "MPC_VEL_MANUAL": 10.0,
             "MAN_DEADZONE": 0.1,
+            "MAN_OVERRIDE_SPD": 1.0,
         }
         """An int is an INT32 parameter, a float a REAL32 one."""
         self.setpoints: deque[tuple[float, Demand]] = deque(maxlen=MAX_SETPOINTS_KEPT)
@@ -144,6 +145,7 @@ class FakeAutopilot:
         self._landed_s: float | None = None
         self._sticks = -math.inf, np.zeros(2)
         """When a person last moved them, and forward and right from -1 to 1."""
+        self._override = StickOverride()
         self.clock_offset_s = clock_ahead_s - self._clock()
         """Its own clock, of its stamps and of TIMESYNC, less ``clock`` times the speed factor."""
 
@@ -386,6 +388,14 @@ class FakeAutopilot:
         cos, sin = math.cos(self._hold_yaw_rad), math.sin(self._hold_yaw_rad)
         return self.parameters["MPC_VEL_MANUAL"] * np.array([cos * ahead - sin * right, sin * ahead + cos * right])
 
+    def _feel(self, moved_s: float, sticks: FloatArray) -> None:
+        """Sticks moved fast take over from every mode but Position, and not from a failsafe, where PX4 asks more."""
+        self._sticks = moved_s, sticks
+        fast = self._override.moved(moved_s, sticks, self.parameters["MAN_OVERRIDE_SPD"])
+        if fast and self._armed and not self.failsafe and self._mode not in {"POSCTL", "ACRO"}:
+            self.checks.say("Pilot took over using sticks", self._clock())
+            self.pilot_selects("POSCTL")
+
     # MAVLink, in
 
     def _handle(self, message: Any, arrived_s: float, *, on_link: bool) -> None:
@@ -403,7 +413,7 @@ class FakeAutopilot:
                     target_component=message.get_srcComponent(),
                 )
             case "MANUAL_CONTROL" if message.target == self._mav.srcSystem:
-                self._sticks = arrived_s, np.clip([message.x, message.y], -1000, 1000) / 1000
+                self._feel(arrived_s, np.clip([message.x, message.y], -1000, 1000) / 1000)
             case "TIMESYNC" if message.tc1 == 0:
                 own_ns = int(1e9 * (self._clock() + self.clock_offset_s))
                 self._mav.timesync_send(own_ns, message.ts1)
