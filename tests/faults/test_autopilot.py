@@ -33,7 +33,7 @@ async def test_the_link_is_lost_and_comes_back(tmp_path: Path, record_property: 
     async with flying(tmp_path) as process:
         process.fake_autopilot.silent = True
         fault_s = time.monotonic()
-        await process.until_event("silent: no message from the autopilot for ")
+        await process.until_event("silent: no position and velocity from the autopilot for 2.")
         reacted(record_property, "link-lost", time.monotonic() - fault_s)
         await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
         assert process.fake_autopilot.failsafe
