@@ -245,8 +245,7 @@ class Gate:
     ) -> tuple[FloatArray, FloatArray]:
         """The velocity that is to result, (2,) m/s, without what leads too fast anywhere, and the setpoint for it.
 
-        A drone that is measured to be faster than a limit has to brake: the limit counts as lower by as much. The
-        setpoint keeps the limits too: a drift that carries the drone away from something may end at any time.
+        A drone that is measured to be faster than a limit has to brake: the limit counts as lower by as much.
         """
         limits = self._space(action, around)
         directions = np.concatenate([towards for towards, _ in limits.values()])
@@ -258,8 +257,24 @@ class Gate:
         over = directions @ velocity > lowered
         result = nearest_within(velocity, directions, lowered)
         objections.extend(list(limits)[i] for i in np.unique(names[over]))
-        sent = limit_norm(result - self.drift, self._parameters.max_speed_m_s)
-        return result, nearest_within(sent, directions, most_m_s)
+        return result, self._for_result(result, directions, most_m_s, lowered)
+
+    def _for_result(
+        self, result: FloatArray, directions: FloatArray, most_m_s: FloatArray, lowered: FloatArray
+    ) -> FloatArray:
+        """The setpoint, (2,) m/s, that is to lead to a velocity within the `lowered` limits, (n,), in this drift.
+
+        The setpoint keeps the limits too, as a drift that carries the drone away from something may end at any time.
+        But it always counters what of the drift would carry the drone beyond a limit now: between a tree to which it is
+        blown and a neighbour on the other side it stands, and is not blown on.
+        """
+        drift, max_m_s = self.drift, self._parameters.max_speed_m_s
+        least = nearest_within(drift, directions, lowered) - drift  # the smallest setpoint with such a result
+        beyond = limit_norm(result - drift - least, max(max_m_s - math.hypot(*least), 0.0))
+        of_setpoint = np.maximum(most_m_s - directions @ least, 0.0)
+        of_result = np.maximum(lowered - directions @ (drift + least), 0.0)
+        within = nearest_within(beyond, np.tile(directions, (2, 1)), np.concatenate([of_setpoint, of_result]))
+        return limit_norm(least + within, max_m_s)
 
     def _within_climb(self, now_s: float, wanted_m: float, request: Request, objections: list[Objection]) -> float:
         """The height nearest to the one to hold that may be asked for now.

@@ -96,6 +96,40 @@ def test_blown_away_from_a_neighbour_it_is_not_sent_there() -> None:
     np.testing.assert_allclose(velocities[-1], [-0.5, 0.2], atol=1e-6)
 
 
+def test_blown_from_a_neighbour_to_a_tree_it_stands() -> None:
+    """What is comes before what could be, were the wind to end."""
+    around = replace(
+        NOWHERE, neighbours=np.array([[-0.9, 0.0, 0.0]]), neighbour_velocities=np.zeros((1, 2)),
+        obstacles=np.array([[0.5, 0.0]]),
+    )  # fmt: skip
+    setpoints, velocities = flown([0.0, 0.0], [0.8, 0.0], Gate(FREE), around=around)
+    np.testing.assert_allclose(velocities[-1], [0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(setpoints[-1], [-0.8, 0.0], atol=1e-6)
+
+
+def test_blown_past_a_tree_it_counters_no_more_than_leads_there() -> None:
+    """The tree is to the north-east, the wind blows north, and to the south a neighbour is near.
+
+    Of the wind the half that leads to the tree, (0.4, 0.4), is taken off; the rest leads to nothing.
+    """
+    around = replace(
+        NOWHERE, neighbours=np.array([[-0.9, 0.0, 0.0]]), neighbour_velocities=np.zeros((1, 2)),
+        obstacles=np.array([[0.35, 0.35]]),
+    )  # fmt: skip
+    setpoints, velocities = flown([0.0, 0.0], [0.8, 0.0], Gate(FREE), around=around)
+    np.testing.assert_allclose(setpoints[-1], [-0.4, -0.4], atol=1e-6)
+    np.testing.assert_allclose(velocities[-1], [0.4, -0.4], atol=1e-6)
+
+
+def test_a_drift_that_needs_all_of_the_speed_limit_leaves_none_for_what_is_asked() -> None:
+    """Blown at 2 m/s to a tree in the north, and asked to fly east at 2 m/s: 2.5 m/s are allowed in all."""
+    p = FREE.model_copy(update={"max_speed_m_s": 2.5})
+    around = replace(NOWHERE, obstacles=np.array([[0.5, 0.0]]))
+    setpoints, velocities = flown([0.0, 2.0], [2.0, 0.0], Gate(p), around=around)
+    np.testing.assert_allclose(velocities[-1], [0.0, 0.5], atol=1e-6)
+    assert np.linalg.norm(setpoints, axis=1).max() <= 2.5 + 1e-9
+
+
 def test_measured_faster_than_a_limit_it_brakes_harder() -> None:
     """2 m from a neighbour that may begin to come, 0.75 v + v^2 / 3 = 0.5 m gives the limit."""
     limit = math.sqrt(0.75**2 + 1.5) - 0.75
