@@ -98,11 +98,12 @@ class ControlLoop:
     def _setpoint(self, i: int, now_s: float, period_s: float, vehicles: Vehicles, order: _Order) -> Setpoint:
         """What the gate of a drone makes of its order now; its supervisor may hand it over instead."""
         drone, here = self._drones[i], vehicles.position[i]
-        decision = drone.supervisor.step(now_s, drone.gate.gusts_m_s, here, blind=self._is_blind(i, now_s))
+        around = self._around(i, now_s, vehicles, order)
+        decision = drone.supervisor.step(now_s, drone.gate.gusts_m_s, around, blind=self._is_blind(i, now_s))
         if decision.state is State.ASKING:
             self._handover.hold(i, here, vehicles.velocity[i])
             self.handed_over[i] = HandedOver(time_s=now_s, reason=decision.reasons[0].sentence)
-        request = self._request(i, Permission(decision.action, now_s), vehicles, order)
+        request = self._request(i, Permission(decision.action, now_s), around, order)
         verdict = drone.gate.step(now_s, request)
         assert verdict.setpoint is not None, "all that it is told is finite and of now"
         if decision.state is not State.ASKING:
@@ -117,13 +118,13 @@ class ControlLoop:
     def _causes(self, i: int, request: Request, verdict: Verdict, vehicles: Vehicles) -> frozenset[Cause]:
         truth = _truth(i, vehicles)
         is_drone = which_are_drones(request.around.neighbours, truth.neighbours)
-        return causes_of(self._drones[i].parameters, request, verdict, truth, is_drone)
+        drone = self._drones[i]
+        return causes_of(drone.parameters, request, verdict, truth, is_drone, drone.supervisor.degraded_by)
 
-    def _request(self, i: int, permission: Permission, vehicles: Vehicles, order: _Order) -> Request:
-        now_s, here = permission.time_s, vehicles.position[i]
-        height_m, commands = float(order.commands.height_m[i]), order.commands
+    def _around(self, i: int, now_s: float, vehicles: Vehicles, order: _Order) -> Surroundings:
+        here, commands = vehicles.position[i], order.commands
         ranges = commands.obstacles[i]
-        around = surroundings(
+        return surroundings(
             commands.neighbours[i],
             now_s - order.time_s,
             moved=here - order.places[i],
@@ -133,6 +134,9 @@ class ControlLoop:
             height_m=float(-here[2]),
             obstacles=np.empty((0, 2)) if ranges is None else nearest_points(ranges, self._sigmas),
         )
+
+    def _request(self, i: int, permission: Permission, around: Surroundings, order: _Order) -> Request:
+        height_m, commands = float(order.commands.height_m[i]), order.commands
         wanted = Wanted(commands.velocity[i], commands.acceleration[i], float(commands.yaw_rad[i]))
         held_m = height_m if math.isfinite(height_m) else self._start_m[i]
         return Request(permission, wanted, order.time_s, held_m, around)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from enum import StrEnum
 
 import numpy as np
 
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import BoolArray, FloatArray
-from flockd.flight.safety import Action, Objection, Request, Surroundings, Verdict
+from flockd.flight.safety import Action, Event, Objection, Request, Surroundings, Verdict
 from flockd.flight.safety.approach import towards_neighbours
 
 _SLOWED = 0.05
@@ -31,8 +32,19 @@ class Cause(StrEnum):
     FENCE = "fence"
     WIND = "wind"
     """The supervisor had it fly slower in strong gusts."""
+    CAMERA = "camera"
+    """Likewise, for a lost camera."""
     OTHER = "other"
-    """A command that is old, or changes faster than the limit of acceleration."""
+    """A command that is old, or changes faster than the limit of acceleration; a height beyond the limits."""
+
+
+_OF_EVENTS = {
+    Event.GUSTS_STRONG: Cause.WIND,
+    Event.NO_ROOM_TO_HOLD: Cause.WIND,
+    Event.CAMERA_LOST: Cause.CAMERA,
+    Event.FENCE_LEFT: Cause.FENCE,
+}
+"""Why the supervisor had a drone fly slower; another event is `OTHER`."""
 
 
 class SlowedTime:
@@ -67,11 +79,17 @@ def is_slowed(request: Request, verdict: Verdict, drift: FloatArray) -> bool:
 
 
 def causes_of(
-    p: GateParameters, request: Request, verdict: Verdict, truth: Surroundings, is_drone: BoolArray
-) -> frozenset[Cause]:  # fmt: skip
+    p: GateParameters,
+    request: Request,
+    verdict: Verdict,
+    truth: Surroundings,
+    is_drone: BoolArray,
+    degraded_by: Collection[Event] = (),
+) -> frozenset[Cause]:
     """Why what was allowed is not what was asked for.
 
     `truth` is where the other drones truly are, and `is_drone` (n,) tells which of the request's neighbours are any.
+    `degraded_by`: why the supervisor has a degraded drone fly slower.
     """
     asked, action, found = request.wanted.velocity, request.permission.action, set()
     if Objection.SEPARATION in verdict.objections:
@@ -85,7 +103,7 @@ def causes_of(
     named = {Objection.OBSTACLE: Cause.OBSTACLE, Objection.FENCE: Cause.FENCE}
     found |= {cause for objection, cause in named.items() if objection in verdict.objections}
     if action is Action.FLY_DEGRADED:
-        found.add(Cause.WIND)
+        found |= {_OF_EVENTS.get(event, Cause.OTHER) for event in degraded_by}
     return frozenset(found or {Cause.OTHER})
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flockd.core.config import load_scenario
-from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.config.scenario import CameraFaultConfig, ScenarioConfig
 from flockd.core.data import data_path
 from flockd.core.messages import FloatArray
 from flockd.flight.flocking.metrics import min_distance
@@ -71,6 +71,27 @@ def test_a_drone_whose_setpoints_have_no_effect_is_slowed_and_then_held() -> Non
     assert max(held.time_s for held in loop.handed_over.values()) < 5.0
     assert loop.slowed.by_cause["wind"] > 0.0
     np.testing.assert_allclose(places, np.broadcast_to(places[0], places.shape))
+
+
+def test_a_lost_camera_is_no_wind() -> None:
+    """Drone 1, which wants 2 m/s, flies at the 1 m/s of a degraded one, until 2 s after its camera is back."""
+    fault = CameraFaultConfig(drone=1, camera="left", kind="uniform", begin_s=2.0, end_s=6.0)
+    scenario = load_scenario(data_path("config") / "encounter.yaml", {"duration_s": 10.0})
+    far = scenario.vehicles[1].model_copy(update={"position_m": (30.0, 30.0, -5.0)})
+    scenario = scenario.model_copy(update={"faults": (fault,), "vehicles": (scenario.vehicles[0], far)})
+    loop, _ = _flown(scenario, Vehicles(scenario.vehicles, scenario.vehicle))
+    assert "wind" not in loop.slowed.by_cause
+    assert loop.slowed.by_cause["camera"] == pytest.approx(6.0 / 20.0, abs=0.02)
+
+
+def test_in_too_strong_gusts_a_drone_among_trees_is_held_where_there_is_room() -> None:
+    """Hold strays by a metre: begun at 9.8 s, 0.65 m from a tree, it would have touched it at 15 s."""
+    of_gusts = {"vehicle.gust_m_s": 0.5, "vehicle.gust_length_m": 10.0, "world.obstacles.trees_per_hectare": 250.0}
+    scenario = load_scenario(data_path("config") / "forest.yaml", of_gusts | {"seed": 1, "duration_s": 20.0})
+    log = fly(scenario, perception="truth", pictured=False).log
+    assert log.clearance is not None
+    assert log.metadata.handed_over
+    assert log.clearance.min() > scenario.vehicle.radius_m
 
 
 def test_a_held_drone_takes_no_command_any_more() -> None:

@@ -9,7 +9,17 @@ import pytest
 from numpy.typing import ArrayLike
 
 from flockd.core.messages import Wanted
-from flockd.flight.safety import Action, Gate, GateParameters, Objection, Permission, Request, Surroundings, Verdict
+from flockd.flight.safety import (
+    Action,
+    Event,
+    Gate,
+    GateParameters,
+    Objection,
+    Permission,
+    Request,
+    Surroundings,
+    Verdict,
+)
 from flockd.sim.slowing import Cause, SlowedTime, causes_of, is_slowed, which_are_drones
 
 GATE = GateParameters(fence_radius_m=None, max_acceleration_m_s2=50.0)
@@ -24,7 +34,12 @@ def _around(*places: list[float], margin_m: float = 0.0) -> Surroundings:
 
 
 def _causes(
-    seen: Surroundings, truth: Surroundings, *, action: Action = Action.FLY, asked: ArrayLike = (1.0, 0.0)
+    seen: Surroundings,
+    truth: Surroundings,
+    *,
+    action: Action = Action.FLY,
+    asked: ArrayLike = (1.0, 0.0),
+    degraded_by: tuple[Event, ...] = (),
 ) -> frozenset[Cause]:
     """Of a second tick that asks for 1 m/s north."""
     gate, parameters = Gate(GATE), GATE
@@ -34,7 +49,7 @@ def _causes(
         verdict = gate.step(now_s, request)
     is_drone = which_are_drones(seen.neighbours, truth.neighbours)
     slowed = is_slowed(request, verdict, gate.drift)
-    return causes_of(parameters, request, verdict, truth, is_drone) if slowed else frozenset()
+    return causes_of(parameters, request, verdict, truth, is_drone, degraded_by) if slowed else frozenset()
 
 
 def test_a_drone_that_is_there_is_a_neighbour() -> None:
@@ -58,9 +73,24 @@ def test_two_may_limit_at_once() -> None:
     assert _causes(seen, truth, asked=(1.0, -0.5)) == {Cause.NEIGHBOUR, Cause.FALSE_DETECTION}
 
 
-def test_an_obstacle_the_fence_wind_and_anything_else() -> None:
+@pytest.mark.parametrize(
+    ("event", "cause"),
+    [
+        (Event.GUSTS_STRONG, Cause.WIND),
+        (Event.NO_ROOM_TO_HOLD, Cause.WIND),
+        (Event.CAMERA_LOST, Cause.CAMERA),
+        (Event.FENCE_LEFT, Cause.FENCE),
+        (Event.HEIGHTS_LEFT, Cause.OTHER),
+    ],
+)
+def test_a_degraded_drone_is_slowed_by_what_degraded_it(event: Event, cause: Cause) -> None:
+    degraded = _causes(ALONE, _around(), action=Action.FLY_DEGRADED, asked=(1.5, 0.0), degraded_by=(event,))
+    assert degraded == {cause}
+    assert _causes(ALONE, _around(), asked=(1.0, 0.0), degraded_by=(event,)) == frozenset(), "long over"
+
+
+def test_an_obstacle_and_anything_else() -> None:
     assert _causes(replace(ALONE, obstacles=np.array([[0.7, 0.0]])), _around()) == {Cause.OBSTACLE}
-    assert _causes(ALONE, _around(), action=Action.FLY_DEGRADED, asked=(1.5, 0.0)) == {Cause.WIND}
     assert _causes(ALONE, _around(), asked=(9.0, 0.0)) == {Cause.OTHER}, "refused as too fast"
 
 

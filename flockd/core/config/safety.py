@@ -116,6 +116,9 @@ class SafetyParameters(Section):
     included), to be degraded."""
     max_gusts_m_s: Positive = consistency.RESPONSE.limit
     """The same, to ask for Hold."""
+    hold_room_m: Annotated[float, Field(ge=0, le=100)] = 2.0
+    """In such gusts Hold, which knows of no obstacles, is asked for where none is nearer than this to the drone's
+    middle; until then, for 30 s at most, the drone flies on, degraded."""
     heartbeat_timeout_s: Annotated[float, Field(gt=0, le=10)] = services.HEARTBEAT.timeout
     """The link to the autopilot counts as lost without a heartbeat for this long, and flockd falls silent for good; two
     of them may be lost while other messages arrive."""

@@ -69,6 +69,8 @@ class Inputs:
     """Range of the nearest confirmed neighbour; infinite without one."""
     refused_commands: int
     """Commands since the last call that the gate found not finite or too large."""
+    obstacle_near: bool
+    """An obstacle is nearer than `hold_room_m`."""
     outside_fence: bool
     """As of `outside_fence`."""
     outside_heights: bool
@@ -126,6 +128,7 @@ class Event(StrEnum):
     LOOP_LATE = "loop_late"
     GUSTS_STRONG = "gusts_strong"
     GUSTS_TOO_STRONG = "gusts_too_strong"
+    NO_ROOM_TO_HOLD = "no_room_to_hold"
     TASK_DIED = "task_died"
     NEIGHBOURS_LOST = "neighbours_lost"
     NEIGHBOUR_CLOSE = "neighbour_close"
@@ -173,6 +176,7 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
     failures = inputs.ego_motion_failures
     temperature = inputs.temperature_c
     lost_link = link_lost(inputs.heartbeat_age_s, inputs.message_age_s, p)
+    too_gusty = not inputs.gusts_m_s <= p.max_gusts_m_s
     table = (
         (Event.SIGHT_LOST, sightless, f"too few cameras deliver images: {', '.join(lost) or 'there are none'}"),
         (Event.CAMERA_LOST, len(lost) > 0 and not sightless, f"a camera is lost: {', '.join(lost)}"),
@@ -228,8 +232,14 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         ),
         (
             Event.GUSTS_TOO_STRONG,
-            not inputs.gusts_m_s <= p.max_gusts_m_s,
+            too_gusty and not inputs.obstacle_near,
             f"gusts carry the drone {inputs.gusts_m_s:.1f} m/s off its setpoints, more than it can bear",
+        ),
+        (
+            Event.NO_ROOM_TO_HOLD,
+            too_gusty and inputs.obstacle_near,
+            f"gusts carry the drone {inputs.gusts_m_s:.1f} m/s off its setpoints, more than it can bear; it flies on "
+            f"to where no obstacle is within {p.hold_room_m:g} m, and asks for Hold there",
         ),
         (Event.TASK_DIED, len(inputs.dead_tasks) > 0, f"ended and should not have: {', '.join(inputs.dead_tasks)}"),
         (

@@ -50,6 +50,11 @@ class Surroundings:
     neighbour_margins: FloatArray | None = None
     """(n, 2) by how much each neighbour may be nearer, m, and come faster, m/s; None: exact."""
 
+    @property
+    def nearest_obstacle_m(self) -> float:
+        """Range of the nearest obstacle; infinite without one."""
+        return float(np.hypot(*self.obstacles.T).min(initial=math.inf))
+
 
 @dataclass(frozen=True, eq=False)
 class Request:

@@ -78,6 +78,8 @@ class Rule:
         return self.later if lasted_s >= self.after_s else self.reaction
 
 
+ROOM_S = 30.0
+"""For how long a drone in too strong gusts flies on for room before it asks for Hold where it is."""
 FOREIGN_S = 0.5
 """For how long somebody else may interfere before Hold is asked for."""
 
@@ -103,6 +105,7 @@ def rules(p: SafetyParameters) -> dict[Event, Rule]:
         Event.LOOP_LATE: Rule(Barrier.NONE, Reaction.DEGRADE),
         Event.GUSTS_STRONG: Rule(Barrier.NONE, Reaction.DEGRADE),
         Event.GUSTS_TOO_STRONG: Rule(Barrier.NONE, Reaction.HOLD),
+        Event.NO_ROOM_TO_HOLD: Rule(Barrier.NONE, Reaction.DEGRADE, ROOM_S, Reaction.HOLD),
         Event.TASK_DIED: Rule(Barrier.WAIT, Reaction.HOLD),
         Event.NEIGHBOURS_LOST: Rule(Barrier.NONE, Reaction.NOTE, alone_s, Reaction.HOLD),
         Event.NEIGHBOUR_CLOSE: Rule(Barrier.NONE, Reaction.NOTE),

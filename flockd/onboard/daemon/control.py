@@ -86,8 +86,9 @@ class Control:
         status, vehicle = self._link.status(), self._link.vehicle_state()
         if vehicle is not None:
             self._history.add(vehicle)
+        obstacle_m = math.inf if self._request is None else self._request.around.nearest_obstacle_m
         inputs = self._input_collector.collect(
-            status, vehicle, self._operator, self._mission_over(), self._streamer.report().fault
+            status, vehicle, self._operator, self._mission_over(), self._streamer.report().fault, obstacle_m
         )
         before, now = self.decision, self._clock()
         self.decision = self._supervisor.step(now, inputs)

@@ -57,8 +57,12 @@ class InputCollector:
         operator: OperatorRequests,
         mission_over: MissionEnd | None,
         stream_fault: str | None,
+        obstacle_m: float,
     ) -> Inputs:
-        """All inputs as of now; requests that count once, or for a flight that is over, are reset in ``operator``."""
+        """All inputs as of now; requests that count once, or for a flight that is over, are reset in ``operator``.
+
+        ``obstacle_m``: the range of the nearest obstacle.
+        """
         now = self._clock()
         pilot_loop, result = self._pilot_loop, self._pilot_loop.newest
         neighbours = result.output.neighbours if result else ()
@@ -85,6 +89,7 @@ class InputCollector:
             neighbours_age_s=now - pilot_loop.neighbour_seen_s,
             nearest_neighbour_m=min(ranges, default=math.inf),
             refused_commands=self._refused() - self._refused_before,
+            obstacle_near=obstacle_m < self._config.safety.hold_room_m,
             outside_fence=outside_fence(self._config.safety.gate, position),
             outside_heights=vehicle is None or outside_heights(self._config.safety.gate, vehicle.height_m),
             motion_age_s=math.inf if vehicle is None else now - vehicle.time_s,

@@ -80,6 +80,7 @@ _CAUSES = {
     "obstacle": "obstacles",
     "fence": "the fence",
     "wind": "wind",
+    "camera": "a lost camera",
     "other": "other limits",
 }
 

@@ -41,6 +41,7 @@ QUIET = Inputs(
     neighbours_age_s=0.4,
     nearest_neighbour_m=2.5,
     refused_commands=0,
+    obstacle_near=False,
     outside_fence=False,
     outside_heights=False,
     motion_age_s=0.03,

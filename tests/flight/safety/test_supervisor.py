@@ -52,6 +52,7 @@ FAULTS = {
     Event.LOOP_LATE: Fault({"loop_lag_s": 0.3}, "ready", Action.FLY_DEGRADED),
     Event.GUSTS_STRONG: Fault({"gusts_m_s": 0.7}, "ready", Action.FLY_DEGRADED),
     Event.GUSTS_TOO_STRONG: Fault({"gusts_m_s": 0.9}, "ready", Action.ASK_HOLD),
+    Event.NO_ROOM_TO_HOLD: Fault({"gusts_m_s": 0.9, "obstacle_near": True}, "ready", Action.FLY_DEGRADED),
     Event.TASK_DIED: Fault({"dead_tasks": ("pilot",)}, "wait", Action.ASK_HOLD),
     Event.NEIGHBOURS_LOST: Fault({"neighbours_age_s": 2.5}, "ready", Action.FLY),
     Event.NEIGHBOUR_CLOSE: Fault({"nearest_neighbour_m": 0.9}, "ready", Action.FLY),
@@ -519,6 +520,24 @@ def test_outside_its_limits_it_has_three_seconds_to_come_back(limit: str) -> Non
     assert flight.run(3.0, **{limit: False}).action is Action.FLY
     assert flight.step(**{limit: True}).run(3.0 - STEP_S).action is Action.FLY_DEGRADED
     assert flight.step().action is Action.ASK_HOLD
+
+
+def test_in_too_strong_gusts_among_obstacles_hold_is_asked_for_where_there_is_room() -> None:
+    flight = flying().run(20.0, gusts_m_s=0.9, obstacle_near=True)
+    assert flight.action is Action.FLY_DEGRADED
+    assert "flies on to where no obstacle is within 2 m" in flight.sentence(Event.NO_ROOM_TO_HOLD)
+    assert flight.step(obstacle_near=False).action is Action.ASK_HOLD
+    assert flight.run(1.0, obstacle_near=True).action is Action.ASK_HOLD
+
+
+def test_where_no_room_is_found_hold_is_asked_for_after_half_a_minute() -> None:
+    flight = flying().step(gusts_m_s=0.9, obstacle_near=True).run(30.0 - STEP_S)
+    assert flight.action is Action.FLY_DEGRADED
+    assert flight.step().action is Action.ASK_HOLD
+
+
+def test_an_obstacle_near_alone_is_no_reason() -> None:
+    assert flying().run(60.0, obstacle_near=True).action is Action.FLY
 
 
 def test_a_degraded_drone_is_well_again_two_seconds_after_the_last_fault() -> None:
