@@ -73,6 +73,16 @@ def test_a_drone_whose_setpoints_have_no_effect_is_slowed_and_then_held() -> Non
     np.testing.assert_allclose(places, np.broadcast_to(places[0], places.shape))
 
 
+def test_gates_leave_a_flock_the_shape_that_the_law_gives_it() -> None:
+    """A regular pentagon: in a flock that flies along, gaps close too."""
+    scenario = _scenario(duration_s=62.0)
+    _, places = _flown(scenario, Vehicles(scenario.vehicles, scenario.vehicle))
+    plan = places[-1, :, :2]
+    apart_m = np.sort(np.linalg.norm(plan[:, None] - plan[None], axis=2)[np.triu_indices(5, 1)])
+    assert np.ptp(apart_m[:5]) < 0.015, "sides"
+    assert np.ptp(apart_m[5:]) < 0.015, "diagonals"
+
+
 def test_a_lost_camera_is_no_wind() -> None:
     """Drone 1, which wants 2 m/s, flies at the 1 m/s of a degraded one, until 2 s after its camera is back."""
     fault = CameraFaultConfig(drone=1, camera="left", kind="uniform", begin_s=2.0, end_s=6.0)

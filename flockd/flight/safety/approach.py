@@ -30,7 +30,9 @@ def towards_neighbours(
     Shalev-Shwartz et al. 2017, "On a formal model of safe and scalable self-driving cars": with v towards a
     neighbour that comes at w (negative: goes), the drone's reaction time r and its braking b,
     (v + w) r + v^2 / 2b + w |w| / 2b <= distance left. The neighbour's gate may let it begin to come just now; so,
-    but for following one that goes, this has to hold for w = v too.
+    but for following one that goes, this has to hold for w = v too. One that goes is followed as fast as it goes, and
+    faster where the drone would still stop behind it if it braked unseen for r: v r + v^2 / 2b - w^2 / 2b <= distance
+    left. Else no gap would ever close in a flock that flies along.
     """
     ranges = np.hypot(offsets[:, 0], offsets[:, 1])
     about_m = max(separation_m, p.vertical_separation_m)
@@ -51,7 +53,10 @@ def towards_neighbours(
     most_m_s = np.sqrt(np.maximum(square, lag**2)) - lag
     soon = p.braking_m_s2 * p.reaction_s  # it begins to come from standstill, or from less
     if_both_come = np.sqrt(soon**2 + p.braking_m_s2 * np.maximum(left_m, 0.0)) - soon
-    most_m_s = np.minimum(most_m_s, np.maximum(if_both_come, -comes))
+    goes = np.maximum(-comes, 0.0)
+    if_it_brakes = np.sqrt(lag**2 + 2 * p.braking_m_s2 * np.maximum(left_m, 0.0) + goes**2) - lag
+    following = np.maximum(np.minimum(if_it_brakes, if_both_come + goes), goes)
+    most_m_s = np.minimum(most_m_s, np.maximum(if_both_come, following))
     return towards, np.where(left_m > 0, most_m_s, 0.0)
 
 

@@ -172,6 +172,27 @@ def test_each_neighbours_own_velocity_counts() -> None:
     assert both[0] < both[1]
 
 
+@pytest.mark.parametrize(("range_m", "goes_m_s"), [(2.47, 1.28), (3.0, 0.8), (6.0, 2.0)])
+def test_behind_one_that_flies_along_it_closes_up_as_far_as_it_still_stops_if_that_one_brakes(
+    range_m: float, goes_m_s: float
+) -> None:
+    """The other brakes at once, the drone a second later, both at 1.5 m/s^2: they stand at the separation of 1 m."""
+    v = float(fastest((range_m, 0.0), velocities=[[goes_m_s, 0.0]])[0])
+    assert v > goes_m_s
+    assert range_m + goes_m_s**2 / 3.0 - v * 1.0 - v**2 / 3.0 == pytest.approx(1.0)
+
+
+def test_too_near_for_that_it_flies_as_fast_as_the_other() -> None:
+    for range_m in (1.01, 1.5, 2.25):
+        assert fastest((range_m, 0.0), velocities=[[1.28, 0.0]])[0] == pytest.approx(1.28)
+
+
+def test_one_that_barely_goes_is_met_as_one_that_may_begin_to_come() -> None:
+    for range_m in (1.5, 3.0, 8.0):
+        stands, creeps = (fastest((range_m, 0.0), velocities=[[goes, 0.0]])[0] for goes in (0.0, 0.1))
+        assert stands <= creeps <= stands + 0.1
+
+
 def test_nobody_follows_a_neighbour_at_the_separation_itself() -> None:
     assert fastest((1.0, 0.0), velocities=[[2.0, 0.0]], separation_m=1.0) == 0.0
     assert fastest((1.001, 0.0), velocities=[[2.0, 0.0]], separation_m=1.0) > 0.0
