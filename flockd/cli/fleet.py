@@ -23,7 +23,7 @@ ALL = "all"
 REPEAT_S = 1.0
 """Half of the time for which an operator's velocity holds."""
 FIND_S, AGAIN_S = 3.0, 0.1
-NO_ANSWER = "did not answer; this computer may not command it, or it is one of the simulator's own pilots"
+NO_ANSWER = "did not answer; this computer may not command it"
 PLAIN = {
     "hold": "Make the drones' autopilots hold position: the drones stop, and flockd hands over.",
     "land": "Make the drones' autopilots land them where they are.",
