@@ -23,7 +23,7 @@ ALL = "all"
 REPEAT_S = 1.0
 """Half of the time for which an operator's velocity holds."""
 FIND_S, AGAIN_S = 3.0, 0.1
-NO_ANSWER = "did not answer; this computer may not command it, or it is one of the simulator's own pilots"
+NO_ANSWER = "did not answer; this computer may not command it"
 PLAIN = {
     "hold": "Make the drones' autopilots hold position: the drones stop, and flockd hands over.",
     "land": "Make the drones' autopilots land them where they are.",
@@ -169,6 +169,8 @@ def _ask(args: argparse.Namespace, command: str, order: MissionOrder | None, rep
 
 def _drones(watcher: FleetWatcher, wanted: str, places: str) -> tuple[str, ...]:
     """The keys `fleet/drone` of drones that are alive: as soon as all named ones are found; of all, after a while."""
+    from flockd.fleet.fleet_status import by_name
+
     names = [] if wanted == ALL else wanted.split(",")
     until_s = time.monotonic() + FIND_S
     while True:
@@ -180,7 +182,7 @@ def _drones(watcher: FleetWatcher, wanted: str, places: str) -> tuple[str, ...]:
     if missing or not alive:
         who = f"{' and '.join(missing)} {'was' if len(missing) == 1 else 'were'} not" if missing else "no drone was"
         raise UnavailableError(f"{who} found at {places}; no request was sent; check `flockd status`")
-    return tuple(sorted(f"{one.fleet}/{one.drone}" for one in alive))
+    return tuple(sorted((f"{one.fleet}/{one.drone}" for one in alive), key=by_name))
 
 
 def _answers(

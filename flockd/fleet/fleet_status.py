@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -21,8 +22,15 @@ def status_rows(drones: Iterable[Watched], now_s: float) -> list[dict[str, Any]]
     return [row for _, row in sorted(rows, key=lambda one: (not one[0], *_worst(one[1])))]
 
 
-def _worst(row: Mapping[str, Any]) -> tuple[bool, int, str, str]:
-    return len(row["identities"]) < 2, WORST_FIRST.index(row["state"]), row["fleet"], row["drone"]
+def by_name(name: str) -> tuple[object, ...]:
+    """Sorts names as people count: drone2 before drone10."""
+    return [(text, int(digits or 0)) for text, digits in re.findall(r"([^0-9]*)([0-9]*)", name)], name
+
+
+def _worst(row: Mapping[str, Any]) -> tuple[object, ...]:
+    return (
+        len(row["identities"]) < 2, WORST_FIRST.index(row["state"]), by_name(row["fleet"]), by_name(row["drone"]),
+    )  # fmt: skip
 
 
 def _row(drone: Watched, now_s: float) -> dict[str, Any]:

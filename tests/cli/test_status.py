@@ -56,6 +56,11 @@ def test_the_worst_stands_first() -> None:
     ]
 
 
+def test_drones_in_one_state_stand_in_the_order_of_their_numbers() -> None:
+    rows = status_rows([_drone(name, "normal") for name in ("drone10", "kite", "drone2", "drone1b", "drone1")], NOW_S)
+    assert [row["drone"] for row in rows] == ["drone1", "drone1b", "drone2", "drone10", "kite"]
+
+
 def test_a_drone_that_has_published_nothing_yet_is_said_to_start() -> None:
     new, broken = Watched("meadow", "a", True), Watched("meadow", "b", True, malformed={"flight": "no JSON"})
     first, second = status_rows([new, broken], NOW_S)

@@ -50,6 +50,8 @@ PACKAGES = (
 )
 BOOT_MODULES = ("virtio_pci", "virtio_blk", "ext4")
 PAGE, SECTION = ROOT / "docs" / "real_drone.md", "## Install it as a service"
+DRONE_FILE = "my_drone.yaml"
+"""What the page calls the file that its reader has written."""
 FAKE_AUTOPILOT = "pymavlink>=2.4.40"
 COMPILE = "import flockd.sim.autopilot.fake_autopilot"
 """What it needs of a dozen MAVLink dialects, and no more."""
@@ -91,7 +93,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, metavar="DIR", help="keep the machine's files here, and use those there")
     parser.add_argument(
-        "--only", nargs="+", default=[], metavar="GROUP", help="of capture, pipelines, sandbox and service"
+        "--only", nargs="+", default=[], metavar="GROUP", help="of capture, pipelines, bench, sandbox and service"
     )
     parser.add_argument("--package", action="store_true", help="check the Debian package, and that alone")
     parser.add_argument("--json", action="store_true")
@@ -263,11 +265,11 @@ def _install(system: Path, wheels: Path, install: str) -> None:
     source, shelf = system / "srv/flockd", system / "srv/wheels"
     source.mkdir(0o700, parents=True)  # what is installed must not need it: the service cannot read it
     copy_sources(source)
+    shutil.copy(ROOT / "tools/checks/device_check/drone.yaml", source / DRONE_FILE)
     shutil.copytree(wheels, shelf)
     _inside(system, f"cd /{source.relative_to(system)}\n{install}")
     install = f"pip install --quiet --no-compile --target /opt/fake-autopilot '{FAKE_AUTOPILOT}'"
     _inside(system, f"/opt/flockd/bin/{install}\nPYTHONPATH=/opt/fake-autopilot /opt/flockd/bin/python -c '{COMPILE}'")
-    shutil.copy(ROOT / "tools/checks/device_check/drone.yaml", system / "etc/flockd/drone.yaml")
     shutil.rmtree(shelf)
 
 

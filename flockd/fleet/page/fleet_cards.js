@@ -32,6 +32,12 @@ async function failure(reply) {
   return reply.ok ? "" : reply.text();
 }
 
+// Why no new picture is there; above it may stand an old one.
+function captioned(figure, why) {
+  const { camera, came } = figure.dataset;
+  return came ? `${camera}, ${Math.round((performance.now() - came) / 1000)} s old: no newer one has come` : `${camera}: ${why}`;
+}
+
 function apart(seconds) {
   if (seconds === null) return "–";
   const sign = seconds < 0 ? "−" : "+";
@@ -181,14 +187,14 @@ export class FleetCards {
       const address = `image/${drone}/${encodeURIComponent(camera)}?at=${state.now}`;
       const reply = await fetch(address, { priority: "low", signal: AbortSignal.timeout(PICTURE_MS) });
       const none = reply.status === 204 ? "no picture has come: it has none, or does not answer" : await failure(reply);
-      put(figure.lastChild, none ? `${camera}: ${none}` : camera);
-      if (!none) {
-        const picture = URL.createObjectURL(await reply.blob());
-        URL.revokeObjectURL(image.src);
-        image.src = picture;
-      }
+      if (none) return put(figure.lastChild, captioned(figure, none));
+      const picture = URL.createObjectURL(await reply.blob());
+      URL.revokeObjectURL(image.src);
+      image.src = picture;
+      figure.dataset.came = performance.now();
+      put(figure.lastChild, camera);
     } catch {
-      put(figure.lastChild, `${camera}: the server cannot be reached`);
+      put(figure.lastChild, captioned(figure, "the server cannot be reached"));
     }
   }
 }

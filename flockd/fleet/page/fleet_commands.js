@@ -29,9 +29,8 @@ export class FleetCommands {
 
   // Why a drone has no command; empty where it has some.
   refusal(key) {
-    const { commands, state: now, flight_mode: mode } = state.rows.get(key);
+    const { commands, state: now } = state.rows.get(key);
     if (!state.live || !state.mayCommand || now === "gone" || (commands || []).length) return "";
-    if (mode === "simulated") return "takes no commands: the simulator's own pilots never do";
     return commands ? "takes no commands: its telemetry.commands allows none" : "takes no commands: it has not told which";
   }
 

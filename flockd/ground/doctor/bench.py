@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from flockd.core.config import DroneConfig
-from flockd.core.messages import FloatArray, Setpoint
+from flockd.core.messages import FloatArray, PilotOutput, ReasonKind, Setpoint
 from flockd.flight.inference.hashes import model_hashes
 from flockd.flight.perception import load_networks
 from flockd.flight.safety import Gate
@@ -57,6 +58,8 @@ class Sample:
     camera_faults: Mapping[str, str]
     neighbours: int
     own_motion: bool
+    why: str | None
+    """Of the newest step, what an own motion may have failed by; None: nothing is missing."""
     command: FloatArray | None
     """(2,) m/s, north and east: what the gate would have let through."""
 
@@ -148,8 +151,15 @@ def _sample(components: Components, time_s: float, command: FloatArray | None) -
         camera_faults={name: camera.fault for name, camera in cameras.items() if camera.fault is not None},
         neighbours=0 if output is None else sum(one.confirmed for one in output.neighbours),
         own_motion=output is not None and output.ego_motion is not None,
+        why=None if output is None else _why_no_motion(output),
         command=command,
     )
+
+
+def _why_no_motion(output: PilotOutput) -> str | None:
+    """The first cause in the line from the input on; a height by another source than wanted is none."""
+    causes = (ReasonKind.INPUT, ReasonKind.CAMERA, ReasonKind.LENS, ReasonKind.PAIR, ReasonKind.EGO_MOTION)
+    return next((reason.text for kind in causes for reason in output.reasons if reason.kind is kind), None)
 
 
 def judged(config: DroneConfig, samples: Sequence[Sample], seconds: float) -> Iterator[Finding]:
@@ -255,7 +265,10 @@ def _what_it_saw(samples: Sequence[Sample]) -> Iterator[Finding]:
     yield warned("neighbours", measured, fix) if most else passed("neighbours", "none were seen")
     known = sum(sample.own_motion for sample in samples) / len(samples)
     measured = f"estimated in {100 * known:.0f} % of the time"
-    fix = "the cameras need something with texture to see, and light"
+    whys = Counter(sample.why for sample in samples if not sample.own_motion and sample.why is not None)
+    if known < STEADY and whys:
+        measured += f"; mostly: {whys.most_common(1)[0][0]}"
+    fix = "show the cameras something with texture, in light; without a range finder lift the drone after its start"
     yield passed("own motion", measured) if known >= STEADY else warned("own motion", measured, fix)
 
 

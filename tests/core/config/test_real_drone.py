@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from pathlib import Path
 
 import pytest
 
 from flockd.cli import main
 from flockd.core.config import DroneConfig, load_drone, load_real_drone
+from flockd.core.config.envelope import PROVEN_M_S
 from flockd.core.errors import ConfigError
 
 CONFIG = Path(__file__).parents[3] / "config"
@@ -164,3 +166,10 @@ def test_doctor_says_whether_it_is_a_first_flight(file: Path, capsys: pytest.Cap
         assert f"PASS  first flight  {told}" in capsys.readouterr().out
     assert main(["doctor", "--config", _write(file, law=3.5), "--only", "limits", "--force"]) == 0
     assert "WARNING  flocking.max_speed_m_s  3.5 m/s is above the 2 m/s" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["quadrotor.yaml", "templates/drone.yaml"])
+def test_the_files_name_the_speed_that_was_proven(name: str) -> None:
+    """Where they say how far the speed may be raised."""
+    said = re.findall(r"([0-9.]+) is (?:.*)the most that was proven", (CONFIG / name).read_text(encoding="utf-8"))
+    assert [float(speed) for speed in said] == [PROVEN_M_S["flocking", "max_speed_m_s"]]

@@ -198,6 +198,9 @@ def test_pictures_of_cameras_come_on_request(flock: Flock) -> None:
     flock.page.locator(f"{of} .look").click()
     for place in range(2):
         expect(flock.page.locator(f"{of} img").nth(place)).to_have_js_property("naturalWidth", 320)
+    flock.page.route("**/image/**", lambda route: route.fulfill(status=204))
+    expect(flock.page.locator(f"{of} figcaption").first).to_contain_text("s old: no newer one has come")
+    flock.page.unroute("**/image/**")
     flock.page.locator(f"{of} .look").click()
     expect(flock.page.locator(f"{of} .pictures")).to_be_hidden()
 

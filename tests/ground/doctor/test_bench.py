@@ -22,7 +22,7 @@ CONFIG = config_for(14540, "tcp/127.0.0.1:1", "tcp/127.0.0.1:2")
 """Of the judgements: a step each 0.25 s, two cameras."""
 WELL = Sample(
     time_s=0.0, armed=False, heartbeat_age_s=0.4, steps=0, failed=0, load=0.5, loop_lag_s=0.01, temperature_c=50.0,
-    camera_age_s={"front": 0.05, "back": 0.05}, camera_faults={}, neighbours=0, own_motion=True,
+    camera_age_s={"front": 0.05, "back": 0.05}, camera_faults={}, neighbours=0, own_motion=True, why=None,
     command=np.array([0.3, 0.4]),
 )  # fmt: skip
 
@@ -120,6 +120,24 @@ def test_what_was_wrong_at_the_end_is_told(wrong: dict[str, object], about: str,
     (finding,) = (one for one in judged(CONFIG, seen, 60.0) if one.about == about)
     assert finding.level is level
     assert told in finding.measured
+
+
+async def test_a_drone_at_the_height_of_its_start_knows_no_motion_and_says_why() -> None:
+    """Without a range finder its height is 0 on the bench, unless it is lifted after its start."""
+    port, frames = free_port(), free_endpoint()
+    config = config_for(port, frames, free_endpoint(), own_velocity="vision")
+    config = config.model_copy(update={"perception": config.perception.model_copy(update={"scale": "height"})})
+    cameras = Cameras(frames)
+    try:
+        with FakeAutopilot(port, heartbeat_s=0.25):
+            seen = await bench(config, "tiny.yaml", 2.0, stop=asyncio.Event(), load=TinyPerceiver)
+    finally:
+        cameras.close()
+    (finding,) = (one for one in judged(config, seen, 2.0) if one.about == "own motion")
+    assert finding.level is Level.WARNING
+    assert finding.measured.startswith("estimated in 0 % of the time; mostly: camera ")
+    assert finding.measured.endswith("is not above the ground: its height is 0.00 m")
+    assert "lift the drone after its start" in finding.fix
 
 
 def test_a_run_without_frames_and_one_that_was_ended_say_so() -> None:

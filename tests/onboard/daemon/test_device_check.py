@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from flockd.core.config import load_drone
+from tools.checks.check_device import DRONE_FILE
 
 ROOT = Path(__file__).parents[3]
 
@@ -46,6 +47,8 @@ def test_the_documentation_installs_what_the_unit_starts() -> None:
     assert start == "sudo systemctl enable --now flockd\n"
     for name in re.findall(r" ((?:config|systemd|requirements)/\S+)", install):
         assert (ROOT / name).is_file(), name
+    written = [name for name in re.findall(r"sudo install -D? ?-m 644 (\S+)", install) if not (ROOT / name).is_file()]
+    assert written == [DRONE_FILE], "what the reader has written, and the check brings"
 
 
 def test_its_drone_can_be_flown() -> None:

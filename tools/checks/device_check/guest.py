@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from tools.checks.device_check import cameras, capture, pipelines, sandbox
+from tools.checks.device_check import bench, cameras, capture, pipelines, sandbox
 from tools.checks.device_check.findings import Check, Notebook
 from tools.checks.device_check.service import Service
 
@@ -35,6 +35,7 @@ def main() -> None:
             capture.is_taken,
         ),
         "pipelines": (lambda: pipelines.streams_a_camera(cameras.WEBCAM), *pipelines.CHECKS),
+        "bench": (lambda: bench.runs(service),),
         "sandbox": (sandbox.holds,),
         "service": (
             service.is_installed,

@@ -60,14 +60,14 @@ class Service:
     def __init__(self, start: str) -> None:
         """``start``: the lines of the documentation that start the unit."""
         self._start = start
-        self._autopilot = FakeAutopilot(PORT).start()
+        self.autopilot = FakeAutopilot(PORT).start()
         self._watcher = FleetWatcher("check", listen=(), connect=(ENDPOINT,))
         self._front: Feeder | None = None
 
     def close(self) -> None:
         """Leaves no process behind."""
         self._watcher.close()
-        self._autopilot.close()
+        self.autopilot.close()
         if self._front is not None:
             self._front.close()
 
@@ -138,7 +138,7 @@ class Service:
         """It takes off by itself, as it is configured to; in flight its cameras fail one after the other."""
         self._wait_for_flight()
         time.sleep(WATCHED_S)
-        came_s = [time_s for time_s, _ in self._autopilot.setpoints if time_s > time.monotonic() - WATCHED_S]
+        came_s = [time_s for time_s, _ in self.autopilot.setpoints if time_s > time.monotonic() - WATCHED_S]
         hz, worst_ms = len(came_s) / WATCHED_S, 1e3 * max(after - before for before, after in pairwise(came_s))
         yield Finding(
             "flies", hz > 19.0, f"{hz:.1f} setpoints a second, at most {worst_ms:.0f} ms apart", "20 a second"
@@ -152,15 +152,15 @@ class Service:
         """Stopped in flight as by a debugger: nothing in it runs any more, and it ends only when it is killed."""
         stopped_s = time.monotonic()
         os.kill(int(_shown("MainPID")), signal.SIGSTOP)
-        until(lambda: self._autopilot.mode != "OFFBOARD", "the autopilot to see that setpoints stopped")
-        yield _soon("setpoints stop", max(self._autopilot.setpoints[-1][0] - stopped_s, 0.0), SETPOINTS_STOP_S, row=45)
+        until(lambda: self.autopilot.mode != "OFFBOARD", "the autopilot to see that setpoints stopped")
+        yield _soon("setpoints stop", max(self.autopilot.setpoints[-1][0] - stopped_s, 0.0), SETPOINTS_STOP_S, row=45)
         until(lambda: _shown("NRestarts") == "1" and _shown("MainPID") != "0", "the unit to start again", look_s=LOOK_S)
         began_s = 1e-6 * int(_shown("ExecMainStartTimestampMonotonic"))
         yield _soon("a hang is restarted", began_s - stopped_s, RESTARTED_S, row=10)
         ready_s = until(lambda: _shown("ActiveState") == "active", "the unit to be ready again", look_s=LOOK_S)
         time.sleep(WATCHED_S)
         state = self._message("flight", ready_s)["state"]
-        sent = sum(time_s > began_s for time_s, _ in self._autopilot.setpoints)
+        sent = sum(time_s > began_s for time_s, _ in self.autopilot.setpoints)
         yield Finding(
             "idle after a restart in the air",
             (state, sent, _shown("NRestarts")) == ("idle", 0, "1"),
@@ -172,19 +172,19 @@ class Service:
 
     def runs_out_of_memory(self) -> Iterator[Finding]:
         """The pilot lands, it flies again, and in the air the unit's memory is cut to less than it has."""
-        self._autopilot.pilot_selects("LAND")
-        until(lambda: not self._autopilot.armed, "the landing")
+        self.autopilot.pilot_selects("LAND")
+        until(lambda: not self.autopilot.armed, "the landing")
         self._wait_for_flight()
         restarts, cut_s = int(_shown("NRestarts")), time.monotonic()
         run("systemctl", "set-property", "--runtime", UNIT, f"MemoryMax={LITTLE_MEMORY}")
-        until(lambda: self._autopilot.mode != "OFFBOARD", "the autopilot to see that setpoints stopped")
+        until(lambda: self.autopilot.mode != "OFFBOARD", "the autopilot to see that setpoints stopped")
         yield _soon("out of memory in flight", time.monotonic() - cut_s, OUT_OF_MEMORY_S, row=28)
         run("systemctl", "set-property", "--runtime", UNIT, "MemoryMax=1G")
         until(lambda: int(_shown("NRestarts")) > restarts, "the unit to start again", look_s=LOOK_S)
         ready_s = until(lambda: _shown("ActiveState") == "active", "the unit to be ready again", look_s=LOOK_S)
-        sent = len(self._autopilot.setpoints)
+        sent = len(self.autopilot.setpoints)
         time.sleep(WATCHED_S)
-        state, more = self._message("flight", ready_s)["state"], len(self._autopilot.setpoints) - sent
+        state, more = self._message("flight", ready_s)["state"], len(self.autopilot.setpoints) - sent
         yield Finding(
             "idle after it ran out of memory", (state, more) == ("idle", 0), f"{state}; {more} setpoints",
             "idle, no setpoint", row=28,
@@ -192,15 +192,15 @@ class Service:
 
     def stops(self) -> Iterator[Finding]:
         """The pilot lands; flockd, which saw it on the ground, flies again, and is stopped in the air."""
-        self._autopilot.pilot_selects("LAND")
-        until(lambda: not self._autopilot.armed, "the landing")
+        self.autopilot.pilot_selects("LAND")
+        until(lambda: not self.autopilot.armed, "the landing")
         self._wait_for_flight()
         time.sleep(WATCHED_S)
         begun_s = time.monotonic()
         run("systemctl", "stop", UNIT)
         took_s = time.monotonic() - begun_s
         result, status = _shown("Result"), _shown("ExecMainStatus")
-        holds = self._autopilot.mode == "LOITER" and not self._autopilot.failsafe
+        holds = self.autopilot.mode == "LOITER" and not self.autopilot.failsafe
         yield Finding(
             "clean stop in the air",
             (result, status) == ("success", "0") and holds and took_s < STOPPED_S,
@@ -253,7 +253,7 @@ class Service:
         )
 
     def _wait_for_flight(self) -> None:
-        until(lambda: self._autopilot.mode == "OFFBOARD", "flockd to take off")
+        until(lambda: self.autopilot.mode == "OFFBOARD", "flockd to take off")
         until(lambda: self._message("flight", time.monotonic())["state"] == "normal", "a quiet flight")
 
     def _counts(self, camera: str) -> Mapping[str, int]:
