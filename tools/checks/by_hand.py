@@ -30,7 +30,7 @@ WALL_M, KEEP_M, RANGE_M = 9.0, 3.0, 15.0
 """North of where the story begins; CP_DIST; and `obstacles.range_m`."""
 WITHIN_M = 1.0
 """Of PX4's simulated truth, as far as its satellites let it."""
-STICK, PUSH_S, STILL_M_S, AWAY_M = 700, 4.0, 0.2, 0.5
+STICK, PUSH_S, STILL_M_S, AWAY_M = 700, 3.0, 0.2, 0.5
 TEXT = "flockd hover: no camera has sent a usable frame for 1.2 s; 2 more reasons"
 
 ASKS = {
@@ -41,6 +41,11 @@ ASKS = {
     "old": "distances come no more",
     "land": "land",
 }
+
+
+async def ready(world: World) -> None:
+    """It knows where it is."""
+    await world.until(lambda: world.link.knows_checks() and not world.link.refusals(), "nothing against arming", 60.0)
 
 
 async def text(world: World) -> None:
@@ -55,7 +60,7 @@ async def text(world: World) -> None:
 async def blind(world: World) -> None:
     """What a pilot has who sets CP_DIST without a source."""
     world.station.set_parameter(0, "CP_DIST", KEEP_M)
-    await asyncio.sleep(6.0)  # PX4 tolerates five seconds after it was switched on
+    await _wait(world, 6.0)  # PX4 tolerates five seconds after it was switched on
     world.station.select(0, "POSCTL")
     await _pushed(world, "blind", STICK)
     await world.saw("blind", world.mode("hold"), "the mode is hold")
@@ -136,7 +141,7 @@ def _north_m(world: World) -> float:
 
 BY_HAND = Stories(
     "What a pilot who flies by hand has of flockd, with the fake autopilot and with PX4 SITL.",
-    (take_off, text, blind, wall, landing),
+    (ready, take_off, text, blind, wall, landing),
     {"arm": "arm", "take off": "take off", **ASKS},
     remote_control=True,
 )
