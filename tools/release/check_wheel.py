@@ -2,29 +2,52 @@
 
 python -m tools.release.check_wheel --out dist
 
-It needs a package index, and 1 GB in the folder for temporary files. Exit code 1: something of it failed, and is named.
+CI runs it too (`.ci/run`). It needs a package index, and 1 GB in the folder for temporary files. Exit code 1:
+something of it failed, and is named.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
 import venv
 from pathlib import Path
+from typing import NamedTuple
 
 from flockd import __version__
 from tools.release.lock import ROOT
 
+PICTURE = ROOT / "tests/ground/pictures/rendered/4_m_4.jpg"
+"""One drone."""
+
+
+class Step(NamedTuple):
+    """A command of the installed package, run in a folder that has nothing else."""
+
+    arguments: tuple[str, ...]
+    shows: str = ""
+    """What its output has to have."""
+    codes: tuple[int, ...] = (0,)
+    """Exit codes that are well."""
+
+
 STEPS = (
-    ("--version",),
-    ("models", "verify"),
-    ("config", "check", "{data}/config/simulator.yaml"),
-    ("sim", "--perception", "truth", "--duration", "5", "--drones", "3", "--out", "{folder}/flight"),
+    Step(("--version",), f"flockd {__version__}"),
+    Step(("models", "verify")),
+    Step(("config", "check", "{data}/config/simulator.yaml")),
+    Step(("sim", "--perception", "truth", "--duration", "5", "--drones", "3", "--out", "{folder}/flight")),
+    Step(("detect", "--fov", "90", "{folder}/picture.jpg"), "1 detection in 1 picture"),
+    # It fails a step that is too slow, as it should on a busy computer; of what is installed nothing may be wrong.
+    Step(
+        ("doctor", "--config", "{data}/config/simulator.yaml"),
+        "PASS     model verification_int8  hash and golden output",
+        (0, 1),
+    ),
 )
-"""What is run of the installed package, in a folder that has nothing else."""
 
 
 def main() -> int:
@@ -44,19 +67,25 @@ def main() -> int:
         _run(folder, tools / "bin/twine", "check", "--strict", *map(str, built))
         _run(folder, alone / "bin/python", "-m", "pip", "install", "--quiet", f"{built[1]}[sim]")
         (data,) = alone.glob("lib/python*/site-packages/flockd/_data")
+        shutil.copy(PICTURE, folder / "picture.jpg")
         for step in STEPS:
-            _run(folder, alone / "bin/flockd", *(word.format(data=data, folder=folder) for word in step))
+            words = [word.format(data=data, folder=folder) for word in step.arguments]
+            _run(folder, alone / "bin/flockd", *words, shows=step.shows, codes=step.codes)
     print(f"{built[0]} and {built[1]} are whole: installed alone, the wheel has flown")
     return 0
 
 
-def _run(folder: Path, program: Path, *arguments: str) -> None:
-    """Raises SystemExit where it fails. Nothing of the checkout is found by it."""
+def _run(folder: Path, program: Path, *arguments: str, shows: str = "", codes: tuple[int, ...] = (0,)) -> None:
+    """Raises SystemExit where it fails or does not show what it should. Nothing of the checkout is found by it."""
     print(f"$ {program.name} {' '.join(arguments)}", flush=True)
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    ended = subprocess.run([str(program), *arguments], cwd=folder, env=environment, check=False)
-    if ended.returncode:
+    command = [str(program), *arguments]
+    ended = subprocess.run(command, cwd=folder, env=environment, stdout=subprocess.PIPE, text=True, check=False)
+    print(ended.stdout, end="", flush=True)
+    if ended.returncode not in codes:
         raise SystemExit(f"check_wheel: {program.name} {' '.join(arguments)} ended with exit code {ended.returncode}")
+    if shows not in ended.stdout:
+        raise SystemExit(f"check_wheel: {program.name} {' '.join(arguments)} did not show {shows!r}")
 
 
 if __name__ == "__main__":

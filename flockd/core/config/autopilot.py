@@ -43,5 +43,8 @@ class AutopilotParameters(Section):
     autopilot`."""
     velocity_trim_memory: Share = 0.7
     """Share of the last correction that each step keeps: noise of single steps goes, slow drifts stay."""
+    obstacle_distance: bool = False
+    """Whether the map of obstacles is sent to the autopilot (`OBSTACLE_DISTANCE`), so that PX4's Collision Prevention
+    stops a pilot who flies by hand in Position mode; CP_DIST switches it on there. Needs `obstacles.enabled`."""
     low_battery_share: Share = 0.2
     """The battery counts as low when the autopilot says that no more than this is left."""

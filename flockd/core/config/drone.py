@@ -86,6 +86,13 @@ class DroneConfig(Section):
         return self
 
     @model_validator(mode="after")
+    def _what_is_sent_of_obstacles_is_looked_for(self) -> Self:
+        if self.autopilot is not None and self.autopilot.obstacle_distance and not self.obstacles.enabled:
+            fault = "needs the map of obstacles; write `enabled: true` in `obstacles`, or false here"
+            refuse(self, {("autopilot", "obstacle_distance"): fault})
+        return self
+
+    @model_validator(mode="after")
     def _only_simulated_time_is_slow(self) -> Self:
         if self.speed_factor != 1.0 and self.autopilot is not None and self.autopilot.address.startswith("serial:"):
             fault = "is for simulations, and an autopilot on a cable is none; delete it"

@@ -223,5 +223,5 @@ class _Triangulation:
             sigma = _FLOW_SIGMA_PX * lens.pixel_angle(ray) / baseline
             certain = (baseline > _MIN_BASELINE_M) & (inverse > _CERTAIN_SIGMAS * sigma)
         places = mounted.rotation @ (ray[certain] / inverse[certain, None]).T
-        relative = (sigma / inverse)[certain].astype(np.float32)
+        relative = (sigma[certain] / inverse[certain]).astype(np.float32)
         return _Points(places.astype(np.float32), relative, np.zeros(len(relative), np.uint8))

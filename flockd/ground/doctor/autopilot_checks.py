@@ -251,6 +251,22 @@ def judge_fence_height(value: float, config: DroneConfig) -> Finding:
     return _judge_limit("GF_MAX_VER_DIST", value, config.safety.gate.max_height_m, "max_height_m")
 
 
+def judge_collision_prevention(value: float, config: DroneConfig) -> Finding:
+    """CP_DIST, in metres."""
+    name, sends = "CP_DIST", config.autopilot is not None and config.autopilot.obstacle_distance
+    if value > 0 and sends:
+        return passed(
+            name, f"{value:g} m: PX4 stops a pilot in Position mode by what flockd sees, and where it does not"
+        )
+    if value > 0:
+        measured = f"{value:g} m: PX4 lets nobody fly in Position mode where nothing sends it distances of obstacles"
+        return warned(name, measured, "set CP_DIST to -1, or autopilot.obstacle_distance to true")
+    if sends:
+        measured = f"{value:g}: PX4 ignores the distances that autopilot.obstacle_distance sends"
+        return warned(name, measured, "set CP_DIST to the distance to keep, in metres")
+    return passed(name, f"{value:g}: PX4 stops no pilot before obstacles")
+
+
 def _judge_limit(name: str, value: float, own_m: float | None, what: str) -> Finding:
     """PX4's limit should lie a little outside flockd's own, as a second line."""
     outside = "where it must never fly" if own_m is None else f"{1.2 * own_m:.0f} m, a little outside flockd's own"
@@ -277,6 +293,7 @@ KINDS: dict[str, type[int] | type[float]] = {
     "GF_ACTION": int,
     "GF_MAX_HOR_DIST": float,
     "GF_MAX_VER_DIST": float,
+    "CP_DIST": float,
 }
 """As PX4 declares them."""
 JUDGES: dict[str, Callable[..., Finding]] = {
@@ -286,5 +303,6 @@ JUDGES: dict[str, Callable[..., Finding]] = {
     "GF_ACTION": judge_fence_action,
     "GF_MAX_HOR_DIST": judge_fence_radius,
     "GF_MAX_VER_DIST": judge_fence_height,
+    "CP_DIST": judge_collision_prevention,
 }
 """Each takes the value and the drone's configuration."""

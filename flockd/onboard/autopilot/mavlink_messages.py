@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -83,6 +83,8 @@ CHUNKS_S = 0.2
 """Within which all chunks of a text come."""
 TEXT_CHUNK = 50
 """Characters of a STATUSTEXT; one with fewer is the last of its text."""
+LONGEST_TEXT = 125
+"""Characters of a text that flockd sends."""
 
 
 @dataclass(frozen=True)
@@ -426,6 +428,20 @@ class StatusText:
             self._chunks += ["..."] * (chunk - len(self._chunks))
         self._chunks.append(text)
         return "".join(self._chunks) if len(text) < TEXT_CHUNK else None
+
+
+def text_chunks(text: str, number: int) -> Iterator[Fields]:
+    """A text as STATUSTEXT messages, without their severity; ``number``, above 0, is for one of several chunks.
+
+    The last has an end within its 50 bytes. PX4 would cut a lone chunk of 50 bytes to 49, and logs no more than 126.
+    """
+    sent = text if text.isascii() else text.encode("ascii", "replace").decode()
+    sent = sent if len(sent) <= LONGEST_TEXT else f"{sent[: LONGEST_TEXT - 3]}..."
+    if len(sent) < TEXT_CHUNK:
+        yield {"id": 0, "chunk_seq": 0, "text": sent}
+        return
+    for chunk in range(len(sent) // TEXT_CHUNK + 1):
+        yield {"id": number, "chunk_seq": chunk, "text": sent[TEXT_CHUNK * chunk :][:TEXT_CHUNK]}
 
 
 def result_text(result: int) -> str:

@@ -16,8 +16,11 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from enum import IntEnum
+from itertools import cycle
 from typing import Any, Self, TypeVar
 
+import numpy as np
 from mavsdk.component_type import ComponentType
 from mavsdk.connection_result import ConnectionResult
 from mavsdk.logging import LogLevel, log_subscribe
@@ -28,10 +31,10 @@ from mavsdk.system import System
 
 from flockd.core import services
 from flockd.core.config.autopilot import AutopilotParameters
-from flockd.core.messages import RangeReading, Setpoint, VehicleState
+from flockd.core.messages import FloatArray, RangeReading, Setpoint, VehicleState
 from flockd.onboard.autopilot.autopilot_status import MODES, AutopilotError, AutopilotStatus, Firmware, FlightMode
 from flockd.onboard.autopilot.clock_sync import ClockEstimate
-from flockd.onboard.autopilot.mavlink_messages import Fields, ReceivedMessages, result_text
+from flockd.onboard.autopilot.mavlink_messages import Fields, ReceivedMessages, result_text, text_chunks
 from flockd.onboard.autopilot.refusal_reasons import REMEDIES_OF_RESULTS
 from flockd.onboard.autopilot.refusals import Refusal
 from flockd.onboard.autopilot.throttled_log import ThrottledLog
@@ -44,6 +47,12 @@ AUTOPILOT_COMPONENT = 1
 SETPOINT_TYPE_MASK = 2531
 """SET_POSITION_TARGET_LOCAL_NED: velocity in x and y, position in z, and yaw; the rest is ignored."""
 MAV_FRAME_LOCAL_NED = 1
+MAV_FRAME_BODY_FRD = 12
+"""Of OBSTACLE_DISTANCE: PX4 1.18 lets the last of several sectors win that overlap one of its own, which are those of
+the body; sectors from north would hide a trunk behind the free sector beside it."""
+NEAREST_OBSTACLE_CM, UNKNOWN_CM = 30, 0xFFFF
+"""PX4 brakes before no obstacle that is as near as the sensor's least range: the nearest is sent 1 cm farther."""
+MAV_DISTANCE_SENSOR_UNKNOWN = 4
 MAV_AUTOPILOT_PX4 = 12
 COMMAND_ARM_DISARM = 400
 COMMAND_SET_MODE = 176
@@ -67,6 +76,8 @@ STREAMS_HZ = {
 most; its heartbeat comes once a second whatever one asks."""
 RECEIVED = (*STREAMS_HZ, "HEARTBEAT", "AUTOPILOT_VERSION", "STATUSTEXT", "EVENT", "CURRENT_EVENT_SEQUENCE")
 TIME_SYNC = "TIMESYNC"
+UNTARGETED = frozenset({"HEARTBEAT", "OBSTACLE_DISTANCE", "STATUSTEXT"})
+"""Messages without a target: for all who hear them."""
 MOST_OPEN = 20
 """Exchanges whose reply is waited for; older ones are lost."""
 REASON_S = 0.5
@@ -90,6 +101,15 @@ _LOG_LEVELS = {
 }
 
 
+class Severity(IntEnum):
+    """MAV_SEVERITY of a text; the graver, the smaller."""
+
+    CRITICAL = 2
+    WARNING = 4
+    NOTICE = 5
+    INFO = 6
+
+
 class AutopilotLink:
     """One autopilot. Everything that is not a coroutine may be called from any thread and returns at once."""
 
@@ -109,6 +129,7 @@ class AutopilotLink:
         self._direct = MavlinkDirect(system)
         self._time_syncs: deque[int] = deque(maxlen=MOST_OPEN)
         """This computer's times in nanoseconds of exchanges that were not answered yet."""
+        self._text_ids = cycle(range(1, 0x10000))
         self._missing: deque[tuple[int, int]] = deque(maxlen=MOST_OPEN)
         """First and last numbers of events to request."""
         for name in (*RECEIVED, TIME_SYNC):
@@ -130,11 +151,18 @@ class AutopilotLink:
         _refuse_a_taken_port(parameters.address)
         log_subscribe(_to_logging)
         executor = ThreadPoolExecutor(1, thread_name_prefix="mavsdk")  # never asyncio's own: it may be saturated
-        mavsdk = create(_configuration(parameters.system_id))
+        configuration = _configuration(parameters.system_id)
+        mavsdk = create(configuration)
         try:
             deadline = clock() + timeout_s
             await _open(mavsdk, parameters.address, executor)
             system = await _find_system(mavsdk, parameters, deadline, timeout_s, clock)
+            if configuration.system_id != system.get_system_id():  # again, as a computer of the autopilot's own system
+                parameters = parameters.model_copy(update={"system_id": int(system.get_system_id())})
+                await asyncio.get_running_loop().run_in_executor(executor, mavsdk.destroy)
+                mavsdk = create(_configuration(parameters.system_id))
+                await _open(mavsdk, parameters.address, executor)
+                system = await _find_system(mavsdk, parameters, deadline, timeout_s, clock)
             link = cls(mavsdk, system, executor, clock, parameters.max_gap_s)
             await link._wait_for("HEARTBEAT", deadline)
             await link._request_streams()
@@ -282,6 +310,33 @@ class AutopilotLink:
         self._sent_s = self._clock()
         self._received.setpoints.sent(self._sent_s, north, east)
 
+    def send_obstacle_distances(self, free_m: FloatArray, range_m: float) -> None:
+        """Sends how far the drone sees that it is free, once: `free_m` (n,) as of `free_ahead`, up to `range_m`."""
+        most_cm = int(100 * range_m)
+        known_cm = np.floor(100 * np.nan_to_num(free_m, nan=0.0, posinf=range_m))
+        centimetres = np.clip(known_cm, NEAREST_OBSTACLE_CM + 1, most_cm).astype(int)
+        centimetres[np.isposinf(free_m)] = most_cm + 1
+        centimetres[np.isnan(free_m)] = UNKNOWN_CM
+        fields = {
+            "time_usec": int(1e6 * self._clock()),
+            "sensor_type": MAV_DISTANCE_SENSOR_UNKNOWN,
+            "distances": centimetres.tolist(),
+            "increment": 360 // len(free_m),
+            "min_distance": NEAREST_OBSTACLE_CM,
+            "max_distance": most_cm,
+            "increment_f": 0.0,
+            "angle_offset": 0.0,
+            "frame": MAV_FRAME_BODY_FRD,
+        }
+        with suppress(MavlinkDirectError):  # a link that cannot send says so where setpoints are sent
+            self._direct.send_message(self._message("OBSTACLE_DISTANCE", fields))
+
+    def send_text(self, text: str, severity: Severity) -> None:
+        """Sends a text once, for ground stations, to which PX4 forwards it, and for PX4's log; cut where too long."""
+        for chunk in text_chunks(text, next(self._text_ids)):
+            with suppress(MavlinkDirectError):  # a link that cannot send says so where setpoints are sent
+                self._direct.send_message(self._message("STATUSTEXT", {"severity": int(severity), **chunk}))
+
     async def request_offboard(self) -> None:
         """Asks for offboard flight; setpoints must be streaming by then. Raises AutopilotError when refused."""
         await self._set_mode("offboard")
@@ -405,7 +460,7 @@ class AutopilotLink:
 
     def _message(self, name: str, fields: Fields) -> MavlinkMessage:
         target = {"target_system": self._system_id, "target_component": AUTOPILOT_COMPONENT}
-        text = json.dumps(fields if name == "HEARTBEAT" else {**target, **fields}, allow_nan=False)
+        text = json.dumps(fields if name in UNTARGETED else {**target, **fields}, allow_nan=False)
         return MavlinkMessage(name, 0, 0, self._system_id, AUTOPILOT_COMPONENT, text)
 
     async def _wait_for(self, name: str, deadline: float) -> Fields:

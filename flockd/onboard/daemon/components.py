@@ -12,9 +12,11 @@ from flockd.onboard.daemon.autopilot_requests import AutopilotRequests
 from flockd.onboard.daemon.control import Control
 from flockd.onboard.daemon.host_monitors import LoopLag, Thermometer, WallClock
 from flockd.onboard.daemon.message_sinks import MessageSinks
+from flockd.onboard.daemon.obstacle_distances import ObstacleDistances
 from flockd.onboard.daemon.operator_commands import OperatorCommands
 from flockd.onboard.daemon.pilot_loop import PilotLoop
 from flockd.onboard.daemon.refusal_watch import RefusalWatch
+from flockd.onboard.daemon.state_texts import StateTexts
 from flockd.onboard.daemon.take_off import TakeOff
 from flockd.onboard.daemon.watched_networks import WatchedNetworks
 from flockd.onboard.sources import FrameSource
@@ -35,6 +37,8 @@ class Components:
     requests: AutopilotRequests
     refusals: RefusalWatch
     take_off: TakeOff
+    distances: ObstacleDistances
+    texts: StateTexts
     sinks: MessageSinks
     telemetry: ZenohTelemetry
     commands: OperatorCommands

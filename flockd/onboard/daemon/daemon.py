@@ -19,6 +19,7 @@ from flockd.onboard.daemon.control import FLYING
 from flockd.onboard.daemon.operator_commands import OperatorRequests
 from flockd.onboard.daemon.service_manager import ServiceManager
 from flockd.onboard.daemon.startup import Connect, open_components
+from flockd.onboard.daemon.state_texts import state_sentence
 from flockd.onboard.daemon.status_messages import notify_service_manager, publish_status
 from flockd.onboard.daemon.watched_networks import InterruptibleNetworks
 from flockd.onboard.sources import open_source
@@ -176,6 +177,8 @@ class Daemon:
         }
         if self._config.autopilot.arm_and_take_off:
             concerns["take-off"] = components.take_off.run
+        if self._config.autopilot.obstacle_distance:
+            concerns["obstacle distances"] = components.distances.run
         async with asyncio.TaskGroup() as group:
             tasks = [
                 group.create_task(self._supervised(name, run, components), name=name) for name, run in concerns.items()
@@ -218,8 +221,8 @@ class Daemon:
         for report in components.link.take_reports():
             components.sinks.event(report)
         if now.state is not before.state:
-            why = "; ".join(reason.sentence for reason in now.reasons)
-            components.sinks.event(f"{now.state}: {why}" if why else str(now.state))
+            components.sinks.event(state_sentence(now))
+        components.texts.update(now)
         if now.state in FLYING and before.state not in FLYING:
             components.sinks.begin_recording()
         elif components.sinks.recording is not None and not components.link.status().armed:

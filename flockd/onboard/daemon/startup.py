@@ -23,9 +23,11 @@ from flockd.onboard.daemon.control import Control
 from flockd.onboard.daemon.host_monitors import LoopLag, Thermometer, WallClock
 from flockd.onboard.daemon.message_sinks import MessageSinks
 from flockd.onboard.daemon.mission_orders import MissionOrders
+from flockd.onboard.daemon.obstacle_distances import ObstacleDistances
 from flockd.onboard.daemon.operator_commands import OperatorCommands, OperatorRequests
 from flockd.onboard.daemon.pilot_loop import PilotLoop
 from flockd.onboard.daemon.refusal_watch import RefusalWatch
+from flockd.onboard.daemon.state_texts import StateTexts
 from flockd.onboard.daemon.supervisor_inputs import InputCollector
 from flockd.onboard.daemon.take_off import TakeOff
 from flockd.onboard.daemon.vehicle_history import VehicleHistory
@@ -109,8 +111,9 @@ async def open_components(
         link=link, gate=gate, streamer=streamer, source=source, pilot_loop=pilot_loop, networks=networks,
         control=control,
         requests=requests, refusals=RefusalWatch(link, sinks.event, clock), take_off=take_off, sinks=sinks,
-        telemetry=telemetry, commands=commands, lag=lag, thermometer=thermometer,
-        wall_clock=WallClock(sinks.event, time.monotonic), dead_tasks=dead_tasks,
+        distances=ObstacleDistances(config, link, pilot_loop, history, clock),
+        texts=StateTexts(link.send_text, clock), telemetry=telemetry, commands=commands, lag=lag,
+        thermometer=thermometer, wall_clock=WallClock(sinks.event, time.monotonic), dead_tasks=dead_tasks,
     )  # fmt: skip
 
 

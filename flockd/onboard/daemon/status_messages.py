@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from flockd.flight.safety import Decision, Event, State
 from flockd.onboard.daemon.components import Components
 from flockd.onboard.daemon.service_manager import ServiceManager
+from flockd.onboard.daemon.state_texts import state_sentence
 from flockd.onboard.telemetry import TOPICS
 from flockd.onboard.telemetry.topics import CameraMessage, ClockMessage, ComputerMessage, FlightMessage, ReasonMessage
 
@@ -26,7 +27,7 @@ async def notify_service_manager(components: Components, service: ServiceManager
         service.starting(f"waits for frames: {'; '.join(faults) or 'none came yet'}", START_MORE_S)
         await asyncio.sleep(START_POLL_S)
     sent = components.control.decision
-    service.ready(_status_line(sent))
+    service.ready(state_sentence(sent))
     components.sinks.event("ready: models loaded, autopilot heard, first frames seen")
     reported: set[str] = set()
     loop = asyncio.get_running_loop()
@@ -38,7 +39,7 @@ async def notify_service_manager(components: Components, service: ServiceManager
         while _matters(components.control.decision) == _matters(sent) and loop.time() < until:
             await asyncio.sleep(STATUS_POLL_S)
         sent = components.control.decision
-        service.status(_status_line(sent))
+        service.status(state_sentence(sent))
 
 
 async def publish_status(components: Components, clock: Callable[[], float]) -> None:
@@ -68,11 +69,6 @@ def _matters(decision: Decision) -> tuple[State, tuple[Event, ...]]:
 def _noisy(images: int) -> dict[str, int]:
     """Their count, absent where there are none, as all counts."""
     return {"noisy": images} if images else {}
-
-
-def _status_line(decision: Decision) -> str:
-    reasons = "; ".join(reason.sentence for reason in decision.reasons)
-    return f"{decision.state}: {reasons}" if reasons else str(decision.state)
 
 
 def _flight_message(components: Components, now: float) -> FlightMessage:

@@ -25,6 +25,7 @@ from pymavlink.dialects.v20 import development as mavlink
 
 from flockd.core.messages import FloatArray
 from flockd.onboard.autopilot.refusal_reasons import CHECKS_FAIL, NO_SETPOINTS
+from flockd.sim.autopilot.collision_prevention import HOLD_S, CollisionPrevention
 from flockd.sim.autopilot.fake_checks import FakeChecks
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.sim.autopilot.fake_telemetry import (
@@ -120,6 +121,7 @@ class FakeAutopilot:
             "MPC_VEL_MANUAL": 10.0,
             "MAN_DEADZONE": 0.1,
             "MAN_OVERRIDE_SPD": 1.0,
+            "CP_DIST": -1.0,
         }
         """An int is an INT32 parameter, a float a REAL32 one."""
         self.setpoints: deque[tuple[float, Demand]] = deque(maxlen=MAX_SETPOINTS_KEPT)
@@ -146,6 +148,7 @@ class FakeAutopilot:
         self._sticks = -math.inf, np.zeros(2)
         """When a person last moved them, and forward and right from -1 to 1."""
         self._override = StickOverride()
+        self.collision_prevention = CollisionPrevention()
         self.clock_offset_s = clock_ahead_s - self._clock()
         """Its own clock, of its stamps and of TIMESYNC, less ``clock`` times the speed factor."""
 
@@ -352,7 +355,9 @@ class FakeAutopilot:
             return
         self._state = self._motion(self._demand(), interval_s)
         height_m = -float(self._state.position[2])
-        if self._mode == "TAKEOFF" and height_m > self.parameters["MIS_TAKEOFF_ALT"] - 0.1:
+        blind = self.parameters["CP_DIST"] > 0 and self.collision_prevention.without_data_s(self._clock()) > HOLD_S
+        risen = height_m > self.parameters["MIS_TAKEOFF_ALT"] - 0.1
+        if (self._mode == "POSCTL" and blind) or (self._mode == "TAKEOFF" and risen):
             self.pilot_selects("LOITER")
         elif self._mode == "RTL" and float(np.linalg.norm(self._state.position[:2])) < ARRIVED_M:
             self.pilot_selects("LAND")
@@ -382,11 +387,14 @@ class FakeAutopilot:
     def _by_hand(self) -> FloatArray:
         """(2,) m/s north and east that the sticks ask for; level, and at rest once they are not heard any more."""
         moved_s, sticks = self._sticks
-        ahead, right = stick_curve(sticks, self.parameters["MAN_DEADZONE"])
+        wanted = self.parameters["MPC_VEL_MANUAL"] * stick_curve(sticks, self.parameters["MAN_DEADZONE"])
         if self._clock() - moved_s > STICKS_FRESH_S:
             return np.zeros(2)
+        if self.parameters["CP_DIST"] > 0:
+            wanted = self.collision_prevention.limited(wanted, self.parameters["CP_DIST"], self._clock())
+        ahead, right = wanted
         cos, sin = math.cos(self._hold_yaw_rad), math.sin(self._hold_yaw_rad)
-        return self.parameters["MPC_VEL_MANUAL"] * np.array([cos * ahead - sin * right, sin * ahead + cos * right])
+        return np.array([cos * ahead - sin * right, sin * ahead + cos * right])
 
     def _feel(self, moved_s: float, sticks: FloatArray) -> None:
         """Sticks moved fast take over from every mode but Position, and not from a failsafe, where PX4 asks more."""
@@ -414,6 +422,10 @@ class FakeAutopilot:
                 )
             case "MANUAL_CONTROL" if message.target == self._mav.srcSystem:
                 self._feel(arrived_s, np.clip([message.x, message.y], -1000, 1000) / 1000)
+            case "STATUSTEXT" if self._ground is not None:  # forwarded, as PX4's links in software do
+                self._socket.sendto(bytes(message.get_msgbuf()), self._ground)
+            case "OBSTACLE_DISTANCE":
+                self.collision_prevention.take(message, arrived_s)
             case "TIMESYNC" if message.tc1 == 0:
                 own_ns = int(1e9 * (self._clock() + self.clock_offset_s))
                 self._mav.timesync_send(own_ns, message.ts1)

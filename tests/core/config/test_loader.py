@@ -494,6 +494,11 @@ def test_the_trim_that_an_error_recommends_is_taken_though_rounding_adds_up(tmp_
     assert load_drone(path).autopilot is not None
 
 
+def test_distances_of_obstacles_cannot_be_sent_where_none_are_looked_for(tmp_path: Path) -> None:
+    (problem,) = _drone_problems(tmp_path, f"{DRONE}autopilot: {{obstacle_distance: true}}\n")
+    assert "autopilot.obstacle_distance: needs the map of obstacles; write `enabled: true` in `obstacles`" in problem
+
+
 def test_a_scenario_without_its_drones_file_has_one_fault_and_no_false_ones(tmp_path: Path) -> None:
     scenario = tmp_path / "square.yaml"
     scenario.write_text((CONFIG / "square.yaml").read_text(encoding="utf-8"), encoding="utf-8")

@@ -34,6 +34,7 @@ GOOD: dict[str, float | int] = {
     "GF_ACTION": 2,
     "GF_MAX_HOR_DIST": 60.0,
     "GF_MAX_VER_DIST": 15.0,
+    "CP_DIST": -1.0,
 }
 """For the quadrotor's own fence of 50 m and 10 m of height."""
 QUESTIONS = {511, 512, 401}
@@ -189,12 +190,23 @@ def test_no_autopilot_is_only_for_the_simulator() -> None:
         ("GF_MAX_VER_DIST", 0.0, Level.WARNING),
         ("GF_MAX_VER_DIST", 9.0, Level.WARNING),
         ("GF_MAX_VER_DIST", 12.0, Level.PASS),
+        ("CP_DIST", -1.0, Level.PASS),
+        ("CP_DIST", 2.0, Level.WARNING),
     ],
 )
 def test_what_is_made_of_each_value(name: str, value: float, level: Level) -> None:
     finding = JUDGES[name](value, _config(14540))
     assert (finding.about, finding.level) == (name, level)
     assert (finding.fix == "") == (level is Level.PASS)
+
+
+@pytest.mark.parametrize(("value", "level"), [(-1.0, Level.WARNING), (2.0, Level.PASS)])
+def test_collision_prevention_is_on_where_flockd_sends_for_it(value: float, level: Level) -> None:
+    config = _config(14540)
+    assert config.autopilot is not None
+    sending = config.autopilot.model_copy(update={"obstacle_distance": True})
+    finding = JUDGES["CP_DIST"](value, config.model_copy(update={"autopilot": sending}))
+    assert (finding.about, finding.level) == ("CP_DIST", level)
 
 
 def test_a_fence_with_corners_reaches_as_far_as_the_farthest_inside_the_circle() -> None:

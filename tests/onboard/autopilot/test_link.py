@@ -7,6 +7,7 @@ import math
 import subprocess
 import sys
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,12 +19,13 @@ from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.scenario import RangeFinderConfig
 from flockd.core.messages import Setpoint, Wanted
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, Firmware
-from flockd.onboard.autopilot.mavsdk_link import SETPOINT_TYPE_MASK, AutopilotLink
+from flockd.onboard.autopilot.mavsdk_link import SETPOINT_TYPE_MASK, AutopilotLink, Severity
 from flockd.sim.autopilot.fake_autopilot import TICK_S, FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.sim.autopilot.fake_telemetry import TelemetryStreams
 from flockd.sim.autopilot.fake_vehicle import Demand, MotionState
 from flockd.sim.free_ports import free_port
+from flockd.sim.ground_station import GroundStation
 from tests.calm import clock
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import Foreigner, attended, flying, until
@@ -330,6 +332,69 @@ def test_nobody_there_is_told_with_what_to_check(port: int) -> None:
 async def test_somebody_elses_autopilot_is_not_taken_for_the_own(port: int, fake_autopilot: FakeAutopilot) -> None:
     with pytest.raises(AutopilotError, match=r"no autopilot with system id 5 .* heard instead: 1"):
         await AutopilotLink.connect(_parameters(port, system_id=5), timeout_s=0.7, clock=clock)
+
+
+async def test_flockd_is_a_computer_of_the_autopilots_own_system_whatever_its_number(port: int) -> None:
+    """PX4 takes an onboard computer of another system for a stranger, and logs no text of it."""
+    senders: set[int] = set()
+
+    class Listening(FakeAutopilot):
+        def _handle(self, message: Any, arrived_s: float, *, on_link: bool) -> None:
+            senders.add(message.get_srcSystem())
+            super()._handle(message, arrived_s, on_link=on_link)
+
+    with Listening(port, system_id=3, height_m=2.5, heartbeat_s=HEARTBEAT_S, clock=clock):
+        link = await AutopilotLink.connect(_parameters(port), clock=clock)
+        senders.clear()
+        assert await link.firmware() == Firmware("PX4", "0.0.1")
+        assert senders == {3}
+        await link.close()
+
+
+LONG_TEXT = (
+    "flockd hover: no camera has sent a usable frame for 1.2 s; the autopilot will be asked for Hold; and so on, and on"
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "heard"),
+    [
+        ("flockd ready", "flockd ready"),
+        (LONG_TEXT[:50], LONG_TEXT[:50]),
+        (LONG_TEXT[:100], LONG_TEXT[:100]),
+        (LONG_TEXT, LONG_TEXT),
+        (2 * LONG_TEXT, f"{(2 * LONG_TEXT)[:122]}..."),
+        ("fl\u00fcgge", "fl?gge"),
+    ],
+)
+async def test_a_text_of_any_length_reaches_a_ground_station_that_the_autopilot_forwards_to(
+    port: int, text: str, heard: str
+) -> None:
+    truth = free_port()
+    with (
+        FakeAutopilot(port, height_m=2.5, heartbeat_s=HEARTBEAT_S, truth_port=truth, clock=clock),
+        GroundStation([truth], clock) as station,
+    ):
+        link = await AutopilotLink.connect(_parameters(port), clock=clock)
+        await until(lambda: station.is_connected(0))
+        link.send_text(text, Severity.WARNING)
+        await until(lambda: station.last_text(0) != "")
+        await until(lambda: station.last_text(0) == heard)
+        await link.close()
+
+
+async def test_the_autopilot_gets_distances_in_centimetres_from_the_nose(
+    port: int, fake_autopilot: FakeAutopilot
+) -> None:
+    """MAVLink: 65535 is unknown, one more than the largest distance is free; and no nearer than the sensor's least."""
+    free_m = np.full(72, np.inf)
+    free_m[[0, 1, 2, 3]] = 4.567, 0.1, np.nan, 14.999
+    link = await AutopilotLink.connect(_parameters(port), clock=clock)
+    assert fake_autopilot.collision_prevention.without_data_s(clock()) == math.inf
+    link.send_obstacle_distances(free_m, 15.0)
+    await until(lambda: fake_autopilot.collision_prevention.without_data_s(clock()) < 1.0)
+    assert fake_autopilot.collision_prevention.distances_cm[:5].tolist() == [456, 31, 65535, 1499, 1501]
+    await link.close()
 
 
 async def test_two_programs_cannot_command_one_drone(port: int, fake_autopilot: FakeAutopilot) -> None:
