@@ -10,6 +10,7 @@ from flockd.flight.geometry import rotation_from_vector, vector_from_rotation
 
 KEPT_S = 1.0
 """Longer than anything is late."""
+_SAME_TIME_S = 1e-9
 _BETWEEN_S = 0.01
 """Over which motion is measured."""
 
@@ -55,6 +56,8 @@ class PoseTrail:
         Raises IndexError where there is none.
         """
         poses = self._poses
+        if abs(time_s - poses[-1].time_s) < _SAME_TIME_S:
+            return poses[-1]
         later = next((i for i in range(len(poses) - 1, 0, -1) if poses[i - 1].time_s <= time_s), 0)
         if later == 0 or time_s >= poses[-1].time_s:
             return poses[-1] if time_s >= poses[-1].time_s else poses[0]
