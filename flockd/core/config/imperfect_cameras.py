@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
+from flockd.core.choices import CameraPreset
 from flockd.core.config.base import NonNegative, Positive, Section, Share
 
 MAX_LATE_S = 0.3
@@ -98,7 +99,7 @@ class LateAttitudeConfig(Section):
     """Standard deviation about each axis, anew each time."""
 
 
-_PRESETS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
+_PRESETS: Mapping[CameraPreset, Mapping[str, Mapping[str, Any]]] = {
     "ideal": {},
     "realistic": {
         # As `config/quadrotor.yaml` sets it; a sensor of at most 60 images a second: rows take 1 / (60 rows), the rule
@@ -129,7 +130,7 @@ class CamerasConfig(Section):
     realistic camera with a global shutter.
     """
 
-    preset: Literal["ideal", "realistic"] = "ideal"
+    preset: CameraPreset = "ideal"
     """`ideal`: none of it. `realistic`: a cheap USB camera with a rolling shutter on a small drone by day, from data
     sheets (sources in `flockd/core/config/imperfect_cameras.py`)."""
     shutter: ShutterConfig = ShutterConfig()
@@ -147,8 +148,8 @@ class CamerasConfig(Section):
         if not isinstance(values, Mapping):
             return values
         filled: dict[str, Any] = dict(values)
-        preset = values.get("preset")
-        for section, defaults in (_PRESETS.get(preset, {}) if isinstance(preset, str) else {}).items():
+        known = {str(name): sections for name, sections in _PRESETS.items()}
+        for section, defaults in known.get(str(values.get("preset")), {}).items():
             given = filled.get(section, {})
             filled[section] = {**defaults, **given} if isinstance(given, Mapping) else given
         return filled

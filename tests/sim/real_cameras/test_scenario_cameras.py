@@ -114,6 +114,14 @@ def test_a_preset_fills_what_is_not_written() -> None:
     assert CamerasConfig.model_validate({"shutter": {"readout_s": 0.01}}).shutter.exposure_s == 0.0
 
 
+def test_the_fisheye_flight_has_the_real_drones_lenses() -> None:
+    scenario = load_scenario(CONFIG / "fisheye_flight.yaml")
+    assert scenario.drone.rig == RIG
+    assert scenario.cameras == CamerasConfig(preset="realistic")
+    ideal = load_scenario(CONFIG / "fisheye_flight.yaml", {"cameras.preset": "ideal"})
+    assert ideal.cameras == CamerasConfig()
+
+
 def test_campaigns_may_vary_a_single_fault() -> None:
     changes: dict[str, str | float] = {"cameras.preset": "realistic", "cameras.noise.gain": 16.0}
     cameras = load_scenario(CONFIG / "paper_flight.yaml", changes).cameras
