@@ -143,11 +143,10 @@ class CameraSimulator:
         flock, mounted = trail.motion_at(shown_s), self.rig.cameras[name].T_body_camera
         R_ned_body = trail.at(shown_s).R_ned_body[drone]
         lever = R_ned_body @ np.cross(flock.turn[drone], mounted.translation)
-        shaking = self._real[drone, name].shaking
         return CameraMotion(
             velocity=(flock.velocity[drone] + lever) @ R_ned_camera,
             turn=flock.turn[drone] @ mounted.rotation,
-            shake=lambda times_s: shaking.at(shown_s + times_s),
+            shake=self._real[drone, name].shaking.around(shown_s),
             drones={i + 1: flock.velocity[i] @ R_ned_camera for i in range(self._count) if i != drone},
         )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -28,3 +29,7 @@ class Shaking:
         """(n, 3) rad at times (n,) s."""
         tones = np.sin(times_s[:, None, None] * self._rad_s + self._phases)
         return np.asarray(tones @ self._amplitudes, np.float64)
+
+    def around(self, time_s: float) -> Callable[[FloatArray], FloatArray]:
+        """The same, of times (n,) s that count from `time_s`."""
+        return lambda since_s: self.at(time_s + since_s)
