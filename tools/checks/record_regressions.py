@@ -1,9 +1,10 @@
-"""Make the three short recordings that the fast tests replay, and what is expected of them.
+"""Make the four short recordings that the fast tests replay, and what is expected of them.
 
-    python -m tools.checks.record_regressions [--out tests/review/replay] [--only references]
+    python -m tools.checks.record_regressions [--out tests/review/replay] [--only references | FLIGHT]
 
 - ``normal``: three drones on their way.
 - ``crossing``: five drones fly through one another's images, 1 to 4 m away.
+- ``fisheye``: as ``normal``, with the fisheyes of `config/quadrotor.yaml`, as bad as real ones.
 - ``faults``: a camera lost, a black image, a torn one, a time stamp twice, one that goes back, a second of nothing.
 
 Images are a quarter of the real size and JPEG, so that a recording is well under a megabyte. After a change that is
@@ -57,16 +58,20 @@ def main() -> None:
     """Make recordings and references."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("tests/review/replay"))
-    parser.add_argument("--only", choices=["references"], help="leave the recordings as they are")
-    arguments = parser.parse_args()
     flights: Mapping[str, Callable[[], tuple[DroneConfig, list[Step]]]] = {
         "normal": lambda: flown(NORMAL, seed=21),
         "crossing": lambda: flown(CROSSING, seed=25),
         "faults": lambda: with_faults(*flown(NORMAL, seed=23)),
+        "fisheye": lambda: flown(NORMAL, seed=29, scenario="fisheye_flight.yaml"),
     }
+    only = "leave the recordings as they are, or make that of one flight"
+    parser.add_argument("--only", choices=["references", *flights], help=only)
+    arguments = parser.parse_args()
     for name, make in flights.items():
         recording, reference = arguments.out / f"{name}.mcap", arguments.out / f"{name}.expected"
-        if arguments.only is None:
+        if arguments.only not in (None, "references", name):
+            continue
+        if arguments.only != "references":
             record(recording, *make())
         with tempfile.TemporaryDirectory() as folder:
             config = with_float_networks(recording, Path(folder) / "drone.yaml")
@@ -87,12 +92,12 @@ def with_float_networks(recording: Path, target: Path) -> Path:
     return target
 
 
-def flown(starts: Starts, *, seed: int) -> tuple[DroneConfig, list[Step]]:
+def flown(starts: Starts, *, seed: int, scenario: str = "paper_flight.yaml") -> tuple[DroneConfig, list[Step]]:
     """A flight in the simulator: what the first drone's pilot was given."""
     keeper = _Keeper()
-    scenario = _scenario(starts, seed)
-    fly(scenario, recorders=[keeper] * len(starts))  # type: ignore[list-item]
-    return scenario.drone, keeper.steps[:: len(starts)]
+    flight = _scenario(scenario, starts, seed)
+    fly(flight, recorders=[keeper] * len(starts))  # type: ignore[list-item]
+    return flight.drone, keeper.steps[:: len(starts)]
 
 
 class _Keeper:
@@ -109,9 +114,9 @@ class _Keeper:
         self.steps.append((frames, vehicle))
 
 
-def _scenario(starts: Starts, seed: int) -> ScenarioConfig:
-    """The paper's flight, shorter, from other places, with cameras of half the width and height."""
-    paper = load_scenario(data_path("config") / "paper_flight.yaml", {"drone.perception.height": "barometer"})
+def _scenario(name: str, starts: Starts, seed: int) -> ScenarioConfig:
+    """A shipped flight, shorter, from other places, with cameras of half the width and height."""
+    paper = load_scenario(data_path("config") / name, {"drone.perception.height": "barometer"})
     cameras = []
     for camera in paper.drone.rig.cameras:
         width, height = camera.size_px
