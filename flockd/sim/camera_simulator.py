@@ -117,9 +117,12 @@ class CameraSimulator:
         # Side by side; noise and faults are drawn in the cameras' order, so that the images do not depend on that.
         drawn = map(view, cameras) if self._executor is None else self._executor.map(view, cameras)
         views, frames = {}, {}
-        for name, (seen, sent) in zip(cameras, drawn, strict=True):
+        for name, (seen, sensed) in zip(cameras, drawn, strict=True):
             views[name] = seen
-            image = self._faults.applied(drone, name, time_s, self._noise.add(sent))
+            image = self._noise.add(sensed)
+            if self._real is not None:
+                image = self._real[drone, name].compressed(image)
+            image = self._faults.applied(drone, name, time_s, image)
             if shots[name].comes:
                 frames[name] = Frame(name, image, shots[name].stamp_s, step)
         R_ned_body, position = vehicles.R_ned_body[drone], vehicles.position[drone]

@@ -209,7 +209,8 @@ def _render_pair(
                 shake=camera.shaking.around(k * interval),
                 drones={d + 1: moves[d] @ R_ned_camera / interval for d in np.nonzero(shown)[0].tolist()},
             )
-            part["image"][index, k] = camera.image(view, move, k * interval, world.light[0] @ R_ned_camera)
+            sensed = camera.image(view, move, k * interval, world.light[0] @ R_ned_camera)
+            part["image"][index, k] = camera.compressed(sensed)
         part["depth"][index, k] = np.minimum(view.depth[1::2, 1::2], 1000.0)
         part["ids"][index, k] = view.ids[1::2, 1::2]
         part["R_ned_camera"][index, k] = R_ned_camera

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from flockd.core.choices import CameraPreset
 from flockd.core.config.base import NonNegative, Positive, Section, Share
@@ -153,3 +153,13 @@ class CamerasConfig(Section):
             given = filled.get(section, {})
             filled[section] = {**defaults, **given} if isinstance(given, Mapping) else given
         return filled
+
+    @model_serializer(mode="wrap")
+    def _say_what_differs_from_the_preset(self, dumped: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """So that another preset may be written over it, as by a campaign, without this one's values staying."""
+        usual = type(self)(preset=self.preset)
+        values: dict[str, Any] = dumped(self)
+        for name in set(values) - {"preset"}:
+            mine, its = getattr(self, name), getattr(usual, name)
+            values[name] = {key: of for key, of in values[name].items() if getattr(mine, key) != getattr(its, key)}
+        return {name: of for name, of in values.items() if of != {}}

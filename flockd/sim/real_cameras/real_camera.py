@@ -33,7 +33,7 @@ class RealCamera:
         self._rng = np.random.default_rng([*seed, 3])
 
     def image(self, view: View, motion: CameraMotion, time_s: float, sun: FloatArray) -> UInt8Array:
-        """What the camera sends, in the order of light: shutter, glass, automatics, sensor, compression.
+        """What the sensor sees, in the order of light: shutter, glass, automatics, noise by gain.
 
         ``sun`` (3,) is the unit vector towards it in the camera's axes. What is not configured changes no bit.
         """
@@ -49,8 +49,11 @@ class RealCamera:
         if config.noise.gain > 0:
             height, width = lens.u.shape
             light = noisy(light, self._tile.crop(height, width, self._rng), config.noise, brightened)
-        image = grey_levels(light)
-        quality = config.compression.jpeg_quality
+        return grey_levels(light)
+
+    def compressed(self, image: UInt8Array) -> UInt8Array:
+        """The image as the camera sends it."""
+        quality = self._config.compression.jpeg_quality
         return image if quality is None else jpeg(image, quality)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockd.campaign.flight_plan import Plan
 from flockd.core.config import ScenarioConfig, load_drone, load_scenario
 from flockd.core.config.imperfect_cameras import CamerasConfig
 from flockd.core.data import data_path
@@ -111,6 +112,7 @@ def test_a_preset_fills_what_is_not_written() -> None:
     assert (cameras.shutter.exposure_s, cameras.shutter.readout_s) == (0.005, 0.0)
     assert cameras.compression.jpeg_quality == 80
     assert CamerasConfig.model_validate(cameras.model_dump()) == cameras, "as `config show` prints it"
+    assert CamerasConfig.model_validate_json(cameras.model_dump_json()) == cameras
     assert CamerasConfig.model_validate({"shutter": {"readout_s": 0.01}}).shutter.exposure_s == 0.0
 
 
@@ -120,6 +122,15 @@ def test_the_fisheye_flight_has_the_real_drones_lenses() -> None:
     assert scenario.cameras == CamerasConfig(preset="realistic")
     ideal = load_scenario(CONFIG / "fisheye_flight.yaml", {"cameras.preset": "ideal"})
     assert ideal.cameras == CamerasConfig()
+
+
+def test_a_campaigns_preset_takes_the_place_of_its_scenarios() -> None:
+    """Before, the scenario's realistic values stayed under a case's `preset: ideal`."""
+    plan = Plan.load(CONFIG / "campaigns" / "cameras.yaml")
+    flown = {str(cell.parameters["case"]): plan.recipe(cell, 0).scenario().cameras for cell in plan.cells}
+    assert flown["ideal"] == CamerasConfig()
+    assert flown["realistic"] == CamerasConfig(preset="realistic")
+    assert flown["gain_8"] == CamerasConfig.model_validate({"noise": {"gain": 8.0}})
 
 
 def test_campaigns_may_vary_a_single_fault() -> None:
