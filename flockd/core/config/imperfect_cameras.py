@@ -161,5 +161,8 @@ class CamerasConfig(Section):
         values: dict[str, Any] = dumped(self)
         for name in set(values) - {"preset"}:
             mine, its = getattr(self, name), getattr(usual, name)
-            values[name] = {key: of for key, of in values[name].items() if getattr(mine, key) != getattr(its, key)}
-        return {name: of for name, of in values.items() if of != {}}
+            if mine == its:
+                del values[name]
+            elif its is not None:
+                values[name] = {key: of for key, of in values[name].items() if getattr(mine, key) != getattr(its, key)}
+        return values
