@@ -25,6 +25,7 @@ from flockd.sim.renderer import View
 
 _MOST_SAMPLES = 16
 """Instants of an exposure, one for each pixel of the longest way."""
+_FEW_SAMPLES = 4
 _MOST_WAY_PX = 60
 _SAME_DEPTH = 0.9
 """Share of a drone's depth from which on what is around it may be it."""
@@ -110,8 +111,8 @@ def exposed(
     if max(float(np.abs(way).max()) for way in ways) < _STILL_PX:
         return light
     total = np.zeros_like(light)
-    # A cubic is sharper where it is taken once; the mean of many is soft anyway.
-    kind = cv2.INTER_CUBIC if samples == 1 else cv2.INTER_LINEAR
+    # Between pixels a linear interpolation blurs by itself; a mean of many ways is soft anyway.
+    kind = cv2.INTER_CUBIC if samples <= _FEW_SAMPLES else cv2.INTER_LINEAR
     for way in ways:
         shown = cv2.remap(light, lens.u - way[..., 0], lens.v - way[..., 1], kind, borderMode=cv2.BORDER_REPLICATE)
         total += np.asarray(shown, np.float32)
