@@ -117,7 +117,10 @@ def test_without_a_command_the_help_is_shown(command: list[str], capsys: pytest.
     assert "examples:\n" in captured.err
 
 
-@pytest.mark.parametrize("option", [["--flow", "dis"], ["--scale", "height"], ["--swap", "flow"], ["--record"]])
+@pytest.mark.parametrize(
+    "option",
+    [["--flow", "dis"], ["--scale", "height"], ["--cameras", "realistic"], ["--swap", "flow"], ["--record"]],
+)
 def test_options_of_sight_are_refused_without_sight(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sim", "--perception", "truth", *option]) == 2
     told = f"{option[0]} has no meaning without networks; drop it or --perception truth\n"

@@ -1,13 +1,15 @@
-"""Make the three short recordings that the fast tests replay, and what is expected of them.
+"""Make the four short recordings that the fast tests replay, and what is expected of them.
 
-    python -m tools.checks.record_regressions [--out tests/review/replay] [--only references]
+    python -m tools.checks.record_regressions [--out tests/review/replay] [--only references | FLIGHT]
 
 - ``normal``: three drones on their way.
 - ``crossing``: five drones fly through one another's images, 1 to 4 m away.
+- ``fisheye``: as ``normal``, with the fisheyes of `config/quadrotor.yaml`, as bad as real ones.
 - ``faults``: a camera lost, a black image, a torn one, a time stamp twice, one that goes back, a second of nothing.
 
-Images are a quarter of the real size and JPEG, so that a recording is well under a megabyte. After a change that is
-meant to change outputs (new networks, say), `--only references` writes the expectations again from the same recordings.
+Images are a quarter of the real size, but for the two cameras and six steps of ``fisheye``, and JPEG, so that a
+recording is well under a megabyte. After a change that is meant to change outputs (new networks, say), `--only
+references` writes the expectations again from the same recordings.
 They are made with the networks in 32-bit floats, in place of those in 8 bits that the recordings were flown with: with
 and without VNNI instructions, processors compute the latter differently.
 """
@@ -27,9 +29,10 @@ import yaml
 from flockd.cli import main as flockd
 from flockd.core.config import DroneConfig, ScenarioConfig, load_scenario
 from flockd.core.config.recording import RecordingConfig
+from flockd.core.config.rig import CameraConfig
 from flockd.core.config.scenario import StartConfig
 from flockd.core.data import data_path
-from flockd.core.messages import Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
+from flockd.core.messages import Frame, FrameSet, MissionOrder, PilotOutput, UInt8Array, VehicleState
 from flockd.flight.inference.hashes import model_hashes
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.recording import Recorder
@@ -41,7 +44,8 @@ Step = tuple[FrameSet, VehicleState]
 Starts = Mapping[tuple[float, float, float], tuple[float, float]]
 """Velocity (north, east) in m/s of the drone at a place (north, east, down) in metres; the first drone is recorded."""
 Change = Callable[[UInt8Array], UInt8Array]
-STEPS = 10
+STEPS, FISHEYE_STEPS = 10, 6
+BAROMETER = {"drone.perception.height": "barometer"}
 DRONE = "drone1"
 NORMAL: Starts = {(0.0, 0.0, -3.0): (1.0, 0.0), (2.5, 1.2, -3.2): (1.0, 0.0), (-0.6, -2.8, -2.8): (1.0, 0.0)}
 CROSSING: Starts = {
@@ -57,16 +61,20 @@ def main() -> None:
     """Make recordings and references."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("tests/review/replay"))
-    parser.add_argument("--only", choices=["references"], help="leave the recordings as they are")
-    arguments = parser.parse_args()
     flights: Mapping[str, Callable[[], tuple[DroneConfig, list[Step]]]] = {
-        "normal": lambda: flown(NORMAL, seed=21),
-        "crossing": lambda: flown(CROSSING, seed=25),
-        "faults": lambda: with_faults(*flown(NORMAL, seed=23)),
+        "normal": lambda: flown(_scenario(NORMAL, seed=21)),
+        "crossing": lambda: flown(_scenario(CROSSING, seed=25)),
+        "faults": lambda: with_faults(*flown(_scenario(NORMAL, seed=23))),
+        "fisheye": lambda: flown(_fisheyes(NORMAL, seed=29)),
     }
+    only = "leave the recordings as they are, or make that of one flight"
+    parser.add_argument("--only", choices=["references", *flights], help=only)
+    arguments = parser.parse_args()
     for name, make in flights.items():
         recording, reference = arguments.out / f"{name}.mcap", arguments.out / f"{name}.expected"
-        if arguments.only is None:
+        if arguments.only not in (None, "references", name):
+            continue
+        if arguments.only != "references":
             record(recording, *make())
         with tempfile.TemporaryDirectory() as folder:
             config = with_float_networks(recording, Path(folder) / "drone.yaml")
@@ -87,12 +95,11 @@ def with_float_networks(recording: Path, target: Path) -> Path:
     return target
 
 
-def flown(starts: Starts, *, seed: int) -> tuple[DroneConfig, list[Step]]:
+def flown(scenario: ScenarioConfig) -> tuple[DroneConfig, list[Step]]:
     """A flight in the simulator: what the first drone's pilot was given."""
-    keeper = _Keeper()
-    scenario = _scenario(starts, seed)
-    fly(scenario, recorders=[keeper] * len(starts))  # type: ignore[list-item]
-    return scenario.drone, keeper.steps[:: len(starts)]
+    keeper, count = _Keeper(), len(scenario.vehicles)
+    fly(scenario, recorders=[keeper] * count)  # type: ignore[list-item]
+    return scenario.drone, keeper.steps[::count]
 
 
 class _Keeper:
@@ -104,24 +111,40 @@ class _Keeper:
     def drain(self) -> None:
         """All is kept at once."""
 
-    def step(self, frames: FrameSet, vehicle: VehicleState, output: PilotOutput, truth: Truth | None) -> None:
+    def step(
+        self, frames: FrameSet, vehicle: VehicleState, output: PilotOutput, truth: Truth | None,
+        order: MissionOrder | None,
+    ) -> None:  # fmt: skip
         """Keep what went in."""
         self.steps.append((frames, vehicle))
 
 
 def _scenario(starts: Starts, seed: int) -> ScenarioConfig:
     """The paper's flight, shorter, from other places, with cameras of half the width and height."""
-    paper = load_scenario(data_path("config") / "paper_flight.yaml", {"drone.perception.height": "barometer"})
+    paper = load_scenario(data_path("config") / "paper_flight.yaml", BAROMETER)
     cameras = []
     for camera in paper.drone.rig.cameras:
         width, height = camera.size_px
         halved = {name: getattr(camera.intrinsics, name) / 2 for name in ("fx", "fy", "cx", "cy")}
         intrinsics = camera.intrinsics.model_copy(update=halved)
         cameras.append(camera.model_copy(update={"size_px": (width // 2, height // 2), "intrinsics": intrinsics}))
-    drone = paper.drone.model_copy(update={"rig": paper.drone.rig.model_copy(update={"cameras": tuple(cameras)})})
+    return _with(paper, cameras, starts, seed, STEPS)
+
+
+def _fisheyes(starts: Starts, seed: int) -> ScenarioConfig:
+    """The same with two fisheyes of full size, as bad as real ones: in halved images they leave little of a drone."""
+    flight = load_scenario(data_path("config") / "fisheye_flight.yaml", BAROMETER)
+    cameras = [camera for camera in flight.drone.rig.cameras if camera.name in ("front", "left")]
+    return _with(flight, cameras, starts, seed, FISHEYE_STEPS)
+
+
+def _with(
+    flight: ScenarioConfig, cameras: Sequence[CameraConfig], starts: Starts, seed: int, steps: int
+) -> ScenarioConfig:
+    drone = flight.drone.model_copy(update={"rig": flight.drone.rig.model_copy(update={"cameras": tuple(cameras)})})
     vehicles = tuple(StartConfig(position_m=p, velocity_m_s=v) for p, v in starts.items())
-    duration_s = STEPS * drone.step_s
-    return paper.model_copy(update={"drone": drone, "vehicles": vehicles, "seed": seed, "duration_s": duration_s})
+    duration_s = steps * drone.step_s
+    return flight.model_copy(update={"drone": drone, "vehicles": vehicles, "seed": seed, "duration_s": duration_s})
 
 
 def with_faults(drone: DroneConfig, steps: Sequence[Step]) -> tuple[DroneConfig, list[Step]]:

@@ -1,4 +1,4 @@
-"""Three short flights, replayed: what came out when they were made comes out today.
+"""Four short flights, replayed: what came out when they were made comes out today.
 
 After a change that is meant to change it: `python -m tools.checks.record_regressions --only references`. Recordings
 stay as they are. They are replayed with the networks in 32-bit floats, whose outputs differ little between processors.
@@ -14,10 +14,11 @@ import pytest
 import yaml
 
 from flockd.cli import main
+from flockd.onboard.recording.reader import Recording
 from tools.checks.record_regressions import with_float_networks
 
 HERE = Path(__file__).parent
-FLIGHTS = ("normal", "crossing", "faults")
+FLIGHTS = ("normal", "crossing", "faults", "fisheye")
 # Another processor adds up in another order. `python -m tools.checks.regression_spread` simulates some: ONNX Runtime
 # without graph optimisation, libraries without AVX. The largest differences in `normal` and `crossing` were 3e-6 in
 # velocity, 0.001 in command, 0.0093 in neighbours, 0.0008 in detections and 1.3e-6 in ego_motion; in `faults`, whose
@@ -67,6 +68,8 @@ def test_the_recordings_hold_what_they_are_named_after() -> None:
     }
     assert confirmed["normal"] >= 1
     assert confirmed["crossing"] >= 2
+    assert confirmed["fisheye"] >= 1
+    assert {camera.intrinsics.model for camera in Recording(HERE / "fisheye.mcap").config.rig.cameras} == {"wide_angle"}
     reasons = " ".join(reason for step in expected["faults"] for reason in step["reasons"])
     assert "camera right: no frame" in reasons
     assert "time stamps do not increase" in reasons
