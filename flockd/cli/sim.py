@@ -15,7 +15,7 @@ from flockd.cli.endpoint_options import ENDPOINT
 from flockd.cli.flight_summary import report_flight
 from flockd.cli.output import Phases, complain
 from flockd.cli.parser import Commands, positive_count, positive_number, seed
-from flockd.core.choices import TRUTH_ROLES, AutopilotKind, HeightSource, ScaleSource, SimulatedPerception
+from flockd.core.choices import TRUTH_ROLES, AutopilotKind, CameraPreset, HeightSource, ScaleSource, SimulatedPerception
 from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ OPTIONS = {
     "wind": "vehicle.wind_m_s",
     "speed": "drone.mission.speed_m_s",
     "radius": "drone.mission.radius_m",
+    "cameras": "cameras.preset",
 }
 """Which key of the configuration an option sets."""
 
@@ -54,6 +55,7 @@ def add(commands: Commands) -> None:
         "flockd sim --perception truth --json > truth.json",
         "flockd sim --perception truth --telemetry --drones 25 --duration 600",
         "flockd sim my_flight.yaml --flow dis --seed 7",
+        "flockd sim config/fisheye_flight.yaml --cameras realistic --duration 20",
         "flockd sim --record --duration 20",
         "flockd sim --autopilot standin --drones 2 --duration 20",
         "flockd sim config/px4_flight.yaml --autopilot px4",
@@ -82,6 +84,9 @@ def add(commands: Commands) -> None:
     parser.add_argument("--scale", choices=get_args(ScaleSource), help="where the background's scale comes from")
     parser.add_argument(
         "--height", choices=get_args(HeightSource), help="what measures the height above ground that gives the scale"
+    )
+    parser.add_argument(
+        "--cameras", choices=get_args(CameraPreset), help="as bad as real ones, or without any of their faults"
     )
     parser.add_argument("--drones", metavar="N", type=_flock_size, help="size of the flock")
     parser.add_argument("--duration", metavar="S", type=positive_number, help="seconds to fly; it changes the world")
@@ -259,7 +264,7 @@ def _recorders(
 def _check_options(args: argparse.Namespace) -> None:
     sim_fleet.check_options(args)
     if args.perception == "truth":
-        idle = [option for option in ("flow", "scale", "height", "swap", "record") if getattr(args, option)]
+        idle = [option for option in ("flow", "scale", "height", "cameras", "swap", "record") if getattr(args, option)]
         if idle:
             raise UsageError(f"--{idle[0]} has no meaning without networks; drop it or --perception truth")
 

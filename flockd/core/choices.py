@@ -46,5 +46,8 @@ AutopilotMode = Literal["hold", "return", "land"]
 SimulatedPerception = Literal["learned", "truth"]
 """Whether a simulated drone flies by its networks or by the simulator's state."""
 
+CameraPreset = Literal["ideal", "realistic"]
+"""How good a simulated drone's cameras are."""
+
 AutopilotKind = Literal["standin", "px4"]
 """Which autopilot a simulated fleet flies with."""

@@ -12,11 +12,13 @@ import numpy as np
 from flockd.core.config.mission import MissionParameters
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FloatArray, Frame, FrameSet, UInt8Array
-from flockd.flight.geometry import build_rig
+from flockd.flight.geometry import build_rig, rotation_from_vector
 from flockd.flight.mission import Moment, Navigator
 from flockd.sim.camera_faults import CameraFaults
 from flockd.sim.drone_models import FAMILIES, drone_model
 from flockd.sim.lens_views import lens_view
+from flockd.sim.pose_trail import FlockPose, PoseTrail
+from flockd.sim.real_cameras import CameraMotion, Shot, real_cameras
 from flockd.sim.renderer import Renderer, View
 from flockd.sim.truth_perception import RenderTruth
 from flockd.sim.vehicles import REFERENCE_DEG
@@ -61,8 +63,13 @@ class CameraSimulator:
         models = [drone_model(family, int(rng.integers(1 << 31))) for _ in range(self._count)]
         self._world = world
         self._renderer = Renderer(world, models)
-        self._noise = _ImageNoise(scenario.sensors.image_noise, scenario.seed)
+        by_gain = scenario.cameras is not None and scenario.cameras.noise.gain > 0
+        self._noise = _ImageNoise(0.0 if by_gain else scenario.sensors.image_noise, scenario.seed)
         self._faults = CameraFaults(scenario.faults, scenario.seed)
+        self._captured, self._real = PoseTrail(), None
+        if scenario.cameras is not None:
+            lenses = {name: mounted.camera for name, mounted in self.rig.cameras.items()}
+            self._real = real_cameras(scenario.cameras, lenses, self._count, scenario.seed)
         count = os.cpu_count() if threads is None else threads
         self._executor = ThreadPoolExecutor(count, thread_name_prefix="camera") if count else None
 
@@ -70,31 +77,78 @@ class CameraSimulator:
         """(n,) metres above z = 0 of the ground that is drawn, at points (n,) north and east."""
         return self._world.height_at(north, east)
 
-    def capture(self, drone: int, step: int, time_s: float, vehicles: FlockPoses) -> tuple[FrameSet, RenderTruth]:
-        """The frame set of one drone, and the truth behind it."""
-        others = [i for i in range(self._count) if i != drone]
-        R_ned_body, position = vehicles.R_ned_body[drone], vehicles.position[drone]
-        cameras = self.rig.cameras
-        turns = {name: R_ned_body @ mounted.T_body_camera.rotation for name, mounted in cameras.items()}
-        places = {name: position + R_ned_body @ mounted.T_body_camera.translation for name, mounted in cameras.items()}
+    def capture(
+        self, drone: int, step: int, time_s: float, vehicles: FlockPoses, trail: PoseTrail | None = None
+    ) -> tuple[FrameSet, RenderTruth]:
+        """The frame set of one drone, and the truth behind it.
 
-        def view(name: str) -> View:
+        ``trail`` holds where the flock was until then, for what is late and for motion; None: what was captured before
+        is taken, so that a flock's motion between two captures is even.
+        """
+        if trail is None:
+            trail = self._captured
+            trail.add(FlockPose(time_s, vehicles.position, vehicles.R_ned_body))
+        others = [i for i in range(self._count) if i != drone]
+        cameras, flock = self.rig.cameras, dict.fromkeys(self.rig.cameras, vehicles)
+        shots = {name: Shot(time_s, time_s, comes=True) for name in cameras}
+        if self._real is not None:
+            shots = {name: self._real[drone, name].clock.shot(time_s) for name in cameras}
+            flock = {name: trail.at(shot.shown_s) for name, shot in shots.items()}
+        turns = {name: self._turn(drone, name, shots[name], flock[name]) for name in cameras}
+        places = {
+            name: flock[name].position[drone] + flock[name].R_ned_body[drone] @ mounted.T_body_camera.translation
+            for name, mounted in cameras.items()
+        }
+
+        def view(name: str) -> tuple[View, UInt8Array]:
             def draw(matrix: FloatArray, size: tuple[int, int], R_lens_part: FloatArray) -> View:
                 return self._renderer.render(
                     matrix, size, turns[name] @ R_lens_part, places[name],
-                    drone_rotations=vehicles.R_ned_body, drone_positions=vehicles.position, shown=others,
+                    drone_rotations=flock[name].R_ned_body, drone_positions=flock[name].position, shown=others,
                 )  # fmt: skip
 
-            return lens_view(cameras[name].camera, draw)
+            seen = lens_view(cameras[name].camera, draw)
+            if self._real is None:
+                return seen, seen.rgb
+            motion = self._motion(drone, name, shots[name].shown_s, turns[name], trail)
+            sun = self._world.light[0] @ turns[name]
+            return seen, self._real[drone, name].image(seen, motion, time_s, sun)
 
         # Side by side; noise and faults are drawn in the cameras' order, so that the images do not depend on that.
         drawn = map(view, cameras) if self._executor is None else self._executor.map(view, cameras)
-        views, frames = dict(zip(cameras, drawn, strict=True)), {}
-        for name, seen in views.items():
-            image = self._faults.applied(drone, name, time_s, self._noise.add(seen.rgb))
-            frames[name] = Frame(name, image, time_s, step)
+        views, frames = {}, {}
+        for name, (seen, sent) in zip(cameras, drawn, strict=True):
+            views[name] = seen
+            image = self._faults.applied(drone, name, time_s, self._noise.add(sent))
+            if shots[name].comes:
+                frames[name] = Frame(name, image, shots[name].stamp_s, step)
+        R_ned_body, position = vehicles.R_ned_body[drone], vehicles.position[drone]
         truth = RenderTruth(views, turns, places, R_ned_body, position, vehicles.R_ned_body, vehicles.position, others)
         return FrameSet(time_s, frames), truth
+
+    def _turn(self, drone: int, name: str, shot: Shot, flock: FlockPoses) -> FloatArray:
+        """(3, 3) from a camera's axes to NED, shaken."""
+        R_ned_camera: FloatArray = flock.R_ned_body[drone] @ self.rig.cameras[name].T_body_camera.rotation
+        if self._real is None:
+            return R_ned_camera
+        angles = self._real[drone, name].shaking.at(np.array([shot.shown_s]))[0]
+        shaken: FloatArray = R_ned_camera @ rotation_from_vector(angles) if angles.any() else R_ned_camera
+        return shaken
+
+    def _motion(
+        self, drone: int, name: str, shown_s: float, R_ned_camera: FloatArray, trail: PoseTrail
+    ) -> CameraMotion:
+        """How a camera moves around the time of its image."""
+        assert self._real is not None
+        flock, mounted = trail.motion_at(shown_s), self.rig.cameras[name].T_body_camera
+        R_ned_body = trail.at(shown_s).R_ned_body[drone]
+        lever = R_ned_body @ np.cross(flock.turn[drone], mounted.translation)
+        return CameraMotion(
+            velocity=(flock.velocity[drone] + lever) @ R_ned_camera,
+            turn=flock.turn[drone] @ mounted.rotation,
+            shake=self._real[drone, name].shaking.around(shown_s),
+            drones={i + 1: flock.velocity[i] @ R_ned_camera for i in range(self._count) if i != drone},
+        )
 
 
 FIELD_GRID_M = 3.0

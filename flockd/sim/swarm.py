@@ -30,6 +30,7 @@ from flockd.sim.control_loop import ControlLoop
 from flockd.sim.exact_states import ExactFlock, HandPilot, fly_exact_states, start_yaw, step_times
 from flockd.sim.pilot_pool import PilotPool
 from flockd.sim.pilots import Stepped
+from flockd.sim.real_cameras import LateAttitude
 from flockd.sim.shown_flock import RealTime, ShownFlock, orders_of
 from flockd.sim.vehicles import SimulatedAutopilot, Vehicles
 
@@ -198,6 +199,8 @@ class _VisionPilots:
         self._autopilots = {
             i: SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=i, ground=ground) for i in self._drones
         }
+        late = None if scenario.cameras is None else scenario.cameras.attitude
+        self._attitudes = {} if late is None else {i: LateAttitude(late, scenario.seed, i) for i in self._drones}
         self._stepped: dict[int, Stepped] = {}
 
     def step(
@@ -209,9 +212,11 @@ class _VisionPilots:
         orders = orders_of(self._shown, self._drones)
         for i in self._drones:
             begin = time.perf_counter()
-            frames, seen = self._cameras.capture(i, step, time_s, vehicles)
+            frames, seen = self._cameras.capture(i, step, time_s, vehicles, vehicles.trail)
             render_ms[i] = 1e3 * (time.perf_counter() - begin)
             state = self._autopilots[i].read(time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i])
+            if self._attitudes:
+                state = self._attitudes[i].heard(state, vehicles.trail)
             with_pictures = pictured and i in self._drones[:_KEY_FRAME_DRONES]
             steps[i] = (
                 frames,

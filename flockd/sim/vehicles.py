@@ -11,6 +11,7 @@ from flockd.core.config.scenario import SensorConfig, StartConfig, VehicleConfig
 from flockd.core.messages import FloatArray, VehicleState
 from flockd.flight.geometry import rotation_from_euler
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, Ground, level_ground
+from flockd.sim.pose_trail import KEPT_S, FlockPose, PoseTrail
 from flockd.sim.wind import GustField
 
 GRAVITY_M_S2 = 9.81
@@ -38,7 +39,7 @@ class Vehicles:
     and leans against wind as far as need be. Height is held, or changed as by a critically damped controller of limited
     climb, down to the ground at z = 0. The attitude is the one whose thrust gives the horizontal acceleration. The
     arrays are replaced by `step`, never changed in place: `position` (n, 3) m and `velocity` (n, 3) m/s in NED,
-    `R_ned_body` (n, 3, 3).
+    `R_ned_body` (n, 3, 3). `trail` has them of the last second, as if the flight had begun a second before.
     """
 
     def __init__(self, starts: Sequence[StartConfig], config: VehicleConfig, *, yaw_rad: float = 0.0, seed: int = 0):
@@ -54,6 +55,9 @@ class Vehicles:
         self.velocity = np.array([[*start.velocity_m_s, 0.0] for start in starts])
         self._thrust = self._drag(self.velocity[:, :2])
         self.R_ned_body = attitude(self._thrust, self._yaw)
+        self.trail = PoseTrail()
+        self.trail.add(FlockPose(-KEPT_S, self.position - KEPT_S * self.velocity, self.R_ned_body))
+        self.trail.add(FlockPose(0.0, self.position, self.R_ned_body))
 
     def step(
         self, setpoints: FloatArray, yaw_setpoints: FloatArray, interval_s: float, heights: FloatArray | None = None
@@ -68,7 +72,8 @@ class Vehicles:
             self._substep(setpoints, yaw_setpoints, interval_s / substeps)
             if climbs and heights is not None:
                 self._climb(heights, interval_s / substeps)
-        self.R_ned_body = attitude(self._thrust, self._yaw)
+            self.R_ned_body = attitude(self._thrust, self._yaw)
+            self.trail.add(FlockPose(self._time_s, self.position, self.R_ned_body))
 
     def _substep(self, setpoints: FloatArray, yaw_setpoints: FloatArray, dt: float) -> None:
         config = self._config

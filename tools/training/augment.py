@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flockd.sim.real_cameras.compression import jpeg
 from tools.training.camera_effects import drawn_effects, through_camera
 
 Image = NDArray[np.uint8]
@@ -41,8 +42,7 @@ def photometric(images: list[Image], rng: np.random.Generator) -> list[Image]:
             grain = np.roll(grain, int(rng.integers(1 << 16)))[: changed.shape[0], : changed.shape[1]]
             changed = cv2.add(changed, cv2.merge([grain] * 3), dtype=cv2.CV_8U)
         if quality is not None:
-            _, packed = cv2.imencode(".jpg", changed, [cv2.IMWRITE_JPEG_QUALITY, quality])
-            changed = np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR))
+            changed = jpeg(np.asarray(changed, np.uint8), quality)
         out.append(np.asarray(changed, dtype=np.uint8))
     return out
 

@@ -14,6 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flockd.core.config.imperfect_cameras import CamerasConfig
+from flockd.sim.real_cameras.compression import jpeg
+
 Image = NDArray[np.uint8]
 _LEAST_SIDE_PX = 8
 
@@ -72,6 +75,29 @@ def drawn_effects(scale: float, rng: np.random.Generator) -> CameraEffects:
         quality=None if is_good else int(rng.integers(30, 96)),
         resampling=float(rng.uniform(0.5, 1.0)) if not is_good and rng.random() < 0.3 else 1.0,
     )
+
+
+def drawn_cameras(rng: np.random.Generator) -> CamerasConfig:
+    """A camera of whole rendered images, from better than the preset `realistic` to about three times worse."""
+    preset = CamerasConfig(preset="realistic")
+    strength = float(np.exp(rng.uniform(math.log(0.1), math.log(3.0))))
+    is_global = bool(rng.random() < 0.5)
+    values = {
+        "shutter": {
+            "exposure_s": preset.shutter.exposure_s * strength,
+            "readout_s": 0.0 if is_global else preset.shutter.readout_s * float(rng.uniform(0.3, 2.0)),
+        },
+        "shake": {"rms_deg": preset.shake.rms_deg * strength * float(rng.uniform(0.0, 2.0))},
+        "noise": {"gain": preset.noise.gain * float(np.exp(rng.uniform(math.log(0.25), math.log(4.0))))},
+        "automatic": {"exposure": float(rng.random()), "white_balance": float(rng.random())},
+        "lens": {
+            "flare": float(rng.exponential(preset.lens.flare)),
+            "dirt": float(rng.exponential(preset.lens.dirt)),
+            "drops": float(rng.exponential(0.02)) if rng.random() < 0.1 else 0.0,
+        },
+        "compression": {"jpeg_quality": int(rng.integers(40, 96)) if rng.random() < 0.7 else None},
+    }
+    return CamerasConfig.model_validate(values)
 
 
 def through_camera(sharp: Image, effects: CameraEffects, rng: np.random.Generator) -> Image:
@@ -133,10 +159,8 @@ def _compressed(image: Image, quality: int, rng: np.random.Generator) -> Image:
     """With the blocks of the compression anywhere, as in a larger image."""
     left, top = int(rng.integers(8)), int(rng.integers(8))
     wide = cv2.copyMakeBorder(image, top, 8, left, 8, cv2.BORDER_REFLECT_101)
-    _, packed = cv2.imencode(".jpg", wide, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    out = cv2.imdecode(packed, cv2.IMREAD_COLOR)
-    assert out is not None
-    return np.ascontiguousarray(out[top : top + image.shape[0], left : left + image.shape[1]], dtype=np.uint8)
+    packed = jpeg(np.asarray(wide, np.uint8), quality)
+    return np.ascontiguousarray(packed[top : top + image.shape[0], left : left + image.shape[1]])
 
 
 def _clipped(values: NDArray[np.float32]) -> Image:

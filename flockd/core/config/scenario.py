@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 
 from flockd.core.config.base import NonNegative, Positive, Section, Share, Vector3, refuse
 from flockd.core.config.drone import DroneConfig
+from flockd.core.config.imperfect_cameras import CamerasConfig
 from flockd.core.config.mission import MissionParameters, mission_faults
 from flockd.core.config.obstacle_field import ObstaclesConfig
 
@@ -163,6 +164,8 @@ class ScenarioConfig(Section):
     vehicles: Annotated[tuple[StartConfig, ...], Field(min_length=1, max_length=MAX_DRONES)]
     vehicle: VehicleConfig = VehicleConfig()
     sensors: SensorConfig = SensorConfig()
+    cameras: CamerasConfig | None = None
+    """How the cameras differ from ideal ones; null: in nothing but `sensors.image_noise`."""
     world: WorldConfig = WorldConfig()
     detections: DetectionsConfig | None = None
     """For `--perception truth`: drones know each other by tracking such detections; null: exactly and at once."""

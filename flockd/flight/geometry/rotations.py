@@ -36,7 +36,7 @@ def euler_from_rotation(rotation: FloatArray) -> tuple[float, float, float]:
 
 
 def rotation_from_vector(vector: FloatArray) -> FloatArray:
-    """(3, 3) rotation about the direction of ``vector`` (3,) by its length in radians."""
+    """(3, 3) rotation about the direction of ``vector`` (3,) by its length in radians; (n, 3, 3) of (n, 3)."""
     return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 

@@ -1,0 +1,155 @@
+"""What separates a simulated drone's cameras from ideal ones, each fault by its physical size; 0 is none of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from pydantic import Field, model_validator
+
+from flockd.core.choices import CameraPreset
+from flockd.core.config.base import NonNegative, Positive, Section, Share
+
+MAX_LATE_S = 0.3
+"""Most that an image or an attitude may be late: what was longer ago is not kept."""
+_Late = Annotated[float, Field(ge=0, le=MAX_LATE_S)]
+
+
+class ShutterConfig(Section):
+    """When the rows of an image are exposed."""
+
+    exposure_s: Annotated[float, Field(ge=0, le=0.1)] = 0.0
+    """Of each row: what moves is smeared over its way in that time."""
+    readout_s: Annotated[float, Field(ge=0, le=0.1)] = 0.0
+    """From the exposure of the first row to that of the last, one row after the other (rolling shutter); 0: all at
+    once (global shutter). An image shows the middle row at its time."""
+
+
+class ShakeConfig(Section):
+    """How propellers shake each camera on its mounting: angles about its three axes, of seeded phases."""
+
+    rms_deg: Annotated[float, Field(ge=0, le=5)] = 0.0
+    """Root mean square of the angle about each axis."""
+    frequency_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
+    """Revolutions of the propellers each second: four tones within 10 % of it hold 80 % of the power, the passing of
+    two blades, at twice the frequency, the rest."""
+
+
+class SensorNoiseConfig(Section):
+    """Noise of the image sensor by its gain (EMVA 1288): shot noise of electrons, and noise of reading them out."""
+
+    gain: Annotated[float, Field(ge=0, le=1000)] = 0.0
+    """Amplification over that at which a full well is white; 0: the same noise everywhere, `sensors.image_noise`."""
+    full_well_e: Positive = 4300.0
+    """Electrons that a pixel holds."""
+    read_noise_e: NonNegative = 1.7
+    """Standard deviation, in electrons."""
+
+
+class AutomaticConfig(Section):
+    """Automatic exposure and white balance, of each camera by itself."""
+
+    exposure: Share = 0.0
+    """Share of the way to a mean of 18 % of white that brightness is corrected; above 1 by gain, with its noise."""
+    white_balance: Share = 0.0
+    """Share of the way to a grey mean that red and blue are corrected."""
+    time_s: Positive = 0.5
+    """Time constant of both."""
+
+
+class LensFaultsConfig(Section):
+    """What is on or in the glass. Dirt and drops stay where they are during a flight."""
+
+    flare: Share = 0.0
+    """Share of the light that is scattered over the image, the sun's included where the lens sees it (veiling glare
+    index, ISO 9358): half of the sun's evenly, half around it."""
+    dirt: Share = 0.0
+    """Share of the image that specks darken, out of focus."""
+    drops: Share = 0.0
+    """Share of the image that drops of water blur."""
+
+
+class CompressionConfig(Section):
+    """Compression of each image by itself, as a camera of pixel format `mjpeg` sends it."""
+
+    jpeg_quality: Annotated[int, Field(ge=1, le=100)] | None = None
+    """null: none."""
+
+
+class CameraTimingConfig(Section):
+    """When cameras expose, and what becomes of the images."""
+
+    apart_s: _Late = 0.0
+    """Cameras run freely: each exposes up to so much before the set's time, as its time stamps say."""
+    delay_s: _Late = 0.0
+    """Images are so much older than their time stamps say, ..."""
+    jitter_s: _Late = 0.0
+    """... and each by up to so much more."""
+    dropped: Share = 0.0
+    """Share of the images that never come."""
+
+
+class LateAttitudeConfig(Section):
+    """The attitude that the autopilot reports, beside `sensors.attitude_error_deg`. In daemons' flights, with PX4 or
+    its stand-in, it is the autopilot's own, and this does nothing."""
+
+    late_s: _Late = 0.0
+    """It is so much older than it says."""
+    noise_deg: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """Standard deviation about each axis, anew each time."""
+
+
+_PRESETS: Mapping[CameraPreset, Mapping[str, Mapping[str, Any]]] = {
+    "ideal": {},
+    "realistic": {
+        # As `config/quadrotor.yaml` sets it; a sensor of at most 60 images a second: rows take 1 / (60 rows), the rule
+        # of https://docs.luxonis.com/hardware/platform/sensors/shutter-type.
+        "shutter": {"exposure_s": 0.005, "readout_s": 0.0167},
+        # 0.3 rad/s at 100 Hz, an assumption: docs/real_drone.md says how to measure one's own. Propellers turn at
+        # 40-300 Hz: https://diydrones.com/forum/topics/vibration-analysis-1.
+        "shake": {"rms_deg": 0.03, "frequency_hz": 100.0},
+        # OV5647, 1.4 um: 4.3 ke, 36 dB, 68 dB, so 4300 / 10^(68 / 20) = 1.7 e (user guide of the OptArc AF51, page 21).
+        # 12 dB of gain: a cloudy day at 5 ms.
+        "noise": {"gain": 4.0, "full_well_e": 4300.0, "read_noise_e": 1.7},
+        "automatic": {"exposure": 0.7, "white_balance": 0.5, "time_s": 0.5},
+        # Simple lenses measure 1 to 3 % (https://www.imatest.com/docs/veilingglare/). A little dust, no rain.
+        "lens": {"flare": 0.02, "dirt": 0.01, "drops": 0.0},
+        "compression": {"jpeg_quality": 80},
+        # Free running at 30 Hz; what a calibration of the delay leaves; USB's share.
+        "timing": {"apart_s": 0.0167, "delay_s": 0.005, "jitter_s": 0.003, "dropped": 0.01},
+        # ATTITUDE_QUATERNION at 50 Hz, read between two of them, and a serial port.
+        "attitude": {"late_s": 0.02, "noise_deg": 0.1},
+    },
+}  # fmt: skip
+
+
+class CamerasConfig(Section):
+    """Cameras as a real drone has them. The lens is that of the drone's own rig.
+
+    A preset gives the values that are not written here: `preset: realistic` with `shutter: {readout_s: 0}` is a
+    realistic camera with a global shutter.
+    """
+
+    preset: CameraPreset = "ideal"
+    """`ideal`: none of it. `realistic`: a cheap USB camera with a rolling shutter on a small drone by day, from data
+    sheets (sources in `flockd/core/config/imperfect_cameras.py`)."""
+    shutter: ShutterConfig = ShutterConfig()
+    shake: ShakeConfig = ShakeConfig()
+    noise: SensorNoiseConfig = SensorNoiseConfig()
+    automatic: AutomaticConfig = AutomaticConfig()
+    lens: LensFaultsConfig = LensFaultsConfig()
+    compression: CompressionConfig = CompressionConfig()
+    timing: CameraTimingConfig = CameraTimingConfig()
+    attitude: LateAttitudeConfig = LateAttitudeConfig()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _begin_with_the_preset(cls, values: Any) -> Any:
+        if not isinstance(values, Mapping):
+            return values
+        filled: dict[str, Any] = dict(values)
+        known = {str(name): sections for name, sections in _PRESETS.items()}
+        for section, defaults in known.get(str(values.get("preset")), {}).items():
+            given = filled.get(section, {})
+            filled[section] = {**defaults, **given} if isinstance(given, Mapping) else given
+        return filled
