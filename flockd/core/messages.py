@@ -407,4 +407,4 @@ class PilotOutput:
     obstacles: ObstacleRanges | None = None
     """The local map; None where obstacles are not looked for."""
     rig: tuple[CameraDeviation, ...] = ()
-    """How each camera differs from its configuration, as far as this flight has shown it."""
+    """How each camera differs from its configuration, as far as this flight has shown it, once in some seconds."""

@@ -20,7 +20,7 @@ from flockd.sim.lens_views import lens_view
 from flockd.sim.pose_trail import FlockPose, PoseTrail
 from flockd.sim.real_cameras import CameraMotion, Shot, real_cameras
 from flockd.sim.renderer import Renderer, View
-from flockd.sim.rig_errors import true_rigs
+from flockd.sim.true_rigs import true_rigs
 from flockd.sim.truth_perception import RenderTruth
 from flockd.sim.vehicles import REFERENCE_DEG
 from flockd.sim.world import World

@@ -20,10 +20,11 @@ from flockd.core.config import ScenarioConfig, load_scenario
 from flockd.core.messages import CameraDeviation, FloatArray, PilotOutput, ReasonKind
 from flockd.flight.geometry import RigCamera, build_rig, rotation_from_vector, vector_from_rotation
 from flockd.onboard.recording import Recorder
-from flockd.sim.rig_errors import true_rigs
 from flockd.sim.swarm import fly
+from flockd.sim.true_rigs import true_rigs
 
-SHOWN_EVERY_S = 20.0
+SHOWN_EVERY = 4
+"""Of the estimates that outputs hold, one each five seconds."""
 
 
 class Kept:
@@ -48,21 +49,22 @@ def main() -> None:
     began_s = time.monotonic()
     swap = frozenset({"flow", "depth"}) if args.exact else frozenset()
     fly(scenario, swap=swap, recorders=cast("Sequence[Recorder]", kept), processes=args.processes, pictured=False)
-    print(
-        f"{scenario.scenario}, {len(kept)} drones, {scenario.duration_s:g} s, "
-        f"flown in {time.monotonic() - began_s:.0f} s: mountings {args.mounting:g} degrees, times {1e3 * args.late:g} ms, focal lengths {100 * args.focal:g} % off"
-    )
+    flown = f"{scenario.scenario}, {len(kept)} drones, {scenario.duration_s:g} s"
+    off = f"mountings {args.mounting:g} degrees, times {1e3 * args.late:g} ms, focal lengths {100 * args.focal:g} % off"
+    print(f"{flown}, flown in {time.monotonic() - began_s:.0f} s: {off}")
     print("found less true:          roll, pitch, yaw in degrees    together      time, ms   focal length, %")
     configured, last = build_rig(scenario.drone.rig), []
     for drone, (one, rig) in enumerate(zip(kept, true_rigs(scenario), strict=True), start=1):
-        steps = round(SHOWN_EVERY_S / scenario.drone.step_s)
-        for number in sorted({*range(steps, len(one.outputs), steps), len(one.outputs)}):
-            output = one.outputs[number - 1]
+        said = [output for output in one.outputs if output.rig]
+        began_s = one.outputs[0].time_s
+        for number, output in enumerate(said):
             for found in output.rig:
-                off = _off(found, rig.cameras[found.camera], configured.cameras[found.camera], args.late)
-                print(f"drone{drone} {found.camera:6} {number * scenario.drone.step_s:4.0f} s " + _text(off, found))
-                if number == len(one.outputs):
-                    last.append(off)
+                found_off = _off(found, rig.cameras[found.camera], configured.cameras[found.camera], args.late)
+                if number == len(said) - 1:
+                    last.append(found_off)
+                if number % SHOWN_EVERY == SHOWN_EVERY - 1 or number == len(said) - 1:
+                    at = f"drone{drone} {found.camera:6} {output.time_s - began_s:4.0f} s "
+                    print(at + _text(found_off, found))
         for reason, since_s in _warnings(one.outputs).items():
             print(f"drone{drone} {since_s:6.1f} s: {reason}")
     turn_deg, time_ms, focal = (np.array(part) for part in zip(*last, strict=True))

@@ -13,6 +13,7 @@ import numpy as np
 from flockd.core.config.drone import DroneConfig
 from flockd.core.messages import (
     NO_STATUS,
+    CameraDeviation,
     Detection,
     EgoMotion,
     FloatArray,
@@ -41,6 +42,8 @@ from flockd.flight.pilot.motions import background_pairs, neighbour_motions
 from flockd.flight.pilot.trim import VelocityTrim
 from flockd.flight.tracking import Blind, Measurement, Prediction, Tracker
 
+RIG_EVERY_S = 5.0
+"""An output in so many seconds says what is known of the rig: it changes slowly, and is long."""
 _ROTATION_TOLERANCE = 1e-3
 """How far an attitude's R R^T may be from the identity: beyond it is no attitude, and not only rounded."""
 _ROUNDING = 1e-6
@@ -97,6 +100,7 @@ class FlockPilot:
         self._calibration = RigCalibration(self._rig)
         self._seen: Seen | None = None
         """What the last step's pairs began at."""
+        self._rig_said_s: float | None = None
         self._tracker = Tracker(config.tracking)
         self._law = FlockingLaw(config.flocking)
         self._map = LocalMap(config.obstacles) if config.obstacles.enabled else None
@@ -168,7 +172,7 @@ class FlockPilot:
         laps.end("flocking")
         self._last_time_s = observation.time_s
         of_height = () if why_no_ground is None else (why_no_ground,)
-        deviations = self._calibration.deviations()
+        deviations = self._deviations(observation.time_s)
         of_rig = [Reason(ReasonKind.RIG, text) for one in deviations for text in rig_faults(one)]
         reasons = (*of_height, *observation.reasons, *why_no_ego, *why_no_motion, *why_no_measurement, *of_rig)
         return PilotOutput(
@@ -267,6 +271,15 @@ class FlockPilot:
             return True
         self._refused_in_a_row += 1
         return False
+
+    def _deviations(self, time_s: float) -> tuple[CameraDeviation, ...]:
+        """What is known of the rig, once in `RIG_EVERY_S`."""
+        if self._rig_said_s is None:
+            self._rig_said_s = time_s
+        if abs(time_s - self._rig_said_s) < RIG_EVERY_S:
+            return ()
+        self._rig_said_s = time_s
+        return self._calibration.deviations()
 
     def _neighbour_motions(
         self, observation: Observation, ego: EgoMotion | None

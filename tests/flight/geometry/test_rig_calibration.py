@@ -156,7 +156,7 @@ def test_two_degrees_thirty_milliseconds_and_two_percent_are_known_after_a_minut
         # and it says how well: neither far better than it is, nor worse than would be of use
         off = vector_from_rotation(rotation_from_vector(found.turn) @ rotation_from_vector(wrong.turns[found.camera]).T)
         assert (np.abs(off) < 4.0 * sigma[:3]).all()
-        assert (sigma < [math.radians(0.2)] * 3 + [0.003, 0.003]).all()
+        assert (sigma < [math.radians(0.2)] * 3 + [0.003, 0.005]).all()
         assert rig_faults(found) == (
             f"camera {found.camera}: it is not turned as configured",
             f"camera {found.camera}: its time stamps are not as configured",
