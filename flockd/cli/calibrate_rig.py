@@ -34,10 +34,12 @@ def add(commands: Commands) -> None:
         "flockd calibrate rig --config my_drone.yaml",
         "flockd calibrate rig pictures/ --config my_drone.yaml --reference front",
         "flockd calibrate rig drone1.mcap --by motion",
+        "flockd calibrate rig --from-flight drone1.mcap",
     )
     description = (
         "Measure the cameras' mountings: relative poses, from a board that two of them see at once; or "
-        "orientation in the body and time offset, from the autopilot's attitude in a recording."
+        "orientation in the body and time offset, from the autopilot's attitude in a recording; or what a flight "
+        "itself found of orientation, time offset and focal length."
     )
     parser = commands("rig", description, examples)
     help_of_source = (
@@ -48,6 +50,9 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--reference", metavar="NAME", help="the camera whose mounting --config gives (default: the first)"
     )
+    parser.add_argument(
+        "--from-flight", metavar="RECORDING", type=Path, help="take over what this flight found of its own rig"
+    )
     help_of_offset = f"largest time offset between cameras and autopilot ({MAX_OFFSET_S:g})"
     parser.add_argument("--max-offset", metavar="S", type=positive_number, default=MAX_OFFSET_S, help=help_of_offset)
     add_shared(parser, "the drone, with its cameras' intrinsics; a recording has its own")
@@ -57,6 +62,8 @@ def add(commands: Commands) -> None:
 def _rig(args: argparse.Namespace) -> int:
     out = args.out or Path("rig.yaml")
     refuse_overwriting(args, out)
+    if args.from_flight is not None:
+        return _from_flight(args, out)
     return _by_motion(args, out) if args.by == "motion" else _by_board(args, out)
 
 
@@ -86,6 +93,26 @@ def _by_motion(args: argparse.Namespace, out: Path) -> int:
     with progress("tracking features", "steps") as on_image:
         alignments = session.align_cameras(args.max_offset, on_image)
     return _report(args, session.by_motion(alignments, out))
+
+
+def _from_flight(args: argparse.Namespace, out: Path) -> int:
+    from flockd.core.errors import ConfigError
+    from flockd.ground.calibration.from_flight import corrected_rig
+
+    if args.source is not None:
+        raise UsageError("--from-flight names the recording; drop SOURCE")
+    recording, config = opened(args.from_flight), loaded(args.config)
+    if config is not None and config.rig != recording.config.rig:
+        message = f"is not the rig that {args.from_flight} was flown with, which is what it found the errors of"
+        raise ConfigError.at(str(args.config), f"{message}; drop --config", "rig")
+    result = corrected_rig(recording, str(args.from_flight), out)
+    if args.json:
+        say_json(result)
+        return ExitCode.DONE
+    for name, one in result["cameras"].items():
+        taken = " and ".join(one["taken"]) or "nothing"
+        say(f"{name}: {one['found']}; taken over: {taken}")
+    return _written(result)
 
 
 def _session(args: argparse.Namespace) -> RigSession:
@@ -132,6 +159,10 @@ def _report(args: argparse.Namespace, result: Mapping[str, Any]) -> int:
             say(f"  time offset {1000 * one['time_offset_s']:.1f} +- {1000 * one['sigma_s']:.1f} ms")
     for board, value in result.get("dropped", {}).items():
         say(f"dropped: {board}: its residual is {value:.2f} px, it does not fit the others")
+    return _written(result)
+
+
+def _written(result: Mapping[str, Any]) -> int:
     if result["time_offset_s"] is not None:
         say(f"time offset of the rig: {1000 * result['time_offset_s']:.1f} ms")
     for note in result["notes"]:

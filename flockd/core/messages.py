@@ -32,6 +32,7 @@ class Shape:
 Vector2 = Annotated[FloatArray, Shape((2,))]
 Vector3 = Annotated[FloatArray, Shape((3,))]
 Matrix3 = Annotated[FloatArray, Shape((3, 3))]
+Matrix5 = Annotated[FloatArray, Shape((5, 5))]
 
 
 class ReasonKind(StrEnum):
@@ -52,6 +53,8 @@ class ReasonKind(StrEnum):
     EGO_MOTION = "ego_motion"
     NEIGHBOUR = "neighbour"
     """A neighbour, or its motion."""
+    RIG = "rig"
+    """Nothing, but that a camera is not as its configuration says."""
     RECORDED = "recorded"
     """Unknown: recordings keep the text alone."""
 
@@ -127,6 +130,8 @@ class VehicleState:
     """(2,) latitude and longitude of home, where the autopilot knows it."""
     ground_range: RangeReading | None = None
     """The newest of the range finder that faces down, however old or bad; None: none was heard."""
+    turn_rate: Vector3 | None = None
+    """(3,) rad/s about the body axes, where it is known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -357,6 +362,22 @@ class Setpoint:
 
 
 @dataclass(frozen=True, eq=False)
+class CameraDeviation:
+    """How a camera differs from its configuration, estimated in flight; nothing is corrected by it."""
+
+    camera: str
+    turn: Vector3
+    """(3,) rotation vector in body axes, rad, by which it is turned from where the configuration has it:
+    ``R_body_camera = exp(turn) R_configured``."""
+    time_offset_s: float
+    """To be added to its time stamps, beside the rig's configured offset."""
+    focal_scale: float
+    """Its focal lengths over the configured ones."""
+    covariance: Matrix5
+    """(5, 5) of turn, time offset, and the focal scale's logarithm."""
+
+
+@dataclass(frozen=True, eq=False)
 class PilotOutput:
     """Everything one step of the pilot found and decided."""
 
@@ -385,3 +406,5 @@ class PilotOutput:
     """From the range finder, or the barometer in its place; None: no range finder is wanted, or there is no scale."""
     obstacles: ObstacleRanges | None = None
     """The local map; None where obstacles are not looked for."""
+    rig: tuple[CameraDeviation, ...] = ()
+    """How each camera differs from its configuration, as far as this flight has shown it, once in some seconds."""

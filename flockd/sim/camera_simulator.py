@@ -20,6 +20,7 @@ from flockd.sim.lens_views import lens_view
 from flockd.sim.pose_trail import FlockPose, PoseTrail
 from flockd.sim.real_cameras import CameraMotion, Shot, real_cameras
 from flockd.sim.renderer import Renderer, View
+from flockd.sim.true_rigs import true_rigs
 from flockd.sim.truth_perception import RenderTruth
 from flockd.sim.vehicles import REFERENCE_DEG
 from flockd.sim.world import World
@@ -43,7 +44,7 @@ class CameraSimulator:
 
     def __init__(self, scenario: ScenarioConfig, threads: int | None = None) -> None:
         """Draws a drone's images on ``threads``; 0: on the calling one; None: as many as there are processors."""
-        self.rig = build_rig(scenario.drone.rig)
+        self.rig, self._rigs = build_rig(scenario.drone.rig), true_rigs(scenario)
         obstacles = obstacles_of(scenario)
         field, path = scenario.world.obstacles, planned_path(scenario)
         clearance_m = scenario.world.clearance_m + _spread(scenario)
@@ -89,7 +90,7 @@ class CameraSimulator:
             trail = self._captured
             trail.add(FlockPose(time_s, vehicles.position, vehicles.R_ned_body))
         others = [i for i in range(self._count) if i != drone]
-        cameras, flock = self.rig.cameras, dict.fromkeys(self.rig.cameras, vehicles)
+        cameras, flock = self._rigs[drone].cameras, dict.fromkeys(self.rig.cameras, vehicles)
         shots = {name: Shot(time_s, time_s, comes=True) for name in cameras}
         if self._real is not None:
             shots = {name: self._real[drone, name].clock.shot(time_s) for name in cameras}
@@ -126,12 +127,22 @@ class CameraSimulator:
             if shots[name].comes:
                 frames[name] = Frame(name, image, shots[name].stamp_s, step)
         R_ned_body, position = vehicles.R_ned_body[drone], vehicles.position[drone]
-        truth = RenderTruth(views, turns, places, R_ned_body, position, vehicles.R_ned_body, vehicles.position, others)
+        truth = RenderTruth(
+            self._rigs[drone],
+            views,
+            turns,
+            places,
+            R_ned_body,
+            position,
+            vehicles.R_ned_body,
+            vehicles.position,
+            others,
+        )
         return FrameSet(time_s, frames), truth
 
     def _turn(self, drone: int, name: str, shot: Shot, flock: FlockPoses) -> FloatArray:
         """(3, 3) from a camera's axes to NED, shaken."""
-        R_ned_camera: FloatArray = flock.R_ned_body[drone] @ self.rig.cameras[name].T_body_camera.rotation
+        R_ned_camera: FloatArray = flock.R_ned_body[drone] @ self._rigs[drone].cameras[name].T_body_camera.rotation
         if self._real is None:
             return R_ned_camera
         angles = self._real[drone, name].shaking.at(np.array([shot.shown_s]))[0]
@@ -143,7 +154,7 @@ class CameraSimulator:
     ) -> CameraMotion:
         """How a camera moves around the time of its image."""
         assert self._real is not None
-        flock, mounted = trail.motion_at(shown_s), self.rig.cameras[name].T_body_camera
+        flock, mounted = trail.motion_at(shown_s), self._rigs[drone].cameras[name].T_body_camera
         R_ned_body = trail.at(shown_s).R_ned_body[drone]
         lever = R_ned_body @ np.cross(flock.turn[drone], mounted.translation)
         return CameraMotion(

@@ -13,7 +13,6 @@ from typing import Self
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FrameSet, MissionOrder, VehicleState
 from flockd.core.side_process import SideProcess
-from flockd.flight.geometry import build_rig
 from flockd.sim.pilots import Pilots, Stepped
 from flockd.sim.truth_perception import RenderTruth, TruthPerception
 
@@ -35,7 +34,7 @@ class PilotPool:
         count = min(len(self.drones), (os.cpu_count() or 1) if processes is None else max(processes, 1))
         self._shares = [self.drones[first::count] for first in range(count)]
         self._scenario = scenario
-        self._swap = partial(TruthPerception, swap=swap, rig=build_rig(scenario.drone.rig)) if swap else None
+        self._swap = partial(TruthPerception, swap=swap) if swap else None
         self._processes: list[SideProcess] = []
         self._here: Pilots | None = None
         self._stack = ExitStack()

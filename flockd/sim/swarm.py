@@ -210,11 +210,14 @@ class _VisionPilots:
         steps = {}
         render_ms = {}
         orders = orders_of(self._shown, self._drones)
+        turn_rates = vehicles.trail.motion_at(time_s).turn
         for i in self._drones:
             begin = time.perf_counter()
             frames, seen = self._cameras.capture(i, step, time_s, vehicles, vehicles.trail)
             render_ms[i] = 1e3 * (time.perf_counter() - begin)
-            state = self._autopilots[i].read(time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i])
+            state = self._autopilots[i].read(
+                time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i], turn_rates[i]
+            )
             if self._attitudes:
                 state = self._attitudes[i].heard(state, vehicles.trail)
             with_pictures = pictured and i in self._drones[:_KEY_FRAME_DRONES]

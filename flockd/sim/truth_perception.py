@@ -22,6 +22,8 @@ _SIZE_M = 0.6
 class RenderTruth:
     """The truth behind one rendered frame set of one drone: ids, depth and poses."""
 
+    rig: Rig
+    """As it truly is."""
     views: Mapping[str, View]
     R_ned_cameras: Mapping[str, FloatArray]
     positions: Mapping[str, FloatArray]
@@ -39,10 +41,10 @@ class TruthPerception:
     Call `show` with the truth behind the next frame set before the pilot's step.
     """
 
-    def __init__(self, learned: Networks, swap: frozenset[str], rig: Rig) -> None:
+    def __init__(self, learned: Networks, swap: frozenset[str]) -> None:
         self.second_stage = learned.second_stage
         self.map_stride = learned.map_stride
-        self._learned, self._swap, self._rig = learned, swap, rig
+        self._learned, self._swap = learned, swap
         self._now: RenderTruth | None = None
         self._before: RenderTruth | None = None
 
@@ -56,7 +58,7 @@ class TruthPerception:
             return self._learned.flow(first, second, labels)
         before, now, camera = _known(self._before), _known(self._now), second.camera
         flow, _ = true_flow(
-            before.views[camera], now.views[camera], _matrix(self._rig, camera),
+            before.views[camera], now.views[camera], now.rig.cameras[camera].camera.matrix,
             R_ned_camera=(before.R_ned_cameras[camera], now.R_ned_cameras[camera]),
             position_ned=(before.positions[camera], now.positions[camera]),
             drone_rotations=(before.drone_rotations, now.drone_rotations),
@@ -120,7 +122,3 @@ def _known(truth: RenderTruth | None) -> RenderTruth:
     if truth is None:
         raise RuntimeError("the truth of a frame set was needed before `show` was called with it")
     return truth
-
-
-def _matrix(rig: Rig, camera: str) -> FloatArray:
-    return rig.cameras[camera].camera.matrix

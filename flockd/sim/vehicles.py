@@ -132,7 +132,14 @@ class SimulatedAutopilot:
         ranger = config.range_finder
         self._range_finder = None if ranger is None else FakeRangeFinder(ranger, ground, (seed, drone, 2))
 
-    def read(self, time_s: float, position: FloatArray, velocity: FloatArray, R_ned_body: FloatArray) -> VehicleState:
+    def read(
+        self,
+        time_s: float,
+        position: FloatArray,
+        velocity: FloatArray,
+        R_ned_body: FloatArray,
+        turn_rate: FloatArray | None = None,
+    ) -> VehicleState:
         """What it says at `time_s`, not before the last, of a drone at `position` (3,) m NED, ground at z = 0.
 
         Home is the world's origin. Yaw errs as roll and pitch do.
@@ -163,6 +170,7 @@ class SimulatedAutopilot:
             position=position[:2] + self._position_error,
             home_deg=np.array(REFERENCE_DEG),
             ground_range=ground_range,
+            turn_rate=turn_rate,
         )
 
     def _drift(self, error: FloatArray, sigma: float, time_constant_s: float, elapsed_s: float) -> FloatArray:

@@ -534,6 +534,16 @@ CATALOGUE = (
         within_s=8.0,
     ),
     Fault(
+        59, "rig-off", "mountings, focal lengths or time stamps are not as configured",
+        "warned with the estimated correction, three standard deviations off; never corrected unasked",
+        (
+            f"{_HERE}rig.py::test_a_rig_is_not_as_configured",
+            f"{_HERE}rig.py::test_a_rig_as_configured_is_flown_without_a_word",
+            "tests/flight/geometry/test_rig_calibration.py",
+        ),
+        within_s=20.0,
+    ),
+    Fault(
         60, "step-exception", "an exception that nobody expected in the pilot's step",
         "caught at the step's border; one step lost with its reason; three in a row: Hold",
         (

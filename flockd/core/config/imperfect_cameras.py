@@ -9,6 +9,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 
 from flockd.core.choices import CameraPreset
 from flockd.core.config.base import NonNegative, Positive, Section, Share
+from flockd.core.config.rig_errors import RigErrorsConfig
 
 MAX_LATE_S = 0.3
 """Most that an image or an attitude may be late: what was longer ago is not kept."""
@@ -141,6 +142,7 @@ class CamerasConfig(Section):
     compression: CompressionConfig = CompressionConfig()
     timing: CameraTimingConfig = CameraTimingConfig()
     attitude: LateAttitudeConfig = LateAttitudeConfig()
+    rig: RigErrorsConfig = RigErrorsConfig()
 
     @model_validator(mode="before")
     @classmethod

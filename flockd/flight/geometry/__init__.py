@@ -12,6 +12,7 @@ from flockd.flight.geometry.neighbour_motion import estimate_neighbour_motion
 from flockd.flight.geometry.pairs import BACKGROUND_LABEL, PointPairs, grid_pixels, label_pixels, lift_matches
 from flockd.flight.geometry.polar import log_polar, log_polar_covariance, log_polar_residual
 from flockd.flight.geometry.rig import Rig, RigCamera, build_rig
+from flockd.flight.geometry.rig_calibration import RigCalibration, Seen, described, differs, rig_faults
 from flockd.flight.geometry.rigid_fit import fit_rigid
 from flockd.flight.geometry.robust.ransac import RansacResult, ransac_rigid
 from flockd.flight.geometry.rotations import (
@@ -37,14 +38,18 @@ __all__ = [
     "RangeMap",
     "RansacResult",
     "Rig",
+    "RigCalibration",
     "RigCamera",
     "RigidTransform",
+    "Seen",
     "VirtualCrop",
     "WideAngleCamera",
     "ZMap",
     "blind_pixels",
     "build_rig",
     "closest_approach",
+    "described",
+    "differs",
     "estimate_ego_motion",
     "estimate_neighbour_motion",
     "euler_from_rotation",
@@ -63,6 +68,7 @@ __all__ = [
     "range_map",
     "ransac_rigid",
     "refine_ego_motion",
+    "rig_faults",
     "rotation_angle_deg",
     "rotation_from_euler",
     "rotation_from_quaternion",

@@ -12,19 +12,12 @@ from flockd.flight.geometry import (
     PointPairs,
     Rig,
     RigCamera,
-    estimate_ego_motion,
     estimate_neighbour_motion,
     grid_pixels,
     label_pixels,
     lift_matches,
 )
 from flockd.flight.perception import CameraObservation, Observation
-
-
-def ego_motion(rig: Rig, observation: Observation, parameters: GeometryParameters) -> EgoMotion:
-    """The drone's own motion from the background (Eq. 7-21). ``ValueError`` says why there is none."""
-    pairs = background_pairs(rig, observation, parameters)
-    return estimate_ego_motion(pairs, rig, observation.interval_s, parameters)
 
 
 def background_pairs(rig: Rig, observation: Observation, parameters: GeometryParameters) -> PointPairs:

@@ -13,6 +13,7 @@ import numpy as np
 from flockd.core.config.drone import DroneConfig
 from flockd.core.messages import (
     NO_STATUS,
+    CameraDeviation,
     Detection,
     EgoMotion,
     FloatArray,
@@ -30,17 +31,19 @@ from flockd.core.messages import (
 )
 from flockd.flight.flocking import FlockingLaw, level_offsets
 from flockd.flight.flocking.passing import clear_of
-from flockd.flight.geometry import build_rig
+from flockd.flight.geometry import RigCalibration, Seen, build_rig, estimate_ego_motion, rig_faults
 from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
 from flockd.flight.obstacles import Avoidance, LocalMap, ObstacleRanging
 from flockd.flight.perception import Networks, Observation, Perception, load_networks
 from flockd.flight.perception.detection.detector import DetectionTrace
 from flockd.flight.pilot.ground import GroundFilter, scaled_by_ground
-from flockd.flight.pilot.motions import ego_motion, neighbour_motions
+from flockd.flight.pilot.motions import background_pairs, neighbour_motions
 from flockd.flight.pilot.trim import VelocityTrim
 from flockd.flight.tracking import Blind, Measurement, Prediction, Tracker
 
+RIG_EVERY_S = 5.0
+"""An output in so many seconds says what is known of the rig: it changes slowly, and is long."""
 _ROTATION_TOLERANCE = 1e-3
 """How far an attitude's R R^T may be from the identity: beyond it is no attitude, and not only rounded."""
 _ROUNDING = 1e-6
@@ -94,6 +97,10 @@ class FlockPilot:
         )
         by_height = config.perception.scale == "height"
         self._ground = GroundFilter(config.perception.height, config.perception.range_finder) if by_height else None
+        self._calibration = RigCalibration(self._rig)
+        self._seen: Seen | None = None
+        """What the last step's pairs began at."""
+        self._rig_said_s: float | None = None
         self._tracker = Tracker(config.tracking)
         self._law = FlockingLaw(config.flocking)
         self._map = LocalMap(config.obstacles) if config.obstacles.enabled else None
@@ -148,7 +155,7 @@ class FlockPilot:
         trace.observation = observation
         if self._config.perception.height == "barometer":
             ground = None  # the height says as much
-        ego, why_no_ego = self._ego_motion(observation)
+        ego, why_no_ego = self._ego_motion(observation, frames)
         ego = self._scaled(observation, ego, ground)
         laps.end("ego_motion")
         motions, why_no_motion = self._neighbour_motions(observation, ego)
@@ -165,7 +172,9 @@ class FlockPilot:
         laps.end("flocking")
         self._last_time_s = observation.time_s
         of_height = () if why_no_ground is None else (why_no_ground,)
-        reasons = (*of_height, *observation.reasons, *why_no_ego, *why_no_motion, *why_no_measurement)
+        deviations = self._deviations(observation.time_s)
+        of_rig = [Reason(ReasonKind.RIG, text) for one in deviations for text in rig_faults(one)]
+        reasons = (*of_height, *observation.reasons, *why_no_ego, *why_no_motion, *why_no_measurement, *of_rig)
         return PilotOutput(
             time_s=observation.time_s,
             ego_motion=ego,
@@ -182,6 +191,7 @@ class FlockPilot:
             noisy_cameras=observation.noisy_cameras,
             ground=ground,
             obstacles=obstacles,
+            rig=deviations,
         )
 
     def _refused(self, frames: FrameSet, reason: Reason) -> PilotOutput:
@@ -207,12 +217,21 @@ class FlockPilot:
             return ()
         return self._tracker.predictions(time_s - self._last_time_s, self._velocity)
 
-    def _ego_motion(self, observation: Observation) -> tuple[EgoMotion | None, Sequence[Reason]]:
-        """The own motion in C (the body frame at the previous observation), or why there is none."""
+    def _ego_motion(self, observation: Observation, frames: FrameSet) -> tuple[EgoMotion | None, Sequence[Reason]]:
+        """The own motion in C (the body frame at the previous observation), or why there is none (Eq. 7-21)."""
+        times_s = {name: frame.time_s for name, frame in frames.frames.items()}
+        before, self._seen = self._seen, Seen(observation.vehicle, frames.time_s, times_s)
         if observation.previous is None:
             return None, ()
+        parameters = self._config.geometry
         try:
-            ego = ego_motion(self._rig, observation, self._config.geometry)
+            pairs = background_pairs(self._rig, observation, parameters)
+        except ValueError as error:
+            return None, (Reason(ReasonKind.EGO_MOTION, f"ego-motion: {error}"),)
+        if before is not None and before.frames_s == observation.previous.time_s:
+            self._calibration.update(before, self._seen, pairs)
+        try:
+            ego = estimate_ego_motion(pairs, self._rig, observation.interval_s, parameters)
         except ValueError as error:
             return None, (Reason(ReasonKind.EGO_MOTION, f"ego-motion: {error}"),)
         if not self._is_plausible(_displacement(observation, ego), ego.interval_s):
@@ -252,6 +271,15 @@ class FlockPilot:
             return True
         self._refused_in_a_row += 1
         return False
+
+    def _deviations(self, time_s: float) -> tuple[CameraDeviation, ...]:
+        """What is known of the rig, once in `RIG_EVERY_S`."""
+        if self._rig_said_s is None:
+            self._rig_said_s = time_s
+        if abs(time_s - self._rig_said_s) < RIG_EVERY_S:
+            return ()
+        self._rig_said_s = time_s
+        return self._calibration.deviations()
 
     def _neighbour_motions(
         self, observation: Observation, ego: EgoMotion | None
@@ -374,6 +402,8 @@ def _why_refused(frames: FrameSet, vehicle: VehicleState) -> Reason | None:
         return Reason(ReasonKind.INPUT, "input refused: the height is not finite")
     if velocity is not None and not np.isfinite(velocity).all():
         return Reason(ReasonKind.INPUT, "input refused: the autopilot's velocity is not finite")
+    if vehicle.turn_rate is not None and not np.isfinite(vehicle.turn_rate).all():
+        return Reason(ReasonKind.INPUT, "input refused: the rate of turn is not finite")
     reading = vehicle.ground_range
     if reading is not None and not math.isfinite(reading.time_s):
         return Reason(ReasonKind.INPUT, "input refused: the range finder's time is not finite")

@@ -113,7 +113,7 @@ class RigSession:
             "show neighbouring cameras a board",
             *_notes_on_time(alignments, offset_s),
         ]
-        _write_rig(out, cameras, round(offset_s, 4))
+        write_rig(out, cameras, round(offset_s, 4))
         return {
             "by": "motion",
             "reference": None,
@@ -173,7 +173,7 @@ class RigSession:
             f"{fit.reference} sits where {self.where} says, and the others beside it: a board cannot determine where "
             "in the body that is, but `--by motion` determines how it is turned"
         ]
-        _write_rig(out, cameras, self.config.rig.time_offset_s)
+        write_rig(out, cameras, self.config.rig.time_offset_s)
         return {
             "by": "board",
             "reference": fit.reference,
@@ -204,7 +204,8 @@ def _notes_on_time(alignments: Mapping[str, Alignment], offset_s: float) -> list
     return [f"the time of camera {worst!r} is {1000 * apart_s:.0f} ms off the others'; the offset is their mean"]
 
 
-def _write_rig(out: Path, cameras: Sequence[CameraConfig], time_offset_s: float) -> None:
+def write_rig(out: Path, cameras: Sequence[CameraConfig], time_offset_s: float) -> None:
+    """A file with a rig section, in place of any that was there."""
     comment = (
         "The cameras of a drone, written by `flockd calibrate rig`. Put this in place of `rig` in your drone's file,",
         "then run `flockd config check` on that.",

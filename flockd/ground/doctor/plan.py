@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 CHECKS = (
     "limits",
+    "rig",
     "instance",
     "memory",
     "disk",
@@ -55,6 +56,7 @@ def plan(
 
     checks: dict[str, tuple[str, tuple[object, ...], float]] = {
         "limits": ("limit_checks.check_limits", (config,), 5.0),
+        "rig": ("rig_checks.check_rig", (config, recordings), 60.0),
         "instance": ("service_checks.check_instance", (config.name, environment), 5.0),
         "memory": ("computer_checks.check_memory", (config,), 5.0),
         "disk": ("computer_checks.check_disk", (config, recordings), 20.0),

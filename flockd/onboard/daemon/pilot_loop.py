@@ -13,6 +13,7 @@ import numpy as np
 
 from flockd.core.config import DroneConfig
 from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, Reason, ReasonKind, VehicleState
+from flockd.flight.geometry import described
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
 from flockd.onboard.daemon.worker import BusyError, LateError, Worker
@@ -71,7 +72,7 @@ class PilotLoop:
         self._failure: str | None = None
         self._unexpected = 0
         """Errors in a row that nobody expects."""
-        self._height_reports, self._lens_reports = HeightReports(), LensReports()
+        self._height_reports, self._lens_reports, self._rig_reports = HeightReports(), LensReports(), RigReports()
         self._took_s: deque[float] = deque(maxlen=STEPS_REMEMBERED)
         self.frames: FrameSet | None = None
         """The newest; None before the first."""
@@ -93,6 +94,7 @@ class PilotLoop:
     def begin_flight(self, number: int) -> None:
         """Uses a new pilot from the next step on: its time begins there, so that a recording can be replayed."""
         self._flight, self._pilot, self.order = number, None, None
+        self._rig_reports = RigReports()
 
     def load(self) -> float:
         """How long the steps take, 95th percentile of the last ones, over how long they may."""
@@ -152,7 +154,12 @@ class PilotLoop:
         self.newest = StepResult(taken_s, output, flight, number)
         self.stepped = frames, output
         self._count(self.newest)
-        for report in (self._height_reports.update(output.reasons), *self._lens_reports.update(output.reasons)):
+        reports = (
+            self._height_reports.update(output.reasons),
+            *self._lens_reports.update(output.reasons),
+            *self._rig_reports.update(output),
+        )
+        for report in reports:
             if report is not None:
                 self._log_event(report)
         self._on_step(frames, vehicle, output, order)
@@ -209,6 +216,24 @@ class LensReports:
         begun = [fault for fault in self._faults if fault not in before]
         return begun + [
             f"{fault.partition(':')[0]}: its lens is clear again" for fault in before if fault not in self._faults
+        ]
+
+
+class RigReports:
+    """Reports, once a flight, what of a camera is not as configured, and by how much."""
+
+    def __init__(self) -> None:
+        self._said: set[str] = set()
+
+    def update(self, output: PilotOutput) -> list[str]:
+        """The sentences that a step's output is worth."""
+        new = [one.text for one in output.reasons if one.kind is ReasonKind.RIG and one.text not in self._said]
+        self._said.update(new)
+        by_camera = {f"camera {one.camera}": described(one) for one in output.rig}
+        return [
+            f"{text}: by what it saw, {by_camera[text.partition(':')[0]]}; it is flown on as configured, and "
+            "`flockd calibrate rig --from-flight` corrects it"
+            for text in new
         ]
 
 

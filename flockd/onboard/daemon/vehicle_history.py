@@ -65,6 +65,7 @@ def _between(before: VehicleState, after: VehicleState, time_s: float) -> Vehicl
         position=_between_vectors(before.position, after.position, share),
         home_deg=after.home_deg,
         ground_range=_nearest_range(before.ground_range, after.ground_range, time_s),
+        turn_rate=turn / (after.time_s - before.time_s),
     )
 
 

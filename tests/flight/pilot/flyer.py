@@ -11,7 +11,7 @@ from flockd.core.choices import ROLES
 from flockd.core.config import ScenarioConfig, load_scenario
 from flockd.core.data import data_path
 from flockd.core.messages import Float32Array, Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
-from flockd.flight.geometry import Rig, RigCamera
+from flockd.flight.geometry import RigCamera
 from flockd.flight.perception import Crop, Perception, RangeEstimate, SceneMaps
 from flockd.flight.pilot import FlockPilot
 from flockd.sim.camera_simulator import CameraSimulator
@@ -52,8 +52,8 @@ def scenario_with(*places: tuple[float, float, float]) -> ScenarioConfig:
 class SpoilableTruth(TruthPerception):
     """The truth, where a test puts nothing else in the place of a role."""
 
-    def __init__(self, rig: Rig) -> None:
-        super().__init__(NoNetworks(), frozenset(ROLES), rig)
+    def __init__(self) -> None:
+        super().__init__(NoNetworks(), frozenset(ROLES))
         self.instead: dict[str, Callable[..., Any]] = {}
         """By role (``flow``, ``scene``, ``ranges``)."""
 
@@ -77,7 +77,7 @@ class Flyer:
     def __init__(self, scenario: ScenarioConfig) -> None:
         self.scenario = scenario
         self.cameras = CameraSimulator(scenario)
-        self.truth = SpoilableTruth(self.cameras.rig)
+        self.truth = SpoilableTruth()
         self.pilot = FlockPilot(scenario.drone, self.truth)
         self.vehicles = Vehicles(scenario.vehicles, scenario.vehicle)
         self.time_s = 100.0

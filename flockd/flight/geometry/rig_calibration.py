@@ -1,0 +1,313 @@
+"""A rig calibrated in flight: how each camera is turned, when it takes its images, its focal length; with covariance.
+
+An error-state Kalman filter. It compares how each camera moved between two images, by what it alone saw
+(`camera_motion`), with how the autopilot says that the body turned and went. The camera's turn is the body's seen from
+another side (hand and eye: Tsai and Lenz 1989), which fixes the mounting about what the drone did not turn about; so
+does the direction in which it went, as far as the autopilot's velocity is right. Images that are late turn late: their
+time follows from rates of turn (Li and Mourikis, "Online temporal calibration for camera-IMU systems", IJRR 2014;
+Qin and Shen, IROS 2018), and the focal length from how large turns appear. See also Kelly and Sukhatme,
+"Visual-inertial sensor fusion: localization, mapping and sensor-to-sensor self-calibration", IJRR 2011. What a flight
+does not show stays as uncertain as it was.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from flockd.core.messages import CameraDeviation, FloatArray, VehicleState
+from flockd.flight.geometry.camera_motion import CameraMotion, camera_motion
+from flockd.flight.geometry.pairs import PointPairs
+from flockd.flight.geometry.rig import Rig, RigCamera
+from flockd.flight.geometry.rotations import rotation_from_vector, vector_from_rotation
+from flockd.flight.geometry.transform import RigidTransform
+
+PRIOR_TURN_RAD, PRIOR_OFFSET_S, PRIOR_FOCAL = math.radians(4.0), 0.06, 0.04
+"""Standard deviations before anything was seen: each axis of a mounting, a time, a focal length's logarithm."""
+_WANDER_TURN_RAD, _WANDER_OFFSET_S, _WANDER_FOCAL = math.radians(0.05), 5e-4, 5e-4
+"""By how much they may change in a minute: mountings give way, and a filter that is certain learns no more."""
+_WANDER_TIME_S = 60.0
+_TURN_SIGMA_RAD = math.radians(0.05)
+"""Of the autopilot's turn between two images, each axis."""
+_VELOCITY_SIGMA_M_S, _VELOCITY_TIME_S = 0.2, 10.0
+"""Error of the autopilot's velocity, each axis, which lasts (PX4's estimate: 0.15 m/s for seconds at a time)."""
+_VELOCITY_NOISE_M_S = 0.1
+"""Beside it, what differs between two images: how the drone went between them is not known."""
+_UNKNOWN_M_S = 10.0
+"""The same where the autopilot says no velocity."""
+_MAX_INTERVAL_S = 2.0
+_ROUNDS = 3
+_FIT_GAIN = 0.1
+_MAX_MISFIT = 16.0
+"""A camera's motion whose normalised square is larger is not used: it followed something that moves."""
+WORTH_TURN_RAD, WORTH_OFFSET_S, WORTH_FOCAL = math.radians(0.5), 0.01, 0.01
+"""What is less is not worth a warning: half a degree puts a drone at 10 m by 0.09 m, and 1 % a range by 1 %."""
+_SURE, _SURE_OF_TURN = 9.0, 14.16
+"""Squares of three standard deviations of one number, and what as few of three numbers together exceed (99.73 %)."""
+_SIZE = 5
+_TURN, _OFFSET, _FOCAL = slice(0, 3), 3, 4
+_LASTING = np.diag(np.array([math.radians(0.1)] * 3 + [1.5e-3, 3e-3]) ** 2)
+"""Beside the filter's own covariance: a network's flow and a rate of turn err in one direction for whole flights. By
+sight in the simulator, `python -m tools.measure.rig_calibration --gusts 0.3`: 0.09 degrees an axis, 1.6 ms and 0.25 %,
+root mean squares of 8 cameras."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What the autopilot said at a frame set's time, and each camera's own time."""
+
+    vehicle: VehicleState
+    frames_s: float
+    """Time of the frame set, on the frames' clock."""
+    times_s: Mapping[str, float]
+    """Of each camera's image, on the same clock."""
+
+
+class Differs(NamedTuple):
+    """Which numbers of a camera differ from the configured ones by three standard deviations and more."""
+
+    turn: bool
+    time: bool
+    focal: bool
+
+
+def differs(deviation: CameraDeviation) -> Differs:
+    """As far as is known."""
+    turn, covariance = deviation.turn, deviation.covariance
+    return Differs(
+        turn=float(turn @ np.linalg.solve(covariance[:3, :3], turn)) > _SURE_OF_TURN,
+        time=deviation.time_offset_s**2 > _SURE * covariance[_OFFSET, _OFFSET],
+        focal=math.log(deviation.focal_scale) ** 2 > _SURE * covariance[_FOCAL, _FOCAL],
+    )
+
+
+def rig_faults(deviation: CameraDeviation) -> tuple[str, ...]:
+    """What of a camera differs, by more than is worth a warning, one sentence each; for people."""
+    sure, found = differs(deviation), []
+    if sure.turn and float(np.linalg.norm(deviation.turn)) > WORTH_TURN_RAD:
+        found.append("it is not turned as configured")
+    if sure.time and abs(deviation.time_offset_s) > WORTH_OFFSET_S:
+        found.append("its time stamps are not as configured")
+    if sure.focal and abs(math.log(deviation.focal_scale)) > WORTH_FOCAL:
+        found.append("its focal length is not as configured")
+    return tuple(f"camera {deviation.camera}: {text}" for text in found)
+
+
+def described(deviation: CameraDeviation) -> str:
+    """How a camera differs from its configuration, with standard deviations, for people."""
+    sigma = np.sqrt(np.diag(deviation.covariance))
+    turns = ", ".join(
+        f"{axis} {math.degrees(angle):+.2f} +- {math.degrees(of_angle):.2f}"
+        for axis, angle, of_angle in zip(("roll", "pitch", "yaw"), deviation.turn, sigma[_TURN], strict=True)
+    )
+    return (
+        f"turned by {turns} degrees, time {1e3 * deviation.time_offset_s:+.0f} +- {1e3 * sigma[_OFFSET]:.0f} ms, "
+        f"focal length {100 * (deviation.focal_scale - 1):+.1f} +- {100 * sigma[_FOCAL]:.1f} %"
+    )
+
+
+@dataclass
+class _Camera:
+    mounted: RigCamera
+    R_body_camera: FloatArray
+    offset_s: float = 0.0
+    log_focal: float = 0.0
+    misfit: float = 1.0
+    """How much larger its errors are than it says, squared."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Row:
+    """One camera's share of an update: ``information`` of ``by_state @ state + by_noise @ noise - measured``."""
+
+    place: int
+    by_state: FloatArray
+    """(6, 5)"""
+    by_velocity: FloatArray
+    """(6, 3)"""
+    by_noise: FloatArray
+    """(6, 6)"""
+    measured: FloatArray
+    """(6,) how the camera turned and went beside what is expected, body axes."""
+    information: FloatArray
+    """(6, 6)"""
+
+
+class RigCalibration:
+    """The filter of one rig."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._cameras = {
+            name: _Camera(mounted, mounted.T_body_camera.rotation) for name, mounted in rig.cameras.items()
+        }
+        sigmas = [PRIOR_TURN_RAD] * 3 + [PRIOR_OFFSET_S, PRIOR_FOCAL]
+        wander = [_WANDER_TURN_RAD] * 3 + [_WANDER_OFFSET_S, _WANDER_FOCAL]
+        count = len(self._cameras)
+        self._wander = np.array(wander * count + [0.0] * 3) ** 2 / _WANDER_TIME_S
+        self._covariance = np.diag(np.array(sigmas * count + [_VELOCITY_SIGMA_M_S] * 3) ** 2)
+        self._velocity_error = np.zeros(3)
+
+    def update(self, before: Seen, after: Seen, pairs: PointPairs) -> None:
+        """Takes what stood still between two frame sets, which are at most some seconds apart; else it is left out."""
+        interval_s = after.vehicle.time_s - before.vehicle.time_s
+        if not 0.0 < interval_s <= _MAX_INTERVAL_S:
+            return
+        self._wait(interval_s)
+        used = {}
+        for name, camera in self._cameras.items():
+            motion = self._motion(name, before, after, pairs)
+            if motion is not None and self._fits(self._row(name, motion, before, after, np.zeros(6)), camera):
+                used[name] = motion
+        if not used:
+            return
+        known, off = before.vehicle.velocity_ned is not None, np.zeros(6)
+        for _ in range(_ROUNDS):
+            rows = [self._row(name, motion, before, after, off) for name, motion in used.items()]
+            step, off, covariance = self._solved(rows, interval_s, known=known)
+            off[3:] += step[-3:] * interval_s
+        self._covariance = covariance
+        self._move(step)
+
+    def deviations(self) -> tuple[CameraDeviation, ...]:
+        """How each camera differs from its configuration, as far as is known."""
+        found = []
+        for place, (name, camera) in enumerate(self._cameras.items()):
+            mine = slice(place * _SIZE, (place + 1) * _SIZE)
+            found.append(
+                CameraDeviation(
+                    camera=name,
+                    turn=vector_from_rotation(camera.R_body_camera @ camera.mounted.T_body_camera.rotation.T),
+                    time_offset_s=camera.offset_s,
+                    focal_scale=math.exp(camera.log_focal),
+                    covariance=self._covariance[mine, mine] + _LASTING,
+                )
+            )
+        return tuple(found)
+
+    def _wait(self, interval_s: float) -> None:
+        """The state as uncertain as it becomes meanwhile."""
+        keep = math.exp(-interval_s / _VELOCITY_TIME_S)
+        kept = np.ones(len(self._covariance))
+        kept[-3:] = keep
+        self._covariance = self._covariance * np.outer(kept, kept) + np.diag(self._wander * interval_s)
+        self._covariance[-3:, -3:] += (1.0 - keep**2) * _VELOCITY_SIGMA_M_S**2 * np.eye(3)
+        self._velocity_error = keep * self._velocity_error
+
+    def _motion(self, name: str, before: Seen, after: Seen, pairs: PointPairs) -> CameraMotion | None:
+        camera = self._cameras[name]
+        if name not in before.times_s or name not in after.times_s:
+            return None
+        turn, went = _body_motion(before, after, name, camera.offset_s, None)
+        R = camera.R_body_camera
+        start = RigidTransform(R.T @ turn @ R, R.T @ went)
+        return camera_motion(camera.mounted, pairs, start, camera.log_focal)
+
+    def _row(self, name: str, motion: CameraMotion, before: Seen, after: Seen, off: FloatArray) -> _Row:
+        """Linear about what the body did by all that is known: ``off`` (6,) beside the autopilot's turn and way.
+
+        About the autopilot's alone, or the camera's alone, the noise of either would count as motion.
+        """
+        camera, place = self._cameras[name], list(self._cameras).index(name)
+        R, arm = camera.R_body_camera, camera.mounted.T_body_camera.translation
+        turn, went = _body_motion(before, after, name, camera.offset_s, self._velocity_error)
+        first, second = (_rate(one) for one in (before, after))
+        R_body_ned = _attitude(before, name, camera.offset_s).T
+        expected = went + (turn - np.eye(3)) @ arm
+        about, near = turn @ rotation_from_vector(off[:3]), expected + R_body_ned @ off[3:]
+        by_state, by_velocity, by_noise = np.zeros((6, _SIZE)), np.zeros((6, 3)), np.zeros((6, 6))
+        by_state[:3, _TURN] = np.eye(3) - about.T
+        by_state[:3, _OFFSET] = second - about.T @ first
+        by_state[3:, _TURN] = _cross(near)
+        by_state[3:, _OFFSET] = np.cross(near, first)
+        # Into body axes: the rotation from the right, and the translation, are turned by the mounting alike.
+        into = np.kron(np.eye(2), R)
+        by_state[:, _FOCAL] = -into @ motion.by_focal(RigidTransform(R.T @ about @ R, R.T @ near))
+        by_velocity[3:] = R_body_ned * (after.vehicle.time_s - before.vehicle.time_s)
+        by_noise[:3, :3], by_noise[3:, 3:] = np.eye(3), R_body_ned
+        measured = np.concatenate(
+            [
+                vector_from_rotation(turn.T @ R @ motion.motion.rotation @ R.T),
+                R @ motion.motion.translation - expected,
+            ]
+        )
+        information = into @ motion.information @ into.T / camera.misfit
+        return _Row(place, by_state, by_velocity, by_noise, measured, information)
+
+    def _fits(self, row: _Row, camera: _Camera) -> bool:
+        """Whether a camera's motion is one that may be; learns how large its errors are."""
+        mine = np.r_[row.place * _SIZE : (row.place + 1) * _SIZE, len(self._covariance) - 3 : len(self._covariance)]
+        H = np.concatenate([row.by_state, row.by_velocity], axis=1)
+        noise = np.diag([_TURN_SIGMA_RAD] * 3 + [_VELOCITY_NOISE_M_S] * 3) ** 2
+        spread = H @ self._covariance[np.ix_(mine, mine)] @ H.T + row.by_noise @ noise @ row.by_noise.T
+        spread += np.linalg.inv(row.information)
+        square = float(row.measured @ np.linalg.solve(spread, row.measured)) / len(row.measured)
+        camera.misfit = max(camera.misfit * min(max(square, 0.1), _MAX_MISFIT) ** _FIT_GAIN, 1.0)
+        return square < _MAX_MISFIT
+
+    def _solved(self, rows: list[_Row], interval_s: float, *, known: bool) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The state's step, what the autopilot's turn and way were off, and the covariance."""
+        size = len(self._covariance)
+        noise_m = (_VELOCITY_NOISE_M_S if known else _UNKNOWN_M_S) * interval_s
+        hessian = np.zeros((size + 6, size + 6))
+        hessian[:size, :size] = np.linalg.inv(self._covariance)
+        hessian[range(size, size + 6), range(size, size + 6)] = [_TURN_SIGMA_RAD**-2] * 3 + [noise_m**-2] * 3
+        gradient = np.zeros(size + 6)
+        for row in rows:
+            J = np.zeros((6, size + 6))
+            J[:, row.place * _SIZE : (row.place + 1) * _SIZE] = row.by_state
+            J[:, size - 3 : size], J[:, size:] = row.by_velocity, row.by_noise
+            hessian += J.T @ row.information @ J
+            gradient += J.T @ row.information @ row.measured
+        covariance = np.linalg.inv(hessian)
+        found = covariance @ gradient
+        covariance = covariance[:size, :size]
+        return found[:size], found[size:], (covariance + covariance.T) / 2.0
+
+    def _move(self, step: FloatArray) -> None:
+        for place, camera in enumerate(self._cameras.values()):
+            mine = step[place * _SIZE : (place + 1) * _SIZE]
+            camera.R_body_camera = rotation_from_vector(mine[_TURN]) @ camera.R_body_camera
+            camera.offset_s += float(mine[_OFFSET])
+            camera.log_focal += float(mine[_FOCAL])
+        self._velocity_error = self._velocity_error + step[-3:]
+
+
+def _rate(seen: Seen) -> FloatArray:
+    """(3,) rad/s, body axes; where it is not known the time cannot be told."""
+    rate = seen.vehicle.turn_rate
+    return np.zeros(3) if rate is None else rate
+
+
+def _attitude(seen: Seen, camera: str, offset_s: float) -> FloatArray:
+    """(3, 3) ``R_ned_body`` when the camera took its image."""
+    late_s = seen.times_s[camera] - seen.frames_s + offset_s
+    return seen.vehicle.R_ned_body @ rotation_from_vector(_rate(seen) * late_s)
+
+
+def _went(before: Seen, after: Seen) -> FloatArray:
+    """(3,) metres NED."""
+    velocities = [one.vehicle.velocity_ned for one in (before, after)]
+    if velocities[0] is None or velocities[1] is None:
+        return np.zeros(3)
+    return (after.vehicle.time_s - before.vehicle.time_s) * (velocities[0] + velocities[1]) / 2.0
+
+
+def _body_motion(
+    before: Seen, after: Seen, camera: str, offset_s: float, velocity_error: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """(3, 3) the body's turn between two images of a camera, and (3,) metres that it went, in its axes at the first."""
+    first, second = (_attitude(one, camera, offset_s) for one in (before, after))
+    went = _went(before, after)
+    if velocity_error is not None:
+        went = went + velocity_error * (after.vehicle.time_s - before.vehicle.time_s)
+    return first.T @ second, first.T @ went
+
+
+def _cross(vector: FloatArray) -> FloatArray:
+    """(3, 3) that takes y to ``vector x y``."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -1,0 +1,152 @@
+"""What a flight found of its rig, by its recording: as a rig to fly with, where it is known and differs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flockd.core.config.rig import CameraConfig, RigConfig
+from flockd.core.messages import CameraDeviation, PilotOutput
+from flockd.flight.geometry import RigidTransform, build_rig, described, differs, rotation_from_vector
+from flockd.ground.calibration.errors import CalibrationError
+from flockd.ground.calibration.fragment import extrinsics_of, measured_today
+from flockd.ground.calibration.rig_session import write_rig
+from flockd.onboard.recording.codec import from_json, parsed
+from flockd.onboard.recording.mcap_file import Entry, RecordingError
+from flockd.onboard.recording.reader import Recording
+from flockd.onboard.recording.record_source import records_of
+from flockd.onboard.recording.streams import OUTPUT
+
+MAX_TURN_RAD, MAX_OFFSET_S, MAX_FOCAL = math.radians(0.5), 0.01, 0.01
+"""What is more uncertain than this is not known: the standard deviation of a mounting about its worst axis, of a time,
+of a focal length."""
+
+
+def found_rig(recording: Recording) -> tuple[CameraDeviation, ...]:
+    """The last that the outputs of a recording say of its cameras; none: they say nothing. Raises RecordingError."""
+    last: tuple[CameraDeviation, ...] = ()
+    for path in recording.contents.paths:
+        for record in records_of(path):
+            if isinstance(record, Entry) and record.stream.topic == OUTPUT.topic:
+                try:
+                    last = from_json(PilotOutput, parsed(record.data)).rig or last
+                except ValueError as error:
+                    raise RecordingError(f"{path}: the output of step {record.sequence} is damaged: {error}") from error
+    names = {camera.name for camera in recording.config.rig.cameras}
+    for one in last:
+        if one.camera not in names or not _is_possible(one):
+            raise RecordingError(f"{recording.path}: what it says of the rig, of camera {one.camera!r}, cannot be")
+    return last
+
+
+def corrected_rig(recording: Recording, source: str, out: Path) -> dict[str, Any]:
+    """Writes the rig that the flight found to ``out`` and gives the result.
+
+    What is not known well, and what differs by less than three standard deviations, stays as it was configured.
+    Raises CalibrationError where nothing is to be taken over.
+    """
+    found = {one.camera: one for one in found_rig(recording)}
+    if not found:
+        raise CalibrationError(
+            f"{source}: says nothing of the rig: it is shorter than some seconds, or was recorded by an older "
+            "flockd; fly again, or try --by motion"
+        )
+    config = recording.config.rig
+    offset_s, note = _offset_s(list(found.values()))
+    cameras, results, notes = [], {}, [] if note is None else [note]
+    for camera in config.cameras:
+        one = found[camera.name]
+        turned, scaled = _takes_turn(one), _takes_focal(one)
+        cameras.append(_corrected(camera, one, turned=turned, scaled=scaled, source=source))
+        results[camera.name] = _result(one, cameras[-1], turned=turned, scaled=scaled)
+        sigma_rad = _worst_turn(one)
+        if sigma_rad > MAX_TURN_RAD:
+            notes.append(
+                f"the mounting of camera {camera.name!r} is known to {math.degrees(sigma_rad):.1f} degrees only, "
+                "and kept: this flight turned too little about some axis"
+            )
+    if offset_s is None and not any(one["taken"] for one in results.values()):
+        told = "; ".join([*notes, "what is known agrees with the configuration"])
+        raise CalibrationError(f"{source}: nothing of the rig is to be corrected: {told}")
+    total_s = round(config.time_offset_s + (offset_s or 0.0), 4)
+    write_rig(out, cameras, total_s)
+    return {
+        "by": "flight",
+        "reference": None,
+        "cameras": results,
+        "time_offset_s": total_s,
+        "notes": notes,
+        "out": str(out),
+    }
+
+
+def _corrected(
+    camera: CameraConfig, found: CameraDeviation, *, turned: bool, scaled: bool, source: str
+) -> CameraConfig:
+    measured = measured_today(camera=camera.name, source=f"{source}, in flight", views=1)
+    changes: dict[str, Any] = {}
+    if turned:
+        before = build_rig(RigConfig(cameras=(camera,))).cameras[camera.name].T_body_camera
+        after = RigidTransform(rotation_from_vector(found.turn) @ before.rotation, before.translation)
+        changes["extrinsics"] = extrinsics_of(after, measured)
+    if scaled:
+        lens = camera.intrinsics
+        focal = {key: round(getattr(lens, key) * found.focal_scale, 4) for key in ("fx", "fy")}
+        changes["intrinsics"] = lens.model_copy(update={**focal, "measured": measured})
+    return camera.model_copy(update=changes)
+
+
+def _result(found: CameraDeviation, camera: CameraConfig, *, turned: bool, scaled: bool) -> dict[str, Any]:
+    taken = [name for name, is_taken in (("mounting", turned), ("focal length", scaled)) if is_taken]
+    return {
+        **camera.extrinsics.model_dump(mode="json", exclude={"measured"}),
+        "fx": camera.intrinsics.fx,
+        "fy": camera.intrinsics.fy,
+        "taken": taken,
+        "found": described(found),
+        "sigma_deg": math.degrees(_worst_turn(found)),
+        "time_offset_s": found.time_offset_s,
+        "sigma_s": math.sqrt(found.covariance[3, 3]),
+        "focal_scale": found.focal_scale,
+        "sigma_focal": math.sqrt(found.covariance[4, 4]),
+    }
+
+
+def _offset_s(found: Sequence[CameraDeviation]) -> tuple[float | None, str | None]:
+    """What is to be added to the rig's offset, or None; and a note where the cameras do not agree."""
+    known = [one for one in found if math.sqrt(one.covariance[3, 3]) < MAX_OFFSET_S]
+    if not known:
+        return None, "the time of the cameras is not known, and kept: this flight turned too evenly"
+    offsets_s = np.array([one.time_offset_s for one in known])
+    mean_s = float(np.average(offsets_s, weights=[1.0 / one.covariance[3, 3] for one in known]))
+    sigma_s = min(math.sqrt(one.covariance[3, 3]) for one in known)  # their errors are the autopilot's together
+    note = None
+    apart_s = np.abs(offsets_s - mean_s)
+    if apart_s.max() > MAX_OFFSET_S:
+        worst = known[int(apart_s.argmax())].camera
+        note = f"the time of camera {worst!r} is {1e3 * apart_s.max():.0f} ms off the others'; the offset is their mean"
+    return (mean_s, note) if abs(mean_s) > 3.0 * sigma_s else (None, note)
+
+
+def _takes_turn(found: CameraDeviation) -> bool:
+    return _worst_turn(found) < MAX_TURN_RAD and differs(found).turn
+
+
+def _takes_focal(found: CameraDeviation) -> bool:
+    return math.sqrt(found.covariance[4, 4]) < MAX_FOCAL and differs(found).focal
+
+
+def _worst_turn(found: CameraDeviation) -> float:
+    """Standard deviation about the axis that is known worst, rad."""
+    return math.sqrt(float(np.linalg.eigvalsh(found.covariance[:3, :3])[-1]))
+
+
+def _is_possible(one: CameraDeviation) -> bool:
+    numbers = np.concatenate([one.turn, [one.time_offset_s, one.focal_scale], one.covariance.ravel()])
+    if not (np.isfinite(numbers).all() and one.focal_scale > 0.0 and np.abs(numbers).max() < 100.0):
+        return False
+    return bool(np.allclose(one.covariance, one.covariance.T) and np.linalg.eigvalsh(one.covariance)[0] > 0.0)

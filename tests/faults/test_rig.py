@@ -1,0 +1,120 @@
+"""A rig that is not as its configuration says: flown in the simulator, told, compared, and corrected when asked."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flockd.cli import main
+from flockd.core.choices import TRUTH_ROLES
+from flockd.core.config import ScenarioConfig, load_drone, load_scenario
+from flockd.core.data import data_path
+from flockd.core.messages import PilotOutput
+from flockd.flight.geometry import build_rig, rotation_angle_deg
+from flockd.ground.doctor import Level
+from flockd.ground.doctor.rig_checks import check_rig
+from flockd.onboard.daemon.pilot_loop import RigReports
+from flockd.onboard.recording import Recorder
+from flockd.onboard.recording.reader import Recording
+from flockd.sim.swarm import fly
+from flockd.sim.true_rigs import true_rigs
+from tests.faults.catalogue import RecordProperty, reacted
+
+pytestmark = pytest.mark.slow
+CAMERAS = ("front", "right", "back", "left")
+FAULTS = ("it is not turned as configured", "its time stamps are not as configured", "its focal length is not")
+NAME = "drone1-20261124T120000000000Z.mcap"
+
+
+class Told(Recorder):
+    """A recorder that keeps the outputs too."""
+
+    outputs: tuple[PilotOutput, ...] = ()
+
+    def step(self, frames, vehicle, output, *others) -> None:  # type: ignore[no-untyped-def]
+        self.outputs = (*self.outputs, output)
+        super().step(frames, vehicle, output, *others)
+
+
+def scenario(deg: float, late_s: float, focal: float) -> ScenarioConfig:
+    """Half a minute of one drone in a light wind, its rig off by so much."""
+    flight = load_scenario(
+        data_path("config") / "paper_flight.yaml",
+        {
+            "duration_s": 30.0,
+            "vehicle.gust_m_s": 0.3,
+            "cameras.timing.delay_s": late_s,
+            "cameras.rig.mounting_deg": deg,
+            "cameras.rig.mounting_m": 0.02 if deg else 0.0,
+            "cameras.rig.focal": focal,
+        },
+    )
+    drone = flight.drone.model_copy(update={"name": "drone1"})
+    return flight.model_copy(update={"drone": drone, "vehicles": flight.vehicles[:1]})
+
+
+def flown(flight: ScenarioConfig, path: Path) -> tuple[PilotOutput, ...]:
+    """With true maps, so that nothing but the rig is wrong; recorded."""
+    with Told(path, drone="drone1", config=flight.drone) as recorder:
+        fly(flight, swap=frozenset(TRUTH_ROLES), recorders=[recorder], processes=0, pictured=False)
+    return recorder.outputs
+
+
+def test_a_rig_is_not_as_configured(
+    tmp_path: Path, record_property: RecordProperty, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two degrees, 2 cm, 30 ms and 2 %: said in flight with the correction, and flown on as configured."""
+    flight = scenario(2.0, 0.03, 0.02)
+    outputs = flown(flight, tmp_path / NAME)
+    reports, told = RigReports(), dict[str, float]()
+    for output in outputs:
+        told |= dict.fromkeys(reports.update(output), output.time_s - outputs[0].time_s)
+    assert len(told) == len(CAMERAS) * len(FAULTS)  # each once
+    for camera in CAMERAS:
+        for fault in FAULTS:
+            (text,) = [text for text in told if text.startswith(f"camera {camera}: {fault}")]
+            assert "it is flown on as configured" in text
+            reacted(record_property, "rig-off", told[text])
+
+    # Before the next flight the doctor compares them ...
+    recording = Recording(tmp_path / NAME)
+    assert recording.config.rig == flight.drone.rig
+    findings = list(check_rig(recording.config, tmp_path))
+    assert [(one.level, one.about) for one in findings] == [(Level.WARNING, f"camera {name}") for name in CAMERAS]
+    assert all("--from-flight" in one.fix for one in findings)
+
+    # ... and who asks for it gets the corrected rig.
+    out = tmp_path / "rig.yaml"
+    assert main(["calibrate", "rig", "--from-flight", str(tmp_path / NAME), "--out", str(out)]) == 0
+    assert "taken over: mounting and focal length" in capsys.readouterr().out
+    corrected = load_drone(out).rig
+    assert corrected.time_offset_s == pytest.approx(-0.03, abs=0.003)
+    (true,) = true_rigs(flight)
+    for name, one in build_rig(corrected).cameras.items():
+        mounted = true.cameras[name]
+        off = one.T_body_camera.rotation.T @ mounted.T_body_camera.rotation
+        assert rotation_angle_deg(off) < 0.2
+        assert one.camera.focal_px == pytest.approx(mounted.camera.focal_px, rel=0.003)
+
+    # With that rig there is nothing to compare the flight with any more.
+    (finding,) = check_rig(recording.config.model_copy(update={"rig": corrected}), tmp_path)
+    assert finding.level is Level.PASS
+    assert "is another than in the last flight" in finding.measured
+
+
+def test_a_rig_as_configured_is_flown_without_a_word(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flight = scenario(0.0, 0.0, 0.0)
+    outputs = flown(flight, tmp_path / NAME)
+    reports = RigReports()
+    assert not [text for output in outputs for text in reports.update(output)]
+    last = [output.rig for output in outputs if output.rig][-1]
+    assert [one.camera for one in last] == list(CAMERAS)
+    assert all(math.degrees(float(np.linalg.norm(one.turn))) < 0.2 for one in last)
+    (finding,) = check_rig(flight.drone, tmp_path)
+    assert finding.level is Level.PASS
+    assert "saw 4 cameras as they are configured" in finding.measured
+    assert main(["calibrate", "rig", "--from-flight", str(tmp_path / NAME), "--out", str(tmp_path / "rig.yaml")]) == 1
+    assert "nothing of the rig is to be corrected" in capsys.readouterr().err

@@ -1,0 +1,224 @@
+"""A rig that is not as configured, found in flight: exact poses, an analytic world, and errors of known size."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from flockd.core.messages import CameraDeviation, FloatArray, VehicleState
+from flockd.flight.geometry import (
+    PointPairs,
+    Rig,
+    RigCalibration,
+    RigCamera,
+    RigidTransform,
+    Seen,
+    rig_faults,
+    rotation_from_euler,
+    rotation_from_vector,
+    vector_from_rotation,
+)
+from flockd.flight.geometry.camera_motion import camera_motion, scaled_focal
+from tests.flight.geometry.synthetic_world import EXACT, Flaws, World, boxes_around, four_camera_rig, seen_twice
+
+STEP_S = 0.5
+FLAWS = Flaws(flow_sigma_px=0.3, depth_sigma=0.1, object_bias=0.1, outliers=0.03)
+TIGHT = 1e-6
+
+
+@dataclass(frozen=True)
+class Way:
+    """How a drone flies."""
+
+    attitude: Callable[[float], FloatArray]
+    position: Callable[[float], FloatArray]
+
+    def pose(self, time_s: float) -> RigidTransform:
+        return RigidTransform(self.attitude(time_s), self.position(time_s))
+
+
+def lively(random: np.random.Generator) -> Way:
+    """A circle of 10 m at 1 m/s, nose ahead, that leans and sways by some degrees at 0.1-0.9 Hz."""
+    hz, phase = random.uniform(0.1, 0.9, (3, 6)), random.uniform(0.0, 2 * np.pi, (3, 6))
+
+    def attitude(t: float) -> FloatArray:
+        roll, pitch, yaw = math.radians(1.5) * np.sin(2 * np.pi * hz * t + phase).sum(axis=1)
+        return rotation_from_euler(roll, pitch, yaw + 0.1 * t)
+
+    return Way(attitude, lambda t: np.array([10 * math.sin(0.1 * t), 10 - 10 * math.cos(0.1 * t), -4.5]))
+
+
+STRAIGHT = Way(lambda t: np.eye(3), lambda t: np.array([t, 0.0, -4.5]))
+"""At 1 m/s, and never turns."""
+
+
+class Autopilot:
+    """The truth with errors that drift: attitude 0.2 degrees in 30 s, velocity 0.1 m/s in 10 s."""
+
+    def __init__(self, way: Way, random: np.random.Generator) -> None:
+        self._way, self._random = way, random
+        self._turned, self._moved = (sigma * random.normal(size=3) for sigma in (math.radians(0.2), 0.1))
+
+    def state(self, t: float) -> VehicleState:
+        self._turned = self._drift(self._turned, math.radians(0.2), 30.0)
+        self._moved = self._drift(self._moved, 0.1, 10.0)
+        before, after = self._way.pose(t - 1e-3), self._way.pose(t + 1e-3)
+        return VehicleState(
+            t,
+            rotation_from_vector(self._turned) @ self._way.attitude(t),
+            4.5,
+            (after.translation - before.translation) / 2e-3 + self._moved,
+            turn_rate=vector_from_rotation(before.rotation.T @ after.rotation) / 2e-3,
+        )
+
+    def _drift(self, error: FloatArray, sigma: float, time_s: float) -> FloatArray:
+        keep = math.exp(-STEP_S / time_s)
+        return keep * error + math.sqrt(1 - keep**2) * sigma * self._random.normal(size=3)
+
+
+@dataclass(frozen=True)
+class Wrong:
+    """What of a rig is not as configured."""
+
+    turns: dict[str, FloatArray]
+    focal: dict[str, float]
+    late_s: float
+
+    def rig(self, configured: Rig) -> Rig:
+        return Rig(
+            {
+                name: RigCamera(
+                    name,
+                    scaled_focal(one.camera, math.log(self.focal[name])),
+                    RigidTransform(
+                        rotation_from_vector(self.turns[name]) @ one.T_body_camera.rotation,
+                        one.T_body_camera.translation,
+                    ),
+                )
+                for name, one in configured.cameras.items()
+            }
+        )
+
+
+def wrong_by(deg: float, focal: float, late_s: float, rig: Rig, random: np.random.Generator) -> Wrong:
+    axes = {name: random.normal(size=3) for name in rig.cameras}
+    return Wrong(
+        {name: math.radians(deg) * axis / np.linalg.norm(axis) for name, axis in axes.items()},
+        {name: 1.0 + focal * float(random.choice([-1, 1])) for name in rig.cameras},
+        late_s,
+    )
+
+
+def flown(way: Way, wrong: Wrong, random: np.random.Generator, steps: int = 120) -> tuple[CameraDeviation, ...]:
+    """What is known after so many steps of half a second."""
+    configured = four_camera_rig()
+    true, calibration = wrong.rig(configured), RigCalibration(configured)
+    world, autopilot = boxes_around(random, 20), Autopilot(way, random)
+    before = None
+    for number in range(steps + 1):
+        t = number * STEP_S
+        seen, pose = Seen(autopilot.state(t), t, dict.fromkeys(true.cameras, t)), way.pose(t - wrong.late_s)
+        if before is not None:
+            pairs = seen_twice(world, true, (before[1], pose), FLAWS, random, stride=24)
+            calibration.update(before[0], seen, lifted_as_configured(pairs, true, configured))
+        before = seen, pose
+    return calibration.deviations()
+
+
+def lifted_as_configured(pairs: PointPairs, true: Rig, configured: Rig) -> PointPairs:
+    """The same pixels and ranges where the configuration puts them."""
+    previous = pairs.previous.copy()
+    for name, one in configured.cameras.items():
+        mine = pairs.camera_names == name
+        range_m = np.linalg.norm(previous[mine] - true.cameras[name].T_body_camera.translation, axis=1)
+        previous[mine] = one.T_body_camera.apply(one.camera.unproject(pairs.pixels_previous[mine], range_m))
+    return replace(pairs, previous=previous)
+
+
+def off_deg(found: CameraDeviation, turn: FloatArray) -> float:
+    off = rotation_from_vector(found.turn) @ rotation_from_vector(turn).T
+    return math.degrees(float(np.linalg.norm(vector_from_rotation(off))))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_two_degrees_thirty_milliseconds_and_two_percent_are_known_after_a_minute(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    wrong = wrong_by(2.0, 0.02, 0.03, four_camera_rig(), random)
+    for found in flown(lively(random), wrong, random):
+        sigma = np.sqrt(np.diag(found.covariance))
+        assert off_deg(found, wrong.turns[found.camera]) < 0.2
+        assert abs(found.time_offset_s + 0.03) < 0.003
+        assert found.focal_scale == pytest.approx(wrong.focal[found.camera], abs=0.003)
+        # and it says how well: neither far better than it is, nor worse than would be of use
+        off = vector_from_rotation(rotation_from_vector(found.turn) @ rotation_from_vector(wrong.turns[found.camera]).T)
+        assert (np.abs(off) < 4.0 * sigma[:3]).all()
+        assert (sigma < [math.radians(0.2)] * 3 + [0.003, 0.005]).all()
+        assert rig_faults(found) == (
+            f"camera {found.camera}: it is not turned as configured",
+            f"camera {found.camera}: its time stamps are not as configured",
+            f"camera {found.camera}: its focal length is not as configured",
+        )
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_rig_as_configured_is_not_complained_of(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    wrong = wrong_by(0.0, 0.0, 0.0, four_camera_rig(), random)
+    for way in (lively(random), STRAIGHT):
+        for found in flown(way, wrong, random, steps=60):
+            assert rig_faults(found) == ()
+            assert off_deg(found, np.zeros(3)) < 0.2 or way is STRAIGHT
+
+
+def test_a_flight_that_never_turns_leaves_open_what_it_does_not_show() -> None:
+    random = np.random.default_rng(0)
+    wrong = wrong_by(2.0, 0.02, 0.03, four_camera_rig(), random)
+    for found in flown(STRAIGHT, wrong, random):
+        roll, pitch, yaw, time, focal = np.sqrt(np.diag(found.covariance))
+        # Nothing but the way it went, to the north, tells of the mountings: not how they are turned about it, and
+        # about the others as badly as the autopilot knows the way: 0.1 m/s of 1 m/s are 6 degrees at a time.
+        assert math.degrees(roll) > 2.5
+        assert 0.5 < math.degrees(pitch) < 3.0
+        assert 0.5 < math.degrees(yaw) < 3.0
+        assert time > 0.05
+        assert focal > 0.02
+        assert rig_faults(found) == ()
+
+
+def test_exact_matches_give_a_cameras_motion_and_how_a_focal_length_spoils_it() -> None:
+    rig, random = four_camera_rig(), np.random.default_rng(5)
+    turn = rotation_from_euler(0.02, -0.03, 0.05)
+    poses = STRAIGHT.pose(0.0), RigidTransform(turn, np.array([0.5, 0.1, -4.4]))
+    pairs = seen_twice(boxes_around(random), rig, poses, EXACT, random)
+    mounted = rig.cameras["right"]
+    true = (poses[0] @ mounted.T_body_camera).inverse() @ (poses[1] @ mounted.T_body_camera)
+    found = camera_motion(mounted, pairs, RigidTransform(np.eye(3), true.translation), 0.0)
+    assert found is not None
+    assert found.motion.rotation == pytest.approx(true.rotation, abs=TIGHT)
+    assert found.motion.translation == pytest.approx(true.translation, abs=TIGHT)
+    # With a focal length that is 1 % too short all directions are 1 % too far from the axis, and turns 1 % too large.
+    short = camera_motion(mounted, pairs, true, math.log(0.99))
+    assert short is not None
+    seemed = vector_from_rotation(true.rotation.T @ short.motion.rotation)
+    assert seemed == pytest.approx(found.by_focal(true)[:3] * math.log(0.99), abs=2e-4)
+    assert np.linalg.norm(seemed) > 0.003 * np.linalg.norm(vector_from_rotation(true.rotation))
+
+
+def test_what_says_nothing_changes_nothing() -> None:
+    rig, random = four_camera_rig(), np.random.default_rng(3)
+    calibration = RigCalibration(rig)
+    autopilot = Autopilot(STRAIGHT, random)
+    first, second = (Seen(autopilot.state(t), t, dict.fromkeys(rig.cameras, t)) for t in (0.0, 0.5))
+    pairs = seen_twice(World(np.empty((0, 2, 3))), rig, (STRAIGHT.pose(0.0), STRAIGHT.pose(0.5)), EXACT, random)
+    before = calibration.deviations()
+    calibration.update(second, first, pairs)  # time that runs backwards
+    calibration.update(first, replace(second, vehicle=replace(second.vehicle, time_s=60.0)), pairs)
+    for one, other in zip(before, calibration.deviations(), strict=True):
+        assert (one.turn == other.turn).all()
+        assert (one.covariance == other.covariance).all()
+    calibration.update(first, second, pairs.select(np.arange(20)))  # too few to tell
+    assert all(np.linalg.norm(one.turn) == 0.0 for one in calibration.deviations())
