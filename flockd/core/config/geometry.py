@@ -1,8 +1,8 @@
-"""Algorithm 1 and what feeds it."""
+"""Motions from paired points, and what feeds them."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -11,15 +11,18 @@ from flockd.core.config.base import Distance, Positive, Section
 
 
 class GeometryParameters(Section):
-    """Algorithm 1 and what feeds it."""
+    """Motions from paired points, and what feeds them."""
 
+    method: Literal["consensus", "paper"] = "consensus"
+    """How a motion is found among false matches: by consensus, which learns the errors' size, or by Algorithm 1."""
     initial_threshold_m: Distance = 0.01
+    """Algorithm 1's first."""
     min_inlier_ratio: Annotated[float, Field(gt=0, lt=1)] = 0.2
     hypotheses: Annotated[int, Field(ge=1, le=100_000)] = 200
     """IT_MAX of Algorithm 1."""
     max_threshold_m: Distance = 2.0
     """Beyond this the motion counts as not estimated."""
-    background_stride_px: Annotated[int, Field(ge=1, le=256)] = 16
+    background_stride_px: Annotated[int, Field(ge=1, le=256)] = 32
     max_depth_m: Distance = 40.0
     """Background farther away says little of the translation and is left out."""
     max_acceleration_m_s2: Positive = consistency.EGO_MOTION.limit
@@ -36,4 +39,4 @@ class GeometryParameters(Section):
     """Factor on the standard deviation of a neighbour's velocity by Eq. 36: it rests on the same ranges as the
     positions do, and so is not independent of them."""
     refine: bool = True
-    """Polish the ego-motion by its reprojection error after Algorithm 1."""
+    """Polish the ego-motion by its reprojection error."""

@@ -15,7 +15,7 @@ from flockd.flight.geometry.robust.solver import GaussNewton, NormalEquations, P
 from flockd.flight.geometry.rotations import rotation_from_vector
 from flockd.flight.geometry.transform import RigidTransform
 
-_MAX_PAIRS = 2500
+_MAX_PAIRS = 800
 """Drawn of more: each costs two residuals a step."""
 _FLOW_SIGMA_PX = 0.3
 _DEPTH_SIGMA = 0.05

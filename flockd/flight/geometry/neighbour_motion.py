@@ -20,6 +20,7 @@ def estimate_neighbour_motion(
     found = ransac_rigid(
         pairs.previous,
         current_in_c,
+        method=parameters.method,
         threshold=parameters.initial_threshold_m,
         min_inlier_ratio=parameters.min_inlier_ratio,
         hypotheses=parameters.hypotheses,

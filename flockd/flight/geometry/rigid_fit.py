@@ -26,7 +26,7 @@ def fit_rigid(source: FloatArray, target: FloatArray, weights: FloatArray | None
         raise ValueError("weights must be finite and not negative, and some must be positive")
     weights = weights / weights.sum()
     for name, points in (("source", source), ("target", target)):
-        _require_spread(name, points, weights)
+        require_spread(name, points, weights)
     rotations, translations = kabsch(source[None], target[None], weights)
     return RigidTransform(rotations[0], translations[0])
 
@@ -72,7 +72,10 @@ def _rotations(covariances: FloatArray) -> FloatArray:
     return rotations
 
 
-def _require_spread(name: str, points: FloatArray, weights: FloatArray) -> None:
+def require_spread(name: str, points: FloatArray, weights: FloatArray | None = None) -> None:
+    """Raises ValueError where points (n, 3) of weights (n,), which sum to 1, coincide or are collinear."""
+    if weights is None:
+        weights = np.full(len(points), 1.0 / len(points))
     centred = points - weights @ points
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh((centred * weights[:, None]).T @ centred), 0.0))
     scale = max(float(np.abs(points).max()), 1e-9)

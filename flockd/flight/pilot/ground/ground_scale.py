@@ -27,7 +27,7 @@ from flockd.flight.geometry import (
 )
 from flockd.flight.perception import CameraObservation, Observation
 
-STRIDE_PX = 4
+STRIDE_PX = 12
 FLOW_SIGMA_PX = 0.3
 MIN_BASELINE_M = 0.08
 """Across the line of sight; with less, the ground's depth is noise."""

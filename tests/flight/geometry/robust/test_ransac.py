@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from flockd.core.messages import FloatArray
-from flockd.flight.geometry import fit_rigid, ransac_rigid, rotation_angle_deg
+from flockd.flight.geometry import fit_rigid, rotation_angle_deg
+from flockd.flight.geometry import ransac_rigid as any_ransac
+
+ransac_rigid = partial(any_ransac, method="paper")
 
 TURN = Rotation.from_euler("ZYX", [10.0, -3.0, 2.0], degrees=True)
 SHIFT = np.array([0.5, -0.1, 0.05])

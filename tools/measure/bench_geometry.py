@@ -1,0 +1,273 @@
+"""Rigid motions between paired points: ours beside peers, on the same pairs, on one thread, in one run.
+
+OMP_NUM_THREADS=1 python -m tools.measure.bench_geometry        # all cases, 30 draws each: some minutes
+OMP_NUM_THREADS=1 python -m tools.measure.bench_geometry --draws 1000 --only "5000, 90 % outliers" --methods consensus
+
+The peers are for comparison alone and are not flockd's: `pip install kiss-matcher pygcransac pymagsac small_gicp`;
+those that are not installed are left out, which the table says. Milliseconds are the median of the best of three
+runs of each draw; degrees and centimetres the median and the 99th percentile; a failure is an answer off by more than
+1 degree or 5 cm (for the cases with large errors, 3 degrees or 20 cm), or none.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flockd.core.messages import FloatArray
+from flockd.flight.geometry import RigidTransform, ransac_rigid
+
+NOISE_M = 0.05
+FAILED_DEG, FAILED_M = 1.0, 0.05
+
+
+@dataclass(frozen=True)
+class Case:
+    """Pairs of one kind."""
+
+    name: str
+    pairs: int
+    outliers: float = 0.0
+    second_motion: float = 0.0
+    """Share of pairs that move otherwise, together."""
+    stereo: bool = False
+    """Errors grow with the range's square, from 2 to 30 m."""
+    turn_deg: float = 10.0
+    flat: bool = False
+    """All on a plane, but for 2 %."""
+    extent_m: float = 0.0
+    """Of an object 6 m away; 0: points all around, from 2 to 15 m."""
+    allowed: float = 1.0
+    """What counts as a failure, times this."""
+
+
+CASES = (
+    Case("300, 0 % outliers", 300),
+    Case("300, 30 % outliers", 300, 0.3),
+    Case("300, 60 % outliers", 300, 0.6, allowed=4.0),
+    Case("5000, 0 % outliers", 5000),
+    Case("5000, 30 % outliers", 5000, 0.3),
+    Case("5000, 60 % outliers", 5000, 0.6),
+    Case("5000, 90 % outliers", 5000, 0.9),
+    Case("50000, 30 % outliers", 50_000, 0.3),
+    Case("50000, 60 % outliers", 50_000, 0.6),
+    Case("5000, 40 % of another motion", 5000, second_motion=0.4),
+    Case("5000, errors of stereo, 30 %", 5000, 0.3, stereo=True, allowed=3.0),
+    Case("5000, turned by 150 degrees, 30 %", 5000, 0.3, turn_deg=150.0),
+    Case("5000, turned by 0.2 degrees, 30 %", 5000, 0.3, turn_deg=0.2),
+    Case("5000, nearly a plane, 30 %", 5000, 0.3, flat=True),
+    Case("100 on an object of 0.6 m, 20 %", 100, 0.2, extent_m=0.6, allowed=8.0),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Draw:
+    """Pairs, and the motion between them."""
+
+    source: FloatArray
+    target: FloatArray
+    motion: RigidTransform
+
+
+def draw(case: Case, seed: int) -> Draw:
+    """Pairs of a case."""
+    random = np.random.default_rng(seed)
+    source = _points(case, random)
+    axis = random.normal(size=3)
+    turn = Rotation.from_rotvec(np.radians(case.turn_deg) * axis / np.linalg.norm(axis))
+    motion = RigidTransform(turn.as_matrix(), random.normal(0.0, 0.3, 3))
+    noise = np.full((case.pairs, 1), NOISE_M if not case.extent_m else 0.02)
+    if case.stereo:
+        noise = 0.002 * np.linalg.norm(source, axis=1, keepdims=True) ** 2
+    target = motion.apply(source) + random.normal(size=source.shape) * noise
+    other = random.random(case.pairs) < case.second_motion
+    second = RigidTransform(Rotation.from_rotvec(random.normal(0.0, 0.1, 3)).as_matrix(), random.normal(0.0, 0.5, 3))
+    target[other] = second.apply(source[other]) + random.normal(size=(int(other.sum()), 3)) * noise[other]
+    wrong = random.random(case.pairs) < case.outliers
+    reach_m = case.extent_m or 3.0
+    target[wrong] += random.uniform(-reach_m, reach_m, (int(wrong.sum()), 3))
+    return Draw(source, target, motion)
+
+
+def _points(case: Case, random: np.random.Generator) -> FloatArray:
+    if case.extent_m:
+        half_m = case.extent_m / 2.0
+        return np.array([6.0, 0.0, 0.0]) + random.uniform(-half_m, half_m, (case.pairs, 3))
+    points = random.normal(size=(case.pairs, 3))
+    points *= random.uniform(2.0, 30.0 if case.stereo else 15.0, (case.pairs, 1)) / np.linalg.norm(
+        points, axis=1, keepdims=True
+    )
+    if case.flat:
+        on_it = random.random(case.pairs) > 0.02
+        points[on_it, 2] = 3.0
+    return points
+
+
+Solve = Callable[[Draw, float], FloatArray]
+"""From pairs and the size of their errors, m, to a motion (4, 4)."""
+
+
+def _ours(method: str) -> Solve:
+    def solve(pairs: Draw, _: float) -> FloatArray:
+        found = ransac_rigid(pairs.source, pairs.target, method=method, min_inlier_ratio=0.05)  # type: ignore[arg-type]
+        return _matrix(found.transform.rotation, found.transform.translation)
+
+    return solve
+
+
+def _kiss_matcher(peer: ModuleType) -> Solve:
+    def solve(pairs: Draw, noise_m: float) -> FloatArray:
+        matcher = peer.KISSMatcher(peer.KISSMatcherConfig(voxel_size=2.0 * noise_m))
+        found = matcher.solve(np.asfortranarray(pairs.source.T), np.asfortranarray(pairs.target.T))
+        return _matrix(np.asarray(found.rotation), np.asarray(found.translation))
+
+    return solve
+
+
+def _pygcransac(peer: ModuleType) -> Solve:
+    def solve(pairs: Draw, noise_m: float) -> FloatArray:
+        both = np.ascontiguousarray(np.hstack([pairs.source, pairs.target]))
+        found, _ = peer.findRigidTransform(
+            both, [], threshold=3.0 * noise_m, max_iters=5000, use_space_partitioning=False
+        )
+        return np.asarray(found).T if found is not None else np.full((4, 4), np.nan)
+
+    return solve
+
+
+def _pymagsac(peer: ModuleType) -> Solve:
+    def solve(pairs: Draw, noise_m: float) -> FloatArray:
+        both = np.ascontiguousarray(np.hstack([pairs.source, pairs.target]))
+        found, _ = peer.findRigidTransformation(both, [], sampler=1, sigma_th=3.0 * noise_m, max_iters=5000)
+        return np.asarray(found).T if found is not None else np.full((4, 4), np.nan)
+
+    return solve
+
+
+def _small_gicp(peer: ModuleType) -> Solve:
+    def solve(pairs: Draw, noise_m: float) -> FloatArray:
+        found = peer.align(pairs.target, pairs.source, max_correspondence_distance=20.0 * noise_m, num_threads=1)
+        return np.asarray(found.T_target_source)
+
+    return solve
+
+
+def _opencv(pairs: Draw, noise_m: float) -> FloatArray:
+    found, affine, _ = cv2.estimateAffine3D(pairs.source, pairs.target, ransacThreshold=3.0 * noise_m)
+    if not found:
+        return np.full((4, 4), np.nan)
+    u, _, vt = np.linalg.svd(affine[:, :3])
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    middle = pairs.source.mean(axis=0)
+    return _matrix(rotation, affine[:, :3] @ middle + affine[:, 3] - rotation @ middle)
+
+
+PEERS: dict[str, tuple[str, Callable[[ModuleType], Solve]]] = {
+    "kiss-matcher": ("kiss_matcher", _kiss_matcher),
+    "pygcransac": ("pygcransac", _pygcransac),
+    "pymagsac": ("pymagsac", _pymagsac),
+    "small_gicp (no pairs used)": ("small_gicp", _small_gicp),
+}
+
+
+def methods() -> tuple[dict[str, Solve], list[str]]:
+    """What can be run here, and the peers that are not installed."""
+    found: dict[str, Solve] = {"consensus": _ours("consensus"), "paper": _ours("paper"), "OpenCV affine": _opencv}
+    missing = []
+    for name, (module, solver) in PEERS.items():
+        try:
+            found[name] = solver(importlib.import_module(module))
+        except ImportError:
+            missing.append(name)
+    return found, missing
+
+
+def _matrix(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, translation
+    return matrix
+
+
+@dataclass(frozen=True)
+class Row:
+    """Of one method in one case."""
+
+    ms: float
+    degrees: tuple[float, float]
+    """Median and 99th percentile."""
+    cm: tuple[float, float]
+    failures: int
+
+
+def measured(case: Case, solve: Solve, draws: int) -> Row:
+    """One method on the draws of a case."""
+    ms, degrees, cm, failures = [], [], [], 0
+    noise_m = 0.02 if case.extent_m else 0.2 if case.stereo else NOISE_M
+    for seed in range(draws):
+        pairs = draw(case, seed)
+        best_s, off_deg, off_m = np.inf, np.inf, np.inf
+        for _ in range(3):
+            start = time.perf_counter()
+            try:
+                found = solve(pairs, noise_m)
+            except ValueError:
+                found = np.full((4, 4), np.nan)
+            best_s = min(best_s, time.perf_counter() - start)
+        if np.isfinite(found).all():
+            left = found[:3, :3] @ pairs.motion.rotation.T
+            off_deg = float(np.degrees(np.arccos(np.clip((np.trace(left) - 1.0) / 2.0, -1.0, 1.0))))
+            middle = pairs.source.mean(axis=0)
+            off_m = float(np.linalg.norm(found[:3, :3] @ middle + found[:3, 3] - pairs.motion.apply(middle[None])[0]))
+        ms.append(1e3 * best_s)
+        degrees.append(off_deg)
+        cm.append(100.0 * off_m)
+        failures += not (off_deg < case.allowed * FAILED_DEG and off_m < case.allowed * FAILED_M)
+    return Row(
+        float(np.median(ms)),
+        (float(np.median(degrees)), float(np.percentile(degrees, 99, method="lower"))),
+        (float(np.median(cm)), float(np.percentile(cm, 99, method="lower"))),
+        failures,
+    )
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--draws", type=int, default=30)
+    parser.add_argument("--only", nargs="+", metavar="CASE", choices=[case.name for case in CASES])
+    parser.add_argument("--methods", nargs="+", metavar="METHOD")
+    options = parser.parse_args()
+    cv2.setNumThreads(1)
+    found, missing = methods()
+    for name in missing:
+        print(f"not installed, left out: {name}")
+    if options.methods:
+        found = {name: solve for name, solve in found.items() if name in options.methods}
+    print(
+        f"{'case':36} {'method':27} {'ms':>8} {'deg':>7} {'99 %':>7} {'cm':>7} {'99 %':>7} failures of {options.draws}"
+    )
+    for case in CASES:
+        if options.only and case.name not in options.only:
+            continue
+        for name, solve in found.items():
+            row = measured(case, solve, options.draws)
+            print(
+                f"{case.name:36} {name:27} {row.ms:8.2f} {row.degrees[0]:7.3f} {row.degrees[1]:7.3f} "
+                f"{row.cm[0]:7.2f} {row.cm[1]:7.2f} {row.failures}",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
