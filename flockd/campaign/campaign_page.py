@@ -106,7 +106,8 @@ def _lead(results: Results) -> str:
     varied = ", ".join(results.parameters)
     how = {"truth": "on exact states", "sight": "by sight", "control": "at control level"}[config.perception]
     how += "" if config.gated else ", without safety gates"
-    return f"Each flight lasts {_durations(results)} {how}. " + (f"What varies: {varied}." if varied else "")
+    unheld = "" if config.perception != "control" else "No supervisor flies along: wind slows and holds nobody. "
+    return f"Each flight lasts {_durations(results)} {how}. {unheld}" + (f"What varies: {varied}." if varied else "")
 
 
 def _durations(results: Results) -> str:

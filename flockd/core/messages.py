@@ -338,7 +338,8 @@ class Wanted:
     velocity: Vector2
     """(2,) m/s, north and east: the law's after limits, and the trim."""
     acceleration: Vector2
-    """(2,) m/s^2, north and east: u of Eq. 38 after limits."""
+    """(2,) m/s^2, north and east: u of Eq. 38 after limits; where who or what is near changed the velocity, what leads
+    to that one in a step."""
     yaw_rad: float | None
     """Heading, clockwise from north; None: as it is, while no good attitude is known."""
     trim: Vector2 | None = None

@@ -9,8 +9,7 @@ import numpy as np
 
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FloatArray, MissionOrder, MissionStatus, Neighbour, ObstacleRanges
-from flockd.flight.flocking import FlockingLaw
-from flockd.flight.flocking.passing import clear_of
+from flockd.flight.flocking import FlockingLaw, passing
 from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
 from flockd.flight.obstacles import Avoidance
@@ -87,9 +86,12 @@ class ExactFlock:
         guidance = pilot.step(Moment(time_s, here[i], middle_of(places[:, :2]), np.array(REFERENCE_DEG), order=order))
         desired = pilot.pull(guidance)
         if ranges is None or not self._avoids:
-            command, acceleration = self._law.command(moving[i], places[:, :2], others, desired, self._step_s)
             if self._passes:
-                command = clear_of(command, moving[i], places, others, self._law.parameters, self._vertical_m)
+                command, acceleration = passing.command(
+                    self._law, moving[i], places, others, desired, self._step_s, self._vertical_m
+                )
+            else:
+                command, acceleration = self._law.command(moving[i], places[:, :2], others, desired, self._step_s)
         else:
             command, acceleration = self._avoidances[i].command(self._law, moving[i], places, others, desired, ranges)
         yaw_rad = float(self._yaw_rad[i]) if guidance.course_rad is None else guidance.course_rad

@@ -218,6 +218,15 @@ def test_the_report_says_what_was_flown(plan: Plan, tmp_path: Path) -> None:
     assert sorted(results.by_seed("min_distance_m", [0, 1])) == [0, 1, 2, 4, 5]
 
 
+@pytest.mark.parametrize(("perception", "says"), [("truth", False), ("control", True)])
+def test_the_report_says_where_no_supervisor_flew(perception: str, says: bool, tmp_path: Path) -> None:
+    text = f"perception: {perception}\nvary: {{vehicle.gust_m_s: {{values: [0.5]}}}}\nmeasure: [order_tail]\n"
+    flown(Plan.load(campaign_file(tmp_path, text)), tmp_path / "out", Shuffled(1))
+    write_campaign_page(Results.load(tmp_path / "out"), tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert ("No supervisor flies along: wind slows and holds nobody." in page) is says
+
+
 def test_figures_stand_under_the_case_and_the_value_that_were_flown(tmp_path: Path) -> None:
     """Neither cases nor values are in the order of the alphabet."""
     text = (

@@ -8,6 +8,7 @@ import numpy as np
 
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import FloatArray
+from flockd.flight.flocking.law import FlockingLaw, level_offsets
 from flockd.flight.geometry.level import SAME_SPOT_M, limit_norm
 
 HORIZON_S = 2.5
@@ -22,6 +23,24 @@ _RING = 24
 _SPEEDS = 1.0, 0.5
 """Directions, and shares of the highest speed, that are tried where no velocity keeps clear of all."""
 _ROUNDING_M_S = 1e-9
+
+
+def command(
+    law: FlockingLaw,
+    velocity: FloatArray,
+    offsets: FloatArray,
+    velocities: FloatArray,
+    desired: FloatArray,
+    step_s: float,
+    vertical_m: float,
+) -> tuple[FloatArray, FloatArray]:
+    """As of `FlockingLaw.command`, but clear of who would come too near; arguments as of `clear_of`.
+
+    The acceleration, (2,) m/s^2, is the law's, or else the one that leads to the velocity in a step.
+    """
+    wanted, acceleration = law.command(velocity, level_offsets(offsets), velocities, desired, step_s)
+    clear = clear_of(wanted, velocity, offsets, velocities, law.parameters, vertical_m)
+    return clear, acceleration if clear is wanted else (clear - velocity) / step_s
 
 
 def clear_of(

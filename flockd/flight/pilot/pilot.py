@@ -29,8 +29,7 @@ from flockd.core.messages import (
     VehicleState,
     Wanted,
 )
-from flockd.flight.flocking import FlockingLaw, level_offsets
-from flockd.flight.flocking.passing import clear_of
+from flockd.flight.flocking import FlockingLaw, passing
 from flockd.flight.geometry import RigCalibration, Seen, build_rig, estimate_ego_motion, rig_faults
 from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
@@ -376,11 +375,10 @@ class FlockPilot:
         desired = self._mission.desired
         own = guidance.velocity if velocity is None else velocity[:2]  # before the first pair: as desired
         if obstacles is None:
-            command, acceleration = self._law.command(
-                own, level_offsets(places), velocities, desired, self._config.step_s
-            )
             vertical_m = self._config.safety.gate.vertical_separation_m
-            command = clear_of(command, own, places, velocities, self._law.parameters, vertical_m)
+            command, acceleration = passing.command(
+                self._law, own, places, velocities, desired, self._config.step_s, vertical_m
+            )
         else:
             command, acceleration = self._avoidance.command(self._law, own, places, velocities, desired, obstacles)
         if self._config.yaw == "course" and guidance.course_rad is not None:

@@ -274,10 +274,11 @@ class Gate:
         blown and a neighbour on the other side it stands, and is not blown on.
         """
         drift, max_m_s = self.drift, self._parameters.max_speed_m_s
-        least = nearest_within(drift, directions, lowered) - drift  # the smallest setpoint with such a result
-        beyond = limit_norm(result - drift - least, max(max_m_s - math.hypot(*least), 0.0))
+        carried = nearest_within(drift, directions, lowered)
+        least = carried - drift  # the smallest setpoint whose result is within the limits
+        beyond = limit_norm(result - carried, max(max_m_s - math.hypot(*least), 0.0))
         of_setpoint = np.maximum(most_m_s - directions @ least, 0.0)
-        of_result = np.maximum(lowered - directions @ (drift + least), 0.0)
+        of_result = np.maximum(lowered - directions @ carried, 0.0)
         within = nearest_within(beyond, np.tile(directions, (2, 1)), np.concatenate([of_setpoint, of_result]))
         return limit_norm(least + within, max_m_s)
 

@@ -37,7 +37,7 @@ class FlightLog:
     command_velocity: FloatArray
     """(S, N, 2) m/s, the setpoint of each step."""
     command_acceleration: FloatArray
-    """(S, N, 2) m/s^2, u of Eq. 38 after its limit."""
+    """(S, N, 2) m/s^2, as of `Wanted`."""
     ego_rotation: FloatArray
     """(S, N, 3, 3) R_FC as estimated over the interval that ended with the step (Eq. 7)."""
     ego_translation: FloatArray

@@ -9,7 +9,8 @@ import pytest
 
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import FloatArray
-from flockd.flight.flocking.passing import HORIZON_S, clear_of
+from flockd.flight.flocking import FlockingLaw
+from flockd.flight.flocking.passing import HORIZON_S, clear_of, command
 
 PARAMETERS = FlockingParameters()
 NORTH = np.array([2.0, 0.0])
@@ -38,6 +39,17 @@ def test_who_meets_nobody_flies_as_it_wants_to() -> None:
 )
 def test_who_comes_not_too_near_changes_nothing(offset: list[float], theirs: list[float]) -> None:
     np.testing.assert_array_equal(passed(offset, theirs), NORTH)
+
+
+def test_the_acceleration_is_the_laws_or_leads_to_the_velocity_that_passes() -> None:
+    """The drone flies as it wants to; one 9 m ahead flies along, and then comes at 3 m/s."""
+    law, offset = FlockingLaw(PARAMETERS), np.array([[9.0, 0.0, 0.0]])
+    for theirs, passes in ((NORTH, False), (-1.5 * NORTH, True)):
+        velocity, acceleration = command(law, NORTH, offset, theirs[None], NORTH, 0.5, 3.0)
+        of_law = law.command(NORTH, offset[:, :2], theirs[None], NORTH, 0.5)
+        assert bool(np.abs(velocity - of_law[0]).max() > 0.1) is passes
+        expected = (velocity - NORTH) / 0.5 if passes else of_law[1]
+        np.testing.assert_allclose(acceleration, expected)
 
 
 def test_two_that_meet_head_on_each_turn_half_of_what_is_needed_to_their_right() -> None:

@@ -130,6 +130,12 @@ def test_a_drift_that_needs_all_of_the_speed_limit_leaves_none_for_what_is_asked
     assert np.linalg.norm(setpoints, axis=1).max() <= 2.5 + 1e-9
 
 
+def test_a_drift_that_is_more_than_the_speed_limit_is_countered_before_all_else() -> None:
+    p = FREE.model_copy(update={"max_speed_m_s": 1.0})
+    setpoints, _ = flown([0.0, 0.5], [2.0, 0.0], Gate(p), around=replace(NOWHERE, obstacles=np.array([[0.5, 0.0]])))
+    np.testing.assert_allclose(setpoints[-1], [-1.0, 0.0], atol=1e-6)
+
+
 def test_measured_faster_than_a_limit_it_brakes_harder() -> None:
     """2 m from a neighbour that may begin to come, 0.75 v + v^2 / 3 = 0.5 m gives the limit."""
     limit = math.sqrt(0.75**2 + 1.5) - 0.75
