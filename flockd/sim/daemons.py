@@ -87,7 +87,8 @@ class Daemons:
             recordings: an existing one.
             environment: this process's own.
         """
-        self._configs, self._folder, self._recordings = configs, folder, recordings
+        self._configs, self._folder = configs, folder
+        self._recordings = recordings.resolve()  # daemons run in `folder`
         self._environment = {**environment, **ONE_THREAD, **SMALL, "XDG_RUNTIME_DIR": str(folder)}
         self._programs = Programs()
         self._listeners = [_Listener(folder / config.name) for config in configs]

@@ -287,7 +287,7 @@ def _neighbours(log: FlightLog) -> Json:
     drone_minutes = log.recorded.sum() * log.metadata.step_s / 60
     return {
         "recall_within_10m": _mean(seen[near]),
-        "false_per_drone_minute": float(log.false_tracks.sum() / drone_minutes),
+        "false_per_drone_minute": float(log.false_tracks.sum() / drone_minutes) if drone_minutes else None,
     }
 
 

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from flockd.core.config import load_drone
+from flockd.core.config import load_real_drone
 from tools.checks.check_device import DRONE_FILE
 
 ROOT = Path(__file__).parents[3]
@@ -52,6 +52,7 @@ def test_the_documentation_installs_what_the_unit_starts() -> None:
 
 
 def test_its_drone_can_be_flown() -> None:
-    config = load_drone(ROOT / "tools" / "checks" / "device_check" / "drone.yaml")
+    config, outside = load_real_drone(ROOT / "tools" / "checks" / "device_check" / "drone.yaml")
+    assert not outside, "`flockd run` would refuse it"
     assert config.source is not None
     assert {camera.device for camera in config.source.cameras} == {"/dev/video10", "/dev/video20"}

@@ -216,6 +216,14 @@ def test_neighbours_by_hand() -> None:
     assert neighbours["false_per_drone_minute"] == pytest.approx(2 / (2 * 0.25))
 
 
+def test_where_no_step_was_recorded_nothing_is_said_of_neighbours() -> None:
+    log = _hand_made()
+    nothing = np.full_like(log.command_velocity, np.nan)
+    summary = summarise(replace(log, tracked=log.tracked[:0], command_velocity=nothing))
+    assert summary["neighbours"] == {"recall_within_10m": None, "false_per_drone_minute": None}
+    json.dumps(summary, allow_nan=False)
+
+
 def test_drones_beyond_ten_metres_do_not_count_for_recall() -> None:
     log = _hand_made()
     position = log.position.copy()

@@ -11,7 +11,7 @@ from tools.checks.device_check.findings import Finding
 from tools.checks.device_check.service import CAMERAS, CONFIG, FRONT_SIZE, RATE_HZ, Service
 from tools.checks.device_check.waiting import PATIENCE_S
 
-MINUTES = 1.0
+MINUTES = 0.5
 NEEDED = {"bench", "steps", "load", *(f"camera {name}" for name in CAMERAS), "control loop", "autopilot", "commands"}
 """What has to pass. The rest depends on what cameras and computer show: these show no world and have no thermometer."""
 

@@ -6,10 +6,11 @@ python -m tools.checks.device_check.guest FINDINGS START [GROUP...]
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 
 from tools.checks.device_check import bench, cameras, capture, pipelines, sandbox
-from tools.checks.device_check.findings import Check, Notebook
+from tools.checks.device_check.findings import Check, Finding, Notebook
 from tools.checks.device_check.service import Service
 
 
@@ -23,6 +24,10 @@ def main() -> None:
     notebook = Notebook(arguments.findings, arguments.groups)
     cameras.load()
     service = Service(arguments.start.read_text(encoding="utf-8"))
+
+    def bench_runs() -> Iterator[Finding]:
+        return bench.runs(service)
+
     groups: dict[str, tuple[Check, ...]] = {
         "capture": (
             capture.streams,
@@ -35,7 +40,7 @@ def main() -> None:
             capture.is_taken,
         ),
         "pipelines": (lambda: pipelines.streams_a_camera(cameras.WEBCAM), *pipelines.CHECKS),
-        "bench": (lambda: bench.runs(service),),
+        "bench": (bench_runs,),
         "sandbox": (sandbox.holds,),
         "service": (
             service.is_installed,
