@@ -44,12 +44,14 @@ OF_EGO_MOTION = ("ego_motion.pairs=100", "ego_motion.inliers=100")
 
 OF_MISSION = "mission=1e-9"
 """Sine and cosine of the course."""
+OF_RIG = "rig=0.005"
+"""Radians, seconds and shares, after five seconds: a tenth of what they are uncertain by."""
 
 Capture = pytest.CaptureFixture[str]
 
 
 def against_reference(flight: str, config: Path, expected: Path | None = None) -> int:
-    tolerances = [*TOLERANCES_OF.get(flight, TOLERANCES), *OF_EGO_MOTION, *OF_NEIGHBOURS, OF_MISSION]
+    tolerances = [*TOLERANCES_OF.get(flight, TOLERANCES), *OF_EGO_MOTION, *OF_NEIGHBOURS, OF_MISSION, OF_RIG]
     arguments = [part for tolerance in tolerances for part in ("--tolerance", tolerance)]
     reference = ["--diff", "--reference", str(expected or HERE / f"{flight}.expected")]
     return main(["replay", str(HERE / f"{flight}.mcap"), "--config", str(config), *reference, *arguments])
