@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 ROS_VENV := .venv-ros
 
 .DEFAULT_GOAL := help
-.PHONY: help demo docs lint test test-all browser coverage ros mutate mutate-all references release deb lock sbom clean
+.PHONY: help demo docs lint test test-all browser coverage ros mutate mutate-all references wheel release deb lock sbom clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -51,8 +51,10 @@ mutate-all: $(VENV)/test.installed ## try them on every mutant, in about a quart
 references: $(VENV)/test.installed ## write what the recorded flights of tests/review/replay are expected to give again
 	$(BIN)/python -m tools.checks.record_regressions --only references
 
-release: $(VENV)/test.installed ## build sdist and wheel in dist, check them, and fly the wheel alone; then sbom and deb
+wheel: $(VENV)/test.installed ## build sdist and wheel in dist, check them, install the wheel alone, and fly it
 	$(BIN)/python -m tools.release.check_wheel --out dist
+
+release: wheel ## that; then sbom and deb
 	$(MAKE) sbom deb
 
 deb: $(BIN)/pip ## build Debian packages for amd64 and arm64 in dist; SYSTEM=debian13 or ubuntu24.04 for others than Debian 12

@@ -39,7 +39,7 @@ STEPS = (
     Step(("--version",), f"flockd {__version__}"),
     Step(("models", "verify")),
     Step(("config", "check", "{data}/config/simulator.yaml")),
-    Step(("sim", "--perception", "truth", "--duration", "5", "--drones", "3", "--out", "{folder}/flight")),
+    Step(("sim", "--perception", "truth", "--duration", "2", "--drones", "3", "--out", "{folder}/flight")),
     Step(("detect", "--fov", "90", "{folder}/picture.jpg"), "1 detection in 1 picture"),
     # It fails a step that is too slow, as it should on a busy computer; of what is installed nothing may be wrong.
     Step(
@@ -61,11 +61,12 @@ def main() -> int:
         tools, alone = folder / "tools", folder / "alone"
         for environment in (tools, alone):
             venv.create(environment, with_pip=True)
-        _run(folder, tools / "bin/python", "-m", "pip", "install", "--quiet", "build", "twine")
+        install = ("-m", "pip", "install", "--quiet", "--no-compile")  # which takes longer than to compile what is used
+        _run(folder, tools / "bin/python", *install, "build", "twine")
         _run(folder, tools / "bin/python", "-m", "build", "--outdir", str(out), str(ROOT))
         built = [out / f"flockd-{__version__}.tar.gz", out / f"flockd-{__version__}-py3-none-any.whl"]
         _run(folder, tools / "bin/twine", "check", "--strict", *map(str, built))
-        _run(folder, alone / "bin/python", "-m", "pip", "install", "--quiet", f"{built[1]}[sim]")
+        _run(folder, alone / "bin/python", *install, f"{built[1]}[sim]")
         (data,) = alone.glob("lib/python*/site-packages/flockd/_data")
         shutil.copy(PICTURE, folder / "picture.jpg")
         for step in STEPS:
