@@ -22,7 +22,10 @@ def add_picture_options(parser: Parser) -> None:
     """Adds the camera and the networks."""
     camera = parser.add_argument_group("the camera of the pictures, one of")
     camera.add_argument(
-        "--fov", metavar="DEG", type=_fov, help="field of view across the longer side, of a lens without distortion"
+        "--fov",
+        metavar="DEG",
+        type=_fov,
+        help="field of view across the longer side, of a lens without distortion; above 100, of a fisheye",
     )
     camera.add_argument("--config", metavar="FILE", type=Path, help="this drone's camera, networks and settings")
     camera.add_argument("--camera", metavar="NAME", help="which of --config's cameras, where it has several")
@@ -37,7 +40,9 @@ def add_picture_options(parser: Parser) -> None:
 def _fov(text: str) -> float:
     angle = positive_number(text)
     if angle > MAX_FOV_DEG:
-        raise argparse.ArgumentTypeError(f"{text} degrees are more than {MAX_FOV_DEG:g}; a pinhole camera has less")
+        raise argparse.ArgumentTypeError(
+            f"{text} degrees are more than {MAX_FOV_DEG:g}; name such a camera with --config"
+        )
     return angle
 
 

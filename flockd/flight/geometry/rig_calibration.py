@@ -152,25 +152,39 @@ class RigCalibration:
         self._velocity_error = np.zeros(3)
 
     def update(self, before: Seen, after: Seen, pairs: PointPairs) -> None:
-        """Takes what stood still between two frame sets, which are at most some seconds apart; else it is left out."""
+        """Takes what stood still between two frame sets, which are at most some seconds apart.
+
+        What is farther apart is left out, and so is what makes no finite numbers: a step must not end of it.
+        """
         interval_s = after.vehicle.time_s - before.vehicle.time_s
         if not 0.0 < interval_s <= _MAX_INTERVAL_S:
             return
         self._wait(interval_s)
+        with np.errstate(all="ignore"):
+            try:
+                step, covariance = self._found(before, after, pairs)
+            except (np.linalg.LinAlgError, ValueError):
+                return
+        if np.isfinite(step).all() and np.isfinite(covariance).all() and (np.diag(covariance) > 0.0).all():
+            self._covariance = covariance
+            self._move(step)
+
+    def _found(self, before: Seen, after: Seen, pairs: PointPairs) -> tuple[FloatArray, FloatArray]:
+        """The state's step and its covariance after it. Raises ValueError where no camera tells anything."""
+        interval_s = after.vehicle.time_s - before.vehicle.time_s
         used = {}
         for name, camera in self._cameras.items():
             motion = self._motion(name, before, after, pairs)
             if motion is not None and self._fits(self._row(name, motion, before, after, np.zeros(6)), camera):
                 used[name] = motion
         if not used:
-            return
+            raise ValueError("no camera tells anything")
         known, off = before.vehicle.velocity_ned is not None, np.zeros(6)
         for _ in range(_ROUNDS):
             rows = [self._row(name, motion, before, after, off) for name, motion in used.items()]
             step, off, covariance = self._solved(rows, interval_s, known=known)
             off[3:] += step[-3:] * interval_s
-        self._covariance = covariance
-        self._move(step)
+        return step, covariance
 
     def deviations(self) -> tuple[CameraDeviation, ...]:
         """How each camera differs from its configuration, as far as is known."""
@@ -245,6 +259,8 @@ class RigCalibration:
         spread = H @ self._covariance[np.ix_(mine, mine)] @ H.T + row.by_noise @ noise @ row.by_noise.T
         spread += np.linalg.inv(row.information)
         square = float(row.measured @ np.linalg.solve(spread, row.measured)) / len(row.measured)
+        if not math.isfinite(square):
+            return False
         camera.misfit = max(camera.misfit * min(max(square, 0.1), _MAX_MISFIT) ** _FIT_GAIN, 1.0)
         return square < _MAX_MISFIT
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from flockd.core.config.perception import DIS, PerceptionConfig
 from flockd.core.messages import Detection, FloatArray, Frame, FrameSet, UInt8Array, VehicleState
-from flockd.flight.geometry import Camera, PinholeCamera, Rig, RigCamera, RigidTransform
+from flockd.flight.geometry import Camera, PinholeCamera, Rig, RigCamera, RigidTransform, WideAngleCamera
 from flockd.flight.perception import Networks, Perception, load_networks
 from flockd.flight.perception.detection.detector import DetectionTrace
 from flockd.flight.perception.detection.refinement import Candidate
@@ -20,6 +20,7 @@ from flockd.flight.perception.detection.roi import angle_between
 
 MAX_SIDE_PX = 1280
 """Larger pictures are resized to this before the networks: they were trained on cameras of 640 pixels."""
+WIDEST_PINHOLE_DEG = 100.0
 _R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """Rotation of a camera that faces forward: optical right-down-forward axes to the body's forward-right-down."""
 _MAX_INSTANCE = 2.0
@@ -87,7 +88,7 @@ class PictureDetector:
         Args:
             image: (h, w, 3) RGB, 8 bits.
             camera: of the picture, of the picture's size or of the size that it is to be resized to; or
-            fov_deg: instead of it: field of view across the longer side, of a lens without distortion.
+            fov_deg: instead of it: field of view across the longer side, as for `camera_with_fov`.
 
         Raises ValueError for what is no such image, and where not one of ``camera`` and ``fov_deg`` is given.
         """
@@ -151,8 +152,11 @@ class PictureDetector:
 
 
 @lru_cache(maxsize=8)  # one object for pictures of one size, as rays are cached by it
-def camera_with_fov(size: tuple[int, int], fov_deg: float) -> PinholeCamera:
-    """A camera without distortion, of a picture's size or, for a larger one, of the size to resize it to.
+def camera_with_fov(size: tuple[int, int], fov_deg: float) -> Camera:
+    """A camera of a picture's size or, for a larger one, of the size to resize it to.
+
+    Without distortion up to `WIDEST_PINHOLE_DEG`, and an equidistant fisheye beyond: a lens without distortion draws a
+    drone at 60 degrees off its axis twice as long as wide, and hardly one is built.
 
     Args:
         size: width and height of the picture.
@@ -161,9 +165,10 @@ def camera_with_fov(size: tuple[int, int], fov_deg: float) -> PinholeCamera:
     longer = max(size)
     if longer > MAX_SIDE_PX:
         size = (max(round(size[0] * MAX_SIDE_PX / longer), 1), max(round(size[1] * MAX_SIDE_PX / longer), 1))
-    focal = max(size) / 2 / math.tan(math.radians(fov_deg) / 2)
+    half_rad, is_pinhole = math.radians(fov_deg) / 2, fov_deg <= WIDEST_PINHOLE_DEG
+    focal = max(size) / 2 / (math.tan(half_rad) if is_pinhole else half_rad)
     matrix = np.array([[focal, 0.0, size[0] / 2], [0.0, focal, size[1] / 2], [0.0, 0.0, 1.0]])
-    return PinholeCamera(matrix, size)
+    return PinholeCamera(matrix, size) if is_pinhole else WideAngleCamera(matrix, size)
 
 
 def _box_of(mask: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> FloatArray | None:

@@ -220,5 +220,9 @@ def test_what_says_nothing_changes_nothing() -> None:
     for one, other in zip(before, calibration.deviations(), strict=True):
         assert (one.turn == other.turn).all()
         assert (one.covariance == other.covariance).all()
+    fast = replace(second.vehicle, velocity_ned=np.full(3, 1e300))
+    for absurd in (fast, replace(second.vehicle, turn_rate=np.full(3, 1e200))):
+        calibration.update(first, replace(second, vehicle=absurd), pairs)
+    assert all(np.isfinite(one.turn).all() and np.isfinite(one.covariance).all() for one in calibration.deviations())
     calibration.update(first, second, pairs.select(np.arange(20)))  # too few to tell
     assert all(np.linalg.norm(one.turn) == 0.0 for one in calibration.deviations())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import struct
@@ -90,6 +91,16 @@ def test_a_pictures_camera_is_given_once() -> None:
     for arguments in ({}, {"camera": camera_with_fov(SIZE, FOV_DEG), "fov_deg": FOV_DEG}):
         with pytest.raises(ValueError, match="and not both"):
             detector.detect(image, **arguments)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("fov_deg", [25.0, 90.0, 120.0, 150.0])
+def test_a_field_of_view_reaches_from_border_to_border_and_keeps_a_drones_shape(fov_deg: float) -> None:
+    """A small round thing is imaged nearly round: at the border of a pinhole of 120 degrees it would be 2 to 1."""
+    camera = camera_with_fov((640, 480), fov_deg)
+    left, right = camera.rays(np.array([[0.0, 240.0], [640.0, 240.0]]))
+    assert math.degrees(math.acos(float(left @ right))) == pytest.approx(fov_deg)
+    here, along, down = camera.rays(np.array([[638.0, 240.0], [639.0, 240.0], [638.0, 241.0]]))
+    assert np.linalg.norm(down - here) / np.linalg.norm(along - here) < 1.42
 
 
 def test_a_known_size_gives_the_range(capsys: Capture) -> None:
