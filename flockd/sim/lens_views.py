@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -18,6 +19,8 @@ _WIDEST = math.radians(75.0)
 _FINER = 1.3
 """Pixels a radian of a view's middle over the lens's, so that sampling loses nothing."""
 _MARGIN_PX = 2
+_KEPT = 32
+"""Cameras whose views are kept, of 16 MB each at 640x480: those of five drones, each with a rig of its own."""
 
 Draw = Callable[[FloatArray, tuple[int, int], FloatArray], View]
 """Draws a pinhole view: its matrix (3, 3), its size and the turn (3, 3) from its axes to the lens's."""
@@ -64,14 +67,10 @@ class _Part:
     """(h, w) z in the lens's axes over z in the view's."""
 
 
-_PARTS: dict[int, tuple[Camera, tuple[_Part, ...]]] = {}
-
-
+@lru_cache(_KEPT)
 def _parts(camera: Camera) -> tuple[_Part, ...]:
     """Made once for each camera: two cameras are the same only if they are one object."""
-    if id(camera) not in _PARTS:
-        _PARTS[id(camera)] = camera, tuple(_cut(camera))
-    return _PARTS[id(camera)][1]
+    return tuple(_cut(camera))
 
 
 def _cut(camera: Camera) -> list[_Part]:
