@@ -10,22 +10,30 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.drone import DroneConfig
 from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.config.source import SourceParameters
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
-from flockd.core.messages import Frame, RangeReading, Reason, ReasonKind, VehicleState
+from flockd.core.messages import Frame, RangeReading, Reason, ReasonKind, VehicleState, Wanted
 from flockd.flight.inference import OnnxModel
+from flockd.flight.safety import Action, Decision, Gate, Inputs, Permission, Request, State, Surroundings
+from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
+from flockd.onboard.daemon.control import Control
 from flockd.onboard.daemon.host_monitors import LoopLag, WallClock, hottest_zone_c
 from flockd.onboard.daemon.lock import only_instance
+from flockd.onboard.daemon.operator_commands import OperatorRequests
 from flockd.onboard.daemon.service_manager import ServiceManager
-from flockd.onboard.daemon.supervisor_inputs import CameraMonitor
+from flockd.onboard.daemon.supervisor_inputs import CameraMonitor, InputCollector
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
 from flockd.onboard.daemon.worker import BusyError, LateError, Worker
 from flockd.onboard.sources import CameraStatus, Count
@@ -293,3 +301,35 @@ def test_a_range_finder_that_fails_is_an_event_and_so_is_its_return() -> None:
     steps: tuple[tuple[Reason, ...], ...] = ((), (left, weak), (weak,), (old,), (left,), ())
     found = [reports.update(reasons) for reasons in steps]
     assert found == [None, weak.text, None, old.text, "height: the range finder works again", None]
+
+
+def test_the_supervisor_is_told_of_an_obstacle_where_hold_needs_room() -> None:
+    """As of the last tick's surroundings: `safety.hold_room_m` is 2 m."""
+    config = _flyable("front").model_copy(update={"autopilot": AutopilotParameters()})
+    status = AutopilotStatus(0.0, 0.1, 0.1, "offboard", True, False, "air", None, None, True, True, None, None)
+    parts: Any = SimpleNamespace(  # all that the control loop asks, of whichever part
+        newest=None, noisy_images=Counter(), ego_motion_failures=0, neighbour_seen_s=0.0, load=lambda: 0.5, faults=0,
+        stuck=False, worst_s=lambda: 0.0, hottest_c=None, report=lambda: SimpleNamespace(fault=None), end=str,
+        takeover=None, status=dict,
+    )  # fmt: skip
+    collector = InputCollector(config, parts, parts, parts, Gate(config.safety.gate), parts, parts, {}, lambda: 0.0)
+    link: Any = SimpleNamespace(status=lambda: status, vehicle_state=lambda: None)
+    control = Control(
+        config, link, parts, parts, collector, parts, parts, OperatorRequests(), lambda before, now: None, lambda: 0.0
+    )
+    told: list[Inputs] = []
+
+    def step(_: float, inputs: Inputs) -> Decision:
+        told.append(inputs)
+        return Decision(State.IDLE, Action.SILENCE, ())
+
+    control._supervisor = SimpleNamespace(step=step)  # type: ignore[assignment]
+    for away_m in (1.9, 2.1):
+        around = Surroundings(
+            np.zeros(2), np.zeros(2), 0.0, np.empty((0, 3)), np.empty((0, 2)), 5.0, np.array([[away_m, 0.0]])
+        )
+        wanted = Wanted(np.zeros(2), np.zeros(2), None)
+        control._request = Request(Permission(Action.FLY, 0.0), wanted, 0.0, 5.0, around)
+        control.tick()
+    control.tick()  # in silence nothing is known to be near
+    assert [inputs.obstacle_near for inputs in told] == [True, False, False]
