@@ -164,9 +164,8 @@ def test_two_degrees_thirty_milliseconds_and_two_percent_are_known_after_a_minut
         )
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_a_rig_as_configured_is_not_complained_of(seed: int) -> None:
-    random = np.random.default_rng(seed)
+def test_a_rig_as_configured_is_not_complained_of() -> None:
+    random = np.random.default_rng(0)
     wrong = wrong_by(0.0, 0.0, 0.0, four_camera_rig(), random)
     for way in (lively(random), STRAIGHT):
         for found in flown(way, wrong, random, steps=60):
