@@ -78,11 +78,6 @@ class CameraSimulator:
         """(n,) metres above z = 0 of the ground that is drawn, at points (n,) north and east."""
         return self._world.height_at(north, east)
 
-    @property
-    def sun(self) -> FloatArray:
-        """(3,) unit vector towards it, NED."""
-        return np.asarray(self._world.light[0], np.float64)
-
     def capture(
         self, drone: int, step: int, time_s: float, vehicles: FlockPoses, trail: PoseTrail | None = None
     ) -> tuple[FrameSet, RenderTruth]:
@@ -116,8 +111,9 @@ class CameraSimulator:
             seen = lens_view(cameras[name].camera, draw)
             if self._real is None:
                 return seen, seen.rgb
-            motion = self.motion(drone, name, shots[name].shown_s, turns[name], trail)
-            return seen, self._real[drone, name].image(seen, motion, time_s, self.sun @ turns[name])
+            motion = self._motion(drone, name, shots[name].shown_s, turns[name], trail)
+            sun = self._world.light[0] @ turns[name]
+            return seen, self._real[drone, name].image(seen, motion, time_s, sun)
 
         # Side by side; noise and faults are drawn in the cameras' order, so that the images do not depend on that.
         drawn = map(view, cameras) if self._executor is None else self._executor.map(view, cameras)
@@ -153,8 +149,10 @@ class CameraSimulator:
         shaken: FloatArray = R_ned_camera @ rotation_from_vector(angles) if angles.any() else R_ned_camera
         return shaken
 
-    def motion(self, drone: int, name: str, shown_s: float, R_ned_camera: FloatArray, trail: PoseTrail) -> CameraMotion:
-        """How a camera of a scenario that has `cameras` moves around the time of its image."""
+    def _motion(
+        self, drone: int, name: str, shown_s: float, R_ned_camera: FloatArray, trail: PoseTrail
+    ) -> CameraMotion:
+        """How a camera moves around the time of its image."""
         assert self._real is not None
         flock, mounted = trail.motion_at(shown_s), self._rigs[drone].cameras[name].T_body_camera
         R_ned_body = trail.at(shown_s).R_ned_body[drone]
