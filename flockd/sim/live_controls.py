@@ -189,3 +189,17 @@ class LiveControls:
 
 def _name(drone: int) -> str:
     return f"drone{drone + 1}"
+
+
+def answered(controls: LiveControls) -> Callable[[str, bytes], Mapping[str, object]]:
+    """What replies to queries under the simulator's key: `state`, or a control's name."""
+
+    def reply(last: str, payload: bytes) -> Mapping[str, object]:
+        match last:
+            case "state":
+                return {**controls.state()}
+            case "time":
+                return {"time_s": time.monotonic(), "wall_s": time.time(), "identity": controls.state()["identity"]}
+        return {**controls.ask(last, payload)}
+
+    return reply
