@@ -62,7 +62,7 @@ def fly(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) -> int:
     endpoint = args.telemetry_at or ENDPOINT
     with ExitStack() as stack:
         zenoh = stack.enter_context(ZenohTelemetry(fleet, listen=[endpoint]))
-        controls = LiveControls(scenario, zenoh.identity)
+        controls = LiveControls(scenario, zenoh.identity, by_sight=args.perception != "truth")
         zenoh.reply_to(f"{key_of(fleet)}/**", answered(controls))
         shown = ShownFlock(scenario, zenoh, stack.enter_context(Repeater(zenoh)))
         watcher = stack.enter_context(FleetWatcher(fleet, listen=[], connect=[endpoint]))

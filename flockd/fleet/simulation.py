@@ -29,6 +29,8 @@ class SimulationMessage(TypedDict):
 
     identity: str
     """Of all of its drones, in their liveliness tokens."""
+    by_sight: bool
+    """Its drones fly on what they see."""
     flight: int
     """Counts up at each restart."""
     time_s: float

@@ -27,11 +27,15 @@ class LiveControls:
         self,
         scenario: ScenarioConfig,
         identity: str,
+        *,
+        by_sight: bool,
         clock: Callable[[], float] = time.monotonic,
         wait: Callable[[threading.Condition, float], object] = threading.Condition.wait,
     ) -> None:
-        """``identity``: of all its drones; ``wait``: until something has changed, for so long at most."""
+        """``identity``: of all its drones; ``by_sight``: how these fly; ``wait``: until something has changed, for so
+        long at most."""
         self._scenario, self._identity, self._clock, self._wait_on = scenario, identity, clock, wait
+        self._by_sight = by_sight
         self._checks = OrderChecks(identity, time.monotonic)
         self._changed = threading.Condition()
         self._disturbed = UNDISTURBED
@@ -92,6 +96,7 @@ class LiveControls:
                 off.setdefault(_name(drone), []).append(camera)
             return SimulationMessage(
                 identity=self._identity,
+                by_sight=self._by_sight,
                 flight=self._flight,
                 time_s=self._time_s,
                 paused=self._paused,
