@@ -221,12 +221,12 @@ export class FleetMap {
     pen.stroke();
     pen.fillText(`${spacing} m`, width - 12, height - 19);
     pen.textAlign = "center";
-    pen.fillText("N", width - 20, 62);
+    pen.fillText("N", width - 20, height - 56);
     pen.beginPath();
-    pen.moveTo(width - 20, 66);
-    pen.lineTo(width - 15, 80);
-    pen.lineTo(width - 20, 77);
-    pen.lineTo(width - 25, 80);
+    pen.moveTo(width - 20, height - 52);
+    pen.lineTo(width - 15, height - 38);
+    pen.lineTo(width - 20, height - 41);
+    pen.lineTo(width - 25, height - 38);
     pen.fill();
   }
 
