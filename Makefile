@@ -8,13 +8,16 @@ BIN := $(VENV)/bin
 ROS_VENV := .venv-ros
 
 .DEFAULT_GOAL := help
-.PHONY: help demo docs lint test test-all browser coverage ros mutate mutate-all references wheel release deb lock sbom clean
+.PHONY: help demo live docs lint test test-all browser coverage ros mutate mutate-all references wheel release deb lock sbom clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
 
 demo: $(VENV)/sim.installed ## fly the paper's flight in the simulator and write its report
 	$(BIN)/flockd sim
+
+live: $(VENV)/sim.installed $(VENV)/fleet.installed ## fly a simulated flock on exact states on a page in the browser, until Ctrl-C
+	$(BIN)/flockd sim --live --perception truth
 
 docs: $(VENV)/docs.installed ## build the documentation as a site in out/site
 	$(BIN)/python -m tools.docs.docs_reference

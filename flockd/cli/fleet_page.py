@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +17,7 @@ from flockd.core.errors import ExitCode, UnavailableError
 if TYPE_CHECKING:
     from flockd.fleet.page.fleet_source import FleetSource
     from flockd.fleet.page.page_connections import PageConnections
+    from flockd.fleet.page.page_server import PageServer
 
 PORT = 8470
 
@@ -44,23 +46,34 @@ def _run(args: argparse.Namespace) -> int:
 
 
 async def _serve(args: argparse.Namespace, source: FleetSource) -> None:
-    """Until it is cancelled, as Ctrl-C does."""
-    from aiohttp import web
-
     from flockd.fleet.page.page_access import PageAccess, lasting_key
-    from flockd.fleet.page.page_connections import PageConnections
     from flockd.fleet.page.page_server import PageServer
 
     access = PageAccess(None if args.key_file is None else lasting_key(args.key_file))
     page = PageServer(source, access, may_command=not args.watch_only, operator=args.operator)
+
+    def served(port: int) -> None:
+        sentence = f"the fleet page is at http://{{host}}:{port}/?key={access.key}"
+        announce(args, sentence, "whoever has this address with its key may do what this computer may")
+
+    await serve_page(page, args.server_address, args.port, served)
+
+
+async def serve_page(page: PageServer, address: str, port: int, served: Callable[[int], None]) -> None:
+    """Until it is cancelled, as Ctrl-C does. ``served``: is told the port, once there is somebody at it.
+
+    Raises UnavailableError for an address or a port that cannot be used.
+    """
+    from aiohttp import web
+
+    from flockd.fleet.page.page_connections import PageConnections
+
     runner = web.AppRunner(page.application(), access_log=None, shutdown_timeout=1.0)
     await runner.setup()
     try:
         assert runner.server is not None
         connections = PageConnections(runner.server, page.trusted)
-        port = await _listen(connections, args.server_address, args.port)
-        sentence = f"the fleet page is at http://{{host}}:{port}/?key={access.key}"
-        announce(args, sentence, "whoever has this address with its key may do what this computer may")
+        served(await _listen(connections, address, port))
         await connections.run()
     finally:
         await runner.cleanup()

@@ -10,8 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
-from flockd.cli import sim_fleet
-from flockd.cli.endpoint_options import ENDPOINT
+from flockd.cli import sim_fleet, sim_live
+from flockd.cli.endpoint_options import ENDPOINT, add_operator_option
+from flockd.cli.fleet_page import PORT
+from flockd.cli.fleet_source import port_number
 from flockd.cli.flight_summary import report_flight
 from flockd.cli.output import Phases, complain
 from flockd.cli.parser import Commands, positive_count, positive_number, seed
@@ -53,6 +55,8 @@ def add(commands: Commands) -> None:
         "flockd sim",
         "flockd sim --duration 20 --wind 3,-1 --speed 1.5 --radius 15 --out out/windy",
         "flockd sim --perception truth --json > truth.json",
+        "flockd sim --live --perception truth",
+        "flockd sim --live config/forest.yaml --drones 3",
         "flockd sim --perception truth --telemetry --drones 25 --duration 600",
         "flockd sim my_flight.yaml --flow dis --seed 7",
         "flockd sim config/fisheye_flight.yaml --cameras realistic --duration 20",
@@ -117,13 +121,27 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument("--force", action="store_true", help="overwrite an earlier flight in that folder")
     parser.add_argument(
+        "--live",
+        action="store_true",
+        help="fly on the fleet page in the browser, in real time where the computer can: send drones places, pause, "
+        "slow down, disturb, begin again; until Ctrl-C, without a report",
+    )
+    parser.add_argument(
+        "--port", metavar="N", type=port_number, help=f"with --live: of the page (default: {PORT}; 0: any)"
+    )
+    parser.add_argument(
+        "--no-browser", dest="browser", action="store_false", help="with --live: print the address, and open no browser"
+    )
+    add_operator_option(parser)
+    parser.add_argument(
         "--telemetry",
         action="store_true",
         help="publish over zenoh while flying, with pictures, and take orders; with --perception truth in real time",
     )
     parser.add_argument(
         "--telemetry-at", metavar="ENDPOINT",
-        help=f"where --telemetry listens, or where the daemons of --autopilot connect to (default: {ENDPOINT})",
+        help="where --telemetry and --live listen, or where the daemons of --autopilot connect to "
+        f"(default: {ENDPOINT})",
     )  # fmt: skip
     parser.add_argument(
         "--record",
@@ -168,6 +186,8 @@ def _run(args: argparse.Namespace) -> int:
     _check_options(args)
     args.settings = _settings_of(args)
     scenario = _scenario(args)
+    if args.live:
+        return sim_live.fly(args, scenario, _plain(scenario.scenario))
     directory = _folder(scenario, args)
     try:
         return _fly_into(directory, scenario, args)
@@ -262,6 +282,7 @@ def _recorders(
 
 
 def _check_options(args: argparse.Namespace) -> None:
+    sim_live.check_options(args)
     sim_fleet.check_options(args)
     if args.perception == "truth":
         idle = [option for option in ("flow", "scale", "height", "cameras", "swap", "record") if getattr(args, option)]

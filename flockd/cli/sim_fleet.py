@@ -30,8 +30,8 @@ def check_options(args: argparse.Namespace) -> None:
     if args.autopilot is None:
         if args.speed_factor is not None:
             raise UsageError("--speed-factor is for real daemons; drop it, or name their --autopilot")
-        if args.telemetry_at is not None and not args.telemetry:
-            raise UsageError("--telemetry-at is for --telemetry and for --autopilot; add one of them, or drop it")
+        if args.telemetry_at is not None and not (args.telemetry or args.live):
+            raise UsageError("--telemetry-at is for --telemetry, --live and --autopilot; add one of them, or drop it")
         return
     slowest, fastest = SPEED_FACTORS
     if args.speed_factor is not None and not slowest <= args.speed_factor <= fastest:

@@ -37,9 +37,12 @@ class DroneQueries:
     Every call waits for the reply, up to ``ANSWER_S``: not for an event loop.
     """
 
-    def __init__(self, session: zenoh.Session, orders: zenoh.Session) -> None:
-        """``orders``: another connection, or the same; nothing else goes over it. Both stay their owner's."""
-        self._session, self._orders = session, orders
+    def __init__(self, session: zenoh.Session, orders: zenoh.Session, prefix: str = PREFIX) -> None:
+        """``orders``: another connection, or the same; nothing else goes over it. Both stay their owner's.
+
+        ``prefix``: of the keys; another than drones' for what replies as they do.
+        """
+        self._session, self._orders, self._prefix = session, orders, prefix
         self._name, self._numbers = secrets.token_hex(8), itertools.count(1)
 
     def ask(
@@ -47,7 +50,7 @@ class DroneQueries:
     ) -> AnswerMessage | None:
         """The answer to an operator's command. ``identity``: that of its liveliness token."""
         for session in dict.fromkeys((self._orders, self._session)):  # one may not be connected yet
-            now: TimeMessage | None = self._message(f"{drone}/time", TimeMessage, session=session)
+            now: TimeMessage | None = self.message(f"{drone}/time", TimeMessage, session=session)
             if now is None:
                 continue
             ask = AskMessage(
@@ -59,7 +62,7 @@ class DroneQueries:
                 order=None if order is None else {**order},
             )
             payload = json.dumps(ask, allow_nan=False).encode()
-            answer: AnswerMessage | None = self._message(
+            answer: AnswerMessage | None = self.message(
                 f"{drone}/ask/{command}", AnswerMessage, payload, session=session
             )
             return answer
@@ -67,13 +70,13 @@ class DroneQueries:
 
     def about(self, drone: str) -> AboutMessage | None:
         """What a drone flies with."""
-        about: AboutMessage | None = self._message(f"{drone}/about", AboutMessage)
+        about: AboutMessage | None = self.message(f"{drone}/about", AboutMessage)
         return about
 
     def clock(self, drone: str) -> ClockReading | None:
         """How long the link takes, and how far the clocks are apart."""
         sent_s, began_s = time.time(), time.monotonic()
-        reply = self._message(f"{drone}/time", TimeMessage)
+        reply = self.message(f"{drone}/time", TimeMessage)
         delay_s = time.monotonic() - began_s
         if reply is None or reply["wall_s"] is None:
             return None
@@ -85,8 +88,8 @@ class DroneQueries:
         size_px = jpeg_size(image) if image is not None and image.startswith(b"\xff\xd8") else None
         return image if size_px is not None and max(size_px) <= MAX_PICTURE_PX else None
 
-    def _message(self, key: str, kind: type, payload: bytes = b"", *, session: zenoh.Session | None = None) -> Any:
-        """A reply that is a message of this kind."""
+    def message(self, key: str, kind: type, payload: bytes = b"", *, session: zenoh.Session | None = None) -> Any:
+        """The reply to a query for `fleet/drone/...`, where it is a message of this kind."""
         raw = self._reply(key, payload, session=session)
         if raw is None:
             return None
@@ -102,7 +105,7 @@ class DroneQueries:
         """The first, of those that are not too long. What is asked over the connection for orders goes first."""
         priority = zenoh.Priority.DATA_LOW if session is None else zenoh.Priority.REAL_TIME
         for reply in (session or self._session).get(
-            f"{PREFIX}/{key}", payload=payload, timeout=timeout_s, priority=priority
+            f"{self._prefix}/{key}", payload=payload, timeout=timeout_s, priority=priority
         ):
             if reply.ok is not None and len(reply.ok.payload) <= MAX_REPLY_BYTES:
                 data: bytes = reply.ok.payload.to_bytes()

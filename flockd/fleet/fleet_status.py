@@ -38,12 +38,7 @@ def _row(drone: Watched, now_s: float) -> dict[str, Any]:
     computer: Mapping[str, Any] = drone.message("computer", now_s) or {}
     clock: Mapping[str, Any] = drone.message("clock", now_s) or {}
     neighbours = drone.message("neighbours", now_s)
-    pilot: Mapping[str, Any] = drone.message("state", now_s) or {}
-    health: Mapping[str, Any] = drone.message("health", now_s) or {}
     state = flight.get("state", QUIET) if drone.alive else GONE
-    simulated = drone.alive and "flight" not in drone.topics and bool(health)  # the simulator's own pilot: no daemon
-    if simulated:
-        state = "normal" if health["ok"] else "degraded"
     starting = drone.alive and not drone.topics and not drone.malformed
     malformed = [f"its message `{topic}` is malformed: {_told(why)}" for topic, why in sorted(drone.malformed.items())]
     blind = [camera["fault"] for camera in computer.get("cameras", {}).values() if camera["fault"]]
@@ -53,8 +48,8 @@ def _row(drone: Watched, now_s: float) -> dict[str, Any]:
         "drone": drone.drone,
         "identities": sorted(drone.identities),
         "state": state if state in WORST_FIRST else QUIET,
-        "flight_mode": "simulated" if simulated else flight.get("flight_mode"),
-        "height_m": pilot.get("height_m") if simulated else flight.get("height_m"),
+        "flight_mode": flight.get("flight_mode"),
+        "height_m": flight.get("height_m"),
         "battery_share": flight.get("battery_share"),
         "neighbours": None
         if neighbours is None
@@ -70,7 +65,6 @@ def _row(drone: Watched, now_s: float) -> dict[str, Any]:
         + malformed
         + (["it has published nothing yet: it starts, or loads its networks"] if starting else [])
         + [reason["sentence"] for reason in flight.get("reasons", ())]
-        + [str(reason) for reason in (health.get("reasons", ()) if simulated else ())]
         + blind,
     }
 

@@ -144,6 +144,10 @@ class FleetWatcher(SessionOwner):
             f"{drones}/alive/**", self._take_token, history=True
         )
 
+    def queries_under(self, prefix: str) -> DroneQueries:
+        """To what replies as drones do, under other keys."""
+        return DroneQueries(self._session, self._orders, prefix)
+
     def close(self) -> None:
         """Ends both connections."""
         if self._orders is not self._session:

@@ -15,6 +15,7 @@ from flockd.core.messages import FloatArray, Frame, FrameSet, UInt8Array
 from flockd.flight.geometry import build_rig, rotation_from_vector
 from flockd.flight.mission import Moment, Navigator
 from flockd.sim.camera_faults import CameraFaults
+from flockd.sim.disturbances import UNDISTURBED, Disturbances
 from flockd.sim.drone_models import FAMILIES, drone_model
 from flockd.sim.lens_views import lens_view
 from flockd.sim.pose_trail import FlockPose, PoseTrail
@@ -65,21 +66,33 @@ class CameraSimulator:
         self._world = world
         self._renderer = Renderer(world, models)
         by_gain = scenario.cameras is not None and scenario.cameras.noise.gain > 0
-        self._noise = _ImageNoise(0.0 if by_gain else scenario.sensors.image_noise, scenario.seed)
+        self._scenario, self._image_noise = scenario, 0.0 if by_gain else scenario.sensors.image_noise
+        self.begin_again()
+        count = os.cpu_count() if threads is None else threads
+        self._executor = ThreadPoolExecutor(count, thread_name_prefix="camera") if count else None
+
+    def begin_again(self) -> None:
+        """For another flight from the beginning in the same world."""
+        scenario, self._real = self._scenario, None
+        self._noise = _ImageNoise(self._image_noise, scenario.seed)
         self._faults = CameraFaults(scenario.faults, scenario.seed)
-        self._captured, self._real = PoseTrail(), None
+        self._captured = PoseTrail()
         if scenario.cameras is not None:
             lenses = {name: mounted.camera for name, mounted in self.rig.cameras.items()}
             self._real = real_cameras(scenario.cameras, lenses, self._count, scenario.seed)
-        count = os.cpu_count() if threads is None else threads
-        self._executor = ThreadPoolExecutor(count, thread_name_prefix="camera") if count else None
 
     def ground_height(self, north: FloatArray, east: FloatArray) -> FloatArray:
         """(n,) metres above z = 0 of the ground that is drawn, at points (n,) north and east."""
         return self._world.height_at(north, east)
 
     def capture(
-        self, drone: int, step: int, time_s: float, vehicles: FlockPoses, trail: PoseTrail | None = None
+        self,
+        drone: int,
+        step: int,
+        time_s: float,
+        vehicles: FlockPoses,
+        trail: PoseTrail | None = None,
+        disturbed: Disturbances = UNDISTURBED,
     ) -> tuple[FrameSet, RenderTruth]:
         """The frame set of one drone, and the truth behind it.
 
@@ -89,7 +102,8 @@ class CameraSimulator:
         if trail is None:
             trail = self._captured
             trail.add(FlockPose(time_s, vehicles.position, vehicles.R_ned_body))
-        others = [i for i in range(self._count) if i != drone]
+        others = [i for i in range(self._count) if i != drone and i not in disturbed.removed]
+        off = disturbed.cameras_off_of(drone)
         cameras, flock = self._rigs[drone].cameras, dict.fromkeys(self.rig.cameras, vehicles)
         shots = {name: Shot(time_s, time_s, comes=True) for name in cameras}
         if self._real is not None:
@@ -124,7 +138,7 @@ class CameraSimulator:
             if self._real is not None:
                 image = self._real[drone, name].compressed(image)
             image = self._faults.applied(drone, name, time_s, image)
-            if shots[name].comes:
+            if shots[name].comes and name not in off:
                 frames[name] = Frame(name, image, shots[name].stamp_s, step)
         R_ned_body, position = vehicles.R_ned_body[drone], vehicles.position[drone]
         truth = RenderTruth(

@@ -11,10 +11,11 @@ from flockd.core.config.safety import GateParameters
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FloatArray, Setpoint, Wanted
 from flockd.flight.obstacles import nearest_points
-from flockd.flight.safety import Gate, Permission, Request, State, Surroundings, Verdict
+from flockd.flight.safety import Decision, Gate, Permission, Request, State, Surroundings, Verdict
 from flockd.flight.safety.surroundings import surroundings
 from flockd.review.flight_log.metadata import HandedOver
 from flockd.sim.commands import Commands
+from flockd.sim.disturbances import UNDISTURBED, Disturbances
 from flockd.sim.handover import Handover
 from flockd.sim.made_up_detections import lost_cameras
 from flockd.sim.slowing import Cause, SlowedTime, causes_of, is_slowed, which_are_drones
@@ -45,6 +46,13 @@ class _Drone(NamedTuple):
     parameters: GateParameters
 
 
+class FlightStatus(NamedTuple):
+    """Who flies a drone, and why, as in telemetry."""
+
+    state: State
+    reasons: tuple[str, ...]
+
+
 class ControlLoop:
     """Flies all drones of a flight from one step of their pilots to the next.
 
@@ -57,22 +65,49 @@ class ControlLoop:
         self._step_s, self._sigmas = scenario.drone.step_s, scenario.drone.obstacles.sigmas
         self._handover = Handover(scenario)
         self._drones = {
-            i: _Drone(Gate(safety.gate), WindSupervisor(safety), safety.gate)
-            for i, vehicle in enumerate(scenario.vehicles)
-            for safety in [scenario.drone_of(i).safety]
-            if gated and not vehicle.by_hand
+            i: _drone(scenario, i) for i, vehicle in enumerate(scenario.vehicles) if gated and not vehicle.by_hand
         }
         self._start_m = [-vehicle.position_m[2] for vehicle in scenario.vehicles]
         self._scenario = scenario
         self._latency_s = scenario.detections.latency_s if scenario.detections is not None else 0.0
         self._in_force: _Order | None = None
+        self._disturbed = UNDISTURBED
+        self._supervised: dict[int, Decision] = {}
         self.slowed = SlowedTime()
         """How long gates let drones fly otherwise than their pilots asked for."""
         self.handed_over: dict[int, HandedOver] = {}
         """By the drone's number, from 0."""
 
-    def fly(self, time_s: float, vehicles: Vehicles, commands: Commands) -> None:
+    def hold(self, i: int, time_s: float, vehicles: Vehicles) -> None:
+        """An operator asks for Hold: the drone's autopilot takes over and holds its place."""
+        self._hand_over(i, time_s, vehicles, "an operator asked for Hold")
+
+    def resume(self, i: int) -> None:
+        """An operator has a drone that its autopilot holds fly on as its pilot asks."""
+        if i not in self._handover.taken:
+            return
+        self._handover.resume(i)
+        self._supervised.pop(i, None)
+        if i in self._drones:
+            self._drones[i] = _drone(self._scenario, i)
+
+    def status(self, i: int) -> FlightStatus:
+        """Who flies a drone, and why."""
+        if i in self._handover.taken:
+            reasons = (self.handed_over[i].reason,) if i in self.handed_over else ()
+            return FlightStatus(State.ASKING, reasons)
+        decision = self._supervised.get(i)
+        if decision is None:
+            return FlightStatus(State.NORMAL, ())
+        return FlightStatus(decision.state, tuple(reason.sentence for reason in decision.reasons))
+
+    def gusts_m_s(self, i: int) -> float:
+        """By how much wind carries a drone off its setpoints, as its gate finds; 0 without one."""
+        return self._drones[i].gate.gusts_m_s if i in self._drones else 0.0
+
+    def fly(self, time_s: float, vehicles: Vehicles, commands: Commands, disturbed: Disturbances = UNDISTURBED) -> None:
         """From `time_s` one step on."""
+        self._disturbed = disturbed
         velocity, height_m = self._handover.applied(
             commands.takeovers, vehicles.position, commands.velocity, commands.height_m
         )
@@ -85,7 +120,7 @@ class ControlLoop:
             if now_s - time_s >= self._latency_s - _SAME_TIME_S:
                 order = coming
             setpoints, heights = order.velocity.copy(), order.height_m.copy()
-            for i in self._drones.keys() - self._handover.taken:
+            for i in self._drones.keys() - self._handover.taken - disturbed.removed:
                 setpoint = self._setpoint(i, now_s, period_s, vehicles, order)
                 setpoints[i] = setpoint.velocity
                 if math.isfinite(order.height_m[i]):
@@ -97,12 +132,12 @@ class ControlLoop:
 
     def _setpoint(self, i: int, now_s: float, period_s: float, vehicles: Vehicles, order: _Order) -> Setpoint:
         """What the gate of a drone makes of its order now; its supervisor may hand it over instead."""
-        drone, here = self._drones[i], vehicles.position[i]
+        drone = self._drones[i]
         around = self._around(i, now_s, vehicles, order)
-        decision = drone.supervisor.step(now_s, drone.gate.gusts_m_s, around, blind=self._is_blind(i, now_s))
+        decision = drone.supervisor.step(now_s, drone.gate.gusts_m_s, around, lost=self._lost_cameras(i, now_s))
+        self._supervised[i] = decision
         if decision.state is State.ASKING:
-            self._handover.hold(i, here, vehicles.velocity[i])
-            self.handed_over[i] = HandedOver(time_s=now_s, reason=decision.reasons[0].sentence)
+            self._hand_over(i, now_s, vehicles, decision.reasons[0].sentence)
         request = self._request(i, Permission(decision.action, now_s), around, order)
         verdict = drone.gate.step(now_s, request)
         assert verdict.setpoint is not None, "all that it is told is finite and of now"
@@ -111,9 +146,14 @@ class ControlLoop:
             self.slowed.add(period_s, self._causes(i, request, verdict, vehicles) if slowed else frozenset())
         return verdict.setpoint
 
-    def _is_blind(self, i: int, now_s: float) -> bool:
-        """Whether a camera of a drone that flies on made-up detections is lost."""
-        return self._scenario.detections is not None and bool(lost_cameras(self._scenario, i, now_s))
+    def _hand_over(self, i: int, now_s: float, vehicles: Vehicles, why: str) -> None:
+        self._handover.hold(i, vehicles.position[i], vehicles.velocity[i])
+        self.handed_over[i] = HandedOver(time_s=now_s, reason=why)
+
+    def _lost_cameras(self, i: int, now_s: float) -> frozenset[str]:
+        """Those that are off, and those of a drone that flies on made-up detections that have a fault."""
+        off = self._disturbed.cameras_off_of(i)
+        return off if self._scenario.detections is None else off | lost_cameras(self._scenario, i, now_s)
 
     def _causes(self, i: int, request: Request, verdict: Verdict, vehicles: Vehicles) -> frozenset[Cause]:
         truth = _truth(i, vehicles)
@@ -140,6 +180,11 @@ class ControlLoop:
         wanted = Wanted(commands.velocity[i], commands.acceleration[i], float(commands.yaw_rad[i]))
         held_m = height_m if math.isfinite(height_m) else self._start_m[i]
         return Request(permission, wanted, order.time_s, held_m, around)
+
+
+def _drone(scenario: ScenarioConfig, i: int) -> _Drone:
+    safety, cameras = scenario.drone_of(i).safety, [camera.name for camera in scenario.drone.rig.cameras]
+    return _Drone(Gate(safety.gate), WindSupervisor(safety, cameras), safety.gate)
 
 
 def _truth(i: int, vehicles: Vehicles) -> Surroundings:

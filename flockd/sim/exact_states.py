@@ -10,11 +10,13 @@ import numpy as np
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FloatArray, MissionOrder, MissionStatus, Neighbour, ObstacleRanges
 from flockd.flight.flocking import FlockingLaw, passing
+from flockd.flight.geometry import build_rig, rotation_from_euler
 from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
 from flockd.flight.obstacles import Avoidance
 from flockd.sim.commands import Commands
 from flockd.sim.control_loop import ControlLoop
+from flockd.sim.disturbances import UNDISTURBED, Disturbances
 from flockd.sim.made_up_detections import TrackedNeighbours
 from flockd.sim.vehicles import REFERENCE_DEG, Vehicles
 from flockd.sim.worlds.obstacle_worlds import obstacles_of
@@ -41,6 +43,7 @@ class ExactFlock:
             for i, vehicle in enumerate(scenario.vehicles)
         ]
         self._yaw_rad = np.full(len(self._pilots), start_yaw(scenario))
+        self._rig = build_rig(drone.rig)
         made_up, n = scenario.detections, len(self._pilots)
         self._tracked = [] if made_up is None else [TrackedNeighbours(scenario, made_up, i) for i in range(n)]
         self._obstacles = obstacles_of(scenario)
@@ -54,14 +57,19 @@ class ExactFlock:
         positions: FloatArray,
         velocities: FloatArray,
         orders: Mapping[int, MissionOrder] | None = None,
+        disturbed: Disturbances = UNDISTURBED,
     ) -> Commands:
         """The commands for drones at (n, 3) m and (n, 3) m/s in NED; called in order of time.
 
-        `orders` are operators' of now, by drone, beside those that were given at the beginning.
+        `orders` are operators' of now, by drone, beside those that were given at the beginning. In the view of a camera
+        that is off, as `disturbed` says, a drone knows of nobody.
         """
         self._new = orders or {}
         seen = [true_ranges(self._obstacles, time_s, place) if self._obstacles.solids else None for place in positions]
-        known = [self._neighbours(i, time_s, positions, velocities) for i in range(len(positions))]
+        known = [
+            self._neighbours(i, time_s, positions, velocities, disturbed.cameras_off_of(i))
+            for i in range(len(positions))
+        ]
         found = [self._of(i, time_s, positions, velocities, known[i], ranges) for i, ranges in enumerate(seen)]
         velocity, acceleration, yaw_rad, height_m, missions, desired = zip(*found, strict=True)
         self._yaw_rad = np.array(yaw_rad)
@@ -106,13 +114,16 @@ class ExactFlock:
         return newest
 
     def _neighbours(
-        self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray
+        self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray, cameras_off: frozenset[str]
     ) -> tuple[Neighbour, ...]:
         if self._tracked:
-            return self._tracked[i].step(time_s, positions, velocities, float(self._yaw_rad[i]))
+            return self._tracked[i].step(time_s, positions, velocities, float(self._yaw_rad[i]), cameras_off)
         offsets = positions[:, :2] - positions[i, :2]
         seen = np.hypot(offsets[:, 0], offsets[:, 1]) <= self._law.parameters.observation_distance_m
         seen[i] = False
+        if cameras_off:
+            R_ned_body = rotation_from_euler(0.0, 0.0, float(self._yaw_rad[i]))
+            seen &= ~self._rig.hidden((positions - positions[i]) @ R_ned_body, cameras_off)
         return tuple(
             Neighbour(
                 int(j) + 1, positions[j] - positions[i], velocities[j], position_sigma_m=0.0, velocity_sigma_m_s=0.0,

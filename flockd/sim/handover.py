@@ -37,6 +37,11 @@ class Handover:
         self._taken[drone] = "hold"
         self._held[drone] = position + velocity * (math.hypot(*velocity[:2]) / (2 * _HOLD_BRAKING_M_S2))
 
+    def resume(self, drone: int) -> None:
+        """Its pilot flies it again."""
+        self._taken.pop(drone, None)
+        self._held.pop(drone, None)
+
     def holding(self, positions: FloatArray) -> dict[int, tuple[FloatArray, float]]:
         """Of each drone in Hold the velocity (2,) m/s back to its place, from (n, 3) m NED, and its height, m."""
         return {i: (_HOLD_PER_S * (held - positions[i])[:2], -float(held[2])) for i, held in self._held.items()}

@@ -24,11 +24,12 @@ class TrackedNeighbours:
         self._position: FloatArray | None = None
 
     def step(
-        self, time_s: float, positions: FloatArray, velocities: FloatArray, yaw_rad: float = 0.0
-    ) -> tuple[Neighbour, ...]:
+        self, time_s: float, positions: FloatArray, velocities: FloatArray, yaw_rad: float = 0.0,
+        cameras_off: frozenset[str] = frozenset(),
+    ) -> tuple[Neighbour, ...]:  # fmt: skip
         """With all drones at (n, 3) m and (n, 3) m/s in NED, and the drone's own heading; called once a step.
 
-        In the view of a camera that has a fault nobody is detected.
+        In the view of a camera that has a fault or is off nobody is detected.
         """
         here = positions[self._drone]
         if self._position is not None:
@@ -36,7 +37,8 @@ class TrackedNeighbours:
         self._position = here
         offsets = np.delete(positions, self._drone, axis=0) - here
         found = [detection for offset in offsets if (detection := self._detection(offset)) is not None]
-        gone, R_ned_body = lost_cameras(self._scenario, self._drone, time_s), rotation_from_euler(0.0, 0.0, yaw_rad)
+        gone = lost_cameras(self._scenario, self._drone, time_s) | cameras_off
+        R_ned_body = rotation_from_euler(0.0, 0.0, yaw_rad)
 
         def blind(places: FloatArray) -> BoolArray:
             return self._rig.hidden(places @ R_ned_body, gone)

@@ -73,11 +73,12 @@ class PilotPool:
         *,
         pictured: bool,
         order: MissionOrder | None = None,
+        begins: bool = False,
     ) -> Future[Stepped]:
         """Steps a drone's pilot, see `Pilots`; the result is there once the drone's process has come to it."""
         place = self.drones.index(drone) % len(self._shares)
         pilots: Callable[..., Stepped] = self._here or self._processes[place].ask
-        inputs = (drone, frames, vehicle, truth if self._swap else None, pictured, order)
+        inputs = (drone, frames, vehicle, truth if self._swap else None, pictured, order, begins)
         if not self.on_this_thread:
             return self._threads[place].submit(pilots, *inputs)
         stepped: Future[Stepped] = Future()

@@ -37,10 +37,8 @@ class Pilots:
         """Pilots of ``drones``, counted from 0. Raises ModelError."""
         learned = load_networks(scenario.drone.perception)
         self._truths = {} if swap is None else {i: swap(learned) for i in drones}
-        self._pilots = {
-            i: FlockPilot(scenario.drone_of(i), self._truths.get(i, learned), stopwatch=time.perf_counter)
-            for i in drones
-        }
+        self._scenario, self._learned = scenario, learned
+        self._pilots = {i: self._pilot(i) for i in drones}
 
     def __call__(
         self,
@@ -50,14 +48,21 @@ class Pilots:
         truth: RenderTruth | None,
         pictured: bool,
         order: MissionOrder | None = None,
+        begins: bool = False,
     ) -> Stepped:
-        """One step of one drone, with an operator's order.
+        """One step of one drone, with an operator's order; ``begins``: of a new pilot, which knows of nothing before.
 
         ``truth`` is what its frames show, for a swap; ``pictured``: with its key frames.
         """
         if truth is not None:
             self._truths[drone].show(truth)
+        if begins:
+            self._pilots[drone] = self._pilot(drone)
         trace = StepTrace() if pictured else None
         output = self._pilots[drone].step(frames, vehicle, trace, order)
         seen = [] if trace is None else capture(trace, output, drone)
         return Stepped(output, [frame.at_half_size() for frame in seen])
+
+    def _pilot(self, drone: int) -> FlockPilot:
+        networks = self._truths.get(drone, self._learned)
+        return FlockPilot(self._scenario.drone_of(drone), networks, stopwatch=time.perf_counter)

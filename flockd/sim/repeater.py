@@ -36,6 +36,11 @@ class Repeater:
         self._over.set()
         self._thread.join()
 
+    def forget(self, drone: str) -> None:
+        """Of a drone that is gone, nothing is sent again."""
+        with self._lock:
+            self._newest = {key: message for key, message in self._newest.items() if key[0] != drone}
+
     def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
         """See `TelemetrySink`."""
         with self._lock:

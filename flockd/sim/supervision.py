@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 from flockd.core.config.safety import SafetyParameters
@@ -35,20 +36,21 @@ _WELL = Inputs(
 class WindSupervisor:
     """The supervisor of a drone that flies from the start on."""
 
-    def __init__(self, parameters: SafetyParameters) -> None:
-        self._parameters = parameters
+    def __init__(self, parameters: SafetyParameters, cameras: Sequence[str]) -> None:
+        """``cameras``: their names."""
+        self._parameters, self._cameras = parameters, dict.fromkeys(cameras, _SEES)
         self.degraded_by: frozenset[Event] = frozenset()
         """Why the drone was last degraded: it flies slower for a while after that is over."""
         self._supervisor = Supervisor(parameters)
         for changes in ({"armed": False, "in_air": False, "flight_mode": "hold"}, {"flight_mode": "hold"}, {}):
             self._supervisor.step(-math.inf, replace(_WELL, **changes))
 
-    def step(self, now_s: float, gusts_m_s: float, around: Surroundings, *, blind: bool = False) -> Decision:
-        """As of `now_s`, carried off its setpoints by `gusts_m_s`; `blind`: one of its cameras is lost."""
+    def step(self, now_s: float, gusts_m_s: float, around: Surroundings, *, lost: Collection[str] = ()) -> Decision:
+        """As of `now_s`, carried off its setpoints by `gusts_m_s`; `lost`: the names of its lost cameras."""
         gate = self._parameters.gate
         inputs = replace(
             _WELL,
-            cameras={"one": _SEES, "other": _LOST} if blind else _WELL.cameras,
+            cameras={**self._cameras, **dict.fromkeys(lost, _LOST)},
             gusts_m_s=gusts_m_s,
             obstacle_near=around.nearest_obstacle_m < self._parameters.hold_room_m,
             outside_fence=outside_fence(gate, around.position),

@@ -27,6 +27,7 @@ from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.clearances import with_obstacles
 from flockd.sim.commands import Commands
 from flockd.sim.control_loop import ControlLoop
+from flockd.sim.disturbances import UNDISTURBED, Disturbances
 from flockd.sim.exact_states import ExactFlock, HandPilot, fly_exact_states, start_yaw, step_times
 from flockd.sim.pilot_pool import PilotPool
 from flockd.sim.pilots import Stepped
@@ -93,22 +94,28 @@ def fly(
     vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=start_yaw(scenario), seed=scenario.seed)
     chosen = key_frame_steps(len(times)) if pictured else set()
     key_frames: list[KeyFrame] = []
-    flown = 0
+    flown, pace = 0, RealTime()
     with ExitStack() as stack:
         pool = stack.enter_context(PilotPool(scenario, swap, processes)) if perception == "learned" else None
         companion = None
-        pilots: _ExactStatePilots | _VisionPilots = _ExactStatePilots(scenario, shown, gated=gated)
+        pilots: ExactStatePilots | VisionPilots = ExactStatePilots(scenario, shown, gated=gated)
         if pool is not None:
             companion = fly_exact_states(scenario, gated=gated)[1:]
-            pilots = _VisionPilots(scenario, pool, shown, recorders, companion, preparing)
+            pilots = VisionPilots(scenario, pool, shown, recorders, companion, preparing)
         preparing(_PREPARATIONS, _PREPARATIONS)
         try:
             for step, time_s in enumerate(times):
+                if shown is not None and pool is None:
+                    pace.wait(float(time_s))
                 builder.add_truth(step, vehicles.position, vehicles.velocity, vehicles.R_ned_body)
                 commands = pilots.step(step, float(time_s), vehicles, builder, pictured=step in chosen)
                 builder.add_missions(step, commands.desired, commands.missions)
                 key_frames += pilots.key_frames()
+                if shown is not None:
+                    shown.take_requests(float(time_s), loop, vehicles)
                 loop.fly(float(time_s), vehicles, commands)
+                if shown is not None:
+                    shown.show_flight(float(time_s), loop)
                 flown = step + 1
                 progress(flown, len(times))
         except KeyboardInterrupt:
@@ -142,23 +149,36 @@ _PREPARATIONS = 4
 """The companion on exact states, the world, the networks, the pilots."""
 
 
-class _ExactStatePilots:
+class ExactStatePilots:
     """The flocking law on the exact states of all drones."""
 
     def __init__(self, scenario: ScenarioConfig, shown: ShownFlock | None, *, gated: bool) -> None:
-        self._flock, self._shown, self._pace = ExactFlock(scenario, passes=gated), shown, RealTime()
+        self._scenario, self._gated, self._shown = scenario, gated, shown
+        self.begin_again()
         self._by_hand = [vehicle.by_hand for vehicle in scenario.vehicles]
 
+    def begin_again(self) -> None:
+        """For another flight from the beginning."""
+        self._flock = ExactFlock(self._scenario, passes=self._gated)
+
     def step(
-        self, step: int, time_s: float, vehicles: Vehicles, builder: FlightLogBuilder, *, pictured: bool
+        self,
+        step: int,
+        time_s: float,
+        vehicles: Vehicles,
+        builder: FlightLogBuilder | None,
+        *,
+        pictured: bool,
+        disturbed: Disturbances = UNDISTURBED,
     ) -> Commands:
-        """Commands for all drones; there are no images."""
+        """Commands for all drones; there are no images. ``builder``: None where nothing is kept."""
         positions, velocities = vehicles.position, vehicles.velocity
         orders = orders_of(self._shown, range(len(positions)))
-        commands = self._flock.step(time_s, positions, velocities, orders)
+        commands = self._flock.step(time_s, positions, velocities, orders, disturbed)
         if self._shown is not None:
-            self._pace.wait(time_s)
             self._shown.show_exact(step, time_s, vehicles, commands)
+        if builder is None:
+            return commands
         for i in (i for i, by_hand in enumerate(self._by_hand) if not by_hand):
             others = np.arange(len(positions)) != i
             relative = positions[others] - positions[i]
@@ -173,7 +193,7 @@ class _ExactStatePilots:
         return []
 
 
-class _VisionPilots:
+class VisionPilots:
     """One pilot a drone, each given only its own images and its own autopilot's readings."""
 
     def __init__(
@@ -182,9 +202,10 @@ class _VisionPilots:
         pool: PilotPool,
         shown: ShownFlock | None,
         recorders: Sequence[Recorder],
-        companion: tuple[FloatArray, FloatArray],
+        companion: tuple[FloatArray, FloatArray] | None,
         preparing: Callable[[int, int], None],
     ) -> None:
+        """``companion``: for what is recorded; None where nothing is."""
         self._companion = companion
         preparing(1, _PREPARATIONS)
         self._shown, self._recorders = shown, recorders
@@ -194,6 +215,15 @@ class _VisionPilots:
         preparing(3, _PREPARATIONS)
         self._pool, self._drones = pool, pool.drones
         self._scenario, self._yaw_rad = scenario, start_yaw(scenario)
+        self._begin()
+
+    def begin_again(self) -> None:
+        """For another flight from the beginning, in the same world and with the same networks."""
+        self._cameras.begin_again()
+        self._begin()
+
+    def _begin(self) -> None:
+        scenario = self._scenario
         self._hands = {i: HandPilot(scenario, i) for i in range(len(scenario.vehicles)) if i not in self._drones}
         ground = self._cameras.ground_height
         self._autopilots = {
@@ -202,18 +232,27 @@ class _VisionPilots:
         late = None if scenario.cameras is None else scenario.cameras.attitude
         self._attitudes = {} if late is None else {i: LateAttitude(late, scenario.seed, i) for i in self._drones}
         self._stepped: dict[int, Stepped] = {}
+        self._begins = set(self._drones)
 
     def step(
-        self, step: int, time_s: float, vehicles: Vehicles, builder: FlightLogBuilder, *, pictured: bool
+        self,
+        step: int,
+        time_s: float,
+        vehicles: Vehicles,
+        builder: FlightLogBuilder | None,
+        *,
+        pictured: bool,
+        disturbed: Disturbances = UNDISTURBED,
     ) -> Commands:
-        """Commands for all drones. Each steps as soon as its images are drawn."""
+        """Commands for all drones. Each steps as soon as its images are drawn. ``builder``: as of exact states."""
         steps = {}
         render_ms = {}
-        orders = orders_of(self._shown, self._drones)
+        flying = [i for i in self._drones if i not in disturbed.removed]
+        orders = orders_of(self._shown, flying)
         turn_rates = vehicles.trail.motion_at(time_s).turn
-        for i in self._drones:
+        for i in flying:
             begin = time.perf_counter()
-            frames, seen = self._cameras.capture(i, step, time_s, vehicles, vehicles.trail)
+            frames, seen = self._cameras.capture(i, step, time_s, vehicles, vehicles.trail, disturbed)
             render_ms[i] = 1e3 * (time.perf_counter() - begin)
             state = self._autopilots[i].read(
                 time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i], turn_rates[i]
@@ -224,20 +263,24 @@ class _VisionPilots:
             steps[i] = (
                 frames,
                 state,
-                self._pool.step(i, frames, state, seen, pictured=with_pictures, order=orders.get(i)),
+                self._pool.step(
+                    i, frames, state, seen, pictured=with_pictures, order=orders.get(i), begins=i in self._begins
+                ),
             )
+        self._begins = set()
         self._stepped = {i: future.result() for i, (_, _, future) in steps.items()}
-        truth = self._truth(step, time_s, vehicles)
+        truth = None if self._companion is None else self._truth(step, time_s, vehicles, self._companion)
         for i, stepped in self._stepped.items():
             frames, state, _ = steps[i]
             output = stepped.output
             if self._shown is not None:
                 self._shown.show(i, frames, state, output)
-            if self._recorders:
+            if self._recorders and truth is not None:
                 recorder = self._recorders[self._drones.index(i)]
                 recorder.drain()  # simulated time stands still, so nothing need ever be dropped
                 recorder.step(frames, state, output, truth, orders.get(i))
-            builder.add_output(step, i, output, state.R_ned_body, {"render": render_ms[i], **output.stages_ms})
+            if builder is not None:
+                builder.add_output(step, i, output, state.R_ned_body, {"render": render_ms[i], **output.stages_ms})
         return self._commands(time_s, vehicles)
 
     def _commands(self, time_s: float, vehicles: Vehicles) -> Commands:
@@ -260,7 +303,7 @@ class _VisionPilots:
             commands.yaw_rad[i] = self._yaw_rad
         return replace(commands, missions=tuple(missions), obstacles=tuple(obstacles), neighbours=tuple(neighbours))
 
-    def _truth(self, step: int, time_s: float, vehicles: Vehicles) -> Truth:
+    def _truth(self, step: int, time_s: float, vehicles: Vehicles, companion: tuple[FloatArray, FloatArray]) -> Truth:
         """For recordings only: no pilot gets it."""
         drones = (
             TrueDrone(
@@ -268,8 +311,8 @@ class _VisionPilots:
                 position=vehicles.position[i],
                 velocity=vehicles.velocity[i],
                 R_ned_body=vehicles.R_ned_body[i],
-                exact_position=self._companion[0][step, i],
-                exact_velocity=self._companion[1][step, i],
+                exact_position=companion[0][step, i],
+                exact_velocity=companion[1][step, i],
             )
             for i in range(len(vehicles.position))
         )

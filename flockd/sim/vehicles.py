@@ -11,6 +11,7 @@ from flockd.core.config.scenario import SensorConfig, StartConfig, VehicleConfig
 from flockd.core.messages import FloatArray, VehicleState
 from flockd.flight.geometry import rotation_from_euler
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, Ground, level_ground
+from flockd.sim.disturbances import Disturbances
 from flockd.sim.pose_trail import KEPT_S, FlockPose, PoseTrail
 from flockd.sim.wind import GustField
 
@@ -18,6 +19,8 @@ GRAVITY_M_S2 = 9.81
 MAX_LEAN_M_S2 = GRAVITY_M_S2 * math.tan(math.radians(45.0))
 """The largest acceleration, at PX4's default of MPC_TILTMAX_AIR."""
 _MAX_SUBSTEP_S = 0.02
+_AWAY_M = 1e5
+"""To the north of the origin: nobody sees one that is so far away."""
 _DRAG_PER_S = 0.3
 """Deceleration by the air for each m/s against it: what a multirotor leans against to hold its speed."""
 MAX_CLIMB_M_S = 1.5
@@ -46,6 +49,7 @@ class Vehicles:
         """Start in level flight at the configured velocities, all heading `yaw_rad`; `seed` rules the gusts."""
         n = len(starts)
         self._config = config
+        self._seed, self._gust_m_s = seed, config.gust_m_s
         self._gusts, self._time_s = GustField.of(config, seed), 0.0
         self._blown = np.zeros((n, 2))
         """What of the velocity gusts added, m/s."""
@@ -58,6 +62,18 @@ class Vehicles:
         self.trail = PoseTrail()
         self.trail.add(FlockPose(-KEPT_S, self.position - KEPT_S * self.velocity, self.R_ned_body))
         self.trail.add(FlockPose(0.0, self.position, self.R_ned_body))
+
+    def disturb(self, disturbed: Disturbances) -> None:
+        """From now on other gusts blow, and drones are gone: far away, at a standstill."""
+        gust_m_s = self._config.gust_m_s if disturbed.gust_m_s is None else disturbed.gust_m_s
+        if gust_m_s != self._gust_m_s:
+            self._gust_m_s = gust_m_s
+            self._gusts = GustField.of(self._config.model_copy(update={"gust_m_s": gust_m_s}), self._seed)
+        if disturbed.removed:
+            gone = list(disturbed.removed)
+            self.position, self.velocity = self.position.copy(), self.velocity.copy()
+            self.position[gone, 0] = _AWAY_M * (1.0 + np.array(gone))
+            self.velocity[gone] = 0.0
 
     def step(
         self, setpoints: FloatArray, yaw_setpoints: FloatArray, interval_s: float, heights: FloatArray | None = None

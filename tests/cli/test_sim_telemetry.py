@@ -40,7 +40,7 @@ def test_the_daemons_of_a_simulation_connect_where_they_are_told(
     assert connected == [("tcp/127.0.0.1:7447",), ("tcp/127.0.0.1:7999",)]
     capsys.readouterr()
     assert main(["sim", "--telemetry-at", "tcp/127.0.0.1:7999", "--out", str(tmp_path / "three")]) == 2
-    assert "--telemetry-at is for --telemetry and for --autopilot" in capsys.readouterr().err
+    assert "--telemetry-at is for --telemetry, --live and --autopilot" in capsys.readouterr().err
 
 
 GOAL_NE = (-7.0, -6.0)

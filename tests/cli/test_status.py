@@ -89,17 +89,6 @@ def test_a_row_tells_what_is_the_matter() -> None:
     assert (row["neighbours"], row["load"], row["battery_share"], row["height_m"]) == (2, 0.8, 0.5, 4.0)
 
 
-def test_a_simulated_drone_is_there_and_healthy() -> None:
-    """`flockd sim --telemetry` has no daemon, so no `flight` message: its pilots' own messages say how it is."""
-    state = {"time_s": 5.0, "height_m": 4.2}
-    topics = {"state": Heard(NOW_S - 0.5, state), "health": Heard(NOW_S - 0.5, {"ok": True, "reasons": []})}
-    (row,) = status_rows([Watched("paper_flight", "drone1", alive=True, topics=topics)], NOW_S)
-    assert (row["state"], row["flight_mode"], row["height_m"], row["matters"]) == ("normal", "simulated", 4.2, [])
-    topics["health"] = Heard(NOW_S - 0.5, {"ok": False, "reasons": ["no flow"]})
-    (row,) = status_rows([Watched("paper_flight", "drone1", alive=True, topics=topics)], NOW_S)
-    assert (row["state"], row["matters"]) == ("degraded", ["no flow"])
-
-
 def test_a_drone_whose_time_passes_slowly_is_not_quiet() -> None:
     """At a speed factor of 0.25 two messages a second come every 2 s, above the 1.5 s after which they are stale."""
     from flockd.fleet.watcher import _heard

@@ -14,6 +14,7 @@ from flockd.onboard.telemetry import TelemetrySink
 from flockd.onboard.telemetry.publisher import Ask, NewestImage, ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage
 from flockd.review.flight_log.log import FlightLog
+from flockd.sim.repeater import Repeater
 from flockd.sim.shown_flock import ShownFlock
 from flockd.sim.start import with_drones
 from flockd.sim.swarm import Flight, fly
@@ -39,10 +40,13 @@ class Announced:
     def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
         self.images[drone] = newest_image
 
+    def withdraw(self, drone: str) -> None:
+        raise AssertionError(drone)
+
 
 def flown(telemetry: TelemetrySink) -> FlightLog:
     announced = Announced()
-    log = fly(scenario(), shown=ShownFlock(scenario(), announced, telemetry), processes=1).log
+    log = fly(scenario(), shown=ShownFlock(scenario(), announced, Repeater(telemetry)), processes=1).log
     pictures = [newest("front") for newest in announced.images.values()]
     assert [picture[:2] for picture in pictures if picture is not None] == [b"\xff\xd8"] * 2, "JPEGs of both"
     return log

@@ -48,6 +48,7 @@ def drone_rows(drones: Iterable[Watched], known: Mapping[str, Known], now_s: flo
         origin = origin or rows[key]["home_deg"]
     for row in rows.values():
         row["home_ne"] = _offset(origin, row["home_deg"])
+        row["origin_ne"] = _sum(row["home_ne"], row["origin_ne"])
     return rows
 
 
@@ -102,6 +103,7 @@ def _row(drone: Watched, status: Mapping[str, Any], known: Known, now_s: float) 
         "version": None if about is None else about["version"],
         "commands": None if about is None else about["commands"],
         "fence": _fence(configuration),
+        "origin_ne": _vector(_section(configuration, "mission").get("origin_m")),
     }
 
 
@@ -183,10 +185,18 @@ def _offset(origin: list[float] | tuple[float, float] | None, home_deg: list[flo
     ]
 
 
+def _section(configuration: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    section = configuration.get(name)
+    return section if isinstance(section, dict) else {}
+
+
+def _sum(one: list[float] | None, other: list[float] | None) -> list[float] | None:
+    return None if one is None or other is None else [round(a + b, 2) for a, b in zip(one, other, strict=True)]
+
+
 def _fence(configuration: Mapping[str, Any]) -> Row | None:
     """Around the drone's home, from its configuration, which a peer sent: None for what is no fence."""
-    safety = configuration.get("safety")
-    gate = safety.get("gate") if isinstance(safety, dict) else None
+    gate = _section(configuration, "safety").get("gate")
     if not isinstance(gate, dict):
         return None
     radius, corners = gate.get("fence_radius_m"), gate.get("fence_corners_m")

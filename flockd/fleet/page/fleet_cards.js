@@ -55,8 +55,8 @@ function ordered({ orders, orders_refused: refused }) {
 }
 
 export class FleetCards {
-  constructor(section, choose, commands) {
-    [this.section, this.choose, this.commands] = [section, choose, commands];
+  constructor(section, choose, commands, simulation) {
+    [this.section, this.choose, this.commands, this.simulation] = [section, choose, commands, simulation];
     this.template = document.getElementById("card");
     this.cards = new Map();
     this.parts = new WeakMap();
@@ -104,6 +104,8 @@ export class FleetCards {
     for (const button of card.querySelectorAll("[data-command]")) {
       button.addEventListener("click", () => this.commands.confirm(button.dataset.command, [key]));
     }
+    card.querySelector(".remove").addEventListener("click", () => this.simulation.remove(key));
+    card.querySelector(".pictures").hidden = !state.simulation?.by_sight;
     card.querySelector(".look").addEventListener("click", () => {
       const pictures = card.querySelector(".pictures");
       pictures.hidden = !pictures.hidden;
@@ -113,7 +115,7 @@ export class FleetCards {
     const one = (name) => card.querySelector(name);
     this.parts.set(card, {
       name: one(".name span"), state: one(".state"), meaning: one(".meaning"), why: one(".why"), look: one(".look"),
-      refusal: one(".refusal"), orders: one(".orders"), identity: one(".identity"), pictures: one(".pictures"), values: [...list.querySelectorAll("dd")],
+      refusal: one(".refusal"), orders: one(".orders"), identity: one(".identity"), pictures: one(".pictures"), remove: one(".remove"), values: [...list.querySelectorAll("dd")],
       buttons: [...card.querySelectorAll("[data-command]")],
     });
   }
@@ -145,9 +147,20 @@ export class FleetCards {
     }
     const blind = !Object.keys(row.cameras).length;
     if (parts.look.disabled !== blind) parts.look.disabled = blind;
-    put(parts.refusal, this.commands.refusal(key));
+    put(parts.refusal, this.simulation.told(key) || this.commands.refusal(key));
+    const removable = Boolean(state.simulation) && !this.simulation.isRemoved(key);
+    if (parts.remove.hidden === removable) parts.remove.hidden = !removable;
+    for (const figure of parts.pictures.children) this.writeSwitch(key, figure);
     put(parts.orders, ordered(row));
     put(parts.identity, row.identities.length > 1 ? `${row.identities.length} drones` : row.identities.join(""));
+  }
+
+  // Of a simulated drone's camera.
+  writeSwitch(key, figure) {
+    const [, button] = figure.children;
+    button.hidden = !state.simulation;
+    put(button, this.simulation.isOff(key, figure.dataset.camera) ? "Switch on" : "Switch off");
+    figure.classList.toggle("off", this.simulation.isOff(key, figure.dataset.camera));
   }
 
   // New pictures for the cards that show theirs, a few at a time: a browser has six connections to a server, and orders
@@ -178,7 +191,9 @@ export class FleetCards {
     if (!figure) {
       figure = document.createElement("figure");
       figure.dataset.camera = camera;
-      figure.append(new Image(), document.createElement("figcaption"));
+      figure.append(new Image(), document.createElement("button"), document.createElement("figcaption"));
+      figure.children[1].addEventListener("click", () => this.simulation.switch(key, camera));
+      this.writeSwitch(key, figure);
       figure.firstChild.alt = `what the camera ${camera} sees`;
       pictures.append(figure);
     }

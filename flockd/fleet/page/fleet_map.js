@@ -10,13 +10,14 @@ function median(values) {
 }
 
 export class FleetMap {
-  constructor(section, choose) {
+  constructor(section, choose, send) {
     this.canvas = section.querySelector("canvas");
     this.note = section.querySelector(".note");
     this.legend = section.querySelector(".obstacles");
     this.neighbours = section.querySelector("[name=neighbours]");
     this.follow = section.querySelector("[name=follow]");
-    this.choose = choose;
+    [this.choose, this.send] = [choose, send];
+    this.sends = section.querySelector("[name=goal]");
     this.view = { north: 0, east: 0, metres: 0.05 };
     this.waiting = false;
     this.neighbours.addEventListener("input", () => this.changed());
@@ -109,7 +110,8 @@ export class FleetMap {
       const far = Math.hypot(x - at[0], y - at[1]);
       if (far < least) [nearest, least] = [key, far];
     }
-    this.choose(nearest);
+    if (nearest || !this.sends.checked || this.alone) this.choose(nearest);
+    else this.send(this.ground(at));
   }
 
   // Where each drone is, or was last; without any position one drone's own view, with it in the middle.
@@ -187,6 +189,7 @@ export class FleetMap {
     for (const key of [...keys].reverse()) this.drone(pen, key); // the first one, which gets the label, on top
     this.labels(pen, keys);
     this.legend.hidden = !obstacles;
+    this.sends.parentElement.hidden = !state.mayCommand;
   }
 
   grid(pen, width, height) {
@@ -218,12 +221,12 @@ export class FleetMap {
     pen.stroke();
     pen.fillText(`${spacing} m`, width - 12, height - 19);
     pen.textAlign = "center";
-    pen.fillText("N", width - 20, 62);
+    pen.fillText("N", width - 20, height - 56);
     pen.beginPath();
-    pen.moveTo(width - 20, 66);
-    pen.lineTo(width - 15, 80);
-    pen.lineTo(width - 20, 77);
-    pen.lineTo(width - 25, 80);
+    pen.moveTo(width - 20, height - 52);
+    pen.lineTo(width - 15, height - 38);
+    pen.lineTo(width - 20, height - 41);
+    pen.lineTo(width - 25, height - 38);
     pen.fill();
   }
 

@@ -4,6 +4,7 @@ import { FleetCommands } from "./fleet_commands.js";
 import { FleetCurves } from "./fleet_curves.js";
 import { FleetMap } from "./fleet_map.js";
 import { ReplayControls } from "./fleet_replay.js";
+import { SimulationControls } from "./fleet_simulation.js";
 import { STATES, nameOf, put, state, take } from "./fleet_state.js";
 
 const token = document.querySelector("meta[name=token]").content;
@@ -14,8 +15,9 @@ const SILENT_MS = 5000;
 const EVENTS_SHOWN = 200;
 
 const commands = new FleetCommands(token);
-const map = new FleetMap(document.getElementById("map"), choose);
-const cards = new FleetCards(document.getElementById("cards"), choose, commands);
+const map = new FleetMap(document.getElementById("map"), choose, (place) => commands.sendTo(place));
+const simulation = new SimulationControls(document.getElementById("simulation"), commands);
+const cards = new FleetCards(document.getElementById("cards"), choose, commands, simulation);
 const curves = new FleetCurves(document.getElementById("curves"));
 const summary = document.getElementById("summary");
 const trouble = document.getElementById("trouble");
@@ -77,8 +79,11 @@ async function greeted(hello) {
 
 function show(message) {
   const first = !state.order.length && message.order.length;
+  const before = state.simulation;
+  if (simulation.take(message.simulation)) state.history.clear();
   take(message);
-  cards.changed(Object.keys(message.rows));
+  const changed = JSON.stringify(before) !== JSON.stringify(state.simulation);
+  cards.changed(changed ? state.order : Object.keys(message.rows));
   commands.changed();
   map.changed();
   replay.shown(state.now);

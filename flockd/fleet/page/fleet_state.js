@@ -10,6 +10,7 @@ export const state = {
   history: new Map(),
   columns: {},
   chosen: null,
+  simulation: null,
 };
 
 const COLOURS = ["#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#a39400", "#808890"];

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from aiohttp import WSMsgType, web
 
@@ -20,13 +20,14 @@ from flockd.fleet.page.drone_rows import HISTORY_COLUMNS, Known, Row
 from flockd.fleet.page.fleet_source import Event, FleetSource, events_after
 from flockd.fleet.page.page_access import HEADERS, PageAccess, is_own_host, is_own_origin
 from flockd.fleet.page.page_pictures import PagePictures
+from flockd.fleet.simulation import SimulationMessage, checked_control
 from flockd.fleet.watcher import MAX_DRONES
 from flockd.onboard.telemetry.order_messages import parse_order
 from flockd.onboard.telemetry.topics import AnswerMessage
 
 PUSH_EVERY_S = 0.25
 MAX_REQUEST_BYTES = 1 << 14
-COMMANDS = ("hold", "land", "resume", "goto")
+COMMANDS = ("hold", "land", "resume", "goto", "velocity")
 """What the page may ask of drones."""
 _FOLDER = Path(__file__).parent
 _TYPES = {".js": "text/javascript", ".css": "text/css"}
@@ -39,10 +40,28 @@ _TOKEN = "@TOKEN@"
 """In the page, for the session's."""
 
 
+class Simulation(Protocol):
+    """A simulation that the page controls: `flockd.fleet.simulation.SimulationLink`."""
+
+    def state(self) -> SimulationMessage | None:
+        """How it is doing; None: there is nothing to control."""
+
+    def ask(self, control: str, value: Mapping[str, object], operator: str) -> AnswerMessage:
+        """The answer to a control. Waits; called on a thread of its own."""
+
+
 class PageServer:
     """The application of one fleet. `application` gives what aiohttp serves."""
 
-    def __init__(self, source: FleetSource, access: PageAccess, *, may_command: bool, operator: str = "page") -> None:
+    def __init__(
+        self,
+        source: FleetSource,
+        access: PageAccess,
+        *,
+        may_command: bool,
+        operator: str = "page",
+        simulation: Simulation | None = None,
+    ) -> None:
         """For one event loop.
 
         Args:
@@ -50,12 +69,13 @@ class PageServer:
             access: who may see it.
             may_command: whether this page passes commands on at all; each drone decides too.
             operator: who gives commands here, as drones are told; the page and where it is open are added.
+            simulation: what the page controls beside the drones; None, as with real ones: it has no such controls.
         """
         self._source, self._access, self._may_command, self._operator = source, access, may_command, operator
         self._order_threads = ThreadPoolExecutor(_ORDER_THREADS, "orders of the fleet page")
         """Nothing else waits on them."""
         self._pictures = PagePictures(source.image)
-        self._pages = 0
+        self._pages, self._simulation = 0, simulation
         self.trusted: set[object] = set()
         """Connections over which a page with the key has asked for something."""
         self._plotly: bytes | None = None
@@ -71,6 +91,7 @@ class PageServer:
                 web.get("/image/{fleet}/{drone}/{camera}", self._image),
                 web.get("/live", self._live),
                 web.post("/ask", self._ask),
+                web.post("/simulate", self._simulate),
                 web.get("/{file:[a-z_]+\\.(?:js|css)}", self._file),
             ]
         )
@@ -143,18 +164,14 @@ class PageServer:
 
     async def _ask(self, request: web.Request) -> web.Response:
         """A command to drones, one answer a drone. Only from this server's own page."""
-        session = request.cookies.get(self._access.cookie)
-        if not is_own_origin(request.headers) or not self._access.is_token(
-            session, request.headers.get("X-Flockd-Token")
-        ):
-            return _text(403, "commands are taken from this server's own page only; load it again")
-        if not self._may_command:
-            return _text(403, "this page shows, and commands nothing: `flockd fleet` was started so")
+        refusal = self._refusal_to_command(request)
+        if refusal is not None:
+            return refusal
         try:
             drones, command, order = _asked(_object(await request.read()))
         except ValueError as error:
             return _text(400, str(error))
-        operator = self._operator_of(request, session)
+        operator = self._operator_of(request)
         loop, known = asyncio.get_running_loop(), self._source.known()
         # Those that never answer come last, where there are more than threads.
         drones.sort(key=lambda drone: known.get(drone, Known()).delay_s is None)
@@ -166,6 +183,34 @@ class PageServer:
         )
         told: dict[str, AnswerMessage] = dict(zip(drones, answers, strict=True))
         return web.json_response(told, dumps=_json)
+
+    async def _simulate(self, request: web.Request) -> web.Response:
+        """A control of the simulation. Only from this server's own page, and only where there is a simulation."""
+        refusal = self._refusal_to_command(request)
+        if refusal is not None:
+            return refusal
+        if self._simulation is None:
+            return _text(403, "these drones are not simulated here: there is nothing to control beside them")
+        try:
+            body = _object(await request.read())
+            control, value = str(body.get("control")), checked_control(body.get("control"), body.get("value"))
+        except ValueError as error:
+            return _text(400, str(error))
+        answer = await asyncio.get_running_loop().run_in_executor(
+            self._order_threads, self._simulation.ask, control, value, self._operator_of(request)
+        )
+        return web.json_response(answer, dumps=_json)
+
+    def _refusal_to_command(self, request: web.Request) -> web.Response | None:
+        """None for a command from this server's own page, where it may command."""
+        session = request.cookies.get(self._access.cookie)
+        if not is_own_origin(request.headers) or not self._access.is_token(
+            session, request.headers.get("X-Flockd-Token")
+        ):
+            return _text(403, "commands are taken from this server's own page only; load it again")
+        if not self._may_command:
+            return _text(403, "this page shows, and commands nothing: `flockd fleet` was started so")
+        return None
 
     async def _live(self, request: web.Request) -> web.StreamResponse:
         """Rows as they change. The page's first message has to carry its session's token."""
@@ -193,12 +238,13 @@ class PageServer:
         if not self._access.is_token(request.cookies.get(self._access.cookie), hello.get("token")):
             await socket.close(code=4403, message=b"load the page again")
             return
-        feed = _Feed(self._source, socket)
+        feed = _Feed(self._source, socket, self._simulation)
         await feed.greet(may_command=self._may_command)
         await (feed.push() if self._source.span_s is None else feed.follow())
 
-    def _operator_of(self, request: web.Request, session: str | None) -> str:
+    def _operator_of(self, request: web.Request) -> str:
         """Whose page it is that commands: of one computer, each has a number."""
+        session = request.cookies.get(self._access.cookie)
         elsewhere = request.remote not in {None, "127.0.0.1", "::1"}
         return f"{self._operator}, page {(session or '')[:4]}{f' at {request.remote}' if elsewhere else ''}"
 
@@ -206,8 +252,8 @@ class PageServer:
 class _Feed:
     """What one page is sent: each time only what has changed for it."""
 
-    def __init__(self, source: FleetSource, socket: web.WebSocketResponse) -> None:
-        self._source, self._socket = source, socket
+    def __init__(self, source: FleetSource, socket: web.WebSocketResponse, simulation: Simulation | None) -> None:
+        self._source, self._socket, self._simulation = source, socket, simulation
         self._sent: dict[str, Row] = {}
         self._event: Event | None = None
         """The newest that was sent."""
@@ -257,6 +303,7 @@ class _Feed:
                 "events": new,
                 "all_events": replay,
                 "notes": self._source.notes(),
+                "simulation": None if self._simulation is None else self._simulation.state(),
             }
         )
 
@@ -275,7 +322,7 @@ def _asked(body: Mapping[str, Any]) -> tuple[list[str], str, dict[str, object] |
         raise ValueError(f"a command goes to {MAX_DRONES} drones at most")
     if command not in COMMANDS:
         raise ValueError(f"the page's commands are {', '.join(COMMANDS)}")
-    if command != "goto":
+    if command not in {"goto", "velocity"}:
         return list(dict.fromkeys(drones)), command, None
     parse_order(command, order)
     return list(dict.fromkeys(drones)), command, order

@@ -91,7 +91,7 @@ class OperatorCommands:
     def recent(self) -> list[TakenOrderMessage]:
         """For telemetry: the last order of each operator of the last minute, the newest first."""
         now_s = self._clock()
-        return [_message(order, now_s) for order in self._checks.recent()]
+        return [taken_message(order, now_s) for order in self._checks.recent()]
 
     def _apply(self, command: str, ask: AskMessage) -> None:
         """Raises ValueError with the reason for which it is refused."""
@@ -106,7 +106,8 @@ class OperatorCommands:
             self._loop.call_soon_threadsafe(self._requests.apply, command)
 
 
-def _message(order: TakenOrder, now_s: float) -> TakenOrderMessage:
+def taken_message(order: TakenOrder, now_s: float) -> TakenOrderMessage:
+    """As telemetry has it; ``now_s``: on the clock by which it was taken."""
     return TakenOrderMessage(
         operator=order.operator, command=order.command, sequence=order.sequence, age_s=now_s - order.taken_s
     )

@@ -8,6 +8,7 @@ import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import zenoh
@@ -21,6 +22,13 @@ Ask = Callable[[str, bytes], AnswerMessage]
 """Takes an operator's command by name, with what its query carries, on a thread of zenoh's; returns at once."""
 NewestImage = Callable[[str], bytes | None]
 """Gives a camera's newest image as JPEG, on a thread of zenoh's; None where there is none."""
+
+
+class Declared(Protocol):
+    """A token or queryable of a session."""
+
+    def undeclare(self) -> None:
+        """It is there no more."""
 
 
 class ZenohTelemetry(SessionOwner):
@@ -41,7 +49,8 @@ class ZenohTelemetry(SessionOwner):
     ) -> None:
         self._prefix = f"{PREFIX}/{checked_name(fleet)}"
         self._publishers: dict[tuple[str, str], zenoh.Publisher] = {}
-        self._kept: list[object] = []
+        self._kept: dict[str, list[Declared]] = {}
+        """What is declared of each drone."""
         self._lost = 0
         self.identity = secrets.token_hex(4)
         """Of this process's drones, beside their names, which two drones may share by mistake."""
@@ -66,10 +75,11 @@ class ZenohTelemetry(SessionOwner):
     def show_alive(self, drone: str) -> None:
         """Publishes that a drone is alive for as long as this session is, and tells its clocks; no daemon to ask."""
         key = f"{self._prefix}/{checked_name(drone)}"
-        self._kept += [
+        self._keep(
+            drone,
             self._session.liveliness().declare_token(f"{key}/alive/{self.identity}"),
             self._session.declare_queryable(f"{key}/time", self._tell_time),
-        ]
+        )
 
     def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
         """Publishes that a drone is alive for as long as this session is, and replies to queries.
@@ -78,14 +88,37 @@ class ZenohTelemetry(SessionOwner):
         """
         self.show_alive(drone)
         key = f"{self._prefix}/{drone}"
-        self._kept += [
+        self._keep(
+            drone,
             self._session.declare_queryable(f"{key}/about", lambda query: _reply(query, about)),
             self._session.declare_queryable(
                 f"{key}/ask/*",
                 lambda query: _reply(query, ask(str(query.key_expr).rpartition("/")[2], _payload(query))),
             ),
             self._session.declare_queryable(f"{key}/image/*", lambda query: _send_image(query, newest_image)),
-        ]
+        )
+
+    def withdraw(self, drone: str) -> None:
+        """A drone is alive no more, and replies to nothing."""
+        for declared in self._kept.pop(drone, []):
+            declared.undeclare()
+
+    def reply_to(self, keys: str, reply: Callable[[str, bytes], Mapping[str, object]]) -> None:
+        """Replies to queries for keys of something that is no drone, each by its last part and what it carries.
+
+        On threads of zenoh's. Raises ValueError for keys that are drones'.
+        """
+        if keys.startswith(f"{PREFIX}/"):
+            raise ValueError(f"{keys!r} is a drone's")
+        self._keep(
+            keys,
+            self._session.declare_queryable(
+                keys, lambda query: _reply(query, reply(str(query.key_expr).rpartition("/")[2], _payload(query)))
+            ),
+        )
+
+    def _keep(self, what: str, *declared: Declared) -> None:
+        self._kept.setdefault(what, []).extend(declared)
 
     def _tell_time(self, query: zenoh.Query) -> None:
         _reply(query, TimeMessage(time_s=time.monotonic(), wall_s=time.time(), identity=self.identity))

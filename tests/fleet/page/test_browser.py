@@ -13,7 +13,8 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from subprocess import Popen
+from signal import SIGINT
+from subprocess import PIPE, Popen
 from typing import NamedTuple
 
 import pytest
@@ -25,6 +26,7 @@ from tools.measure.bench_fleet_page import (
     CAMERAS,
     NARROW,
     PATIENCE_MS,
+    WIDE,
     chromium,
     hold_s,
     look_at_silent,
@@ -219,6 +221,87 @@ def test_a_killed_drone_is_shown_with_the_reason(flock: Flock) -> None:
     told("from the kill until the drone is shown as gone", began_s)
     expect(flock.page.locator(f"{of} .why")).to_contain_text("its process has ended or cannot be reached")
     expect(flock.page.locator("#summary")).to_contain_text("1 gone")
+
+
+def test_a_simulated_flock_is_flown_and_disturbed_by_hand() -> None:
+    """`flockd sim --live` beside the others: a goal by a click on the map, and every control of the simulation."""
+    command = ["sim", "--live", "--perception", "truth", "--drones", "3", "--no-browser", "--port", "0"]
+    run = [sys.executable, "-c", "import sys; from flockd.cli import main; sys.exit(main())", *command]
+    began_s = time.monotonic()
+    with Popen([*run, "--telemetry-at", free_endpoint()], stdout=PIPE, text=True) as flight:
+        try:
+            assert flight.stdout is not None
+            address = re.search(r"http://\S+", flight.stdout.readline())
+            assert address is not None
+            with chromium() as browser:
+                page = browser.new_page(viewport=WIDE)
+                page.set_default_timeout(PATIENCE_MS)
+                errors: list[str] = []
+                page.on("pageerror", lambda error: errors.append(str(error)))
+                page.goto(address[0])
+                expect(page.locator("article[data-tone=good]")).to_have_count(3)
+                expect(page.locator("#simulation output")).to_contain_text("× real time")
+                told("from the command until the flock moves on the page", began_s)
+                fly_by_hand(page)
+                page.set_viewport_size(NARROW)
+                assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["width"]
+                assert errors == []
+        finally:
+            flight.send_signal(SIGINT)
+            assert flight.wait(PATIENCE_MS / 1000) == 0
+
+
+def fly_by_hand(page: Page) -> None:
+    """What a person does with the controls, one after the other."""
+    simulation, answers = page.locator("#simulation"), page.locator("#answers")
+    page.locator("#map [name=goal]").check()
+    page.locator("#map canvas").click(position={"x": 60, "y": 60})
+    expect(page.locator("#confirm h2")).to_have_text("Send 3 drones to a place?")
+    expect(page.locator("#confirm [name=north]")).not_to_have_value("")
+    page.locator("#confirm .send").click()
+    expect(answers).to_contain_text("goto is being tried")
+    expect(page.locator("article .meaning").first).to_contain_text("mission: ")
+    expect(page.locator("article .meaning").first).not_to_contain_text("on the circle")
+    page.locator("header [data-command=velocity]").click()
+    page.locator("#confirm [name=v_north]").fill("0.5")
+    page.locator("#confirm [name=v_east]").fill("0")
+    page.locator("#confirm .send").click()
+    expect(answers).to_contain_text("velocity is being tried")
+    expect(page.locator("article .meaning").first).to_contain_text("flies an operator's velocity")
+    of = "article[data-key$=drone3]"
+    page.locator(f"{of} .look").click()
+    page.locator(f"{of} figure button").first.click()
+    expect(answers).to_contain_text("delivers no images any more")
+    expect(page.locator(of)).to_contain_text("a camera is lost: front unplugged")
+    expect(page.locator(f"{of} figure button").first).to_have_text("Switch on")
+    simulation.locator("[name=gusts]").fill("0.3")
+    expect(answers).to_contain_text("gusts of 0.3 m/s")
+    simulation.locator("[name=speed]").select_option("5")
+    expect(answers).to_contain_text("5 times as fast")
+    page.locator(f"{of} .remove").click()
+    expect(page.locator(of)).to_contain_text("was taken out of the simulation")
+    simulation.locator("[name=pause]").click()
+    expect(simulation.locator("output")).to_contain_text("stands still")
+    expect(page.locator("#summary")).to_contain_text("1 gone")
+    simulation.locator("[name=pause]").click()
+    expect(simulation.locator("output")).to_contain_text("× real time")
+    simulation.locator("[name=restart]").click()
+    expect(answers).to_contain_text("the flight begins again")
+    expect(page.locator(f"{of} .state")).to_have_text("normal")
+    expect(page.locator("#summary")).to_have_text("3 drones: 3 normal")
+    expect(page.locator("article .meaning").first).to_contain_text("on the circle")
+
+
+def test_a_page_of_drones_that_no_simulation_flies_has_no_controls_of_one(flock: Flock) -> None:
+    expect(flock.page.locator("#simulation")).to_be_hidden()
+    for button in flock.page.locator("article .remove").all():
+        expect(button).to_be_hidden()
+    page = opened_beside(flock)
+    page.goto(flock.address)
+    refused = page.evaluate("""async () => (await fetch("simulate", {method: "POST",
+        headers: {"X-Flockd-Token": document.querySelector("meta[name=token]").content},
+        body: JSON.stringify({control: "pause"})})).status""")
+    assert refused == 403
 
 
 def test_nothing_was_loaded_from_elsewhere_and_nothing_failed(flock: Flock) -> None:
