@@ -26,6 +26,7 @@ INPUTS = {
     "mavlink": 250,
     "status": 50,
     "commands": 300,
+    "simulation": 300,
     "frames": 300,
     "ros": 150,
     "networks": 2,

@@ -7,6 +7,7 @@ import io
 import json
 import math
 import struct
+import time
 from contextlib import suppress
 from pathlib import Path
 from random import Random
@@ -19,12 +20,14 @@ from pymavlink.dialects.v20 import all as dialect
 from rich.console import Console
 
 from flockd.cli.status import _table
-from flockd.core.config import load_drone
+from flockd.core.config import load_drone, load_scenario
 from flockd.core.config.source import SourceParameters
+from flockd.core.data import data_path
 from flockd.core.messages import MissionOrder
 from flockd.fleet.fleet_status import status_rows
 from flockd.fleet.page.drone_rows import drone_rows, history_row
 from flockd.fleet.ros.order_requests import Whereabouts, goal_of, velocity_of
+from flockd.fleet.simulation import CONTROLS, MAX_GUST_M_S, MAX_SPEED, MIN_SPEED, SimulationMessage
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.autopilot.mavlink_messages import ReceivedMessages
 from flockd.onboard.autopilot.mavsdk_link import RECEIVED
@@ -38,7 +41,9 @@ from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat,
 from flockd.onboard.sources.ros_device import ENCODINGS
 from flockd.onboard.sources.shared_memory import SharedMemorySource
 from flockd.onboard.telemetry.order_messages import parse_order
+from flockd.onboard.telemetry.schema import fault
 from flockd.onboard.telemetry.topics import TOPICS
+from flockd.sim.live_controls import LiveControls
 from tools.checks.fuzzing.mutation import (
     ABSURD_NUMBERS,
     ABSURD_TEXTS,
@@ -228,6 +233,27 @@ def _commands(folder: Path) -> Check:
     return check
 
 
+def _simulation(folder: Path) -> Check:
+    """Controls of a simulation that is flown live: refused, or values within their bounds."""
+    scenario = load_scenario(data_path("config") / "paper_flight.yaml")
+    values = (None, {"factor": 2.0}, {"gust_m_s": 0.5}, {"drone": "drone1", "camera": "front", "works": False})
+
+    def check(random: Random) -> None:
+        controls = LiveControls(scenario, "s", by_sight=False)
+        control, value = random.choice((*ABSURD_TEXTS, *CONTROLS)), random.choice(values)
+        ask = {"identity": "s", "operator": "a", "session": "s", "sequence": 1, "time_s": time.monotonic()}
+        payload = json.dumps({**ask, "order": mutated_json(random, value)}).encode()
+        answer = controls.ask(control, mutated_bytes(random, payload) if random.random() < 0.5 else payload)
+        assert_readable(answer["sentence"])
+        assert control in CONTROLS or not answer["accepted"]
+        state = controls.state()
+        assert fault(json.loads(json.dumps(state, allow_nan=False)), SimulationMessage) is None
+        assert MIN_SPEED <= state["speed"] <= MAX_SPEED
+        assert 0.0 <= state["gust_m_s"] <= MAX_GUST_M_S
+
+    return check
+
+
 # -------------------------------------------------------------------------------------------------------------- frames
 
 
@@ -329,6 +355,7 @@ TARGETS = (
     Target("mavlink", 600, _mavlink),
     Target("status", 40, _status),
     Target("commands", 200, _commands),
+    Target("simulation", 200, _simulation),
     Target("frames", 400, _frames),
     Target("ros", 400, _ros),
 )
