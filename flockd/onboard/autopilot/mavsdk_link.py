@@ -13,7 +13,7 @@ import math
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from enum import IntEnum
@@ -153,21 +153,25 @@ class AutopilotLink:
         executor = ThreadPoolExecutor(1, thread_name_prefix="mavsdk")  # never asyncio's own: it may be saturated
         configuration = _configuration(parameters.system_id)
         mavsdk = create(configuration)
+        kept: list[object] = []
         try:
             deadline = clock() + timeout_s
             await _open(mavsdk, parameters.address, executor)
             system = await _find_system(mavsdk, parameters, deadline, timeout_s, clock)
             if configuration.system_id != system.get_system_id():  # again, as a computer of the autopilot's own system
                 parameters = parameters.model_copy(update={"system_id": int(system.get_system_id())})
+                system.destroy()
                 await asyncio.get_running_loop().run_in_executor(executor, mavsdk.destroy)
                 mavsdk = create(_configuration(parameters.system_id))
                 await _open(mavsdk, parameters.address, executor)
                 system = await _find_system(mavsdk, parameters, deadline, timeout_s, clock)
+            kept.append(system)
             link = cls(mavsdk, system, executor, clock, parameters.max_gap_s)
+            kept.append(link)
             await link._wait_for("HEARTBEAT", deadline)
             await link._request_streams()
         except BaseException:
-            executor.submit(mavsdk.destroy)  # after a call of it that still runs, which would end the process
+            executor.submit(_destroy, mavsdk, kept)  # after a call of it that still runs, which would end the process
             executor.shutdown(wait=False)
             raise
         return link
@@ -512,18 +516,26 @@ async def _find_system(
     wanted = parameters.system_id
     while True:
         systems = {int(system.get_system_id()): system for system in mavsdk.get_systems() if system.has_autopilot()}
-        if wanted is None and systems:
-            return next(iter(systems.values()))
-        if wanted in systems:
-            return systems[wanted]
+        heard = sorted(systems)
+        chosen = next(iter(systems), None) if wanted is None else wanted
+        found = None if chosen is None else systems.pop(chosen, None)
+        for system in systems.values():  # now: one that is collected while MAVSDK is destroyed ends the process
+            system.destroy()
+        if found is not None:
+            return found
         if clock() > deadline:
-            others = f"; heard instead: {', '.join(map(str, sorted(systems)))}" if systems else ""
+            others = f"; heard instead: {', '.join(map(str, heard))}" if heard else ""
             who = "no autopilot" if wanted is None else f"no autopilot with system id {wanted}"
             raise AutopilotError(
                 f"{who} was heard at {parameters.address} within {timeout_s:g} s{others}; "
                 "check autopilot.address, autopilot.system_id and that the autopilot is on"
             )
         await asyncio.sleep(0.05)
+
+
+def _destroy(mavsdk: Mavsdk, _kept: Sequence[object]) -> None:
+    """Destroys MAVSDK. What is kept meanwhile is not collected before: that ends the process too."""
+    mavsdk.destroy()
 
 
 def _settle(answer: asyncio.Future[T], value: T) -> None:
