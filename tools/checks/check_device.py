@@ -93,7 +93,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, metavar="DIR", help="keep the machine's files here, and use those there")
     parser.add_argument(
-        "--only", nargs="+", default=[], metavar="GROUP", help="of capture, pipelines, bench, sandbox and service"
+        "--only",
+        nargs="+",
+        default=[],
+        metavar="GROUP",
+        help="of capture, pipelines, sandbox and service, and bench, which runs only where it is named",
     )
     parser.add_argument("--package", action="store_true", help="check the Debian package, and that alone")
     parser.add_argument("--json", action="store_true")
