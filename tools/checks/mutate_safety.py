@@ -148,8 +148,9 @@ def report(mutants: Sequence[Mutant], survivors: Sequence[Mutant], *, whole: boo
     killed = len(mutants) - len(survivors)
     print(f"{len(mutants)} mutants: {killed} killed, {len(survivors) - len(unexplained)} equivalent, ", end="")
     print(f"{len(unexplained)} survived")
-    files, tried = {mutant.file for mutant in mutants}, {mutant.name for mutant in mutants}
-    expected = {name for name in EQUIVALENT if name in tried or (whole and name.partition(" ")[0] in files)}
+    files = {mutant.file for mutant in mutants}
+    # Of two changes of one function with the same text a sample may hold the one that tests notice.
+    expected = {name for name in EQUIVALENT if whole and name.partition(" ")[0] in files}
     stale = expected - {mutant.name for mutant in survivors}
     for name in sorted(stale):
         print(f"EQUIVALENT has an entry without a survivor; delete it: {name}")
