@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from mavsdk.connection_result import ConnectionResult
 from mavsdk.mavsdk import Mavsdk
+from mavsdk.system import System
 from pymavlink.dialects.v20 import common as mavlink
 
 from flockd.core.config.autopilot import AutopilotParameters
@@ -332,6 +333,28 @@ def test_nobody_there_is_told_with_what_to_check(port: int) -> None:
 async def test_somebody_elses_autopilot_is_not_taken_for_the_own(port: int, fake_autopilot: FakeAutopilot) -> None:
     with pytest.raises(AutopilotError, match=r"no autopilot with system id 5 .* heard instead: 1"):
         await AutopilotLink.connect(_parameters(port, system_id=5), timeout_s=0.7, clock=clock)
+
+
+async def test_no_system_outlives_a_search_that_fails(port: int, fake_autopilot: FakeAutopilot) -> None:
+    """One that is collected while MAVSDK is destroyed, on another thread, ends the process."""
+    handed_out: list[System] = []
+    alive_at_the_end: list[int] = []
+
+    class Watched(Mavsdk):  # type: ignore[misc]
+        def get_systems(self) -> list[System]:
+            found: list[System] = super().get_systems()
+            handed_out.extend(system for system in found if system.has_autopilot())
+            return found
+
+        def destroy(self) -> None:
+            alive_at_the_end.append(sum(system._handle is not None for system in handed_out))
+            super().destroy()
+
+    with pytest.raises(AutopilotError, match="heard instead: 1"):
+        await AutopilotLink.connect(_parameters(port, system_id=5), timeout_s=0.7, clock=clock, create=Watched)
+    await until(lambda: bool(alive_at_the_end))
+    assert handed_out
+    assert alive_at_the_end[0] == 0
 
 
 async def test_flockd_is_a_computer_of_the_autopilots_own_system_whatever_its_number(port: int) -> None:
