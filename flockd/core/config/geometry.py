@@ -14,7 +14,8 @@ class GeometryParameters(Section):
     """Motions from paired points, and what feeds them."""
 
     method: Literal["consensus", "paper"] = "consensus"
-    """How a motion is found among false matches: by consensus, which learns the errors' size, or by Algorithm 1."""
+    """How the own motion is found among false matches: by consensus, which learns the errors' size, or by Algorithm 1,
+    as a neighbour's always is."""
     initial_threshold_m: Distance = 0.01
     """Algorithm 1's first."""
     min_inlier_ratio: Annotated[float, Field(gt=0, lt=1)] = 0.2

@@ -14,13 +14,14 @@ def estimate_neighbour_motion(
 ) -> NeighbourMotion:
     """How one neighbour moved in C, and where it is in F, from all pairs on it, whichever cameras saw them.
 
-    Raises ValueError with the reason where there is no estimate.
+    By Algorithm 1: of a few pairs, whose errors are not small beside the neighbour's size, consensus learns too little,
+    and rounding decided whether there was a motion. Raises ValueError with the reason where there is no estimate.
     """
     current_in_c = RigidTransform(ego.rotation, ego.translation).apply(pairs.current)  # Eq. 22
     found = ransac_rigid(
         pairs.previous,
         current_in_c,
-        method=parameters.method,
+        method="paper",
         threshold=parameters.initial_threshold_m,
         min_inlier_ratio=parameters.min_inlier_ratio,
         hypotheses=parameters.hypotheses,

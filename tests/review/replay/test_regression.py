@@ -26,6 +26,7 @@ FLIGHTS = ("normal", "crossing", "faults", "fisheye")
 # lie above by factors of 1.6 to 77. Units are m, rad and s; a detection's log range is the logarithm of metres.
 TOLERANCES = ("velocity=1e-4", "command=0.002", "neighbours=0.015", "detections=0.003", "ego_motion=1e-4")
 TOLERANCES_OF = {
+    "fisheye": ("velocity=1e-4", "command=0.002", "neighbours=0.015", "detections=0.012", "ego_motion=1e-4"),
     "faults": ("velocity=0.001", "command=0.015", "neighbours=0.12", "detections=0.02", "ego_motion=0.001"),
 }
 # A neighbour's motion has few pairs: one more or less moved it by up to 0.11 m/s, half of that in metres, 0.22 in its
