@@ -70,6 +70,12 @@ class Innovation:
         """The squared Mahalanobis distance."""
         return float(self.residual @ np.linalg.solve(self.covariance, self.residual))
 
+    def squared_angle(self, position: FloatArray) -> float:
+        """The squared Mahalanobis distance of the bearings alone, from that of the predicted `position` (3,) m."""
+        across = np.linalg.svd(position[None, :])[2][1:]
+        angle = across @ self.residual[:3]
+        return float(angle @ np.linalg.solve(across @ self.covariance[:3, :3] @ across.T, angle))
+
     @property
     def log_determinant(self) -> float:
         """Logarithm of the covariance's determinant."""

@@ -46,18 +46,31 @@ class Hypotheses:
     each: tuple[Hypothesis, ...]
 
     @classmethod
-    def first(cls, measurement: Measurement, own_velocity: FloatArray | None, parameters: TrackingParameters) -> Self:
-        """After a first detection. `own_velocity` (3,) NED m/s; None: no drone is known to fly with this one."""
+    def first(
+        cls,
+        measurement: Measurement,
+        own_velocity: FloatArray | None,
+        parameters: TrackingParameters,
+        misjudged: State | None = None,
+    ) -> Self:
+        """After a first detection. `own_velocity` (3,) NED m/s; None: no drone is known to fly with this one.
+
+        `misjudged`: a neighbour that should have been seen in this bearing, and was not, at its own range. It is most
+        likely the one that was detected, at a range that is wrong, and flies as it did.
+        """
         bearing = measurement.bearing
         along = np.outer(bearing, bearing)
         unknown, alike = parameters.speed_sigma_m_s**2, parameters.relative_speed_sigma_m_s**2
         stranger = filter.initial(measurement, np.zeros(3), unknown * np.eye(3), parameters)
         if own_velocity is None:
             return cls((Hypothesis(1.0, stranger),))
+        share = parameters.stranger_probability
         mate = filter.initial(measurement, own_velocity, alike * np.eye(3), parameters)
+        if misjudged is not None:
+            share = parameters.hiding_stranger_probability
+            mate = filter.initial(measurement, misjudged.velocity, misjudged.velocity_covariance, parameters)
         across = own_velocity - along @ own_velocity
         meets = filter.initial(measurement, across, alike * np.eye(3) + (unknown - alike) * along, parameters)
-        share = parameters.stranger_probability
         each = (Hypothesis(1.0 - share, mate), Hypothesis(share / 2, meets), Hypothesis(share / 2, stranger))
         return cls(tuple(_likeliest_first(each)))
 

@@ -91,7 +91,7 @@ class Tracker:
                 track = self._tracks[column]
                 self._detect(track, measurement, innovation, weight)
             else:
-                track = self._begin(measurement, own_velocity)
+                track = self._begin(measurement, own_velocity, self._misjudged(measurement, missed))
                 self._tracks.append(track)
             numbers.append(track.number)
         for track in self._tracks:
@@ -153,7 +153,8 @@ class Tracker:
     def _detect(self, track: _Track, measurement: Measurement, innovation: Innovation, weight: float) -> None:
         interval_s = max(0.0, self._time_s - track.last_seen_s)
         track.hits += 1
-        track.agreed += innovation.squared_distance <= self.parameters.confirm_sigma**2
+        track.agrees = innovation.squared_distance <= self.parameters.confirm_sigma**2
+        track.agreed += track.agrees
         track.existence = existence.detected(track.existence, innovation, weight, self.parameters)
         track.drone_probability = existence.averaged(
             track.drone_probability, measurement.drone_probability, track.hits, interval_s, self.parameters
@@ -161,11 +162,21 @@ class Tracker:
         track.hypotheses = track.hypotheses.updated(measurement, self.parameters)
         track.last_seen_s = self._time_s
 
-    def _begin(self, measurement: Measurement, own_velocity: FloatArray | None) -> _Track:
+    def _misjudged(self, measurement: Measurement, missed: Sequence[_Track]) -> State | None:
+        """The neighbour, of those that were `missed`, whose bearing a detection has that fits no track; None: of none.
+
+        One that is confirmed and was detected before where it was to be: of one that was not, the velocity is in doubt.
+        """
+        known = [track.state for track in missed if track.confirmed and track.agrees]
+        off = [filter.innovation(state, measurement, self.parameters).squared_angle(state.position) for state in known]
+        nearest = int(np.argmin(off)) if off else 0
+        return known[nearest] if off and off[nearest] <= self.parameters.confirm_sigma**2 else None
+
+    def _begin(self, measurement: Measurement, own_velocity: FloatArray | None, misjudged: State | None) -> _Track:
         self._created += 1
         return _Track(
             number=self._created,
-            hypotheses=Hypotheses.first(measurement, own_velocity, self.parameters),
+            hypotheses=Hypotheses.first(measurement, own_velocity, self.parameters, misjudged),
             existence=self.parameters.birth_probability,
             drone_probability=measurement.drone_probability,
             first_seen_s=self._time_s,
@@ -199,6 +210,8 @@ class _Track:
     hits: int = 1
     agreed: int = 1
     """How many of the hits were within `confirm_sigma`."""
+    agrees: bool = True
+    """Whether the last one was."""
     confirmed: bool = False
     was_confirmed: bool = False
 

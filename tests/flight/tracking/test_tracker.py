@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from flockd.core.config.safety import GateParameters
 from flockd.core.messages import Detection, Neighbour
 from flockd.flight.geometry import log_polar, log_polar_covariance, rotation_from_euler
+from flockd.flight.safety.approach import towards_neighbours
+from flockd.flight.safety.surroundings import surroundings
 from flockd.flight.tracking import Measurement, Tracker, TrackingParameters
 
 Array = NDArray[np.float64]
@@ -245,6 +248,58 @@ def test_inside_the_gate_an_outlier_moves_a_track_the_less_the_farther_off_it_is
     gain = moved_m[0] / 1.0  # 1 m is honest here: the plain Kalman gain
     assert moved_m[2] < 0.75 * gain * 3.0
     assert moved_m[1] * 2.5 == pytest.approx(moved_m[2] * 3.0, rel=0.02)  # beyond 2.5 sigma it falls as 1 / distance
+
+
+def _towards(tracker: Tracker) -> float:
+    """How fast, m/s, the gate lets the drone fly north, as soon as the neighbours are known."""
+    around = surroundings(
+        tracker.neighbours(),
+        0.1,
+        moved=0.1 * CRUISE,
+        position=np.zeros(2),
+        velocity=CRUISE,
+        yaw_rad=0.0,
+        height_m=5.0,
+        obstacles=np.empty((0, 2)),
+    )
+    _, most_m_s = towards_neighbours(
+        GateParameters(), around.neighbours, around.neighbour_velocities, 1.0, around.neighbour_margins
+    )
+    return float(most_m_s.min(initial=math.inf))
+
+
+def test_one_wrong_range_of_a_known_neighbour_does_not_stop_the_drone() -> None:
+    """3.4 m instead of 4.2 m, a range of 2 % by its own account: more than six deviations, so that it fits no track."""
+    place = np.array([4.2, 0.0, 0.0])
+    tracker, now_s = _settled(place, sigma_m=0.06)
+    numbers = _step(tracker, now_s + STEP_S, np.array([3.4, 0.0, 0.0]), sigma_m=0.06)
+    assert numbers == (2,)
+    assert _towards(tracker) > 1.0
+    _step(tracker, now_s + 2 * STEP_S, place, sigma_m=0.06)
+    assert _towards(tracker) > 1.0
+
+
+def test_a_stranger_beside_a_known_neighbour_still_slows_at_once() -> None:
+    place = np.array([4.2, 0.0, 0.0])
+    for both_seen, where in ((True, [3.4, 0.0, 0.0]), (False, [3.4, 0.6, 0.0])):
+        tracker, now_s = _settled(place, sigma_m=0.06)
+        seen = [np.array(where), place] if both_seen else [np.array(where)]
+        _step(tracker, now_s + STEP_S, *seen, sigma_m=0.06)
+        assert _towards(tracker) < 0.8
+
+
+@pytest.mark.parametrize("comes_m_s", [2.0, 0.0])
+def test_a_stranger_that_hides_a_known_neighbour_is_believed_in_time(comes_m_s: float) -> None:
+    """It came out from behind something in front of the neighbour, hovers or comes: the gate brakes before 1 m."""
+    place, stranger_m = np.array([8.0, 0.0, 0.0]), 5.5
+    tracker, now_s = _settled(place, sigma_m=0.06)
+    for step in range(1, 20):
+        _step(tracker, now_s + step * STEP_S, np.array([stranger_m, 0.0, 0.0]), sigma_m=0.06)
+        limit_m_s = _towards(tracker)
+        if limit_m_s < 0.5:
+            break
+        stranger_m -= STEP_S * (1.0 + comes_m_s)
+    assert stranger_m > 1.0 + 0.5 * (1.0 + comes_m_s)
 
 
 def test_a_track_follows_a_jump_that_stays() -> None:
