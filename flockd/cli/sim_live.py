@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import html
 import os
 import sys
+import tempfile
 import threading
 import webbrowser
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.endpoint_options import ENDPOINT
@@ -76,7 +79,7 @@ def fly(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) -> int:
             complain(f"other programs find it at {endpoint}; Ctrl-C ends it")
         sys.stdout.flush()  # whoever reads a pipe needs the address now
         if args.browser and _has_screen():
-            webbrowser.open(address)
+            stack.enter_context(_opened(address))
         with suppress(KeyboardInterrupt), Phases(quiet=args.quiet, verbose=args.verbose) as phases:
             fly_live(
                 scenario,
@@ -93,6 +96,19 @@ def fly(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) -> int:
 def _has_screen() -> bool:
     """Whether a browser has somewhere to open: not a text browser in this terminal."""
     return sys.platform in {"darwin", "win32"} or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+@contextmanager
+def _opened(address: str) -> Iterator[None]:
+    """Opens the address in the browser by a page that this user alone may read, while this lasts.
+
+    The address has the key in it, and all users of a computer may see the command lines of all its processes.
+    """
+    with tempfile.NamedTemporaryFile("w", prefix="flockd-", suffix=".html", encoding="utf-8") as page:
+        page.write(f'<meta http-equiv="refresh" content="0; url={html.escape(address)}">')
+        page.flush()
+        webbrowser.open(Path(page.name).as_uri())
+        yield
 
 
 @contextmanager

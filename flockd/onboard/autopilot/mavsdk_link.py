@@ -177,9 +177,13 @@ class AutopilotLink:
         return link
 
     async def close(self) -> None:
-        """Ends the link; nothing of it may be used afterwards."""
-        await self._call(self._mavsdk.destroy)
+        """Ends the link; nothing of it may be used afterwards.
+
+        It is ended even where nobody waits for that so long, after a call that still runs.
+        """
+        ended = self._executor.submit(_destroy, self._mavsdk, (self,))
         self._executor.shutdown(wait=False)
+        await asyncio.shield(asyncio.wrap_future(ended))
 
     @property
     def system_id(self) -> int:

@@ -6,6 +6,7 @@ import asyncio
 import math
 import subprocess
 import sys
+import threading
 import time
 from typing import Any
 
@@ -475,3 +476,29 @@ async def test_a_start_that_is_given_up_does_not_destroy_mavsdk_under_its_own_ca
     await asyncio.wait({connecting})
     await asyncio.wait_for(destroyed.wait(), 10.0)
     assert told[:3] == ["begins", "ends", "destroyed"]
+
+
+async def test_a_close_that_nobody_waits_for_still_destroys_mavsdk(port: int, fake_autopilot: FakeAutopilot) -> None:
+    """Behind a request that the autopilot does not answer. One that is collected instead ends the process (seen)."""
+    asked, answer = threading.Event(), threading.Event()
+    destroyed = asyncio.Event()
+    loop = asyncio.get_running_loop()
+
+    def ask() -> None:
+        asked.set()
+        answer.wait()
+
+    class Watched(Mavsdk):  # type: ignore[misc]
+        def destroy(self) -> None:
+            super().destroy()
+            loop.call_soon_threadsafe(destroyed.set)
+
+    link = await AutopilotLink.connect(_parameters(port), clock=clock, create=Watched)
+    asking = asyncio.create_task(link._call(ask))
+    await until(asked.is_set)
+    with pytest.raises(TimeoutError):
+        async with asyncio.timeout(0.1):
+            await link.close()
+    answer.set()
+    await asking
+    await asyncio.wait_for(destroyed.wait(), 10.0)
