@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 ROS_VENV := .venv-ros
 
 .DEFAULT_GOAL := help
-.PHONY: help demo live docs lint test test-all browser coverage ros mutate mutate-all references wheel release deb lock sbom clean
+.PHONY: help demo live docs lint test test-all browser coverage ros mutate mutate-all references wheel release deb container lock sbom clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -57,12 +57,15 @@ references: $(VENV)/test.installed ## write what the recorded flights of tests/r
 wheel: $(VENV)/test.installed ## build sdist and wheel in dist, check them, install the wheel alone, and fly it
 	$(BIN)/python -m tools.release.check_wheel --out dist
 
-release: wheel ## that; then sbom and deb
-	$(MAKE) sbom deb
+release: wheel ## that; then sbom, deb and container
+	$(MAKE) sbom deb container
 
 deb: $(BIN)/pip ## build Debian packages for amd64 and arm64 in dist; SYSTEM=debian13 or ubuntu24.04 for others than Debian 12
 	$(BIN)/python -m tools.release.deb --arch amd64 --system $(SYSTEM) --out dist
 	$(BIN)/python -m tools.release.deb --arch arm64 --system $(SYSTEM) --out dist
+
+container: $(BIN)/pip ## build the container, install this computer's package of dist in another, and run both; BASE=IMAGE for another Debian 12
+	$(BIN)/python -m tools.release.check_container --packages dist $(if $(BASE),--base $(BASE))
 
 lock: $(VENV)/release.installed ## write requirements/service.txt again, with the newest versions that pyproject.toml permits
 	$(BIN)/python -m tools.release.lock
