@@ -197,6 +197,10 @@ def _spread_out(axes: Axes, values: Sequence[Any]) -> None:
     axes.minorticks_off()
 
 
+_MOST_COLUMNS = 8
+"""Of a heat map, in which numbers and names have room beside each other."""
+
+
 def _heat_map(drawing: Figure, axes: Axes, results: Results, figure: FigureName, across: str, up: str) -> None:
     columns, rows = results.values_of(across), results.values_of(up)
     means = np.full((len(rows), len(columns)), np.nan)
@@ -206,10 +210,11 @@ def _heat_map(drawing: Figure, axes: Axes, results: Results, figure: FigureName,
             means[row, column] = np.mean(list(seeds.values())) if seeds else np.nan
     image = axes.imshow(means, origin="lower", aspect="auto", cmap="viridis")
     drawing.colorbar(image, ax=axes, label=label_of(figure))
-    axes.set_xticks(range(len(columns)), [shown(value) for value in columns])
+    crowded = len(columns) > _MOST_COLUMNS
+    axes.set_xticks(range(len(columns)), [shown(value) for value in columns], rotation=90.0 if crowded else 0.0)
     axes.set_yticks(range(len(rows)), [shown(value) for value in rows])
     axes.set(xlabel=across, ylabel=up)
-    if means.size <= 100:
+    if means.size <= 100 and not crowded:
         middle = np.nanmean(means) if np.isfinite(means).any() else 0.0
         for (row, column), mean in np.ndenumerate(means):
             text = f"{mean:.3g}" if np.isfinite(mean) else ""
