@@ -68,11 +68,11 @@ class NoiseParameters(Section):
     max_white: Share = 0.25
     """The image is not used where more of it than this is white noise. 1, here and in the next two: all are used."""
     max_white_rise: Share = 0.08
-    """Nor is it where this much more of it is white noise than of any of the camera's last five images, ..."""
+    """Nor is it where this much more of it is white noise than of any image of the last half minute, ..."""
     rough_level: Positive = 20.0
     """... or where details at one of the finest scales are stronger than this, in grey levels, ..."""
     max_rough_rise: Share = 0.4
-    """... in this much more of it than in any of the last five."""
+    """... in this much more of it than in any of those."""
     max_unexplained: Share = 0.35
     """Nor is it where this much more of it than of the other cameras' images does not follow from the image before, as
     when it is damaged in blocks, or covered by soft noise. 1: all are used."""

@@ -25,8 +25,8 @@ _BLOCK = 16
 """Details on one side of a block at the finest scale: two image pixels each."""
 _SIGMA_PER_MEAN = float(np.sqrt(np.pi / 2))
 """Standard deviation over the mean magnitude, for normal numbers."""
-_REMEMBERED = 5
-"""Images of a camera that are its history."""
+_REMEMBERED_S = 30.0
+"""Of a camera's images: what it showed before a hand, or a wall near by, covered it, is no noise when it comes back."""
 _FORGOTTEN_S = 2.0
 """After so long without an image, a camera may see something else entirely."""
 
@@ -73,6 +73,8 @@ class NoiseMonitor:
         if abs(time_s - history.time_s) > _FORGOTTEN_S:
             history.used.clear()
         history.time_s = time_s
+        while history.used and time_s - history.used[0][0] > _REMEMBERED_S:
+            history.used.popleft()
         shares = noise_shares(image, self._parameters)
         if self._is_noise(shares, history):
             history.clean_needed = self._parameters.clean_images
@@ -80,8 +82,12 @@ class NoiseMonitor:
         history.clean_needed = max(history.clean_needed - 1, 0)
         if history.clean_needed:
             return True
-        history.used.append(shares)
+        history.used.append((time_s, shares))
         return False
+
+    def forget(self, camera: str) -> None:
+        """What the camera showed, as of a lens that is covered: once it is clear, any view may come all at once."""
+        self._cameras.pop(camera, None)
 
     def _is_noise(self, shares: NoiseShares, history: _History) -> bool:
         parameters = self._parameters
@@ -89,8 +95,8 @@ class NoiseMonitor:
             return True
         if not history.used:
             return False
-        white_rise = shares.white - max(used.white for used in history.used)
-        rough_rise = shares.rough - max(used.rough for used in history.used)
+        white_rise = shares.white - max(used.white for _, used in history.used)
+        rough_rise = shares.rough - max(used.rough for _, used in history.used)
         return white_rise > parameters.max_white_rise or rough_rise > parameters.max_rough_rise
 
 
@@ -98,8 +104,8 @@ class NoiseMonitor:
 class _History:
     """History of one camera."""
 
-    used: deque[NoiseShares] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
-    """Its last images that were."""
+    used: deque[tuple[float, NoiseShares]] = field(default_factory=deque)
+    """Its last images that were, each with its time."""
     time_s: float = -np.inf
     """Time of its last image."""
     clean_needed: int = 0

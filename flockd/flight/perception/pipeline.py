@@ -104,6 +104,7 @@ class Perception:
         for name, fault in self._lens.bad(images, frames.time_s, vehicle.R_ned_body).items():
             noisy.append(name)
             reasons.append(Reason(ReasonKind.LENS, f"camera {name}: {fault}"))
+            self._noise.forget(name)
             del usable[name]
         return usable, tuple(noisy), reasons
 

@@ -111,6 +111,22 @@ def test_noise_that_was_filtered_is_noticed_as_it_comes_all_at_once(blur_px: flo
     assert Camera().shows(SCENE) + Camera().shows(soft, after_s=5.0) == [False, False], "it may be another view"
 
 
+GRAVEL = scene(0.8, 60.0, seed=4)
+COVERED = np.full((*SIZE, 3), 50, np.uint8)
+
+
+def test_gravel_that_was_covered_is_no_noise_when_it_comes_back() -> None:
+    """As it was seen before it was covered, or as nobody can tell who saw none; but not from one image to the next."""
+    assert noise_shares(GRAVEL, PARAMETERS).rough > PARAMETERS.max_rough_rise
+    assert Camera().shows(COVERED, GRAVEL, GRAVEL, GRAVEL) == [False, True, True, True]
+    assert Camera().shows(GRAVEL, *[COVERED] * 20, GRAVEL, GRAVEL) == [False] * 23
+    monitor = NoiseMonitor(PARAMETERS)
+    for step in range(8):
+        assert not monitor.is_noisy("front", COVERED if step < 6 else GRAVEL, step * STEP_S)
+        if 2 <= step < 6:  # by then the lens counts as covered
+            monitor.forget("front")
+
+
 def test_a_turn_from_the_sky_to_the_finest_texture_is_no_noise() -> None:
     """A view of 90 degrees that turns by 60 degrees a second, towards gravel that nothing blurs: in 0.5 s a third."""
     sky, gravel = scene(1.2, 3.0), scene(0.8, 50.0, seed=3)
