@@ -49,12 +49,22 @@ class Crop:
     """Whether the network is to be given the mirror image, on which it errs differently. The estimate is as if not."""
 
 
+LOOKS_ALIKE = 1.5
+"""A drone that looks larger or smaller than known ones look, by more than this factor, is of another type."""
+
+
 @dataclass(frozen=True)
 class KnownSize:
     """Size of every drone of the fleet, from tip to tip, and its standard deviation."""
 
     size_m: float
     sigma_m: float
+    looks_m: float | None = None
+    """What the network judges such drones' size to be: those that look otherwise are none; None: all are."""
+
+    def is_of(self, judged_m: float) -> bool:
+        """Whether a drone whose size the network judges so has this size."""
+        return self.looks_m is None or 1 / LOOKS_ALIKE < judged_m / self.looks_m < LOOKS_ALIKE
 
 
 @dataclass(frozen=True, eq=False)

@@ -121,6 +121,14 @@ class Tracker:
             for track, state in zip(known, states, strict=True)
         )
 
+    def resize(self, size_m: float, own_velocity: FloatArray | None) -> None:
+        """All neighbours are this large, from tip to tip, and so much nearer or farther than their tracks had it.
+
+        `own_velocity` (3,) NED m/s; None: not known.
+        """
+        for track in self._tracks:
+            track.hypotheses = track.hypotheses.changed(lambda state: filter.resized(state, size_m, own_velocity))
+
     def neighbours(self) -> tuple[Neighbour, ...]:
         """All tracks as of the last `predict` and `update`, confirmed or not, by track number."""
         return tuple(
