@@ -55,6 +55,8 @@ class ReasonKind(StrEnum):
     """A neighbour, or its motion."""
     RIG = "rig"
     """Nothing, but that a camera is not as its configuration says."""
+    SIZE = "size"
+    """Nothing, but that the neighbours are not as large as the configuration says."""
     RECORDED = "recorded"
     """Unknown: recordings keep the text alone."""
 

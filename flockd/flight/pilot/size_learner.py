@@ -16,9 +16,11 @@ from flockd.flight.pilot.weave import Weave
 from flockd.flight.tracking import Measurement
 from flockd.flight.tracking.flock_size import FlockSize, SizeEstimate
 
-_USED_BEYOND, _USED_UNTIL = 2.0, 1.0
-"""The learned size is used once it is so many of its standard deviations from what the networks judge, until it is so
-near: for drones that they know they judge better."""
+_USED_BEYOND, _USED_UNTIL = 2.0, 1.5
+"""The learned size is used once the sizes that the networks judge are off it by so many of its standard deviations,
+root mean square, until they are so near: those of drones that they know they judge better."""
+_MOST_OFF = 0.5
+"""One judged size counts as no farther off, in log size: it may be of something else."""
 _CONTRADICTED = 3.0
 """A size that the configuration says is contradicted by one that is so many standard deviations off."""
 _REFRESHED = 0.25
@@ -74,7 +76,7 @@ class SizeLearner:
     @property
     def reasons(self) -> tuple[Reason, ...]:
         """That the configuration says another size."""
-        return () if self._contradiction is None else (Reason(ReasonKind.NEIGHBOUR, self._contradiction),)
+        return () if self._contradiction is None else (Reason(ReasonKind.SIZE, self._contradiction),)
 
     @property
     def moves(self) -> bool:
@@ -115,11 +117,12 @@ class SizeLearner:
         if self._said is not None:
             if self._contradiction is None and found.deviations(self._said.size_m, self._said.sigma) > _CONTRADICTED:
                 self._contradiction = (
-                    f"neighbour: drone_size_m says {self._said.size_m:.2f} m, and the flight shows {found.size_m:.2f} "
-                    f"+-{found.sigma * found.size_m:.2f} m; measure the drones"
+                    f"size: perception.drone_size_m says {self._said.size_m:.2f} m, and the flight shows "
+                    f"{found.size_m:.2f} +-{found.sigma * found.size_m:.2f} m; measure the drones"
                 )
             return False
-        off = found.deviations(self._looks_m)
+        judged = np.minimum(np.abs(np.array(self._judged) - math.log(found.size_m)), _MOST_OFF)
+        off = float(np.sqrt(np.mean(judged**2))) / found.sigma
         if used is None:
             self._used = found if off > _USED_BEYOND else None
         elif off < _USED_UNTIL:

@@ -24,9 +24,9 @@ _SETTLES_S = 3.0
 """So long afterwards it is still on its way back."""
 _DRAWN_WITHIN_S = 30.0
 """It begins at a time drawn from so many seconds, for not all to weave at once."""
-_CLIMB_M_S = 0.12
-"""A neighbour that rises or sinks faster is weaving: at most one other may be, when a drone begins."""
-_AGAIN_S = (2.0, 8.0)
+_CLIMB_M_S = 0.2
+"""A neighbour that rises or sinks faster is weaving, and the drone waits."""
+_AGAIN_S = (1.0, 4.0)
 """Where it may not begin it tries again after so long."""
 _STEADY_S = 6.0
 """For so long the mission's height has to have been the same: a flock changes its height together."""
@@ -35,8 +35,8 @@ _AT_HEIGHT_M = 0.5
 _ABOVE_LOWEST_M = 0.5
 """It stays so far within the heights that the gate allows: the lowest is near the ground."""
 _COLUMN = 1.5
-"""Level distance, in the gate's degraded separations, within which no other drone may be: nearer to one above or below
-the gate lets it rise or sink no more."""
+"""Level distance, in the gate's degraded separations, within which no other drone may be when it begins: nearer to one
+above or below the gate lets it rise or sink no more, as it also does later."""
 
 
 class Weave:
@@ -67,7 +67,7 @@ class Weave:
     ) -> float | None:
         """The height to ask for instead of the mission's, `wanted_m`; None: the one that the flight began at.
 
-        The drone is at `height_m`; `neighbours` are all tracks, confirmed or not. `needed`: there is something to
+        The drone is at `height_m`. `needed`: there is something to
         learn, and nothing that forbids it.
         """
         if self._steady_since_s is None or wanted_m != self._wanted_m:
@@ -76,7 +76,7 @@ class Weave:
             return wanted_m
         assert self._began_s is not None
         elapsed_s = time_s - self._began_s
-        may = needed and self._steady_since_s <= self._began_s and not self._is_near(neighbours)
+        may = needed and self._steady_since_s <= self._began_s
         if elapsed_s < DURATION_S and not may:
             elapsed_s, self._began_s = DURATION_S, time_s - DURATION_S
         if not 0.0 <= elapsed_s < DURATION_S + _SETTLES_S:
@@ -111,9 +111,9 @@ class Weave:
             and abs(height_m - base_m) <= _AT_HEIGHT_M
             and room_m >= _ASKED_M + _ABOVE_LOWEST_M
             and not self._is_near(neighbours)
-            and sum(one.confirmed and abs(one.velocity[2]) > _CLIMB_M_S for one in neighbours) < 1
+            and not any(one.confirmed and abs(one.velocity[2]) > _CLIMB_M_S for one in neighbours)
         )
 
     def _is_near(self, neighbours: Sequence[Neighbour]) -> bool:
         column_m = _COLUMN * self._gate.degraded_separation_m
-        return any(math.hypot(*one.position[:2]) < column_m for one in neighbours)
+        return any(one.confirmed and math.hypot(*one.position[:2]) < column_m for one in neighbours)

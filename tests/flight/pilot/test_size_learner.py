@@ -119,12 +119,11 @@ def test_a_size_that_the_networks_judge_well_stays_theirs() -> None:
 def test_a_size_that_was_said_and_is_wrong_is_a_warning_with_both() -> None:
     outputs = Flight(drone(drone_size_m=JUDGED_M, drone_size_sigma_m=0.01)).fly(60.0)
     first, last = (
-        [reason.text for reason in one.reasons if reason.kind is ReasonKind.NEIGHBOUR]
-        for one in (outputs[5], outputs[-1])
+        [reason.text for reason in one.reasons if reason.kind is ReasonKind.SIZE] for one in (outputs[5], outputs[-1])
     )
     assert first == []
     assert last == [
-        "neighbour: drone_size_m says 0.56 m, and the flight shows 0.39 +-0.04 m; measure the drones",
+        "size: perception.drone_size_m says 0.56 m, and the flight shows 0.39 +-0.04 m; measure the drones",
     ]
 
 
@@ -205,14 +204,12 @@ def test_it_does_not_begin_while_nothing_is_to_be_learned() -> None:
     assert (Weaving().asked(60.0, needed=False) == 0.0).all()
 
 
-@pytest.mark.parametrize("what", ["another comes", "the mission's height changes", "it is needed no more"])
+@pytest.mark.parametrize("what", ["the mission's height changes", "it is needed no more"])
 def test_it_ends_at_once(what: str) -> None:
     weaving = Weaving()
     while not weaving.asked(STEP_S)[0]:
         pass
-    if what == "another comes":
-        weaving.neighbours = (at(2.0),)
-    elif what == "the mission's height changes":
+    if what == "the mission's height changes":
         weaving.wanted_m = HEIGHT_M + 1.0
     lifts = weaving.asked(12.0, needed=what != "it is needed no more")
     assert (lifts == (1.0 if what == "the mission's height changes" else 0.0)).all()
