@@ -161,7 +161,7 @@ def fly(seed: int, by_time: dict[float, Errors], of_types: Errors, *, types: boo
         asked = heights.copy()
         for i, weave in enumerate(weaves):
             needed, others = not wove[i] or weave.moves, commands.neighbours[i]
-            asked[i] = weave.height(time_s, -here[i, 2], heights[i], others, random, needed=needed)
+            asked[i] = weave.height(time_s, -here[i, 2], -here[i, 2], heights[i], others, random, needed=needed)
             wove[i] |= weave.moves
         if began_s is None and weaves[0].moves:
             began_s = time_s

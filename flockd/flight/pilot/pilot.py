@@ -174,7 +174,7 @@ class FlockPilot:
         laps.end("tracking")
         obstacles = self._local_map(observation, ego, ground, velocity)
         laps.end("obstacles")
-        command = self._command(observation, neighbours, velocity, obstacles)
+        command = self._command(observation, neighbours, velocity, obstacles, ground)
         laps.end("flocking")
         self._last_time_s = observation.time_s
         of_height = () if why_no_ground is None else (why_no_ground,)
@@ -386,6 +386,7 @@ class FlockPilot:
         neighbours: Sequence[Neighbour],
         velocity: FloatArray | None,
         obstacles: ObstacleRanges | None,
+        ground: GroundEstimate | None,
     ) -> Wanted:
         if self._first_time_s is None:
             self._first_time_s = observation.time_s
@@ -418,7 +419,7 @@ class FlockPilot:
         height_m = guidance.height_m
         if self._size is not None:
             ends = guidance.takeover is not None
-            height_m = self._size.height(observation.time_s, vehicle, height_m, neighbours, ends)
+            height_m = self._size.height(observation.time_s, vehicle, ground, height_m, neighbours, ends=ends)
             self._mission = replace(self._mission, sentence=self._mission.sentence + self._size.sentence)
         trim = self._trim.velocity
         return Wanted(

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from flockd.core.config.drone import DroneConfig
-from flockd.core.messages import FloatArray, Neighbour, Reason, ReasonKind, SizeStatus, VehicleState
+from flockd.core.messages import FloatArray, GroundEstimate, Neighbour, Reason, ReasonKind, SizeStatus, VehicleState
 from flockd.flight.perception.maps import KnownSize
 from flockd.flight.pilot.weave import Weave
 from flockd.flight.tracking import Measurement
@@ -132,7 +132,14 @@ class SizeLearner:
         return self._used is not used
 
     def height(
-        self, time_s: float, vehicle: VehicleState, wanted_m: float | None, neighbours: Sequence[Neighbour], ends: bool
+        self,
+        time_s: float,
+        vehicle: VehicleState,
+        ground: GroundEstimate | None,
+        wanted_m: float | None,
+        neighbours: Sequence[Neighbour],
+        *,
+        ends: bool,
     ) -> float | None:
         """The height to ask for, with the weave in it; as of `Wanted`. ``ends``: the mission is over."""
         if self._random is None:
@@ -142,7 +149,10 @@ class SizeLearner:
             self._wove_s = time_s
         is_old = self._wove_s is None or time_s - self._wove_s > _OLD_S
         needed = self._allowed and not ends and (self._weave.moves or self._found is None or is_old)
-        return self._weave.height(time_s, vehicle.height_m, wanted_m, neighbours, self._random, needed=needed)
+        above_ground_m = vehicle.height_m if ground is None else ground.height_m
+        return self._weave.height(
+            time_s, vehicle.height_m, above_ground_m, wanted_m, neighbours, self._random, needed=needed
+        )
 
     def cautious(self, neighbours: Sequence[Neighbour]) -> tuple[Neighbour, ...]:
         """With what the used size may be off in the ranges that the gate reckons with: it errs alike in all steps."""

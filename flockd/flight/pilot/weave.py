@@ -34,6 +34,8 @@ _AT_HEIGHT_M = 0.5
 """From the mission's height the drone is no farther off when it begins."""
 _ABOVE_LOWEST_M = 0.5
 """It stays so far within the heights that the gate allows: the lowest is near the ground."""
+_ABOVE_GROUND_M = 2.0
+"""Nor does it begin lower above the ground, which may be higher than at home."""
 _COLUMN = 1.5
 """Level distance, in the gate's degraded separations, within which no other drone may be when it begins: nearer to one
 above or below the gate lets it rise or sink no more, as it also does later."""
@@ -59,6 +61,7 @@ class Weave:
         self,
         time_s: float,
         height_m: float,
+        above_ground_m: float,
         wanted_m: float | None,
         neighbours: Sequence[Neighbour],
         random: np.random.Generator,
@@ -67,12 +70,11 @@ class Weave:
     ) -> float | None:
         """The height to ask for instead of the mission's, `wanted_m`; None: the one that the flight began at.
 
-        The drone is at `height_m`. `needed`: there is something to
-        learn, and nothing that forbids it.
+        The drone is at `height_m` above home. `needed`: there is something to learn, and nothing that forbids it.
         """
         if self._steady_since_s is None or wanted_m != self._wanted_m:
             self._wanted_m, self._steady_since_s = wanted_m, time_s
-        if self._began_s is None and not self._begins(time_s, height_m, neighbours, random, needed):
+        if self._began_s is None and not self._begins(time_s, height_m, above_ground_m, neighbours, random, needed):
             return wanted_m
         assert self._began_s is not None
         elapsed_s = time_s - self._began_s
@@ -87,7 +89,13 @@ class Weave:
         return base_m + lift_m
 
     def _begins(
-        self, time_s: float, height_m: float, neighbours: Sequence[Neighbour], random: np.random.Generator, needed: bool
+        self,
+        time_s: float,
+        height_m: float,
+        above_ground_m: float,
+        neighbours: Sequence[Neighbour],
+        random: np.random.Generator,
+        needed: bool,
     ) -> bool:
         if not needed:
             self._next_s = None
@@ -96,7 +104,7 @@ class Weave:
             self._next_s = time_s + random.uniform(0.0, _DRAWN_WITHIN_S)
         if time_s < self._next_s:
             return False
-        if not self._may_begin(time_s, height_m, neighbours):
+        if above_ground_m < _ABOVE_GROUND_M or not self._may_begin(time_s, height_m, neighbours):
             self._next_s = time_s + random.uniform(*_AGAIN_S)
             return False
         self._began_s, self._base_m = time_s, height_m

@@ -55,6 +55,8 @@ _LOOKS_ALIKE = 0.2
 """Two drones whose logarithms of the judged sizes differ by much more are of two types: a standard deviation."""
 _TOLD = 1.0
 """A track whose log likelihoods differ by less tells nothing of the size."""
+_REMEMBERED = 200
+"""So many ended tracks are remembered, the newest."""
 _MODE_WIDTH, _MODE_SHARE = 0.3, 0.8
 """Of a size's probability so much has to lie within this, in log size, of the likeliest: else there are two."""
 
@@ -96,7 +98,8 @@ class FlockSize:
     def keep(self, numbers: set[int]) -> None:
         """Only these tracks still exist; what the others showed stays."""
         ended = [self._tracks.pop(number) for number in self._tracks.keys() - numbers]
-        self._past += [one for one in ended if np.ptp(one.log_likelihood) > _TOLD]
+        told = [one for one in ended if np.ptp(one.log_likelihood) > _TOLD]
+        self._past = [*self._past, *told][-_REMEMBERED:]
 
     def of_looks(self, size_m: float) -> SizeEstimate | None:
         """The size of drones that the networks judge to have another, `size_m`; None: not known to `MOST_SIGMA`."""

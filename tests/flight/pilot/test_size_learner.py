@@ -149,6 +149,7 @@ class Weaving:
     height_m: float = HEIGHT_M
     wanted_m: float | None = HEIGHT_M
     neighbours: Sequence[Neighbour] = ()
+    hill_m: float = 0.0
 
     def __post_init__(self) -> None:
         self._weave, self._random = Weave(drone().safety.gate), np.random.default_rng(0)
@@ -159,7 +160,13 @@ class Weaving:
         lifts = []
         for _ in range(round(duration_s / STEP_S)):
             height_m = self._weave.height(
-                self._time_s, self.height_m, self.wanted_m, self.neighbours, self._random, needed=needed
+                self._time_s,
+                self.height_m,
+                self.height_m - self.hill_m,
+                self.wanted_m,
+                self.neighbours,
+                self._random,
+                needed=needed,
             )
             lifts.append(math.nan if height_m is None else height_m - HEIGHT_M)
             self._time_s += STEP_S
@@ -185,18 +192,19 @@ def test_it_goes_up_and_down_twice_and_ends_where_it_began() -> None:
 
 
 @pytest.mark.parametrize(
-    ("height_m", "neighbours"),
+    ("height_m", "neighbours", "hill_m"),
     [
-        pytest.param(1.5, (), id="near the ground"),
-        pytest.param(29.5, (), id="near the highest height"),
-        pytest.param(5.0, (), id="not yet at its height"),
-        pytest.param(HEIGHT_M, (at(2.0),), id="another is near"),
-        pytest.param(HEIGHT_M, (at(4.0, climb_m_s=0.3),), id="another weaves"),
+        pytest.param(1.5, (), 0.0, id="near the lowest height"),
+        pytest.param(29.5, (), 0.0, id="near the highest height"),
+        pytest.param(5.0, (), 0.0, id="not yet at its height"),
+        pytest.param(HEIGHT_M, (at(2.0),), 0.0, id="another is near"),
+        pytest.param(HEIGHT_M, (at(4.0, climb_m_s=0.3),), 0.0, id="another weaves"),
+        pytest.param(HEIGHT_M, (), 2.5, id="over a hill"),
     ],
 )
-def test_it_does_not_begin(height_m: float, neighbours: Sequence[Neighbour]) -> None:
+def test_it_does_not_begin(height_m: float, neighbours: Sequence[Neighbour], hill_m: float) -> None:
     wanted_m = HEIGHT_M if height_m == 5.0 else height_m
-    weaving = Weaving(height_m, wanted_m, neighbours)
+    weaving = Weaving(height_m, wanted_m, neighbours, hill_m)
     assert (np.diff(weaving.asked(60.0)) == 0.0).all()
 
 
