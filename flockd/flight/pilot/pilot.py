@@ -104,7 +104,7 @@ class FlockPilot:
         """What the last step's pairs began at."""
         self._rig_said_s: float | None = None
         self._tracker = Tracker(config.tracking)
-        self._size = SizeLearner(config) if config.flocking.size == "weave" else None
+        self._size = None if config.flocking.size == "off" else SizeLearner(config)
         self._law = FlockingLaw(config.flocking)
         self._map = LocalMap(config.obstacles) if config.obstacles.enabled else None
         self._ranging = ObstacleRanging(self._rig, config.obstacles) if config.obstacles.enabled else None

@@ -25,8 +25,13 @@ _CONTRADICTED = 3.0
 """A size that the configuration says is contradicted by one that is so many standard deviations off."""
 _REFRESHED = 0.25
 """Ranges follow the estimate once it has moved by this share of its standard deviation."""
-_JUDGED = 400
-"""So many judged sizes are kept, the newest: those of five drones in 40 s."""
+_JUDGED, _FEWEST_JUDGED, _NEAR_M = 400, 24, 8.0
+"""So many judged sizes are kept, the newest, so many are enough, and of drones so near: farther ones look like much."""
+_SCATTER = 0.03
+"""Standard deviation of the judged log sizes from which the networks do not know the drones. Of families that they know
+it is below 0.01, of two that they do not know from 0.08 to 0.25."""
+_MIDDLE = 2.563
+"""Standard deviations of a normal distribution within which 80 % are."""
 _OLD_S = 600.0
 """The drone weaves again when its last weave is so long ago."""
 
@@ -39,6 +44,7 @@ class SizeLearner:
         self._said = None if size_m is None else SizeEstimate(size_m, config.perception.drone_size_sigma_m / size_m)
         self._weave, self._sizes = Weave(config.safety.gate), FlockSize()
         self._allowed = config.safety.first_flight_layer is None
+        self._always = config.flocking.size == "weave"
         self._name = config.name
         self._random: np.random.Generator | None = None
         self._found: SizeEstimate | None = None
@@ -57,10 +63,10 @@ class SizeLearner:
         return None if used is None else KnownSize(used.size_m, used.sigma * used.size_m, self._looks_m)
 
     @property
-    def status(self) -> SizeStatus:
-        """As of now."""
+    def status(self) -> SizeStatus | None:
+        """As of now; None: nothing was learned yet."""
         if self._found is None:
-            return SizeStatus(self._weave.moves)
+            return SizeStatus(weaves=True) if self._weave.moves else None
         return SizeStatus(self._weave.moves, self._found.size_m, self._found.sigma, used=self._used is not None)
 
     @property
@@ -96,11 +102,20 @@ class SizeLearner:
         self._sizes.keep({one.track for one in neighbours})
         confirmed = {one.track for one in neighbours if one.confirmed}
         if self._used is None:
-            logs = [math.log(one.size_m) for number, one in measured.items() if number in confirmed]
+            known = [one for number, one in measured.items() if number in confirmed and one.range_m < _NEAR_M]
+            logs = [math.log(one.size_m) for one in known]
             self._judged = [*self._judged, *logs][-_JUDGED:]
             self._looks_m = math.exp(float(np.median(self._judged))) if self._judged else 0.0
         self._found = self._sizes.of_looks(self._looks_m) if self._judged else None
         return self._choose()
+
+    @property
+    def _is_unknown_type(self) -> bool:
+        """Whether the networks judge the others' size otherwise from view to view."""
+        if self._said is not None or len(self._judged) < _FEWEST_JUDGED:
+            return False
+        low, high = np.quantile(self._judged, [0.1, 0.9])
+        return float(high - low) > _SCATTER * _MIDDLE
 
     def _as_judged(self, measurement: Measurement) -> Measurement:
         """With the range that follows from the size that the networks judge, as far as that is still known."""
@@ -148,7 +163,8 @@ class SizeLearner:
         if self._weave.moves:
             self._wove_s = time_s
         is_old = self._wove_s is None or time_s - self._wove_s > _OLD_S
-        needed = self._allowed and not ends and (self._weave.moves or self._found is None or is_old)
+        asked = self._allowed and not ends and (self._always or self._is_unknown_type)
+        needed = asked and (self._weave.moves or self._found is None or is_old)
         above_ground_m = vehicle.height_m if ground is None else ground.height_m
         return self._weave.height(
             time_s, vehicle.height_m, above_ground_m, wanted_m, neighbours, self._random, needed=needed
