@@ -27,7 +27,7 @@ _REFRESHED = 0.25
 """Ranges follow the estimate once it has moved by this share of its standard deviation."""
 _JUDGED, _FEWEST_JUDGED, _NEAR_M = 400, 24, 8.0
 """So many judged sizes are kept, the newest, so many are enough, and of drones so near: farther ones look like much."""
-_SCATTER = 0.03
+_SCATTER = 0.05
 """Standard deviation of the judged log sizes from which the networks do not know the drones. Of families that they know
 it is below 0.01, of two that they do not know from 0.08 to 0.25."""
 _MIDDLE = 2.563
