@@ -426,4 +426,4 @@ class PilotOutput:
     rig: tuple[CameraDeviation, ...] = ()
     """How each camera differs from its configuration, as far as this flight has shown it, once in some seconds."""
     size: SizeStatus | None = None
-    """None where the neighbours' size is not to be learned."""
+    """None while nothing is learned of the neighbours' size."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, UInt8Array
 from flockd.flight.geometry import PinholeCamera, RigidTransform, ZMap
 from flockd.flight.perception.detection.instances import Instance
+from flockd.flight.tracking import looks_alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,10 +50,6 @@ class Crop:
     """Whether the network is to be given the mirror image, on which it errs differently. The estimate is as if not."""
 
 
-LOOKS_ALIKE = 1.5
-"""A drone that looks larger or smaller than known ones look, by more than this factor, is of another type."""
-
-
 @dataclass(frozen=True)
 class KnownSize:
     """Size of every drone of the fleet, from tip to tip, and its standard deviation."""
@@ -64,7 +61,7 @@ class KnownSize:
 
     def is_of(self, judged_m: float) -> bool:
         """Whether a drone whose size the network judges so has this size."""
-        return self.looks_m is None or 1 / LOOKS_ALIKE < judged_m / self.looks_m < LOOKS_ALIKE
+        return self.looks_m is None or looks_alike(judged_m, self.looks_m)
 
 
 @dataclass(frozen=True, eq=False)

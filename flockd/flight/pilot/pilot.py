@@ -348,9 +348,9 @@ class FlockPilot:
             before = observation.previous.vehicle
             interval_s, way[2] = observation.interval_s, before.height_m - observation.vehicle.height_m
             way = way if ego is None else _displacement(observation, ego)
-        changed = size.see(interval_s, way, measured, self._tracker.neighbours())
-        if changed and size.used is not None:
-            self._tracker.resize(size.used.size_m, velocity)
+        if changed := size.see(interval_s, way, measured, self._tracker.neighbours()):
+            before_m, now_m = changed
+            self._tracker.resize(now_m, before_m, velocity)
         return size.cautious(self._tracker.neighbours())
 
     def _local_map(
