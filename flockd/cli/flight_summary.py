@@ -50,6 +50,8 @@ def show_summary(directory: Path, summary: Mapping[str, Any], *, as_json: bool) 
 
 
 def _key_figures(summary: Mapping[str, Any]) -> dict[str, str]:
+    from flockd.review.report.summary import sizes_text
+
     flock, neighbours, own = summary["flock"], summary["neighbours"], summary["own_account"]
     figures = {
         "autopilot": summary["autopilot"] or "",
@@ -64,6 +66,7 @@ def _key_figures(summary: Mapping[str, Any]) -> dict[str, str]:
         "mission": _mission(summary["mission"]),
         "obstacles": _obstacles(summary["obstacles"]),
         "own motion estimated": "" if summary["has_truth"] else _number(own["own_motion_ratio"], "of the steps", 3),
+        "size of the others learned": sizes_text(summary),
         "neighbours known within 10 m": _number(neighbours["recall_within_10m"], "of 1", 3),
         "false neighbours": _number(neighbours["false_per_drone_minute"], "a drone and minute", 2),
     }

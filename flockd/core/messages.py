@@ -55,6 +55,8 @@ class ReasonKind(StrEnum):
     """A neighbour, or its motion."""
     RIG = "rig"
     """Nothing, but that a camera is not as its configuration says."""
+    SIZE = "size"
+    """Nothing, but that the neighbours are not as large as the configuration says."""
     RECORDED = "recorded"
     """Unknown: recordings keep the text alone."""
 
@@ -378,6 +380,20 @@ class CameraDeviation:
     """(5, 5) of turn, time offset, and the focal scale's logarithm."""
 
 
+@dataclass(frozen=True)
+class SizeStatus:
+    """What the drone has learned in flight of how large its neighbours are."""
+
+    weaves: bool
+    """Whether it moves up and down now, to learn it."""
+    size_m: float | None = None
+    """From tip to tip; None: not known well enough, or of several types."""
+    sigma: float | None = None
+    """Relative standard deviation of `size_m`."""
+    used: bool = False
+    """Whether ranges follow from this size, as the networks judge the drones to be of another."""
+
+
 @dataclass(frozen=True, eq=False)
 class PilotOutput:
     """Everything one step of the pilot found and decided."""
@@ -409,3 +425,5 @@ class PilotOutput:
     """The local map; None where obstacles are not looked for."""
     rig: tuple[CameraDeviation, ...] = ()
     """How each camera differs from its configuration, as far as this flight has shown it, once in some seconds."""
+    size: SizeStatus | None = None
+    """None while nothing is learned of the neighbours' size."""

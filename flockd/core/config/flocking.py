@@ -36,6 +36,12 @@ class FlockingParameters(Section):
     separation_distance_m: Distance = 1.5
     """D_II"""
     weight: WeightParameters = WeightParameters()
+    size: Literal["auto", "weave", "off"] = "auto"
+    """Whether the drone learns how large the others are. `weave`: twelve seconds at a time it moves up and down by
+    0.3 m, and the shift of the others' bearings tells their ranges without their size. Where the networks judge it
+    otherwise by more than two standard deviations, ranges follow from the size that was learned. `auto`: only where
+    `perception.drone_size_m` says none, and the sizes that the networks judge scatter, as of drones that they do not
+    know."""
     own_weight: NonNegative = 1.0
     """W_i of Eq. 42"""
     max_speed_m_s: Annotated[float, Field(gt=0, le=50)] = 3.0

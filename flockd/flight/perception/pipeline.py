@@ -32,8 +32,8 @@ class Perception:
     def __init__(self, rig: Rig, networks: Networks, config: PerceptionConfig) -> None:
         self._rig, self._networks, self._config = rig, networks, config
         size_m = config.drone_size_m
-        known_size = None if size_m is None else KnownSize(size_m, config.drone_size_sigma_m)
-        self._detector = Detector(rig, networks, config.detection, known_size)
+        self._said_size = None if size_m is None else KnownSize(size_m, config.drone_size_sigma_m)
+        self._detector = Detector(rig, networks, config.detection)
         self._needs_ground = config.scale == "height"
         self._noise = NoiseMonitor(config.noise)
         self._continuity = ContinuityMonitor(config.noise)
@@ -48,6 +48,7 @@ class Perception:
         predictions: Sequence[Prediction] = (),
         trace: DetectionTrace | None = None,
         lap: Callable[[str], None] = lambda stage: None,
+        learned_size: KnownSize | None = None,
     ) -> Observation:
         """What the newest frame set shows.
 
@@ -58,6 +59,7 @@ class Perception:
             predictions: where tracks should be; the detector searches there too.
             trace: filled with what the detector went through, where a caller wants to see it.
             lap: called at the end of each stage with its name, to time it.
+            learned_size: of every drone, where the configuration says none; None: the network judges each one's.
         """
         usable, noisy, without_image = self._usable(frames, vehicle)
         scenes, depths, without_scene = self._scenes(usable, vehicle, ground)
@@ -66,7 +68,8 @@ class Perception:
         flows, without_flow = self._flows(previous, {name: usable[name] for name in scenes})
         lap("flow")
         images = {name: usable[name].image for name in scenes}
-        found = self._detector.detect(images, scenes, depths, vehicle, predictions, trace or DetectionTrace())
+        size = self._said_size or learned_size
+        found = self._detector.detect(images, scenes, depths, vehicle, predictions, trace or DetectionTrace(), size)
         cameras = {}
         for name, mask in found.masks.items():
             metres = depths.get(name)

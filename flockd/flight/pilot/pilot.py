@@ -36,8 +36,10 @@ from flockd.flight.mission.navigator import middle_of
 from flockd.flight.obstacles import Avoidance, LocalMap, ObstacleRanging
 from flockd.flight.perception import Networks, Observation, Perception, load_networks
 from flockd.flight.perception.detection.detector import DetectionTrace
+from flockd.flight.perception.maps import KnownSize
 from flockd.flight.pilot.ground import GroundFilter, scaled_by_ground
 from flockd.flight.pilot.motions import background_pairs, neighbour_motions
+from flockd.flight.pilot.size_learner import SizeLearner
 from flockd.flight.pilot.trim import VelocityTrim
 from flockd.flight.tracking import Blind, Measurement, Prediction, Tracker
 
@@ -70,6 +72,7 @@ class Observer(Protocol):
         predictions: Sequence[Prediction],
         trace: DetectionTrace | None,
         lap: Callable[[str], None],
+        learned_size: KnownSize | None,
     ) -> Observation:
         """What the newest frame set shows."""
 
@@ -101,6 +104,7 @@ class FlockPilot:
         """What the last step's pairs began at."""
         self._rig_said_s: float | None = None
         self._tracker = Tracker(config.tracking)
+        self._size = None if config.flocking.size == "off" else SizeLearner(config)
         self._law = FlockingLaw(config.flocking)
         self._map = LocalMap(config.obstacles) if config.obstacles.enabled else None
         self._ranging = ObstacleRanging(self._rig, config.obstacles) if config.obstacles.enabled else None
@@ -150,7 +154,10 @@ class FlockPilot:
         trace = trace or StepTrace()
         predictions = self._predictions(frames.time_s)
         ground, why_no_ground = (None, None) if self._ground is None else self._ground.update(vehicle)
-        observation = self._perception.observe(frames, vehicle, ground, predictions, trace.detection, laps.end)
+        learned_size = None if self._size is None else self._size.used
+        observation = self._perception.observe(
+            frames, vehicle, ground, predictions, trace.detection, laps.end, learned_size
+        )
         trace.observation = observation
         if self._config.perception.height == "barometer":
             ground = None  # the height says as much
@@ -163,17 +170,20 @@ class FlockPilot:
         velocity = self._own_velocity(observation, ego)
         detections, measurements, why_no_measurement = self._measurements(observation, motions)
         tracks = self._track(observation, ego, measurements, velocity)
-        neighbours = self._tracker.neighbours()
+        neighbours = self._with_sizes(observation, ego, dict(zip(tracks, measurements, strict=True)), velocity)
         laps.end("tracking")
         obstacles = self._local_map(observation, ego, ground, velocity)
         laps.end("obstacles")
-        command = self._command(observation, neighbours, velocity, obstacles)
+        command = self._command(observation, neighbours, velocity, obstacles, ground)
         laps.end("flocking")
         self._last_time_s = observation.time_s
         of_height = () if why_no_ground is None else (why_no_ground,)
         deviations = self._deviations(observation.time_s)
         of_rig = [Reason(ReasonKind.RIG, text) for one in deviations for text in rig_faults(one)]
-        reasons = (*of_height, *observation.reasons, *why_no_ego, *why_no_motion, *why_no_measurement, *of_rig)
+        of_size = () if self._size is None else self._size.reasons
+        reasons = (
+            *of_height, *observation.reasons, *why_no_ego, *why_no_motion, *why_no_measurement, *of_rig, *of_size,
+        )  # fmt: skip
         return PilotOutput(
             time_s=observation.time_s,
             ego_motion=ego,
@@ -191,6 +201,7 @@ class FlockPilot:
             ground=ground,
             obstacles=obstacles,
             rig=deviations,
+            size=None if self._size is None else self._size.status,
         )
 
     def _refused(self, frames: FrameSet, reason: Reason) -> PilotOutput:
@@ -321,6 +332,27 @@ class FlockPilot:
             self._tracker.predict(observation.interval_s, displacement, sigma_m)
         return self._tracker.update(observation.time_s, measurements, velocity, self._blind(observation))
 
+    def _with_sizes(
+        self,
+        observation: Observation,
+        ego: EgoMotion | None,
+        measured: Mapping[int, Measurement],
+        velocity: FloatArray | None,
+    ) -> tuple[Neighbour, ...]:
+        """The neighbours after what their measurements, by track, tell of their size."""
+        size = self._size
+        if size is None:
+            return self._tracker.neighbours()
+        interval_s, way = 0.0, np.zeros(3)
+        if observation.previous is not None:
+            before = observation.previous.vehicle
+            interval_s, way[2] = observation.interval_s, before.height_m - observation.vehicle.height_m
+            way = way if ego is None else _displacement(observation, ego)
+        if changed := size.see(interval_s, way, measured, self._tracker.neighbours()):
+            before_m, now_m = changed
+            self._tracker.resize(now_m, before_m, velocity)
+        return size.cautious(self._tracker.neighbours())
+
     def _local_map(
         self,
         observation: Observation,
@@ -354,6 +386,7 @@ class FlockPilot:
         neighbours: Sequence[Neighbour],
         velocity: FloatArray | None,
         obstacles: ObstacleRanges | None,
+        ground: GroundEstimate | None,
     ) -> Wanted:
         if self._first_time_s is None:
             self._first_time_s = observation.time_s
@@ -383,9 +416,14 @@ class FlockPilot:
             command, acceleration = self._avoidance.command(self._law, own, places, velocities, desired, obstacles)
         if self._config.yaw == "course" and guidance.course_rad is not None:
             self._yaw_rad = guidance.course_rad
+        height_m = guidance.height_m
+        if self._size is not None:
+            ends = guidance.takeover is not None
+            height_m = self._size.height(observation.time_s, vehicle, ground, height_m, neighbours, ends=ends)
+            self._mission = replace(self._mission, sentence=self._mission.sentence + self._size.sentence)
         trim = self._trim.velocity
         return Wanted(
-            self._trim.corrected(command), acceleration, self._yaw_rad, trim if trim.any() else None, guidance.height_m
+            self._trim.corrected(command), acceleration, self._yaw_rad, trim if trim.any() else None, height_m
         )
 
 

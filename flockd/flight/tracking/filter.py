@@ -127,6 +127,21 @@ def predict(
     )
 
 
+def resized(state: State, size_m: float, own_velocity: FloatArray | None) -> State:
+    """The state of a drone that turns out to be of this size: seen as large, it is that much nearer or farther.
+
+    So is its velocity relative to the own one, (3,) NED m/s; None: that is not known, and its velocity stays.
+    """
+    factor = size_m / state.size_m
+    of_velocity = 1.0 if own_velocity is None else factor
+    own = np.zeros(3) if own_velocity is None else own_velocity
+    scale = np.array([factor] * 3 + [of_velocity] * 3 + [1.0])
+    mean = scale * state.mean
+    mean[3:6] += (1.0 - of_velocity) * own
+    mean[6] = math.log(size_m)
+    return State(mean, scale[:, None] * state.covariance * scale)
+
+
 def innovation(state: State, measurement: Measurement, parameters: TrackingParameters) -> Innovation:
     """The innovation of a measurement against the predicted state."""
     residual, derivative = _linearised(state.mean, measurement)

@@ -103,3 +103,12 @@ class Measurement:
     def position(self) -> FloatArray:
         """(3,) metres, NED, own drone at the origin."""
         return self.range_m * self.bearing
+
+
+_ALIKE = 1.5
+"""A drone that looks larger or smaller than another by more than this factor is of another type."""
+
+
+def looks_alike(size_m: float, other_m: float) -> bool:
+    """Whether two drones of judged sizes may be of one type; false for NaN."""
+    return 1 / _ALIKE < size_m / other_m < _ALIKE

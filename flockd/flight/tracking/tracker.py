@@ -14,7 +14,7 @@ from flockd.flight.tracking.association import assign
 from flockd.flight.tracking.filter import Innovation, State
 from flockd.flight.tracking.hypotheses import Hypotheses
 from flockd.flight.tracking.manoeuvres import Manoeuvres
-from flockd.flight.tracking.measurement import Measurement
+from flockd.flight.tracking.measurement import Measurement, looks_alike
 
 Blind = Callable[[FloatArray], BoolArray]
 """Tells which (n,) of the positions (n, 3), metres NED from the own drone, no camera could show at this time."""
@@ -120,6 +120,15 @@ class Tracker:
             )
             for track, state in zip(known, states, strict=True)
         )
+
+    def resize(self, size_m: float, until_now_m: float, own_velocity: FloatArray | None) -> None:
+        """Neighbours that were about `until_now_m` large, from tip to tip, are `size_m`, and so much nearer or farther.
+
+        `own_velocity` (3,) NED m/s; None: not known.
+        """
+        for track in self._tracks:
+            if looks_alike(track.state.size_m, until_now_m):
+                track.hypotheses = track.hypotheses.changed(lambda state: filter.resized(state, size_m, own_velocity))
 
     def neighbours(self) -> tuple[Neighbour, ...]:
         """All tracks as of the last `predict` and `update`, confirmed or not, by track number."""

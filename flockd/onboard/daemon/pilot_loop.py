@@ -72,7 +72,8 @@ class PilotLoop:
         self._failure: str | None = None
         self._unexpected = 0
         """Errors in a row that nobody expects."""
-        self._height_reports, self._lens_reports, self._rig_reports = HeightReports(), LensReports(), RigReports()
+        self._height_reports, self._lens_reports = HeightReports(), LensReports()
+        self._rig_reports, self._size_reports = RigReports(), SizeReports()
         self._took_s: deque[float] = deque(maxlen=STEPS_REMEMBERED)
         self.frames: FrameSet | None = None
         """The newest; None before the first."""
@@ -94,7 +95,7 @@ class PilotLoop:
     def begin_flight(self, number: int) -> None:
         """Uses a new pilot from the next step on: its time begins there, so that a recording can be replayed."""
         self._flight, self._pilot, self.order = number, None, None
-        self._rig_reports = RigReports()
+        self._rig_reports, self._size_reports = RigReports(), SizeReports()
 
     def load(self) -> float:
         """How long the steps take, 95th percentile of the last ones, over how long they may."""
@@ -158,6 +159,7 @@ class PilotLoop:
             self._height_reports.update(output.reasons),
             *self._lens_reports.update(output.reasons),
             *self._rig_reports.update(output),
+            *self._size_reports.update(output),
         )
         for report in reports:
             if report is not None:
@@ -235,6 +237,30 @@ class RigReports:
             "`flockd calibrate rig --from-flight` corrects it"
             for text in new
         ]
+
+
+class SizeReports:
+    """Reports when the drone begins to weave, when it has found how large the others are, and what contradicts it."""
+
+    def __init__(self) -> None:
+        self._weaves = self._used = self._contradicted = False
+
+    def update(self, output: PilotOutput) -> list[str]:
+        """The sentences that a step's output is worth."""
+        size, sentences = output.size, []
+        if size is None:
+            return []
+        if size.weaves and not self._weaves:
+            sentences.append("size: moves up and down to learn how large the others are")
+        if size.used and not self._used:
+            sentences.append(
+                f"size: the others are {size.size_m:.2f} m large, +-{size.sigma:.0%}; ranges follow from it"
+            )
+        contradictions = [one.text for one in output.reasons if one.kind is ReasonKind.SIZE]
+        if not self._contradicted:
+            sentences += contradictions
+        self._weaves, self._used, self._contradicted = size.weaves, size.used, bool(contradictions)
+        return sentences
 
 
 def _frame_period_s(config: DroneConfig) -> float:

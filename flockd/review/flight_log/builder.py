@@ -9,7 +9,7 @@ import numpy as np
 
 from flockd.core.messages import SECTORS, BoolArray, FloatArray, MissionStatus, ObstacleRanges, PilotOutput
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.flight_log.metadata import FlightMetadata
+from flockd.review.flight_log.metadata import FlightMetadata, LearnedSize
 from flockd.review.flight_log.truth_matching import match_neighbours
 
 _BY_STEP = (
@@ -42,6 +42,7 @@ class FlightLogBuilder:
         self._tracked: list[tuple[float, ...]] = []
         self._stages: dict[str, list[float]] = {}
         self._mission_over = [False] * n
+        self._sizes: dict[int, LearnedSize] = {}
 
     def add_truth(self, step: int, position: FloatArray, velocity: FloatArray, R_ned_body: FloatArray) -> None:
         """True states of all drones as a step begins: (N, 3) m and (N, 3) m/s NED, (N, 3, 3).
@@ -111,6 +112,10 @@ class FlightLogBuilder:
             self._own_velocity[step, i] = output.velocity
         self._command_velocity[step, i] = output.command.velocity
         self._command_acceleration[step, i] = output.command.acceleration
+        size = output.size
+        if size is not None and size.size_m is not None and size.sigma is not None:
+            since_s = self._sizes[i].since_s if i in self._sizes else float(self._times[step])
+            self._sizes[i] = LearnedSize(since_s=since_s, size_m=size.size_m, sigma=size.sigma, used=size.used)
         for stage, ms in stages_ms.items():
             self._stages.setdefault(stage, []).append(ms)
 
@@ -142,6 +147,7 @@ class FlightLogBuilder:
         """The log, with positions and velocities (S, N, 3) of the companion with exact states, if there is one."""
         drones = self._position.shape[1]
         truth_position, truth_velocity = companion or (np.zeros((0, drones, 3)), np.zeros((0, drones, 3)))
+        metadata = metadata.model_copy(update={"sizes": self._sizes})
         looked = not np.isnan(self._obstacle_range).all()
         return FlightLog(
             time_s=self._times, position=self._position, velocity=self._velocity, attitude=self._attitude,

@@ -69,6 +69,19 @@ class HandedOver(BaseModel):
     reason: str
 
 
+class LearnedSize(BaseModel):
+    """What a drone had learned of the others' size when its flight ended."""
+
+    model_config = _FROZEN
+
+    since_s: float
+    """When it first knew one."""
+    size_m: float
+    sigma: float
+    used: bool
+    """As of `SizeStatus`."""
+
+
 class MissionMetadata(BaseModel):
     """Where the drones of a flight wanted to go."""
 
@@ -139,6 +152,8 @@ class FlightMetadata(BaseModel):
     """The same by cause (`flockd.sim.slowing.Cause`); a moment may have several."""
     handed_over: dict[int, HandedOver] = {}
     """By the number of a simulated drone, from 0: when and why it did not fly on."""
+    sizes: dict[int, LearnedSize] = {}
+    """By the number of a drone that learned one, from 0."""
     interrupted: bool = False
     """It was ended before its time; `duration_s` is what was flown."""
     mission: MissionMetadata

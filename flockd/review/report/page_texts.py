@@ -13,7 +13,7 @@ from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import EXACT_STATES
 from flockd.review.report.paper_results import TABLE_2, TABLE_3
 from flockd.review.report.style import FEW
-from flockd.review.report.summary import causes_text
+from flockd.review.report.summary import causes_text, sizes_text
 
 Summary = Mapping[str, Any]
 
@@ -193,6 +193,9 @@ def _facts(summary: Summary, log: FlightLog) -> list[dict[str, str]]:
             _fact("Neighbours known", _number(100 * neighbours["recall_within_10m"], 1), "of those within 10 m", "%"),
             _fact("False neighbours", _number(neighbours["false_per_drone_minute"], 2), "per drone and minute"),
         ]
+    if learned := sizes_text(summary):
+        size, _, remark = learned.partition(" m, ")
+        facts.append(_fact("Size learned", size, f"of the others, tip to tip, {remark}", "m"))
     if not summary["has_truth"]:
         account = summary["own_account"]
         known = account["own_motion_ratio"]

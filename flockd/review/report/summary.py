@@ -40,7 +40,7 @@ def summarise(log: FlightLog) -> Json:
     false tracks; of drones and steps that were recorded. A flight whose perception is "truth" has no perception:
     its `neighbours` are null and it is itself Table 3's "truth". Of a recording without truth (`has_truth`) all of
     these are null. `mission` is `mission_figures`, `obstacles` is `obstacle_figures`. `own_account` needs no truth:
-    the recorded drones' own estimates. `gated`, `slowed_share` and `slowed_by` are as in `FlightMetadata`.
+    the recorded drones' own estimates. `gated`, `slowed_share`, `slowed_by` and `sizes` are as in `FlightMetadata`.
     `handed_over` says how many simulated drones' supervisors asked for Hold, since when, how near two drones came
     of which flockd flew at least one, and how often one that it flew hit an obstacle. `autopilot` names what real
     daemons flew, and `fleet` holds their figures; null where the simulator ran the pilots.
@@ -68,7 +68,7 @@ def summarise(log: FlightLog) -> Json:
 
 _FROM_METADATA = (
     "scenario", "perception", "flow", "scale", "drones", "duration_s", "step_s", "seed", "wall_s", "circle_until_s",
-    "desired_distance_m", "gated", "slowed_share", "slowed_by",
+    "desired_distance_m", "gated", "slowed_share", "slowed_by", "sizes",
     "settings", "recorded", "began", "version", "interrupted", "autopilot", "fleet",
 )  # fmt: skip
 
@@ -88,6 +88,15 @@ _CAUSES = {
 def causes_text(summary: Mapping[str, Any]) -> str:
     """What gates slowed drones down for, and for how much of the time; a moment may have several causes."""
     return ", ".join(f"{_CAUSES[cause]} {100 * part:.1f} %" for cause, part in summary["slowed_by"].items())
+
+
+def sizes_text(summary: Mapping[str, Any]) -> str:
+    """How many drones learned the others' size in flight, and what; empty where none did."""
+    sizes = [one["size_m"] for one in summary["sizes"].values()]
+    if not sizes:
+        return ""
+    used = sum(one["used"] for one in summary["sizes"].values())
+    return f"{min(sizes):.2f} to {max(sizes):.2f} m, by {len(sizes)} of {summary['drones']} drones; {used} go by it"
 
 
 def write_summary(summary: Json, path: Path) -> None:

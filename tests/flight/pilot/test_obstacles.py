@@ -35,6 +35,7 @@ class Observer:
         predictions: Any,
         trace: Any,
         lap: Callable[[str], None],
+        learned_size: Any,
     ) -> Observation:
         ranges = true_ranges(WALL, frames.time_s, np.array([0.0, 0.0, -4.0])) if self.sees else None
         return Observation(frames.time_s, vehicle, {}, (), None, obstacles=ranges)

@@ -641,3 +641,20 @@ def test_a_measurement_that_is_no_number_is_refused() -> None:
     ):
         with pytest.raises(ValueError, match=reason):
             Measurement(**{**good, **bad})  # type: ignore[arg-type]
+
+
+def test_a_drone_that_turns_out_larger_is_farther_and_faster_in_proportion() -> None:
+    """0.9 m instead of 0.6: half as far again, and so its velocity relative to the own one; the bearing stays."""
+    tracker = Tracker(TrackingParameters())
+    for step in range(20):
+        _step(tracker, step * STEP_S, AHEAD + 0.2 * step * STEP_S * np.array([0.0, 1.0, 0.0]))
+    (before,) = tracker.neighbours()
+    tracker.resize(0.5, 1.0, CRUISE)
+    assert tracker.neighbours()[0].position.tolist() == before.position.tolist(), "it is none of those"
+    tracker.resize(0.9, 0.6, CRUISE)
+    (after,) = tracker.neighbours()
+    assert after.position == pytest.approx(1.5 * before.position, rel=0.01)
+    assert after.velocity - CRUISE == pytest.approx(1.5 * (before.velocity - CRUISE), abs=0.01)
+    assert after.position_sigma_m == pytest.approx(1.5 * before.position_sigma_m, rel=0.05)
+    (prediction,) = tracker.predictions(STEP_S, CRUISE)
+    assert prediction.size_m == pytest.approx(0.9)

@@ -24,7 +24,7 @@ from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.config.source import SourceParameters
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
-from flockd.core.messages import Frame, RangeReading, Reason, ReasonKind, VehicleState, Wanted
+from flockd.core.messages import Frame, PilotOutput, RangeReading, Reason, ReasonKind, SizeStatus, VehicleState, Wanted
 from flockd.flight.inference import OnnxModel
 from flockd.flight.safety import Action, Decision, Gate, Inputs, Permission, Request, State, Surroundings
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
@@ -301,6 +301,31 @@ def test_a_range_finder_that_fails_is_an_event_and_so_is_its_return() -> None:
     steps: tuple[tuple[Reason, ...], ...] = ((), (left, weak), (weak,), (old,), (left,), ())
     found = [reports.update(reasons) for reasons in steps]
     assert found == [None, weak.text, None, old.text, "height: the range finder works again", None]
+
+
+def test_what_is_learned_of_the_others_size_is_an_event_each_time_that_it_is_new() -> None:
+    from flockd.onboard.daemon.pilot_loop import SizeReports
+
+    reports = SizeReports()
+    said = Reason(ReasonKind.SIZE, "size: perception.drone_size_m says 0.56 m, and the flight shows 0.39 +-0.04 m")
+    steps = (
+        (None, ()),
+        (SizeStatus(weaves=True), ()),
+        (SizeStatus(weaves=True), ()),
+        (SizeStatus(True, 0.431, 0.08, used=True), ()),
+        (SizeStatus(False, 0.43, 0.07, used=True), (said,)),
+        (SizeStatus(False, 0.43, 0.07, used=True), (said,)),
+    )
+    command = Wanted(np.zeros(2), np.zeros(2), 0.0)
+    told = [
+        reports.update(PilotOutput(0.0, None, None, (), (), {}, (), command, reasons, size=size))
+        for size, reasons in steps
+    ]
+    weaves, found = (
+        "size: moves up and down to learn how large the others are",
+        "size: the others are 0.43 m large, +-8%; ranges follow from it",
+    )
+    assert told == [[], [weaves], [], [found], [said.text], []]
 
 
 def test_the_supervisor_is_told_of_an_obstacle_where_hold_needs_room() -> None:

@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 
 from flockd.core.config import load_scenario
 from flockd.core.data import data_path
+from flockd.core.messages import PilotOutput, SizeStatus, Wanted
+from flockd.review.flight_log.builder import FlightLogBuilder
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.flight_log.metadata import FlightMetadata, HandedOver, MissionMetadata
+from flockd.review.flight_log.metadata import FlightMetadata, HandedOver, LearnedSize, MissionMetadata
 from flockd.review.flight_log.truth_matching import match_neighbours
 from flockd.review.report.page_texts import page_texts
 from flockd.review.report.paper_results import TABLE_2, TABLE_3
-from flockd.review.report.summary import causes_text, summarise, write_summary
+from flockd.review.report.summary import causes_text, sizes_text, summarise, write_summary
 
 Array = NDArray[np.float64]
 STEPS, DRONES = 30, 2
@@ -428,3 +430,24 @@ def test_what_gates_slowed_drones_down_for_is_told_apart() -> None:
     assert causes_text(summary) == "neighbours 1.1 %, false detections 0.1 %"
     (slowed,) = [fact for fact in page_texts(summary, log)["facts"] if fact["name"] == "Slowed"]
     assert slowed["remark"] == "of the time, by safety gates: neighbours 1.1 %, false detections 0.1 %"
+
+
+def test_what_drones_learned_of_the_others_size_is_told() -> None:
+    log = _hand_made()
+    assert "Size learned" not in [fact["name"] for fact in page_texts(summarise(log), log)["facts"]]
+    sizes = {0: LearnedSize(since_s=12.0, size_m=0.43, sigma=0.07, used=True)}
+    summary = summarise(replace(log, metadata=log.metadata.model_copy(update={"sizes": sizes})))
+    assert sizes_text(summary) == f"0.43 to 0.43 m, by 1 of {summary['drones']} drones; 1 go by it"
+    (learned,) = [fact for fact in page_texts(summary, log)["facts"] if fact["name"] == "Size learned"]
+    assert (learned["value"], learned["unit"]) == ("0.43 to 0.43", "m")
+
+
+def test_the_log_keeps_what_was_learned_last_and_since_when() -> None:
+    builder = FlightLogBuilder(np.array([0.0, 0.5, 1.0]), 1)
+    sizes = (SizeStatus(weaves=True), SizeStatus(True, 0.46, 0.09), SizeStatus(False, 0.43, 0.07, used=True))
+    for step, size in enumerate(sizes):
+        command = Wanted(np.zeros(2), np.zeros(2), 0.0)
+        output = PilotOutput(0.5 * step, None, None, (), (), {}, (), command, size=size)
+        builder.add_output(step, 0, output, np.eye(3), {})
+    kept = builder.build(_hand_made().metadata, None).metadata.sizes
+    assert kept == {0: LearnedSize(since_s=0.5, size_m=0.43, sigma=0.07, used=True)}

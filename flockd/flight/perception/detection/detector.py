@@ -46,12 +46,8 @@ class DetectionTrace:
 class Detector:
     """Finds drones in the images of a rig."""
 
-    def __init__(
-        self, rig: Rig, networks: Networks, parameters: DetectionParameters, known_size: KnownSize | None = None
-    ) -> None:
+    def __init__(self, rig: Rig, networks: Networks, parameters: DetectionParameters) -> None:
         self._rig, self._networks, self._parameters = rig, networks, parameters
-        stage = networks.second_stage
-        self._refining = None if stage is None else (stage.rules, Cascade(networks, stage, parameters, known_size))
         self._renderers = {name: MaskRenderer(c, networks.map_stride) for name, c in rig.cameras.items()}
 
     def detect(
@@ -62,6 +58,7 @@ class Detector:
         vehicle: VehicleState,
         predictions: Sequence[Prediction],
         trace: DetectionTrace,
+        known_size: KnownSize | None = None,
     ) -> Detected:
         """The drones in view, and their masks.
 
@@ -72,14 +69,16 @@ class Detector:
             vehicle: for the attitude.
             predictions: of tracks, where the second stage searches too.
             trace: filled.
+            known_size: of every drone; None: the network judges each one's.
         """
         if not images:
             return Detected((), {})
         rig = Rig({name: self._rig.cameras[name] for name in images})
-        if self._refining is None:
+        stage = self._networks.second_stage
+        if stage is None:
             trace.candidates += candidates_from_depth(rig, scenes, depths, self._parameters)
             return self._masked(suppress(trace.candidates, self._parameters), images, scenes, ())
-        rules, cascade = self._refining
+        rules, cascade = stage.rules, Cascade(self._networks, stage, self._parameters, known_size)
         proposals = propose_instances(rig, scenes, rules, self._parameters)
         first = cascade.refine(rig, images, proposals)
         predicted, unpredicted = propose_predictions(

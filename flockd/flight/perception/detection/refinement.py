@@ -186,7 +186,7 @@ class Cascade:
 
     def _candidate(self, stage: _Stage, view: VirtualCrop, estimate: RangeEstimate) -> Candidate:
         """The camera sits beside the body's origin, so that bearing and range change a little."""
-        if self._known_size is not None:
+        if self._known_size is not None and self._known_size.is_of(estimate.size_m):
             estimate = estimate.of_size(self._known_size)
         ray = view.camera.rays(estimate.centre[None])[0]
         bearing, log_range = ray, estimate.log_range

@@ -27,6 +27,17 @@ def test_range_is_size_over_apparent_size() -> None:
     assert (known.drone_probability, known.centre.tolist()) == (0.9, [48.0, 48.0])
 
 
+def test_a_size_that_was_learned_is_that_of_drones_that_look_as_those_did() -> None:
+    """Those looked 0.9 m large and were found to be 0.6 m; one that looks 1.4 m large is of another type."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
+    frames, vehicle = flyer.take_frames()
+    (true,) = flyer.perception().observe(frames, vehicle, None).detections
+    for looks, factor in ((1.0, 0.7), (1.4, 0.7), (1.6, 1.0), (0.6, 1.0)):
+        learned = KnownSize(0.7 * true.size_m, 0.01, looks_m=looks * true.size_m)
+        (known,) = flyer.perception().observe(frames, vehicle, None, learned_size=learned).detections
+        assert known.range_m == pytest.approx(factor * true.range_m, rel=0.02)
+
+
 @pytest.mark.parametrize("size_m", [0.0, math.inf, math.nan])
 def test_nonsense_of_the_network_gives_no_range(size_m: float) -> None:
     assert math.isnan(replace(ESTIMATE, size_m=size_m).of_size(KnownSize(0.5, 0.02)).log_range)

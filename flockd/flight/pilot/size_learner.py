@@ -1,0 +1,184 @@
+"""What a drone learns in flight of the others' size, when it weaves for that, and whether ranges follow from it."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from flockd.core.config.drone import DroneConfig
+from flockd.core.messages import FloatArray, GroundEstimate, Neighbour, Reason, ReasonKind, SizeStatus, VehicleState
+from flockd.flight.perception.maps import KnownSize
+from flockd.flight.pilot.weave import Weave
+from flockd.flight.tracking import Measurement
+from flockd.flight.tracking.flock_size import FlockSize, SizeEstimate
+
+_USED_BEYOND, _USED_UNTIL = 2.0, 1.5
+"""The learned size is used once the sizes that the networks judge are off it by so many of its standard deviations,
+root mean square, until they are so near: those of drones that they know they judge better."""
+_MOST_OFF = 0.5
+"""One judged size counts as no farther off, in log size: it may be of something else."""
+_CONTRADICTED = 3.0
+"""A size that the configuration says is contradicted by one that is so many standard deviations off."""
+_REFRESHED = 0.25
+"""Ranges follow the estimate once it has moved by this share of its standard deviation."""
+_JUDGED, _FEWEST_JUDGED, _NEAR_M = 400, 24, 8.0
+"""So many judged sizes are kept, the newest, so many are enough, and of drones so near: farther ones look like much."""
+_SCATTER = 0.05
+"""Standard deviation of the judged log sizes from which the networks do not know the drones. Of the twelve families
+that they know it is 0.003 to 0.03, of two that they do not know 0.08 to 0.25."""
+_MIDDLE = 2.563
+"""Standard deviations of a normal distribution within which 80 % are."""
+_OLD_S = 600.0
+"""The drone weaves again when its last weave is so long ago."""
+
+
+class SizeLearner:
+    """One drone's, for one flight."""
+
+    def __init__(self, config: DroneConfig) -> None:
+        size_m = config.perception.drone_size_m
+        self._said = None if size_m is None else SizeEstimate(size_m, config.perception.drone_size_sigma_m / size_m)
+        self._weave, self._sizes = Weave(config.safety.gate), FlockSize()
+        self._allowed = config.safety.first_flight_layer is None
+        self._always = config.flocking.size == "weave"
+        self._name = config.name
+        self._random: np.random.Generator | None = None
+        self._found: SizeEstimate | None = None
+        self._used: SizeEstimate | None = None
+        self._judged: list[float] = []
+        """Log sizes of confirmed neighbours as the networks judged them, while nothing else is used."""
+        self._looks_m = 0.0
+        """Their median."""
+        self._wove_s: float | None = None
+        self._contradiction: str | None = None
+
+    @property
+    def used(self) -> KnownSize | None:
+        """What ranges follow from; None: from what the networks judge, or the configuration says."""
+        used = self._used
+        return None if used is None else KnownSize(used.size_m, used.sigma * used.size_m, self._looks_m)
+
+    @property
+    def status(self) -> SizeStatus | None:
+        """As of now; None: nothing was learned yet."""
+        if self._found is None:
+            return SizeStatus(weaves=True) if self._weave.moves else None
+        return SizeStatus(self._weave.moves, self._found.size_m, self._found.sigma, used=self._used is not None)
+
+    @property
+    def sentence(self) -> str:
+        """For people, to be added to what the mission does; empty where there is nothing to say."""
+        parts = []
+        if self._weave.moves:
+            parts.append("; weaves up and down to learn the others' size")
+        if self._used is not None:
+            parts.append(f"; has found the others to be {self._used.size_m:.2f} m large")
+        return "".join(parts)
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """That the configuration says another size."""
+        return () if self._contradiction is None else (Reason(ReasonKind.SIZE, self._contradiction),)
+
+    def see(
+        self, interval_s: float, way: FloatArray, measured: Mapping[int, Measurement], neighbours: Sequence[Neighbour]
+    ) -> tuple[float, float] | None:
+        """Take in a step's measurements by track, `interval_s` after the last.
+
+        Where ranges now follow another size: the one until now, and that one, in metres.
+
+        `way` (3,) metres NED is how far the drone went since then; of it the weave's part is what is vertical, while it
+        moves the drone.
+        """
+        wove = np.array([0.0, 0.0, way[2] if self._weave.moves else 0.0])
+        self._sizes.step(interval_s, wove, {number: self._as_judged(one) for number, one in measured.items()})
+        self._sizes.keep({one.track for one in neighbours})
+        confirmed = {one.track for one in neighbours if one.confirmed}
+        if self._used is None:
+            known = [one for number, one in measured.items() if number in confirmed and one.range_m < _NEAR_M]
+            logs = [math.log(one.size_m) for one in known]
+            self._judged = [*self._judged, *logs][-_JUDGED:]
+            self._looks_m = math.exp(float(np.median(self._judged))) if self._judged else 0.0
+        self._found = self._sizes.of_looks(self._looks_m) if self._judged else None
+        before_m = self._looks_m if self._used is None else self._used.size_m
+        changed = self._choose()
+        return (before_m, self._used.size_m) if changed and self._used is not None else None
+
+    @property
+    def _is_unknown_type(self) -> bool:
+        """Whether the networks judge the others' size otherwise from view to view."""
+        if self._said is not None or len(self._judged) < _FEWEST_JUDGED:
+            return False
+        low, high = np.quantile(self._judged, [0.1, 0.9])
+        return float(high - low) > _SCATTER * _MIDDLE
+
+    def _as_judged(self, measurement: Measurement) -> Measurement:
+        """With the range that follows from the size that the networks judge, as far as that is still known."""
+        if self._used is None or not math.isclose(measurement.size_m, self._used.size_m):
+            return measurement
+        log_range = measurement.log_range + math.log(self._looks_m / self._used.size_m)
+        return replace(measurement, size_m=self._looks_m, log_range=log_range)
+
+    def _choose(self) -> bool:
+        """Whether the size that is used has changed."""
+        found, used = self._found, self._used
+        if found is None:
+            return False
+        if self._said is not None:
+            if self._contradiction is None and found.deviations(self._said.size_m, self._said.sigma) > _CONTRADICTED:
+                self._contradiction = (
+                    f"size: perception.drone_size_m says {self._said.size_m:.2f} m, and the flight shows "
+                    f"{found.size_m:.2f} +-{found.sigma * found.size_m:.2f} m; measure the drones"
+                )
+            return False
+        judged = np.minimum(np.abs(np.array(self._judged) - math.log(found.size_m)), _MOST_OFF)
+        off = float(np.sqrt(np.mean(judged**2))) / found.sigma
+        if used is None:
+            self._used = found if off > _USED_BEYOND else None
+        elif off < _USED_UNTIL:
+            self._used = None
+        elif found.deviations(used.size_m) > _REFRESHED:
+            self._used = found
+        return self._used is not used
+
+    def height(
+        self,
+        time_s: float,
+        vehicle: VehicleState,
+        ground: GroundEstimate | None,
+        wanted_m: float | None,
+        neighbours: Sequence[Neighbour],
+        *,
+        ends: bool,
+    ) -> float | None:
+        """The height to ask for, with the weave in it; as of `Wanted`. ``ends``: the mission is over."""
+        if self._random is None:
+            seed = vehicle.R_ned_body.tobytes() + np.float64(vehicle.height_m).tobytes()
+            self._random = np.random.default_rng(zlib.crc32(seed, zlib.crc32(self._name.encode())))
+        if self._weave.moves:
+            self._wove_s = time_s
+        is_old = self._wove_s is None or time_s - self._wove_s > _OLD_S
+        asked = self._allowed and not ends and (self._always or self._is_unknown_type)
+        needed = asked and (self._weave.moves or self._found is None or is_old)
+        above_ground_m = vehicle.height_m if ground is None else ground.height_m
+        return self._weave.height(
+            time_s, vehicle.height_m, above_ground_m, wanted_m, neighbours, self._random, needed=needed
+        )
+
+    def cautious(self, neighbours: Sequence[Neighbour]) -> tuple[Neighbour, ...]:
+        """With what the used size may be off in the ranges that the gate reckons with: it errs alike in all steps."""
+        if self._used is None:
+            return tuple(neighbours)
+        return tuple(_as_uncertain(one, self._used.sigma) for one in neighbours)
+
+
+def _as_uncertain(neighbour: Neighbour, sigma: float) -> Neighbour:
+    possible = tuple(
+        replace(one, range_sigma_m=math.hypot(one.range_sigma_m, sigma * float(np.linalg.norm(one.position))))
+        for one in neighbour.possible or ()
+    )
+    return replace(neighbour, possible=possible or None)

@@ -1,0 +1,127 @@
+"""The weave: twelve seconds up and down, from which a drone learns how large the others are (`tracking.flock_size`).
+
+The flocking law is level, so that nobody follows. One drone at a time shows most: each draws when it begins.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from flockd.core.config.safety import GateParameters
+from flockd.core.messages import Neighbour
+
+AMPLITUDE_M = 0.3
+"""By how much the drone moves up and down, ..."""
+_ASKED_M = 0.43
+"""... and what it is asked for: of a period of 6 s a height controller of 1 m/s for each metre, PX4's default, follows
+0.7."""
+PERIOD_S = 6.0
+DURATION_S = 12.0
+_SETTLES_S = 3.0
+"""So long afterwards it is still on its way back."""
+_DRAWN_WITHIN_S = 30.0
+"""It begins at a time drawn from so many seconds, for not all to weave at once."""
+_CLIMB_M_S = 0.2
+"""A neighbour that rises or sinks faster is weaving, and the drone waits."""
+_AGAIN_S = (1.0, 4.0)
+"""Where it may not begin it tries again after so long."""
+_STEADY_S = 6.0
+"""For so long the mission's height has to have been the same: a flock changes its height together."""
+_AT_HEIGHT_M = 0.5
+"""From the mission's height the drone is no farther off when it begins."""
+_ABOVE_LOWEST_M = 0.5
+"""It stays so far within the heights that the gate allows: the lowest is near the ground."""
+_ABOVE_GROUND_M = 2.0
+"""Nor does it begin lower above the ground, which may be higher than at home."""
+_COLUMN = 1.5
+"""Level distance, in the gate's degraded separations, within which no other drone may be when it begins: nearer to one
+above or below the gate lets it rise or sink no more, as it also does later."""
+
+
+class Weave:
+    """When one drone moves up and down, and how."""
+
+    def __init__(self, gate: GateParameters) -> None:
+        self._gate = gate
+        self._next_s: float | None = None
+        self._began_s: float | None = None
+        self._base_m = 0.0
+        self._wanted_m: float | None = None
+        self._steady_since_s: float | None = None
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves the drone, or has just done so."""
+        return self._began_s is not None
+
+    def height(
+        self,
+        time_s: float,
+        height_m: float,
+        above_ground_m: float,
+        wanted_m: float | None,
+        neighbours: Sequence[Neighbour],
+        random: np.random.Generator,
+        *,
+        needed: bool,
+    ) -> float | None:
+        """The height to ask for instead of the mission's, `wanted_m`; None: the one that the flight began at.
+
+        The drone is at `height_m` above home. `needed`: there is something to learn, and nothing that forbids it.
+        """
+        if self._steady_since_s is None or wanted_m != self._wanted_m:
+            self._wanted_m, self._steady_since_s = wanted_m, time_s
+        if self._began_s is None and not self._begins(time_s, height_m, above_ground_m, neighbours, random, needed):
+            return wanted_m
+        assert self._began_s is not None
+        elapsed_s = time_s - self._began_s
+        may = needed and self._steady_since_s <= self._began_s
+        if elapsed_s < DURATION_S and not may:
+            elapsed_s, self._began_s = DURATION_S, time_s - DURATION_S
+        if not 0.0 <= elapsed_s < DURATION_S + _SETTLES_S:
+            self._began_s = self._next_s = None
+            return wanted_m
+        base_m = self._base_m if wanted_m is None else wanted_m
+        lift_m = _ASKED_M * math.sin(2 * math.pi * elapsed_s / PERIOD_S) if elapsed_s < DURATION_S else 0.0
+        return base_m + lift_m
+
+    def _begins(
+        self,
+        time_s: float,
+        height_m: float,
+        above_ground_m: float,
+        neighbours: Sequence[Neighbour],
+        random: np.random.Generator,
+        needed: bool,
+    ) -> bool:
+        if not needed:
+            self._next_s = None
+            return False
+        if self._next_s is None:
+            self._next_s = time_s + random.uniform(0.0, _DRAWN_WITHIN_S)
+        if time_s < self._next_s:
+            return False
+        if above_ground_m < _ABOVE_GROUND_M or not self._may_begin(time_s, height_m, neighbours):
+            self._next_s = time_s + random.uniform(*_AGAIN_S)
+            return False
+        self._began_s, self._base_m = time_s, height_m
+        return True
+
+    def _may_begin(self, time_s: float, height_m: float, neighbours: Sequence[Neighbour]) -> bool:
+        assert self._steady_since_s is not None
+        base_m = height_m if self._wanted_m is None else self._wanted_m
+        room_m = min(base_m - self._gate.min_height_m, self._gate.max_height_m - base_m)
+        return (
+            time_s - self._steady_since_s >= _STEADY_S
+            and abs(height_m - base_m) <= _AT_HEIGHT_M
+            and room_m >= _ASKED_M + _ABOVE_LOWEST_M
+            and not self._is_near(neighbours)
+            and not any(one.confirmed and abs(one.velocity[2]) > _CLIMB_M_S for one in neighbours)
+        )
+
+    def _is_near(self, neighbours: Sequence[Neighbour]) -> bool:
+        column_m = _COLUMN * self._gate.degraded_separation_m
+        return any(one.confirmed and math.hypot(*one.position[:2]) < column_m for one in neighbours)

@@ -1,0 +1,127 @@
+"""How large the neighbours are, by the parallax of the own weave."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from flockd.core.messages import FloatArray
+from flockd.flight.geometry import log_polar_covariance
+from flockd.flight.tracking import Measurement
+from flockd.flight.tracking.flock_size import FlockSize, SizeEstimate
+
+STEP_S = 0.5
+SIZE_M = 0.4
+PLACES = np.array([[3.0, 1.0, 0.4], [-1.0, 3.5, -0.6], [-3.0, -2.0, 0.1], [2.0, -3.0, 0.8]])
+BEARING_SIGMA_RAD, RANGE_SIGMA = 0.004, 0.015
+
+
+def rise(time_s: float) -> float:
+    """How far below its height a drone is that weaves for 12 s."""
+    return -0.3 * math.sin(2 * math.pi * time_s / 6.0) if 0.0 <= time_s <= 12.0 else 0.0
+
+
+def measured(place: FloatArray, size_m: float, assumed_m: float, random: np.random.Generator) -> Measurement:
+    """Of a drone of one size that the networks judge to have another; the range errs as they say, and by 5 % more."""
+    bearing = place / np.linalg.norm(place) + random.normal(0.0, BEARING_SIGMA_RAD, 3)
+    bearing /= np.linalg.norm(bearing)
+    longer = random.normal(0.0, math.hypot(RANGE_SIGMA, 0.05))
+    log_range = math.log(float(np.linalg.norm(place)) * assumed_m / size_m) + longer
+    covariance = log_polar_covariance(bearing, RANGE_SIGMA, BEARING_SIGMA_RAD)
+    return Measurement(bearing, log_range, covariance, assumed_m)
+
+
+def flown(
+    random: np.random.Generator,
+    *,
+    sizes_m: tuple[float, ...] = (SIZE_M,) * 4,
+    wrong: float = 1.35,
+    weaves: bool = True,
+    follow: float = 0.0,
+    tree: bool = False,
+    outliers: float = 0.0,
+) -> FlockSize:
+    """A drone among others that drift about their places, each a random walk in velocity, level 0.2 and vertical 1e-4
+    m^2/s^3; they `follow` that share of its own level motion."""
+    learned = FlockSize()
+    places, speeds = PLACES.copy(), np.zeros_like(PLACES)
+    own_m_s = np.zeros(3)
+    below_m = 0.0
+    for step in range(40):
+        kick = random.normal(size=PLACES.shape) * np.sqrt(np.array([0.2, 0.2, 1e-4]) * STEP_S) * 0.3
+        own_kick = random.normal(size=3) * [0.2, 0.2, 0.0]
+        own_m_s, speeds = 0.8 * own_m_s + own_kick, 0.9 * speeds + kick
+        way = np.zeros(3)
+        if weaves:
+            now_m = rise(STEP_S * step - 4.0)
+            way[2], below_m = now_m - below_m, now_m
+        places = places + STEP_S * speeds - way - STEP_S * (1.0 - follow) * own_m_s
+        places = places + 0.1 * (PLACES - [0.0, 0.0, below_m] - places)
+        sighted = {
+            number: measured(place, size_m, wrong * size_m, random)
+            for number, (place, size_m) in enumerate(zip(places, sizes_m, strict=True))
+            if random.random() > 0.05
+        }
+        if outliers:
+            for number in sighted.keys() & {n for n in range(4) if random.random() < outliers}:
+                sighted[number] = measured(random.normal(0.0, 3.0, 3), SIZE_M, wrong * SIZE_M, random)
+        if tree and 4 <= step < 34:
+            sighted[9] = measured(np.array([6.0, 2.0, 1.0]) - [0, 0, below_m], 1.5, wrong * SIZE_M, random)
+        learned.step(STEP_S, way, sighted)
+    return learned
+
+
+def errors(estimates: list[SizeEstimate | None], size_m: float) -> FloatArray:
+    assert all(estimate is not None for estimate in estimates)
+    return np.array([math.log(one.size_m / size_m) / one.sigma for one in estimates if one is not None])
+
+
+def test_the_size_is_learned_and_errs_as_it_says() -> None:
+    """Over 30 flights: the normalised error squared, 1 if the deviation were exact; it is taken larger by 4 %, as no
+    model knows all."""
+    found = [flown(np.random.default_rng(seed)).of_looks(1.35 * SIZE_M) for seed in range(30)]
+    off = errors(found, SIZE_M)
+    assert 0.1 < float(np.mean(off**2)) < 1.3
+    assert np.median([one.sigma for one in found if one is not None]) < 0.08
+
+
+@pytest.mark.parametrize("wrong", [0.6, 1.0, 1.6])
+def test_what_the_networks_judge_does_not_matter(wrong: float) -> None:
+    found = [flown(np.random.default_rng(seed), wrong=wrong).of_looks(wrong * SIZE_M) for seed in range(5)]
+    assert np.abs(errors(found, SIZE_M)).max() < 3.0
+
+
+@pytest.mark.parametrize("follow", [0.0, 0.9])
+def test_without_a_weave_nothing_is_learned(follow: float) -> None:
+    """However the drone moves, and whether or not its mates move as it does."""
+    assert flown(np.random.default_rng(0), weaves=False, follow=follow).of_looks(SIZE_M) is None
+
+
+def test_a_tree_and_outliers_do_not_move_it() -> None:
+    found = [flown(np.random.default_rng(seed), tree=True, outliers=0.1).of_looks(1.35 * SIZE_M) for seed in range(10)]
+    assert np.abs(errors(found, SIZE_M)).max() < 3.0
+
+
+def test_of_two_types_each_has_its_own_size() -> None:
+    """0.4 and 0.64 m: no track takes the other type's for its own."""
+    sizes_m = (0.4, 0.4, 0.64, 0.64)
+    for seed in range(5):
+        learned = flown(np.random.default_rng(seed), sizes_m=sizes_m)
+        for number, size_m in enumerate(sizes_m):
+            found = learned.of_track(number)
+            assert found is None or found.deviations(size_m) < 3.0
+            assert found is None or abs(math.log(found.size_m / size_m)) < 0.2
+        assert any(learned.of_track(number) is not None for number in range(4))
+
+
+def test_what_a_track_told_outlives_it() -> None:
+    learned = flown(np.random.default_rng(0))
+    before = learned.of_looks(1.35 * SIZE_M)
+    learned.keep(set())
+    after = learned.of_looks(1.35 * SIZE_M)
+    assert before is not None
+    assert after is not None
+    assert (after.size_m, after.sigma) == pytest.approx((before.size_m, before.sigma))
+    assert learned.of_track(0) is None
