@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from flockd.cli.config import loaded as loaded_drone
 from flockd.cli.output import complain, progress, say, say_json
 from flockd.cli.parser import Commands
+from flockd.cli.profile_table import say_profile
 from flockd.cli.recording_options import add_stretch, opened, refuse_existing, stretch
 from flockd.cli.replay_dataset import add_dataset_options, refuse_dataset_options, run_dataset
 from flockd.core.errors import ExitCode, UsageError
@@ -28,6 +29,7 @@ def add(commands: Commands) -> None:
     examples = (
         "flockd replay drone1.mcap --diff",
         "flockd replay drone1.mcap --start 60 --end 70 --speed 1",
+        "flockd replay drone1.mcap --profile",
         "flockd replay drone1.mcap --config my_drone.yaml --out again.mcap",
         "flockd replay drone1.mcap --diff --reference drone1.expected --tolerance command=1e-6",
         "flockd replay drone1.mcap --reference drone1.expected --update-reference",
@@ -45,6 +47,9 @@ def add(commands: Commands) -> None:
     parser.add_argument("--config", metavar="FILE", type=Path, help="fly with this drone's or scenario's settings")
     parser.add_argument("--out", metavar="FILE", type=Path, help="write a new recording")
     parser.add_argument("--diff", action="store_true", help="compare every output with what was recorded")
+    parser.add_argument(
+        "--profile", action="store_true", help="say where time goes on this computer, and which step_s it can keep"
+    )
     parser.add_argument("--reference", metavar="FILE", type=Path, help="compare with this file instead")
     parser.add_argument("--update-reference", action="store_true", help="write the outputs to the reference")
     parser.add_argument(
@@ -128,19 +133,28 @@ def _recording(args: argparse.Namespace) -> Iterator[Recording]:
 
 
 def _replay(args: argparse.Namespace, recording: Recording) -> int:
+    from flockd.ground.doctor.computer import peak_memory_mb
     from flockd.review.replay.fidelity import damage_warnings, replay_warnings
+    from flockd.review.replay.profile import Watch, profile_result
     from flockd.review.replay.recorded_flight import compare_replay, replay_flight, replay_result
 
     config = _config(args, recording)
     start_s, end_s = stretch(recording, args)
+    if args.profile:
+        _refuse_short(recording, start_s, end_s)
     warnings = [*damage_warnings(recording), *replay_warnings(recording, config, start_s)]
     for warning in warnings:
         complain(warning)
     expected = _reference(args)
+    watch = Watch() if args.profile else None
     with progress("replaying", "steps") as show_progress:
-        replay = replay_flight(
-            recording, config, start_s, end_s, speed=args.speed, out=args.out, progress=show_progress
-        )
+
+        def after_step(done: int, total: int) -> None:
+            show_progress(done, total)
+            if watch is not None:
+                watch.look()
+
+        replay = replay_flight(recording, config, start_s, end_s, speed=args.speed, out=args.out, progress=after_step)
     if args.update_reference:
         from flockd.onboard.recording.difference import save_reference
 
@@ -150,10 +164,14 @@ def _replay(args: argparse.Namespace, recording: Recording) -> int:
         part_only = args.start > 0 or args.end is not None
         comparison = compare_replay(recording.drone, replay, expected, dict(args.tolerance), part_only=part_only)
     result = replay_result(recording, replay, warnings, comparison)
+    if watch is not None:
+        result["profile"] = profile_result(replay, config, watch, peak_memory_mb())
     if args.json:
         say_json(result)
     else:
         _say_result(args, comparison, result)
+        if watch is not None:
+            say_profile(result["profile"])
     return ExitCode.CHECK_FAILED if comparison is not None and comparison.first else ExitCode.DONE
 
 
@@ -164,10 +182,23 @@ def _check_options(args: argparse.Namespace) -> None:
         raise UsageError("--diff and --update-reference exclude each other; compare first, then update")
     if args.reference is not None and not (args.diff or args.update_reference):
         raise UsageError("--reference alone does nothing; add --diff or --update-reference")
+    if args.profile and args.speed > 0:
+        raise UsageError("--profile measures how fast it goes, and --speed holds it back; drop one of them")
     if args.tolerance and not args.diff:
         raise UsageError("--tolerance has no meaning without --diff; add it")
     if args.out is not None:
         refuse_existing(args.out)
+
+
+def _refuse_short(recording: Recording, start_s: float, end_s: float) -> None:
+    from flockd.review.replay.profile import LEAST_STEPS
+
+    steps = sum(start_s <= time_s <= end_s for _, time_s in recording.contents.steps)
+    if steps < LEAST_STEPS:
+        raise UsageError(
+            f"{recording.path}: has {steps} {'step' if steps == 1 else 'steps'} there, and --profile needs "
+            f"{LEAST_STEPS} or more; choose a longer flight, or drop --start and --end"
+        )
 
 
 def _config(args: argparse.Namespace, recording: Recording) -> DroneConfig:

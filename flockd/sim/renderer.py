@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
-from flockd.sim import _raster, textures
+from flockd.sim import _raster, _shading, textures
 from flockd.sim.airframe import DroneModel, machine_texels
 from flockd.sim.distractors import Distractor, Placed
 from flockd.sim.mesh import face_normals
@@ -91,17 +91,17 @@ class Renderer:
         focal = float(np.sqrt(K[0, 0] * K[1, 1]))
         P = np.ascontiguousarray(K @ R.T)
 
-        blobs, blob_rows = self._shadows(positions, P, origin, width, height)
+        blobs = self._shadows(positions, P, origin, width, height)
         depth = np.empty((height, width), dtype=np.float32)
         sharp = np.empty((height, width, 3), dtype=np.uint8)
         q = _raster.project_vertices(world.vertices, P, origin)
         rows, planes = _set_up(q, world.triangles, width, height)
         hit, _ = _fill(rows, planes, width, height)
-        _raster.shade_scene(
-            hit, planes, inverse_K, R, origin, focal, world.normals, world.texture, world.uv, world.level,
+        _shading.shade_scene(
+            hit, planes, K, inverse_K, R, origin, focal, world.normals, world.texture, world.uv, world.level,
             world.tint, world.texels, textures.TEXTURE_BITS, world.ground_map, GROUND_MAP_BITS, world.ground_kind,
             world.ground_detail, world.extent_m, world.shadow_map, world.shadow_frame, world.light,
-            world.fog_per_m, world.sky, SKY_BITS, world.tone, blobs, blob_rows, sharp, depth,
+            world.fog_per_m, world.sky, SKY_BITS, world.tone, blobs, sharp, depth,
         )  # fmt: skip
         view = View(
             rgb=sharp.copy(),
@@ -161,30 +161,22 @@ class Renderer:
             self._linear, identity, view.rgb, view.depth, view.ids,
         )  # fmt: skip
 
-    def _shadows(
-        self, positions: FloatArray, P: FloatArray, origin: FloatArray, width: int, height: int
-    ) -> tuple[FloatArray, IntArray]:
-        """Discs that stand for the drones in the sun, and per image row the columns that their shadows may touch."""
+    def _shadows(self, positions: FloatArray, P: FloatArray, origin: FloatArray, width: int, height: int) -> FloatArray:
+        """(k, 9) discs that stand for the drones in the sun, and where in the image their shadows may be."""
         world = self._world
         sun = world.light[0]
-        rows = np.zeros((height, 2), dtype=np.int64)
         blobs = []
         for model, position in zip(self._drones, positions, strict=True):
             if not np.isfinite(position).all():
                 continue
             # A quadrotor fills roughly half of the disc around it.
             radius = 0.36 * model.size_m
-            blobs.append((*position, radius, 0.6))
             ground = -world.height_at(position[:1], position[1:2])[0]
             foot = position - sun * (max(0.0, ground - position[2]) / -sun[2])
             reach = 2.0 * radius + 0.02 * (ground - position[2])
             spread = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-0.4, 0.4)]) * reach / -sun[2]
-            left, top, right, bottom = _bounds((foot + spread - origin) @ P.T, width, height)
-            if left < right and top < bottom:
-                empty = rows[top:bottom, 1] == 0
-                rows[top:bottom, 0] = np.where(empty, left, np.minimum(rows[top:bottom, 0], left))
-                rows[top:bottom, 1] = np.maximum(rows[top:bottom, 1], right)
-        return np.array(blobs, dtype=np.float64).reshape(-1, 5), rows
+            blobs.append((*position, radius, 0.6, *_bounds((foot + spread - origin) @ P.T, width, height)))
+        return np.array(blobs, dtype=np.float64).reshape(-1, 9)
 
 
 def _set_up(q: FloatArray, triangles: Indices, width: int, height: int) -> tuple[Indices, FloatArray]:

@@ -63,7 +63,7 @@ def draw_sky(rng: Generator) -> tuple[FloatArray, float, PackedArray]:
     white = (0.95 * (1 - overcast) + 0.8 * overcast) * (1.15 - 0.25 * np.clip(density, 0, 2)[..., None])
     sky = sky * (1 - amount) + white * amount
     light = np.stack([sun, sun_colour, skylight, bounce, horizon])
-    return light, fog, textures.pack_pyramid((sky / 4.0).astype(np.float32))[: size * size]
+    return light, fog, textures.pack_pyramid((sky / 4.0).astype(np.float32))
 
 
 def tone_curve(rng: Generator) -> UInt8Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from contextlib import ExitStack
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -265,3 +265,52 @@ def test_the_recordings_make_the_flights_own_log(flight: Flight) -> None:
             assert getattr(again, part.name).tobytes() == getattr(flight.log, part.name).tobytes(), part.name
     facts = ("drones", "duration_s", "step_s", "perception", "flow", "scale", "circle_until_s", "desired_distance_m")
     assert again.metadata.model_dump(include=set(facts)) == flight.log.metadata.model_dump(include=set(facts))
+
+
+def test_where_time_goes_and_which_step_to_configure(
+    path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    """Ten steps of a made-up flight: the first, which warms up, takes 9 s, the others 120 to 160 ms."""
+    took_s = iter([9.0, 0.12, 0.12, 0.12, 0.12, 0.14, 0.14, 0.14, 0.16, 0.16])
+
+    class Timed(MadeUpPilot):
+        def step(self, frames: FrameSet, vehicle: VehicleState, *, order: MissionOrder | None = None) -> PilotOutput:
+            whole_s = next(took_s)
+            clock[0] += whole_s
+            output = super().step(frames, vehicle, order=order)
+            return replace(output, stages_ms={"flow": 750.0 * whole_s, "detection": 250.0 * whole_s})
+
+    clock = [0.0]
+    monkeypatch.setattr("flockd.review.replay.recorded_flight.FlockPilot", Timed)
+    monkeypatch.setattr("flockd.review.replay.recorded_flight.time.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("flockd.review.replay.recorded_flight.time.process_time", lambda: 1.5 * clock[0])
+    assert main(["replay", str(path), "--profile", "--json"]) == 0
+    profile = json.loads(capsys.readouterr().out)["profile"]
+    assert list(profile["stages"]) == ["flow", "detection", "step"]
+    step, flow = profile["stages"]["step"], profile["stages"]["flow"]
+    assert (step["p50_ms"], step["p95_ms"]) == pytest.approx((140.0, 160.0))
+    assert (flow["p50_ms"], flow["p95_ms"], flow["share"]) == pytest.approx((105.0, 120.0, 0.75))
+    assert (profile["steps"], profile["cores_busy"]) == (9, pytest.approx(1.5))
+    assert profile["processor_ms"] == pytest.approx(210.0)
+    assert (profile["step_s"], profile["least_step_s"]) == (0.5, 0.2), "160 ms are four fifths of it"
+    assert profile["memory_mb"] > 10
+    assert profile["cameras"] == {"front": [160, 120], "left": [160, 120]}
+
+
+def test_the_table_of_where_time_goes(path: Path, capsys: Capture) -> None:
+    assert main(["replay", str(path), "--profile"]) == 0
+    out = capsys.readouterr().out
+    for part in (
+        "stage ",
+        "p50 ms",
+        "step  ",
+        "computer: ",
+        "instructions for 8-bit",
+        "memory: ",
+        "onnxruntime 1",
+        "step_s: ",
+    ):
+        assert part in out
+    for wrong in (["--speed", "1"], ["--end", "0.2"]):
+        assert main(["replay", str(path), "--profile", *wrong]) == 2
+        assert "--profile" in capsys.readouterr().err

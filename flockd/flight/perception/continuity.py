@@ -124,11 +124,18 @@ def _in_the_light_of(moved: Float32Array, now: Float32Array, used: BoolArray) ->
     for _ in range(_FIT_ROUNDS):
         if x[kept].std() < 1.0:
             break
-        gain, offset = np.polyfit(x[kept], y[kept], 1)
+        gain, offset = _line(x[kept].astype(np.float64), y[kept].astype(np.float64))
         errors = np.abs(gain * x + offset - y)
         kept = errors <= np.median(errors)
     gain = float(np.clip(gain, *_GAINS))
     return np.asarray(gain * moved + np.median(y - gain * x), np.float32)
+
+
+def _line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """Gain and offset of the line of least squares through points (n,): a fifth of the time of `np.polyfit`."""
+    from_mean = x - x.mean()
+    gain = float(from_mean @ y) / float(from_mean @ from_mean)
+    return gain, float(y.mean() - gain * x.mean())
 
 
 def _mean(values: Float32Array) -> Float32Array:

@@ -62,6 +62,8 @@ class Sample:
     """Of the newest step, what an own motion may have failed by; None: nothing is missing."""
     command: FloatArray | None
     """(2,) m/s, north and east: what the gate would have let through."""
+    stages_ms: Mapping[str, float]
+    """Where the time of the newest step went."""
 
 
 async def bench(
@@ -153,6 +155,7 @@ def _sample(components: Components, time_s: float, command: FloatArray | None) -
         own_motion=output is not None and output.ego_motion is not None,
         why=None if output is None else _why_no_motion(output),
         command=command,
+        stages_ms={} if output is None else output.stages_ms,
     )
 
 
@@ -208,6 +211,12 @@ def _steps(config: DroneConfig, samples: Sequence[Sample], ran_s: float) -> Iter
         yield warned("load", f"{measured}: it would have slowed down", fix)
     else:
         yield passed("load", measured)
+    stages = {stage: [s.stages_ms[stage] for s in samples if stage in s.stages_ms] for stage in samples[-1].stages_ms}
+    spread = {stage: np.percentile(taken_ms, (50, 95)) for stage, taken_ms in stages.items()}
+    longest = sorted(spread, key=lambda stage: -spread[stage][0])
+    shown = ", ".join(f"{stage} {spread[stage][0]:.0f} / {spread[stage][1]:.0f}" for stage in longest)
+    if shown:
+        yield passed("stages", f"ms, median / 95th percentile: {shown}")
 
 
 def _cameras(config: DroneConfig, samples: Sequence[Sample]) -> Iterator[Finding]:

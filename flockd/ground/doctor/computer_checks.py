@@ -86,8 +86,8 @@ def check_memory(config: DroneConfig, meminfo: Path = MEMORY) -> Iterator[Findin
 
 def check_temperature(config: DroneConfig, folder: Path = THERMAL) -> Iterator[Finding]:
     """How hot it is now, at rest, and whether the processor is being slowed down for it."""
-    zones = dict(_zones(folder))
-    slowed = sorted(_slowed(folder))
+    zones = dict(thermal_zones(folder))
+    slowed = sorted(processors_slowed(folder))
     if slowed:
         measured = f"the processor is being slowed down ({', '.join(slowed)})"
         yield warned("temperature", measured, "cool it, and check its power supply; then measure the step again")
@@ -106,7 +106,7 @@ def check_temperature(config: DroneConfig, folder: Path = THERMAL) -> Iterator[F
         yield passed("temperature", measured)
 
 
-def _zones(folder: Path) -> Iterator[tuple[str, float]]:
+def thermal_zones(folder: Path) -> Iterator[tuple[str, float]]:
     """Those that can be read; a zone that is switched off cannot."""
     for zone in sorted(folder.glob("thermal_zone*")):
         try:
@@ -115,7 +115,7 @@ def _zones(folder: Path) -> Iterator[tuple[str, float]]:
             continue
 
 
-def _slowed(folder: Path) -> Iterator[str]:
+def processors_slowed(folder: Path) -> Iterator[str]:
     """Cooling devices that are the processor itself, and at work."""
     for device in folder.glob("cooling_device*"):
         try:

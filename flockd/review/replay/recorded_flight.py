@@ -33,7 +33,10 @@ class Replay:
     times_s: list[float] = field(default_factory=list)
     """Time of each step's frames."""
     reading_s: float = 0.0
-    computing_s: float = 0.0
+    steps_ms: list[float] = field(default_factory=list)
+    """What each step took."""
+    processor_ms: list[float] = field(default_factory=list)
+    """Processor time of each, all threads together."""
     stages_ms: dict[str, list[float]] = field(default_factory=dict)
 
 
@@ -66,9 +69,10 @@ def replay_flight(
     with ExitStack() as stack:
         recorder = None if out is None else stack.enter_context(_recording_to(out, recording, config))
         for step, read_s in _paced(recording.steps(start_s, end_s), speed):
-            begin_s = time.perf_counter()
+            begin_s, processor_begin_s = time.perf_counter(), time.process_time()
             output = pilot.step(step.frames, step.vehicle, order=step.order)
-            replay.computing_s += time.perf_counter() - begin_s
+            replay.steps_ms.append(1e3 * (time.perf_counter() - begin_s))
+            replay.processor_ms.append(1e3 * (time.process_time() - processor_begin_s))
             replay.reading_s += read_s
             replay.times_s.append(step.frames.time_s)
             replay.outputs[step.number] = to_json(output)
@@ -102,7 +106,7 @@ def replay_result(
 ) -> dict[str, Any]:
     """The result of a replay as JSON, for `flockd replay --json`."""
     duration_s = replay.times_s[-1] - replay.times_s[0]
-    spent_s = replay.reading_s + replay.computing_s
+    spent_s = replay.reading_s + sum(replay.steps_ms) / 1e3
     return {
         "recording": str(recording.path),
         "drone": recording.drone,

@@ -35,9 +35,12 @@ def test_the_angle_of_a_rotation_survives_from_tiny_to_half_a_turn(degrees: floa
 
 def test_rotation_vectors_agree_with_scipy() -> None:
     random = np.random.default_rng(1)
-    for scale in (1e-12, 1e-6, 0.1, 3.0):
+    for scale in (0.0, 1e-200, 1e-12, 1e-6, 0.1, 3.0, 20.0):
         vector = random.normal(0.0, scale, 3)
-        assert np.allclose(rotation_from_vector(vector), Rotation.from_rotvec(vector).as_matrix(), atol=1e-14)
+        expected = Rotation.from_rotvec(vector).as_matrix()
+        assert np.allclose(rotation_from_vector(vector), expected, rtol=0.0, atol=1e-14)
+        assert np.allclose(rotation_from_vector(vector[None])[0], expected, rtol=0.0, atol=1e-14)
+    assert np.isnan(rotation_from_vector(np.array([0.0, np.inf, 1.0]))).all()
 
 
 def test_transforms_chain_and_invert_like_4x4_matrices() -> None:

@@ -23,7 +23,7 @@ CONFIG = config_for(14540, "tcp/127.0.0.1:1", "tcp/127.0.0.1:2")
 WELL = Sample(
     time_s=0.0, armed=False, heartbeat_age_s=0.4, steps=0, failed=0, load=0.5, loop_lag_s=0.01, temperature_c=50.0,
     camera_age_s={"front": 0.05, "back": 0.05}, camera_faults={}, neighbours=0, own_motion=True, why=None,
-    command=np.array([0.3, 0.4]),
+    command=np.array([0.3, 0.4]), stages_ms={"scene": 60.0, "flow": 90.0},
 )  # fmt: skip
 
 
@@ -51,7 +51,7 @@ async def test_the_whole_line_runs_and_nothing_that_moves_a_drone_is_sent() -> N
             assert commands, "what the gate would have let through"
             assert max(float(np.hypot(*command)) for command in commands) > 0.0
             found = list(judged(config, seen, 2.0))
-            assert [one.about for one in found][:3] == ["bench", "steps", "load"]
+            assert [one.about for one in found][:4] == ["bench", "steps", "load", "stages"]
 
             autopilot.pilot_arms()
             stopped = await bench(config, "tiny.yaml", 60.0, stop=asyncio.Event(), load=TinyPerceiver)
@@ -88,6 +88,7 @@ def test_a_good_run_passes_with_its_figures() -> None:
     assert {one.level for one in found.values()} == {Level.PASS}
     assert found["steps"].measured == "240 steps, 4.00 a second of 4.00 configured"
     assert found["load"].measured == "a step takes 50 % of its time, at worst 50 %"
+    assert found["stages"].measured == "ms, median / 95th percentile: flow 90 / 90, scene 60 / 60"
     assert found["camera back"].measured == "newest frame 50 ms old, at worst 50 ms"
     assert found["temperature"].measured == "50 °C at the start, 70 at most, 70 at the end; limit 85"
     assert found["autopilot"].measured.startswith("heartbeats at most 0.4 s apart")

@@ -11,6 +11,7 @@ from flockd.core.config import DroneConfig, load_drone
 from flockd.core.config.recording import RecordingConfig
 from flockd.core.data import data_path
 from flockd.ground.doctor import Finding, Level
+from flockd.ground.doctor.computer import Computer, Condition
 from flockd.ground.doctor.computer_checks import (
     check_clock,
     check_disk,
@@ -150,3 +151,59 @@ def test_a_drone_with_a_larger_queue_needs_more(tmp_path: Path) -> None:
     meminfo.write_text("MemTotal: 8000000 kB\nMemAvailable: 1000000 kB\n", encoding="ascii")
     larger: DroneConfig = QUADROTOR.model_copy(update={"recording": RecordingConfig(queue_mb=1000.0)})
     assert next(iter(check_memory(larger, meminfo))).level is Level.FAILURE
+
+
+PI_5 = """processor	: 0
+BogoMIPS	: 108.00
+Features	: fp asimd evtstrm aes pmull sha1 sha2 crc32 atomics fphp asimdhp cpuid asimdrdm lrcpc dcpop asimddp
+CPU implementer	: 0x41
+CPU part	: 0xd0b
+
+Model		: Raspberry Pi 5 Model B Rev 1.0
+"""
+PI_4 = "Features	: fp asimd evtstrm crc32 cpuid\n"
+SERVER = """model name	: AMD EPYC 9354
+flags		: fpu sse4_2 avx2 avx512f avx512bw avx512_vnni avx_vnni
+model name	: another core's
+"""
+DESKTOP = "model name	: Intel(R) Core(TM) i5-4570\nflags		: sse4_2 avx2\n"
+
+
+@pytest.mark.parametrize(
+    ("cpuinfo", "name", "eight_bit", "vector"),
+    [
+        (PI_5, "Raspberry Pi 5 Model B Rev 1.0", ("dotprod",), ("NEON",)),
+        (PI_4, "unknown", (), ("NEON",)),
+        (SERVER, "AMD EPYC 9354", ("AVX-512 VNNI", "AVX-VNNI"), ("AVX-512", "AVX2")),
+        (DESKTOP, "Intel(R) Core(TM) i5-4570", (), ("AVX2",)),
+        ("", "unknown", (), ()),
+    ],
+)
+def test_a_computer_says_which_instructions_it_has(
+    cpuinfo: str, name: str, eight_bit: tuple[str, ...], vector: tuple[str, ...], tmp_path: Path
+) -> None:
+    (tmp_path / "cpuinfo").write_text(cpuinfo, encoding="utf-8")
+    (tmp_path / "meminfo").write_text("MemTotal:  8000000 kB\n", encoding="ascii")
+    computer = Computer.this(tmp_path / "cpuinfo", tmp_path / "none", tmp_path / "meminfo")
+    assert (computer.name, computer.eight_bit, computer.vector) == (name, eight_bit, vector)
+    assert computer.memory_mb == pytest.approx(8192.0)
+    assert computer.cores >= 1
+    (tmp_path / "model").write_bytes(b"NVIDIA Jetson Orin Nano Developer Kit\0")
+    board = Computer.this(tmp_path / "cpuinfo", tmp_path / "model", tmp_path / "none")
+    assert (board.name, board.memory_mb) == ("NVIDIA Jetson Orin Nano Developer Kit", None)
+
+
+def test_how_a_computer_does_now(tmp_path: Path) -> None:
+    thermal, clocks = tmp_path / "thermal", tmp_path / "cpu"
+    thermal.mkdir()
+    _computer(
+        thermal,
+        thermal_zone0=("board", "40000"),
+        thermal_zone1=("cpu-thermal", "61500"),
+        cooling_device0=("cpufreq-cpu0", "2"),
+    )
+    for core, khz in (("cpu0", "1500000"), ("cpu1", "2400000")):
+        (clocks / core / "cpufreq").mkdir(parents=True)
+        (clocks / core / "cpufreq" / "scaling_cur_freq").write_text(f"{khz}\n", encoding="ascii")
+    assert Condition.now(thermal, clocks) == Condition(61.5, "cpu-thermal", ("cpufreq-cpu0",), 2400.0)
+    assert Condition.now(tmp_path / "none", tmp_path / "none") == Condition(None, "", (), None)

@@ -145,7 +145,13 @@ def propose_residuals(
 
 def largest_blobs(pixels: BoolArray, max_blobs: int, min_px: int) -> list[Instance]:
     """The largest groups (at most ``max_blobs``) of at least ``min_px`` pixels (h, w) that touch each other."""
-    count, _, stats, centres = cv2.connectedComponentsWithStats(pixels.astype(np.uint8))
+    mask = pixels.astype(np.uint8)
+    x, y, across, down = cv2.boundingRect(mask)  # they are few: the rest of the image takes most of the time
+    if not across:
+        return []
+    count, _, stats, centres = cv2.connectedComponentsWithStats(mask[y : y + down, x : x + across])
+    stats[:, [cv2.CC_STAT_LEFT, cv2.CC_STAT_TOP]] += (x, y)
+    centres += (x, y)
     largest = sorted(range(1, count), key=lambda k: -stats[k, cv2.CC_STAT_AREA])[:max_blobs]
     found = []
     for k in largest:

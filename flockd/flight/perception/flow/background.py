@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flockd.core.messages import UNCLASSED, BoolArray, Float32Array, UInt8Array
+from flockd.core.messages import UNCLASSED, BoolArray, Float32Array, FloatArray, UInt8Array
 from flockd.flight.perception.flow.images import gradients, grey
 
 _CELL_PX = 4
@@ -89,8 +90,8 @@ def _texture(image: Float32Array, window: tuple[int, int]) -> Float32Array:
 def _difference(before: Float32Array, after: Float32Array, flow: Float32Array, window: tuple[int, int]) -> Float32Array:
     """Mean grey levels by which the images differ along the flow, over a window."""
     height, width = before.shape
-    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    warped = cv2.remap(after, u + flow[..., 0], v + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    to = _cells(height, width).astype(np.float32) + flow
+    warped = cv2.remap(after, to[..., 0], to[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(cv2.blur(np.abs(before - warped), window), np.float32)
 
 
@@ -99,22 +100,27 @@ def _homography_flow(flow: Float32Array, sure: BoolArray) -> Float32Array:
     none = np.zeros_like(flow)
     height, width = sure.shape
     stride = _HOMOGRAPHY_STRIDE_CELLS
-    step = np.s_[stride // 2 :: stride]
-    rows, columns = (axis[step, step][sure[step, step]] for axis in np.mgrid[:height, :width])
-    if len(rows) < _HOMOGRAPHY_MIN_CELLS:
+    some = np.s_[stride // 2 :: stride, stride // 2 :: stride]
+    cells = _cells(height, width)
+    start = cells[some][sure[some]]
+    if len(start) < _HOMOGRAPHY_MIN_CELLS:
         return none
-    start = np.stack([columns, rows], 1).astype(np.float64)
-    end = start + flow[rows, columns]
+    end = start + flow[some][sure[some]]
     found, _ = cv2.findHomography(start, end, cv2.USAC_MAGSAC, _HOMOGRAPHY_TOLERANCE_CELLS)
     if found is None:
         return none
-    v, u = np.mgrid[:height, :width].astype(np.float64)
-    cells = np.stack([u, v], 2)
     along = (cv2.perspectiveTransform(cells, np.asarray(found, np.float64)) - cells).astype(np.float32)
     off = np.linalg.norm(along - flow, axis=2)
     allowed = _HOMOGRAPHY_MAX_ERROR * width
     usable = np.isfinite(along).all() and np.median(off) < allowed and off.max() < width
     return along if usable else none
+
+
+@lru_cache(maxsize=8)
+def _cells(height: int, width: int) -> FloatArray:
+    """(h, w, 2) column and row of each cell; not to be changed."""
+    v, u = np.mgrid[:height, :width].astype(np.float64)
+    return np.stack([u, v], 2)
 
 
 def _spread(values: Float32Array, weight: Float32Array) -> Float32Array:

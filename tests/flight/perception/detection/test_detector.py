@@ -139,6 +139,7 @@ def test_an_image_full_of_false_ones_gives_only_the_largest_residuals() -> None:
     speck = np.zeros((640, 480), np.bool_)
     speck[100:103, 200:207] = True
     assert not largest_blobs(speck, max_blobs=6, min_px=24)
+    assert not largest_blobs(np.zeros_like(speck), max_blobs=6, min_px=24)
 
 
 def test_instances_get_the_labels_of_their_detections() -> None:
