@@ -49,7 +49,7 @@ def main() -> None:
                         help="folder with the airframes' repositories; default: $FLOCKD_MESHES")  # fmt: skip
     parser.add_argument("--moments", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--samples", type=int, default=16, help="of each pixel, before the noise is taken out")
+    parser.add_argument("--samples", type=int, default=8, help="of each pixel, before the noise is taken out")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the pictures, and a contact sheet, there")
     parser.add_argument("--rigs", nargs="+", choices=("pinhole", "fisheye"), default=("pinhole", "fisheye"))

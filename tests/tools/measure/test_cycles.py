@@ -92,7 +92,7 @@ def test_the_polynomial_leads_back_to_the_angle_of_flockds_lens() -> None:
 def test_a_lens_that_blender_has_not_is_refused(changed: dict[str, object], says: str) -> None:
     lens = cycles_card.lenses_of(cycles_card.drones()["fisheye"])[0]
     with pytest.raises(ValueError, match=says):
-        blender_camera(Lens(**{**vars(lens), **changed}))  # type: ignore[arg-type]
+        blender_camera(Lens(**{**vars(lens), **changed}))
 
 
 def test_known_places_are_in_the_image() -> None:

@@ -31,7 +31,8 @@ Array = NDArray[Any]
 NED_TO_BLENDER = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """North, east, down to east, north, up."""
 _RDF_TO_BLENDER_CAMERA = np.diag([1.0, -1.0, -1.0])
-_MIDDLE_GREY = 0.16
+_MIDDLE = 0.14
+"""What the middle of all pixels is exposed to."""
 _NOISE = 1.5
 """Grey levels of noise at mid-tones."""
 
@@ -42,48 +43,46 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     markers(job, out / "markers.json")
     for moment in job.moments:
-        missing = [rig for rig in job.rigs if not _file(out, moment, rig).is_file()]
-        if missing:
-            _moment(job, moment, missing, out)
-            print(f"moment {moment.number}: {', '.join(missing)}", flush=True)
+        for rig, lenses in job.rigs.items():
+            file = out / f"moment_{moment.number:03d}_{rig}.npz"
+            if not file.is_file():
+                _moment(job, moment, lenses, file)
+                print(file.name, flush=True)
 
 
-def _file(out: Path, moment: Moment, rig: str) -> Path:
-    return out / f"moment_{moment.number:03d}_{rig}.npz"
-
-
-def _moment(job: Job, moment: Moment, rigs: list[str], out: Path) -> None:
+def _moment(job: Job, moment: Moment, lenses: tuple[Lens, ...], file: Path) -> None:
     _new_scene(job)
     build(moment)
     shapes = [airframe(Path(job.meshes), one.airframe) for one in moment.neighbours]
     drones = [_drone(shape, moment.neighbours[k].paint, moment.neighbours[k].seed, k) for k, shape in enumerate(shapes)]
-    found: dict[str, dict[str, list[Array]]] = {rig: {"linear": [], "truth": []} for rig in rigs}
-    ground = []
-    for kind in ("linear", "truth"):
-        if kind == "truth":
-            _show_truth()
+
+    def both() -> Array:
+        """(2, cameras, h, w, 3) before and after the step."""
+        images = []
         for k in range(2):
             for parts, neighbour in zip(drones, moment.neighbours, strict=True):
                 for part in parts:
                     part.matrix_world = _matrix(neighbour.poses[k].rotation, neighbour.poses[k].position)
-            for rig in rigs:
-                for lens in job.rigs[rig]:
-                    found[rig][kind].append(_taken(lens, moment.own[k]))
-            if kind == "linear":
-                ground.append(_below(moment.own[k]))
+            images.append(np.stack([_taken(lens, moment.own[k]) for lens in lenses]))
+        return np.stack(images)
+
+    linear = both()
+    ground_range_m = np.array([_below(own) for own in moment.own])
+    _show_truth()
+    truth = both()
     rng = np.random.Generator(np.random.PCG64([moment.seed, moment.number, 2]))
-    for rig, of in found.items():
-        truth = np.stack(of["truth"])
-        shape = (2, len(job.rigs[rig]), *truth.shape[1:3])
+    unfinished = file.with_suffix(".part")
+    with unfinished.open("wb") as written:
         np.savez_compressed(
-            _file(out, moment, rig),
-            rgb=_developed(np.stack(of["linear"]), rng).reshape(*shape, 3),
-            range_m=truth[..., 0].reshape(shape).astype(np.float32),
-            ids=np.rint(truth[..., 1]).reshape(shape).astype(np.uint8),
-            ground_range_m=np.array(ground),
+            written,
+            rgb=_developed(linear, rng),
+            range_m=truth[..., 0],
+            ids=np.rint(truth[..., 1]).astype(np.uint8),
+            ground_range_m=ground_range_m,
             sizes_m=np.array([shape.size_m for shape in shapes]),
             between_motors_m=np.array([shape.between_motors_m for shape in shapes]),
         )
+    unfinished.rename(file)
 
 
 def markers(job: Job, path: Path) -> None:
@@ -120,7 +119,7 @@ def _new_scene(job: Job) -> None:
     scene.cycles.samples, scene.cycles.use_adaptive_sampling = job.samples, False
     scene.cycles.use_denoising = True
     scene.cycles.denoiser = "OPENIMAGEDENOISE"
-    scene.cycles.max_bounces, scene.cycles.diffuse_bounces, scene.cycles.glossy_bounces = 4, 2, 2
+    scene.cycles.max_bounces, scene.cycles.diffuse_bounces, scene.cycles.glossy_bounces = 2, 1, 1
     scene.cycles.caustics_reflective = scene.cycles.caustics_refractive = False
     scene.render.image_settings.file_format = "OPEN_EXR"
     scene.render.image_settings.color_depth = "32"
@@ -240,20 +239,16 @@ def _matrix(rotation: Array, position: Any) -> Matrix:
 def _developed(linear: Array, rng: np.random.Generator) -> Array:
     """8-bit sRGB of linear images (n, h, w, 3): one exposure for all, highlights rolled off, a little noise.
 
-    The curve is Hable's of 2010 ("Filmic Tonemapping Operators").
+    The curve is Narkowicz's of 2015 ("ACES Filmic Tone Mapping Curve").
     """
     luminance = linear @ np.array([0.2126, 0.7152, 0.0722], np.float32)
-    x = linear * np.float32(_MIDDLE_GREY / max(float(np.median(luminance)), 1e-6))
-    bright = _hable(np.maximum(x, 0.0) * 2.0) / _hable(np.float32(11.2))
+    x = linear * np.float32(_MIDDLE / max(float(np.median(luminance)), 1e-6))
+    x = np.maximum(x, 0.0)
+    bright = np.minimum(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 1.0)
     srgb = np.where(bright <= 0.0031308, 12.92 * bright, 1.055 * np.maximum(bright, 1e-9) ** (1 / 2.4) - 0.055)
     noisy = 255.0 * srgb + rng.normal(0.0, _NOISE, srgb.shape)
     developed: Array = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
     return developed
-
-
-def _hable(x: Any) -> Any:
-    a, b, c, d, e, f = 0.15, 0.50, 0.10, 0.20, 0.02, 0.30
-    return (x * (a * x + c * b) + d * e) / (x * (a * x + b) + d * f) - e / f
 
 
 if __name__ == "__main__":

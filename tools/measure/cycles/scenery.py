@@ -19,7 +19,7 @@ from tools.measure.cycles.plan import EXTENT_M, Moment, ground_height
 Array = NDArray[Any]
 HALF_GROUND_M = 150.0
 _CELL_M = 1.0
-_GRASS_WITHIN_M, _BLADES = 22.0, 150_000
+_STREWN_WITHIN_M, _BLADES, _STONES = 22.0, 150_000, 40_000
 _MODELS = 4
 """Different trees of each kind."""
 _GROUND_COLOURS: dict[
@@ -40,6 +40,8 @@ def build(moment: Moment) -> None:
     _ground(moment)
     if moment.ground in ("meadow", "dry grass"):
         _grass(moment, rng)
+    else:
+        _stones(moment, rng)
     shapes = {
         kind: [_plant(kind, k) for k in range(_MODELS)]
         for kind in ("broadleaf", "conifer", "bush")
@@ -105,13 +107,13 @@ def _sky(moment: Moment) -> None:
     air.sky_type = "MULTIPLE_SCATTERING"
     air.sun_elevation, air.sun_rotation = moment.sun_elevation, moment.sun_azimuth
     air.aerosol_density = moment.haze
-    air.sun_intensity = max(0.02, 1.0 - moment.clouds) if moment.clouds > 0.9 else 1.0
+    air.sun_intensity = 0.05 if moment.clouds > 0.9 else 1.0
     where = nodes.new("ShaderNodeTexCoord")
     stretched = nodes.new("ShaderNodeMapping")
     stretched.inputs["Scale"].default_value = (1.5, 1.5, 5.0)
     stretched.inputs["Location"].default_value = (moment.seed % 97, moment.number % 89, 0.0)
     noise = nodes.new("ShaderNodeTexNoise")
-    noise.inputs["Scale"].default_value, noise.inputs["Detail"].default_value = 2.0, 8.0
+    noise.inputs["Scale"].default_value, noise.inputs["Detail"].default_value = 2.0, 3.0
     edge = nodes.new("ShaderNodeValToRGB")
     middle = 0.75 - 0.5 * moment.clouds
     edge.color_ramp.elements[0].position = max(0.0, middle - 0.08)
@@ -159,20 +161,11 @@ def _ground_material(moment: Moment) -> Any:
     made = material("ground", one, 0.95)
     nodes, links = made.node_tree.nodes, made.node_tree.links
     where = nodes.new("ShaderNodeNewGeometry")
-    fine = _noise(nodes, links, where.outputs["Position"], 6.0, 12.0)
-    coarse = _noise(nodes, links, where.outputs["Position"], 0.15, 6.0)
-    grains = nodes.new("ShaderNodeTexVoronoi")
-    grains.inputs["Scale"].default_value = 14.0
-    links.new(where.outputs["Position"], grains.inputs["Vector"])
+    fine = _noise(nodes, links, where.outputs["Position"], 6.0, 4.0)
+    coarse = _noise(nodes, links, where.outputs["Position"], 0.15, 2.0)
     mixed = _mixed(nodes, links, _steep(nodes, links, fine, 0.35, 0.65), one, two)
     patched = _mixed(nodes, links, _steep(nodes, links, coarse, 0.5, 0.62), mixed, patch)
-    dark = _mixed(nodes, links, grains.outputs["Distance"], patched, tuple(0.5 * c for c in one))
-    links.new(dark, nodes["Principled BSDF"].inputs["Base Color"])
-    bump = nodes.new("ShaderNodeBump")
-    bump.inputs["Distance"].default_value = 0.05
-    bump.inputs["Strength"].default_value = 0.8
-    links.new(fine, bump.inputs["Height"])
-    links.new(bump.outputs["Normal"], nodes["Principled BSDF"].inputs["Normal"])
+    links.new(patched, nodes["Principled BSDF"].inputs["Base Color"])
     return made
 
 
@@ -205,9 +198,7 @@ def _mixed(nodes: Any, links: Any, share: Any, first: Any, second: Any) -> Any:
 
 def _grass(moment: Moment, rng: np.random.Generator) -> None:
     """Single blades around the own drone, a triangle each; farther off the ground's colours stand for them."""
-    out, angle = _GRASS_WITHIN_M * np.sqrt(rng.uniform(0, 1, _BLADES)), rng.uniform(0, 2 * math.pi, _BLADES)
-    east, north = out * np.sin(angle), out * np.cos(angle)
-    foot = np.stack([east, north, ground_height(moment.relief, north, east)], axis=1)
+    foot = _strewn(moment, rng, _BLADES)
     turn, long = rng.uniform(0, 2 * math.pi, _BLADES), rng.uniform(0.06, 0.22, _BLADES)
     wide = np.stack([np.cos(turn), np.sin(turn), np.zeros(_BLADES)], 1) * rng.uniform(0.004, 0.012, _BLADES)[:, None]
     lean = np.stack([rng.normal(0, 0.35, _BLADES), rng.normal(0, 0.35, _BLADES), np.ones(_BLADES)], axis=1)
@@ -217,16 +208,38 @@ def _grass(moment: Moment, rng: np.random.Generator) -> None:
     mesh_object("grass", corners, np.arange(3 * _BLADES).reshape(-1, 3), material("grass", None, 0.7), colours)
 
 
+def _stones(moment: Moment, rng: np.random.Generator) -> None:
+    """Loose stones around the own drone, four triangles each."""
+    middle = _strewn(moment, rng, _STONES)
+    size = rng.uniform(0.01, 0.035, (_STONES, 1, 1)) * np.where(rng.random((_STONES, 1, 1)) < 0.02, 4.0, 1.0)
+    corners = middle[:, None] + size * rng.normal(0.0, 0.7, (_STONES, 4, 3))
+    faces = 4 * np.arange(_STONES)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
+    one, two, _ = (np.array(colour) for colour in _GROUND_COLOURS[moment.ground])
+    colours = (one + (two - one) * rng.uniform(0, 1, (_STONES, 1))) * rng.uniform(0.5, 1.4, (_STONES, 1))
+    mesh_object(
+        "stones", corners.reshape(-1, 3), faces.reshape(-1, 3), material("stones", None), np.repeat(colours, 4, axis=0)
+    )
+
+
+def _strewn(moment: Moment, rng: np.random.Generator, count: int) -> Array:
+    """(count, 3) places on the ground around the own drone."""
+    out, angle = _STREWN_WITHIN_M * np.sqrt(rng.uniform(0, 1, count)), rng.uniform(0, 2 * math.pi, count)
+    east, north = out * np.sin(angle), out * np.cos(angle)
+    return np.stack([east, north, ground_height(moment.relief, north, east)], axis=1)
+
+
 def _plant(kind: str, number: int) -> Any:
     """One of the trees or bushes, 1 m high, out of sight: `_put` shows it where it stands."""
     rng = np.random.Generator(np.random.PCG64([{"broadleaf": 0, "conifer": 1, "bush": 2}[kind], number]))
-    bark, green = np.array([0.08, 0.055, 0.035]), np.array([0.045, 0.085, 0.02])
+    bark, green = np.array([0.1, 0.07, 0.045]), np.array([0.075, 0.14, 0.035])
     if kind == "broadleaf":
+        around, high = rng.uniform(0, 2 * math.pi, 26), rng.uniform(0.3, 0.9, 26)
+        out = 0.3 * np.sqrt(np.maximum(0.0, 1.0 - ((high - 0.58) / 0.38) ** 2)) * np.sqrt(rng.uniform(0.1, 1.0, 26))
         lumps = [
-            (np.array([rng.normal(0, 0.13), rng.normal(0, 0.13), rng.uniform(0.42, 0.85)]), rng.uniform(0.1, 0.2))
-            for _ in range(14)
+            (np.array([r * math.cos(a), r * math.sin(a), h]), rng.uniform(0.07, 0.13))
+            for r, a, h in zip(out, around, high, strict=True)
         ]
-        middles, size, trunk = _in_lumps(rng, lumps, 7000), 0.022, 0.5
+        middles, size, trunk = _in_lumps(rng, lumps, 9000), 0.017, 0.5
     elif kind == "conifer":
         up = rng.uniform(0.0, 1.0, 7000) ** 1.4
         out = (1.0 - up) * 0.2 * np.sqrt(rng.uniform(0.2, 1, 7000)) * (1.0 + 0.3 * np.sin(up * 70.0))
