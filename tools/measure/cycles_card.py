@@ -7,7 +7,8 @@ python -m tools.measure.cycles_card --blender VENV/bin/python --meshes MESHES --
 
 Each moment is two frame sets of four cameras, 0.5 s apart, by the pinholes of `config/simulator.yaml` and by the
 fisheyes of `config/quadrotor.yaml`. With `--keep`, what was rendered stays, and the next run goes on from there. Beside
-it stand the same drones' places drawn by flockd's renderer, with shapes that the networks know.
+Cycles stand the same places drawn by flockd's renderer: with the same real airframes, and with shapes that the networks
+learnt from.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ from tools.measure.cycles.lens import Lens
 from tools.measure.cycles.plan import Moment, moment
 from tools.measure.cycles.sheet import contact_sheet
 from tools.measure.cycles.sources import AIRFRAMES
-from tools.measure.cycles.taken import Taken, draw_taken, read_taken
+from tools.measure.cycles.taken import Taken, draw_taken, known_models, read_taken, real_models
 
 LENS_WITHIN_PX = 0.5
 """Cycles shows balls at known places no farther than this from where flockd's camera model has them."""
-_NAME = 46
+_NAME, _WIDTH = 41, 13
 
 
 def main() -> None:
@@ -130,29 +131,44 @@ def _render(job: Job, blender: str | None, folder: Path) -> None:
 
 
 def _print_card(moments: tuple[Moment, ...], configs: dict[str, DroneConfig], folder: Path, *, with_own: bool) -> None:
-    findings: dict[str, Findings] = {}
     for name, config in configs.items():
         networks, rig = load_networks(config.perception), build_rig(config.rig)
         there = [one for one in moments if (folder / f"moment_{one.number:03d}_{name}.npz").is_file()]
-        taken: list[Taken] = [read_taken(folder / f"moment_{one.number:03d}_{name}.npz", one) for one in there]
-        findings[f"Cycles {name}"] = look(config, networks, taken)
-        contact_sheet(findings[f"Cycles {name}"], taken, rig, folder / f"sheet_{name}.jpg")
+
+        def rendered(one: Moment, name: str = name) -> Taken:
+            return read_taken(folder / f"moment_{one.number:03d}_{name}.npz", one)
+
+        columns = {}
+        if there:
+            columns["Cycles"] = look(config, networks, map(rendered, there))
+            contact_sheet(columns["Cycles"], there, rendered, rig, folder / f"sheet_{name}.png")
         if with_own:
-            findings[f"own {name}"] = look(config, networks, [draw_taken(one, rig) for one in there])
-    columns = {name: dict(rows(found)) for name, found in findings.items()}
-    for pair in (list(columns)[k : k + 2] for k in range(0, len(columns), 2)):
+            real = (
+                draw_taken(one, rig, real_models(one, folder), [of.airframe for of in one.neighbours])
+                for one in moments
+            )
+            known = (draw_taken(one, rig, *known_models(one)) for one in moments)
+            columns |= {"own, real": look(config, networks, real), "own, known": look(config, networks, known)}
+        _print_columns(name, columns)
+
+
+def _print_columns(rig: str, columns: dict[str, Findings]) -> None:
+    print()
+    print(f"{rig:{_NAME}s}" + "".join(f"{name:>{_WIDTH}s}" for name in columns))
+    figures = {name: dict(rows(found)) for name, found in columns.items()}
+    for row in next(iter(figures.values()), {}):
+        print(f"{row:{_NAME}s}" + "".join(f"{figures[name][row]:>{_WIDTH}s}" for name in columns))
+    for name, found in columns.items():
         print()
-        print(f"{'':{_NAME}s} " + " ".join(f"{name:>16s}" for name in pair))
-        for row in columns[pair[0]]:
-            print(f"{row:{_NAME}s} " + " ".join(f"{columns[name][row]:>16s}" for name in pair))
-    for name, found in findings.items():
-        print()
-        print(f"{name + ', drones at least 12 px wide':{_NAME}s} {'found':>10s} {'range bias':>10s} {'off by':>10s}")
-        for shape, *figures in by_shape(found):
-            licence = f" ({AIRFRAMES[shape].licence})" if shape in AIRFRAMES else ""
-            print(f"{shape + licence:{_NAME}s} " + " ".join(f"{figure:>10s}" for figure in figures))
+        print(
+            f"{f'{rig}, {name}, over 12 px':{_NAME}s}"
+            + "".join(f"{of:>{_WIDTH}s}" for of in ("found", "bias", "off by"))
+        )
+        for shape, *shown in by_shape(found):
+            licence = f", {AIRFRAMES[shape].licence}" if shape in AIRFRAMES else ""
+            print(f"{shape + licence:{_NAME}s}" + "".join(f"{figure:>{_WIDTH}s}" for figure in shown))
         if found.rejected:
-            print(f"pictures not used: {len(found.rejected)}, first: {found.rejected[0]}")
+            print(f"pictures not used: {len(found.rejected)}, the first as {found.rejected[0]}")
 
 
 if __name__ == "__main__":

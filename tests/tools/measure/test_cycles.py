@@ -17,7 +17,7 @@ from tools.measure.cycles.jobs import PROPELLER, Job, read_job, write_job
 from tools.measure.cycles.lens import SENSOR_MM, Lens, blender_camera, known_places, theta_polynomial
 from tools.measure.cycles.plan import CLEAR_M, RANGES_M, ground_height, moment, rotation
 from tools.measure.cycles.sources import AIRFRAMES, Source
-from tools.measure.cycles.taken import draw_taken
+from tools.measure.cycles.taken import draw_taken, known_models
 
 NAMES = tuple(AIRFRAMES)
 MOMENTS = [moment(7, number, NAMES) for number in range(40)]
@@ -124,20 +124,20 @@ def test_the_cards_figures() -> None:
     found.sights = [sight(40, 0.05), sight(40, -0.15), sight(40, 0.25), sight(40, None), sight(8, None)]
     found.false = [(0, 0, np.array([1.0, 0, 0]))]
     card = dict(rows(found))
-    assert card["drones found, 30 to 80 px wide"] == "75 % (4)"
-    assert card["drones found, 6 to 12 px wide"] == "0 % (1)"
+    assert card["found, 30 to 80 px wide"] == "75 % (4)"
+    assert card["found, 6 to 12 px wide"] == "0 % (1)"
     assert card["false in 500 pictures"] == "31"
-    assert card["range off by, 0 to 5 m: median"] == "15.0 % (3)"
-    assert card["range bias, 0 to 5 m: median"] == "+5.0 % (3)"
+    assert card["range at 0 to 5 m, median error"] == "15.0 % (3)"
+    assert card["range at 0 to 5 m, bias"] == "5.0 %"
     assert (card["range errors inside 1 sigma"], card["range errors inside 2 sigma"]) == ("33 % (3)", "67 % (3)")
-    assert card["own motion over a step: estimated"] == "67 % (3)"
-    assert card["own motion over a step: median error, m"] == "0.03 (2)"
+    assert card["own motion, estimated"] == "67 % (3)"
+    assert card["own motion, median error, m"] == "0.03 (2)"
 
 
 def test_flockds_own_pictures_of_a_moment_hold_its_drones_where_they_were_planned() -> None:
     config = cycles_card.drones()["pinhole"]
     rig = build_rig(config.rig)
-    taken = draw_taken(MOMENTS[0], rig)
+    taken = draw_taken(MOMENTS[0], rig, *known_models(MOMENTS[0]))
     planned = np.subtract([one.poses[0].position for one in MOMENTS[0].neighbours], MOMENTS[0].own[0].position)
     assert taken.neighbours[0] - taken.position[0] == pytest.approx(planned)
     seen = 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -75,7 +75,7 @@ class Findings:
     """Why images were not used."""
 
 
-def look(config: DroneConfig, networks: Networks, moments: Sequence[Taken]) -> Findings:
+def look(config: DroneConfig, networks: Networks, moments: Iterable[Taken]) -> Findings:
     """Each moment is flown by a pilot that remembers nothing from before it."""
     found, rig = Findings(), build_rig(config.rig)
     for taken in moments:
@@ -173,56 +173,52 @@ def _own_motion(taken: Taken, out: PilotOutput, found: Findings) -> None:
 
 
 def rows(found: Findings) -> list[tuple[str, str]]:
-    """The card of one renderer and rig: names and figures, with what each was measured on in brackets."""
-    lines = []
+    """The card of one renderer and rig: names and figures, with how many they were measured on in brackets."""
+    lines = [("moments", str(found.frame_sets // 2))]
     for low, high in WIDTHS_PX:
         of = [one.found for one in found.sights if low <= one.width_px < high]
-        name = f"{low:g} to {high:g} px" if high < 1e4 else f"over {low:g} px"
-        lines.append((f"drones found, {name} wide", _share(of)))
+        lines.append((f"found, {_span(low, high, 'px')} wide", _share(of)))
     lines.append(("false, a frame set", _number(len(found.false) / found.frame_sets, found.frame_sets)))
     lines.append(("false in 500 pictures", f"{500 * len(found.false) / found.images:.0f}"))
     known = [one for one in found.sights if one.found and not one.cut]
     for low, high in RANGES_M:
         errors = np.array([one.error for one in known if low <= one.range_m < high])
-        name = f"{low:g} to {high:g} m" if high < 1e3 else f"over {low:g} m"
-        lines.append((f"range off by, {name}: median", _percent(np.abs(errors), np.median)))
-        lines.append(
-            (f"range off by, {name}: 95th percentile", _percent(np.abs(errors), lambda e: np.quantile(e, 0.95)))
-        )
-        lines.append((f"range bias, {name}: median", _percent(errors, np.median, sign="+")))
+        name = f"range at {_span(low, high, 'm')}"
+        lines.append((f"{name}, median error", _percent(np.abs(errors), np.median, len(errors))))
+        lines.append((f"{name}, 95th percentile", _percent(np.abs(errors), _p95)))
+        lines.append((f"{name}, bias", _percent(errors, np.median)))
     for sigmas in (1, 2):
         inside = [abs(one.error) < sigmas * one.sigma for one in known]
         lines.append((f"range errors inside {sigmas} sigma", _share(inside)))
     lines.append(("mask IoU within 10 m, mean", _number(_figure(found.ious, np.mean), len(found.ious))))
     pixels = np.concatenate(found.depth) if found.depth else np.empty(0)
-    lines.append(("background depth of a pixel: median", _percent(pixels, np.median)))
-    lines.append(("background depth, mean of a picture: median", _percent([e.mean() for e in found.depth], np.median)))
+    lines.append(("background depth of a pixel, median", _percent(pixels, np.median)))
+    pictures = [errors.mean() for errors in found.depth]
+    lines.append(("the same, mean of a picture, median", _percent(pictures, np.median, len(pictures))))
     for name, values, unit in (
-        ("own motion over a step", found.own_m, "m"),
-        ("own rotation over a step", found.own_deg, "deg"),
-        ("a neighbour's velocity", found.velocity_m_s, "m/s"),
+        ("own motion", found.own_m, "m"),
+        ("own rotation", found.own_deg, "deg"),
+        ("neighbour's velocity", found.velocity_m_s, "m/s"),
     ):
         finite = np.array(values)[np.isfinite(values)] if values else np.empty(0)
-        lines.append((f"{name}: estimated", _share(list(np.isfinite(values)) if values else [])))
-        lines.append((f"{name}: median error, {unit}", _number(_figure(finite, np.median), len(finite))))
-        lines.append((f"{name}: 95th percentile, {unit}", _number(_figure(finite, _p95), len(finite))))
+        lines.append((f"{name}, estimated", _share(list(np.isfinite(values)) if values else [])))
+        lines.append((f"{name}, median error, {unit}", _number(_figure(finite, np.median), len(finite))))
+        lines.append((f"{name}, 95th percentile, {unit}", _number(_figure(finite, _p95), len(finite))))
     return lines
 
 
+def _span(low: float, high: float, unit: str) -> str:
+    return f"{low:g} to {high:g} {unit}" if high < 1e3 else f"over {low:g} {unit}"
+
+
 def by_shape(found: Findings) -> list[tuple[str, str, str, str]]:
-    """Of each shape: its name, drones found of those at least 12 px wide, median range bias, median range error."""
+    """Of each shape, where it is at least 12 px wide: name, share found, median bias and median error of its range."""
     lines = []
     for name in sorted({one.name for one in found.sights}):
         mine = [one for one in found.sights if one.name == name and one.width_px >= WIDTHS_PX[1][0]]
         errors = np.array([one.error for one in mine if one.found and not one.cut])
-        lines.append(
-            (
-                name,
-                _share([one.found for one in mine]),
-                _percent(errors, np.median, sign="+"),
-                _percent(np.abs(errors), np.median),
-            )
-        )
+        bias, off = _percent(errors, np.median), _percent(np.abs(errors), np.median, len(errors))
+        lines.append((name, _share([one.found for one in mine]), bias, off))
     return lines
 
 
@@ -238,8 +234,9 @@ def _share(values: Sequence[Any]) -> str:
     return f"{100 * np.mean(values):.0f} % ({len(values)})" if len(values) else "-"
 
 
-def _percent(values: Any, of: Any, sign: str = "") -> str:
-    return f"{100 * float(of(np.asarray(values))):{sign}.1f} % ({len(values)})" if len(values) else "-"
+def _percent(values: Any, of: Any, count: int | None = None) -> str:
+    brackets = "" if count is None else f" ({count})"
+    return f"{100 * _figure(values, of):.1f} %{brackets}" if len(values) else "-"
 
 
 def _number(value: float, count: int) -> str:

@@ -26,6 +26,11 @@ class Job:
     threads: int
 
 
+def airframe_file(folder: Path, name: str) -> Path:
+    """Where an airframe is kept as it is drawn."""
+    return folder / f"airframe_{name.replace(' ', '_')}.npz"
+
+
 def write_job(job: Job, path: Path) -> None:
     """As JSON."""
     path.write_text(json.dumps(asdict(job)), encoding="utf-8")

@@ -138,6 +138,22 @@ def ground_height(relief: tuple[tuple[float, float, float, float], ...], north: 
     return height
 
 
+def painted(colours: Array, paint: str) -> Array:
+    """(m, 3) linear colours of a drone of another paint, one of `PAINTS`; what is light stays lighter."""
+    if paint == "white":
+        colours = 0.65 + 0.3 * (colours - colours.mean(axis=0))
+    if paint == "dark":
+        colours = 0.02 + 0.1 * colours
+    return np.clip(colours, 0.01, 0.9)
+
+
+def blades(hub: Array, radius_m: float, turn: float) -> Array:
+    """(4, 3) corners of a propeller of two blades, tip to tip, in body FRD; ``turn`` from forward, radians."""
+    along = np.array([math.cos(turn), math.sin(turn), 0.0])
+    across = 0.06 * radius_m * np.array([-along[1], along[0], 0.0])
+    return np.array([hub + s * radius_m * along + w * across for s, w in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+
+
 def rotation(roll: float, pitch: float, yaw: float) -> Array:
     """(3, 3) R_ned_body: yaw, then pitch, then roll."""
     cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))

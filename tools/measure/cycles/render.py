@@ -2,9 +2,9 @@
 
 PYTHON -m tools.measure.cycles.render JOB.json OUT
 
-For each moment and rig ``moment_NNN_RIG.npz`` with (2, cameras, h, w) ``rgb``, ``range_m`` along the ray (0: sky), and
-``ids`` (0 world, k drone k - 1, `PROPELLER` + k what turns of it); ``sizes_m``, ``between_motors_m`` of the drones and
-``ground_range_m`` (2,) below the own drone along its down axis (NaN: none).
+For each airframe ``airframe_NAME.npz``, as it is drawn. For each moment and rig ``moment_NNN_RIG.npz`` with
+(2, cameras, h, w) ``rgb``, ``range_m`` along the ray (0: sky), and ``ids`` (0 world, k drone k - 1, `PROPELLER` + k
+what turns of it); ``sizes_m`` of the drones and ``ground_range_m`` (2,) below the own drone along its down axis (NaN: none).
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from mathutils import Matrix, Vector
 from numpy.typing import NDArray
 
 from tools.measure.cycles.airframes import Airframe, airframe
-from tools.measure.cycles.jobs import PROPELLER, Job, read_job
+from tools.measure.cycles.jobs import PROPELLER, Job, airframe_file, read_job
 from tools.measure.cycles.lens import Lens, blender_camera, known_places
-from tools.measure.cycles.plan import Moment, Pose
+from tools.measure.cycles.plan import Moment, Pose, blades, painted
 from tools.measure.cycles.scenery import build, material, mesh_object
 
 Array = NDArray[Any]
@@ -41,6 +41,8 @@ def main() -> None:
     """Render what a job asks for; a file that is there already is left as it is."""
     job, out = read_job(Path(sys.argv[1])), Path(sys.argv[2])
     out.mkdir(parents=True, exist_ok=True)
+    for name in sorted({one.airframe for moment in job.moments for one in moment.neighbours}):
+        _save_airframe(airframe(Path(job.meshes), name), airframe_file(out, name))
     markers(job, out / "markers.json")
     for moment in job.moments:
         for rig, lenses in job.rigs.items():
@@ -48,6 +50,19 @@ def main() -> None:
             if not file.is_file():
                 _moment(job, moment, lenses, file)
                 print(file.name, flush=True)
+
+
+def _save_airframe(shape: Airframe, path: Path) -> None:
+    np.savez(
+        path,
+        vertices=shape.vertices,
+        triangles=shape.triangles,
+        colours=shape.colours,
+        hubs=np.array([rotor.hub for rotor in shape.rotors]),
+        radii=np.array([rotor.radius_m for rotor in shape.rotors]),
+        size_m=shape.size_m,
+        between_motors_m=shape.between_motors_m,
+    )
 
 
 def _moment(job: Job, moment: Moment, lenses: tuple[Lens, ...], file: Path) -> None:
@@ -80,7 +95,6 @@ def _moment(job: Job, moment: Moment, lenses: tuple[Lens, ...], file: Path) -> N
             ids=np.rint(truth[..., 1]).astype(np.uint8),
             ground_range_m=ground_range_m,
             sizes_m=np.array([shape.size_m for shape in shapes]),
-            between_motors_m=np.array([shape.between_motors_m for shape in shapes]),
         )
     unfinished.rename(file)
 
@@ -123,6 +137,7 @@ def _new_scene(job: Job) -> None:
     scene.cycles.caustics_reflective = scene.cycles.caustics_refractive = False
     scene.render.image_settings.file_format = "OPEN_EXR"
     scene.render.image_settings.color_depth = "32"
+    scene.render.image_settings.exr_codec = "NONE"
     scene.render.resolution_percentage = 100
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     camera.data.clip_start, camera.data.clip_end = 0.02, 1e5
@@ -157,14 +172,9 @@ def _show_truth() -> None:
 def _drone(shape: Airframe, paint: str, seed: int, number: int) -> list[Any]:
     """The body, and of each propeller two blades and the disc that they blur into."""
     rng = np.random.Generator(np.random.PCG64(seed))
-    colours = shape.colours
-    if paint == "white":
-        colours = 0.65 + 0.3 * (colours - colours.mean(axis=0))
-    if paint == "dark":
-        colours = 0.02 + 0.1 * colours
     plastic = material(f"drone {number}", None, float(rng.uniform(0.25, 0.6)))
     # Object axes are the body's FRD; a face that looks the wrong way is lit all the same.
-    body = mesh_object(f"drone {number}", shape.vertices, shape.triangles, plastic, np.clip(colours, 0.01, 0.9))
+    body = mesh_object(f"drone {number}", shape.vertices, shape.triangles, plastic, painted(shape.colours, paint))
     body.pass_index = number + 1
     blade, blur = material("blade", (0.03, 0.03, 0.03), 0.4), _see_through(float(rng.uniform(0.08, 0.3)))
     parts = [body]
@@ -186,11 +196,9 @@ def _disc(hub: Array, radius_m: float, surface: Any) -> Any:
 
 
 def _blades(hub: Array, radius_m: float, turn: float, surface: Any) -> Any:
-    """Two, from hub to tip, 3 mm above the disc."""
-    along = np.array([math.cos(turn), math.sin(turn), 0.0])
-    across = 0.06 * radius_m * np.array([-along[1], along[0], 0.0])
-    corners = [hub + s * radius_m * along + w * across - [0, 0, 0.003] for s, w in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    return mesh_object("blades", np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]), surface)
+    """3 mm above the disc."""
+    corners = blades(hub, radius_m, turn) - [0, 0, 0.003]
+    return mesh_object("blades", corners, np.array([[0, 1, 2], [0, 2, 3]]), surface)
 
 
 def _see_through(share: float) -> Any:

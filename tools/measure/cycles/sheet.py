@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from flockd.flight.geometry import Rig
 from tools.measure.cycles.card import Findings
 from tools.measure.cycles.jobs import PROPELLER
+from tools.measure.cycles.plan import Moment
 from tools.measure.cycles.taken import Taken
 
 Array = NDArray[Any]
@@ -20,30 +22,31 @@ _SIDE, _ACROSS, _MOST = 160, 10, 30
 _SCENES = 6
 
 
-def contact_sheet(found: Findings, moments: Sequence[Taken], rig: Rig, path: Path) -> None:
+def contact_sheet(
+    found: Findings, moments: Sequence[Moment], read: Callable[[Moment], Taken], rig: Rig, path: Path
+) -> None:
     """Whole pictures on top, then crops: found (white), missed and false (red)."""
-    by_number = {taken.number: taken for taken in moments}
-    scenes = [_fitted(taken.rgb[0, c % taken.rgb.shape[1]], 266) for c, taken in enumerate(moments[:_SCENES])]
-    parts = [np.hstack(scenes)] if scenes else []
-    for name, wanted in (("found", True), ("missed", False)):
-        chosen = [one for one in found.sights if one.found is wanted][:_MOST]
+    planned = {one.number: one for one in moments}
+
+    @lru_cache(maxsize=1)  # the crops of a moment follow each other
+    def taken(number: int) -> Taken:
+        return read(planned[number])
+
+    first = [taken(one.number) for one in moments[:_SCENES]]
+    parts = [np.hstack([_fitted(one.rgb[0, c % one.rgb.shape[1]], 266) for c, one in enumerate(first)])]
+    for wanted in (True, False):
         crops = []
-        for one in chosen:
-            taken = by_number[one.number]
-            crop = _around_drone(taken, one.k, one.drone)
-            text = f"{one.error:+.0%}" if wanted else name
-            crops.append(_named(crop, f"{one.range_m:.1f}m {one.width_px:.0f}px {text}", wanted))
+        for one in [one for one in found.sights if one.found is wanted][:_MOST]:
+            said = f"{one.error:+.0%}" if wanted else "missed"
+            crop = _around_drone(taken(one.number), one.k, one.drone)
+            crops.append(_named(crop, f"{one.range_m:.1f}m {one.width_px:.0f}px {said}", wanted))
         parts.append(_grid(crops))
-    crops = []
-    for number, k, bearing in found.false[:_MOST]:
-        cut = _around_direction(by_number[number], k, bearing, rig)
-        if cut is not None:
-            crops.append(_named(cut, f"false, moment {number}", False))
-    parts.append(_grid(crops))
-    wide = max((part.shape[1] for part in parts if part.size), default=0)
-    if wide:
-        padded = [cv2.copyMakeBorder(p, 0, 6, 0, wide - p.shape[1], cv2.BORDER_CONSTANT) for p in parts if p.size]
-        cv2.imwrite(str(path), cv2.cvtColor(np.vstack(padded), cv2.COLOR_RGB2BGR))
+    false = [(number, _around_direction(taken(number), k, bearing, rig)) for number, k, bearing in found.false[:_MOST]]
+    parts.append(_grid([_named(cut, f"false, moment {number}", False) for number, cut in false if cut is not None]))
+    parts = [part for part in parts if part.size]
+    wide = max(part.shape[1] for part in parts)
+    padded = [cv2.copyMakeBorder(part, 0, 6, 0, wide - part.shape[1], cv2.BORDER_CONSTANT) for part in parts]
+    cv2.imwrite(str(path), cv2.cvtColor(np.vstack(padded), cv2.COLOR_RGB2BGR))
 
 
 def _around_drone(taken: Taken, k: int, n: int) -> Array:

@@ -13,13 +13,16 @@ from numpy.typing import NDArray
 
 from flockd.core.messages import Frame, FrameSet, RangeReading, VehicleState
 from flockd.flight.geometry import Rig, RigCamera, ZMap, range_map
+from flockd.sim.airframe import DroneModel
 from flockd.sim.autopilot.fake_range_finder import range_to_ground
 from flockd.sim.drone_models import drone_model
 from flockd.sim.lens_views import lens_view
 from flockd.sim.renderer import Renderer, View
 from flockd.sim.world import World
-from tools.measure.cycles.plan import STEP_S, Moment
+from tools.measure.cycles.jobs import airframe_file
+from tools.measure.cycles.plan import STEP_S, Moment, blades, painted
 from tools.training import worlds
+from tools.training.own_mesh import model_of
 
 Array = NDArray[Any]
 BAROMETER_SIGMA_M, RANGE_SIGMA_M = 0.1, 0.03
@@ -77,13 +80,39 @@ def read_taken(path: Path, moment: Moment) -> Taken:
     )  # fmt: skip
 
 
-def draw_taken(moment: Moment, rig: Rig) -> Taken:
-    """The same drones at the same places above a test world of flockd's renderer, as shapes that the networks know."""
+def known_models(moment: Moment) -> tuple[list[DroneModel], list[str]]:
+    """In the neighbours' places, shapes that the networks learnt from, and their names."""
+    rng = np.random.Generator(np.random.PCG64([moment.seed, moment.number, 5]))
+    families = [int(rng.choice(worlds.FAMILIES)) for _ in moment.neighbours]
+    return [drone_model(family, int(rng.integers(1 << 30))) for family in families], [f"family {k}" for k in families]
+
+
+def real_models(moment: Moment, folder: Path) -> list[DroneModel]:
+    """The neighbours themselves, from the files of `tools.measure.cycles.render`; their propellers as blades."""
+    models = []
+    for neighbour in moment.neighbours:
+        rng = np.random.Generator(np.random.PCG64(neighbour.seed))
+        with np.load(airframe_file(folder, neighbour.airframe)) as arrays:
+            shape = dict(arrays)
+        corners, faces, colours = (
+            [shape["vertices"]],
+            [shape["triangles"]],
+            [painted(shape["colours"], neighbour.paint)],
+        )
+        for hub, radius_m in zip(shape["hubs"], shape["radii"], strict=True):
+            first = sum(len(part) for part in corners)
+            corners.append(blades(hub, radius_m, rng.uniform(0.0, 2.0 * math.pi)))
+            faces.append(np.array([[0, 1, 2], [0, 2, 3]]) + first)
+            colours.append(np.full((2, 3), 0.03))
+        models.append(model_of(np.vstack(corners), np.vstack(faces), np.vstack(colours), float(shape["size_m"])))
+    return models
+
+
+def draw_taken(moment: Moment, rig: Rig, models: Sequence[DroneModel], names: Sequence[str]) -> Taken:
+    """The same places above a test world, drawn by flockd's renderer, with these shapes of these names there."""
     seed = worlds.TEST[moment.number + 5000]
     rng = np.random.Generator(np.random.PCG64([moment.seed, moment.number, 3]))
     world = World.generate(seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
-    families = [int(rng.choice(worlds.FAMILIES)) for _ in moment.neighbours]
-    models = [drone_model(family, int(rng.integers(1 << 30))) for family in families]
     renderer = Renderer(world, models)
     planned, own = _neighbours(moment), np.array([pose.position for pose in moment.own])
     moved = _place(world, np.vstack([own, planned.reshape(-1, 3)]), rng)
@@ -103,7 +132,7 @@ def draw_taken(moment: Moment, rig: Rig) -> Taken:
     below = [range_to_ground(own[k], R_ned_body[k, :, 2], world.height_at) for k in range(2)]
     return Taken(
         moment.number, np.stack(rgb).reshape(*shape, 3), np.stack(ranges).reshape(shape), np.stack(ids).reshape(shape),
-        tuple(f"family {family}" for family in families), np.array([model.size_m for model in models]), R_ned_body, own,
+        tuple(names), np.array([model.size_m for model in models]), R_ned_body, own,
         planned, _vehicles(moment, [-place[2] for place in own], below),
     )  # fmt: skip
 
