@@ -179,6 +179,9 @@ def _made(pieces: Any, rotors: list[tuple[Array, float]]) -> Airframe:
     reach = np.hstack([radii, radii, 0.0 * radii])
     everything = np.vstack([vertices, hubs - reach, hubs + reach])
     middle = (everything.min(axis=0) + everything.max(axis=0)) / 2.0
+    edges = vertices[triangles[:, 1:]] - vertices[triangles[:, :1]]
+    has_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > 1e-12
+    triangles, colours = triangles[has_area], colours[has_area]
     if len(triangles) > _MOST_TRIANGLES:
         raise ValueError(f"an airframe of {len(triangles)} triangles; at most {_MOST_TRIANGLES} are meant to be drawn")
     return Airframe(

@@ -4,7 +4,7 @@ PYTHON -m tools.measure.cycles.render JOB.json OUT
 
 For each airframe ``airframe_NAME.npz``, as it is drawn. For each moment and rig ``moment_NNN_RIG.npz`` with
 (2, cameras, h, w) ``rgb``, ``range_m`` along the ray (0: sky), and ``ids`` (0 world, k drone k - 1, `PROPELLER` + k
-what turns of it); ``sizes_m`` of the drones and ``ground_range_m`` (2,) below the own drone along its down axis (NaN: none).
+what turns of it); ``sizes_m`` of the drones; ``ground_range_m`` (2,) along the own drone's down axis (NaN: none).
 """
 
 from __future__ import annotations
