@@ -2,6 +2,7 @@
 
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +14,11 @@ from flockd.flight.geometry import WideAngleCamera, build_rig
 from tools.measure import cycles_card
 from tools.measure.cycles.airframes import airframe
 from tools.measure.cycles.card import Findings, Sight, iou_of, rows
-from tools.measure.cycles.jobs import PROPELLER, Job, read_job, write_job
+from tools.measure.cycles.jobs import PROPELLER, Job, airframe_file, read_job, write_job
 from tools.measure.cycles.lens import SENSOR_MM, Lens, blender_camera, known_places, theta_polynomial
 from tools.measure.cycles.plan import CLEAR_M, RANGES_M, ground_height, moment, rotation
 from tools.measure.cycles.sources import AIRFRAMES, Source
-from tools.measure.cycles.taken import draw_taken, known_models
+from tools.measure.cycles.taken import draw_taken, known_models, real_models
 
 NAMES = tuple(AIRFRAMES)
 MOMENTS = [moment(7, number, NAMES) for number in range(40)]
@@ -150,6 +151,22 @@ def test_flockds_own_pictures_of_a_moment_hold_its_drones_where_they_were_planne
                 assert np.median(mine) == pytest.approx(np.linalg.norm(place - at), abs=taken.sizes_m[n])
     assert seen
     assert isinstance(taken.vehicles[0], VehicleState)
+
+
+def test_a_real_airframe_is_drawn_with_its_propellers_blades_in_its_paint(tmp_path: Path) -> None:
+    one = replace(MOMENTS[0], neighbours=(replace(MOMENTS[0].neighbours[0], airframe="a b", paint="dark"),))
+    hubs, corners = np.array([[0.2, 0, -0.05], [-0.2, 0, -0.05]]), np.array([[0.1, 0, 0], [0, 0.1, 0], [-0.1, 0, 0.05]])
+    np.savez(
+        airframe_file(tmp_path, "a b"), vertices=corners, triangles=[[0, 1, 2]], colours=[[0.5, 0.5, 0.5]], hubs=hubs,
+        radii=[0.1, 0.1], size_m=0.6,
+    )  # fmt: skip
+    (model,) = real_models(one, tmp_path)
+    assert model.size_m == 0.6
+    assert len(model.triangles) == 2 * (1 + 2 * 2)  # each from both sides
+    assert model.colours[0] == pytest.approx(0.02 + 0.1 * 0.5)
+    blades = model.vertices[3:].reshape(2, 4, 3)
+    assert blades.mean(axis=1) == pytest.approx(hubs, abs=1e-6)
+    assert np.linalg.norm(blades[:, 0] - blades[:, 1], axis=1) == pytest.approx(0.2, abs=1e-6)
 
 
 def _box(path: Path, size: tuple[float, float, float]) -> None:
