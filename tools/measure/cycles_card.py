@@ -19,6 +19,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from flockd.core.data import data_path
 from flockd.flight.geometry import build_rig
 from flockd.flight.perception import load_networks
 from tools.measure.cycles.card import Findings, by_shape, look, rows
-from tools.measure.cycles.jobs import Job, write_job
+from tools.measure.cycles.jobs import Job, read_job, write_job
 from tools.measure.cycles.lens import Lens
 from tools.measure.cycles.plan import Moment, moment
 from tools.measure.cycles.sheet import contact_sheet
@@ -57,15 +58,20 @@ def main() -> None:
     parser.add_argument("--only-rendered", action="store_true", help="render nothing: measure what FOLDER holds")
     parser.add_argument("--no-own", action="store_true", help="without the pictures of flockd's renderer beside it")
     arguments = parser.parse_args()
+    if arguments.only_rendered and not arguments.keep:
+        parser.error("--only-rendered measures what a folder holds: name it with --keep")
     configs = {name: config for name, config in drones().items() if name in arguments.rigs}
     moments = tuple(moment(arguments.seed, k, tuple(AIRFRAMES)) for k in range(arguments.moments))
     with tempfile.TemporaryDirectory() as temporary:
-        folder = arguments.keep or Path(temporary)
+        folder = (arguments.keep or Path(temporary)).absolute()
         folder.mkdir(parents=True, exist_ok=True)
+        _check_same(folder / "job.json", moments)
         if not arguments.only_rendered:
             rigs = {name: lenses_of(config) for name, config in configs.items()}
             _render(Job(moments, rigs, str(arguments.meshes or ""), arguments.samples, arguments.threads),
                     arguments.blender, folder)  # fmt: skip
+        if not (folder / "markers.json").is_file():
+            sys.exit(f"{folder}: nothing is rendered there")
         off_px = lens_errors_px(folder / "markers.json", configs)
         for name, off in off_px.items():
             print(f"{name}: known places are within {off:.2f} px of where flockd's camera model has them")
@@ -111,19 +117,27 @@ def lens_errors_px(markers: Path, configs: dict[str, DroneConfig]) -> dict[str, 
     return errors
 
 
+def _check_same(path: Path, moments: tuple[Moment, ...]) -> None:
+    """A folder holds moments of one seed: those of two would be taken for each other."""
+    kept = read_job(path).moments if path.is_file() else ()
+    if any(one != other for one, other in zip(kept, moments, strict=False)):
+        sys.exit(
+            f"{path.parent}: holds other moments, of another seed or another version; name another folder with --keep"
+        )
+
+
 def _render(job: Job, blender: str | None, folder: Path) -> None:
     if blender is None or not Path(blender).is_file():
         sys.exit(
             "Cycles needs a Python 3.11 with bpy==5.0.1, trimesh, pycollada and pillow in an environment of its own: "
-            "name it with --blender or FLOCKD_BLENDER_PYTHON (how to make it: --help)."
+            "name it with --blender or FLOCKD_BLENDER_PYTHON (how to make it: --help)"
         )
     if not Path(job.meshes).is_dir() or not job.meshes:
-        sys.exit(
-            "the airframes' meshes are not part of flockd: name their folder with --meshes or FLOCKD_MESHES (--help)."
-        )
+        sys.exit("airframes' meshes are not part of flockd: name their folder with --meshes or FLOCKD_MESHES (--help)")
     path = folder / "job.json"
-    write_job(job, path)
-    command = [blender, "-m", "tools.measure.cycles.render", str(path), str(folder)]
+    write_job(replace(job, meshes=str(Path(job.meshes).absolute())), path)
+    # Not resolved: the link is what makes it the environment's Python.
+    command = [str(Path(blender).absolute()), "-m", "tools.measure.cycles.render", str(path), str(folder)]
     # Blender prints a line for each tile; what it says of errors goes to the error stream.
     done = subprocess.run(command, stdout=subprocess.DEVNULL, check=False, cwd=Path(__file__).parents[2])
     if done.returncode:

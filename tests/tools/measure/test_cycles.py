@@ -213,3 +213,14 @@ def test_what_is_missing_is_said_in_a_sentence(
     monkeypatch.delenv("FLOCKD_MESHES", raising=False)
     with pytest.raises(SystemExit, match=says):
         cycles_card.main()
+
+
+def test_moments_of_two_seeds_are_not_mixed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_job(Job((moment(1, 0, NAMES),), {}, "", 8, 1), tmp_path / "job.json")
+    arguments = ["cycles_card", "--keep", str(tmp_path), "--only-rendered", "--moments", "1"]
+    monkeypatch.setattr(sys, "argv", [*arguments, "--seed", "0"])
+    with pytest.raises(SystemExit, match="holds other moments"):
+        cycles_card.main()
+    monkeypatch.setattr(sys, "argv", [*arguments, "--seed", "1"])
+    with pytest.raises(SystemExit, match="nothing is rendered"):  # the same seed: goes on
+        cycles_card.main()

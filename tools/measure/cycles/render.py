@@ -41,8 +41,11 @@ def main() -> None:
     """Render what a job asks for; a file that is there already is left as it is."""
     job, out = read_job(Path(sys.argv[1])), Path(sys.argv[2])
     out.mkdir(parents=True, exist_ok=True)
-    for name in sorted({one.airframe for moment in job.moments for one in moment.neighbours}):
-        _save_airframe(airframe(Path(job.meshes), name), airframe_file(out, name))
+    try:
+        for name in sorted({one.airframe for moment in job.moments for one in moment.neighbours}):
+            _save_airframe(airframe(Path(job.meshes), name), airframe_file(out, name))
+    except ValueError as error:
+        sys.exit(str(error))
     markers(job, out / "markers.json")
     for moment in job.moments:
         for rig, lenses in job.rigs.items():

@@ -98,7 +98,7 @@ def _height(moment: Moment, north: float, east: float) -> float:
 
 
 def _sky(moment: Moment) -> None:
-    """Blender's physical atmosphere with the sun in it, and clouds of noise before both."""
+    """Blender's physical atmosphere with the sun in it, and before both clouds, which are noise."""
     world = bpy.data.worlds.new("sky")
     bpy.context.scene.world = world
     world.use_nodes = True
@@ -131,7 +131,6 @@ def _sky(moment: Moment) -> None:
     links.new(edge.outputs["Color"], mix.inputs["Factor"])
     links.new(air.outputs["Color"], mix.inputs[6])
     links.new(bright.outputs[0], mix.inputs[7])
-    # No clouds where there are none, and not over the sun's own disc alone.
     if moment.clouds == 0.0:
         links.new(air.outputs["Color"], strength.inputs["Color"])
     else:
