@@ -119,7 +119,7 @@ def test_what_propellers_blur_counts_for_no_mask() -> None:
 
 def test_the_cards_figures() -> None:
     def sight(width: float, error: float | None, range_m: float = 4.0) -> Sight:
-        return Sight(0, 0, 0, "X", range_m, width, False, 40.0, error is not None, error or 0.0, 0.1)
+        return Sight(0, 0, 0, "X", range_m, width, False, True, error is not None, error or 0.0, 0.1)
 
     found = Findings(frame_sets=4, images=16, own_m=[0.02, float("nan"), 0.04])
     found.sights = [sight(40, 0.05), sight(40, -0.15), sight(40, 0.25), sight(40, None), sight(8, None)]

@@ -45,8 +45,8 @@ class Sight:
     """Of the box around all that is seen of it, in the camera that shows it largest."""
     cut: bool
     """By that image's border."""
-    contrast: float
-    """Grey levels between what is seen of it and what surrounds it."""
+    proposed: bool
+    """Some proposal is no farther from it than the drone is large: the second stage was asked about it."""
     found: bool
     error: float
     """Relative, of the range; 0 where it was not found."""
@@ -87,12 +87,15 @@ def look(config: DroneConfig, networks: Networks, moments: Iterable[Taken]) -> F
             found.frame_sets += 1
             found.images += len(rig.cameras)
             found.rejected += [reason.text for reason in out.reasons if reason.kind in ("camera", "lens")]
-            _compare(taken, k, rig, trace.observation, out, found)
+            asked = [proposal.roi.direction for proposal in trace.detection.proposals]
+            _compare(taken, k, rig, trace.observation, out, found, asked)
         _own_motion(taken, out, found)
     return found
 
 
-def _compare(taken: Taken, k: int, rig: Rig, seen: Observation, out: PilotOutput, found: Findings) -> None:
+def _compare(
+    taken: Taken, k: int, rig: Rig, seen: Observation, out: PilotOutput, found: Findings, asked: Sequence[Array]
+) -> None:
     ids = taken.ids[k]
     solid = [np.count_nonzero(ids == n + 1, axis=(1, 2)) for n in range(len(taken.names))]
     shown = [n for n in range(len(taken.names)) if solid[n].max() > 0]
@@ -102,13 +105,13 @@ def _compare(taken: Taken, k: int, rig: Rig, seen: Observation, out: PilotOutput
         if solid[n].max() < MIN_PIXELS:
             continue
         range_m, detection = float(np.linalg.norm(place)), pairs.get(row)
-        width, cut, contrast = _box(taken, k, n)
+        width, cut = _box(taken, k, n)
+        proposed = any(_angle(one, place) <= taken.sizes_m[n] / range_m for one in asked)
         error = 0.0 if detection is None else detection.range_m / range_m - 1.0
         sigma = 1.0 if detection is None else detection.range_sigma_m / detection.range_m
+        is_found, name = detection is not None, taken.names[n]
         found.sights.append(
-            Sight(
-                taken.number, k, n, taken.names[n], range_m, width, cut, contrast, detection is not None, error, sigma
-            )
+            Sight(taken.number, k, n, name, range_m, width, cut, proposed or is_found, is_found, error, sigma)
         )
         if k == 1 and detection is not None:
             motion = out.neighbour_motions.get(detection.label)
@@ -144,20 +147,19 @@ def iou_of(said: Array, ids: Array, drone: int) -> float:
     return float((mine & guess).sum() / max(int((mine | guess).sum()), 1))
 
 
-def _box(taken: Taken, k: int, n: int) -> tuple[float, bool, float]:
-    """Width in pixels, whether it is cut, and contrast, where neighbour ``n`` is seen largest."""
+def _box(taken: Taken, k: int, n: int) -> tuple[float, bool]:
+    """Width in pixels, and whether it is cut, where neighbour ``n`` is seen largest."""
     of_drone = taken.ids[k] % PROPELLER == n + 1
     c = int(np.count_nonzero(of_drone, axis=(1, 2)).argmax())
     rows, columns = np.nonzero(of_drone[c])
     height, width = of_drone[c].shape
     low, high = (rows.min(), columns.min()), (rows.max() + 1, columns.max() + 1)
     cut = min(low) < _AT_BORDER_PX or high[0] > height - _AT_BORDER_PX or high[1] > width - _AT_BORDER_PX
-    margin = 3 + (high[1] - low[1]) // 4
-    part = np.s_[max(0, low[0] - margin) : high[0] + margin, max(0, low[1] - margin) : high[1] + margin]
-    grey = taken.rgb[k, c][part].mean(axis=2)
-    own, around = taken.ids[k, c][part] == n + 1, taken.ids[k, c][part] == 0
-    contrast = abs(float(grey[own].mean() - grey[around].mean())) if own.any() and around.any() else 0.0
-    return float(high[1] - low[1]), bool(cut), contrast
+    return float(high[1] - low[1]), bool(cut)
+
+
+def _angle(a: Array, b: Array) -> float:
+    return float(np.arccos(np.clip(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), -1.0, 1.0)))
 
 
 def _own_motion(taken: Taken, out: PilotOutput, found: Findings) -> None:
@@ -178,6 +180,8 @@ def rows(found: Findings) -> list[tuple[str, str]]:
     for low, high in WIDTHS_PX:
         of = [one.found for one in found.sights if low <= one.width_px < high]
         lines.append((f"found, {_span(low, high, 'px')} wide", _share(of)))
+    large = [one.proposed for one in found.sights if one.width_px >= WIDTHS_PX[1][0]]
+    lines.append((f"proposed, {_span(WIDTHS_PX[1][0], 1e4, 'px')} wide", _share(large)))
     lines.append(("false, a frame set", _number(len(found.false) / found.frame_sets, found.frame_sets)))
     lines.append(("false in 500 pictures", f"{500 * len(found.false) / found.images:.0f}"))
     known = [one for one in found.sights if one.found and not one.cut]
