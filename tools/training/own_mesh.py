@@ -53,7 +53,7 @@ def read_meshes(paths: Sequence[Path], size_m: float, up: str | None = None) -> 
     surfaces = [_surface(path, size_m, up) for path in paths]
     corners = np.vstack([vertices for vertices, _, _ in surfaces])
     middle = (corners.min(0) + corners.max(0)) / 2
-    return [_model(vertices - middle, triangles, colours, size_m) for vertices, triangles, colours in surfaces]
+    return [model_of(vertices - middle, triangles, colours, size_m) for vertices, triangles, colours in surfaces]
 
 
 def _surface(path: Path, size_m: float, up: str | None) -> tuple[Array, Array, Array]:
@@ -231,8 +231,11 @@ def _linear(grey: Array) -> Array:
     return np.where(grey <= 0.04045, grey / 12.92, ((grey + 0.055) / 1.055) ** 2.4)
 
 
-def _model(vertices: Array, triangles: Array, colours: Array, size_m: float) -> DroneModel:
-    """Each triangle is seen from both sides: in files of many programs, some face the wrong way."""
+def model_of(vertices: Array, triangles: Array, colours: Array, size_m: float) -> DroneModel:
+    """A drone of corners (n, 3) in body FRD, triangles (m, 3) and their linear colours (m, 3).
+
+    Each triangle is seen from both sides: in files of many programs, some face the wrong way.
+    """
     mesh, both = Mesh(), np.vstack([triangles, triangles[:, ::-1]])
     mesh.add(vertices, both, 0, np.vstack([colours, colours]), (0.3, 0.3))
     return DroneModel(

@@ -6,7 +6,7 @@ import numpy as np
 
 from flockd.core.messages import Detection
 from flockd.flight.geometry import log_polar, log_polar_covariance
-from tools.measure.evaluation.on_pairs import Findings, _pairings, compare_drones
+from tools.measure.evaluation.on_pairs import Findings, compare_drones, pairings
 from tools.training.dataset import HEIGHT, WIDTH, PairSet
 
 
@@ -18,15 +18,15 @@ def detection(*position: float) -> Detection:
 def test_a_far_drone_keeps_its_detection_though_it_lies_within_a_near_ones_outline() -> None:
     near, far = np.array([2.0, 0.0, 0.0]), np.array([10.0, 1.0, 0.0])
     of_far, of_near = detection(10.5, 1.05, 0.0), detection(2.1, -0.21, 0.0)
-    found = _pairings((of_far, of_near), [near, far], [0.5, 0.5])
+    found = pairings((of_far, of_near), [near, far], [0.5, 0.5])
     assert found[0] is of_near
     assert found[1] is of_far
 
 
 def test_one_detection_is_not_two_drones_and_none_is_found_in_another_direction() -> None:
     near, far = np.array([2.0, 0.0, 0.0]), np.array([10.0, 0.1, 0.0])
-    assert list(_pairings((detection(9.0, 0.09, 0.0),), [near, far], [0.5, 0.5])) == [1]
-    assert not _pairings((detection(0.0, 2.0, 0.0),), [near, far], [0.5, 0.5])
+    assert list(pairings((detection(9.0, 0.09, 0.0),), [near, far], [0.5, 0.5])) == [1]
+    assert not pairings((detection(0.0, 2.0, 0.0),), [near, far], [0.5, 0.5])
 
 
 def test_a_drone_is_proposed_where_the_second_stage_was_asked_about_its_direction() -> None:

@@ -159,7 +159,7 @@ def compare_drones(
     seen = np.flatnonzero(pairs["drone_pixels"][index, 0] >= MIN_PIXELS)
     places = [R_BODY_CAMERA @ np.asarray(pairs["drone_centre"][index, 0, drone], np.float64) for drone in seen]
     sizes_m = [SIZES_M[int(pairs["drone_family"][index, drone])] for drone in seen]
-    detection_of = _pairings(detections, places, sizes_m)
+    detection_of = pairings(detections, places, sizes_m)
     for row, (drone, true, size_m) in enumerate(zip(seen, places, sizes_m, strict=True)):
         range_m, best = float(np.linalg.norm(true)), detection_of.get(row)
         left, top, right, bottom = pairs["drone_box"][index, 0, drone]
@@ -174,7 +174,9 @@ def compare_drones(
     found.false += len(detections) - len(detection_of)
 
 
-def _pairings(detections: tuple[Detection, ...], places: list[Array], sizes_m: list[float]) -> dict[int, Detection]:
+def pairings(
+    detections: Sequence[Detection], places: Sequence[Array], sizes_m: Sequence[float]
+) -> dict[int, Detection]:
     """The detection of each drone that was found: first those that lie nearest to each other."""
     away = sorted(
         (_angle(detection.position, place) / (size_m / 2 / float(np.linalg.norm(place))), drone, number)

@@ -1,0 +1,1 @@
+"""Perception on pictures of Blender's Cycles, a renderer that shares nothing with flockd's own."""
