@@ -19,6 +19,9 @@ from flockd.flight.tracking.flock_size import FlockSize, SizeEstimate
 _USED_BEYOND, _USED_UNTIL = 2.0, 1.5
 """The learned size is used once the sizes that the networks judge are off it by so many of its standard deviations,
 root mean square, until they are so near: those of drones that they know they judge better."""
+_PLAUSIBLE = 2.0
+"""A learned size is not used if it is more than so many times what the networks judge, or less than the share: none of
+the families that they do not know is judged so wrong, but drones that rise together look larger."""
 _MOST_OFF = 0.5
 """One judged size counts as no farther off, in log size: it may be of something else."""
 _CONTRADICTED = 3.0
@@ -137,7 +140,9 @@ class SizeLearner:
             return False
         judged = np.minimum(np.abs(np.array(self._judged) - math.log(found.size_m)), _MOST_OFF)
         off = float(np.sqrt(np.mean(judged**2))) / found.sigma
-        if used is None:
+        if not 1 / _PLAUSIBLE < found.size_m / self._looks_m < _PLAUSIBLE:
+            self._used = None
+        elif used is None:
             self._used = found if off > _USED_BEYOND else None
         elif off < _USED_UNTIL:
             self._used = None

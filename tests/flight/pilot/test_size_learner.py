@@ -110,6 +110,14 @@ def test_a_size_that_the_networks_judge_wrong_is_learned_and_used() -> None:
     assert f"the others to be {size.size_m:.2f} m large" in sentences[-1]
 
 
+@pytest.mark.parametrize("judged_m", [0.17, 0.95])
+def test_a_size_that_is_not_plausible_is_not_used(judged_m: float) -> None:
+    """More than twice what the networks judge, or less than half."""
+    outputs = Flight(drone(), judged_m=judged_m).fly(60.0)
+    assert any(one.size is not None and one.size.size_m is not None for one in outputs)
+    assert not any(one.size.used for one in outputs if one.size)
+
+
 def test_a_size_that_the_networks_judge_well_stays_theirs() -> None:
     outputs = Flight(drone(), judged_m=SIZE_M).fly(60.0)
     size = outputs[-1].size
