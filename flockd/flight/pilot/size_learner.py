@@ -19,6 +19,9 @@ from flockd.flight.tracking.flock_size import FlockSize, SizeEstimate
 _USED_BEYOND, _USED_UNTIL = 2.0, 1.5
 """The learned size is used once the sizes that the networks judge are off it by so many of its standard deviations,
 root mean square, until they are so near: those of drones that they know they judge better."""
+_PLAUSIBLE = 2.0
+"""A learned size is not used if it is more than so many times what the networks judge, or less than the share: none of
+the families that they do not know is judged so wrong, but drones that rise together look larger."""
 _MOST_OFF = 0.5
 """One judged size counts as no farther off, in log size: it may be of something else."""
 _CONTRADICTED = 3.0
@@ -28,8 +31,8 @@ _REFRESHED = 0.25
 _JUDGED, _FEWEST_JUDGED, _NEAR_M = 400, 24, 8.0
 """So many judged sizes are kept, the newest, so many are enough, and of drones so near: farther ones look like much."""
 _SCATTER = 0.05
-"""Standard deviation of the judged log sizes from which the networks do not know the drones. Of the twelve families
-that they know it is 0.003 to 0.03, of two that they do not know 0.08 to 0.25."""
+"""Standard deviation of the judged log sizes from which the networks do not know the drones. Of eleven families that
+they know it is 0.003 to 0.03, of a twelfth, 0.26 m large, 0.16, and of two that they do not know 0.08 to 0.25."""
 _MIDDLE = 2.563
 """Standard deviations of a normal distribution within which 80 % are."""
 _OLD_S = 600.0
@@ -137,7 +140,9 @@ class SizeLearner:
             return False
         judged = np.minimum(np.abs(np.array(self._judged) - math.log(found.size_m)), _MOST_OFF)
         off = float(np.sqrt(np.mean(judged**2))) / found.sigma
-        if used is None:
+        if not 1 / _PLAUSIBLE < found.size_m / self._looks_m < _PLAUSIBLE:
+            self._used = None
+        elif used is None:
             self._used = found if off > _USED_BEYOND else None
         elif off < _USED_UNTIL:
             self._used = None

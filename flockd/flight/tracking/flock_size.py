@@ -237,11 +237,13 @@ def _if_told(log_likelihood: FloatArray, probability: float) -> FloatArray:
 
 
 def _estimate(log_likelihood: FloatArray) -> SizeEstimate | None:
-    """The likeliest size; None where it is not known well enough, or there are two."""
+    """The likeliest size; None where it is not known well enough, there are two, or it is no size that is weighed."""
     weights = np.exp(log_likelihood - log_likelihood.max())
-    near = np.abs(LOG_SIZES - LOG_SIZES[np.argmax(weights)]) <= _MODE_WIDTH
+    likeliest = LOG_SIZES[np.argmax(weights)]
+    near = np.abs(LOG_SIZES - likeliest) <= _MODE_WIDTH
     share = weights[near].sum() / weights.sum()
     weights = np.where(near, weights, 0.0) / weights[near].sum()
     mean = float(weights @ LOG_SIZES)
     sigma = math.sqrt(float(weights @ (LOG_SIZES - mean) ** 2) + _LEAST_SIGMA**2)
-    return SizeEstimate(math.exp(mean), sigma) if share >= _MODE_SHARE and sigma < MOST_SIGMA else None
+    inside = LOG_SIZES[0] + _MODE_WIDTH <= likeliest <= LOG_SIZES[-1] - _MODE_WIDTH
+    return SizeEstimate(math.exp(mean), sigma) if inside and share >= _MODE_SHARE and sigma < MOST_SIGMA else None

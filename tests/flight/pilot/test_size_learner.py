@@ -13,12 +13,21 @@ import pytest
 
 from flockd.core.config import DroneConfig, load_scenario
 from flockd.core.data import data_path
-from flockd.core.messages import Detection, FloatArray, FrameSet, Neighbour, PilotOutput, ReasonKind, VehicleState
+from flockd.core.messages import (
+    Detection,
+    FloatArray,
+    FrameSet,
+    Neighbour,
+    PilotOutput,
+    ReasonKind,
+    VehicleState,
+)
 from flockd.flight.geometry import log_polar_covariance
 from flockd.flight.perception import Observation
 from flockd.flight.perception.maps import KnownSize
 from flockd.flight.pilot import FlockPilot
 from flockd.flight.pilot.weave import AMPLITUDE_M, DURATION_S, PERIOD_S, Weave
+from flockd.flight.tracking.flock_size import FlockSize, SizeEstimate
 
 STEP_S = 0.5
 SIZE_M, JUDGED_M = 0.4, 0.56
@@ -108,6 +117,16 @@ def test_a_size_that_the_networks_judge_wrong_is_learned_and_used() -> None:
     sentences = [one.mission.sentence for one in outputs]
     assert "weaves up and down" in sentences[begins]
     assert f"the others to be {size.size_m:.2f} m large" in sentences[-1]
+
+
+@pytest.mark.parametrize("judged_m", [0.19, 0.95])
+def test_a_size_that_is_not_plausible_is_not_used(judged_m: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """More than twice what the networks judge, or less than half."""
+    found = SizeEstimate(SIZE_M, 0.05)
+    monkeypatch.setattr(FlockSize, "of_looks", lambda self, size_m: found)
+    outputs = Flight(drone(), judged_m=judged_m).fly(10.0)
+    assert outputs[-1].size is not None
+    assert (outputs[-1].size.size_m, outputs[-1].size.used) == (SIZE_M, False)
 
 
 def test_a_size_that_the_networks_judge_well_stays_theirs() -> None:

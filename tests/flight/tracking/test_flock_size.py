@@ -42,9 +42,10 @@ def flown(
     follow: float = 0.0,
     tree: bool = False,
     outliers: float = 0.0,
+    all_rise: bool = False,
 ) -> FlockSize:
     """A drone among others that drift about their places, each a random walk in velocity, level 0.2 and vertical 1e-4
-    m^2/s^3; they `follow` that share of its own level motion."""
+    m^2/s^3; they `follow` that share of its own level motion, and if `all_rise` its weave too."""
     learned = FlockSize()
     places, speeds = PLACES.copy(), np.zeros_like(PLACES)
     own_m_s = np.zeros(3)
@@ -57,8 +58,9 @@ def flown(
         if weaves:
             now_m = rise(STEP_S * step - 4.0)
             way[2], below_m = now_m - below_m, now_m
-        places = places + STEP_S * speeds - way - STEP_S * (1.0 - follow) * own_m_s
-        places = places + 0.1 * (PLACES - [0.0, 0.0, below_m] - places)
+        shown_m, shown = (0.0, np.zeros(3)) if all_rise else (below_m, way)
+        places = places + STEP_S * speeds - shown - STEP_S * (1.0 - follow) * own_m_s
+        places = places + 0.1 * (PLACES - [0.0, 0.0, shown_m] - places)
         sighted = {
             number: measured(place, size_m, wrong * size_m, random)
             for number, (place, size_m) in enumerate(zip(places, sizes_m, strict=True))
@@ -97,6 +99,14 @@ def test_what_the_networks_judge_does_not_matter(wrong: float) -> None:
 def test_without_a_weave_nothing_is_learned(follow: float) -> None:
     """However the drone moves, and whether or not its mates move as it does."""
     assert flown(np.random.default_rng(0), weaves=False, follow=follow).of_looks(SIZE_M) is None
+
+
+def test_in_a_flock_that_rises_together_nothing_is_learned() -> None:
+    """No bearing shifts, as of drones that are infinitely large and far."""
+    for seed in range(5):
+        learned = flown(np.random.default_rng(seed), all_rise=True)
+        assert learned.of_looks(1.35 * SIZE_M) is None
+        assert [learned.of_track(number) for number in range(4)] == [None] * 4
 
 
 def test_a_tree_and_outliers_do_not_move_it() -> None:
