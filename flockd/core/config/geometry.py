@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from flockd.core import consistency
-from flockd.core.config.base import Distance, Duration, Positive, Section
+from flockd.core.config.base import Distance, Positive, Section
 
 
 class GeometryParameters(Section):
@@ -30,9 +30,6 @@ class GeometryParameters(Section):
     """An ego-motion that would need more than this since the last one is refused, twice in a row at most."""
     max_refused_ego_motions: Annotated[int, Field(ge=0)] = 2
     """In a row: after these, it is the last velocity that is doubted."""
-    velocity_time_s: Duration = 0.4
-    """Over so long the own velocity is averaged, where steps are shorter: a step errs by as many centimetres however
-    short it is, so that a tenth of a second alone gives a velocity five times as wrong as half a second does."""
     own_displacement_sigma_m: Positive = 0.02
     """Standard deviation of the own motion over one step, each axis, for tracking."""
     max_drone_pixels: Annotated[int, Field(ge=1)] = 300

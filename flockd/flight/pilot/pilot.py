@@ -47,8 +47,6 @@ _ROTATION_TOLERANCE = 1e-3
 """How far an attitude's R R^T may be from the identity: beyond it is no attitude, and not only rounded."""
 _ROUNDING = 1e-6
 """The same: what is farther off is replaced by the nearest rotation, as measurements and transforms ask for one."""
-_SURE_SIGMAS = 3.0
-"""A velocity that changes by less than its own error says nothing of an acceleration."""
 _BY_VELOCITY_SIGMA_M = 0.1
 """Standard deviation of where the drone went in a step, each axis, by its velocity alone."""
 
@@ -267,7 +265,6 @@ class FlockPilot:
         parameters = self._config.geometry
         change = float(np.linalg.norm(displacement / interval_s - self._velocity))
         allowed = parameters.max_acceleration_m_s2 * interval_s * (1 + self._refused_in_a_row)
-        allowed += _SURE_SIGMAS * parameters.own_displacement_sigma_m / interval_s
         if change <= allowed or self._refused_in_a_row == parameters.max_refused_ego_motions:
             self._refused_in_a_row = 0
             return True
@@ -293,10 +290,7 @@ class FlockPilot:
     def _own_velocity(self, observation: Observation, ego: EgoMotion | None) -> FloatArray | None:
         """(3,) NED m/s. Where vision fails, the last one that it gave."""
         if ego is not None:
-            velocity = _displacement(observation, ego) / ego.interval_s  # Eq. 21
-            share = min(1.0, ego.interval_s / self._config.geometry.velocity_time_s)
-            before = velocity if self._velocity is None else self._velocity
-            self._velocity = velocity if share == 1.0 else before + share * (velocity - before)
+            self._velocity = _displacement(observation, ego) / ego.interval_s  # Eq. 21
         return observation.vehicle.velocity_ned if self._config.own_velocity == "autopilot" else self._velocity
 
     def _measurements(

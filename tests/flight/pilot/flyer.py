@@ -97,8 +97,8 @@ class Flyer:
     def step(self) -> PilotOutput:
         return self.pilot.step(*self.take_frames())
 
-    def move(self, step_s: float = STEP_S) -> None:
+    def move(self) -> None:
         count = len(self.scenario.vehicles)
-        self.vehicles.step(CRUISE[:count], TURNED[:count], step_s)
-        self.time_s += step_s
+        self.vehicles.step(CRUISE[:count], TURNED[:count], STEP_S)
+        self.time_s += STEP_S
         self.steps += 1
