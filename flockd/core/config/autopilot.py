@@ -42,7 +42,7 @@ class AutopilotParameters(Section):
     by its own estimate, which GNSS alone leaves off by 0.1 to 0.3 m/s. 0: not at all. Does nothing with `own_velocity:
     autopilot`."""
     velocity_trim_memory: Share = 0.7
-    """Share of the last correction that each step keeps: noise of single steps goes, slow drifts stay."""
+    """Share of a correction that is kept over half a second: noise of single steps goes, slow drifts stay."""
     obstacle_distance: bool = False
     """Whether the map of obstacles is sent to the autopilot (`OBSTACLE_DISTANCE`), so that PX4's Collision Prevention
     stops a pilot who flies by hand in Position mode; CP_DIST switches it on there. Needs `obstacles.enabled`."""

@@ -9,16 +9,19 @@ import numpy as np
 from flockd.core.messages import EgoMotion, FloatArray, VehicleState
 from flockd.flight.geometry.level import limit_norm
 
+MEMORY_S = 0.5
+"""The paper's step."""
+
 
 class VelocityTrim:
-    """The autopilot's velocity less the one that the cameras measured, averaged over some steps and limited.
+    """The autopilot's velocity less the one that the cameras measured, averaged over some time and limited.
 
     An autopilot flies a setpoint v so that its own estimate becomes v. Where that estimate is off by b, the drone moves
     with v - b, and so do neighbours with other b: a flock with equal commands drifts together. So b is added.
     """
 
     def __init__(self, limit_m_s: float, memory: float, gate_m_s: float) -> None:
-        """``limit_m_s``: its largest norm; 0: no trim. ``memory``: share of the last trim that each step keeps.
+        """``limit_m_s``: its largest norm; 0: no trim. ``memory``: share of a trim that is kept over `MEMORY_S`.
 
         ``gate_m_s``: what the gate lets through.
         """
@@ -49,4 +52,5 @@ class VelocityTrim:
         wrong = (believed - before.R_ned_body @ ego.velocity)[:2]
         if not np.isfinite(wrong).all():
             return  # it would never leave the mean again
-        self._mean = self._memory * self._mean + (1 - self._memory) * limit_norm(wrong, 2 * self._limit_m_s)
+        kept = self._memory ** (ego.interval_s / MEMORY_S)
+        self._mean = kept * self._mean + (1 - kept) * limit_norm(wrong, 2 * self._limit_m_s)

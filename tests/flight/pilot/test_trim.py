@@ -94,3 +94,15 @@ def test_a_law_and_a_trim_at_their_limits_pass_the_gate_though_rounding_adds_up(
         assert math.hypot(*wanted.velocity) == pytest.approx(4.0)
         gate.step(0.0, Request(Permission(Action.FLY, 0.0), wanted, 0.0, 5.0, around))
     assert gate.counts == {}
+
+
+def test_short_steps_forget_as_much_in_half_a_second_as_one_long_step() -> None:
+    trims = []
+    for step_s in (0.5, 0.1):
+        trim = VelocityTrim(0.5, 0.7, GATE_M_S)
+        for step in range(round(2.0 / step_s) + 1):
+            moved = EgoMotion(np.eye(3), R_NED_BODY.T @ np.array([-0.2, 0.1, 0.0]) * step_s, step_s, 100, 90, 0.1)
+            trim.update(VehicleState(step * step_s, R_NED_BODY, 4.0, np.zeros(3)), moved if step else None)
+        trims.append(trim.velocity)
+    assert trims[1] == pytest.approx(trims[0])
+    assert trims[0] == pytest.approx((1.0 - 0.7**4) * np.array([0.2, -0.1]))
