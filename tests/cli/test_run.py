@@ -178,6 +178,7 @@ def test_a_stall_of_the_computer_ends_in_the_autopilots_failsafe_and_is_named(tm
             _stall(process, 3.0)
             assert autopilot.mode == "LOITER"
             manager.until(lambda: manager.last_status.startswith("silent"), process)
+            time.sleep(0.5)  # what was sent before has arrived
             before = len(autopilot.setpoints)
             time.sleep(1.0)
             assert (autopilot.mode, len(autopilot.setpoints)) == ("LOITER", before), "no resumption by itself"
