@@ -176,7 +176,8 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
     failures = inputs.ego_motion_failures
     temperature = inputs.temperature_c
     lost_link = link_lost(inputs.heartbeat_age_s, inputs.message_age_s, p)
-    too_gusty = not inputs.gusts_m_s <= p.max_gusts_m_s
+    # While another's setpoints are followed, being off the own ones is no wind.
+    too_gusty = not inputs.gusts_m_s <= p.max_gusts_m_s and inputs.foreign_setpoints is None
     table = (
         (Event.SIGHT_LOST, sightless, f"too few cameras deliver images: {', '.join(lost) or 'there are none'}"),
         (Event.CAMERA_LOST, len(lost) > 0 and not sightless, f"a camera is lost: {', '.join(lost)}"),

@@ -218,13 +218,20 @@ def test_silent_stays_silent_whatever_happens_and_afterwards(event: Event) -> No
     assert flight.events[0] is Event.NOT_OFFBOARD
 
 
+CAUSE_AND_EFFECT = (
+    {Event.LINK_LOST, Event.STREAM_ENDED},
+    {Event.FOREIGN_SETPOINTS, Event.GUSTS_TOO_STRONG},
+    {Event.FOREIGN_SETPOINTS, Event.NO_ROOM_TO_HOLD},
+)
+
+
 @EVENTS
 def test_of_two_events_the_worse_wins_and_is_reported_first(event: Event) -> None:
     for other, fault in FAULTS.items():
         if fault.changes.keys() & FAULTS[event].changes.keys():
             continue  # two values of one number
-        if {event, other} == {Event.LINK_LOST, Event.STREAM_ENDED}:
-            continue  # the one is the cause of the other, and told alone
+        if {event, other} in CAUSE_AND_EFFECT:
+            continue  # told by its cause alone
         flight = flying().step(**FAULTS[event].changes, **fault.changes)
         expected = worst(fault.action, FAULTS[event].action)
         assert flight.action is expected, other
@@ -534,6 +541,15 @@ def test_where_no_room_is_found_hold_is_asked_for_after_half_a_minute() -> None:
     flight = flying().step(gusts_m_s=0.9, obstacle_near=True).run(30.0 - STEP_S)
     assert flight.action is Action.FLY_DEGRADED
     assert flight.step().action is Action.ASK_HOLD
+
+
+@pytest.mark.parametrize("obstacle_near", [False, True])
+def test_being_off_the_own_setpoints_while_anothers_are_followed_is_no_wind(obstacle_near: bool) -> None:
+    foreign = {"foreign_setpoints": "3 m/s north", "gusts_m_s": 3.0, "obstacle_near": obstacle_near}
+    flight = flying().step(**foreign)
+    assert flight.action is Action.FLY_DEGRADED
+    assert flight.run(0.5, **foreign).action is Action.ASK_HOLD
+    assert flight.events == [Event.FOREIGN_SETPOINTS]
 
 
 def test_an_obstacle_near_alone_is_no_reason() -> None:
