@@ -64,7 +64,7 @@ class Inputs:
     dead_tasks: tuple[str, ...]
     """Names of tasks that have ended and should not have."""
     neighbours_age_s: float
-    """Since a confirmed neighbour was last seen; infinite before the first."""
+    """Since a neighbour was last seen, confirmed or about to be; infinite before the first."""
     nearest_neighbour_m: float
     """Range of the nearest confirmed neighbour; infinite without one."""
     refused_commands: int

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockd.core.config import DroneConfig
-from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, Reason, ReasonKind, VehicleState
+from flockd.core.messages import FrameSet, MissionOrder, Neighbour, PilotOutput, Reason, ReasonKind, VehicleState
 from flockd.flight.geometry import described
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
@@ -26,6 +26,8 @@ STEP_DEADLINE_S = 30.0
 """Deadline of a whole step, whose networks have deadlines of their own; the drone has been handed over long before."""
 LEAVE_S = 0.7
 STEPS_REMEMBERED = 20
+SEEN_PROBABILITY = 0.9
+"""Of a track with two detections that agree: who has one is not alone, though flocking waits for a third."""
 MAX_UNEXPECTED = 3
 """Steps in a row that end in an error that nobody expects; then the loop ends, and the drone holds."""
 
@@ -88,7 +90,7 @@ class PilotLoop:
         self.noisy_images: Counter[str] = Counter()
         """That were not used, by camera."""
         self.neighbour_seen_s = -math.inf
-        """When a confirmed neighbour was last seen."""
+        """When a neighbour was last seen: one that is confirmed, or about to be (`SEEN_PROBABILITY`)."""
         self.order: MissionOrder | None = None
         """An operator's that no finished step has taken yet."""
 
@@ -188,8 +190,15 @@ class PilotLoop:
         if result.number > 1:  # the first has nothing to compare with
             self.ego_motion_failures = 0 if result.output.ego_motion is not None else self.ego_motion_failures + 1
         self.noisy_images.update(result.output.noisy_cameras)
-        seen = [result.time_s - neighbour.unseen_s for neighbour in result.output.neighbours if neighbour.confirmed]
-        self.neighbour_seen_s = max([self.neighbour_seen_s, *seen])
+        self.neighbour_seen_s = max(self.neighbour_seen_s, last_seen_s(result.time_s, result.output.neighbours))
+
+
+def last_seen_s(time_s: float, neighbours: Sequence[Neighbour]) -> float:
+    """When one of the `neighbours` of the step at `time_s` was seen: one that is confirmed, or as good as that."""
+    return max(
+        (time_s - n.unseen_s for n in neighbours if n.confirmed or n.existence_probability >= SEEN_PROBABILITY),
+        default=-math.inf,
+    )
 
 
 class HeightReports:

@@ -24,7 +24,17 @@ from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.config.source import SourceParameters
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
-from flockd.core.messages import Frame, PilotOutput, RangeReading, Reason, ReasonKind, SizeStatus, VehicleState, Wanted
+from flockd.core.messages import (
+    Frame,
+    Neighbour,
+    PilotOutput,
+    RangeReading,
+    Reason,
+    ReasonKind,
+    SizeStatus,
+    VehicleState,
+    Wanted,
+)
 from flockd.flight.inference import OnnxModel
 from flockd.flight.safety import Action, Decision, Gate, Inputs, Permission, Request, State, Surroundings
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
@@ -301,6 +311,21 @@ def test_a_range_finder_that_fails_is_an_event_and_so_is_its_return() -> None:
     steps: tuple[tuple[Reason, ...], ...] = ((), (left, weak), (weak,), (old,), (left,), ())
     found = [reports.update(reasons) for reasons in steps]
     assert found == [None, weak.text, None, old.text, "height: the range finder works again", None]
+
+
+def test_who_has_seen_another_twice_is_not_alone_though_it_is_not_confirmed_yet() -> None:
+    from flockd.onboard.daemon.pilot_loop import last_seen_s
+
+    def track(unseen_s: float, probability: float, *, confirmed: bool) -> Neighbour:
+        return Neighbour(1, np.ones(3), np.zeros(3), 0.1, 0.1, 2.0, unseen_s, 2, confirmed, probability)
+
+    confirmed, twice, once = (
+        track(2.0, 0.7, confirmed=True),
+        track(1.0, 0.95, confirmed=False),
+        track(0.0, 0.5, confirmed=False),
+    )
+    seen = [last_seen_s(20.0, tracks) for tracks in ((), (once,), (confirmed, once), (confirmed, twice, once))]
+    assert seen == [-math.inf, -math.inf, 18.0, 19.0]
 
 
 def test_what_is_learned_of_the_others_size_is_an_event_each_time_that_it_is_new() -> None:
