@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from flockd.campaign.flight_plan import Plan, Run
@@ -27,6 +28,16 @@ def test_the_examples_can_be_flown(path: Path) -> None:
     plan = Plan.load(path)
     assert plan.most_flights == len(plan.cells) * plan.config.seeds
     assert plan.config.campaign == path.stem
+
+
+@pytest.mark.parametrize("name", ["encounters", "reciprocal", "reciprocal_25", "head_on_by_sight"])
+def test_drones_that_are_to_avoid_each_other_begin_far_apart(name: str) -> None:
+    """Else a flight shows where drones were put, not what they do: two groups once began a metre apart."""
+    plan = Plan.load(next(path for path in EXAMPLES if path.stem == name))
+    for cell in plan.cells:
+        starts = np.array([one.position_m for one in plan.recipe(cell, 0).scenario().vehicles])
+        apart_m = np.linalg.norm(starts[:, None] - starts, axis=-1)[np.triu_indices(len(starts), 1)]
+        assert apart_m.min() >= 2.0, cell.parameters
 
 
 def test_a_grid_is_all_combinations_in_the_order_of_the_file(tmp_path: Path) -> None:
