@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, VehicleState
-from flockd.flight.perception import Networks, load_networks
+from flockd.flight.perception import ImageNetworks, load_networks
 from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.review.flight_log.capture import capture
 from flockd.review.flight_log.key_frames import KeyFrame
@@ -17,7 +17,7 @@ from flockd.review.flight_log.key_frames import KeyFrame
 if TYPE_CHECKING:  # a process of pilots does not load the renderer, unless truths need it
     from flockd.sim.truth_perception import RenderTruth, TruthPerception
 
-Swap = Callable[[Networks], "TruthPerception"]
+Swap = Callable[[ImageNetworks], "TruthPerception"]
 """Puts the truth in the place of some networks."""
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
 from flockd.flight.geometry import Rig, RigCamera, ZMap
-from flockd.flight.perception import Crop, Instance, Networks, RangeEstimate, SceneMaps
+from flockd.flight.perception import Crop, ImageNetworks, Instance, OneByOne, RangeEstimate, SceneMaps
 from flockd.sim.renderer import View, true_flow
 
 _SKY_M = 1000.0
@@ -35,13 +35,13 @@ class RenderTruth:
     shown: Sequence[int]
 
 
-class TruthPerception:
+class TruthPerception(OneByOne):
     """Takes the swapped roles from the renderer's truth and all others from the learned perception. One for each drone.
 
     Call `show` with the truth behind the next frame set before the pilot's step.
     """
 
-    def __init__(self, learned: Networks, swap: frozenset[str]) -> None:
+    def __init__(self, learned: ImageNetworks, swap: frozenset[str]) -> None:
         self.second_stage = learned.second_stage
         self.map_stride = learned.map_stride
         self._learned, self._swap = learned, swap

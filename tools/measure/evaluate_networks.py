@@ -22,7 +22,7 @@ from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
 from flockd.core.messages import Frame
 from flockd.flight.geometry import PinholeCamera, RigidTransform
-from flockd.flight.perception import Crop, Networks, OnnxNetworks
+from flockd.flight.perception import Crop, OnnxNetworks
 from tools.measure.evaluation.on_pairs import HEIGHT_SIGMAS_M, MASK_WITHIN_M, Findings, look_at_pairs
 from tools.measure.evaluation.on_rigs import ego_motion_errors
 from tools.training import worlds
@@ -190,7 +190,7 @@ def _distances(found: Findings, note: str) -> Iterator[Row]:
                 yield Row(f"distance{note}, {what}, {name}", 100 * float(figure(errors)), "%", len(errors))
 
 
-def rows_of_rigs(perception: Networks, count: int) -> Iterator[Row]:
+def rows_of_rigs(perception: OnnxNetworks, count: int) -> Iterator[Row]:
     """The own motion, from the four cameras of the paper's drone."""
     drone = load_scenario(data_path("config") / "paper_flight.yaml").drone
     errors = ego_motion_errors(drone, perception, worlds.TEST[1000 : 1000 + count], RIG_STEPS)
@@ -200,7 +200,7 @@ def rows_of_rigs(perception: Networks, count: int) -> Iterator[Row]:
         yield Row(f"own motion over 0.5 m, {name}, estimated", 100 * len(known) / len(errors[given]), "%", len(known))
 
 
-def rows_of_cost(perception: Networks, pairs: PairSet, threads: int) -> Iterator[Row]:
+def rows_of_cost(perception: OnnxNetworks, pairs: PairSet, threads: int) -> Iterator[Row]:
     """Time of an image with up to four drones; their crops are cut beforehand."""
     camera = rig_camera(WIDTH / 2)
     side = perception.second_stage.crop_size if perception.second_stage else 0

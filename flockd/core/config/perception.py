@@ -131,12 +131,13 @@ class PerceptionConfig(Section):
     models_dir: str | None = None
     """Folder of the manifests; by default the one that comes with flockd."""
     threads: Annotated[int, Field(ge=1, le=64)] = 2
+    """Of the networks. A drone's daemon computes as many of its cameras at once, and shares out what is left."""
     provider: Provider = "cpu"
     """What ONNX Runtime computes with. Another one than this is never used in its place."""
     engines_dir: str | None = None
     """Where `flockd models prepare` keeps what a provider has built; by default `engines` beside the manifests."""
     deadline_s: Annotated[float, Field(gt=0, le=60)] = 1.0
-    """In flight, a network that has not finished one call by then is stuck, and is ended."""
+    """In flight, a network that has not finished all cameras' images by then is stuck, and is ended."""
     detection: DetectionParameters = DetectionParameters()
     noise: NoiseParameters = NoiseParameters()
     drone_size_m: Annotated[float, Field(ge=MIN_DRONE_SIZE_M, le=MAX_DRONE_SIZE_M)] | None = None

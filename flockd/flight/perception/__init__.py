@@ -2,7 +2,7 @@
 
 from flockd.flight.perception.detection.instances import Instance, group_instances
 from flockd.flight.perception.flow import DisFlow, Flow, OnnxFlow
-from flockd.flight.perception.interface import Networks
+from flockd.flight.perception.interface import ImageNetworks, ImagePair, ImageView, Networks, OneByOne, outcome
 from flockd.flight.perception.maps import Crop, OpenDepth, RangeEstimate, SceneMaps
 from flockd.flight.perception.observation import CameraObservation, Observation
 from flockd.flight.perception.onnx import OnnxNetworks, load_networks
@@ -13,9 +13,13 @@ __all__ = [
     "Crop",
     "DisFlow",
     "Flow",
+    "ImageNetworks",
+    "ImagePair",
+    "ImageView",
     "Instance",
     "Networks",
     "Observation",
+    "OneByOne",
     "OnnxFlow",
     "OnnxNetworks",
     "OpenDepth",
@@ -24,4 +28,5 @@ __all__ = [
     "SceneMaps",
     "group_instances",
     "load_networks",
+    "outcome",
 ]

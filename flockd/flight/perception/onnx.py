@@ -24,6 +24,7 @@ from flockd.flight.inference.session import OnnxModel
 from flockd.flight.perception.detection.instances import group_instances
 from flockd.flight.perception.detection.second_stage import SecondStage
 from flockd.flight.perception.flow import DisFlow, Flow, OnnxFlow, background_flow, object_flow
+from flockd.flight.perception.interface import OneByOne
 from flockd.flight.perception.maps import Crop, OpenDepth, RangeEstimate, SceneMaps
 from flockd.flight.perception.requirements import check_roles
 
@@ -37,12 +38,16 @@ _MIN_RAY_Z = 0.1
 """Least z of a unit ray, for its tangents to stay finite: 84 degrees off the optical axis."""
 
 
-def load_networks(config: PerceptionConfig, deadline: Deadline = no_deadline) -> OnnxNetworks:
-    """The networks that a configuration names; `deadline` is for the golden input of each. Raises ModelError."""
-    return OnnxNetworks(config, models_folder(config), deadline)
+def load_networks(config: PerceptionConfig, deadline: Deadline = no_deadline, *, at_once: int = 1) -> OnnxNetworks:
+    """The networks that a configuration names; `deadline` is for the golden input of each. Raises ModelError.
+
+    Of the configured threads each of so many images `at_once` has its share.
+    """
+    shared = config.model_copy(update={"threads": max(1, config.threads // at_once)})
+    return OnnxNetworks(shared, models_folder(config), deadline)
 
 
-class OnnxNetworks:
+class OnnxNetworks(OneByOne):
     """The networks that a configuration names. Stateless: may serve several pilots."""
 
     def __init__(self, config: PerceptionConfig, models_dir: Path, deadline: Deadline = no_deadline) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-import cv2
-
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.messages import Float32Array, Frame, FrameSet, GroundEstimate, Reason, ReasonKind, VehicleState
 from flockd.flight.geometry import RangeMap, Rig, ground_inverse_depth
@@ -14,7 +12,7 @@ from flockd.flight.perception.continuity import ContinuityMonitor
 from flockd.flight.perception.detection.detector import DetectionTrace, Detector
 from flockd.flight.perception.detection.masks import depth_of_drones, without_borders
 from flockd.flight.perception.image_noise import NoiseMonitor
-from flockd.flight.perception.interface import Networks
+from flockd.flight.perception.interface import CAMERA_FAULTS, ImagePair, ImageView, Networks
 from flockd.flight.perception.lens import LensMonitor
 from flockd.flight.perception.maps import KnownSize, SceneMaps
 from flockd.flight.perception.metric_depth import metric_depth
@@ -22,8 +20,6 @@ from flockd.flight.perception.observation import CameraObservation, Observation
 from flockd.flight.tracking import Prediction
 
 Reasons = list[Reason]
-CAMERA_FAULTS = (FloatingPointError, ValueError, cv2.error)
-"""What one camera's image may end in: an output that is not finite, a height below the ground, an image to no use."""
 
 
 class Perception:
@@ -115,15 +111,20 @@ class Perception:
         self, frames: Mapping[str, Frame], vehicle: VehicleState, ground: GroundEstimate | None
     ) -> tuple[dict[str, SceneMaps], dict[str, RangeMap], Reasons]:
         """The networks' maps of every camera, and the metres of those that have any."""
-        scenes, depths, reasons = {}, {}, []
+        views, scenes, depths, reasons = {}, {}, {}, []
         for name, frame in frames.items():
             try:
-                plane = self._plane(name, vehicle, ground)
-                scene = self._networks.scene(frame, self._rig.cameras[name], plane)
-                if plane is not None or not self._needs_ground:
-                    depths[name] = metric_depth(scene, plane, self._rig.cameras[name].camera)
+                views[name] = ImageView(frame, self._rig.cameras[name], self._plane(name, vehicle, ground))
+            except ValueError as error:  # a height below the ground
+                reasons.append(_of_camera(name, str(error)))
+        for (name, view), scene in zip(views.items(), self._networks.scenes(list(views.values())), strict=True):
+            try:
+                if isinstance(scene, Exception):
+                    raise scene
+                if view.ground is not None or not self._needs_ground:
+                    depths[name] = metric_depth(scene, view.ground, view.camera.camera)
                 scenes[name] = scene
-            except CAMERA_FAULTS as error:  # an output that is not finite; a height below the ground
+            except CAMERA_FAULTS as error:
                 reasons.append(_of_camera(name, str(error)))
         return scenes, depths, reasons
 
@@ -154,16 +155,14 @@ class Perception:
         """By camera, from the image before to this one."""
         if previous is None:
             return {}, []
-        flows, reasons = {}, []
+        pairs = {}
         for name, frame in frames.items():
             before = previous.cameras.get(name)
             if before is not None:
-                first = Frame(name, before.image, previous.time_s, 0)
-                try:
-                    flows[name] = self._networks.flow(first, frame, before.labels)
-                except CAMERA_FAULTS as error:
-                    reasons.append(_of_camera(name, str(error)))
-        return flows, reasons
+                pairs[name] = ImagePair(Frame(name, before.image, previous.time_s, 0), frame, before.labels)
+        found = dict(zip(pairs, self._networks.flows(list(pairs.values())), strict=True))
+        flows = {name: flow for name, flow in found.items() if not isinstance(flow, Exception)}
+        return flows, [_of_camera(name, str(error)) for name, error in found.items() if isinstance(error, Exception)]
 
 
 def _of_camera(name: str, text: str) -> Reason:

@@ -12,20 +12,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockd.core.config import DroneConfig
+from flockd.core.errors import UnavailableError
 from flockd.core.messages import FloatArray, PilotOutput, ReasonKind, Setpoint
 from flockd.flight.inference.hashes import model_hashes
-from flockd.flight.perception import load_networks
 from flockd.flight.safety import Gate
 from flockd.ground.doctor.finding import Finding, failed, passed, warned
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
-from flockd.onboard.daemon import Components, Daemon, InterruptibleNetworks, ServiceManager
+from flockd.onboard.daemon import Components, Daemon, InterruptibleNetworks, ServiceManager, load_side_by_side
 from flockd.onboard.deadline import GOLDEN_S, within
 
 SAMPLE_S = 0.5
 STEADY = 0.95
 """Least share of the steps that were due."""
 GATE_PERIOD_S = 0.05
+FIRST_FRAME_S = 60.0
+"""Slow cameras open within ten; what has brought nothing by then brings nothing."""
 
 
 class SilentLink(AutopilotLink):
@@ -75,6 +77,7 @@ async def bench(
     on_second: Callable[[int], None] = lambda seconds: None,
     load: Callable[[], InterruptibleNetworks] | None = None,
     clock: Callable[[], float] = time.monotonic,
+    patience_s: float = FIRST_FRAME_S,
 ) -> list[Sample]:
     """Runs the daemon with a link that sends nothing, until the time is over, `stop` is set, or the drone is armed.
 
@@ -86,13 +89,14 @@ async def bench(
         on_second: called with how many seconds are over.
         load: loads the networks; None: the configured ones.
         clock: monotonic seconds.
+        patience_s: for the first frame, from when all else runs.
 
-    Raises FlockdError for what cannot be opened.
+    Raises FlockdError for what cannot be opened, and where no frame comes.
     """
     daemon = Daemon(
         config,
         file,
-        load_networks=load or (lambda: load_networks(config.perception, within(GOLDEN_S))),
+        load_networks=load or (lambda: load_side_by_side(config, within(GOLDEN_S))),
         models=model_hashes(config.perception),
         recordings=None,
         service=ServiceManager({}),
@@ -101,7 +105,7 @@ async def bench(
     )
     running = asyncio.create_task(daemon.run())
     try:
-        return await _sampled(daemon, running, Gate(config.safety.gate), seconds, stop, on_second, clock)
+        return await _sampled(daemon, running, Gate(config.safety.gate), seconds, stop, on_second, clock, patience_s)
     finally:
         daemon.ask_to_stop()
         await asyncio.wait({running})
@@ -111,15 +115,20 @@ async def bench(
 
 async def _sampled(
     daemon: Daemon, running: asyncio.Task[object], gate: Gate, seconds: float, stop: asyncio.Event,
-    on_second: Callable[[int], None], clock: Callable[[], float],
+    on_second: Callable[[int], None], clock: Callable[[], float], patience_s: float,
 ) -> list[Sample]:  # fmt: skip
     samples: list[Sample] = []
-    began_s = sampled_s = math.inf
+    began_s = sampled_s = late_s = math.inf
     command: FloatArray | None = None
     while not running.done() and not stop.is_set():
         await asyncio.sleep(GATE_PERIOD_S)
         components, now = daemon.components, clock()
-        if components is None or components.pilot_loop.frames is None:
+        if components is None:
+            continue
+        if components.pilot_loop.frames is None:
+            late_s = min(late_s, now + patience_s)
+            if now > late_s:
+                raise UnavailableError(_why_no_frame(components, patience_s))
             continue
         if math.isinf(began_s):
             began_s, sampled_s = now, now - SAMPLE_S
@@ -134,6 +143,14 @@ async def _sampled(
         if now - began_s >= seconds:
             break
     return samples
+
+
+def _why_no_frame(components: Components, patience_s: float) -> str:
+    cameras = components.source.status()
+    faults = [f"camera {name} {camera.fault or 'delivers nothing'}" for name, camera in cameras.items()]
+    return (
+        f"no images of all cameras came within {patience_s:g} s: {'; '.join(faults)}; `flockd doctor` says what to do"
+    )
 
 
 def _sample(components: Components, time_s: float, command: FloatArray | None) -> Sample:

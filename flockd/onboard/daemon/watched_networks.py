@@ -5,13 +5,13 @@ from __future__ import annotations
 import concurrent.futures
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
-from flockd.core.messages import Float32Array, Frame, UInt8Array
-from flockd.flight.geometry import RigCamera
-from flockd.flight.perception import Crop, Networks, RangeEstimate, SceneMaps
+from flockd.core.messages import Float32Array
+from flockd.flight.perception import Crop, ImagePair, ImageView, Networks, RangeEstimate, SceneMaps
 from flockd.onboard.daemon.worker import Worker
 
+T = TypeVar("T")
 TERMINATE_S = 0.5
 """How long a run may take to end when told to; ONNX Runtime takes a few milliseconds."""
 MAX_ABANDONED = 2
@@ -53,20 +53,21 @@ class WatchedNetworks:
         """Only a new process can help."""
         return max(self._abandoned.values(), default=0) >= MAX_ABANDONED
 
-    def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
+    def flows(self, pairs: Sequence[ImagePair]) -> list[Float32Array | Exception]:
         """Raises NetworkStuckError; so do the next two."""
-        result: Float32Array = self._call("flow", self._networks.flow, first, second, labels)
-        return result
+        return self._counted(self._call("flow", self._networks.flows, pairs))
 
-    def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
-        """Depth and drones of one image."""
-        result: SceneMaps = self._call("scene", self._networks.scene, frame, camera, ground)
-        return result
+    def scenes(self, views: Sequence[ImageView]) -> list[SceneMaps | Exception]:
+        """Depth and drones of each image."""
+        return self._counted(self._call("scene", self._networks.scenes, views))
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         """Range and centre of the drone in the middle of each crop."""
-        result: tuple[RangeEstimate, ...] = self._call("ranges", self._networks.ranges, crops)
-        return result
+        try:
+            return self._call("ranges", self._networks.ranges, crops)
+        except FloatingPointError:
+            self.faults += 1
+            raise
 
     def leave(self) -> None:
         """Ends the running call and refuses later ones; returns within a fraction of a second, on any thread."""
@@ -74,20 +75,20 @@ class WatchedNetworks:
         self._networks.terminate()
         self._worker.leave(TERMINATE_S)
 
-    def _call(self, kind: str, function: Callable[..., Any], *arguments: object) -> Any:
+    def _counted(self, results: list[T | Exception]) -> list[T | Exception]:
+        self.faults += sum(isinstance(result, FloatingPointError) for result in results)
+        return results
+
+    def _call(self, kind: str, function: Callable[..., T], argument: object) -> T:
         if self._left:
             raise NetworkStuckError("the networks have been stopped")
-        call = self._worker.submit(function, *arguments)
+        call = self._worker.submit(function, argument)
         if not self._done_within(call, self._deadline_s):
             self._end(kind, call)
             raise NetworkStuckError(f"a network call took longer than {self._deadline_s:g} s")
         self.stuck = False
         self._abandoned[kind] = 0
-        try:
-            return call.result()
-        except FloatingPointError:
-            self.faults += 1
-            raise
+        return call.result()
 
     def _end(self, kind: str, call: concurrent.futures.Future[Any]) -> None:
         self.stuck = True

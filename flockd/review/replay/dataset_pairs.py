@@ -20,7 +20,7 @@ from flockd.core.messages import (
     VehicleState,
 )
 from flockd.flight.geometry import RigCamera, RigidTransform, ZMap, build_rig, rotation_angle_deg
-from flockd.flight.perception import Crop, Networks, RangeEstimate, SceneMaps
+from flockd.flight.perception import Crop, ImageNetworks, OneByOne, RangeEstimate, SceneMaps
 from flockd.flight.pilot import FlockPilot
 from flockd.ground.datasets import Dataset, DatasetFrame
 from flockd.ground.datasets.dataset import Moment
@@ -61,10 +61,10 @@ def size_of(motion: RigidTransform) -> tuple[float, float]:
     return rotation_angle_deg(motion.rotation), float(np.linalg.norm(motion.translation))
 
 
-class RecordedDepth:
+class RecordedDepth(OneByOne):
     """The learned perception, with the recorded depth in place of the network's."""
 
-    def __init__(self, learned: Networks) -> None:
+    def __init__(self, learned: ImageNetworks) -> None:
         self.second_stage = learned.second_stage
         self.map_stride = learned.map_stride
         self._learned = learned
@@ -89,7 +89,7 @@ class RecordedDepth:
 
 
 def fly_pairs(
-    dataset: Dataset, config: DroneConfig, learned: Networks, *, stride: int, recorded_depth: bool
+    dataset: Dataset, config: DroneConfig, learned: ImageNetworks, *, stride: int, recorded_depth: bool
 ) -> Iterator[Pair]:
     """Each frame i with frame i + ``stride``, in order, as a pilot with this configuration sees them.
 

@@ -13,6 +13,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.recording import RecordingConfig
 from flockd.flight.inference.hashes import model_hashes
 from flockd.flight.pilot import FlockPilot
+from flockd.onboard.daemon.side_by_side import load_side_by_side
 from flockd.onboard.recording import Recorder, RecordingError
 from flockd.onboard.recording.codec import to_json
 from flockd.onboard.recording.difference import Comparison, compare
@@ -63,7 +64,7 @@ def replay_flight(
 
     Raises RecordingError when ``out`` cannot be written, ModelError.
     """
-    pilot = FlockPilot(config, stopwatch=time.perf_counter)
+    pilot = FlockPilot(config, load_side_by_side(config), stopwatch=time.perf_counter)
     total = sum(start_s <= step_s <= end_s for _, step_s in recording.contents.steps)
     replay = Replay()
     with ExitStack() as stack:

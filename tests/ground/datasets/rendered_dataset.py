@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
 from flockd.flight.geometry import RigCamera, ZMap
-from flockd.flight.perception import Crop, DisFlow, RangeEstimate, SceneMaps
+from flockd.flight.perception import Crop, DisFlow, OneByOne, RangeEstimate, SceneMaps
 from flockd.sim.renderer import Renderer
 from flockd.sim.world import World
 from tests.flight.perception.shipped import SECOND_STAGE
@@ -59,7 +59,7 @@ def scene() -> Scene:
     return Scene(images, depth, np.array(poses))
 
 
-class Onlooker:
+class Onlooker(OneByOne):
     """In the place of the networks: OpenCV's flow, no drones, and the scene's depth in its order."""
 
     map_stride = 2

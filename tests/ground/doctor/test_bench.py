@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 from flockd.cli import main
+from flockd.core.errors import UnavailableError
 from flockd.ground.doctor.bench import Sample, bench, judged
 from flockd.ground.doctor.finding import Level
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.free_ports import free_endpoint, free_port
-from tests.onboard.daemon.aboard import Cameras, TinyPerceiver, config_for
+from tests.onboard.daemon.aboard import CAMERAS, Cameras, TinyPerceiver, config_for
 
 CONFIG = config_for(14540, "tcp/127.0.0.1:1", "tcp/127.0.0.1:2")
 """Of the judgements: a step each 0.25 s, two cameras."""
@@ -150,12 +151,30 @@ def test_a_run_without_frames_and_one_that_was_ended_say_so() -> None:
     assert "no frame came" in {one.about: one.measured for one in judged(CONFIG, silent, 60.0)}["camera back"]
 
 
+async def test_where_no_frame_comes_it_ends_and_says_of_which_camera() -> None:
+    port, frames = free_port(), free_endpoint()
+    config = config_for(port, frames, free_endpoint())
+    cameras = Cameras(frames)
+    cameras.silent = set(CAMERAS)
+    try:
+        with (
+            FakeAutopilot(port, heartbeat_s=0.25),
+            pytest.raises(
+                UnavailableError, match=r"no images .* within 0\.5 s: camera front .*; camera back "
+            ) as caught,
+        ):
+            await bench(config, "tiny.yaml", 600.0, stop=asyncio.Event(), load=TinyPerceiver, patience_s=0.5)
+    finally:
+        cameras.close()
+    assert "`flockd doctor` says" in str(caught.value)
+
+
 def test_the_command_runs_it_and_ends_with_what_it_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     port, frames = free_port(), free_endpoint()
     config = config_for(port, frames, free_endpoint())
-    monkeypatch.setattr("flockd.ground.doctor.bench.load_networks", lambda *_: TinyPerceiver())
+    monkeypatch.setattr("flockd.ground.doctor.bench.load_side_by_side", lambda *_: TinyPerceiver())
     monkeypatch.setattr("flockd.cli.doctor.load_to_fly", lambda file, force: config)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     cameras = Cameras(frames)

@@ -30,7 +30,7 @@ from flockd.core.config.telemetry import OperatorCommand, TelemetryParameters
 from flockd.core.messages import Float32Array, Frame, UInt8Array
 from flockd.fleet.watcher import FleetWatcher, Heard
 from flockd.flight.geometry import RigCamera, ZMap
-from flockd.flight.perception import Crop, RangeEstimate, SceneMaps
+from flockd.flight.perception import Crop, OneByOne, RangeEstimate, SceneMaps
 from flockd.onboard.autopilot.refusal_reasons import REASONS
 from flockd.onboard.daemon import Daemon, Ending, ServiceManager
 from flockd.onboard.sources import FramePublisher
@@ -53,7 +53,7 @@ PATIENT = SafetyParameters(degraded_load=50.0, max_load=100.0, max_loop_lag_s=2.
 """These stories are not about how fast the computer is that tells them."""
 
 
-class TinyPerceiver:
+class TinyPerceiver(OneByOne):
     """Not networks: says that all stands still before a tilted wall, and sees no drone. A test may spoil it."""
 
     map_stride = 2

@@ -36,6 +36,7 @@ from flockd.core.messages import (
     Wanted,
 )
 from flockd.flight.inference import OnnxModel
+from flockd.flight.perception import ImagePair
 from flockd.flight.safety import Action, Decision, Gate, Inputs, Permission, Request, State, Surroundings
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
 from flockd.onboard.daemon.control import Control
@@ -51,7 +52,7 @@ from tests.onboard.daemon.aboard import TinyPerceiver
 
 IMAGE = np.zeros((48, 64, 3), np.uint8)
 FRAME = Frame("front", IMAGE, 0.0, 0)
-NO_DRONES = np.zeros((48, 64), np.uint8)
+PAIR = ImagePair(FRAME, FRAME, np.zeros((48, 64), np.uint8))
 
 
 def test_a_worker_answers_passes_errors_on_and_is_not_kept_by_a_job_that_hangs() -> None:
@@ -82,24 +83,24 @@ def _raises_timeout() -> None:
 def test_a_stuck_network_is_ended_then_abandoned_then_hopeless() -> None:
     tiny = TinyPerceiver()
     networks = WatchedNetworks(tiny, deadline_s=0.05)
-    networks.flow(FRAME, FRAME, NO_DRONES)
+    networks.flows([PAIR])
     assert (networks.stuck, networks.hopeless) == (False, False)
 
     tiny.hangs.set()
     with pytest.raises(NetworkStuckError, match=r"took longer than 0\.05 s"):
-        networks.flow(FRAME, FRAME, NO_DRONES)
+        networks.flows([PAIR])
     assert (networks.stuck, networks.ended, tiny.told_to_end, networks.hopeless) == (True, 1, 1, False)
-    networks.flow(FRAME, FRAME, NO_DRONES)
+    networks.flows([PAIR])
     assert not networks.stuck, "it answers again"
 
     tiny.ends_when_told = False
     tiny.hangs.set()
     for hopeless in (False, True):
         with pytest.raises(NetworkStuckError):
-            networks.flow(FRAME, FRAME, NO_DRONES)
+            networks.flows([PAIR])
         assert networks.hopeless is hopeless
     tiny.hangs.clear()
-    networks.flow(FRAME, FRAME, NO_DRONES)
+    networks.flows([PAIR])
     assert not networks.hopeless, "a worker of its own answers"
 
 
@@ -122,8 +123,9 @@ def test_a_network_with_an_output_that_is_not_finite_is_counted() -> None:
     tiny = TinyPerceiver()
     tiny.not_finite = 1
     networks = WatchedNetworks(tiny, deadline_s=5.0)
-    with pytest.raises(FloatingPointError):
-        networks.flow(FRAME, FRAME, NO_DRONES)
+    fault, flow = networks.flows([PAIR, PAIR])
+    assert isinstance(fault, FloatingPointError)
+    assert isinstance(flow, np.ndarray)
     assert (networks.faults, networks.stuck) == (1, False)
 
 

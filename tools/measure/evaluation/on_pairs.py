@@ -13,7 +13,7 @@ from flockd.core.choices import ScaleSource
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.messages import UNCLASSED, Detection, Frame, FrameSet, VehicleState
 from flockd.flight.geometry import Rig
-from flockd.flight.perception import DisFlow, Networks, Perception
+from flockd.flight.perception import DisFlow, OnnxNetworks, Perception
 from flockd.flight.perception.detection.detector import DetectionTrace
 from flockd.flight.pilot.ground import level_ground
 from flockd.sim.drone_models import FAMILIES, drone_model
@@ -84,7 +84,7 @@ class Findings:
         return np.concatenate(self.flow[name, on_drones])
 
 
-def look_at_pairs(pairs: PairSet, networks: Networks, indices: Iterable[int]) -> Findings:
+def look_at_pairs(pairs: PairSet, networks: OnnxNetworks, indices: Iterable[int]) -> Findings:
     """The second stage and all, on each pair's first image; the flow on both. The autopilot's height errs.
 
     Drones are what they are with a barometer.
