@@ -97,7 +97,7 @@ def main() -> int:
         nargs="+",
         default=[],
         metavar="GROUP",
-        help="of capture, pipelines, sandbox and service, and bench, which runs only where it is named",
+        help="of capture, pipelines, sandbox, bench and service",
     )
     parser.add_argument("--package", action="store_true", help="check the Debian package, and that alone")
     parser.add_argument("--json", action="store_true")
