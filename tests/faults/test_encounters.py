@@ -155,7 +155,7 @@ def test_two_drones_whose_autopilots_obey_a_little_late_and_weakly_stay_apart(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(autopilots, "Vehicles", partial(_Late, 0.3))
-    met = fly(_head_on(1.5), 15.0, WEAK)
+    met = fly(_head_on(1.5), 20.0, WEAK)
     assert met.apart_m.min() < NEAR_M
     assert met.apart_m.min() >= APART_M
 
