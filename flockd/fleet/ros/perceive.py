@@ -13,6 +13,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.errors import UsageError
 from flockd.core.messages import PilotOutput, VehicleState
 from flockd.flight.pilot import FlockPilot
+from flockd.onboard.daemon import load_side_by_side
 from flockd.onboard.ros import message_trees as trees
 from flockd.onboard.ros.message_trees import Names, ros_name
 from flockd.onboard.ros.ros_node import Delivery, RosNode
@@ -44,7 +45,7 @@ class PerceptionNode:
         """``node`` stays its owner's. Raises ModelError."""
         self._config, self._node, self._vehicle_topic = config, node, vehicle_topic
         self._names = Names(ros_name(config.name))
-        self._pilot = FlockPilot(config, stopwatch=time.perf_counter)
+        self._pilot = FlockPilot(config, load_side_by_side(config), stopwatch=time.perf_counter)
         self._states = NearestState()
         self._kind: str | None = None
         self._last_s, self._told_s = -np.inf, -np.inf

@@ -19,6 +19,7 @@ from flockd.flight.perception import Networks
 from flockd.flight.perception.requirements import check_roles
 from flockd.flight.pilot import FlockPilot
 from flockd.ground.doctor.finding import Finding, Level, failed, failed_from_error, passed, warned
+from flockd.onboard.daemon import load_side_by_side
 from flockd.onboard.deadline import GOLDEN_S, within
 
 STEPS = 4
@@ -63,7 +64,7 @@ def _each(config: DroneConfig) -> Iterator[Finding]:
 
 def time_steps(config: DroneConfig, networks: Networks | None = None) -> list[tuple[float, PilotOutput]]:
     """Steps of the pilot over an empty meadow, at the size of the cameras: seconds, and the output."""
-    pilot = FlockPilot(config, networks, stopwatch=time.perf_counter)
+    pilot = FlockPilot(config, networks or load_side_by_side(config), stopwatch=time.perf_counter)
     timed = []
     for number in range(STEPS):
         time_s = number * config.step_s

@@ -50,7 +50,9 @@ def drone_config() -> DroneConfig:
 class MadeUpPilot:
     """Its outputs hang on every pixel, every number of the vehicle's state, and all that came before."""
 
-    def __init__(self, config: DroneConfig, stopwatch: Callable[[], float] | None = None) -> None:
+    def __init__(
+        self, config: DroneConfig, networks: object = None, stopwatch: Callable[[], float] | None = None
+    ) -> None:
         self._memory = 0.1
         self.gain = config.flocking.cohesion
 
