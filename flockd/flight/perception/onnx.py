@@ -41,20 +41,22 @@ _MIN_RAY_Z = 0.1
 def load_networks(config: PerceptionConfig, deadline: Deadline = no_deadline, *, at_once: int = 1) -> OnnxNetworks:
     """The networks that a configuration names; `deadline` is for the golden input of each. Raises ModelError.
 
-    Of the configured threads each of so many images `at_once` has its share.
+    Of the configured threads each of so many images `at_once` has its share; crops of all images have all.
     """
-    shared = config.model_copy(update={"threads": max(1, config.threads // at_once)})
-    return OnnxNetworks(shared, models_folder(config), deadline)
+    return OnnxNetworks(config, models_folder(config), deadline, at_once)
 
 
 class OnnxNetworks(OneByOne):
     """The networks that a configuration names. Stateless: may serve several pilots."""
 
-    def __init__(self, config: PerceptionConfig, models_dir: Path, deadline: Deadline = no_deadline) -> None:
-        """``deadline`` is for each network's run on its golden input. Raises ModelError."""
-        self._models = _Models(config, models_dir, deadline)
+    def __init__(
+        self, config: PerceptionConfig, models_dir: Path, deadline: Deadline = no_deadline, at_once: int = 1
+    ) -> None:
+        """See `load_networks`. Raises ModelError."""
+        share = max(1, config.threads // at_once)
+        self._models = _Models(config, models_dir, deadline, share)
         self._flow_refinement = config.flow_refinement
-        cv2.setNumThreads(config.threads)
+        cv2.setNumThreads(share)
         self._flow = self._build_flow(config)
         self._depth = self._models.open(config.depth, "depth")
         self._segmentation = self._models.open(config.segmentation, "segmentation")
@@ -213,11 +215,16 @@ class OnnxNetworks(OneByOne):
         return DisFlow(network, config.flow_refinement_scale, quick=config.flow_refinement == "quick_dis")
 
 
+_OF_CROPS = frozenset({"distance", "verification"})
+"""Roles on crops of all images, in one batch."""
+
+
 class _Models:
     """Opens each model once, however many roles it fills."""
 
-    def __init__(self, config: PerceptionConfig, folder: Path, deadline: Deadline) -> None:
-        self._config, self._folder, self._deadline = config, folder, deadline
+    def __init__(self, config: PerceptionConfig, folder: Path, deadline: Deadline, share: int) -> None:
+        """``share``: threads of what runs on single images."""
+        self._config, self._folder, self._deadline, self._share = config, folder, deadline, share
         self._opened: dict[Path, OnnxModel] = {}
 
     def open(self, name: str, role: Role) -> OnnxModel:
@@ -228,7 +235,7 @@ class _Models:
                 raise ModelError(f"perception.{role}: {_what_to_name_instead(name, role, path, self._folder)}")
             self._opened[path] = OnnxModel(
                 path,
-                threads=self._config.threads,
+                threads=self._config.threads if role in _OF_CROPS else self._share,
                 provider=self._config.provider,
                 engines=engines_folder(self._config),
                 check=check_roles,
