@@ -167,7 +167,7 @@ class AutopilotLink:
                 system = await _find_system(mavsdk, parameters, deadline, timeout_s, clock)
             kept.append(system)
             link = cls(mavsdk, system, executor, clock, parameters.max_gap_s)
-            kept.append(link)
+            kept += [link, link._callbacks()]
             await link._wait_for("HEARTBEAT", deadline)
             await link._request_streams()
         except BaseException:
@@ -181,9 +181,15 @@ class AutopilotLink:
 
         It is ended even where nobody waits for that so long, after a call that still runs.
         """
-        ended = self._executor.submit(_destroy, self._mavsdk, (self,))
+        ended = self._executor.submit(_destroy, self._mavsdk, (self, self._callbacks()))
         self._executor.shutdown(wait=False)
         await asyncio.shield(asyncio.wrap_future(ended))
+
+    def _callbacks(self) -> list[tuple[object, ...]]:
+        """What MAVSDK 4.1 calls from its own thread. Its plugins let go of them before that thread has ended: a message
+        that still waits for its turn then calls memory that is free (seen on a busy computer)."""
+        held = [vars(plugin) for plugin in (self._direct, self._param)]
+        return [(*one.get("_callbacks", ()), *one.get("_subscriptions", {}).values()) for one in held]
 
     @property
     def system_id(self) -> int:

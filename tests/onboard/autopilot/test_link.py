@@ -21,7 +21,7 @@ from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.scenario import RangeFinderConfig
 from flockd.core.messages import Setpoint, Wanted
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, Firmware
-from flockd.onboard.autopilot.mavsdk_link import SETPOINT_TYPE_MASK, AutopilotLink, Severity
+from flockd.onboard.autopilot.mavsdk_link import RECEIVED, SETPOINT_TYPE_MASK, TIME_SYNC, AutopilotLink, Severity
 from flockd.sim.autopilot.fake_autopilot import TICK_S, FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.sim.autopilot.fake_telemetry import TelemetryStreams
@@ -177,6 +177,15 @@ async def test_an_autopilot_that_has_started_anew_is_asked_for_its_streams_again
             assert fake_autopilot.stream_intervals_s != rates
             await until(lambda: dict(fake_autopilot.stream_intervals_s) == rates)
             assert "the autopilot has started anew" in link.take_reports()
+
+
+async def test_all_that_mavsdk_calls_is_kept_until_it_is_destroyed(port: int) -> None:
+    """By attributes of MAVSDK that are its own: another version may name them otherwise."""
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock):
+        link = await AutopilotLink.connect(_parameters(port))
+        subscribed, _ = link._callbacks()
+        assert len(subscribed) >= len({*RECEIVED, TIME_SYNC})
+        await link.close()
 
 
 async def test_one_lost_heartbeat_loses_no_link_and_is_counted(port: int) -> None:
