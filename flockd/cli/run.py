@@ -96,13 +96,14 @@ def _check_limits() -> None:
 async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceManager) -> Ending:
     """With SIGTERM and Ctrl-C for standstill, Hold and the end, and SIGHUP for the configuration."""
     from flockd.flight.inference.hashes import model_hashes
-    from flockd.onboard.daemon import Daemon, clock_at, load_side_by_side
+    from flockd.flight.perception import load_networks
+    from flockd.onboard.daemon import Daemon, cameras_at_once, clock_at
     from flockd.onboard.deadline import GOLDEN_S, within
 
     daemon = Daemon(
         config,
         str(args.config),
-        load_networks=lambda: load_side_by_side(config, within(GOLDEN_S)),
+        load_networks=lambda: load_networks(config.perception, within(GOLDEN_S), at_once=cameras_at_once(config)),
         models=model_hashes(config.perception),
         recordings=args.record,
         service=service,

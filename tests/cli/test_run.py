@@ -33,8 +33,8 @@ from tests.onboard.test_deadline import endless
 
 RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
 WITHOUT_NETWORKS = (
-    "import flockd.onboard.daemon; from tests.onboard.daemon.aboard import TinyPerceiver; "
-    f"flockd.onboard.daemon.load_side_by_side = lambda *_: TinyPerceiver(); {RUN}"
+    "import flockd.flight.perception; from tests.onboard.daemon.aboard import TinyPerceiver; "
+    f"flockd.flight.perception.load_networks = lambda *_, **__: TinyPerceiver(); {RUN}"
 )
 ROOT = Path(__file__).parents[2]
 SECONDS_TO_FAIL = 60.0

@@ -137,7 +137,7 @@ class PerceptionConfig(Section):
     engines_dir: str | None = None
     """Where `flockd models prepare` keeps what a provider has built; by default `engines` beside the manifests."""
     deadline_s: Annotated[float, Field(gt=0, le=60)] = 1.0
-    """In flight, a network that has not finished all cameras' images by then is stuck, and is ended."""
+    """In flight, a network that has not finished one call by then is stuck, and is ended."""
     detection: DetectionParameters = DetectionParameters()
     noise: NoiseParameters = NoiseParameters()
     drone_size_m: Annotated[float, Field(ge=MIN_DRONE_SIZE_M, le=MAX_DRONE_SIZE_M)] | None = None

@@ -36,9 +36,7 @@ class ImagePair(NamedTuple):
     """(h, w) of the first image: one value a drone, 0 and 255 none."""
 
 
-class Networks(Protocol):
-    """What perception asks of networks: `OnnxNetworks`, or exact ones that a simulator puts in their place."""
-
+class _Stages(Protocol):
     @property
     def map_stride(self) -> int:
         """Image pixels per pixel of the first stage's maps."""
@@ -49,14 +47,6 @@ class Networks(Protocol):
         """How the crops are cut that `ranges` takes; None: there is no second stage."""
         ...
 
-    def flows(self, pairs: Sequence[ImagePair]) -> list[Float32Array | Exception]:
-        """Of each pair (h, w, 2) pixels from the first image to the second, or one of `CAMERA_FAULTS`."""
-        ...
-
-    def scenes(self, views: Sequence[ImageView]) -> list[SceneMaps | Exception]:
-        """Depth and drones of each image, or one of `CAMERA_FAULTS`."""
-        ...
-
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         """Range and centre of the drone in the middle of each crop.
 
@@ -65,18 +55,20 @@ class Networks(Protocol):
         ...
 
 
-class ImageNetworks(Protocol):
+class Networks(_Stages, Protocol):
+    """What perception asks of networks: `OnnxNetworks`, or exact ones that a simulator puts in their place."""
+
+    def flows(self, pairs: Sequence[ImagePair]) -> list[Float32Array | Exception]:
+        """Of each pair (h, w, 2) pixels from the first image to the second, or one of `CAMERA_FAULTS`."""
+        ...
+
+    def scenes(self, views: Sequence[ImageView]) -> list[SceneMaps | Exception]:
+        """Depth and drones of each image, or one of `CAMERA_FAULTS`."""
+        ...
+
+
+class ImageNetworks(_Stages, Protocol):
     """The same for one image, or one pair, at a time: what `OneByOne` makes `Networks` of."""
-
-    @property
-    def map_stride(self) -> int:
-        """See `Networks`."""
-        ...
-
-    @property
-    def second_stage(self) -> SecondStage | None:
-        """See `Networks`."""
-        ...
 
     def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
         """Of one `ImagePair`; raises one of `CAMERA_FAULTS`."""
@@ -84,10 +76,6 @@ class ImageNetworks(Protocol):
 
     def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
         """Of one `ImageView`; raises one of `CAMERA_FAULTS`."""
-        ...
-
-    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        """See `Networks`."""
         ...
 
 

@@ -15,11 +15,12 @@ from flockd.core.config import DroneConfig
 from flockd.core.errors import UnavailableError
 from flockd.core.messages import FloatArray, PilotOutput, ReasonKind, Setpoint
 from flockd.flight.inference.hashes import model_hashes
+from flockd.flight.perception import load_networks
 from flockd.flight.safety import Gate
 from flockd.ground.doctor.finding import Finding, failed, passed, warned
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
-from flockd.onboard.daemon import Components, Daemon, InterruptibleNetworks, ServiceManager, load_side_by_side
+from flockd.onboard.daemon import Components, Daemon, InterruptibleNetworks, ServiceManager, cameras_at_once
 from flockd.onboard.deadline import GOLDEN_S, within
 
 SAMPLE_S = 0.5
@@ -93,10 +94,15 @@ async def bench(
 
     Raises FlockdError for what cannot be opened, and where no frame comes.
     """
+
+    def with_networks() -> InterruptibleNetworks:
+        return load_networks(config.perception, within(GOLDEN_S), at_once=cameras_at_once(config))
+
     daemon = Daemon(
         config,
         file,
-        load_networks=load or (lambda: load_side_by_side(config, within(GOLDEN_S))),
+        load_networks=load
+        or (lambda: load_networks(config.perception, within(GOLDEN_S), at_once=cameras_at_once(config))),
         models=model_hashes(config.perception),
         recordings=None,
         service=ServiceManager({}),

@@ -4,10 +4,9 @@ from flockd.onboard.daemon.components import Components
 from flockd.onboard.daemon.daemon import Daemon, DaemonError, Ending
 from flockd.onboard.daemon.lock import only_instance, service_lock
 from flockd.onboard.daemon.service_manager import ServiceManager
-from flockd.onboard.daemon.side_by_side import SideBySide, load_side_by_side
 from flockd.onboard.daemon.simulated_loop import event_loop_at
 from flockd.onboard.daemon.stderr_log import StderrLog
-from flockd.onboard.daemon.watched_networks import InterruptibleNetworks
+from flockd.onboard.daemon.watched_networks import InterruptibleNetworks, cameras_at_once, load_side_by_side
 from flockd.onboard.sources import clock_at
 
 __all__ = [
@@ -17,8 +16,8 @@ __all__ = [
     "Ending",
     "InterruptibleNetworks",
     "ServiceManager",
-    "SideBySide",
     "StderrLog",
+    "cameras_at_once",
     "clock_at",
     "event_loop_at",
     "load_side_by_side",

@@ -31,7 +31,7 @@ from flockd.onboard.daemon.state_texts import StateTexts
 from flockd.onboard.daemon.supervisor_inputs import InputCollector
 from flockd.onboard.daemon.take_off import TakeOff
 from flockd.onboard.daemon.vehicle_history import VehicleHistory
-from flockd.onboard.daemon.watched_networks import InterruptibleNetworks, WatchedNetworks
+from flockd.onboard.daemon.watched_networks import InterruptibleNetworks, WatchedNetworks, cameras_at_once
 from flockd.onboard.daemon.worker import BusyError, LateError, Worker
 from flockd.onboard.sources import FrameSource
 from flockd.onboard.telemetry.preview import Previews
@@ -120,7 +120,7 @@ async def open_components(
 async def _networks(config: DroneConfig, loading: Worker, load: Callable[[], InterruptibleNetworks]) -> WatchedNetworks:
     networks = await loading.do(LOAD_S, load)
     loading.leave()
-    return WatchedNetworks(networks, config.perception.deadline_s / config.speed_factor)
+    return WatchedNetworks(networks, config.perception.deadline_s / config.speed_factor, cameras_at_once(config))
 
 
 def _open_telemetry(config: DroneConfig) -> ZenohTelemetry:

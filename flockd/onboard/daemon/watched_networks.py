@@ -1,28 +1,51 @@
-"""The networks on a worker of their own, with a deadline for each call: end the run, then the worker, then give up."""
+"""The networks on workers of their own, with a deadline for each call: end the runs, then the workers, then give up."""
 
 from __future__ import annotations
 
-import concurrent.futures
+import math
+import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from typing import Any, Protocol, TypeVar, cast
 
+from flockd.core.config import DroneConfig
 from flockd.core.messages import Float32Array
-from flockd.flight.perception import Crop, ImagePair, ImageView, Networks, RangeEstimate, SceneMaps
+from flockd.flight.perception import (
+    Crop,
+    ImageNetworks,
+    ImagePair,
+    ImageView,
+    RangeEstimate,
+    SceneMaps,
+    load_networks,
+    outcome,
+)
 from flockd.onboard.daemon.worker import Worker
 
 T = TypeVar("T")
 TERMINATE_S = 0.5
 """How long a run may take to end when told to; ONNX Runtime takes a few milliseconds."""
 MAX_ABANDONED = 2
-"""Workers given up in a row by calls of one kind, before only a new process can help."""
+"""Calls of one kind in a row whose workers were given up, before only a new process can help."""
 
 
-class InterruptibleNetworks(Networks, Protocol):
+class InterruptibleNetworks(ImageNetworks, Protocol):
     """Networks whose runs can be ended."""
 
     def terminate(self) -> None:
         """Ends every call under way, from any thread."""
+
+
+def cameras_at_once(config: DroneConfig) -> int:
+    """On how many cameras' images `perception.threads` lets the networks run side by side."""
+    return min(config.perception.threads, len(config.rig.cameras))
+
+
+def load_side_by_side(config: DroneConfig) -> WatchedNetworks:
+    """The drone's networks as they run in flight, but for deadlines. Raises ModelError."""
+    at_once = cameras_at_once(config)
+    return WatchedNetworks(load_networks(config.perception, at_once=at_once), math.inf, at_once)
 
 
 class NetworkStuckError(Exception):
@@ -30,16 +53,20 @@ class NetworkStuckError(Exception):
 
 
 class WatchedNetworks:
-    """`Networks` in front of others; one thread calls it, the counts are for any thread."""
+    """`Networks` in front of others, on so many images `at_once`; one thread calls it, the counts are for any thread.
 
-    def __init__(self, networks: InterruptibleNetworks, deadline_s: float) -> None:
+    What an image gives does not depend on how many are computed at once: each is computed by one worker. Each has
+    `deadline_s` from when its worker begins.
+    """
+
+    def __init__(self, networks: InterruptibleNetworks, deadline_s: float, at_once: int = 1) -> None:
         self.second_stage = networks.second_stage
         self.map_stride = networks.map_stride
         self._networks = networks
         self._deadline_s = deadline_s
-        self._worker = Worker("networks")
+        self._workers = [Worker("networks") for _ in range(at_once)]
         self._abandoned: Counter[str] = Counter()
-        """Workers given up since the last call of that name returned."""
+        """Calls whose workers were given up since the last call of that name returned."""
         self._left = False
         self.stuck = False
         """The last call passed its deadline."""
@@ -55,50 +82,75 @@ class WatchedNetworks:
 
     def flows(self, pairs: Sequence[ImagePair]) -> list[Float32Array | Exception]:
         """Raises NetworkStuckError; so do the next two."""
-        return self._counted(self._call("flow", self._networks.flows, pairs))
+        return self._counted(self._each("flow", self._networks.flow, pairs))
 
     def scenes(self, views: Sequence[ImageView]) -> list[SceneMaps | Exception]:
         """Depth and drones of each image."""
-        return self._counted(self._call("scene", self._networks.scenes, views))
+        return self._counted(self._each("scene", self._networks.scene, views))
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        """Range and centre of the drone in the middle of each crop."""
-        try:
-            return self._call("ranges", self._networks.ranges, crops)
-        except FloatingPointError:
-            self.faults += 1
-            raise
+        """Range and centre of the drone in the middle of each crop; all in one batch."""
+        (result,) = self._counted(self._each("ranges", self._networks.ranges, [(crops,)]))
+        if isinstance(result, Exception):
+            raise result
+        return result
 
     def leave(self) -> None:
         """Ends the running call and refuses later ones; returns within a fraction of a second, on any thread."""
         self._left = True
         self._networks.terminate()
-        self._worker.leave(TERMINATE_S)
+        until_s = time.monotonic() + TERMINATE_S
+        for worker in self._workers:
+            worker.leave(max(until_s - time.monotonic(), 0.0))
 
     def _counted(self, results: list[T | Exception]) -> list[T | Exception]:
         self.faults += sum(isinstance(result, FloatingPointError) for result in results)
         return results
 
-    def _call(self, kind: str, function: Callable[..., T], argument: object) -> T:
-        if self._left:
-            raise NetworkStuckError("the networks have been stopped")
-        call = self._worker.submit(function, argument)
-        if not self._done_within(call, self._deadline_s):
-            self._end(kind, call)
-            raise NetworkStuckError(f"a network call took longer than {self._deadline_s:g} s")
+    def _each(self, kind: str, function: Callable[..., T], calls: Sequence[tuple[object, ...]]) -> list[T | Exception]:
+        """For each call what it returns, or which of `CAMERA_FAULTS` it raises."""
+        results: list[T | Exception | None] = [None] * len(calls)
+        left, idle = iter(range(len(calls))), list(self._workers)
+        running: dict[Future[Any], tuple[int, Worker, float]] = {}
+        while True:
+            while idle and not self._left and (k := next(left, None)) is not None:
+                worker = idle.pop()
+                until_s = time.monotonic() + self._deadline_s
+                running[worker.submit(outcome, function, *calls[k])] = k, worker, until_s
+            if self._left:
+                self._wait_for_end(running)
+                raise NetworkStuckError("the networks have been stopped")
+            if not running:
+                break
+            first_s = min(until_s for _, _, until_s in running.values())
+            done, _ = wait(running, _timeout(first_s - time.monotonic()), FIRST_COMPLETED)
+            if not done:
+                self._end(kind, running)
+                raise NetworkStuckError(f"a network call took longer than {self._deadline_s:g} s")
+            for call in done:
+                k, worker, _ = running.pop(call)
+                idle.append(worker)
+                if call.exception() is not None:
+                    self._wait_for_end(running)  # none is left inside ONNX Runtime
+                results[k] = call.result()
         self.stuck = False
         self._abandoned[kind] = 0
-        return call.result()
+        return cast("list[T | Exception]", results)
 
-    def _end(self, kind: str, call: concurrent.futures.Future[Any]) -> None:
+    def _wait_for_end(self, running: Mapping[Future[Any], object]) -> None:
+        wait(running, _timeout(self._deadline_s))
+
+    def _end(self, kind: str, running: Mapping[Future[Any], tuple[int, Worker, float]]) -> None:
         self.stuck = True
         self.ended += 1
         self._networks.terminate()
-        if not self._done_within(call, TERMINATE_S):
-            self._abandoned[kind] += 1
-            self._worker.leave()
-            self._worker = Worker("networks")
+        _, hung = wait(running, TERMINATE_S)
+        self._abandoned[kind] += bool(hung)
+        for call in hung:
+            _, worker, _ = running[call]
+            worker.leave()
+            self._workers[self._workers.index(worker)] = Worker("networks")
 
-    @staticmethod
-    def _done_within(call: concurrent.futures.Future[Any], timeout_s: float) -> bool:
-        return bool(concurrent.futures.wait([call], timeout_s).done)
+
+def _timeout(left_s: float) -> float | None:
+    return None if math.isinf(left_s) else max(left_s, 0.0)

@@ -13,7 +13,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.recording import RecordingConfig
 from flockd.flight.inference.hashes import model_hashes
 from flockd.flight.pilot import FlockPilot
-from flockd.onboard.daemon.side_by_side import load_side_by_side
+from flockd.onboard.daemon import load_side_by_side
 from flockd.onboard.recording import Recorder, RecordingError
 from flockd.onboard.recording.codec import to_json
 from flockd.onboard.recording.difference import Comparison, compare

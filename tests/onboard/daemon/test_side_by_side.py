@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from flockd.core.messages import Float32Array, Frame, UInt8Array
 from flockd.flight.perception import ImagePair
-from flockd.onboard.daemon import SideBySide
+from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
 from tests.onboard.daemon.aboard import TinyPerceiver
 
 TOGETHER_S = 20.0
@@ -46,18 +47,18 @@ def fault(error: Exception) -> Callable[[], None]:
 def test_images_are_computed_at_once_and_come_back_in_order() -> None:
     networks, together = Pictures(), threading.Barrier(3)
     networks.instead = dict.fromkeys(range(6), lambda: together.wait(TOGETHER_S))
-    flows = SideBySide(networks, 3).flows([pair(k) for k in range(6)])
+    flows = WatchedNetworks(networks, TOGETHER_S, 3).flows([pair(k) for k in range(6)])
     assert [float(flow[0, 0, 0]) for flow in flows if isinstance(flow, np.ndarray)] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
 
 
 def test_the_fault_of_one_image_is_its_own() -> None:
     networks = Pictures()
     networks.instead = {0: fault(ValueError("too small")), 2: fault(FloatingPointError("not finite"))}
-    flows = SideBySide(networks, 2).flows([pair(k) for k in range(4)])
+    flows = WatchedNetworks(networks, TOGETHER_S, 2).flows([pair(k) for k in range(4)])
     assert [type(flow) for flow in flows] == [ValueError, np.ndarray, FloatingPointError, np.ndarray]
 
 
-def test_an_error_that_nobody_expects_comes_when_all_others_have_ended() -> None:
+def test_an_error_that_nobody_expects_comes_when_what_runs_beside_it_has_ended() -> None:
     networks, failed = Pictures(), threading.Event()
 
     def fails() -> None:
@@ -66,5 +67,29 @@ def test_an_error_that_nobody_expects_comes_when_all_others_have_ended() -> None
 
     networks.instead = {0: fails, 1: lambda: failed.wait(TOGETHER_S)}
     with pytest.raises(KeyError):
-        SideBySide(networks, 2).flows([pair(k) for k in range(5)])
-    assert networks.done == [1, 2, 3, 4]
+        WatchedNetworks(networks, TOGETHER_S, 2).flows([pair(k) for k in range(5)])
+    assert networks.done[0] == 1
+
+
+def test_each_image_has_the_deadline_for_itself() -> None:
+    networks = Pictures()
+    networks.instead = dict.fromkeys(range(6), lambda: time.sleep(0.3))
+    assert len(WatchedNetworks(networks, 0.9, 1).flows([pair(k) for k in range(6)])) == 6
+
+
+def test_a_thread_that_hangs_is_replaced_and_the_others_stay() -> None:
+    networks, let_go = Pictures(), threading.Event()
+    watched = WatchedNetworks(networks, 0.5, 2)
+    networks.instead = {1: let_go.wait}
+    with pytest.raises(NetworkStuckError):
+        watched.flows([pair(k) for k in range(4)])
+    assert (watched.stuck, watched.ended, watched.hopeless) == (True, 1, False)
+    networks.instead = {}
+    assert len(watched.flows([pair(k) for k in range(4)])) == 4
+    assert not watched.stuck
+    networks.instead = {0: let_go.wait}
+    for hopeless in (False, True):
+        with pytest.raises(NetworkStuckError):
+            watched.flows([pair(k) for k in range(4)])
+        assert watched.hopeless is hopeless
+    let_go.set()
