@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-Role = Literal["flow", "depth", "segmentation", "distance", "verification"]
-"""What a network is used for: optical flow of two images, depth of one, drones in one, range of the drone in a crop,
-and whether there is a drone in a crop."""
+Role = Literal["flow", "depth", "segmentation", "detector", "distance", "verification"]
+"""What a network is used for: optical flow of two images, depth of one, pixels of drones in one, boxes of drones in
+one, range of the drone in a crop, and whether there is a drone in a crop."""
 ROLES: tuple[Role, ...] = get_args(Role)
-TRUTH_ROLES = tuple(role for role in ROLES if role != "verification")
-"""Those that a simulator can fill with the truth. The true distance also tells whether there is a drone."""
+TRUTH_ROLES = tuple(role for role in ROLES if role not in ("detector", "verification"))
+"""Those that a simulator can fill with the truth. True segments need no boxes, and the true distance also tells whether
+there is a drone."""
 
 Provider = Literal["cpu", "cuda", "tensorrt", "openvino"]
 """What computes the networks: ONNX Runtime's execution providers."""

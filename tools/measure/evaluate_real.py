@@ -1,10 +1,10 @@
 """Measure single-frame detection on real pictures, and print one table.
 
-python -m tools.measure.evaluate_real --data SKYDRONES --without-drones office=FOLDER --without-drones streets=FOLDER
-[--json]
+python -m tools.measure.evaluate_real --data SKYDRONES --labelled towns=FOLDER --without-drones office=FOLDER [--json]
 
 SKYDRONES holds `clips/` and `labels.json` of drones, birds, airplanes and helicopters before the sky; its clips 31-40
-and 91-100 of each kind are measured on. Pictures of the other folders hold no drone: all that is found there is false.
+and 91-100 of each kind are measured on. A labelled folder holds pictures and `labels.json`, boxes in COCO's format.
+Pictures of the other folders hold no drone: all that is found there is false.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from rich.table import Table
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
 from flockd.ground.pictures import Labelled, PictureDetector, PictureFile, find_pictures, summary
+from flockd.ground.pictures.coco_labels import read_labels
 from flockd.ground.pictures.scoring import WIDTH_CLASSES
 from flockd.ground.pictures.single_frame import Box
 from tools.training.skydrones import SPLITS, split_of
@@ -44,11 +45,13 @@ def main() -> None:
     """Run the pipeline over every set."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder with clips/ and labels.json")
+    parser.add_argument("--labelled", action="append", default=[], metavar="NAME=FOLDER")
     parser.add_argument("--without-drones", action="append", default=[], metavar="NAME=FOLDER")
     parser.add_argument("--models", type=Path, default=data_path("models"), help="folder of the networks")
     parser.add_argument("--distance", default="distance_int8")
     parser.add_argument("--verification", default="verification_int8")
     parser.add_argument("--neighbours", default="neighbours_int8")
+    parser.add_argument("--detector", default=PerceptionConfig().detector)
     parser.add_argument("--fov", type=float, default=90.0, metavar="DEG", help="across the longer side")
     parser.add_argument("--scale", type=float, default=1.0, help="resize every picture first")
     parser.add_argument("--split", choices=SPLITS, default="validation", help="of the clips")
@@ -59,14 +62,18 @@ def main() -> None:
     sets: dict[str, list[Picture]] = {}
     if arguments.data:
         sets |= sky_pictures(arguments.data, arguments.split)
+    for given in arguments.labelled:
+        name, _, folder = given.partition("=")
+        sets[name] = list(labelled_pictures(Path(folder)))
     for given in arguments.without_drones:
         name, _, folder = given.partition("=")
         sets[name] = list(free_pictures(Path(folder)))
     if not sets:
-        parser.error("give --data, --without-drones or both")
+        parser.error("give --data, --labelled or --without-drones")
     config = PerceptionConfig(
         depth=arguments.neighbours, segmentation=arguments.neighbours, distance=arguments.distance,
-        verification=arguments.verification, models_dir=str(arguments.models), threads=arguments.threads,
+        verification=arguments.verification, detector=arguments.detector, models_dir=str(arguments.models),
+        threads=arguments.threads,
     )  # fmt: skip
     detector = PictureDetector(config)
     results: dict[str, dict[str, object]] = {}
@@ -115,6 +122,12 @@ def sky_pictures(folder: Path, split: str) -> dict[str, list[Picture]]:
         clip, frame = folder / "clips" / label["clip"], int(label["frame"])
         sets.setdefault(kind, []).append((f"{clip.stem}_{frame:04d}", partial(clips.frame, clip, frame), boxes))
     return sets
+
+
+def labelled_pictures(folder: Path) -> Iterator[Picture]:
+    """The pictures that a folder's ``labels.json`` names."""
+    for picture, labels in read_labels(folder / "labels.json", find_pictures([folder])).items():
+        yield str(picture.relative), partial(_image, picture), labels.boxes
 
 
 def free_pictures(folder: Path) -> Iterator[Picture]:

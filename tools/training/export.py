@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from flockd.flight.inference.feeds import golden_feeds
 from flockd.flight.inference.manifest import Manifest
+from tools.training.detector.network import CLASSES, Boxes
 from tools.training.manifests import write_manifest
 from tools.training.networks import DistanceNet, FlowNet, NeighboursNet, VerificationNet
 
@@ -36,7 +37,8 @@ REAL_DATA = (
     "odm_data_caliterra@bec3dc72 (CC0 1.0); drone_dataset_brighton_beach@9506a9bf (P. Toffanin, BSD-2-Clause). "
     "Begun with the encoder of `distance`."
 )
-TRAINED_BY = {"verification": "tools.training.train_verification"}
+DETECTOR_DATA = "TODO"
+TRAINED_BY = {"verification": "tools.training.train_verification", "detector": "tools.training.train_detector"}
 """Where it is not tools.training.train."""
 
 IMAGE = {"shape": [1, "h", "w", 3], "dtype": "uint8", "meaning": "RGB image", "unit": "grey levels 0-255"}
@@ -46,6 +48,10 @@ COLUMNS = {
         *("drone_logit", "log_apparent_size"),
     ),
     "drone": ("drone_logit",),
+    "boxes": (
+        *("centre_right_px", "centre_down_px", "width_px", "height_px"),
+        *(f"{name}_probability" for name in CLASSES),
+    ),
 }
 """Columns of an output (n, k), in the order in which the network writes them."""
 NETWORKS: dict[str, dict[str, Any]] = {
@@ -124,6 +130,29 @@ NETWORKS: dict[str, dict[str, Any]] = {
         "inputs": {"crop": {**IMAGE, "shape": ["n", 96, 96, 3]}},
         "outputs": {"drone": (["n", 1], "logit of a drone being there", "1")},
     },
+    "detector": {
+        "net": Boxes,
+        "roles": ["detector"],
+        "description": "YOLOX-nano: boxes of drones in one image, and of birds, airplanes and helicopters",
+        "data": DETECTOR_DATA,
+        "size_multiple": 32,
+        "golden_size": [320, 256],
+        "thresholds": {
+            "box_probability": 0.05,
+            "overlap": 0.5,
+            "evidence_gain": 1.0,
+            "evidence_offset": 0.0,
+            "no_box_evidence": 0.0,
+        },
+        "inputs": {"image": IMAGE},
+        "outputs": {
+            "boxes": (
+                ["cells", 4 + len(CLASSES)],
+                "centre right and down, width, height, and probability of each class",
+                "input px, input px, input px, input px, 1, 1, 1, 1",
+            )
+        },
+    },
     "flow": {
         "net": FlowNet,
         "roles": ["flow"],
@@ -164,7 +193,7 @@ def main() -> None:
     if isinstance(net, FlowNet):
         net.iterations = arguments.iterations
     state = torch.load(arguments.checkpoint, map_location="cpu")
-    net.load_state_dict(state["net"])
+    (net.detector if isinstance(net, Boxes) else net).load_state_dict(state["net"])
     if arguments.begun_with:
         draw_back(net, torch.load(arguments.begun_with, map_location="cpu")["net"])
     trained_by = TRAINED_BY.get(arguments.network, f"tools.training.train {arguments.network}")
@@ -236,6 +265,7 @@ def _write_onnx(
     free = {0: "n"} if "crop" in manifest.contents else None
     axes = {n: free or ({1: "h", 2: "w"} if v.dtype == np.uint8 else {2: "h2", 3: "w2"}) for n, v in feeds.items()}
     axes |= {name: free or {2: "ho", 3: "wo"} for name in outputs}
+    axes |= {name: {0: "cells"} for name in outputs if name == "boxes"}
     torch.onnx.export(
         net, tuple(torch.from_numpy(v) for v in feeds.values()), str(file), input_names=list(feeds),
         output_names=outputs, opset_version=17, dynamo=False, dynamic_axes=axes,

@@ -6,7 +6,7 @@ network says the same as before and training can go on with it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import onnx
@@ -37,14 +37,19 @@ def begin_with_onnx(net: nn.Module, path: Path, run: Callable[[], object]) -> No
     biases = {_norm_after(name): value for name, value in weights.items() if name not in own}
     if missing := norms.keys() - biases.keys():
         raise ValueError(f"{path}: nothing for {sorted(missing)[0]}; it is not {type(net).__name__}'s")
-    hooks = [norm.register_forward_pre_hook(_settled_to(biases[name])) for name, norm in norms.items()]
-    momenta = [norm.momentum for norm in norms.values()]
+    settle_norms(net, {norm: biases[name] for name, norm in norms.items()}, run)
+
+
+def settle_norms(net: nn.Module, biases: Mapping[nn.BatchNorm2d, Tensor], run: Callable[[], object]) -> None:
+    """Each normalisation adds its bias and does nothing else to what it sees while ``run`` calls ``net``."""
+    hooks = [norm.register_forward_pre_hook(_settled_to(bias)) for norm, bias in biases.items()]
+    momenta = [norm.momentum for norm in biases]
     net.train()
-    for norm in norms.values():
+    for norm in biases:
         norm.momentum = 0.0
     with torch.no_grad():
         run()
-    for hook, norm, momentum in zip(hooks, norms.values(), momenta, strict=True):
+    for hook, norm, momentum in zip(hooks, biases, momenta, strict=True):
         hook.remove()
         norm.momentum = momentum
 

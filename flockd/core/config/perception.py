@@ -124,6 +124,8 @@ class PerceptionConfig(Section):
     """Where DIS after a network stops: at a 2^n-th of the size."""
     depth: str = "neighbours_int8"
     segmentation: str = "neighbours_int8"
+    detector: str = "none"
+    """Boxes of drones, found in the whole image. `none`: the segmentation alone proposes where a drone may be."""
     distance: str = "distance_int8"
     """Second stage: a drone's range from its crop alone. `none`: the depth map decides."""
     verification: str = "verification_int8"
@@ -174,6 +176,6 @@ class PerceptionConfig(Section):
     @property
     def networks(self) -> dict[Role, str]:
         """The model's name, or its manifest's path, of each role that a network fills."""
-        unused = {"verification"} if self.distance == NO_MODEL else set()
+        unused = {"detector", "verification"} if self.distance == NO_MODEL else set()
         names = {role: getattr(self, role) for role in ROLES if role not in unused}
         return {role: name for role, name in names.items() if name not in {DIS, NO_MODEL}}

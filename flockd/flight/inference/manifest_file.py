@@ -137,7 +137,9 @@ def models_for(role: Role, folder: Path) -> tuple[str, ...]:
     return (*found, *_WITHOUT_MODEL.get(role, ()))
 
 
-_WITHOUT_MODEL: Mapping[str, tuple[str, ...]] = {"flow": (DIS,), "distance": (NO_MODEL,), "verification": (NO_MODEL,)}
+_WITHOUT_MODEL: Mapping[str, tuple[str, ...]] = {
+    "flow": (DIS,), "detector": (NO_MODEL,), "distance": (NO_MODEL,), "verification": (NO_MODEL,)
+}  # fmt: skip
 
 
 def find_manifests(folder: Path) -> tuple[Path, ...]:

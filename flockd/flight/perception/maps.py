@@ -48,6 +48,8 @@ class Crop:
     T_body_camera: RigidTransform
     mirrored: bool = False
     """Whether the network is to be given the mirror image, on which it errs differently. The estimate is as if not."""
+    evidence: float = 0.0
+    """Log odds of a drone that are known already; they add to what the crop shows."""
 
 
 @dataclass(frozen=True)

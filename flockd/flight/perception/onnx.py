@@ -21,6 +21,7 @@ from flockd.flight.inference.manifest import Unknown
 from flockd.flight.inference.manifest_file import manifest_path, models_folder, models_for
 from flockd.flight.inference.providers import engines_folder
 from flockd.flight.inference.session import OnnxModel
+from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, with_boxes
 from flockd.flight.perception.detection.instances import group_instances
 from flockd.flight.perception.detection.second_stage import SecondStage
 from flockd.flight.perception.flow import DisFlow, Flow, OnnxFlow, background_flow, object_flow
@@ -62,6 +63,7 @@ class OnnxNetworks(OneByOne):
         self._segmentation = self._models.open(config.segmentation, "segmentation")
         self._unknown = self._what_is_unknown(config)
         self._distance = None if config.distance == NO_MODEL else self._models.open(config.distance, "distance")
+        self._detector, self._box_rules = self._open_detector(config)
         has_verification = self._distance is not None and config.verification != NO_MODEL
         self._verification = self._models.open(config.verification, "verification") if has_verification else None
         self.map_stride = self._segmentation.manifest.map_stride or 1
@@ -105,6 +107,9 @@ class OnnxNetworks(OneByOne):
             proposal, certain = threshold("proposal_logit"), threshold("mask_logit")
         labels, instances = group_instances(logit - np.float32(proposal), offset, scale=self.map_stride)
         labels = np.asarray(cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
+        if self._detector is not None and self._box_rules is not None:
+            boxes, odds = self._boxes(self._detector, self._box_rules, frame.image, camera)
+            labels, instances = with_boxes(labels, instances, boxes, odds, self._box_rules)
         low = cv2.resize((logit < certain).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
         peak = self._segmentation.manifest.thresholds.get("proposal_peak_logit", proposal) - proposal
         return SceneMaps(
@@ -118,11 +123,11 @@ class OnnxNetworks(OneByOne):
         if not crops:
             return ()
         images = [np.ascontiguousarray(c.image[:, ::-1]) if c.mirrored else c.image for c in crops]
-        size = self.second_stage.crop_size
+        size, evidence = self.second_stage.crop_size, np.array([crop.evidence for crop in crops])
         if self._verification is None:
-            return self._ranges(self._distance, crops, images, np.zeros(len(crops)), limit=math.inf)
+            return self._ranges(self._distance, crops, images, evidence, limit=math.inf)
         outputs = _in_batches(self._verification, images)
-        logits = self._verification.manifest.results["drone"].by_column(outputs["drone"])["drone_logit"].astype(float)
+        logits = self._verification.manifest.results["drone"].by_column(outputs["drone"])["drone_logit"] + evidence
         limit = self._verification.manifest.threshold("distance_logit_limit")
         # Where there is no drone, there is no range to ask for: most crops of a cluttered image end here.
         most = _probability(logits + limit)
@@ -159,6 +164,23 @@ class OnnxNetworks(OneByOne):
             _estimate({name: float(column[k]) for name, column in columns.items()}, float(evidence[k]), crop, masks[k])
             for k, crop in enumerate(crops)
         )
+
+    def _open_detector(self, config: PerceptionConfig) -> tuple[OnnxModel | None, BoxRules | None]:
+        if self._distance is None or config.detector == NO_MODEL:
+            return None, None
+        detector = self._models.open(config.detector, "detector")
+        return detector, BoxRules.of(detector.manifest)
+
+    def _boxes(
+        self, detector: OnnxModel, rules: BoxRules, image: UInt8Array, camera: RigCamera
+    ) -> tuple[FloatArray, FloatArray]:
+        """Boxes (n, 4) of drones, left, top, right, bottom in pixels of the image, and their log odds (n,)."""
+        fitting = fit(detector.manifest, (image.shape[1], image.shape[0]))
+        rows = detector.infer({"image": [fitting.enter(image)]})["boxes"]
+        boxes, odds = kept_boxes(detector.manifest.results["boxes"].by_column(rows), rules)
+        boxes /= np.tile(fitting.scale, 2)
+        inside = camera.camera.in_image((boxes[:, :2] + boxes[:, 2:]) / 2)
+        return boxes[inside], odds[inside]
 
     def _run(self, model: OnnxModel, image: UInt8Array, planes: Float32Array) -> dict[str, Float32Array]:
         """One model's maps (c, h, w) that show all of an image, at the model's resolution."""

@@ -77,6 +77,26 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
         },
         map_stride=True,
     ),
+    "detector": Requirements(
+        inputs=("image",),
+        outputs=("boxes",),
+        columns={"boxes": ("centre_right_px", "centre_down_px", "width_px", "height_px", "drone_probability")},
+        thresholds={
+            "box_probability": Threshold("A box of less probability is not proposed.", 1e-4, 1.0),
+            "overlap": Threshold(
+                "Of two boxes whose intersection over union is more, the more probable one is kept.", 0.0, 1.0
+            ),
+            "evidence_gain": Threshold(
+                "The log odds of a box count so many times beside those that the second stage says of its crop, ...",
+                0.0,
+                10.0,
+            ),
+            "evidence_offset": Threshold("... and this much is added to them.", *_LOGIT),
+            "no_box_evidence": Threshold(
+                "The log odds that count so for what the segmentation alone proposes.", *_LOGIT
+            ),
+        },
+    ),
     "distance": Requirements(
         inputs=("crop",),
         outputs=("range",),

@@ -29,6 +29,8 @@ class Instance:
     area_px: float
     score: float = 0.0
     """By how much the highest logit of its pixels exceeds the threshold of a pixel; the more, the likelier a drone."""
+    evidence: float = 0.0
+    """What a detector says of it: log odds of a drone, which add to those of the second stage."""
 
 
 def group_instances(

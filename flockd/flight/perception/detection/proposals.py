@@ -49,6 +49,11 @@ class Proposal:
         """Area of its pixels in the first stage."""
         return self.instance.area_px if self.instance else 0.0
 
+    @property
+    def evidence(self) -> float:
+        """Log odds of a drone before any crop."""
+        return self.instance.evidence if self.instance else 0.0
+
 
 def propose_instances(
     rig: Rig, scenes: Mapping[str, SceneMaps], rules: CropRules, parameters: DetectionParameters

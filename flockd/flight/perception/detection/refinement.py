@@ -156,7 +156,8 @@ class Cascade:
         reasons = []
         for stage in stages:
             try:
-                cut.append((stage, *take_crop(rig, images, stage.roi, self._crop_size)))
+                crop = take_crop(rig, images, stage.roi, self._crop_size, stage.proposal.evidence)
+                cut.append((stage, *crop))
             except ValueError as error:
                 reasons.append(_dropped(error))
         ranged, unranged = self._ranges(cut)

@@ -101,11 +101,13 @@ def pixel_angle(rig: Rig, cameras: Iterable[str], direction: FloatArray) -> floa
     return min(angle for angle in angles if angle > 0.0)
 
 
-def take_crop(rig: Rig, images: Mapping[str, UInt8Array], roi: Roi, size_px: int) -> tuple[Crop, VirtualCrop]:
+def take_crop(
+    rig: Rig, images: Mapping[str, UInt8Array], roi: Roi, size_px: int, evidence: float = 0.0
+) -> tuple[Crop, VirtualCrop]:
     """The crop of a region, drawn from whichever cameras of the rig see there, and the virtual camera."""
     view = virtual_crop(rig, roi.direction, roi.half_angle, size_px)
     image, _ = view.sample(images, range_m=roi.range_m)
-    return Crop(image, view.camera, view.T_body_virtual, roi.mirrored), view
+    return Crop(image, view.camera, view.T_body_virtual, roi.mirrored, evidence), view
 
 
 def angle_between(a: FloatArray, b: FloatArray) -> float:

@@ -1,0 +1,228 @@
+"""YOLOX-nano in torch (Ge et al. 2021, "YOLOX: Exceeding YOLO Series in 2021"; depth 0.33, width 0.25, depthwise).
+
+An anchor-free detector: in each cell of three maps (strides 8, 16, 32) a box, an objectness, and classes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+from onnx import numpy_helper
+from torch import Tensor, nn
+
+from tools.training.from_onnx import settle_norms
+
+STRIDES = (8, 16, 32)
+CLASSES = ("drone", "bird", "airplane", "helicopter")
+COCO = {"airplane": 4, "bird": 14, "kite": 33}
+_BEGUN_WITH = (("kite", "bird", "airplane"), ("bird",), ("airplane",), ("airplane",))
+"""Of which classes of COCO each of ours takes the mean of the last layer's weights."""
+_WIDTHS = (16, 32, 64, 128, 256)
+_HEAD = 64
+_BN = {"eps": 1e-3, "momentum": 0.03}
+
+
+class Unit(nn.Module):
+    """Convolution, batch norm, SiLU."""
+
+    def __init__(self, into: int, out: int, size: int = 1, stride: int = 1, groups: int = 1) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(into, out, size, stride, size // 2, groups=groups, bias=False)
+        self.norm = nn.BatchNorm2d(out, **_BN)
+        self.act = nn.SiLU(inplace=True)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(n, into, h, w) -> (n, out, h, w) / stride."""
+        y: Tensor = self.act(self.norm(self.conv(x)))
+        return y
+
+
+def _separable(into: int, out: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(Unit(into, into, 3, stride, groups=into), Unit(into, out))
+
+
+class _Bottleneck(nn.Module):
+    def __init__(self, width: int, *, shortcut: bool) -> None:
+        super().__init__()
+        self.first, self.second, self.shortcut = Unit(width, width), _separable(width, width), shortcut
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Keeps the shape."""
+        y: Tensor = self.second(self.first(x))
+        return y + x if self.shortcut else y
+
+
+class _CrossStage(nn.Module):
+    """Cross-stage partial block: half of the channels go through bottlenecks."""
+
+    def __init__(self, into: int, out: int, count: int = 1, *, shortcut: bool = False) -> None:
+        super().__init__()
+        half = out // 2
+        self.through, self.past = Unit(into, half), Unit(into, half)
+        self.blocks = nn.Sequential(*(_Bottleneck(half, shortcut=shortcut) for _ in range(count)))
+        self.joined = Unit(2 * half, out)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(n, into, h, w) -> (n, out, h, w)."""
+        through, past = self.through(x), self.past(x)
+        y: Tensor = self.joined(torch.cat([self.blocks(through), past], 1))
+        return y
+
+
+class _Pyramid(nn.Module):
+    """Spatial pyramid pooling."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first, self.last = Unit(width, width // 2), Unit(2 * width, width)
+        self.pools = nn.ModuleList(nn.MaxPool2d(size, 1, size // 2) for size in (5, 9, 13))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Keeps the shape."""
+        x = self.first(x)
+        y: Tensor = self.last(torch.cat([x, *(pool(x) for pool in self.pools)], 1))
+        return y
+
+
+class _Head(nn.Module):
+    def __init__(self, into: int, classes: int) -> None:
+        super().__init__()
+        self.stem = Unit(into, _HEAD)
+        self.cls_convs = nn.Sequential(_separable(_HEAD, _HEAD), _separable(_HEAD, _HEAD))
+        self.cls = nn.Conv2d(_HEAD, classes, 1)
+        self.reg_convs = nn.Sequential(_separable(_HEAD, _HEAD), _separable(_HEAD, _HEAD))
+        self.reg, self.obj = nn.Conv2d(_HEAD, 4, 1), nn.Conv2d(_HEAD, 1, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(n, into, h, w) -> (n, 5 + classes, h, w)."""
+        x = self.stem(x)
+        classes = self.cls(self.cls_convs(x))
+        box = self.reg_convs(x)
+        return torch.cat([self.reg(box), self.obj(box), classes], 1)
+
+
+class DroneDetector(nn.Module):
+    """(n, 3, h, w) RGB 0-255, h and w multiples of 32 -> (n, 5 + classes, h/s, w/s) for each stride s.
+
+    Channels: centre right and down of the cell's corner, cells; log width and height, cells; logits of an object, and
+    of each class given that there is one.
+    """
+
+    def __init__(self, classes: int = len(CLASSES)) -> None:
+        super().__init__()
+        a, b, c, d, e = _WIDTHS
+        self.focus = Unit(12, a, 3)
+        self.dark2 = nn.Sequential(_separable(a, b, 2), _CrossStage(b, b, 1, shortcut=True))
+        self.dark3 = nn.Sequential(_separable(b, c, 2), _CrossStage(c, c, 3, shortcut=True))
+        self.dark4 = nn.Sequential(_separable(c, d, 2), _CrossStage(d, d, 3, shortcut=True))
+        self.dark5 = nn.Sequential(_separable(d, e, 2), _Pyramid(e), _CrossStage(e, e))
+        self.lateral, self.mixed4 = Unit(e, d), _CrossStage(2 * d, d)
+        self.reduce, self.mixed3 = Unit(d, c), _CrossStage(2 * c, c)
+        self.down3, self.out4 = _separable(c, c, 2), _CrossStage(2 * c, d)
+        self.down4, self.out5 = _separable(d, d, 2), _CrossStage(2 * d, e)
+        self.heads = nn.ModuleList(_Head(width, classes) for width in (c, d, e))
+
+    def forward(self, images: Tensor) -> list[Tensor]:
+        """See the class."""
+        x = images.flip(1)  # the weights were made for BGR
+        x = torch.cat([x[..., ::2, ::2], x[..., 1::2, ::2], x[..., ::2, 1::2], x[..., 1::2, 1::2]], 1)
+        at3 = self.dark3(self.dark2(self.focus(x)))
+        at4 = self.dark4(at3)
+        at5 = self.dark5(at4)
+        low = self.lateral(at5)
+        mixed = self.reduce(self.mixed4(torch.cat([_doubled(low), at4], 1)))
+        out3 = self.mixed3(torch.cat([_doubled(mixed), at3], 1))
+        out4 = self.out4(torch.cat([self.down3(out3), mixed], 1))
+        out5 = self.out5(torch.cat([self.down4(out4), low], 1))
+        return [head(out) for head, out in zip(self.heads, (out3, out4, out5), strict=True)]
+
+
+class Boxes(nn.Module):
+    """(1, h, w, 3) RGB 0-255 -> (cells, 4 + classes): centre and size in pixels, probabilities of the classes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.detector = DroneDetector()
+
+    def forward(self, image: Tensor) -> Tensor:
+        """See the class."""
+        maps = self.detector(image.permute(0, 3, 1, 2).float())
+        box, there, kinds = decoded(maps)
+        return torch.cat([box, there.sigmoid()[..., None] * kinds.sigmoid()], 2)[0]
+
+
+def cells(maps: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Corners of all cells (a, 2) right and down, pixels, and their strides (a, 1)."""
+    corners, strides = [], []
+    for map_, stride in zip(maps, STRIDES, strict=True):
+        one = torch.ones_like(map_[0, 0])
+        corner = torch.stack([one.cumsum(1), one.cumsum(0)], -1).reshape(-1, 2) - 1
+        corners.append(corner * stride)
+        strides.append(one.reshape(-1, 1) * stride)
+    return torch.cat(corners), torch.cat(strides)
+
+
+def decoded(maps: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Boxes (n, a, 4) centre and size, pixels; logits of an object (n, a) and of classes (n, a, classes)."""
+    flat = torch.cat([map_.float().flatten(2) for map_ in maps], 2).transpose(1, 2)
+    corners, strides = cells(maps)
+    middle = flat[..., :2] * strides + corners
+    size = flat[..., 2:4].clamp(max=8.0).exp() * strides
+    return torch.cat([middle, size], -1), flat[..., 4], flat[..., 5:]
+
+
+def _doubled(x: Tensor) -> Tensor:
+    return nn.functional.interpolate(x, scale_factor=2.0, mode="nearest")
+
+
+def begin_with_coco(network: DroneDetector, path: Path, images: Tensor) -> None:
+    """Weights of an ONNX file of YOLOX-nano, and what batch norms see of ``images`` (n, 3, h, w).
+
+    The file has its batch norms folded into its convolutions, which come in the order in which they are run, as ours
+    do. Raises ValueError where one differs.
+    """
+    graph = onnx.load(str(path)).graph
+    stored = {one.name: numpy_helper.to_array(one) for one in graph.initializer}
+    given = [[stored[name] for name in node.input[1:]] for node in graph.node if node.op_type == "Conv"]
+    modules = _in_order(network)
+    if len(modules) != len(given):
+        raise ValueError(f"{path}: has {len(given)} convolutions, and YOLOX-nano {len(modules)}")
+    norms = {id(unit.conv): unit.norm for unit in network.modules() if isinstance(unit, Unit)}
+    heads = {id(head.cls) for head in network.heads}
+    biases: dict[nn.BatchNorm2d, Tensor] = {}
+    for conv, arrays in zip(modules, given, strict=True):
+        weight, bias = (torch.tensor(np.array(_of_our_classes(a) if id(conv) in heads else a)) for a in arrays)
+        if conv.weight.shape != weight.shape:
+            raise ValueError(f"{path}: a convolution is {list(weight.shape)}, and must be {list(conv.weight.shape)}")
+        conv.weight.data = weight
+        if conv.bias is not None:
+            conv.bias.data = bias
+        else:
+            biases[norms[id(conv)]] = bias
+    settle_norms(network, biases, lambda: network(images))
+
+
+def _of_our_classes(of_coco: NDArray[Any]) -> NDArray[Any]:
+    """(classes, ...) from the (80, ...) of COCO."""
+    return np.stack([np.mean([of_coco[COCO[name]] for name in names], axis=0) for names in _BEGUN_WITH])
+
+
+def _in_order(network: DroneDetector) -> list[nn.Conv2d]:
+    """Its convolutions as they are run."""
+    order: list[nn.Conv2d] = []
+    hooks = [
+        module.register_forward_hook(lambda m, *_: order.append(m))
+        for module in network.modules()
+        if isinstance(module, nn.Conv2d)
+    ]
+    with torch.no_grad():
+        network.eval()(torch.zeros(1, 3, 64, 64))
+    for hook in hooks:
+        hook.remove()
+    return order
