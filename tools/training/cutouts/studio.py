@@ -23,7 +23,7 @@ from tools.training.cutouts.drones import Drone, propeller, swept
 from tools.training.cutouts.plan import SIZE_PX, Light, Scene, View
 
 Array = NDArray[Any]
-_SAMPLES, _MASK_SAMPLES = 12, 6
+_SAMPLES, _MASK_SAMPLES = 8, 6
 _SMOOTH_BELOW = math.radians(38.0)
 _FAR_M = 200.0
 _LIGHT = np.array([0.2126, 0.7152, 0.0722])
