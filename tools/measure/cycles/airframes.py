@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import warnings
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,7 @@ from tools.measure.cycles.sources import AIRFRAMES, Assembly, Part, Source
 
 Array = NDArray[Any]
 _GREY, _BLACK = (0.12, 0.12, 0.12), (0.02, 0.02, 0.02)
-_MOST_TRIANGLES = 60_000
+_MOST_TRIANGLES = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +67,9 @@ class Airframe:
         return float(np.linalg.norm(hubs[:, None] - hubs[None], axis=2).max())
 
 
-def airframe(folder: Path, name: str) -> Airframe:
-    """The airframe of a name in `AIRFRAMES`. Raises ValueError where its files are missing or it is not of its size."""
-    source = AIRFRAMES[name]
+def airframe(folder: Path, name: str, sources: Mapping[str, Source] = AIRFRAMES) -> Airframe:
+    """The airframe of a name in ``sources``. Raises ValueError where its files are missing or it is not of its size."""
+    source = sources[name]
     try:
         made = _assembled(folder, source) if isinstance(source.made_of, Assembly) else _of_sdf(folder, source.made_of)
     except OSError as error:
@@ -92,7 +94,8 @@ def _assembled(folder: Path, source: Source) -> Airframe:
 
 def _turned(part: Part) -> Array:
     turn = np.eye(4)
-    turn[:3, :3] = rotation(0.0, 0.0, math.radians(part.yaw_deg)) @ np.diag([1.0, -1.0 if part.mirrored else 1.0, 1.0])
+    turned = rotation(math.radians(part.roll_deg), 0.0, math.radians(part.yaw_deg))
+    turn[:3, :3] = part.scale * turned @ np.diag([1.0, -1.0 if part.mirrored else 1.0, 1.0])
     turn[:3, 3] = part.position_m
     return turn
 
@@ -135,10 +138,11 @@ def _piece(path: Path, placed: Array, colour: tuple[float, float, float] | None)
         raise FileNotFoundError(2, "missing", str(path))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        # Some files name a node "<STL_BINARY>", which XML does not allow.
-        text = io.BytesIO(path.read_bytes().replace(b'"<STL_BINARY>"', b'"STL_BINARY"'))
         scene: Any = trimesh.load_scene(
-            text, path.suffix[1:], resolver=trimesh.resolvers.FilePathResolver(str(path)), process=False
+            io.BytesIO(_legible(path)),
+            path.suffix[1:],
+            resolver=trimesh.resolvers.FilePathResolver(str(path)),
+            process=False,
         )
         corners, faces, colours, first = [], [], [], 0
         for turn, name in map(scene.graph.get, scene.graph.nodes_geometry):
@@ -150,6 +154,15 @@ def _piece(path: Path, placed: Array, colour: tuple[float, float, float] | None)
             colours.append(np.tile(colour, (len(shape.faces), 1)) if colour else _colours(shape))
             first += len(shape.vertices)
     return np.vstack(corners), np.vstack(faces), np.vstack(colours)
+
+
+def _legible(path: Path) -> bytes:
+    """The file as XML allows it: some name a node "<STL_BINARY>" or "a&b", others lack their last characters."""
+    text = path.read_bytes()
+    if path.suffix != ".dae":
+        return text
+    text = re.sub(rb"&(?!\w+;)", b"&amp;", text.replace(b'"<STL_BINARY>"', b'"STL_BINARY"'))
+    return re.sub(rb"</COLLAD?\s*$", b"</COLLADA>", text)
 
 
 def _colours(shape: Any) -> Array:

@@ -16,6 +16,10 @@ class Part:
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     mirrored: bool = False
     """Left and right."""
+    scale: float = 1.0
+    """Metres in the file's unit."""
+    roll_deg: float = 0.0
+    """Before ``yaw_deg``."""
 
 
 @dataclass(frozen=True)
