@@ -21,7 +21,7 @@ from flockd.flight.inference.manifest import Unknown
 from flockd.flight.inference.manifest_file import manifest_path, models_folder, models_for
 from flockd.flight.inference.providers import engines_folder
 from flockd.flight.inference.session import OnnxModel
-from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, with_boxes
+from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes, with_boxes
 from flockd.flight.perception.detection.instances import group_instances
 from flockd.flight.perception.detection.second_stage import SecondStage
 from flockd.flight.perception.flow import DisFlow, Flow, OnnxFlow, background_flow, object_flow
@@ -31,6 +31,8 @@ from flockd.flight.perception.requirements import check_roles
 
 CROPS_PER_RUN = 24
 """Crops in one run of a network, so that an image full of false proposals does not take more memory."""
+_WHOLE_PX = 800
+"""Longer side of an image in which a detector sees drones of any size."""
 _MIN_DEPTH_M, _MAX_DEPTH_M = 1e-3, 1e3
 """Where a reciprocal of depth is taken: nearer than the lens, and where flow and height measure nothing any more."""
 _NO_DRONE_LOGIT = np.float32(-50.0)
@@ -174,11 +176,23 @@ class OnnxNetworks(OneByOne):
     def _boxes(
         self, detector: OnnxModel, rules: BoxRules, image: UInt8Array, camera: RigCamera
     ) -> tuple[FloatArray, FloatArray]:
-        """Boxes (n, 4) of drones, left, top, right, bottom in pixels of the image, and their log odds (n,)."""
-        fitting = fit(detector.manifest, (image.shape[1], image.shape[0]))
-        rows = detector.infer({"image": [fitting.enter(image)]})["boxes"]
-        boxes, odds = kept_boxes(detector.manifest.results["boxes"].by_column(rows), rules)
-        boxes /= np.tile(fitting.scale, 2)
+        """Boxes (n, 4) of drones, left, top, right, bottom in pixels of the image, and their log odds (n,).
+
+        A large image is looked at in half its size too, and so on: a drone may be larger than the network can see.
+        """
+        seen, scale, found = image, 1.0, []
+        while True:
+            fitting = fit(detector.manifest, (seen.shape[1], seen.shape[0]))
+            rows = detector.infer({"image": [fitting.enter(seen)]})["boxes"]
+            columns = detector.manifest.results["boxes"].by_column(rows)
+            found.append(probable_boxes(columns, rules, (scale * fitting.scale[0], scale * fitting.scale[1])))
+            if max(seen.shape[:2]) <= _WHOLE_PX:
+                break
+            scale /= 2
+            seen = np.asarray(cv2.resize(seen, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
+        boxes, odds = kept_boxes(
+            np.concatenate([one for one, _ in found]), np.concatenate([p for _, p in found]), rules
+        )
         inside = camera.camera.in_image((boxes[:, :2] + boxes[:, 2:]) / 2)
         return boxes[inside], odds[inside]
 

@@ -42,20 +42,30 @@ class BoxRules:
         )
 
 
-def kept_boxes(columns: Mapping[str, Float32Array], rules: BoxRules) -> tuple[FloatArray, FloatArray]:
-    """Boxes (n, 4) left, top, right, bottom that are probable enough and no second ones of a drone; log odds (n,).
+def probable_boxes(
+    columns: Mapping[str, Float32Array], rules: BoxRules, scale: tuple[float, float]
+) -> tuple[FloatArray, FloatArray]:
+    """Boxes (n, 4) left, top, right, bottom that are probable enough, and their probabilities (n,).
 
-    ``columns``: the detector's output, (m,) each. The most probable boxes come first.
+    Args:
+        columns: a detector's output, (m,) each.
+        rules: of the detector.
+        scale: pixels of what it saw per pixel of the image, right and down.
     """
-    probability = columns["drone_probability"]
-    good = np.flatnonzero(probability >= rules.least_probability)
-    half = np.stack([columns["width_px"][good], columns["height_px"][good]], 1).astype(float) / 2
-    middle = np.stack([columns["centre_right_px"][good], columns["centre_down_px"][good]], 1).astype(float)
-    p = probability[good].astype(float)
-    corners = np.hstack([middle - half, 2 * half])
-    kept = np.asarray(cv2.dnn.NMSBoxes(corners.tolist(), p.tolist(), 0.0, rules.overlap), int).reshape(-1)
-    p = np.clip(p[kept], 1e-6, 1 - 1e-6)
-    return np.hstack([middle - half, middle + half])[kept], np.log(p / (1 - p))
+    good = np.flatnonzero(columns["drone_probability"] >= rules.least_probability)
+    right, down, width, height = (
+        columns[name][good].astype(float) for name in ("centre_right_px", "centre_down_px", "width_px", "height_px")
+    )
+    boxes = np.stack([right - width / 2, down - height / 2, right + width / 2, down + height / 2], 1)
+    return boxes / np.tile(scale, 2), columns["drone_probability"][good].astype(float)
+
+
+def kept_boxes(boxes: FloatArray, probability: FloatArray, rules: BoxRules) -> tuple[FloatArray, FloatArray]:
+    """Those of the boxes (n, 4) that are no second ones of a drone, the most probable first, and their log odds."""
+    corners = np.hstack([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]])
+    kept = np.asarray(cv2.dnn.NMSBoxes(corners.tolist(), probability.tolist(), 0.0, rules.overlap), int).reshape(-1)
+    p = np.clip(probability[kept], 1e-6, 1 - 1e-6)
+    return boxes[kept], np.log(p / (1 - p))
 
 
 def with_boxes(
