@@ -32,6 +32,7 @@ def add_picture_options(parser: Parser) -> None:
     networks = parser.add_argument_group("the networks", "by default those of --config, else flockd's own")
     networks.add_argument("--models", metavar="FOLDER", type=Path, help="folder of the manifests")
     networks.add_argument("--first-stage", metavar="NAME", help="the model for depth and segmentation")
+    networks.add_argument("--detector", metavar="NAME", help="the model for boxes of drones, or `none`")
     networks.add_argument("--second-stage", metavar="NAME", help="the model for the distance")
     networks.add_argument("--verification", metavar="NAME", help="the model that verifies detections, or `none`")
     networks.add_argument("--threads", metavar="N", type=_threads, help="processor threads (2)")
@@ -115,6 +116,8 @@ def perception_of(args: argparse.Namespace, drone: DroneConfig | None, **more: A
         values |= {"depth": args.first_stage, "segmentation": args.first_stage}
     if args.second_stage is not None:
         values["distance"] = args.second_stage
+    if args.detector is not None:
+        values["detector"] = args.detector
     if args.verification is not None:
         values["verification"] = args.verification
     if args.threads is not None:

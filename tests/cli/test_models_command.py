@@ -13,7 +13,7 @@ from flockd.core.data import data_path
 from flockd.flight.inference import load_manifest
 from tests.flight.inference.foreign import one_channel_depth
 
-FLOAT = ("distance", "flow", "neighbours", "verification")
+FLOAT = ("detector", "distance", "flow", "neighbours", "verification")
 
 
 def test_the_list_shows_hash_and_licence(capsys: pytest.CaptureFixture[str]) -> None:

@@ -38,7 +38,7 @@ from tools.training.train import begin_with, train
 
 SIDES_PX = {256: 24, 320: 16, 416: 9}
 """Width and height of a batch's pictures, and how many of them take about the same time."""
-MIX = {"composite": 0.52, "without": 0.16, "labelled": 0.16, "worlds": 0.16}
+MIX = {"composite": 0.42, "without": 0.14, "labelled": 0.30, "worlds": 0.14}
 """Shares of the pictures. Half of those without a drone are the very backgrounds of composites of the same batch."""
 KINDS = tuple(MIX)
 

@@ -23,12 +23,12 @@ from flockd.flight.perception.onnx import CROPS_PER_RUN
 from tests.flight.perception.cameras import camera_of, crop_of, rendered
 
 MODELS = data_path("models")
-NETWORKS = ("distance", "flow", "neighbours", "verification")
+NETWORKS = ("detector", "distance", "flow", "neighbours", "verification")
 NAMES = [f"{network}{twin}" for network in NETWORKS for twin in ("", "_int8")]
 ROOT = Path(__file__).parents[3]
 
 
-def test_four_models_and_their_twins_fill_the_five_roles() -> None:
+def test_five_models_and_their_twins_fill_the_six_roles() -> None:
     manifests = [load_manifest(path)[0] for path in find_manifests(MODELS)]
     assert [m.name for m in manifests] == NAMES
     for twins in (False, True):

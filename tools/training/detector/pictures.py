@@ -216,7 +216,7 @@ def _looked_at(cutout: Image, width: float, rng: Generator) -> NDArray[np.float3
     both: NDArray[Any] = np.concatenate([colour * alpha, 255.0 * alpha], 2).astype(np.float32)
     height, across = both.shape[:2]
     scale, angle = width / across, rng.normal(0, 10.0)
-    while scale < 0.5:  # so that nothing is skipped when it is shrunk
+    while scale < 0.5 and min(both.shape[:2]) > 1:  # so that nothing is skipped when it is shrunk
         both = cv2.resize(both, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         scale = width / both.shape[1]
     height, across = both.shape[:2]
