@@ -37,7 +37,7 @@ def main() -> None:
     kinds = {one["name"]: one["id"] for one in coco["categories"]}
     boxed = {one["image_id"] for one in coco["annotations"]}
     first = 1 + max((one["id"] for one in coco["annotations"]), default=0)
-    found = []
+    found: list[dict[str, object]] = []
     for picture in coco["images"]:
         box = None if picture["id"] in boxed else only_box(net, arguments.labels.parent / picture["file_name"])
         if box is not None:
