@@ -19,7 +19,7 @@ FLOAT = ("detector", "distance", "flow", "neighbours", "verification")
 def test_the_list_shows_hash_and_licence(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["models", "list", "--json"]) == 0
     listed = {model["name"]: model for model in json.loads(capsys.readouterr().out)}
-    assert sorted(listed) == sorted([*FLOAT, *(f"{name}_int8" for name in FLOAT)])
+    assert sorted(listed) == sorted([*FLOAT, *(f"{name}_int8" for name in FLOAT if name != "detector")])
     assert {model["licence"] for model in listed.values()} == {"Apache-2.0"}
     assert listed["flow"]["sha256"] == load_manifest(data_path("models") / "flow.yaml")[0].sha256
 
@@ -68,6 +68,8 @@ def test_on_the_cpu_there_is_nothing_to_prepare(tmp_path: Path, capsys: pytest.C
     assert load_drone(drone).perception.provider == "cpu"
     assert main(["models", "prepare", "--config", str(drone), "--json"]) == 0
     prepared = json.loads(capsys.readouterr().out)
-    assert [one["model"] for one in prepared] == ["flow_int8", "neighbours_int8", "distance_int8", "verification_int8"]
+    assert [one["model"] for one in prepared] == [
+        *("flow_int8", "neighbours_int8", "detector", "distance_int8", "verification_int8")
+    ]
     assert all(one["engines"] is None and one["start_s"] > 0 for one in prepared)
     assert not (tmp_path / "engines").exists()

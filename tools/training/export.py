@@ -150,9 +150,9 @@ NETWORKS: dict[str, dict[str, Any]] = {
         "thresholds": {
             "box_probability": 0.05,
             "overlap": 0.5,
-            "evidence_gain": 1.0,
-            "evidence_offset": 0.0,
-            "no_box_evidence": 0.0,
+            "evidence_gain": 2.0,
+            "evidence_offset": 1.5,
+            "no_box_evidence": -1.0,
         },
         "inputs": {"image": IMAGE},
         "outputs": {

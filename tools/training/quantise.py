@@ -1,8 +1,7 @@
-"""Make the 8-bit twin of a network: half the time on a CPU. The range of its numbers is learnt from images.
+"""Make the 8-bit twin of a network: half the time on a CPU. The range of its numbers is learnt from rendered images.
 
 python -m tools.training.quantise models/neighbours.yaml --data DATA/training --out models
 python -m tools.training.quantise models/distance.yaml --data DATA/crops --out models
-python -m tools.training.quantise models/detector.yaml --data PHOTOGRAPHS --out models
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from flockd.flight.inference import Manifest, load_manifest
 from flockd.flight.inference.feeds import golden_feeds
 from flockd.flight.inference.fitting import fit
 from tools.training.dataset import HEIGHT, WIDTH, ground_plane, open_pairs, ray_tangents
-from tools.training.detector.pictures import Photographs
 from tools.training.manifests import write_manifest
 
 Feeds = dict[str, NDArray[Any]]
@@ -32,8 +30,6 @@ IMAGES, COMPARED = 32, 16
 WITHOUT_HEIGHT = 0.3
 """Share of the images whose geometry says nothing of the ground."""
 IN_8_BITS = ("Conv", "Relu", "Resize")
-OF_BOXES_IN_8_BITS = (*IN_8_BITS, "Sigmoid", "Mul", "Concat", "MaxPool", "Add")
-"""A detector's sums lose little, and what lies between its convolutions would take most of its time."""
 KEPT = ("head", "look")
 """Layers with this in their names stay as they are: they write metres and places. So do sums, which in 8 bits cost ten
 times the accuracy that all else together does."""
@@ -49,7 +45,7 @@ def main() -> None:
         "--data",
         type=Path,
         required=True,
-        help="folder of tools.training.render_training_data, of tools.training.render_drone_crops, or of photographs",
+        help="folder of tools.training.render_training_data, or tools.training.render_drone_crops",
     )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--accuracy", action="append", default=[], metavar="WHAT=FIGURE", help="measured accuracy")
@@ -66,13 +62,12 @@ def quantise(float_manifest: Path, data: Path, out: Path, accuracy: dict[str, st
     Raises SystemExit where one differs too much.
     """
     manifest, file = load_manifest(float_manifest)
-    is_of_boxes = "boxes" in manifest.results
-    draw = _crops if "crop" in manifest.contents else _photographs if is_of_boxes else _images
+    draw = _crops if "crop" in manifest.contents else _images
     feeds = list(draw(manifest, data, IMAGES + COMPARED))
     name = f"{manifest.name}_int8"
     out.mkdir(parents=True, exist_ok=True)
     twin = out / f"{name}.onnx"
-    _quantise(file, feeds[:IMAGES], twin, OF_BOXES_IN_8_BITS if is_of_boxes else IN_8_BITS)
+    _quantise(file, feeds[:IMAGES], twin)
     differences = _differences(file, twin, feeds[IMAGES:])
     accuracy = accuracy | {
         f"{output}, mean difference from {manifest.name}": f"{d} deviations" for output, d in differences.items()
@@ -100,7 +95,7 @@ class _Reader(CalibrationDataReader):
         return next(self._rest, None)
 
 
-def _quantise(file: Path, feeds: Sequence[Feeds], twin: Path, operations: Sequence[str]) -> None:
+def _quantise(file: Path, feeds: Sequence[Feeds], twin: Path) -> None:
     """Weights of seven bits: sums of more overflow on processors without instructions made for this."""
     with tempfile.TemporaryDirectory() as folder:
         prepared = Path(folder) / "prepared.onnx"
@@ -112,7 +107,7 @@ def _quantise(file: Path, feeds: Sequence[Feeds], twin: Path, operations: Sequen
         quantize_static(
             str(prepared), str(twin), _Reader(feeds), quant_format=QuantFormat.QDQ,
             activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8, per_channel=True, reduce_range=True,
-            op_types_to_quantize=list(operations), nodes_to_exclude=kept,
+            op_types_to_quantize=list(IN_8_BITS), nodes_to_exclude=kept,
             extra_options={"TensorQuantOverrides": {name: [steps] for name in entries}},
         )  # fmt: skip
         model = onnx.load(str(twin))
@@ -194,15 +189,6 @@ def _images(manifest: Manifest, folder: Path, count: int) -> Iterator[Feeds]:
         planes = np.concatenate([ray_tangents(focal), ground[None] * np.float32(rng.random() >= WITHOUT_HEIGHT)])
         contents = {"image": images[0], "first": images[0], "second": images[1], "geometry": planes}
         yield {name: contents[spec.carries or name][None] for name, spec in manifest.inputs.items()}
-
-
-def _photographs(manifest: Manifest, folder: Path, count: int) -> Iterator[Feeds]:
-    """Parts of real pictures, of the size of a camera's image."""
-    (name,) = manifest.inputs
-    rng = np.random.Generator(np.random.PCG64(0))
-    photographs = Photographs(folder)
-    for _ in range(count):
-        yield {name: photographs.draw(WIDTH, rng).image[None]}
 
 
 def _crops(manifest: Manifest, folder: Path, count: int) -> Iterator[Feeds]:

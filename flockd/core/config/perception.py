@@ -124,7 +124,7 @@ class PerceptionConfig(Section):
     """Where DIS after a network stops: at a 2^n-th of the size."""
     depth: str = "neighbours_int8"
     segmentation: str = "neighbours_int8"
-    detector: str = "none"
+    detector: str = "detector"
     """Boxes of drones, found in the whole image. `none`: the segmentation alone proposes where a drone may be."""
     distance: str = "distance_int8"
     """Second stage: a drone's range from its crop alone. `none`: the depth map decides."""

@@ -38,7 +38,7 @@ def test_the_shipped_manifests_fill_their_roles(path: Path) -> None:
 def test_each_role_of_the_configuration_has_its_requirements() -> None:
     assert tuple(REQUIREMENTS) == ROLES
     config = PerceptionConfig()
-    assert config.networks == {role: getattr(config, role) for role in ROLES if getattr(config, role) != "none"}
+    assert config.networks == {role: getattr(config, role) for role in ROLES}
     without = PerceptionConfig(flow="dis", distance="none")
     assert list(without.networks) == ["depth", "segmentation"]
     assert [path.stem for path in manifests_of(without)] == ["neighbours_int8"]

@@ -29,8 +29,13 @@ def test_a_flipped_bit_is_a_failure_of_that_model_alone(copies: Path) -> None:
     content = bytearray((copies / "distance_int8.onnx").read_bytes())
     content[len(content) // 2] ^= 1
     (copies / "distance_int8.onnx").write_bytes(content)
-    flow, neighbours, distance, verification = check_models(_with(models_dir=str(copies)))
-    good = {"flow_int8": flow, "neighbours_int8": neighbours, "verification_int8": verification}
+    flow, neighbours, detector, distance, verification = check_models(_with(models_dir=str(copies)))
+    good = {
+        "flow_int8": flow,
+        "neighbours_int8": neighbours,
+        "detector": detector,
+        "verification_int8": verification,
+    }
     for name, finding in good.items():
         assert (finding.level, finding.about) == (Level.PASS, f"model {name}")
         assert "hash and golden output are right" in finding.measured
