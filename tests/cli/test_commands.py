@@ -170,7 +170,7 @@ def test_config_check_reports_for_people_and_machines(scenario: Path, capsys: py
     assert json.loads(capsys.readouterr().out) == {
         "ok": False,
         "problems": [
-            {"file": str(drone), "line": 32, "key": "yaw", "message": "corse is not known; did you mean `course`?"}
+            {"file": str(drone), "line": 33, "key": "yaw", "message": "corse is not known; did you mean `course`?"}
         ],
     }, "a problem of a file named twice is told once"
 

@@ -39,7 +39,7 @@ class DetectedDrone:
     """One detection in one picture."""
 
     box: Box
-    """Around its mask and the first stage's instances of it."""
+    """The detector's; where it has none, around the mask and the first stage's instances of it."""
     centre_px: tuple[float, float]
     """Right and down, of the detection's bearing."""
     probability: float
@@ -127,11 +127,15 @@ class PictureDetector:
         centre = camera.project(one.position[None] @ _R_BODY_CAMERA)[0]
         size_px = one.size_m / one.range_m * camera.focal_px
         mine = [c for c in candidates if angle_between(c.bearing, one.bearing) < one.size_m / one.range_m / 2]
-        boxes = [c.proposal.instance.box for c in mine if c.proposal.instance is not None]
-        boxes = [box for box in boxes if (box[2:] - box[:2]).max() <= _MAX_INSTANCE * size_px]
-        masked = _box_of(mask == one.label)
-        if masked is not None:
-            boxes.append(masked)
+        instances = [c.proposal.instance for c in mine if c.proposal.instance is not None]
+        boxed = max((i for i in instances if i.boxed), key=lambda instance: instance.score, default=None)
+        if boxed is not None:
+            boxes = [boxed.box]
+        else:
+            boxes = [i.box for i in instances if (i.box[2:] - i.box[:2]).max() <= _MAX_INSTANCE * size_px]
+            masked = _box_of(mask == one.label)
+            if masked is not None:
+                boxes.append(masked)
         if not boxes:  # no mask, or a nearer drone's covers it
             boxes.append(np.clip([*(centre - size_px / 2), *(centre + size_px / 2)], 0, np.tile(camera.size, 2)))
         box = np.concatenate([np.min(boxes, axis=0)[:2], np.max(boxes, axis=0)[2:]])

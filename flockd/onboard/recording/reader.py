@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from flockd.core.config import DroneConfig
+from flockd.core.config.perception import NO_MODEL
 from flockd.core.image_header import cost_fault
 from flockd.core.messages import Frame, FrameSet, MissionOrder, UInt8Array, VehicleState
 from flockd.onboard.recording import foxglove
@@ -288,7 +289,7 @@ def _time_of(path: Path, data: bytes) -> float:
 
 def _config(path: Path, contents: Contents) -> DroneConfig:
     try:
-        return DroneConfig.model_validate_json(contents.configuration)
+        config = DroneConfig.model_validate_json(contents.configuration)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "the whole"
@@ -297,6 +298,10 @@ def _config(path: Path, contents: Contents) -> DroneConfig:
             f"{path}: the configuration in it is not one of this flockd ({key}: {first['msg']}); "
             f"use the flockd that wrote it, {version}"
         ) from error
+    if "detector" in config.perception.model_fields_set:
+        return config
+    flown_without = config.perception.model_copy(update={"detector": NO_MODEL})  # by a flockd that had none
+    return config.model_copy(update={"perception": flown_without})
 
 
 def is_calibration(topic: str) -> bool:

@@ -101,7 +101,9 @@ def with_boxes(
             labels[labels == part.label] = same.label
             del left[part.label]
         centre = (box[:2] + box[2:]) / 2
-        found.append(replace(same, box=box, centre=centre, score=_FIRST + float(log_odds), evidence=evidence))
+        found.append(
+            replace(same, box=box, centre=centre, score=_FIRST + float(log_odds), evidence=evidence, boxed=True)
+        )
     return labels, (*found, *left.values())
 
 

@@ -31,6 +31,8 @@ class Instance:
     """By how much the highest logit of its pixels exceeds the threshold of a pixel; the more, the likelier a drone."""
     evidence: float = 0.0
     """What a detector says of it: log odds of a drone, which add to those of the second stage."""
+    boxed: bool = False
+    """Whether the box is a detector's, and so of the whole drone."""
 
 
 def group_instances(
