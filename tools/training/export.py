@@ -42,7 +42,7 @@ DETECTOR_DATA = (
     "tools.training.render_cutouts (its own shapes, and airframes of mrs_uav_gazebo_simulation, BSD-3-Clause, and "
     "of subt and rotors_simulator, Apache-2.0) before real photographs, and worlds of "
     "tools.training.render_training_data. Real pictures, none of a held-out scene: the sets of `verification` "
-    "without robocup_ml's days of 2019 and 2023, and odm_data_seneca@9220acfd (CC0 1.0), CarND- "
+    "without robocup_ml's days of 2019 and 2023, and odm_data_seneca@9220acfd (CC0 1.0), CarND-"
     "LaneLines-P1@ce5681be and CarND-Advanced-Lane-Lines@91b08035 (Udacity, MIT); of the data set of Drone "
     "Detection and Classification using Machine Learning and Sensor Fusion all clips but 31-40, 91-100 and from "
     "111 (F. Svanstroem, CC0 1.0), where the boxes of 381 birds, airplanes and helicopters were found by "
