@@ -126,7 +126,7 @@ class AutopilotLink:
         self._sent_s = -math.inf
         """When the last setpoint was sent."""
         self._param = Param(system)
-        self._direct = MavlinkDirect(system)
+        self._direct: Any = MavlinkDirect(system)
         self._time_syncs: deque[int] = deque(maxlen=MOST_OPEN)
         """This computer's times in nanoseconds of exchanges that were not answered yet."""
         self._text_ids = cycle(range(1, 0x10000))
@@ -181,7 +181,8 @@ class AutopilotLink:
 
         It is ended even where nobody waits for that so long, after a call that still runs.
         """
-        ended = self._executor.submit(_destroy, self._mavsdk, (self, self._callbacks()))
+        ended = self._executor.submit(_destroy, self._mavsdk, (self, self._direct, self._callbacks()))
+        self._direct = _Closed()
         self._executor.shutdown(wait=False)
         await asyncio.shield(asyncio.wrap_future(ended))
 
@@ -541,6 +542,14 @@ async def _find_system(
                 "check autopilot.address, autopilot.system_id and that the autopilot is on"
             )
         await asyncio.sleep(0.05)
+
+
+class _Closed:
+    """In the plugin's place once the link is closed: what still runs must not call memory that is free."""
+
+    def send_message(self, _message: object) -> None:
+        """Refuses."""
+        raise MavlinkDirectError(MavlinkDirectResult.CONNECTION_ERROR, "send_message()")
 
 
 def _destroy(mavsdk: Mavsdk, _kept: Sequence[object]) -> None:
