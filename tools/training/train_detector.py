@@ -20,10 +20,9 @@ from torch import Tensor
 
 from tools.training.dataset import open_pairs
 from tools.training.detector.loss import detection_loss
-from tools.training.detector.network import DroneDetector, begin_with_coco
+from tools.training.detector.network import NO_BOX, DroneDetector, begin_with_coco
 from tools.training.detector.pictures import (
     MOST_BOXES,
-    NO_BOX,
     Cutouts,
     Labelled,
     Photographs,

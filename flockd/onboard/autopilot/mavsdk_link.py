@@ -126,7 +126,7 @@ class AutopilotLink:
         self._sent_s = -math.inf
         """When the last setpoint was sent."""
         self._param = Param(system)
-        self._direct: Any = MavlinkDirect(system)
+        self._direct: MavlinkDirect | _Closed = MavlinkDirect(system)
         self._time_syncs: deque[int] = deque(maxlen=MOST_OPEN)
         """This computer's times in nanoseconds of exchanges that were not answered yet."""
         self._text_ids = cycle(range(1, 0x10000))
@@ -447,7 +447,10 @@ class AutopilotLink:
 
         numbers = {f"param{i}": float(value) for i, value in enumerate((*values, *[0.0] * (7 - len(values))), start=1)}
         fields = {"command": command, "confirmation": 0, **numbers}
-        self._direct.send_command_async(self._message("COMMAND_LONG", fields), on_answer)
+        try:
+            self._direct.send_command_async(self._message("COMMAND_LONG", fields), on_answer)
+        except MavlinkDirectError as error:
+            raise AutopilotError(f"MAVSDK could not ask the autopilot {what} ({error.result.name.lower()})") from error
         result, ack = await answer
         if result != MavlinkDirectResult.SUCCESS:
             raise AutopilotError(f"the autopilot was asked {what} and did not respond ({result.name.lower()})")
@@ -545,11 +548,18 @@ async def _find_system(
 
 
 class _Closed:
-    """In the plugin's place once the link is closed: what still runs must not call memory that is free."""
+    """In the plugin's place once the link is closed: what still runs must not call memory that is free.
+
+    A task that is cancelled runs once more where its time had come already.
+    """
 
     def send_message(self, _message: object) -> None:
         """Refuses."""
         raise MavlinkDirectError(MavlinkDirectResult.CONNECTION_ERROR, "send_message()")
+
+    def send_command_async(self, _message: object, _on_answer: object) -> None:
+        """Refuses."""
+        raise MavlinkDirectError(MavlinkDirectResult.CONNECTION_ERROR, "send_command_async()")
 
 
 def _destroy(mavsdk: Mavsdk, _kept: Sequence[object]) -> None:

@@ -20,6 +20,7 @@ from flockd.flight.inference import OnnxModel, find_manifests, load_manifest
 from flockd.flight.perception import DisFlow, OnnxFlow, OnnxNetworks
 from flockd.flight.perception.flow import background_flow
 from flockd.flight.perception.onnx import CROPS_PER_RUN
+from flockd.ground.pictures.scoring import intersection_over_union
 from tests.flight.perception.cameras import camera_of, crop_of, rendered
 
 MODELS = data_path("models")
@@ -39,6 +40,17 @@ def test_the_models_fill_the_six_roles_and_twins_of_all_but_the_detector_five() 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_model_opens_and_gives_its_golden_output(name: str) -> None:
     OnnxModel(MODELS / f"{name}.yaml", threads=1)
+
+
+def test_the_detector_finds_a_drone_in_the_whole_image_and_its_evidence_is_for_it() -> None:
+    view = rendered(222.0, (480, 352), (3.0, 0.3, -3.6))
+    networks = OnnxNetworks(PerceptionConfig(flow="dis"), MODELS)
+    maps = networks.scene(Frame("front", view.rgb, 0.0, 0), camera_of(222.0, (480, 352)), None)
+    (drone,) = [one for one in maps.instances if one.boxed]
+    rows, columns = np.nonzero(view.ids == 1)
+    seen = (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
+    assert intersection_over_union(tuple(drone.box.tolist()), seen) > 0.5
+    assert drone.evidence > 0
 
 
 def test_another_models_weights_do_not_give_the_golden_output(copies: Path) -> None:

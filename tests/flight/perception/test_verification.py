@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -69,6 +70,15 @@ def test_the_distance_networks_logit_is_added_up_to_the_limit(copies: Path) -> N
         assert added == pytest.approx(np.clip(alone, -limit, limit), abs=1e-3)
     assert min(alone[:2]) > 1.0
     assert alone[2] < -1.0
+
+
+def test_what_is_known_of_a_crop_before_is_added_to_what_it_shows() -> None:
+    networks = OnnxNetworks(PerceptionConfig(flow="dis"), MODELS)
+    ground = crops()[2]
+    before, doubted, believed = networks.ranges([replace(ground, evidence=e) for e in (0.0, -1.5, 30.0)])
+    assert logit(doubted) == pytest.approx(logit(before) - 1.5, abs=1e-3)
+    assert math.isnan(before.log_range)
+    assert math.isfinite(believed.log_range), "what is believed is asked for its range"
 
 
 def test_ranges_are_asked_for_where_there_may_be_a_drone(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -188,6 +188,20 @@ async def test_all_that_mavsdk_calls_is_kept_until_it_is_destroyed(port: int) ->
         await link.close()
 
 
+async def test_what_still_sends_over_a_closed_link_is_refused(port: int) -> None:
+    """MAVSDK would call memory that is free, which ends the process."""
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock):
+        link = await AutopilotLink.connect(_parameters(port))
+        attending = asyncio.create_task(link.attend())
+        await asyncio.sleep(0)
+        await link.close()
+        with pytest.raises(AutopilotError, match="could not send a setpoint"):
+            link.send_setpoint(Setpoint(0.0, np.zeros(2), 2.5, 0.0))
+        with pytest.raises(AutopilotError, match="could not ask the autopilot"):
+            await link.request_offboard()
+        attending.cancel()
+
+
 async def test_one_lost_heartbeat_loses_no_link_and_is_counted(port: int) -> None:
     """PX4's: one a second."""
     with FakeAutopilot(port, height_m=HOVER_M, clock=clock) as fake_autopilot:

@@ -12,8 +12,8 @@ import torch
 from torch import nn
 
 from tools.training.detector.loss import detection_loss
-from tools.training.detector.network import CLASSES, DroneDetector, begin_with_coco, decoded
-from tools.training.detector.pictures import NOT_JUDGED, Cutouts, Scene, part_of, with_drones
+from tools.training.detector.network import CLASSES, NOT_JUDGED, DroneDetector, begin_with_coco, decoded
+from tools.training.detector.pictures import Cutouts, Scene, part_of, with_drones
 
 CELLS = ((8, 8), (4, 4), (2, 2))
 """Rows and columns of the maps of an image of 64 x 64 pixels."""

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from tools.training.detector.network import CLASSES, cells, decoded
+from tools.training.detector.network import CLASSES, NOT_JUDGED, cells, decoded
 
 NEAR_CELLS = 1.5
 """A cell may answer for a box whose centre is at most so many cells away, right and down."""
@@ -23,7 +23,8 @@ _LEAST_TARGET = 0.75
 
 
 def detection_loss(maps: Sequence[Tensor], boxes: Tensor, classes: Tensor) -> tuple[Tensor, dict[str, float]]:
-    """Loss and figures; boxes (n, m, 4) centre and size, pixels, classes (n, m), -1: no box, -2: not judged there.
+    """Loss and figures; boxes (n, m, 4) centre and size, pixels, classes (n, m), of ``CLASSES``, ``NO_BOX``
+    or ``NOT_JUDGED``.
 
     Cells whose centre lies in a box that is not judged learn nothing of whether there is an object.
     """
@@ -35,7 +36,7 @@ def detection_loss(maps: Sequence[Tensor], boxes: Tensor, classes: Tensor) -> tu
     box_loss, class_loss, count = predicted.new_zeros(()), predicted.new_zeros(()), 0
     overlaps = []
     for k in range(len(boxes)):
-        for box in boxes[k][classes[k] == -2]:
+        for box in boxes[k][classes[k] == NOT_JUDGED]:
             judged[k][((middles - box[:2]).abs() < box[2:] / 2 + strides / 2).all(1)] = 0
         real = classes[k] >= 0
         if not real.any():

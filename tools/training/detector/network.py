@@ -20,6 +20,8 @@ from tools.training.from_onnx import settle_norms
 
 STRIDES = (8, 16, 32)
 CLASSES = ("drone", "bird", "airplane", "helicopter")
+NO_BOX, NOT_JUDGED = -1, -2
+"""Classes of a box that is none, and of one where nothing is learnt of whether there is an object."""
 COCO = {"airplane": 4, "bird": 14, "kite": 33}
 _BEGUN_WITH = (("kite", "bird", "airplane"), ("bird",), ("airplane",), ("airplane",))
 """Of which classes of COCO each of ours takes the mean of the last layer's weights."""

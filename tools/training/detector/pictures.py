@@ -17,12 +17,10 @@ from numpy.typing import NDArray
 from tools.training.augment import as_filmed
 from tools.training.camera_effects import drawn_effects, through_camera
 from tools.training.dataset import PairSet
-from tools.training.detector.network import CLASSES
+from tools.training.detector.network import CLASSES, NOT_JUDGED
 
 Image = NDArray[np.uint8]
 Boxes = NDArray[np.float32]
-NO_BOX, NOT_JUDGED = -1, -2
-"""Classes of a box that is none, and of one where nothing is learnt of whether there is an object."""
 MOST_BOXES = 10
 LEAST_WIDTH_PX = 5.0
 """Of what is learnt as a drone; what is smaller is not judged."""
@@ -100,7 +98,7 @@ class Photographs:
 
 
 class Labelled:
-    """Real pictures with boxes: a folder with ``labels.json`` in COCO's format, or with ``index.jsonl``."""
+    """Real pictures with boxes: a folder with ``labels.json`` in COCO's format; those without a box are left out."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

@@ -16,6 +16,8 @@ _SAME_OVERLAP = 0.3
 """Intersection over union from which a box and an instance are one drone."""
 _PART = 0.8
 """An instance of which so much lies in a box of at least twice its width is a part of that drone."""
+_SUREST = 0.95
+"""No box counts as more probable: a detector that is sure and wrong may not overrule whatever the second stage says."""
 _FIRST = 50.0
 """Added to the score of what a detector found: it is proposed before what the segmentation alone finds."""
 
@@ -61,10 +63,10 @@ def probable_boxes(
 
 
 def kept_boxes(boxes: FloatArray, probability: FloatArray, rules: BoxRules) -> tuple[FloatArray, FloatArray]:
-    """Those of the boxes (n, 4) that are no second ones of a drone, the most probable first, and their log odds."""
+    """Those of the boxes (n, 4) that are no second ones of a drone, the most probable first; their log odds (n,)."""
     corners = np.hstack([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]])
     kept = np.asarray(cv2.dnn.NMSBoxes(corners.tolist(), probability.tolist(), 0.0, rules.overlap), int).reshape(-1)
-    p = np.clip(probability[kept], 1e-6, 1 - 1e-6)
+    p = np.clip(probability[kept], 1 - _SUREST, _SUREST)
     return boxes[kept], np.log(p / (1 - p))
 
 

@@ -38,6 +38,11 @@ def test_of_two_boxes_of_one_drone_the_more_probable_one_stays() -> None:
     assert odds == pytest.approx([np.log(4.0), 0.0], abs=1e-6)
 
 
+def test_a_detector_that_is_sure_of_all_counts_as_one_that_is_right_in_nineteen_of_twenty() -> None:
+    _, odds = found((50, 40, 20, 10, 1.0))
+    assert odds == pytest.approx([np.log(19.0)])
+
+
 def test_boxes_are_in_pixels_of_the_image_and_not_of_what_the_detector_saw() -> None:
     kept, _ = found((50, 40, 20, 10, 0.6), scale=(0.5, 0.25))
     assert kept == pytest.approx(boxes((80, 140, 120, 180)))
