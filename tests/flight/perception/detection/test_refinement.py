@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from flockd.flight.perception import Crop, RangeEstimate
+from flockd.flight.perception.maps import SceneMaps
 from tests.flight.pilot.flyer import Flyer, scenario_with
 
 
@@ -96,3 +97,22 @@ def test_nonsense_for_the_mirrored_crop_gives_no_detection(wrong: dict[str, Any]
 
     flyer.truth.instead["ranges"] = ranges
     assert not flyer.step().detections
+
+
+def test_every_crop_of_a_proposal_carries_what_a_detector_said_of_it() -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
+    estimates, scenes = flyer.truth.sound("ranges"), flyer.truth.sound("scene")
+    carried: list[float] = []
+
+    def scene(*arguments: Any) -> SceneMaps:
+        maps: SceneMaps = scenes(*arguments)
+        return replace(maps, instances=tuple(replace(one, evidence=2.5) for one in maps.instances))
+
+    def ranges(crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+        carried.extend(crop.evidence for crop in crops)
+        given: tuple[RangeEstimate, ...] = estimates(crops)
+        return given
+
+    flyer.truth.instead |= {"scene": scene, "ranges": ranges}
+    assert flyer.step().detections
+    assert carried == [2.5] * 3
