@@ -151,8 +151,9 @@ NETWORKS: dict[str, dict[str, Any]] = {
             "box_probability": 0.05,
             "overlap": 0.5,
             "evidence_gain": 2.0,
-            "evidence_offset": 1.5,
+            "large_box_evidence": 5.0,
             "no_box_evidence": -1.0,
+            "distance_logit_limit": 1.0,
         },
         "inputs": {"image": IMAGE},
         "outputs": {

@@ -130,7 +130,8 @@ class OnnxNetworks(OneByOne):
             return self._ranges(self._distance, crops, images, evidence, limit=math.inf)
         outputs = _in_batches(self._verification, images)
         logits = self._verification.manifest.results["drone"].by_column(outputs["drone"])["drone_logit"] + evidence
-        limit = self._verification.manifest.threshold("distance_logit_limit")
+        judge = self._verification if self._detector is None else self._detector
+        limit = judge.manifest.threshold("distance_logit_limit")
         # Where there is no drone, there is no range to ask for: most crops of a cluttered image end here.
         most = _probability(logits + limit)
         rest = [k for k, p in enumerate(most) if p > self.second_stage.thresholds.another_crop]

@@ -87,13 +87,20 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
                 "Of two boxes whose intersection over union is more, the more probable one is kept.", 0.0, 1.0
             ),
             "evidence_gain": Threshold(
-                "The log odds of a box count so many times beside those that the second stage says of its crop, ...",
+                "The log odds of a box count so many times beside those that the second stage says of its crop.",
                 0.0,
                 10.0,
             ),
-            "evidence_offset": Threshold("... and this much is added to them.", *_LOGIT),
+            "large_box_evidence": Threshold(
+                "So much is added to them for a large box, by the logarithm of its width: nothing up to 40 pixels, all "
+                "of it from 300.",
+                *_LOGIT,
+            ),
             "no_box_evidence": Threshold(
                 "The log odds that count so for what the segmentation alone proposes.", *_LOGIT
+            ),
+            "distance_logit_limit": Threshold(
+                "Beside a detector, `verification`'s limit of the same name is this.", 0.0, 50.0
             ),
         },
     ),

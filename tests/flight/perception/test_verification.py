@@ -53,14 +53,17 @@ def test_a_drone_keeps_the_range_that_the_distance_network_gives_and_what_is_non
     assert math.isnan(with_it[2].log_range)
 
 
-def test_the_distance_networks_logit_is_added_up_to_the_limit(copies: Path) -> None:
-    manifest = copies / "verification.yaml"
-    names = {"distance": "distance", "verification": "verification"}
+@pytest.mark.parametrize(("detector", "says"), [("none", "verification"), ("detector", "detector")])
+def test_the_distance_networks_logit_is_added_up_to_the_limit(copies: Path, detector: str, says: str) -> None:
+    manifest = copies / f"{says}.yaml"
+    names = {"distance": "distance", "verification": "verification", "detector": detector}
+    judge = copies / "verification.yaml"
+    judge.write_text(judge.read_text("utf-8").replace("another_crop_probability: 0.2", "another_crop_probability: 0.0"))
     shipped = manifest.read_text(encoding="utf-8")
 
     def limited(limit: float) -> list[float]:
         document = yaml.safe_load(shipped)
-        document["thresholds"] |= {"distance_logit_limit": limit, "another_crop_probability": 0.0}
+        document["thresholds"]["distance_logit_limit"] = limit
         manifest.write_text(yaml.safe_dump(document), encoding="utf-8")
         return [logit(one) for one in ranges(copies, **names)]
 

@@ -16,6 +16,9 @@ _SAME_OVERLAP = 0.3
 """Intersection over union from which a box and an instance are one drone."""
 _PART = 0.8
 """An instance of which so much lies in a box of at least twice its width is a part of that drone."""
+_LARGE_PX = (40.0, 300.0)
+"""Width of boxes beyond which what the second stage says against a drone counts less and less, and least: it learnt on
+real drones of 6 to 60 pixels, and refuses large ones."""
 _SUREST = 0.95
 """No box counts as more probable: a detector that is sure and wrong may not overrule whatever the second stage says."""
 _FIRST = 50.0
@@ -29,7 +32,7 @@ class BoxRules:
     least_probability: float
     overlap: float
     gain: float
-    offset: float
+    large: float
     no_box: float
 
     @classmethod
@@ -39,9 +42,15 @@ class BoxRules:
             least_probability=manifest.threshold("box_probability"),
             overlap=manifest.threshold("overlap"),
             gain=manifest.threshold("evidence_gain"),
-            offset=manifest.threshold("evidence_offset"),
+            large=manifest.threshold("large_box_evidence"),
             no_box=manifest.threshold("no_box_evidence"),
         )
+
+    def evidence(self, box: FloatArray, log_odds: float) -> float:
+        """Log odds of a drone, to add to the second stage's, of a box (4,) that has these of the detector's own."""
+        small, large = np.log(_LARGE_PX)
+        width = np.log(max(float(box[2] - box[0]), 1.0))
+        return self.gain * log_odds + self.large * float(np.clip((width - small) / (large - small), 0.0, 1.0))
 
 
 def probable_boxes(
@@ -88,7 +97,7 @@ def with_boxes(
     free = iter(sorted(set(range(1, UNCLASSED)) - left.keys()))
     found = []
     for box, log_odds in zip(boxes, odds, strict=True):
-        evidence = rules.gain * float(log_odds) + rules.offset
+        evidence = rules.evidence(box, float(log_odds))
         same = max(left.values(), key=lambda one: _overlap(one.box, box), default=None)
         if same is not None and _overlap(same.box, box) >= _SAME_OVERLAP:
             del left[same.label]

@@ -9,7 +9,7 @@ from flockd.core.messages import FloatArray
 from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes, with_boxes
 from flockd.flight.perception.detection.instances import Instance
 
-RULES = BoxRules(least_probability=0.05, overlap=0.5, gain=0.5, offset=1.0, no_box=-2.0)
+RULES = BoxRules(least_probability=0.05, overlap=0.5, gain=0.5, large=4.0, no_box=-2.0)
 DRONE = (100.0, 50.0, 140.0, 70.0)
 
 
@@ -63,7 +63,7 @@ def test_an_instance_takes_the_box_that_is_the_same_drone_and_keeps_its_label() 
     assert (drone.label, drone.area_px) == (3, 100.0)
     assert drone.box == pytest.approx(DRONE)
     assert drone.centre == pytest.approx([120, 60])
-    assert drone.evidence == pytest.approx(0.5 * 2.0 + 1.0)
+    assert drone.evidence == pytest.approx(0.5 * 2.0)
     assert set(np.unique(marked)) == {0, 3}
 
 
@@ -71,7 +71,7 @@ def test_what_only_the_detector_finds_gets_a_label_of_its_own_and_comes_first() 
     far = instance(1, (10, 10, 20, 20))
     _, seen = with_boxes(np.zeros((100, 200), np.uint8), (far,), boxes(DRONE), np.array([-1.0]), RULES)
     assert [one.label for one in sorted(seen, key=lambda one: -one.score)] == [2, 1]
-    assert seen[0].evidence == pytest.approx(0.5)
+    assert seen[0].evidence == pytest.approx(-0.5)
 
 
 def test_what_only_the_segmentation_finds_is_less_likely_a_drone() -> None:
@@ -79,6 +79,11 @@ def test_what_only_the_segmentation_finds_is_less_likely_a_drone() -> None:
         np.zeros((100, 200), np.uint8), (instance(1, (10, 10, 20, 20)),), boxes(), np.zeros(0), RULES
     )
     assert one.evidence == RULES.no_box
+
+
+@pytest.mark.parametrize(("width_px", "added"), [(12, 0.0), (40, 0.0), (40 * 7.5**0.5, 2.0), (300, 4.0), (600, 4.0)])
+def test_what_the_second_stage_says_against_a_large_box_counts_less(width_px: float, added: float) -> None:
+    assert RULES.evidence(np.array([0.0, 0.0, width_px, 20.0]), 3.0) == pytest.approx(0.5 * 3.0 + added)
 
 
 def test_the_parts_of_a_large_drone_are_one_with_it() -> None:
