@@ -4,7 +4,8 @@ python -m tools.measure.evaluate_real --data SKYDRONES --labelled towns=FOLDER -
 
 SKYDRONES holds `clips/` and `labels.json` of drones, birds, airplanes and helicopters before the sky; its clips 31-40
 and 91-100 of each kind are measured on. A labelled folder holds pictures and `labels.json`, boxes in COCO's format.
-Pictures of the other folders hold no drone: all that is found there is false.
+Pictures of the other folders hold no drone: all that is found there is false. `--sheets` draws drones that were found
+and missed, and what was taken for one.
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,6 +33,7 @@ from flockd.ground.pictures import Labelled, PictureDetector, PictureFile, find_
 from flockd.ground.pictures.coco_labels import read_labels
 from flockd.ground.pictures.scoring import WIDTH_CLASSES
 from flockd.ground.pictures.single_frame import Box
+from tools.measure.evaluation.on_pictures import Looks
 from tools.training.skydrones import SPLITS, split_of
 
 Image = NDArray[np.uint8]
@@ -57,6 +60,7 @@ def main() -> None:
     parser.add_argument("--split", choices=SPLITS, default="validation", help="of the clips")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--detections", type=Path, help="write every detection of every picture as JSON")
+    parser.add_argument("--sheets", type=Path, metavar="FOLDER", help="write a contact sheet of each set")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     sets: dict[str, list[Picture]] = {}
@@ -76,28 +80,14 @@ def main() -> None:
         threads=arguments.threads,
     )  # fmt: skip
     detector = PictureDetector(config)
-    results: dict[str, dict[str, object]] = {}
+    results: dict[str, dict[str, Any]] = {}
     written: dict[str, list[dict[str, object]]] = {}
     for name, pictures in sets.items():
-        begin = time.monotonic()
-        measured, proposals = [], 0
         shown = track(pictures, name, console=Console(stderr=True), disable=not sys.stderr.isatty())
-        for _, read, boxes in shown:
-            image, scale = read(), arguments.scale
-            if scale != 1.0:
-                image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
-            resized = tuple((scale * a, scale * b, scale * c, scale * d) for a, b, c, d in boxes)
-            found = detector.detect(image, fov_deg=arguments.fov)
-            measured.append(Labelled(found.detections, resized))
-            proposals += found.proposals
-        ms = 1e3 * (time.monotonic() - begin) / max(len(pictures), 1)
-        results[name] = {
-            "images": len(pictures),
-            **summary(measured),
-            "proposals_per_image": round(proposals / max(len(pictures), 1), 2),
-            "ms_per_image": round(ms, 1),
-            "at_probability": {str(p): summary(measured, p) for p in PROBABILITIES[1:]},
-        }
+        results[name], measured, looks = _measured(detector, shown, arguments.fov, arguments.scale)
+        if arguments.sheets:
+            arguments.sheets.mkdir(parents=True, exist_ok=True)
+            looks.write(arguments.sheets / f"{name}.jpg")
         written[name] = [
             {"picture": picture, "boxes": one.boxes, "found": [asdict(drone) for drone in one.detections]}
             for (picture, _, _), one in zip(pictures, measured, strict=True)
@@ -108,6 +98,33 @@ def main() -> None:
         print(json.dumps(results, indent=1))
     else:
         _print_table(results)
+
+
+def _measured(
+    detector: PictureDetector, pictures: Iterable[Picture], fov_deg: float, scale: float
+) -> tuple[dict[str, Any], list[Labelled], Looks]:
+    """One set's figures, what was found in each picture, and how the drones look."""
+    begin = time.monotonic()
+    measured, looks, proposals = list[Labelled](), Looks(), 0
+    for _, read, boxes in pictures:
+        image = read()
+        if scale != 1.0:
+            image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+        resized = tuple((scale * a, scale * b, scale * c, scale * d) for a, b, c, d in boxes)
+        found = detector.detect(image, fov_deg=fov_deg)
+        measured.append(Labelled(found.detections, resized))
+        looks.add(image, measured[-1])
+        proposals += found.proposals
+    ms = 1e3 * (time.monotonic() - begin) / max(len(measured), 1)
+    figures = {
+        "images": len(measured),
+        **summary(measured),
+        "proposals_per_image": round(proposals / max(len(measured), 1), 2),
+        "ms_per_image": round(ms, 1),
+        "by_look": {look: {"found": hit, "boxes": of} for look, (hit, of) in sorted(looks.counts.items())},
+        "at_probability": {str(p): summary(measured, p) for p in PROBABILITIES[1:]},
+    }
+    return figures, measured, looks
 
 
 def sky_pictures(folder: Path, split: str) -> dict[str, list[Picture]]:
@@ -162,10 +179,10 @@ class _Clips:
         return np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
 
 
-def _print_table(results: dict[str, dict[str, object]]) -> None:
+def _print_table(results: dict[str, dict[str, Any]]) -> None:
     table = Table("set", "images", *(f"{w} px" for w in WIDTH_CLASSES), "AP50", "false, pictures", "proposals", "ms")
     for name, all_of in results.items():
-        rows = {"": all_of, **{f" p >= {p}": one for p, one in all_of["at_probability"].items()}}  # type: ignore[attr-defined]
+        rows = {"": all_of, **{f" p >= {p}": one for p, one in all_of["at_probability"].items()}}
         for note, one in rows.items():
             cells = [
                 f"{100 * c['found'] / c['boxes']:.0f} % of {c['boxes']}" if (c := one["by_width"][w])["boxes"] else ""
@@ -176,6 +193,12 @@ def _print_table(results: dict[str, dict[str, object]]) -> None:
                 f"{one['false']} in {one['measured']}", str(all_of["proposals_per_image"]), str(all_of["ms_per_image"]),
             )  # fmt: skip
     Console(width=200).print(table)
+    for name, all_of in results.items():
+        said = [
+            f"{look} {100 * n['found'] / n['boxes']:.0f} % of {n['boxes']}" for look, n in all_of["by_look"].items()
+        ]
+        if said:
+            print(f"{name}, drones found by their brightness and what is around them: {'; '.join(said)}")
 
 
 if __name__ == "__main__":

@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.flight.geometry import Rig
+from tools.measure.contact_sheet import cut_out, grid, named, write_sheet
 from tools.measure.cycles.card import Findings
 from tools.measure.cycles.jobs import PROPELLER
 from tools.measure.cycles.plan import Moment
 from tools.measure.cycles.taken import Taken
 
 Array = NDArray[Any]
-_SIDE, _ACROSS, _MOST = 160, 10, 30
+_MOST = 30
 _SCENES = 6
 
 
@@ -39,14 +40,11 @@ def contact_sheet(
         for one in [one for one in found.sights if one.found is wanted][:_MOST]:
             said = f"{one.error:+.0%}" if wanted else "missed"
             crop = _around_drone(taken(one.number), one.k, one.drone)
-            crops.append(_named(crop, f"{one.range_m:.1f}m {one.width_px:.0f}px {said}", wanted))
-        parts.append(_grid(crops))
+            crops.append(named(crop, f"{one.range_m:.1f}m {one.width_px:.0f}px {said}", good=wanted))
+        parts.append(grid(crops))
     false = [(number, _around_direction(taken(number), k, bearing, rig)) for number, k, bearing in found.false[:_MOST]]
-    parts.append(_grid([_named(cut, f"false, moment {number}", False) for number, cut in false if cut is not None]))
-    parts = [part for part in parts if part.size]
-    wide = max(part.shape[1] for part in parts)
-    padded = [cv2.copyMakeBorder(part, 0, 6, 0, wide - part.shape[1], cv2.BORDER_CONSTANT) for part in parts]
-    cv2.imwrite(str(path), cv2.cvtColor(np.vstack(padded), cv2.COLOR_RGB2BGR))
+    parts.append(grid([named(cut, f"false, moment {number}", good=False) for number, cut in false if cut is not None]))
+    write_sheet(parts, path)
 
 
 def _around_drone(taken: Taken, k: int, n: int) -> Array:
@@ -54,37 +52,16 @@ def _around_drone(taken: Taken, k: int, n: int) -> Array:
     c = int(np.count_nonzero(of_drone, axis=(1, 2)).argmax())
     rows, columns = np.nonzero(of_drone[c])
     half = max(12, int(0.8 * max(np.ptp(rows), np.ptp(columns))))
-    return _crop(taken.rgb[k, c], (columns.min() + columns.max()) // 2, (rows.min() + rows.max()) // 2, half)
+    return cut_out(taken.rgb[k, c], (columns.min() + columns.max()) // 2, (rows.min() + rows.max()) // 2, half)
 
 
 def _around_direction(taken: Taken, k: int, bearing: Array, rig: Rig) -> Array | None:
     for c, camera in enumerate(rig.cameras.values()):
         u, v = camera.pixels_of_directions(bearing[None])[0]
         if np.isfinite(u):
-            return _crop(taken.rgb[k, c], int(u), int(v), 30)
+            return cut_out(taken.rgb[k, c], int(u), int(v), 30)
     return None
-
-
-def _crop(image: Array, u: int, v: int, half: int) -> Array:
-    padded = cv2.copyMakeBorder(image, half, half, half, half, cv2.BORDER_CONSTANT)
-    return cv2.resize(padded[v : v + 2 * half, u : u + 2 * half], (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
 
 
 def _fitted(image: Array, high: int) -> Array:
     return cv2.resize(image, (round(image.shape[1] * high / image.shape[0]), high), interpolation=cv2.INTER_AREA)
-
-
-def _named(image: Array, text: str, good: bool) -> Array:
-    named = image.copy()
-    colour = (255, 255, 255) if good else (255, 60, 60)
-    cv2.putText(named, text, (3, _SIDE - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.38, (0, 0, 0), 3, cv2.LINE_AA)
-    cv2.putText(named, text, (3, _SIDE - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.38, colour, 1, cv2.LINE_AA)
-    return named
-
-
-def _grid(crops: list[Array]) -> Array:
-    if not crops:
-        return np.empty((0, 0, 3), np.uint8)
-    blank = np.zeros_like(crops[0])
-    crops = crops + [blank] * (-len(crops) % _ACROSS)
-    return np.vstack([np.hstack(crops[k : k + _ACROSS]) for k in range(0, len(crops), _ACROSS)])
