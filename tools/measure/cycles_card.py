@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from flockd.core.config import DroneConfig, load_drone
+from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
 from flockd.flight.geometry import build_rig
 from flockd.flight.perception import load_networks
@@ -54,13 +55,14 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=8, help="of each pixel, before the noise is taken out")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the pictures, and a contact sheet, there")
+    parser.add_argument("--detector", default=PerceptionConfig().detector, metavar="NAME", help="a network, or `none`")
     parser.add_argument("--rigs", nargs="+", choices=("pinhole", "fisheye"), default=("pinhole", "fisheye"))
     parser.add_argument("--only-rendered", action="store_true", help="render nothing: measure what FOLDER holds")
     parser.add_argument("--no-own", action="store_true", help="without the pictures of flockd's renderer beside it")
     arguments = parser.parse_args()
     if arguments.only_rendered and not arguments.keep:
         parser.error("--only-rendered measures what a folder holds: name it with --keep")
-    configs = {name: config for name, config in drones().items() if name in arguments.rigs}
+    configs = {name: config for name, config in drones(arguments.detector).items() if name in arguments.rigs}
     moments = tuple(moment(arguments.seed, k, tuple(AIRFRAMES)) for k in range(arguments.moments))
     with tempfile.TemporaryDirectory() as temporary:
         folder = (arguments.keep or Path(temporary)).absolute()
@@ -82,9 +84,11 @@ def main() -> None:
         _print_card(moments, configs, folder, with_own=not arguments.no_own)
 
 
-def drones() -> dict[str, DroneConfig]:
-    """The simulator's drone, with its own pinholes and with the cameras of a real drone's configuration."""
+def drones(detector: str) -> dict[str, DroneConfig]:
+    """The simulator's drone and a detector, with its own pinholes and with a real drone's cameras."""
     pinhole, real = (load_drone(data_path("config") / f"{name}.yaml") for name in ("simulator", "quadrotor"))
+    perception = pinhole.perception.model_copy(update={"detector": detector})
+    pinhole = pinhole.model_copy(update={"perception": perception})
     return {"pinhole": pinhole, "fisheye": pinhole.model_copy(update={"rig": real.rig})}
 
 

@@ -46,21 +46,21 @@ def test_drones_of_a_moment_are_clear_of_each_other_of_the_ground_and_of_trees()
 
 
 def test_a_job_is_read_as_it_was_written(tmp_path: Path) -> None:
-    rigs = {name: cycles_card.lenses_of(config) for name, config in cycles_card.drones().items()}
+    rigs = {name: cycles_card.lenses_of(config) for name, config in cycles_card.drones("none").items()}
     job = Job(tuple(MOMENTS[:3]), rigs, "meshes", 16, 1)
     write_job(job, tmp_path / "job.json")
     assert read_job(tmp_path / "job.json") == job
 
 
 def test_the_real_drones_cameras_look_forward_right_back_and_left() -> None:
-    lenses = cycles_card.lenses_of(cycles_card.drones()["fisheye"])
+    lenses = cycles_card.lenses_of(cycles_card.drones("none")["fisheye"])
     assert [lens.model for lens in lenses] == ["wide_angle"] * 4
     axes = [np.round(np.array(lens.R_body_camera)[:, 2], 9).tolist() for lens in lenses]
     assert axes == [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]]
 
 
 def test_a_pinhole_is_told_by_its_focal_length_in_millimetres() -> None:
-    told = blender_camera(cycles_card.lenses_of(cycles_card.drones()["pinhole"])[0])
+    told = blender_camera(cycles_card.lenses_of(cycles_card.drones("none")["pinhole"])[0])
     # Blender: the angle across the sensor's width is 2 atan(width / 2 f).
     assert 2 * math.atan(told["sensor_width"] / 2 / told["lens"]) == pytest.approx(2 * math.atan(240 / 222))
     assert (told["shift_x"], told["shift_y"]) == (0, 0)
@@ -91,13 +91,13 @@ def test_the_polynomial_leads_back_to_the_angle_of_flockds_lens() -> None:
     ],
 )
 def test_a_lens_that_blender_has_not_is_refused(changed: dict[str, object], says: str) -> None:
-    lens = cycles_card.lenses_of(cycles_card.drones()["fisheye"])[0]
+    lens = cycles_card.lenses_of(cycles_card.drones("none")["fisheye"])[0]
     with pytest.raises(ValueError, match=says):
         blender_camera(Lens(**{**vars(lens), **changed}))
 
 
 def test_known_places_are_in_the_image() -> None:
-    for config in cycles_card.drones().values():
+    for config in cycles_card.drones("none").values():
         camera = next(iter(build_rig(config.rig).cameras.values())).camera
         pixels = camera.project(known_places(cycles_card.lenses_of(config)[0]))
         assert camera.in_image(pixels).all()
@@ -136,7 +136,7 @@ def test_the_cards_figures() -> None:
 
 
 def test_flockds_own_pictures_of_a_moment_hold_its_drones_where_they_were_planned() -> None:
-    config = cycles_card.drones()["pinhole"]
+    config = cycles_card.drones("none")["pinhole"]
     rig = build_rig(config.rig)
     taken = draw_taken(MOMENTS[0], rig, *known_models(MOMENTS[0]))
     planned = np.subtract([one.poses[0].position for one in MOMENTS[0].neighbours], MOMENTS[0].own[0].position)
