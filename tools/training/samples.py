@@ -23,7 +23,6 @@ from tools.training.dataset import (
     rig_camera,
 )
 from tools.training.networks import MAX_DEPTH_M
-from tools.training.real_samples import repainted
 
 Sample = dict[str, NDArray[Any]]
 
@@ -34,13 +33,8 @@ def neighbours_sample(
     rng: np.random.Generator,
     *,
     crop_px: int | None = None,
-    behind: NDArray[np.uint8] | None = None,
 ) -> Sample:
-    """Image, geometry planes and targets for ``NeighboursNet``; ``crop_px``: of a square, mostly around a drone.
-
-    ``behind``, of the sample's size, is shown behind the drones instead of the rendered world. Its depth is not known:
-    NaN.
-    """
+    """Image, geometry planes and targets for ``NeighboursNet``; ``crop_px``: of a square, mostly around a drone."""
     k = int(rng.integers(2))
     image, depth, ids = pairs["image"][index][k], pairs["depth"][index][k], pairs["ids"][index][k]
     focal = float(pairs["focal"][index])
@@ -59,10 +53,6 @@ def neighbours_sample(
         half = np.s_[..., top // 2 : (top + crop_px) // 2, left // 2 : (left + crop_px) // 2]
         depth, ids, offset, geometry = depth[half], ids[half], offset[half], geometry[half]
     depth = np.minimum(depth.astype(np.float32), MAX_DEPTH_M)
-    if behind is not None:
-        share = cv2.resize((ids > 0).astype(np.float32), None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)[:, :, None]
-        image = np.round(share * repainted(image, rng) + (1 - share) * behind).astype(np.uint8)
-        depth = np.where(ids > 0, depth, np.float32(np.nan))
     image = as_filmed(image, rng)
     if rng.random() < 0.5:
         image, depth, ids = image[:, ::-1], depth[:, ::-1], ids[:, ::-1]

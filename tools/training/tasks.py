@@ -11,9 +11,8 @@ from torch.nn import functional as F
 
 from tools.training.augment import photometric
 from tools.training.crop_files import CropFiles
-from tools.training.dataset import HEIGHT, WIDTH, PairSet
+from tools.training.dataset import PairSet
 from tools.training.networks import MAX_DEPTH_M, MAX_FAMILIES, DistanceNet, FlowNet, NeighboursNet
-from tools.training.real_scenes import RealScenes
 from tools.training.samples import Sample, flow_sample, neighbours_sample, no_drone_sample
 
 Batch = dict[str, Tensor]
@@ -41,32 +40,16 @@ class Task:
 
 
 class NeighboursTask(Task):
-    """Depth, mask and centre offsets of one image, rendered or real."""
+    """Depth, mask and centre offsets of one image."""
 
-    def __init__(self, pairs: PairSet, real: RealScenes) -> None:
+    def __init__(self, pairs: PairSet) -> None:
         super().__init__(NeighboursNet(), 12, 1.2e-3)
-        self.pairs, self.real = pairs, real
-        self.drawn = 0
-        kinds = {"rendered": 0.55}
-        if real.without:
-            kinds |= {"composite": 0.12, "without": 0.23}
-        if real.labelled:
-            kinds["with"] = 0.10
-        self._kinds, shares = list(kinds), np.array(list(kinds.values()))
-        self._shares = shares / shares.sum()
+        self.pairs, self.drawn = pairs, 0
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """See ``Task``. Every fourth batch holds whole images, the others three times as many windows around drones."""
         crop_px = 256 if self.drawn % 4 else None
-        size = (crop_px, crop_px) if crop_px else (WIDTH, HEIGHT)
-        kind = str(rng.choice(self._kinds, p=self._shares))
-        if kind == "without":
-            return self.real.sample_without(size, rng)
-        if kind == "with":
-            return self.real.sample_with(size, rng)
-        behind = self.real.background(size, rng) if kind == "composite" else None
-        index = int(rng.integers(self.pairs.count))
-        return neighbours_sample(self.pairs, index, rng, crop_px=crop_px, behind=behind)
+        return neighbours_sample(self.pairs, int(rng.integers(self.pairs.count)), rng, crop_px=crop_px)
 
     def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
         """See ``Task``."""
@@ -74,33 +57,27 @@ class NeighboursTask(Task):
         return [self.sample(rng) for _ in range(self.batch if self.drawn % 4 else self.batch // 3)]
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
-        """See ``Task``. Targets that are NaN are not known, and nothing is learnt of them."""
+        """See ``Task``."""
         depth, logit, offset = self.net(batch["image"], batch["geometry"])
-        true, judged = batch["depth"].nan_to_num(1.0), batch["drone"].isfinite().float()
-        mask, known = batch["drone"].nan_to_num(0.0), batch["depth"].isfinite()
-        error = (depth.log() - true.log()).abs() * known
+        true, mask = batch["depth"], batch["drone"]
+        error = (depth.log() - true.log()).abs()
         sky = true >= MAX_DEPTH_M
-        weight = torch.where(sky, 0.3, 1.0) * (1 + 3 * mask) * known
-        depth_loss = (error * weight).sum() / weight.sum().clamp(min=1)
+        weight = torch.where(sky, 0.3, 1.0) * (1 + 3 * mask)
+        depth_loss = (error * weight).sum() / weight.sum()
         bce = F.binary_cross_entropy_with_logits(logit, mask, reduction="none")
-        focal = (1 - torch.exp(-bce)) ** 1.5 * bce * (1 + 3 * mask) * judged
-        probability = torch.sigmoid(logit) * judged
+        focal = (1 - torch.exp(-bce)) ** 1.5 * bce * (1 + 3 * mask)
+        probability = torch.sigmoid(logit)
         dice = 1 - (2 * (probability * mask).sum((1, 2, 3)) + 20) / (
             probability.sum((1, 2, 3)) + mask.sum((1, 2, 3)) + 20
         )
         mask_loss = focal.mean() * 40 + 0.5 * dice.mean()
         distance = (offset - batch["offset"]).abs().sum(1, keepdim=True)
         offset_loss = (distance * mask).sum() / (mask.sum() + 1)
-        near = known & (~sky) & (mask < 0.5)
-        guess = (logit > 0) & (judged > 0)
-        rendered = known.flatten(1).any(1)
-        right, either = (guess & (mask > 0.5))[rendered], (guess | (mask > 0.5))[rendered]
-        real = guess[~rendered & (mask.flatten(1).sum(1) == 0)].flatten(1)
+        guess, near = logit > 0, (~sky) & (mask < 0.5)
         figures = {
             "depth": float(error[near].median().detach()),
-            "iou": float(right.sum() / (either.sum() + 1)),
+            "iou": float((guess & (mask > 0.5)).sum() / ((guess | (mask > 0.5)).sum() + 1)),
             "offset": float(offset_loss.detach()),
-            "ghosts": float(real.any(1).float().mean()),
         }
         return depth_loss + mask_loss + 0.05 * offset_loss, figures
 

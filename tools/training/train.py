@@ -30,7 +30,6 @@ from torch.optim.swa_utils import AveragedModel
 
 from tools.training.dataset import open_pairs
 from tools.training.from_onnx import begin_with_onnx
-from tools.training.real_scenes import RealScenes
 from tools.training.samples import Sample
 from tools.training.tasks import Batch, DistanceTask, FlowTask, NeighboursTask, Task
 
@@ -42,7 +41,7 @@ def _task(arguments: argparse.Namespace) -> Task:
     if arguments.network == "flow":
         return FlowTask(pairs)
     if arguments.network == "neighbours":
-        return NeighboursTask(pairs, RealScenes.of(arguments.pictures, arguments.labels))
+        return NeighboursTask(pairs)
     if arguments.negatives is None or arguments.crops is None:
         raise SystemExit("the distance network needs --crops and --negatives")
     return DistanceTask(pairs, arguments.negatives, arguments.crops)
@@ -57,8 +56,6 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0, help="of training in all, over every resumption")
     parser.add_argument("--negatives", type=Path, help="what is no drone, for `distance`: file of mine_negatives.py")
     parser.add_argument("--crops", type=Path, help="drones, for `distance`: folder of render_drone_crops.py")
-    parser.add_argument("--pictures", type=Path, help="real pictures without drones, for `neighbours`: their folder")
-    parser.add_argument("--labels", type=Path, help="real drones, for `neighbours`: COCO file beside its pictures")
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
     parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt, or an .onnx")
     parser.add_argument("--compile", action="store_true", help="`distance` a fifth faster; needs a C++ compiler")
