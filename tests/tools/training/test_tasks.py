@@ -1,11 +1,88 @@
-"""What the first stage learns of one image."""
+"""What the training of the first and of the second stage asks of them. Needs the extra `train`."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import numpy as np
+import pytest
 import torch
+from torch import Tensor
 
 from tools.training.dataset import PairSet
-from tools.training.tasks import NeighboursTask
+from tools.training.networks import DistanceNet
+from tools.training.tasks import DistanceTask, NeighboursTask
+
+DRONES, OTHERS = 6, 6
+
+
+def batch() -> dict[str, Tensor]:
+    """Crops of noise, the first half of which are said to show drones."""
+    n = DRONES + OTHERS
+    there = (torch.arange(n) < DRONES).float()
+    return {
+        "picture": torch.randint(0, 256, (n, 96, 96, 3), dtype=torch.uint8),
+        "mask": torch.zeros(n, 96, 96, dtype=torch.uint8),
+        "target": torch.zeros(n, 3),
+        "motors": torch.full((n, 4, 2), torch.nan),
+        "family": torch.zeros(n, dtype=torch.int64),
+        "apparent": torch.zeros(n),
+        "drone": there,
+    }
+
+
+def answering(logit: float) -> DistanceNet:
+    """A network that says of every crop that there is a drone in it, by this logit."""
+    net = DistanceNet()
+    net.head.weight.data.zero_()
+    net.head.bias.data.zero_()
+    net.head.bias.data[4] = logit
+    return net
+
+
+def task_of(folder: Path) -> DistanceTask:
+    np.save(folder / "negatives.npy", np.zeros((0, 5)))
+    np.savez(folder / "crops.npz", **{name: values.numpy() for name, values in batch().items()})
+    task = DistanceTask(PairSet({}, 0), folder / "negatives.npy", folder)
+    task.net = answering(0.0).train()
+    return task
+
+
+@pytest.mark.parametrize(
+    ("sure", "forgotten", "pull"),
+    [(-3.0, 3.0, 0.1), (-0.5, 0.5, 0.05), (5.0, 0.0, 0.0)],
+    ids=["much surer", "a little surer", "mistaken"],
+)
+def test_what_a_teacher_is_surer_of_is_no_drone_pulls_the_logit_down(
+    tmp_path: Path, sure: float, forgotten: float, pull: float
+) -> None:
+    torch.manual_seed(0)
+    task = task_of(tmp_path)
+    task.teacher = answering(sure).eval()
+    loss, figures = task.loss(batch())
+    loss.backward()
+    assert figures["forgotten"] == pytest.approx(forgotten)
+    # Half of the crops are drones, all with the logit 0: by the labels alone it is neither to rise nor to fall.
+    assert float(task.net.get_parameter("head.bias").grad[4]) == pytest.approx(pull, abs=1e-6)
+    assert all(value.grad is None for value in task.teacher.parameters()), "the teacher does not learn"
+
+
+def test_with_a_teacher_crops_without_a_drone_are_mixed_with_each_other_alone(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    task = task_of(tmp_path)
+    seen: list[Tensor] = []
+    task.net.register_forward_pre_hook(lambda _net, given: seen.append(given[0]))
+    task.teacher = answering(0.0).eval()
+    given = batch()
+    # Grey levels that light and noise cannot carry from one kind to another.
+    given["picture"][:DRONES], given["picture"][DRONES:] = 30, 200
+    given["picture"][DRONES] = 110
+    task.loss(given)
+    drones, others = seen[0][:DRONES].float(), seen[0][DRONES:].float()
+    assert (drones.mean((1, 2, 3)) < 60).all()
+    assert (others.mean((1, 2, 3)) > 80).all()
+    kinds = (others.mean(3) < 155).float().mean((1, 2))
+    assert ((kinds > 0.01) & (kinds < 0.99)).any(), "one shows a part of the darker one, or it of another"
 
 
 def test_depth_mask_and_offsets_are_drawn_towards_the_truth() -> None:
