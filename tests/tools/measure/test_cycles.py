@@ -59,6 +59,11 @@ def test_the_real_drones_cameras_look_forward_right_back_and_left() -> None:
     assert axes == [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]]
 
 
+@pytest.mark.parametrize("detector", ["none", "detector"])
+def test_both_rigs_are_measured_with_the_detector_that_is_asked_for(detector: str) -> None:
+    assert [one.perception.detector for one in cycles_card.drones(detector).values()] == [detector] * 2
+
+
 def test_a_pinhole_is_told_by_its_focal_length_in_millimetres() -> None:
     told = blender_camera(cycles_card.lenses_of(cycles_card.drones("none")["pinhole"])[0])
     # Blender: the angle across the sensor's width is 2 atan(width / 2 f).

@@ -5,7 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tools.training.export import draw_back
+from flockd.core.data import data_path
+from flockd.flight.inference import load_manifest
+from tools.training.export import NETWORKS, draw_back
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_network_that_is_exported_again_is_judged_as_the_shipped_one(name: str) -> None:
+    manifest, _ = load_manifest(data_path("models") / f"{name}.yaml")
+    assert manifest.thresholds == NETWORKS[name].get("thresholds", {})
 
 
 def test_weights_are_drawn_back_a_third_of_the_way_to_what_the_run_began_with() -> None:
