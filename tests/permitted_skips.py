@@ -39,9 +39,7 @@ PERMITTED = (
         "this computer can compute with CUDA",
         "install onnxruntime in place of onnxruntime-gpu",
     ),
-    PermittedSkip(
-        "tests/flight/inference/*", "this computer has TensorRT", "install onnxruntime in place of onnxruntime-gpu"
-    ),
+    PermittedSkip("tests/cli/*", "this computer has TensorRT", "install onnxruntime in place of onnxruntime-gpu"),
     PermittedSkip(
         "tests/onboard/recording/*",
         "a small file system cannot be mounted",
