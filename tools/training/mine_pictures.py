@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from flockd.flight.geometry import PinholeCamera, Rig, RigCamera, RigidTransform, virtual_crop
 from flockd.flight.inference import OnnxModel
 from flockd.flight.perception import group_instances
+from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes
 from tools.training.dataset import open_pairs
 from tools.training.real_patches import PATCH_PX, PATCH_REACH
 from tools.training.skydrones import SPLITS, split_of
@@ -37,7 +38,7 @@ EAGER_LOGIT = -1.5
 """The pipeline proposes from this logit up."""
 FIRST_MARGIN = 0.95
 """Half the pipeline's first crop, as a share of the way from its middle to the proposal's farthest corner."""
-MOST_PROPOSALS, PLACES = 10, 3
+MOST_PROPOSALS, PLACES = 10, 6
 """In one picture."""
 FRAMES_A_CLIP = 40
 FOLLOW_STEP, FOLLOW_STEPS = 3, 4
@@ -73,7 +74,7 @@ class Miner:
         for box in boxes if keeps_drones else ():
             self._cut("drone", rig, image, box)
         for _ in range(places):
-            half = float(np.exp(self._rng.uniform(math.log(5.0), math.log(110.0))))
+            half = float(np.exp(self._rng.uniform(math.log(5.0), math.log(300.0))))
             u, v = self._rng.uniform(0, width), self._rng.uniform(0, height)
             place = (u - half, v - half * 0.5, u + half, v + half * 0.5)
             if all(_gap(place, other) > 0 for other in boxes):
@@ -89,6 +90,11 @@ class Miner:
         np.savez(path, allow_pickle=False, **arrays)
 
     def _proposed(self, image: Image) -> list[Box]:
+        if "boxes" in self._model.manifest.results:
+            rules = BoxRules.of(self._model.manifest)
+            columns = self._model.manifest.results["boxes"].by_column(self._model.run({"image": image[None]})["boxes"])
+            boxes, _ = kept_boxes(*probable_boxes(columns, rules, (1.0, 1.0)), rules)
+            return [tuple(float(x) for x in box) for box in boxes]  # type: ignore[misc]
         height, width = image.shape[:2]
         focal = width / 2
         u = (np.arange(width // 2) * 2 + 1 - width / 2) / focal
@@ -128,7 +134,7 @@ def main() -> None:
     parser.add_argument("--skydrones", type=Path)
     parser.add_argument("--pairs", type=Path, help="rendered pairs")
     parser.add_argument("--split", choices=SPLITS, default="training", help="of the clips")
-    parser.add_argument("--model", type=Path, required=True, help="manifest of a neighbours network")
+    parser.add_argument("--model", type=Path, required=True, help="manifest of a neighbours network or of a detector")
     parser.add_argument("--most", type=int, default=100_000, help="pictures of one source")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
@@ -138,7 +144,7 @@ def main() -> None:
         _mine_clips(arguments.skydrones, arguments.split, model, arguments.out)
     if arguments.pairs:
         _mine_pairs(arguments.pairs, model, arguments.out / "rendered.npz")
-    for folder in sorted(arguments.crops.iterdir()) if arguments.crops else []:
+    for folder in sorted(one for one in arguments.crops.iterdir() if one.is_dir()) if arguments.crops else []:
         target = arguments.out / f"{folder.name}.npz"
         if target.is_file():
             continue

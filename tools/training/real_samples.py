@@ -19,8 +19,10 @@ from tools.training.real_patches import CROP_PX, RealPatches, crop_of_drone, cro
 
 Sample = dict[str, NDArray[Any]]
 Image = NDArray[np.uint8]
-WIDTHS_PX = (6.0, 60.0)
-"""How wide a softened drone is in the camera's image, evenly by its logarithm."""
+WIDTHS_PX = (6.0, 240.0)
+"""How wide a softened drone is in the camera's image, evenly by its logarithm. Cut-outs have no more pixels."""
+_LIKE_BEHIND = 0.25
+"""Share of composites whose drone is nearly as bright as its background."""
 _NEGATIVE_SCALES = (0.4, 1.0)
 _LEAST_SCALE = 0.07
 _TRIES = 6
@@ -35,7 +37,7 @@ proportion: who is taught drones that cannot be seen learns to see them everywhe
 
 
 def softened(sample: Sample, rng: np.random.Generator) -> Sample:
-    """A rendered sample as a real camera shows a drone 6 to 60 px wide."""
+    """A rendered sample as a real camera shows a drone of ``WIDTHS_PX``."""
     width_px = _drawn_width(rng)
     scale = _scale(sample, width_px)
     seen = visibility(sample["picture"], sample["mask"], scale) if sample["drone"] > 0.5 else 1.0
@@ -49,7 +51,7 @@ def sharp(sample: Sample) -> Sample:
 
 
 def composite(sample: Sample, backgrounds: RealPatches, rng: np.random.Generator) -> Sample:
-    """A rendered drone, repainted, in front of a real background, through a real camera."""
+    """The sample with its drone, repainted, in front of a real background, through a real camera."""
     image, seen, scale = sample["picture"], 0.0, 1.0
     share = sample["mask"][:, :, None].astype(np.float32) / 255
     for _ in range(_TRIES):
@@ -59,13 +61,26 @@ def composite(sample: Sample, backgrounds: RealPatches, rng: np.random.Generator
         width_px = min(_drawn_width(rng), camera_px * _shown_px(sample))
         if width_px < WIDTHS_PX[0]:
             continue
-        painted = share * repainted(sample["picture"], rng) + (1 - share) * behind
+        own = repainted(sample["picture"], rng)
+        if rng.random() < _LIKE_BEHIND:
+            own = _as_bright(own, share, behind, rng)
+        painted = share * own + (1 - share) * behind
         image, scale = np.clip(np.round(painted), 0, 255).astype(np.uint8), _scale(sample, width_px)
         seen = visibility(image, sample["mask"], scale, behind)
         if seen >= 1.0:
             break
     picture = through_camera(image, drawn_effects(scale, rng), rng)
-    return _sample(picture, drone=1.0, weight=seen)
+    return {**sample, **_sample(picture, drone=1.0, weight=seen)}
+
+
+def _as_bright(
+    own: NDArray[np.float32], share: NDArray[np.floating[Any]], behind: Image, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """The drone's colours, nearly as bright as what is behind it."""
+    mine = float((share * own).mean() / max(float(share.mean()), 1e-3))
+    wanted = float((share * behind).mean() / max(float(share.mean()), 1e-3))
+    factor = np.float32(1 + rng.uniform(0.3, 0.9) * (wanted / max(mine, 1.0) - 1))
+    return np.asarray(own * factor, np.float32)
 
 
 def visibility(picture: Image, mask: Image, scale: float, behind: Image | None = None) -> float:
@@ -83,7 +98,8 @@ def visibility(picture: Image, mask: Image, scale: float, behind: Image | None =
     change = cv2.resize(share * (picture - hidden), size, interpolation=cv2.INTER_AREA)
     texture = min(float(free.std(0).mean()), _TEXTURE_SIGMA)
     energy = float((change.max(2) ** 2 + change.min(2) ** 2).sum()) / 2 / (_SENSOR_SIGMA**2 + texture**2)
-    return min(1.0, energy / _SURELY_VISIBLE)
+    # However large it is, a drone of which no pixel stands out of the noise cannot be seen.
+    return min(1.0, energy / _SURELY_VISIBLE, (float(np.abs(change).max()) / (2 * _SENSOR_SIGMA)) ** 2)
 
 
 def repainted(picture: Image, rng: np.random.Generator) -> NDArray[np.float32]:

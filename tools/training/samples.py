@@ -97,16 +97,25 @@ def crop_around(drone: DroneInView, rng: np.random.Generator) -> VirtualCrop:
 
 
 def crop_at(centre: NDArray[Any], size_m: float, focal: float, rng: np.random.Generator) -> VirtualCrop:
-    """Where the second stage might look: half of the time as aimed by the first network, else by itself."""
-    aimed = rng.random() < 0.5
-    # How much of the crop the drone fills must say nothing about metres: it is drawn apart from family and range.
-    fill = float(np.exp(np.clip(rng.normal(np.log(1.35), 0.1 if aimed else 0.27), np.log(0.7), np.log(2.4))))
+    """Where the second stage might look, see ``drawn_fill``."""
+    fill, off = drawn_fill(rng)
     half_width = size_m / 2 * fill
-    shift_m = rng.normal(0, 0.03 if aimed else 0.15, 2) * half_width
+    shift_m = off * half_width
     right, down = _across(centre)
     aim = R_BODY_CAMERA @ _in_view(centre + shift_m[0] * right + shift_m[1] * down, focal)
     half_angle = float(np.arctan(half_width / np.linalg.norm(centre)))
     return virtual_crop(Rig({"camera": rig_camera(focal)}), aim / np.linalg.norm(aim), half_angle, 96)
+
+
+def drawn_fill(rng: np.random.Generator) -> tuple[float, NDArray[np.float64]]:
+    """The crop's width in sizes of its drone, and how far it is aimed right and down of it in halves of that width.
+
+    Half of the time as aimed by the first network, else by itself.
+    """
+    aimed = rng.random() < 0.5
+    # How much of the crop the drone fills must say nothing about metres: it is drawn apart from family and range.
+    fill = float(np.exp(np.clip(rng.normal(np.log(1.35), 0.1 if aimed else 0.27), np.log(0.7), np.log(2.4))))
+    return fill, rng.normal(0, 0.03 if aimed else 0.15, 2)
 
 
 def sample_of(drone: DroneInView, crop: VirtualCrop, image: NDArray[Any], mine: NDArray[Any]) -> Sample:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -23,6 +23,7 @@ from torch.nn import functional as F
 from tools.training import real_samples
 from tools.training.augment import photometric
 from tools.training.crop_files import CropFiles
+from tools.training.cutout_crops import CutoutCrops
 from tools.training.from_onnx import begin_with_onnx
 from tools.training.networks import DistanceNet, VerificationNet
 from tools.training.real_patches import RealPatches
@@ -30,8 +31,8 @@ from tools.training.samples import Sample
 from tools.training.tasks import Batch, Task
 from tools.training.train import begin_with, train
 
-MIX = {"rendered": 30, "composite": 16, "real drone": 10, "cut out": 6, "negative": 34}
-"""Samples of a batch."""
+MIX = {"rendered": 18, "composite": 8, "airframe": 22, "real drone": 8, "cut out": 4, "negative": 40}
+"""Samples of a batch; `airframe` is a cut-out of tools.training.render_cutouts before a real background."""
 KINDS = tuple(MIX)
 SOFTENED_SHARE = 0.5
 """Share of the rendered crops that is softened."""
@@ -54,14 +55,18 @@ class VerificationTask(Task):
 
     net: VerificationNet
 
-    def __init__(self, rendered: Path, patches: Path, mix: Mapping[str, int] = MIX) -> None:
-        """``mix``: samples of a batch, by kinds of ``KINDS``."""
+    def __init__(
+        self, rendered: Path, patches: Path, cutouts: Sequence[Path] = (), mix: Mapping[str, int] = MIX
+    ) -> None:
+        """``mix``: samples of a batch, by kinds of ``KINDS``; no `airframe` where there are no ``cutouts``."""
+        mix = {kind: count for kind, count in mix.items() if cutouts or kind != "airframe"}
         super().__init__(VerificationNet(), sum(mix.values()), 6e-4)
         self.mix = mix
         self.rendered = CropFiles(rendered)
         self.negatives = RealPatches(patches, "negative", weights=NEGATIVE_WEIGHTS)
         self.places = RealPatches(patches, "place", weights={"skydrones": 8.0, "skyothers": 8.0})
         self.drones = RealPatches(patches, "drone")
+        self.cutouts = CutoutCrops(cutouts) if cutouts else None
         self.hard: deque[tuple[int, int]] = deque(maxlen=HARD_ONES)
 
     def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
@@ -78,6 +83,8 @@ class VerificationTask(Task):
         backgrounds = self.places if rng.random() < 0.6 else self.negatives
         if kind == "cut out":
             return real_samples.real_drone(self.drones, rng, backgrounds=backgrounds)
+        if kind == "airframe" and self.cutouts:
+            return real_samples.composite(self.cutouts.draw(rng), backgrounds, rng)
         drawn = self.rendered.draw(rng)
         if kind == "composite":
             while drawn["drone"] < 0.5 or drawn["mask"].mean() < 8:
@@ -129,6 +136,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rendered", type=Path, required=True)
     parser.add_argument("--patches", type=Path, required=True)
+    parser.add_argument("--cutouts", type=Path, action="append", default=[], help="of tools.training.render_cutouts")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--start", type=Path, help="another run's checkpoint.pt, or verification.onnx or distance.onnx")
     parser.add_argument("--minutes", type=float, default=60.0)
@@ -139,7 +147,7 @@ def main() -> None:
     torch.manual_seed(arguments.seed)
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(1)
-    task = VerificationTask(arguments.rendered, arguments.patches)
+    task = VerificationTask(arguments.rendered, arguments.patches, arguments.cutouts)
     task.rate = arguments.rate or task.rate
     arguments.out.mkdir(parents=True, exist_ok=True)
     if arguments.start and not (arguments.out / "checkpoint.pt").is_file():

@@ -99,7 +99,7 @@ def specialise_verification(arguments: argparse.Namespace, pictures: LabelledPic
     jobs = [CropJob(work / "crops" / f"{seed}.npz", seed, SCENES, drones_of_training) for seed in seeds]
     for done, total in render_crops(jobs, arguments.processes):
         print(f"{done}/{total} worlds, {time.monotonic() - begin:.0f} s", flush=True)
-    task = VerificationTask(work / "crops", work / "patches", MIX)
+    task = VerificationTask(work / "crops", work / "patches", mix=MIX)
     task.rate = RATE
     run = work / "run"
     run.mkdir(exist_ok=True)
