@@ -6,11 +6,12 @@ Everything here is horizontal: north and east.
 from __future__ import annotations
 
 from flockd.core.config.flocking import FlockingParameters, WeightParameters
-from flockd.flight.flocking.law import FlockingLaw, level_offsets
+from flockd.flight.flocking.law import FlockingLaw, level_offsets, lookahead_s
 
 __all__ = [
     "FlockingLaw",
     "FlockingParameters",
     "WeightParameters",
     "level_offsets",
+    "lookahead_s",
 ]

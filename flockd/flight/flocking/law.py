@@ -13,6 +13,9 @@ from flockd.flight.geometry.level import SAME_SPOT_M, limit_norm
 
 _MIN_DISTANCE_M = 1e-3
 """Nearer than this counts as this far: Eq. 39 and 41 have a pole at zero distance."""
+SAMPLING_TIME_S = 0.5
+"""The sampling time st of the paper, and the least that a command looks ahead. A command is the own velocity plus u st:
+an error e of the own velocity that lasts moves the velocity where u = -e / st, so short steps would amplify it."""
 
 
 class FlockingLaw:
@@ -59,7 +62,7 @@ class FlockingLaw:
         """The velocity to ask for, (2,) m/s, and the acceleration that leads there, (2,) m/s^2, both within limits.
 
         The acceleration's norm is limited first, then that of V + u * st. Arguments and errors as of `acceleration`;
-        `step_s` is the sampling time st.
+        `step_s` is the sampling time st, which counts as `SAMPLING_TIME_S` where it is shorter.
         """
         return self.limited(velocity, self.acceleration(velocity, positions, velocities, desired), step_s)
 
@@ -68,7 +71,13 @@ class FlockingLaw:
         if not (math.isfinite(step_s) and step_s > 0):
             raise ValueError(f"the step must be finite and positive, not {step_s} s")
         u = limit_norm(acceleration, self.parameters.max_acceleration_m_s2)
-        return limit_norm(np.asarray(velocity, dtype=float) + u * step_s, self.parameters.max_speed_m_s), u
+        asked = np.asarray(velocity, dtype=float) + u * lookahead_s(step_s)
+        return limit_norm(asked, self.parameters.max_speed_m_s), u
+
+
+def lookahead_s(step_s: float) -> float:
+    """The st of V + u st, s, for steps that are so long."""
+    return max(step_s, SAMPLING_TIME_S)
 
 
 def level_offsets(offsets: FloatArray) -> FloatArray:

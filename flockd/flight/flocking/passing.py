@@ -8,7 +8,7 @@ import numpy as np
 
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import FloatArray
-from flockd.flight.flocking.law import FlockingLaw, level_offsets
+from flockd.flight.flocking.law import FlockingLaw, level_offsets, lookahead_s
 from flockd.flight.geometry.level import SAME_SPOT_M, limit_norm
 
 HORIZON_S = 2.5
@@ -36,11 +36,11 @@ def command(
 ) -> tuple[FloatArray, FloatArray]:
     """As of `FlockingLaw.command`, but clear of who would come too near; arguments as of `clear_of`.
 
-    The acceleration, (2,) m/s^2, is the law's, or else the one that leads to the velocity in a step.
+    The acceleration, (2,) m/s^2, is the law's, or else the one that leads to the velocity within its sampling time.
     """
     wanted, acceleration = law.command(velocity, level_offsets(offsets), velocities, desired, step_s)
     clear = clear_of(wanted, velocity, offsets, velocities, law.parameters, vertical_m)
-    return clear, acceleration if clear is wanted else (clear - velocity) / step_s
+    return clear, acceleration if clear is wanted else (clear - velocity) / lookahead_s(step_s)
 
 
 def clear_of(

@@ -7,7 +7,7 @@ import numpy as np
 from flockd.core.config.avoidance import ObstacleParameters
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray, ObstacleRanges
-from flockd.flight.flocking import FlockingLaw, level_offsets
+from flockd.flight.flocking import FlockingLaw, level_offsets, lookahead_s
 from flockd.flight.geometry.level import limit_norm
 from flockd.flight.obstacles.local_map import nearest_points
 from flockd.flight.obstacles.steering import Steering
@@ -48,7 +48,7 @@ class Avoidance:
         flock = velocities.mean(axis=0) if len(velocities) else np.zeros(2)
         asked, _ = law.limited(velocity, self.steered(wanted, ranges, flock) - velocity, self._step_s)
         safe = self.within(asked, ranges, neighbours, velocities)
-        return safe, (safe - velocity) / self._step_s
+        return safe, (safe - velocity) / lookahead_s(self._step_s)
 
     def steered(self, wanted: FloatArray, ranges: ObstacleRanges, flock: FloatArray) -> FloatArray:
         """The velocity (2,) m/s to fly with instead of the `wanted` one, which the flocking law tends to.

@@ -13,6 +13,7 @@ import numpy as np
 from flockd.core.config.perceived import PerceivedErrors
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FloatArray, IntArray
+from flockd.flight.flocking import lookahead_s
 from flockd.sim.control_level import flock_figures, law_sums, motion, perceived_sums
 from flockd.sim.control_level.cells import CELLS_A_DRONE, sort_flights
 from flockd.sim.control_level.flight_code import FlightCode, Seen
@@ -124,7 +125,7 @@ class FlockFlights:
             p = self._drone.flocking
             motion.commands(
                 a, b, self.sums.reshape(2, -1), desired.reshape(2, -1), p.velocity * p.own_weight, own,
-                self._drone.step_s, p.max_acceleration_m_s2, p.max_speed_m_s, commands,
+                lookahead_s(self._drone.step_s), p.max_acceleration_m_s2, p.max_speed_m_s, commands,
             )  # fmt: skip
 
         def fly(a: int, b: int) -> None:

@@ -41,7 +41,7 @@ class Substeps(NamedTuple):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def commands(
-    begin: int, end: int, sums: Any, desired: Any, following: float, own: Any, step_s: float, most_u: float,
+    begin: int, end: int, sums: Any, desired: Any, following: float, own: Any, lookahead_s: float, most_u: float,
     most_v: float, out: Any,
 ) -> None:  # fmt: skip
     """Velocities to ask for, (2, flights * n) m/s: `FlockingLaw.limited`, with u_vf of Eq. 42 added.
@@ -55,8 +55,8 @@ def commands(
         if norm > most_u:
             un *= most_u / norm
             ue *= most_u / norm
-        vn = own[0, i] + un * step_s
-        ve = own[1, i] + ue * step_s
+        vn = own[0, i] + un * lookahead_s
+        ve = own[1, i] + ue * lookahead_s
         norm = math.sqrt(vn * vn + ve * ve)
         if norm > most_v:
             vn *= most_v / norm

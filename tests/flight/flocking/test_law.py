@@ -96,6 +96,16 @@ def test_own_weight_and_strength_scale_the_desired_velocity() -> None:
     np.testing.assert_allclose(law.acceleration(STILL, NOBODY, NOBODY, [1.0, -1.0]), [3.0, -3.0])
 
 
+def test_shorter_steps_than_the_papers_ask_for_the_same_velocity_and_longer_ones_for_more() -> None:
+    """An error of the own velocity shifts the flight by where u st cancels it: by ten times as much at st = 0.05 s."""
+    law = FlockingLaw(FlockingParameters(max_speed_m_s=9.0))
+    asked = {step: law.command([0.2, 0.0], NOBODY, NOBODY, [1.0, 0.5], step)[0] for step in (0.05, 0.1, 0.5, 1.0)}
+    np.testing.assert_allclose(asked[0.5], [0.2 + 0.8 * 0.5, 0.5 * 0.5])
+    assert np.array_equal(asked[0.05], asked[0.5])
+    assert np.array_equal(asked[0.1], asked[0.5])
+    np.testing.assert_allclose(asked[1.0], [1.0, 0.5])
+
+
 def test_a_neighbour_exactly_below_pushes_south_and_nothing_overflows() -> None:
     law = FlockingLaw()
     for tiny in (0.0, 1e-300, 1e-9, 1e-3):

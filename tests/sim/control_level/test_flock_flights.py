@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from flockd.core.config import load_scenario
+from flockd.core.config.loader import load_perceived_errors
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.data import data_path
 from flockd.core.errors import UsageError
@@ -219,3 +220,20 @@ def test_a_flight_that_arrives_says_when() -> None:
 def test_drones_flown_by_hand_are_refused() -> None:
     with pytest.raises(UsageError, match=r"vehicles\[0\] is flown by hand"):
         fly_flocks([_scenario("led_by_hand")])
+
+
+def test_at_10_hz_a_flock_with_measured_errors_keeps_the_order_that_it_has_at_2_hz() -> None:
+    """What the own velocity is wrong by for seconds is not to be added to it ten times a second."""
+    errors = load_perceived_errors(data_path("config") / "perceived" / "shipped_networks.yaml")
+    flown = {
+        step_s: fly_flocks(
+            [_scenario().model_copy(update={"seed": seed, "drone": drone}) for seed in range(4)], errors=errors
+        )
+        for step_s in (0.5, 0.1)
+        for drone in [_scenario().drone.model_copy(update={"step_s": step_s})]
+    }
+    disorder = {step_s: 1 - np.mean([figures["order_tail"] for figures in each]) for step_s, each in flown.items()}
+    assert disorder[0.5] < 0.001, "as flown in the paper"
+    assert disorder[0.1] < 2 * disorder[0.5]
+    nearest = {step_s: min(figures["min_distance_m"] for figures in each) for step_s, each in flown.items()}
+    assert nearest[0.1] > nearest[0.5] - 0.05
