@@ -25,28 +25,38 @@ ALLOWED_DIFFERENCE = 2e-3
 """Between ONNX Runtime and torch, as a share of the output's largest value."""
 BEGUN_WITH_SHARE = 0.35
 DATA = "Rendered by tools.training.render_training_data from seeded worlds; no foreign data."
+_CLIPS = "Drone Detection and Classification using Machine Learning and Sensor Fusion"
+_AIRFRAMES = (
+    "drones rendered by tools.training.render_cutouts (its own shapes, and airframes of mrs_uav_gazebo_simulation, "
+    "BSD-3-Clause, and of subt and rotors_simulator, Apache-2.0) before real photographs"
+)
+_SETS = (
+    "BoofCV-Data@cc6d8adf (P. Abeles, CC BY 4.0; without what others made and without mvs and triple); "
+    "DoorDetect-Dataset@1db107fe (part of Open Images, listed as CC BY 2.0); license-plate-dataset@f00f309e "
+    "(R. L. Chiriac, MIT); robocup_ml@45430e3b (A. Poole, Apache-2.0); sample-videos@57978890 (Intel, CC BY 4.0); "
+    "clothing-dataset@7ed86a9c (A. Grigorev, CC0 1.0); odm_data_caliterra@bec3dc72 (CC0 1.0); "
+    "drone_dataset_brighton_beach@9506a9bf (P. Toffanin, BSD-2-Clause)"
+)
+_MORE_SETS = (
+    "odm_data_seneca@9220acfd (CC0 1.0); CarND-LaneLines-P1@ce5681be and CarND-Advanced-Lane-Lines@91b08035 "
+    f"(Udacity, MIT); data set of {_CLIPS}, all clips but 31-40, 91-100 and from 111 (F. Svanstroem, CC0 1.0)"
+)
+DISTANCE_DATA = (
+    "Rendered by tools.training.render_drone_crops and tools.training.render_training_data from seeded worlds; and "
+    f"{_AIRFRAMES}, none of a held-out scene: {_SETS}; {_MORE_SETS}."
+)
 REAL_DATA = (
     "Rendered by tools.training.render_drone_crops from seeded worlds. Real pictures, none of a held-out scene: "
-    "data set of Drone Detection and Classification using Machine Learning and Sensor Fusion, clips 11-20, 51-60, "
-    "71-80 and from 111 of each kind (F. Svanstroem, CC0 1.0); HoloLens sample data of deep-video-mvs, first 73 frames "
-    "(A. Duzceker, MIT); BoofCV-Data@cc6d8adf (P. Abeles, CC BY 4.0; without "
-    "what others made and without mvs and triple); DoorDetect-Dataset@1db107fe, openimages-personcar@3b7ac13b and "
-    "Machine-Learning-with-Apache-Spark-Quick-Start-Guide@d001ad4b (parts of Open Images, listed as CC BY 2.0); "
-    "license-plate-dataset@f00f309e (R. L. Chiriac, MIT); robocup_ml@45430e3b (A. Poole, Apache-2.0); "
-    "sample-videos@57978890 (Intel, CC BY 4.0); clothing-dataset@7ed86a9c (A. Grigorev, CC0 1.0); "
-    "odm_data_caliterra@bec3dc72 (CC0 1.0); drone_dataset_brighton_beach@9506a9bf (P. Toffanin, BSD-2-Clause). "
-    "Begun with the encoder of `distance`."
+    f"data set of {_CLIPS}, from 111 too (F. Svanstroem, CC0 1.0); HoloLens sample data of deep-video-mvs, first 73 "
+    f"frames (A. Duzceker, MIT); {_SETS}; openimages-personcar@3b7ac13b and "
+    "Machine-Learning-with-Apache-Spark-Quick-Start-Guide@d001ad4b (parts of Open Images, listed as CC BY 2.0). At "
+    f"last also {_AIRFRAMES} of these sets and of {_MORE_SETS}. Begun with the encoder of `distance`."
 )
 DETECTOR_DATA = (
-    "Begun with YOLOX-nano as trained on COCO (Megvii, Apache-2.0). Drones rendered by "
-    "tools.training.render_cutouts (its own shapes, and airframes of mrs_uav_gazebo_simulation, BSD-3-Clause, and "
-    "of subt and rotors_simulator, Apache-2.0) before real photographs, and worlds of "
+    f"Begun with YOLOX-nano as trained on COCO (Megvii, Apache-2.0). Then {_AIRFRAMES}, and worlds of "
     "tools.training.render_training_data. Real pictures, none of a held-out scene: the sets of `verification` "
-    "without robocup_ml's days of 2019 and 2023, and odm_data_seneca@9220acfd (CC0 1.0), CarND-"
-    "LaneLines-P1@ce5681be and CarND-Advanced-Lane-Lines@91b08035 (Udacity, MIT); of the data set of Drone "
-    "Detection and Classification using Machine Learning and Sensor Fusion all clips but 31-40, 91-100 and from "
-    "111 (F. Svanstroem, CC0 1.0), where the boxes of 381 birds, airplanes and helicopters were found by "
-    "tools.training.label_flyers."
+    f"without robocup_ml's days of 2019 and 2023, and {_MORE_SETS}, where the boxes of 381 birds, airplanes and "
+    "helicopters were found by tools.training.label_flyers."
 )
 TRAINED_BY = {"verification": "tools.training.train_verification", "detector": "tools.training.train_detector"}
 """Where it is not tools.training.train."""
@@ -92,6 +102,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "distance": {
         "net": DistanceNet,
         "roles": ["distance"],
+        "data": DISTANCE_DATA,
         "description": "Range of the drone in the middle of a crop, its centre, the uncertainty, and its pixels",
         "size_multiple": 1,
         "golden_size": [96, 96],
