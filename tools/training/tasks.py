@@ -89,7 +89,7 @@ class NeighboursTask(Task):
 class RealLooks:
     """Cut-outs of many airframes before real backgrounds, and such backgrounds alone."""
 
-    airframe_share, no_drone_share, softened_share = 0.35, 0.10, 0.25
+    airframe_share, no_drone_share, softened_share = 0.25, 0.10, 0.20
     """Of all samples; and of the rendered ones that are shown as a cheap camera shows them."""
     shapes_share = 0.15
     """Of the rendered drones: among the cut-outs are some too, and too many spoil the ranges of known drones."""

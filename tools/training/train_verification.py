@@ -40,7 +40,7 @@ PLACES_SHARE = 0.15
 """Share of the negatives that is cut anywhere, not where the first stage proposed a drone."""
 NOISE_SHARE = 0.05
 """Share of the negatives that is what a failing sensor delivers."""
-NEGATIVE_WEIGHTS = {"skyothers": 130.0, "rendered": 80.0}
+NEGATIVE_WEIGHTS = {"skyothers": 150.0, "rendered": 150.0}
 """What flies besides drones, and what the first stage proposes in the worlds of the test flights, are drawn more often
 than the number of their patches says."""
 HARD_PROBABILITY, HARD_SHARE, HARD_ONES, FEWEST_HARD = 0.3, 0.35, 4000, 200

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from flockd.core.data import data_path
+from tools.training import mine_pictures
 from tools.training.mine_pictures import FOLLOW_STEP, FOLLOW_STEPS, followed, found_again
+from tools.training.real_patches import PATCH_PX
 from tools.training.skydrones import split_of
 
+RENDERED = Path(__file__).resolve().parents[2] / "ground" / "pictures" / "rendered"
 SKY, DRONE = (120, 160, 200), (40, 45, 50)
 WIDE, HIGH = 14, 5
 LABELLED = 40
@@ -74,3 +82,26 @@ def test_each_block_of_ten_clips_is_on_one_side() -> None:
         11: "training", 20: "training", 31: "validation", 40: "validation", 51: "training", 80: "training",
         91: "validation", 100: "validation", 111: "tuning", 114: "tuning",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("network", ["neighbours_int8", "detector"])
+def test_what_either_first_stage_proposes_in_a_folder_of_pictures_is_mined(
+    network: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A picture with a drone stands for one where something is proposed; a file beside the folders is none."""
+    (tmp_path / "photographs" / "some").mkdir(parents=True)
+    (tmp_path / "photographs" / "index.jsonl").write_text("")
+    shutil.copy(RENDERED / "2.5_m_0.jpg", tmp_path / "photographs" / "some")
+    model = data_path("models") / f"{network}.yaml"
+    arguments = [tmp_path / "mined", "--crops", tmp_path / "photographs", "--model", model]
+    monkeypatch.setattr(sys, "argv", ["mine_pictures", *map(str, arguments)])
+    mine_pictures.main()
+    assert [path.name for path in (tmp_path / "mined").iterdir()] == ["some.npz"]
+    with np.load(tmp_path / "mined" / "some.npz") as mined:
+        assert len(mined["negative"]) >= 1
+        assert len(mined["place"]) == mine_pictures.PLACES
+        assert len(mined["drone"]) == 0
+        left, top, right, bottom = mined["negative_box"][0]
+    # Aimed at what was proposed: its box is around the middle of the patch.
+    assert left < PATCH_PX / 2 < right
+    assert top < PATCH_PX / 2 < bottom
