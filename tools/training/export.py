@@ -41,10 +41,6 @@ _MORE_SETS = (
     "odm_data_seneca@9220acfd (CC0 1.0); CarND-LaneLines-P1@ce5681be and CarND-Advanced-Lane-Lines@91b08035 "
     f"(Udacity, MIT); data set of {_CLIPS}, all clips but 31-40, 91-100 and from 111 (F. Svanstroem, CC0 1.0)"
 )
-DISTANCE_DATA = (
-    "Rendered by tools.training.render_drone_crops and tools.training.render_training_data from seeded worlds; and "
-    f"{_AIRFRAMES}, none of a held-out scene: {_SETS}; {_MORE_SETS}."
-)
 REAL_DATA = (
     "Rendered by tools.training.render_drone_crops from seeded worlds. Real pictures, none of a held-out scene: "
     f"data set of {_CLIPS}, from 111 too (F. Svanstroem, CC0 1.0); HoloLens sample data of deep-video-mvs, first 73 "
@@ -102,7 +98,6 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "distance": {
         "net": DistanceNet,
         "roles": ["distance"],
-        "data": DISTANCE_DATA,
         "description": "Range of the drone in the middle of a crop, its centre, the uncertainty, and its pixels",
         "size_multiple": 1,
         "golden_size": [96, 96],
