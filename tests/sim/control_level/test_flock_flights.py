@@ -235,5 +235,5 @@ def test_at_10_hz_a_flock_with_measured_errors_keeps_the_order_that_it_has_at_2_
     disorder = {step_s: 1 - np.mean([figures["order_tail"] for figures in each]) for step_s, each in flown.items()}
     assert disorder[0.5] < 0.001, "as flown in the paper"
     assert disorder[0.1] < 2 * disorder[0.5]
-    nearest = {step_s: min(figures["min_distance_m"] for figures in each) for step_s, each in flown.items()}
+    nearest = {step_s: float(np.min([figures["min_distance_m"] for figures in each])) for step_s, each in flown.items()}
     assert nearest[0.1] > nearest[0.5] - 0.05
