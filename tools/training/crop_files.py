@@ -23,9 +23,8 @@ _AIMED_OFF_PX, _AIMED_PX = 4.0, (60.0, 84.0)
 class CropFiles:
     """Every sample of every file of ``render_drone_crops.py``, in memory."""
 
-    def __init__(self, folder: Path, shapes_share: float = worlds.SHAPES_SHARE) -> None:
-        """``shapes_share``: of the drones that are drawn, how many are of the generator's shapes."""
-        self._folder, self._shapes_share = folder, shapes_share
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
         self._files: dict[Path, Sample] = {}
         self._ends = np.zeros(0, np.int64)
         self._of_family: list[NDArray[np.int64]] = []
@@ -56,7 +55,7 @@ class CropFiles:
         self._aimed_of_family = [np.flatnonzero((family == one) & aimed) for one in names]
         is_none, is_family, is_shape = names == -1, (names >= 0) & (names < MAX_FAMILIES), names >= MAX_FAMILIES
         of_drones = np.zeros(len(names))
-        for which, of in ((is_family, 1 - self._shapes_share), (is_shape, self._shapes_share)):
+        for which, of in ((is_family, 1 - worlds.SHAPES_SHARE), (is_shape, worlds.SHAPES_SHARE)):
             of_drones[which] = of / max(1, int(np.count_nonzero(which)))
         drones = float(of_drones.sum())
         share = _NONE_SHARE if is_none.any() and drones > 0 else float(is_none.any())
@@ -64,7 +63,7 @@ class CropFiles:
 
     def draw(self, rng: np.random.Generator) -> Sample:
         """Any of them, and now and then what is none: every family as often as any other, however many crops there are
-        of it, every shape as any other, and all shapes together ``shapes_share`` of the drones."""
+        of it, every shape as any other, and all shapes together ``worlds.SHAPES_SHARE`` of the drones."""
         one = int(rng.choice(len(self._shares), p=self._shares))
         rows = self._of_family[one]
         if rng.random() < _AIMED_SHARE and len(self._aimed_of_family[one]):

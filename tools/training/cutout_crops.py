@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.training.networks import MAX_FAMILIES
 from tools.training.real_patches import CROP_PX
 from tools.training.samples import Sample, drawn_fill
 
@@ -44,22 +43,18 @@ class CutoutCrops:
         self._shares = shares / shares.sum()
 
     def draw(self, rng: np.random.Generator) -> Sample:
-        """A sample as of ``samples.sample_of``; where ``mask`` is 0, its ``picture`` shows nothing that counts."""
+        """A drone for ``real_samples.composite``; where ``mask`` is 0, its ``picture`` shows nothing that counts."""
         drones = list(self._of_drone[self._kinds[int(rng.choice(len(self._kinds), p=self._shares))]].values())
         ones = drones[int(rng.integers(len(drones)))]
         path, entry = ones[int(rng.integers(len(ones)))]
         fill, off = drawn_fill(rng)
-        place = off * CROP_PX / 2
+        place = (1 + off) * CROP_PX / 2
         scale = CROP_PX / (entry["size_m"] * fill) * entry["range_m"] / entry["focal_px"]
-        seen = _placed(self._image(path), np.array(entry["middle_px"]), CROP_PX / 2 + place, scale, rng)
+        seen = _placed(self._image(path), np.array(entry["middle_px"]), place, scale, rng)
         opaque = seen[..., 3:]
-        log_range = math.log(entry["size_m"] * fill / CROP_PX)
         return {
             "picture": np.clip(np.rint(seen[..., :3] / np.maximum(opaque, 1e-3)), 0, 255).astype(np.uint8),
             "mask": np.clip(np.rint(255 * opaque[..., 0]), 0, 255).astype(np.uint8),
-            "target": np.array([log_range, *place], np.float32),
-            "motors": np.full((4, 2), np.nan, np.float32),
-            "family": np.array(MAX_FAMILIES),
             "apparent": np.array(math.log(CROP_PX / fill), np.float32),
             "drone": np.array(1.0, np.float32),
         }

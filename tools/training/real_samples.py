@@ -51,7 +51,7 @@ def sharp(sample: Sample) -> Sample:
 
 
 def composite(sample: Sample, backgrounds: RealPatches, rng: np.random.Generator) -> Sample:
-    """The sample with its drone, repainted, in front of a real background, through a real camera."""
+    """The sample's drone, repainted, in front of a real background, through a real camera."""
     image, seen, scale = sample["picture"], 0.0, 1.0
     share = sample["mask"][:, :, None].astype(np.float32) / 255
     for _ in range(_TRIES):
@@ -70,7 +70,7 @@ def composite(sample: Sample, backgrounds: RealPatches, rng: np.random.Generator
         if seen >= 1.0:
             break
     picture = through_camera(image, drawn_effects(scale, rng), rng)
-    return {**sample, **_sample(picture, drone=1.0, weight=seen)}
+    return _sample(picture, drone=1.0, weight=seen)
 
 
 def _as_bright(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +9,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tools.training import real_samples
 from tools.training.augment import photometric
 from tools.training.crop_files import CropFiles
-from tools.training.cutout_crops import CutoutCrops
 from tools.training.dataset import PairSet
 from tools.training.networks import MAX_DEPTH_M, MAX_FAMILIES, DistanceNet, FlowNet, NeighboursNet
-from tools.training.real_patches import RealPatches
 from tools.training.samples import Sample, flow_sample, neighbours_sample, no_drone_sample
 
 Batch = dict[str, Tensor]
@@ -86,34 +82,6 @@ class NeighboursTask(Task):
         return depth_loss + mask_loss + 0.05 * offset_loss, figures
 
 
-class RealLooks:
-    """Cut-outs of many airframes before real backgrounds, and such backgrounds alone."""
-
-    airframe_share, no_drone_share, softened_share = 0.25, 0.10, 0.20
-    """Of all samples; and of the rendered ones that are shown as a cheap camera shows them."""
-    shapes_share = 0.15
-    """Of the rendered drones: among the cut-outs are some too, and too many spoil the ranges of known drones."""
-    least_seen = 0.3
-
-    def __init__(self, cutouts: Sequence[Path], patches: Path) -> None:
-        self.cutouts = CutoutCrops(cutouts)
-        self.places, self.negatives = RealPatches(patches, "place"), RealPatches(patches, "negative")
-
-    def airframe(self, rng: np.random.Generator) -> Sample:
-        """One that can be seen."""
-        while True:
-            behind = self.places if rng.random() < 0.6 else self.negatives
-            sample = real_samples.composite(self.cutouts.draw(rng), behind, rng)
-            if sample["exists_weight"] > self.least_seen:
-                return sample
-
-    def no_drone(self, like: Sample, rng: np.random.Generator) -> Sample:
-        """With the fields of ``like``."""
-        source = self.places if rng.random() < 0.3 else self.negatives
-        nothing = {name: np.zeros_like(values) for name, values in like.items()}
-        return {**nothing, **real_samples.negative(*source.draw(rng)[:2], rng)}
-
-
 class DistanceTask(Task):
     """Range of the drone in the middle of a crop, and which pixels are its own.
 
@@ -128,11 +96,10 @@ class DistanceTask(Task):
     """A network that saw more places: what it is sure is no drone, this one is to be as sure of (learning without
     forgetting, Li and Hoiem 2016)."""
 
-    def __init__(self, pairs: PairSet, negatives: Path, pictures: Path, real: RealLooks | None = None) -> None:
+    def __init__(self, pairs: PairSet, negatives: Path, pictures: Path) -> None:
         super().__init__(DistanceNet(), 64, 2e-3)
-        self.real = real
         self.pairs, self.negatives = pairs, np.load(negatives)
-        self.drones = CropFiles(pictures, real.shapes_share) if real else CropFiles(pictures)
+        self.drones = CropFiles(pictures)
         self.no_drones: list[Sample] = []
 
     def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
@@ -146,18 +113,8 @@ class DistanceTask(Task):
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """See ``Task``."""
-        return {name: values for name, values in self._any(rng).items() if name != "exists_weight"}
-
-    def _any(self, rng: np.random.Generator) -> Sample:
-        kind = rng.random()
-        if self.real and kind < self.real.airframe_share:
-            return self.real.airframe(rng)
         from_pool = rng.random() < self.no_drone_share
         drawn = self.no_drones[int(rng.integers(self.pool_size))] if from_pool else self.drones.draw(rng)
-        if self.real and kind > 1 - self.real.no_drone_share:
-            return self.real.no_drone(drawn, rng)
-        if self.real and rng.random() < self.real.softened_share:
-            return {**drawn, **real_samples.softened(drawn, rng)}
         (picture,) = photometric([drawn["picture"]], rng)
         return {**drawn, "picture": picture}
 

@@ -31,7 +31,7 @@ from torch.optim.swa_utils import AveragedModel
 from tools.training.dataset import open_pairs
 from tools.training.from_onnx import begin_with_onnx
 from tools.training.samples import Sample
-from tools.training.tasks import Batch, DistanceTask, FlowTask, NeighboursTask, RealLooks, Task
+from tools.training.tasks import Batch, DistanceTask, FlowTask, NeighboursTask, Task
 
 NETWORKS = ("neighbours", "distance", "flow")
 
@@ -44,12 +44,7 @@ def _task(arguments: argparse.Namespace) -> Task:
         return NeighboursTask(pairs)
     if arguments.negatives is None or arguments.crops is None:
         raise SystemExit("the distance network needs --crops and --negatives")
-    real = None
-    if arguments.cutouts:
-        if arguments.patches is None:
-            raise SystemExit("--cutouts needs --patches, the backgrounds that they are put before")
-        real = RealLooks(arguments.cutouts, arguments.patches)
-    return DistanceTask(pairs, arguments.negatives, arguments.crops, real)
+    return DistanceTask(pairs, arguments.negatives, arguments.crops)
 
 
 def main() -> None:
@@ -61,8 +56,6 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0, help="of training in all, over every resumption")
     parser.add_argument("--negatives", type=Path, help="what is no drone, for `distance`: file of mine_negatives.py")
     parser.add_argument("--crops", type=Path, help="drones, for `distance`: folder of render_drone_crops.py")
-    parser.add_argument("--cutouts", type=Path, action="append", default=[], help="of render_cutouts.py, likewise")
-    parser.add_argument("--patches", type=Path, help="backgrounds for cut-outs: folder of mine_pictures.py")
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
     parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt, or an .onnx")
     parser.add_argument("--compile", action="store_true", help="`distance` a fifth faster; needs a C++ compiler")

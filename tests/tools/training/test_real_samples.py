@@ -104,11 +104,4 @@ def test_every_kind_of_sample_has_the_same_parts(tmp_path: Path) -> None:
     kinds = [sharp(rendered()), softened(rendered(), rng), composite(rendered(), places, rng), of_real, none]
     kinds.append(real_drone(drones, rng, backgrounds=places))
     shapes = [{name: value.shape for name, value in kind.items()} for kind in kinds]
-    assert all(shapes[0].items() <= one.items() for one in shapes)
-
-
-def test_a_composite_keeps_what_is_known_of_its_drone(tmp_path: Path) -> None:
-    places = patches(tmp_path, "place", np.full((1, PATCH_PX, PATCH_PX, 3), 90, np.uint8), 60.0, (40, 40, 120, 120))
-    made = composite(rendered(), places, np.random.default_rng(3))
-    for name in ("mask", "target", "apparent", "family"):
-        assert np.array_equal(made[name], rendered()[name])
+    assert all(one == shapes[0] for one in shapes)
