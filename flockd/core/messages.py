@@ -252,6 +252,8 @@ class Detection:
     """More than one where the drone straddles an image border."""
     label: int
     """Its value in the masks of this frame set, from 1 up."""
+    log_size_sigma: float = 0.0
+    """Standard deviation of the logarithm of `size_m`, a part of that of the log range: it errs with it."""
 
     @property
     def range_m(self) -> float:

@@ -61,7 +61,7 @@ IMAGE = {"shape": [1, "h", "w", 3], "dtype": "uint8", "meaning": "RGB image", "u
 COLUMNS = {
     "range": (
         *("log_range_per_focal", "right_px", "down_px", "log_relative_sigma"),
-        *("drone_logit", "log_apparent_size"),
+        *("drone_logit", "log_apparent_size", "log_size_sigma"),
     ),
     "drone": ("drone_logit",),
     "boxes": (
@@ -122,10 +122,11 @@ NETWORKS: dict[str, dict[str, Any]] = {
         "inputs": {"picture": {**IMAGE, "shape": ["n", 96, 96, 3], "carries": "crop"}},
         "outputs": {
             "range": (
-                ["n", 6],
-                "log(range / focal length), centre right and down of the middle, log of the first's deviation, "
-                "logit of a drone being there, log(size * focal length / range)",
-                "log(m/px), px, px, 1, 1, log(px)",
+                ["n", 7],
+                "log(range / focal length), centre right and down of the middle, log of the first's deviation for a "
+                "drone of known size, logit of a drone being there, log(size * focal length / range), log of the "
+                "deviation of log(size)",
+                "log(m/px), px, px, 1, 1, log(px), 1",
             ),
             "mask": (["n", 96, 96], "logit of being this drone's", "1"),
         },

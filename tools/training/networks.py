@@ -186,11 +186,12 @@ class DistanceNet(nn.Module):
     apart tells how large the drone appears, to a fraction of a pixel. What the whole crop tells which
     shape of drone it is, hence its size in metres. Range is one over the other.
 
-    Input: `picture` (n, 96, 96, 3) uint8, the crop of a virtual camera that faces the drone. Outputs (n, 6):
+    Input: `picture` (n, 96, 96, 3) uint8, the crop of a virtual camera that faces the drone. Outputs (n, 7):
     log of (range in m / focal length in px), the drone's centre right and down of the crop's centre in px,
-    log of the standard deviation of the first, logit of there being a drone at all, log of the drone's size in px
-    as it would appear from the side (its size in m times focal length over range). And (n, 96, 96): for each pixel the
-    logit of being this drone's.
+    log of the standard deviation of the first for a drone of a known shape, logit of there being a drone at all, log of
+    the drone's size in px as it would appear from the side (its size in m times focal length over range), log of the
+    standard deviation of the logarithm of its size in m, by which the first errs as well. And (n, 96, 96): for each
+    pixel the logit of being this drone's.
     """
 
     size = 96
@@ -214,7 +215,8 @@ class DistanceNet(nn.Module):
         self.summary = nn.Sequential(nn.Linear(128 * 9 + 6 * self.maps + 2, 160), nn.ReLU(True))
         self.thought = nn.Sequential(nn.Linear(160, 160), nn.ReLU(True), nn.Linear(160, 160))
         self.head = nn.Linear(160, 6)
-        for last in (*(block.second[1] for block in self.more.values()), self.thought[2]):
+        self.doubt = nn.Sequential(nn.Linear(self.summary[0].in_features + 160, 64), nn.ReLU(True), nn.Linear(64, 1))
+        for last in (*(block.second[1] for block in self.more.values()), self.thought[2], self.doubt[2]):
             nn.init.zeros_(last.weight)  # what is added to a trained network changes nothing at first
             nn.init.zeros_(last.bias)
         self.family = nn.Linear(160, MAX_FAMILIES)
@@ -237,12 +239,14 @@ class DistanceNet(nn.Module):
         where, mask = _in_full_precision(self.look, x), self.mask(x)[:, 0]
         middles, moments = _in_full_precision(_moments, where)
         spread, shape = _spread(middles[:, : self.motors])
-        x = _in_full_precision(self.summary, torch.cat([whole.float(), moments, shape], 1))
+        seen = torch.cat([whole.float(), moments, shape], 1)
+        x = _in_full_precision(self.summary, seen)
         x = x + _in_full_precision(self.thought, x)
         out = _in_full_precision(self.head, x)
         apparent = spread + out[:, 5:] + 1.0
+        doubt = (_in_full_precision(self.doubt, torch.cat([seen, x], 1)) - 5.0).clamp(-7.0, 1.0)
         sigma = (out[:, 3:4] - 3.0).clamp(-7.0, 1.0)
-        out = torch.cat([out[:, :1] - 0.5 - apparent, out[:, 1:3] * 10.0, sigma, out[:, 4:5], apparent], 1)
+        out = torch.cat([out[:, :1] - 0.5 - apparent, out[:, 1:3] * 10.0, sigma, out[:, 4:5], apparent, doubt], 1)
         if not self.training:
             return out, mask
         return out, mask, _in_full_precision(self.family, x), where[:, : self.motors].flatten(2).log_softmax(2)

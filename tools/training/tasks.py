@@ -26,6 +26,10 @@ class Task:
     def __init__(self, net: nn.Module, batch: int, rate: float) -> None:
         self.net, self.batch, self.rate = net, batch, rate
 
+    def begin(self) -> None:
+        """From now on the network learns."""
+        self.net.train()
+
     def sample(self, rng: np.random.Generator) -> Sample:
         """One training sample."""
         raise NotImplementedError
@@ -132,11 +136,11 @@ class DistanceTask(Task):
         there = batch["drone"]
         error = (out[:, 0] - batch["target"][:, 0]).abs()
         centre = (out[:, 1:3] - batch["target"][:, 1:3]).abs().clamp(max=30).sum(1)
-        nll = error / torch.exp(out[:, 3]) * 1.414 + out[:, 3]
+        apparent = (out[:, 5] - batch["apparent"]).abs()
+        nll = _laplace_nll(error, out[:, 3]) + _laplace_nll(_size_error(out, batch).detach(), out[:, 6])
         # A generated or a fleet's own shape has no name in the hint, and where an own one's motors are may be unknown.
         named = torch.where(batch["family"] < MAX_FAMILIES, batch["family"], NO_NAME)
         family = F.cross_entropy(families, named, reduction="none", ignore_index=NO_NAME)
-        apparent = (out[:, 5] - batch["apparent"]).abs()
         known = batch["motors"].isfinite().all(2).all(1)
         where = -(_motor_maps(batch["motors"].nan_to_num(0.0)) * motors).sum(2).mean(1) * known
         each = 0.3 * nll + 2.0 * error + 0.05 * centre + 0.3 * family + 2.0 * apparent + 0.2 * where
@@ -162,6 +166,55 @@ class DistanceTask(Task):
             figures["forgotten"] = float(forgotten.mean().detach())
             loss = loss + 0.1 * F.smooth_l1_loss(forgotten, torch.zeros_like(forgotten))
         return loss, figures
+
+
+class SigmaTask(Task):
+    """How far a trained ``DistanceNet`` may misjudge a drone's size, also one that it has never seen; nothing else.
+
+    Ranges, centres and masks stay as they are: only ``doubt`` learns. Shapes of the generator stand for the unknown.
+    """
+
+    known_share = 0.8
+    """What the families that the network learnt count in the loss; as many of the drawn drones are shapes."""
+
+    def __init__(self, pictures: Path) -> None:
+        super().__init__(DistanceNet(), 64, 1e-3)
+        self.drones = CropFiles(pictures)
+        for name, weights in self.net.named_parameters():
+            weights.requires_grad = name.startswith("doubt.")
+
+    def begin(self) -> None:
+        """See ``Task``. Its normalisations learn nothing either."""
+        self.net.eval()
+
+    def sample(self, rng: np.random.Generator) -> Sample:
+        """See ``Task``."""
+        self.drones.look_for_more()
+        drawn = self.drones.draw(rng)
+        (picture,) = photometric([drawn["picture"]], rng)
+        return {**drawn, "picture": picture}
+
+    def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
+        """See ``Task``."""
+        batch = _flipped(batch)
+        out = self.net(batch["picture"])[0]
+        error = _size_error(out, batch)
+        there, known = batch["drone"], batch["family"] < MAX_FAMILIES
+        weight = there * torch.where(known, self.known_share, 1 - self.known_share)
+        loss = (weight * _laplace_nll(error, out[:, 6])).sum() / weight.sum().clamp(min=1e-3)
+        within = (error < torch.exp(out[:, 6])).float().detach()
+        known, unknown = known & (there > 0.5), ~known & (there > 0.5)
+        return loss, {"known": float(within[known].mean()), "unknown": float(within[unknown].mean())}
+
+
+def _size_error(out: Tensor, batch: Batch) -> Tensor:
+    """(n,) by how much the logarithm of the size in metres is misjudged."""
+    return (out[:, 0] + out[:, 5] - batch["target"][:, 0] - batch["apparent"]).abs()
+
+
+def _laplace_nll(error: Tensor, log_sigma: Tensor) -> Tensor:
+    """Negative log likelihood of a Laplace distribution, whose mean deviation is its standard one over root 2."""
+    return error / torch.exp(log_sigma) * 1.414 + log_sigma
 
 
 def _mask_loss(logits: Tensor, mask: Tensor, drone: Tensor) -> tuple[Tensor, float]:

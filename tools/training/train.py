@@ -3,6 +3,9 @@
     python -m tools.training.train neighbours --data DATA --out RUNS/neighbours --minutes 40
     python -m tools.training.train distance   --data DATA --out RUNS/distance --minutes 90 --crops P --negatives N.npy
     python -m tools.training.train flow       --data DATA --out RUNS/flow --minutes 40
+    python -m tools.training.train sigma      --crops P --out RUNS/sigma --start RUNS/distance/checkpoint.pt
+
+`sigma` is the last part of `distance`: how far it may misjudge a drone's size, also of one that it has not seen.
 
 Writes OUT/checkpoint.pt, OUT/curve.csv and a picture of it every few minutes. Uses a GPU where there is one.
 With --start it goes on from another run's weights, or from a network of models/, and keeps them as OUT/start.pt.
@@ -31,12 +34,18 @@ from torch.optim.swa_utils import AveragedModel
 from tools.training.dataset import open_pairs
 from tools.training.from_onnx import begin_with_onnx
 from tools.training.samples import Sample
-from tools.training.tasks import Batch, DistanceTask, FlowTask, NeighboursTask, Task
+from tools.training.tasks import Batch, DistanceTask, FlowTask, NeighboursTask, SigmaTask, Task
 
-NETWORKS = ("neighbours", "distance", "flow")
+NETWORKS = ("neighbours", "distance", "sigma", "flow")
 
 
 def _task(arguments: argparse.Namespace) -> Task:
+    if arguments.network == "sigma":
+        if arguments.crops is None or arguments.start is None:
+            raise SystemExit("sigma needs --crops, and the distance network that it belongs to with --start")
+        return SigmaTask(arguments.crops)
+    if arguments.data is None:
+        raise SystemExit(f"{arguments.network} needs --data")
     pairs = open_pairs(arguments.data)
     if arguments.network == "flow":
         return FlowTask(pairs)
@@ -51,7 +60,7 @@ def main() -> None:
     """Train until the minutes are over."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("network", choices=NETWORKS)
-    parser.add_argument("--data", type=Path, required=True, help="folder of render_training_data.py")
+    parser.add_argument("--data", type=Path, help="folder of render_training_data.py")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--minutes", type=float, default=60.0, help="of training in all, over every resumption")
     parser.add_argument("--negatives", type=Path, help="what is no drone, for `distance`: file of mine_negatives.py")
@@ -112,7 +121,8 @@ def train(task: Task, out: Path, budget_s: float, seed: int) -> None:
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     net = task.net.to(device).to(memory_format=torch.channels_last)
     mean = AveragedModel(net, avg_fn=_recent_mean, use_buffers=True)
-    optimiser = torch.optim.AdamW(net.parameters(), lr=task.rate, weight_decay=1e-4)
+    learning = [one for one in net.parameters() if one.requires_grad]
+    optimiser = torch.optim.AdamW(learning, lr=task.rate, weight_decay=1e-4)
     spent, step = 0.0, 0
     checkpoint = out / "checkpoint.pt"
     if checkpoint.is_file():
@@ -124,7 +134,7 @@ def train(task: Task, out: Path, budget_s: float, seed: int) -> None:
         spent, step = state["spent"], state["step"]
     rng = np.random.Generator(np.random.PCG64([seed, step]))
     in_16_bits = is_faster_in_16_bits(device)
-    net.train()
+    task.begin()
     last_save = last_print = spent
     recent: list[dict[str, float]] = []
     batches = _batches(task, rng, device)

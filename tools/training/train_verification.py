@@ -31,7 +31,7 @@ from tools.training.samples import Sample
 from tools.training.tasks import Batch, Task
 from tools.training.train import begin_with, train
 
-MIX = {"rendered": 18, "composite": 8, "airframe": 22, "real drone": 8, "cut out": 4, "negative": 40}
+MIX = {"rendered": 36, "composite": 8, "airframe": 22, "real drone": 8, "cut out": 4, "negative": 46}
 """Samples of a batch; `airframe` is a cut-out of tools.training.render_cutouts before a real background."""
 KINDS = tuple(MIX)
 SOFTENED_SHARE = 0.5
@@ -40,7 +40,7 @@ PLACES_SHARE = 0.15
 """Share of the negatives that is cut anywhere, not where the first stage proposed a drone."""
 NOISE_SHARE = 0.05
 """Share of the negatives that is what a failing sensor delivers."""
-NEGATIVE_WEIGHTS = {"skyothers": 150.0, "rendered": 150.0}
+NEGATIVE_WEIGHTS = {"skyothers": 150.0, "rendered": 300.0}
 """What flies besides drones, and what the first stage proposes in the worlds of the test flights, are drawn more often
 than the number of their patches says."""
 HARD_PROBABILITY, HARD_SHARE, HARD_ONES, FEWEST_HARD = 0.3, 0.35, 4000, 200

@@ -73,7 +73,7 @@ class RangeEstimate:
     log_range: float
     """Natural logarithm of the range in metres, from the virtual camera's optical centre."""
     log_range_sigma: float
-    """Standard deviation of `log_range`."""
+    """Standard deviation of `log_range`, if the size is right."""
     centre: FloatArray
     """(2,) u, v of the drone's centre in the crop."""
     size_m: float
@@ -82,12 +82,13 @@ class RangeEstimate:
     """Probability that there is a drone at all."""
     mask: Float32Array | None = None
     """(size, size) logit of each pixel of the crop being that drone's; None: the model does not say."""
+    log_size_sigma: float = 0.0
+    """Standard deviation of the logarithm of `size_m`. `log_range` errs with it, by as much again."""
 
     def of_size(self, known: KnownSize) -> RangeEstimate:
         """With the range at which a drone of a known size has this apparent size.
 
-        The network says one deviation, that of its range; as it judges most drones' size well, that is what its
-        apparent size errs by. The known size's own deviation adds to it, as the two are independent.
+        What the apparent size errs by stays; the known size's own deviation stands for that of the judged one.
         """
         if not (self.size_m > 0 and math.isfinite(self.size_m)):
             return replace(self, log_range=math.nan)
@@ -95,6 +96,6 @@ class RangeEstimate:
         return replace(
             self,
             log_range=math.log(known.size_m) - log_apparent_size,
-            log_range_sigma=math.hypot(self.log_range_sigma, known.sigma_m / known.size_m),
             size_m=known.size_m,
+            log_size_sigma=known.sigma_m / known.size_m,
         )

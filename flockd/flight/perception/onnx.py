@@ -336,6 +336,7 @@ def _estimate(columns: Mapping[str, float], drone_logit: float, crop: Crop, mask
         size_m=float(np.exp(columns["log_range_per_focal"] + columns["log_apparent_size"])),
         drone_probability=float(_probability(np.array(drone_logit))),
         mask=mask,
+        log_size_sigma=float(np.exp(columns.get("log_size_sigma", -np.inf))),
     )
 
 

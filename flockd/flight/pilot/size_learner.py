@@ -33,6 +33,9 @@ _JUDGED, _FEWEST_JUDGED, _NEAR_M = 400, 24, 8.0
 _SCATTER = 0.05
 """Standard deviation of the judged log sizes from which the networks do not know the drones. Of eleven families that
 they know it is 0.003 to 0.03, of a twelfth, 0.26 m large, 0.16, and of two that they do not know 0.08 to 0.25."""
+_DOUBTED = 0.15
+"""What the networks' own standard deviations of the log sizes say that for, at the median: of families that they know
+it is 0.01 to 0.06, of two that they do not know 0.31."""
 _MIDDLE = 2.563
 """Standard deviations of a normal distribution within which 80 % are."""
 _OLD_S = 600.0
@@ -54,6 +57,8 @@ class SizeLearner:
         self._used: SizeEstimate | None = None
         self._judged: list[float] = []
         """Log sizes of confirmed neighbours as the networks judged them, while nothing else is used."""
+        self._doubts: list[float] = []
+        """What they said those may be off."""
         self._looks_m = 0.0
         """Their median."""
         self._wove_s: float | None = None
@@ -105,6 +110,7 @@ class SizeLearner:
             known = [one for number, one in measured.items() if number in confirmed and one.range_m < _NEAR_M]
             logs = [math.log(one.size_m) for one in known]
             self._judged = [*self._judged, *logs][-_JUDGED:]
+            self._doubts = [*self._doubts, *(one.log_size_sigma for one in known)][-_JUDGED:]
             self._looks_m = math.exp(float(np.median(self._judged))) if self._judged else 0.0
         self._found = self._sizes.of_looks(self._looks_m) if self._judged else None
         before_m = self._looks_m if self._used is None else self._used.size_m
@@ -113,11 +119,16 @@ class SizeLearner:
 
     @property
     def _is_unknown_type(self) -> bool:
-        """Whether the networks judge the others' size otherwise from view to view."""
+        """Whether the networks judge the others' size otherwise from view to view, or say that they do not know it."""
         if self._said is not None or len(self._judged) < _FEWEST_JUDGED:
             return False
         low, high = np.quantile(self._judged, [0.1, 0.9])
-        return float(high - low) > _SCATTER * _MIDDLE
+        return float(high - low) > _SCATTER * _MIDDLE or self._doubt > _DOUBTED
+
+    @property
+    def _doubt(self) -> float:
+        """What the networks say that the judged log sizes may be off: a standard deviation."""
+        return float(np.median(self._doubts)) if len(self._doubts) >= _FEWEST_JUDGED else 0.0
 
     def _as_judged(self, measurement: Measurement) -> Measurement:
         """With the range that follows from the size that the networks judge, as far as that is still known."""
@@ -175,10 +186,14 @@ class SizeLearner:
         )
 
     def cautious(self, neighbours: Sequence[Neighbour]) -> tuple[Neighbour, ...]:
-        """With what the used size may be off in the ranges that the gate reckons with: it errs alike in all steps."""
-        if self._used is None:
+        """With what the size may be off in the ranges that the gate reckons with: it errs alike in all steps.
+
+        That of the learned size; before, what the networks say of drones that they do not know.
+        """
+        sigma = self._doubt if self._used is None else self._used.sigma
+        if self._said is not None or (self._used is None and sigma <= _DOUBTED):
             return tuple(neighbours)
-        return tuple(_as_uncertain(one, self._used.sigma) for one in neighbours)
+        return tuple(_as_uncertain(one, sigma) for one in neighbours)
 
 
 def _as_uncertain(neighbour: Neighbour, sigma: float) -> Neighbour:

@@ -39,8 +39,11 @@ HEIGHT_M = 4.0
 class Flight:
     """A drone that holds its place among others, and goes to the heights that its pilot asks for."""
 
-    def __init__(self, config: DroneConfig, *, judged_m: float = JUDGED_M, scatter: float = 0.0) -> None:
-        """`scatter`: standard deviation of the logarithm of the judged size."""
+    def __init__(
+        self, config: DroneConfig, *, judged_m: float = JUDGED_M, scatter: float = 0.0, doubt: float = 0.0
+    ) -> None:
+        """`scatter`: standard deviation of the logarithm of the judged size; `doubt`: what the network says of it."""
+        self._doubt = doubt
         self._judged_m, self._random, self._scatter = judged_m, np.random.default_rng(3), scatter
         networks: Any = object()  # never asked for anything
         self._pilot = FlockPilot(config, networks, observer=self)
@@ -65,8 +68,8 @@ class Flight:
         looks_m = self._judged_m * math.exp(self._random.normal(0.0, self._scatter))
         size_m = looks_m if known is None or not known.is_of(looks_m) else known.size_m
         log_range = math.log(float(np.linalg.norm(offset)) * size_m / SIZE_M) + self._random.normal(0.0, 0.02)
-        covariance = log_polar_covariance(bearing, 0.03, 0.004)
-        return Detection(bearing, log_range, covariance, 0.95, size_m, ("front",), label)
+        covariance = log_polar_covariance(bearing, math.hypot(0.03, self._doubt), 0.004)
+        return Detection(bearing, log_range, covariance, 0.95, size_m, ("front",), label, self._doubt)
 
     def fly(self, duration_s: float) -> list[PilotOutput]:
         """All outputs."""
@@ -119,6 +122,17 @@ def test_a_size_that_the_networks_judge_wrong_is_learned_and_used() -> None:
     assert f"the others to be {size.size_m:.2f} m large" in sentences[-1]
 
 
+@pytest.mark.parametrize(("doubt", "least", "most"), [(0.3, 0.28, 0.4), (0.03, 0.0, 0.1)])
+def test_the_gate_reckons_with_what_a_judged_size_may_be_off(doubt: float, least: float, most: float) -> None:
+    """Of drones that the networks do not know, as long as nothing was learned. It lasts, and does not average out."""
+    last = Flight(drone("auto"), doubt=doubt).fly(8.0)[-1]
+    assert last.size is None or not last.size.used
+    for one in last.neighbours:
+        assert one.possible
+        sigmas = [of.range_sigma_m / float(np.linalg.norm(of.position)) for of in one.possible]
+        assert all(least <= sigma <= most for sigma in sigmas)
+
+
 @pytest.mark.parametrize("judged_m", [0.19, 0.95])
 def test_a_size_that_is_not_plausible_is_not_used(judged_m: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """More than twice what the networks judge, or less than half."""
@@ -155,18 +169,19 @@ def test_it_is_off_where_it_is_not_asked_for() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scatter", "said", "weaves"),
+    ("scatter", "doubt", "said", "weaves"),
     [
-        pytest.param(0.1, {}, True, id="the networks do not know them"),
-        pytest.param(0.01, {}, False, id="they know them"),
-        pytest.param(0.1, {"drone_size_m": SIZE_M}, False, id="their size is said"),
+        pytest.param(0.1, 0.02, {}, True, id="the networks do not know them"),
+        pytest.param(0.01, 0.3, {}, True, id="the networks judge them alike, and say that they do not know them"),
+        pytest.param(0.01, 0.06, {}, False, id="they know them"),
+        pytest.param(0.1, 0.3, {"drone_size_m": SIZE_M}, False, id="their size is said"),
     ],
 )
-def test_by_itself_it_weaves_where_the_judged_sizes_scatter(
-    scatter: float, said: dict[str, float], *, weaves: bool
+def test_by_itself_it_weaves_where_the_judged_sizes_are_uncertain(
+    scatter: float, doubt: float, said: dict[str, float], *, weaves: bool
 ) -> None:
     """As of drones that the networks do not know, and whose size nobody said."""
-    outputs = Flight(drone("auto", **said), scatter=scatter).fly(60.0)
+    outputs = Flight(drone("auto", **said), scatter=scatter, doubt=doubt).fly(60.0)
     assert any(one.size is not None and one.size.weaves for one in outputs) is weaves
     if weaves:
         assert outputs[-1].size is not None

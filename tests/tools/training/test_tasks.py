@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tools.training.dataset import PairSet
 from tools.training.networks import DistanceNet
-from tools.training.tasks import DistanceTask, NeighboursTask
+from tools.training.tasks import DistanceTask, NeighboursTask, SigmaTask
 
 DRONES, OTHERS = 6, 6
 
@@ -83,6 +83,27 @@ def test_with_a_teacher_crops_without_a_drone_are_mixed_with_each_other_alone(tm
     assert (others.mean((1, 2, 3)) > 80).all()
     kinds = (others.mean(3) < 155).float().mean((1, 2))
     assert ((kinds > 0.01) & (kinds < 0.99)).any(), "one shows a part of the darker one, or it of another"
+
+
+def test_sigma_learns_how_far_sizes_are_off_and_changes_nothing_else(tmp_path: Path) -> None:
+    """All drones are judged half as large as they are. Of a Laplace distribution with that mean deviation, ln 2, the
+    standard deviation is root 2 times as much."""
+    torch.manual_seed(0)
+    given = batch() | {"drone": torch.ones(DRONES + OTHERS)}
+    np.savez(tmp_path / "crops.npz", **{name: values.numpy() for name, values in given.items()})
+    task = SigmaTask(tmp_path)
+    task.begin()
+    torch.nn.init.constant_(task.net.get_parameter("doubt.2.bias"), 4.0)  # 37 %: sixty steps are to be enough
+    before = task.net(given["picture"])[0].detach()
+    given["target"][:, 0], given["apparent"] = before[:, 0], before[:, 5] + np.log(2.0)
+    optimiser = torch.optim.Adam([one for one in task.net.parameters() if one.requires_grad], 1e-3)
+    for _ in range(60):
+        optimiser.zero_grad()
+        task.loss(given)[0].backward()
+        optimiser.step()
+    after = task.net(given["picture"])[0].detach()
+    assert torch.equal(after[:, :6], before[:, :6])
+    assert float(torch.exp(after[:, 6]).mean()) == pytest.approx(np.sqrt(2.0) * np.log(2.0), rel=0.1)
 
 
 def test_depth_mask_and_offsets_are_drawn_towards_the_truth() -> None:

@@ -70,7 +70,9 @@ def measured(manifest: Path, crops: HeldOut) -> dict[str, str]:
                 figures[f"error of {name}, {low:g}-{high:g} m, median / p95 / bias"] = (
                     f"{np.median(off):.2%} / {np.quantile(off, 0.95):.2%} / {np.median(errors[at]):+.2%}"
                 )
-    sigmas = np.abs(out["log_range_per_focal"] - crops.log_range) / np.exp(out["log_relative_sigma"])
+    of_size = np.exp(out["log_size_sigma"]) if "log_size_sigma" in out else 0.0
+    sigma = np.hypot(np.exp(out["log_relative_sigma"]), of_size)
+    sigmas = np.abs(out["log_range_per_focal"] - crops.log_range) / sigma
     figures["errors inside 1 and 2 sigma"] = f"{np.mean(sigmas < 1):.0%}, {np.mean(sigmas < 2):.0%}"
     least = np.log(1 / (1 / model.manifest.threshold("drone_probability") - 1))
     figures["drones called a drone"] = f"{np.mean(out['drone_logit'] > least):.1%}"

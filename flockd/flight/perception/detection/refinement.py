@@ -29,10 +29,13 @@ class Candidate:
     log_range: float
     """Natural logarithm of the range in metres."""
     log_range_sigma: float
+    """Standard deviation of `log_range`, if the size is right."""
     bearing_sigma_rad: float
     size_m: float
     drone_probability: float = 1.0
     masks: tuple[CropMask, ...] = ()
+    log_size_sigma: float = 0.0
+    """As of `RangeEstimate`."""
 
     @property
     def range_m(self) -> float:
@@ -46,7 +49,7 @@ class Candidate:
 
     @property
     def covariance(self) -> FloatArray:
-        """(3, 3) as of `Detection.covariance`."""
+        """(3, 3) as of `Detection.covariance`, if the size is right: that errs alike in all views of a drone."""
         return log_polar_covariance(self.bearing, self.log_range_sigma, self.bearing_sigma_rad)
 
 
@@ -197,7 +200,7 @@ class Cascade:
         masks = () if estimate.mask is None else (CropMask(view, estimate.mask, stage.roi.half_angle),)
         return Candidate(
             stage.proposal, bearing, log_range, estimate.log_range_sigma, self._thresholds.bearing_sigma_rad,
-            estimate.size_m, estimate.drone_probability, masks,
+            estimate.size_m, estimate.drone_probability, masks, estimate.log_size_sigma,
         )  # fmt: skip
 
     def _with_mirrored(
@@ -256,7 +259,7 @@ class Cascade:
 
 
 def mean_candidate(one: Candidate, other: Candidate) -> Candidate:
-    """The mean of log range, bearing, log size and log sigma, weighted by the variances; the lesser probability."""
+    """The mean of log range, bearing, log size and sigmas, weighted by the variances; the lesser probability."""
     weight = one.log_range_sigma**-2 / (one.log_range_sigma**-2 + other.log_range_sigma**-2)
 
     def mean(a: float, b: float) -> float:
@@ -271,6 +274,7 @@ def mean_candidate(one: Candidate, other: Candidate) -> Candidate:
         size_m=math.exp(mean(math.log(one.size_m), math.log(other.size_m))),
         drone_probability=min(one.drone_probability, other.drone_probability),
         masks=one.masks + other.masks,
+        log_size_sigma=mean(one.log_size_sigma, other.log_size_sigma),
     )
 
 

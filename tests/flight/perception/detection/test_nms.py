@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -73,3 +74,12 @@ def test_a_fused_detection_is_the_weighted_mean_with_the_best_ones_variance() ->
     assert fused.cameras == ("front", "left")
     assert fused.label == 3
     assert np.trace(fused.covariance) == pytest.approx(0.05**2 + 2 * 0.004**2)
+
+
+def test_a_size_that_is_not_known_makes_the_range_uncertain_too() -> None:
+    """3 % by the apparent size and 40 % by the size are 40.1 %."""
+    unknown = replace(candidate(towards(0.0, 4.0), 0.03), log_size_sigma=0.4)
+    fused = fuse([unknown], 1)
+    assert fused.log_size_sigma == 0.4
+    assert fused.range_sigma_m / fused.range_m == pytest.approx(math.hypot(0.03, 0.4))
+    assert np.trace(unknown.covariance) == pytest.approx(0.03**2 + 2 * 0.004**2), "all its views are off alike"
