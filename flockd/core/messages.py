@@ -270,6 +270,12 @@ class Detection:
         """Standard deviation along the line of sight, to first order."""
         return self.range_m * math.sqrt(float(self.bearing @ self.covariance @ self.bearing))
 
+    @property
+    def way_sigma_m(self) -> float:
+        """The same without the size's part, which is alike in all detections of one drone."""
+        variance = float(self.bearing @ self.covariance @ self.bearing) - self.log_size_sigma**2
+        return self.range_m * math.sqrt(max(variance, 0.0))
+
 
 SECTORS = 72
 """Directions of `ObstacleRanges`: one every 5 degrees."""

@@ -481,7 +481,7 @@ def _measurement(
     velocity, sigma_m_s = None, 1.0
     if motion is not None and observation.previous is not None:
         velocity = observation.previous.vehicle.R_ned_body @ motion.velocity
-        sigma_m_s = caution * math.sqrt(2) * detection.range_sigma_m / motion.interval_s
+        sigma_m_s = caution * math.sqrt(2) * detection.way_sigma_m / motion.interval_s
     return Measurement.of(detection, R_ned_body, velocity, sigma_m_s)
 
 

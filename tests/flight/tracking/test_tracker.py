@@ -621,6 +621,8 @@ def test_a_detection_is_turned_into_level_axes() -> None:
         label=1,
         log_size_sigma=0.08,
     )
+    assert detection.range_sigma_m == pytest.approx(0.5)
+    assert detection.way_sigma_m == pytest.approx(5.0 * 0.06), "10 % are the range's, 8 % of them the size's"
     measurement = Measurement.of(detection, rotation_from_euler(0.0, 0.0, math.pi / 2))
     np.testing.assert_allclose(measurement.position, [0.0, 5.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(measurement.covariance, np.diag([0.0001, 0.01, 0.0004]), atol=1e-12)
