@@ -322,6 +322,10 @@ def _probability(logit: FloatArray) -> FloatArray:
     return np.asarray(1.0 / (1.0 + np.exp(-logit)))
 
 
+_MOST_SIZE_SIGMA = 0.5
+"""Twice that is a factor of 2.7 in size either way: a network that says more says that it knows nothing."""
+
+
 def _estimate(columns: Mapping[str, float], drone_logit: float, crop: Crop, mask: Float32Array | None) -> RangeEstimate:
     """The estimate from one crop's output, with a mirror image's turned back."""
     size = crop.camera.size[0]
@@ -336,7 +340,7 @@ def _estimate(columns: Mapping[str, float], drone_logit: float, crop: Crop, mask
         size_m=float(np.exp(columns["log_range_per_focal"] + columns["log_apparent_size"])),
         drone_probability=float(_probability(np.array(drone_logit))),
         mask=mask,
-        log_size_sigma=float(np.exp(columns.get("log_size_sigma", -np.inf))),
+        log_size_sigma=min(float(np.exp(columns.get("log_size_sigma", -np.inf))), _MOST_SIZE_SIGMA),
     )
 
 
