@@ -243,7 +243,7 @@ class Detection:
     """Natural logarithm of the range in metres."""
     covariance: Matrix3
     """(3, 3) in body axes, of what `flockd.flight.geometry.log_polar_residual` measures: along the bearing the
-    variance of the log range, across it that of the angle, rad^2."""
+    variance of the log range, if the size is right; across it that of the angle, rad^2."""
     drone_probability: float
     """Probability that it is a drone at all."""
     size_m: float
@@ -253,7 +253,7 @@ class Detection:
     label: int
     """Its value in the masks of this frame set, from 1 up."""
     log_size_sigma: float = 0.0
-    """Standard deviation of the logarithm of `size_m`, a part of that of the log range: it errs with it."""
+    """Standard deviation of the logarithm of `size_m`: the log range errs with it, alike in all of a drone's."""
 
     @property
     def range_m(self) -> float:
@@ -268,13 +268,12 @@ class Detection:
     @property
     def range_sigma_m(self) -> float:
         """Standard deviation along the line of sight, to first order."""
-        return self.range_m * math.sqrt(float(self.bearing @ self.covariance @ self.bearing))
+        return math.hypot(self.way_sigma_m, self.range_m * self.log_size_sigma)
 
     @property
     def way_sigma_m(self) -> float:
-        """The same without the size's part, which is alike in all detections of one drone."""
-        variance = float(self.bearing @ self.covariance @ self.bearing) - self.log_size_sigma**2
-        return self.range_m * math.sqrt(max(variance, 0.0))
+        """The same if the size is right: of how far the drone went between two detections of it."""
+        return self.range_m * math.sqrt(float(self.bearing @ self.covariance @ self.bearing))
 
 
 SECTORS = 72

@@ -168,14 +168,13 @@ def _noise(measurement: Measurement, parameters: TrackingParameters) -> FloatArr
     """(4, 4) covariance of a measurement's log-polar coordinates and log size.
 
     A range is a size over an apparent size, so that the two err together: by as much, with `size_correlation`. What the
-    judged size may be off is left out: it lasts, and is no noise. A filter that took it for noise would find the range
-    from how the neighbour moves, and in a flock that tells nothing of it (`flock_size`).
+    judged size may be off (`Detection.log_size_sigma`) is no part of it: that lasts, and is no noise. A filter that
+    took it for noise would find the range from how the neighbour moves, which in a flock tells nothing of it
+    (`flock_size`).
     """
-    bearing, of_size = measurement.bearing, measurement.log_size_sigma**2
-    variance = measurement.log_range_variance - of_size
-    across = parameters.size_correlation * variance * bearing[:, None]
-    covariance = measurement.covariance - of_size * np.outer(bearing, bearing)
-    return np.block([[covariance, across], [across.T, np.array([[variance]])]])
+    variance = measurement.log_range_variance
+    across = parameters.size_correlation * variance * measurement.bearing[:, None]
+    return np.block([[measurement.covariance, across], [across.T, np.array([[variance]])]])
 
 
 def _at(measurement: Measurement, velocity: FloatArray) -> FloatArray:

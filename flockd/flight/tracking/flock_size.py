@@ -222,9 +222,8 @@ def _motion(interval_s: float) -> tuple[FloatArray, FloatArray]:
 
 
 def _noise(measurement: Measurement) -> FloatArray:
-    """(3, 3) covariance of bearing and assumed log range, in NED axes: by the apparent size alone."""
-    along = _RANGE_SIGMA**2 - measurement.log_size_sigma**2
-    noise: FloatArray = measurement.covariance + along * np.outer(measurement.bearing, measurement.bearing)
+    """(3, 3) covariance of bearing and assumed log range, in NED axes."""
+    noise: FloatArray = measurement.covariance + _RANGE_SIGMA**2 * np.outer(measurement.bearing, measurement.bearing)
     return noise
 
 

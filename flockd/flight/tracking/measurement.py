@@ -31,7 +31,7 @@ class Measurement:
     drone_probability: float = 1.0
     """Probability that it is a drone at all, 0 to 1."""
     log_size_sigma: float = 0.0
-    """As of `Detection`: the part of `covariance` along the bearing by which size and range err together."""
+    """As of `Detection`."""
     velocity: FloatArray | None = None
     """(3,) m/s over ground, where one was estimated (Eq. 36)."""
     velocity_sigma_m_s: float = 1.0
@@ -48,8 +48,8 @@ class Measurement:
             raise ValueError(f"a measured size must be finite and positive, not {self.size_m} m")
         if not 0 <= self.drone_probability <= 1:
             raise ValueError(f"a probability lies between 0 and 1, not at {self.drone_probability}")
-        if not (self.log_size_sigma >= 0 and self.log_size_sigma**2 <= self.log_range_variance):  # a NaN fails too
-            raise ValueError(f"a size's sigma lies between 0 and the range's, not at {self.log_size_sigma}")
+        if not (math.isfinite(self.log_size_sigma) and self.log_size_sigma >= 0):
+            raise ValueError(f"a size's sigma must be finite and not negative, not {self.log_size_sigma}")
         if self.velocity is not None and not np.isfinite(self.velocity).all():
             raise ValueError("a measured velocity must be finite")
         if not (math.isfinite(self.velocity_sigma_m_s) and self.velocity_sigma_m_s > 0):

@@ -68,7 +68,7 @@ class Flight:
         looks_m = self._judged_m * math.exp(self._random.normal(0.0, self._scatter))
         size_m = looks_m if known is None or not known.is_of(looks_m) else known.size_m
         log_range = math.log(float(np.linalg.norm(offset)) * size_m / SIZE_M) + self._random.normal(0.0, 0.02)
-        covariance = log_polar_covariance(bearing, math.hypot(0.03, self._doubt), 0.004)
+        covariance = log_polar_covariance(bearing, 0.03, 0.004)
         return Detection(bearing, log_range, covariance, 0.95, size_m, ("front",), label, self._doubt)
 
     def fly(self, duration_s: float) -> list[PilotOutput]:

@@ -106,9 +106,7 @@ def fuse(group: Sequence[Candidate], label: int) -> Detection:
     return Detection(
         bearing=bearing,
         log_range=float(weights @ [one.log_range for one in group]),
-        covariance=log_polar_covariance(
-            bearing, math.hypot(best.log_range_sigma, best.log_size_sigma), best.bearing_sigma_rad
-        ),
+        covariance=log_polar_covariance(bearing, best.log_range_sigma, best.bearing_sigma_rad),
         drone_probability=max(one.drone_probability for one in group),
         size_m=math.exp(float(weights @ [math.log(one.size_m) for one in group])),
         cameras=tuple(dict.fromkeys(name for one in group for name in one.proposal.cameras)),

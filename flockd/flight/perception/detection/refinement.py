@@ -49,7 +49,7 @@ class Candidate:
 
     @property
     def covariance(self) -> FloatArray:
-        """(3, 3) as of `Detection.covariance`, if the size is right: that errs alike in all views of a drone."""
+        """(3, 3) as of `Detection.covariance`."""
         return log_polar_covariance(self.bearing, self.log_range_sigma, self.bearing_sigma_rad)
 
 

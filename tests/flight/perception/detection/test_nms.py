@@ -82,4 +82,4 @@ def test_a_size_that_is_not_known_makes_the_range_uncertain_too() -> None:
     fused = fuse([unknown], 1)
     assert fused.log_size_sigma == 0.4
     assert fused.range_sigma_m / fused.range_m == pytest.approx(math.hypot(0.03, 0.4))
-    assert np.trace(unknown.covariance) == pytest.approx(0.03**2 + 2 * 0.004**2), "all its views are off alike"
+    assert np.trace(fused.covariance) == pytest.approx(0.03**2 + 2 * 0.004**2), "all its views are off alike"
