@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from flockd import __version__
 from flockd.cli import (
@@ -62,6 +64,19 @@ def installing(extra: str) -> str:
     if (checkout / "pyproject.toml").is_file():
         return f"{sys.executable} -m pip install -e '{checkout}[{extra}]'"
     return f"{sys.executable} -m pip install 'flockd[{extra}]'"
+
+
+def program() -> NoReturn:
+    """The installed `flockd`: `main`, then the end of the process without the interpreter's own.
+
+    A library's thread that asks for Python while the interpreter takes itself down aborts the process, by SIGABRT, and
+    its exit code is lost: a service manager would start again what a wrong configuration has ended.
+    """
+    code = main()
+    atexit._run_exitfuncs()  # what libraries have asked for; there is no public name
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -26,7 +26,7 @@ SMALL = {"MALLOC_ARENA_MAX": "2"}
 """As systemd's unit sets it: fewer, fuller pools of memory."""
 RECORDING = RecordingConfig(images="jpeg", jpeg_quality=80, file_mb=20000.0, quota_mb=100000.0)
 """One file for a flight, which costs the daemon little."""
-_RUN = "import sys; from flockd.cli import main; sys.exit(main())"
+_RUN = "from flockd.cli import program; program()"
 
 
 def fleet_configs(

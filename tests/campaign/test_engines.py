@@ -124,7 +124,7 @@ def _end(_: object) -> None:
 @contextmanager
 def command(path: Path, out: Path, *more: str) -> Iterator[subprocess.Popen[bytes]]:
     """`flockd campaign` of a file, as a person runs it."""
-    program = "import sys; from flockd.cli import main; sys.exit(main())"
+    program = "from flockd.cli import program; program()"
     words = [sys.executable, "-c", program, "campaign", str(path), "--out", str(out), *more]
     with subprocess.Popen(words, env=with_package(os.environ), stderr=subprocess.DEVNULL) as process:
         yield process

@@ -31,7 +31,7 @@ from tests.onboard.autopilot.conftest import HEARTBEAT_S
 from tests.onboard.daemon.aboard import Cameras, config_for
 from tests.onboard.test_deadline import endless
 
-RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
+RUN = "from flockd.cli import program; program()"
 WITHOUT_NETWORKS = (
     "import flockd.flight.perception; from tests.onboard.daemon.aboard import TinyPerceiver; "
     f"flockd.flight.perception.load_networks = lambda *_, **__: TinyPerceiver(); {RUN}"

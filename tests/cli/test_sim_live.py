@@ -21,7 +21,7 @@ from flockd.cli import main
 from flockd.sim.free_ports import free_endpoint
 
 ROOT = Path(__file__).parents[2]
-RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
+RUN = "from flockd.cli import program; program()"
 SECONDS_TO_FAIL = 240.0
 GOAL_NE = (-4.0, -3.0)
 

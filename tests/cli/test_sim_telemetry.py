@@ -21,7 +21,7 @@ from flockd.review.flight_log.log import FlightLog
 from flockd.sim.free_ports import free_endpoint
 
 ROOT = Path(__file__).parents[2]
-RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
+RUN = "from flockd.cli import program; program()"
 
 
 def test_the_daemons_of_a_simulation_connect_where_they_are_told(

@@ -226,7 +226,7 @@ def test_no_descriptors_are_left_at_the_start(tmp_path: Path) -> None:
     config = config_for(free_port(), free_endpoint(), free_endpoint())
     path = tmp_path / "drone.yaml"
     path.write_text(yaml.safe_dump(config.model_dump(mode="json", exclude_defaults=True)), encoding="utf-8")
-    run = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
+    run = "from flockd.cli import program; program()"
     for limit, count in ((resource.RLIMIT_NOFILE, 24), (resource.RLIMIT_NOFILE, 40), (resource.RLIMIT_AS, 450 << 20)):
         ended = subprocess.run(
             [sys.executable, "-c", run, "run", "--config", str(path)], cwd=ROOT, capture_output=True, text=True,

@@ -13,7 +13,7 @@ from tests.ground.datasets.test_image_headers import _claiming
 from tests.onboard.recording.made_up import record
 
 pytestmark = pytest.mark.slow
-RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
+RUN = "from flockd.cli import program; program()"
 ROOT = Path(__file__).parents[2]
 MEMORY_BYTES = 3 << 30
 """Address space; libraries take most of it."""

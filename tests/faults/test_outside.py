@@ -22,7 +22,7 @@ from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, client
 from tests.onboard.telemetry.test_malformed import FLIGHT
 
 pytestmark = pytest.mark.slow
-RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
+RUN = "from flockd.cli import program; program()"
 ROOT = Path(__file__).parents[2]
 
 

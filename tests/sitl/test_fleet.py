@@ -95,7 +95,7 @@ def test_two_daemons_fly_from_rendered_frames_and_the_report_is_the_simulators(
 def test_nobody_is_left_behind_when_it_is_told_to_end(tmp_path: Path) -> None:
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
     options = ["--autopilot", "standin", "--out", str(tmp_path / "out")]
-    run = "import sys; from flockd.cli import main; sys.exit(main())"
+    run = "from flockd.cli import program; program()"
     with subprocess.Popen(
         [sys.executable, "-c", run, "sim", str(_scenario(tmp_path, drones=1)), *options],
         cwd=data_path("config").parent, env=environment, stderr=subprocess.PIPE, text=True,
@@ -121,8 +121,8 @@ def test_an_interrupted_fleet_lands_and_leaves_a_report_of_what_was_flown(tmp_pa
     options = ["--autopilot", "standin", "--speed-factor", "0.5", "--duration", "600", "--out", str(out)]
     # As from a terminal: a shell that starts something in the background has it ignore Ctrl-C.
     run = (
-        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler);"
-        "from flockd.cli import main; sys.exit(main())"
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
+        "from flockd.cli import program; program()"
     )
     with subprocess.Popen(
         [sys.executable, "-c", run, "sim", str(_scenario(tmp_path, drones=2)), *options],
@@ -257,7 +257,7 @@ def test_px4_flies_by_sight(tmp_path: Path) -> None:
 def test_px4_enters_its_failsafe_when_its_daemon_is_frozen(tmp_path: Path) -> None:
     """No setpoint for a second is a failsafe of PX4 in offboard: it ends with another mode."""
     out = tmp_path / "out"
-    run = "import sys; from flockd.cli import main; sys.exit(main())"
+    run = "from flockd.cli import program; program()"
     options = ["--autopilot", "px4", "--drones", "2", "--duration", "20", "--out", str(out)]
     with subprocess.Popen(
         [sys.executable, "-c", run, "sim", *options], cwd=data_path("config").parent,

@@ -44,7 +44,7 @@ FOLLOWS_M = 10.0
 """At the end, those who follow a drone that is flown by hand have to be as near to it."""
 CLOSEST_M = 1.0
 ORDER_ANSWER_S = 60.0
-_RUN = "import sys; from flockd.cli import main; sys.exit(main())"
+_RUN = "from flockd.cli import program; program()"
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from playwright.sync_api import Browser, Page, ViewportSize, expect, sync_playwr
 
 from flockd.sim.free_ports import free_endpoint
 
-_RUN = "import sys; from flockd.cli import main; sys.exit(main())"
+_RUN = "from flockd.cli import program; program()"
 _ARGUMENTS = ("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking")
 SAMPLER = """seconds => new Promise(done => {
   const [times, began] = [[], performance.now()];

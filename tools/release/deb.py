@@ -38,11 +38,9 @@ HAND_MADE, PACKAGED = "/opt/flockd/bin/flockd", "/usr/bin/flockd"
 """What the units of systemd/ start, and what those of the package do."""
 COMMAND = f"""\
 #!/{HOME}/bin/python
-import sys
+from flockd.cli import program
 
-from flockd.cli import main
-
-sys.exit(main())
+program()
 """
 DONE, UNAVAILABLE = 0, 69
 

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-FLOCKD = "import sys; from flockd.cli import main; sys.exit(main())"
+FLOCKD = "from flockd.cli import program; program()"
 PATIENCE_S = 60.0
 
 

@@ -287,7 +287,7 @@ def test_a_video_that_breaks_off_is_distinguished_from_one_that_ends(
 def test_what_is_no_video_is_one_sentence_whatever_the_decoder_thinks(tmp_path: Path) -> None:
     video = tmp_path / "clip.mp4"
     video.write_bytes(b"\0\0\0\x1cftypisom\0\0\x02\0isomiso2mp41" + bytes(1000))
-    command = [sys.executable, "-c", "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"]
+    command = [sys.executable, "-c", "from flockd.cli import program; program()"]
     done = subprocess.run([*command, "replay", str(video)], capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert done.stderr == f"{video}: is no video that can be decoded; restore it, or convert it to MP4\n"

@@ -261,7 +261,7 @@ def test_a_configurations_control_codes_do_not_reach_the_terminal(tmp_path: Path
     path.write_text('name: "\\e[2J\\e]0;owned\\a"\n"\\e[31mred": 1\nrig: {cameras: "\\x9b5m"}\n', encoding="utf-8")
     with pytest.raises(ConfigError):
         load_drone(path)
-    run = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
+    run = "from flockd.cli import program; program()"
     for options in (["config", "check"], ["run", "--config"]):
         ended = subprocess.run(
             [sys.executable, "-c", run, *options, str(path)], cwd=ROOT, capture_output=True, check=False

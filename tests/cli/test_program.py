@@ -1,0 +1,44 @@
+"""The installed `flockd` as a process: its exit code."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.onboard.test_deadline import endless
+
+ROOT = Path(__file__).parents[2]
+GIVEN_UP = """
+import sys, threading, time
+import numpy as np, onnxruntime as ort
+import flockd.cli
+
+session, options = ort.InferenceSession(sys.argv[1]), ort.RunOptions()
+feeds = {i.name: np.zeros(i.shape, np.float32) for i in session.get_inputs()}
+threading.Thread(target=lambda: session.run(None, feeds, options), daemon=True).start()
+
+def main():
+    time.sleep(0.5)  # until it runs
+    options.terminate = True
+    return 78
+
+flockd.cli.main = main
+flockd.cli.program()
+"""
+
+
+def test_a_run_of_a_network_that_was_given_up_does_not_take_the_exit_code(tmp_path: Path) -> None:
+    """Told to end, it asks for Python once more; where the interpreter takes itself down, that aborts the process."""
+    network = endless(tmp_path).with_suffix(".onnx")
+    command = [sys.executable, "-c", GIVEN_UP, str(network)]
+    assert subprocess.run(command, cwd=ROOT, check=False, timeout=60.0).returncode == 78
+
+
+def test_what_is_printed_last_is_not_lost() -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", "from flockd.cli import program; program()", "models", "list"],
+        cwd=ROOT, check=False, capture_output=True, text=True, timeout=60.0,
+    )  # fmt: skip
+    assert ended.returncode == 0
+    assert ended.stdout.startswith("model "), "to a pipe, which is written when it is full or flushed"
