@@ -19,7 +19,7 @@ Provider = Literal["cpu", "cuda", "tensorrt", "openvino"]
 """What computes the networks: ONNX Runtime's execution providers."""
 PROVIDERS: tuple[Provider, ...] = get_args(Provider)
 
-FlowRefinement = Literal["dis", "quick_dis", "none"]
+FlowRefinement = Literal["lucas_kanade", "dis", "none"]
 """What sharpens a network's flow."""
 
 ScaleSource = Literal["network", "height"]

@@ -23,7 +23,7 @@ from flockd.flight.safety import (
 _SEES = CameraHealth(age_s=0.0, period_s=1.0, unplugged=False, frozen=False, noisy=False)
 _LOST = replace(_SEES, unplugged=True)
 _WELL = Inputs(
-    cameras={"one": _SEES}, dropped_share=0.0, estimate_age_s=0.0, ego_motion_failures=0, network_faults=0,
+    cameras={"one": _SEES}, dropped_share=0.0, estimate_age_s=0.0, ego_motion_age_s=0.0, network_faults=0,
     inference_stuck=False, load=0.0, temperature_c=None, loop_lag_s=0.0, gusts_m_s=0.0, dead_tasks=(),
     neighbours_age_s=0.0, nearest_neighbour_m=math.inf, refused_commands=0, obstacle_near=False,
     outside_fence=False, outside_heights=False, motion_age_s=0.0,

@@ -23,7 +23,8 @@ class GeometryParameters(Section):
     """IT_MAX of Algorithm 1."""
     max_threshold_m: Distance = 2.0
     """Beyond this the motion counts as not estimated."""
-    background_stride_px: Annotated[int, Field(ge=1, le=256)] = 32
+    background_stride_px: Annotated[int, Field(ge=1, le=256)] = 16
+    """Between the matches of an image; 16 are the points at which Lucas & Kanade's method makes the flow exact."""
     max_depth_m: Distance = 40.0
     """Background farther away says little of the translation and is left out."""
     max_acceleration_m_s2: Positive = consistency.EGO_MOTION.limit

@@ -115,13 +115,13 @@ class PerceptionConfig(Section):
 
     flow: str = "flow_int8"
     """`dis` is OpenCV's DIS flow instead of a network."""
-    flow_refinement: FlowRefinement = "quick_dis"
-    """A network's flow finds what moved far; DIS then makes it exact. `quick_dis` is for flight: 12 ms an image, where
-    `dis` takes 34, and where the images show nothing, the surroundings determine the flow. With a sensor's depth, on
-    images that are blurred and moved far, `dis` is worth its time, and every pixel keeps its own flow.
+    flow_refinement: FlowRefinement = "lucas_kanade"
+    """A network's flow finds what moved far; this makes it exact. `lucas_kanade` is for flight: 4 ms an image.
+    It follows points 16 px apart, and where the images show nothing, the surroundings determine the flow. `dis` takes
+    34 ms, and each pixel keeps its own flow: for a sensor's depth, and images that are blurred and moved far.
     """
     flow_refinement_scale: Annotated[int, Field(ge=0, le=5)] = 1
-    """Where DIS after a network stops: at a 2^n-th of the size."""
+    """Where `dis` after a network stops: at a 2^n-th of the size."""
     depth: str = "neighbours_int8"
     segmentation: str = "neighbours_int8"
     detector: str = "detector"

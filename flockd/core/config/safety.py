@@ -97,10 +97,10 @@ class SafetyParameters(Section):
     """Limit of the share of dropped frames of late; above it, degraded."""
     estimate_timeout_s: Annotated[float, Field(gt=0, le=60)] = services.ESTIMATE.timeout
     """Hover when the pilot's newest output is older than this; leave it three of its steps."""
-    degraded_ego_motion_failures: Annotated[int, Field(ge=1)] = 2
-    """Steps in a row without own motion, to be degraded."""
-    max_ego_motion_failures: Annotated[int, Field(ge=1)] = 6
-    """Steps in a row without own motion, to hover."""
+    degraded_ego_motion_s: Annotated[float, Field(gt=0, le=600)] = 0.75
+    """How long no step has found the own motion, to be degraded: at two steps a second, two in a row."""
+    max_ego_motion_s: Annotated[float, Field(gt=0, le=600)] = 2.75
+    """The same, to hover."""
     degraded_load: Positive = 1.0
     """How long the steps take (95th percentile) over how long they may, to be degraded."""
     max_load: Positive = 2.0
@@ -148,7 +148,7 @@ class SafetyParameters(Section):
     @model_validator(mode="after")
     def _worse_comes_later(self) -> Self:
         for mild, grave in (
-            ("degraded_ego_motion_failures", "max_ego_motion_failures"),
+            ("degraded_ego_motion_s", "max_ego_motion_s"),
             ("degraded_load", "max_load"),
             ("degraded_temperature_c", "max_temperature_c"),
             ("degraded_gusts_m_s", "max_gusts_m_s"),

@@ -22,6 +22,9 @@ from flockd.flight.geometry.transform import RigidTransform
 MIN_MATCHES = 40
 _MAX_MATCHES = 300
 _ROUNDS, _FINE_ROUNDS = 7, 4
+_NEAR, _THERE = 1.0, 1e-4
+"""Squares of standard deviations that a step is long: below the first the fine rounds begin, below the second they
+end."""
 _DEPTH_SIGMA = 3.0
 """Relative error of a depth, and of all depths of an image together."""
 _FLOW_PX = 0.2
@@ -87,7 +90,8 @@ def camera_motion(
     pairs = pairs.select(mine)
     range_m = np.linalg.norm(pairs.previous - mounted.T_body_camera.translation, axis=1)
     sights = Sights.of(mounted.camera, pairs, range_m, log_focal)
-    numbers = np.concatenate([sights.jacobian(start).reshape(len(mine), -1), sights.after], axis=1)
+    _, jacobian = sights.linearised(start)
+    numbers = np.concatenate([jacobian.reshape(len(mine), -1), sights.after], axis=1)
     seen = np.asarray(np.isfinite(numbers).all(axis=1))
     if np.count_nonzero(seen) < MIN_MATCHES:
         return None
@@ -131,23 +135,24 @@ class Sights:
             before_other=self.before_other[which],
         )
 
-    def residuals(self, motion: RigidTransform) -> FloatArray:
-        """(n, 2) pixels: where the motion moves each point to, off where it was seen."""
-        off: FloatArray = np.einsum("nij,nj->ni", self.across, _unit(_moved(self.before, motion)))
-        return off
+    def linearised(self, motion: RigidTransform) -> tuple[FloatArray, FloatArray]:
+        """(n, 2) pixels: where the motion moves each point to, off where it was seen; and how that changes.
 
-    def jacobian(self, motion: RigidTransform) -> FloatArray:
-        """(n, 2, 7) by a rotation vector on the right, the translation, and the logarithm of all depths."""
+        (n, 2, 7) by a rotation vector on the right, the translation, and the logarithm of all depths.
+        """
         moved = _moved(self.before, motion)
-        unit, length = _unit(moved), np.linalg.norm(moved, axis=1)
-        along = np.einsum("nij,nj->ni", self.across, unit)
+        length = np.sqrt(np.einsum("ni,ni->n", moved, moved))
+        unit = moved / length[:, None]
+        along: FloatArray = np.einsum("nij,nj->ni", self.across, unit)
         by_point = (self.across - along[:, :, None] * unit[:, None, :]) / length[:, None, None]
+        by_start = by_point @ motion.rotation.T
         jacobian = np.empty((len(moved), 2, 7))
         # exp(w)^T y is y - w x y, and a . (y x w) is w . (a x y)
-        jacobian[:, :, _ROTATION] = np.cross(by_point, moved[:, None, :])
-        jacobian[:, :, _TRANSLATION] = -by_point @ motion.rotation.T
-        jacobian[:, :, _DEPTH] = np.einsum("nij,nj->ni", by_point @ motion.rotation.T, self.before)
-        return jacobian
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            jacobian[:, :, i] = by_point[:, :, j] * moved[:, None, k] - by_point[:, :, k] * moved[:, None, j]
+        jacobian[:, :, _TRANSLATION] = -by_start
+        jacobian[:, :, _DEPTH] = np.einsum("nij,nj->ni", by_start, self.before)
+        return along, jacobian
 
     def by_focal(self, motion: RigidTransform) -> FloatArray:
         """(n, 2) pixels by the logarithm of the focal length, of where the motion moves each point to."""
@@ -170,9 +175,9 @@ def _unit(vectors: FloatArray) -> FloatArray:
 
 
 def _solved(sights: Sights, start: RigidTransform) -> CameraMotion | None:
-    motion = start
+    motion, fine = start, False
     for number in range(_ROUNDS):
-        residuals, jacobian = sights.residuals(motion), sights.jacobian(motion)
+        residuals, jacobian = sights.linearised(motion)
         if not np.isfinite(jacobian).all():
             return None
         whitening = _whitening(jacobian[:, :, _DEPTH])
@@ -180,7 +185,7 @@ def _solved(sights: Sights, start: RigidTransform) -> CameraMotion | None:
         size2 = (white**2).sum(axis=1)
         # For a Rayleigh distribution the median is sqrt(2 ln 2) sigma.
         sigma = max(float(np.median(np.sqrt(size2))) / np.sqrt(2.0 * np.log(2.0)), 1.0)
-        fine = number >= _ROUNDS - _FINE_ROUNDS
+        fine = fine or number >= _ROUNDS - _FINE_ROUNDS
         kernel: Kernel = Tukey(_TUKEY_SIGMAS * sigma) if fine else Cauchy(_CAUCHY_SIGMAS * sigma)
         weights = kernel.weight(size2) / (sigma**2 * _MATCHES_A_FLOW)
         J = (whitening @ jacobian).reshape(-1, 7)
@@ -193,9 +198,12 @@ def _solved(sights: Sights, start: RigidTransform) -> CameraMotion | None:
         information, slope = information[:6, :6], (J.T @ (white.ravel() * np.repeat(weights, 2)))[:6]
         if not np.isfinite(information).all() or np.linalg.cond(information) > _MAX_CONDITION:
             return None
-        if number < _ROUNDS - 1:
-            step = np.linalg.solve(information, -slope)
-            motion = RigidTransform(motion.rotation @ rotation_from_vector(step[:3]), motion.translation + step[3:])
+        step = np.linalg.solve(information, -slope)
+        length2 = float(-slope @ step)
+        if number == _ROUNDS - 1 or (fine and length2 < _THERE):
+            break
+        fine = length2 < _NEAR or fine
+        motion = RigidTransform(motion.rotation @ rotation_from_vector(step[:3]), motion.translation + step[3:])
     whitened = (J[:, :6] * np.repeat(weights, 2)[:, None]).reshape(-1, 2, 6)
     projection = -np.linalg.solve(information, np.einsum("nij,nik->njk", whitening, whitened).reshape(-1, 6).T)
     return CameraMotion(motion, information, sigma * _FLOW_PX, len(white), sights, projection)

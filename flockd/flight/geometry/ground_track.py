@@ -14,6 +14,8 @@ BESIDE = 2.0
 MIN_POINTS = 40
 MIN_SPAN = 0.5
 """In heights: of the measured places in view; over less, a single bump decides."""
+MAX_SEEN = 1000
+"""Points; of more some are left out evenly, as four times as many say the same."""
 ROUNDS = 3
 
 
@@ -39,6 +41,7 @@ def scale_on_track(samples: GroundSamples, track: FloatArray, slope: FloatArray,
     around = (factor * seen[:, :2] > track[:, :2].min(axis=0) - margin_m).all(axis=1)
     around &= (factor * seen[:, :2] < track[:, :2].max(axis=0) + margin_m).all(axis=1)
     seen = seen[around]
+    seen = seen[:: -(-len(seen) // MAX_SEEN) or 1]
     for _ in range(ROUNDS):
         away = (factor * seen[:, None, :2] - track[None, :, :2]) / reach_m
         weights = np.exp(-0.5 * (away**2).sum(axis=2)) * ((away**2).sum(axis=2) < BESIDE**2)

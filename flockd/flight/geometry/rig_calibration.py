@@ -181,16 +181,21 @@ class RigCalibration:
     def _found(self, before: Seen, after: Seen, pairs: PointPairs) -> tuple[FloatArray, FloatArray]:
         """The state's step and its covariance after it. Raises ValueError where no camera tells anything."""
         interval_s = after.vehicle.time_s - before.vehicle.time_s
-        used = {}
+        used, rows, off = {}, [], np.zeros(6)
         for name, camera in self._cameras.items():
             motion = self._motion(name, before, after, pairs)
-            if motion is not None and self._fits(self._row(name, motion, before, after, np.zeros(6)), camera):
+            if motion is None:
+                continue
+            row = self._row(name, motion, before, after, off)
+            if self._fits(row, camera):
                 used[name] = motion
+                rows.append(row)
         if not used:
             raise ValueError("no camera tells anything")
-        known, off = before.vehicle.velocity_ned is not None, np.zeros(6)
-        for _ in range(_ROUNDS):
-            rows = [self._row(name, motion, before, after, off) for name, motion in used.items()]
+        known = before.vehicle.velocity_ned is not None
+        for number in range(_ROUNDS):
+            if number:
+                rows = [self._row(name, motion, before, after, off) for name, motion in used.items()]
             step, off, covariance = self._solved(rows, interval_s, known=known)
             off[3:] += step[-3:] * interval_s
         return step, covariance

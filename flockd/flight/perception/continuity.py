@@ -16,6 +16,7 @@ import numpy as np
 
 from flockd.core.config.perception import NoiseParameters
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, UInt8Array
+from flockd.flight.perception.flow.images import grey, shrunk
 
 _LONGER_SIDE_PX = 96
 """Longer side of the small images that are compared: noise of single pixels averages out, and DIS takes a
@@ -146,4 +147,4 @@ def _small_grey(image: UInt8Array) -> UInt8Array:
     height, width = image.shape[:2]
     scale = _LONGER_SIDE_PX / max(height, width)
     size = (max(round(scale * width), 1), max(round(scale * height), 1))
-    return np.asarray(cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA), np.uint8)
+    return shrunk(grey(image), size)

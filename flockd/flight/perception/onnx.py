@@ -24,7 +24,7 @@ from flockd.flight.inference.session import OnnxModel
 from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes, with_boxes
 from flockd.flight.perception.detection.instances import group_instances
 from flockd.flight.perception.detection.second_stage import SecondStage
-from flockd.flight.perception.flow import DisFlow, Flow, OnnxFlow, background_flow, object_flow
+from flockd.flight.perception.flow import DisFlow, Flow, OnnxFlow, grid_flow, object_flow
 from flockd.flight.perception.interface import OneByOne
 from flockd.flight.perception.maps import Crop, OpenDepth, RangeEstimate, SceneMaps
 from flockd.flight.perception.requirements import check_roles
@@ -82,8 +82,8 @@ class OnnxNetworks(OneByOne):
         """See `Networks`. The flow of each drone is found by itself."""
         before, after = first.image, second.image
         flow = self._flow.flow(before, after)
-        if self._flow_refinement == "quick_dis":
-            flow = background_flow(flow, before, after, labels)
+        if self._flow_refinement == "lucas_kanade":
+            flow = grid_flow(flow, before, after, labels)
         return object_flow(flow, before, after, labels)
 
     def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
@@ -249,7 +249,8 @@ class OnnxNetworks(OneByOne):
         network = OnnxFlow(self._models.open(config.flow, "flow"))
         if config.flow_refinement == "none":
             return network
-        return DisFlow(network, config.flow_refinement_scale, quick=config.flow_refinement == "quick_dis")
+        when_lost = config.flow_refinement == "lucas_kanade"
+        return DisFlow(network, config.flow_refinement_scale, when_lost=when_lost)
 
 
 _OF_CROPS = frozenset({"distance", "verification"})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 
 from flockd.core.config.geometry import GeometryParameters
@@ -72,7 +73,7 @@ def neighbour_pairs(rig: Rig, observation: Observation, parameters: GeometryPara
     for camera, before, after, flow in _seen_twice(rig, observation):
         if before.depth is None or after.depth is None:
             continue
-        relabelled = table[before.labels]
+        relabelled = np.asarray(cv2.LUT(before.labels, table), np.uint8)
         for label, found in pairs.items():
             pixels = label_pixels(relabelled, label, parameters.max_drone_pixels)
             if len(pixels):

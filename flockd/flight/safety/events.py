@@ -47,8 +47,8 @@ class Inputs:
     """Share of the frames of the last seconds that were corrupt, truncated, stamped out of order, or noise."""
     estimate_age_s: float
     """Age of the pilot's newest output; infinite before the first."""
-    ego_motion_failures: int
-    """Steps in a row in which the pilot found no motion of its own."""
+    ego_motion_age_s: float
+    """For how long the pilot's steps have found no motion of the drone's own."""
     network_faults: int
     """Outputs of a network that are NaN, infinite or out of range, since the last call."""
     inference_stuck: bool
@@ -173,7 +173,6 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
     """What is the matter, each with one short sentence for people; empty in a quiet flight."""
     lost = [f"{name} {fault}" for name, camera in inputs.cameras.items() if (fault := _fault(camera, p))]
     sightless = len(lost) == len(inputs.cameras) or len(lost) > p.max_lost_cameras
-    failures = inputs.ego_motion_failures
     temperature = inputs.temperature_c
     lost_link = link_lost(inputs.heartbeat_age_s, inputs.message_age_s, p)
     # While another's setpoints are followed, being off the own ones is no wind.
@@ -193,13 +192,13 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         ),
         (
             Event.EGO_MOTION_POOR,
-            p.degraded_ego_motion_failures <= failures < p.max_ego_motion_failures,
-            f"ego-motion not estimated in {failures} steps in a row",
+            p.degraded_ego_motion_s < inputs.ego_motion_age_s <= p.max_ego_motion_s,
+            f"no ego-motion estimated {_since(inputs.ego_motion_age_s)}",
         ),
         (
             Event.EGO_MOTION_LOST,
-            failures >= p.max_ego_motion_failures,
-            f"ego-motion not estimated in {failures} steps in a row",
+            not inputs.ego_motion_age_s <= p.max_ego_motion_s,
+            f"no ego-motion estimated {_since(inputs.ego_motion_age_s)}",
         ),
         (Event.NETWORK_FAULT, inputs.network_faults > 0, "a network's output is not finite or not plausible"),
         (Event.INFERENCE_STUCK, inputs.inference_stuck, "a network does not respond"),

@@ -85,8 +85,8 @@ class PilotLoop:
         self.steps = 0
         self.failed = 0
         """Steps without a result, because a network was late or an error came that nobody expects."""
-        self.ego_motion_failures = 0
-        """In a row."""
+        self._ego_motion_s = 0.0
+        """Time of the flight's newest step that found the own motion, or of its first, which has nothing to compare."""
         self.noisy_images: Counter[str] = Counter()
         """That were not used, by camera."""
         self.neighbour_seen_s = -math.inf
@@ -98,6 +98,11 @@ class PilotLoop:
         """Uses a new pilot from the next step on: its time begins there, so that a recording can be replayed."""
         self._flight, self._pilot, self.order = number, None, None
         self._rig_reports, self._size_reports = RigReports(), SizeReports()
+
+    @property
+    def ego_motion_age_s(self) -> float:
+        """For how long the steps, as of the newest, have found no own motion."""
+        return 0.0 if self.newest is None else self.newest.time_s - self._ego_motion_s
 
     def load(self) -> float:
         """How long the steps take, 95th percentile of the last ones, over how long they may."""
@@ -187,8 +192,8 @@ class PilotLoop:
             raise StepsFailedError(f"{self._unexpected} steps in a row failed; the last with {why}") from error
 
     def _count(self, result: StepResult) -> None:
-        if result.number > 1:  # the first has nothing to compare with
-            self.ego_motion_failures = 0 if result.output.ego_motion is not None else self.ego_motion_failures + 1
+        if result.output.ego_motion is not None or result.number == 1:
+            self._ego_motion_s = result.time_s
         self.noisy_images.update(result.output.noisy_cameras)
         self.neighbour_seen_s = max(self.neighbour_seen_s, last_seen_s(result.time_s, result.output.neighbours))
 

@@ -78,7 +78,7 @@ class InputCollector:
             cameras=summary.cameras,
             dropped_share=summary.dropped_share,
             estimate_age_s=math.inf if result is None else now - result.time_s,
-            ego_motion_failures=pilot_loop.ego_motion_failures,
+            ego_motion_age_s=pilot_loop.ego_motion_age_s,
             network_faults=self._networks.faults - self._faults_before,
             inference_stuck=self._networks.stuck,
             load=pilot_loop.load(),

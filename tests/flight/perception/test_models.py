@@ -18,7 +18,7 @@ from flockd.core.errors import ModelError
 from flockd.core.messages import BoolArray, Float32Array, Frame, UInt8Array
 from flockd.flight.inference import OnnxModel, find_manifests, load_manifest
 from flockd.flight.perception import DisFlow, OnnxFlow, OnnxNetworks
-from flockd.flight.perception.flow import background_flow
+from flockd.flight.perception.flow import grid_flow
 from flockd.flight.perception.onnx import CROPS_PER_RUN
 from flockd.ground.pictures.scoring import intersection_over_union
 from tests.flight.perception.cameras import camera_of, crop_of, rendered
@@ -211,22 +211,21 @@ def test_many_images_go_in_batches_no_larger_than_what_is_prepared(monkeypatch: 
     np.testing.assert_allclose(ranges, [perception.ranges([picture])[0].log_range for picture in pictures], atol=1e-3)
 
 
-def test_the_network_of_flow_is_sharpened_by_dis_unless_configured_otherwise() -> None:
+def test_the_network_of_flow_is_made_exact_as_configured() -> None:
     first, second = shifted_pictures((9, -5), (480, 640))
     network = OnnxFlow(OnnxModel(MODELS / "flow_int8.yaml", threads=1))
+    no_drones = np.zeros(first.shape[:2], np.uint8)
+    rough = network.flow(first, second)
     for refinement, expected in (
-        ("none", network),
-        ("dis", DisFlow(network)),
-        ("quick_dis", DisFlow(network, quick=True)),
+        ("none", rough),
+        ("dis", DisFlow(network).flow(first, second)),
+        ("lucas_kanade", grid_flow(rough, first, second, no_drones)),
     ):
         config = PerceptionConfig.model_validate({"flow_refinement": refinement})
-        no_drones = np.zeros(first.shape[:2], np.uint8)
         found = OnnxNetworks(config, MODELS).flow(
             Frame("camera", first, 0.0, 0), Frame("camera", second, 0.5, 1), no_drones
         )
-        flow = expected.flow(first, second)
-        settled = background_flow(flow, first, second, no_drones) if refinement == "quick_dis" else flow
-        np.testing.assert_allclose(found, settled, atol=1e-4)
+        np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
 def test_the_second_stage_marks_which_pixels_are_the_drones_in_a_mirror_too() -> None:

@@ -37,7 +37,7 @@ def test_limits_of_the_gate(limits: dict[str, Any], words: str) -> None:
 @pytest.mark.parametrize(
     ("limits", "words"),
     [
-        ({"degraded_ego_motion_failures": 7}, "degraded_ego_motion_failures is above max_ego_motion_failures"),
+        ({"degraded_ego_motion_s": 7.0}, "degraded_ego_motion_s is above max_ego_motion_s"),
         ({"degraded_load": 2.5}, "degraded_load is above max_load"),
         ({"degraded_temperature_c": 99.0}, "degraded_temperature_c is above max_temperature_c"),
         ({"hover_s": 10.0}, "less than or equal to 3"),

@@ -360,7 +360,7 @@ def test_the_supervisor_is_told_of_an_obstacle_where_hold_needs_room() -> None:
     config = _flyable("front").model_copy(update={"autopilot": AutopilotParameters()})
     status = AutopilotStatus(0.0, 0.1, 0.1, "offboard", True, False, "air", None, None, True, True, None, None)
     parts: Any = SimpleNamespace(  # all that the control loop asks, of whichever part
-        newest=None, noisy_images=Counter(), ego_motion_failures=0, neighbour_seen_s=0.0, load=lambda: 0.5, faults=0,
+        newest=None, noisy_images=Counter(), ego_motion_age_s=0.0, neighbour_seen_s=0.0, load=lambda: 0.5, faults=0,
         stuck=False, worst_s=lambda: 0.0, hottest_c=None, report=lambda: SimpleNamespace(fault=None), end=str,
         takeover=None, status=dict,
     )  # fmt: skip

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from flockd.core.messages import Float32Array, UInt8Array
+from flockd.flight.perception.flow.images import shrunk
 
 _SHORTER_SIDE_PX = 45
 """Shorter side of the small images that are compared: at this size a motion of half the image is some 20 pixels, and
@@ -81,5 +80,4 @@ def _correlations(a: NDArray[np.float32], b: NDArray[np.float32], size: tuple[in
 def _small(image: UInt8Array) -> NDArray[np.float32]:
     factor = min(1.0, _SHORTER_SIDE_PX / min(image.shape))
     size = (round(image.shape[1] * factor), round(image.shape[0] * factor))
-    resized: NDArray[Any] = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return resized.astype(np.float32)
+    return shrunk(image, size).astype(np.float32)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
@@ -14,21 +12,6 @@ from flockd.flight.perception.flow.images import grey
 from flockd.flight.perception.interface import Flow
 
 
-@dataclass(frozen=True)
-class DisEffort:
-    """How much of its time DIS spends on what."""
-
-    patch_stride_px: int
-    gradient_descents: int
-    variational_refinements: int
-
-
-MEDIUM = DisEffort(patch_stride_px=3, gradient_descents=25, variational_refinements=5)
-"""OpenCV's preset of this name: errs by 0.16 px at the median in 34 ms."""
-QUICK = DisEffort(patch_stride_px=5, gradient_descents=12, variational_refinements=1)
-"""0.20 px in 12 ms, and lost more easily."""
-
-
 class DisFlow:
     """OpenCV's dense inverse search (Kroeger et al. 2016): alone for small computers, or after another flow.
 
@@ -37,18 +20,17 @@ class DisFlow:
     """
 
     def __init__(
-        self, start: Flow | None = None, finest_scale: int = 1, *, quick: bool = False, min_correlation: float = 0.8
+        self, start: Flow | None = None, finest_scale: int = 1, *, when_lost: bool = False, min_correlation: float = 0.8
     ) -> None:
         """``start``: the flow to begin with at the coarsest scale; None: no motion.
 
-        ``finest_scale``: it stops at a 2^n-th of the size. ``quick``: with `QUICK` and not `MEDIUM` effort. Other
-        starts are tried where the images correlate by less than ``min_correlation`` along the flow.
+        ``finest_scale``: it stops at a 2^n-th of the size. ``when_lost``: the start's flow is taken as it is, but where
+        the images correlate by less than ``min_correlation`` along it; there other starts are tried.
         """
-        self.name = f"{start.name}+dis" if start else "dis"
+        self.name = start.name if start and when_lost else f"{start.name}+dis" if start else "dis"
         self._start = start
         self._finest_scale = finest_scale
-        self._effort = QUICK if quick else MEDIUM
-        self._min_correlation = min_correlation
+        self._when_lost, self._min_correlation = when_lost, min_correlation
         self._idle: list[cv2.DISOpticalFlow] = []
         """None is for two callers at once. Each keeps its memory, which to take anew costs a third of its time."""
 
@@ -57,7 +39,9 @@ class DisFlow:
         before, after = grey(first), grey(second)
         if self._start is None:
             return self._refined(np.zeros((*before.shape, 2), np.float32), before, after)
-        best = self._refined(self._start.flow(first, second), before, after)
+        best = self._start.flow(first, second)
+        if not self._when_lost:
+            best = self._refined(best, before, after)
         correlation = flow_correlation(before, after, best)
         for other_start in (feature_flow, translation_flow):
             if correlation >= self._min_correlation:
@@ -82,7 +66,4 @@ class DisFlow:
     def _made(self) -> cv2.DISOpticalFlow:
         dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         dis.setFinestScale(self._finest_scale)
-        dis.setPatchStride(self._effort.patch_stride_px)
-        dis.setGradientDescentIterations(self._effort.gradient_descents)
-        dis.setVariationalRefinementIterations(self._effort.variational_refinements)
         return dis

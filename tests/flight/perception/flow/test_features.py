@@ -87,8 +87,8 @@ def test_what_a_flow_says_does_not_hang_on_the_flows_before_it() -> None:
     """DIS keeps its memory from call to call, also for images of another size."""
     first = pattern(1)
     second, _ = moved(first, turn(1.0, 1.0, 3.0, 2.0))
-    alone = DisFlow(quick=True).flow(first, second)
-    used = DisFlow(quick=True)
+    alone = DisFlow().flow(first, second)
+    used = DisFlow()
     used.flow(second, pattern(2))
     used.flow(pattern(3, 200, 150), pattern(4, 200, 150))
     assert np.array_equal(used.flow(first, second), alone)

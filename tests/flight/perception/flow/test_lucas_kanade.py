@@ -1,4 +1,4 @@
-"""The background's flow where the images do not tell it."""
+"""The background's flow made exact, also where the images do not tell it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flockd.core.messages import Float32Array, UInt8Array
-from flockd.flight.perception.flow import background_flow
+from flockd.flight.perception.flow import grid_flow
 
 HEIGHT, WIDTH = 320, 400
 MOVED = (6.0, -4.0)
@@ -44,9 +44,24 @@ NO_DRONES = np.zeros((HEIGHT, WIDTH), np.uint8)
 
 def test_a_plain_sky_moves_as_its_surroundings_say() -> None:
     first, second = images()
-    settled = background_flow(told((-9.0, 15.0)), first, second, NO_DRONES)
+    settled = grid_flow(told((-9.0, 15.0)), first, second, NO_DRONES)
     assert off(settled, SKY) < 0.3
     assert off(settled, GROUND) < 0.01
+
+
+def test_it_makes_a_flow_exact_that_is_some_pixels_off() -> None:
+    first, second = images()
+    rough = told(MOVED) + np.array([5.0, -6.0], np.float32)
+    assert off(rough, GROUND) > 7.0
+    assert off(grid_flow(rough, first, second, NO_DRONES), GROUND) < 0.1
+
+
+def test_a_point_that_goes_astray_takes_what_those_around_it_add() -> None:
+    """A piece of the second image shows something else."""
+    first, second = images()
+    second[200:240, 160:200] = np.random.default_rng(3).integers(0, 256, (40, 40, 3))
+    exact = grid_flow(told(MOVED), first, second, NO_DRONES)
+    assert np.linalg.norm(exact[GROUND] - MOVED, axis=-1).max() < 1.0
 
 
 def test_what_is_seen_well_keeps_its_own_flow_although_all_else_moves_otherwise() -> None:
@@ -55,7 +70,7 @@ def test_what_is_seen_well_keeps_its_own_flow_although_all_else_moves_otherwise(
     second[np.s_[215:275, 130:210]] = first[part]
     flow = told(MOVED)
     flow[part] = (30.0, 15.0)
-    settled = background_flow(flow, first, second, NO_DRONES)
+    settled = grid_flow(flow, first, second, NO_DRONES)
     inside = settled[210:250, 112:168]
     assert np.abs(np.median(inside, axis=(0, 1)) - [30.0, 15.0]).max() < 0.3
 
@@ -68,7 +83,7 @@ def test_beside_a_drone_the_background_does_not_move_with_it() -> None:
     beside = np.zeros((HEIGHT, WIDTH), np.bool_)
     beside[190:240, 170:230] = True
     beside &= labels == 0
-    settled = background_flow(flow, first, second, labels)
+    settled = grid_flow(flow, first, second, labels)
     assert np.median(np.linalg.norm(settled[beside] - MOVED, axis=1)) < 0.5
     assert (settled[labels == 1] == flow[labels == 1]).all()
 
@@ -77,7 +92,7 @@ def test_beside_a_drone_the_background_does_not_move_with_it() -> None:
 def test_where_nothing_is_to_be_seen_the_flow_stays_about_the_same(of: tuple[float, float]) -> None:
     empty = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
     flow = np.full((HEIGHT, WIDTH, 2), of, np.float32)
-    np.testing.assert_allclose(background_flow(flow, empty, empty, NO_DRONES), flow, atol=0.01)
+    np.testing.assert_allclose(grid_flow(flow, empty, empty, NO_DRONES), flow, atol=0.01)
 
 
 def test_a_flow_that_went_astray_stays_finite() -> None:
@@ -85,4 +100,4 @@ def test_a_flow_that_went_astray_stays_finite() -> None:
     rng = np.random.default_rng(1)
     for scale in (1.0, 1e3, 1e6):
         flow = (scale * rng.normal(size=(HEIGHT, WIDTH, 2))).astype(np.float32)
-        assert np.isfinite(background_flow(flow, first, second, NO_DRONES)).all()
+        assert np.isfinite(grid_flow(flow, first, second, NO_DRONES)).all()
