@@ -151,4 +151,4 @@ def test_read_a_flights_figures_into_pandas(tmp_path: Path, monkeypatch: pytest.
         )
     count, nearest_m, _, farthest_m = (float(one) for one in flights["1"])
     assert count == 10
-    assert 2.5 < nearest_m < farthest_m < 3.5
+    assert 2.5 < nearest_m < farthest_m < 4.0

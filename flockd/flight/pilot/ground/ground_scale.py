@@ -28,8 +28,8 @@ from flockd.flight.geometry import (
 from flockd.flight.perception import CameraObservation, Observation
 
 MATCHES = 1200
-"""Of each image: with four times as many the scale was no better. Of 640x480 pixels they are the points at which the flow
-is exact."""
+"""Of each image: with four times as many the scale was no better. Of 640x480 pixels they are those at which the flow is
+exact."""
 FLOW_SIGMA_PX = 0.3
 MIN_BASELINE_M = 0.08
 """Across the line of sight; with less, the ground's depth is noise."""
