@@ -20,7 +20,7 @@ from flockd.flight.geometry.rotations import rotation_from_vector
 from flockd.flight.geometry.transform import RigidTransform
 
 MIN_MATCHES = 40
-_MAX_MATCHES = 300
+_MAX_MATCHES = 600
 _ROUNDS, _FINE_ROUNDS = 7, 4
 _NEAR, _THERE = 1.0, 1e-4
 """Squares of standard deviations that a step is long: below the first the fine rounds begin, below the second they
