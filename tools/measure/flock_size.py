@@ -5,8 +5,10 @@ the others, in gusts of up to 0.3 m/s. What the first sees of the others errs as
 (`config/perceived`), and by the side that it sees; sizes are assumed wrong by a drawn factor; there are false
 detections, and its own motion errs. Printed are, by the time since its weave began: flights with a published size, its
 error (median, 90 %, largest), and the mean normalised error squared, which is 1 where the standard deviation is right.
+With `--take-off` it learns from its own climb, among others that stand on the ground and take off one after the other.
 
     python -m tools.measure.flock_size --flights 200
+    python -m tools.measure.flock_size --flights 200 --take-off
 """
 
 from __future__ import annotations
@@ -45,6 +47,9 @@ FALSE_SHARE = 0.25
 _MIXED_EVERY = 4
 """In one of so many flights, flown once more, two of the four others are larger."""
 AFTER_S = (6.0, 12.0, 15.0, 30.0)
+CLIMB_M, CLIMB_M_S = 4.0, 1.0
+STAGGERS_S = (0.0, 2.0, 5.0, 10.0)
+"""Between one drone's take-off and the next one's."""
 
 
 @dataclass
@@ -173,11 +178,46 @@ def fly(seed: int, by_time: dict[float, Errors], of_types: Errors, *, types: boo
         of_types.add(learned.of_track(j), sizes_m[j])
 
 
+def take_off(seed: int, stagger_s: float, seen_s: dict[float, Errors]) -> None:
+    """The first climbs from the ground among four that stand there and follow, each so much later than the last."""
+    random = np.random.default_rng(seed)
+    flown = scenario(seed, random)
+    step_s, sight, learned = flown.drone.step_s, Sight(np.full(DRONES, SIZE_M), random, flown.drone.step_s), FlockSize()
+    turns = 2 * math.pi * (np.arange(DRONES) + random.uniform(0.0, 0.5, DRONES)) / (DRONES - 1)
+    away_m = np.concatenate([[0.0], random.uniform(3.0, 8.0, DRONES - 1)])
+    level = away_m[:, None] * np.column_stack([np.cos(turns), np.sin(turns)])
+    before_m = 0.0
+    for step in range(1, round(max(seen_s) / step_s) + 1):
+        climbed_m = np.clip(CLIMB_M_S * (step * step_s - stagger_s * np.arange(DRONES)), 0.0, CLIMB_M)
+        places = np.column_stack([level, -0.2 - climbed_m])
+        wove = np.array([0.0, 0.0, before_m - climbed_m[0] + random.normal(0.0, WAY_SIGMA_M)])
+        learned.step(step_s, wove, sight.step(places))
+        before_m = float(climbed_m[0])
+        if step * step_s in seen_s:
+            seen_s[step * step_s].add(learned.of_looks(sight.judged_m), SIZE_M)
+
+
+def print_take_off(flights: int) -> None:
+    """A row for each time between take-offs, and each time since the first."""
+    print("between take-offs, since the first | published | error: median / 90 % / largest | bias | sigma | NEES")
+    for stagger_s in STAGGERS_S:
+        seen_s = {after_s: Errors() for after_s in (3.0, 5.0, 10.0)}
+        for seed in range(flights):
+            take_off(seed, stagger_s, seen_s)
+        for after_s, errors in seen_s.items():
+            print(f"{stagger_s:.0f} s, {after_s:.0f} s | {errors.row}")
+
+
 def main() -> None:
     """Flies and prints."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--flights", type=int, default=200, metavar="N")
-    flights = parser.parse_args().flights
+    parser.add_argument("--take-off", action="store_true", help="learn from the own climb, not from a weave")
+    arguments = parser.parse_args()
+    flights = arguments.flights
+    if arguments.take_off:
+        print_take_off(flights)
+        return
     by_time, each, mixed = {after_s: Errors() for after_s in AFTER_S}, Errors(), Errors()
     for seed in range(flights):
         fly(seed, by_time, each, types=False)

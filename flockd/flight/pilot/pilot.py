@@ -351,6 +351,8 @@ class FlockPilot:
         if changed := size.see(interval_s, way, measured, self._tracker.neighbours()):
             before_m, now_m = changed
             self._tracker.resize(now_m, before_m, velocity)
+        for track, own_m in size.own_sizes(self._tracker.neighbours()).items():
+            self._tracker.resize_one(track, own_m, velocity)
         return size.cautious(self._tracker.neighbours())
 
     def _local_map(

@@ -24,6 +24,8 @@ _PLAUSIBLE = 2.0
 the families that they do not know is judged so wrong, but drones that rise together look larger."""
 _MOST_OFF = 0.5
 """One judged size counts as no farther off, in log size: it may be of something else."""
+_OTHERWISE = 2.0
+"""One neighbour's own size is used where it is off that of all by so many standard deviations of both."""
 _CONTRADICTED = 3.0
 """A size that the configuration says is contradicted by one that is so many standard deviations off."""
 _REFRESHED = 0.25
@@ -57,6 +59,8 @@ class SizeLearner:
         self._random: np.random.Generator | None = None
         self._found: SizeEstimate | None = None
         self._used: SizeEstimate | None = None
+        self._own: dict[int, SizeEstimate] = {}
+        """By track, of those whose own size is another than that of all."""
         self._judged: list[float] = []
         """Log sizes of confirmed neighbours as the networks judged them, while nothing else is used."""
         self._doubts: list[float] = []
@@ -85,8 +89,9 @@ class SizeLearner:
         parts = []
         if self._weave.moves:
             parts.append("; weaves up and down to learn the others' size")
-        if self._used is not None:
-            parts.append(f"; has found the others to be {self._used.size_m:.2f} m large")
+        sizes = [one.size_m for one in (*((self._used,) if self._used else ()), *self._own.values())]
+        if sizes:
+            parts.append(f"; has found the others to be {_listed(sizes)} m large")
         return "".join(parts)
 
     @property
@@ -118,6 +123,33 @@ class SizeLearner:
         before_m = self._looks_m if self._used is None else self._used.size_m
         changed = self._choose()
         return (before_m, self._used.size_m) if changed and self._used is not None else None
+
+    def own_sizes(self, neighbours: Sequence[Neighbour]) -> dict[int, float]:
+        """In metres by track, of those that have just been found to be otherwise than all, or than they were.
+
+        After `see`. In a flock of several types not all are alike, however they look.
+        """
+        numbers = {one.track for one in neighbours if one.confirmed}
+        self._own = {number: one for number, one in self._own.items() if number in numbers}
+        if self._said is not None or self._wove_s is None:
+            return {}
+        changed = {}
+        for number in sorted(numbers):
+            found, own = self._sizes.of_track(number), self._own.get(number)
+            if found is None:
+                continue
+            of_all_m = self._looks_m if self._used is None else self._used.size_m
+            if own is None:
+                is_new = found.deviations(of_all_m, found.sigma) > _OTHERWISE and self._may_be(found)
+            else:
+                is_new = found.deviations(own.size_m) > _REFRESHED
+            if is_new:
+                self._own[number] = found
+                changed[number] = found.size_m
+        return changed
+
+    def _may_be(self, found: SizeEstimate) -> bool:
+        return self._looks_m > 0.0 and 1 / _PLAUSIBLE < found.size_m / self._looks_m < _PLAUSIBLE
 
     @property
     def _is_unknown_type(self) -> bool:
@@ -153,7 +185,7 @@ class SizeLearner:
             return False
         judged = np.minimum(np.abs(np.array(self._judged) - math.log(found.size_m)), _MOST_OFF)
         off = float(np.sqrt(np.mean(judged**2))) / found.sigma
-        if not 1 / _PLAUSIBLE < found.size_m / self._looks_m < _PLAUSIBLE:
+        if not self._may_be(found):
             self._used = None
         elif used is None:
             self._used = found if off > _USED_BEYOND else None
@@ -192,15 +224,25 @@ class SizeLearner:
 
         That of the learned size; before, of drones that the networks do not know, `_DOUBTED`.
         """
-        if self._used is not None:
-            return tuple(_as_uncertain(one, self._used.sigma) for one in neighbours)
+        return tuple(_as_uncertain(one, self._sigma_of(one.track)) for one in neighbours)
+
+    def _sigma_of(self, track: int) -> float:
+        own = self._own.get(track, self._used)
+        if own is not None:
+            return own.sigma
         if self._said is not None or self._doubt <= _DOUBTED:
-            return tuple(neighbours)
-        learned = math.inf if self._found is None else _USED_BEYOND * self._found.sigma
-        return tuple(_as_uncertain(one, min(_DOUBTED, learned)) for one in neighbours)
+            return 0.0
+        return min(_DOUBTED, math.inf if self._found is None else _USED_BEYOND * self._found.sigma)
+
+
+def _listed(sizes_m: Sequence[float]) -> str:
+    """Each once, as people read them."""
+    return " and ".join(dict.fromkeys(f"{size_m:.2f}" for size_m in sorted(sizes_m)))
 
 
 def _as_uncertain(neighbour: Neighbour, sigma: float) -> Neighbour:
+    if sigma == 0.0:
+        return neighbour
     possible = tuple(
         replace(one, range_sigma_m=math.hypot(one.range_sigma_m, sigma * float(np.linalg.norm(one.position))))
         for one in neighbour.possible or ()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -93,6 +93,10 @@ class Measurement:
         bearing, log_range = log_polar(position)
         covariance = log_polar_covariance(bearing, range_sigma_m / math.exp(log_range), bearing_sigma_rad)
         return cls(bearing, log_range, covariance, size_m, drone_probability)
+
+    def of_size(self, size_m: float) -> Self:
+        """As it is of a drone of this size, which appears as large."""
+        return replace(self, size_m=size_m, log_range=self.log_range + math.log(size_m / self.size_m))
 
     @property
     def range_m(self) -> float:

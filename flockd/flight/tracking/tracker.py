@@ -31,6 +31,8 @@ class Prediction:
     size_m: float
     """As of `Detection.size_m`."""
     existence_probability: float
+    size_known: bool = False
+    """The flight has shown the size, whatever the networks judge."""
 
 
 class Tracker:
@@ -81,7 +83,8 @@ class Tracker:
         interval_s = max(0.0, time_s - self._time_s)
         weight = min(1.0, interval_s / self.parameters.evidence_interval_s)
         self._time_s = time_s
-        pairs = assign(measurements, [track.hypotheses for track in self._tracks], self.parameters)
+        known = [track.known_size_m for track in self._tracks]
+        pairs = assign(measurements, [track.hypotheses for track in self._tracks], self.parameters, known)
         missed = self._without({column for column, _ in pairs.values()})
         self._miss(missed, weight, blind)
         numbers = []
@@ -115,6 +118,7 @@ class Tracker:
                 position=state.position,
                 covariance=state.position_covariance,
                 size_m=state.size_m,
+                size_known=track.known_size_m is not None,
                 existence_probability=track.drone_probability
                 * existence.predicted(track.existence, interval_s, self.parameters),
             )
@@ -124,10 +128,17 @@ class Tracker:
     def resize(self, size_m: float, until_now_m: float, own_velocity: FloatArray | None) -> None:
         """Neighbours that were about `until_now_m` large, from tip to tip, are `size_m`, and so much nearer or farther.
 
-        `own_velocity` (3,) NED m/s; None: not known.
+        Those whose own size is known stay. `own_velocity` (3,) NED m/s; None: not known.
         """
         for track in self._tracks:
-            if looks_alike(track.state.size_m, until_now_m):
+            if track.known_size_m is None and looks_alike(track.state.size_m, until_now_m):
+                track.hypotheses = track.hypotheses.changed(lambda state: filter.resized(state, size_m, own_velocity))
+
+    def resize_one(self, number: int, size_m: float, own_velocity: FloatArray | None) -> None:
+        """The neighbour of one track is `size_m` large, and so is what is measured of it from now on."""
+        for track in self._tracks:
+            if track.number == number:
+                track.known_size_m = size_m
                 track.hypotheses = track.hypotheses.changed(lambda state: filter.resized(state, size_m, own_velocity))
 
     def neighbours(self) -> tuple[Neighbour, ...]:
@@ -161,6 +172,8 @@ class Tracker:
 
     def _detect(self, track: _Track, measurement: Measurement, innovation: Innovation, weight: float) -> None:
         interval_s = max(0.0, self._time_s - track.last_seen_s)
+        if track.known_size_m is not None:
+            measurement = measurement.of_size(track.known_size_m)
         track.hits += 1
         track.agrees = innovation.squared_distance <= self.parameters.confirm_sigma**2
         track.agreed += track.agrees
@@ -223,6 +236,8 @@ class _Track:
     """Whether the last one was."""
     confirmed: bool = False
     was_confirmed: bool = False
+    known_size_m: float | None = None
+    """Its own, as the flight has shown; None: as measured."""
 
     @property
     def state(self) -> State:

@@ -40,9 +40,16 @@ class Flight:
     """A drone that holds its place among others, and goes to the heights that its pilot asks for."""
 
     def __init__(
-        self, config: DroneConfig, *, judged_m: float = JUDGED_M, scatter: float = 0.0, doubt: float = 0.0
+        self,
+        config: DroneConfig,
+        *,
+        judged_m: float = JUDGED_M,
+        scatter: float = 0.0,
+        doubt: float = 0.0,
+        sizes_m: Sequence[float] = (SIZE_M,) * len(PLACES),
     ) -> None:
         """`scatter`: standard deviation of the logarithm of the judged size; `doubt`: what the network says of it."""
+        self._sizes_m = sizes_m
         self._doubt = doubt
         self._judged_m, self._random, self._scatter = judged_m, np.random.default_rng(3), scatter
         networks: Any = object()  # never asked for anything
@@ -67,7 +74,8 @@ class Flight:
         bearing /= np.linalg.norm(bearing)
         looks_m = self._judged_m * math.exp(self._random.normal(0.0, self._scatter))
         size_m = looks_m if known is None or not known.is_of(looks_m) else known.size_m
-        log_range = math.log(float(np.linalg.norm(offset)) * size_m / SIZE_M) + self._random.normal(0.0, 0.02)
+        true_m = self._sizes_m[label - 1]
+        log_range = math.log(float(np.linalg.norm(offset)) * size_m / true_m) + self._random.normal(0.0, 0.02)
         covariance = log_polar_covariance(bearing, 0.03, 0.004)
         return Detection(bearing, log_range, covariance, 0.95, size_m, ("front",), label, self._doubt)
 
@@ -83,6 +91,18 @@ class Flight:
                 self.below_m -= (asked_m - height_m) * (1 - math.exp(-STEP_S))  # 1 m/s for each metre
             self.time_s += STEP_S
         return outputs
+
+
+def _range_errors(output: PilotOutput, below_m: float) -> list[float]:
+    """Relative, of the neighbour in the direction of each of the others."""
+    errors = []
+    for place in PLACES - [0.0, 0.0, below_m]:
+        range_m = float(np.linalg.norm(place))
+        found_m = {
+            float(one.position @ place) / r: r for one in output.neighbours if (r := np.linalg.norm(one.position))
+        }
+        errors.append(float(found_m[max(found_m)]) / range_m - 1)
+    return errors
 
 
 def drone(size: str = "weave", **perception: float) -> DroneConfig:
@@ -120,6 +140,19 @@ def test_a_size_that_the_networks_judge_wrong_is_learned_and_used() -> None:
     sentences = [one.mission.sentence for one in outputs]
     assert "weaves up and down" in sentences[begins]
     assert f"the others to be {size.size_m:.2f} m large" in sentences[-1]
+
+
+def test_each_of_two_types_that_look_alike_has_its_own_size() -> None:
+    """All are judged to be 0.56 m large; two are 0.4 and two 0.76 m."""
+    flight = Flight(drone(), sizes_m=(0.4, 0.76, 0.4, 0.76))
+    before = flight.fly(5.0)[-1]
+    last = flight.fly(60.0)[-1]
+    first, final = (_range_errors(output, flight.below_m) for output in (before, last))
+    assert min(map(abs, first)) > 0.09, "0.56 / 0.4 and 0.56 / 0.76"
+    assert max(map(abs, final)) < 0.1
+    sizes_m = [float(word) for word in re.findall(r"\d\.\d\d", last.mission.sentence)]
+    assert min(sizes_m) == pytest.approx(0.4, rel=0.1)
+    assert max(sizes_m) == pytest.approx(0.76, rel=0.1)
 
 
 @pytest.mark.parametrize(("doubt", "least", "most"), [(0.3, 0.15, 0.2), (0.03, 0.0, 0.1)])
