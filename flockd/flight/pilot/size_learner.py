@@ -114,7 +114,8 @@ class SizeLearner:
         self._sizes.keep({one.track for one in neighbours})
         confirmed = {one.track for one in neighbours if one.confirmed}
         if self._used is None:
-            known = [one for number, one in measured.items() if number in confirmed and one.range_m < _NEAR_M]
+            judged = confirmed - self._own.keys()
+            known = [one for number, one in measured.items() if number in judged and one.range_m < _NEAR_M]
             logs = [math.log(one.size_m) for one in known]
             self._judged = [*self._judged, *logs][-_JUDGED:]
             self._doubts = [*self._doubts, *(one.log_size_sigma for one in known)][-_JUDGED:]
