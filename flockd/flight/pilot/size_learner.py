@@ -238,7 +238,8 @@ class SizeLearner:
 
 def _listed(sizes_m: Sequence[float]) -> str:
     """Each once, as people read them."""
-    return " and ".join(dict.fromkeys(f"{size_m:.2f}" for size_m in sorted(sizes_m)))
+    *words, last = dict.fromkeys(f"{size_m:.2f}" for size_m in sorted(sizes_m))
+    return f"{', '.join(words)} and {last}" if words else last
 
 
 def _as_uncertain(neighbour: Neighbour, sigma: float) -> Neighbour:
