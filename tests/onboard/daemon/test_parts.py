@@ -25,6 +25,7 @@ from flockd.core.config.source import SourceParameters
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.core.messages import (
+    EgoMotion,
     Frame,
     Neighbour,
     PilotOutput,
@@ -43,6 +44,7 @@ from flockd.onboard.daemon.control import Control
 from flockd.onboard.daemon.host_monitors import LoopLag, WallClock, hottest_zone_c
 from flockd.onboard.daemon.lock import only_instance
 from flockd.onboard.daemon.operator_commands import OperatorRequests
+from flockd.onboard.daemon.pilot_loop import PilotLoop, StepResult
 from flockd.onboard.daemon.service_manager import ServiceManager
 from flockd.onboard.daemon.supervisor_inputs import CameraMonitor, InputCollector
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
@@ -353,6 +355,20 @@ def test_what_is_learned_of_the_others_size_is_an_event_each_time_that_it_is_new
         "size: the others are 0.43 m large, +-8%; ranges follow from it",
     )
     assert told == [[], [weaves], [], [found], [said.text], []]
+
+
+def test_the_own_motion_is_missed_from_the_last_step_that_found_it() -> None:
+    """In seconds of the steps, also where a flight begins, whose first step has nothing to compare with."""
+    anything: Any = None
+    loop = PilotLoop(_flyable("front"), anything, anything, anything, anything, anything, lambda: 0.0)
+    found, command = EgoMotion(np.eye(3), np.zeros(3), 0.1, 9, 9, 0.1), Wanted(np.zeros(2), np.zeros(2), 0.0)
+    ages = []
+    steps = [(5.0, 1, None), (5.1, 2, found), (5.2, 3, None), (5.9, 4, None), (6.0, 5, found), (80.0, 1, None)]
+    for time_s, number, ego in steps:
+        loop.newest = StepResult(time_s, PilotOutput(time_s, ego, None, (), (), {}, (), command), 1, number)
+        loop._count(loop.newest)
+        ages.append(loop.ego_motion_age_s)
+    assert ages == pytest.approx([0.0, 0.0, 0.1, 0.8, 0.0, 0.0])
 
 
 def test_the_supervisor_is_told_of_an_obstacle_where_hold_needs_room() -> None:

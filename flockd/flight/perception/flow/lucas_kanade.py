@@ -111,7 +111,7 @@ def _beside(drones: UInt8Array, size: tuple[int, int]) -> BoolArray:
 @lru_cache(maxsize=8)
 def _points(size: tuple[int, int]) -> Float32Array:
     """(n, m, 2) the pixels of `grid_pixels` of an image of (width, height), centres whole; not to be changed."""
-    u, v = (np.arange(GRID_PX // 2, max(length, GRID_PX), GRID_PX) for length in size)
+    u, v = (np.arange(min(GRID_PX, length) // 2, length, GRID_PX) for length in size)
     return np.stack(np.meshgrid(u, v), axis=2).astype(np.float32)
 
 

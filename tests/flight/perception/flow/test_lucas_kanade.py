@@ -88,6 +88,14 @@ def test_beside_a_drone_the_background_does_not_move_with_it() -> None:
     assert (settled[labels == 1] == flow[labels == 1]).all()
 
 
+@pytest.mark.parametrize("size", [(480, 640), (120, 161), (37, 50), (12, 9), (1, 2)])
+def test_images_of_any_size_have_a_flow_of_theirs(size: tuple[int, int]) -> None:
+    image = np.random.default_rng(4).integers(0, 256, (*size, 3), np.uint8)
+    found = grid_flow(np.zeros((*size, 2), np.float32), image, image, np.zeros(size, np.uint8))
+    assert found.shape == (*size, 2)
+    assert np.abs(found).max() < 0.1
+
+
 @pytest.mark.parametrize("of", [(0.0, 0.0), (7.0, 3.0)])
 def test_where_nothing_is_to_be_seen_the_flow_stays_about_the_same(of: tuple[float, float]) -> None:
     empty = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
