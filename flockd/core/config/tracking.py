@@ -69,7 +69,7 @@ class TrackingParameters(Section):
     """Time constant of the average of the network's drone probabilities over a track; its existence probability is
     multiplied by it."""
     confirm_hits: Annotated[int, Field(ge=1)] = 3
-    """No track is confirmed with fewer detections that agree with it."""
+    """No track is confirmed with fewer detections that agree with it, after the first each by `evidence_interval_s`."""
     confirm_sigma: Positive = 3.6
     """A detection farther off than this many standard deviations does not agree: 99 % of those of the motion and
     measurement model are nearer (chi-square with 4 degrees of freedom)."""

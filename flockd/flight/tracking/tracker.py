@@ -176,7 +176,7 @@ class Tracker:
             measurement = measurement.of_size(track.known_size_m)
         track.hits += 1
         track.agrees = innovation.squared_distance <= self.parameters.confirm_sigma**2
-        track.agreed += track.agrees
+        track.agreed += weight * track.agrees
         track.existence = existence.detected(track.existence, innovation, weight, self.parameters)
         track.drone_probability = existence.averaged(
             track.drone_probability, measurement.drone_probability, track.hits, interval_s, self.parameters
@@ -230,8 +230,8 @@ class _Track:
     first_seen_s: float
     last_seen_s: float
     hits: int = 1
-    agreed: int = 1
-    """How many of the hits were within `confirm_sigma`."""
+    agreed: float = 1.0
+    """How many of the hits were within `confirm_sigma`, as far as they are independent evidence."""
     agrees: bool = True
     """Whether the last one was."""
     confirmed: bool = False
