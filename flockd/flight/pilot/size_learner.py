@@ -32,6 +32,8 @@ _REFRESHED = 0.25
 """Ranges follow the estimate once it has moved by this share of its standard deviation."""
 _JUDGED, _FEWEST_JUDGED, _NEAR_M = 400, 24, 8.0
 """So many judged sizes are kept, the newest, so many are enough, and of drones so near: farther ones look like much."""
+_VIEWS_S = 0.45
+"""Judged sizes nearer to each other in time are of one view, and only one of them counts."""
 _SCATTER = 0.05
 """Standard deviation of the judged log sizes from which the networks do not know the drones. Of eleven families that
 they know it is 0.003 to 0.03, of a twelfth, 0.26 m large, 0.16, and of two that they do not know 0.08 to 0.25."""
@@ -67,6 +69,8 @@ class SizeLearner:
         """What they said those may be off."""
         self._looks_m = 0.0
         """Their median."""
+        self._unjudged_s = math.inf
+        """Since the newest of them."""
         self._wove_s: float | None = None
         self._contradiction: str | None = None
 
@@ -113,7 +117,9 @@ class SizeLearner:
         self._sizes.step(interval_s, wove, {number: self._as_judged(one) for number, one in measured.items()})
         self._sizes.keep({one.track for one in neighbours})
         confirmed = {one.track for one in neighbours if one.confirmed}
-        if self._used is None:
+        self._unjudged_s += interval_s
+        if self._used is None and self._unjudged_s >= _VIEWS_S:
+            self._unjudged_s = 0.0
             judged = confirmed - self._own.keys()
             known = [one for number, one in measured.items() if number in judged and one.range_m < _NEAR_M]
             logs = [math.log(one.size_m) for one in known]

@@ -142,6 +142,20 @@ def test_a_size_that_the_networks_judge_wrong_is_learned_and_used() -> None:
     assert f"the others to be {size.size_m:.2f} m large" in sentences[-1]
 
 
+def test_ten_steps_a_second_judge_no_more_views_than_two(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else a few seconds of one view stand for a minute of many."""
+    counts = []
+    for step_s in (0.5, 0.1):
+        monkeypatch.setattr("tests.flight.pilot.test_size_learner.STEP_S", step_s)
+        flight = Flight(drone("auto"))
+        flight.fly(12.0)
+        learner = flight._pilot._size
+        assert learner is not None
+        counts.append(len(learner._judged))
+    assert counts[0] > 60
+    assert counts[1] == pytest.approx(counts[0], rel=0.1)
+
+
 def test_each_of_two_types_that_look_alike_has_its_own_size() -> None:
     """All are judged to be 0.56 m large; two are 0.4 and two 0.76 m."""
     flight = Flight(drone(), sizes_m=(0.4, 0.76, 0.4, 0.76))
