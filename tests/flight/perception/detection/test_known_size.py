@@ -12,6 +12,8 @@ from pydantic import ValidationError
 from flockd.core.config.perception import PerceptionConfig
 from flockd.flight.perception import Perception, RangeEstimate
 from flockd.flight.perception.maps import KnownSize
+from flockd.flight.tracking import Prediction
+from flockd.sim.truth_perception import _SIZE_M
 from tests.flight.pilot.flyer import Flyer, scenario_with
 
 ESTIMATE = RangeEstimate(math.log(4.0), 0.03, np.array([48.0, 48.0]), size_m=0.8, drone_probability=0.9)
@@ -37,6 +39,19 @@ def test_a_size_that_was_learned_is_that_of_drones_that_look_as_those_did() -> N
         learned = KnownSize(0.7 * true.size_m, 0.01, looks_m=looks * true.size_m)
         (known,) = flyer.perception().observe(frames, vehicle, None, learned_size=learned).detections
         assert known.range_m == pytest.approx(factor * true.range_m, rel=0.02)
+
+
+def test_where_a_track_is_predicted_its_own_size_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first stage misses the drone; the track is 0.7 times as far as the size that is judged would have it."""
+    monkeypatch.setattr("flockd.flight.perception.detection.detector.propose_instances", lambda *_: [])
+    monkeypatch.setattr("flockd.flight.perception.detection.detector.propose_residuals", lambda *_: [])
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
+    frames, vehicle = flyer.take_frames()
+    place = np.array([0.7 * 3.0, 0.0, 0.0])
+    for size_m, known, factors in ((0.7 * _SIZE_M, True, [0.7]), (0.7 * _SIZE_M, False, [])):
+        track = Prediction(place, 0.01 * np.eye(3), size_m, 0.99, size_known=known)
+        found = flyer.perception().observe(frames, vehicle, None, [track]).detections
+        assert [one.range_m / 3.0 for one in found] == pytest.approx(factors, rel=0.05)
 
 
 @pytest.mark.parametrize("size_m", [0.0, math.inf, math.nan])

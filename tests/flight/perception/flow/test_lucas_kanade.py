@@ -88,6 +88,20 @@ def test_beside_a_drone_the_background_does_not_move_with_it() -> None:
     assert (settled[labels == 1] == flow[labels == 1]).all()
 
 
+def test_points_on_a_drone_say_nothing_of_the_background_beside_it() -> None:
+    """They follow the drone, which goes its own way."""
+    first, second = images()
+    drone, there = np.s_[200:232, 160:208], np.s_[210:242, 175:223]
+    second[there] = first[drone]
+    flow, labels = told(MOVED), NO_DRONES.copy()
+    labels[drone] = 1
+    flow[drone] = (15.0, 10.0)
+    beside = np.zeros((HEIGHT, WIDTH), np.bool_)
+    beside[194:238, 154:214] = True
+    settled = grid_flow(flow, first, second, labels)
+    assert np.linalg.norm(settled[beside & (labels == 0)] - MOVED, axis=1).max() < 1.0
+
+
 @pytest.mark.parametrize("size", [(480, 640), (120, 161), (37, 50), (12, 9), (1, 2)])
 def test_images_of_any_size_have_a_flow_of_theirs(size: tuple[int, int]) -> None:
     image = np.random.default_rng(4).integers(0, 256, (*size, 3), np.uint8)
