@@ -136,18 +136,17 @@ class SizeLearner:
 
         After `see`. In a flock of several types not all are alike, however they look.
         """
-        numbers = {one.track for one in neighbours if one.confirmed}
-        self._own = {number: one for number, one in self._own.items() if number in numbers}
+        self._own = {one.track: self._own[one.track] for one in neighbours if one.track in self._own}
         if self._said is not None or self._wove_s is None:
             return {}
         changed = {}
-        for number in sorted(numbers):
+        of_all_m = self._looks_m if self._used is None else self._used.size_m
+        for number in [one.track for one in neighbours if one.confirmed]:
             found, own = self._sizes.of_track(number), self._own.get(number)
-            if found is None:
+            if found is None or not self._may_be(found):
                 continue
-            of_all_m = self._looks_m if self._used is None else self._used.size_m
             if own is None:
-                is_new = found.deviations(of_all_m, found.sigma) > _OTHERWISE and self._may_be(found)
+                is_new = found.deviations(of_all_m, found.sigma) > _OTHERWISE
             else:
                 is_new = found.deviations(own.size_m) > _REFRESHED
             if is_new:
@@ -175,8 +174,7 @@ class SizeLearner:
         """With the range that follows from the size that the networks judge, as far as that is still known."""
         if self._used is None or not math.isclose(measurement.size_m, self._used.size_m):
             return measurement
-        log_range = measurement.log_range + math.log(self._looks_m / self._used.size_m)
-        return replace(measurement, size_m=self._looks_m, log_range=log_range)
+        return measurement.of_size(self._looks_m)
 
     def _choose(self) -> bool:
         """Whether the size that is used has changed."""

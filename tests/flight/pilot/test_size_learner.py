@@ -190,6 +190,17 @@ def test_a_size_that_is_not_plausible_is_not_used(judged_m: float, monkeypatch: 
     assert (outputs[-1].size.size_m, outputs[-1].size.used) == (SIZE_M, False)
 
 
+def test_an_own_size_that_is_not_plausible_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor one that becomes so: the track of a drone that begins to rise with the own one."""
+    said = iter([SizeEstimate(SIZE_M, 0.05)] * 40)
+    monkeypatch.setattr(FlockSize, "of_looks", lambda self, size_m: None)
+    monkeypatch.setattr(FlockSize, "of_track", lambda self, number: next(said, SizeEstimate(3.0, 0.05)))
+    outputs = Flight(drone()).fly(60.0)
+    assert any("0.40 m large" in one.mission.sentence for one in outputs)
+    assert not any("3.00" in one.mission.sentence for one in outputs)
+    assert max(float(np.linalg.norm(one.position)) for one in outputs[-1].neighbours) < 6.0
+
+
 def test_a_size_that_the_networks_judge_well_stays_theirs() -> None:
     outputs = Flight(drone(), judged_m=SIZE_M).fly(60.0)
     size = outputs[-1].size

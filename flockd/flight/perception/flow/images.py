@@ -1,8 +1,6 @@
-"""Grey levels, smoothing and gradients of images, as several methods of flow need them."""
+"""Grey levels, smoothing and smaller images, as several methods of flow need them."""
 
 from __future__ import annotations
-
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -26,13 +24,3 @@ def shrunk(image: UInt8Array, size: tuple[int, int]) -> UInt8Array:
 def smoothed(image: UInt8Array | Float32Array, sigma_px: float) -> Float32Array:
     """The image after a Gaussian filter."""
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), dtype=np.float32)
-
-
-def gradients(image: Float32Array, kernel: Literal["central", "sobel"]) -> tuple[Float32Array, Float32Array]:
-    """How the grey levels of (h, w) change per pixel to the right and down.
-
-    ``central``: differences of both neighbours; ``sobel``: of three rows or columns of them, which has less noise.
-    """
-    size, scale = (1, 1 / 2) if kernel == "central" else (3, 1 / 8)
-    right, down = (cv2.Sobel(image, cv2.CV_32F, *way, ksize=size, scale=scale) for way in ((1, 0), (0, 1)))
-    return np.asarray(right, np.float32), np.asarray(down, np.float32)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from flockd.core.messages import UNCLASSED, BoolArray, Float32Array, UInt8Array
 from flockd.flight.perception.flow.images import grey
 
-GRID_PX = 16
+_GRID_PX = 16
 """Between the points: with 8 the flow is as exact between them too, for three times the time."""
 _WINDOW_PX = 9
 _HALVINGS = 2
@@ -104,20 +104,20 @@ def _followed(
 def _beside(drones: UInt8Array, size: tuple[int, int]) -> BoolArray:
     """Which of the points are on a drone or beside one."""
     cells = cv2.resize(drones * np.uint8(255), size, interpolation=cv2.INTER_AREA)
-    reach = 2 * -(-_DRONE_MARGIN_PX // GRID_PX) + 1
+    reach = 2 * -(-_DRONE_MARGIN_PX // _GRID_PX) + 1
     return np.asarray(cv2.dilate(cells, np.ones((reach, reach), np.uint8)) > 0)
 
 
 @lru_cache(maxsize=8)
 def _points(size: tuple[int, int]) -> Float32Array:
     """(n, m, 2) the pixels of `grid_pixels` of an image of (width, height), centres whole; not to be changed."""
-    u, v = (np.arange(min(GRID_PX, length) // 2, length, GRID_PX) for length in size)
+    u, v = (np.arange(min(_GRID_PX, length) // 2, length, _GRID_PX) for length in size)
     return np.stack(np.meshgrid(u, v), axis=2).astype(np.float32)
 
 
 def _between(at_points: Float32Array, size: tuple[int, int]) -> Float32Array:
     """(h, w, 2) of an image of (width, height), from what is at the points (n, m, 2)."""
-    rows, columns = (GRID_PX * count for count in at_points.shape[:2])
+    rows, columns = (_GRID_PX * count for count in at_points.shape[:2])
     full = cv2.resize(at_points, (columns, rows), interpolation=cv2.INTER_LINEAR)[: size[1], : size[0]]
     beyond = size[1] - full.shape[0], size[0] - full.shape[1]
     if any(beyond):
