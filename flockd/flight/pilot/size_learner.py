@@ -44,6 +44,8 @@ deviations being near what those two are off: with all of it drones would stop b
 time."""
 _MIDDLE = 2.563
 """Standard deviations of a normal distribution within which 80 % are."""
+_VAGUE = 0.07
+"""A relative standard deviation beyond which the drone weaves, though it has seen another do so."""
 _OLD_S = 600.0
 """The drone weaves again when its last weave is so long ago."""
 
@@ -137,7 +139,7 @@ class SizeLearner:
         After `see`. In a flock of several types not all are alike, however they look.
         """
         self._own = {one.track: self._own[one.track] for one in neighbours if one.track in self._own}
-        if self._said is not None or self._wove_s is None:
+        if self._said is not None:
             return {}
         changed = {}
         of_all_m = self._looks_m if self._used is None else self._used.size_m
@@ -218,7 +220,8 @@ class SizeLearner:
             self._wove_s = time_s
         is_old = self._wove_s is None or time_s - self._wove_s > _OLD_S
         asked = self._allowed and not ends and (self._always or self._is_unknown_type)
-        needed = asked and (self._weave.moves or self._found is None or is_old)
+        is_vague = self._found is None or self._found.sigma > _VAGUE
+        needed = asked and (self._weave.moves or is_vague or is_old)
         above_ground_m = vehicle.height_m if ground is None else ground.height_m
         return self._weave.height(
             time_s, vehicle.height_m, above_ground_m, wanted_m, neighbours, self._random, needed=needed

@@ -12,17 +12,9 @@ import numpy as np
 
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import Neighbour
+from flockd.flight.tracking.weave_path import ASKED_M, DURATION_S, SETTLES_S, asked_lift_m
 
-AMPLITUDE_M = 0.3
-"""By how much the drone moves up and down, ..."""
-_ASKED_M = 0.43
-"""... and what it is asked for: of a period of 6 s a height controller of 1 m/s for each metre, PX4's default, follows
-0.7."""
-PERIOD_S = 6.0
-DURATION_S = 12.0
-_SETTLES_S = 3.0
-"""So long afterwards it is still on its way back."""
-_DRAWN_WITHIN_S = 30.0
+_DRAWN_WITHIN_S = 8.0
 """It begins at a time drawn from so many seconds, for not all to weave at once."""
 _CLIMB_M_S = 0.2
 """A neighbour that rises or sinks faster is weaving, and the drone waits."""
@@ -72,7 +64,9 @@ class Weave:
 
         The drone is at `height_m` above home. `needed`: there is something to learn, and nothing that forbids it.
         """
-        if self._steady_since_s is None or wanted_m != self._wanted_m:
+        if self._steady_since_s is None:  # a flight begins at its height
+            self._wanted_m, self._steady_since_s = wanted_m, time_s - _STEADY_S
+        elif wanted_m != self._wanted_m:
             self._wanted_m, self._steady_since_s = wanted_m, time_s
         if self._began_s is None and not self._begins(time_s, height_m, above_ground_m, neighbours, random, needed):
             return wanted_m
@@ -81,12 +75,11 @@ class Weave:
         may = needed and self._steady_since_s <= self._began_s
         if elapsed_s < DURATION_S and not may:
             elapsed_s, self._began_s = DURATION_S, time_s - DURATION_S
-        if not 0.0 <= elapsed_s < DURATION_S + _SETTLES_S:
+        if not 0.0 <= elapsed_s < DURATION_S + SETTLES_S:
             self._began_s = self._next_s = None
             return wanted_m
         base_m = self._base_m if wanted_m is None else wanted_m
-        lift_m = _ASKED_M * math.sin(2 * math.pi * elapsed_s / PERIOD_S) if elapsed_s < DURATION_S else 0.0
-        return base_m + lift_m
+        return base_m + asked_lift_m(elapsed_s)
 
     def _begins(
         self,
@@ -117,7 +110,7 @@ class Weave:
         return (
             time_s - self._steady_since_s >= _STEADY_S
             and abs(height_m - base_m) <= _AT_HEIGHT_M
-            and room_m >= _ASKED_M + _ABOVE_LOWEST_M
+            and room_m >= ASKED_M + _ABOVE_LOWEST_M
             and not self._is_near(neighbours)
             and not any(one.confirmed and abs(one.velocity[2]) > _CLIMB_M_S for one in neighbours)
         )

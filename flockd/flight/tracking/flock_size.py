@@ -21,6 +21,7 @@ from flockd.core.config.perception import MAX_DRONE_SIZE_M, MIN_DRONE_SIZE_M
 from flockd.core.messages import FloatArray
 from flockd.flight.tracking.filter import MIN_RANGE_M
 from flockd.flight.tracking.measurement import Measurement
+from flockd.flight.tracking.weave_path import AMPLITUDE_SIGMA, DURATION_S, SETTLES_S, climb_m_s, lift_m
 
 LOG_SIZES = np.linspace(math.log(MIN_DRONE_SIZE_M), math.log(MAX_DRONE_SIZE_M), 155)
 """(G,) the sizes that are weighed, as logarithms of metres, 3 % apart."""
@@ -28,15 +29,22 @@ MOST_SIGMA = 0.1
 """An estimate is published below this relative standard deviation."""
 _LEAST_SIGMA = 0.04
 """What the model does not know of adds this to every estimate's relative standard deviation."""
-_TEMPER = 0.7
+_TEMPER = 0.9
 """Power of all likelihoods: errors of cameras and networks last longer than a step, and are no independent evidence. So
 chosen that errors are as large as is said (`python -m tools.measure.flock_size`)."""
-_LEVEL, _VERTICAL = 0.2, (1e-4, 0.02)
+_LEVEL, _VERTICAL, _WEAVING = 0.2, (1e-4, 0.02), 3e-4
 """Spectral densities, assumed m^2/s^3, of the acceleration of a neighbour relative to the own drone. Each vertical one
-is a motion model: it flies level, or weaves itself. They are not of metres, so that they say nothing of the scale. The
-level one is that of gusts: of smaller ones beside it, the sizes for which mates happen to move smoothly profit."""
+is a motion model: it flies level, rises and sinks in any way, or weaves. They are not of metres, so that they say
+nothing of the scale. The level one is that of gusts: of smaller ones beside it, the sizes for which mates happen to
+move smoothly profit."""
 _SWITCHING = 0.02
 """Probability that a neighbour moves by another model from one step to the next."""
+_BEGINS_S, _BEGINS_PER_S = 0.25, 0.01
+"""That it begins to weave is asked so often, and has this probability a second."""
+_BEGAN_SIGMA_S = 0.1
+"""Standard deviation of when it then began, between two times that are asked."""
+_GIVEN_UP = -12.0
+"""A weave is followed no longer where, for no size near what it looks like, its log probability is above this."""
 _SPEED_SIGMA, _CLIMB_SIGMA = 0.7, 0.2
 """Standard deviations of a new neighbour's relative velocity, assumed m/s."""
 _ASPECT_SIGMA, _ASPECT_TIME_S, _RANGE_SIGMA = 0.05, 5.0, 0.1
@@ -45,6 +53,10 @@ else the log range that follows from it errs by beside what the network says. Of
 More of it as lasting would leave the range to the bearings, and there an extended Kalman filter is biased by their
 noise (V. Aidala, "Kalman filter behavior in bearings-only tracking applications", IEEE Transactions on Aerospace and
 Electronic Systems 15(1), 1979)."""
+_STATE = 9
+"""Numbers of a model's state."""
+_FIRST_SIGMAS = np.array([_SPEED_SIGMA, _SPEED_SIGMA, _CLIMB_SIGMA, _ASPECT_SIGMA, AMPLITUDE_SIGMA, _BEGAN_SIGMA_S])
+"""Standard deviations of all but the position, of a new neighbour."""
 _ROBUST_SIGMA = 2.5
 """Innovations beyond this many standard deviations count less and less."""
 _ASTRAY = 0.05
@@ -124,37 +136,91 @@ class FlockSize:
 
 
 class _Track:
-    """One track, under every motion model: filters over position and relative velocity, assumed metres, NED, and the
-    logarithm by which the side that is seen makes the range longer."""
+    """One track, under every motion model: filters over position and relative velocity, assumed metres, NED, the
+    logarithm by which the side that is seen makes the range longer, by what share a weave of its is larger than
+    `lift_m`, and how many seconds later it began.
+
+    The first two models are of `_VERTICAL`; each of the others is a weave that began at another time.
+    """
 
     def __init__(self, measurement: Measurement) -> None:
-        models = len(_VERTICAL)
         self.log_assumed_m = math.log(measurement.size_m)
-        self._mean = np.zeros((models, 7))
-        self._mean[:, :3] = measurement.position
-        self._covariance = np.zeros((models, 7, 7))
-        self._covariance[:, :3, :3] = measurement.range_m**2 * _noise(measurement)
-        self._covariance[:, range(3, 7), range(3, 7)] = (
-            np.array([_SPEED_SIGMA, _SPEED_SIGMA, _CLIMB_SIGMA, _ASPECT_SIGMA]) ** 2
-        )
-        self._sensitivity = np.zeros((models, 7))
-        """The mean's derivative with respect to the scale, the assumed over the true size."""
         self._scales = np.exp(self.log_assumed_m - LOG_SIZES)
         """(G,) of each size."""
         self._scale = 1.0
-        """The one that the mean is for."""
-        self._log_weights = np.full((models, len(LOG_SIZES)), -math.log(models))
+        """The one that the means are for."""
         self._log_prior = -0.5 * ((LOG_SIZES - self.log_assumed_m) / _JUDGED_SIGMA) ** 2
+        self._plausible = np.abs(LOG_SIZES - self.log_assumed_m) < 2 * _JUDGED_SIGMA
         self.log_likelihood = np.zeros(len(LOG_SIZES))
         """(G,) of the sizes by all measurements, tempered."""
+        mean, covariance = np.zeros(_STATE), np.zeros((_STATE, _STATE))
+        mean[:3] = measurement.position
+        covariance[:3, :3] = measurement.range_m**2 * _noise(measurement)
+        covariance[range(3, _STATE), range(3, _STATE)] = _FIRST_SIGMAS**2
+        models = len(_VERTICAL)
+        self._mean, self._covariance = np.tile(mean, (models, 1)), np.tile(covariance, (models, 1, 1))
+        self._sensitivity = np.zeros((models, _STATE))
+        """The mean's derivative with respect to the scale, the assumed over the true size."""
+        self._log_weights = np.full((models, len(LOG_SIZES)), -math.log(models))
+        self._elapsed_s: list[float] = []
+        """Since each weave began."""
+        self._unasked_s = 0.0
 
     def predict(self, interval_s: float, wove: FloatArray) -> None:
         """`interval_s` later, the own drone having been moved by the weave by `wove` (3,) m."""
-        transition, noise = _motion(interval_s)
-        way = np.concatenate([wove, np.zeros(4)])
-        self._mean = self._mean @ transition.T - self._scale * way
-        self._sensitivity = self._sensitivity @ transition.T - way
-        self._covariance = transition @ self._covariance @ transition.T + noise
+        models = len(self._mean)
+        transition, noise, way = _motion(interval_s, models), _process_noise(interval_s, models), np.zeros(_STATE)
+        way[:3] = wove
+        lifts = np.zeros(models)
+        for model, elapsed_s in enumerate(self._elapsed_s, len(_VERTICAL)):
+            lifts[model] = lift_m(elapsed_s + interval_s) - lift_m(elapsed_s)
+            transition[model, 2, 7] = -self._scale * lifts[model]
+            transition[model, 2, 8] = self._scale * (climb_m_s(elapsed_s + interval_s) - climb_m_s(elapsed_s))
+        moved = np.einsum("mij,mj->mi", transition, self._mean)
+        by_scale = np.einsum("mij,mj->mi", transition, self._sensitivity) - way
+        by_scale[:, 2] += (
+            transition[:, 2, 7] * self._mean[:, 7] + transition[:, 2, 8] * self._mean[:, 8]
+        ) / self._scale
+        by_scale[:, 2] -= lifts
+        self._mean = moved - self._scale * way
+        self._mean[:, 2] -= self._scale * lifts
+        self._sensitivity = by_scale
+        self._covariance = transition @ self._covariance @ transition.transpose(0, 2, 1) + noise
+        self._elapsed_s = [elapsed_s + interval_s for elapsed_s in self._elapsed_s]
+        self._end_weaves()
+        self._unasked_s += interval_s
+        while self._unasked_s >= _BEGINS_S - 1e-6:
+            self._unasked_s -= _BEGINS_S
+            self._begin_weave(self._unasked_s)
+
+    def _begin_weave(self, elapsed_s: float) -> None:
+        """One more model: that it flew level, and has woven for `elapsed_s`."""
+        self._mean = np.vstack([self._mean, self._mean[:1]])
+        self._covariance = np.concatenate([self._covariance, self._covariance[:1]])
+        self._sensitivity = np.vstack([self._sensitivity, self._sensitivity[:1]])
+        begins = self._log_weights[:1] + math.log(_BEGINS_PER_S * _BEGINS_S)
+        self._log_weights = np.vstack([self._log_weights, begins])
+        self._elapsed_s.append(elapsed_s)
+
+    def _end_weaves(self) -> None:
+        """Those that are over fly level again; those that cannot be are given up."""
+        first = len(_VERTICAL)
+        over = np.array([elapsed_s > DURATION_S + SETTLES_S for elapsed_s in self._elapsed_s], dtype=bool)
+        likely = (self._log_weights[first:, self._plausible] > _GIVEN_UP).any(axis=1)
+        size = int(np.argmax(self.log_likelihood + self._log_prior))
+        for model in np.flatnonzero(over & likely) + first:
+            if self._log_weights[model, size] > self._log_weights[0, size]:
+                for each in (self._mean, self._covariance, self._sensitivity):
+                    each[0] = each[model]
+                self._mean[0, 7:] = self._sensitivity[0, 7:] = 0.0
+                self._covariance[0, 7:] = self._covariance[0, :, 7:] = 0.0
+                self._covariance[0, [7, 8], [7, 8]] = _FIRST_SIGMAS[4:] ** 2
+            self._log_weights[0] = np.logaddexp(self._log_weights[0], self._log_weights[model])
+        kept = np.concatenate([np.ones(first, dtype=bool), likely & ~over])
+        self._mean, self._covariance, self._sensitivity, self._log_weights = (
+            each[kept] for each in (self._mean, self._covariance, self._sensitivity, self._log_weights)
+        )
+        self._elapsed_s = [elapsed_s for elapsed_s, one in zip(self._elapsed_s, kept[first:], strict=True) if one]
 
     def update(self, measurement: Measurement) -> None:
         """Takes in a measurement."""
@@ -174,7 +240,7 @@ class _Track:
         gain = np.linalg.solve(excess[:, None, None] * spread, derivative @ self._covariance).transpose(0, 2, 1)
         self._weigh(np.maximum(distances, 0.0) / excess[:, None], spread, excess)
         self._mean = self._mean + np.einsum("mij,mj->mi", gain, residual)
-        left = np.eye(7) - gain @ derivative
+        left = np.eye(_STATE) - gain @ derivative
         self._sensitivity = np.einsum("mij,mj->mi", left, self._sensitivity)
         covariance = left @ self._covariance
         self._covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
@@ -184,14 +250,16 @@ class _Track:
         far = distances > _ROBUST_SIGMA**2
         distances = np.where(far, 2 * _ROBUST_SIGMA * np.sqrt(distances) - _ROBUST_SIGMA**2, distances)
         log_volume = np.linalg.slogdet(spread).logabsdet + 3 * np.log(excess)
-        stays, switches = math.log1p(-_SWITCHING), math.log(_SWITCHING / len(distances))
-        logs = np.logaddexp(stays + self._log_weights, switches) - 0.5 * (distances + log_volume[:, None])
+        logs = math.log1p(-_SWITCHING) + self._log_weights
+        bases = slice(len(_VERTICAL))
+        logs[bases] = np.logaddexp(logs[bases], math.log(_SWITCHING / len(_VERTICAL)))
+        logs -= 0.5 * (distances + log_volume[:, None])
         marginal = np.logaddexp.reduce(logs, axis=0)
         self._log_weights = logs - marginal
         self.log_likelihood = self.log_likelihood + _TEMPER * marginal
 
     def _linearised(self, measurement: Measurement) -> tuple[FloatArray, FloatArray]:
-        """Residuals (M, 3) as of `log_polar_residual`, and the derivative (M, 3, 7) of the predicted measurement."""
+        """Residuals (M, 3) as of `log_polar_residual`, and the derivative (M, 3, 9) of the predicted measurement."""
         ranges = np.maximum(np.linalg.norm(self._mean[:, :3], axis=1), MIN_RANGE_M)
         bearings = self._mean[:, :3] / ranges[:, None]
         cosines = np.clip(bearings @ measurement.bearing, -1.0, 1.0)
@@ -200,25 +268,33 @@ class _Track:
         turned = across * (np.arctan2(sines, cosines) / np.maximum(sines, 1e-12))[:, None]
         log_range = measurement.log_range - math.log(measurement.size_m) + self.log_assumed_m
         along = log_range - np.log(ranges) - self._mean[:, 6]
-        derivative = np.zeros((len(ranges), 3, 7))
+        derivative = np.zeros((len(ranges), 3, _STATE))
         derivative[:, range(3), range(3)] = 1.0 / ranges[:, None]
         derivative[:, :, 6] = bearings
         return turned + along[:, None] * bearings, derivative
 
 
-def _motion(interval_s: float) -> tuple[FloatArray, FloatArray]:
-    """The transition (7, 7) and the noise of each motion model (M, 7, 7)."""
+def _motion(interval_s: float, models: int) -> FloatArray:
+    """The transition (M, 9, 9) of each model, but for what a weave does."""
+    transition = np.eye(_STATE)
+    transition[:3, 3:6] = interval_s * np.eye(3)
+    transition[6, 6] = math.exp(-interval_s / _ASPECT_TIME_S)
+    return np.tile(transition, (models, 1, 1))
+
+
+def _process_noise(interval_s: float, models: int) -> FloatArray:
+    """(M, 9, 9) of each model."""
     dt = interval_s
-    keep = math.exp(-dt / _ASPECT_TIME_S)
-    transition = np.eye(7)
-    transition[:3, 3:6] = dt * np.eye(3)
-    transition[6, 6] = keep
-    noise = np.zeros((len(_VERTICAL), 7, 7))
-    for model, vertical in enumerate(_VERTICAL):
-        density = np.diag([_LEVEL, _LEVEL, vertical])
-        noise[model, :6, :6] = np.kron(np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), density)
-    noise[:, 6, 6] = (1 - keep**2) * _ASPECT_SIGMA**2
-    return transition, noise
+    noise = np.zeros((models, _STATE, _STATE))
+    by_time = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+    for axis in range(3):
+        noise[:, axis : axis + 4 : 3, axis : axis + 4 : 3] = by_time
+    noise[:, :6, :6] *= _LEVEL
+    of_height = np.full(models, _WEAVING)
+    of_height[: len(_VERTICAL)] = _VERTICAL
+    noise[:, 2:6:3, 2:6:3] *= of_height[:, None, None] / _LEVEL
+    noise[:, 6, 6] = -math.expm1(-2 * dt / _ASPECT_TIME_S) * _ASPECT_SIGMA**2
+    return noise
 
 
 def _noise(measurement: Measurement) -> FloatArray:

@@ -23,6 +23,17 @@ def rise(time_s: float) -> float:
     return -0.3 * math.sin(2 * math.pi * time_s / 6.0) if 0.0 <= time_s <= 12.0 else 0.0
 
 
+def followed(below_m: float, sinks_m_s: float, step: int, asked_m: float, period_s: float) -> tuple[float, float]:
+    """How far below its height, and how fast it sinks, a drone is half a second later that asks for a sine of heights
+    for 12 s: 1 m/s for each metre, taken up within 0.2 s."""
+    time_s = STEP_S * step - 4.2
+    wanted_m = -asked_m * math.sin(2 * math.pi * time_s / period_s) if 0.0 <= time_s <= 12.0 else 0.0
+    for _ in range(50):
+        sinks_m_s += (wanted_m - below_m - sinks_m_s) * STEP_S / 50 / 0.2
+        below_m += sinks_m_s * STEP_S / 50
+    return below_m, sinks_m_s
+
+
 def measured(place: FloatArray, size_m: float, assumed_m: float, random: np.random.Generator) -> Measurement:
     """Of a drone of one size that the networks judge to have another; the range errs as they say, and by 5 % more."""
     bearing = place / np.linalg.norm(place) + random.normal(0.0, BEARING_SIGMA_RAD, 3)
@@ -43,13 +54,15 @@ def flown(
     tree: bool = False,
     outliers: float = 0.0,
     all_rise: bool = False,
+    mate: tuple[float, float] | None = None,
 ) -> FlockSize:
     """A drone among others that drift about their places, each a random walk in velocity, level 0.2 and vertical 1e-4
-    m^2/s^3; they `follow` that share of its own level motion, and if `all_rise` its weave too."""
+    m^2/s^3; they `follow` that share of its own level motion, and if `all_rise` its weave too. `mate`: the first of
+    them asks for heights this much, m, above and below its own, with this period, s."""
     learned = FlockSize()
     places, speeds = PLACES.copy(), np.zeros_like(PLACES)
     own_m_s = np.zeros(3)
-    below_m = 0.0
+    below_m = mate_below_m = mate_sinks_m_s = 0.0
     for step in range(40):
         kick = random.normal(size=PLACES.shape) * np.sqrt(np.array([0.2, 0.2, 1e-4]) * STEP_S) * 0.3
         own_kick = random.normal(size=3) * [0.2, 0.2, 0.0]
@@ -61,9 +74,13 @@ def flown(
         shown_m, shown = (0.0, np.zeros(3)) if all_rise else (below_m, way)
         places = places + STEP_S * speeds - shown - STEP_S * (1.0 - follow) * own_m_s
         places = places + 0.1 * (PLACES - [0.0, 0.0, shown_m] - places)
+        shown_places = places.copy()
+        if mate is not None:
+            mate_below_m, mate_sinks_m_s = followed(mate_below_m, mate_sinks_m_s, step, *mate)
+            shown_places[0, 2] += mate_below_m
         sighted = {
             number: measured(place, size_m, wrong * size_m, random)
-            for number, (place, size_m) in enumerate(zip(places, sizes_m, strict=True))
+            for number, (place, size_m) in enumerate(zip(shown_places, sizes_m, strict=True))
             if random.random() > 0.05
         }
         if outliers:
@@ -99,6 +116,25 @@ def test_what_the_networks_judge_does_not_matter(wrong: float) -> None:
 def test_without_a_weave_nothing_is_learned(follow: float) -> None:
     """However the drone moves, and whether or not its mates move as it does."""
     assert flown(np.random.default_rng(0), weaves=False, follow=follow).of_looks(SIZE_M) is None
+
+
+def test_whoever_sees_another_weave_learns_its_size() -> None:
+    """Its autopilot answers a little faster than the simulator's."""
+    found = [flown(np.random.default_rng(seed), weaves=False, mate=(0.43, 6.0)) for seed in range(20)]
+    for sizes in ([one.of_looks(1.35 * SIZE_M) for one in found], [one.of_track(0) for one in found]):
+        known = [one for one in sizes if one is not None]
+        assert len(known) > 10
+        off = errors([*known], SIZE_M)
+        assert np.abs(off).max() < 3.0
+        assert np.mean(off**2) < 2.0
+
+
+@pytest.mark.parametrize("mate", [(1.0, 9.0), (0.6, 3.0), (2.0, 24.0)])
+def test_another_that_rises_in_another_way_tells_nothing(mate: tuple[float, float]) -> None:
+    """Metres asked for above and below, and the period in seconds."""
+    for seed in range(10):
+        found = flown(np.random.default_rng(seed), weaves=False, mate=mate).of_looks(1.35 * SIZE_M)
+        assert found is None or found.deviations(SIZE_M) < 3.0
 
 
 def test_in_a_flock_that_rises_together_nothing_is_learned() -> None:
