@@ -32,6 +32,9 @@ _REFRESHED = 0.25
 """Ranges follow the estimate once it has moved by this share of its standard deviation."""
 _JUDGED, _FEWEST_JUDGED, _NEAR_M = 400, 24, 8.0
 """So many judged sizes are kept, the newest, so many are enough, and of drones so near: farther ones look like much."""
+_FEWEST_DOUBTS = 8
+"""Of what the networks say that those may be off fewer are enough: it differs by five times between drones that they
+know and others."""
 _VIEWS_S = 0.45
 """Judged sizes nearer to each other in time are of one view, and only one of them counts."""
 _SCATTER = 0.05
@@ -162,15 +165,17 @@ class SizeLearner:
     @property
     def _is_unknown_type(self) -> bool:
         """Whether the networks judge the others' size otherwise from view to view, or say that they do not know it."""
-        if self._said is not None or len(self._judged) < _FEWEST_JUDGED:
+        if self._said is not None:
             return False
+        if self._doubt > _DOUBTED or len(self._judged) < _FEWEST_JUDGED:
+            return self._doubt > _DOUBTED
         low, high = np.quantile(self._judged, [0.1, 0.9])
-        return float(high - low) > _SCATTER * _MIDDLE or self._doubt > _DOUBTED
+        return float(high - low) > _SCATTER * _MIDDLE
 
     @property
     def _doubt(self) -> float:
         """What the networks say that the judged log sizes may be off: a standard deviation."""
-        return float(np.median(self._doubts)) if len(self._doubts) >= _FEWEST_JUDGED else 0.0
+        return float(np.median(self._doubts)) if len(self._doubts) >= _FEWEST_DOUBTS else 0.0
 
     def _as_judged(self, measurement: Measurement) -> Measurement:
         """With the range that follows from the size that the networks judge, as far as that is still known."""

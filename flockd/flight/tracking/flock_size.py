@@ -157,14 +157,16 @@ class _Track:
         mean[:3] = measurement.position
         covariance[:3, :3] = measurement.range_m**2 * _noise(measurement)
         covariance[range(3, _STATE), range(3, _STATE)] = _FIRST_SIGMAS**2
-        models = len(_VERTICAL)
+        self._elapsed_s = np.arange(0.0, DURATION_S, _BEGINS_S).tolist()
+        """Since each weave began: a new neighbour may have begun before it was seen."""
+        models = len(_VERTICAL) + len(self._elapsed_s)
         self._mean, self._covariance = np.tile(mean, (models, 1)), np.tile(covariance, (models, 1, 1))
         self._sensitivity = np.zeros((models, _STATE))
         """The mean's derivative with respect to the scale, the assumed over the true size."""
-        self._log_weights = np.full((models, len(LOG_SIZES)), -math.log(models))
-        self._elapsed_s: list[float] = []
-        """Since each weave began."""
+        self._log_weights = np.full((models, len(LOG_SIZES)), math.log(_BEGINS_PER_S * _BEGINS_S))
+        self._log_weights[: len(_VERTICAL)] = -math.log(len(_VERTICAL))
         self._unasked_s = 0.0
+        """Since the newest of them."""
 
     def predict(self, interval_s: float, wove: FloatArray) -> None:
         """`interval_s` later, the own drone having been moved by the weave by `wove` (3,) m."""
