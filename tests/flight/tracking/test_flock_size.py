@@ -55,6 +55,7 @@ def flown(
     outliers: float = 0.0,
     all_rise: bool = False,
     mate: tuple[float, float] | None = None,
+    seen_from_s: float = 0.0,
 ) -> FlockSize:
     """A drone among others that drift about their places, each a random walk in velocity, level 0.2 and vertical 1e-4
     m^2/s^3; they `follow` that share of its own level motion, and if `all_rise` its weave too. `mate`: the first of
@@ -88,7 +89,7 @@ def flown(
                 sighted[number] = measured(random.normal(0.0, 3.0, 3), SIZE_M, wrong * SIZE_M, random)
         if tree and 4 <= step < 34:
             sighted[9] = measured(np.array([6.0, 2.0, 1.0]) - [0, 0, below_m], 1.5, wrong * SIZE_M, random)
-        learned.step(STEP_S, way, sighted)
+        learned.step(STEP_S, way, sighted if STEP_S * step >= seen_from_s else {})
     return learned
 
 
@@ -118,9 +119,11 @@ def test_without_a_weave_nothing_is_learned(follow: float) -> None:
     assert flown(np.random.default_rng(0), weaves=False, follow=follow).of_looks(SIZE_M) is None
 
 
-def test_whoever_sees_another_weave_learns_its_size() -> None:
+@pytest.mark.parametrize("seen_from_s", [0.0, 6.5], ids=["from its beginning", "from its middle"])
+def test_whoever_sees_another_weave_learns_its_size(seen_from_s: float) -> None:
     """Its autopilot answers a little faster than the simulator's."""
-    found = [flown(np.random.default_rng(seed), weaves=False, mate=(0.43, 6.0)) for seed in range(20)]
+    mate = (0.43, 6.0)
+    found = [flown(np.random.default_rng(seed), weaves=False, mate=mate, seen_from_s=seen_from_s) for seed in range(20)]
     for sizes in ([one.of_looks(1.35 * SIZE_M) for one in found], [one.of_track(0) for one in found]):
         known = [one for one in sizes if one is not None]
         assert len(known) > 10
