@@ -12,7 +12,7 @@ import numpy as np
 
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import Neighbour
-from flockd.flight.tracking.weave_path import ASKED_M, DURATION_S, SETTLES_S, asked_lift_m
+from flockd.flight.tracking.weave_path import ASKED_M, DURATION_S, SETTLES_S, asked_lift_m, lift_m
 
 _DRAWN_WITHIN_S = 8.0
 """It begins at a time drawn from so many seconds, for not all to weave at once."""
@@ -28,6 +28,8 @@ _ABOVE_LOWEST_M = 0.5
 """It stays so far within the heights that the gate allows: the lowest is near the ground."""
 _ABOVE_GROUND_M = 2.0
 """Nor does it begin lower above the ground, which may be higher than at home."""
+_ASTRAY_M = 0.2
+"""A weave that is so far off `lift_m`, over a second, ends: whoever sees it would take the drone for larger."""
 _COLUMN = 1.5
 """Level distance, in the gate's degraded separations, within which no other drone may be when it begins: nearer to one
 above or below the gate lets it rise or sink no more, as it also does later."""
@@ -41,6 +43,8 @@ class Weave:
         self._next_s: float | None = None
         self._began_s: float | None = None
         self._base_m = 0.0
+        self._astray_m = self._compared_s = 0.0
+        """How far the drone is from where a weave leads, over the last second, and when since its beginning."""
         self._wanted_m: float | None = None
         self._steady_since_s: float | None = None
 
@@ -72,14 +76,21 @@ class Weave:
             return wanted_m
         assert self._began_s is not None
         elapsed_s = time_s - self._began_s
+        base_m = self._base_m if wanted_m is None else wanted_m
         may = needed and self._steady_since_s <= self._began_s
-        if elapsed_s < DURATION_S and not may:
+        if elapsed_s < DURATION_S and not (may and self._follows(elapsed_s, height_m - base_m)):
             elapsed_s, self._began_s = DURATION_S, time_s - DURATION_S
         if not 0.0 <= elapsed_s < DURATION_S + SETTLES_S:
             self._began_s = self._next_s = None
             return wanted_m
-        base_m = self._base_m if wanted_m is None else wanted_m
         return base_m + asked_lift_m(elapsed_s)
+
+    def _follows(self, elapsed_s: float, risen_m: float) -> bool:
+        """Whether the drone moves as the others take it to, and no gate holds it between two of them."""
+        share = -math.expm1(-max(elapsed_s - self._compared_s, 0.0))
+        self._astray_m += share * (risen_m - lift_m(elapsed_s) - self._astray_m)
+        self._compared_s = elapsed_s
+        return abs(self._astray_m) <= _ASTRAY_M
 
     def _begins(
         self,
@@ -101,6 +112,7 @@ class Weave:
             self._next_s = time_s + random.uniform(*_AGAIN_S)
             return False
         self._began_s, self._base_m = time_s, height_m
+        self._astray_m = self._compared_s = 0.0
         return True
 
     def _may_begin(self, time_s: float, height_m: float, neighbours: Sequence[Neighbour]) -> bool:

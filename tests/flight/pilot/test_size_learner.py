@@ -285,13 +285,15 @@ class Weaving:
     wanted_m: float | None = HEIGHT_M
     neighbours: Sequence[Neighbour] = ()
     hill_m: float = 0.0
+    follows: bool = True
+    """Whether the drone goes to the height that is asked for, 1 m/s for each metre."""
 
     def __post_init__(self) -> None:
         self._weave, self._random = Weave(drone().safety.gate), np.random.default_rng(0)
         self._time_s = 0.0
 
     def asked(self, duration_s: float, *, needed: bool = True) -> FloatArray:
-        """What is asked for, less what the mission wants; the drone follows at once."""
+        """What is asked for, less what the mission wants."""
         lifts = []
         for _ in range(round(duration_s / STEP_S)):
             height_m = self._weave.height(
@@ -304,6 +306,8 @@ class Weaving:
                 needed=needed,
             )
             lifts.append(math.nan if height_m is None else height_m - HEIGHT_M)
+            if height_m is not None and self.follows and abs(height_m - HEIGHT_M) < 0.5:
+                self.height_m += (height_m - self.height_m) * (1 - math.exp(-STEP_S))
             self._time_s += STEP_S
         return np.array(lifts)
 
@@ -339,12 +343,20 @@ def test_it_goes_up_and_down_twice_and_ends_where_it_began() -> None:
 )
 def test_it_does_not_begin(height_m: float, neighbours: Sequence[Neighbour], hill_m: float) -> None:
     wanted_m = HEIGHT_M if height_m == 5.0 else height_m
-    weaving = Weaving(height_m, wanted_m, neighbours, hill_m)
+    weaving = Weaving(height_m, wanted_m, neighbours, hill_m, follows=False)
     assert (np.diff(weaving.asked(60.0)) == 0.0).all()
 
 
 def test_it_does_not_begin_while_nothing_is_to_be_learned() -> None:
     assert (Weaving().asked(60.0, needed=False) == 0.0).all()
+
+
+def test_a_weave_that_the_drone_does_not_follow_ends() -> None:
+    """A gate holds it between two others: who sees the little that it moves would take it for large."""
+    lifts = Weaving(follows=False).asked(30.0)
+    begins = np.flatnonzero(lifts)[0]
+    ends = np.flatnonzero(lifts[begins:] == 0.0)[0]
+    assert STEP_S * ends <= 3.0
 
 
 @pytest.mark.parametrize("what", ["the mission's height changes", "it is needed no more"])
