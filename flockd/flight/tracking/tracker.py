@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -15,6 +16,9 @@ from flockd.flight.tracking.filter import Innovation, State
 from flockd.flight.tracking.hypotheses import Hypotheses
 from flockd.flight.tracking.manoeuvres import Manoeuvres
 from flockd.flight.tracking.measurement import Measurement, looks_alike
+
+_OF_USUAL = 0.02
+"""The share of one detection in what is usual: that of the last fifty."""
 
 Blind = Callable[[FloatArray], BoolArray]
 """Tells which (n,) of the positions (n, 3), metres NED from the own drone, no camera could show at this time."""
@@ -45,6 +49,8 @@ class Tracker:
         self.parameters = parameters or TrackingParameters()
         self._tracks: list[_Track] = []
         self._manoeuvres = Manoeuvres(self.parameters)
+        self._usual_log_sigma: float | None = None
+        """Logarithm of the standard deviation of a confirmed neighbour's log range, as detected."""
         self._time_s = 0.0
         self._created = 0
 
@@ -176,13 +182,28 @@ class Tracker:
             measurement = measurement.of_size(track.known_size_m)
         track.hits += 1
         track.agrees = innovation.squared_distance <= self.parameters.confirm_sigma**2
-        track.agreed += weight * track.agrees
+        track.agreed += weight * track.agrees * self._share(measurement)
+        if track.confirmed:
+            self._remember(measurement, weight)
         track.existence = existence.detected(track.existence, innovation, weight, self.parameters)
         track.drone_probability = existence.averaged(
             track.drone_probability, measurement.drone_probability, track.hits, interval_s, self.parameters
         )
         track.hypotheses = track.hypotheses.updated(measurement, self.parameters)
         track.last_seen_s = self._time_s
+
+    def _share(self, measurement: Measurement) -> float:
+        """As how much of a detection one counts."""
+        if self._usual_log_sigma is None:
+            return 1.0
+        usual = math.exp(self._usual_log_sigma)
+        return min(1.0, self.parameters.vague_factor * usual / math.sqrt(measurement.log_range_variance))
+
+    def _remember(self, measurement: Measurement, weight: float) -> None:
+        """How certain the range of a confirmed neighbour is."""
+        log_sigma = math.log(measurement.log_range_variance) / 2
+        usual = log_sigma if self._usual_log_sigma is None else self._usual_log_sigma
+        self._usual_log_sigma = usual + _OF_USUAL * weight * (log_sigma - usual)
 
     def _misjudged(self, measurement: Measurement, missed: Sequence[_Track]) -> State | None:
         """The neighbour, of those that were `missed`, whose bearing a detection has that fits no track; None: of none.
@@ -203,6 +224,7 @@ class Tracker:
             drone_probability=measurement.drone_probability,
             first_seen_s=self._time_s,
             last_seen_s=self._time_s,
+            agreed=self._share(measurement),
         )
 
     def _confirm(self, track: _Track) -> None:
@@ -229,9 +251,9 @@ class _Track:
     """Probability that it is a drone if it exists."""
     first_seen_s: float
     last_seen_s: float
+    agreed: float
+    """How many of the hits were within `confirm_sigma`, as far as they are independent evidence and certain."""
     hits: int = 1
-    agreed: float = 1.0
-    """How many of the hits were within `confirm_sigma`, as far as they are independent evidence."""
     agrees: bool = True
     """Whether the last one was."""
     confirmed: bool = False

@@ -47,6 +47,39 @@ def _settled(position: Array = AHEAD, *, steps: int = 10, sigma_m: float = 0.05)
     return tracker, (steps - 1) * STEP_S
 
 
+def _steps_until_confirmed(sigma_m: float, *, beside_sigma_m: float | None) -> int:
+    """Of something ahead, beside a neighbour that is confirmed and detected with another standard deviation."""
+    tracker, begins = Tracker(TrackingParameters(confirm_hits=3, vague_factor=4.0)), 0
+    beside = np.array([0.0, 5.0, 0.0])
+    if beside_sigma_m is not None:
+        begins = 10
+        for k in range(begins):
+            _step(tracker, k * STEP_S, beside, sigma_m=beside_sigma_m)
+    for k in range(begins, begins + 30):
+        tracker.predict(STEP_S, CRUISE * STEP_S)
+        known = [] if beside_sigma_m is None else [_seen(beside, beside_sigma_m)]
+        tracker.update(k * STEP_S, [*known, _seen(AHEAD, sigma_m)], CRUISE)
+        if len(_confirmed(tracker)) == 1 + len(known):
+            return k + 1 - begins
+    return 30
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "beside_sigma_m", "steps"),
+    [
+        pytest.param(0.8, None, 3, id="nothing is known of how certain drones' ranges are"),
+        pytest.param(0.8, 1.0, 3, id="as certain as those of another drone, which nobody knows well either"),
+        pytest.param(0.05, 0.0625, 3, id="as certain, of known drones"),
+        pytest.param(0.8, 0.0625, 12, id="16 times less certain: each counts as a quarter"),
+    ],
+)
+def test_what_is_seen_less_well_than_drones_are_takes_longer_to_be_one(
+    sigma_m: float, beside_sigma_m: float | None, steps: int
+) -> None:
+    """Standard deviations in metres, at 4 m ahead and 5 m beside: of the log range a fourth and a fifth."""
+    assert _steps_until_confirmed(sigma_m, beside_sigma_m=beside_sigma_m) == steps
+
+
 def test_what_the_network_doubts_is_not_confirmed_however_often_it_is_detected() -> None:
     tracker = Tracker(TrackingParameters(drone_probability_memory_s=5.0, confirm_probability=0.9))
     confirmed = []
