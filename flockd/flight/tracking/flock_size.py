@@ -190,7 +190,7 @@ class _Track:
         self._covariance = transition @ self._covariance @ transition.transpose(0, 2, 1) + noise
         self._elapsed_s = [elapsed_s + interval_s for elapsed_s in self._elapsed_s]
         self._end_weaves()
-        self._unasked_s += interval_s
+        self._unasked_s = min(self._unasked_s + interval_s, DURATION_S)
         while self._unasked_s >= _BEGINS_S - 1e-6:
             self._unasked_s -= _BEGINS_S
             self._begin_weave(self._unasked_s)

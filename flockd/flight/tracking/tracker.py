@@ -19,6 +19,9 @@ from flockd.flight.tracking.measurement import Measurement, looks_alike
 
 _OF_USUAL = 0.02
 """The share of one detection in what is usual: that of the last fifty."""
+_SUREST, _LEAST_VARIANCE = 0.01, 1e-12
+"""No usual standard deviation counts as smaller, or a network that is too sure of one neighbour would keep others from
+being confirmed; and no variance, whose logarithm is taken, is."""
 
 Blind = Callable[[FloatArray], BoolArray]
 """Tells which (n,) of the positions (n, 3), metres NED from the own drone, no camera could show at this time."""
@@ -196,12 +199,12 @@ class Tracker:
         """As how much of a detection one counts."""
         if self._usual_log_sigma is None:
             return 1.0
-        usual = math.exp(self._usual_log_sigma)
-        return min(1.0, self.parameters.vague_factor * usual / math.sqrt(measurement.log_range_variance))
+        usual = max(self._usual_log_sigma, math.log(_SUREST))
+        return min(1.0, self.parameters.vague_factor * math.exp(usual - _log_sigma(measurement)))
 
     def _remember(self, measurement: Measurement, weight: float) -> None:
         """How certain the range of a confirmed neighbour is."""
-        log_sigma = math.log(measurement.log_range_variance) / 2
+        log_sigma = _log_sigma(measurement)
         usual = log_sigma if self._usual_log_sigma is None else self._usual_log_sigma
         self._usual_log_sigma = usual + _OF_USUAL * weight * (log_sigma - usual)
 
@@ -237,6 +240,11 @@ class Tracker:
     def _is_kept(self, track: _Track) -> bool:
         unseen_s = self._time_s - track.last_seen_s
         return unseen_s <= self.parameters.max_unseen_s and track.existence >= self.parameters.drop_probability
+
+
+def _log_sigma(measurement: Measurement) -> float:
+    """Logarithm of the standard deviation of its log range."""
+    return math.log(max(measurement.log_range_variance, _LEAST_VARIANCE)) / 2
 
 
 @dataclass

@@ -174,3 +174,12 @@ def test_what_a_track_told_outlives_it() -> None:
     assert after is not None
     assert (after.size_m, after.sigma) == pytest.approx((before.size_m, before.sigma))
     assert learned.of_track(0) is None
+
+
+def test_a_long_gap_begins_no_more_weaves_than_one_takes() -> None:
+    """A step after an hour takes as long as any."""
+    learned = flown(np.random.default_rng(0))
+    learned.step(3600.0, np.zeros(3), {})
+    assert max(len(track._elapsed_s) for track in learned._tracks.values()) < 100
+    learned.step(STEP_S, np.zeros(3), {0: measured(PLACES[0], SIZE_M, SIZE_M, np.random.default_rng(1))})
+    assert np.isfinite(learned._tracks[0].log_likelihood).all()

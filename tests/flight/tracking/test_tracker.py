@@ -70,7 +70,8 @@ def _steps_until_confirmed(sigma_m: float, *, beside_sigma_m: float | None) -> i
         pytest.param(0.8, None, 3, id="nothing is known of how certain drones' ranges are"),
         pytest.param(0.8, 1.0, 3, id="as certain as those of another drone, which nobody knows well either"),
         pytest.param(0.05, 0.0625, 3, id="as certain, of known drones"),
-        pytest.param(0.8, 0.0625, 12, id="16 times less certain: each counts as a quarter"),
+        pytest.param(0.8, 0.13, 6, id="8 times less certain: each counts as a half"),
+        pytest.param(0.15, 0.0005, 3, id="certain, beside one that a network is too sure of"),
     ],
 )
 def test_what_is_seen_less_well_than_drones_are_takes_longer_to_be_one(
