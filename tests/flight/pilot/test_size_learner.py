@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Sequence
@@ -48,13 +49,13 @@ class Flight:
         scatter: float = 0.0,
         doubt: float = 0.0,
         sizes_m: Sequence[float] = (SIZE_M,) * len(PLACES),
-        weaver: int | None = None,
+        weavers: Sequence[int] = (),
     ) -> None:
         """`scatter`: standard deviation of the logarithm of the judged size; `doubt`: what the network says of it.
 
-        `weaver`: the one of the others that weaves, from 6 s on.
+        `weavers`: those of the others that weave, the first from 6 s on, each further one 16 s later.
         """
-        self._weaver, self._lift_m = weaver, 0.0
+        self._weavers, self._lifts_m = weavers, np.zeros(len(weavers))
         self._sizes_m = sizes_m
         self._doubt = doubt
         self._judged_m, self._random, self._scatter = judged_m, np.random.default_rng(3), scatter
@@ -71,8 +72,7 @@ class Flight:
         """Four drones, at the range at which one of the size that it goes by has their apparent size."""
         self.told.append(learned_size)
         places = PLACES.copy()
-        if self._weaver is not None:
-            places[self._weaver, 2] -= self._lift_m
+        places[list(self._weavers), 2] -= self._lifts_m
         found = tuple(self._detection(place, learned_size, k + 1) for k, place in enumerate(places))
         self._last = Observation(frames.time_s, vehicle, {}, found, self._last)
         return self._last
@@ -98,9 +98,9 @@ class Flight:
             asked_m = outputs[-1].command.height_m
             if asked_m is not None:
                 self.below_m -= (asked_m - height_m) * (1 - math.exp(-STEP_S))  # 1 m/s for each metre
-            wove_s = self.time_s - 6.0
-            wanted_m = 0.43 * math.sin(2 * math.pi * wove_s / 6.0) if 0.0 <= wove_s < 12.0 else 0.0
-            self._lift_m += (wanted_m - self._lift_m) * (1 - math.exp(-STEP_S))
+            wove_s = self.time_s - 6.0 - 16.0 * np.arange(len(self._weavers))
+            wanted_m = np.where((wove_s >= 0.0) & (wove_s < 12.0), 0.43 * np.sin(2 * math.pi * wove_s / 6.0), 0.0)
+            self._lifts_m += (wanted_m - self._lifts_m) * (1 - math.exp(-STEP_S))
             self.time_s += STEP_S
         return outputs
 
@@ -184,12 +184,25 @@ def test_each_of_two_types_that_look_alike_has_its_own_size() -> None:
 def test_whoever_sees_another_weave_learns_the_size(monkeypatch: pytest.MonkeyPatch) -> None:
     """A drone that finds no room to weave itself."""
     monkeypatch.setattr(Weave, "_may_begin", lambda self, *rest: False)
-    flight = Flight(drone(), weaver=0)
-    outputs = flight.fly(22.0)
+    outputs = Flight(drone(), weavers=[0]).fly(22.0)
     assert not any(one.size.weaves for one in outputs if one.size)
     assert outputs[-1].size is not None
     assert outputs[-1].size.used
     assert outputs[-1].size.size_m == pytest.approx(SIZE_M, rel=0.15)
+
+
+def test_a_neighbours_own_size_is_used_without_an_own_weave(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Weave, "_may_begin", lambda self, *rest: False)
+    monkeypatch.setattr(FlockSize, "of_looks", lambda self, size_m: None)
+    monkeypatch.setattr(FlockSize, "of_track", lambda self, number: SizeEstimate(SIZE_M, 0.05) if number == 1 else None)
+    assert "the others to be 0.40 m large" in Flight(drone()).fly(10.0)[-1].mission.sentence
+
+
+def test_a_drone_that_knows_the_size_weaves_once_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FlockSize, "of_looks", lambda self, size_m: SizeEstimate(SIZE_M, 0.05))
+    outputs = Flight(drone()).fly(60.0)
+    weaves = [one.size is not None and one.size.weaves for one in outputs]
+    assert sum(now and not before for before, now in itertools.pairwise([False, *weaves])) == 1
 
 
 @pytest.mark.parametrize(("doubt", "least", "most"), [(0.3, 0.15, 0.2), (0.03, 0.0, 0.1)])
@@ -355,8 +368,7 @@ def test_a_weave_that_the_drone_does_not_follow_ends() -> None:
     """A gate holds it between two others: who sees the little that it moves would take it for large."""
     lifts = Weaving(follows=False).asked(30.0)
     begins = np.flatnonzero(lifts)[0]
-    ends = np.flatnonzero(lifts[begins:] == 0.0)[0]
-    assert STEP_S * ends <= 3.0
+    assert (lifts[begins + 7 : begins + 12] == 0.0).all(), "from 3.5 s on, when it should go down"
 
 
 @pytest.mark.parametrize("what", ["the mission's height changes", "it is needed no more"])
