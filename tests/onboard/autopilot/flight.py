@@ -85,6 +85,7 @@ class Foreigner:
 
     def __init__(self, autopilot: FakeAutopilot, *, north_m_s: float, east_m_s: float) -> None:
         self._autopilot, self._velocity = autopilot, (north_m_s, east_m_s)
+        self.sent = 0
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -101,6 +102,7 @@ class Foreigner:
         sender = mavlink.MAVLink(self, srcSystem=255, srcComponent=190)
         while not self._closing.wait(0.05 / calm.SPEED_FACTOR):
             sender.set_position_target_local_ned_send(0, 1, 1, 1, 2531, 0, 0, -2.5, north, east, 0, 0, 0, 0, 0, 0)
+            self.sent += 1
 
     def write(self, data: bytes) -> None:
         """Takes what pymavlink has packed."""
