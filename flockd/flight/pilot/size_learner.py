@@ -167,8 +167,10 @@ class SizeLearner:
         """Whether the networks judge the others' size otherwise from view to view, or say that they do not know it."""
         if self._said is not None:
             return False
-        if self._doubt > _DOUBTED or len(self._judged) < _FEWEST_JUDGED:
-            return self._doubt > _DOUBTED
+        if self._doubt > _DOUBTED:
+            return True
+        if len(self._judged) < _FEWEST_JUDGED:
+            return False
         low, high = np.quantile(self._judged, [0.1, 0.9])
         return float(high - low) > _SCATTER * _MIDDLE
 

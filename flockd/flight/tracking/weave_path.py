@@ -16,7 +16,7 @@ DURATION_S = 12.0
 """... for so long."""
 SETTLES_S = 3.0
 """So long afterwards it is still on its way back."""
-_GAIN_PER_S, _ANSWERS_S = 1.0, 0.25
+HEIGHT_GAIN_PER_S, _ANSWERS_S = 1.0, 0.25
 """A height controller asks for so much climb for each metre that is missing (PX4's default of MPC_Z_P), which the drone
 takes up with this time constant: it moves by 0.34 m up and down. Autopilots differ: `AMPLITUDE_SIGMA`."""
 AMPLITUDE_SIGMA = 0.06
@@ -43,7 +43,7 @@ def _path() -> tuple[FloatArray, FloatArray, FloatArray]:
     times_s = np.arange(0.0, DURATION_S + 2 * SETTLES_S, _TABLE_S)
     lifts_m, climbs_m_s = np.zeros(len(times_s)), np.zeros(len(times_s))
     for i, time_s in enumerate(times_s[:-1].tolist()):
-        wanted_m_s = _GAIN_PER_S * (asked_lift_m(time_s) - lifts_m[i])
+        wanted_m_s = HEIGHT_GAIN_PER_S * (asked_lift_m(time_s) - lifts_m[i])
         climbs_m_s[i + 1] = climbs_m_s[i] + (wanted_m_s - climbs_m_s[i]) * _TABLE_S / _ANSWERS_S
         lifts_m[i + 1] = lifts_m[i] + climbs_m_s[i + 1] * _TABLE_S
     return times_s, lifts_m, climbs_m_s

@@ -122,6 +122,7 @@ class FakeAutopilot:
             "MAN_DEADZONE": 0.1,
             "MAN_OVERRIDE_SPD": 1.0,
             "CP_DIST": -1.0,
+            "MPC_Z_P": 1.0,
         }
         """An int is an INT32 parameter, a float a REAL32 one."""
         self.setpoints: deque[tuple[float, Demand]] = deque(maxlen=MAX_SETPOINTS_KEPT)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -93,7 +94,7 @@ def flown(
     return learned
 
 
-def errors(estimates: list[SizeEstimate | None], size_m: float) -> FloatArray:
+def errors(estimates: Sequence[SizeEstimate | None], size_m: float) -> FloatArray:
     assert all(estimate is not None for estimate in estimates)
     return np.array([math.log(one.size_m / size_m) / one.sigma for one in estimates if one is not None])
 
@@ -127,7 +128,7 @@ def test_whoever_sees_another_weave_learns_its_size(seen_from_s: float) -> None:
     for sizes in ([one.of_looks(1.35 * SIZE_M) for one in found], [one.of_track(0) for one in found]):
         known = [one for one in sizes if one is not None]
         assert len(known) > 10
-        off = errors([*known], SIZE_M)
+        off = errors(known, SIZE_M)
         assert np.abs(off).max() < 3.0
         assert np.mean(off**2) < 2.0
 
