@@ -63,7 +63,7 @@ def fly(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) -> int:
     from flockd.sim.shown_flock import ShownFlock
 
     endpoint = args.telemetry_at or ENDPOINT
-    with ExitStack() as stack:
+    with suppress(KeyboardInterrupt), ExitStack() as stack:
         zenoh = stack.enter_context(ZenohTelemetry(fleet, listen=[endpoint]))
         controls = LiveControls(scenario, zenoh.identity, by_sight=args.perception != "truth")
         zenoh.reply_to(f"{key_of(fleet)}/**", answered(controls))
@@ -80,7 +80,7 @@ def fly(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) -> int:
         sys.stdout.flush()  # whoever reads a pipe needs the address now
         if args.browser and _has_screen():
             stack.enter_context(_opened(address))
-        with suppress(KeyboardInterrupt), Phases(quiet=args.quiet, verbose=args.verbose) as phases:
+        with Phases(quiet=args.quiet, verbose=args.verbose) as phases:
             fly_live(
                 scenario,
                 shown,
