@@ -43,6 +43,9 @@ class CameraDeviceParameters(Section):
     has to run in real time."""
     pixel_format: PixelFormat = "mjpeg"
     """For kind `v4l2`; pipelines and topics say it themselves."""
+    turn_deg: Literal[0, 90, 180, 270] = 0
+    """For kind `v4l2`: clockwise, by how much its images are turned so that up is up, where the camera is mounted on its
+    side or upside down. `size_px` and the lens in the rig are those of the turned image. Pipelines have `videoflip`."""
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 30.0
     controls: tuple[ControlParameters, ...] = ()
     """For kind `v4l2`: set in this order whenever the camera is opened; what is not named here stays as it was."""
@@ -118,7 +121,7 @@ class SourceParameters(Section):
 
 
 _KEYS = {
-    "v4l2": ("device", "pixel_format", "controls"),
+    "v4l2": ("device", "pixel_format", "controls", "turn_deg"),
     "gstreamer": ("pipeline",),
     "ros": ("topic", "camera_info", "stamps"),
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import cv2
 import numpy as np
@@ -27,6 +27,7 @@ PACKED: Mapping[str, tuple[int, int | None]] = {
     "GRAY8": (1, cv2.COLOR_GRAY2RGB),
 }
 """Bytes a pixel, and OpenCV's conversion, by GStreamer's name."""
+_TURNS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 _START, _END = b"\xff\xd8", b"\xff\xd9"
 _SAMPLE_STRIDE = 8
 _FLAT_DEVIATION = 1.0
@@ -132,6 +133,23 @@ class RgbFormat:
         """See ``ImageFormat``; nothing is copied."""
         self.check(data)
         return np.frombuffer(data, np.uint8).reshape(self.size[1], self.size[0], 3)
+
+
+@dataclass(frozen=True)
+class TurnedFormat:
+    """Of a camera that is mounted on its side or upside down."""
+
+    inner: ImageFormat
+    """As the camera sends them."""
+    clockwise_deg: Literal[90, 180, 270]
+
+    def check(self, data: bytes) -> None:
+        """See ``ImageFormat``."""
+        self.inner.check(data)
+
+    def decode(self, data: bytes) -> UInt8Array:
+        """See ``ImageFormat``: up is up."""
+        return np.asarray(cv2.rotate(self.inner.decode(data), _TURNS[self.clockwise_deg]), np.uint8)
 
 
 def check_length(data: bytes, length: int) -> None:

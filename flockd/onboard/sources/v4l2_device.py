@@ -17,7 +17,7 @@ from fractions import Fraction
 from flockd.core.choices import PixelFormat
 from flockd.core.config.source import CameraDeviceParameters, ControlParameters
 from flockd.onboard.sources.devices import CameraDevice, CameraError, CapturedBuffer
-from flockd.onboard.sources.image_formats import ImageFormat, MjpegFormat, PackedFormat
+from flockd.onboard.sources.image_formats import ImageFormat, MjpegFormat, PackedFormat, TurnedFormat
 from flockd.onboard.sources.v4l2_kernel import (
     VIDIOC_DQBUF,
     VIDIOC_G_CTRL,
@@ -61,17 +61,21 @@ class V4l2Device(CameraDevice):
     start_s = 3.0
 
     def __init__(self, camera: CameraDeviceParameters, size: tuple[int, int], kernel: Kernel | None = None) -> None:
-        """Opens the device, sets it up as asked, and starts it; what the driver does not grant is a CameraError."""
+        """Opens the device, sets it up as asked, and starts it; what the driver does not grant is a CameraError.
+
+        ``size`` is the image's as it is used: width and height, of a camera on its side turned.
+        """
         self._kernel = kernel or Kernel()
         self._who = f"{camera.name}: {camera.device}"
-        self._size, self._pixel_format = size, camera.pixel_format
+        self._size = size if camera.turn_deg % 180 == 0 else (size[1], size[0])
+        self._pixel_format, self._turn_deg = camera.pixel_format, camera.turn_deg
         self._maps: list[mmap.mmap] = []
         self._bytes_per_line = 0
         with self._telling("cannot be opened"):
             self._descriptor = self._kernel.open(camera.place)
         try:
             self._check_capabilities()
-            self._set_format(size, camera.pixel_format)
+            self._set_format(self._size, camera.pixel_format)
             self._set_rate(camera.rate_hz)
             self._set_controls(camera.controls)
             self._start()
@@ -103,9 +107,10 @@ class V4l2Device(CameraDevice):
 
     def image_format(self) -> ImageFormat:
         """See ``CameraDevice``."""
+        sent: ImageFormat = PackedFormat("YUY2", self._size, self._bytes_per_line)
         if self._pixel_format == "mjpeg":
-            return MjpegFormat(self._size)
-        return PackedFormat("YUY2", self._size, self._bytes_per_line)
+            sent = MjpegFormat(self._size)
+        return sent if self._turn_deg == 0 else TurnedFormat(sent, self._turn_deg)
 
     def close(self) -> None:
         """Stops the camera and gives it back."""

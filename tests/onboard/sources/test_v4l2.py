@@ -49,9 +49,14 @@ def start() -> Iterator[Start]:
     """Starts a source of the given cameras; each camera's device is /dev/ and its name."""
     started: list[DeviceSource] = []
 
-    def begin(kernel: Kernel, *cameras: CameraDeviceParameters, silence_s: float = SECONDS_TO_FAIL) -> DeviceSource:
+    def begin(
+        kernel: Kernel,
+        *cameras: CameraDeviceParameters,
+        silence_s: float = SECONDS_TO_FAIL,
+        size: tuple[int, int] = SIZE,
+    ) -> DeviceSource:
         parameters = SourceParameters(kind="v4l2", cameras=cameras, silence_s=silence_s, set_tolerance_s=5.0)
-        source = DeviceSource({c.name: SIZE for c in cameras}, parameters, Devices(kernel))
+        source = DeviceSource({c.name: size for c in cameras}, parameters, Devices(kernel))
         started.append(source)
         source.start()
         return source
@@ -145,6 +150,20 @@ def test_the_driver_is_asked_for_what_the_configuration_says_in_its_order(start:
         ("Exposure Time, Absolute", 50),
         ("Gain", 32),
     ]
+
+
+@pytest.mark.parametrize(("turn_deg", "red"), [(90, np.s_[:320]), (270, np.s_[320:]), (180, np.s_[:, 320:])])
+def test_a_camera_on_its_side_gives_images_in_which_up_is_up(start: Start, turn_deg: int, red: tuple[slice, ...]) -> None:
+    """A clockwise quarter of a turn brings the left, which is red, to the top."""
+    kernel = FakeKernel(front=FakeCamera())
+    source = start(kernel, _camera(turn_deg=turn_deg), size=SIZE if turn_deg == 180 else SIZE[::-1])
+    kernel.send("front", JPEGS[0])
+    image = _next(source).frames["front"].image
+    assert kernel.cameras["/dev/front"].settings[0] == ("format", (*SIZE, b"MJPG")), "as the sensor has it"
+    assert image.shape == ((480, 640, 3) if turn_deg == 180 else (640, 480, 3))
+    is_red = image[..., 0].astype(int) > image[..., 2]
+    assert is_red[red].mean() > 0.98
+    assert is_red.mean() == pytest.approx(0.5, abs=0.02)
 
 
 def test_names_of_controls_are_those_that_v4l2_ctl_prints() -> None:
