@@ -30,6 +30,7 @@ def add(commands: Commands) -> None:
         "flockd cameras",
         "flockd cameras --measure --picture pictures",
         "flockd cameras --size 1280x720 --names front back --write cameras.yaml",
+        "flockd cameras --turn-deg 90 --write cameras.yaml",
     )
     description = "List the cameras of this computer, measure what they give, and write the configuration of them."
     parser = commands("cameras", description, examples)
@@ -40,6 +41,10 @@ def add(commands: Commands) -> None:
     parser.add_argument("--picture", metavar="FOLDER", type=Path, help="save an image of each camera; measures too")
     parser.add_argument("--size", metavar="WxH", type=size, default=(640, 480), help="of an image, the nearest to this")
     parser.add_argument("--write", metavar="FILE", type=Path, help="write the sections `rig` and `source` for them")
+    parser.add_argument(
+        "--turn-deg", type=int, choices=(0, 90, 180, 270), default=0,
+        help="clockwise, what makes up up in their images: 90 for cameras on their sides, tops to the right",
+    )  # fmt: skip
     parser.add_argument("--names", metavar="NAME", nargs="+", help="of the cameras in the rig, in the listed order")
     parser.add_argument("--force", action="store_true", help="overwrite the file if it exists")
     parser.add_argument("--json", action="store_true", help="print JSON")
@@ -76,12 +81,12 @@ def run(args: argparse.Namespace, computer: Computer) -> int:
     else:
         _print(found, modes, measured, pictures)
     if args.write is not None:
-        _write(args.write, usable, args.names)
+        _write(args.write, usable, args.names, args.turn_deg)
     faulty = any(camera.fault for camera in found) or any(row.watched.fault for row in measured.values())
     return ExitCode.CHECK_FAILED if faulty else ExitCode.DONE
 
 
-def _write(file: Path, usable: Sequence[tuple[FoundCamera, Mode]], names: Sequence[str] | None) -> None:
+def _write(file: Path, usable: Sequence[tuple[FoundCamera, Mode]], names: Sequence[str] | None, turn_deg: int) -> None:
     from flockd.cli.config_new import write_checked
     from flockd.core.config.new_files import camera_names
     from flockd.ground.cameras.sections import sections_text
@@ -91,7 +96,7 @@ def _write(file: Path, usable: Sequence[tuple[FoundCamera, Mode]], names: Sequen
     names = names or camera_names(len(usable))
     if len(set(names)) != len(usable) or len(names) != len(usable):
         raise UsageError(f"--names gives {len(set(names))} names for {len(usable)} cameras; give each its own")
-    write_checked(file, sections_text(dict(zip(names, usable, strict=True))))
+    write_checked(file, sections_text(dict(zip(names, usable, strict=True)), turn_deg))
 
 
 def _save_pictures(folder: Path, found: Sequence[FoundCamera], measured: Mapping[str, Measured]) -> dict[str, Path]:

@@ -89,12 +89,19 @@ def _drone_questions() -> tuple[_Question, ...]:
         _Question(
             "cameras", "number of cameras, evenly spaced around the drone", "number of cameras", "4", _camera_count, "N"
         ),
-        _Question("size", "of an image in pixels", "size of an image", "640x480", size, "WxH"),
+        _Question(
+            "size",
+            "of an image in pixels, where up is up: higher than wide for cameras on their side",
+            "size of an image",
+            "480x640",
+            size,
+            "WxH",
+        ),
         _Question(
             "field-of-view",
-            "of an image's width, 10 to 190",
+            "of an image's longer side, 10 to 190",
             "field of view in degrees",
-            "120",
+            "130",
             _field_of_view,
             "DEG",
         ),
@@ -174,7 +181,7 @@ def _new_drone(args: argparse.Namespace) -> int:
     values = answers | {
         "rig": rig,
         "max_height": f"{max_height_m:.1f}",
-        "cameras": source_cameras(answers["source"], names),
+        "cameras": source_cameras(answers["source"], names, upright=answers["size"][1] > answers["size"][0]),
     }
     write_checked(args.file, new_file("drone", values, (answers["source"], answers["mission"])))
     return ExitCode.DONE

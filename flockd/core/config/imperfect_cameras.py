@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
@@ -24,6 +24,9 @@ class ShutterConfig(Section):
     readout_s: Annotated[float, Field(ge=0, le=0.1)] = 0.0
     """From the exposure of the first row to that of the last, one row after the other (rolling shutter); 0: all at
     once (global shutter). An image shows the middle row at its time."""
+    readout_from: Literal["top", "right", "left"] = "top"
+    """Where the sensor's first row is in the upright image: of a camera on its side (`turn_deg` 90, 270) at the right,
+    at the left."""
 
 
 class ShakeConfig(Section):

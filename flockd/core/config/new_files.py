@@ -23,11 +23,15 @@ _SOURCE_CAMERA = {
     - name: {name}
       device: /dev/v4l/by-path/{change_me}-{number}-video-index0
       pixel_format: mjpeg
-      rate_hz: 30""",
-    "gstreamer": "    - {{name: {name}, pipeline: nvarguscamerasrc sensor-id={number} ! nvvidconv, rate_hz: 30}}",
+      rate_hz: 30{turned}""",
+    "gstreamer": (
+        "    - {{name: {name}, pipeline: nvarguscamerasrc sensor-id={number} ! nvvidconv{turned}, rate_hz: 30}}"
+    ),
     "ros": "    - {{name: {name}, topic: /{name}/image_raw, rate_hz: 30}}",
     "shared_memory": "",
 }
+_TURNED = {"v4l2": "\n      turn_deg: 90", "gstreamer": " flip-method=3"}
+"""By a quarter, clockwise."""
 
 
 def new_file(kind: Literal["drone", "scenario"], values: Mapping[str, str], chosen: Collection[str]) -> str:
@@ -43,12 +47,15 @@ def new_file(kind: Literal["drone", "scenario"], values: Mapping[str, str], chos
 
 
 def rig_cameras(sizes: Mapping[str, tuple[int, int]], field_of_view_deg: float) -> str:
-    """The list `rig.cameras`: they look evenly around, with perfect wide-angle lenses. ``sizes`` by name, in pixels."""
+    """The list `rig.cameras`: they look evenly around, with perfect wide-angle lenses. ``sizes`` by name, in pixels.
+
+    The field of view is that of the longer side.
+    """
     lines = []
     for number, (name, (width, height)) in enumerate(sizes.items()):
         yaw_deg = 360.0 * number / len(sizes)
         forward_m, right_m = 0.1 * math.cos(math.radians(yaw_deg)), 0.1 * math.sin(math.radians(yaw_deg))
-        focal_px = width / 2 / math.radians(field_of_view_deg / 2)
+        focal_px = max(width, height) / 2 / math.radians(field_of_view_deg / 2)
         lines += [
             f"    - name: {name}",
             f"      size_px: [{width}, {height}]",
@@ -59,10 +66,12 @@ def rig_cameras(sizes: Mapping[str, tuple[int, int]], field_of_view_deg: float) 
     return "\n".join((*lines, ""))
 
 
-def source_cameras(kind: str, names: Sequence[str]) -> str:
-    """The list `source.cameras` for cameras that are yet to be named by their sockets."""
+def source_cameras(kind: str, names: Sequence[str], *, upright: bool) -> str:
+    """The list `source.cameras` for cameras that are yet to be named by their sockets; upright: on their sides."""
+    turned = _TURNED.get(kind, "") if upright else ""
     return "\n".join(
-        _SOURCE_CAMERA[kind].format(name=name, number=number, change_me=CHANGE_ME) for number, name in enumerate(names)
+        _SOURCE_CAMERA[kind].format(name=name, number=number, change_me=CHANGE_ME, turned=turned)
+        for number, name in enumerate(names)
     )
 
 

@@ -44,8 +44,8 @@ class CameraDeviceParameters(Section):
     pixel_format: PixelFormat = "mjpeg"
     """For kind `v4l2`; pipelines and topics say it themselves."""
     turn_deg: Literal[0, 90, 180, 270] = 0
-    """For kind `v4l2`: clockwise, by how much its images are turned so that up is up, where the camera is mounted on its
-    side or upside down. `size_px` and the lens in the rig are those of the turned image. Pipelines have `videoflip`."""
+    """For kind `v4l2`: by how much its images are turned, clockwise, so that up is up, where the camera is mounted on
+    its side or upside down. `size_px` and the lens in the rig are of the turned image. Pipelines have `videoflip`."""
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 30.0
     controls: tuple[ControlParameters, ...] = ()
     """For kind `v4l2`: set in this order whenever the camera is opened; what is not named here stays as it was."""

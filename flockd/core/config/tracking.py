@@ -19,6 +19,9 @@ class TrackingParameters(Section):
     manoeuvre_time_s: Duration = 0.5
     """How long an acceleration lasts. The white acceleration noise of the motion model has the spectral density
     acceleration_sigma_m_s2^2 * manoeuvre_time_s (Bar-Shalom, Li & Kirubarajan 2001, section 6.2)."""
+    first_acceleration_sigma_m_s2: Positive = 0.8
+    """The same at the beginning of a flight, when the flock takes its shape; forgotten with the time constant
+    `own_manoeuvre_memory_s`."""
     own_manoeuvre_memory_s: Duration = 3.0
     """Neighbours are taken to manoeuvre as hard as this drone did of late, if that is more: gusts and turns move them
     all. Time constant of that average."""

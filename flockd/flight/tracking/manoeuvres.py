@@ -18,14 +18,14 @@ class Manoeuvres:
     """The density of the acceleration noise that neighbours are taken to have: as much as the own drone had of late.
 
     What moves this drone, gusts, a turn of the flock or a tree in the way, moves its neighbours too. Never less than
-    the parameters say. North and east have one density, down has its own.
+    the parameters say, and at first as much as they say for that. North and east have one density, down has its own.
     """
 
     def __init__(self, parameters: TrackingParameters) -> None:
         self._least = parameters.acceleration_sigma_m_s2**2 * parameters.manoeuvre_time_s
         self._memory_s = parameters.own_manoeuvre_memory_s
         self._shortest_s = parameters.evidence_interval_s / 2
-        self._own = np.zeros(3)
+        self._own: FloatArray = np.full(3, parameters.first_acceleration_sigma_m_s2**2 * parameters.manoeuvre_time_s)
         self._last: tuple[FloatArray, float] | None = None
         """Velocity (3,) m/s of the last interval, and its variance an axis."""
         self._way: FloatArray = np.zeros(3)

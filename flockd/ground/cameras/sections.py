@@ -6,17 +6,26 @@ import json
 from collections.abc import Mapping
 
 from flockd.core.config.new_files import rig_cameras
+from flockd.core.errors import UsageError
 from flockd.ground.cameras.found import FoundCamera, Mode
 
-FIELD_OF_VIEW_DEG = 120.0
+FIELD_OF_VIEW_DEG = 130.0
 """Written down until the lenses are calibrated."""
 _BY_HAND = {"auto_exposure": 1, "exposure_auto": 1, "exposure_time_absolute": 50, "exposure_absolute": 50}
 """What cameras of the USB video class take for an exposure of 5 ms that is set by hand."""
 
 
-def sections_text(cameras: Mapping[str, tuple[FoundCamera, Mode]]) -> str:
-    """A commented file that `flockd config check` passes; cameras by their names in the rig."""
+def sections_text(cameras: Mapping[str, tuple[FoundCamera, Mode]], turn_deg: int = 0) -> str:
+    """A commented file that `flockd config check` passes; cameras by their names in the rig.
+
+    ``turn_deg``: as of `CameraDeviceParameters`. Raises UsageError where it is not 0 and one needs a pipeline.
+    """
     as_pipelines = any(camera.element for camera, _ in cameras.values())
+    if as_pipelines and turn_deg:
+        raise UsageError(
+            "--turn-deg is for USB cameras, and one of these needs a pipeline; add `videoflip` to each there"
+        )
+    sizes = {name: mode.size if turn_deg % 180 == 0 else mode.size[::-1] for name, (_, mode) in cameras.items()}
     lines = [
         "# Written by `flockd cameras`: the cameras of this computer, as sections of a drone's configuration.",
         "# Fill in which camera looks where: exchange the names. `flockd cameras --picture FOLDER` shows what each",
@@ -24,7 +33,7 @@ def sections_text(cameras: Mapping[str, tuple[FoundCamera, Mode]]) -> str:
         "rig:",
         "  # Fill in: intrinsics and extrinsics, by `flockd calibrate camera` and `flockd calibrate rig`.",
         "  cameras:",
-        rig_cameras({name: mode.size for name, (_, mode) in cameras.items()}, FIELD_OF_VIEW_DEG),
+        rig_cameras(sizes, FIELD_OF_VIEW_DEG),
         "source:",
         f"  kind: {'gstreamer' if as_pipelines else 'v4l2'}",
         "  cameras:",
@@ -40,6 +49,8 @@ def sections_text(cameras: Mapping[str, tuple[FoundCamera, Mode]]) -> str:
             lines.append(f"      device: {json.dumps(parameters.device)}")
             lines.append(f"      pixel_format: {parameters.pixel_format}")
         lines.append(f"      rate_hz: {parameters.rate_hz:g}")
+        if turn_deg:
+            lines.append(f"      turn_deg: {turn_deg}")
         if not as_pipelines:
             lines += _controls(camera)
     tolerance_s = max(0.02, 0.6 / slowest_hz)

@@ -65,7 +65,10 @@ def coverage(rig: RigConfig) -> Finding:
     directions = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))], axis=1)
     seen = build_rig(rig).covers(directions)
     if seen.all():
-        return passed("rig", f"{len(rig.cameras)} cameras see all of the horizon")
+        return passed(
+            "rig",
+            f"{len(rig.cameras)} cameras see all of the horizon, and all around to {_reach_deg(rig)} degrees off it",
+        )
     if not seen.any():
         return failed("rig", "no camera sees the horizon", "fix the cameras' extrinsics")
     gaps = " and ".join(_gaps(~seen))
@@ -74,6 +77,18 @@ def coverage(rig: RigConfig) -> Finding:
         f"blind at the horizon {gaps}, clockwise from forward: neighbours there are not seen",
         "turn, widen or add cameras, or fix their extrinsics",
     )
+
+
+def _reach_deg(rig: RigConfig) -> int:
+    """Up to how many degrees above and below the horizon the cameras see all around."""
+    built, angles = build_rig(rig), np.radians(np.arange(0, 360, _STEP_DEG))
+    around = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))], axis=1)
+    for reach_deg in range(_STEP_DEG, 90, _STEP_DEG):
+        reach = math.radians(reach_deg)
+        for side in (math.sin(reach), -math.sin(reach)):
+            if not built.covers(math.cos(reach) * around + [0.0, 0.0, side]).all():
+                return reach_deg - _STEP_DEG
+    return 90
 
 
 def _gaps(blind: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> list[str]:

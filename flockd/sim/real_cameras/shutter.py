@@ -99,12 +99,11 @@ def exposed(
     light: Float32Array, view: View, lens: LensField, motion: CameraMotion, shutter: ShutterConfig
 ) -> Float32Array:
     """The light (h, w, 3) that each row gathers in its exposure, of what the view shows at the middle row's time."""
-    height = len(lens.u)
     longest_s = (shutter.exposure_s + shutter.readout_s) / 2
     if longest_s == 0.0:
         return light
     velocity = pixel_velocity(view, lens, motion, longest_s)
-    row_s = ((np.arange(height) + 0.5) / height - 0.5) * shutter.readout_s
+    row_s = _read_at(lens, shutter)
     samples = _samples(velocity, lens, motion, shutter.exposure_s)
     instants = (np.arange(samples) + 0.5) / samples - 0.5
     ways = [_way(velocity, lens, motion, row_s + instant * shutter.exposure_s) for instant in instants]
@@ -117,6 +116,16 @@ def exposed(
         shown = cv2.remap(light, lens.u - way[..., 0], lens.v - way[..., 1], kind, borderMode=cv2.BORDER_REPLICATE)
         total += np.asarray(shown, np.float32)
     return np.where(lens.imaged[..., None], total / samples, light)
+
+
+def _read_at(lens: LensField, shutter: ShutterConfig) -> FloatArray:
+    """Seconds after the image's time of each of the sensor's rows: (h, 1) of the image's, or (1, w) of its columns."""
+    height, width = lens.u.shape
+    count = height if shutter.readout_from == "top" else width
+    read_s: FloatArray = ((np.arange(count) + 0.5) / count - 0.5) * shutter.readout_s
+    if shutter.readout_from == "top":
+        return read_s.reshape(-1, 1)
+    return (read_s if shutter.readout_from == "left" else read_s[::-1]).reshape(1, -1)
 
 
 def pixel_velocity(view: View, lens: LensField, motion: CameraMotion, within_s: float) -> Float32Array:
@@ -157,11 +166,15 @@ def _samples(velocity: Float32Array, lens: LensField, motion: CameraMotion, expo
 
 
 def _way(velocity: Float32Array, lens: LensField, motion: CameraMotion, row_s: FloatArray) -> Float32Array:
-    """(h, w, 2) pixels that what is seen has moved since the middle row's time, at each row's."""
+    """(h, w, 2) pixels that what is seen has moved since the image's time, when each row of the sensor is exposed."""
     since = motion.shake(np.append(row_s, 0.0))
     shaken = (since[:-1] - since[-1]).astype(np.float32)
-    way = velocity * row_s.astype(np.float32)[:, None, None]
+    way = velocity * row_s.astype(np.float32)[..., None]
     if shaken.any():
-        height, width = lens.u.shape
-        way += (lens.by_turn.reshape(height, 2 * width, 3) @ shaken[..., None]).reshape(height, width, 2)
+        if len(row_s) == 1:
+            shaken = shaken.reshape(1, -1, 3)
+            way += sum(lens.by_turn[..., axis] * shaken[..., axis, None] for axis in range(3))
+        else:
+            height, width = lens.u.shape
+            way += (lens.by_turn.reshape(height, 2 * width, 3) @ shaken[..., None]).reshape(height, width, 2)
     return np.asarray(np.clip(way, -_MOST_WAY_PX, _MOST_WAY_PX), np.float32)

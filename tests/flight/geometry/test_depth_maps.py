@@ -38,10 +38,10 @@ def wall_z(ahead_m: float) -> ZMap:
     return ZMap(np.full((height, width), ahead_m, np.float32))
 
 
-@pytest.mark.parametrize("off_axis_deg", [0.0, 30.0, 50.0])
+@pytest.mark.parametrize("off_axis_deg", [0.0, 30.0, 60.0])
 def test_a_map_of_z_lifts_a_pixel_to_where_it_is(off_axis_deg: float) -> None:
     angle = math.radians(off_axis_deg)
-    point = 5.0 * np.array([[math.sin(angle), 0.0, math.cos(angle)]])
+    point = 5.0 * np.array([[0.0, math.sin(angle), math.cos(angle)]])
     pixel = FRONT.camera.project(point)
     column, row = pixel[0].astype(int)
     ranges = range_map(wall_z(point[0, 2]), FRONT.camera)
@@ -55,14 +55,14 @@ def test_there_and_back_is_the_same_map() -> None:
 
 
 def test_a_detected_drone_stands_at_its_range_in_the_map_whichever_way_it_is() -> None:
-    bearing = np.array([math.cos(math.radians(50.0)), math.sin(math.radians(50.0)), 0.0])
+    bearing = np.array([math.cos(math.radians(50.0)), 0.0, math.sin(math.radians(50.0))])
     position = FRONT.T_body_camera.translation + 5.0 * bearing
     range_m = float(np.linalg.norm(position))
     detection = Detection(position / range_m, math.log(range_m), 1e-4 * np.eye(3), 1.0, 0.5, ("front",), 1)
     column, row = FRONT.pixels_of_points(position[None])[0].astype(int)
-    labels = np.zeros((480, 640), np.uint8)
+    labels = np.zeros((640, 480), np.uint8)
     labels[row - 3 : row + 4, column - 3 : column + 4] = 1
-    moved = depth_of_drones(RangeMap(np.full((480, 640), 5.0, np.float32)), labels, FRONT, [detection])
+    moved = depth_of_drones(RangeMap(np.full((640, 480), 5.0, np.float32)), labels, FRONT, [detection])
     lifted = FRONT.camera.unproject(np.array([[column + 0.5, row + 0.5]]), moved[row, [column]].astype(np.float64))
     np.testing.assert_allclose(FRONT.T_body_camera.apply(lifted)[0], position, atol=0.02)
 
@@ -84,7 +84,7 @@ def test_the_own_motion_before_an_exact_wall_is_as_exact_as_with_a_pinhole() -> 
     """What an equidistant lens shows of a wall that is exactly known: 0.5 m to the right and ahead."""
     step = np.array([0.4, 0.0, 0.3])
     flow, before, after = seen_wall(step)
-    none = np.zeros((480, 640), np.uint8)
+    none = np.zeros((640, 480), np.uint8)
     stride = CONFIG.geometry.background_stride_px
     pairs = lift_matches(
         FRONT, grid_pixels(FRONT.camera.size, stride), flow, before, after, none, none, max_depth_m=40.0
@@ -95,8 +95,8 @@ def test_the_own_motion_before_an_exact_wall_is_as_exact_as_with_a_pinhole() -> 
 
 
 def test_a_pinhole_and_a_fisheye_lift_the_same_wall_to_the_same_points() -> None:
-    matrix = np.array([[320.0, 0.0, 320.0], [0.0, 320.0, 240.0], [0.0, 0.0, 1.0]])
-    pinhole = RigCamera("pinhole", PinholeCamera(matrix, (640, 480)), RigidTransform(np.eye(3), np.zeros(3)))
+    matrix = np.array([[320.0, 0.0, 240.0], [0.0, 320.0, 320.0], [0.0, 0.0, 1.0]])
+    pinhole = RigCamera("pinhole", PinholeCamera(matrix, (480, 640)), RigidTransform(np.eye(3), np.zeros(3)))
     point = np.array([[2.0, 1.0, WALL_M]])
     for lens in (pinhole.camera, FRONT.camera):
         pixel = lens.project(point)

@@ -15,6 +15,8 @@ from flockd.flight.tracking.manoeuvres import Manoeuvres
 Array = NDArray[np.float64]
 STEP_S = 0.5
 LEAST = 0.2**2 * 0.5
+CALM = TrackingParameters(first_acceleration_sigma_m_s2=0.2)
+"""Nothing is left of the start."""
 SUBSTEPS = 50
 
 
@@ -31,6 +33,15 @@ def test_steady_flight_has_the_density_of_the_parameters() -> None:
     for _ in range(20):
         manoeuvres.see(np.array([0.5, 0.1, 0.0]), 0.0, STEP_S)
     np.testing.assert_allclose(manoeuvres.density, LEAST)
+
+
+def test_the_start_is_wild_until_the_own_motion_says_otherwise() -> None:
+    """0.8 m/s^2 for 0.5 s at first; steady flight is told from it after some of the 3 s of memory."""
+    manoeuvres = Manoeuvres(TrackingParameters(first_acceleration_sigma_m_s2=0.8, own_manoeuvre_memory_s=3.0))
+    assert manoeuvres.density[0] == pytest.approx(0.32)
+    for _ in range(13):
+        manoeuvres.see(np.array([0.5, 0.1, 0.0]), 0.0, STEP_S)
+    assert manoeuvres.density[0] == pytest.approx(0.32 * math.exp(-12 * STEP_S / 3.0))
 
 
 @pytest.mark.parametrize("density", [0.1, 1.0])
@@ -53,7 +64,7 @@ def test_errors_of_the_own_motion_are_no_manoeuvres() -> None:
 
 def test_two_frame_sets_at_nearly_the_same_time_are_no_manoeuvre() -> None:
     """Steady flight at 1 m/s; one step takes 2 ms, in which an error of 2 cm would be 10 m/s."""
-    manoeuvres = Manoeuvres(TrackingParameters())
+    manoeuvres = Manoeuvres(CALM)
     for _ in range(5):
         manoeuvres.see(np.array([0.5, 0.0, 0.0]), 0.02, STEP_S)
     manoeuvres.see(np.array([0.022, 0.0, 0.0]), 0.02, 0.002)
@@ -74,7 +85,7 @@ def test_it_is_forgotten_in_calm_air() -> None:
 
 
 def test_an_unknown_motion_is_no_manoeuvre() -> None:
-    manoeuvres = Manoeuvres(TrackingParameters())
+    manoeuvres = Manoeuvres(CALM)
     manoeuvres.see(np.array([2.0, 0.0, 0.0]), 0.0, STEP_S)
     manoeuvres.see(None, 0.0, STEP_S)
     manoeuvres.see(np.zeros(3), 0.0, STEP_S)

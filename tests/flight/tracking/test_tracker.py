@@ -18,6 +18,8 @@ from flockd.flight.tracking import Measurement, Tracker, TrackingParameters
 
 Array = NDArray[np.float64]
 STEP_S = 0.5
+STEADY = 0.2
+"""m/s^2, of acceleration: as much at first as later."""
 AHEAD = np.array([4.0, 0.0, 0.0])
 CRUISE = np.array([1.0, 0.0, 0.0])
 
@@ -40,8 +42,8 @@ def _confirmed(tracker: Tracker) -> list[Neighbour]:
 
 
 def _settled(position: Array = AHEAD, *, steps: int = 10, sigma_m: float = 0.05) -> tuple[Tracker, float]:
-    """A tracker that has followed one flock mate at `position`, and the time now."""
-    tracker = Tracker(TrackingParameters())
+    """A tracker that has followed one flock mate at `position`, and the time now, when the start is forgotten."""
+    tracker = Tracker(TrackingParameters(first_acceleration_sigma_m_s2=STEADY))
     for step in range(steps):
         _step(tracker, step * STEP_S, position, sigma_m=sigma_m)
     return tracker, (steps - 1) * STEP_S
@@ -367,6 +369,7 @@ def test_the_first_update_is_the_textbook_kalman_filter() -> None:
     tracker = Tracker(
         TrackingParameters(
             acceleration_sigma_m_s2=0.4,
+            first_acceleration_sigma_m_s2=0.4,
             size_correlation=1e-6,
             stranger_probability=1e-9,  # the range of a mate alone
         )
@@ -519,7 +522,7 @@ def test_the_filtered_velocity_beats_differences_on_a_circle() -> None:
 def test_the_filter_knows_its_own_error() -> None:
     """Truth drawn from the filter's own model: the squared error over its variance averages to 1."""
     rng = np.random.default_rng(5)
-    parameters = TrackingParameters()
+    parameters = TrackingParameters(first_acceleration_sigma_m_s2=STEADY)
     density = parameters.acceleration_sigma_m_s2**2 * 0.5
     noise = np.linalg.cholesky(density * np.array([[STEP_S**3 / 3, STEP_S**2 / 2], [STEP_S**2 / 2, STEP_S]]))
     position_errors, velocity_errors = [], []

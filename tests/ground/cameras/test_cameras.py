@@ -166,6 +166,25 @@ def test_what_is_written_checks_and_names_the_devices(computer: type[_Shelf], ca
     assert "--names gives 1 names for 2 cameras; give each its own" in capsys.readouterr().err
 
 
+def test_cameras_on_their_sides_are_written_upright(computer: type[_Shelf], capsys: Capture, tmp_path: Path) -> None:
+    computer.has(FakeKernel(video0=USB))
+    file = tmp_path / "cameras.yaml"
+    assert main(["cameras", "--write", str(file), "--turn-deg", "90"]) == 0
+    config = load_drone(file)
+    assert config.source is not None
+    assert (config.rig.cameras[0].size_px, config.source.cameras[0].turn_deg) == ((480, 640), 90)
+    # 320 px at 65 degrees of an equidistant lens: r = f theta.
+    assert config.rig.cameras[0].intrinsics.fy == pytest.approx(320 / 1.1344640, abs=0.05)
+
+
+def test_a_pipeline_turns_its_images_itself(computer: type[_Shelf], capsys: Capture, tmp_path: Path) -> None:
+    computer.has(FakeKernel(video0=SENSOR, video1=USB), {"gst-device-monitor-1.0": MONITOR})
+    file = tmp_path / "cameras.yaml"
+    assert main(["cameras", "--write", str(file), "--turn-deg", "90"]) == 2
+    assert "add `videoflip`" in capsys.readouterr().err
+    assert not file.exists()
+
+
 def test_a_raspberry_pis_camera_becomes_a_pipeline(computer: type[_Shelf], tmp_path: Path) -> None:
     """Its sensor is a V4L2 device too, which gives raw values only; the USB camera beside it goes through GStreamer."""
     computer.has(FakeKernel(video0=SENSOR, video1=USB), {"gst-device-monitor-1.0": MONITOR})

@@ -21,7 +21,7 @@ def _camera(**lens: object) -> CameraConfig:
 
 def test_how_wide_a_camera_sees() -> None:
     assert width_deg(_camera()) == pytest.approx(90.0)  # the pinhole: 2 atan(320 / 320)
-    assert width_deg(QUADROTOR.cameras[0]) == pytest.approx(120.0, abs=0.05)  # the equidistant: 640 / 305.6 rad
+    assert width_deg(QUADROTOR.cameras[0]) == pytest.approx(97.5, abs=0.05)  # the equidistant: 480 / 282.1 rad
     assert width_deg(_camera(model="wide_angle", fx=203.7, fy=203.7)) == pytest.approx(180.0, abs=0.05)
 
 
@@ -57,10 +57,15 @@ def test_four_cameras_see_all_around_and_three_do_not() -> None:
     three = RigConfig(cameras=tuple(camera for camera in QUADROTOR.cameras if camera.name != "back"))
     found = coverage(three)
     assert found.level is Level.WARNING
-    # The right camera ends 60 degrees behind 90, the left one begins 60 before 270.
-    assert "from 150 to 210 degrees" in found.measured or "from 151 to 209 degrees" in found.measured
+    # The right camera ends 48.75 degrees behind 90, the left one begins 48.75 before 270.
+    assert "from 139 to 221 degrees" in found.measured
     ahead_is_blind = RigConfig(cameras=tuple(camera for camera in QUADROTOR.cameras if camera.name != "front"))
-    assert "from 331 to 29 degrees" in coverage(ahead_is_blind).measured.replace("330 to 30", "331 to 29")
+    assert "from 319 to 41 degrees" in coverage(ahead_is_blind).measured
+
+
+def test_it_says_how_far_up_and_down_they_see_all_around() -> None:
+    """Between two pinholes, 45 degrees off each axis, an edge at 320 of 222 px is at atan(320 / 222 * cos 45)."""
+    assert "all around to 45 degrees off it" in coverage(SIMULATOR).measured
 
 
 def test_cameras_that_face_the_ground_see_no_horizon() -> None:

@@ -153,7 +153,9 @@ def test_the_driver_is_asked_for_what_the_configuration_says_in_its_order(start:
 
 
 @pytest.mark.parametrize(("turn_deg", "red"), [(90, np.s_[:320]), (270, np.s_[320:]), (180, np.s_[:, 320:])])
-def test_a_camera_on_its_side_gives_images_in_which_up_is_up(start: Start, turn_deg: int, red: tuple[slice, ...]) -> None:
+def test_a_camera_on_its_side_gives_images_in_which_up_is_up(
+    start: Start, turn_deg: int, red: tuple[slice, ...]
+) -> None:
     """A clockwise quarter of a turn brings the left, which is red, to the top."""
     kernel = FakeKernel(front=FakeCamera())
     source = start(kernel, _camera(turn_deg=turn_deg), size=SIZE if turn_deg == 180 else SIZE[::-1])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from flockd.sim.drone_models import drone_model
 from flockd.sim.lens_views import lens_view
 from flockd.sim.real_cameras.light import linear_light
 from flockd.sim.real_cameras.shake import Shaking
-from flockd.sim.real_cameras.shutter import CameraMotion, LensField, exposed
+from flockd.sim.real_cameras.shutter import CameraMotion, LensField, Shake, exposed
 from flockd.sim.renderer import Renderer, View
 from flockd.sim.world import World
 
@@ -63,9 +64,9 @@ def width_px(row: FloatArray) -> float:
 
 
 def taken(
-    light: Float32Array, seen: View, how: CameraMotion, camera: Camera = PINHOLE, **shutter: float
+    light: Float32Array, seen: View, how: CameraMotion, camera: Camera = PINHOLE, **shutter: object
 ) -> Float32Array:
-    return exposed(light, seen, LensField.of(camera), how, ShutterConfig(**shutter))
+    return exposed(light, seen, LensField.of(camera), how, ShutterConfig.model_validate(shutter))
 
 
 def test_a_turn_smears_by_rate_times_exposure_times_focal_length() -> None:
@@ -89,6 +90,39 @@ def test_a_rolling_shutter_skews_by_rate_times_readout_times_focal_length() -> N
     assert skewed[0] - skewed[-1] == pytest.approx(9.0 * 239 / 240, rel=0.03)
     assert skewed[120] == pytest.approx(160, abs=0.1), "the middle row is of the image's time"
     assert np.abs(np.diff(skewed, 2)).max() < 0.1, "evenly"
+
+
+@pytest.mark.parametrize(("readout_from", "later_px"), [("left", -9.0), ("right", 9.0)])
+def test_a_camera_on_its_side_is_read_across(readout_from: str, later_px: float) -> None:
+    """1 rad/s downward, 30 ms from one side to the other, 300 px: 9 px farther up where it is read last."""
+    light = edge(120).transpose(1, 0, 2)[: SIZE[1]].copy()
+    light = np.repeat(light[:, :1], SIZE[0], axis=1)
+    seen = taken(light, view(np.inf), motion(turn=(-1.0, 0.0, 0.0)), readout_s=0.03, readout_from=readout_from)
+    rises = SIZE[1] - seen[..., 0].sum(axis=0, dtype=np.float64)
+    assert rises[-1] - rises[0] == pytest.approx(later_px * 319 / 320, rel=0.03)
+    assert rises[160] == pytest.approx(120, abs=0.1)
+
+
+def test_shaking_skews_a_camera_on_its_side_as_one_upright_that_is_turned() -> None:
+    """The square scene's light, turned by a quarter, read from the right: as that of the scene read from the top."""
+    square = PinholeCamera(np.array([[200.0, 0.0, 120.0], [0.0, 200.0, 120.0], [0.0, 0.0, 1.0]]), (240, 240))
+    light = np.random.default_rng(3).random((24, 24, 3), dtype=np.float32).repeat(10, axis=0).repeat(10, axis=1)
+    shaking = Shaking(ShakeConfig(rms_deg=1.0, frequency_hz=50.0), np.random.default_rng(4))
+    none = np.zeros((240, 240), np.uint8)
+    seen = View(np.zeros((240, 240, 3), np.uint8), np.full((240, 240), np.inf, np.float32), none, none > 0)
+
+    def turned(times_s: FloatArray) -> FloatArray:
+        right, down, ahead = shaking.at(times_s).T  # the upright image's right is the sensor's up
+        return np.stack([-down, right, ahead], axis=1)
+
+    def shown(image: Float32Array, shake: Shake, readout_from: Literal["top", "right"]) -> Float32Array:
+        how = CameraMotion(np.zeros(3), np.zeros(3), shake, {})
+        return exposed(image, seen, LensField.of(square), how, ShutterConfig(readout_s=0.03, readout_from=readout_from))
+
+    upright = shown(light, shaking.at, "top")
+    on_its_side = shown(np.ascontiguousarray(np.rot90(light, -1)), turned, "right")
+    assert np.abs(upright - light).mean() > 0.01
+    np.testing.assert_allclose(np.rot90(on_its_side), upright, atol=0.02)
 
 
 def test_an_equidistant_lens_smears_the_same_50_degrees_off_its_axis() -> None:
