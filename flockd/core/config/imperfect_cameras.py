@@ -143,6 +143,9 @@ class CamerasConfig(Section):
     automatic: AutomaticConfig = AutomaticConfig()
     lens: LensFaultsConfig = LensFaultsConfig()
     compression: CompressionConfig = CompressionConfig()
+    reduce: Literal[1, 2, 4] = 1
+    """As of a drone's `source.cameras`: the sensor has so many times so many pixels, each as noisy as `noise` says, and
+    the compressed image is reduced."""
     timing: CameraTimingConfig = CameraTimingConfig()
     attitude: LateAttitudeConfig = LateAttitudeConfig()
     rig: RigErrorsConfig = RigErrorsConfig()

@@ -46,6 +46,9 @@ class CameraDeviceParameters(Section):
     turn_deg: Literal[0, 90, 180, 270] = 0
     """For kind `v4l2`: by how much its images are turned, clockwise, so that up is up, where the camera is mounted on
     its side or upside down. `size_px` and the lens in the rig are of the turned image. Pipelines have `videoflip`."""
+    reduce: Literal[1, 2, 4] = 1
+    """For kind `v4l2`: the camera sends images so many times as wide and as high as the rig says, which are reduced:
+    they have less noise then, and less of what compression leaves."""
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 30.0
     controls: tuple[ControlParameters, ...] = ()
     """For kind `v4l2`: set in this order whenever the camera is opened; what is not named here stays as it was."""
@@ -121,7 +124,7 @@ class SourceParameters(Section):
 
 
 _KEYS = {
-    "v4l2": ("device", "pixel_format", "controls", "turn_deg"),
+    "v4l2": ("device", "pixel_format", "controls", "turn_deg", "reduce"),
     "gstreamer": ("pipeline",),
     "ros": ("topic", "camera_info", "stamps"),
 }

@@ -28,6 +28,7 @@ PACKED: Mapping[str, tuple[int, int | None]] = {
 }
 """Bytes a pixel, and OpenCV's conversion, by GStreamer's name."""
 _TURNS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
+_REDUCING = {1: cv2.IMREAD_COLOR_RGB, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4}
 _START, _END = b"\xff\xd8", b"\xff\xd9"
 _SAMPLE_STRIDE = 8
 _FLAT_DEVIATION = 1.0
@@ -58,6 +59,8 @@ class MjpegFormat:
 
     size: tuple[int, int]
     """Width, height."""
+    reduce: Literal[1, 2, 4] = 1
+    """Of what comes out, each pixel is made of so many times so many: of the lower frequencies of each block."""
 
     def check(self, data: bytes) -> None:
         """See ``ImageFormat``: begin, end and size."""
@@ -75,13 +78,15 @@ class MjpegFormat:
     def decode(self, data: bytes) -> UInt8Array:
         """See ``ImageFormat``."""
         self.check(data)
-        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+        flags = _REDUCING[self.reduce] | cv2.IMREAD_IGNORE_ORIENTATION
         try:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         except cv2.error as error:
             raise CorruptImageError(f"JPEG cannot be decoded ({error})") from error
         if image is None:
             raise CorruptImageError("JPEG cannot be decoded")
+        if self.reduce > 1:  # OpenCV reduces in its own order of colours only
+            image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         return plausible(np.asarray(image, np.uint8))
 
 
@@ -95,6 +100,8 @@ class PackedFormat:
     """Width, height."""
     bytes_per_line: int | None = None
     """None: each row is filled up to four bytes, as GStreamer does."""
+    reduce: Literal[1, 2, 4] = 1
+    """Of what comes out, each pixel is the mean of so many times so many."""
 
     def check(self, data: bytes) -> None:
         """See ``ImageFormat``: size, and rows that hold their pixels."""
@@ -112,7 +119,11 @@ class PackedFormat:
         rows = np.frombuffer(data, np.uint8).reshape(height, self._bytes_per_line())
         pixels = np.ascontiguousarray(rows[:, : depth * across]).reshape(height, across, depth)
         image = pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion), np.uint8)
-        return plausible(np.ascontiguousarray(image[:, :width]))
+        whole = plausible(np.ascontiguousarray(image[:, :width]))
+        if self.reduce == 1:
+            return whole
+        size = width // self.reduce, height // self.reduce
+        return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.uint8)
 
     def _bytes_per_line(self) -> int:
         return self.bytes_per_line or up_to(4, PACKED[self.name][0] * self.size[0])

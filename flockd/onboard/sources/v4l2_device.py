@@ -63,12 +63,13 @@ class V4l2Device(CameraDevice):
     def __init__(self, camera: CameraDeviceParameters, size: tuple[int, int], kernel: Kernel | None = None) -> None:
         """Opens the device, sets it up as asked, and starts it; what the driver does not grant is a CameraError.
 
-        ``size`` is the image's as it is used: width and height, of a camera on its side turned.
+        ``size`` is the image's as it is used: width and height, reduced, and of a camera on its side turned.
         """
         self._kernel = kernel or Kernel()
         self._who = f"{camera.name}: {camera.device}"
-        self._size = size if camera.turn_deg % 180 == 0 else (size[1], size[0])
-        self._pixel_format, self._turn_deg = camera.pixel_format, camera.turn_deg
+        width, height = size if camera.turn_deg % 180 == 0 else (size[1], size[0])
+        self._size = width * camera.reduce, height * camera.reduce
+        self._pixel_format, self._turn_deg, self._reduce = camera.pixel_format, camera.turn_deg, camera.reduce
         self._maps: list[mmap.mmap] = []
         self._bytes_per_line = 0
         with self._telling("cannot be opened"):
@@ -107,9 +108,9 @@ class V4l2Device(CameraDevice):
 
     def image_format(self) -> ImageFormat:
         """See ``CameraDevice``."""
-        sent: ImageFormat = PackedFormat("YUY2", self._size, self._bytes_per_line)
+        sent: ImageFormat = PackedFormat("YUY2", self._size, self._bytes_per_line, self._reduce)
         if self._pixel_format == "mjpeg":
-            sent = MjpegFormat(self._size)
+            sent = MjpegFormat(self._size, self._reduce)
         return sent if self._turn_deg == 0 else TurnedFormat(sent, self._turn_deg)
 
     def close(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import cv2
 import numpy as np
 
 from flockd.core.config.imperfect_cameras import CamerasConfig
@@ -46,15 +47,20 @@ class RealCamera:
         if config.automatic.exposure or config.automatic.white_balance:
             gains = self._automatic.gains(light, lens.imaged, time_s)
             light, brightened = light * gains.astype(np.float32), float(gains[1])
+        height, width = (config.reduce * side for side in lens.u.shape)
+        if config.reduce > 1:
+            light = np.asarray(cv2.resize(light, (width, height), interpolation=cv2.INTER_CUBIC), np.float32)
         if config.noise.gain > 0:
-            height, width = lens.u.shape
             light = noisy(light, self._tile.crop(height, width, self._rng), config.noise, brightened)
         return grey_levels(light)
 
     def compressed(self, image: UInt8Array) -> UInt8Array:
         """The image as the camera sends it."""
-        quality = self._config.compression.jpeg_quality
-        return image if quality is None else jpeg(image, quality)
+        quality, reduce = self._config.compression.jpeg_quality, self._config.reduce
+        if quality is not None:
+            return jpeg(image, quality, reduce)
+        height, width = self._lens.u.shape
+        return image if reduce == 1 else np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def real_cameras(

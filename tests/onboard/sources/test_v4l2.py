@@ -168,6 +168,30 @@ def test_a_camera_on_its_side_gives_images_in_which_up_is_up(
     assert is_red.mean() == pytest.approx(0.5, abs=0.02)
 
 
+@pytest.mark.parametrize("pixel_format", ["mjpeg", "yuyv"])
+def test_a_larger_image_is_reduced_to_the_rigs_size(start: Start, pixel_format: str) -> None:
+    """The camera is asked for 640 x 480, the rig has a quarter of the pixels: the mean of four, with half the noise."""
+    kernel = FakeKernel(front=FakeCamera())
+    source = start(kernel, _camera(reduce=2, pixel_format=pixel_format), size=(320, 240))
+    noise = np.random.default_rng(5).normal(0.0, 8.0, (*SIZE[::-1], 1))
+    grey = np.repeat(np.clip(128.0 + noise, 0, 255), 3, axis=2).astype(np.uint8)
+    sent = jpeg(grey) if pixel_format == "mjpeg" else _yuyv_of(grey)
+    kernel.send("front", sent)
+    image = _next(source).frames["front"].image
+    code = b"MJPG" if pixel_format == "mjpeg" else b"YUYV"
+    assert kernel.cameras["/dev/front"].settings[0] == ("format", (*SIZE, code))
+    assert image.shape == (240, 320, 3)
+    assert image[..., 1].std() == pytest.approx(grey[..., 1].std() / 2, rel=0.15)
+    mean = grey[..., 1].reshape(240, 2, 320, 2).mean(axis=(1, 3))
+    assert np.corrcoef(image[..., 1].ravel(), mean.ravel())[0, 1] > 0.9
+
+
+def _yuyv_of(grey: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> bytes:
+    """Its brightness without colours; luma from 16 to 235."""
+    luma = np.rint(16.0 + grey[..., 0] * (219.0 / 255.0)).astype(np.uint8)
+    return np.stack([luma, np.full_like(luma, 128)], axis=-1).tobytes()
+
+
 def test_names_of_controls_are_those_that_v4l2_ctl_prints() -> None:
     names = [b"Exposure Time, Absolute", b"White Balance Temperature, Auto", b"Gain", b"Exposure (Absolute)"]
     assert [control_name(name) for name in names] == [

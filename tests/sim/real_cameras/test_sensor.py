@@ -9,6 +9,7 @@ import pytest
 
 from flockd.core.config.imperfect_cameras import (
     AutomaticConfig,
+    CamerasConfig,
     CameraTimingConfig,
     LateAttitudeConfig,
     LensFaultsConfig,
@@ -22,10 +23,12 @@ from flockd.sim.real_cameras.attitude import LateAttitude
 from flockd.sim.real_cameras.compression import jpeg
 from flockd.sim.real_cameras.glass import Glass
 from flockd.sim.real_cameras.light import grey_levels, linear_light
+from flockd.sim.real_cameras.real_camera import RealCamera
 from flockd.sim.real_cameras.sensor import Automatic, NoiseTile, noisy
 from flockd.sim.real_cameras.shake import Shaking
-from flockd.sim.real_cameras.shutter import LensField
+from flockd.sim.real_cameras.shutter import CameraMotion, LensField
 from flockd.sim.real_cameras.timing import CameraClock
+from flockd.sim.renderer import View
 
 SIZE = (320, 240)
 CAMERA = PinholeCamera(np.array([[160.0, 0.0, 160.0], [0.0, 160.0, 120.0], [0.0, 0.0, 1.0]]), SIZE)
@@ -46,6 +49,26 @@ def test_light_and_grey_levels_are_those_of_srgb() -> None:
     assert light[0, 10, 0] == pytest.approx(10 / 255 / 12.92, rel=1e-6)
     assert np.array_equal(grey_levels(light), greys)
     assert np.array_equal(grey_levels(np.array([[[-0.1, 1.1, 2.0]]], np.float32)), [[[0, 255, 255]]])
+
+
+@pytest.mark.parametrize("quality", [None, 80])
+def test_twice_as_many_pixels_that_are_reduced_have_half_the_noise(quality: int | None) -> None:
+    """Four independent pixels make one. A JPEG takes some of the noise out by itself, so that less is won."""
+    grey = View(
+        np.full((*SIZE[::-1], 3), 128, np.uint8), np.full(SIZE[::-1], 9.0, np.float32), np.zeros(SIZE[::-1], np.uint8),
+        np.zeros(SIZE[::-1], np.bool_),
+    )  # fmt: skip
+    still = CameraMotion(np.zeros(3), np.zeros(3), lambda times_s: np.zeros((len(times_s), 3)), {})
+    off = []
+    for reduce in (1, 2):
+        config = CamerasConfig.model_validate(
+            {"noise": {"gain": 16.0}, "compression": {"jpeg_quality": quality}, "reduce": reduce}
+        )
+        camera = RealCamera(config, LENS, NoiseTile(3), (7,))
+        image = camera.compressed(camera.image(grey, still, 0.0, BEHIND))
+        assert image.shape == (*SIZE[::-1], 3)
+        off.append(float((image.astype(float) - 128.0).std()))
+    assert off[1] == pytest.approx(off[0] / 2, rel=0.1) if quality is None else off[1] < 0.75 * off[0]
 
 
 def test_noise_at_the_lowest_gain_is_that_of_the_data_sheet() -> None:
