@@ -171,6 +171,6 @@ class CamerasConfig(Section):
             mine, its = getattr(self, name), getattr(usual, name)
             if mine == its:
                 del values[name]
-            elif its is not None:
+            elif isinstance(its, Section):
                 values[name] = {key: of for key, of in values[name].items() if getattr(mine, key) != getattr(its, key)}
         return values

@@ -14,7 +14,7 @@ Probability = Annotated[float, Field(gt=0, lt=1)]
 class TrackingParameters(Section):
     """Neighbours over time: motion model, association and existence probability."""
 
-    acceleration_sigma_m_s2: Positive = 0.2
+    acceleration_sigma_m_s2: Positive = 0.3
     """How hard a neighbour may manoeuvre at least, standard deviation an axis."""
     manoeuvre_time_s: Duration = 0.5
     """How long an acceleration lasts. The white acceleration noise of the motion model has the spectral density

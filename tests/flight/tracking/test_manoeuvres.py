@@ -14,8 +14,8 @@ from flockd.flight.tracking.manoeuvres import Manoeuvres
 
 Array = NDArray[np.float64]
 STEP_S = 0.5
-LEAST = 0.2**2 * 0.5
-CALM = TrackingParameters(first_acceleration_sigma_m_s2=0.2)
+LEAST = 0.3**2 * 0.5
+CALM = TrackingParameters(first_acceleration_sigma_m_s2=0.3)
 """Nothing is left of the start."""
 SUBSTEPS = 50
 
@@ -39,9 +39,9 @@ def test_the_start_is_wild_until_the_own_motion_says_otherwise() -> None:
     """0.8 m/s^2 for 0.5 s at first; steady flight is told from it after some of the 3 s of memory."""
     manoeuvres = Manoeuvres(TrackingParameters(first_acceleration_sigma_m_s2=0.8, own_manoeuvre_memory_s=3.0))
     assert manoeuvres.density[0] == pytest.approx(0.32)
-    for _ in range(13):
+    for _ in range(9):
         manoeuvres.see(np.array([0.5, 0.1, 0.0]), 0.0, STEP_S)
-    assert manoeuvres.density[0] == pytest.approx(0.32 * math.exp(-12 * STEP_S / 3.0))
+    assert manoeuvres.density[0] == pytest.approx(0.32 * math.exp(-8 * STEP_S / 3.0))
 
 
 @pytest.mark.parametrize("density", [0.1, 1.0])

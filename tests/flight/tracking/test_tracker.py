@@ -18,7 +18,7 @@ from flockd.flight.tracking import Measurement, Tracker, TrackingParameters
 
 Array = NDArray[np.float64]
 STEP_S = 0.5
-STEADY = 0.2
+STEADY = 0.3
 """m/s^2, of acceleration: as much at first as later."""
 AHEAD = np.array([4.0, 0.0, 0.0])
 CRUISE = np.array([1.0, 0.0, 0.0])

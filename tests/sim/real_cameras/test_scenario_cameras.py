@@ -20,8 +20,8 @@ from flockd.sim.vehicles import Vehicles
 
 CONFIG = data_path("config")
 RIG = load_drone(CONFIG / "quadrotor.yaml").rig
-ON_THEIR_SIDES = {"shutter": {"readout_from": "right"}}
-"""As `turn_deg: 90` of `quadrotor.yaml` has it."""
+AS_MOUNTED = {"shutter": {"readout_from": "right"}, "reduce": 2}
+"""As `turn_deg: 90` and `reduce: 2` of `quadrotor.yaml` have it."""
 
 
 def scenario_with(cameras: CamerasConfig | None, image_noise: float = 2.0) -> ScenarioConfig:
@@ -121,18 +121,18 @@ def test_a_preset_fills_what_is_not_written() -> None:
 def test_the_fisheye_flight_has_the_real_drones_lenses() -> None:
     scenario = load_scenario(CONFIG / "fisheye_flight.yaml")
     assert scenario.drone.rig == RIG
-    assert scenario.cameras == CamerasConfig.model_validate({"preset": "realistic", **ON_THEIR_SIDES})
+    assert scenario.cameras == CamerasConfig.model_validate({"preset": "realistic", **AS_MOUNTED})
     ideal = load_scenario(CONFIG / "fisheye_flight.yaml", {"cameras.preset": "ideal"})
-    assert ideal.cameras == CamerasConfig.model_validate(ON_THEIR_SIDES)
+    assert ideal.cameras == CamerasConfig.model_validate(AS_MOUNTED)
 
 
 def test_a_campaigns_preset_takes_the_place_of_its_scenarios() -> None:
     """Before, the scenario's realistic values stayed under a case's `preset: ideal`."""
     plan = Plan.load(CONFIG / "campaigns" / "cameras.yaml")
     flown = {str(cell.parameters["case"]): plan.recipe(cell, 0).scenario().cameras for cell in plan.cells}
-    assert flown["ideal"] == CamerasConfig.model_validate(ON_THEIR_SIDES)
-    assert flown["realistic"] == CamerasConfig.model_validate({"preset": "realistic", **ON_THEIR_SIDES})
-    assert flown["gain_8"] == CamerasConfig.model_validate({"noise": {"gain": 8.0}, **ON_THEIR_SIDES})
+    assert flown["ideal"] == CamerasConfig.model_validate(AS_MOUNTED)
+    assert flown["realistic"] == CamerasConfig.model_validate({"preset": "realistic", **AS_MOUNTED})
+    assert flown["gain_8"] == CamerasConfig.model_validate({"noise": {"gain": 8.0}, **AS_MOUNTED})
 
 
 def test_campaigns_may_vary_a_single_fault() -> None:
