@@ -1,4 +1,4 @@
-"""flockd's tracker and Stone Soup's on the same recorded detections, by Stone Soup's own metrics.
+"""flockd's tracker and Stone Soup's (GNN, JPDA, GM-PHD) on the same recorded detections, by Stone Soup's own metrics.
 
 Each step's detections of a recorded flight by sight, with their covariances, and the own motion as the drone estimated
 it, go to each tracker; what it confirms is compared with the true neighbours within 10 m: GOSPA and OSPA (p = 2,
@@ -23,18 +23,21 @@ from stonesoup.dataassociator.neighbour import GNNWith2DAssignment
 from stonesoup.dataassociator.probability import JPDA
 from stonesoup.deleter.time import UpdateTimeStepsDeleter
 from stonesoup.hypothesiser.distance import DistanceHypothesiser
+from stonesoup.hypothesiser.gaussianmixture import GaussianMixtureHypothesiser
 from stonesoup.hypothesiser.probability import PDAHypothesiser
 from stonesoup.initiator.simple import MultiMeasurementInitiator
 from stonesoup.measures import Mahalanobis
 from stonesoup.metricgenerator.ospametric import GOSPAMetric, OSPAMetric
+from stonesoup.mixturereducer.gaussianmixture import GaussianMixtureReducer
 from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRange
 from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
 from stonesoup.predictor.kalman import KalmanPredictor
 from stonesoup.tracker.simple import MultiTargetMixtureTracker, MultiTargetTracker
 from stonesoup.types.angle import Bearing, Elevation
 from stonesoup.types.detection import Detection
-from stonesoup.types.state import GaussianState, State
+from stonesoup.types.state import GaussianState, State, TaggedWeightedGaussianState
 from stonesoup.updater.kalman import ExtendedKalmanUpdater
+from stonesoup.updater.pointprocess import PHDUpdater
 
 from flockd import Recording
 from flockd.core.messages import Detection as Sighting
@@ -52,6 +55,10 @@ in turns)."""
 SPEED_SIGMA_M_S = 1.0
 POINTS, UNSEEN_STEPS = 3, 3
 """As flockd's tracker confirms, and drops."""
+PHD_BORN, PHD_FOUND, PHD_SURVIVAL = 0.1, 0.5, 0.99
+"""Weights of a component that is born, and from which on it counts; its probability of surviving a step."""
+PHD_GATE, PHD_MERGE = 4, 5
+"""Mahalanobis distances: of detections from components, and of components that become one."""
 EPOCH = datetime(2026, 1, 1)
 Positions = dict[int, FloatArray]
 """By track, (3,) metres NED from where the recording began."""
@@ -128,6 +135,44 @@ def _tracker(kind: str, detector: list[tuple[datetime, set[Detection]]]) -> Any:
     return MultiTargetMixtureTracker(initiator, deleter, detector, probable, updater)
 
 
+def by_gm_phd(steps: list[Step]) -> Iterator[Positions]:
+    """What Stone Soup's Gaussian-mixture PHD filter finds: components of a weight above a half.
+
+    New ones are born where the last step's detections were (B. Ristic, D. Clark, B.-N. Vo, B.-T. Vo, "Adaptive target
+    birth intensity for PHD and CPHD filters", 2012).
+    """
+    predictor = KalmanPredictor(CombinedLinearGaussianTransitionModel([ConstantVelocity(ACCELERATION)] * 3))
+    updater = ExtendedKalmanUpdater(measurement_model=None)
+    near = DistanceHypothesiser(predictor, updater, Mahalanobis(), missed_distance=PHD_GATE)
+    hypothesiser = GaussianMixtureHypothesiser(near, order_by_detection=True)
+    filter_ = PHDUpdater(
+        updater, clutter_spatial_density=CLUTTER_PER_M3, prob_detection=DETECTED, prob_survival=PHD_SURVIVAL
+    )
+    reducer = GaussianMixtureReducer(prune_threshold=1e-3, merge_threshold=PHD_MERGE)
+    numbers: dict[Any, int] = {}
+    components: list[Any] = []
+    for step in steps:
+        when = EPOCH + timedelta(seconds=step.time_s)
+        hypotheses = hypothesiser.hypothesise(components, _detections(step), when, order_by_detection=True)
+        components = reducer.reduce(filter_.update(hypotheses))
+        found = [one for one in components if one.weight > PHD_FOUND]
+        yield {numbers.setdefault(one.tag, len(numbers)): _place(one) for one in found}
+        components += [_born(step, one, when, len(numbers) + index) for index, one in enumerate(step.seen)]
+
+
+def _born(step: Step, seen: Measurement, when: datetime, number: int) -> Any:
+    """The component of a detection."""
+    along = np.outer(seen.bearing, seen.bearing)
+    across = float(np.trace(seen.covariance) - seen.log_range_variance) / 2
+    place = seen.range_m**2 * (seen.log_range_variance * along + across * (np.eye(3) - along))
+    covariance = np.zeros((6, 6))
+    covariance[::2, ::2], covariance[1::2, 1::2] = place, SPEED_SIGMA_M_S**2 * np.eye(3)
+    velocity = np.zeros(3) if step.velocity is None else step.velocity
+    mean = np.stack([step.own + seen.position, velocity], axis=1).reshape(6, 1)
+    tag = f"{when.isoformat()} {number}"
+    return TaggedWeightedGaussianState(mean, covariance, timestamp=when, weight=PHD_BORN, tag=tag)
+
+
 def _detections(step: Step) -> set[Detection]:
     found = set()
     for one in step.seen:
@@ -190,11 +235,12 @@ def main() -> None:
     parser.add_argument("recordings", nargs="+", type=Path, metavar="FOLDER", help="recordings of one flight")
     print("flight, tracker | GOSPA | OSPA | localisation | missed | false | switches")
     for folder in parser.parse_args().recordings:
-        scores = {kind: Scores() for kind in ("flockd", "GNN", "JPDA")}
+        scores = {kind: Scores() for kind in ("flockd", "GNN", "JPDA", "GM-PHD")}
         for path in sorted(folder.glob("*.mcap")):
             steps = steps_of(path)
             for kind, score in scores.items():
-                score.add(steps, by_flockd(steps) if kind == "flockd" else by_stone_soup(kind, steps))
+                own = {"flockd": by_flockd, "GM-PHD": by_gm_phd}
+                score.add(steps, own[kind](steps) if kind in own else by_stone_soup(kind, steps))
         for kind, score in scores.items():
             print(f"{folder}, {kind} | {score.row}")
 
