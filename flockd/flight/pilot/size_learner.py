@@ -105,8 +105,8 @@ class SizeLearner:
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        """That the configuration says another size."""
-        return () if self._contradiction is None else (Reason(ReasonKind.SIZE, self._contradiction),)
+        """That the configuration says another size, or that the drone does not weave as it should."""
+        return tuple(Reason(ReasonKind.SIZE, text) for text in (self._contradiction, self._weave.given_up) if text)
 
     def see(
         self, interval_s: float, way: FloatArray, measured: Mapping[int, Measurement], neighbours: Sequence[Neighbour]

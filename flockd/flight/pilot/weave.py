@@ -12,7 +12,15 @@ import numpy as np
 
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import Neighbour
-from flockd.flight.tracking.weave_path import ASKED_M, DURATION_S, SETTLES_S, asked_lift_m, lift_m
+from flockd.flight.tracking.weave_path import (
+    AMPLITUDE_SIGMA,
+    ASKED_M,
+    DURATION_S,
+    PERIOD_S,
+    SETTLES_S,
+    asked_lift_m,
+    lift_m,
+)
 
 _DRAWN_WITHIN_S = 8.0
 """It begins at a time drawn from so many seconds, for not all to weave at once."""
@@ -30,6 +38,11 @@ _ABOVE_GROUND_M = 2.0
 """Nor does it begin lower above the ground, which may be higher than at home."""
 _ASTRAY_M = 0.2
 """A weave that is so far off `lift_m`, over a second, ends: whoever sees it would take the drone for larger."""
+_MOST_UNLIKE = 3 * AMPLITUDE_SIGMA
+"""So does one that, over its first period, moves the drone by as much more or less than it should, ..."""
+_ALIKE = AMPLITUDE_SIGMA
+"""... and after two in a row whose shares are so near it weaves no more: its autopilot follows heights otherwise. A
+gate that holds it does not hold it twice alike."""
 _COLUMN = 1.5
 """Level distance, in the gate's degraded separations, within which no other drone may be when it begins: nearer to one
 above or below the gate lets it rise or sink no more, as it also does later."""
@@ -45,8 +58,22 @@ class Weave:
         self._base_m = 0.0
         self._astray_m = self._compared_s = 0.0
         """How far the drone is from where a weave leads, over the last second, and when since its beginning."""
+        self._lifts_m: list[tuple[float, float]] = []
+        """How high it should have been above where the weave began, and how high it was, at each step since."""
+        self._unlike: list[float] = []
+        """By which share of what they should the weaves moved the drone that were ended for that."""
         self._wanted_m: float | None = None
         self._steady_since_s: float | None = None
+
+    @property
+    def given_up(self) -> str | None:
+        """Why it weaves no more, for people."""
+        if len(self._unlike) < 2 or abs(self._unlike[-1] - self._unlike[-2]) > _ALIKE:
+            return None
+        return (
+            f"weave: the drone rises and sinks by {self._unlike[-1]:.0%} of what others reckon with; it weaves no more; "
+            "its autopilot should follow heights as theirs do (PX4: MPC_Z_P 1.0)"
+        )
 
     @property
     def moves(self) -> bool:
@@ -72,6 +99,7 @@ class Weave:
             self._wanted_m, self._steady_since_s = wanted_m, time_s - _STEADY_S
         elif wanted_m != self._wanted_m:
             self._wanted_m, self._steady_since_s = wanted_m, time_s
+        needed = needed and self.given_up is None
         if self._began_s is None and not self._begins(time_s, height_m, above_ground_m, neighbours, random, needed):
             return wanted_m
         assert self._began_s is not None
@@ -90,6 +118,14 @@ class Weave:
         share = -math.expm1(-max(elapsed_s - self._compared_s, 0.0))
         self._astray_m += share * (risen_m - lift_m(elapsed_s) - self._astray_m)
         self._compared_s = elapsed_s
+        self._lifts_m.append((lift_m(elapsed_s), risen_m))
+        if elapsed_s >= PERIOD_S:
+            should_m, was_m = np.array(self._lifts_m).T
+            should_m -= should_m.mean()
+            share = float(should_m @ was_m / (should_m @ should_m))
+            if abs(share - 1.0) > _MOST_UNLIKE:
+                self._unlike.append(share)
+                return False
         return abs(self._astray_m) <= _ASTRAY_M
 
     def _begins(
@@ -113,6 +149,7 @@ class Weave:
             return False
         self._began_s, self._base_m = time_s, height_m
         self._astray_m = self._compared_s = 0.0
+        self._lifts_m = []
         return True
 
     def _may_begin(self, time_s: float, height_m: float, neighbours: Sequence[Neighbour]) -> bool:

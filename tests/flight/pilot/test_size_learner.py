@@ -298,12 +298,17 @@ class Weaving:
     wanted_m: float | None = HEIGHT_M
     neighbours: Sequence[Neighbour] = ()
     hill_m: float = 0.0
-    follows: bool = True
-    """Whether the drone goes to the height that is asked for, 1 m/s for each metre."""
+    gain_per_s: float = 1.0
+    """How fast the drone goes to the height that is asked for, m/s for each metre; 0: it stays."""
 
     def __post_init__(self) -> None:
         self._weave, self._random = Weave(drone().safety.gate), np.random.default_rng(0)
         self._time_s = 0.0
+
+    @property
+    def given_up(self) -> str | None:
+        """Why it weaves no more."""
+        return self._weave.given_up
 
     def asked(self, duration_s: float, *, needed: bool = True) -> FloatArray:
         """What is asked for, less what the mission wants."""
@@ -319,8 +324,8 @@ class Weaving:
                 needed=needed,
             )
             lifts.append(math.nan if height_m is None else height_m - HEIGHT_M)
-            if height_m is not None and self.follows and abs(height_m - HEIGHT_M) < 0.5:
-                self.height_m += (height_m - self.height_m) * (1 - math.exp(-STEP_S))
+            if height_m is not None and abs(height_m - HEIGHT_M) < 0.5:
+                self.height_m += (height_m - self.height_m) * (1 - math.exp(-self.gain_per_s * STEP_S))
             self._time_s += STEP_S
         return np.array(lifts)
 
@@ -356,7 +361,7 @@ def test_it_goes_up_and_down_twice_and_ends_where_it_began() -> None:
 )
 def test_it_does_not_begin(height_m: float, neighbours: Sequence[Neighbour], hill_m: float) -> None:
     wanted_m = HEIGHT_M if height_m == 5.0 else height_m
-    weaving = Weaving(height_m, wanted_m, neighbours, hill_m, follows=False)
+    weaving = Weaving(height_m, wanted_m, neighbours, hill_m, gain_per_s=0.0)
     assert (np.diff(weaving.asked(60.0)) == 0.0).all()
 
 
@@ -366,9 +371,25 @@ def test_it_does_not_begin_while_nothing_is_to_be_learned() -> None:
 
 def test_a_weave_that_the_drone_does_not_follow_ends() -> None:
     """A gate holds it between two others: who sees the little that it moves would take it for large."""
-    lifts = Weaving(follows=False).asked(30.0)
+    lifts = Weaving(gain_per_s=0.0).asked(30.0)
     begins = np.flatnonzero(lifts)[0]
     assert (lifts[begins + 7 : begins + 12] == 0.0).all(), "from 3.5 s on, when it should go down"
+
+
+@pytest.mark.parametrize(("gain_per_s", "weaves"), [(0.6, 2), (1.0, 5), (4.0, 2)])
+def test_an_autopilot_that_follows_heights_otherwise_weaves_twice_in_vain(gain_per_s: float, weaves: int) -> None:
+    """It moves by 63 and 118 % of what the others reckon with; each weave is ended after its first 6 s."""
+    weaving = Weaving(gain_per_s=gain_per_s)
+    lifts = weaving.asked(90.0)
+    began = np.flatnonzero((lifts != 0.0) & (np.roll(lifts, 1) == 0.0) & (np.roll(lifts, 2) == 0.0))
+    if weaves == 2:
+        assert len(began) == 2
+        assert np.count_nonzero(lifts) <= 2 * PERIOD_S / STEP_S
+        assert "weaves no more" in (weaving.given_up or "")
+        assert "MPC_Z_P" in (weaving.given_up or "")
+    else:
+        assert len(began) >= 4
+        assert weaving.given_up is None
 
 
 @pytest.mark.parametrize("what", ["the mission's height changes", "it is needed no more"])
