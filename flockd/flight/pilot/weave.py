@@ -71,7 +71,7 @@ class Weave:
         if len(self._unlike) < 2 or abs(self._unlike[-1] - self._unlike[-2]) > _ALIKE:
             return None
         return (
-            f"weave: the drone rises and sinks by {self._unlike[-1]:.0%} of what others reckon with; it weaves no more; "
+            f"weave: the drone rises and sinks by {self._unlike[-1]:.0%} of what it should, and weaves no more; "
             "its autopilot should follow heights as theirs do (PX4: MPC_Z_P 1.0)"
         )
 
