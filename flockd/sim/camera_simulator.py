@@ -74,7 +74,7 @@ class CameraSimulator:
     def begin_again(self) -> None:
         """For another flight from the beginning in the same world."""
         scenario, self._real = self._scenario, None
-        self._noise = _ImageNoise(self._image_noise, scenario.seed)
+        self._noise = ImageNoise(self._image_noise, scenario.seed)
         self._faults = CameraFaults(scenario.faults, scenario.seed)
         self._captured = PoseTrail()
         if scenario.cameras is not None:
@@ -188,7 +188,7 @@ def field_grid(extent_m: float) -> FloatArray:
     return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
 
 
-class _ImageNoise:
+class ImageNoise:
     """Noise that differs from image to image: a seeded crop of one large tile of normal noise."""
 
     def __init__(self, sigma: float, seed: int) -> None:
@@ -196,12 +196,15 @@ class _ImageNoise:
         self._tile = sigma * self._rng.standard_normal((1031, 1033, 3), dtype=np.float32) if sigma > 0 else None
 
     def add(self, image: UInt8Array) -> UInt8Array:
+        """The image (h, w, 3) with it."""
         if self._tile is None:
             return image
-        height, width = image.shape[:2]
-        top = int(self._rng.integers(self._tile.shape[0] - height))
-        left = int(self._rng.integers(self._tile.shape[1] - width))
+        (height, width), (tall, wide) = image.shape[:2], self._tile.shape[:2]
+        top = int(self._rng.integers(max(tall - height, 1)))
+        left = int(self._rng.integers(max(wide - width, 1)))
         noise = self._tile[top : top + height, left : left + width]
+        if noise.shape != image.shape:
+            noise = np.resize(self._tile, image.shape)
         return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), dtype=np.uint8)
 
 

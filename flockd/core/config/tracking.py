@@ -71,9 +71,9 @@ class TrackingParameters(Section):
     drone_probability_memory_s: Duration = 5.0
     """Time constant of the average of the network's drone probabilities over a track; its existence probability is
     multiplied by it."""
-    confirm_hits: Annotated[int, Field(ge=1)] = 3
+    confirm_hits: Annotated[int, Field(ge=1)] = 2
     """No track is confirmed with fewer detections that agree with it, after the first each by `evidence_interval_s`."""
-    vague_factor: Annotated[float, Field(ge=1)] = 4.0
+    vague_factor: Annotated[float, Field(ge=1)] = 2.0
     """A detection whose range is less certain than that of confirmed neighbours usually is, by more than this factor,
     counts as fewer, in proportion: what is no drone is seldom seen well."""
     confirm_sigma: Positive = 3.6

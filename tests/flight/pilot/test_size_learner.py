@@ -208,7 +208,7 @@ def test_a_drone_that_knows_the_size_weaves_once_for_the_others(monkeypatch: pyt
 @pytest.mark.parametrize(("doubt", "least", "most"), [(0.3, 0.15, 0.2), (0.03, 0.0, 0.1)])
 def test_the_gate_reckons_with_what_a_judged_size_may_be_off(doubt: float, least: float, most: float) -> None:
     """Of drones that the networks do not know, as long as nothing was learned. It lasts, and does not average out."""
-    last = Flight(drone("auto"), doubt=doubt).fly(5.0)[-1]
+    last = Flight(drone("auto"), doubt=doubt).fly(4.0)[-1]
     assert last.size is None or not last.size.used
     for one in last.neighbours:
         assert one.possible

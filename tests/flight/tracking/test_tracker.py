@@ -125,7 +125,7 @@ def test_existence_depends_on_time_and_not_on_the_rate_of_frame_sets() -> None:
 def test_what_is_seen_ten_times_a_second_is_confirmed_after_the_same_time() -> None:
     """Three detections half a second apart: by 1 s. At ten steps a second 0.2 s were enough before."""
     for step_s in (0.5, 0.1):
-        tracker, confirmed_s = Tracker(TrackingParameters()), math.nan
+        tracker, confirmed_s = Tracker(TrackingParameters(confirm_hits=3)), math.nan
         for k in range(round(3.0 / step_s)):
             tracker.predict(step_s, np.zeros(3))
             tracker.update(k * step_s, [_seen(AHEAD)])
@@ -172,7 +172,7 @@ def test_a_track_where_the_rig_is_blind_is_as_probable_as_before_but_ages(blind_
 
 
 def test_a_prediction_is_where_the_flock_mate_flies_to() -> None:
-    tracker = Tracker(TrackingParameters())
+    tracker = Tracker(TrackingParameters(confirm_hits=3))
     for k in range(2):
         _step(tracker, k * STEP_S, AHEAD + np.array((0.1 * k, 0.0, 0.0)), sigma_m=0.01)
     assert tracker.predictions(STEP_S, CRUISE) == ()  # not confirmed yet
@@ -224,7 +224,7 @@ def test_confirmation_takes_the_number_of_hits_asked_for() -> None:
 
 def test_a_detection_that_contradicts_a_track_does_not_confirm_it() -> None:
     """A third detection within the gate, at half the size and half the range as the track has it, but not near."""
-    tracker = Tracker(TrackingParameters())
+    tracker = Tracker(TrackingParameters(confirm_hits=3))
     _step(tracker, 0.0, AHEAD, sigma_m=0.5)
     _step(tracker, STEP_S, AHEAD, sigma_m=0.5)
     tracker.predict(STEP_S, CRUISE * STEP_S)
