@@ -98,7 +98,7 @@ def test_track_your_own_detections(tmp_path: Path) -> None:
     *steps, end = printed(TRACK, tmp_path)
     confirmed = [numbers(line) for line in steps if line.endswith(", confirmed")]
     assert {track for _, track, *_ in confirmed} == {1}
-    assert [time_s for time_s, *_ in confirmed] == [1.0 + 0.5 * step for step in range(8)]
+    assert [time_s for time_s, *_ in confirmed] == [0.5 + 0.5 * step for step in range(9)]
     for time_s, _, north, east in confirmed:
         assert (north, east) == pytest.approx((6.0, 0.8 * time_s), abs=0.1)
     assert next(numbers(line)[0] for line in steps if "track 2" in line) == 2.0
