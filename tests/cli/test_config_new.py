@@ -33,6 +33,23 @@ def test_a_drone_has_its_cameras_evenly_around(tmp_path: Path) -> None:
     assert (drone.name, drone.mission.kind) == ("kite", "follow")
 
 
+@pytest.mark.parametrize(("size", "turn_deg"), [("480x640", 90), ("640x480", 0)])
+def test_images_that_are_higher_than_wide_are_of_cameras_on_their_sides(
+    tmp_path: Path, size: str, turn_deg: int
+) -> None:
+    usb, other = tmp_path / "usb.yaml", tmp_path / "other.yaml"
+    assert main(["config", "new", "drone", str(usb), "--size", size, "--defaults"]) == 0
+    drone = load_drone(usb)
+    assert drone.source is not None
+    assert {camera.turn_deg for camera in drone.source.cameras} == {turn_deg}
+    # 320 px at 65 degrees of an equidistant lens, along the longer side: r = f theta.
+    assert drone.rig.cameras[0].intrinsics.fx == pytest.approx(320 / 1.1344640, abs=0.05)
+    assert main(["config", "new", "drone", str(other), "--size", size, "--source", "gstreamer", "--defaults"]) == 0
+    pipelines = load_drone(other).source
+    assert pipelines is not None
+    assert all(("flip-method=3" in (camera.pipeline or "")) is (turn_deg == 90) for camera in pipelines.cameras)
+
+
 @pytest.mark.parametrize("shipped", [True, False], ids=["shipped", "new"])
 def test_a_real_drone_hovers_at_a_metre_per_second_at_most_until_its_owner_says_otherwise(
     shipped: bool, tmp_path: Path
