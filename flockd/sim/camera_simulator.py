@@ -204,7 +204,8 @@ class ImageNoise:
         left = int(self._rng.integers(max(wide - width, 1)))
         noise = self._tile[top : top + height, left : left + width]
         if noise.shape != image.shape:
-            noise = np.resize(self._tile, image.shape)
+            rows, columns = np.arange(top, top + height) % tall, np.arange(left, left + width) % wide
+            noise = self._tile[rows[:, None], columns]
         return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), dtype=np.uint8)
 
 

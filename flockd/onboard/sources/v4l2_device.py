@@ -140,9 +140,10 @@ class V4l2Device(CameraDevice):
             self._kernel.ioctl(self._descriptor, VIDIOC_S_FMT, asked)
         if (asked.width, asked.height) != size or asked.pixelformat != FOURCC[pixel_format]:
             offered = int(asked.pixelformat).to_bytes(4, "little").decode("ascii", "replace")
+            smaller = f", or write a smaller reduce than {self._reduce}" if self._reduce > 1 else ""
             raise CameraError(
                 f"{self._who} offers {asked.width}x{asked.height} {offered} instead of {size[0]}x{size[1]} "
-                f"{pixel_format}; choose from what `v4l2-ctl --list-formats-ext` lists"
+                f"{pixel_format}; choose from what `v4l2-ctl --list-formats-ext` lists{smaller}"
             )
         self._bytes_per_line = int(asked.bytesperline) or 2 * size[0]
 

@@ -385,6 +385,12 @@ def test_an_error_of_the_stream_closes_the_camera_and_opens_it_again(start: Star
             "choose from what `v4l2-ctl --list-formats-ext` lists",
         ),
         (
+            FakeCamera(formats=((640, 480, b"MJPG"),)),
+            {"reduce": 2},
+            "front: /dev/front offers 640x480 MJPG instead of 1280x960 mjpeg; "
+            "choose from what `v4l2-ctl --list-formats-ext` lists, or write a smaller reduce than 2",
+        ),
+        (
             FakeCamera(),
             {"rate_hz": 60.0},
             "front: /dev/front runs at 30 instead of 60 images a second; write rate_hz: 30",
@@ -416,7 +422,7 @@ def test_an_error_of_the_stream_closes_the_camera_and_opens_it_again(start: Star
             "front: /dev/front makes 32 of gain 40; write a value it can keep",
         ),
     ],
-    ids=["size", "rate", "metadata", "no such control", "range", "automatic on", "step"],
+    ids=["size", "size to reduce", "rate", "metadata", "no such control", "range", "automatic on", "step"],
 )
 def test_what_the_camera_cannot_do_is_said_in_one_sentence(
     start: Start, camera: FakeCamera, asked: dict[str, Any], sentence: str
