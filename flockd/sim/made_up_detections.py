@@ -29,7 +29,7 @@ class TrackedNeighbours:
     ) -> tuple[Neighbour, ...]:  # fmt: skip
         """With all drones at (n, 3) m and (n, 3) m/s in NED, and the drone's own heading; called once a step.
 
-        In the view of a camera that has a fault or is off nobody is detected.
+        Nobody is detected but in the view of a camera that has no fault and is on.
         """
         here = positions[self._drone]
         if self._position is not None:
@@ -40,12 +40,11 @@ class TrackedNeighbours:
         gone = lost_cameras(self._scenario, self._drone, time_s) | cameras_off
         R_ned_body = rotation_from_euler(0.0, 0.0, yaw_rad)
 
-        def blind(places: FloatArray) -> BoolArray:
-            return self._rig.hidden(places @ R_ned_body, gone)
+        def shown(places: FloatArray, radius_m: float) -> BoolArray:
+            return self._rig.shows(places @ R_ned_body, radius_m, gone)
 
-        if gone:
-            found = [one for one in found if not blind(one.position[None])[0]]
-        self._tracker.update(time_s, found, velocities[self._drone], blind if gone else None)
+        found = [one for one in found if shown(one.position[None], 0.0)[0]]
+        self._tracker.update(time_s, found, velocities[self._drone], shown)
         return self._tracker.neighbours()
 
     def _detection(self, offset: FloatArray) -> Measurement | None:

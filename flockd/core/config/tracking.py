@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 from pydantic import Field, model_validator
 
 from flockd.core.config.base import Duration, Positive, Section
+
+_ROUNDING = 1e-9
 
 Probability = Annotated[float, Field(gt=0, lt=1)]
 
@@ -86,7 +89,12 @@ class TrackingParameters(Section):
     drop_probability: Probability = 0.1
     """A track is dropped when its existence probability falls below this."""
     max_unseen_s: Duration = 1.5
-    """A track without a detection for longer is dropped whatever its existence probability."""
+    """A track that should have been in view for longer without a detection is dropped whatever its existence
+    probability. A confirmed neighbour that leaves the cameras' view, as above or below, is remembered until then."""
+
+    def confirm_steps(self, step_s: float) -> int:
+        """With which step, at the earliest, a neighbour is confirmed that all steps of `step_s` show."""
+        return 1 + (self.confirm_hits - 1) * math.ceil(self.evidence_interval_s / step_s - _ROUNDING)
 
     @model_validator(mode="after")
     def _ordered(self) -> TrackingParameters:

@@ -66,12 +66,19 @@ class Rig:
 
     def hidden(self, points_body: FloatArray, gone: Set[str]) -> BoolArray:
         """Mask (n,): which body points (n, 3) only cameras that are `gone` would show."""
-        shown = {name: np.isfinite(uv).all(axis=1) for name, uv in self.pixels_of(points_body).items()}
-        nobody = np.zeros(len(points_body), dtype=np.bool_)
-        of_gone = np.any([nobody, *(mask for name, mask in shown.items() if name in gone)], axis=0)
-        of_others = np.any([nobody, *(mask for name, mask in shown.items() if name not in gone)], axis=0)
-        hidden: BoolArray = of_gone & ~of_others
+        hidden: BoolArray = self.shows(points_body) & ~self.shows(points_body, without=gone)
         return hidden
+
+    def shows(self, points_body: FloatArray, radius_m: float = 0.0, without: Set[str] = frozenset()) -> BoolArray:
+        """Mask (n,): around which body points (n, 3) any camera but those named images all within `radius_m`."""
+        shown = np.zeros(len(points_body), dtype=np.bool_)
+        for name in self.cameras.keys() - without:
+            camera = self.cameras[name]
+            sides = radius_m * camera.T_body_camera.rotation[:, :2].T  # its right and down
+            around = points_body[:, None] + (np.concatenate([sides, -sides]) if radius_m else np.zeros((1, 3)))
+            uv = camera.pixels_of_points(around.reshape(-1, 3)).reshape(len(points_body), -1, 2)
+            shown |= np.isfinite(uv).all(axis=(1, 2))
+        return shown
 
 
 def build_rig(config: RigConfig) -> Rig:

@@ -41,7 +41,7 @@ from flockd.flight.pilot.ground import GroundFilter, scaled_by_ground
 from flockd.flight.pilot.motions import background_pairs, neighbour_motions
 from flockd.flight.pilot.size_learner import SizeLearner
 from flockd.flight.pilot.trim import VelocityTrim
-from flockd.flight.tracking import Blind, Measurement, Prediction, Tracker
+from flockd.flight.tracking import Measurement, Prediction, Shown, Tracker
 
 RIG_EVERY_S = 5.0
 """An output in so many seconds says what is known of the rig: it changes slowly, and is long."""
@@ -330,7 +330,7 @@ class FlockPilot:
             displacement = None if ego is None else _displacement(observation, ego)
             sigma_m = self._config.geometry.own_displacement_sigma_m
             self._tracker.predict(observation.interval_s, displacement, sigma_m)
-        return self._tracker.update(observation.time_s, measurements, velocity, self._blind(observation))
+        return self._tracker.update(observation.time_s, measurements, velocity, self._shown(observation))
 
     def _with_sizes(
         self,
@@ -373,14 +373,11 @@ class FlockPilot:
         ranges = observation.obstacles or self._ranging.ranges(observation, ego, ground)
         return self._map.step(observation.time_s, ranges, displacement, sigma_m)
 
-    def _blind(self, observation: Observation) -> Blind | None:
-        """Where only cameras point that gave nothing in this step; None: they all did."""
+    def _shown(self, observation: Observation) -> Shown:
+        """Tells who is wholly in view of a camera that gave an image in this step."""
         gone = self._rig.cameras.keys() - observation.cameras.keys()
-        if not gone:
-            return None
-
         R_ned_body = observation.vehicle.R_ned_body
-        return lambda places: self._rig.hidden(places @ R_ned_body, gone)  # row by row R^T p: into the body
+        return lambda places, radius_m: self._rig.shows(places @ R_ned_body, radius_m, gone)  # rows R^T p: in the body
 
     def _command(
         self,

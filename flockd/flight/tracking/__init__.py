@@ -4,6 +4,6 @@ from __future__ import annotations
 
 from flockd.core.config.tracking import TrackingParameters
 from flockd.flight.tracking.measurement import Measurement, looks_alike
-from flockd.flight.tracking.tracker import Blind, Prediction, Tracker
+from flockd.flight.tracking.tracker import Prediction, Shown, Tracker
 
-__all__ = ["Blind", "Measurement", "Prediction", "Tracker", "TrackingParameters", "looks_alike"]
+__all__ = ["Measurement", "Prediction", "Shown", "Tracker", "TrackingParameters", "looks_alike"]

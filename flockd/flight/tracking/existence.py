@@ -18,9 +18,9 @@ def predicted(probability: float, interval_s: float, parameters: TrackingParamet
     return probability * math.exp(-interval_s / parameters.survival_time_s)
 
 
-def missed(probability: float, weight: float, parameters: TrackingParameters) -> float:
-    """After a frame set without a detection of the track, where the cameras could have shown it."""
-    return _bayes(probability, weight * math.log(1.0 - parameters.detection_probability))
+def missed(probability: float, in_view: float, weight: float, parameters: TrackingParameters) -> float:
+    """After a frame set without a detection of the track, which the cameras show with the probability `in_view`."""
+    return _bayes(probability, weight * math.log(1.0 - in_view * parameters.detection_probability))
 
 
 def detected(probability: float, innovation: Innovation, weight: float, parameters: TrackingParameters) -> float:

@@ -19,12 +19,17 @@ from flockd.flight.tracking.measurement import Measurement, looks_alike
 
 _OF_USUAL = 0.02
 """The share of one detection in what is usual: that of the last fifty."""
+_ROUNDING_S = 1e-9
 _SUREST, _LEAST_VARIANCE = 0.01, 1e-12
 """No usual standard deviation counts as smaller, or a network that is too sure of one neighbour would keep others from
 being confirmed; and no variance, whose logarithm is taken, is."""
 
-Blind = Callable[[FloatArray], BoolArray]
-"""Tells which (n,) of the positions (n, 3), metres NED from the own drone, no camera could show at this time."""
+Shown = Callable[[FloatArray, float], BoolArray]
+"""Tells around which (n,) of the positions (n, 3), metres NED from the own drone, a camera shows all within a radius in
+metres at this time."""
+_SIGMA_POINTS = math.sqrt(3) * np.concatenate([np.eye(3), -np.eye(3)])
+"""(6, 3) points that stand for three independent standard normal numbers (S. Julier, J. Uhlmann, "Unscented filtering
+and nonlinear estimation", 2004), all of one weight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,12 +87,14 @@ class Tracker:
         time_s: float,
         measurements: Sequence[Measurement],
         own_velocity: FloatArray | None = None,
-        blind: Blind | None = None,
+        shown: Shown | None = None,
     ) -> tuple[int, ...]:
         """Take in one frame set's measurements at `time_s`; the track number of each, new where it fits no track.
 
-        `own_velocity` (3,) NED m/s is what flock mates start with, as they move alike (`Hypotheses`). A track that is
-        missed where the rig is `blind` (None: nowhere) is as probable as before, but ages as any other.
+        `own_velocity` (3,) NED m/s is what flock mates start with, as they move alike (`Hypotheses`). `shown` (None:
+        everything is) is what the cameras could see. A confirmed neighbour that leaves their view is as probable as
+        before and does not age, but for the share of its possible places that they see: it is remembered until it
+        should have come into view again.
         """
         interval_s = max(0.0, time_s - self._time_s)
         weight = min(1.0, interval_s / self.parameters.evidence_interval_s)
@@ -95,7 +102,7 @@ class Tracker:
         known = [track.known_size_m for track in self._tracks]
         pairs = assign(measurements, [track.hypotheses for track in self._tracks], self.parameters, known)
         missed = self._without({column for column, _ in pairs.values()})
-        self._miss(missed, weight, blind)
+        self._miss(missed, interval_s, weight, shown)
         numbers = []
         for index, measurement in enumerate(measurements):
             if index in pairs:
@@ -172,12 +179,11 @@ class Tracker:
     def _without(self, assigned: set[int]) -> list[_Track]:
         return [track for index, track in enumerate(self._tracks) if index not in assigned]
 
-    def _miss(self, tracks: Sequence[_Track], weight: float, blind: Blind | None) -> None:
-        if blind is not None and tracks:
-            hidden = blind(np.array([track.state.position for track in tracks]))
-            tracks = [track for track, one in zip(tracks, hidden, strict=True) if not one]
+    def _miss(self, tracks: Sequence[_Track], interval_s: float, weight: float, shown: Shown | None) -> None:
         for track in tracks:
-            track.existence = existence.missed(track.existence, weight, self.parameters)
+            in_view = 1.0 if shown is None or not track.was_confirmed else _probability_in_view(track.state, shown)
+            track.existence = existence.missed(track.existence, in_view, weight, self.parameters)
+            track.missing_s += in_view * interval_s
 
     def _detect(self, track: _Track, measurement: Measurement, innovation: Innovation, weight: float) -> None:
         interval_s = max(0.0, self._time_s - track.last_seen_s)
@@ -193,7 +199,7 @@ class Tracker:
             track.drone_probability, measurement.drone_probability, track.hits, interval_s, self.parameters
         )
         track.hypotheses = track.hypotheses.updated(measurement, self.parameters)
-        track.last_seen_s = self._time_s
+        track.last_seen_s, track.missing_s = self._time_s, 0.0
 
     def _share(self, measurement: Measurement) -> float:
         """As how much of a detection one counts."""
@@ -238,8 +244,16 @@ class Tracker:
         track.was_confirmed |= track.confirmed
 
     def _is_kept(self, track: _Track) -> bool:
-        unseen_s = self._time_s - track.last_seen_s
-        return unseen_s <= self.parameters.max_unseen_s and track.existence >= self.parameters.drop_probability
+        return (
+            track.missing_s <= self.parameters.max_unseen_s + _ROUNDING_S
+            and track.existence >= self.parameters.drop_probability
+        )
+
+
+def _probability_in_view(state: State, shown: Shown) -> float:
+    """That a camera shows all of the neighbour, wherever it is: one that the border cuts is often missed."""
+    root = np.linalg.cholesky(state.position_covariance)
+    return float(shown(state.position + _SIGMA_POINTS @ root.T, state.size_m / 2).mean())
 
 
 def _log_sigma(measurement: Measurement) -> float:
@@ -262,6 +276,8 @@ class _Track:
     agreed: float
     """How many of the hits were within `confirm_sigma`, as far as they are independent evidence and certain."""
     hits: int = 1
+    missing_s: float = 0.0
+    """How long it should have been in view since it was last detected, and was not."""
     agrees: bool = True
     """Whether the last one was."""
     confirmed: bool = False

@@ -64,7 +64,7 @@ class Control:
         self._input_collector, self._requests, self._history = input_collector, requests, history
         self._operator, self._on_tick, self._clock = operator, on_tick, clock
         self._supervisor = Supervisor(config.safety)
-        self._first_steps = max(2, config.tracking.confirm_hits)
+        self._first_steps = max(2, config.tracking.confirm_steps(config.step_s))
         self._height_m = math.nan
         self._yaw_rad = math.nan
         self._flight = 0

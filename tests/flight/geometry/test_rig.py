@@ -88,6 +88,27 @@ def test_a_point_lands_in_the_cameras_that_see_it_with_their_lever_arms() -> Non
     assert np.isnan(pixels["right"][0]).all()  # ahead of that camera, but outside its image
 
 
+def test_all_of_a_drone_is_shown_where_one_camera_images_all_of_it() -> None:
+    """The front camera's image ends 47.2 degrees to the right of ahead and the right one's begins at 42.8; a drone of
+    0.3 m radius 3 m away is 11.5 degrees wide.
+    """
+    rig = four_camera_rig()
+
+    def shown(right_deg: float, down_deg: float, radius_m: float, without: frozenset[str] = frozenset()) -> bool:
+        right, down = np.radians([right_deg, down_deg])
+        there = [[np.cos(down) * np.cos(right), np.cos(down) * np.sin(right), np.sin(down)]]
+        return bool(rig.shows(3.0 * np.array(there), radius_m, without)[0])
+
+    assert shown(30.0, 0.0, 0.3)
+    assert shown(45.0, 0.0, 0.0)
+    assert not shown(45.0, 0.0, 0.3), "each of two cameras shows a part of it"
+    assert shown(0.0, 47.0, 0.3)
+    assert not shown(0.0, 53.0, 0.3)
+    assert shown(0.0, 53.0, 0.0)
+    assert not shown(30.0, 0.0, 0.0, frozenset({"front"}))
+    assert shown(45.0, 0.0, 0.0, frozenset({"front"}))
+
+
 def test_a_rig_without_cameras_or_with_a_misfiled_one_is_refused() -> None:
     camera = four_camera_rig().cameras["front"]
     with pytest.raises(ValueError, match="at least one"):

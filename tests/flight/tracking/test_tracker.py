@@ -14,7 +14,7 @@ from flockd.core.messages import Detection, Neighbour
 from flockd.flight.geometry import log_polar, log_polar_covariance, rotation_from_euler
 from flockd.flight.safety.approach import towards_neighbours
 from flockd.flight.safety.surroundings import surroundings
-from flockd.flight.tracking import Measurement, Tracker, TrackingParameters
+from flockd.flight.tracking import Measurement, Shown, Tracker, TrackingParameters
 
 Array = NDArray[np.float64]
 STEP_S = 0.5
@@ -147,28 +147,57 @@ def test_dense_clutter_makes_a_detection_say_less() -> None:
     assert probability[1e5] < 0.5
 
 
-@pytest.mark.parametrize("blind_ahead", [False, True])
-def test_a_track_where_the_rig_is_blind_is_as_probable_as_before_but_ages(blind_ahead: bool) -> None:
+def _missed(tracker: Tracker, first: int, last: int, shown: Shown) -> list[float]:
+    """The existence probability of the one neighbour after each step without a detection, while it is known."""
+    found = []
+    for k in range(first, last):
+        tracker.predict(STEP_S, CRUISE * STEP_S)
+        tracker.update(k * STEP_S, [], CRUISE, shown)
+        found += [neighbour.existence_probability for neighbour in tracker.neighbours()]
+    return found
+
+
+@pytest.mark.parametrize("seen_ahead", [True, False])
+def test_a_neighbour_out_of_view_is_as_probable_as_before_and_is_remembered(seen_ahead: bool) -> None:
     tracker = Tracker(TrackingParameters(max_unseen_s=1.5, survival_time_s=3600.0))
-    for k in range(3):
+    for k in range(4):
         _step(tracker, k * STEP_S, AHEAD)
     (before,) = tracker.neighbours()
 
-    def blind(places: Array) -> NDArray[np.bool_]:
-        assert places.shape == (1, 3)
-        hidden: NDArray[np.bool_] = (places[:, 0] > 0.0) == blind_ahead
-        return hidden
+    def shown(places: Array, radius_m: float) -> NDArray[np.bool_]:
+        seen: NDArray[np.bool_] = (places[:, 0] > 0.0) == seen_ahead
+        return seen
 
-    found = []
-    for k in range(3, 7):
-        tracker.predict(STEP_S, CRUISE * STEP_S)
-        tracker.update(k * STEP_S, [], CRUISE, blind)
-        found += [neighbour.existence_probability for neighbour in tracker.neighbours()]
-    assert len(found) == 3, "after 1.5 s it is gone, however blind"
-    if blind_ahead:
-        assert found == pytest.approx([before.existence_probability] * 3, abs=5e-4)
-    else:
+    found = _missed(tracker, 4, 8, shown)
+    if seen_ahead:
+        assert len(found) == 3, "after 1.5 s it is gone"
         assert found[2] < found[1] < found[0] < before.existence_probability
+    else:
+        assert found == pytest.approx([before.existence_probability] * 4, abs=1e-3)
+        _step(tracker, 8 * STEP_S, AHEAD)
+        (again,) = tracker.neighbours()
+        assert again.track == before.track and again.confirmed
+
+
+def test_who_is_out_of_view_is_forgotten_when_it_should_have_come_back() -> None:
+    """Most of its possible places grow to be in view, beyond a border 1 m behind where it was last seen."""
+    tracker = Tracker(TrackingParameters(max_unseen_s=1.5, survival_time_s=3600.0))
+    for k in range(4):
+        _step(tracker, k * STEP_S, AHEAD)
+
+    def shown(places: Array, radius_m: float) -> NDArray[np.bool_]:
+        seen: NDArray[np.bool_] = np.abs(places[:, 0] - AHEAD[0]) > 1.0
+        return seen
+
+    found = _missed(tracker, 4, 60, shown)
+    assert 4 < len(found) < 50
+    assert found[-1] < found[0]
+
+
+def test_one_that_was_never_confirmed_is_not_remembered_out_of_view() -> None:
+    tracker = Tracker(TrackingParameters(max_unseen_s=1.5, survival_time_s=3600.0))
+    _step(tracker, 0.0, AHEAD)
+    assert len(_missed(tracker, 1, 10, lambda places, radius_m: np.zeros(len(places), dtype=np.bool_))) <= 3
 
 
 def test_a_prediction_is_where_the_flock_mate_flies_to() -> None:
@@ -704,3 +733,16 @@ def test_a_drone_that_turns_out_larger_is_farther_and_faster_in_proportion() -> 
     assert after.position_sigma_m == pytest.approx(1.5 * before.position_sigma_m, rel=0.05)
     (prediction,) = tracker.predictions(STEP_S, CRUISE)
     assert prediction.size_m == pytest.approx(0.9)
+
+
+@pytest.mark.parametrize("step_s", [0.5, 0.1])
+@pytest.mark.parametrize("hits", [1, 2, 3])
+def test_the_parameters_say_with_which_step_a_neighbour_is_confirmed(step_s: float, hits: int) -> None:
+    tracker, k = Tracker(TrackingParameters(confirm_hits=hits)), 0
+    while not _confirmed(tracker) and k < 50:
+        if k:
+            tracker.predict(step_s, CRUISE * step_s)
+        tracker.update(k * step_s, [_seen(AHEAD)], CRUISE)
+        k += 1
+    assert k >= tracker.parameters.confirm_steps(step_s) == {0.5: hits, 0.1: 1 + 5 * (hits - 1)}[step_s]
+    assert k <= tracker.parameters.confirm_steps(step_s) + 1
