@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -90,18 +91,23 @@ class ExactFlock:
         seen = [one for one in known if one.confirmed]
         places = np.reshape([one.position for one in seen], (len(seen), 3))
         others = np.reshape([one.velocity for one in seen], (len(seen), 3))[:, :2]
+        ages_s = np.array([one.age_s for one in seen]) if self._tracked else math.inf
         order = self._newest_order(i, time_s)
         guidance = pilot.step(Moment(time_s, here[i], middle_of(places[:, :2]), np.array(REFERENCE_DEG), order=order))
         desired = pilot.pull(guidance)
         if ranges is None or not self._avoids:
             if self._passes:
                 command, acceleration = passing.command(
-                    self._law, moving[i], places, others, desired, self._step_s, self._vertical_m
+                    self._law, moving[i], places, others, desired, self._step_s, self._vertical_m, ages_s
                 )
             else:
-                command, acceleration = self._law.command(moving[i], places[:, :2], others, desired, self._step_s)
+                command, acceleration = self._law.command(
+                    moving[i], places[:, :2], others, desired, self._step_s, ages_s
+                )
         else:
-            command, acceleration = self._avoidances[i].command(self._law, moving[i], places, others, desired, ranges)
+            command, acceleration = self._avoidances[i].command(
+                self._law, moving[i], places, others, desired, ranges, ages_s
+            )
         yaw_rad = float(self._yaw_rad[i]) if guidance.course_rad is None else guidance.course_rad
         height_m = np.nan if guidance.height_m is None else guidance.height_m
         return command, acceleration, yaw_rad, height_m, pilot.status(guidance), desired

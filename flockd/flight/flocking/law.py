@@ -25,13 +25,19 @@ class FlockingLaw:
         self.parameters = parameters or FlockingParameters()
 
     def acceleration(
-        self, velocity: ArrayLike, positions: ArrayLike, velocities: ArrayLike, desired_velocity: ArrayLike
+        self,
+        velocity: ArrayLike,
+        positions: ArrayLike,
+        velocities: ArrayLike,
+        desired_velocity: ArrayLike,
+        ages_s: ArrayLike = math.inf,
     ) -> FloatArray:
         """U of Eq. 38: (2,) m/s^2, not limited.
 
         All arguments are level, north and east. `velocity` (2,) is the own one over ground; `positions` (n, 2) metres
         are the neighbours' relative to the own drone (Q_j - Q_i); `velocities` (n, 2) theirs over ground;
-        `desired_velocity` (2,) is efv of Eq. 42. n may be 0. A neighbour at no distance pushes to the south, as one
+        `desired_velocity` (2,) is efv of Eq. 42. `ages_s` (n,), or one for all, says how long they have been seen:
+        see `FlockingParameters.cohesion_jerk_m_s3`. n may be 0. A neighbour at no distance pushes to the south, as one
         that sits 1 mm to the north; `level_offsets` keeps two drones from that. Raises ValueError for other shapes
         and for numbers that are not finite.
         """
@@ -43,12 +49,17 @@ class FlockingLaw:
         offsets = np.where(np.any(offsets != 0, axis=1, keepdims=True), offsets, [_MIN_DISTANCE_M, 0.0])
         distances = np.hypot(offsets[:, 0], offsets[:, 1])
         near = distances <= max(p.observation_distance_m, p.separation_distance_m)
+        ages = np.broadcast_to(np.asarray(ages_s, dtype=float), len(near))[near]
         offsets, theirs, distances = offsets[near], theirs[near], distances[near]
         directions = offsets / distances[:, None]
         distances = np.maximum(distances, _MIN_DISTANCE_M)
 
+        pull = p.cohesion * distances * np.log(distances / p.desired_distance_m)
         weights = influence_weights(p.weight, distances, distances <= p.observation_distance_m)
-        cohesion = p.cohesion * (weights * distances * np.log(distances / p.desired_distance_m)) @ directions  # Eq. 39
+        if p.cohesion_jerk_m_s3 is not None:
+            grown = p.cohesion_jerk_m_s3 * ages
+            weights *= np.where(pull > grown, grown / np.where(pull > 0, pull, 1.0), 1.0)
+        cohesion = weights * pull @ directions  # Eq. 39
         alignment = p.alignment * weights @ (theirs - own)  # Eq. 40
         crowding = np.maximum(1 / distances - 1 / p.separation_distance_m, 0.0)  # 0 beyond D_II
         separation = -p.separation * crowding**2 @ directions  # Eq. 41
@@ -57,14 +68,20 @@ class FlockingLaw:
         return u
 
     def command(
-        self, velocity: ArrayLike, positions: ArrayLike, velocities: ArrayLike, desired: ArrayLike, step_s: float
+        self,
+        velocity: ArrayLike,
+        positions: ArrayLike,
+        velocities: ArrayLike,
+        desired: ArrayLike,
+        step_s: float,
+        ages_s: ArrayLike = math.inf,
     ) -> tuple[FloatArray, FloatArray]:
         """The velocity to ask for, (2,) m/s, and the acceleration that leads there, (2,) m/s^2, both within limits.
 
         The acceleration's norm is limited first, then that of V + u * st. Arguments and errors as of `acceleration`;
         `step_s` is the sampling time st, which counts as `SAMPLING_TIME_S` where it is shorter.
         """
-        return self.limited(velocity, self.acceleration(velocity, positions, velocities, desired), step_s)
+        return self.limited(velocity, self.acceleration(velocity, positions, velocities, desired, ages_s), step_s)
 
     def limited(self, velocity: ArrayLike, acceleration: FloatArray, step_s: float) -> tuple[FloatArray, FloatArray]:
         """As `command`, for an acceleration (2,) m/s^2 without limits."""

@@ -33,12 +33,13 @@ def command(
     desired: FloatArray,
     step_s: float,
     vertical_m: float,
+    ages_s: FloatArray | float = math.inf,
 ) -> tuple[FloatArray, FloatArray]:
     """As of `FlockingLaw.command`, but clear of who would come too near; arguments as of `clear_of`.
 
     The acceleration, (2,) m/s^2, is the law's, or else the one that leads to the velocity within its sampling time.
     """
-    wanted, acceleration = law.command(velocity, level_offsets(offsets), velocities, desired, step_s)
+    wanted, acceleration = law.command(velocity, level_offsets(offsets), velocities, desired, step_s, ages_s)
     clear = clear_of(wanted, velocity, offsets, velocities, law.parameters, vertical_m)
     return clear, acceleration if clear is wanted else (clear - velocity) / lookahead_s(step_s)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from flockd.core.config.avoidance import ObstacleParameters
@@ -37,13 +39,14 @@ class Avoidance:
         velocities: FloatArray,
         desired: FloatArray,
         ranges: ObstacleRanges,
+        ages_s: FloatArray | float = math.inf,
     ) -> tuple[FloatArray, FloatArray]:
         """The velocity to ask for, (2,) m/s, and the acceleration that leads there, (2,) m/s^2.
 
         As of `FlockingLaw.command`, but `neighbours` are (n, 3) metres NED from the drone. Under the law the velocity
         tends to V + u: that one is steered around obstacles, and the one that the step leads to has to be safe.
         """
-        u = law.acceleration(velocity, level_offsets(neighbours), velocities, desired)
+        u = law.acceleration(velocity, level_offsets(neighbours), velocities, desired, ages_s)
         wanted = limit_norm(velocity + u, law.parameters.max_speed_m_s)
         flock = velocities.mean(axis=0) if len(velocities) else np.zeros(2)
         asked, _ = law.limited(velocity, self.steered(wanted, ranges, flock) - velocity, self._step_s)

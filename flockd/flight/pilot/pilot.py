@@ -392,6 +392,7 @@ class FlockPilot:
         seen = [n for n in neighbours if n.confirmed]
         places = np.array([n.position for n in seen]).reshape(-1, 3)
         velocities = np.array([n.velocity[:2] for n in seen]).reshape(-1, 2)
+        ages_s = np.array([n.age_s for n in seen])
         vehicle = observation.vehicle
         guidance = self._navigator.step(
             Moment(
@@ -409,10 +410,12 @@ class FlockPilot:
         if obstacles is None:
             vertical_m = self._config.safety.gate.vertical_separation_m
             command, acceleration = passing.command(
-                self._law, own, places, velocities, desired, self._config.step_s, vertical_m
+                self._law, own, places, velocities, desired, self._config.step_s, vertical_m, ages_s
             )
         else:
-            command, acceleration = self._avoidance.command(self._law, own, places, velocities, desired, obstacles)
+            command, acceleration = self._avoidance.command(
+                self._law, own, places, velocities, desired, obstacles, ages_s
+            )
         if self._config.yaw == "course" and guidance.course_rad is not None:
             self._yaw_rad = guidance.course_rad
         height_m = guidance.height_m

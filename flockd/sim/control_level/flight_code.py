@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,8 @@ class Seen(NamedTuple):
     """(k, 3) m, NED, from the drone."""
     velocities: FloatArray
     """(k, 3) m/s, NED, over ground."""
+    ages_s: FloatArray | float = math.inf
+    """(k,) for how long it has known them."""
 
 
 class FlightCode:
@@ -49,7 +52,7 @@ class FlightCode:
     ) -> FloatArray:
         """The velocity (2,) m/s that drone `i` at `velocity` (2,) asks for among obstacles; see `Avoidance`."""
         level = seen.velocities[:, :2]
-        return self._avoidances[i].command(self._law, velocity, seen.offsets, level, desired, ranges)[0]
+        return self._avoidances[i].command(self._law, velocity, seen.offsets, level, desired, ranges, seen.ages_s)[0]
 
     def clear(self, velocity: FloatArray, command: FloatArray, seen: Seen) -> FloatArray:
         """The velocity (2,) m/s that a drone at `velocity` (2,) asks for in open air instead of its `command` (2,)."""

@@ -176,7 +176,7 @@ class FlockFlights:
             flight, slot, *cells, table, figures, seeds[flight], step, reach, *self._room
         )  # fmt: skip
         known = self._room.seen[:count]
-        return Seen(known[:, [0, 1, 4]], np.column_stack([known[:, 2:4], known[:, 5]]))
+        return Seen(known[:, [0, 1, 4]], np.column_stack([known[:, 2:4], known[:, 5]]), known[:, 6])
 
     def perceive(self, step: int, pool: ThreadPoolExecutor | None = None, threads: int = 1) -> None:
         """What each drone sees of the others now, and what the law makes of it: `sums`."""

@@ -18,7 +18,7 @@ from flockd.sim.control_level.cells import column_of, row_of, slice_of_row
 
 MIN_DISTANCE_M = 1e-3
 """As in `flockd.flight.flocking.law`: nearer counts as this far."""
-COHESION, ALIGNMENT, SEPARATION, OBSERVATION_M, DESIRED_M, SEPARATION_M = range(6)
+COHESION, ALIGNMENT, SEPARATION, OBSERVATION_M, DESIRED_M, SEPARATION_M, JERK = range(7)
 """Where in the array of `law_figures`."""
 
 _LN2 = 0.6931471805599453
@@ -51,6 +51,7 @@ def law_figures(p: FlockingParameters) -> FloatArray:
         [
             p.cohesion, p.alignment, p.separation,
             p.observation_distance_m, p.desired_distance_m, p.separation_distance_m,
+            math.inf if p.cohesion_jerk_m_s3 is None else p.cohesion_jerk_m_s3,
         ]
     )  # fmt: skip
 

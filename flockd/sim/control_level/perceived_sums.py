@@ -20,6 +20,7 @@ from flockd.sim.control_level.cells import row_of, slice_of_row
 from flockd.sim.control_level.law_sums import (
     ALIGNMENT,
     COHESION,
+    JERK,
     MIN_DISTANCE_M,
     OBSERVATION_M,
     SEPARATION_M,
@@ -30,8 +31,8 @@ from flockd.sim.control_level.law_sums import (
 
 DISTANCE, MISSED, BIAS, RANGE, BEARING, VELOCITY = 0, 1, 2, 3, 5, 7
 """Columns of `by_distance`; an error takes two: of z and of z^3, for a normal number z."""
-RANGE_LIMIT, ELEVATION, HIDDEN, RADIUS, STRETCH, MISSED_STRETCH, OWN, OWN_STRETCH, FALSE, LIFETIME, FALSE_M = (
-    0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 11,
+RANGE_LIMIT, ELEVATION, HIDDEN, RADIUS, STRETCH, MISSED_STRETCH, OWN, OWN_STRETCH, FALSE, LIFETIME, FALSE_M, STEP_S = (
+    0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 11, 14,
 )  # fmt: skip
 """Entries of `constants`; `OWN` takes two, `FALSE_M` three."""
 _STRETCHES = 1.7
@@ -56,7 +57,7 @@ class Room(NamedTuple):
     @classmethod
     def of(cls, n: int) -> Self:
         """With room for all others and the false ones."""
-        return cls(np.empty(n, np.int64), np.empty(n), np.empty((n, 4)), np.empty((n + MOST_FALSE, 6)), np.empty(2))
+        return cls(np.empty(n, np.int64), np.empty(n), np.empty((n, 4)), np.empty((n + MOST_FALSE, 7)), np.empty(2))
 
 
 def by_distance(errors: PerceivedErrors) -> FloatArray:
@@ -82,7 +83,7 @@ def constants(errors: PerceivedErrors, step_s: float) -> FloatArray:
             errors.drone_radius_m, _STRETCHES * errors.error_time_s / step_s,
             _STRETCHES * errors.missed_time_s / step_s, *_cubic(errors.own_velocity_error_m_s),
             _STRETCHES * errors.own_velocity_time_s / step_s, min(false.at_once / MOST_FALSE, 1.0),
-            false.lifetime_s / step_s, *false.distances_m,
+            false.lifetime_s / step_s, *false.distances_m, step_s,
         ]
     )  # fmt: skip
 
@@ -204,7 +205,7 @@ def perceived_sums(
     n = by_slot.shape[2]
     slots, ranges, rays = np.empty(n, np.int64), np.empty(n), np.empty((n, 4))
     room = n + MOST_FALSE
-    seen = np.empty((room, 6))
+    seen = np.empty((room, 7))
     keys, numbers = np.empty(max(nearest, 1)), np.empty(max(nearest, 1), np.int64)
     z, sums = np.empty(2), np.empty(2)
     limit = farthest(figures, law)
@@ -235,8 +236,11 @@ def perceived_sums(
             j = k if nearest == 0 else numbers[k]
             if seen[j, 0] ** 2 + seen[j, 1] ** 2 <= law[OBSERVATION_M] ** 2:
                 pull, ex, ey = cohesion(seen[j, 0], seen[j, 1], law)
-                sums[0] += law[COHESION] * pull * ex + law[ALIGNMENT] * (seen[j, 2] - vn)
-                sums[1] += law[COHESION] * pull * ey + law[ALIGNMENT] * (seen[j, 3] - ve)
+                pull *= law[COHESION]
+                grown = law[JERK] * seen[j, 6]
+                weight = grown / pull if pull > grown else 1.0
+                sums[0] += weight * (pull * ex + law[ALIGNMENT] * (seen[j, 2] - vn))
+                sums[1] += weight * (pull * ey + law[ALIGNMENT] * (seen[j, 3] - ve))
         middle_n, middle_e = 0.0, 0.0
         for k in range(count):
             middle_n += seen[k, 0]
@@ -271,9 +275,10 @@ def perceive(
     f: int, slot: int, by_slot: Any, grid: Any, starts: Any, order: Any, table: Any, figures: Any, seed: Any, step: int,
     reach: float, slots: Any, ranges: Any, rays: Any, seen: Any, z: Any,
 ) -> int:  # fmt: skip
-    """Fills `seen` (.., 6) with the neighbours that one drone perceives; how many.
+    """Fills `seen` (.., 7) with the neighbours that one drone perceives; how many.
 
-    A row is the level place, m from the drone, and velocity, m/s; and, without errors, how far below it is and sinks.
+    A row is the level place, m from the drone, and velocity, m/s; without errors, how far below it is and sinks; and
+    for how long it has been seen, s: those that are there as if always.
     """
     n = by_slot.shape[2]
     x, y, depth = by_slot[0, f], by_slot[1, f], by_slot[2, f]
@@ -302,7 +307,7 @@ def perceive(
         seen[count, 0], seen[count, 1] = px, py
         seen[count, 2] = by_slot[3, f, j] + _error(table, d, VELOCITY, z[0])
         seen[count, 3] = by_slot[4, f, j] + _error(table, d, VELOCITY, z[1])
-        seen[count, 4], seen[count, 5] = dz, by_slot[5, f, j]
+        seen[count, 4], seen[count, 5], seen[count, 6] = dz, by_slot[5, f, j], math.inf
         count += 1
     for k in range(MOST_FALSE):
         at = step / figures[LIFETIME] + _uniform(_mixed(seed, drone, 4 + k, -1))
@@ -321,5 +326,6 @@ def perceive(
             seen[count, 0], seen[count, 1] = d * math.cos(bearing), d * math.sin(bearing)
             seen[count, 2], seen[count, 3] = by_slot[3, f, slot], by_slot[4, f, slot]
             seen[count, 4], seen[count, 5] = 0.0, by_slot[5, f, slot]
+            seen[count, 6] = (at - math.floor(at)) * figures[LIFETIME] * figures[STEP_S]
             count += 1
     return count

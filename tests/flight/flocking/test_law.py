@@ -61,6 +61,29 @@ def test_cohesion_pulls_a_far_neighbour_and_is_nothing_at_the_desired_distance()
     np.testing.assert_allclose(u, [0.0, -0.175 * math.log(2)], atol=1e-15)
 
 
+def test_the_pull_of_who_is_new_grows_slowly_and_its_push_is_whole_at_once() -> None:
+    law = FlockingLaw(ALL_OFF.model_copy(update={"cohesion": 0.1, "alignment": 0.1, "separation": 10.0}))
+    of_paper = FlockingLaw(law.parameters.model_copy(update={"cohesion_jerk_m_s3": None}))
+    far, theirs, whole = [[0.0, 7.0]], [[0.5, 0.0]], 0.7 * math.log(2)  # 0.485 m/s^2
+
+    def pull(law: FlockingLaw, age_s: float) -> Array:
+        return law.acceleration(STILL, far, theirs, STILL, [age_s])
+
+    np.testing.assert_array_equal(pull(law, 0.0), [0.0, 0.0])
+    np.testing.assert_allclose(pull(law, 2.0), [0.1 * 0.5 * 0.2 / whole, 0.2])  # W of Eq. 39 and 40
+    for followed in (
+        pull(law, 5.0),
+        pull(law, math.inf),
+        pull(of_paper, 0.0),
+        law.acceleration(STILL, far, theirs, STILL),
+    ):
+        np.testing.assert_allclose(followed, [0.05, whole])
+    near = [[0.0, 1.0]]
+    np.testing.assert_allclose(
+        law.acceleration(STILL, near, STILL[None], STILL, [0.0]), of_paper.acceleration(STILL, near, STILL[None], STILL)
+    )
+
+
 def test_nobody_beyond_the_observation_distance_counts() -> None:
     law = FlockingLaw()
     inside = law.acceleration(STILL, [[20.0, 0.0]], [[1.0, 0.0]], STILL)

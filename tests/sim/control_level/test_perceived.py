@@ -125,6 +125,36 @@ def test_nobody_is_seen_beyond_the_range_or_too_far_above() -> None:
     assert _seen(FlockFlights([above], _errors(elevation_limit_deg=70.0)), 0)[0, 0] != 0.0
 
 
+def test_what_is_seen_for_a_moment_hardly_draws_the_flock_apart() -> None:
+    """The worst of 60 flights with the errors of the shipped networks, beside the same with the whole pull at once."""
+    base = load_scenario(data_path("config") / "paper_flight.yaml")
+    measured = load_perceived_errors(data_path("config") / "perceived" / "shipped_networks.yaml")
+    worst = {}
+    for jerk in (0.1, None):
+        flocking = base.drone.flocking.model_copy(update={"cohesion_jerk_m_s3": jerk})
+        scenario = base.model_copy(update={"drone": base.drone.model_copy(update={"flocking": flocking})})
+        flights = [scenario.model_copy(update={"seed": seed}) for seed in range(60)]
+        worst[jerk] = min(float(one["order_tail"] or 0.0) for one in fly_flocks(flights, errors=measured))
+    assert worst[0.1] > 0.998 > worst[None]
+
+
+def test_a_false_neighbour_pulls_by_its_age() -> None:
+    """0.1 * 9 * ln(9 / 3.5) = 0.85 m/s^2 by Eq. 39, at most 0.1 m/s^3 for the 2 s that it lasts."""
+    false = {"at_once": 0.4, "lifetime_s": 2.0, "distances_m": [8.9, 9.0, 9.1]}
+
+    def pulls(jerk: float | None) -> FloatArray:
+        flights = FlockFlights(
+            _pair(40.0, 500, {"cohesion_jerk_m_s3": jerk}), _errors(range_limit_m=30.0, false_neighbours=false)
+        )
+        sums = np.hypot(*np.array([_seen(flights, step) for step in range(6)]).transpose(1, 0, 2))
+        some: FloatArray = sums[sums > 1e-9]
+        return some
+
+    assert np.median(pulls(None)) == pytest.approx(0.85, abs=0.01)
+    assert 0.05 < np.median(pulls(0.1)) < 0.15
+    assert np.percentile(pulls(0.1), 95) < 0.25
+
+
 def test_false_neighbours_are_as_many_as_measured() -> None:
     errors = _errors(range_limit_m=30.0, false_neighbours={**FAULTLESS["false_neighbours"], "at_once": 0.4})
     flights = FlockFlights(_pair(40.0, 2000), errors)
