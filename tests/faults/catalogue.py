@@ -610,5 +610,14 @@ CATALOGUE = (
         ),
         within_s=2.0,
     ),
+    Fault(
+        67, "camera-elsewhere", "a camera is upside down or on its side, or two are swapped",
+        "warned; flown on as configured",
+        (
+            f"{_HERE}rig.py::test_a_camera_is_upside_down_or_two_are_swapped",
+            "tests/flight/geometry/test_rig_calibration.py::test_a_camera_that_is_upside_down_or_another_one_is_said",
+        ),
+        within_s=20.0,
+    ),
 )
 # fmt: on

@@ -13,12 +13,20 @@ from flockd.core.choices import TRUTH_ROLES
 from flockd.core.config import ScenarioConfig, load_drone, load_scenario
 from flockd.core.data import data_path
 from flockd.core.messages import PilotOutput
-from flockd.flight.geometry import build_rig, rotation_angle_deg
+from flockd.flight.geometry import (
+    Rig,
+    RigCamera,
+    RigidTransform,
+    build_rig,
+    rotation_angle_deg,
+    rotation_from_vector,
+)
 from flockd.ground.doctor import Level
 from flockd.ground.doctor.rig_checks import check_rig
 from flockd.onboard.daemon.pilot_loop import RigReports
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.reader import Recording
+from flockd.sim import camera_simulator
 from flockd.sim.swarm import fly
 from flockd.sim.true_rigs import true_rigs
 from tests.faults.catalogue import RecordProperty, reacted
@@ -103,6 +111,35 @@ def test_a_rig_is_not_as_configured(
     (finding,) = check_rig(recording.config.model_copy(update={"rig": corrected}), tmp_path)
     assert finding.level is Level.PASS
     assert "is another than in the last flight" in finding.measured
+
+
+@pytest.mark.parametrize(
+    "axes",
+    [{"front": (math.pi, 0.0, 0.0)}, {"left": (0.0, 0.0, math.pi), "right": (0.0, 0.0, math.pi)}],
+    ids=["front upside down", "left and right swapped"],
+)
+def test_a_camera_is_upside_down_or_two_are_swapped(
+    axes: dict[str, tuple[float, float, float]],
+    tmp_path: Path,
+    record_property: RecordProperty,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    flight = scenario(0.0, 0.0, 0.0)
+    cameras = dict(build_rig(flight.drone.rig).cameras)
+    for name, axis in axes.items():
+        mount = cameras[name].T_body_camera
+        turned = RigidTransform(rotation_from_vector(np.array(axis)) @ mount.rotation, mount.translation)
+        cameras[name] = RigCamera(name, cameras[name].camera, turned)
+    monkeypatch.setattr(camera_simulator, "true_rigs", lambda scenario: [Rig(cameras)])
+    outputs = flown(flight, tmp_path / NAME)
+    reports, told = RigReports(), dict[str, float]()
+    for output in outputs:
+        told |= dict.fromkeys(reports.update(output), output.time_s - outputs[0].time_s)
+    for name in axes:
+        (text,) = [text for text in told if text.startswith(f"camera {name}: it moves otherwise than the drone")]
+        assert text.endswith("turned as configured? It is flown on as configured.")
+        reacted(record_property, "camera-elsewhere", told[text])
+    assert len([text for text in told if "moves otherwise" in text]) == len(axes)
 
 
 def test_a_rig_as_configured_is_flown_without_a_word(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

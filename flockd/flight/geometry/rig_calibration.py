@@ -46,6 +46,11 @@ _ROUNDS = 3
 _FIT_GAIN = 0.1
 _MAX_MISFIT = 16.0
 """A camera's motion whose normalised square is larger is not used: it followed something that moves."""
+_MAX_INFLATION = 9.0
+"""No camera's errors are taken to be larger than three times what it says."""
+_CONTRADICTED_GAIN, _CONTRADICTED = 0.125, 0.5
+"""Share of one motion in how many of a camera's last ones were not used, and from which on it is said: after three
+seconds in which none was. In flights with mountings up to 20 degrees off none is left out."""
 WORTH_TURN_RAD, WORTH_OFFSET_S, WORTH_FOCAL = math.radians(0.5), 0.01, 0.01
 """What is less is not worth a warning: half a degree puts a drone at 10 m by 0.09 m, and 1 % a range by 1 %."""
 _SURE, _SURE_OF_TURN = 9.0, 14.16
@@ -120,6 +125,8 @@ class _Camera:
     log_focal: float = 0.0
     misfit: float = 1.0
     """How much larger its errors are than it says, squared."""
+    unused: float = 0.0
+    """The share of its last motions that were not used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,6 +223,17 @@ class RigCalibration:
             )
         return tuple(found)
 
+    def contradictions(self) -> tuple[str, ...]:
+        """Cameras whose motion is not that of the body, wherever a mounting that is a little off may be; for people.
+
+        Turned or upside down, swapped with another, or before something that moves along.
+        """
+        return tuple(
+            f"camera {name}: it moves otherwise than the drone: is it the one of that name, turned as configured?"
+            for name, camera in self._cameras.items()
+            if camera.unused > _CONTRADICTED
+        )
+
     def _wait(self, interval_s: float) -> None:
         """The state as uncertain as it becomes meanwhile."""
         keep = math.exp(-interval_s / _VELOCITY_TIME_S)
@@ -275,8 +293,11 @@ class RigCalibration:
         square = float(row.measured @ np.linalg.solve(spread, row.measured)) / len(row.measured)
         if not math.isfinite(square):
             return False
-        camera.misfit = max(camera.misfit * min(max(square, 0.1), _MAX_MISFIT) ** _FIT_GAIN, 1.0)
-        return square < _MAX_MISFIT
+        misfit = camera.misfit * min(max(square, 0.1), _MAX_MISFIT) ** _FIT_GAIN
+        camera.misfit = min(max(misfit, 1.0), _MAX_INFLATION)
+        fits = square < _MAX_MISFIT
+        camera.unused += _CONTRADICTED_GAIN * ((not fits) - camera.unused)
+        return fits
 
     def _solved(self, rows: list[_Row], interval_s: float, *, known: bool) -> tuple[FloatArray, FloatArray, FloatArray]:
         """The state's step, what the autopilot's turn and way were off, and the covariance."""

@@ -179,7 +179,9 @@ class FlockPilot:
         self._last_time_s = observation.time_s
         of_height = () if why_no_ground is None else (why_no_ground,)
         deviations = self._deviations(observation.time_s)
-        of_rig = [Reason(ReasonKind.RIG, text) for one in deviations for text in rig_faults(one)]
+        faults = [text for one in deviations for text in rig_faults(one)]
+        faults += self._calibration.contradictions() if deviations else ()
+        of_rig = [Reason(ReasonKind.RIG, text) for text in faults]
         of_size = () if self._size is None else self._size.reasons
         reasons = (
             *of_height, *observation.reasons, *why_no_ego, *why_no_motion, *why_no_measurement, *of_rig, *of_size,

@@ -13,7 +13,7 @@ import numpy as np
 
 from flockd.core.config import DroneConfig
 from flockd.core.messages import FrameSet, MissionOrder, Neighbour, PilotOutput, Reason, ReasonKind, VehicleState
-from flockd.flight.geometry import described
+from flockd.flight.geometry import described, rig_faults
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
 from flockd.onboard.daemon.worker import BusyError, LateError, Worker
@@ -245,12 +245,13 @@ class RigReports:
         """The sentences that a step's output is worth."""
         new = [one.text for one in output.reasons if one.kind is ReasonKind.RIG and one.text not in self._said]
         self._said.update(new)
-        by_camera = {f"camera {one.camera}": described(one) for one in output.rig}
-        return [
-            f"{text}: by what it saw, {by_camera[text.partition(':')[0]]}; it is flown on as configured, and "
+        corrections = {
+            text: f": by what it saw, {described(one)}; it is flown on as configured, and "
             "`flockd calibrate rig --from-flight` corrects it"
-            for text in new
-        ]
+            for one in output.rig
+            for text in rig_faults(one)
+        }
+        return [text + corrections.get(text, " It is flown on as configured.") for text in new]
 
 
 class SizeReports:

@@ -115,6 +115,11 @@ def wrong_by(deg: float, focal: float, late_s: float, rig: Rig, random: np.rando
 
 def flown(way: Way, wrong: Wrong, random: np.random.Generator, steps: int = 120) -> tuple[CameraDeviation, ...]:
     """What is known after so many steps of half a second."""
+    return flown_by(way, wrong, random, steps).deviations()
+
+
+def flown_by(way: Way, wrong: Wrong, random: np.random.Generator, steps: int) -> RigCalibration:
+    """The filter after so many steps of half a second."""
     configured = four_camera_rig()
     true, calibration = wrong.rig(configured), RigCalibration(configured)
     world, autopilot = boxes_around(random, 20), Autopilot(way, random)
@@ -126,7 +131,7 @@ def flown(way: Way, wrong: Wrong, random: np.random.Generator, steps: int = 120)
             pairs = seen_twice(world, true, (before[1], pose), FLAWS, random, stride=24)
             calibration.update(before[0], seen, lifted_as_configured(pairs, true, configured))
         before = seen, pose
-    return calibration.deviations()
+    return calibration
 
 
 def lifted_as_configured(pairs: PointPairs, true: Rig, configured: Rig) -> PointPairs:
@@ -225,3 +230,27 @@ def test_what_says_nothing_changes_nothing() -> None:
     assert all(np.isfinite(one.turn).all() and np.isfinite(one.covariance).all() for one in calibration.deviations())
     calibration.update(first, second, pairs.select(np.arange(20)))  # too few to tell
     assert all(np.linalg.norm(one.turn) == 0.0 for one in calibration.deviations())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({}, ()),
+        ({"front": (math.radians(20.0), 0.0, 0.0)}, ()),
+        ({"front": (math.pi, 0.0, 0.0)}, ("front",)),
+        ({"left": (0.0, -math.pi / 2, 0.0)}, ("left",)),
+        ({"front": (0.0, 0.0, math.pi), "back": (0.0, 0.0, math.pi)}, ("front", "back")),
+    ],
+    ids=["as configured", "20 degrees off", "upside down", "on its side", "two swapped"],
+)
+def test_a_camera_that_is_upside_down_or_another_one_is_said(
+    wrong: dict[str, tuple[float, ...]], named: tuple[str, ...]
+) -> None:
+    """The rotation vectors are in body axes."""
+    random, configured = np.random.default_rng(3), four_camera_rig()
+    turns = {name: np.array(wrong.get(name, (0.0, 0.0, 0.0))) for name in configured.cameras}
+    calibration = flown_by(lively(random), Wrong(turns, dict.fromkeys(turns, 1.0), 0.0), random, 40)
+    assert calibration.contradictions() == tuple(
+        f"camera {name}: it moves otherwise than the drone: is it the one of that name, turned as configured?"
+        for name in named
+    )
