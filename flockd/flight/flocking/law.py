@@ -37,7 +37,7 @@ class FlockingLaw:
         All arguments are level, north and east. `velocity` (2,) is the own one over ground; `positions` (n, 2) metres
         are the neighbours' relative to the own drone (Q_j - Q_i); `velocities` (n, 2) theirs over ground;
         `desired_velocity` (2,) is efv of Eq. 42. `ages_s` (n,), or one for all, says how long they have been seen:
-        see `FlockingParameters.cohesion_jerk_m_s3`. n may be 0. A neighbour at no distance pushes to the south, as one
+        see `FlockingParameters.cohesion_time_s`. n may be 0. A neighbour at no distance pushes to the south, as one
         that sits 1 mm to the north; `level_offsets` keeps two drones from that. Raises ValueError for other shapes
         and for numbers that are not finite.
         """
@@ -56,8 +56,8 @@ class FlockingLaw:
 
         pull = p.cohesion * distances * np.log(distances / p.desired_distance_m)
         weights = influence_weights(p.weight, distances, distances <= p.observation_distance_m)
-        if p.cohesion_jerk_m_s3 is not None:
-            grown = p.cohesion_jerk_m_s3 * ages
+        if p.cohesion_time_s is not None:
+            grown = p.max_acceleration_m_s2 * (ages / p.cohesion_time_s) ** 2
             weights *= np.where(pull > grown, grown / np.where(pull > 0, pull, 1.0), 1.0)
         cohesion = weights * pull @ directions  # Eq. 39
         alignment = p.alignment * weights @ (theirs - own)  # Eq. 40

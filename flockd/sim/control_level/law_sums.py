@@ -18,8 +18,8 @@ from flockd.sim.control_level.cells import column_of, row_of, slice_of_row
 
 MIN_DISTANCE_M = 1e-3
 """As in `flockd.flight.flocking.law`: nearer counts as this far."""
-COHESION, ALIGNMENT, SEPARATION, OBSERVATION_M, DESIRED_M, SEPARATION_M, JERK = range(7)
-"""Where in the array of `law_figures`."""
+COHESION, ALIGNMENT, SEPARATION, OBSERVATION_M, DESIRED_M, SEPARATION_M, GROWTH = range(7)
+"""Where in the array of `law_figures`. `GROWTH` times the square of a neighbour's age is the most that it may pull."""
 
 _LN2 = 0.6931471805599453
 _SQRT_HALF_BITS = 0x3FE6A09E667F3BCD
@@ -51,7 +51,7 @@ def law_figures(p: FlockingParameters) -> FloatArray:
         [
             p.cohesion, p.alignment, p.separation,
             p.observation_distance_m, p.desired_distance_m, p.separation_distance_m,
-            math.inf if p.cohesion_jerk_m_s3 is None else p.cohesion_jerk_m_s3,
+            math.inf if p.cohesion_time_s is None else p.max_acceleration_m_s2 / p.cohesion_time_s**2,
         ]
     )  # fmt: skip
 

@@ -20,7 +20,7 @@ from flockd.sim.control_level.cells import row_of, slice_of_row
 from flockd.sim.control_level.law_sums import (
     ALIGNMENT,
     COHESION,
-    JERK,
+    GROWTH,
     MIN_DISTANCE_M,
     OBSERVATION_M,
     SEPARATION_M,
@@ -237,7 +237,7 @@ def perceived_sums(
             if seen[j, 0] ** 2 + seen[j, 1] ** 2 <= law[OBSERVATION_M] ** 2:
                 pull, ex, ey = cohesion(seen[j, 0], seen[j, 1], law)
                 pull *= law[COHESION]
-                grown = law[JERK] * seen[j, 6]
+                grown = law[GROWTH] * seen[j, 6] ** 2
                 weight = grown / pull if pull > grown else 1.0
                 sums[0] += weight * (pull * ex + law[ALIGNMENT] * (seen[j, 2] - vn))
                 sums[1] += weight * (pull * ey + law[ALIGNMENT] * (seen[j, 3] - ve))

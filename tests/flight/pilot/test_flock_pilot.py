@@ -98,18 +98,18 @@ def test_a_neighbour_before_a_camera_that_is_gone_is_as_probable_as_before(gone:
 def test_a_neighbour_pulls_by_how_long_it_has_been_seen() -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (8.0, 0.0, -3.6)))
     drone = flyer.scenario.drone
-    as_in_paper = drone.flocking.model_copy(update={"cohesion_jerk_m_s3": None})
+    as_in_paper = drone.flocking.model_copy(update={"cohesion_time_s": None})
     other = FlockPilot(drone.model_copy(update={"flocking": as_in_paper}), flyer.truth)
     for step in range(10):
         frames, state = flyer.take_frames()
         ours, papers = flyer.pilot.step(frames, state), other.step(frames, state)
         flyer.move()
-        if step in (2, 9):
+        if step in (2, 3, 9):
             (neighbour,) = ours.neighbours
             whole = 0.1 * (d := float(np.hypot(*neighbour.position[:2]))) * math.log(d / 3.5)
             lacking = papers.command.acceleration[0] - ours.command.acceleration[0]
             assert neighbour.confirmed and neighbour.age_s == pytest.approx(step * STEP_S)
-            assert lacking == pytest.approx(whole - 0.1 * neighbour.age_s, abs=0.05)
+            assert lacking == pytest.approx(max(whole - 2.0 * (neighbour.age_s / 5.0) ** 2, 0.0), abs=0.05)
 
 
 def test_an_output_that_is_not_finite_costs_its_frame_only() -> None:
