@@ -108,16 +108,19 @@ def test_a_latency_of_a_step_is_refused(tmp_path: Path) -> None:
         load_scenario(tmp_path / "late.yaml")
 
 
+def limited(scenario: ScenarioConfig, time_s: float) -> ScenarioConfig:
+    flocking = scenario.drone.flocking.model_copy(update={"cohesion_time_s": time_s})
+    return scenario.model_copy(update={"drone": scenario.drone.model_copy(update={"flocking": flocking})})
+
+
 def test_who_pulls_away_at_the_start_is_followed() -> None:
     """Three drones of which one knows the goal, seen up to 11 m: new neighbours pull little, but soon enough."""
     scenario = load_scenario(CONFIG / "one_knows.yaml", {"duration_s": 30.0})
     three = scenario.model_copy(
         update={"vehicles": scenario.vehicles[:3], "detections": DetectionsConfig(missed=0.05, range_m=11.0)}
     )
-    positions = fly_exact_states(three)[1]
+    positions = fly_exact_states(limited(three, 5.0))[1]
     apart = np.linalg.norm(positions[:, None] - positions[:, :, None], axis=-1)
     assert apart[-1].max() < 11.0
-    slow = three.drone.flocking.model_copy(update={"cohesion_time_s": 20.0})
-    lost = three.model_copy(update={"drone": three.drone.model_copy(update={"flocking": slow})})
-    positions = fly_exact_states(lost)[1]
+    positions = fly_exact_states(limited(three, 20.0))[1]
     assert np.linalg.norm(positions[-1, 0] - positions[-1, 1:], axis=-1).min() > 11.0

@@ -58,7 +58,7 @@ class FlockingLaw:
         weights = influence_weights(p.weight, distances, distances <= p.observation_distance_m)
         if p.cohesion_time_s is not None:
             grown = p.max_acceleration_m_s2 * (ages / p.cohesion_time_s) ** 2
-            weights *= np.where(pull > grown, grown / np.where(pull > 0, pull, 1.0), 1.0)
+            pull = np.minimum(pull, grown)
         cohesion = weights * pull @ directions  # Eq. 39
         alignment = p.alignment * weights @ (theirs - own)  # Eq. 40
         crowding = np.maximum(1 / distances - 1 / p.separation_distance_m, 0.0)  # 0 beyond D_II

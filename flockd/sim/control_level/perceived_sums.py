@@ -236,11 +236,11 @@ def perceived_sums(
             j = k if nearest == 0 else numbers[k]
             if seen[j, 0] ** 2 + seen[j, 1] ** 2 <= law[OBSERVATION_M] ** 2:
                 pull, ex, ey = cohesion(seen[j, 0], seen[j, 1], law)
-                pull *= law[COHESION]
+                pull = law[COHESION] * pull
                 grown = law[GROWTH] * seen[j, 6] ** 2
-                weight = grown / pull if pull > grown else 1.0
-                sums[0] += weight * (pull * ex + law[ALIGNMENT] * (seen[j, 2] - vn))
-                sums[1] += weight * (pull * ey + law[ALIGNMENT] * (seen[j, 3] - ve))
+                pull = grown if pull > grown else pull
+                sums[0] += pull * ex + law[ALIGNMENT] * (seen[j, 2] - vn)
+                sums[1] += pull * ey + law[ALIGNMENT] * (seen[j, 3] - ve)
         middle_n, middle_e = 0.0, 0.0
         for k in range(count):
             middle_n += seen[k, 0]

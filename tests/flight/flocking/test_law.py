@@ -62,15 +62,17 @@ def test_cohesion_pulls_a_far_neighbour_and_is_nothing_at_the_desired_distance()
 
 
 def test_the_pull_of_who_is_new_grows_slowly_and_its_push_is_whole_at_once() -> None:
-    law = FlockingLaw(ALL_OFF.model_copy(update={"cohesion": 0.1, "alignment": 0.1, "separation": 10.0}))
+    law = FlockingLaw(
+        ALL_OFF.model_copy(update={"cohesion": 0.1, "alignment": 0.1, "separation": 10.0, "cohesion_time_s": 5.0})
+    )
     of_paper = FlockingLaw(law.parameters.model_copy(update={"cohesion_time_s": None}))
     far, theirs, whole = [[0.0, 7.0]], [[0.5, 0.0]], 0.7 * math.log(2)  # 0.485 m/s^2
 
     def pull(law: FlockingLaw, age_s: float) -> Array:
         return law.acceleration(STILL, far, theirs, STILL, [age_s])
 
-    np.testing.assert_array_equal(pull(law, 0.0), [0.0, 0.0])
-    np.testing.assert_allclose(pull(law, 2.0), [0.1 * 0.5 * 0.32 / whole, 0.32])  # W of Eq. 39 and 40
+    np.testing.assert_array_equal(pull(law, 0.0), [0.05, 0.0])
+    np.testing.assert_allclose(pull(law, 2.0), [0.05, 0.32])  # 2 (2 / 5)^2
     for followed in (
         pull(law, 5.0),
         pull(law, math.inf),
