@@ -252,8 +252,9 @@ class Tracker:
 
 def _probability_in_view(state: State, shown: Shown) -> float:
     """That a camera shows all of the neighbour, wherever it is: one that the border cuts is often missed."""
-    root = np.linalg.cholesky(state.position_covariance)
-    return float(shown(state.position + _SIGMA_POINTS @ root.T, state.size_m / 2).mean())
+    variances, axes = np.linalg.eigh(state.position_covariance)
+    spread = _SIGMA_POINTS * np.sqrt(np.maximum(variances, 0.0))  # rounding may make none of them negative
+    return float(shown(state.position + spread @ axes.T, state.size_m / 2).mean())
 
 
 def _log_sigma(measurement: Measurement) -> float:

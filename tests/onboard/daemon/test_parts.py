@@ -371,6 +371,23 @@ def test_the_own_motion_is_missed_from_the_last_step_that_found_it() -> None:
     assert ages == pytest.approx([0.0, 0.0, 0.1, 0.8, 0.0, 0.0])
 
 
+@pytest.mark.parametrize(("step_s", "first"), [(0.5, 2), (0.1, 6)])
+def test_standstill_is_wanted_until_neighbours_can_be_confirmed(step_s: float, first: int) -> None:
+    """Two detections, half a second apart."""
+    config = _flyable("front").model_copy(update={"autopilot": AutopilotParameters(), "step_s": step_s})
+    anything: Any = None
+    loop: Any = SimpleNamespace(newest=None)
+    control = Control(
+        config, anything, anything, loop, anything, anything, anything, OperatorRequests(), anything, lambda: 0.0
+    )
+    command, flown = Wanted(np.ones(2), np.zeros(2), 0.0), []
+    for number in range(1, 9):
+        output = PilotOutput(0.0, None, None, (), (), {}, (), command)
+        loop.newest = StepResult(0.0, output, control._flight, number)
+        flown.append(bool(control._wanted(0.0)[0].velocity.any()))
+    assert flown.index(True) + 1 == first
+
+
 def test_the_supervisor_is_told_of_an_obstacle_where_hold_needs_room() -> None:
     """As of the last tick's surroundings: `safety.hold_room_m` is 2 m."""
     config = _flyable("front").model_copy(update={"autopilot": AutopilotParameters()})
