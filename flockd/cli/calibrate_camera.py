@@ -61,6 +61,10 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--pixel-format", choices=get_args(PixelFormat), default="mjpeg", help="of a /dev/video (mjpeg)"
     )
+    parser.add_argument(
+        "--turn-deg", type=int, choices=(0, 90, 180, 270), default=0,
+        help="of a /dev/video: clockwise, what makes up up in its images, as in the drone's file; --size is as turned",
+    )  # fmt: skip
     parser.add_argument("--print-board", metavar="FILE", type=Path, help="write the board to print (.pdf, .png)")
     add_shared(parser, "the drone, for its camera's device and serial")
     parser.set_defaults(run=_camera)
@@ -144,7 +148,7 @@ def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, 
     if not re.fullmatch("[a-z0-9_-]+", name):
         raise UsageError(f"--camera {name}: a camera's name has small letters, digits, _ and - only")
     if path.is_relative_to("/dev"):
-        live = image_sources.device_config(str(path), name, args.size, args.pixel_format)
+        live = image_sources.device_config(str(path), name, args.size, args.pixel_format, args.turn_deg)
         return name, image_sources.from_cameras(live, str(path), args.seconds, enough)
     if path.is_dir():
         return name, image_sources.from_folder(path, name)

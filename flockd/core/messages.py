@@ -385,6 +385,9 @@ class CameraDeviation:
     """Its focal lengths over the configured ones."""
     covariance: Matrix5
     """(5, 5) of turn, time offset, and the focal scale's logarithm."""
+    elsewhere: bool = False
+    """It moves otherwise than the drone, as no mounting that is a little off explains: the other numbers say nothing.
+    Turned or upside down, swapped with another, or before something that moves along."""
 
 
 @dataclass(frozen=True)
@@ -425,7 +428,7 @@ class PilotOutput:
     mission: MissionStatus = NO_STATUS
     """As of the last good step."""
     noisy_cameras: tuple[str, ...] = ()
-    """Whose images were noise, and were not used."""
+    """Whose images were not used: noise, damage, a lens that shows too little, a camera that is `elsewhere`."""
     ground: GroundEstimate | None = None
     """From the range finder, or the barometer in its place; None: no range finder is wanted, or there is no scale."""
     obstacles: ObstacleRanges | None = None

@@ -18,6 +18,7 @@ import pytest
 from flockd.cli import main
 from flockd.core.config import DroneConfig, load_drone
 from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
+from flockd.core.errors import UsageError
 from flockd.core.messages import Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
 from flockd.ground.calibration.board import BoardFinder, BoardSpec
 from flockd.ground.calibration.image_sources import identity
@@ -184,6 +185,22 @@ def test_before_a_live_camera_a_person_gets_instructions(
     measured = load_drone(out).rig.cameras[0].intrinsics.measured
     assert measured is not None
     assert measured.camera == "not known, /dev/video7"
+
+
+def test_a_camera_on_its_side_is_calibrated_upright(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[DroneConfig] = []
+
+    def refuse(config: DroneConfig, file: str) -> None:
+        opened.append(config)
+        raise UsageError("seen enough")
+
+    monkeypatch.setattr("flockd.ground.calibration.image_sources.open_source", refuse)
+    command = ("calibrate", "camera", "/dev/video7", "--size", "360x480", "--out", str(tmp_path / "a.yaml"))
+    assert main([*command, "--turn-deg", "90"]) == 2
+    source = opened[0].source
+    assert source is not None
+    assert source.cameras[0].turn_deg == 90
+    assert opened[0].rig.cameras[0].size_px == (360, 480)
 
 
 def test_a_v4l2_camera_is_read(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -612,7 +612,7 @@ CATALOGUE = (
     ),
     Fault(
         67, "camera-elsewhere", "a camera is upside down or on its side, or two are swapped",
-        "warned; flown on as configured",
+        "warned; flown without it, degraded; two: Hold",
         (
             f"{_HERE}rig.py::test_a_camera_is_upside_down_or_two_are_swapped",
             "tests/flight/geometry/test_rig_calibration.py::test_a_camera_that_is_upside_down_or_another_one_is_said",

@@ -137,9 +137,13 @@ def test_a_camera_is_upside_down_or_two_are_swapped(
         told |= dict.fromkeys(reports.update(output), output.time_s - outputs[0].time_s)
     for name in axes:
         (text,) = [text for text in told if text.startswith(f"camera {name}: it moves otherwise than the drone")]
-        assert text.endswith("turned as configured? It is flown on as configured.")
+        assert text.endswith("turned as configured? The drone flies without it.")
         reacted(record_property, "camera-elsewhere", told[text])
     assert len([text for text in told if "moves otherwise" in text]) == len(axes)
+    assert set(outputs[-1].noisy_cameras) == set(axes)
+    found = [one for one in check_rig(flight.drone, tmp_path) if one.level is Level.FAILURE]
+    assert [one.about for one in found] == [f"camera {name}" for name in CAMERAS if name in axes]
+    assert all("flockd cameras --picture" in one.fix for one in found)
 
 
 def test_a_rig_as_configured_is_flown_without_a_word(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

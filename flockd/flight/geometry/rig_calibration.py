@@ -48,9 +48,9 @@ _MAX_MISFIT = 16.0
 """A camera's motion whose normalised square is larger is not used: it followed something that moves."""
 _MAX_INFLATION = 9.0
 """No camera's errors are taken to be larger than three times what it says."""
-_CONTRADICTED_GAIN, _CONTRADICTED = 0.125, 0.5
-"""Share of one motion in how many of a camera's last ones were not used, and from which on it is said: after three
-seconds in which none was. In flights with mountings up to 20 degrees off none is left out."""
+_AGREEMENT_GAIN, _AGREES = 0.125, 0.5
+"""Share of one motion in whether a camera's last ones agree with the body's (1) or not (-1), and from which on it does:
+after three seconds in which all did, or none. In flights with mountings up to 20 degrees off all do."""
 WORTH_TURN_RAD, WORTH_OFFSET_S, WORTH_FOCAL = math.radians(0.5), 0.01, 0.01
 """What is less is not worth a warning: half a degree puts a drone at 10 m by 0.09 m, and 1 % a range by 1 %."""
 _SURE, _SURE_OF_TURN = 9.0, 14.16
@@ -94,6 +94,9 @@ def differs(deviation: CameraDeviation) -> Differs:
 
 def rig_faults(deviation: CameraDeviation) -> tuple[str, ...]:
     """What of a camera differs, by more than is worth a warning, one sentence each; for people."""
+    if deviation.elsewhere:
+        text = "it moves otherwise than the drone: is it the one of that name, turned as configured?"
+        return (f"camera {deviation.camera}: {text}",)
     sure, found = differs(deviation), []
     if sure.turn and float(np.linalg.norm(deviation.turn)) > WORTH_TURN_RAD:
         found.append("it is not turned as configured")
@@ -125,8 +128,8 @@ class _Camera:
     log_focal: float = 0.0
     misfit: float = 1.0
     """How much larger its errors are than it says, squared."""
-    unused: float = 0.0
-    """The share of its last motions that were not used."""
+    agreement: float = 0.0
+    """Whether its last motions agree with the body's: 1, -1 not, 0 not known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,20 +222,19 @@ class RigCalibration:
                     time_offset_s=camera.offset_s,
                     focal_scale=math.exp(camera.log_focal),
                     covariance=self._covariance[mine, mine] + _LASTING,
+                    elsewhere=camera.agreement < -_AGREES,
                 )
             )
         return tuple(found)
 
-    def contradictions(self) -> tuple[str, ...]:
-        """Cameras whose motion is not that of the body, wherever a mounting that is a little off may be; for people.
+    def elsewhere(self) -> tuple[str, ...]:
+        """Cameras to fly without, as of `CameraDeviation.elsewhere`; none where more do so than agree with the drone.
 
-        Turned or upside down, swapped with another, or before something that moves along.
+        Of one camera and the autopilot, or the attitude that is late to most, it is not known which is wrong.
         """
-        return tuple(
-            f"camera {name}: it moves otherwise than the drone: is it the one of that name, turned as configured?"
-            for name, camera in self._cameras.items()
-            if camera.unused > _CONTRADICTED
-        )
+        agreements = {name: camera.agreement for name, camera in self._cameras.items()}
+        found = tuple(name for name, agreement in agreements.items() if agreement < -_AGREES)
+        return found if len(found) <= sum(agreement > _AGREES for agreement in agreements.values()) else ()
 
     def _wait(self, interval_s: float) -> None:
         """The state as uncertain as it becomes meanwhile."""
@@ -296,7 +298,7 @@ class RigCalibration:
         misfit = camera.misfit * min(max(square, 0.1), _MAX_MISFIT) ** _FIT_GAIN
         camera.misfit = min(max(misfit, 1.0), _MAX_INFLATION)
         fits = square < _MAX_MISFIT
-        camera.unused += _CONTRADICTED_GAIN * ((not fits) - camera.unused)
+        camera.agreement += _AGREEMENT_GAIN * ((1.0 if fits else -1.0) - camera.agreement)
         return fits
 
     def _solved(self, rows: list[_Row], interval_s: float, *, known: bool) -> tuple[FloatArray, FloatArray, FloatArray]:

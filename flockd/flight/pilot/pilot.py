@@ -150,6 +150,8 @@ class FlockPilot:
         if refusal is not None:
             return self._refused(frames, refusal)
         vehicle = _with_rotation(vehicle)
+        elsewhere = self._calibration.elsewhere()
+        frames = replace(frames, frames={name: one for name, one in frames.frames.items() if name not in elsewhere})
         laps = _Laps(self._stopwatch)
         trace = trace or StepTrace()
         predictions = self._predictions(frames.time_s)
@@ -180,7 +182,6 @@ class FlockPilot:
         of_height = () if why_no_ground is None else (why_no_ground,)
         deviations = self._deviations(observation.time_s)
         faults = [text for one in deviations for text in rig_faults(one)]
-        faults += self._calibration.contradictions() if deviations else ()
         of_rig = [Reason(ReasonKind.RIG, text) for text in faults]
         of_size = () if self._size is None else self._size.reasons
         reasons = (
@@ -199,7 +200,7 @@ class FlockPilot:
             counts=Counter(reason.text for reason in reasons),
             stages_ms=laps.stages_ms,
             mission=self._mission,
-            noisy_cameras=observation.noisy_cameras,
+            noisy_cameras=(*observation.noisy_cameras, *elsewhere),
             ground=ground,
             obstacles=obstacles,
             rig=deviations,

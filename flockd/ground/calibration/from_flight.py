@@ -11,7 +11,7 @@ import numpy as np
 
 from flockd.core.config.rig import CameraConfig, RigConfig
 from flockd.core.messages import CameraDeviation, PilotOutput
-from flockd.flight.geometry import RigidTransform, build_rig, described, differs, rotation_from_vector
+from flockd.flight.geometry import RigidTransform, build_rig, described, differs, rig_faults, rotation_from_vector
 from flockd.ground.calibration.errors import CalibrationError
 from flockd.ground.calibration.fragment import extrinsics_of, measured_today
 from flockd.ground.calibration.rig_session import write_rig
@@ -64,7 +64,9 @@ def corrected_rig(recording: Recording, source: str, out: Path) -> dict[str, Any
         cameras.append(_corrected(camera, one, turned=turned, scaled=scaled, source=source))
         results[camera.name] = _result(one, cameras[-1], turned=turned, scaled=scaled)
         sigma_rad = _worst_turn(one)
-        if sigma_rad > MAX_TURN_RAD:
+        if one.elsewhere:
+            notes.append(*rig_faults(one))
+        elif sigma_rad > MAX_TURN_RAD:
             notes.append(
                 f"the mounting of camera {camera.name!r} is known to {math.degrees(sigma_rad):.1f} degrees only, "
                 "and kept: this flight turned too little about some axis"
@@ -118,7 +120,7 @@ def _result(found: CameraDeviation, camera: CameraConfig, *, turned: bool, scale
 
 def _offset_s(found: Sequence[CameraDeviation]) -> tuple[float | None, str | None]:
     """What is to be added to the rig's offset, or None; and a note where the cameras do not agree."""
-    known = [one for one in found if math.sqrt(one.covariance[3, 3]) < MAX_OFFSET_S]
+    known = [one for one in found if not one.elsewhere and math.sqrt(one.covariance[3, 3]) < MAX_OFFSET_S]
     if not known:
         return None, "the time of the cameras is not known, and kept: this flight turned too evenly"
     offsets_s = np.array([one.time_offset_s for one in known])
@@ -133,11 +135,11 @@ def _offset_s(found: Sequence[CameraDeviation]) -> tuple[float | None, str | Non
 
 
 def _takes_turn(found: CameraDeviation) -> bool:
-    return _worst_turn(found) < MAX_TURN_RAD and differs(found).turn
+    return not found.elsewhere and _worst_turn(found) < MAX_TURN_RAD and differs(found).turn
 
 
 def _takes_focal(found: CameraDeviation) -> bool:
-    return math.sqrt(found.covariance[4, 4]) < MAX_FOCAL and differs(found).focal
+    return not found.elsewhere and math.sqrt(found.covariance[4, 4]) < MAX_FOCAL and differs(found).focal
 
 
 def _worst_turn(found: CameraDeviation) -> float:

@@ -133,8 +133,8 @@ def identity(device: Path, sysfs: Path = SYSFS) -> str:
     return f"{_text(entry / 'name') or 'not known'}, {device}"
 
 
-def device_config(device: str, camera: str, size: tuple[int, int], pixel_format: str) -> DroneConfig:
-    """A drone with this camera alone, with placeholder intrinsics. Raises UsageError."""
+def device_config(device: str, camera: str, size: tuple[int, int], pixel_format: str, turn_deg: int = 0) -> DroneConfig:
+    """A drone with this camera alone, placeholder intrinsics, an upright image of this ``size``. Raises UsageError."""
     lens = {"fx": size[0] * 1.0, "fy": size[0] * 1.0, "cx": size[0] / 2, "cy": size[1] / 2}
     try:
         return DroneConfig.model_validate(
@@ -142,7 +142,9 @@ def device_config(device: str, camera: str, size: tuple[int, int], pixel_format:
                 "rig": {"cameras": ({"name": camera, "size_px": size, "intrinsics": lens},)},
                 "source": {
                     "kind": "v4l2",
-                    "cameras": ({"name": camera, "device": device, "pixel_format": pixel_format},),
+                    "cameras": (
+                        {"name": camera, "device": device, "pixel_format": pixel_format, "turn_deg": turn_deg},
+                    ),
                 },
             }
         )

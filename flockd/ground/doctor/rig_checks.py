@@ -10,7 +10,7 @@ from flockd.core.errors import FlockdError
 from flockd.flight.geometry import described, rig_faults
 from flockd.ground.calibration.from_flight import found_rig
 from flockd.ground.doctor.computer_checks import STATE_FOLDER
-from flockd.ground.doctor.finding import Finding, passed, warned
+from flockd.ground.doctor.finding import Finding, failed, passed, warned
 from flockd.onboard.recording.reader import Recording
 
 ABOUT = "rig"
@@ -37,8 +37,13 @@ def check_rig(config: DroneConfig, folder: Path | None, state_folder: Path = STA
     off = [one for one in found if rig_faults(one)]
     for one in off:
         texts = "; ".join(fault.partition(": ")[2] for fault in rig_faults(one))
-        fix = f"flockd calibrate rig --from-flight {newest} writes the corrected rig; see that the camera is fixed"
-        yield warned(f"camera {one.camera}", f"in the last flight {texts}: {described(one)}", fix)
+        about = f"camera {one.camera}"
+        if one.elsewhere:
+            fix = "look at `flockd cameras --picture`: then correct the rig, or how it is mounted or plugged in"
+            yield failed(about, f"in the last flight {texts}", fix)
+        else:
+            fix = f"flockd calibrate rig --from-flight {newest} writes the corrected rig; see that the camera is fixed"
+            yield warned(about, f"in the last flight {texts}: {described(one)}", fix)
     if not off:
         yield passed(ABOUT, f"the last flight, {newest.name}, saw {len(found)} cameras as they are configured")
 

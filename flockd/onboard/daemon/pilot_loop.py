@@ -12,7 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockd.core.config import DroneConfig
-from flockd.core.messages import FrameSet, MissionOrder, Neighbour, PilotOutput, Reason, ReasonKind, VehicleState
+from flockd.core.messages import (
+    CameraDeviation,
+    FrameSet,
+    MissionOrder,
+    Neighbour,
+    PilotOutput,
+    Reason,
+    ReasonKind,
+    VehicleState,
+)
 from flockd.flight.geometry import described, rig_faults
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
@@ -245,13 +254,18 @@ class RigReports:
         """The sentences that a step's output is worth."""
         new = [one.text for one in output.reasons if one.kind is ReasonKind.RIG and one.text not in self._said]
         self._said.update(new)
-        corrections = {
-            text: f": by what it saw, {described(one)}; it is flown on as configured, and "
+        corrections = {text: self._done(one, output) for one in output.rig for text in rig_faults(one)}
+        return [text + corrections[text] for text in new]
+
+    def _done(self, one: CameraDeviation, output: PilotOutput) -> str:
+        if one.camera in output.noisy_cameras:
+            return " The drone flies without it."
+        if one.elsewhere:
+            return " It is flown on as configured, as too few others agree with the autopilot."
+        return (
+            f": by what it saw, {described(one)}; it is flown on as configured, and "
             "`flockd calibrate rig --from-flight` corrects it"
-            for one in output.rig
-            for text in rig_faults(one)
-        }
-        return [text + corrections.get(text, " It is flown on as configured.") for text in new]
+        )
 
 
 class SizeReports:

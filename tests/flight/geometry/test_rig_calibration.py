@@ -250,7 +250,19 @@ def test_a_camera_that_is_upside_down_or_another_one_is_said(
     random, configured = np.random.default_rng(3), four_camera_rig()
     turns = {name: np.array(wrong.get(name, (0.0, 0.0, 0.0))) for name in configured.cameras}
     calibration = flown_by(lively(random), Wrong(turns, dict.fromkeys(turns, 1.0), 0.0), random, 40)
-    assert calibration.contradictions() == tuple(
+    assert calibration.elsewhere() == named
+    told = [text for one in calibration.deviations() for text in rig_faults(one)]
+    assert [text for text in told if "moves otherwise" in text] == [
         f"camera {name}: it moves otherwise than the drone: is it the one of that name, turned as configured?"
         for name in named
-    )
+    ]
+    assert {one.camera for one in calibration.deviations() if one.elsewhere} == set(named)
+
+
+def test_where_most_cameras_contradict_the_autopilot_none_is_flown_without() -> None:
+    random, configured = np.random.default_rng(3), four_camera_rig()
+    upside_down = ("front", "left", "back")
+    turns = {name: np.array([math.pi * (name in upside_down), 0.0, 0.0]) for name in configured.cameras}
+    calibration = flown_by(lively(random), Wrong(turns, dict.fromkeys(turns, 1.0), 0.0), random, 40)
+    assert {one.camera for one in calibration.deviations() if one.elsewhere} == set(upside_down)
+    assert calibration.elsewhere() == ()
