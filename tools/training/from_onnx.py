@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import numpy as np
 import onnx
 import torch
-from onnx import numpy_helper
+from onnx import TensorProto, numpy_helper
 from torch import Tensor, nn
 
+from tools.training.halve import HALVED
 from tools.training.networks import first_layers_of
 
 
@@ -71,7 +73,11 @@ def _settled_to(bias: Tensor) -> Callable[[nn.BatchNorm2d, tuple[Tensor]], None]
 def _weights(path: Path, net: nn.Module) -> dict[str, Tensor]:
     """Every parameter of the file, under its name in torch; a folded normalisation is its convolution's bias."""
     graph = onnx.load(str(path)).graph
-    values = {one.name: torch.from_numpy(numpy_helper.to_array(one).copy()) for one in graph.initializer}
+    values = {
+        one.name.removesuffix(HALVED): torch.tensor(numpy_helper.to_array(one).astype(np.float32))
+        for one in graph.initializer
+        if one.data_type in (TensorProto.FLOAT, TensorProto.FLOAT16)
+    }
     named = {name: value for name, value in values.items() if not name.startswith("onnx::")}
     nameless: list[tuple[Tensor, Tensor]] = []
     for node in graph.node:
