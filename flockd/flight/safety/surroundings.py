@@ -56,7 +56,8 @@ def _credible(neighbour: Neighbour) -> Iterator[tuple[PossibleMotion, float]]:
     """The motions that a neighbour may have, and by how many standard deviations each may be wrong.
 
     `BEYOND` is shared among them: the less probable one is, the nearer to its mean is what remains of it, and one less
-    probable than its share does not count (Boole's inequality: the neighbour is beyond all with at most `BEYOND`).
+    probable than its share does not count (Boole's inequality: a neighbour is there, and beyond all, with at most
+    `BEYOND`). Of a single detection it is about as probable that nothing is there: that slows, and does not stop.
     """
     possible = neighbour.possible or (
         PossibleMotion(
@@ -65,8 +66,9 @@ def _credible(neighbour: Neighbour) -> Iterator[tuple[PossibleMotion, float]]:
     )
     share = BEYOND / len(possible)
     for motion in possible:
-        if motion.probability > share:
-            yield motion, -_NORMAL.inv_cdf(share / motion.probability)
+        probability = motion.probability * neighbour.existence_probability
+        if probability > share:
+            yield motion, -_NORMAL.inv_cdf(share / probability)
 
 
 def _by_now(place: FloatArray, way: FloatArray, moved: FloatArray) -> FloatArray:

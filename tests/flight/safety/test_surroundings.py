@@ -52,6 +52,17 @@ def test_neighbours_fly_on_and_the_drone_has_moved() -> None:
     np.testing.assert_allclose(around.neighbour_margins, [[0.2, 0.4], [0.4, 0.8]])
 
 
+def test_one_that_is_as_likely_not_there_counts_by_half() -> None:
+    """By tables: 0.0228 of 0.5 are 0.0455, beyond 1.690 deviations; of 0.02 it is more than all, and nothing counts."""
+    doubted = [
+        replace(neighbour(1, [5.0, 0.0, 0.0], [2.0, 0.0, 0.0], confirmed=False), existence_probability=probability)
+        for probability in (0.5, 0.02)
+    ]
+    margins = told(doubted, np.empty((0, 2))).neighbour_margins
+    assert margins is not None
+    np.testing.assert_allclose(margins, [[0.169, 0.338]], atol=1e-3)
+
+
 def test_one_that_may_move_in_two_ways_counts_as_both_each_by_its_probability() -> None:
     """By tables of the normal distribution: 0.0114 of 0.9 and of 0.1 are 0.0126 and 0.1138, beyond 2.238 and 1.207."""
     mate, comes = (

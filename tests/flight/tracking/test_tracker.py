@@ -357,6 +357,19 @@ def test_one_wrong_range_of_a_known_neighbour_does_not_stop_the_drone() -> None:
     assert _towards(tracker) > 1.0
 
 
+def test_one_false_detection_ahead_slows_for_a_step_and_does_not_stop() -> None:
+    """As seen in flight: 5.4 m ahead, once. One that comes at 2 m/s is seen twice, and stops it."""
+    ahead, limits_m_s = np.array([5.4, 0.0, 0.0]), []
+    for second in ((), (ahead - 1.5 * CRUISE,)):
+        tracker, now_s = _settled(np.array([2.5, 4.0, 0.0]))
+        _step(tracker, now_s + STEP_S, np.array([2.5, 4.0, 0.0]), ahead, sigma_m=0.15)
+        assert 0.3 < _towards(tracker) < 1.0
+        _step(tracker, now_s + 2 * STEP_S, np.array([2.5, 4.0, 0.0]), *second, sigma_m=0.15)
+        limits_m_s.append(_towards(tracker))
+    assert limits_m_s[0] > 1.0
+    assert limits_m_s[1] < 0.3
+
+
 def test_a_stranger_beside_a_known_neighbour_still_slows_at_once() -> None:
     place = np.array([4.2, 0.0, 0.0])
     for both_seen, where in ((True, [3.4, 0.0, 0.0]), (False, [3.4, 0.6, 0.0])):
