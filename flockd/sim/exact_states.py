@@ -10,11 +10,13 @@ import numpy as np
 
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FloatArray, MissionOrder, MissionStatus, Neighbour, ObstacleRanges
-from flockd.flight.flocking import FlockingLaw, passing
+from flockd.flight.flocking import FlockingLaw
+from flockd.flight.flocking.passing import Passing
 from flockd.flight.geometry import build_rig, rotation_from_euler
 from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
 from flockd.flight.obstacles import Avoidance
+from flockd.flight.safety.surroundings import limits_towards
 from flockd.sim.commands import Commands
 from flockd.sim.control_loop import ControlLoop
 from flockd.sim.disturbances import UNDISTURBED, Disturbances
@@ -48,7 +50,8 @@ class ExactFlock:
         made_up, n = scenario.detections, len(self._pilots)
         self._tracked = [] if made_up is None else [TrackedNeighbours(scenario, made_up, i) for i in range(n)]
         self._obstacles = obstacles_of(scenario)
-        self._vertical_m = drone.safety.gate.vertical_separation_m
+        self._gate = drone.safety.gate
+        self._passings = [Passing(self._law, self._gate.vertical_separation_m) for _ in self._pilots]
         self._avoids = drone.obstacles.enabled
         self._avoidances = [Avoidance(drone.obstacles, drone.safety.gate, drone.step_s) for _ in self._pilots]
 
@@ -97,8 +100,9 @@ class ExactFlock:
         desired = pilot.pull(guidance)
         if ranges is None or not self._avoids:
             if self._passes:
-                command, acceleration = passing.command(
-                    self._law, moving[i], places, others, desired, self._step_s, self._vertical_m, ages_s
+                tracks = [one.track for one in seen]
+                command, acceleration = self._passings[i].command(
+                    moving[i], places, others, desired, self._step_s, tracks, limits_towards(known, self._gate), ages_s
                 )
             else:
                 command, acceleration = self._law.command(

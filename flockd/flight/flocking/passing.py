@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import FloatArray
 from flockd.flight.flocking.law import FlockingLaw, level_offsets, lookahead_s
 from flockd.flight.geometry.level import SAME_SPOT_M, limit_norm
+from flockd.flight.safety.half_planes import crossings, nearest_within
 
 HORIZON_S = 2.5
 """Who would come too near within this time is passed: five steps of the paper's pilot."""
@@ -19,29 +21,58 @@ half of what is left each time."""
 _HEAD_ON_RAD = 0.1
 """Off a course that leads to a neighbour's middle by less than this, its side is noise: each turns to its right, as
 aircraft do (ICAO Annex 2, Rules of the Air, 3.2.2.2)."""
+_COMES_M_S, _COMES_S = 0.5, 2 * HORIZON_S
+"""A neighbour that comes at least so fast, and would be too near within this time, is stepped aside for."""
+_WORTH_M_S = 0.5
+"""The other side is taken where its velocity is nearer to the wanted one by this much, as where the gate does not let the
+drone go to this one, and backing off would be left."""
 _RING = 24
 _SPEEDS = 1.0, 0.5
 """Directions, and shares of the highest speed, that are tried where no velocity keeps clear of all."""
 _ROUNDING_M_S = 1e-9
+_DIGITS = 9
+"""Of m/s that count."""
 
 
-def command(
-    law: FlockingLaw,
-    velocity: FloatArray,
-    offsets: FloatArray,
-    velocities: FloatArray,
-    desired: FloatArray,
-    step_s: float,
-    vertical_m: float,
-    ages_s: FloatArray | float = math.inf,
-) -> tuple[FloatArray, FloatArray]:
-    """As of `FlockingLaw.command`, but clear of who would come too near; arguments as of `clear_of`.
+Limits = tuple[FloatArray, FloatArray]
+"""Directions (k, 2) of length 1, and how fast the last gate lets the drone fly along each, (k,) m/s, 0 or more."""
+NO_LIMITS: Limits = (np.empty((0, 2)), np.empty(0))
 
-    The acceleration, (2,) m/s^2, is the law's, or else the one that leads to the velocity within its sampling time.
+
+class Passing:
+    """One drone's passing of its neighbours, each on the side that it once took until it is passed.
+
+    Without memory the noise of a course that is nearly head-on decides anew in each step, and a drone that turns now to
+    one side and now to the other stays in the way.
     """
-    wanted, acceleration = law.command(velocity, level_offsets(offsets), velocities, desired, step_s, ages_s)
-    clear = clear_of(wanted, velocity, offsets, velocities, law.parameters, vertical_m)
-    return clear, acceleration if clear is wanted else (clear - velocity) / lookahead_s(step_s)
+
+    def __init__(self, law: FlockingLaw, vertical_m: float) -> None:
+        """`vertical_m`: as of `clear_of`."""
+        self._law, self._vertical_m = law, vertical_m
+        self._sides: dict[int, float] = {}
+
+    def command(
+        self,
+        velocity: FloatArray,
+        offsets: FloatArray,
+        velocities: FloatArray,
+        desired: FloatArray,
+        step_s: float,
+        tracks: Sequence[int],
+        limits: Limits = NO_LIMITS,
+        ages_s: FloatArray | float = math.inf,
+    ) -> tuple[FloatArray, FloatArray]:
+        """As of `FlockingLaw.command`, but clear of who would come too near; arguments as of `clear_of`.
+
+        `tracks`: the neighbours' numbers. The acceleration, (2,) m/s^2, is the law's, or else the one that leads to the
+        velocity within its sampling time.
+        """
+        law = self._law
+        wanted, acceleration = law.command(velocity, level_offsets(offsets), velocities, desired, step_s, ages_s)
+        sides = np.array([self._sides.get(track, 0.0) for track in tracks])
+        clear = clear_of(wanted, velocity, offsets, velocities, law.parameters, self._vertical_m, sides, limits)
+        self._sides = dict(zip(tracks, sides.tolist(), strict=True))
+        return clear, acceleration if clear is wanted else (clear - velocity) / lookahead_s(step_s)
 
 
 def clear_of(
@@ -51,77 +82,91 @@ def clear_of(
     velocities: FloatArray,
     parameters: FlockingParameters,
     vertical_m: float,
+    sides: FloatArray | None = None,
+    limits: Limits = NO_LIMITS,
 ) -> FloatArray:
     """The velocity nearest to the `wanted` one, (2,) m/s, that passes each neighbour at the separation distance.
 
     `velocity` (2,) m/s is the own one, `offsets` (n, 3) metres NED are the neighbours' and `velocities` (n, 2) m/s
-    theirs, over ground. One that is `vertical_m` above or below, or more, is passed anyway.
+    theirs, over ground. One that is `vertical_m` above or below, or more, is passed anyway. `sides` (n,) says on which
+    side each was being passed, 1 right, -1 left, 0 none, and is changed to what it is now; None: none were. A side is
+    taken where the last gate, as of its `limits`, leaves way.
 
     Optimal reciprocal collision avoidance (J. van den Berg, S. Guy, M. Lin, D. Manocha, "Reciprocal n-body collision
     avoidance", 2011): for each neighbour one half-plane of velocities, so that none comes nearer within `HORIZON_S` if
     both take their share. Where one is nearer already it comes no nearer, and the law's separation parts them. Where
     nobody would come too near it is what was wanted; where no velocity is clear of all, the one that is least off.
     """
-    distance_m, max_speed_m_s = parameters.separation_distance_m, parameters.max_speed_m_s
-    at_height = np.abs(offsets[:, 2]) < vertical_m
-    normals, least = _half_planes(velocity, offsets[at_height, :2], velocities[at_height], distance_m)
+    taken = np.zeros(len(offsets)) if sides is None else sides
+    near = np.flatnonzero((np.abs(offsets[:, 2]) < vertical_m) & (np.hypot(offsets[:, 0], offsets[:, 1]) > SAME_SPOT_M))
+
+    def plane(one: int, side: float) -> tuple[FloatArray, float, float]:
+        relative = velocity - velocities[one]
+        return _half_plane(velocity, offsets[one, :2], relative, parameters.separation_distance_m, side)
+
+    planes = {one: plane(one, taken[one]) for one in near.tolist()}
+    found = _clearest(wanted, planes.values(), parameters.max_speed_m_s, limits)
+    for one in planes:
+        if found is not None and planes[one][2] and not taken[one]:
+            others = {**planes, one: plane(one, -planes[one][2])}
+            other = _clearest(wanted, others.values(), parameters.max_speed_m_s, limits)
+            if other is not None and (other[0], other[1] + _WORTH_M_S) < found[:2]:
+                planes, found = others, other
+    taken[:] = 0.0
+    for one, (_, _, side) in planes.items():
+        taken[one] = side
+    return wanted if found is None else found[2]
+
+
+def _clearest(
+    wanted: FloatArray, planes: Iterable[tuple[FloatArray, float, float]], max_speed_m_s: float, limits: Limits
+) -> tuple[float, float, FloatArray] | None:
+    """By how much, m/s, the velocity that is least off the half-planes is off them and off `wanted`, and it.
+
+    None: `wanted` is off none.
+    """
+    normals, least = np.reshape([one[0] for one in planes], (-1, 2)), np.array([one[1] for one in planes])
     if (normals @ wanted >= least - _ROUNDING_M_S).all():
-        return wanted
+        return None
     angles = np.arange(_RING) * (2 * math.pi / _RING)
     ring = np.column_stack([np.cos(angles), np.sin(angles)])
     feet = wanted + (least - normals @ wanted)[:, None] * normals
-    tried = np.vstack([feet, _crossings(normals, least), *(max_speed_m_s * share * ring for share in _SPEEDS)])
-    tried = np.array([limit_norm(one, max_speed_m_s) for one in tried])
-    off = np.maximum(least - tried @ normals.T, 0.0).max(axis=1)
-    best = tried[off <= off.min() + _ROUNDING_M_S]
-    nearest: FloatArray = best[np.argmin(np.linalg.norm(best - wanted, axis=1))]
-    return nearest
-
-
-def _half_planes(
-    velocity: FloatArray, offsets: FloatArray, velocities: FloatArray, distance_m: float
-) -> tuple[FloatArray, FloatArray]:
-    """Normals (k, 2) and the least part, (k,) m/s, that the own velocity is to have along each."""
-    found = [
-        _half_plane(velocity, offset, velocity - theirs, distance_m)
-        for offset, theirs in zip(offsets, velocities, strict=True)
-        if math.hypot(*offset) > SAME_SPOT_M
-    ]
-    return np.reshape([normal for normal, _ in found], (-1, 2)), np.array([least for _, least in found])
+    tried = np.vstack([feet, crossings(normals, least), *(max_speed_m_s * share * ring for share in _SPEEDS)])
+    tried = np.array([nearest_within(limit_norm(one, max_speed_m_s), *limits) for one in tried])
+    off = np.round(np.maximum(least - tried @ normals.T, 0.0).max(axis=1), _DIGITS)
+    best = tried[off == off.min()]
+    far = np.linalg.norm(best - wanted, axis=1)
+    return float(off.min()), float(far.min()), best[np.argmin(far)]
 
 
 def _half_plane(
-    velocity: FloatArray, offset: FloatArray, relative: FloatArray, distance_m: float
-) -> tuple[FloatArray, float]:
-    """Of one neighbour: the nearest point outside the cone of relative velocities that lead to it, cut off at the time.
+    velocity: FloatArray, offset: FloatArray, relative: FloatArray, distance_m: float, side: float
+) -> tuple[FloatArray, float, float]:
+    """Of one neighbour its normal (2,), the least part, m/s, that the own velocity is to have along it, and its side.
 
-    The cone's apex is standstill; its end is a circle of `distance_m` over the horizon around the offset over it.
+    It leads to the nearest point outside the cone of relative velocities that lead to the neighbour, cut off at the
+    horizon. The cone's apex is standstill; its end is a circle of `distance_m` over the horizon around the offset over
+    it. Where the neighbour itself comes, backing off would only delay it: the cone is not cut off. A `side` that was
+    taken (0: none) stays while the relative velocity leads into the cone.
     """
     range_m = math.hypot(*offset)
     ahead = offset / range_m
+    closing_m_s = float(relative @ ahead)
     if range_m <= distance_m:
-        return -ahead, float(velocity @ -ahead) + max(float(relative @ ahead), 0.0)
+        return -ahead, float(velocity @ -ahead) + max(closing_m_s, 0.0), side
+    comes = closing_m_s - float(velocity @ ahead) > _COMES_M_S and closing_m_s * _COMES_S > range_m - distance_m
     beyond = relative - offset / HORIZON_S
     along = float(beyond @ offset)
-    if along < 0 and along**2 > distance_m**2 * float(beyond @ beyond):
+    if not comes and along < 0 and along**2 > distance_m**2 * float(beyond @ beyond):
         normal = beyond / math.hypot(*beyond)
         change = distance_m / HORIZON_S - math.hypot(*beyond)
     else:
         right = np.array([-ahead[1], ahead[0]])  # north and east: a quarter turn clockwise
-        to_right = float(relative @ right) > -_HEAD_ON_RAD * math.hypot(*relative)
         sine = distance_m / range_m
-        normal = math.sqrt(1 - sine**2) * (right if to_right else -right) - sine * ahead
+        cosine, to_right_m_s = math.sqrt(1 - sine**2), float(relative @ right)
+        if cosine * abs(to_right_m_s) > sine * closing_m_s or not side:  # past the cone, or at the beginning
+            head_on = abs(to_right_m_s) < _HEAD_ON_RAD * math.hypot(*relative)
+            side = math.copysign(1.0, to_right_m_s) if side or not head_on else 1.0
+        normal = cosine * side * right - sine * ahead
         change = -float(relative @ normal)
-    return normal, float(velocity @ normal) + (_SHARE * change if change > 0 else change)
-
-
-def _crossings(normals: FloatArray, least: FloatArray) -> FloatArray:
-    """(m, 2): where two of the lines n . v = least cross, for each two that are not parallel."""
-    i, j = np.triu_indices(len(normals), 1)
-    determinants = normals[i, 0] * normals[j, 1] - normals[i, 1] * normals[j, 0]
-    cross = np.abs(determinants) > 1e-6
-    a, b, c, d = normals[i][cross], normals[j][cross], least[i][cross], least[j][cross]
-    points: FloatArray = (
-        np.column_stack([c * b[:, 1] - d * a[:, 1], d * a[:, 0] - c * b[:, 0]]) / determinants[cross, None]
-    )
-    return points
+    return normal, float(velocity @ normal) + (_SHARE * change if change > 0 else change), side

@@ -29,7 +29,8 @@ from flockd.core.messages import (
     VehicleState,
     Wanted,
 )
-from flockd.flight.flocking import FlockingLaw, passing
+from flockd.flight.flocking import FlockingLaw
+from flockd.flight.flocking.passing import Passing
 from flockd.flight.geometry import RigCalibration, Seen, build_rig, estimate_ego_motion, rig_faults
 from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
@@ -41,6 +42,7 @@ from flockd.flight.pilot.ground import GroundFilter, scaled_by_ground
 from flockd.flight.pilot.motions import background_pairs, neighbour_motions
 from flockd.flight.pilot.size_learner import SizeLearner
 from flockd.flight.pilot.trim import VelocityTrim
+from flockd.flight.safety.surroundings import limits_towards
 from flockd.flight.tracking import Measurement, Prediction, Shown, Tracker
 
 RIG_EVERY_S = 5.0
@@ -106,6 +108,7 @@ class FlockPilot:
         self._tracker = Tracker(config.tracking)
         self._size = None if config.flocking.size == "off" else SizeLearner(config)
         self._law = FlockingLaw(config.flocking)
+        self._passing = Passing(self._law, config.safety.gate.vertical_separation_m)
         self._map = LocalMap(config.obstacles) if config.obstacles.enabled else None
         self._ranging = ObstacleRanging(self._rig, config.obstacles) if config.obstacles.enabled else None
         self._avoidance = Avoidance(config.obstacles, config.safety.gate, config.step_s)
@@ -411,9 +414,9 @@ class FlockPilot:
         desired = self._mission.desired
         own = guidance.velocity if velocity is None else velocity[:2]  # before the first pair: as desired
         if obstacles is None:
-            vertical_m = self._config.safety.gate.vertical_separation_m
-            command, acceleration = passing.command(
-                self._law, own, places, velocities, desired, self._config.step_s, vertical_m, ages_s
+            tracks, limits = [n.track for n in seen], limits_towards(neighbours, self._config.safety.gate)
+            command, acceleration = self._passing.command(
+                own, places, velocities, desired, self._config.step_s, tracks, limits, ages_s
             )
         else:
             command, acceleration = self._avoidance.command(

@@ -7,7 +7,9 @@ from statistics import NormalDist
 
 import numpy as np
 
+from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray, Neighbour, PossibleMotion
+from flockd.flight.safety.approach import towards_neighbours
 from flockd.flight.safety.gate import Surroundings
 
 _NORMAL = NormalDist()
@@ -49,6 +51,21 @@ def surroundings(
         ),
         height_m=height_m,
         obstacles=obstacles - moved[:2],
+    )
+
+
+def limits_towards(neighbours: Sequence[Neighbour], p: GateParameters) -> tuple[FloatArray, FloatArray]:
+    """Directions (k, 2) and how fast, (k,) m/s, the gate lets the drone fly there, as the step ends.
+
+    For a pilot that is not to ask for what cannot be flown.
+    """
+    nowhere, still = np.zeros(3), np.zeros(2)
+    around = surroundings(
+        neighbours, 0.0, moved=nowhere, position=still, velocity=nowhere, yaw_rad=0.0, height_m=0.0,
+        obstacles=np.empty((0, 2)),
+    )  # fmt: skip
+    return towards_neighbours(
+        p, around.neighbours, around.neighbour_velocities, p.min_separation_m, around.neighbour_margins
     )
 
 

@@ -10,7 +10,7 @@ import pytest
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import FloatArray
 from flockd.flight.flocking import FlockingLaw
-from flockd.flight.flocking.passing import HORIZON_S, clear_of, command
+from flockd.flight.flocking.passing import HORIZON_S, Passing, clear_of
 
 PARAMETERS = FlockingParameters()
 NORTH = np.array([2.0, 0.0])
@@ -31,7 +31,7 @@ def test_who_meets_nobody_flies_as_it_wants_to() -> None:
     [
         ([3.0, 0.0, 0.0], [2.0, 0.0]),  # a mate that flies along
         ([-3.0, 0.0, 0.0], [2.0, 0.0]),
-        ([20.0, 0.0, 0.0], [-2.0, 0.0]),  # 18.5 m to the separation at 4 m/s: farther than the horizon
+        ([22.0, 0.0, 0.0], [-2.0, 0.0]),  # 20.5 m to the separation at 4 m/s: farther than twice the horizon
         ([6.0, 4.0, 0.0], [-2.0, 0.0]),  # passes 4 m aside
         ([6.0, 0.0, -3.0], [-2.0, 0.0]),  # above
         ([-6.0, 0.0, 0.0], [-2.0, 0.0]),  # gone by
@@ -45,7 +45,7 @@ def test_the_acceleration_is_the_laws_or_leads_to_the_velocity_that_passes() -> 
     """The drone flies as it wants to; one 9 m ahead flies along, and then comes at 3 m/s."""
     law, offset = FlockingLaw(PARAMETERS), np.array([[9.0, 0.0, 0.0]])
     for theirs, passes in ((NORTH, False), (-1.5 * NORTH, True)):
-        velocity, acceleration = command(law, NORTH, offset, theirs[None], NORTH, 0.5, 3.0)
+        velocity, acceleration = Passing(law, 3.0).command(NORTH, offset, theirs[None], NORTH, 0.5, [1])
         of_law = law.command(NORTH, offset[:, :2], theirs[None], NORTH, 0.5)
         assert bool(np.abs(velocity - of_law[0]).max() > 0.1) is passes
         expected = (velocity - NORTH) / 0.5 if passes else of_law[1]
@@ -68,12 +68,51 @@ def test_one_that_stays_clear_to_the_left_is_passed_to_the_left() -> None:
     assert north_m_s < 2.0
 
 
+def test_a_side_that_was_taken_stays_while_the_course_is_in_doubt_and_is_forgotten_with_the_neighbour() -> None:
+    """One comes at 1.8 m/s, its course now 9 degrees off to one side and now to the other."""
+    still, offset = np.array([0.1, 0.0]), np.array([[5.0, 0.0, 0.0]])
+    passing, law = Passing(FlockingLaw(PARAMETERS), 3.0), FlockingLaw(PARAMETERS)
+
+    def aside(of: Passing, east_m_s: float, track: int) -> float:
+        return float(of.command(still, offset, np.array([[-1.8, east_m_s]]), NORTH, 0.5, [track])[0][1])
+
+    forgetful = [aside(Passing(law, 3.0), east_m_s, 7) for east_m_s in (0.3, -0.3, 0.3)]
+    assert [math.copysign(1, one) for one in forgetful] == [-1, 1, -1]
+    assert [math.copysign(1, aside(passing, east_m_s, 7)) for east_m_s in (0.3, -0.3, 0.3)] == [-1, -1, -1]
+    assert aside(passing, -0.3, 8) > 0, "another one"
+    assert aside(passing, -0.3, 7) > 0, "it was away for a step"
+
+
+def test_past_the_side_that_was_taken_the_other_one_is_free() -> None:
+    """5 m away, the cone is 17.5 degrees wide to each side: 25 degrees off it flies by on the other side."""
+    still, offset, sides = np.array([0.1, 0.0]), np.array([[5.0, 0.0, 0.0]]), np.array([-1.0])
+    theirs = np.array([[-1.8, -1.8 * math.tan(math.radians(25.0))]])
+    np.testing.assert_array_equal(clear_of(still, still, offset, theirs, PARAMETERS, 3.0, sides), still)
+    assert sides[0] == 1.0
+
+
 def test_far_away_a_slower_approach_is_enough() -> None:
-    """9 m away at 4 m/s, 7.5 m to the separation: it may be 3 m/s; of the 1 m/s too much half is taken off."""
+    """9 m away at 3.4 m/s, 7.5 m to the separation: it may be 3 m/s; of the 0.4 m/s too much half is taken off."""
     assert 7.5 / HORIZON_S == 3.0
-    np.testing.assert_allclose(passed([9.0, 0.0, 0.0], [-2.0, 0.0])[0], 2.0, atol=0.5)
-    slowed = clear_of(NORTH, NORTH, np.array([[9.0, 0.0, 0.0]]), np.array([[-1.2, 0.0]]), PARAMETERS, 3.0)
-    np.testing.assert_allclose(slowed, [1.9, 0.0])
+    np.testing.assert_allclose(passed([9.0, 0.0, 0.0], [-0.4, 0.0], 1.5 * NORTH), [2.8, 0.0])
+
+
+def test_for_one_that_comes_by_itself_it_steps_aside_at_once() -> None:
+    """9 m away at 3.2 m/s: it is stepped aside for, though a slower approach would do for now."""
+    north_m_s, east_m_s = passed([9.0, 0.0, 0.0], [-1.2, 0.0])
+    assert east_m_s == pytest.approx(0.5 * 3.2 / 6.0 * math.sqrt(1 - 1 / 36), rel=0.01)
+    assert north_m_s > 1.9
+
+
+def test_it_turns_to_the_side_to_which_the_gate_lets_it_fly() -> None:
+    """One comes head-on; to the right, where the rule would send it, the gate lets it fly no faster than 0.1 m/s."""
+    offset, theirs = np.array([[6.0, 0.0, 0.0]]), np.array([[-2.0, 0.0]])
+    right = np.array([[0.0, 1.0]])
+    for most_m_s, side in ((1.0, 1.0), (0.1, -1.0)):
+        sides, limits = np.zeros(1), (right, np.array([most_m_s]))
+        velocity = clear_of(NORTH, NORTH, offset, theirs, PARAMETERS, 3.0, sides, limits)
+        assert math.copysign(1.0, velocity[1]) == sides[0] == side
+        assert velocity[1] <= most_m_s
 
 
 def test_nearer_than_the_separation_it_comes_no_nearer() -> None:
