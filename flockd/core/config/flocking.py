@@ -36,10 +36,10 @@ class FlockingParameters(Section):
     separation_distance_m: Distance = 1.5
     """D_II"""
     weight: WeightParameters = WeightParameters()
-    cohesion_time_s: Duration | None = None
+    cohesion_time_s: Duration | None = 5.0
     """After how long a neighbour may pull with `max_acceleration_m_s2`; until then with the square of the share of that
     time for which it has been seen. What is no drone is mostly seen for a few seconds, and far away, where Eq. 39 pulls
-    most. null: no limit, as in the paper. docs/concepts/flocking_law.md says what 5 s win and cost."""
+    most. null: no limit, as in the paper. docs/concepts/flocking_law.md says what it wins and costs."""
     size: Literal["auto", "weave", "off"] = "auto"
     """Whether the drone learns how large the others are. `weave`: twelve seconds at a time it moves up and down by
     0.3 m, and the shift of the others' bearings tells their ranges without their size. Where the networks judge it

@@ -17,7 +17,7 @@ HORIZON_S = 2.5
 """Who would come too near within this time is passed: five steps of the paper's pilot."""
 _SHARE = 0.5
 """Of the change of velocity that is needed each of two takes half. Where the other does nothing, the next steps take
-half of what is left each time."""
+half of what is left each time; of one that comes and is too near within the horizon, all of it."""
 _HEAD_ON_RAD = 0.1
 """Off a course that leads to a neighbour's middle by less than this, its side is noise: each turns to its right, as
 aircraft do (ICAO Annex 2, Rules of the Air, 3.2.2.2)."""
@@ -169,4 +169,5 @@ def _half_plane(
             side = math.copysign(1.0, to_right_m_s) if side or not head_on else 1.0
         normal = cosine * side * right - sine * ahead
         change = -float(relative @ normal)
-    return normal, float(velocity @ normal) + (_SHARE * change if change > 0 else change), side
+    share = 1.0 if comes and closing_m_s * HORIZON_S > range_m - distance_m else _SHARE
+    return normal, float(velocity @ normal) + (share * change if change > 0 else change), side

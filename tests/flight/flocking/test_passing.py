@@ -52,19 +52,25 @@ def test_the_acceleration_is_the_laws_or_leads_to_the_velocity_that_passes() -> 
         np.testing.assert_allclose(acceleration, expected)
 
 
-def test_two_that_meet_head_on_each_turn_half_of_what_is_needed_to_their_right() -> None:
-    """6 m away and 1.5 m to keep: the cone's side is asin(1.5 / 6) off; of 4 m/s its sine is across, and half of it."""
-    sine = 0.25
+@pytest.mark.parametrize(("range_m", "share"), [(15.0, 0.5), (6.0, 1.0)])
+def test_two_that_meet_head_on_each_turn_to_their_right(range_m: float, share: float) -> None:
+    """1.5 m to keep: the cone's side is asin(1.5 / range) off; of 4 m/s its sine is across.
+
+    Half of it is taken while there is time, all of it where the separation is reached within the horizon.
+    """
+    sine = 1.5 / range_m
     normal = np.array([-sine, math.sqrt(1 - sine**2)])
-    np.testing.assert_allclose(passed([6.0, 0.0, 0.0], [-2.0, 0.0]), NORTH + 0.5 * 4.0 * sine * normal)
-    np.testing.assert_allclose(passed([-6.0, 0.0, 0.0], [2.0, 0.0], -NORTH), -(NORTH + 0.5 * 4.0 * sine * normal))
+    np.testing.assert_allclose(passed([range_m, 0.0, 0.0], [-2.0, 0.0]), NORTH + share * 4.0 * sine * normal)
+    np.testing.assert_allclose(
+        passed([-range_m, 0.0, 0.0], [2.0, 0.0], -NORTH), -(NORTH + share * 4.0 * sine * normal)
+    )
 
 
 def test_one_that_stays_clear_to_the_left_is_passed_to_the_left() -> None:
-    """1 m to the right at 6 m is asin(1.5 / 6.08) - 9.5 = 4.8 degrees into the cone; half of 4 m/s times its sine."""
+    """1 m to the right at 6 m is asin(1.5 / 6.08) - 9.5 = 4.8 degrees into the cone; of 4 m/s times its sine."""
     north_m_s, east_m_s = passed([6.0, 1.0, 0.0], [-2.0, 0.0])
     into = math.asin(1.5 / math.hypot(6.0, 1.0)) - math.atan2(1.0, 6.0)
-    assert east_m_s == pytest.approx(-2.0 * math.sin(into) * math.cos(into), rel=0.01)
+    assert east_m_s == pytest.approx(-4.0 * math.sin(into) * math.cos(into), rel=0.01)
     assert north_m_s < 2.0
 
 
@@ -98,9 +104,9 @@ def test_far_away_a_slower_approach_is_enough() -> None:
 
 
 def test_for_one_that_comes_by_itself_it_steps_aside_at_once() -> None:
-    """9 m away at 3.2 m/s: it is stepped aside for, though a slower approach would do for now."""
-    north_m_s, east_m_s = passed([9.0, 0.0, 0.0], [-1.2, 0.0])
-    assert east_m_s == pytest.approx(0.5 * 3.2 / 6.0 * math.sqrt(1 - 1 / 36), rel=0.01)
+    """12 m away at 3.2 m/s: it is stepped aside for, though a slower approach would do for now, and is none yet."""
+    north_m_s, east_m_s = passed([12.0, 0.0, 0.0], [-1.2, 0.0])
+    assert east_m_s == pytest.approx(0.5 * 3.2 / 8.0 * math.sqrt(1 - 1 / 64), rel=0.01)
     assert north_m_s > 1.9
 
 

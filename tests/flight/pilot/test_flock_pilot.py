@@ -98,11 +98,11 @@ def test_a_neighbour_before_a_camera_that_is_gone_is_as_probable_as_before(gone:
 def test_a_neighbour_pulls_by_how_long_it_has_been_seen() -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (8.0, 0.0, -3.6)))
     drone = flyer.scenario.drone
-    flocking = drone.flocking.model_copy(update={"cohesion_time_s": 5.0})
-    limited = FlockPilot(drone.model_copy(update={"flocking": flocking}), flyer.truth)
+    as_in_paper = drone.flocking.model_copy(update={"cohesion_time_s": None})
+    other = FlockPilot(drone.model_copy(update={"flocking": as_in_paper}), flyer.truth)
     for step in range(10):
         frames, state = flyer.take_frames()
-        papers, ours = flyer.pilot.step(frames, state), limited.step(frames, state)
+        ours, papers = flyer.pilot.step(frames, state), other.step(frames, state)
         flyer.move()
         if step in (2, 3, 9):
             (neighbour,) = ours.neighbours
