@@ -10,8 +10,8 @@ import numpy as np
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import FloatArray
 from flockd.flight.flocking.law import FlockingLaw, level_offsets, lookahead_s
-from flockd.flight.geometry.level import SAME_SPOT_M, limit_norm
-from flockd.flight.safety.half_planes import crossings, nearest_within
+from flockd.flight.geometry.level import SAME_SPOT_M
+from flockd.flight.safety.half_planes import crossings
 
 HORIZON_S = 2.5
 """Who would come too near within this time is passed: five steps of the paper's pilot."""
@@ -24,8 +24,8 @@ aircraft do (ICAO Annex 2, Rules of the Air, 3.2.2.2)."""
 _COMES_M_S, _COMES_S = 0.5, 2 * HORIZON_S
 """A neighbour that comes at least so fast, and would be too near within this time, is stepped aside for."""
 _WORTH_M_S = 0.5
-"""The other side is taken where its velocity is nearer to the wanted one by this much, as where the gate does not let the
-drone go to this one, and backing off would be left."""
+"""The other side is taken where its velocity is nearer to the wanted one by this much, as where the gate lets the drone
+not go to this one, and only backing off would be left."""
 _RING = 24
 _SPEEDS = 1.0, 0.5
 """Directions, and shares of the highest speed, that are tried where no velocity keeps clear of all."""
@@ -106,8 +106,9 @@ def clear_of(
 
     planes = {one: plane(one, taken[one]) for one in near.tolist()}
     found = _clearest(wanted, planes.values(), parameters.max_speed_m_s, limits)
-    for one in planes:
-        if found is not None and planes[one][2] and not taken[one]:
+    for one in sorted(planes, key=lambda one: math.hypot(*offsets[one, :2])):
+        normal, least_m_s, side = planes[one]
+        if found is not None and side and not taken[one] and normal @ wanted < least_m_s:
             others = {**planes, one: plane(one, -planes[one][2])}
             other = _clearest(wanted, others.values(), parameters.max_speed_m_s, limits)
             if other is not None and (other[0], other[1] + _WORTH_M_S) < found[:2]:
@@ -128,11 +129,16 @@ def _clearest(
     normals, least = np.reshape([one[0] for one in planes], (-1, 2)), np.array([one[1] for one in planes])
     if (normals @ wanted >= least - _ROUNDING_M_S).all():
         return None
+    towards, most_m_s = (one[limits[1] < max_speed_m_s] for one in limits)  # the others bind nothing
+    across, at_m_s = np.vstack([normals, towards]), np.concatenate([least, most_m_s])
+    feet = wanted + (at_m_s - across @ wanted)[:, None] * across
+    tried = np.vstack([feet, crossings(across, at_m_s)])
+    tried *= np.minimum(1.0, max_speed_m_s / np.maximum(np.linalg.norm(tried, axis=1), _ROUNDING_M_S))[:, None]
+    tried = tried[(tried @ towards.T <= most_m_s + _ROUNDING_M_S).all(axis=1)]
     angles = np.arange(_RING) * (2 * math.pi / _RING)
     ring = np.column_stack([np.cos(angles), np.sin(angles)])
-    feet = wanted + (least - normals @ wanted)[:, None] * normals
-    tried = np.vstack([feet, crossings(normals, least), *(max_speed_m_s * share * ring for share in _SPEEDS)])
-    tried = np.array([nearest_within(limit_norm(one, max_speed_m_s), *limits) for one in tried])
+    fastest = (most_m_s / np.maximum(ring @ towards.T, _ROUNDING_M_S)).min(axis=1, initial=max_speed_m_s)[:, None]
+    tried = np.vstack([tried, *(np.minimum(max_speed_m_s * share, fastest) * ring for share in _SPEEDS)])
     off = np.round(np.maximum(least - tried @ normals.T, 0.0).max(axis=1), _DIGITS)
     best = tried[off == off.min()]
     far = np.linalg.norm(best - wanted, axis=1)

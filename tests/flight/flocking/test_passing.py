@@ -61,9 +61,7 @@ def test_two_that_meet_head_on_each_turn_to_their_right(range_m: float, share: f
     sine = 1.5 / range_m
     normal = np.array([-sine, math.sqrt(1 - sine**2)])
     np.testing.assert_allclose(passed([range_m, 0.0, 0.0], [-2.0, 0.0]), NORTH + share * 4.0 * sine * normal)
-    np.testing.assert_allclose(
-        passed([-range_m, 0.0, 0.0], [2.0, 0.0], -NORTH), -(NORTH + share * 4.0 * sine * normal)
-    )
+    np.testing.assert_allclose(passed([-range_m, 0.0, 0.0], [2.0, 0.0], -NORTH), -(NORTH + share * 4.0 * sine * normal))
 
 
 def test_one_that_stays_clear_to_the_left_is_passed_to_the_left() -> None:
