@@ -67,12 +67,25 @@ class Passing:
         `tracks`: the neighbours' numbers. The acceleration, (2,) m/s^2, is the law's, or else the one that leads to the
         velocity within its sampling time.
         """
-        law = self._law
-        wanted, acceleration = law.command(velocity, level_offsets(offsets), velocities, desired, step_s, ages_s)
-        sides = np.array([self._sides.get(track, 0.0) for track in tracks])
-        clear = clear_of(wanted, velocity, offsets, velocities, law.parameters, self._vertical_m, sides, limits)
-        self._sides = dict(zip(tracks, sides.tolist(), strict=True))
+        wanted, acceleration = self._law.command(velocity, level_offsets(offsets), velocities, desired, step_s, ages_s)
+        clear = self.clear(wanted, velocity, offsets, velocities, tracks, limits)
         return clear, acceleration if clear is wanted else (clear - velocity) / lookahead_s(step_s)
+
+    def clear(
+        self,
+        wanted: FloatArray,
+        velocity: FloatArray,
+        offsets: FloatArray,
+        velocities: FloatArray,
+        tracks: Sequence[int],
+        limits: Limits = NO_LIMITS,
+    ) -> FloatArray:
+        """As of `clear_of`, for neighbours of these numbers."""
+        sides = np.array([self._sides.get(track, 0.0) for track in tracks])
+        law = self._law.parameters
+        clear = clear_of(wanted, velocity, offsets, velocities, law, self._vertical_m, sides, limits)
+        self._sides = dict(zip(tracks, sides.tolist(), strict=True))
+        return clear
 
 
 def clear_of(

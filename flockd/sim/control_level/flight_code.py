@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,9 +12,10 @@ from flockd.core.config.drone import DroneConfig
 from flockd.core.config.scenario import VehicleConfig
 from flockd.core.messages import FloatArray, ObstacleRanges, Wanted
 from flockd.flight.flocking import FlockingLaw
-from flockd.flight.flocking.passing import clear_of
+from flockd.flight.flocking.passing import Passing
 from flockd.flight.obstacles import Avoidance, nearest_points
 from flockd.flight.safety import Action, Gate, Permission, Request, Surroundings
+from flockd.flight.safety.approach import towards_neighbours
 from flockd.sim.control_level import motion
 
 _SETPOINT_RATE_HZ = 20.0
@@ -29,6 +31,8 @@ class Seen(NamedTuple):
     """(k, 3) m/s, NED, over ground."""
     ages_s: FloatArray | float = math.inf
     """(k,) for how long it has known them."""
+    numbers: Sequence[int] = ()
+    """The k neighbours' numbers; empty: not known from step to step."""
 
 
 class FlightCode:
@@ -39,6 +43,7 @@ class FlightCode:
         gate, step_s = drone.safety.gate, drone.step_s
         self._avoidances = [Avoidance(drone.obstacles, gate, step_s) for _ in range(drones)]
         self._gates = [Gate(gate) for _ in range(drones)]
+        self._passings = [Passing(self._law, gate.vertical_separation_m) for _ in range(drones)]
         rate_hz = _SETPOINT_RATE_HZ if drone.autopilot is None else drone.autopilot.setpoint_rate_hz
         self._ticks = max(round(step_s * rate_hz), 1)
         self._tick_s = step_s / self._ticks
@@ -54,11 +59,18 @@ class FlightCode:
         level = seen.velocities[:, :2]
         return self._avoidances[i].command(self._law, velocity, seen.offsets, level, desired, ranges, seen.ages_s)[0]
 
-    def clear(self, velocity: FloatArray, command: FloatArray, seen: Seen) -> FloatArray:
-        """The velocity (2,) m/s that a drone at `velocity` (2,) asks for in open air instead of its `command` (2,)."""
-        law, vertical_m = self._drone.flocking, self._drone.safety.gate.vertical_separation_m
-        near = np.hypot(seen.offsets[:, 0], seen.offsets[:, 1]) <= law.observation_distance_m
-        return clear_of(command, velocity, seen.offsets[near], seen.velocities[near, :2], law, vertical_m)
+    def clear(self, i: int, velocity: FloatArray, command: FloatArray, seen: Seen) -> FloatArray:
+        """The velocity (2,) m/s that drone `i` at `velocity` (2,) asks for in open air instead of its `command` (2,).
+
+        Where neighbours have no numbers no side is remembered.
+        """
+        gate = self._drone.safety.gate
+        near = np.hypot(seen.offsets[:, 0], seen.offsets[:, 1]) <= self._drone.flocking.observation_distance_m
+        offsets, level = seen.offsets[near], seen.velocities[near, :2]
+        numbers = np.array(seen.numbers)[near].tolist() if seen.numbers else [-1 - one for one in range(len(offsets))]
+        passing = self._passings[i] if seen.numbers else Passing(self._law, gate.vertical_separation_m)
+        limits = towards_neighbours(gate, offsets, level, gate.min_separation_m)
+        return passing.clear(command, velocity, offsets, level, numbers, limits)
 
     def fly_gated(
         self, i: int, begin_s: float, states: FloatArray, blown: FloatArray, commands: FloatArray, heights: FloatArray,

@@ -159,7 +159,7 @@ class FlockFlights:
             if ranges is not None:
                 commands[:, drone] = code.around(drone, own[:, drone], seen, desired[:, drone], ranges)
             else:
-                commands[:, drone] = code.clear(own[:, drone], commands[:, drone].copy(), seen)
+                commands[:, drone] = code.clear(drone, own[:, drone], commands[:, drone].copy(), seen)
             if self._gated:
                 code.fly_gated(drone, time_s, states, self._blown, commands, heights, self._gusts, seen, ranges)
 
@@ -168,7 +168,8 @@ class FlockFlights:
         drone = int(self._order[flight, slot])
         if self._errors is None:
             others = np.delete(states[:, flight].T, drone, axis=0)
-            return Seen(others[:, :3] - states[:3, flight, drone], others[:, 3:])
+            numbers = [other for other in range(states.shape[2]) if other != drone]
+            return Seen(others[:, :3] - states[:3, flight, drone], others[:, 3:], numbers=numbers)
         cells = self._by_slot, self._grids[flight], self._starts[flight], self._order
         table, figures, seeds = self._errors
         reach = perceived_sums.farthest(figures, self._law)
