@@ -31,8 +31,11 @@ PRIOR_TURN_RAD, PRIOR_OFFSET_S, PRIOR_FOCAL = math.radians(4.0), 0.06, 0.04
 _WANDER_TURN_RAD, _WANDER_OFFSET_S, _WANDER_FOCAL = math.radians(0.05), 5e-4, 5e-4
 """By how much they may change in a minute: mountings give way, and a filter that is certain learns no more."""
 _WANDER_TIME_S = 60.0
-_TURN_SIGMA_RAD = math.radians(0.05)
-"""Of the autopilot's turn between two images, each axis."""
+_TURN_SIGMA_RAD, _LEAST_TURN_RAD, _TURN_GAIN = math.radians(0.15), math.radians(0.05), 0.1
+"""Of the autopilot's turn between two images, each axis: before anything was seen, and at least. An attitude that jitters
+by more than it counts for looks like turns of the body about axes about which it never turned, and tells mountings that
+it does not know; so how much it jitters is learnt from what all cameras agree on (expectation maximisation), each time
+by this share."""
 _VELOCITY_SIGMA_M_S, _VELOCITY_TIME_S = 0.2, 10.0
 """Error of the autopilot's velocity, each axis, which lasts (PX4's estimate: 0.15 m/s for seconds at a time)."""
 _VELOCITY_NOISE_M_S = 0.1
@@ -149,6 +152,19 @@ class _Row:
     """(6, 6)"""
 
 
+class _Found(NamedTuple):
+    """What an update found."""
+
+    step: FloatArray
+    """Of the state."""
+    covariance: FloatArray
+    """Of the state, after it."""
+    off: FloatArray
+    """(6,) by how much the autopilot's turn, rad, and way, m, were off."""
+    turn_square: float
+    """The mean square that the turn was off by, each axis, rad^2: expected, as it is not known exactly."""
+
+
 class RigCalibration:
     """The filter of one rig."""
 
@@ -162,6 +178,7 @@ class RigCalibration:
         self._wander = np.array(wander * count + [0.0] * 3) ** 2 / _WANDER_TIME_S
         self._covariance = np.diag(np.array(sigmas * count + [_VELOCITY_SIGMA_M_S] * 3) ** 2)
         self._velocity_error = np.zeros(3)
+        self._turn_variance = _TURN_SIGMA_RAD**2
         self._time_s: float | None = None
         """Of the last update."""
 
@@ -181,15 +198,17 @@ class RigCalibration:
         self._wait(elapsed_s)
         with np.errstate(all="ignore"):
             try:
-                step, covariance = self._found(before, after, pairs)
+                found = self._found(before, after, pairs)
             except (np.linalg.LinAlgError, ValueError):
                 return
-        if np.isfinite(step).all() and np.isfinite(covariance).all() and (np.diag(covariance) > 0.0).all():
-            self._covariance = covariance
-            self._move(step)
+        if all(np.isfinite(one).all() for one in found) and (np.diag(found.covariance) > 0.0).all():
+            self._covariance = found.covariance
+            self._move(found.step)
+            jitter = max(found.turn_square, _LEAST_TURN_RAD**2)
+            self._turn_variance += _TURN_GAIN * (jitter - self._turn_variance)
 
-    def _found(self, before: Seen, after: Seen, pairs: PointPairs) -> tuple[FloatArray, FloatArray]:
-        """The state's step and its covariance after it. Raises ValueError where no camera tells anything."""
+    def _found(self, before: Seen, after: Seen, pairs: PointPairs) -> _Found:
+        """Raises ValueError where no camera tells anything."""
         interval_s = after.vehicle.time_s - before.vehicle.time_s
         used, rows, off = {}, [], np.zeros(6)
         for name, camera in self._cameras.items():
@@ -206,9 +225,10 @@ class RigCalibration:
         for number in range(_ROUNDS):
             if number:
                 rows = [self._row(name, motion, before, after, off) for name, motion in used.items()]
-            step, off, covariance = self._solved(rows, interval_s, known=known)
-            off[3:] += step[-3:] * interval_s
-        return step, covariance
+            found = self._solved(rows, interval_s, known=known)
+            off = found.off.copy()
+            off[3:] += found.step[-3:] * interval_s
+        return found
 
     def deviations(self) -> tuple[CameraDeviation, ...]:
         """How each camera differs from its configuration, as far as is known."""
@@ -289,7 +309,7 @@ class RigCalibration:
         """Whether a camera's motion is one that may be; learns how large its errors are."""
         mine = np.r_[row.place * _SIZE : (row.place + 1) * _SIZE, len(self._covariance) - 3 : len(self._covariance)]
         H = np.concatenate([row.by_state, row.by_velocity], axis=1)
-        noise = np.diag([_TURN_SIGMA_RAD] * 3 + [_VELOCITY_NOISE_M_S] * 3) ** 2
+        noise = np.diag([self._turn_variance] * 3 + [_VELOCITY_NOISE_M_S**2] * 3)
         spread = H @ self._covariance[np.ix_(mine, mine)] @ H.T + row.by_noise @ noise @ row.by_noise.T
         spread += np.linalg.inv(row.information)
         square = float(row.measured @ np.linalg.solve(spread, row.measured)) / len(row.measured)
@@ -301,13 +321,12 @@ class RigCalibration:
         camera.agreement += _AGREEMENT_GAIN * ((1.0 if fits else -1.0) - camera.agreement)
         return fits
 
-    def _solved(self, rows: list[_Row], interval_s: float, *, known: bool) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The state's step, what the autopilot's turn and way were off, and the covariance."""
+    def _solved(self, rows: list[_Row], interval_s: float, *, known: bool) -> _Found:
         size = len(self._covariance)
         noise_m = (_VELOCITY_NOISE_M_S if known else _UNKNOWN_M_S) * interval_s
         hessian = np.zeros((size + 6, size + 6))
         hessian[:size, :size] = np.linalg.inv(self._covariance)
-        hessian[range(size, size + 6), range(size, size + 6)] = [_TURN_SIGMA_RAD**-2] * 3 + [noise_m**-2] * 3
+        hessian[range(size, size + 6), range(size, size + 6)] = [1.0 / self._turn_variance] * 3 + [noise_m**-2] * 3
         gradient = np.zeros(size + 6)
         for row in rows:
             J = np.zeros((6, size + 6))
@@ -317,8 +336,10 @@ class RigCalibration:
             gradient += J.T @ row.information @ row.measured
         covariance = np.linalg.inv(hessian)
         found = covariance @ gradient
+        turn = slice(size, size + 3)
+        turn_square = float(np.mean(found[turn] ** 2 + np.diag(covariance)[turn]))
         covariance = covariance[:size, :size]
-        return found[:size], found[size:], (covariance + covariance.T) / 2.0
+        return _Found(found[:size], (covariance + covariance.T) / 2.0, found[size:], turn_square)
 
     def _move(self, step: FloatArray) -> None:
         for place, camera in enumerate(self._cameras.values()):

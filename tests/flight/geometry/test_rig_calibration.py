@@ -57,10 +57,10 @@ STRAIGHT = Way(lambda t: np.eye(3), lambda t: np.array([t, 0.0, -4.5]))
 
 
 class Autopilot:
-    """The truth with errors that drift: attitude 0.2 degrees in 30 s, velocity 0.1 m/s in 10 s."""
+    """The truth with errors that drift: attitude 0.2 degrees in 30 s, velocity 0.1 m/s in 10 s; jitter anew each time."""
 
-    def __init__(self, way: Way, random: np.random.Generator) -> None:
-        self._way, self._random = way, random
+    def __init__(self, way: Way, random: np.random.Generator, jitter_deg: float = 0.0) -> None:
+        self._way, self._random, self._jitter_rad = way, random, math.radians(jitter_deg)
         self._turned, self._moved = (sigma * random.normal(size=3) for sigma in (math.radians(0.2), 0.1))
 
     def state(self, t: float) -> VehicleState:
@@ -69,11 +69,14 @@ class Autopilot:
         before, after = self._way.pose(t - 1e-3), self._way.pose(t + 1e-3)
         return VehicleState(
             t,
-            rotation_from_vector(self._turned) @ self._way.attitude(t),
+            rotation_from_vector(self._turned + self._jitter()) @ self._way.attitude(t),
             4.5,
             (after.translation - before.translation) / 2e-3 + self._moved,
             turn_rate=vector_from_rotation(before.rotation.T @ after.rotation) / 2e-3,
         )
+
+    def _jitter(self) -> FloatArray:
+        return self._jitter_rad * self._random.normal(size=3) if self._jitter_rad else np.zeros(3)
 
     def _drift(self, error: FloatArray, sigma: float, time_s: float) -> FloatArray:
         keep = math.exp(-STEP_S / time_s)
@@ -118,11 +121,13 @@ def flown(way: Way, wrong: Wrong, random: np.random.Generator, steps: int = 120)
     return flown_by(way, wrong, random, steps).deviations()
 
 
-def flown_by(way: Way, wrong: Wrong, random: np.random.Generator, steps: int) -> RigCalibration:
+def flown_by(
+    way: Way, wrong: Wrong, random: np.random.Generator, steps: int, jitter_deg: float = 0.0
+) -> RigCalibration:
     """The filter after so many steps of half a second."""
     configured = four_camera_rig()
     true, calibration = wrong.rig(configured), RigCalibration(configured)
-    world, autopilot = boxes_around(random, 20), Autopilot(way, random)
+    world, autopilot = boxes_around(random, 20), Autopilot(way, random, jitter_deg)
     before = None
     for number in range(steps + 1):
         t = number * STEP_S
@@ -176,6 +181,19 @@ def test_a_rig_as_configured_is_not_complained_of() -> None:
         for found in flown(way, wrong, random, steps=60):
             assert rig_faults(found) == ()
             assert off_deg(found, np.zeros(3)) < 0.2 or way is STRAIGHT
+
+
+def test_what_the_attitude_jitters_is_learnt_and_tells_no_mountings() -> None:
+    """In still air a circle says little of how mountings are turned about the vertical; jitter is no turn of the body."""
+    circle = Way(lambda t: rotation_from_euler(0.0, 0.0, 0.1 * t), lively(np.random.default_rng(0)).position)
+    yaw_sigmas_deg = []
+    for jitter_deg in (0.0, 0.3):
+        random = np.random.default_rng(1)
+        wrong = wrong_by(0.0, 0.0, 0.0, four_camera_rig(), random)
+        found = flown_by(circle, wrong, random, 120, jitter_deg).deviations()
+        assert not [text for one in found for text in rig_faults(one)]
+        yaw_sigmas_deg.append(min(math.degrees(math.sqrt(one.covariance[2, 2])) for one in found))
+    assert yaw_sigmas_deg[1] > 0.9 * yaw_sigmas_deg[0] > 0.7
 
 
 def test_a_flight_that_never_turns_leaves_open_what_it_does_not_show() -> None:
