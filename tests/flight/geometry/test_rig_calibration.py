@@ -57,7 +57,7 @@ STRAIGHT = Way(lambda t: np.eye(3), lambda t: np.array([t, 0.0, -4.5]))
 
 
 class Autopilot:
-    """The truth with errors that drift: attitude 0.2 degrees in 30 s, velocity 0.1 m/s in 10 s; jitter anew each time."""
+    """The truth with errors that drift: attitude 0.2 degrees in 30 s, velocity 0.1 m/s in 10 s; and with jitter."""
 
     def __init__(self, way: Way, random: np.random.Generator, jitter_deg: float = 0.0) -> None:
         self._way, self._random, self._jitter_rad = way, random, math.radians(jitter_deg)
@@ -184,7 +184,7 @@ def test_a_rig_as_configured_is_not_complained_of() -> None:
 
 
 def test_what_the_attitude_jitters_is_learnt_and_tells_no_mountings() -> None:
-    """In still air a circle says little of how mountings are turned about the vertical; jitter is no turn of the body."""
+    """In still air a circle says little of how mountings are turned about the vertical, with or without jitter."""
     circle = Way(lambda t: rotation_from_euler(0.0, 0.0, 0.1 * t), lively(np.random.default_rng(0)).position)
     yaw_sigmas_deg = []
     for jitter_deg in (0.0, 0.3):
