@@ -32,10 +32,10 @@ _WANDER_TURN_RAD, _WANDER_OFFSET_S, _WANDER_FOCAL = math.radians(0.05), 5e-4, 5e
 """By how much they may change in a minute: mountings give way, and a filter that is certain learns no more."""
 _WANDER_TIME_S = 60.0
 _TURN_SIGMA_RAD, _LEAST_TURN_RAD, _TURN_GAIN = math.radians(0.15), math.radians(0.05), 0.1
-"""Of the autopilot's turn between two images, each axis: before anything was seen, and at least. An attitude that jitters
-by more than it counts for looks like turns of the body about axes about which it never turned, and tells mountings
-that it does not know; so how much it jitters is learnt from what all cameras agree on (expectation maximisation), each
-time by this share."""
+"""Of the autopilot's turn between two images, each axis: before anything was seen, and at least. An attitude that
+jitters by more than it counts for looks like turns of the body about axes about which it never turned, and tells
+mountings that it does not know; so how much it jitters is learnt from what all cameras agree on (expectation
+maximisation), each time by this share."""
 _VELOCITY_SIGMA_M_S, _VELOCITY_TIME_S = 0.2, 10.0
 """Error of the autopilot's velocity, each axis, which lasts (PX4's estimate: 0.15 m/s for seconds at a time)."""
 _VELOCITY_NOISE_M_S = 0.1

@@ -57,7 +57,7 @@ STRAIGHT = Way(lambda t: np.eye(3), lambda t: np.array([t, 0.0, -4.5]))
 
 
 class Autopilot:
-    """The truth with errors that drift: attitude 0.2 degrees in 30 s, velocity 0.1 m/s in 10 s; and with jitter."""
+    """The truth with errors that drift, attitude 0.2 degrees in 30 s, velocity 0.1 m/s in 10 s, and with jitter."""
 
     def __init__(self, way: Way, random: np.random.Generator, jitter_deg: float = 0.0) -> None:
         self._way, self._random, self._jitter_rad = way, random, math.radians(jitter_deg)
