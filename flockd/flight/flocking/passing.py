@@ -11,7 +11,6 @@ from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import FloatArray
 from flockd.flight.flocking.law import FlockingLaw, level_offsets, lookahead_s
 from flockd.flight.geometry.level import SAME_SPOT_M
-from flockd.flight.safety.half_planes import crossings
 
 HORIZON_S = 2.5
 """Who would come too near within this time is passed: five steps of the paper's pilot."""
@@ -145,7 +144,7 @@ def _clearest(
     towards, most_m_s = (one[limits[1] < max_speed_m_s] for one in limits)  # the others bind nothing
     across, at_m_s = np.vstack([normals, towards]), np.concatenate([least, most_m_s])
     feet = wanted + (at_m_s - across @ wanted)[:, None] * across
-    tried = np.vstack([feet, crossings(across, at_m_s)])
+    tried = np.vstack([feet, _crossings(across, at_m_s)])
     tried *= np.minimum(1.0, max_speed_m_s / np.maximum(np.linalg.norm(tried, axis=1), _ROUNDING_M_S))[:, None]
     tried = tried[(tried @ towards.T <= most_m_s + _ROUNDING_M_S).all(axis=1)]
     angles = np.arange(_RING) * (2 * math.pi / _RING)
@@ -190,3 +189,15 @@ def _half_plane(
         change = -float(relative @ normal)
     share = 1.0 if comes and closing_m_s * HORIZON_S > range_m - distance_m else _SHARE
     return normal, float(velocity @ normal) + (share * change if change > 0 else change), side
+
+
+def _crossings(normals: FloatArray, least: FloatArray) -> FloatArray:
+    """(m, 2): where two of the lines n . v = least cross, for each two that are not parallel."""
+    i, j = np.triu_indices(len(normals), 1)
+    determinants = normals[i, 0] * normals[j, 1] - normals[i, 1] * normals[j, 0]
+    cross = np.abs(determinants) > 1e-6
+    a, b, c, d = normals[i][cross], normals[j][cross], least[i][cross], least[j][cross]
+    points: FloatArray = (
+        np.column_stack([c * b[:, 1] - d * a[:, 1], d * a[:, 0] - c * b[:, 0]]) / determinants[cross, None]
+    )
+    return points

@@ -23,14 +23,14 @@ def nearest_within(velocity: FloatArray, directions: FloatArray, limits: FloatAr
     binding = ~(limits > np.hypot(*velocity) + _ROUNDING_M_S)  # the others hold for all that is no longer
     directions, limits, over = directions[binding], limits[binding], over[binding]
     feet = velocity - over[:, None] * directions
-    candidates = np.vstack([np.zeros(2), feet, crossings(directions, limits)])
+    candidates = np.vstack([np.zeros(2), feet, _crossings(directions, limits)])
     fits = np.max(candidates @ directions.T - limits, axis=1, initial=-np.inf) <= _ROUNDING_M_S
     fitting = candidates[fits]
     nearest: FloatArray = fitting[np.argmin(np.linalg.norm(fitting - velocity, axis=1))]
     return nearest
 
 
-def crossings(directions: FloatArray, limits: FloatArray) -> FloatArray:
+def _crossings(directions: FloatArray, limits: FloatArray) -> FloatArray:
     """(m, 2): where two of the lines n . v = limit cross, for each two that are not parallel (Cramer's rule)."""
     i, j = np.triu_indices(len(directions), 1)
     a, b = directions[i], directions[j]
