@@ -38,17 +38,14 @@ def surroundings(
     the drone itself flew since then; `position` (2,) m from home, `velocity` (3,) m/s NED, NaN where not known;
     `obstacles` (m, 2) m from where the drone was then.
     """
-    motions = [motion for one in neighbours for motion in _credible(one)]
-    n = len(motions)
+    places, velocities, margins = _motions(neighbours, age_s, moved)
     return Surroundings(
         position=position,
         velocity=velocity[:2],
         yaw_rad=yaw_rad,
-        neighbours=np.reshape([_by_now(one.position, age_s * one.velocity, moved) for one, _ in motions], (n, 3)),
-        neighbour_velocities=np.reshape([one.velocity[:2] for one, _ in motions], (n, 2)),
-        neighbour_margins=np.reshape(
-            [(sigmas * one.range_sigma_m, sigmas * one.closing_sigma_m_s) for one, sigmas in motions], (n, 2)
-        ),
+        neighbours=places,
+        neighbour_velocities=velocities,
+        neighbour_margins=margins,
         height_m=height_m,
         obstacles=obstacles - moved[:2],
     )
@@ -59,13 +56,20 @@ def limits_towards(neighbours: Sequence[Neighbour], p: GateParameters) -> tuple[
 
     For a pilot that is not to ask for what cannot be flown.
     """
-    nowhere, still = np.zeros(3), np.zeros(2)
-    around = surroundings(
-        neighbours, 0.0, moved=nowhere, position=still, velocity=nowhere, yaw_rad=0.0, height_m=0.0,
-        obstacles=np.empty((0, 2)),
-    )  # fmt: skip
-    return towards_neighbours(
-        p, around.neighbours, around.neighbour_velocities, p.min_separation_m, around.neighbour_margins
+    places, velocities, margins = _motions(neighbours, 0.0, np.zeros(3))
+    return towards_neighbours(p, places, velocities, p.min_separation_m, margins)
+
+
+def _motions(
+    neighbours: Sequence[Neighbour], age_s: float, moved: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Places (k, 3) m, velocities (k, 2) m/s and margins (k, 2) of all motions that neighbours may have by now."""
+    motions = [motion for one in neighbours for motion in _credible(one)]
+    k = len(motions)
+    return (
+        np.reshape([_by_now(one.position, age_s * one.velocity, moved) for one, _ in motions], (k, 3)),
+        np.reshape([one.velocity[:2] for one, _ in motions], (k, 2)),
+        np.reshape([(sigmas * one.range_sigma_m, sigmas * one.closing_sigma_m_s) for one, sigmas in motions], (k, 2)),
     )
 
 

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray, Neighbour, PossibleMotion
 from flockd.flight.safety import Surroundings
-from flockd.flight.safety.surroundings import BEYOND, surroundings
+from flockd.flight.safety.surroundings import BEYOND, limits_towards, surroundings
 
 
 def told(neighbours: list[Neighbour], obstacles: FloatArray) -> Surroundings:
@@ -140,3 +141,21 @@ def test_the_drone_itself_is_where_it_is_now() -> None:
     np.testing.assert_array_equal(around.position, [30.0, 40.0])
     np.testing.assert_array_equal(around.velocity, [2.0, -4.0])
     assert (around.yaw_rad, around.height_m) == (0.3, 6.0)
+
+
+def test_a_pilot_hears_how_fast_the_gate_lets_it_fly_towards_each() -> None:
+    """4 m ahead, 3 m left: sqrt(0.75^2 + 1.5 * 3) - 0.75 = 1.5 m/s, as if it began to come now; below, no limit."""
+    p, here = GateParameters(), [4.0, 0.0, 0.0]
+    known = [
+        replace(neighbour(1, at, [0.0, 0.0, 0.0], confirmed=True), position_sigma_m=0.0, velocity_sigma_m_s=0.0)
+        for at in (here, [0.0, 6.0, 3.5])
+    ]
+    directions, most_m_s = limits_towards(known, p)
+    np.testing.assert_allclose(directions, [[1.0, 0.0]])
+    np.testing.assert_allclose(most_m_s, [1.5])
+    (goes,) = limits_towards([replace(known[0], velocity=np.array([1.0, 0.0, 0.0]))], p)[1]
+    assert goes == pytest.approx(2.0)  # sqrt(1.5^2 + 2 * 1.5 * 3 + 1^2) - 1.5: it may brake unseen for a second
+    _, in_doubt_m_s = limits_towards([neighbour(5, here, [0.0, 0.0, 0.0], confirmed=False)], p)
+    assert in_doubt_m_s < 1.0
+    directions, most_m_s = limits_towards([], p)
+    assert directions.shape == (0, 2) and most_m_s.shape == (0,)
