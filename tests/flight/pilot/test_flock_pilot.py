@@ -22,7 +22,7 @@ from flockd.core.messages import (
     UInt8Array,
     VehicleState,
 )
-from flockd.flight.geometry import RigCamera, rotation_angle_deg
+from flockd.flight.geometry import RigCalibration, RigCamera, rotation_angle_deg
 from flockd.flight.perception import Crop, Observation, RangeEstimate, SceneMaps
 from flockd.flight.pilot import FlockPilot
 from tests.flight.pilot.flyer import STEP_S, Flyer, scenario_with
@@ -74,6 +74,17 @@ def test_the_others_of_the_rig_fly_on_without_one_camera() -> None:
     assert output.counts["camera left: no frame"] == 1
     assert output.ego_motion is not None
     assert len(output.detections) == 1
+
+
+def test_a_camera_that_is_elsewhere_is_flown_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+    assert flyer.step().noisy_cameras == ()
+    flyer.move()
+    monkeypatch.setattr(RigCalibration, "elsewhere", lambda calibration: ("front",))
+    output = flyer.step()
+    assert output.noisy_cameras == ("front",)
+    assert output.counts["camera front: no frame"] == 1
+    assert not output.detections, "the neighbour is ahead"
 
 
 @pytest.mark.parametrize(("gone", "less_probable"), [("front", False), ("back", True)])

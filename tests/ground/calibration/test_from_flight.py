@@ -86,6 +86,21 @@ def test_what_is_not_known_is_kept_and_named(tmp_path: Path) -> None:
     assert result["time_offset_s"] == pytest.approx(-0.03)  # by the camera that knows it
 
 
+def test_of_a_camera_that_is_elsewhere_nothing_is_taken_and_the_doctor_names_it(tmp_path: Path) -> None:
+    lost = replace(seen("front", time_s=-0.3), elsewhere=True)
+    recording = recorded(tmp_path, [(lost, seen("left"))])
+    out = tmp_path / "rig.yaml"
+    result = corrected_rig(recording, "flight", out)
+    assert result["cameras"]["front"]["taken"] == []
+    assert result["notes"][0].startswith("camera front: it moves otherwise than the drone")
+    assert load_drone(out).rig.cameras[0] == recording.config.rig.cameras[0]
+    assert result["time_offset_s"] == pytest.approx(-0.03)
+    first, second = check_rig(as_drone1(recording.config), tmp_path)
+    assert (first.level, first.about) == (Level.FAILURE, "camera front")
+    assert "flockd cameras --picture" in first.fix
+    assert (second.level, second.about) == (Level.WARNING, "camera left")
+
+
 def test_what_agrees_with_the_configuration_is_not_replaced(tmp_path: Path) -> None:
     little = np.radians([0.1, -0.2, 0.1])
     recording = recorded(tmp_path, [(seen("front", little, 0.002, 1.004), seen("left", little, 0.002, 1.004))])
