@@ -54,6 +54,9 @@ _MAX_INFLATION = 9.0
 _AGREEMENT_GAIN, _AGREES = 0.125, 0.5
 """Share of one motion in whether a camera's last ones agree with the body's (1) or not (-1), and from which on it does:
 after three seconds in which all did, or none. In flights with mountings up to 20 degrees off all do."""
+_MOVES_M, _MOVES_RAD = 0.2, math.radians(1.0)
+"""A body that went and turned by less says nothing of that: who walks before a drone on the ground makes no camera one
+that is elsewhere."""
 WORTH_TURN_RAD, WORTH_OFFSET_S, WORTH_FOCAL = math.radians(0.5), 0.01, 0.01
 """What is less is not worth a warning: half a degree puts a drone at 10 m by 0.09 m, and 1 % a range by 1 %."""
 _SURE, _SURE_OF_TURN = 9.0, 14.16
@@ -211,12 +214,14 @@ class RigCalibration:
         """Raises ValueError where no camera tells anything."""
         interval_s = after.vehicle.time_s - before.vehicle.time_s
         used, rows, off = {}, [], np.zeros(6)
+        turned_rad = np.linalg.norm(vector_from_rotation(before.vehicle.R_ned_body.T @ after.vehicle.R_ned_body))
+        moves = bool(np.linalg.norm(_went(before, after)) > _MOVES_M or turned_rad > _MOVES_RAD)
         for name, camera in self._cameras.items():
             motion = self._motion(name, before, after, pairs)
             if motion is None:
                 continue
             row = self._row(name, motion, before, after, off)
-            if self._fits(row, camera):
+            if self._fits(row, camera, moves=moves):
                 used[name] = motion
                 rows.append(row)
         if not used:
@@ -305,8 +310,9 @@ class RigCalibration:
         information = into @ motion.information @ into.T / camera.misfit
         return _Row(place, by_state, by_velocity, by_noise, measured, information)
 
-    def _fits(self, row: _Row, camera: _Camera) -> bool:
-        """Whether a camera's motion is one that may be; learns how large its errors are."""
+    def _fits(self, row: _Row, camera: _Camera, *, moves: bool) -> bool:
+        """Whether a camera's motion is one that may be; learns how large its errors are, and if the drone moves whether
+        they agree."""
         mine = np.r_[row.place * _SIZE : (row.place + 1) * _SIZE, len(self._covariance) - 3 : len(self._covariance)]
         H = np.concatenate([row.by_state, row.by_velocity], axis=1)
         noise = np.diag([self._turn_variance] * 3 + [_VELOCITY_NOISE_M_S**2] * 3)
@@ -318,7 +324,8 @@ class RigCalibration:
         misfit = camera.misfit * min(max(square, 0.1), _MAX_MISFIT) ** _FIT_GAIN
         camera.misfit = min(max(misfit, 1.0), _MAX_INFLATION)
         fits = square < _MAX_MISFIT
-        camera.agreement += _AGREEMENT_GAIN * ((1.0 if fits else -1.0) - camera.agreement)
+        if moves:
+            camera.agreement += _AGREEMENT_GAIN * ((1.0 if fits else -1.0) - camera.agreement)
         return fits
 
     def _solved(self, rows: list[_Row], interval_s: float, *, known: bool) -> _Found:

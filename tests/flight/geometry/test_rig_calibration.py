@@ -122,12 +122,12 @@ def flown(way: Way, wrong: Wrong, random: np.random.Generator, steps: int = 120)
 
 
 def flown_by(
-    way: Way, wrong: Wrong, random: np.random.Generator, steps: int, jitter_deg: float = 0.0
+    way: Way, wrong: Wrong, random: np.random.Generator, steps: int, jitter_deg: float = 0.0, said: Way | None = None
 ) -> RigCalibration:
-    """The filter after so many steps of half a second."""
+    """The filter after so many steps of half a second; `said`: the way that the autopilot tells, if another."""
     configured = four_camera_rig()
     true, calibration = wrong.rig(configured), RigCalibration(configured)
-    world, autopilot = boxes_around(random, 20), Autopilot(way, random, jitter_deg)
+    world, autopilot = boxes_around(random, 20), Autopilot(said or way, random, jitter_deg)
     before = None
     for number in range(steps + 1):
         t = number * STEP_S
@@ -275,6 +275,14 @@ def test_a_camera_that_is_upside_down_or_another_one_is_said(
         for name in named
     ]
     assert {one.camera for one in calibration.deviations() if one.elsewhere} == set(named)
+
+
+def test_who_walks_before_a_drone_that_stands_still_makes_no_camera_one_that_is_elsewhere() -> None:
+    """All that its cameras see moves."""
+    random, still = np.random.default_rng(3), Way(lambda t: np.eye(3), lambda t: np.array([0.0, 0.0, -4.5]))
+    as_configured = wrong_by(0.0, 0.0, 0.0, four_camera_rig(), random)
+    found = flown_by(lively(random), as_configured, random, 40, said=still)
+    assert not [one.camera for one in found.deviations() if one.elsewhere]
 
 
 def test_where_most_cameras_contradict_the_autopilot_none_is_flown_without() -> None:
