@@ -121,7 +121,8 @@ def clear_of(
     for one in sorted(planes, key=lambda one: math.hypot(*offsets[one, :2])):
         normal, least_m_s, side = planes[one]
         if found is not None and side and not taken[one] and normal @ wanted < least_m_s:
-            others = {**planes, one: plane(one, -planes[one][2])}
+            others = {**planes, one: plane(one, -side)}
+            # Not where the wanted one is clear there: nobody would turn, and 150 flights pass nearer (1.6, not 1.8 m).
             other = _clearest(wanted, others.values(), parameters.max_speed_m_s, limits)
             if other is not None and (other[0], other[1] + _WORTH_M_S) < found[:2]:
                 planes, found = others, other
