@@ -63,6 +63,14 @@ class CameraMotion:
         change: FloatArray = self.projection @ self.sights.by_focal(motion).ravel()
         return change
 
+    def by_readout(self, motion: RigidTransform, rates: tuple[FloatArray, FloatArray]) -> FloatArray:
+        """(6, 2) likewise with the seconds that pass over the image's width, and over its height, as rows are read.
+
+        ``rates`` are those of turn, (3,) rad/s in the camera's axes, at the first image and at the second.
+        """
+        changes = self.sights.by_readout(motion, rates)
+        return np.stack([self.projection @ change.ravel() for change in changes], axis=1)
+
 
 def scaled_focal(camera: Camera, log_scale: float) -> Camera:
     """The camera with its focal lengths multiplied by ``exp(log_scale)``."""
@@ -161,6 +169,17 @@ class Sights:
         stepped = _unit(_moved(self.before_other, motion)) - there
         changes: FloatArray = np.einsum("nij,nj->ni", self.across, stepped) / _FOCAL_STEP
         return np.nan_to_num(changes)
+
+    def by_readout(self, motion: RigidTransform, rates: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Two of (n, 2) pixels a second of readout over the width, and over the height, of the same."""
+        moved = _moved(self.before, motion)
+        length = np.linalg.norm(moved, axis=1, keepdims=True)
+        first = np.cross(rates[0], self.before) @ motion.rotation / length
+        second = np.cross(rates[1], self.after)
+        places = [self.camera.project(points) / self.camera.size - 0.5 for points in (self.before, self.after)]
+        changes = (first * places[0][:, axis, None] - second * places[1][:, axis, None] for axis in (0, 1))
+        across, along = (np.nan_to_num(np.einsum("nij,nj->ni", self.across, change)) for change in changes)
+        return across, along
 
 
 def _moved(points: FloatArray, motion: RigidTransform) -> FloatArray:

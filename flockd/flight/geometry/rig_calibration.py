@@ -44,6 +44,10 @@ _WAY_SIGMA = 0.03
 """Of the way that a camera sees, share of it, each axis: a network's flow has the direction off by 0.4 to 3.9 degrees
 (standard deviations of cameras in realistic flights, beside the truth), for seconds at a time, where its matches claim
 0.2. Believed, it told focal lengths and mountings that nobody had changed."""
+_READOUT_S = 0.02
+"""Of all cameras alike: the time over an image's width, and over its height, in which rows are read one after the
+other; 0 for a global shutter. Where the rate of turn changes, that makes turns about other axes of turns, and focal
+lengths (E. Ringaby and P.-E. Forssen, "Efficient video rectification and stabilisation for cell-phones", IJCV 2012)."""
 _UNKNOWN_M_S = 10.0
 """The same where the autopilot says no velocity."""
 _MAX_INTERVAL_S = 2.0
@@ -65,7 +69,7 @@ WORTH_TURN_RAD, WORTH_OFFSET_S, WORTH_FOCAL = math.radians(0.5), 0.01, 0.01
 """What is less is not worth a warning: half a degree puts a drone at 10 m by 0.09 m, and 1 % a range by 1 %."""
 _SURE, _SURE_OF_TURN = 9.0, 14.16
 """Squares of three standard deviations of one number, and what as few of three numbers together exceed (99.73 %)."""
-_SIZE = 5
+_SIZE, _SHARED = 5, 5
 _TURN, _OFFSET, _FOCAL = slice(0, 3), 3, 4
 _LASTING = np.diag(np.array([math.radians(0.1)] * 3 + [1.5e-3, 3e-3]) ** 2)
 """Beside the filter's own covariance: a network's flow and a rate of turn err in one direction for whole flights. By
@@ -144,13 +148,14 @@ class _Camera:
 
 @dataclass(frozen=True, eq=False)
 class _Row:
-    """One camera's share of an update: ``information`` of ``by_state @ state + by_noise @ noise - measured``."""
+    """One camera's share of an update: ``information`` of
+    ``by_state @ state + by_shared @ shared + by_noise @ noise - measured``."""
 
     place: int
     by_state: FloatArray
     """(6, 5)"""
-    by_velocity: FloatArray
-    """(6, 3)"""
+    by_shared: FloatArray
+    """(6, 5) readout, and the velocity's error."""
     by_noise: FloatArray
     """(6, 6)"""
     measured: FloatArray
@@ -182,8 +187,10 @@ class RigCalibration:
         sigmas = [PRIOR_TURN_RAD] * 3 + [PRIOR_OFFSET_S, PRIOR_FOCAL]
         wander = [_WANDER_TURN_RAD] * 3 + [_WANDER_OFFSET_S, _WANDER_FOCAL]
         count = len(self._cameras)
-        self._wander = np.array(wander * count + [0.0] * 3) ** 2 / _WANDER_TIME_S
-        self._covariance = np.diag(np.array(sigmas * count + [_VELOCITY_SIGMA_M_S] * 3) ** 2)
+        self._wander = np.array(wander * count + [0.0] * _SHARED) ** 2 / _WANDER_TIME_S
+        shared = [_READOUT_S] * 2 + [_VELOCITY_SIGMA_M_S] * 3
+        self._covariance = np.diag(np.array(sigmas * count + shared) ** 2)
+        self._readout = np.zeros(2)
         self._velocity_error = np.zeros(3)
         self._turn_variance = _TURN_SIGMA_RAD**2
         self._time_s: float | None = None
@@ -295,15 +302,17 @@ class RigCalibration:
         R_body_ned = _attitude(before, name, camera.offset_s).T
         expected = went + (turn - np.eye(3)) @ arm
         about, near = turn @ rotation_from_vector(off[:3]), expected + R_body_ned @ off[3:]
-        by_state, by_velocity, by_noise = np.zeros((6, _SIZE)), np.zeros((6, 3)), np.zeros((6, 6))
+        by_state, by_shared, by_noise = np.zeros((6, _SIZE)), np.zeros((6, _SHARED)), np.zeros((6, 6))
         by_state[:3, _TURN] = np.eye(3) - about.T
         by_state[:3, _OFFSET] = second - about.T @ first
         by_state[3:, _TURN] = _cross(near)
         by_state[3:, _OFFSET] = np.cross(near, first)
         # Into body axes: the rotation from the right, and the translation, are turned by the mounting alike.
         into = np.kron(np.eye(2), R)
-        by_state[:, _FOCAL] = -into @ motion.by_focal(RigidTransform(R.T @ about @ R, R.T @ near))
-        by_velocity[3:] = R_body_ned * (after.vehicle.time_s - before.vehicle.time_s)
+        by_all_known = RigidTransform(R.T @ about @ R, R.T @ near)
+        by_state[:, _FOCAL] = -into @ motion.by_focal(by_all_known)
+        by_shared[:, :2] = -into @ motion.by_readout(by_all_known, (R.T @ first, R.T @ second))
+        by_shared[3:, 2:] = R_body_ned * (after.vehicle.time_s - before.vehicle.time_s)
         by_noise[:3, :3], by_noise[3:, 3:] = np.eye(3), R_body_ned
         measured = np.concatenate(
             [
@@ -311,16 +320,18 @@ class RigCalibration:
                 R @ motion.motion.translation - expected,
             ]
         )
+        measured -= by_shared[:, :2] @ self._readout
         spread = np.linalg.inv(into @ motion.information @ into.T)
         spread[3:, 3:] += (_WAY_SIGMA * np.linalg.norm(motion.motion.translation)) ** 2 * np.eye(3)
         information = np.asarray(np.linalg.inv(spread), np.float64) / camera.misfit
-        return _Row(place, by_state, by_velocity, by_noise, measured, information)
+        return _Row(place, by_state, by_shared, by_noise, measured, information)
 
     def _fits(self, row: _Row, camera: _Camera, *, moves: bool) -> bool:
         """Whether a camera's motion is one that may be; learns how large its errors are, and if the drone moves whether
         they agree."""
-        mine = np.r_[row.place * _SIZE : (row.place + 1) * _SIZE, len(self._covariance) - 3 : len(self._covariance)]
-        H = np.concatenate([row.by_state, row.by_velocity], axis=1)
+        size = len(self._covariance)
+        mine = np.r_[row.place * _SIZE : (row.place + 1) * _SIZE, size - _SHARED : size]
+        H = np.concatenate([row.by_state, row.by_shared], axis=1)
         noise = np.diag([self._turn_variance] * 3 + [_VELOCITY_NOISE_M_S**2] * 3)
         spread = H @ self._covariance[np.ix_(mine, mine)] @ H.T + row.by_noise @ noise @ row.by_noise.T
         spread += np.linalg.inv(row.information)
@@ -344,7 +355,7 @@ class RigCalibration:
         for row in rows:
             J = np.zeros((6, size + 6))
             J[:, row.place * _SIZE : (row.place + 1) * _SIZE] = row.by_state
-            J[:, size - 3 : size], J[:, size:] = row.by_velocity, row.by_noise
+            J[:, size - _SHARED : size], J[:, size:] = row.by_shared, row.by_noise
             hessian += J.T @ row.information @ J
             gradient += J.T @ row.information @ row.measured
         covariance = np.linalg.inv(hessian)
@@ -360,6 +371,7 @@ class RigCalibration:
             camera.R_body_camera = rotation_from_vector(mine[_TURN]) @ camera.R_body_camera
             camera.offset_s += float(mine[_OFFSET])
             camera.log_focal += float(mine[_FOCAL])
+        self._readout = self._readout + step[-_SHARED:-3]
         self._velocity_error = self._velocity_error + step[-3:]
 
 

@@ -90,7 +90,9 @@ def _library() -> tuple[ctypes.CDLL, type[ctypes.Structure]]:
     name = ctypes.util.find_library("openh264")
     needs = "`cameras.compression.h264_mbit_s` needs the library openh264, version 2.0 to 2.6"
     if name is None:
-        raise UnavailableError(f"{needs}, which is not on this machine: on Debian and Ubuntu, `apt install libopenh264-7`.")
+        raise UnavailableError(
+            f"{needs}, which is not on this machine: on Debian and Ubuntu, `apt install libopenh264-7`."
+        )
     library, version = ctypes.CDLL(name), _Version()
     library.WelsGetCodecVersionEx(ctypes.byref(version))
     if version.major != 2 or version.minor > 6:
@@ -146,7 +148,9 @@ class H264Stream:
     def __init__(self, size: tuple[int, int], mbit_s: float) -> None:
         """`size`: width and height. Raises UnavailableError where they are odd, the library is missing, or refuses."""
         if any(side % 2 for side in size):
-            raise UnavailableError(f"`cameras.compression.h264_mbit_s`: images of {size[0]} x {size[1]} have odd sides.")
+            raise UnavailableError(
+                f"`cameras.compression.h264_mbit_s`: images of {size[0]} x {size[1]} have odd sides."
+            )
         self._size, self._number = size, 0
         parameters = _EncoderParameters(0, *size, round(1e6 * mbit_s), _BY_BIT_RATE, RATE_HZ)
         self._encoder, self._decoder = _Codec("SVCEncoder"), _Codec("Decoder")
