@@ -388,6 +388,11 @@ class CameraDeviation:
     elsewhere: bool = False
     """It moves otherwise than the drone, as no mounting that is a little off explains: the other numbers say nothing.
     Turned or upside down, swapped with another, or before something that moves along."""
+    readout_s: Vector2 | None = None
+    """(2,) seconds in which rows are read one after the other, over the image's width (from its right: negative) and
+    over its height; of all cameras together. Near 0: a global shutter."""
+    readout_sigma_s: Vector2 | None = None
+    """(2,) standard deviations."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from flockd.flight.geometry.neighbour_motion import estimate_neighbour_motion
 from flockd.flight.geometry.pairs import BACKGROUND_LABEL, PointPairs, grid_pixels, label_pixels, lift_matches
 from flockd.flight.geometry.polar import log_polar, log_polar_covariance, log_polar_residual
 from flockd.flight.geometry.rig import Rig, RigCamera, build_rig
-from flockd.flight.geometry.rig_calibration import RigCalibration, Seen, described, differs, rig_faults
+from flockd.flight.geometry.rig_calibration import RigCalibration, Seen, described, differs, rig_faults, rolling
 from flockd.flight.geometry.rigid_fit import fit_rigid
 from flockd.flight.geometry.robust.ransac import RansacResult, ransac_rigid
 from flockd.flight.geometry.rotations import (
@@ -69,6 +69,7 @@ __all__ = [
     "ransac_rigid",
     "refine_ego_motion",
     "rig_faults",
+    "rolling",
     "rotation_angle_deg",
     "rotation_from_euler",
     "rotation_from_quaternion",

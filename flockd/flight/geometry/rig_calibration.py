@@ -134,6 +134,18 @@ def described(deviation: CameraDeviation) -> str:
     )
 
 
+def rolling(deviation: CameraDeviation) -> tuple[str, ...]:
+    """One sentence for each side of the images over which rows are read one after the other, as far as is known."""
+    if deviation.readout_s is None or deviation.readout_sigma_s is None:
+        return ()
+    sides = zip(("width", "height"), deviation.readout_s, deviation.readout_sigma_s, strict=True)
+    return tuple(
+        f"rows are read over the images' {side} in {1e3 * time_s:+.0f} +- {1e3 * sigma_s:.0f} ms: a rolling shutter"
+        for side, time_s, sigma_s in sides
+        if time_s**2 > _SURE * sigma_s**2
+    )
+
+
 @dataclass
 class _Camera:
     mounted: RigCamera
@@ -248,7 +260,7 @@ class RigCalibration:
 
     def deviations(self) -> tuple[CameraDeviation, ...]:
         """How each camera differs from its configuration, as far as is known."""
-        found = []
+        found, shared = [], np.sqrt(np.diag(self._covariance)[-_SHARED:])
         for place, (name, camera) in enumerate(self._cameras.items()):
             mine = slice(place * _SIZE, (place + 1) * _SIZE)
             found.append(
@@ -259,6 +271,8 @@ class RigCalibration:
                     focal_scale=math.exp(camera.log_focal),
                     covariance=self._covariance[mine, mine] + _LASTING,
                     elsewhere=camera.agreement < -_AGREES,
+                    readout_s=self._readout.copy(),
+                    readout_sigma_s=shared[:2].copy(),
                 )
             )
         return tuple(found)

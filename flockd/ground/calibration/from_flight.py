@@ -11,7 +11,15 @@ import numpy as np
 
 from flockd.core.config.rig import CameraConfig, RigConfig
 from flockd.core.messages import CameraDeviation, PilotOutput
-from flockd.flight.geometry import RigidTransform, build_rig, described, differs, rig_faults, rotation_from_vector
+from flockd.flight.geometry import (
+    RigidTransform,
+    build_rig,
+    described,
+    differs,
+    rig_faults,
+    rolling,
+    rotation_from_vector,
+)
 from flockd.ground.calibration.errors import CalibrationError
 from flockd.ground.calibration.fragment import extrinsics_of, measured_today
 from flockd.ground.calibration.rig_session import write_rig
@@ -58,6 +66,7 @@ def corrected_rig(recording: Recording, source: str, out: Path) -> dict[str, Any
     config = recording.config.rig
     offset_s, note = _offset_s(list(found.values()))
     cameras, results, notes = [], {}, [] if note is None else [note]
+    notes += rolling(next(iter(found.values())))
     for camera in config.cameras:
         one = found[camera.name]
         turned, scaled = _takes_turn(one), _takes_focal(one)
@@ -148,7 +157,8 @@ def _worst_turn(found: CameraDeviation) -> float:
 
 
 def _is_possible(one: CameraDeviation) -> bool:
-    numbers = np.concatenate([one.turn, [one.time_offset_s, one.focal_scale], one.covariance.ravel()])
+    readout = [of for of in (one.readout_s, one.readout_sigma_s) if of is not None]
+    numbers = np.concatenate([one.turn, [one.time_offset_s, one.focal_scale], one.covariance.ravel(), *readout])
     if not (np.isfinite(numbers).all() and one.focal_scale > 0.0 and np.abs(numbers).max() < 100.0):
         return False
     return bool(np.allclose(one.covariance, one.covariance.T) and np.linalg.eigvalsh(one.covariance)[0] > 0.0)

@@ -18,6 +18,7 @@ from flockd.flight.geometry import (
     RigidTransform,
     Seen,
     rig_faults,
+    rolling,
     rotation_from_euler,
     rotation_from_vector,
     vector_from_rotation,
@@ -235,6 +236,10 @@ def test_rows_that_are_read_one_after_the_other_turn_no_mounting() -> None:
         flown_by(starting, wrong, np.random.default_rng(1), 9, readout_s=readout_s).deviations()
         for readout_s in (0.0, 0.03)
     )
+    for found, readout_s in ((at_once, 0.0), (in_rows, 0.03)):
+        assert found[0].readout_s == pytest.approx([readout_s, 0.0], abs=0.002)
+    assert rolling(at_once[0]) == ()
+    assert rolling(in_rows[0]) == ("rows are read over the images' width in +31 +- 4 ms: a rolling shutter",)
     for one, other in zip(at_once, in_rows, strict=True):
         assert rig_faults(one) == rig_faults(other) == ()
         assert np.degrees(other.turn) == pytest.approx(np.degrees(one.turn), abs=0.2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -84,6 +85,19 @@ def test_what_is_not_known_is_kept_and_named(tmp_path: Path) -> None:
     ]
     assert load_drone(out).rig.cameras[0] == recording.config.rig.cameras[0]
     assert result["time_offset_s"] == pytest.approx(-0.03)  # by the camera that knows it
+
+
+def test_a_rolling_shutter_is_said(tmp_path: Path) -> None:
+    def rolled(one: CameraDeviation) -> CameraDeviation:
+        return replace(one, readout_s=np.array([-0.017, 0.001]), readout_sigma_s=np.array([0.002, 0.002]))
+
+    turned, as_configured = rolled(seen("front")), rolled(seen("front", np.zeros(3), 0.0, 1.0))
+    said = "rows are read over the images' width in -17 +- 2 ms: a rolling shutter"
+    recording = recorded(tmp_path, [(turned, seen("left"))])
+    assert corrected_rig(recording, "flight", tmp_path / "rig.yaml")["notes"] == [said]
+    other = recorded(tmp_path, [(as_configured, replace(as_configured, camera="left"))], NAME.replace("12", "13"))
+    with pytest.raises(CalibrationError, match=rf"to be corrected: {re.escape(said)}; what is known agrees"):
+        corrected_rig(other, "flight", tmp_path / "again.yaml")
 
 
 def test_of_a_camera_that_is_elsewhere_nothing_is_taken_and_the_doctor_names_it(tmp_path: Path) -> None:
