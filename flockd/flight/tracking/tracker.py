@@ -20,6 +20,9 @@ from flockd.flight.tracking.measurement import Measurement, looks_alike
 _OF_USUAL = 0.02
 """The share of one detection in what is usual: that of the last fifty."""
 _ROUNDING_S = 1e-9
+_UNSEEN_SHARE = 0.1
+"""Who was followed for long is looked for longer than `max_unseen_s`: for this share of that time, while it is likely
+to exist. Else its next detection, often a vague one, would be of a stranger."""
 _SUREST, _LEAST_VARIANCE = 0.01, 1e-12
 """No usual standard deviation counts as smaller, or a network that is too sure of one neighbour would keep others from
 being confirmed; and no variance, whose logarithm is taken, is."""
@@ -244,10 +247,9 @@ class Tracker:
         track.was_confirmed |= track.confirmed
 
     def _is_kept(self, track: _Track) -> bool:
-        return (
-            track.missing_s <= self.parameters.max_unseen_s + _ROUNDING_S
-            and track.existence >= self.parameters.drop_probability
-        )
+        known_s = track.last_seen_s - track.first_seen_s
+        longest_s = max(self.parameters.max_unseen_s, _UNSEEN_SHARE * known_s)
+        return track.missing_s <= longest_s + _ROUNDING_S and track.existence >= self.parameters.drop_probability
 
 
 def _probability_in_view(state: State, shown: Shown) -> float:

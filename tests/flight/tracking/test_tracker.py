@@ -242,6 +242,18 @@ def test_five_noisy_frames_and_then_a_dropout() -> None:
     assert tracker.neighbours() == ()
 
 
+@pytest.mark.parametrize("steps", [8, 80])
+def test_who_was_followed_for_long_is_still_there_after_a_longer_dropout(steps: int) -> None:
+    """Two seconds without a detection, then one whose range is 40 % too long: of the mate of 40 s, not of a stranger."""
+    tracker, time_s = _settled(steps=steps)
+    for _ in range(4):
+        time_s += STEP_S
+        _step(tracker, time_s)
+    numbers = _step(tracker, time_s + STEP_S, 1.4 * AHEAD, sigma_m=0.3 * float(np.linalg.norm(AHEAD)))
+    followed = [one.track for one in tracker.neighbours()]
+    assert (numbers == (1,)) == (followed == [1]) == (steps == 80)
+
+
 def test_confirmation_takes_the_number_of_hits_asked_for() -> None:
     tracker = Tracker(TrackingParameters(confirm_hits=3))
     found = []
