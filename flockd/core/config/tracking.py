@@ -89,8 +89,9 @@ class TrackingParameters(Section):
     drop_probability: Probability = 0.1
     """A track is dropped when its existence probability falls below this."""
     max_unseen_s: Duration = 1.5
-    """A track that should have been in view for longer without a detection, and for longer than a tenth of the time that
-    it was followed, is dropped whatever its existence probability. A confirmed neighbour that leaves the cameras' view, as above or below, is remembered until then."""
+    """A track that should have been in view for longer without a detection, and for longer than a tenth of the time
+    that it was followed, is dropped whatever its existence probability. A confirmed neighbour that leaves the cameras'
+    view, as above or below, is remembered until then."""
 
     def confirm_steps(self, step_s: float) -> int:
         """With which step, at the earliest, a neighbour is confirmed that all steps of `step_s` show."""

@@ -244,7 +244,7 @@ def test_five_noisy_frames_and_then_a_dropout() -> None:
 
 @pytest.mark.parametrize("steps", [8, 80])
 def test_who_was_followed_for_long_is_still_there_after_a_longer_dropout(steps: int) -> None:
-    """Two seconds without a detection, then one whose range is 40 % too long: of the mate of 40 s, not of a stranger."""
+    """Two seconds without a detection, then one whose range is 40 % too long: of the mate of 40 s, no stranger."""
     tracker, time_s = _settled(steps=steps)
     for _ in range(4):
         time_s += STEP_S
