@@ -149,8 +149,9 @@ def test_a_recording_that_says_nothing_of_its_rig(tmp_path: Path) -> None:
         seen("front", sigmas=(0.0,) * 5),
         replace(seen("front"), covariance=np.full((5, 5), 1e300)),
         replace(seen("front"), covariance=-np.eye(5)),
+        replace(seen("front"), readout_s=np.array([math.nan, 0.0]), readout_sigma_s=np.full(2, 0.001)),
     ],
-    ids=["stranger", "nan", "no focal length", "negative", "certain", "absurd", "negative variances"],
+    ids=["stranger", "nan", "no focal length", "negative", "certain", "absurd", "negative variances", "nan readout"],
 )
 def test_what_cannot_be_is_refused_in_one_sentence(wrong: CameraDeviation, tmp_path: Path) -> None:
     recording = recorded(tmp_path, [(wrong,)])
