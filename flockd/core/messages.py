@@ -409,6 +409,20 @@ class SizeStatus:
     """Whether ranges follow from this size, as the networks judge the drones to be of another."""
 
 
+@dataclass(frozen=True)
+class LearnedSize:
+    """How large a pilot found the others to be, for the pilot of the flight that follows."""
+
+    size_m: float
+    """From tip to tip."""
+    sigma: float
+    """Relative standard deviation of `size_m`."""
+    looks_m: float
+    """What the networks judge the size of such drones to be."""
+    doubted: bool
+    """Whether they say that they do not know it."""
+
+
 @dataclass(frozen=True, eq=False)
 class PilotOutput:
     """Everything one step of the pilot found and decided."""

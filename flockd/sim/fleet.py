@@ -130,6 +130,8 @@ class _Fleet:
         """Programs that have to run now; `_poll` raises when one has ended."""
         self._left_s: dict[int, float] = {}
         """When a drone was first seen out of offboard, in seconds of the flight."""
+        self._began_s = 0.0
+        """When the drones began to take off."""
         self._climbed_s = dict.fromkeys(self._all, -np.inf)
         """When a drone rose or sank last."""
 
@@ -156,8 +158,9 @@ class _Fleet:
     def take_off(self) -> None:
         """Arms, climbs to the drone's own height, and selects offboard when flockd is ready."""
         station = self._station
-        self._request(station.is_armed, station.arm, ARM_S, "could not be armed")
-        self._request(self._is_up, self._request_climb, CLIMB_S, "did not reach its height")
+        self._began_s, apart_s = self._clock(), self._scenario.take_off_apart_s * (len(self._all) - 1)
+        up_s = ARM_S + CLIMB_S + apart_s
+        self._request(self._is_up, self._request_climb, up_s, "could not be armed or did not reach its height")
         self._wait_for(
             lambda i: self._status(i).startswith("ready") and station.mode_is(i, "LOITER"),
             READY_S,
@@ -276,8 +279,12 @@ class _Fleet:
         return level and abs(error_m) < AT_HEIGHT_M and self._station.mode_is(i, "LOITER")
 
     def _request_climb(self, i: int) -> None:
-        """Once it has left the ground, another take-off would lead higher."""
-        if self._height_m(i) < ON_GROUND_M:
+        """When its turn has come; once it has left the ground, another take-off would lead higher."""
+        if self._clock() - self._began_s < i * self._scenario.take_off_apart_s:
+            return
+        if not self._station.is_armed(i):
+            self._station.arm(i)
+        elif self._height_m(i) < ON_GROUND_M:
             self._station.select(i, "TAKEOFF")
 
     def _last_messages(self, i: int) -> str:

@@ -162,6 +162,8 @@ class ScenarioConfig(Section):
     """One step of the drone at least, one day at most."""
     seed: Annotated[int, Field(ge=0)] = 0
     vehicles: Annotated[tuple[StartConfig, ...], Field(min_length=1, max_length=MAX_DRONES)]
+    take_off_apart_s: NonNegative = 0.0
+    """With real daemons (`--autopilot`): one drone takes off so long after the other."""
     vehicle: VehicleConfig = VehicleConfig()
     sensors: SensorConfig = SensorConfig()
     cameras: CamerasConfig | None = None

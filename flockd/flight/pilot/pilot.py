@@ -19,6 +19,7 @@ from flockd.core.messages import (
     FloatArray,
     FrameSet,
     GroundEstimate,
+    LearnedSize,
     MissionOrder,
     Neighbour,
     NeighbourMotion,
@@ -88,11 +89,15 @@ class FlockPilot:
         networks: Networks | None = None,
         stopwatch: Callable[[], float] | None = None,
         observer: Observer | None = None,
+        learned: LearnedSize | None = None,
+        *,
+        flies: bool = True,
     ) -> None:
         """``networks`` may be shared by several pilots; None: those that the configuration names.
 
         ``stopwatch`` (seconds) only fills ``stages_ms``. ``observer`` takes perception's place: simulations have exact
-        ones. Raises ModelError.
+        ones. ``learned`` is of the others' size, before this flight. Without ``flies`` nobody flies what this pilot
+        wants, as before a flight. Raises ModelError.
         """
         self._config = config
         self._rig = build_rig(config.rig)
@@ -106,7 +111,8 @@ class FlockPilot:
         """What the last step's pairs began at."""
         self._rig_said_s: float | None = None
         self._tracker = Tracker(config.tracking)
-        self._size = None if config.flocking.size == "off" else SizeLearner(config)
+        self._size = None if config.flocking.size == "off" else SizeLearner(config, learned, flies=flies)
+        self._flies = flies
         self._law = FlockingLaw(config.flocking)
         self._passing = Passing(self._law, config.safety.gate.vertical_separation_m)
         self._map = LocalMap(config.obstacles) if config.obstacles.enabled else None
@@ -209,6 +215,11 @@ class FlockPilot:
             rig=deviations,
             size=None if self._size is None else self._size.status,
         )
+
+    @property
+    def learned(self) -> LearnedSize | None:
+        """What the steps until now showed of the others' size, for the next flight's pilot."""
+        return None if self._size is None else self._size.learned
 
     def _refused(self, frames: FrameSet, reason: Reason) -> PilotOutput:
         """The output of a step that was not done."""
@@ -353,7 +364,7 @@ class FlockPilot:
         if observation.previous is not None:
             before = observation.previous.vehicle
             interval_s, way[2] = observation.interval_s, before.height_m - observation.vehicle.height_m
-            way = way if ego is None else _displacement(observation, ego)
+            way = way if ego is None or not self._flies else _displacement(observation, ego)
         if changed := size.see(interval_s, way, measured, self._tracker.neighbours()):
             before_m, now_m = changed
             self._tracker.resize(now_m, before_m, velocity)

@@ -10,7 +10,16 @@ from dataclasses import replace
 import numpy as np
 
 from flockd.core.config.drone import DroneConfig
-from flockd.core.messages import FloatArray, GroundEstimate, Neighbour, Reason, ReasonKind, SizeStatus, VehicleState
+from flockd.core.messages import (
+    FloatArray,
+    GroundEstimate,
+    LearnedSize,
+    Neighbour,
+    Reason,
+    ReasonKind,
+    SizeStatus,
+    VehicleState,
+)
 from flockd.flight.perception.maps import KnownSize
 from flockd.flight.pilot.weave import Weave
 from flockd.flight.tracking import Measurement
@@ -18,7 +27,8 @@ from flockd.flight.tracking.flock_size import FlockSize, SizeEstimate
 
 _USED_BEYOND, _USED_UNTIL = 2.0, 1.5
 """The learned size is used once the sizes that the networks judge are off it by so many of its standard deviations,
-root mean square, until they are so near: those of drones that they know they judge better."""
+root mean square, until they are so near: those of drones that they know they judge better. Where they say that they do
+not know the drones it is used at once."""
 _PLAUSIBLE = 2.0
 """A learned size is not used if it is more than so many times what the networks judge, or less than the share: none of
 the families that they do not know is judged so wrong, but drones that rise together look larger."""
@@ -56,11 +66,14 @@ _OLD_S = 600.0
 class SizeLearner:
     """One drone's, for one flight."""
 
-    def __init__(self, config: DroneConfig) -> None:
+    def __init__(self, config: DroneConfig, learned: LearnedSize | None = None, *, flies: bool = True) -> None:
+        """``learned``: before the flight. Without ``flies`` the autopilot or a person flies the drone: however it rises
+        and sinks then, nobody answers, and it does not weave."""
         size_m = config.perception.drone_size_m
         self._said = None if size_m is None else SizeEstimate(size_m, config.perception.drone_size_sigma_m / size_m)
         self._weave, self._sizes = Weave(config.safety.gate), FlockSize()
-        self._allowed = config.safety.first_flight_layer is None
+        self._flies = flies
+        self._allowed = flies and config.safety.first_flight_layer is None
         self._always = config.flocking.size == "weave"
         self._name = config.name
         self._random: np.random.Generator | None = None
@@ -77,13 +90,23 @@ class SizeLearner:
         self._unjudged_s = math.inf
         """Since the newest of them."""
         self._wove_s: float | None = None
+        self._was_doubted = False
+        """Whether the networks said so before the flight."""
         self._contradiction: str | None = None
+        if learned is not None and self._said is None:
+            self._begin_with(learned)
 
     @property
     def used(self) -> KnownSize | None:
         """What ranges follow from; None: from what the networks judge, or the configuration says."""
         used = self._used
         return None if used is None else KnownSize(used.size_m, used.sigma * used.size_m, self._looks_m)
+
+    @property
+    def learned(self) -> LearnedSize | None:
+        """What goes into the next flight; None: nothing but what the networks judge."""
+        used = self._used
+        return None if used is None else LearnedSize(used.size_m, used.sigma, self._looks_m, self._is_doubted)
 
     @property
     def status(self) -> SizeStatus | None:
@@ -116,9 +139,9 @@ class SizeLearner:
         Where ranges now follow another size: the one until now, and that one, in metres.
 
         `way` (3,) metres NED is how far the drone went since then; of it the weave's part is what is vertical, while it
-        moves the drone.
+        moves the drone, and before a flight all that is.
         """
-        wove = np.array([0.0, 0.0, way[2] if self._weave.moves else 0.0])
+        wove = np.array([0.0, 0.0, way[2] if self._weave.moves or not self._flies else 0.0])
         self._sizes.step(interval_s, wove, {number: self._as_judged(one) for number, one in measured.items()})
         self._sizes.keep({one.track for one in neighbours})
         confirmed = {one.track for one in neighbours if one.confirmed}
@@ -159,6 +182,12 @@ class SizeLearner:
                 changed[number] = found.size_m
         return changed
 
+    def _begin_with(self, learned: LearnedSize) -> None:
+        self._used = self._found = SizeEstimate(learned.size_m, learned.sigma)
+        self._looks_m, self._judged = learned.looks_m, [math.log(learned.looks_m)]
+        self._was_doubted = learned.doubted
+        self._sizes.remember(learned.looks_m, self._used)
+
     def _may_be(self, found: SizeEstimate) -> bool:
         return self._looks_m > 0.0 and 1 / _PLAUSIBLE < found.size_m / self._looks_m < _PLAUSIBLE
 
@@ -167,12 +196,17 @@ class SizeLearner:
         """Whether the networks judge the others' size otherwise from view to view, or say that they do not know it."""
         if self._said is not None:
             return False
-        if self._doubt > _DOUBTED:
+        if self._is_doubted:
             return True
         if len(self._judged) < _FEWEST_JUDGED:
             return False
         low, high = np.quantile(self._judged, [0.1, 0.9])
         return float(high - low) > _SCATTER * _MIDDLE
+
+    @property
+    def _is_doubted(self) -> bool:
+        """Whether the networks say, or did before the flight, that they do not know the others' size."""
+        return self._was_doubted or self._doubt > _DOUBTED
 
     @property
     def _doubt(self) -> float:
@@ -198,7 +232,7 @@ class SizeLearner:
                 )
             return False
         judged = np.minimum(np.abs(np.array(self._judged) - math.log(found.size_m)), _MOST_OFF)
-        off = float(np.sqrt(np.mean(judged**2))) / found.sigma
+        off = math.inf if self._is_doubted else float(np.sqrt(np.mean(judged**2))) / found.sigma
         if not self._may_be(found):
             self._used = None
         elif used is None:

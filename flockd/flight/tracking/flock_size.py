@@ -12,8 +12,9 @@ weigh each of many sizes.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from flockd.flight.tracking.weave_path import AMPLITUDE_SIGMA, DURATION_S, SETTL
 
 LOG_SIZES = np.linspace(math.log(MIN_DRONE_SIZE_M), math.log(MAX_DRONE_SIZE_M), 155)
 """(G,) the sizes that are weighed, as logarithms of metres, 3 % apart."""
+_GRID = float(LOG_SIZES[1] - LOG_SIZES[0])
 MOST_SIGMA = 0.1
 """An estimate is published below this relative standard deviation."""
 _LEAST_SIGMA = 0.04
@@ -91,13 +93,13 @@ class FlockSize:
 
     def __init__(self) -> None:
         self._tracks: dict[int, _Track] = {}
-        self._past: list[_Track] = []
-        """Tracks that ended and told something."""
+        self._past: list[_Evidence] = []
+        """Of tracks that ended and told something."""
 
     def step(self, interval_s: float, wove: FloatArray, sighted: Mapping[int, Measurement]) -> None:
         """Take in a step's measurements by track number, `interval_s` after the last.
 
-        `wove` (3,) NED metres is the way that the weave alone moved the own drone meanwhile.
+        `wove` (3,) NED metres is the way that moved the own drone meanwhile and that nobody answers, as the weave.
         """
         for track in self._tracks.values():
             track.predict(interval_s, wove)
@@ -110,29 +112,47 @@ class FlockSize:
     def keep(self, numbers: set[int]) -> None:
         """Only these tracks still exist; what the others showed stays."""
         ended = [self._tracks.pop(number) for number in self._tracks.keys() - numbers]
-        told = [one for one in ended if np.ptp(one.log_likelihood) > _TOLD]
+        told = [one.evidence for one in ended if np.ptp(one.log_likelihood) > _TOLD]
         self._past = [*self._past, *told][-_REMEMBERED:]
+
+    def remember(self, looks_m: float, known: SizeEstimate) -> None:
+        """That drones which the networks judge to be `looks_m` large were found to have another size."""
+        sigma = math.sqrt(max(known.sigma**2 - _LEAST_SIGMA**2, _GRID**2))
+        log_likelihood = -0.5 * ((LOG_SIZES - math.log(known.size_m)) / sigma) ** 2
+        self._past.append(_Evidence(math.log(looks_m), log_likelihood))
 
     def of_looks(self, size_m: float) -> SizeEstimate | None:
         """The size of drones that the networks judge to have another, `size_m`; None: not known to `MOST_SIGMA`."""
-        return _estimate(self._shared(math.log(size_m), (*self._past, *self._tracks.values())))
+        return _estimate(self._shared(math.log(size_m), self._evidence(self._tracks.values())))
 
     def of_track(self, number: int) -> SizeEstimate | None:
         """One track's own size, with what the others' evidence has in common with it; None as of `of_looks`."""
         own = self._tracks.get(number)
         if own is None:
             return None
-        others = [one for one in (*self._past, *self._tracks.values()) if one is not own]
+        others = self._evidence(one for one in self._tracks.values() if one is not own)
         shared = self._shared(own.log_assumed_m, others)
         return _estimate(own.log_likelihood + _if_told(shared, 1.0 - _ASTRAY))
 
-    def _shared(self, log_judged_m: float, tracks: Sequence[_Track]) -> FloatArray:
-        """(G,) log likelihood by tracks of the size of a drone that is judged to be so large."""
+    def _evidence(self, tracks: Iterable[_Track]) -> list[_Evidence]:
+        return [*self._past, *(one.evidence for one in tracks)]
+
+    def _shared(self, log_judged_m: float, tracks: Sequence[_Evidence]) -> FloatArray:
+        """(G,) log likelihood by what tracks showed of the size of a drone that is judged to be so large."""
         total = np.zeros(len(LOG_SIZES))
         for one in tracks:
             alike = math.exp(-0.5 * ((one.log_assumed_m - log_judged_m) / _LOOKS_ALIKE) ** 2)
             total += _if_told(one.log_likelihood, (1.0 - _ASTRAY) * alike)
         return total
+
+
+class _Evidence(NamedTuple):
+    """What one track showed."""
+
+    log_assumed_m: float
+    """As its size was judged."""
+    log_likelihood: FloatArray
+    """(G,) of the sizes."""
 
 
 class _Track:
@@ -194,6 +214,11 @@ class _Track:
         while self._unasked_s >= _BEGINS_S - 1e-6:
             self._unasked_s -= _BEGINS_S
             self._begin_weave(self._unasked_s)
+
+    @property
+    def evidence(self) -> _Evidence:
+        """As of now."""
+        return _Evidence(self.log_assumed_m, self.log_likelihood)
 
     def _begin_weave(self, elapsed_s: float) -> None:
         """One more model: that it flew level, and has woven for `elapsed_s`."""

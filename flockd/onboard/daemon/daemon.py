@@ -224,7 +224,7 @@ class Daemon:
             components.sinks.event(state_sentence(now))
         components.texts.update(now)
         if now.state in FLYING and before.state not in FLYING:
-            components.sinks.begin_recording()
+            components.sinks.begin_recording(components.pilot_loop.learned_before)
         elif components.sinks.recording is not None and not components.link.status().armed:
             components.sinks.end_recording()
         handed_over = now.state in {State.IDLE, State.SILENT} and not components.requests.asking

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from flockd.core.config import DroneConfig
-from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, VehicleState
+from flockd.core.messages import FrameSet, LearnedSize, MissionOrder, PilotOutput, VehicleState
 from flockd.onboard.daemon.worker import BusyError, Worker
 from flockd.onboard.recording import Recorder
 from flockd.onboard.telemetry import TelemetrySink, publish_step
@@ -64,8 +64,8 @@ class MessageSinks:
             return None
         return self._recorder.failure or str(self._path)
 
-    def begin_recording(self) -> None:
-        """Begins a new file for a flight, where flights are recorded."""
+    def begin_recording(self, learned: LearnedSize | None = None) -> None:
+        """Begins a new file for a flight, where flights are recorded; ``learned``: what its pilot begins with."""
         if self._folder is None:
             return
         self.end_recording()
@@ -76,6 +76,7 @@ class MessageSinks:
             drone=self._config.name,
             config=self._config,
             models=self._models,
+            learned=learned,
             on_event=self._on_event,
         )
         self.event(f"recording to {self._path}")

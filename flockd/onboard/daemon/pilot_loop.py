@@ -15,6 +15,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.messages import (
     CameraDeviation,
     FrameSet,
+    LearnedSize,
     MissionOrder,
     Neighbour,
     PilotOutput,
@@ -79,7 +80,12 @@ class PilotLoop:
         self._decoding = Worker("decoding")
         self._geometry = Worker("geometry")
         self._pilot: FlockPilot | None = None
-        self._flight = 0
+        self._flight = self._begun = 0
+        """Number of the flight, and how often a pilot was begun."""
+        self._flies = False
+        self._learned: LearnedSize | None = None
+        self.learned_before: LearnedSize | None = None
+        """Of the others' size, which the flight's pilot began with."""
         self._failure: str | None = None
         self._unexpected = 0
         """Errors in a row that nobody expects."""
@@ -105,7 +111,18 @@ class PilotLoop:
 
     def begin_flight(self, number: int) -> None:
         """Uses a new pilot from the next step on: its time begins there, so that a recording can be replayed."""
-        self._flight, self._pilot, self.order = number, None, None
+        self._flight, self._flies, self.learned_before = number, True, self._learned
+        self._begin()
+
+    def watch(self) -> None:
+        """Uses a new pilot, which nobody flies, from the next step on: what was seen while people carried the drones
+        tells nothing of their size, and the climb that comes does."""
+        self._flies, self._learned, self.learned_before = False, None, None
+        self._begin()
+
+    def _begin(self) -> None:
+        self._begun += 1
+        self._pilot = self.order = None
         self._rig_reports, self._size_reports = RigReports(), SizeReports()
 
     @property
@@ -144,7 +161,7 @@ class PilotLoop:
         self._decoding.leave(LEAVE_S)
 
     async def _step(self, taken_s: float, frames: FrameSet, vehicle: VehicleState) -> None:
-        flight, order = self._flight, self.order
+        begun, order = self._begun, self.order
         self.steps += 1
         try:
             pilot = self._pilot
@@ -161,14 +178,14 @@ class PilotLoop:
             return
         finally:
             self._took_s.append(self._clock() - taken_s)
-        if flight != self._flight:
-            return  # a flight began meanwhile; this result is the old pilot's
+        if begun != self._begun:
+            return  # another pilot began meanwhile; this result is the old one's
         if self.order is order:
             self.order = None  # a step that fails is not recorded, so that the next takes the order again
         self._failure, self._unexpected = None, 0
         number = 1 if self._pilot is None or self.newest is None else self.newest.number + 1
-        self._pilot = pilot
-        self.newest = StepResult(taken_s, output, flight, number)
+        self._pilot, self._learned = pilot, pilot.learned
+        self.newest = StepResult(taken_s, output, self._flight, number)
         self.stepped = frames, output
         self._count(self.newest)
         reports = (
@@ -183,7 +200,13 @@ class PilotLoop:
         self._on_step(frames, vehicle, output, order)
 
     def _new_pilot(self) -> FlockPilot:
-        return FlockPilot(self._config, self._networks, stopwatch=time.perf_counter)
+        return FlockPilot(
+            self._config,
+            self._networks,
+            stopwatch=time.perf_counter,
+            learned=self.learned_before,
+            flies=self._flies,
+        )
 
     def _note_failure(self, why: str) -> None:
         """Counts a failed step; an event for a new reason."""

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from flockd.core.config import DroneConfig
 from flockd.core.config.perception import NO_MODEL
 from flockd.core.image_header import cost_fault
-from flockd.core.messages import Frame, FrameSet, MissionOrder, UInt8Array, VehicleState
+from flockd.core.messages import Frame, FrameSet, LearnedSize, MissionOrder, UInt8Array, VehicleState
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.codec import from_json, parsed
 from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, Note, Record, RecordingError
@@ -28,6 +28,7 @@ from flockd.onboard.recording.streams import (
     FLIGHT_NOTE,
     FORMAT,
     FRAMES,
+    LEARNED_SIZE,
     MODELS_NOTE,
     ORDER,
     OUTPUT,
@@ -117,6 +118,8 @@ class Recording:
         self.path = Path(path)
         self.contents = _survey(self.path, progress)
         self.config = _config(self.path, self.contents)
+        self.learned = _learned(self.path, self.contents.flight)
+        """What the flight's pilot began with of the others' size."""
 
     @property
     def drone(self) -> str:
@@ -302,6 +305,18 @@ def _config(path: Path, contents: Contents) -> DroneConfig:
         return config
     flown_without = config.perception.model_copy(update={"detector": NO_MODEL})  # by a flockd that had none
     return config.model_copy(update={"perception": flown_without})
+
+
+def _learned(path: Path, flight: Mapping[str, str]) -> LearnedSize | None:
+    if LEARNED_SIZE not in flight:
+        return None
+    try:
+        learned: LearnedSize = from_json(LearnedSize, parsed(flight[LEARNED_SIZE].encode()))
+    except ValueError as error:
+        raise RecordingError(f"{path}: its {LEARNED_SIZE} cannot be read ({error}); use another copy") from error
+    if not all(0 < number < math.inf for number in (learned.size_m, learned.sigma, learned.looks_m)):
+        raise RecordingError(f"{path}: its {LEARNED_SIZE} is no size; use another copy")
+    return learned
 
 
 def is_calibration(topic: str) -> bool:

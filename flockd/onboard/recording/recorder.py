@@ -21,7 +21,7 @@ from flockd import __version__
 from flockd.core.config import DroneConfig
 from flockd.core.config.recording import RecordingConfig
 from flockd.core.config.rig import RigConfig
-from flockd.core.messages import Frame, FrameSet, MissionOrder, PilotOutput, VehicleState
+from flockd.core.messages import Frame, FrameSet, LearnedSize, MissionOrder, PilotOutput, VehicleState
 from flockd.core.secrets import masked
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.codec import to_json
@@ -35,6 +35,7 @@ from flockd.onboard.recording.streams import (
     FLIGHT_NOTE,
     FORMAT,
     FRAMES,
+    LEARNED_SIZE,
     MODELS_NOTE,
     ORDER,
     OUTPUT,
@@ -99,6 +100,7 @@ class Recorder:
         settings: RecordingConfig | None = None,
         models: Mapping[str, str] | None = None,
         facts: Mapping[str, str] | None = None,
+        learned: LearnedSize | None = None,
         on_event: Callable[[str], None] = lambda event: None,
     ) -> None:
         """Begins a new recording over whatever `path` held.
@@ -110,6 +112,7 @@ class Recorder:
             settings: how to record; by default the configuration's own.
             models: SHA-256 of each model in use, by name.
             facts: more to be known of the flight, such as what of it was not learned.
+            learned: of the others' size before the flight; its pilot began with it.
             on_event: called, from the recorder's thread or the caller's, with what went wrong, in one sentence.
         """
         self._settings = settings or config.recording
@@ -117,6 +120,8 @@ class Recorder:
         self._on_event = on_event
         began = datetime.now(UTC).isoformat(timespec="seconds")
         flight = {"drone": drone, "began": began, "images": self._settings.images, **_VERSIONS, **(facts or {})}
+        if learned is not None:
+            flight[LEARNED_SIZE] = json.dumps(to_json(learned))
         head = (
             Note(MODELS_NOTE, models or {}),
             Inclosure(CONFIGURATION, "application/json", _without_passwords(config)),

@@ -22,6 +22,8 @@ RECOVERED, CUT, REPLAYED = EDITED = ("recovered_from", "cut_from", "replayed_fro
 """Facts of a recording that was made of another."""
 PILOT_BEGAN = "pilot_began_s"
 """A fact of what was cut or recovered: when the pilot took its first step, from which it counts its time."""
+LEARNED_SIZE = "learned_size"
+"""A fact of a flight: what its pilot began with of the others' size, as JSON."""
 CONFIGURATION = "configuration.json"
 
 

@@ -218,7 +218,7 @@ def fleet_key_frames(recordings: Path, run: FleetRun) -> tuple[KeyFrame, ...]:
     times = [time_s for _, time_s in recording.contents.steps]
     key_frames: list[KeyFrame] = []
     for index in sorted(key_frame_steps(len(times))):
-        pilot = FlockPilot(recording.config, networks)
+        pilot = FlockPilot(recording.config, networks, learned=recording.learned)
         for step in recording.steps(times[max(index - 1, 0)], times[index]):
             trace = StepTrace()
             output = pilot.step(step.frames, step.vehicle, trace, step.order)

@@ -92,7 +92,7 @@ def key_frames(
     ``log`` is of the flight that the recording is of. Raises ModelError where the networks are not installed,
     RecordingError where the recording is damaged.
     """
-    pilot = FlockPilot(recording.config)
+    pilot = FlockPilot(recording.config, learned=recording.learned)
     names, zero_s = log.metadata.names or [], log.metadata.clock_at_start_s or 0.0
     steps = len(recording.contents.steps)
     chosen = key_frame_steps(steps)

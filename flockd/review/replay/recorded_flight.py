@@ -64,7 +64,7 @@ def replay_flight(
 
     Raises RecordingError when ``out`` cannot be written, ModelError.
     """
-    pilot = FlockPilot(config, load_side_by_side(config), stopwatch=time.perf_counter)
+    pilot = FlockPilot(config, load_side_by_side(config), stopwatch=time.perf_counter, learned=recording.learned)
     total = sum(start_s <= step_s <= end_s for _, step_s in recording.contents.steps)
     replay = Replay()
     with ExitStack() as stack:
@@ -148,7 +148,13 @@ def _recording_to(out: Path, recording: Recording, config: DroneConfig) -> Itera
     models = model_hashes(config.perception)
     with written_whole(out) as draft:
         with Recorder(
-            draft, drone=recording.drone, config=config, settings=settings, models=models, facts=facts
+            draft,
+            drone=recording.drone,
+            config=config,
+            settings=settings,
+            models=models,
+            facts=facts,
+            learned=recording.learned,
         ) as recorder:
             yield recorder
         if recorder.failure is not None:

@@ -74,7 +74,7 @@ class Scenes:
         """Raises ModelError where the networks that the recording flew with are not here."""
         self._recording = recording
         self.rig: Rig = build_rig(recording.config.rig)
-        self._pilot = FlockPilot(recording.config) if fly_again else None
+        self._pilot = FlockPilot(recording.config, learned=recording.learned) if fly_again else None
         self.compared = 0
         """Steps whose outputs came out once more."""
         self.equal = 0

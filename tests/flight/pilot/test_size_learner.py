@@ -18,6 +18,7 @@ from flockd.core.messages import (
     Detection,
     FloatArray,
     FrameSet,
+    LearnedSize,
     Neighbour,
     PilotOutput,
     ReasonKind,
@@ -50,6 +51,8 @@ class Flight:
         doubt: float = 0.0,
         sizes_m: Sequence[float] = (SIZE_M,) * len(PLACES),
         weavers: Sequence[int] = (),
+        learned: LearnedSize | None = None,
+        flies: bool = True,
     ) -> None:
         """`scatter`: standard deviation of the logarithm of the judged size; `doubt`: what the network says of it.
 
@@ -60,7 +63,7 @@ class Flight:
         self._doubt = doubt
         self._judged_m, self._random, self._scatter = judged_m, np.random.default_rng(3), scatter
         networks: Any = object()  # never asked for anything
-        self._pilot = FlockPilot(config, networks, observer=self)
+        self._pilot = FlockPilot(config, networks, observer=self, learned=learned, flies=flies)
         self.below_m = self.time_s = 0.0
         self._last: Observation | None = None
         self.told: list[KnownSize | None] = []
@@ -88,14 +91,19 @@ class Flight:
         covariance = log_polar_covariance(bearing, 0.03, 0.004)
         return Detection(bearing, log_range, covariance, 0.95, size_m, ("front",), label, self._doubt)
 
-    def fly(self, duration_s: float) -> list[PilotOutput]:
-        """All outputs."""
+    @property
+    def learned(self) -> LearnedSize | None:
+        return self._pilot.learned
+
+    def fly(self, duration_s: float, climb_m_s: float = 0.0) -> list[PilotOutput]:
+        """All outputs; somebody else makes the drone climb."""
         outputs = []
         for _ in range(round(duration_s / STEP_S)):
             height_m = HEIGHT_M - self.below_m
             state = VehicleState(self.time_s, np.eye(3), height_m, np.zeros(3), np.zeros(2))
             outputs.append(self._pilot.step(FrameSet(self.time_s, {}), state))
             asked_m = outputs[-1].command.height_m
+            self.below_m -= climb_m_s * STEP_S
             if asked_m is not None:
                 self.below_m -= (asked_m - height_m) * (1 - math.exp(-STEP_S))  # 1 m/s for each metre
             wove_s = self.time_s - 6.0 - 16.0 * np.arange(len(self._weavers))
@@ -152,6 +160,37 @@ def test_a_size_that_the_networks_judge_wrong_is_learned_and_used() -> None:
     sentences = [one.mission.sentence for one in outputs]
     assert "weaves up and down" in sentences[begins]
     assert re.search(r"the others to be 0\.(39|4[0-2]) m large", sentences[-1])
+
+
+def test_a_climb_that_somebody_else_flies_teaches_the_size_for_the_flight() -> None:
+    """Four seconds of it, among others that stand; the flight's pilot has the ranges right from the first on."""
+    before = Flight(drone("auto", height_m=8.0), doubt=0.3, flies=False)
+    before.below_m = 4.0
+    before.fly(3.0)
+    assert before.learned is None
+    outputs = [*before.fly(4.0, climb_m_s=1.0), *before.fly(20.0)]
+    assert not any(one.size.weaves for one in outputs if one.size is not None)
+    learned = before.learned
+    assert learned is not None
+    assert learned.size_m == pytest.approx(SIZE_M, rel=0.1)
+    assert learned.looks_m == pytest.approx(JUDGED_M, rel=0.02)
+    flight = Flight(drone("auto"), doubt=0.3, learned=learned)
+    outputs = flight.fly(4.0)
+    assert flight.told[0] == KnownSize(learned.size_m, learned.sigma * learned.size_m, learned.looks_m)
+    assert max(map(abs, _range_errors(outputs[2], 0.0))) < 0.15
+    weaves = [one.size is not None and one.size.weaves for one in (*outputs, *flight.fly(20.0))]
+    assert any(weaves), "others learn from it"
+
+
+def test_in_a_flight_only_the_weave_tells_of_the_size() -> None:
+    """How else it rises the others may do too."""
+    flight = Flight(drone("off"))
+    assert flight.learned is None
+    flight = Flight(drone("auto"))
+    flight.fly(3.0)
+    flight.fly(4.0, climb_m_s=1.0)
+    flight.fly(3.0)
+    assert flight.learned is None
 
 
 def test_ten_steps_a_second_judge_no_more_views_than_two(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -243,6 +282,15 @@ def test_a_size_that_the_networks_judge_well_stays_theirs() -> None:
     assert size is not None
     assert size.size_m == pytest.approx(SIZE_M, rel=0.1)
     assert not any(one.size.used for one in outputs if one.size)
+
+
+@pytest.mark.parametrize(("doubt", "used"), [(0.3, True), (0.02, False)])
+def test_a_size_that_the_networks_say_they_do_not_know_is_never_theirs(doubt: float, used: bool) -> None:
+    """Judged 8 % wrong, which is less than what the learned size may be off."""
+    size = Flight(drone("weave"), judged_m=0.432, doubt=doubt).fly(60.0)[-1].size
+    assert size is not None
+    assert size.size_m == pytest.approx(SIZE_M, rel=0.1)
+    assert size.used is used
 
 
 def test_a_size_that_was_said_and_is_wrong_is_a_warning_with_both() -> None:

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,6 +28,8 @@ from flockd.core.errors import UnavailableError
 from flockd.core.messages import (
     EgoMotion,
     Frame,
+    FrameSet,
+    LearnedSize,
     Neighbour,
     PilotOutput,
     RangeReading,
@@ -371,6 +374,38 @@ def test_the_own_motion_is_missed_from_the_last_step_that_found_it() -> None:
     assert ages == pytest.approx([0.0, 0.0, 0.1, 0.8, 0.0, 0.0])
 
 
+def test_what_was_learned_since_the_drone_was_armed_goes_into_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[tuple[LearnedSize | None, bool]] = []
+
+    class Pilot:
+        def __init__(self, *_: object, learned: LearnedSize | None, flies: bool, stopwatch: object) -> None:
+            made.append((learned, flies))
+            self.learned = LearnedSize(0.1 * len(made), 0.05, 0.3, doubted=True)
+
+        def step(self, frames: FrameSet, *_: object) -> PilotOutput:
+            return PilotOutput(frames.time_s, None, None, (), (), {}, (), Wanted(np.zeros(2), np.zeros(2), 0.0))
+
+    monkeypatch.setattr("flockd.onboard.daemon.pilot_loop.FlockPilot", Pilot)
+    anything: Any = lambda *_: None  # noqa: E731
+    networks: Any = SimpleNamespace(leave=lambda: None)
+    loop = PilotLoop(_flyable("front"), anything, networks, anything, anything, anything, lambda: 0.0)
+    state = VehicleState(0.0, np.eye(3), 0.0, None)
+    begun: list[Callable[[], None]] = [
+        lambda: None, loop.watch, lambda: loop.begin_flight(1), lambda: loop.begin_flight(2), loop.watch,
+    ]  # fmt: skip
+
+    async def tell() -> None:
+        for begin in begun:
+            begin()
+            await loop._step(0.0, FrameSet(0.0, {}), state)
+
+    asyncio.run(tell())
+    loop.leave()
+    sizes_m = [None if learned is None else round(learned.size_m, 3) for learned, _ in made]
+    assert sizes_m == [None, None, 0.2, 0.3, None]
+    assert [flies for _, flies in made] == [False, False, True, True, False]
+
+
 @pytest.mark.parametrize(("step_s", "first"), [(0.5, 2), (0.1, 6)])
 def test_standstill_is_wanted_until_neighbours_can_be_confirmed(step_s: float, first: int) -> None:
     """Two detections, half a second apart."""
@@ -390,12 +425,12 @@ def test_standstill_is_wanted_until_neighbours_can_be_confirmed(step_s: float, f
 
 def test_the_supervisor_is_told_of_an_obstacle_where_hold_needs_room() -> None:
     """As of the last tick's surroundings: `safety.hold_room_m` is 2 m."""
-    config = _flyable("front").model_copy(update={"autopilot": AutopilotParameters()})
+    config, watched = _flyable("front").model_copy(update={"autopilot": AutopilotParameters()}), list[int]()
     status = AutopilotStatus(0.0, 0.1, 0.1, "offboard", True, False, "air", None, None, True, True, None, None)
     parts: Any = SimpleNamespace(  # all that the control loop asks, of whichever part
         newest=None, noisy_images=Counter(), ego_motion_age_s=0.0, neighbour_seen_s=0.0, load=lambda: 0.5, faults=0,
         stuck=False, worst_s=lambda: 0.0, hottest_c=None, report=lambda: SimpleNamespace(fault=None), end=str,
-        takeover=None, status=dict,
+        takeover=None, status=dict, watch=lambda: watched.append(1),
     )  # fmt: skip
     collector = InputCollector(config, parts, parts, parts, Gate(config.safety.gate), parts, parts, {}, lambda: 0.0)
     link: Any = SimpleNamespace(status=lambda: status, vehicle_state=lambda: None)
@@ -418,3 +453,4 @@ def test_the_supervisor_is_told_of_an_obstacle_where_hold_needs_room() -> None:
         control.tick()
     control.tick()  # in silence nothing is known to be near
     assert [inputs.obstacle_near for inputs in told] == [True, False, False]
+    assert len(watched) == 1, "once, as it is armed"

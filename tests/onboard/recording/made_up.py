@@ -18,6 +18,7 @@ from flockd.core.messages import (
     EgoMotion,
     Frame,
     FrameSet,
+    LearnedSize,
     MissionOrder,
     Neighbour,
     PilotOutput,
@@ -32,6 +33,7 @@ from flockd.onboard.recording.mcap_file import Damage, McapFile, Record, read_re
 
 WIDTH, HEIGHT = 160, 120
 MODELS = {"flow": "ab" * 32}
+LEARNED = LearnedSize(0.43, 1 / 11, 1 / 3, doubted=True)
 
 
 def drone_config() -> DroneConfig:
@@ -51,9 +53,13 @@ class MadeUpPilot:
     """Its outputs hang on every pixel, every number of the vehicle's state, and all that came before."""
 
     def __init__(
-        self, config: DroneConfig, networks: object = None, stopwatch: Callable[[], float] | None = None
+        self,
+        config: DroneConfig,
+        networks: object = None,
+        stopwatch: Callable[[], float] | None = None,
+        learned: LearnedSize | None = None,
     ) -> None:
-        self._memory = 0.1
+        self._memory = 0.1 if learned is None else learned.size_m / learned.looks_m + learned.sigma
         self.gain = config.flocking.cohesion
 
     def step(self, frames: FrameSet, vehicle: VehicleState, *, order: MissionOrder | None = None) -> PilotOutput:
@@ -121,13 +127,17 @@ def rewritten(source: Path, target: Path, change: Callable[[Record], Record]) ->
 
 
 def record(
-    path: Path, steps: int = 10, settings: RecordingConfig | None = None, period_s: float = 0.1
+    path: Path,
+    steps: int = 10,
+    settings: RecordingConfig | None = None,
+    period_s: float = 0.1,
+    learned: LearnedSize | None = LEARNED,
 ) -> list[PilotOutput]:
     """Records a made-up flight, and gives what its pilot said."""
     config = drone_config()
-    pilot = MadeUpPilot(config)
+    pilot = MadeUpPilot(config, learned=learned)
     outputs = []
-    with Recorder(path, drone="drone1", config=config, settings=settings, models=MODELS) as recorder:
+    with Recorder(path, drone="drone1", config=config, settings=settings, models=MODELS, learned=learned) as recorder:
         for frames, vehicle in inputs(steps, period_s):
             outputs.append(pilot.step(frames, vehicle))
             recorder.drain()

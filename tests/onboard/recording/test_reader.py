@@ -26,7 +26,7 @@ from flockd.onboard.recording.export import export_images, export_tables
 from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, McapFile, Note, Record, read_records
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.streams import is_image
-from tests.onboard.recording.made_up import record, rewritten
+from tests.onboard.recording.made_up import LEARNED, record, rewritten
 
 ROOT = Path(__file__).parents[3]
 
@@ -63,6 +63,31 @@ def test_what_is_no_recording_is_refused_in_one_sentence(tmp_path: Path, whole: 
     content = whole.read_bytes()
     path.write_bytes(content.replace(b"\x01\x00\x00\x001", b"\x01\x00\x00\x002", 1))
     assert refusal(path) == "is of format '2', and this flockd reads '1'; use the flockd that wrote it"
+
+
+def test_what_the_pilot_began_with_of_the_others_size_comes_back_to_the_last_bit(tmp_path: Path, whole: Path) -> None:
+    assert Recording(whole).learned == LEARNED
+    record(tmp_path / "x.mcap", learned=None)
+    assert Recording(tmp_path / "x.mcap").learned is None
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("{", "cannot be read (Expecting property name enclosed in double quotes: line 1 column 2 (char 1))"),
+        ("[]", "cannot be read"),
+        ('{"size_m": 0.4, "sigma": 0.1}', "cannot be read"),
+        ('{"size_m": 0.4, "sigma": 0.1, "looks_m": "NaN", "doubted": true}', "is no size"),
+        ('{"size_m": -0.4, "sigma": 0.1, "looks_m": 0.3, "doubted": true}', "is no size"),
+    ],
+)
+def test_a_size_that_is_none_is_refused(text: str, fault: str, tmp_path: Path, whole: Path) -> None:
+    def change(one: Record) -> Record:
+        if isinstance(one, Note) and one.name == "flockd":
+            return replace(one, facts={**one.facts, "learned_size": text})
+        return one
+
+    assert refusal(rewritten(whole, tmp_path / "x.mcap", change)).startswith(f"its learned_size {fault}")
 
 
 def test_a_configuration_of_another_version_is_refused_with_the_version_that_reads_it(

@@ -21,6 +21,7 @@ from flockd.core.messages import (
     EgoMotion,
     Frame,
     FrameSet,
+    LearnedSize,
     MissionOrder,
     Neighbour,
     PilotOutput,
@@ -342,6 +343,7 @@ class Looking:
     """A pilot that only looks."""
 
     config: DroneConfig
+    learned: LearnedSize | None
 
     def step(
         self, frames: FrameSet, vehicle: VehicleState, trace: StepTrace, order: MissionOrder | None = None

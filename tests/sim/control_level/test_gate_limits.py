@@ -64,7 +64,7 @@ def test_drones_that_fly_at_each_other_stop_in_time() -> None:
 
 def test_a_gated_flight_is_the_same_in_any_batch_and_in_any_number_of_threads() -> None:
     errors = load_perceived_errors(data_path("config") / "perceived" / "shipped_networks.yaml")
-    flock = _scenario(130).model_copy(update={"duration_s": 2.0})
+    flock = _scenario(130).model_copy(update={"duration_s": 1.0})
     flown = [scattered(flock.model_copy(update={"seed": seed}), 0.1) for seed in range(4)]
     alone = fly_flocks(flown[2:3], errors=errors, gated=True)
     assert fly_flocks(flown, errors=errors, gated=True, threads=2)[2:3] == alone
