@@ -220,7 +220,10 @@ def test_the_report_says_what_was_flown(plan: Plan, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("perception", "says"), [("truth", False), ("control", True)])
 def test_the_report_says_where_no_supervisor_flew(perception: str, says: bool, tmp_path: Path) -> None:
-    text = f"perception: {perception}\nfixed: {{duration_s: 4.0}}\nvary: {{vehicle.gust_m_s: {{values: [0.5]}}}}\nmeasure: [order_tail]\n"
+    text = (
+        f"perception: {perception}\nfixed: {{duration_s: 4.0}}\n"
+        "vary: {vehicle.gust_m_s: {values: [0.5]}}\nmeasure: [order_tail]\n"
+    )
     flown(Plan.load(campaign_file(tmp_path, text)), tmp_path / "out", Shuffled(1))
     write_campaign_page(Results.load(tmp_path / "out"), tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")

@@ -36,6 +36,8 @@ class _World:
     modes: list[str] = field(default_factory=lambda: ["OFFBOARD", "OFFBOARD"])
     armed: list[bool] = field(default_factory=lambda: [True, True])
     climb_m_s: float = 0.0
+    up: float = 1.0
+    """The share of their heights at which they are."""
     statuses: list[str] = field(default_factory=lambda: ["normal", "normal"])
     daemons: list[_Program] = field(default_factory=lambda: [_Program("drone1"), _Program("drone2")])
     px4s: list[_Program] = field(default_factory=lambda: [_Program("PX4 instance 0"), _Program("PX4 instance 1")])
@@ -46,8 +48,9 @@ class _World:
         if mode == "LAND" and self.px4s[i].ended is None:
             self.armed[i] = False
 
-    def fleet(self) -> _Fleet:
+    def fleet(self, apart_s: float = 0.0) -> _Fleet:
         scenario = with_drones(load_scenario(data_path("config") / "paper_flight.yaml"), 2)
+        scenario = scenario.model_copy(update={"take_off_apart_s": apart_s})
         height_m = np.array([-vehicle.position_m[2] for vehicle in scenario.vehicles])
         station = SimpleNamespace(
             mode_is=lambda i, mode: self.modes[i] == mode,
@@ -55,8 +58,10 @@ class _World:
             is_armed=lambda i: self.armed[i],
             last_text=lambda i: "",
             select=self.select,
+            arm=lambda i: self.armed.__setitem__(i, True),
             poses=lambda: SimpleNamespace(
-                position=np.column_stack([np.zeros((2, 2)), -height_m]), velocity=np.full((2, 3), -self.climb_m_s)
+                position=np.column_stack([np.zeros((2, 2)), -self.up * height_m]),
+                velocity=np.full((2, 3), -self.climb_m_s),
             ),
         )
         daemons = SimpleNamespace(
@@ -123,6 +128,18 @@ def test_a_drone_that_still_climbs_is_not_at_its_height() -> None:
     assert not fleet._is_up(0), "level for half a second"
     world.now_s = 1.5
     assert fleet._is_up(0)
+
+
+def test_one_drone_arms_and_takes_off_so_long_after_the_other() -> None:
+    world = _World(armed=[False, False], up=0.0)
+    fleet, done = world.fleet(apart_s=5.0), []
+    for world.now_s in (0.0, 1.0, 4.9, 5.0, 6.0):
+        for i in range(2):
+            fleet._request_climb(i)
+        done.append((list(world.armed), list(world.selected)))
+    first, both = (0, "TAKEOFF"), [(0, "TAKEOFF"), (1, "TAKEOFF")]
+    assert [armed for armed, _ in done] == [[True, False]] * 3 + [[True, True]] * 2
+    assert [selected for _, selected in done] == [[], [first], [first] * 2, [first] * 3, [first] * 3 + both]
 
 
 def test_a_long_text_of_the_autopilot_is_joined_from_its_chunks() -> None:
