@@ -25,10 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.core.config.imperfect_cameras import CamerasConfig
+from flockd.core.config.obstacle_field import ObstaclesConfig
+from flockd.core.errors import UsageError
 from flockd.flight.geometry import PinholeCamera, vector_from_rotation
 from flockd.sim.airframe import DroneModel
 from flockd.sim.drone_models import drone_model
 from flockd.sim.worlds.obstacle_worlds import LOWEST_CROWN_M, generate_obstacles
+from flockd.sim.worlds.obstacles import Obstacles
 from tools.training import worlds
 from tools.training.camera_effects import drawn_cameras
 from tools.training.dataset import FOCAL_PX, HEIGHT, MAX_DRONES, R_BODY_CAMERA, WIDTH, create_part, note
@@ -115,13 +118,13 @@ def _render_world(job: PairJob) -> None:
 
     folder, seed, count = job.folder, job.seed, job.pairs
     rng = np.random.Generator(np.random.PCG64(seed))
-    field = worlds.drawn_obstacles(seed, job.obstacles_share)
+    field, obstacles = _standing(worlds.drawn_obstacles(seed, job.obstacles_share), seed)
     world = World.generate(
         seed,
         ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])),
         keep_out=None if field is None else field_grid(field.extent_m),
         clearance_m=9.0 if field is None else FIELD_GRID_M,
-        obstacles=None if field is None else generate_obstacles(field, seed, np.zeros((0, 2))),
+        obstacles=obstacles,
     )
     drawn = rng.choice(worlds.SHAPES, SHAPES_A_WORLD) if job.shapes_share else ()
     shapes = [generated_drone(int(shape), int(rng.integers(1 << 31))) for shape in drawn]
@@ -141,6 +144,18 @@ def _render_world(job: PairJob) -> None:
         folder, seed=seed, pairs=count, families=list(job.families), shapes_share=job.shapes_share,
         obstacles=None if field is None else field.kind,
     )  # fmt: skip
+
+
+def _standing(field: ObstaclesConfig | None, seed: int) -> tuple[ObstaclesConfig | None, Obstacles | None]:
+    """The drawn obstacles where they stand; where a place is too small for so many, a fifth fewer of them, and again."""
+    if field is None:
+        return None, None
+    while True:
+        try:
+            return field, generate_obstacles(field, seed, np.zeros((0, 2)))
+        except UsageError:
+            fewer = {key: 0.8 * getattr(field, key) for key in ("houses_per_hectare", "trees_per_hectare")}
+            field = field.model_copy(update=fewer)
 
 
 def _places_among(world: Any, count: int, rng: np.random.Generator, extent_m: float) -> Array:

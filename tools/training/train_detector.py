@@ -95,7 +95,9 @@ def _sample(scene: Scene) -> Sample:
 def main() -> None:
     """Train until the minutes are over."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--coco", type=Path, required=True, help="YOLOX-nano as ONNX, 80 classes")
+    parser.add_argument(
+        "--coco", type=Path, required=True, help="YOLOX-nano as ONNX, of COCO's 80 classes, or a detector of models/"
+    )
     parser.add_argument("--cutouts", type=Path, required=True)
     parser.add_argument("--photographs", type=Path, required=True)
     parser.add_argument("--labelled", type=Path, action="append", required=True)

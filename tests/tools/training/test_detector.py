@@ -73,6 +73,12 @@ def test_it_begins_as_the_network_in_the_file_with_fewer_classes(tmp_path: Path)
     for our, their in zip(got, expected, strict=True):
         assert our[:, :5].numpy() == pytest.approx(their[:, :5].numpy(), abs=2e-3)
         assert our[:, 6].numpy() == pytest.approx(their[:, 5 + 14].numpy(), abs=2e-3)  # a bird is COCO's class 14
+    own_file, again = tmp_path / "detector.onnx", DroneDetector()
+    torch.onnx.export(ours.eval(), (images,), str(own_file), opset_version=17, dynamo=False)
+    begin_with_coco(again, own_file, images)
+    with torch.no_grad():
+        pairs = list(zip(again.train()(images), ours.train()(images), strict=True))
+    assert all(a.numpy() == pytest.approx(b.numpy(), abs=2e-3) for a, b in pairs), "all of its own classes"
     other_file = tmp_path / "other.onnx"
     torch.onnx.export(nn.Conv2d(3, 4, 3), (images,), str(other_file), opset_version=17, dynamo=False)
     with pytest.raises(ValueError, match="has 1 convolutions"):

@@ -113,3 +113,15 @@ def test_images_from_before_they_had_masks_are_refused_by_name(tmp_path: Path) -
     np.savez(tmp_path / "1.npz", picture=np.zeros((1, 96, 96, 3), np.uint8), drone=np.ones(1, np.float32))
     with pytest.raises(ValueError, match=r"1\.npz: its crops have no masks; make the folder anew"):
         CropFiles(tmp_path)
+
+
+def test_a_place_too_small_for_the_drawn_houses_gets_fewer() -> None:
+    from flockd.core.config.obstacle_field import ObstaclesConfig
+    from tools.training.render_training_data import _standing
+
+    drawn = ObstaclesConfig(kind="village", extent_m=28.0, min_gap_m=2.0, houses_per_hectare=16.0)
+    stands, obstacles = _standing(drawn, 3)
+    assert obstacles is not None
+    assert stands is not None
+    assert 2.0 < stands.houses_per_hectare < 16.0
+    assert _standing(None, 3) == (None, None)

@@ -186,6 +186,8 @@ def _doubled(x: Tensor) -> Tensor:
 def begin_with_coco(network: DroneDetector, path: Path, images: Tensor) -> None:
     """Weights of an ONNX file of YOLOX-nano, and what batch norms see of ``images`` (n, 3, h, w).
 
+    Its classes are COCO's or ours.
+
     The file has its batch norms folded into its convolutions, which come in the order in which they are run, as ours
     do. Raises ValueError where one differs.
     """
@@ -211,7 +213,9 @@ def begin_with_coco(network: DroneDetector, path: Path, images: Tensor) -> None:
 
 
 def _of_our_classes(of_coco: NDArray[Any]) -> NDArray[Any]:
-    """(classes, ...) from the (80, ...) of COCO."""
+    """(classes, ...) from the (80, ...) of COCO; those of a detector of ours stay."""
+    if len(of_coco) == len(CLASSES):
+        return of_coco
     return np.stack([np.mean([of_coco[COCO[name]] for name in names], axis=0) for names in _BEGUN_WITH])
 
 
