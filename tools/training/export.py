@@ -174,13 +174,14 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "flow": {
         "net": FlowNet,
         "roles": ["flow"],
-        "description": "Optical flow on quarter-size images: best match anywhere, then a recurrent refinement",
-        "image_scale": 0.25,
+        "description": "Optical flow on images of an eighth of the size: best match anywhere, then a recurrent refinement",
+        "image_scale": 0.125,
+        "least_side_px": 60,
         "size_multiple": 8,
         "golden_size": [120, 160],
         "inputs": {
-            "first": {**IMAGE, "meaning": "earlier RGB image, quarter size"},
-            "second": {**IMAGE, "meaning": "later RGB image, quarter size"},
+            "first": {**IMAGE, "meaning": "earlier RGB image, made smaller"},
+            "second": {**IMAGE, "meaning": "later RGB image, made smaller"},
         },
         "outputs": {"flow": ([1, 2, "h", "w"], "from first to second, right and down", "input px")},
     },

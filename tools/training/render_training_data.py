@@ -147,7 +147,7 @@ def _render_world(job: PairJob) -> None:
 
 
 def _standing(field: ObstaclesConfig | None, seed: int) -> tuple[ObstaclesConfig | None, Obstacles | None]:
-    """The drawn obstacles where they stand; where a place is too small for so many, a fifth fewer of them, and again."""
+    """The drawn obstacles where they stand; where there is no room for so many, a fifth fewer, and again."""
     if field is None:
         return None, None
     while True:

@@ -62,7 +62,8 @@ def fit(manifest: Manifest, image: Size) -> Fitting:
     if fixed is not None:
         scale = min(fixed[0] / image[0], fixed[1] / image[1])
         return Fitting(image, (round(image[0] * scale), round(image[1] * scale)), fixed)
-    inner = (round(image[0] * manifest.image_scale), round(image[1] * manifest.image_scale))
+    scale = max(manifest.image_scale, min(manifest.least_side_px / min(image), 1.0))
+    inner = (round(image[0] * scale), round(image[1] * scale))
     multiple = manifest.size_multiple
     return Fitting(image, inner, (inner[0] + -inner[0] % multiple, inner[1] + -inner[1] % multiple))
 

@@ -169,6 +169,8 @@ class Manifest(Section):
     description: str
     image_scale: Positive = 1.0
     """The images are resized by this factor before they enter. A model of fixed size takes them as large as fits."""
+    least_side_px: Annotated[int, Field(ge=0)] = 0
+    """The shorter side enters with so many pixels at least, as far as the image has them."""
     size_multiple: Annotated[int, Field(ge=1)] = 1
     """Height and width that enter are padded to a multiple of this."""
     map_stride: Annotated[int, Field(ge=1, le=64)] | None = None

@@ -191,8 +191,9 @@ class OnnxNetworks(OneByOne):
                 break
             scale /= 2
             seen = np.asarray(cv2.resize(seen, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
-        boxes, probability, other = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        boxes, odds = kept_boxes(boxes, probability, other, rules)
+        boxes, odds = kept_boxes(
+            np.concatenate([one for one, _ in found]), np.concatenate([p for _, p in found]), rules
+        )
         inside = camera.camera.in_image((boxes[:, :2] + boxes[:, 2:]) / 2)
         return boxes[inside], odds[inside]
 

@@ -10,9 +10,11 @@ import pytest
 import yaml
 from onnx import helper
 
+from flockd.core.data import data_path
 from flockd.core.errors import ModelError
 from flockd.flight.inference import OnnxModel, read_manifest
 from flockd.flight.inference.feeds import feeds_for, golden_feeds
+from flockd.flight.inference.fitting import fit
 from flockd.flight.inference.manifest import Manifest
 from tests.flight.inference.foreign import (
     SIZE,
@@ -250,3 +252,21 @@ def test_an_output_that_is_not_there_is_refused(tmp_path: Path) -> None:
         ModelError, match=r"outputs: the manifest names \['moved'\] but the model file has \['motion'\]"
     ):
         OnnxModel(path, threads=1)
+
+
+@pytest.mark.parametrize(
+    ("image", "enters"),
+    [
+        ((640, 480), (80, 60)),
+        ((1280, 960), (160, 120)),
+        ((320, 240), (80, 60)),
+        ((480, 640), (60, 80)),
+        ((64, 48), (64, 48)),
+    ],
+)
+def test_a_small_image_enters_no_smaller_than_the_manifest_says(
+    image: tuple[int, int], enters: tuple[int, int]
+) -> None:
+    """The shipped flow sees images of an eighth of the size, and of 60 pixels at least along the shorter side."""
+    manifest = read_manifest(data_path("models") / "flow.yaml").manifest
+    assert fit(manifest, image).inner == enters

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from flockd.core.messages import Detection
-from flockd.flight.geometry import log_polar, log_polar_covariance
-from tools.measure.evaluation.on_pairs import Findings, compare_drones, pairings
-from tools.training.dataset import HEIGHT, WIDTH, PairSet
+from flockd.flight.geometry import RangeMap, ZMap, log_polar, log_polar_covariance, range_map
+from tools.measure.evaluation.on_pairs import Findings, compare_drones, depth_errors, pairings
+from tools.training.dataset import HEIGHT, WIDTH, PairSet, rig_camera
 
 
 def detection(*position: float) -> Detection:
@@ -49,3 +50,15 @@ def test_a_drone_is_proposed_where_the_second_stage_was_asked_about_its_directio
     assert [drone.proposed for drone in found.drones] == [True, False]
     assert found.proposed(12, np.inf) == 0.5
     assert found.found(12, np.inf) == 0.0
+
+
+def test_ranges_along_the_rays_are_compared_with_depths_along_the_optical_axis() -> None:
+    """A wall across the view: its corners are farther along the rays, and no error."""
+    camera, ids = rig_camera(200.0), np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8)
+    wall, true = np.full((HEIGHT, WIDTH), 5.0, np.float32), np.full(ids.shape, 5.0, np.float32)
+    ranges = range_map(ZMap(wall), camera.camera)
+    assert ranges.max() > 8.0
+    ids[:, :10] = 1  # a drone
+    errors = depth_errors(RangeMap(1.1 * ranges), camera, true, ids)
+    assert len(errors) == ids[:, 10:].size
+    assert errors == pytest.approx(0.1, abs=1e-5)

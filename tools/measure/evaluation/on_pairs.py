@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from flockd.core.choices import ScaleSource
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.messages import UNCLASSED, Detection, Frame, FrameSet, VehicleState
-from flockd.flight.geometry import Rig
+from flockd.flight.geometry import RangeMap, Rig, RigCamera, z_map
 from flockd.flight.perception import DisFlow, OnnxNetworks, Perception
 from flockd.flight.perception.detection.detector import DetectionTrace
 from flockd.flight.pilot.ground import level_ground
@@ -105,9 +105,9 @@ def look_at_pairs(pairs: PairSet, networks: OnnxNetworks, indices: Iterable[int]
             trace = DetectionTrace()
             perception = Perception(rig, networks, PerceptionConfig(scale=scale))
             view = perception.observe(frames, vehicle, level_ground(vehicle), trace=trace)
-            metres = view.cameras["camera"].depth
-            assert metres is not None
-            off = _depth_errors(metres[1::2, 1::2], depth, ids)
+            ranges = view.cameras["camera"].depth
+            assert ranges is not None
+            off = depth_errors(RangeMap(ranges), rig.cameras["camera"], depth, ids)
             found.depth[given].append(float(off.mean()) if off.size else 0.0)
             found.depth_pixels[given].append(off[::16])
         labels = view.cameras["camera"].labels
@@ -125,7 +125,12 @@ def look_at_pairs(pairs: PairSet, networks: OnnxNetworks, indices: Iterable[int]
     return found
 
 
-def _depth_errors(guess: Array, true: Array, ids: Array) -> Array:
+def depth_errors(ranges: RangeMap, camera: RigCamera, true: Array, ids: Array) -> Array:
+    """(n,) relative errors of ranges (h, w) where the background of a rendered pair is near.
+
+    ``true`` (h / 2, w / 2) metres along the optical axis, as rendered; ``ids`` alike, 0 where there is no drone.
+    """
+    guess = z_map(ranges, camera.camera)[1::2, 1::2]
     near = (ids == 0) & (true < 60.0)
     return np.asarray(np.abs(guess[near] - true[near]) / true[near])
 

@@ -14,8 +14,6 @@ from flockd.flight.perception.detection.instances import Instance
 
 _SAME_OVERLAP = 0.3
 """Intersection over union from which a box and an instance are one drone."""
-_ONE_THING = 0.5
-"""The same, from which boxes of two classes are of one thing."""
 _PART = 0.8
 """An instance of which so much lies in a box of at least twice its width is a part of that drone."""
 _LARGE_PX = (40.0, 300.0)
@@ -23,8 +21,6 @@ _LARGE_PX = (40.0, 300.0)
 real drones of 6 to 60 pixels, and refuses large ones."""
 _SUREST = 0.95
 """No box counts as more probable: a detector that is sure and wrong may not overrule whatever the second stage says."""
-OTHER_CLASSES = ("bird_probability", "airplane_probability", "helicopter_probability")
-"""Columns of a detector's output that it may have."""
 _FIRST = 50.0
 """Added to the score of what a detector found: it is proposed before what the segmentation alone finds."""
 
@@ -59,40 +55,28 @@ class BoxRules:
 
 def probable_boxes(
     columns: Mapping[str, Float32Array], rules: BoxRules, scale: tuple[float, float]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Boxes (n, 4) left, top, right, bottom that are probable enough, how probable (n,) they are by the detector,
-    and how probable (n,) that the same thing is of another class.
+) -> tuple[FloatArray, FloatArray]:
+    """Boxes (n, 4) left, top, right, bottom that are probable enough, and their probabilities (n,).
 
     Args:
         columns: a detector's output, (m,) each.
         rules: of the detector.
         scale: pixels of what it saw per pixel of the image, right and down.
     """
+    good = np.flatnonzero(columns["drone_probability"] >= rules.least_probability)
     right, down, width, height = (
-        columns[name].astype(float) for name in ("centre_right_px", "centre_down_px", "width_px", "height_px")
+        columns[name][good].astype(float) for name in ("centre_right_px", "centre_down_px", "width_px", "height_px")
     )
     boxes = np.stack([right - width / 2, down - height / 2, right + width / 2, down + height / 2], 1)
-    probability = columns["drone_probability"].astype(float)
-    others = [column for name, column in columns.items() if name in OTHER_CLASSES]
-    other = np.max(others, axis=0).astype(float) if others else np.zeros(len(probability))
-    good, rivals = (np.flatnonzero(each >= rules.least_probability) for each in (probability, other))
-    one_thing = _overlap(boxes[good][:, None], boxes[rivals]) >= _ONE_THING
-    same = np.where(one_thing, other[rivals], 0.0).max(axis=1, initial=0.0)
-    return boxes[good] / np.tile(scale, 2), probability[good], same
+    return boxes / np.tile(scale, 2), columns["drone_probability"][good].astype(float)
 
 
-def kept_boxes(
-    boxes: FloatArray, probability: FloatArray, other: FloatArray, rules: BoxRules
-) -> tuple[FloatArray, FloatArray]:
-    """Those of the boxes (n, 4) that are no second ones of a drone, the most probable first; their log odds (n,).
-
-    A detector judges each class by itself, and one thing is of one class: the odds are those of "it is a drone and
-    nothing else" to "it is none", so that another class that is probable there counts against a drone.
-    """
+def kept_boxes(boxes: FloatArray, probability: FloatArray, rules: BoxRules) -> tuple[FloatArray, FloatArray]:
+    """Those of the boxes (n, 4) that are no second ones of a drone, the most probable first; their log odds (n,)."""
     corners = np.hstack([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]])
     kept = np.asarray(cv2.dnn.NMSBoxes(corners.tolist(), probability.tolist(), 0.0, rules.overlap), int).reshape(-1)
-    p, of_other = np.clip(probability[kept], 1 - _SUREST, _SUREST), np.clip(other[kept], 0.0, _SUREST)
-    return boxes[kept], np.log(p / (1 - p)) + np.log1p(-of_other)
+    p = np.clip(probability[kept], 1 - _SUREST, _SUREST)
+    return boxes[kept], np.log(p / (1 - p))
 
 
 def with_boxes(
@@ -137,19 +121,13 @@ def with_boxes(
 def _is_part(of: FloatArray, box: FloatArray) -> bool:
     if 2 * (of[2] - of[0]) > box[2] - box[0]:
         return False
-    return float(_common(of, box)) >= _PART * float(np.prod(of[2:] - of[:2]))
+    return _common(of, box) >= _PART * float(np.prod(of[2:] - of[:2]))
 
 
-def _overlap(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(...) intersection over union of boxes (..., 4)."""
+def _overlap(a: FloatArray, b: FloatArray) -> float:
     common = _common(a, b)
-    both = np.prod(a[..., 2:] - a[..., :2], axis=-1) + np.prod(b[..., 2:] - b[..., :2], axis=-1)
-    shared: FloatArray = common / np.maximum(both - common, 1e-9)
-    return shared
+    return common / max(float(np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2])) - common, 1e-9)
 
 
-def _common(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(...) the area that boxes (..., 4) have in common."""
-    sides = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
-    area: FloatArray = np.prod(np.maximum(sides, 0.0), axis=-1)
-    return area
+def _common(a: FloatArray, b: FloatArray) -> float:
+    return float(np.prod(np.maximum(np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]), 0.0)))

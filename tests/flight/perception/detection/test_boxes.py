@@ -102,20 +102,3 @@ def test_a_smaller_drone_before_a_large_one_stays_where_it_has_a_box_of_its_own(
         np.zeros((100, 200), np.uint8), (instance(1, small),), boxes(small, DRONE), np.array([3.0, 2.0]), RULES
     )
     assert [one.box.tolist() for one in seen] == [list(small), list(DRONE)]
-
-
-@pytest.mark.parametrize(
-    ("helicopter", "odds"),
-    [
-        ((50.0, 40.0, 20.0, 10.0, 0.75), 1.5 * 0.25),  # the same thing: 0.6 / 0.4 times what is left of one
-        ((53.0, 40.0, 20.0, 10.0, 0.75), 1.5 * 0.25),
-        ((62.0, 40.0, 20.0, 10.0, 0.75), 1.5),  # another thing
-        ((50.0, 40.0, 20.0, 10.0, 0.04), 1.5),  # nothing
-        ((50.0, 40.0, 20.0, 10.0, 1.0), 1.5 * 0.05),  # as sure as any class counts
-    ],
-)
-def test_another_class_at_the_same_place_counts_against_a_drone(helicopter: tuple[float, ...], odds: float) -> None:
-    rows = columns((50, 40, 20, 10, 0.6), (*helicopter[:4], 0.0))
-    both = {**rows, "helicopter_probability": np.array([0.0, helicopter[4]], np.float32)}
-    _, found_odds = kept_boxes(*probable_boxes(both, RULES, (1.0, 1.0)), RULES)
-    assert np.exp(found_odds) == pytest.approx([odds], rel=1e-5)
