@@ -250,7 +250,12 @@ def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
         sizes = sorted({camera.size_px for camera in config.rig.cameras})
         feeds = [
             golden_feeds(model.manifest),
-            *(feeds_for(model.manifest, size, batch) for size in sizes for batch in (1, CROPS_PER_RUN)),
+            *(
+                feeds_for(model.manifest, size, batch, without_height=without_height)
+                for size in sizes
+                for batch in (1, CROPS_PER_RUN)
+                for without_height in (False, True)
+            ),
         ]
         for each in feeds:
             model.run(each)

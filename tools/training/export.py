@@ -75,6 +75,9 @@ NETWORKS: dict[str, dict[str, Any]] = {
         "net": NeighboursNet,
         "roles": ["depth", "segmentation"],
         "description": "U-Net: metric depth, drone mask and centre offsets of one image",
+        "image_scale": 0.75,
+        "image_scale_without_height": 1.0,
+        "least_side_px": 360,
         "size_multiple": 32,
         "map_stride": 2,
         "thresholds": {"proposal_logit": -1.5, "mask_logit": 0.4, "proposal_logit_alone": 0.0},
@@ -174,7 +177,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "flow": {
         "net": FlowNet,
         "roles": ["flow"],
-        "description": "Optical flow on images of an eighth of the size: best match anywhere, then a recurrent refinement",
+        "description": "Optical flow on small images: best match anywhere, then a recurrent refinement",
         "image_scale": 0.125,
         "least_side_px": 60,
         "size_multiple": 8,
