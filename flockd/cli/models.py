@@ -250,12 +250,7 @@ def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
         sizes = sorted({camera.size_px for camera in config.rig.cameras})
         feeds = [
             golden_feeds(model.manifest),
-            *(
-                feeds_for(model.manifest, size, batch, without_height=without_height)
-                for size in sizes
-                for batch in (1, CROPS_PER_RUN)
-                for without_height in (False, True)
-            ),
+            *(feeds_for(model.manifest, size, batch) for size in sizes for batch in (1, CROPS_PER_RUN)),
         ]
         for each in feeds:
             model.run(each)

@@ -34,9 +34,9 @@ def golden_feeds(manifest: Manifest) -> Feeds:
     return feeds
 
 
-def feeds_for(manifest: Manifest, image: Size, batch: int = 1, *, without_height: bool = False) -> Feeds:
+def feeds_for(manifest: Manifest, image: Size, batch: int = 1) -> Feeds:
     """What enters for images of a camera, or for so many crops, with nothing in them."""
-    fitting, feeds = fit(manifest, image, without_height=without_height), {}
+    fitting, feeds = fit(manifest, image), {}
     for name, spec in manifest.inputs.items():
         if spec.kind == "planes":
             feeds[name] = _zeros(manifest, spec, fitting.full)

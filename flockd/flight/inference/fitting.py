@@ -56,16 +56,13 @@ class Fitting:
         return map_[..., : round(height * self.inner[1] / self.full[1]), : round(width * self.inner[0] / self.full[0])]
 
 
-def fit(manifest: Manifest, image: Size, *, without_height: bool = False) -> Fitting:
-    """How images of this size enter a model; ``without_height``: above ground, which goes with them otherwise."""
+def fit(manifest: Manifest, image: Size) -> Fitting:
+    """How images of this size enter a model."""
     fixed = manifest.fixed_size
     if fixed is not None:
         scale = min(fixed[0] / image[0], fixed[1] / image[1])
         return Fitting(image, (round(image[0] * scale), round(image[1] * scale)), fixed)
-    scale = manifest.image_scale
-    if without_height and manifest.image_scale_without_height is not None:
-        scale = manifest.image_scale_without_height
-    scale = max(scale, min(manifest.least_side_px / min(image), 1.0))
+    scale = max(manifest.image_scale, min(manifest.least_side_px / min(image), 1.0))
     inner = (round(image[0] * scale), round(image[1] * scale))
     multiple = manifest.size_multiple
     return Fitting(image, inner, (inner[0] + -inner[0] % multiple, inner[1] + -inner[1] % multiple))

@@ -169,8 +169,6 @@ class Manifest(Section):
     description: str
     image_scale: Positive = 1.0
     """The images are resized by this factor before they enter. A model of fixed size takes them as large as fits."""
-    image_scale_without_height: Positive | None = None
-    """The same where no height above ground is known, and the image alone has to tell the metres; null: the same."""
     least_side_px: Annotated[int, Field(ge=0)] = 0
     """The shorter side enters with so many pixels at least, as far as the image has them."""
     size_multiple: Annotated[int, Field(ge=1)] = 1

@@ -90,12 +90,12 @@ class OnnxNetworks(OneByOne):
         """See `Networks`."""
         height, width = frame.image.shape[:2]
         planes = geometry_planes(camera, ground, self.map_stride)
-        maps = self._run(self._depth, frame.image, planes, without_height=ground is None)
+        maps = self._run(self._depth, frame.image, planes)
         depth = np.asarray(
             cv2.resize(maps["depth"][0], (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.float32
         )
         if self._segmentation is not self._depth:
-            maps = self._run(self._segmentation, frame.image, planes, without_height=ground is None)
+            maps = self._run(self._segmentation, frame.image, planes)
         logit = self._at_map_stride(maps["drone"], (width, height))[0]
         blind = blind_pixels(camera.camera, self.map_stride)
         if blind.any():
@@ -115,12 +115,7 @@ class OnnxNetworks(OneByOne):
         low = cv2.resize((logit < certain).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
         peak = self._segmentation.manifest.thresholds.get("proposal_peak_logit", proposal) - proposal
         return SceneMaps(
-            self._depth_of(depth, camera, without_height=ground is None),
-            labels,
-            instances,
-            uncertain=low & (labels > 0),
-            logit=logit,
-            min_score=peak,
+            self._depth_of(depth, camera), labels, instances, uncertain=low & (labels > 0), logit=logit, min_score=peak
         )
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
@@ -202,11 +197,9 @@ class OnnxNetworks(OneByOne):
         inside = camera.camera.in_image((boxes[:, :2] + boxes[:, 2:]) / 2)
         return boxes[inside], odds[inside]
 
-    def _run(
-        self, model: OnnxModel, image: UInt8Array, planes: Float32Array, *, without_height: bool
-    ) -> dict[str, Float32Array]:
+    def _run(self, model: OnnxModel, image: UInt8Array, planes: Float32Array) -> dict[str, Float32Array]:
         """One model's maps (c, h, w) that show all of an image, at the model's resolution."""
-        fitting = fit(model.manifest, (image.shape[1], image.shape[0]), without_height=without_height)
+        fitting = fit(model.manifest, (image.shape[1], image.shape[0]))
         contents: dict[str, Sequence[UInt8Array] | Float32Array] = {"image": [fitting.enter(image)]}
         if "geometry" in model.manifest.contents:
             contents["geometry"] = fitting.enter_planes(planes, self.map_stride)[None]
@@ -222,14 +215,13 @@ class OnnxNetworks(OneByOne):
             resized *= np.array([width / maps.shape[2], height / maps.shape[1]], np.float32)[:, None, None]
         return np.asarray(resized, dtype=np.float32)
 
-    def _depth_of(self, depth: Float32Array, camera: RigCamera, *, without_height: bool) -> ZMap | OpenDepth:
+    def _depth_of(self, depth: Float32Array, camera: RigCamera) -> ZMap | OpenDepth:
         """Metres where the depth network knows them, else what it leaves open; from its output, resized."""
         meaning = self._depth.manifest.results["depth"].depth
         is_inverse = meaning.quantity == "inverse_depth"
         if meaning.focal_px:
             size = (depth.shape[1], depth.shape[0])
-            fitting = fit(self._depth.manifest, size, without_height=without_height)
-            longer = fitting.scale[0] * camera.camera.focal_px / meaning.focal_px
+            longer = fit(self._depth.manifest, size).scale[0] * camera.camera.focal_px / meaning.focal_px
             depth = depth / longer if is_inverse else depth * longer
         if self._unknown == "nothing":
             metres = 1.0 / np.maximum(depth, 1.0 / _MAX_DEPTH_M) if is_inverse else depth

@@ -270,11 +270,3 @@ def test_a_small_image_enters_no_smaller_than_the_manifest_says(
     """The shipped flow sees images of an eighth of the size, and of 60 pixels at least along the shorter side."""
     manifest = read_manifest(data_path("models") / "flow.yaml").manifest
     assert fit(manifest, image).inner == enters
-
-
-def test_an_image_that_alone_has_to_tell_the_metres_enters_whole() -> None:
-    manifest = read_manifest(data_path("models") / "neighbours_int8.yaml").manifest
-    sizes = [fit(manifest, (640, 480), without_height=alone).inner for alone in (False, True)]
-    assert sizes == [(480, 360), (640, 480)]
-    flow = read_manifest(data_path("models") / "flow.yaml").manifest
-    assert fit(flow, (640, 480), without_height=True).inner == (80, 60)
