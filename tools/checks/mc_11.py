@@ -91,6 +91,7 @@ async def engage(world: World) -> None:
     await _pattern(world, "pattern")
     world.station.select(0, "LOITER")
     await world.saw("disengage", world.mode("hold"), "the mode is hold")
+    await world.until(_flies(world, "LOITER"), "Hold, as the ground station hears it")
     await _silent_for_good(world, "disengage")
 
 
@@ -107,6 +108,7 @@ async def takeover(world: World) -> None:
             break
         world.stick = 0
         await _comes(world, lambda: False, 1.0)
+    await world.until(_flies(world, "POSCTL"), "Position, as the ground station hears it")
     await _silent_for_good(world, story)
     sent, place = world.streamer.report().sent, _place(world)
     world.stick = STICK
