@@ -16,6 +16,7 @@ from pymavlink.dialects.v20 import development as mavlink
 from flockd.core.config import DroneConfig
 from flockd.core.config.mission import MissionParameters, WaypointParameters
 from flockd.core.errors import ConfigError, ConfigProblem
+from flockd.core.messages import LearnedSize
 from flockd.fleet.fleet_status import status_rows
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon import DaemonError, Ending
@@ -240,7 +241,7 @@ def _replays_to_the_last_bit(recording: Recording) -> None:
     steps = list(recording.steps())
     assert len(steps) > 5
     perceiver = TinyPerceiver()
-    pilot = FlockPilot(recording.config, perceiver)
+    pilot = FlockPilot(recording.config, perceiver, learned=recording.learned)
     for step in steps:
         assert step.output is not None
         perceiver.not_finite = sum("is not finite" in reason for reason in step.output["reasons"])
@@ -249,8 +250,12 @@ def _replays_to_the_last_bit(recording: Recording) -> None:
 
 
 async def test_an_operator_sends_it_somewhere_and_the_recording_replays(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, capsys: pytest.CaptureFixture[str]
-) -> None:
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Also what its pilot began with of the others' size, which the one before the flight learned."""
+    learned = LearnedSize(0.43, 0.08, 0.31, doubted=True)
+    monkeypatch.setattr(FlockPilot, "learned", learned)
     async with aboard(
         fake_autopilot,
         port,
@@ -274,13 +279,14 @@ async def test_an_operator_sends_it_somewhere_and_the_recording_replays(
         assert float(np.linalg.norm(away)) < 1.5
         assert fake_autopilot.mode == "OFFBOARD"
         assert await ship.fleet("velocity", "tiny", "0.3", "0") == 0
-        await until(lambda: ship.mission("sentence") == "flies an operator's velocity", SECONDS_TO_FAIL)
+        await until(lambda: str(ship.mission("sentence")).startswith("flies an operator's velocity"), SECONDS_TO_FAIL)
         await until(lambda: str(ship.mission("sentence")).startswith("hovers"), SECONDS_TO_FAIL)
     told = capsys.readouterr()
     assert "m from home, outside the fence of 100 m" in told.err
     assert "flockd does not fly the drone now" in told.err
     (path,) = tmp_path.glob("tiny-*.mcap")
     recording = Recording(path)
+    assert recording.learned == learned
     _replays_to_the_last_bit(recording)
     orders = [step.order for step in recording.steps() if step.order is not None]
     assert [order.speed_m_s for order in orders] == [1.0, None]

@@ -383,6 +383,8 @@ def test_what_was_learned_since_the_drone_was_armed_goes_into_the_flight(monkeyp
             self.learned = LearnedSize(0.1 * len(made), 0.05, 0.3, doubted=True)
 
         def step(self, frames: FrameSet, *_: object) -> PilotOutput:
+            for begin in during:
+                begin()
             return PilotOutput(frames.time_s, None, None, (), (), {}, (), Wanted(np.zeros(2), np.zeros(2), 0.0))
 
     monkeypatch.setattr("flockd.onboard.daemon.pilot_loop.FlockPilot", Pilot)
@@ -390,6 +392,7 @@ def test_what_was_learned_since_the_drone_was_armed_goes_into_the_flight(monkeyp
     networks: Any = SimpleNamespace(leave=lambda: None)
     loop = PilotLoop(_flyable("front"), anything, networks, anything, anything, anything, lambda: 0.0)
     state = VehicleState(0.0, np.eye(3), 0.0, None)
+    during: list[Callable[[], None]] = []  # what happens while a step is under way
     begun: list[Callable[[], None]] = [
         lambda: None, loop.watch, lambda: loop.begin_flight(1), lambda: loop.begin_flight(2), loop.watch,
     ]  # fmt: skip
@@ -400,6 +403,9 @@ def test_what_was_learned_since_the_drone_was_armed_goes_into_the_flight(monkeyp
             await loop._step(0.0, FrameSet(0.0, {}), state)
 
     asyncio.run(tell())
+    newest, during = loop.newest, [lambda: loop.begin_flight(3)]
+    asyncio.run(loop._step(0.0, FrameSet(9.0, {}), state))
+    assert loop.newest is newest, "a flight began while the step was under way: its result is nobody's"
     loop.leave()
     sizes_m = [None if learned is None else round(learned.size_m, 3) for learned, _ in made]
     assert sizes_m == [None, None, 0.2, 0.3, None]
