@@ -164,12 +164,12 @@ def test_a_size_that_the_networks_judge_wrong_is_learned_and_used() -> None:
 
 def test_a_climb_that_somebody_else_flies_teaches_the_size_for_the_flight() -> None:
     """Four seconds of it, among others that stand; the flight's pilot has the ranges right from the first on."""
-    before = Flight(drone("auto", height_m=8.0), doubt=0.3, flies=False)
+    before = Flight(drone("auto"), doubt=0.3, flies=False)
     before.below_m = 4.0
     before.fly(3.0)
     assert before.learned is None
-    outputs = [*before.fly(4.0, climb_m_s=1.0), *before.fly(20.0)]
-    assert not any(one.size.weaves for one in outputs if one.size is not None)
+    before.fly(4.0, climb_m_s=1.0)
+    before.fly(20.0)
     learned = before.learned
     assert learned is not None
     assert learned.size_m == pytest.approx(SIZE_M, rel=0.1)
@@ -180,6 +180,11 @@ def test_a_climb_that_somebody_else_flies_teaches_the_size_for_the_flight() -> N
     assert max(map(abs, _range_errors(outputs[2], 0.0))) < 0.15
     weaves = [one.size is not None and one.size.weaves for one in (*outputs, *flight.fly(20.0))]
     assert any(weaves), "others learn from it"
+
+
+def test_nobody_weaves_before_the_flight() -> None:
+    outputs = Flight(drone("weave"), flies=False).fly(30.0)
+    assert not any(one.size.weaves for one in outputs if one.size is not None)
 
 
 def test_in_a_flight_only_the_weave_tells_of_the_size() -> None:
