@@ -231,14 +231,14 @@ def _mask_loss(logits: Tensor, mask: Tensor, drone: Tensor) -> tuple[Tensor, flo
 
 def _flipped(batch: Batch) -> Batch:
     """Another half of the crops each time left to right, a tenth in strange colours, all in another light."""
-    n = len(batch["picture"])
-    mirror = torch.rand(n) < 0.5
+    n, device = len(batch["picture"]), batch["picture"].device
+    mirror = torch.rand(n, device=device) < 0.5
     sign = torch.where(mirror, -1.0, 1.0)
-    light = torch.exp(0.1 * torch.randn(n, 1, 1, 1) + 0.04 * torch.randn(n, 1, 1, 3))
+    light = torch.exp(0.1 * torch.randn(n, 1, 1, 1, device=device) + 0.04 * torch.randn(n, 1, 1, 3, device=device))
     picture = torch.where(mirror[:, None, None, None], batch["picture"].flip(2), batch["picture"])
-    strange = (torch.rand(n) < 0.1)[:, None, None, None]
+    strange = (torch.rand(n, device=device) < 0.1)[:, None, None, None]
     picture = torch.where(strange, picture[..., torch.randperm(3)], picture)
-    picture = (picture.float() * light + 5.0 * torch.randn(n, 1, 1, 1)).clamp(0, 255).to(torch.uint8)
+    picture = (picture.float() * light + 5.0 * torch.randn(n, 1, 1, 1, device=device)).clamp(0, 255).to(torch.uint8)
     mask = torch.where(mirror[:, None, None], batch["mask"].flip(2), batch["mask"])
     target, motors = batch["target"].clone(), batch["motors"].clone()
     target[:, 1] *= sign
@@ -264,7 +264,7 @@ def _motor_maps(motors: Tensor, sigma: float = 1.5) -> Tensor:
     """
     order = motors[:, :, 0].argsort(1)
     places = torch.gather(motors, 1, order[:, :, None].expand(-1, -1, 2)).clamp(-47.0, 47.0)
-    at = 2.0 * torch.arange(48) + 1.0 - 48.0
+    at = 2.0 * torch.arange(48, device=motors.device) + 1.0 - 48.0
     across = torch.softmax(-((at - places[:, :, 0:1]) ** 2) / (2 * sigma**2), 2)
     along = torch.softmax(-((at - places[:, :, 1:2]) ** 2) / (2 * sigma**2), 2)
     return torch.einsum("nkv,nku->nkvu", along, across).flatten(2)

@@ -21,15 +21,14 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
+from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from tools.training.dataset import open_pairs
 from tools.training.from_onnx import begin_with_onnx
@@ -68,7 +67,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
     parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt, or an .onnx")
     parser.add_argument("--compile", action="store_true", help="`distance` a fifth faster; needs a C++ compiler")
-    parser.add_argument("--threads", type=int, default=2)
+    add_machine(parser)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     compiler = os.environ.get("CXX", "g++")
@@ -88,7 +87,13 @@ def main() -> None:
         torch.save({"net": task.net.state_dict()}, arguments.out / "start.pt")
     if arguments.compile:
         task.net.compile(dynamic=False)
-    train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed)
+    train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed, arguments.workers)
+
+
+def add_machine(parser: argparse.ArgumentParser) -> None:
+    """What of this machine a training may use."""
+    parser.add_argument("--threads", type=int, default=2, help="that learn, where there is no GPU")
+    parser.add_argument("--workers", type=int, default=0, help="processes that draw samples, beside a GPU; 0: a thread")
 
 
 def start(task: Task, weights: Path, seed: int) -> None:
@@ -99,7 +104,7 @@ def start(task: Task, weights: Path, seed: int) -> None:
     if weights.suffix != ".onnx":
         begin_with(task.net, torch.load(weights, map_location="cpu")["net"])
         return
-    batch = _stack(task.batch_samples(np.random.default_rng(seed)), torch.device("cpu"))
+    batch = _stack(task.batch_samples(np.random.default_rng(seed)))
     begin_with_onnx(task.net, weights, lambda: task.loss(batch))
 
 
@@ -113,8 +118,8 @@ def begin_with(net: nn.Module, weights: dict[str, Tensor]) -> None:
     net.load_state_dict(own)
 
 
-def train(task: Task, out: Path, budget_s: float, seed: int) -> None:
-    """One cosine-shaped run of ``budget_s`` seconds of training.
+def train(task: Task, out: Path, budget_s: float, seed: int, workers: int = 0) -> None:
+    """One cosine-shaped run of ``budget_s`` seconds of training; so many ``workers`` (processes) draw the samples.
 
     What is kept is the mean of the weights over about the last thousand steps: each step's own errs to all sides.
     """
@@ -132,19 +137,18 @@ def train(task: Task, out: Path, budget_s: float, seed: int) -> None:
         mean.n_averaged.fill_(state["step"])
         optimiser.load_state_dict(state["optimiser"])
         spent, step = state["spent"], state["step"]
-    rng = np.random.Generator(np.random.PCG64([seed, step]))
     in_16_bits = is_faster_in_16_bits(device)
     task.begin()
     last_save = last_print = spent
     recent: list[dict[str, float]] = []
-    batches = _batches(task, rng, device)
+    batches = _batches(task, [seed, step], workers)
     while spent < budget_s:
         begin = time.monotonic()
         share = spent / budget_s
         rate = task.rate * min(1.0, (step + 1) / 300) * (0.5 + 0.5 * math.cos(math.pi * share)) + 1e-6
         for group in optimiser.param_groups:
             group["lr"] = rate
-        batch = next(batches)
+        batch = {name: values.to(device) for name, values in next(batches).items()}
         with torch.autocast(device.type, dtype=torch.bfloat16, enabled=in_16_bits):
             loss, figures = task.loss(batch)
         if torch.isfinite(loss):
@@ -197,20 +201,41 @@ def _recent_mean(mean: Tensor, new: Tensor, count: Tensor) -> Tensor:
     return mean + share * (new - mean)
 
 
-def _batches(task: Task, rng: np.random.Generator, device: torch.device) -> Iterator[Batch]:
-    """Without end; the next one is made while the last one is learnt from."""
-    with ThreadPoolExecutor(1) as loader:
-        upcoming = loader.submit(task.batch_samples, rng)
+def _batches(task: Task, seed: list[int], workers: int) -> Iterator[Batch]:
+    """Without end; the next ones are made while the last one is learnt from."""
+    if workers:
+        loader = DataLoader(
+            _Batches(task, seed),
+            batch_size=None,
+            num_workers=workers,
+            prefetch_factor=3,
+            multiprocessing_context="fork",
+        )
+        yield from loader
+    upcoming_of = iter(_Batches(task, seed))
+    with ThreadPoolExecutor(1) as loading:
+        upcoming = loading.submit(next, upcoming_of)
         while True:
-            samples, upcoming = upcoming.result(), loader.submit(task.batch_samples, rng)
-            yield _stack(samples, device)
+            batch, upcoming = upcoming.result(), loading.submit(next, upcoming_of)
+            yield batch
 
 
-def _stack(samples: list[Sample], device: torch.device) -> Batch:
-    def joined(name: str) -> NDArray[Any]:
-        return np.stack([sample[name] for sample in samples])
+class _Batches(IterableDataset[Batch]):
+    """Of a task; every process that iterates draws others."""
 
-    return {name: torch.from_numpy(joined(name)).to(device) for name in samples[0]}
+    def __init__(self, task: Task, seed: list[int]) -> None:
+        self._task, self._seed = task, seed
+
+    def __iter__(self) -> Iterator[Batch]:
+        """Without end."""
+        worker = get_worker_info()
+        rng = np.random.Generator(np.random.PCG64([*self._seed, worker.id] if worker else self._seed))
+        while True:
+            yield _stack(self._task.batch_samples(rng))
+
+
+def _stack(samples: list[Sample]) -> Batch:
+    return {name: torch.from_numpy(np.stack([sample[name] for sample in samples])) for name in samples[0]}
 
 
 def _note(out: Path, step: int, spent: float, recent: list[dict[str, float]]) -> None:

@@ -33,11 +33,11 @@ from tools.training.detector.pictures import (
 )
 from tools.training.samples import Sample
 from tools.training.tasks import Batch, Task
-from tools.training.train import begin_with, train
+from tools.training.train import add_machine, begin_with, train
 
 SIDES_PX = {256: 24, 320: 16, 416: 9}
 """Width and height of a batch's pictures, and how many of them take about the same time."""
-MIX = {"composite": 0.42, "without": 0.14, "labelled": 0.30, "worlds": 0.14}
+MIX = {"composite": 0.40, "without": 0.22, "labelled": 0.25, "worlds": 0.13}
 """Shares of the pictures. Half of those without a drone are the very backgrounds of composites of the same batch."""
 KINDS = tuple(MIX)
 
@@ -45,8 +45,10 @@ KINDS = tuple(MIX)
 class DetectorTask(Task):
     """Drones before everything, what flies besides them, and pictures without any."""
 
-    def __init__(self, cutouts: Path, photographs: Path, labelled: list[Path], worlds: Path) -> None:
-        super().__init__(DroneDetector(), 16, 5e-4)
+    def __init__(self, cutouts: Path, photographs: Path, labelled: list[Path], worlds: Path, times: int = 1) -> None:
+        """``times`` as many pictures a batch as ``SIDES_PX`` says."""
+        super().__init__(DroneDetector(), 16 * times, 5e-4)
+        self.times = times
         self.cutouts, self.photographs = Cutouts(cutouts), Photographs(photographs)
         self.labelled, self.worlds = [Labelled(folder) for folder in labelled], Worlds(open_pairs(worlds))
         self.drawn = 0
@@ -59,7 +61,7 @@ class DetectorTask(Task):
         side = int(rng.choice(list(SIDES_PX)))
         background: Scene | None = None
         samples: list[Sample] = []
-        while len(samples) < SIDES_PX[side]:
+        while len(samples) < self.times * SIDES_PX[side]:
             kind = str(rng.choice(KINDS, p=list(MIX.values())))
             if kind == "labelled":
                 scene = self.labelled[int(rng.integers(len(self.labelled)))].draw(side, rng)
@@ -106,13 +108,14 @@ def main() -> None:
     parser.add_argument("--start", type=Path, help="another run's checkpoint.pt")
     parser.add_argument("--minutes", type=float, default=240.0)
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
-    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--times", type=int, default=1, help="as many pictures a batch: a GPU has room for them")
+    add_machine(parser)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     torch.manual_seed(arguments.seed)
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(1)
-    task = DetectorTask(arguments.cutouts, arguments.photographs, arguments.labelled, arguments.worlds)
+    task = DetectorTask(arguments.cutouts, arguments.photographs, arguments.labelled, arguments.worlds, arguments.times)
     task.rate = arguments.rate or task.rate
     arguments.out.mkdir(parents=True, exist_ok=True)
     if arguments.start:
@@ -123,7 +126,7 @@ def main() -> None:
             begin_with_coco(task.net, arguments.coco, torch.from_numpy(images).permute(0, 3, 1, 2).float())
         except ValueError as error:
             raise SystemExit(f"--coco: {error}") from None
-    train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed)
+    train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed, arguments.workers)
 
 
 def _of_one_size(task: DetectorTask, rng: np.random.Generator) -> list[Sample]:

@@ -10,7 +10,6 @@ tools.training.train, and writes the same files.
 from __future__ import annotations
 
 import argparse
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -29,7 +28,7 @@ from tools.training.networks import DistanceNet, VerificationNet
 from tools.training.real_patches import RealPatches
 from tools.training.samples import Sample
 from tools.training.tasks import Batch, Task
-from tools.training.train import begin_with, train
+from tools.training.train import add_machine, begin_with, train
 
 MIX = {"rendered": 36, "composite": 8, "airframe": 22, "real drone": 8, "cut out": 4, "negative": 46}
 """Samples of a batch; `airframe` is a cut-out of tools.training.render_cutouts before a real background."""
@@ -50,6 +49,29 @@ NO_PLACE = np.array([-1, -1])
 """The place of a sample that is no negative patch."""
 
 
+class HardOnes:
+    """Places of the negatives that were last taken for drones; processes that draw samples see what another adds."""
+
+    def __init__(self) -> None:
+        self._places = torch.zeros(HARD_ONES, 2, dtype=torch.int64).share_memory_()
+        self._added = torch.zeros(1, dtype=torch.int64).share_memory_()
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return min(int(self._added), HARD_ONES)
+
+    def add(self, places: Tensor) -> None:
+        """(n, 2) source and row; the oldest ones give way."""
+        self._places[(self._added + torch.arange(len(places))) % HARD_ONES] = places.cpu()
+        self._added += len(places)
+
+    def draw(self, rng: np.random.Generator) -> tuple[int, int]:
+        """Any of them."""
+        source, row = self._places[int(rng.integers(self.count))].tolist()
+        return source, row
+
+
 class VerificationTask(Task):
     """Drones and what is none: rendered, rendered before real backgrounds, and real."""
 
@@ -67,7 +89,7 @@ class VerificationTask(Task):
         self.places = RealPatches(patches, "place", weights={"skydrones": 8.0, "skyothers": 8.0})
         self.drones = RealPatches(patches, "drone")
         self.cutouts = CutoutCrops(cutouts) if cutouts else None
-        self.hard: deque[tuple[int, int]] = deque(maxlen=HARD_ONES)
+        self.hard = HardOnes()
 
     def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
         """As many of each kind as the mix says."""
@@ -101,19 +123,20 @@ class VerificationTask(Task):
             return real_samples.noise(*self.places.draw(rng)[:2], rng)
         if rng.random() < PLACES_SHARE:
             return real_samples.negative(*self.places.draw(rng)[:2], rng)
-        is_hard = len(self.hard) >= FEWEST_HARD and rng.random() < HARD_SHARE
-        place = self.hard[int(rng.integers(len(self.hard)))] if is_hard else self.negatives.draw_place(rng)
+        is_hard = self.hard.count >= FEWEST_HARD and rng.random() < HARD_SHARE
+        place = self.hard.draw(rng) if is_hard else self.negatives.draw_place(rng)
         return real_samples.negative(*self.negatives.at(place)[:2], rng) | {"place": np.array(place)}
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """See ``Task``. A drone that can hardly be seen has little weight."""
         crops = batch["picture"]
-        crops = torch.where(torch.rand(len(crops))[:, None, None, None] < 0.5, crops.flip(2), crops)
+        mirror = torch.rand(len(crops), device=crops.device) < 0.5
+        crops = torch.where(mirror[:, None, None, None], crops.flip(2), crops)
         logits, there, kind = self.net(crops)[:, 0], batch["drone"], batch["kind"]
         loss = F.binary_cross_entropy_with_logits(logits, there, weight=batch["exists_weight"])
         probability = torch.sigmoid(logits.detach())
         mistaken = (batch["place"][:, 0] >= 0) & (probability > HARD_PROBABILITY)
-        self.hard.extend((source, row) for source, row in batch["place"][mistaken].tolist())
+        self.hard.add(batch["place"][mistaken])
         figures = {"rendered none": float((probability[(kind == 0) & (there < 0.5)] > 0.8).float().mean())}
         for number, name in enumerate(KINDS):
             if name not in self.mix:
@@ -141,7 +164,7 @@ def main() -> None:
     parser.add_argument("--start", type=Path, help="another run's checkpoint.pt, or verification.onnx or distance.onnx")
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
-    parser.add_argument("--threads", type=int, default=2)
+    add_machine(parser)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     torch.manual_seed(arguments.seed)
@@ -153,7 +176,7 @@ def main() -> None:
     if arguments.start and not (arguments.out / "checkpoint.pt").is_file():
         _start(task, arguments.start, arguments.seed)
         torch.save({"net": task.net.state_dict()}, arguments.out / "start.pt")
-    train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed)
+    train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed, arguments.workers)
 
 
 def _start(task: VerificationTask, weights: Path, seed: int) -> None:

@@ -31,64 +31,45 @@ def detection_loss(maps: Sequence[Tensor], boxes: Tensor, classes: Tensor) -> tu
     predicted, there, kinds = decoded(maps)
     corners, strides = cells(maps)
     middles = corners + strides / 2
-    wanted = torch.zeros_like(there)
-    judged = torch.ones_like(there)
-    box_loss, class_loss, count = predicted.new_zeros(()), predicted.new_zeros(()), 0
-    overlaps = []
-    for k in range(len(boxes)):
-        for box in boxes[k][classes[k] == NOT_JUDGED]:
-            judged[k][((middles - box[:2]).abs() < box[2:] / 2 + strides / 2).all(1)] = 0
-        real = classes[k] >= 0
-        if not real.any():
-            continue
-        truth, kind = boxes[k][real], classes[k][real]
-        cell, of, overlap = _assigned(predicted[k], there[k], kinds[k], truth, kind, middles, strides)
-        if not len(cell):
-            continue
-        wanted[k, cell], judged[k, cell] = 1.0, 1.0
-        box_loss = box_loss + (1 - _overlap(predicted[k, cell], truth[of]) ** 2).sum()
-        target = F.one_hot(kind[of], len(CLASSES)) * overlap.clamp(min=_LEAST_TARGET)[:, None]
-        class_loss = class_loss + F.binary_cross_entropy_with_logits(kinds[k, cell], target, reduction="sum")
-        count += len(cell)
-        overlaps.append(overlap)
+    away = (middles[None, None] - boxes[:, :, None, :2]).abs()
+    unknown = (away < boxes[:, :, None, 2:] / 2 + strides / 2).all(3) & (classes == NOT_JUDGED)[:, :, None]
+    image, cell, of, overlap = _assigned(predicted, there, kinds, boxes, classes, (away <= NEAR_CELLS * strides).all(3))
+    wanted, judged = torch.zeros_like(there), (~unknown.any(1)).float()
+    wanted[image, cell], judged[image, cell] = 1.0, 1.0
+    box_loss = (1 - _overlap(predicted[image, cell], boxes[image, of]) ** 2).sum()
+    target = F.one_hot(classes[image, of], len(CLASSES)) * overlap.clamp(min=_LEAST_TARGET)[:, None]
+    class_loss = F.binary_cross_entropy_with_logits(kinds[image, cell], target, reduction="sum")
     object_loss = F.binary_cross_entropy_with_logits(there, wanted, weight=judged, reduction="sum")
-    loss = (_BOX_WEIGHT * box_loss + object_loss + class_loss) / max(count, 1)
+    count = max(len(cell), 1)
+    loss = (_BOX_WEIGHT * box_loss + object_loss + class_loss) / count
     return loss, {
-        "overlap": float(torch.cat(overlaps).mean()) if overlaps else float("nan"),
-        "object": float(object_loss.detach()) / max(count, 1),
-        "class": float(class_loss.detach()) / max(count, 1),
+        "overlap": float(overlap.mean()),
+        "object": float(object_loss.detach()) / count,
+        "class": float(class_loss.detach()) / count,
     }
 
 
 @torch.no_grad()
 def _assigned(
-    predicted: Tensor, there: Tensor, kinds: Tensor, truth: Tensor, kind: Tensor, middles: Tensor, strides: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Cells, which box each answers for, and their overlap."""
-    away = (middles[None] - truth[:, None, :2]).abs()
-    near = (away <= NEAR_CELLS * strides[None]).all(-1)
-    some = near.any(0).nonzero()[:, 0]
-    if not len(some):
-        return some, some, middles.new_zeros(0)
-    near = near[:, some]
-    overlap = _overlap(predicted[some][None], truth[:, None])
-    score = (there[some].sigmoid()[:, None] * kinds[some].sigmoid()).sqrt().clamp(1e-6, 1 - 1e-6)
-    one_hot = F.one_hot(kind, len(CLASSES)).float()
-    wrong = -(one_hot[:, None] * score.log() + (1 - one_hot[:, None]) * (1 - score).log()).sum(-1)
-    cost = wrong - _OVERLAP_COST * (overlap + 1e-8).log() + _FAR_COST * ~near
-    chosen = torch.zeros_like(near)
-    for j in range(len(truth)):
-        best = overlap[j][near[j]].topk(min(_BEST, int(near[j].sum()))).values
-        number = max(int(best.sum()), 1)
-        chosen[j, cost[j].topk(min(number, len(some)), largest=False).indices] = True
-    chosen &= near
-    twice = chosen.sum(0) > 1
-    if twice.any():
-        of = cost[:, twice].argmin(0)
-        chosen[:, twice] = False
-        chosen[of, twice.nonzero()[:, 0]] = True
-    box, cell = chosen.nonzero(as_tuple=True)
-    return some[cell], box, overlap[box, cell]
+    predicted: Tensor, there: Tensor, kinds: Tensor, boxes: Tensor, classes: Tensor, near: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Image, cell, which box it answers for, and their overlap; ``near`` (n, m, cells): which may answer for which."""
+    near = near & (classes >= 0)[:, :, None]
+    overlap = _overlap(predicted[:, None], boxes[:, :, None])
+    score = (there.sigmoid()[..., None] * kinds.sigmoid()).sqrt().clamp(1e-6, 1 - 1e-6)
+    right, wrong = score.log(), (1 - score).log()
+    own = F.one_hot(classes.clamp(min=0), len(CLASSES)).to(score)
+    unlike = -(own @ (right - wrong).transpose(1, 2) + wrong.sum(2)[:, None])
+    cost = (unlike - _OVERLAP_COST * (overlap + 1e-8).log()).where(near, _FAR_COST)
+    best = overlap.where(near, 0.0).topk(_BEST, 2).values.sum(2).int().clamp(min=1)
+    cheapest = cost.topk(_BEST, 2, largest=False).indices
+    taken = torch.arange(_BEST, device=cost.device) < best[:, :, None]
+    chosen = torch.zeros_like(near).scatter_(2, cheapest, taken) & near
+    # A cell that several boxes chose answers for the one that costs it least.
+    least = cost.where(chosen, _FAR_COST).argmin(1, keepdim=True)
+    chosen &= torch.arange(near.shape[1], device=cost.device)[:, None] == least
+    image, box, cell = chosen.nonzero(as_tuple=True)
+    return image, cell, box, overlap[image, box, cell]
 
 
 def _overlap(a: Tensor, b: Tensor) -> Tensor:
