@@ -122,10 +122,12 @@ def test_run_the_pilot_over_a_recording(tmp_path: Path) -> None:
 
 
 def test_see_what_the_networks_see(tmp_path: Path) -> None:
-    """The one neighbour flies ahead; a range's standard deviation is 5 cm."""
+    """The one neighbour flies ahead; a range's standard deviation is 5 cm. As the page says, one image may miss it."""
     recorded(tmp_path)
-    lines = printed(SEE, tmp_path)
-    for line, expected in zip(lines, expected_steps(), strict=True):
+    steps = list(zip(printed(SEE, tmp_path), expected_steps(), strict=True))
+    seen = [(line, expected) for line, expected in steps if not line.endswith("[]")]
+    assert len(seen) >= 0.7 * len(steps)
+    for line, expected in seen:
         time_s, depth_m, range_m = numbers(line)
         (detection,) = expected["detections"]
         assert time_s == expected["time_s"]

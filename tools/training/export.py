@@ -39,7 +39,8 @@ _SETS = (
 )
 _MORE_SETS = (
     "odm_data_seneca@9220acfd (CC0 1.0); CarND-LaneLines-P1@ce5681be and CarND-Advanced-Lane-Lines@91b08035 "
-    f"(Udacity, MIT); data set of {_CLIPS}, all clips but 31-40, 91-100 and from 111 (F. Svanstroem, CC0 1.0)"
+    "(Udacity, MIT); DeepForest@1bad4419, its pictures of NEON (B. Weinstein and others, MIT); "
+    f"data set of {_CLIPS}, all clips but 31-40, 91-100 and from 111 (F. Svanstroem, CC0 1.0)"
 )
 REAL_DATA = (
     "Rendered by tools.training.render_drone_crops from seeded worlds. Real pictures, none of a held-out scene: "
@@ -51,8 +52,8 @@ REAL_DATA = (
 DETECTOR_DATA = (
     f"Begun with YOLOX-nano as trained on COCO (Megvii, Apache-2.0). Then {_AIRFRAMES}, and worlds of "
     "tools.training.render_training_data. Real pictures, none of a held-out scene: the sets of `verification` "
-    f"without robocup_ml's days of 2019 and 2023, and {_MORE_SETS}, where the boxes of 381 birds, airplanes and "
-    "helicopters were found by tools.training.label_flyers."
+    f"without robocup_ml's days of 2019 and 2023, and {_MORE_SETS}, where boxes that its labels lack were "
+    "found by the detector before it, in frames in which it saw one thing only."
 )
 TRAINED_BY = {"verification": "tools.training.train_verification", "detector": "tools.training.train_detector"}
 """Where it is not tools.training.train."""
@@ -159,6 +160,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
             "overlap": 0.5,
             "evidence_gain": 2.0,
             "large_box_evidence": 4.0,
+            "small_box_evidence": 4.0,
             "no_box_evidence": -3.0,
             "distance_logit_limit": 1.0,
         },
@@ -204,8 +206,9 @@ def main() -> None:
         "--begun-with",
         type=Path,
         metavar="CHECKPOINT",
-        help=f"what the run was started with, its start.pt: the weights' mean, {BEGUN_WITH_SHARE:g} of it, is exported",
+        help="what the run was started with, its start.pt: the mean of both weights is exported",
     )
+    parser.add_argument("--share", type=float, default=BEGUN_WITH_SHARE, help="of --begun-with in that mean")
     parser.add_argument("--accuracy", action="append", default=[], metavar="WHAT=FIGURE", help="measured accuracy")
     arguments = parser.parse_args()
     net: nn.Module = NETWORKS[arguments.network]["net"]()
@@ -214,7 +217,7 @@ def main() -> None:
     state = torch.load(arguments.checkpoint, map_location="cpu")
     (net.detector if isinstance(net, Boxes) else net).load_state_dict(state["net"])
     if arguments.begun_with:
-        draw_back(net, torch.load(arguments.begun_with, map_location="cpu")["net"])
+        draw_back(net, torch.load(arguments.begun_with, map_location="cpu")["net"], arguments.share)
     trained_by = TRAINED_BY.get(arguments.network, f"tools.training.train {arguments.network}")
     path = export(
         arguments.network,
@@ -242,7 +245,7 @@ def export(network: str, net: nn.Module, out: Path, **written: Any) -> Path:
     return write_manifest(manifest.model_dump(mode="json", exclude_defaults=True), file, outputs)
 
 
-def draw_back(net: nn.Module, start: dict[str, Tensor]) -> None:
+def draw_back(net: nn.Module, start: dict[str, Tensor], share: float = BEGUN_WITH_SHARE) -> None:
     """Weights between a run's end and its start err less than either (WiSE-FT, Wortsman et al. 2022).
 
     Layers that the start did not have stay as they are.
@@ -252,7 +255,7 @@ def draw_back(net: nn.Module, start: dict[str, Tensor]) -> None:
         if name not in weights or weights[name].shape != old.shape:
             raise SystemExit(f"--begun-with: its {name} is not the run's; give what the run was started with")
         if old.is_floating_point():
-            weights[name] = torch.lerp(weights[name], old, BEGUN_WITH_SHARE)
+            weights[name] = torch.lerp(weights[name], old, share)
     net.load_state_dict(weights)
 
 

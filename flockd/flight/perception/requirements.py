@@ -96,6 +96,9 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
                 "of it from 300.",
                 *_LOGIT,
             ),
+            "small_box_evidence": Threshold(
+                "The same for a small one: nothing from 20 pixels on, all of it up to 8.", *_LOGIT
+            ),
             "no_box_evidence": Threshold(
                 "The log odds that count so for what the segmentation alone proposes.", *_LOGIT
             ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ import torch
 from flockd.core.data import data_path
 from tools.training.networks import VerificationNet
 from tools.training.real_patches import PATCH_PX
+from tools.training.train_verification import HARD_ONES, HardOnes
 
 ROOT = Path(__file__).resolve().parents[3]
 MODELS = data_path("models")
@@ -48,7 +50,7 @@ def data(tmp_path: Path) -> Path:
 def train_verification(data: Path, start: Path) -> subprocess.CompletedProcess[str]:
     folders = ("--rendered", data / "rendered", "--patches", data / "patches", "--out", data / "run")
     command = [sys.executable, "-m", "tools.training.train_verification", *map(str, folders)]
-    options = ["--start", str(start), "--minutes", "0.01", "--rate", "3e-4", "--threads", "1"]
+    options = ["--start", str(start), "--minutes", "0.01", "--rate", "3e-4", "--threads", "1", "--workers", "1"]
     return subprocess.run(command + options, cwd=ROOT, capture_output=True, text=True, check=False, timeout=300)
 
 
@@ -67,6 +69,25 @@ def test_it_begins_with_the_file_s_answers_and_learns_from_there(data: Path) -> 
     begun = answers(data / "run" / "start.pt", crops)
     assert np.abs(begun - theirs).max() < 1e-3 * np.abs(theirs).max()
     assert np.abs(answers(data / "run" / "checkpoint.pt", crops) - begun).max() > 0.0
+
+
+def test_a_process_that_draws_samples_sees_what_another_one_found_hard() -> None:
+    hard = HardOnes()
+    other = multiprocessing.get_context("fork").Process(target=hard.add, args=(torch.tensor([[1, 7], [1, 7]]),))
+    other.start()
+    other.join()
+    assert hard.count == 2
+    assert hard.draw(np.random.default_rng(0)) == (1, 7)
+
+
+def test_of_what_was_hard_the_oldest_gives_way() -> None:
+    hard = HardOnes()
+    for row in range(HARD_ONES // 100 + 1):
+        hard.add(torch.full((100, 2), row))
+    drawn = {hard.draw(np.random.default_rng(k))[1] for k in range(400)}
+    assert hard.count == HARD_ONES
+    assert 0 not in drawn
+    assert HARD_ONES // 100 in drawn
 
 
 def test_another_network_s_file_is_refused_in_one_sentence(data: Path) -> None:

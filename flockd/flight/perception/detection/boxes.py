@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -19,6 +20,8 @@ _PART = 0.8
 _LARGE_PX = (40.0, 300.0)
 """Width of boxes beyond which what the second stage says against a drone counts less and less, and least: it learnt on
 real drones of 6 to 60 pixels, and refuses large ones."""
+_SMALL_PX = (20.0, 8.0)
+"""The same of boxes that are less wide, all of it from the second down: a crop of so few pixels shows no shape."""
 _SUREST = 0.95
 """No box counts as more probable: a detector that is sure and wrong may not overrule whatever the second stage says."""
 _FIRST = 50.0
@@ -33,6 +36,7 @@ class BoxRules:
     overlap: float
     gain: float
     large: float
+    small: float
     no_box: float
 
     @classmethod
@@ -43,14 +47,20 @@ class BoxRules:
             overlap=manifest.threshold("overlap"),
             gain=manifest.threshold("evidence_gain"),
             large=manifest.threshold("large_box_evidence"),
+            small=manifest.threshold("small_box_evidence"),
             no_box=manifest.threshold("no_box_evidence"),
         )
 
     def evidence(self, box: FloatArray, log_odds: float) -> float:
         """Log odds of a drone, to add to the second stage's, of a box (4,) that has these of the detector's own."""
-        small, large = np.log(_LARGE_PX)
-        width = np.log(max(float(box[2] - box[0]), 1.0))
-        return self.gain * log_odds + self.large * float(np.clip((width - small) / (large - small), 0.0, 1.0))
+        width = max(float(box[2] - box[0]), 1.0)
+        return self.gain * log_odds + self.large * _share(width, _LARGE_PX) + self.small * _share(width, _SMALL_PX)
+
+
+def _share(width: float, ends: tuple[float, float]) -> float:
+    """0 at the first of ``ends``, 1 at the second, by the logarithm."""
+    first, second = np.log(ends)
+    return float(np.clip((math.log(width) - first) / (second - first), 0.0, 1.0))
 
 
 def probable_boxes(

@@ -9,7 +9,7 @@ from flockd.core.messages import FloatArray
 from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes, with_boxes
 from flockd.flight.perception.detection.instances import Instance
 
-RULES = BoxRules(least_probability=0.05, overlap=0.5, gain=0.5, large=4.0, no_box=-2.0)
+RULES = BoxRules(least_probability=0.05, overlap=0.5, gain=0.5, large=4.0, small=3.0, no_box=-2.0)
 DRONE = (100.0, 50.0, 140.0, 70.0)
 
 
@@ -81,8 +81,11 @@ def test_what_only_the_segmentation_finds_is_less_likely_a_drone() -> None:
     assert one.evidence == RULES.no_box
 
 
-@pytest.mark.parametrize(("width_px", "added"), [(12, 0.0), (40, 0.0), (40 * 7.5**0.5, 2.0), (300, 4.0), (600, 4.0)])
-def test_what_the_second_stage_says_against_a_large_box_counts_less(width_px: float, added: float) -> None:
+@pytest.mark.parametrize(
+    ("width_px", "added"),
+    [(5, 3.0), (8, 3.0), (160**0.5, 1.5), (20, 0.0), (40, 0.0), (40 * 7.5**0.5, 2.0), (300, 4.0), (600, 4.0)],
+)
+def test_what_the_second_stage_says_against_a_small_or_a_large_box_counts_less(width_px: float, added: float) -> None:
     assert RULES.evidence(np.array([0.0, 0.0, width_px, 20.0]), 3.0) == pytest.approx(0.5 * 3.0 + added)
 
 
