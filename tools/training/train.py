@@ -141,14 +141,14 @@ def train(task: Task, out: Path, budget_s: float, seed: int, workers: int = 0) -
     task.begin()
     last_save = last_print = spent
     recent: list[dict[str, float]] = []
-    batches = _batches(task, [seed, step], workers)
+    upcoming = batches(task, [seed, step], workers)
     while spent < budget_s:
         begin = time.monotonic()
         share = spent / budget_s
         rate = task.rate * min(1.0, (step + 1) / 300) * (0.5 + 0.5 * math.cos(math.pi * share)) + 1e-6
         for group in optimiser.param_groups:
             group["lr"] = rate
-        batch = {name: values.to(device) for name, values in next(batches).items()}
+        batch = {name: values.to(device) for name, values in next(upcoming).items()}
         with torch.autocast(device.type, dtype=torch.bfloat16, enabled=in_16_bits):
             loss, figures = task.loss(batch)
         if torch.isfinite(loss):
@@ -201,7 +201,7 @@ def _recent_mean(mean: Tensor, new: Tensor, count: Tensor) -> Tensor:
     return mean + share * (new - mean)
 
 
-def _batches(task: Task, seed: list[int], workers: int) -> Iterator[Batch]:
+def batches(task: Task, seed: list[int], workers: int) -> Iterator[Batch]:
     """Without end; the next ones are made while the last one is learnt from."""
     if workers:
         loader = DataLoader(
