@@ -159,7 +159,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
             "box_probability": 0.05,
             "overlap": 0.5,
             "evidence_gain": 2.0,
-            "large_box_evidence": 4.0,
+            "large_box_evidence": 3.5,
             "small_box_evidence": 4.0,
             "no_box_evidence": -3.0,
             "distance_logit_limit": 1.0,
