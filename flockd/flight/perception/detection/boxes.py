@@ -24,6 +24,7 @@ _SMALL_PX = (20.0, 8.0)
 """The same of boxes that are less wide, all of it from the second down: a crop of so few pixels shows no shape."""
 _SUREST = 0.95
 """No box counts as more probable: a detector that is sure and wrong may not overrule whatever the second stage says."""
+_SUREST_ODDS = math.log(_SUREST / (1 - _SUREST))
 _FIRST = 50.0
 """Added to the score of what a detector found: it is proposed before what the segmentation alone finds."""
 
@@ -54,7 +55,10 @@ class BoxRules:
     def evidence(self, box: FloatArray, log_odds: float) -> float:
         """Log odds of a drone, to add to the second stage's, of a box (4,) that has these of the detector's own."""
         width = max(float(box[2] - box[0]), 1.0)
-        return self.gain * log_odds + self.large * _share(width, _LARGE_PX) + self.small * _share(width, _SMALL_PX)
+        # Being small makes a doubtful box count more, and never more than the surest one.
+        room = max(self.gain * (_SUREST_ODDS - log_odds), 0.0)
+        small = min(self.small * _share(width, _SMALL_PX), room)
+        return self.gain * log_odds + self.large * _share(width, _LARGE_PX) + small
 
 
 def _share(width: float, ends: tuple[float, float]) -> float:

@@ -86,7 +86,13 @@ def test_what_only_the_segmentation_finds_is_less_likely_a_drone() -> None:
     [(5, 3.0), (8, 3.0), (160**0.5, 1.5), (20, 0.0), (40, 0.0), (40 * 7.5**0.5, 2.0), (300, 4.0), (600, 4.0)],
 )
 def test_what_the_second_stage_says_against_a_small_or_a_large_box_counts_less(width_px: float, added: float) -> None:
-    assert RULES.evidence(np.array([0.0, 0.0, width_px, 20.0]), 3.0) == pytest.approx(0.5 * 3.0 + added)
+    assert RULES.evidence(np.array([0.0, 0.0, width_px, 20.0]), -4.0) == pytest.approx(0.5 * -4.0 + added)
+
+
+def test_a_small_box_never_counts_more_than_the_surest_one() -> None:
+    small = np.array([0.0, 0.0, 6.0, 4.0])
+    assert RULES.evidence(small, 2.0) == pytest.approx(0.5 * np.log(19.0))
+    assert RULES.evidence(small, np.log(19.0)) == pytest.approx(0.5 * np.log(19.0))
 
 
 def test_the_parts_of_a_large_drone_are_one_with_it() -> None:
