@@ -348,6 +348,7 @@ async def test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe(
         before = len(fake_autopilot.setpoints)
         await ship.until_state("silent")
         assert len(fake_autopilot.setpoints) == before, "one more, and PX4 would be in offboard again"
+        await until(lambda: any(event.startswith("silent: ") for event in ship.events), SECONDS_TO_FAIL)
         silent = next(event for event in ship.events if event.startswith("silent: "))
         assert silent.startswith("silent: setpoints ended: the control loop is late, for more than 0.5 s in offboard")
         assert "; the flight mode is hold" in silent, "the consequence beside the cause, and after it"
