@@ -212,6 +212,7 @@ def batches(task: Task, seed: list[int], workers: int) -> Iterator[Batch]:
             multiprocessing_context="fork",
         )
         yield from loader
+        return
     upcoming_of = iter(_Batches(task, seed))
     with ThreadPoolExecutor(1) as loading:
         upcoming = loading.submit(next, upcoming_of)

@@ -44,6 +44,20 @@ def test_the_right_answer_costs_less_than_another_box_and_than_nothing() -> None
     assert costs[0] < costs[1] < costs[2]
 
 
+def test_a_cell_answers_for_one_box_and_one_cell_for_a_box_that_none_overlaps() -> None:
+    """By hand: 83 of 84 cells are asked for no object, one for an object, all at a logit of -5."""
+    boxes = torch.tensor([[[28.0, 20.0, 40.0, 30.0], [28.0, 20.0, 30.0, 40.0]]])
+    _, figures = detection_loss(maps(), boxes, torch.tensor([[0, 1]]))
+    assert figures["object"] == pytest.approx(83 * np.log1p(np.exp(-5.0)) + np.log1p(np.exp(5.0)), rel=1e-4)
+
+
+def test_the_class_of_the_box_is_learnt_and_no_other() -> None:
+    given = [one.requires_grad_() for one in maps(0.0)]
+    detection_loss(given, torch.tensor([[[28.0, 20.0, 16.0, 8.0]]]), torch.tensor([[2]]))[0].backward()
+    gradient = torch.cat([one.grad.flatten(2) for one in given if one.grad is not None], 2)[0, 5:].sum(1)
+    assert (gradient < 0).tolist() == [False, False, True, False]
+
+
 def test_pictures_of_a_batch_are_learnt_from_apart() -> None:
     torch.manual_seed(3)
     given = [torch.randn(2, 5 + len(CLASSES), *cells) for cells in CELLS]

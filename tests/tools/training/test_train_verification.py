@@ -15,7 +15,7 @@ import torch
 from flockd.core.data import data_path
 from tools.training.networks import VerificationNet
 from tools.training.real_patches import PATCH_PX
-from tools.training.train_verification import HARD_ONES, HardOnes
+from tools.training.train_verification import HARD_ONES, HardOnes, VerificationTask
 
 ROOT = Path(__file__).resolve().parents[3]
 MODELS = data_path("models")
@@ -69,6 +69,14 @@ def test_it_begins_with_the_file_s_answers_and_learns_from_there(data: Path) -> 
     begun = answers(data / "run" / "start.pt", crops)
     assert np.abs(begun - theirs).max() < 1e-3 * np.abs(theirs).max()
     assert np.abs(answers(data / "run" / "checkpoint.pt", crops) - begun).max() > 0.0
+
+
+def test_what_is_taken_for_a_drone_is_remembered(data: Path) -> None:
+    """Untrained, it says a half of everything, which is more than it may of a negative."""
+    task = VerificationTask(data / "rendered", data / "patches")
+    samples = task.batch_samples(np.random.default_rng(0))
+    task.loss({name: torch.from_numpy(np.stack([one[name] for one in samples])) for name in samples[0]})
+    assert 0 < task.hard.count <= task.mix["negative"]
 
 
 def test_a_process_that_draws_samples_sees_what_another_one_found_hard() -> None:

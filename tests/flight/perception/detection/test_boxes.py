@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import yaml
 
+from flockd.core.data import data_path
 from flockd.core.messages import FloatArray
+from flockd.flight.inference import OnnxModel
 from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes, with_boxes
 from flockd.flight.perception.detection.instances import Instance
 
@@ -87,6 +90,15 @@ def test_what_only_the_segmentation_finds_is_less_likely_a_drone() -> None:
 )
 def test_what_the_second_stage_says_against_a_small_or_a_large_box_counts_less(width_px: float, added: float) -> None:
     assert RULES.evidence(np.array([0.0, 0.0, width_px, 20.0]), -4.0) == pytest.approx(0.5 * -4.0 + added)
+
+
+def test_the_shipped_rules_are_those_of_its_manifest() -> None:
+    given = yaml.safe_load((data_path("models") / "detector.yaml").read_text(encoding="utf-8"))["thresholds"]
+    rules = BoxRules.of(OnnxModel(data_path("models") / "detector.yaml", threads=1).manifest)
+    assert (rules.gain, rules.large, rules.small, rules.no_box) == tuple(
+        given[name] for name in ("evidence_gain", "large_box_evidence", "small_box_evidence", "no_box_evidence")
+    )
+    assert len({rules.gain, rules.large, rules.small, rules.no_box}) == 4
 
 
 def test_a_small_box_never_counts_more_than_the_surest_one() -> None:
