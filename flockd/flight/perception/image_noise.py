@@ -113,15 +113,13 @@ class _History:
 
 def _haar(image: Float32Array) -> tuple[Float32Array, Float32Array]:
     """The diagonal details (h/2, w/2) of one level of the orthonormal Haar transform, and what is left for the next."""
-    upper, lower = image[0::2], image[1::2]
-    difference, total = upper - lower, upper + lower
-    half = np.float32(0.5)
-    return half * (difference[:, 0::2] - difference[:, 1::2]), half * (total[:, 0::2] + total[:, 1::2])
+    difference = cv2.subtract(image[0::2], image[1::2])
+    rest = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return np.float32(0.5) * (difference[:, 0::2] - difference[:, 1::2]), np.asarray(2.0 * rest, np.float32)
 
 
 def _sigmas(details: Float32Array, side: int) -> Float32Array:
     """The standard deviation of the details in each block of so many on a side, as if they were normal."""
-    height, width = details.shape
-    blocks = np.abs(details).reshape(height // side, side, width // side, side)
-    sigmas: Float32Array = _SIGMA_PER_MEAN * blocks.mean(axis=(1, 3))
+    size = details.shape[1] // side, details.shape[0] // side
+    sigmas: Float32Array = _SIGMA_PER_MEAN * cv2.resize(np.abs(details), size, interpolation=cv2.INTER_AREA)
     return sigmas

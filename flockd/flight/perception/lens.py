@@ -12,10 +12,11 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from flockd.core.config.perception import NoiseParameters
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, UInt8Array
@@ -59,17 +60,18 @@ def clarity(image: UInt8Array, ground: BoolArray) -> Clarity | None:
     cut = image[: ground.shape[0] * side, : ground.shape[1] * side]
     grey = cv2.cvtColor(cut, cv2.COLOR_RGB2GRAY)
     if side >= 2 * _LEAST_BLOCK_PX:
-        grey, side = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), side // 2
+        grey = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     fine_out = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _FINE_PX)
     coarse_out = cv2.GaussianBlur(fine_out, (0, 0), _COARSE_PX)
-    fine, coarse = (_deviations(part, ground, side) for part in (grey - fine_out, fine_out - coarse_out))
+    fine = _deviations(cv2.subtract(grey, fine_out, dtype=cv2.CV_32F), ground)
+    coarse = _deviations(cv2.subtract(fine_out, coarse_out), ground)
     contrast = float(np.quantile(coarse, _QUANTILE))
     return Clarity(contrast, float(np.quantile(fine, _QUANTILE)) / max(contrast, _FAINTEST))
 
 
-def _deviations(details: Float32Array, ground: BoolArray, side: int) -> Float32Array:
+def _deviations(details: NDArray[Any], ground: BoolArray) -> Float32Array:
     rows, columns = ground.shape
-    squares = (details * details).reshape(rows, side, columns, side).mean(axis=(1, 3))
+    squares = cv2.resize(cv2.multiply(details, details), (columns, rows), interpolation=cv2.INTER_AREA)
     deviations: Float32Array = np.sqrt(squares[ground])
     return deviations
 

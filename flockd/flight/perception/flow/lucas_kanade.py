@@ -63,7 +63,7 @@ def grid_flow(flow: Float32Array, first: UInt8Array, second: UInt8Array, labels:
     size = points.shape[1], points.shape[0]
     column, row = points.astype(np.intp).transpose(2, 0, 1)
     start = flow[row, column]
-    drones = ((labels > 0) & (labels != UNCLASSED)).astype(np.uint8)
+    drones = np.asarray(cv2.inRange(labels, 1, UNCLASSED - 1), np.uint8)
     moved, weight, textured = _followed(grey(first), grey(second), points, start)
     beside = _beside(drones, size)
     weight[beside] = 0.0
@@ -72,12 +72,16 @@ def grid_flow(flow: Float32Array, first: UInt8Array, second: UInt8Array, labels:
     unseen = _spread(moved - plane, sure) + plane
     seen = _spread(moved - start, sure) + start
     settled = own * moved + (1.0 - own) * np.where((textured & ~beside)[..., None], seen, unseen)
-    full = cv2.add(flow, _between(settled - start, (width, height)))
-    if drones.any():
-        leaked = cv2.dilate(drones, _NEAR_DRONES) > 0
-        full[leaked] = _between(settled, (width, height))[leaked]
-        full[drones > 0] = flow[drones > 0]
-    return np.asarray(full, np.float32)
+    full = np.asarray(cv2.add(flow, _between(settled - start, (width, height))), np.float32)
+    left, top, columns, rows = cv2.boundingRect(drones)
+    if columns:
+        box = np.s_[max(top - _DRONE_MARGIN_PX, 0) : top + rows + _DRONE_MARGIN_PX,
+                    max(left - _DRONE_MARGIN_PX, 0) : left + columns + _DRONE_MARGIN_PX]  # fmt: skip
+        around = np.ascontiguousarray(full[box])
+        cv2.copyTo(_between(settled, (width, height))[box], cv2.dilate(drones[box], _NEAR_DRONES), around)
+        cv2.copyTo(flow[box], drones[box], around)
+        full[box] = around
+    return full
 
 
 def _followed(
@@ -103,7 +107,7 @@ def _followed(
 
 def _beside(drones: UInt8Array, size: tuple[int, int]) -> BoolArray:
     """Which of the points are on a drone or beside one."""
-    cells = cv2.resize(drones * np.uint8(255), size, interpolation=cv2.INTER_AREA)
+    cells = cv2.resize(drones, size, interpolation=cv2.INTER_AREA)
     reach = 2 * -(-_DRONE_MARGIN_PX // _GRID_PX) + 1
     return np.asarray(cv2.dilate(cells, np.ones((reach, reach), np.uint8)) > 0)
 
