@@ -109,7 +109,7 @@ class PinholeCamera(Camera):
         points = np.asarray(points, dtype=np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
             inverse_z = np.where(points[:, 2] > 0.0, 1.0 / points[:, 2], np.nan)
-            normalised = np.empty((len(points), 2))
+            normalised = np.empty((2, len(points))).T  # each column in one piece, for what follows
             np.multiply(points[:, 0], inverse_z, out=normalised[:, 0])
             np.multiply(points[:, 1], inverse_z, out=normalised[:, 1])
             if self.distortion:

@@ -28,15 +28,12 @@ class RigCamera:
 
     def pixels_of_points(self, points_body: FloatArray) -> FloatArray:
         """(n, 2) pixels of body points (n, 3); NaN rows where the point is not in this camera's image."""
-        return self._seen((np.asarray(points_body) - self.T_body_camera.translation) @ self.T_body_camera.rotation)
+        return self.pixels_of_directions(np.asarray(points_body) - self.T_body_camera.translation)
 
     def pixels_of_directions(self, directions_body: FloatArray) -> FloatArray:
         """(n, 2) pixels of body directions (n, 3), as of points at infinity; NaN rows where not in the image."""
-        return self._seen(np.asarray(directions_body) @ self.T_body_camera.rotation)
-
-    def _seen(self, points_camera: FloatArray) -> FloatArray:
-        pixels = self.camera.project(points_camera)
-        pixels[~self.camera.in_image(pixels)] = np.nan
+        pixels = self.camera.project((self.T_body_camera.rotation.T @ np.asarray(directions_body).T).T)
+        np.copyto(pixels.T, np.nan, where=~self.camera.in_image(pixels))
         return pixels
 
 
@@ -58,6 +55,8 @@ class Rig:
         seen = np.zeros(len(directions), dtype=np.bool_)
         for camera in self.cameras.values():
             seen |= np.isfinite(camera.pixels_of_directions(directions)[:, 0])
+            if seen.all():
+                break
         return seen
 
     def pixels_of(self, points_body: FloatArray) -> dict[str, FloatArray]:

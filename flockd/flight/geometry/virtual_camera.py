@@ -19,6 +19,7 @@ from flockd.flight.geometry.transform import RigidTransform
 _GREY = 128
 _AT_A_TIME = 30_000
 """OpenCV samples no more places in a row."""
+_NOT_IN_IT = -1.0
 _MINIFICATION = 1.5
 """Image pixels per crop pixel from which on single samples would alias."""
 
@@ -50,62 +51,65 @@ class VirtualCrop:
                 continue
             drawn = _draw(images[name], where, self._minification(self.rig.cameras[name]))
             if seen.all():
-                return drawn, seen
-            cv2.copyTo(drawn, seen.view(np.uint8), crop)
-            valid |= seen
+                crop, valid = drawn, seen
+            else:
+                cv2.copyTo(drawn, seen.view(np.uint8), crop)
+                valid |= seen
         return crop, valid
 
     def look_up(self, values: Float32Array, points_body: FloatArray) -> Float32Array:
         """(n,) what a map (size, size) over the image says at points (n, 3) of the body; NaN where not in it."""
-        pixels = self.camera.project(self.T_body_virtual.inverse().apply(points_body))
-        inside = self.camera.in_image(pixels)
-        found = np.full(len(points_body), np.nan, np.float32)
-        places = (pixels[inside] - 0.5).astype(np.float32)
-        for start in range(0, len(places), _AT_A_TIME):
-            u, v = places[start : start + _AT_A_TIME].T[:, :, None]
-            part = cv2.remap(values, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            found[np.flatnonzero(inside)[start : start + _AT_A_TIME]] = part[:, 0]
-        return found
+        towards = self.T_body_virtual.rotation.T @ (points_body - self.T_body_virtual.translation).T
+        pixels = self.camera.project(towards.T)
+        u, v = (pixels.T - 0.5).astype(np.float32)[:, None]
+        found = np.empty(len(pixels), np.float32)
+        for start in range(0, len(pixels), _AT_A_TIME):
+            part = slice(start, start + _AT_A_TIME)
+            found[part] = cv2.remap(values, u[:, part], v[:, part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.where(self.camera.in_image(pixels), found, np.float32(np.nan))
 
     def _maps(self, images: Mapping[str, UInt8Array], range_m: float | None) -> dict[str, Float32Array]:
-        """For each camera that is needed, u and v (2, size, size) of what it fills the crop with; NaN elsewhere."""
-        pixel_centres = _pixel_centres(self.camera.size)
-        directions = self.camera.rays(pixel_centres) @ self.T_body_virtual.rotation.T
+        """For each camera that is needed, u and v (2, size, size) of what it fills the crop with; NaN elsewhere.
+
+        Of several the last one counts.
+        """
+        shape, pixels = (2, self.camera.size[1], self.camera.size[0]), _pixels(self.camera.size)
+        to_body = self.T_body_virtual.rotation @ np.linalg.inv(self.camera.matrix)
+        if self.main in images and (where := _seen_whole(self.rig.cameras[self.main], to_body, pixels)) is not None:
+            return {self.main: where.astype(np.float32).reshape(shape)}
+        directions = to_body @ pixels  # not of unit length, which no camera needs
         maps: dict[str, FloatArray] = {}
-        missing = np.ones(len(directions), dtype=np.bool_)
+        missing = np.arange(directions.shape[1])
         if self.main in images:
-            maps[self.main] = self.rig.cameras[self.main].pixels_of_directions(directions)
-            missing = np.isnan(maps[self.main][:, 0])
-        others = [camera for name, camera in self.rig.cameras.items() if name != self.main and name in images]
-        if missing.any() and others:
-            if range_m is None:
-                pixels = [camera.pixels_of_directions(directions[missing]) for camera in others]
-            else:
-                towards = directions[missing]
-                lengths = np.sqrt(np.einsum("ij,ij->i", towards, towards))
-                points = self.T_body_virtual.translation + towards * (range_m / lengths)[:, None]
-                pixels = [camera.pixels_of_points(points) for camera in others]
-            margins = np.stack([_margin(camera, seen) for camera, seen in zip(others, pixels, strict=True)])
-            best = margins.argmax(axis=0)
-            for index, camera in enumerate(others):
-                chosen = (best == index) & (margins[index] >= 0.0)
-                if chosen.any():
-                    full = np.full((len(directions), 2), np.nan)
-                    full[np.flatnonzero(missing)[chosen]] = pixels[index][chosen]
-                    maps[camera.name] = full
-        shape = (2, self.camera.size[1], self.camera.size[0])
-        return {name: where.T.astype(np.float32, order="C").reshape(shape) for name, where in maps.items()}
+            maps[self.main] = self.rig.cameras[self.main].pixels_of_directions(directions.T).T
+            missing = np.flatnonzero(np.isnan(maps[self.main][0]))
+        towards = np.take(directions, missing, axis=1)
+        if range_m is not None:
+            towards *= range_m / np.sqrt(np.einsum("ij,ij->j", towards, towards))
+            towards += self.T_body_virtual.translation[:, None]
+        deepest = np.full(len(missing), _NOT_IN_IT)
+        for name, camera in self.rig.cameras.items():
+            if name == self.main or name not in images or not len(missing):
+                continue
+            see = camera.pixels_of_directions if range_m is None else camera.pixels_of_points
+            seen = see(towards.T)
+            margin = _margin(camera, seen)
+            deeper = margin > deepest
+            if deeper.any():
+                maps[name] = np.full((2, directions.shape[1]), np.nan)
+                maps[name][:, missing[deeper]] = np.compress(deeper, seen.T, axis=1)
+                deepest = np.maximum(deepest, margin)
+        return {name: where.astype(np.float32).reshape(shape) for name, where in maps.items()}
 
     def _minification(self, camera: RigCamera) -> int:
         """How many pixels of a camera's image, each way, fall into one of the crop's at its middle."""
         R_camera_virtual = camera.T_body_camera.rotation.T @ self.T_body_virtual.rotation
         # Pixels of the image per radian both ways across the line of sight: their product is an area.
         per_radian = camera.camera.jacobian(R_camera_virtual[:, 2][None])[0] @ R_camera_virtual[:, :2]
-        # A camera that only sees the crop's rim may not see its middle; its pixels are then taken one by one.
-        if not np.isfinite(per_radian).all():
-            return 1
-        minification = math.sqrt(abs(float(np.linalg.det(per_radian)))) / self.camera.focal_px
-        return min(round(minification), *camera.camera.size) if minification > _MINIFICATION else 1
+        (a, b), (c, d) = per_radian.tolist()
+        # A camera that only sees the crop's rim may not see its middle (NaN); its pixels are then taken one by one.
+        minification = math.sqrt(abs(a * d - b * c)) / self.camera.focal_px
+        return round(min(minification, *camera.camera.size)) if minification > _MINIFICATION else 1
 
 
 def virtual_crop(rig: Rig, direction_body: FloatArray, half_angle_rad: float, size_px: int) -> VirtualCrop:
@@ -121,10 +125,7 @@ def virtual_crop(rig: Rig, direction_body: FloatArray, half_angle_rad: float, si
         )
     forward = np.asarray(direction_body, dtype=np.float64)
     forward = forward / np.linalg.norm(forward)
-    margins = {
-        name: float(_margin(camera, camera.pixels_of_directions(forward[None]))[0])
-        for name, camera in rig.cameras.items()
-    }
+    margins = {name: _margin_of(camera, forward) for name, camera in rig.cameras.items()}
     main = max(margins, key=lambda name: margins[name])
     if margins[main] < 0.0:
         raise ValueError(f"no camera sees the body direction {np.round(forward, 3).tolist()}")
@@ -142,21 +143,36 @@ def virtual_crop(rig: Rig, direction_body: FloatArray, half_angle_rad: float, si
 
 def _level_towards(forward: FloatArray) -> FloatArray:
     """``R_body_virtual``: z along ``forward``, x horizontal."""
-    right = np.array([-forward[1], forward[0], 0.0])  # down x forward
-    length = float(np.linalg.norm(right))
-    # Straight up or down every x is horizontal: the body's right then.
-    right = right / length if length > 1e-6 else np.array([0.0, 1.0, 0.0])
-    return np.stack([right, np.cross(forward, right), forward], axis=1)
+    x, y, z = forward.tolist()
+    length = math.hypot(x, y)
+    # The right is down x forward. Straight up or down every x is horizontal: the body's right then.
+    right_x, right_y = (-y / length, x / length) if length > 1e-6 else (0.0, 1.0)
+    return np.array([[right_x, -z * right_y, x], [right_y, z * right_x, y], [0.0, x * right_y - y * right_x, z]])
 
 
 @lru_cache(maxsize=8)
-def _pixel_centres(size: tuple[int, int]) -> FloatArray:
-    return grid_pixels(size, 1)
+def _pixels(size: tuple[int, int]) -> FloatArray:
+    """(3, n) homogeneous coordinates of the pixel centres, row by row."""
+    return np.insert(grid_pixels(size, 1).T, 2, 1.0, axis=0)
+
+
+def _seen_whole(camera: RigCamera, to_body: FloatArray, pixels: FloatArray) -> FloatArray | None:
+    """A camera's u and v (2, n) of homogeneous pixels of a crop (3, n) by their homography; None where there is none.
+
+    It is that of most crops, and takes half the time: of a pinhole without distortion that has all of them in its
+    image. ``to_body`` (3, 3) makes directions of the pixels.
+    """
+    if not isinstance(camera.camera, PinholeCamera) or camera.camera.distortion:
+        return None
+    seen = camera.camera.matrix @ camera.T_body_camera.rotation.T @ to_body @ pixels
+    if seen[2].min() <= 0.0:
+        return None
+    where: FloatArray = seen[:2] / seen[2]
+    return where if camera.camera.in_image(where.T).all() else None
 
 
 def _draw(image: UInt8Array, where: Float32Array, minification: int) -> UInt8Array:
     """The image's colours at u and v (2, h, w), averaged over ``minification`` pixels both ways; any at NaN."""
-    origin = np.zeros(2, dtype=np.float32)
     if minification > 1:
         # Only the part that the crop covers, a block wider, cut along whole blocks.
         low = np.maximum(np.nanmin(where, axis=(1, 2)) // minification - 1, 0).astype(np.int64) * minification
@@ -168,16 +184,24 @@ def _draw(image: UInt8Array, where: Float32Array, minification: int) -> UInt8Arr
             (int(blocks[0]), int(blocks[1])),
             interpolation=cv2.INTER_AREA,
         )
-        image, origin = part.astype(np.uint8, copy=False), low.astype(np.float32)
+        image = part.astype(np.uint8, copy=False)
+        where = (where - low.astype(np.float32)[:, None, None]) / np.float32(minification)
     # Centres are at integers here, and beyond the outermost ones the border repeats.
-    x, y = (where - origin[:, None, None]) / np.float32(minification) - np.float32(0.5)
+    x, y = where - np.float32(0.5)
     drawn = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return drawn.astype(np.uint8, copy=False)
 
 
 def _margin(camera: RigCamera, pixels: FloatArray) -> FloatArray:
-    """(n,) distance from the image's border, in focal lengths so that cameras compare; -1 for what is not in it."""
+    """(n,) distance from the image's border, in focal lengths so that cameras compare; `_NOT_IN_IT` elsewhere."""
     width, height = camera.camera.size
     u, v = pixels.T
     margin = np.minimum(np.minimum(u, width - u), np.minimum(v, height - v)) / camera.camera.focal_px
-    return np.where(np.isfinite(margin), margin, -1.0)
+    return np.where(np.isfinite(margin), margin, _NOT_IN_IT)
+
+
+def _margin_of(camera: RigCamera, direction_body: FloatArray) -> float:
+    """The same of one direction (3,), in half the time; any negative value for what is not in it."""
+    width, height = camera.camera.size
+    u, v = camera.camera.project((direction_body @ camera.T_body_camera.rotation)[None])[0].tolist()
+    return min(u, width - u, v, height - v) / camera.camera.focal_px if math.isfinite(u) else _NOT_IN_IT

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
+
+import cv2
 
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, UInt8Array
 from flockd.flight.geometry import PinholeCamera, RigidTransform, ZMap
@@ -36,6 +39,12 @@ class SceneMaps:
     """(h, w) / `Networks.map_stride`, of each pixel being any drone's; None: the labels are all that is known."""
     min_score: float = 0.0
     """Instances of a lower score are not proposed."""
+
+    @cached_property
+    def labelled(self) -> tuple[slice, slice]:
+        """The part of the image, at least one pixel, that has all labels: they are few."""
+        left, top, width, height = cv2.boundingRect(self.labels)
+        return slice(top, top + max(height, 1)), slice(left, left + max(width, 1))
 
 
 @dataclass(frozen=True, eq=False)

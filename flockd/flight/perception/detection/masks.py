@@ -105,21 +105,22 @@ class MaskRenderer:
         """
         stride = self._stride
         widest = min(_CROP_CORNERS * max(mask.half_angle for mask in masks), math.pi / 2)
-        rows, columns = np.nonzero(self._rays @ bearing.astype(np.float32) > math.cos(widest))
-        if not len(rows):
+        near = cv2.transform(self._rays, bearing[None].astype(np.float32)) > math.cos(widest)
+        left, top, width, height = cv2.boundingRect(near.view(np.uint8))
+        if not width:
             return (slice(0), slice(0)), np.zeros((0, 0), np.float32)
-        points = self._camera.T_body_camera.translation + range_m * self._rays[rows, columns].astype(np.float64)
-        crops = np.stack([mask.view.look_up(mask.logit, points) for mask in masks])
-        covered = np.isfinite(crops)
-        top, left, bottom, right = rows.min(), columns.min(), rows.max() + 1, columns.max() + 1
-        mean = np.where(covered, crops, 0.0).sum(0) / np.maximum(covered.sum(0), 1)
-        coarse = np.full((bottom - top, right - left), _CERTAINLY_NOT, np.float32)
-        coarse[rows - top, columns - left] = np.where(covered.any(0), mean + logit[rows, columns], _CERTAINLY_NOT)
-        size = int(right - left) * stride, int(bottom - top) * stride
+        part = np.s_[top : top + height, left : left + width]
+        rays = self._rays[part].reshape(-1, 3).astype(np.float64, order="F")
+        points = self._camera.T_body_camera.translation + range_m * rays
+        crops = np.stack([mask.view.look_up(mask.logit, points).reshape(height, width) for mask in masks])
+        covered = np.isfinite(crops) & near[part]
+        mean = np.where(covered, crops, np.float32(0)).sum(0) / np.maximum(covered.sum(0), 1)
+        coarse = np.where(covered.any(0), mean + logit[part], _CERTAINLY_NOT).astype(np.float32)
+        size = width * stride, height * stride
         back = np.array([[1.0, 0.0, 1.0 - stride], [0.0, 1.0, 1.0 - stride]]) / stride
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         fine = cv2.warpAffine(coarse, back, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        box = slice(top * stride, bottom * stride), slice(left * stride, right * stride)
+        box = slice(top * stride, (top + height) * stride), slice(left * stride, (left + width) * stride)
         return box, np.asarray(fine, np.float32)
 
 
@@ -138,9 +139,10 @@ def _draw(labels: UInt8Array, drones: Iterable[DroneLogits]) -> UInt8Array:
     drawn, highest = labels.copy(), np.zeros(labels.shape, np.float32)
     for drone in drones:
         mine = drone.logit > highest[drone.box]
-        drawn[drawn == drone.label] = UNCLASSED  # the crops hold all of the drone: whose these are is not known
-        drawn[drone.box][mine] = drone.label
-        highest[drone.box][mine] = drone.logit[mine]
+        # The crops hold all of the drone: whose these are is not known.
+        np.copyto(drawn, UNCLASSED, where=drawn == drone.label)
+        np.copyto(drawn[drone.box], drone.label, where=mine)
+        np.copyto(highest[drone.box], drone.logit, where=mine)
     return drawn
 
 
@@ -154,19 +156,19 @@ def first_stage_labels(scene: SceneMaps, label_of: Mapping[int, int], rejected: 
     for instance in scene.instances:
         otherwise = 0 if instance in rejected else UNCLASSED
         table[instance.label] = label_of.get(instance.label, otherwise)
-    labels = np.asarray(cv2.LUT(scene.labels, table), np.uint8)
+    labels = np.zeros_like(scene.labels)
+    part = scene.labelled
+    labels[part] = cv2.LUT(scene.labels[part], table)
     if scene.uncertain is not None:
-        labels[scene.uncertain & (labels > 0)] = UNCLASSED
+        np.copyto(labels[part], UNCLASSED, where=scene.uncertain[part] & (labels[part] > 0))
     return labels
 
 
 def without_borders(labels: UInt8Array, border_px: int) -> UInt8Array:
     """Background within ``border_px`` of a drone becomes `UNCLASSED`: masks and depth maps are least certain there."""
-    drone = (labels > 0).astype(np.uint8)
-    if not drone.any():
-        return labels
+    drone = cv2.threshold(labels, 0, UNCLASSED, cv2.THRESH_BINARY)[1]
     wide = cv2.dilate(drone, np.ones((2 * border_px + 1, 2 * border_px + 1), np.uint8))
-    return np.where((wide > 0) & (labels == 0), np.uint8(UNCLASSED), labels)
+    return np.asarray(cv2.bitwise_or(labels, cv2.bitwise_xor(wide, drone)), np.uint8)  # `UNCLASSED` has all bits
 
 
 def depth_of_drones(

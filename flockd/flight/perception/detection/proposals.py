@@ -131,8 +131,9 @@ def propose_residuals(
     for name, scene in scenes.items():
         if scene.uncertain is None:
             continue
-        mask = masks[name]
-        residual = (mask == UNCLASSED) & (scene.labels > 0) & ~scene.uncertain
+        mask, part = masks[name], scene.labelled
+        residual = np.zeros(mask.shape, np.bool_)
+        residual[part] = (mask[part] == UNCLASSED) & (scene.labels[part] > 0) & ~scene.uncertain[part]
         proposed = best_instances(scene, parameters.max_proposals)
         if len(proposed) < len(scene.instances):
             residual &= np.isin(scene.labels, [one.label for one in proposed])
