@@ -66,9 +66,14 @@ def open_session(file: ManifestFile, *, threads: int, provider: Provider, folder
     options.log_severity_level = 3
     options.enable_mem_pattern = False  # one block for all tensors of a run holds 30 MB more and is no faster
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    in_8_bits = file.manifest.providers == ("cpu",)  # the few layers in float gain nothing from a layout of their own
     try:
         session = ort.InferenceSession(
-            str(file.model), options, providers=_providers(provider, threads, folder), enable_fallback=0
+            str(file.model),
+            options,
+            providers=_providers(provider, threads, folder),
+            enable_fallback=0,
+            disabled_optimizers=["NchwcTransformer"] if in_8_bits else None,
         )
     except Exception as error:  # noqa: BLE001 - ONNX Runtime's own exception types are private
         if (lacking := shortage_of(error)) is not None:
