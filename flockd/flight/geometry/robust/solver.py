@@ -50,7 +50,9 @@ class NormalEquations:
 
     def damped(self, diagonal: FloatArray) -> NormalEquations:
         """With ``diagonal`` (n,) added to the hessian's: the larger, the shorter that parameter's step."""
-        return replace(self, hessian=self.hessian + np.diag(diagonal))
+        hessian = self.hessian.copy()
+        hessian.flat[:: len(hessian) + 1] += diagonal
+        return NormalEquations(self.cost, self.gradient, hessian)
 
     def step(self) -> FloatArray:
         """(n,)"""
