@@ -25,7 +25,7 @@ from flockd.flight.geometry.rotations import (
     vector_from_rotation,
 )
 from flockd.flight.geometry.transform import RigidTransform
-from flockd.flight.geometry.triangulation import inverse_ranges, inverse_ranges_of_rays
+from flockd.flight.geometry.triangulation import inverse_ranges_of_rays
 from flockd.flight.geometry.virtual_camera import VirtualCrop, virtual_crop
 
 __all__ = [
@@ -57,7 +57,6 @@ __all__ = [
     "fit_rigid",
     "grid_pixels",
     "ground_inverse_depth",
-    "inverse_ranges",
     "inverse_ranges_of_rays",
     "label_pixels",
     "lift_matches",

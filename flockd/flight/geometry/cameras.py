@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -84,15 +85,23 @@ class Camera(ABC):
     def _to_pixels(self, normalised: FloatArray) -> FloatArray:
         # Column by column: numpy broadcasts a row of two several times slower, and a crop has thousands of pixels.
         pixels = np.empty_like(normalised)
-        for axis in range(2):
-            pixels[:, axis] = normalised[:, axis] * self.matrix[axis, axis] + self.matrix[axis, 2]
+        for axis, (focal, centre) in enumerate(self._intrinsics):
+            np.multiply(normalised[:, axis], focal, out=pixels[:, axis])
+            pixels[:, axis] += centre
         return pixels
 
     def _from_pixels(self, pixels: FloatArray) -> FloatArray:
-        normalised = np.empty((len(pixels), 2))
-        for axis in range(2):
-            normalised[:, axis] = (pixels[:, axis] - self.matrix[axis, 2]) / self.matrix[axis, axis]
-        return normalised
+        normalised = np.empty((2, len(pixels)))
+        for axis, (focal, centre) in enumerate(self._intrinsics):
+            np.subtract(pixels[:, axis], centre, out=normalised[axis])
+            normalised[axis] /= focal
+        return normalised.T
+
+    @cached_property
+    def _intrinsics(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Focal length and principal point in pixels, of each axis."""
+        (fx, _, cx), (_, fy, cy), _ = self.matrix.tolist()
+        return (fx, cx), (fy, cy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,20 +116,18 @@ class PinholeCamera(Camera):
     def project(self, points: FloatArray) -> FloatArray:
         """Pixels (n, 2) of points (n, 3); NaN rows behind the camera."""
         points = np.asarray(points, dtype=np.float64)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inverse_z = np.where(points[:, 2] > 0.0, 1.0 / points[:, 2], np.nan)
-            normalised = np.empty((2, len(points))).T  # each column in one piece, for what follows
-            np.multiply(points[:, 0], inverse_z, out=normalised[:, 0])
-            np.multiply(points[:, 1], inverse_z, out=normalised[:, 1])
-            if self.distortion:
-                normalised = self._distort(normalised)
+        inverse_z = 1.0 / np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
+        normalised = np.empty((2, len(points))).T  # each column in one piece, for what follows
+        np.multiply(points[:, 0], inverse_z, out=normalised[:, 0])
+        np.multiply(points[:, 1], inverse_z, out=normalised[:, 1])
+        if self.distortion:
+            normalised = self._distort(normalised)
         return self._to_pixels(normalised)
 
     def jacobian(self, points: FloatArray) -> FloatArray:
         """(n, 2, 3) derivative of `project`."""
         points = np.asarray(points, dtype=np.float64)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inverse_z = np.where(points[:, 2] > 0.0, 1.0 / points[:, 2], np.nan)
+        inverse_z = 1.0 / np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
         normalised = points[:, :2] * inverse_z[:, None]
         derivative = np.zeros((len(points), 2, 3))
         derivative[:, 0, 0] = inverse_z
@@ -136,10 +143,11 @@ class PinholeCamera(Camera):
         normalised = self._from_pixels(pixels)
         if self.distortion:
             normalised = self._undistort(normalised)
-        unit = np.empty((len(normalised), 3))
-        np.divide(1.0, np.sqrt(np.einsum("ij,ij->i", normalised, normalised) + 1.0), out=unit[:, 2])
-        np.multiply(normalised[:, 0], unit[:, 2], out=unit[:, 0])
-        np.multiply(normalised[:, 1], unit[:, 2], out=unit[:, 1])
+        unit, (x, y) = np.empty((len(normalised), 3)), normalised.T
+        z = 1.0 / np.sqrt(x * x + y * y + 1.0)
+        np.multiply(x, z, out=unit[:, 0])
+        np.multiply(y, z, out=unit[:, 1])
+        unit[:, 2] = z
         return unit
 
     def pixel_angle(self, rays: FloatArray) -> FloatArray:
@@ -151,6 +159,7 @@ class PinholeCamera(Camera):
         k1, k2, p1, p2 = self.distortion[:4]
         return k1, k2, p1, p2, self.distortion[4] if len(self.distortion) == 5 else 0.0
 
+    @cached_property
     def _radius_limit(self) -> float:
         k1, k2, _, _, k3 = self._coefficients()
         return _first_turning_point((k1, k2, k3))
@@ -160,7 +169,7 @@ class PinholeCamera(Camera):
         x, y = normalised.T
         r2 = x * x + y * y
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        radial = np.where(r2 < self._radius_limit() ** 2, radial, np.nan)
+        radial = np.where(r2 < self._radius_limit**2, radial, np.nan)
         return np.stack(
             [
                 x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
@@ -190,8 +199,7 @@ class PinholeCamera(Camera):
                 error = self._distort(estimate) - distorted
                 if not np.nanmax(np.abs(error), initial=0.0) > _NEWTON_TOLERANCE:
                     break
-                a, b = self._distortion_jacobian(estimate)[:, 0].T
-                c, d = self._distortion_jacobian(estimate)[:, 1].T
+                (a, b), (c, d) = self._distortion_jacobian(estimate).transpose(1, 2, 0)
                 step = np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - c * error[:, 0]], axis=1)
                 estimate = estimate - step / (a * d - b * c)[:, None]
             error = self._distort(estimate) - distorted
@@ -216,7 +224,7 @@ class WideAngleCamera(Camera):
         theta = np.arctan2(off_axis, points[:, 2])
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = np.where(off_axis > 0.0, self._radius(theta) / off_axis, 1.0 / points[:, 2])
-        visible = (theta <= self._theta_limit()) & ((off_axis > 0.0) | (points[:, 2] > 0.0))
+        visible = (theta <= self._theta_limit) & ((off_axis > 0.0) | (points[:, 2] > 0.0))
         return self._to_pixels(points[:, :2] * np.where(visible, scale, np.nan)[:, None])
 
     def jacobian(self, points: FloatArray) -> FloatArray:
@@ -232,7 +240,7 @@ class WideAngleCamera(Camera):
             range2 = off_axis**2 + z**2
             radial = np.stack([z * ex, z * ey, -off_axis], axis=1) * (self._slope(theta) / range2)[:, None]
             across = np.stack([-ey, ex, np.zeros_like(x)], axis=1) * (self._radius(theta) / off_axis)[:, None]
-        radial[theta > self._theta_limit()] = np.nan
+        radial[theta > self._theta_limit] = np.nan
         derivative = np.stack(
             [ex[:, None] * radial - ey[:, None] * across, ey[:, None] * radial + ex[:, None] * across], axis=1
         )
@@ -252,6 +260,7 @@ class WideAngleCamera(Camera):
         """(n,) radians: most towards the axis, where it is the same everywhere."""
         return np.full(len(rays), 1.0 / self.focal_px)
 
+    @cached_property
     def _theta_limit(self) -> float:
         return min(math.pi, _first_turning_point(self.distortion)) if self.distortion else math.pi
 
@@ -270,7 +279,7 @@ class WideAngleCamera(Camera):
 
     def _theta(self, radius: FloatArray) -> FloatArray:
         """Newton's method; NaN beyond the largest imaged angle."""
-        limit = self._theta_limit()
+        limit = self._theta_limit
         theta = np.minimum(radius, limit)
         if self.distortion:
             with np.errstate(all="ignore"):

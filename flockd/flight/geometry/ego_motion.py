@@ -10,7 +10,7 @@ from flockd.core.config.geometry import GeometryParameters
 from flockd.core.messages import EgoMotion
 from flockd.flight.geometry.ego_motion_refinement import refine_ego_motion
 from flockd.flight.geometry.pairs import BACKGROUND_LABEL, PointPairs
-from flockd.flight.geometry.rig import Rig
+from flockd.flight.geometry.rig import Rig, RigCamera
 from flockd.flight.geometry.robust.ransac import ransac_rigid
 from flockd.flight.geometry.transform import RigidTransform
 
@@ -53,10 +53,11 @@ def estimate_ego_motion(
         seed=seed,
     )
     motion = found.transform
-    explained = _explained(background, rig, motion)
+    by_camera = [(camera, background.select(background.camera_names == name)) for name, camera in rig.cameras.items()]
+    explained = _explained(by_camera, motion) / len(background)
     if parameters.refine:
         refined = refine_ego_motion(background, rig, motion, agreeing=found.inliers, seed=seed)
-        still = _explained(background, rig, refined) if refined else 0.0
+        still = _explained(by_camera, refined) / len(background) if refined else 0.0
         if refined and still >= ACCEPTANCE.min_kept * explained:
             motion, explained = refined, still
     if explained < ACCEPTANCE.min_explained:
@@ -74,14 +75,12 @@ def estimate_ego_motion(
     )
 
 
-def _explained(pairs: PointPairs, rig: Rig, motion: RigidTransform) -> float:
-    """The share of matches whose point, seen first and moved, falls on its second pixel."""
-    moved = motion.inverse().apply(pairs.previous)
-    near = 0
-    for name, camera in rig.cameras.items():
-        mine = pairs.camera_names == name
+def _explained(by_camera: list[tuple[RigCamera, PointPairs]], motion: RigidTransform) -> int:
+    """Of how many matches, by the camera that saw them, the point, seen first and moved, falls on its second pixel."""
+    near, back = 0, motion.inverse()
+    for camera, pairs in by_camera:
         mount = camera.T_body_camera
-        pixels = camera.camera.project((moved[mine] - mount.translation) @ mount.rotation)
-        distances = np.linalg.norm(pixels - pairs.pixels_current[mine], axis=1)
-        near += int(np.count_nonzero(distances < ACCEPTANCE.explained_px))  # behind a camera it is NaN, and not near
-    return near / len(pairs)
+        pixels = camera.camera.project((back.apply(pairs.previous) - mount.translation) @ mount.rotation)
+        u, v = (pixels - pairs.pixels_current).T
+        near += int(np.count_nonzero(u * u + v * v < ACCEPTANCE.explained_px**2))  # NaN behind a camera, and not near
+    return near

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,10 +10,11 @@ import numpy as np
 
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.geometry.pairs import PointPairs
-from flockd.flight.geometry.rig import Rig, RigCamera
-from flockd.flight.geometry.robust.kernels import Cauchy
+from flockd.flight.geometry.rig import Rig
+from flockd.flight.geometry.robust.kernels import Cauchy, median
 from flockd.flight.geometry.robust.solver import GaussNewton, NormalEquations, Problem
 from flockd.flight.geometry.rotations import rotation_from_vector
+from flockd.flight.geometry.sightlines import crossed, products, times, whitening
 from flockd.flight.geometry.transform import RigidTransform
 
 _MAX_PAIRS = 800
@@ -54,20 +56,17 @@ def refine_ego_motion(
     None means that the steps did not converge or the robust cost did not fall. Raises ValueError for pairs of a camera
     that is not in the rig.
     """
-    strangers = set(pairs.camera_names.tolist()) - set(rig.cameras)
-    if strangers:
-        raise ValueError(f"pairs of camera {sorted(strangers)[0]!r}, which is not in the rig")
+    known = np.isin(pairs.camera_names, list(rig.cameras))
+    if not known.all():
+        raise ValueError(f"pairs of camera {min(pairs.camera_names[~known].tolist())!r}, which is not in the rig")
     agreeing = np.ones(len(pairs), np.bool_) if agreeing is None else agreeing
     if len(pairs) > _MAX_PAIRS:
         drawn = np.sort(np.random.default_rng(seed).choice(len(pairs), _MAX_PAIRS, replace=False))
         pairs, agreeing = pairs.select(drawn), agreeing[drawn]
-    mine = {name: pairs.camera_names == name for name in rig.cameras}
-    views = [_View(rig.cameras[name], pairs.select(which)) for name, which in mine.items() if which.any()]
-    # As `_Reprojection` puts them: camera by camera, there and back.
-    typical = np.concatenate([np.tile(agreeing[which], 2) for which in mine.values()])
+    typical = np.tile(agreeing, 2)  # there and back
     if not typical.any():
         return None
-    start = _Reprojection(views, initial)
+    start = _Reprojection(_Sights.of(pairs, rig), initial)
     rough = _ROUGH_SOLVER.minimise(_Refinement(typical), start)
     if not rough.equations.solvable:
         return None
@@ -80,62 +79,91 @@ def refine_ego_motion(
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
-    """One camera and the pairs it saw."""
+class _Sights:
+    """n pairs, and m = 2 n sights of them: those of the points lifted at t+1 at t, then those of the others at t+1."""
 
-    camera: RigCamera
-    pairs: PointPairs
+    current: FloatArray
+    """(3, n) body axes at t+1."""
+    previous: FloatArray
+    """(3, n) body axes at t."""
+    centres: FloatArray
+    """(3, m) of their cameras."""
+    seen: FloatArray
+    """(3, m) unit vectors towards the pixels, body axes."""
+    across: FloatArray
+    """(3, 2, m) derivatives of the pixels by a point, at a distance of 1 m along these."""
 
-    def reproject(self, points_body: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixels (n, 2) of body points and their derivative (n, 2, 3) by the body coordinates."""
-        mount = self.camera.T_body_camera
-        points_camera = (points_body - mount.translation) @ mount.rotation
-        derivative = self.camera.camera.jacobian(points_camera) @ mount.rotation.T
-        return self.camera.camera.project(points_camera), derivative
-
-
-@dataclass(frozen=True, eq=False)
-class _Linearisation:
-    residuals: FloatArray
-    """(m, 2) pixels"""
-    jacobians: FloatArray
-    """(m, 2, 6) by a left increment (rotation, translation) of the motion"""
-    parallaxes: FloatArray
-    """(m, 2) derivatives by the logarithm of each point's depth"""
+    @classmethod
+    def of(cls, pairs: PointPairs, rig: Rig) -> _Sights:
+        n = len(pairs)
+        centres, seen, across = np.empty((3, 2, n)), np.empty((3, 2, n)), np.empty((3, 2, 2, n))
+        for name, camera in rig.cameras.items():
+            mine = np.flatnonzero(pairs.camera_names == name)
+            R = camera.T_body_camera.rotation
+            rays = camera.camera.rays(np.concatenate([pairs.pixels_previous[mine], pairs.pixels_current[mine]]))
+            centres[:, :, mine] = camera.T_body_camera.translation[:, None, None]
+            seen[:, :, mine] = (R @ rays.T).reshape(3, 2, -1)
+            by_point = camera.camera.jacobian(rays).transpose(2, 1, 0).reshape(3, -1)
+            across[:, :, :, mine] = (R @ by_point).reshape(3, 2, 2, -1)
+        current, previous = (np.ascontiguousarray(points.T) for points in (pairs.current, pairs.previous))
+        return cls(current, previous, centres.reshape(3, -1), seen.reshape(3, -1), across.reshape(3, 2, -1))
 
 
 @dataclass(frozen=True, eq=False)
 class _Reprojection:
-    """All pairs, reprojected both ways by one motion."""
+    """All pairs, reprojected both ways by one motion.
 
-    views: list[_View]
+    To first order in how far a point is off its pixel: what a camera's model adds is far below a pixel where that is
+    a few pixels.
+    """
+
+    sights: _Sights
     motion: RigidTransform
 
     @cached_property
-    def linearised(self) -> _Linearisation:
-        parts = [part for view in self.views for part in self._both_ways(view)]
-        residuals, jacobians, parallaxes = (np.concatenate(part) for part in zip(*parts, strict=True))
-        unseen = ~np.isfinite(residuals[:, 0])
-        residuals[unseen], jacobians[unseen], parallaxes[unseen] = _UNSEEN_PX, 0.0, 0.0
-        return _Linearisation(residuals, jacobians, parallaxes)
+    def moved(self) -> FloatArray:
+        """(3, m) the points in body axes at the time that they are seen."""
+        R, t = self.motion.rotation, self.motion.translation[:, None]
+        return np.concatenate([R @ self.sights.current + t, R.T @ (self.sights.previous - t)], axis=1)
 
-    def _both_ways(self, view: _View) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-        pairs, centre = view.pairs, view.camera.T_body_camera.translation
-        back = self.motion.inverse()
+    @cached_property
+    def from_camera(self) -> FloatArray:
+        """(3, m) likewise, from the camera that sees them."""
+        return self.moved - self.sights.centres
 
-        # From t+1 to t: X = T P_F, and an increment (w, v) moves X by w x X + v.
-        moved = self.motion.apply(pairs.current)
-        pixels, by_point = view.reproject(moved)
-        jacobian = _by_increment(moved, by_point)
-        parallax = _times(by_point @ self.motion.rotation, pairs.current - centre)
-        backward = (pixels - pairs.pixels_previous, jacobian, parallax)
+    @cached_property
+    def depths(self) -> FloatArray:
+        """(m,) metres along the sights; NaN where a point is on the other side of the camera."""
+        depths = np.einsum("im,im->m", self.sights.seen, self.from_camera)
+        return np.where(depths > 0.0, depths, np.nan)
 
-        # From t to t+1: Y = T^-1 P_C, and the increment moves Y by -R'(w x P_C + v).
-        pixels, by_point = view.reproject(back.apply(pairs.previous))
-        by_point = by_point @ back.rotation
-        jacobian = -_by_increment(pairs.previous, by_point)
-        parallax = _times(by_point, pairs.previous - centre)
-        return [backward, (pixels - pairs.pixels_current, jacobian, parallax)]
+    @cached_property
+    def residuals(self) -> FloatArray:
+        """(2, m) pixels"""
+        residuals: FloatArray = products(self.sights.across, self.from_camera) / self.depths
+        return np.where(np.isnan(residuals), _UNSEEN_PX, residuals)
+
+    @property
+    def parallaxes(self) -> FloatArray:
+        """(2, m) derivatives by the logarithm of each point's depth: it moves from the camera that saw it."""
+        R, t, n = self.motion.rotation, self.motion.translation[:, None], self.sights.current.shape[1]
+        centres = self.sights.centres[:, :n]
+        between = np.concatenate([R @ centres + t, R.T @ (centres - t)], axis=1) - self.sights.centres
+        along = np.einsum("im,im->m", self.sights.seen, between)
+        changes = (self.residuals * along - products(self.sights.across, between)) / self.depths
+        return np.where(np.isnan(changes), 0.0, changes)
+
+    def jacobian(self, weighting: _Weighting) -> FloatArray:
+        """(6, 2, m) of the whitened residuals by a left increment (rotation, translation) of the motion."""
+        sights, n = self.sights, self.sights.current.shape[1]
+        by_point = times(weighting.whitening, sights.across)
+        by_point -= times(weighting.whitening, self.residuals) * sights.seen[:, None]
+        by_point /= self.depths
+        by_point[..., np.isnan(self.depths)] = 0.0
+        # An increment (w, v) moves X = T P_F by w x X + v, and Y = T^-1 P_C by -R'(w x P_C + v).
+        by_point[..., n:] = -(self.motion.rotation @ by_point[..., n:].reshape(3, -1)).reshape(3, 2, n)
+        turned = np.concatenate([self.moved[:, :n], sights.previous], axis=1)
+        return np.concatenate([-crossed(by_point, turned), by_point])
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,31 +171,26 @@ class _Weighting:
     """What a residual counts."""
 
     whitening: FloatArray
-    """(m, 2, 2) inverse square roots of the residuals' covariances ``flow^2 I + depth^2 p p'``, p the parallax"""
+    """(2, 2, m) inverse roots of the residuals' covariances ``flow^2 I + depth^2 p p'``, p the parallax"""
     kernel: Cauchy
     """of whitened residuals"""
 
     @classmethod
     def learned(cls, state: _Reprojection, typical: BoolArray) -> _Weighting:
         """From the parallax of all residuals, and the size of the ``typical`` (m,) ones."""
-        parallaxes, flow_px = state.linearised.parallaxes, _FLOW_SIGMA_PX
-        length = np.linalg.norm(parallaxes, axis=1)
-        direction = parallaxes / np.maximum(length, 1e-12)[:, None]
-        discount = 1.0 - flow_px / np.hypot(flow_px, _DEPTH_SIGMA * length)
-        along = direction[:, :, None] * direction[:, None, :]
-        whitening = (np.eye(2) - discount[:, None, None] * along) / flow_px
-        size = np.linalg.norm(_times(whitening[typical], state.linearised.residuals[typical]), axis=1)
+        white_by = whitening(state.parallaxes, _FLOW_SIGMA_PX, _DEPTH_SIGMA)
+        squared = (times(white_by, state.residuals) ** 2).sum(axis=0)
         # Outliers under a half do not move the median, which for a Rayleigh distribution is sqrt(2 ln 2) sigma.
-        sigma = max(float(np.median(size)) / np.sqrt(2.0 * np.log(2.0)), 1e-3)
-        return cls(whitening, Cauchy(_CAUCHY_SIGMAS * sigma))
+        sigma = max(math.sqrt(median(squared[typical]) / (2.0 * math.log(2.0))), 1e-3)
+        return cls(white_by, Cauchy(_CAUCHY_SIGMAS * sigma))
 
     def whitened(self, state: _Reprojection) -> FloatArray:
-        """(m, 2)"""
-        return _times(self.whitening, state.linearised.residuals)
+        """(2, m)"""
+        return times(self.whitening, state.residuals)
 
     def loss(self, state: _Reprojection) -> float:
         """The robust cost of a motion."""
-        return float(self.kernel.loss((self.whitened(state) ** 2).sum(axis=1)).sum())
+        return float(self.kernel.loss((self.whitened(state) ** 2).sum(axis=0)).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,30 +204,9 @@ class _Refinement(Problem[_Reprojection]):
     def linearise(self, state: _Reprojection) -> NormalEquations:
         weighting = self.weighting or _Weighting.learned(state, self.typical)
         white = weighting.whitened(state)
-        weights = weighting.kernel.weight((white**2).sum(axis=1))
-        J = weighting.whitening @ state.linearised.jacobians
-        return NormalEquations.of(white.ravel(), J.reshape(-1, 6), np.repeat(weights, 2))
+        weights = weighting.kernel.weight((white**2).sum(axis=0))
+        return NormalEquations.of(white.ravel(), state.jacobian(weighting).reshape(6, -1).T, np.tile(weights, 2))
 
     def move(self, state: _Reprojection, step: FloatArray) -> _Reprojection:
         increment = RigidTransform(rotation_from_vector(step[:3]), step[3:])
-        return _Reprojection(state.views, increment @ state.motion)
-
-
-def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
-    product: FloatArray = (matrices @ vectors[:, :, None])[:, :, 0]
-    return product
-
-
-def _by_increment(points: FloatArray, by_point: FloatArray) -> FloatArray:
-    """(n, 2, 6) derivatives by (w, v), which move ``points`` (n, 3) by w x p + v, of those (n, 2, 3) by the points.
-
-    `np.cross`, written out: it takes most of its time to arrange its axes.
-    """
-    by_both = np.empty((*by_point.shape[:2], 6))
-    x, y, z = points.T[:, :, None]
-    dx, dy, dz = (by_point[:, :, axis] for axis in range(3))
-    np.subtract(y * dz, z * dy, out=by_both[:, :, 0])
-    np.subtract(z * dx, x * dz, out=by_both[:, :, 1])
-    np.subtract(x * dy, y * dx, out=by_both[:, :, 2])
-    by_both[:, :, 3:] = by_point
-    return by_both
+        return _Reprojection(state.sights, increment @ state.motion)

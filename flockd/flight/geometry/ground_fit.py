@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockd.core.messages import BoolArray, FloatArray
-from flockd.flight.geometry.robust.kernels import Kernel, Tukey
+from flockd.flight.geometry.robust.kernels import Kernel, Tukey, median
 from flockd.flight.geometry.robust.reweighting import reweighted
 
 RELIEF = 0.03
@@ -76,8 +76,9 @@ def fit_ground(samples: GroundSamples, height: float, slope: FloatArray) -> Fitt
     ground = samples.select(near)
     away = level[near] / ground.rays[:, 2]
     spread = np.hypot(ground.sigma, RELIEF * (1.0 + away) * expected[near])
+    rows = _rows(ground) / spread
     plane, weights = reweighted(
-        lambda weights, _: _fitted(ground, weights, spread),
+        lambda weights, _: _fitted(rows, weights),
         lambda plane: _residuals(ground, plane) / spread,
         _tukey,
         np.ones(len(spread)),
@@ -88,13 +89,17 @@ def fit_ground(samples: GroundSamples, height: float, slope: FloatArray) -> Fitt
     return FittedGround(float(plane[0]), plane[1:].copy())
 
 
-def _fitted(ground: GroundSamples, weights: FloatArray, spread: FloatArray) -> FloatArray:
-    """(3,) height and slope. A point at inverse range w is on the plane where ``n . (ray + w offset) = w height``."""
-    at = ground.rays + ground.inverse[:, None] * ground.offsets
-    rows = np.column_stack([ground.inverse, -at[:, :2]])
-    root: FloatArray = np.sqrt(weights) / spread
-    found, *_ = np.linalg.lstsq(rows * root[:, None], at[:, 2] * root, rcond=None)
-    return np.asarray(found, np.float64)
+def _rows(ground: GroundSamples) -> FloatArray:
+    """(4, n) whose first three, times height and slope, make the last. A point at inverse range w is on the plane where
+    ``n . (ray + w offset) = w height``."""
+    x, y, z = (ground.rays + ground.inverse[:, None] * ground.offsets).T
+    return np.stack([ground.inverse, -x, -y, z])
+
+
+def _fitted(rows: FloatArray, weights: FloatArray) -> FloatArray:
+    """(3,) height and slope."""
+    products = (rows * weights) @ rows.T
+    return np.asarray(np.linalg.solve(products[:3, :3], products[:3, 3]), np.float64)
 
 
 def _residuals(ground: GroundSamples, plane: FloatArray) -> FloatArray:
@@ -105,4 +110,4 @@ def _residuals(ground: GroundSamples, plane: FloatArray) -> FloatArray:
 
 
 def _tukey(left: FloatArray) -> Kernel:
-    return Tukey(max(MEDIAN_DEVIATIONS * float(np.median(np.abs(left))), 1e-6))
+    return Tukey(max(MEDIAN_DEVIATIONS * median(np.abs(left)), 1e-6))

@@ -42,16 +42,21 @@ def scale_on_track(samples: GroundSamples, track: FloatArray, slope: FloatArray,
     around &= (factor * seen[:, :2] < track[:, :2].max(axis=0) + margin_m).all(axis=1)
     seen = seen[around]
     seen = seen[:: -(-len(seen) // MAX_SEEN) or 1]
+    x, y, z = seen.T
+    # With the slope, a place says as much of the ground at x, y as its height where the slope is taken out.
+    level = track[:, 2] + track[:, :2] @ slope
     for _ in range(ROUNDS):
-        away = (factor * seen[:, None, :2] - track[None, :, :2]) / reach_m
-        weights = np.exp(-0.5 * (away**2).sum(axis=2)) * ((away**2).sum(axis=2) < BESIDE**2)
+        away_x, away_y = (
+            (factor * at[:, None] - place) / reach_m for at, place in ((x, track[:, 0]), (y, track[:, 1]))
+        )
+        away2 = away_x * away_x + away_y * away_y
+        weights = np.exp(-0.5 * away2) * (away2 < BESIDE**2)
         total = weights.sum(axis=1)
         beside = total > 0.0
         if beside.sum() < MIN_POINTS:
             raise ValueError("too little is seen of the ground that was measured")
-        expected = weights @ track[:, 2] - (weights * (away @ slope) * reach_m).sum(axis=1)
-        factors = expected[beside] / total[beside] / seen[beside, 2]
-        factor = float(np.median(factors))
+        expected = (weights @ level)[beside] / total[beside] - factor * (seen[beside, :2] @ slope)
+        factor = float(np.median(expected / z[beside]))
     used = track[(weights > 0.0).any(axis=0), :2]
     if float(np.linalg.norm(np.ptp(used, axis=0))) < MIN_SPAN * down_m:
         raise ValueError("too little is seen of the ground that was measured")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 
-import cv2
 import numpy as np
 
 from flockd.core.config.geometry import GeometryParameters
-from flockd.core.messages import UNCLASSED, EgoMotion, Float32Array, NeighbourMotion, Reason, ReasonKind
+from flockd.core.messages import UNCLASSED, EgoMotion, Float32Array, FloatArray, NeighbourMotion, Reason, ReasonKind
 from flockd.flight.geometry import (
     PointPairs,
     Rig,
@@ -66,22 +66,21 @@ def neighbour_motions(
 
 def neighbour_pairs(rig: Rig, observation: Observation, parameters: GeometryParameters) -> dict[int, PointPairs | None]:
     """What belongs to each neighbour before and now, by its current label."""
-    same = _labels_by_flow(rig, observation, parameters.max_drone_pixels)
-    table = np.full(256, UNCLASSED, np.uint8)
-    table[list(same.keys())] = list(same.values())
+    limit = parameters.max_drone_pixels
+    pixels = {one.name: label_pixels(before.labels, limit) for one, before, _, _ in _seen_twice(rig, observation)}
+    same = _labels_by_flow(rig, observation, pixels)
     pairs: dict[int, list[PointPairs]] = {after: [] for after in same.values()}
     for camera, before, after, flow in _seen_twice(rig, observation):
         if before.depth is None or after.depth is None:
             continue
-        relabelled = np.asarray(cv2.LUT(before.labels, table), np.uint8)
-        for label, found in pairs.items():
-            pixels = label_pixels(relabelled, label, parameters.max_drone_pixels)
-            if len(pixels):
+        for label_before, label in same.items():
+            if label_before in pixels[camera.name]:
+                relabelled = np.broadcast_to(np.uint8(label), before.labels.shape)
                 lifted = lift_matches(
-                    camera, pixels, flow, before.depth, after.depth, relabelled, after.labels,
-                    max_depth_m=parameters.max_depth_m,
+                    camera, pixels[camera.name][label_before], flow,
+                    before.depth, after.depth, relabelled, after.labels, max_depth_m=parameters.max_depth_m,
                 )  # fmt: skip
-                found.append(lifted)
+                pairs[label].append(lifted)
     return {label: PointPairs.concatenate(found) if found else None for label, found in pairs.items()}
 
 
@@ -94,26 +93,25 @@ def _seen_twice(
             yield rig.cameras[name], observation.previous.cameras[name], observation.cameras[name], flow
 
 
-def _labels_by_flow(rig: Rig, observation: Observation, max_pixels: int) -> dict[int, int]:
-    """Previous label -> current label: where most of a drone's pixels flow to. One to one."""
-    votes: dict[tuple[int, int], int] = {}
+def _labels_by_flow(
+    rig: Rig, observation: Observation, pixels: Mapping[str, Mapping[int, FloatArray]]
+) -> dict[int, int]:
+    """Previous label -> current label: where most of a drone's ``pixels`` flow to, which are by camera and previous
+    label. One to one."""
+    votes: Counter[tuple[int, int]] = Counter()
     detections = observation.previous.detections if observation.previous else ()
     for camera, before, after, flow in _seen_twice(rig, observation):
         height, width = before.labels.shape
         for detection in detections:
-            if camera.name not in detection.cameras:
+            start = pixels[camera.name].get(detection.label)
+            if start is None or camera.name not in detection.cameras:
                 continue
-            pixels = label_pixels(before.labels, detection.label, max_pixels)
-            if not len(pixels):
-                continue
-            start = pixels.astype(np.int64)
-            end = np.floor(pixels + flow[start[:, 1], start[:, 0]]).astype(np.int64)
+            column, row = start.astype(np.int64).T
+            end = np.floor(start + flow[row, column]).astype(np.int64)
             inside = (end[:, 0] >= 0) & (end[:, 0] < width) & (end[:, 1] >= 0) & (end[:, 1] < height)
-            landed, counts = np.unique(after.labels[end[inside, 1], end[inside, 0]], return_counts=True)
-            for label, count in zip(landed, counts, strict=True):
-                if 0 < label < UNCLASSED:
-                    key = (detection.label, int(label))
-                    votes[key] = votes.get(key, 0) + int(count)
+            counts = np.bincount(after.labels[end[inside, 1], end[inside, 0]], minlength=UNCLASSED)
+            for label in np.flatnonzero(counts[1:UNCLASSED]) + 1:
+                votes[detection.label, int(label)] += int(counts[label])
     same: dict[int, int] = {}
     for before_label, after_label in sorted(votes, key=lambda pair: -votes[pair]):
         if before_label not in same and after_label not in same.values():

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from flockd.flight.geometry import GroundSamples, RigidTransform, fit_ground, inverse_ranges, scale_on_track
+from flockd.flight.geometry import GroundSamples, RigidTransform, fit_ground, inverse_ranges_of_rays, scale_on_track
 
 from .synthetic_world import four_camera_rig
 
@@ -45,7 +45,8 @@ def _seen(points: Array, scale: float, noise_px: float, rng: np.random.Generator
         )
         both = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
         start, end = first[both], second[both] + noise_px * rng.standard_normal((both.sum(), 2))
-        inverse, baseline = inverse_ranges(camera, motion, start, end)
+        between = camera.T_body_camera.inverse() @ motion @ camera.T_body_camera
+        inverse, baseline = inverse_ranges_of_rays(camera.camera.rays(start), camera.camera.rays(end), between)
         R_ned_camera = now.as_matrix() @ camera.T_body_camera.rotation
         rays = np.column_stack([(end - [240.0, 320.0]) / 222.0, np.ones(len(end))])
         share = 1.0 / np.linalg.norm(rays, axis=1)  # of z in the range

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flockd.core.messages import Float32Array, FloatArray, IntArray
+from flockd.core.messages import UNCLASSED, Float32Array, FloatArray, IntArray
 from flockd.flight.geometry import PointPairs, RangeMap, RigCamera, grid_pixels, label_pixels, lift_matches
 
 from .synthetic_world import four_camera_rig
@@ -129,10 +129,11 @@ def test_the_grid_is_of_pixel_centres_inside_the_image() -> None:
 def test_label_pixels_are_spread_over_the_whole_patch() -> None:
     labels = np.zeros((20, 30), dtype=np.int64)
     labels[5:15, 10:20] = 7
-    assert len(label_pixels(labels, 7, 1000)) == 100
-    few = label_pixels(labels, 7, 10)
+    labels[0, 0], labels[19, 28:] = 3, UNCLASSED
+    assert {label: len(pixels) for label, pixels in label_pixels(labels, 1000).items()} == {3: 1, 7: 100}
+    assert label_pixels(labels, 10)[3].tolist() == [[0.5, 0.5]]
+    few = label_pixels(labels, 10)[7]
     assert len(few) == 10
     assert few.min(axis=0).tolist()[1] == 5.5
     assert few.max(axis=0).tolist()[1] == 14.5
     assert ((few - 0.5) % 1.0 == 0.0).all()
-    assert label_pixels(labels, 3, 10).shape == (0, 2)

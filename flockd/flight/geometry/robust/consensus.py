@@ -203,8 +203,9 @@ def _alike(triangles: FloatArray) -> FloatArray:
         return triangles
     along = triangles[_NEXT] - triangles
     sides = np.sqrt(np.einsum("ijkl,ijkl->ijk", along, along))
+    before, after = sides[..., 0], sides[..., 1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        unlike = np.abs(sides[..., 0] - sides[..., 1]).max(axis=0) / sides.min(axis=(0, 2))
+        unlike = np.abs(before - after).max(axis=0) / np.minimum(before, after).min(axis=0)
     kept = np.argpartition(unlike, _KEPT_TRIPLES)[:_KEPT_TRIPLES]  # NaN is last
     return triangles[:, kept]
 

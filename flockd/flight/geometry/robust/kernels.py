@@ -59,3 +59,12 @@ class Tukey:
         """See `Kernel`."""
         weights: FloatArray = np.maximum(1.0 - squared / self.scale**2, 0.0) ** 2
         return weights
+
+
+def median(values: FloatArray) -> float:
+    """Of values (n,) without NaN, n at least 1: `np.median` takes several times as long for a few hundred."""
+    middle = len(values) // 2
+    if len(values) % 2:
+        return float(np.partition(values, middle)[middle])
+    parted = np.partition(values, (middle - 1, middle))
+    return float(parted[middle - 1] + parted[middle]) / 2.0

@@ -137,8 +137,10 @@ class GaussNewton:
 
     def _step(self, equations: NormalEquations) -> FloatArray | None:
         """(n,) or None where the hessian is singular."""
-        if math.isfinite(self.max_condition) and not np.linalg.cond(equations.hessian) < self.max_condition:
-            return None
+        if math.isfinite(self.max_condition):
+            sizes = np.abs(np.linalg.eigvalsh(equations.hessian))
+            if not sizes.max() < self.max_condition * sizes.min():
+                return None
         try:
             return equations.step()
         except np.linalg.LinAlgError:

@@ -22,7 +22,7 @@ from flockd.flight.geometry import (
     RigidTransform,
     fit_ground,
     grid_pixels,
-    inverse_ranges,
+    inverse_ranges_of_rays,
     scale_on_track,
 )
 from flockd.flight.perception import CameraObservation, Observation
@@ -80,16 +80,17 @@ def _samples(
     start = grid_pixels(camera.camera.size, max(math.isqrt(width * height // MATCHES), 1))
     column, row = start.astype(np.int64).T
     end = start + flow[row, column]
-    used = camera.camera.in_image(end) & (labels_before[row, column] == 0)
-    start, end = start[used], end[used]
+    used = np.flatnonzero(camera.camera.in_image(end) & (labels_before[row, column] == 0))
+    start, end = start.take(used, axis=0), end.take(used, axis=0)
     column, row = end.astype(np.int64).T
-    background = now.labels[row, column] == 0
-    start, end = start[background], end[background]
-    inverse, baseline = inverse_ranges(camera, RigidTransform(ego.rotation, ego.translation), start, end)
+    background = np.flatnonzero(now.labels[row, column] == 0)
+    start, end = start.take(background, axis=0), end.take(background, axis=0)
     R_ned_body, mount = observation.vehicle.R_ned_body, camera.T_body_camera
+    between = mount.inverse() @ RigidTransform(ego.rotation, ego.translation) @ mount
     seen = camera.camera.rays(end)
+    inverse, baseline = inverse_ranges_of_rays(camera.camera.rays(start), seen, between)
     rays = seen @ (R_ned_body @ mount.rotation).T
-    clear = (baseline > MIN_BASELINE_M) & (inverse > 0.0) & np.isfinite(rays).all(axis=1)  # false for NaN
+    clear = (baseline > MIN_BASELINE_M) & (inverse > 0.0)  # false for NaN
     offsets = np.broadcast_to(R_ned_body @ mount.translation, rays.shape)
     sigma = FLOW_SIGMA_PX * camera.camera.pixel_angle(seen) / np.maximum(baseline, MIN_BASELINE_M)
     return GroundSamples(rays, inverse, offsets, sigma).select(clear)
