@@ -89,7 +89,7 @@ def object_flow(
         second: (h, w, 3) RGB.
         labels: (h, w) of the first image: one value a drone, 0 and 255 no drone.
     """
-    pixels = np.flatnonzero(labels != 0)  # a tenth of the time without the comparison
+    pixels = np.flatnonzero(labels != 0)  # of booleans it takes a seventh of the time
     label_of_pixel = labels.ravel()[pixels]
     large = np.flatnonzero(np.bincount(label_of_pixel)[:UNCLASSED] >= _MIN_PIXELS)
     found = flow.copy() if len(large) else flow
@@ -198,7 +198,7 @@ class _Motion:
         return x[:, _POWERS[0]] * y[:, _POWERS[1]]
 
     def on_grid(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
-        """(2, h, w) pixels right and down where rows (h,) and columns (w,) cross: in a tenth of the time of `at`."""
+        """(2, h, w) pixels right and down where rows (h,) and columns (w,) cross: in a sixth of the time of `at`."""
         x, y = self._powers(rows, columns)
         factors = np.zeros((2, 4, 4))
         factors[:, _POWERS[1, : len(self.terms)], _POWERS[0, : len(self.terms)]] = self.terms.T
