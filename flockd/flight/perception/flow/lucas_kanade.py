@@ -25,6 +25,9 @@ _DIFFERENCE_LEVELS = 4.0
 """Grey levels by which the windows may differ before a point counts for half."""
 _ASTRAY_PX = 3.0
 """By which a point may differ from the median of the nine around it before it counts for half."""
+_ALONE, _RETURNS_PX = 0.5, 1.0
+"""A point that is astray by more than this share of that counts whole if it is found back from where it went, begun
+where those around it came from: something thin and near moves otherwise than what is around it."""
 _MIN_WEIGHT = 1e-4
 _OWN_WEIGHT = np.float32(0.25)
 """From this weight on a point keeps its own flow; below, it takes part of what is around."""
@@ -47,7 +50,8 @@ _HOMOGRAPHY_MAX_ERROR = 0.25
 def grid_flow(flow: Float32Array, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
     """The flow of the background made exact by Lucas & Kanade (1981; Bouguet 2001) at points 16 px apart.
 
-    In between goes what they add to it. A point that goes astray takes what those around it add; one without texture,
+    In between goes what they add to it. A point that goes astray and is not found back from there (Kalal et al. 2010)
+    takes what those around it add; one without texture,
     as of the sky, or beside a drone, what they differ from the homography that most of them follow (normalised
     convolution, Knutsson & Westin 1993, over a pyramid).
 
@@ -88,21 +92,34 @@ def _followed(
     first: UInt8Array, second: UInt8Array, points: Float32Array, start: Float32Array
 ) -> tuple[Float32Array, Float32Array, BoolArray]:
     """How far points (n, m, 2) of grey images have moved, (n, m, 2), by which weights, and where there is texture."""
-    begin = np.ascontiguousarray(points.reshape(-1, 1, 2))
-    end, status, difference = cv2.calcOpticalFlowPyrLK(
-        first, second, begin, begin + start.reshape(-1, 1, 2), winSize=(_WINDOW_PX, _WINDOW_PX), maxLevel=_HALVINGS,
-        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _STEPS, _CONVERGED_PX),
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=_MIN_EIGENVALUE,
-    )  # fmt: skip
+    begin = points.reshape(-1, 1, 2)
+    end, status, difference = _tracked(first, second, begin, begin + start.reshape(-1, 1, 2))
     shape = points.shape[:2]
     found = (status.reshape(shape) > 0) & np.isfinite(end).all(axis=2).reshape(shape)
     moved = np.where(found[..., None], (end - begin).reshape(points.shape), start)
     change = moved - start
-    usual = [cv2.medianBlur(np.ascontiguousarray(change[..., axis]), 3) for axis in (0, 1)]
-    astray = np.abs(change - np.stack(usual, axis=2)).sum(axis=2) / _ASTRAY_PX
+    usual = np.stack([cv2.medianBlur(np.ascontiguousarray(change[..., axis]), 3) for axis in (0, 1)], axis=2)
+    astray = np.abs(change - usual).sum(axis=2) / _ASTRAY_PX
+    if len(alone := np.flatnonzero(found & (astray > _ALONE))):
+        there = end[alone]
+        back, seen, _ = _tracked(second, first, there, there - (start + usual).reshape(-1, 1, 2)[alone])
+        returns = (seen[:, 0] > 0) & (np.abs(back - begin[alone]).sum(axis=(1, 2)) < _RETURNS_PX)
+        astray.flat[alone[returns]] = 0.0
     unlike = np.where(found, difference.reshape(shape), 0.0) / _DIFFERENCE_LEVELS
     weight = np.asarray(found / ((1.0 + unlike**2) * (1.0 + astray**2)), np.float32)
     return moved, weight, found
+
+
+def _tracked(
+    first: UInt8Array, second: UInt8Array, points: Float32Array, start: Float32Array
+) -> tuple[Float32Array, UInt8Array, Float32Array]:
+    """Where points (n, 1, 2) of a grey image are in the next, begun at ``start``; 1 where found; grey levels apart."""
+    end, status, difference = cv2.calcOpticalFlowPyrLK(
+        first, second, np.ascontiguousarray(points), np.ascontiguousarray(start), winSize=(_WINDOW_PX, _WINDOW_PX),
+        maxLevel=_HALVINGS, criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _STEPS, _CONVERGED_PX),
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=_MIN_EIGENVALUE,
+    )  # fmt: skip
+    return np.asarray(end, np.float32), np.asarray(status, np.uint8), np.asarray(difference, np.float32)
 
 
 def _beside(drones: UInt8Array, size: tuple[int, int]) -> BoolArray:

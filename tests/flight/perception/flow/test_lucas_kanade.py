@@ -75,6 +75,18 @@ def test_what_is_seen_well_keeps_its_own_flow_although_all_else_moves_otherwise(
     assert np.abs(np.median(inside, axis=(0, 1)) - [30.0, 15.0]).max() < 0.3
 
 
+def test_a_thin_trunk_before_the_ground_keeps_its_own_flow_that_nothing_told() -> None:
+    """One column of points has it, and all points around them move otherwise."""
+    first, second = images()
+    rng = np.random.default_rng(5)
+    trunk = np.asarray(cv2.resize(rng.integers(0, 90, (50, 4, 3), np.uint8), (16, 200), interpolation=cv2.INTER_CUBIC))
+    first[100:300, 192:208] = trunk
+    second[96:296, 206:222] = trunk
+    settled = grid_flow(told(MOVED), first, second, NO_DRONES)
+    assert np.abs(np.median(settled[130:270, 198:203], axis=(0, 1)) - [14.0, -4.0]).max() < 1.0
+    assert off(settled, np.s_[120:300, 20:170]) < 0.05
+
+
 def test_beside_a_drone_the_background_does_not_move_with_it() -> None:
     first, second = images()
     flow, labels = told(MOVED), NO_DRONES.copy()
