@@ -37,8 +37,9 @@ _HORIZON = 0.1
 
 _GRID = slice(_STRIDE_PX // 2, None, _STRIDE_PX)
 """Rows or columns that `grid_pixels` takes."""
-_STEEPEST = 0.25
-"""Sine of the elevation up to which pixels are triangulated: the band of heights from 3 m on, and its middle nearer."""
+_STEEPEST = 0.6
+"""Sine of the elevation up to which pixels are triangulated: all that is 1.5 m lower from 2 m on. In the direction of
+flight nothing but what is higher or lower has a parallax."""
 _MIN_BASELINE_M = 0.05
 """Across the line of sight: with less between two images, their flow shows no depth."""
 _FLOW_SIGMA_PX = 1.0
@@ -105,7 +106,12 @@ class ObstacleRanging:
 
     def _about_level(self, points: _Points) -> _Points:
         """Those that are in the drone's band of heights, or show how far it sees."""
-        return points.where((np.abs(points.places[2]) <= self._parameters.height_band_m) | _is_level(*points.places))
+        return points.where(self._in_band(points.places[2]) | _is_level(*points.places))
+
+    def _in_band(self, down: Float32Array) -> BoolArray:
+        """(n,) of points so far below the drone."""
+        p = self._parameters
+        return (down >= -p.height_band_m) & (down <= max(p.height_band_m, p.below_m))
 
     def _nearest(self, observation: Observation, points: _Points, ground: GroundEstimate | None) -> ObstacleRanges:
         """The nearest obstacle in each sector, from places (3, n) metres NED from the drone."""
@@ -113,7 +119,7 @@ class ObstacleRanging:
         north, east, down = points.places
         away_m = np.hypot(north, east)
         sectors = np.round(np.arctan2(east, north) * (SECTORS / (2 * math.pi))).astype(np.int64) % SECTORS
-        in_band = np.abs(down) <= p.height_band_m
+        in_band = self._in_band(down)
         above_ground = down <= _ground_down_m(observation, ground, north, east) - _GROUND_MARGIN_M
         counts = in_band & above_ground & (labels == 0) & (away_m <= p.range_m)
         range_m, relative = self._agreed(

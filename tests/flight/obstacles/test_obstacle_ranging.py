@@ -39,8 +39,13 @@ def seen(
     rig: Rig = RIG,
     labels: int = 0,
     of_label: tuple[float, float, float] | None = None,
+    down_m: tuple[float, float] = (-math.inf, math.inf),
+    parameters: ObstacleParameters = PARAMETERS,
 ) -> ObstacleRanges:
-    """Over flat ground under a clear sky, from the middle of the world; `of_label`: a trunk that is masked so."""
+    """Over flat ground under a clear sky, from the middle of the world.
+
+    `of_label`: a trunk that is masked so; `down_m`: of trunks only what is so far below the drone.
+    """
     cameras = {}
     for name, camera in rig.cameras.items():
         width, height = camera.camera.size
@@ -51,7 +56,9 @@ def seen(
         depth = np.where(rays[:, 2] > 0, (HEIGHT_M - origin[2]) / np.maximum(rays[:, 2], 1e-9), SKY_M)
         mask = np.zeros(len(pixels), np.uint8)
         for north, east, radius in trunks:
-            depth = np.minimum(depth, towards_trunk(origin, rays, (north, east), radius))
+            trunk = towards_trunk(origin, rays, (north, east), radius)
+            down = origin[2] + np.where(np.isfinite(trunk), trunk, 0.0) * rays[:, 2]
+            depth = np.where((down >= down_m[0]) & (down <= down_m[1]), np.minimum(depth, trunk), depth)
         if of_label is not None:
             masked = towards_trunk(origin, rays, of_label[:2], of_label[2])
             mask[masked < depth] = labels
@@ -60,7 +67,8 @@ def seen(
         image = np.zeros((*shape, 3), np.uint8)
         ranges = RangeMap(depth.reshape(shape).astype(np.float32))
         cameras[name] = CameraObservation(image, ranges, mask.reshape(shape), None)
-    return RANGING.ranges(Observation(2.0, VehicleState(2.0, R_ned_body, HEIGHT_M), cameras, (), None))
+    ranging = ObstacleRanging(rig, parameters)
+    return ranging.ranges(Observation(2.0, VehicleState(2.0, R_ned_body, HEIGHT_M), cameras, (), None))
 
 
 def found(ranges: ObstacleRanges) -> dict[int, float]:
@@ -95,6 +103,19 @@ def test_the_attitude_turns_the_directions_and_keeps_the_heights() -> None:
     ranges = seen((5.0, 0.0, 0.2), R_ned_body=pitched)
     assert set(found(ranges)) <= {0, 1, SECTORS - 1}
     assert ranges.range_m[0] == pytest.approx(4.8, rel=0.06)
+
+
+def test_a_stump_whose_top_no_camera_shows_stands_in_the_way() -> None:
+    """The top of what ends a metre below the drone may be too thin to be seen; what hangs a metre higher is passed."""
+    assert seen((3.0, 0.0, 0.15), down_m=(1.0, 3.0)).range_m[0] == pytest.approx(2.85, rel=0.06)
+    assert found(seen((3.0, 0.0, 0.15), down_m=(1.6, 3.0))) == {}
+    assert found(seen((3.0, 0.0, 0.15), down_m=(-3.0, -1.0))) == {}
+
+
+def test_the_band_upwards_holds_downwards_too_where_it_is_wider() -> None:
+    wide, narrow = (ObstacleParameters(range_m=12.0, height_band_m=band_m, below_m=0.5) for band_m in (1.2, 0.6))
+    assert 0 in found(seen((3.0, 0.0, 0.15), down_m=(1.0, 3.0), parameters=wide))
+    assert found(seen((3.0, 0.0, 0.15), down_m=(1.0, 3.0), parameters=narrow)) == {}
 
 
 def test_of_two_trunks_in_a_line_the_nearer_one_counts() -> None:
@@ -136,10 +157,18 @@ def test_a_few_wrong_pixels_are_no_obstacle() -> None:
     assert found(RANGING.ranges(Observation(0.0, vehicle, {"front": camera}, (), None))) == {}
 
 
-def test_what_depth_does_not_show_the_flow_does() -> None:
-    """The drone flies 0.6 m north-east and yaws; depth is that of the sky, as of a network that knows no trunks."""
-    trunk, way = (3.0, -0.8, 0.3), np.array([0.5, 0.3, 0.05])
-    yaw = math.radians(8.0)
+@pytest.mark.parametrize(
+    ("trunk", "way", "yaw_deg", "top_m"),
+    [
+        ((3.0, -0.8, 0.3), (0.5, 0.3, 0.05), 8.0, -math.inf),
+        ((3.0, 0.0, 0.2), (0.7, 0.0, 0.0), 0.0, 0.9),  # straight ahead, and all of it lower
+    ],
+)
+def test_what_depth_does_not_show_the_flow_does(
+    trunk: tuple[float, float, float], way: FloatArray, yaw_deg: float, top_m: float
+) -> None:
+    """The drone flies 0.6 m and yaws; depth is that of the sky, as of a network that knows no trunks."""
+    way, yaw = np.array(way), math.radians(yaw_deg)
     R_ned_body = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1.0]])
     before, now = {}, {}
     for name, camera in RIG.cameras.items():
@@ -150,7 +179,9 @@ def test_what_depth_does_not_show_the_flow_does() -> None:
         turn, origin = camera.T_body_camera.rotation, camera.T_body_camera.translation
         rays = camera.camera.unproject(pixels, np.ones(len(pixels))) @ turn.T
         ground = np.where(rays[:, 2] > 0, (HEIGHT_M - origin[2]) / np.maximum(rays[:, 2], 1e-9), 1e4)
-        depth = np.minimum(ground, towards_trunk(origin, rays, trunk[:2], trunk[2]))
+        stands = towards_trunk(origin, rays, trunk[:2], trunk[2])
+        is_trunk = origin[2] + np.where(np.isfinite(stands), stands, 0.0) * rays[:, 2] >= top_m
+        depth = np.where(is_trunk, np.minimum(ground, stands), ground)
         points = (origin + rays * depth[:, None] - way) @ R_ned_body  # in the body now
         flow = camera.camera.project((points - origin) @ turn) - pixels
         before[name] = CameraObservation(depth=sky, flow=None, **blank)
