@@ -22,7 +22,7 @@ class ObstacleParameters(Section):
     height_band_m: _Metres = 0.75
     """What is higher or lower than the drone by more is no obstacle: room for its rotors and for errors in height."""
     below_m: _Metres = 1.5
-    """Downwards it is this, if that is more: of a tree the top may be too thin to be seen, and what is below it is not."""
+    """Downwards it is this, if this is more: a tree's top may be too thin to be seen, and what is lower is not."""
     range_sigma: Annotated[float, Field(gt=0, le=1)] = 0.1
     """Standard deviation of a range from the depth map, as a share of it."""
     min_pixels: Annotated[int, Field(ge=1, le=10_000)] = 4
