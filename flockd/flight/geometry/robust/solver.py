@@ -137,11 +137,11 @@ class GaussNewton:
 
     def _step(self, equations: NormalEquations) -> FloatArray | None:
         """(n,) or None where the hessian is singular."""
-        if math.isfinite(self.max_condition):
-            sizes = np.abs(np.linalg.eigvalsh(equations.hessian))
-            if not sizes.max() < self.max_condition * sizes.min():
-                return None
         try:
+            if math.isfinite(self.max_condition):
+                sizes = np.abs(np.linalg.eigvalsh(equations.hessian))
+                if not sizes.max() < self.max_condition * sizes.min():
+                    return None
             return equations.step()
         except np.linalg.LinAlgError:
             return None
