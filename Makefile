@@ -28,7 +28,7 @@ lint: $(VENV)/test.installed ## ruff and mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: lint ## lint and all tests but the slow ones, on two cores in under 7 minutes
+test: lint ## lint and all tests but the slow ones, on two cores in about 10 minutes
 	$(BIN)/python -m pytest -n 2 -m "not slow" --durations=10 --durations-min=1
 
 test-all: lint ## lint and all tests, those too that take minutes each

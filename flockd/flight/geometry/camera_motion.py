@@ -17,8 +17,8 @@ from flockd.flight.geometry.cameras import Camera
 from flockd.flight.geometry.pairs import PointPairs
 from flockd.flight.geometry.rig import RigCamera
 from flockd.flight.geometry.robust.kernels import Cauchy, Kernel, Tukey, median
-from flockd.flight.geometry.rotations import cross_matrix, rotation_from_vector
-from flockd.flight.geometry.sightlines import crossed, products, times, whitening
+from flockd.flight.geometry.rotations import cross_matrix, crossed, rotation_from_vector
+from flockd.flight.geometry.sightlines import products, times, whitening
 from flockd.flight.geometry.transform import RigidTransform
 
 MIN_MATCHES = 40
@@ -154,7 +154,7 @@ class Sights:
         across, white = times(white_by, self.across), times(white_by, along)
         jacobian = np.empty((7, *along.shape))
         # exp(w)^T y is y - w x y, and a . (y x w) is w . (a x y)
-        jacobian[_ROTATION] = crossed(across, unit)
+        jacobian[_ROTATION] = crossed(across, unit[:, None])
         np.multiply(white, unit[:, None], out=jacobian[_TRANSLATION])
         jacobian[_TRANSLATION] -= across
         jacobian[_TRANSLATION] /= length

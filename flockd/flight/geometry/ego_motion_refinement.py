@@ -13,8 +13,8 @@ from flockd.flight.geometry.pairs import PointPairs
 from flockd.flight.geometry.rig import Rig
 from flockd.flight.geometry.robust.kernels import Cauchy, median
 from flockd.flight.geometry.robust.solver import GaussNewton, NormalEquations, Problem
-from flockd.flight.geometry.rotations import rotation_from_vector
-from flockd.flight.geometry.sightlines import crossed, products, times, whitening
+from flockd.flight.geometry.rotations import crossed, rotation_from_vector
+from flockd.flight.geometry.sightlines import products, times, whitening
 from flockd.flight.geometry.transform import RigidTransform
 
 _MAX_PAIRS = 800
@@ -163,7 +163,7 @@ class _Reprojection:
         # An increment (w, v) moves X = T P_F by w x X + v, and Y = T^-1 P_C by -R'(w x P_C + v).
         by_point[..., n:] = -(self.motion.rotation @ by_point[..., n:].reshape(3, -1)).reshape(3, 2, n)
         turned = np.concatenate([self.moved[:, :n], sights.previous], axis=1)
-        return np.concatenate([-crossed(by_point, turned), by_point])
+        return np.concatenate([-crossed(by_point, turned[:, None]), by_point])
 
 
 @dataclass(frozen=True, eq=False)

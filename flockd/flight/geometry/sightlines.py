@@ -13,14 +13,6 @@ def products(across: FloatArray, vectors: FloatArray) -> FloatArray:
     return along
 
 
-def crossed(directions: FloatArray, vectors: FloatArray) -> FloatArray:
-    """(3, 2, n) cross products of pairs of directions (3, 2, n) with vectors (3, n)."""
-    a, b = np.concatenate([directions, directions[:2]]), np.concatenate([vectors, vectors[:2]])[:, None]
-    product: FloatArray = a[1:4] * b[2:5]
-    product -= a[2:5] * b[1:4]
-    return product
-
-
 def times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
     """(..., 2, n) products of matrices (2, 2, n) with vectors (..., 2, n)."""
     product: FloatArray = matrices[:, 0] * vectors[..., :1, :]

@@ -18,6 +18,7 @@ from scipy.special import gammaln
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, IntArray
 from flockd.flight.geometry.rigid_fit import require_spread
 from flockd.flight.geometry.robust.kernels import Tukey
+from flockd.flight.geometry.rotations import cross_matrix
 from flockd.flight.geometry.transform import RigidTransform
 
 FEWEST_PAIRS = 10
@@ -75,8 +76,7 @@ class Consensus:
         """
         weights, q = 1.0 / self.variances[self.inliers], target[self.inliers]
         moments = (q * weights[:, None]).T @ q
-        x, y, z = weights @ q
-        skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        skew = cross_matrix(weights @ q)
         turning = np.trace(moments) * np.eye(3) - moments
         covariance: FloatArray = np.linalg.inv(np.block([[turning, skew], [skew.T, weights.sum() * np.eye(3)]]))
         return covariance

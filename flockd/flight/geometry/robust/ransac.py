@@ -10,13 +10,12 @@ import numpy as np
 from flockd.core.messages import BoolArray, FloatArray, IntArray
 from flockd.flight.geometry.rigid_fit import checked_pairs, fit_rigid
 from flockd.flight.geometry.robust.consensus import FEWEST_PAIRS, find_consensus
+from flockd.flight.geometry.rotations import crossed
 from flockd.flight.geometry.transform import RigidTransform
 
 _RESELECTIONS = 10
 _FLAT_TRIANGLE = 1e-3  # height over longest side under which three points count as collinear
 _CHUNK = 100_000  # residuals held at once while scoring
-_NEXT, _BEFORE = np.array([1, 2, 0]), np.array([2, 0, 1])
-"""Of three."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +96,7 @@ def _hypotheses(
     """
     corners = np.stack([source.T, target.T], axis=1)[:, :, _random_triples(len(source), count, random).T]
     a, b = corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]
-    normal = _cross(a, b)
+    normal = crossed(a, b)
     (a2, b2, c2, doubled_area2) = (np.einsum("ijk,ijk->jk", one, one) for one in (a, b, a - b, normal))
     wide = (np.sqrt(doubled_area2) > _FLAT_TRIANGLE * np.maximum(np.maximum(a2, b2), c2)).all(axis=0)
     if not wide.any():
@@ -105,7 +104,7 @@ def _hypotheses(
     with np.errstate(divide="ignore", invalid="ignore"):  # of those that are collinear
         length, axes = np.sqrt(a2), np.empty((3, *a.shape))
         axes[0], axes[2] = a / length, normal / np.sqrt(doubled_area2)
-        axes[1] = _cross(axes[2], axes[0])
+        axes[1] = crossed(axes[2], axes[0])
         # The corners in the planes' axes, about their middles.
         x, y = np.zeros((2, 3, *length.shape))
         x[1], x[2], y[2] = length, np.einsum("ijk,ijk->jk", b, axes[0]), np.einsum("ijk,ijk->jk", b, axes[1])
@@ -121,13 +120,6 @@ def _hypotheses(
     middle_source, middle_target = (corners[:, :, 0] + (a + b) / 3.0).transpose(1, 2, 0)
     translations = middle_target - np.einsum("bij,bj->bi", rotations, middle_source)
     return rotations[wide], translations[wide]
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(3, ...): `np.cross`, which takes most of its time to arrange its axes."""
-    product: FloatArray = a[_NEXT] * b[_BEFORE]
-    product -= a[_BEFORE] * b[_NEXT]
-    return product
 
 
 def _random_triples(n: int, count: int, random: np.random.Generator) -> IntArray:
