@@ -121,6 +121,18 @@ def test_a_map_of_another_size_is_refused() -> None:
         lift(grid_pixels(SIZE, 8), (flow, before, RangeMap(np.ones((64, 48), dtype=np.float32))))
 
 
+def test_where_depths_around_disagree_that_of_the_nearest_pixel_is_taken() -> None:
+    random = np.random.default_rng(6)
+    width, height = SIZE
+    depth = RangeMap(np.geomspace(1.0, 30.0, width * height).astype(np.float32)[random.permutation(width * height)])
+    depth = RangeMap(depth.reshape(height, width))
+    pixels = random.uniform(0.5, [width - 0.5, height - 0.5], (300, 2))
+    pairs = lift(pixels, (np.zeros((height, width, 2), np.float32), depth, depth))
+    away_m = np.linalg.norm(pairs.previous - CAMERA.T_body_camera.translation, axis=1)
+    column, row = pairs.pixels_previous.astype(int).T
+    assert np.mean(np.isclose(away_m, depth[row, column], rtol=1e-5)) > 0.98  # of few do all four agree
+
+
 def test_the_grid_is_of_pixel_centres_inside_the_image() -> None:
     assert grid_pixels((4, 3), 1)[:5].tolist() == [[0.5, 0.5], [1.5, 0.5], [2.5, 0.5], [3.5, 0.5], [0.5, 1.5]]
     assert grid_pixels((10, 5), 4).tolist() == [[2.5, 2.5], [6.5, 2.5]]

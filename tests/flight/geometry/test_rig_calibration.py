@@ -280,6 +280,21 @@ def test_exact_matches_give_a_cameras_motion_and_how_a_focal_length_spoils_it() 
     assert np.linalg.norm(seemed) > 0.003 * np.linalg.norm(vector_from_rotation(true.rotation))
 
 
+def test_twice_the_matches_tell_twice_as_much_also_where_half_are_left_out() -> None:
+    rig, random = four_camera_rig(), np.random.default_rng(5)
+    poses = STRAIGHT.pose(0.0), STRAIGHT.pose(0.5)
+    pairs, mounted = seen_twice(boxes_around(random), rig, poses, EXACT, random), rig.cameras["right"]
+    true = (poses[0] @ mounted.T_body_camera).inverse() @ (poses[1] @ mounted.T_body_camera)
+    pairs = pairs.select(np.flatnonzero(pairs.camera_names == "right"))
+    assert len(pairs) >= 600
+    told = []
+    for count in (300, 600):
+        found = camera_motion(mounted, pairs.select(np.linspace(0, len(pairs) - 1, count).astype(np.int64)), true, 0.0)
+        assert found is not None
+        told.append(float(np.trace(found.information[:3, :3])))
+    assert told[1] / told[0] == pytest.approx(2.0, rel=0.1)
+
+
 def test_what_says_nothing_changes_nothing() -> None:
     rig, random = four_camera_rig(), np.random.default_rng(3)
     calibration = RigCalibration(rig)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flockd.flight.geometry import RigidTransform, euler_from_rotation, rotation_angle_deg, rotation_from_euler
-from flockd.flight.geometry.rotations import rotation_from_vector
+from flockd.flight.geometry.rotations import rotation_from_vector, vector_from_rotation
 
 
 def test_euler_angles_agree_with_scipy_both_ways() -> None:
@@ -41,6 +41,14 @@ def test_rotation_vectors_agree_with_scipy() -> None:
         assert np.allclose(rotation_from_vector(vector), expected, rtol=0.0, atol=1e-14)
         assert np.allclose(rotation_from_vector(vector[None])[0], expected, rtol=0.0, atol=1e-14)
     assert np.isnan(rotation_from_vector(np.array([0.0, np.inf, 1.0]))).all()
+
+
+def test_vectors_of_single_rotations_agree_with_scipy_up_to_half_a_turn() -> None:
+    random = np.random.default_rng(4)
+    for degrees in (0.0, 1e-9, 0.01, 30.0, 120.0, 170.0, 179.9):
+        for axis in random.normal(size=(20, 3)):
+            rotation = Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis))
+            assert vector_from_rotation(rotation.as_matrix()) == pytest.approx(rotation.as_rotvec(), abs=1e-12)
 
 
 def test_transforms_chain_and_invert_like_4x4_matrices() -> None:

@@ -104,6 +104,10 @@ def test_what_is_no_solution_is_distinguished() -> None:
     undetermined = Decay(np.zeros(40), NOISY)
     found = GaussNewton(max_steps=5, tolerance=1e-3, max_condition=1e12).minimise(undetermined, np.array([2.0, 0.5]))
     assert not found.equations.solvable
+    # With hardly any fall it says next to nothing.
+    for max_condition, solvable in ((1e4, False), (1e12, True)):
+        optimizer = GaussNewton(max_steps=1, tolerance=1e-3, max_condition=max_condition)
+        assert optimizer.minimise(Decay(1e-3 * T, NOISY), np.array([2.0, 0.5])).equations.solvable is solvable
     solution = LevenbergMarquardt().minimise(undetermined, np.array([2.0, 0.5]))
     assert np.isinf(solution.sigma(40, 2)[1])
 
