@@ -23,6 +23,8 @@ FLOCK = 0.15
 """The same, away from where the neighbours fly."""
 RIGHT_RAD = 0.02
 """To the left costs this much more: of two ways alike all drones take the same."""
+LEAST_SHARE = 0.3
+"""Of the wanted speed, however far a way around turns away: it has to lead out of dead ends."""
 SHORTER = (1.0, 0.6, 0.3)
 """Where no direction is free as far as it should be: shares of that way that do too."""
 BESIDE_M = 0.02
@@ -39,7 +41,10 @@ class Steering:
         self._last_rad: float | None = None
 
     def around(self, wanted: FloatArray, ranges: ObstacleRanges, flock: FloatArray) -> tuple[FloatArray, float]:
-        """The velocity (2,) m/s of the same speed in a free direction, and how far that direction is free, metres.
+        """The velocity (2,) m/s in a free direction, and how far that direction is free, metres.
+
+        The more it turns away from the wanted one, the slower: by (1 + cos(turn)) / 2, at least `LEAST_SHARE`.
+        Who has to fly away from the flock for a way around is pulled back the more, and would fly off the faster.
 
         `wanted` (2,) m/s; `flock` (2,) m/s is the neighbours' mean velocity, zero without any.
         """
@@ -72,7 +77,8 @@ class Steering:
 
     def _taken(self, index: int, wanted: FloatArray, free_m: FloatArray) -> tuple[FloatArray, float]:
         turn = float(TURNS[index])
-        velocity: FloatArray = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ wanted
+        turned = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ wanted
+        velocity: FloatArray = max((1.0 + math.cos(turn)) / 2.0, LEAST_SHARE) * turned
         self._last_rad = math.atan2(velocity[1], velocity[0]) if abs(turn) > TURNED_RAD else None
         return velocity, max(float(free_m[index]), 0.0)
 

@@ -72,8 +72,9 @@ def test_a_trunk_is_passed_on_the_nearer_side_and_in_the_middle_on_the_right(eas
     north, aside = steered((1.5, 0.0), around(trunk(4.0, east)))
     assert north > 1.0
     assert math.copysign(1.0, aside) == side
-    assert math.hypot(north, aside) == pytest.approx(1.5)
-    clearance_m = abs(4.0 * aside - east * north) / 1.5 - 0.2  # of the straight way to the trunk
+    speed = math.hypot(north, aside)
+    assert speed == pytest.approx(1.5 * math.cos(math.atan2(aside, north) / 2) ** 2)
+    clearance_m = abs(4.0 * aside - east * north) / speed - 0.2  # of the straight way to the trunk
     assert clearance_m >= PARAMETERS.clearance_m
 
 
@@ -95,6 +96,16 @@ def test_before_a_wall_it_slides_along() -> None:
     north, east = steered((1.5, 0.0), wall)
     assert east > 0.5
     assert abs(north) < 0.3 * east
+
+
+def test_a_way_that_leads_back_is_flown_at_less_than_a_third_of_the_speed_and_more_than_none() -> None:
+    court = around(
+        Box(2.0, 0.0, 0.2, 8.0, 0.0, -0.5, 8.0), Box(0.0, 2.0, 8.0, 0.2, 0.0, -0.5, 8.0),
+        Box(0.0, -2.0, 8.0, 0.2, 0.0, -0.5, 8.0),
+    )  # fmt: skip
+    north, east = steered((2.4, 0.0), court)
+    assert north < 0.0
+    assert 0.25 * 2.4 < math.hypot(north, east) <= 0.3 * 2.4
 
 
 def test_an_obstacle_that_may_be_nearer_is_met_more_slowly() -> None:
