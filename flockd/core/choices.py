@@ -16,7 +16,7 @@ TRUTH_ROLES = tuple(role for role in ROLES if role not in ("detector", "verifica
 there is a drone."""
 
 Provider = Literal["cpu", "cuda", "tensorrt", "openvino"]
-"""What computes the networks: ONNX Runtime's execution providers."""
+"""What computes the networks: execution providers of ONNX Runtime, or OpenVINO."""
 PROVIDERS: tuple[Provider, ...] = get_args(Provider)
 
 FlowRefinement = Literal["lucas_kanade", "dis", "none"]

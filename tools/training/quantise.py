@@ -77,7 +77,7 @@ def quantise(float_manifest: Path, data: Path, out: Path, accuracy: dict[str, st
         "name": name,
         "file": twin.name,
         "description": f"{manifest.description}; in 8-bit numbers",
-        "providers": ["cpu"],
+        "providers": ["cpu", "openvino"],
         "accuracy": accuracy,
         "command": f"{manifest.command}, tools.training.quantise",
     }

@@ -135,7 +135,8 @@ class PerceptionConfig(Section):
     threads: Annotated[int, Field(ge=1, le=64)] = 2
     """Of the networks. A drone's daemon computes as many of its cameras at once, and shares out what is left."""
     provider: Provider = "cpu"
-    """What ONNX Runtime computes with. Another one than this is never used in its place."""
+    """What computes the networks. Another one than this is never used in its place, but `openvino` leaves crops to
+    `cpu`."""
     engines_dir: str | None = None
     """Where `flockd models prepare` keeps what a provider has built; by default `engines` beside the manifests."""
     deadline_s: Annotated[float, Field(gt=0, le=60)] = 1.0

@@ -1,7 +1,9 @@
-"""What computes the networks: ONNX Runtime's execution providers, and the engines they build ahead of flight."""
+"""What computes the networks: ONNX Runtime's execution providers or OpenVINO, and what they build ahead of flight."""
 
 from __future__ import annotations
 
+import importlib.metadata
+import importlib.util
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,15 +14,16 @@ import onnxruntime as ort
 from flockd.core.choices import Provider
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.errors import ModelError, UnavailableError, shortage_of
+from flockd.flight.inference.manifest import Manifest
 from flockd.flight.inference.manifest_file import ManifestFile, models_folder
+from flockd.flight.inference.runtimes import OnnxRuntime, OpenVino, Runtime
 
 EXECUTION_PROVIDERS: dict[Provider, str] = {
     "cpu": "CPUExecutionProvider",
     "cuda": "CUDAExecutionProvider",
     "tensorrt": "TensorrtExecutionProvider",
-    "openvino": "OpenVINOExecutionProvider",
 }
-_PACKAGES = {"cuda": "onnxruntime-gpu", "tensorrt": "onnxruntime-gpu", "openvino": "onnxruntime-openvino"}
+"""OpenVINO computes by itself: ONNX Runtime's provider for it runs only some of the networks."""
 _BUILDS: frozenset[Provider] = frozenset({"tensorrt", "openvino"})
 """These build an engine for a model and can keep it."""
 _SLOW_TO_BUILD: frozenset[Provider] = frozenset({"tensorrt"})
@@ -37,66 +40,85 @@ def engines_folder(config: PerceptionConfig) -> Path:
 
 
 def engine_folder(engines: Path | None, provider: Provider, name: str, sha256: str) -> Path | None:
-    """Where the engines of one model are, for one provider and this ONNX Runtime; None: it keeps none."""
+    """Where the engines of one model are, for one provider and this version of its library; None: it keeps none."""
     if engines is None or provider not in _BUILDS:
         return None
-    return engines / f"{name}-{sha256[:16]}-{provider}-{ort.__version__}"
+    version = importlib.metadata.version("openvino") if provider == "openvino" else ort.__version__
+    return engines / f"{name}-{sha256[:16]}-{provider}-{version}"
 
 
 def available() -> tuple[Provider, ...]:
-    """What the ONNX Runtime that is installed can compute with."""
+    """What the libraries that are installed can compute with."""
     found = ort.get_available_providers()
-    return tuple(provider for provider, name in EXECUTION_PROVIDERS.items() if name in found)
+    of_onnx_runtime = tuple(provider for provider, name in EXECUTION_PROVIDERS.items() if name in found)
+    return (*of_onnx_runtime, "openvino") if importlib.util.find_spec("openvino") else of_onnx_runtime
 
 
-def open_session(file: ManifestFile, *, threads: int, provider: Provider, folder: Path | None) -> ort.InferenceSession:
-    """A session that runs on the provider that was asked for, with its engines in ``folder``.
+def provider_of(manifest: Manifest, wanted: Provider) -> Provider:
+    """What computes a model where ``wanted`` is configured: OpenVINO leaves crops to ONNX Runtime on the processor.
+
+    They come in batches of any size, which ONNX Runtime computes faster.
+    """
+    takes_batches = any(isinstance(spec.shape[0], str) for spec in manifest.inputs.values())
+    return "cpu" if wanted == "openvino" and takes_batches else wanted
+
+
+def open_runtime(file: ManifestFile, *, threads: int, provider: Provider, folder: Path | None) -> Runtime:
+    """The model, opened by the provider that was asked for, with its engines in ``folder``.
 
     Raises ModelError where that cannot be: never another provider in its place.
     """
-    wanted = EXECUTION_PROVIDERS[provider]
     if provider not in available():
-        raise ModelError(
-            f"perception.provider: this ONNX Runtime has no {wanted}; install {_PACKAGES[provider]} in its place, or "
-            f"write {' or '.join(available())}"
+        missing = (
+            "OpenVINO is not installed"
+            if provider == "openvino"
+            else (f"this ONNX Runtime has no {EXECUTION_PROVIDERS[provider]}")
         )
+        instead = "flockd[openvino]" if provider == "openvino" else "onnxruntime-gpu in its place"
+        raise ModelError(f"perception.provider: {missing}; install {instead}, or write {' or '.join(available())}")
+    try:
+        if provider == "openvino":
+            return OpenVino(file.model, threads, folder)
+        runtime = OnnxRuntime(_session(file, threads, provider, folder))
+    except Exception as error:  # noqa: BLE001 - the libraries' own exception types are private
+        if (lacking := shortage_of(error)) is not None:
+            raise UnavailableError(f"{file.model} cannot be loaded: out of {lacking}; raise the limits") from None
+        reason = str(error).splitlines()[0]
+        if provider == "cpu":
+            raise file.error(("file",), f"{file.model} cannot be loaded ({reason}); restore it") from None
+        name = EXECUTION_PROVIDERS.get(provider, OpenVino.provider)
+        raise file.error(
+            ("file",),
+            f"{file.model} cannot be loaded by {name} ({reason}); fix what it says, or write perception.provider: cpu",
+        ) from None
+    # Where a provider's libraries do not load, ONNX Runtime only warns and takes the CPU.
+    wanted = EXECUTION_PROVIDERS[provider]
+    if runtime.provider != wanted:
+        raise ModelError(
+            f"perception.provider: {wanted} does not start here, and ONNX Runtime took {runtime.provider} in its "
+            f"place; install the libraries that {provider} needs, or write cpu"
+        )
+    return runtime
+
+
+def _session(file: ManifestFile, threads: int, provider: Provider, folder: Path | None) -> ort.InferenceSession:
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
     options.enable_mem_pattern = False  # one block for all tensors of a run holds 30 MB more and is no faster
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    in_8_bits = file.manifest.providers == ("cpu",)  # the few layers in float gain nothing from a layout of their own
-    try:
-        session = ort.InferenceSession(
-            str(file.model),
-            options,
-            providers=_providers(provider, threads, folder),
-            enable_fallback=0,
-            disabled_optimizers=["NchwcTransformer"] if in_8_bits else None,
-        )
-    except Exception as error:  # noqa: BLE001 - ONNX Runtime's own exception types are private
-        if (lacking := shortage_of(error)) is not None:
-            raise UnavailableError(f"{file.model} cannot be loaded: out of {lacking}; raise the limits") from None
-        reason = str(error).splitlines()[0]
-        if provider == "cpu":
-            raise file.error(("file",), f"{file.model} cannot be loaded ({reason}); restore it") from None
-        raise file.error(
-            ("file",),
-            f"{file.model} cannot be loaded by {wanted} ({reason}); fix what it says, or write "
-            "perception.provider: cpu",
-        ) from None
-    # Where a provider's libraries do not load, ONNX Runtime only warns and takes the CPU.
-    found = session.get_providers()
-    if found[0] != wanted:
-        raise ModelError(
-            f"perception.provider: {wanted} does not start here, and ONNX Runtime took {found[0]} in its place; "
-            f"install the libraries that {provider} needs, or write cpu"
-        )
-    return session
+    in_8_bits = bool(file.manifest.providers)  # the few layers in float gain nothing from a layout of their own
+    return ort.InferenceSession(
+        str(file.model),
+        options,
+        providers=_providers(provider, folder),
+        enable_fallback=0,
+        disabled_optimizers=["NchwcTransformer"] if in_8_bits else None,
+    )
 
 
-def _providers(provider: Provider, threads: int, folder: Path | None) -> list[tuple[str, dict[str, str]]]:
+def _providers(provider: Provider, folder: Path | None) -> list[tuple[str, dict[str, str]]]:
     """Providers with their options, the first one first."""
     # By default, CUDA tries all algorithms at each new shape.
     cuda = (EXECUTION_PROVIDERS["cuda"], {"cudnn_conv_algo_search": "HEURISTIC"})
@@ -111,13 +133,7 @@ def _providers(provider: Provider, threads: int, folder: Path | None) -> list[tu
             }
         # What TensorRT has no layer for runs beside it on the GPU.
         return [(EXECUTION_PROVIDERS["tensorrt"], options), cuda]
-    if provider == "cuda":
-        return [cuda]
-    if provider == "openvino":
-        options = {"device_type": "CPU", "num_of_threads": str(threads)}
-        if folder is not None:
-            options["cache_dir"] = str(folder)
-    return [(EXECUTION_PROVIDERS[provider], options)]
+    return [cuda] if provider == "cuda" else [(EXECUTION_PROVIDERS[provider], options)]
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import NDArray
 
 from flockd.core.choices import Provider
@@ -23,7 +22,14 @@ from flockd.flight.inference.checks import (
 from flockd.flight.inference.feeds import golden_feeds, shapes_of
 from flockd.flight.inference.fitting import entering, leaving
 from flockd.flight.inference.manifest_file import Check, ManifestFile, nothing_more, read_manifest
-from flockd.flight.inference.providers import Prepared, Shapes, engine_folder, is_slow_to_build, open_session
+from flockd.flight.inference.providers import (
+    Prepared,
+    Shapes,
+    engine_folder,
+    is_slow_to_build,
+    open_runtime,
+    provider_of,
+)
 
 
 class OnnxModel:
@@ -45,7 +51,7 @@ class OnnxModel:
         Args:
             path: the manifest.
             threads: on the CPU.
-            provider: what computes it; never another in its place.
+            provider: what computes it; never another in its place, but for crops (`provider_of`).
             engines: where providers keep what they build.
             preparing: whether a provider that is slow to build may do so now.
             check: what else has to be true of the manifest.
@@ -55,6 +61,7 @@ class OnnxModel:
         content = file.read_model()
         self.manifest = file.manifest
         self._refuse_provider(file, provider)
+        provider = provider_of(self.manifest, provider)
         check_weights(file, content)
         del content
         self._engines = engine_folder(engines, provider, self.manifest.name, self.manifest.sha256)
@@ -65,15 +72,14 @@ class OnnxModel:
             raise file.error(("file",), f"{self.manifest.file} {message}; run `flockd models prepare` first")
         if self._engines is not None:
             self._engines.mkdir(parents=True, exist_ok=True)
-        self._session = open_session(file, threads=threads, provider=provider, folder=self._engines)
-        self._running: set[ort.RunOptions] = set()
-        check_tensors(file, self._session.get_inputs(), self._session.get_outputs())
-        self._check_golden(file, deadline)
+        self._runtime = open_runtime(file, threads=threads, provider=provider, folder=self._engines)
+        check_tensors(file, self._runtime.inputs, self._runtime.outputs)
+        self._check_golden(file, provider, deadline)
 
     @property
     def provider(self) -> str:
-        """What really runs it, by ONNX Runtime's own account, which may not be what was asked for."""
-        return str(self._session.get_providers()[0])
+        """What really runs it, by the library's own account, which may not be what was asked for."""
+        return self._runtime.provider
 
     @property
     def engines(self) -> Path | None:
@@ -88,7 +94,7 @@ class OnnxModel:
         if not self._may_build and not (self._prepared and self._prepared.covers(shapes_of(feeds))):
             raise ValueError(f"model {self.manifest.name} is not prepared for inputs of {shapes_of(feeds)}")
         names = list(self.manifest.outputs)
-        outputs = dict(zip(names, self._run(names, feeds), strict=True))
+        outputs = dict(zip(names, self._runtime.run(names, feeds), strict=True))
         for name, value in outputs.items():
             if not np.isfinite(value).all():
                 raise FloatingPointError(f"model {self.manifest.name}: output {name} is not finite")
@@ -112,18 +118,8 @@ class OnnxModel:
             Prepared.over(shapes).save(self._engines)
 
     def terminate(self) -> None:
-        """Ends the runs that are under way, from any thread; ONNX Runtime then raises an error of its own in them."""
-        for options in tuple(self._running):
-            options.terminate = True
-
-    def _run(self, names: list[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
-        options = ort.RunOptions()
-        self._running.add(options)
-        try:
-            outputs: list[NDArray[Any]] = self._session.run(names, dict(feeds), options)
-        finally:
-            self._running.discard(options)
-        return outputs
+        """Ends the runs that are under way, from any thread; they then raise an error of the library's own."""
+        self._runtime.terminate()
 
     def _refuse_provider(self, file: ManifestFile, provider: Provider) -> None:
         made_for = self.manifest.providers
@@ -134,10 +130,10 @@ class OnnxModel:
                 "(flockd's own without _int8 are made for any), or another perception.provider",
             )
 
-    def _check_golden(self, file: ManifestFile, deadline: Deadline) -> None:
+    def _check_golden(self, file: ManifestFile, provider: Provider, deadline: Deadline) -> None:
         outputs: dict[str, NDArray[Any]] = {}
         try:
             deadline(lambda: outputs.update(self.run(golden_feeds(self.manifest))), self.terminate)
-        except Exception as error:  # noqa: BLE001 - ONNX Runtime's own exception types are private
+        except Exception as error:  # noqa: BLE001 - the libraries' own exception types are private
             raise cannot_run(file, self.provider, error) from None
-        check_golden(file, outputs)
+        check_golden(file, provider, outputs)

@@ -37,8 +37,6 @@ class SceneMaps:
     """(h, w) pixels of the drones that may just as well be background; None: no such."""
     logit: Float32Array | None = None
     """(h, w) / `Networks.map_stride`, of each pixel being any drone's; None: the labels are all that is known."""
-    min_score: float = 0.0
-    """Instances of a lower score are not proposed."""
 
     @cached_property
     def labelled(self) -> tuple[slice, slice]:

@@ -113,10 +113,7 @@ class OnnxNetworks(OneByOne):
             boxes, odds = self._boxes(self._detector, self._box_rules, frame.image, camera)
             labels, instances = with_boxes(labels, instances, boxes, odds, self._box_rules)
         low = cv2.resize((logit < certain).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
-        peak = self._segmentation.manifest.thresholds.get("proposal_peak_logit", proposal) - proposal
-        return SceneMaps(
-            self._depth_of(depth, camera), labels, instances, uncertain=low & (labels > 0), logit=logit, min_score=peak
-        )
+        return SceneMaps(self._depth_of(depth, camera), labels, instances, uncertain=low & (labels > 0), logit=logit)
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         """See `Networks`."""

@@ -17,8 +17,6 @@ class Threshold:
     low: float
     high: float
     """It lies between these, both included."""
-    optional: bool = False
-    """Whether a manifest may leave it out."""
 
 
 @dataclass(frozen=True)
@@ -65,11 +63,6 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
                 "Logit from which pixels of a proposal count as the drone's; above the proposals', whose masks are a "
                 "little too wide.",
                 *_LOGIT,
-            ),
-            "proposal_peak_logit": Threshold(
-                "Highest logit of its pixels from which a proposal goes to the second stage; by default any does.",
-                *_LOGIT,
-                optional=True,
             ),
             "proposal_logit_alone": Threshold(
                 "Logit from which pixels are a drone's where there is no second stage.", *_LOGIT
@@ -186,8 +179,7 @@ def _faults_of_numbers(manifest: Manifest, role: Role, needed: Requirements) -> 
         value = manifest.thresholds.get(name)
         limits = f"a number from {threshold.low:g} to {threshold.high:g}"
         if value is None:
-            if not threshold.optional:
-                yield Fault(("thresholds", name), f"is missing for the role {role}; add it with {limits}")
+            yield Fault(("thresholds", name), f"is missing for the role {role}; add it with {limits}")
         elif not threshold.low <= value <= threshold.high:
             yield Fault(("thresholds", name), f"{value:g} is out of range; write {limits}")
     if needed.crop and manifest.crop is None:

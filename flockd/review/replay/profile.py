@@ -22,7 +22,7 @@ from flockd.review.replay.recorded_flight import Replay
 LEAST_STEPS = 5
 """Of fewer the slowest twentieth is a single one, and the first does not count."""
 _ROUND_TO_S = 0.05
-_LIBRARIES = ("onnxruntime", "onnxruntime-gpu", "onnxruntime-openvino", "opencv-python-headless", "numpy")
+_LIBRARIES = ("onnxruntime", "onnxruntime-gpu", "openvino", "opencv-python-headless", "numpy")
 """Packages that decide how fast it is; one of the runtimes is installed."""
 STEP = "step"
 """The row of all stages together, and what is between them."""

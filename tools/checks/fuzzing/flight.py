@@ -46,7 +46,7 @@ def _networks(folder: Path) -> Check:
     source = Random(0)
     for model in networks._models._opened.values():
         outputs = {name: spec.shape for name, spec in model.manifest.outputs.items()}
-        model._run = _invented(outputs, lambda: source)  # type: ignore[method-assign]
+        model._runtime.run = _invented(outputs, lambda: source)  # type: ignore[method-assign]
     size = config.rig.cameras[0].size_px
 
     def check(random: Random) -> None:

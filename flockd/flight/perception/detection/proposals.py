@@ -70,10 +70,9 @@ def propose_instances(
 
 
 def best_instances(scene: SceneMaps, most: int) -> list[Instance]:
-    """At most so many, and none below the score that the first stage asks for; of equal scores the larger."""
-    good = [one for one in scene.instances if one.score >= scene.min_score]
-    kept = {one.label for one in sorted(good, key=lambda one: (-one.score, -one.area_px))[:most]}
-    return [one for one in good if one.label in kept]
+    """At most so many, of the highest score; of equal scores the larger."""
+    kept = {one.label for one in sorted(scene.instances, key=lambda one: (-one.score, -one.area_px))[:most]}
+    return [one for one in scene.instances if one.label in kept]
 
 
 def propose_predictions(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from flockd.core.config.perception import DetectionParameters
@@ -53,10 +51,6 @@ def test_of_too_many_the_best_are_proposed_in_their_order() -> None:
     assert proposed(scene, DetectionParameters(max_proposals=1)) == [4]
 
 
-def test_none_below_the_models_own_threshold_is_proposed() -> None:
-    assert proposed(replace(scene_of(3.0, 0.5, 2.0), min_score=1.0), DetectionParameters()) == [1, 3]
-
-
 def test_residuals_count_among_the_proposals_and_bring_nothing_back() -> None:
     """No mask explains any of eight certain instances, as where the second stage had no mask for them."""
     scene = scene_of(*range(8, 0, -1))
@@ -70,6 +64,3 @@ def test_residuals_count_among_the_proposals_and_bring_nothing_back() -> None:
     assert len(residuals(12)) == 4
     assert len(residuals(30)) == 6
     assert residuals(8) == []
-    few = replace(scene, min_score=6.0)  # the three best alone
-    found = propose_residuals(RIG, {"front": few}, masks, RULES, DetectionParameters())
-    assert sorted(one.instance.box[0] for one in found if one.instance) == [4.0, 18.0, 32.0]

@@ -1,0 +1,139 @@
+"""The libraries that compute networks, behind one interface: ONNX Runtime, and OpenVINO for Intel's processors."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import onnxruntime as ort
+from numpy.typing import NDArray
+
+from flockd.flight.inference.checks import Tensor
+
+if TYPE_CHECKING:
+    import openvino
+
+Arrays = Mapping[str, NDArray[Any]]
+_Shapes = tuple[tuple[int, ...], ...]
+"""Of all inputs, in the model's order."""
+
+
+class Runtime(Protocol):
+    """A model that a library has opened. ``run`` may be called from any thread."""
+
+    provider: str
+    """What really computes it, by the library's own account."""
+    inputs: Sequence[Tensor]
+    outputs: Sequence[Tensor]
+
+    def run(self, names: Sequence[str], feeds: Arrays) -> list[NDArray[Any]]:
+        """The outputs of these names. Raises the library's own errors."""
+        ...
+
+    def terminate(self) -> None:
+        """Ends the runs that are under way, from any thread: they raise."""
+        ...
+
+
+class OnnxRuntime:
+    """A session of ONNX Runtime."""
+
+    def __init__(self, session: ort.InferenceSession) -> None:
+        self._session = session
+        self._running: set[ort.RunOptions] = set()
+        self.provider = str(session.get_providers()[0])
+        self.inputs: Sequence[Tensor] = session.get_inputs()
+        self.outputs: Sequence[Tensor] = session.get_outputs()
+
+    def run(self, names: Sequence[str], feeds: Arrays) -> list[NDArray[Any]]:
+        """See `Runtime`."""
+        options = ort.RunOptions()
+        self._running.add(options)
+        try:
+            outputs: list[NDArray[Any]] = self._session.run(list(names), dict(feeds), options)
+        finally:
+            self._running.discard(options)
+        return outputs
+
+    def terminate(self) -> None:
+        """See `Runtime`."""
+        for options in tuple(self._running):
+            options.terminate = True
+
+
+@dataclass
+class _Tensor:
+    name: str
+    type: str
+    shape: Sequence[int | str | None]
+
+
+class OpenVino:
+    """A model that OpenVINO compiles for each shape of input: that computes in two thirds of the time of any shape."""
+
+    provider = "OpenVINO"
+
+    def __init__(self, path: Path, threads: int, folder: Path | None) -> None:
+        """``threads``: of one run; ``folder``: where what was compiled is kept. Raises OpenVINO's own errors."""
+        import openvino  # noqa: PLC0415 - an extra
+
+        self._core = openvino.Core()
+        self._model = self._core.read_model(path)
+        self._options: dict[str, Any] = {
+            "INFERENCE_NUM_THREADS": threads,
+            "NUM_STREAMS": 1,
+            "ENABLE_CPU_PINNING": False,  # or all runs at once would share the first core
+            "INFERENCE_PRECISION_HINT": "f32",  # or some processors would round floats to 16 bits, and others not
+        }
+        if folder is not None:
+            self._options["CACHE_DIR"] = str(folder)
+        self.inputs: Sequence[Tensor] = _tensors(self._model.inputs)
+        self.outputs: Sequence[Tensor] = _tensors(self._model.outputs)
+        self._lock = threading.Lock()
+        self._idle: dict[_Shapes, list[openvino.InferRequest]] = {}
+        self._running: set[openvino.InferRequest] = set()
+
+    def run(self, names: Sequence[str], feeds: Arrays) -> list[NDArray[Any]]:
+        """See `Runtime`."""
+        with self._request(tuple(feeds[tensor.name].shape for tensor in self.inputs)) as request:
+            request.start_async(dict(feeds), share_inputs=True)  # `infer` cannot be cancelled
+            request.wait()
+            return [request.get_tensor(name).data.copy() for name in names]
+
+    def terminate(self) -> None:
+        """See `Runtime`."""
+        for request in tuple(self._running):
+            request.cancel()
+
+    @contextmanager
+    def _request(self, shapes: _Shapes) -> Iterator[openvino.InferRequest]:
+        """One that no other thread has: what was compiled once computes one run at a time."""
+        with self._lock:
+            idle = self._idle.setdefault(shapes, [])
+            request = idle.pop() if idle else self._compiled(shapes)
+        self._running.add(request)
+        try:
+            yield request
+        finally:
+            self._running.discard(request)
+            idle.append(request)
+
+    def _compiled(self, shapes: _Shapes) -> openvino.InferRequest:
+        model = self._model.clone()
+        model.reshape({tensor.name: list(shape) for tensor, shape in zip(self.inputs, shapes, strict=True)})
+        return self._core.compile_model(model, "CPU", self._options).create_infer_request()
+
+
+def _tensors(ports: Sequence[Any]) -> tuple[_Tensor, ...]:
+    return tuple(
+        _Tensor(
+            port.any_name,
+            str(port.element_type.to_dtype()),
+            tuple(size.get_length() if size.is_static else None for size in port.partial_shape),
+        )
+        for port in ports
+    )
