@@ -92,9 +92,10 @@ def find_consensus(
     """
     random = np.random.default_rng(seed)
     scored = np.arange(len(source)) if len(source) <= _SCORED_PAIRS else random.integers(0, len(source), _SCORED_PAIRS)
-    apart = target - target.mean(axis=0)
+    rows = np.ascontiguousarray(source.T), np.ascontiguousarray(target.T)  # numpy is fastest along long rows
+    apart = rows[1] - rows[1].mean(axis=1)[:, None]
     reach_m = math.sqrt(3.0 * float(np.vdot(apart, apart)) / len(target))
-    motion = _found(source, target, scored, reach_m, min_inlier_ratio, random)
+    motion = _found(rows, scored, reach_m, min_inlier_ratio, random)
     if motion is None:
         require_spread("source", source)
         require_spread("target", target)
@@ -102,15 +103,15 @@ def find_consensus(
     rotation, translation, agreement = motion
     sigma_m, growth = agreement.sigma_m, np.ones(len(source))
     for polish in range(_POLISHES):
-        squared = _squared(source, target, rotation, translation)
+        squared = _squared(rows, rotation, translation)
         if polish == _POLISHES - 1:
-            growth = _growth(source, squared, squared < (_CUT_SIGMAS * sigma_m) ** 2)
+            growth = _growth(rows[0], squared, squared < (_CUT_SIGMAS * sigma_m) ** 2)
             squared = squared / growth
         if polish > 0:
             sigma_m = _sigma_m(squared, sigma_m)
         weights = Tukey(_CUT_SIGMAS * sigma_m).weight(squared) / growth
-        rotation, translation, spread = _fitted(source, target, weights)
-    squared = _squared(source, target, rotation, translation) / growth
+        rotation, translation, spread = _fitted(rows, weights)
+    squared = _squared(rows, rotation, translation) / growth
     sigma_m = _sigma_m(squared, sigma_m)
     inliers = squared < (_CUT_SIGMAS * sigma_m) ** 2
     if agreement.log_chance >= 0.0 or sigma_m > max_threshold:
@@ -146,18 +147,20 @@ class _Agreement:
     """They agree closely, for the size of the cloud of points: it is no rough motion that brings them near."""
 
 
+_Rows = tuple[FloatArray, FloatArray]
+"""Points before and after, (3, n) both."""
+
+
 def _found(
-    source: FloatArray, target: FloatArray, scored: IntArray, reach_m: float, least: float, random: np.random.Generator
+    rows: _Rows, scored: IntArray, reach_m: float, least: float, random: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, _Agreement] | None:
     """Rotation and translation of the best hypothesis, and its agreement; None: all points are on a line."""
-    n = len(source)
-    source_rows = source[scored].T.astype(np.float32)
-    target_rows = target[scored].T.astype(np.float32)
+    n = rows[0].shape[1]
+    source_rows, target_rows = (points.take(scored, axis=1).astype(np.float32) for points in rows)
     best_score, best = math.inf, None
-    both = np.hstack([source, target])
     drawn, count = 0, _FIRST_TRIPLES
     while True:
-        triangles = _alike(both[_random_triples(n, count, random)].reshape(3, -1, 2, 3))
+        triangles = _alike(rows, _random_triples(n, count, random))
         axes = _frames(triangles)
         rotations = axes[:, 1] @ axes[:, 0].transpose(0, 2, 1)
         middles = triangles.sum(axis=0) / 3.0
@@ -197,17 +200,23 @@ def _random_triples(n: int, count: int, random: np.random.Generator) -> IntArray
     return triples
 
 
-def _alike(triangles: FloatArray) -> FloatArray:
-    """Of triangles (3, b, 2, 3), before and after, those whose sides agree best, for their size."""
-    if triangles.shape[1] <= _KEPT_TRIPLES:
-        return triangles
-    along = triangles[_NEXT] - triangles
-    sides = np.sqrt(np.einsum("ijkl,ijkl->ijk", along, along))
-    before, after = sides[..., 0], sides[..., 1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        unlike = np.abs(before - after).max(axis=0) / np.minimum(before, after).min(axis=0)
-    kept = np.argpartition(unlike, _KEPT_TRIPLES)[:_KEPT_TRIPLES]  # NaN is last
-    return triangles[:, kept]
+def _alike(rows: _Rows, triples: IntArray) -> FloatArray:
+    """(3, b, 2, 3): of the triangles of (3, count) points, before and after, those whose sides agree best, for their
+    size."""
+    if triples.shape[1] > _KEPT_TRIPLES:
+        before, after = (_sides(points, triples) for points in rows)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            unlike = np.abs(before - after).max(axis=0) / np.minimum(before, after).min(axis=0)
+        triples = triples[:, np.argpartition(unlike, _KEPT_TRIPLES)[:_KEPT_TRIPLES]]  # NaN is last
+    return np.stack([points.T[triples] for points in rows], axis=2)
+
+
+def _sides(points: FloatArray, triples: IntArray) -> FloatArray:
+    """(3, count) lengths of the sides of triangles of points (3, n)."""
+    corners = points.take(triples, axis=1)
+    along = corners.take(_NEXT, axis=1)
+    along -= corners
+    return np.sqrt(_squared_lengths(along))
 
 
 def _frames(triangles: FloatArray) -> FloatArray:
@@ -243,11 +252,19 @@ def _squared_of_all(
     return squared
 
 
-def _squared(source: FloatArray, target: FloatArray, rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    off = source @ rotation.T
-    off += translation
-    off -= target
-    squared: FloatArray = np.einsum("ij,ij->i", off, off)
+def _squared(rows: _Rows, rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    off = rotation @ rows[0]
+    off += translation[:, None]
+    off -= rows[1]
+    return _squared_lengths(off)
+
+
+def _squared_lengths(vectors: FloatArray) -> FloatArray:
+    """(n,) of vectors (3, n), which are changed."""
+    vectors *= vectors
+    squared: FloatArray = vectors[0]
+    squared += vectors[1]
+    squared += vectors[2]
     return squared
 
 
@@ -283,14 +300,14 @@ def _counts(n: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _growth(source: FloatArray, squared: FloatArray, inliers: BoolArray) -> FloatArray:
-    """(n,) how much larger than at the middle range the squared errors are: a power of the range, or one.
+    """(n,) how much larger than at the middle range of points (3, n) the squared errors are: a power of it, or one.
 
     The range's errors of stereo and of learned depth grow with it. The power is a regression of the logarithms.
     """
-    flat = np.ones(len(source))
+    flat = np.ones(len(squared))
     if np.count_nonzero(inliers) < _FEWEST_FOR_GROWTH:
         return flat
-    x = np.log(np.maximum(np.einsum("ij,ij->i", source, source), 1e-6))
+    x = np.log(np.maximum(_squared_lengths(source.copy()), 1e-6))
     x -= float(x[inliers].mean())
     within = x[inliers]
     spread = float(within @ within)
@@ -306,12 +323,15 @@ def _growth(source: FloatArray, squared: FloatArray, inliers: BoolArray) -> Floa
     return grown
 
 
-def _fitted(source: FloatArray, target: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _fitted(rows: _Rows, weights: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Rotation and translation of the weighted least squares (Eq. 18-20), and the points' spread (3,), m^2."""
     weights = weights / weights.sum()
-    source_mean, target_mean = weights @ source, weights @ target
-    u, spread, vt = np.linalg.svd(((target - target_mean) * weights[:, None]).T @ (source - source_mean))
-    if np.linalg.det(u) * np.linalg.det(vt) < 0.0:
-        u[:, 2] = -u[:, 2]
+    source, target = rows
+    source_mean, target_mean = source @ weights, target @ weights
+    moments = ((target - target_mean[:, None]) * weights) @ (source - source_mean[:, None]).T
+    u, spread, vt = np.linalg.svd(moments)
     rotation = u @ vt
+    if np.linalg.det(rotation) < 0.0:
+        u[:, 2] = -u[:, 2]
+        rotation = u @ vt
     return rotation, target_mean - rotation @ source_mean, spread
