@@ -128,3 +128,20 @@ def test_the_papers_flight_from_pixels(seed: int) -> None:
     assert summary["flock"]["union_tail"] == 1.0
     assert summary["neighbours"]["recall_within_10m"] >= 0.97
     assert summary["neighbours"]["false_per_drone_minute"] < 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_forest_from_pixels(seed: int) -> None:
+    """Nobody touches a tree or comes within 1 m of another, nobody is lost, recall 0.9; in the second one a drone once
+    ran away around trees faster and faster."""
+    from flockd.review.report.summary import summarise
+
+    log = fly(load_scenario(data_path("config") / "forest.yaml", {"seed": seed})).log
+    summary = summarise(log)
+    assert summary["obstacles"]["collisions"] == 0
+    assert summary["flock"]["min_distance_m"] >= 1.0
+    assert summary["flock"]["union_tail"] == 1.0
+    assert summary["neighbours"]["recall_within_10m"] >= 0.9
+    from_the_middle = np.linalg.norm(log.position - np.median(log.position, axis=1, keepdims=True), axis=2)
+    assert from_the_middle.max() < 10.0

@@ -34,6 +34,7 @@ class ObstacleParameters(Section):
     margin_m: Annotated[float, Field(ge=0, le=20)] = 0.5
     """Added to the clearance where there is room."""
     horizon_s: _Seconds = 3.0
-    """A direction is free where nothing is met within this time."""
+    """A direction is free where nothing is met within this time, at the wanted speed; among neighbours at no more than
+    theirs or 1.5 m/s."""
     sigmas: Annotated[float, Field(ge=0, le=10)] = 2.0
     """An obstacle counts as nearer than measured by so many standard deviations."""

@@ -25,6 +25,8 @@ RIGHT_RAD = 0.02
 """To the left costs this much more: of two ways alike all drones take the same."""
 LEAST_SHARE = 0.3
 """Of the wanted speed, however far a way around turns away: it has to lead out of dead ends."""
+PACE_M_S = 1.5
+"""Among neighbours a direction has to be free for the wanted speed up to this one, or up to theirs."""
 SHORTER = (1.0, 0.6, 0.3)
 """Where no direction is free as far as it should be: shares of that way that do too."""
 BESIDE_M = 0.02
@@ -45,6 +47,7 @@ class Steering:
 
         The more it turns away from the wanted one, the slower: by (1 + cos(turn)) / 2, at least `LEAST_SHARE`.
         Who has to fly away from the flock for a way around is pulled back the more, and would fly off the faster.
+        Nor does that pull ask for a longer free way: among trees none but that back would be long enough.
 
         `wanted` (2,) m/s; `flock` (2,) m/s is the neighbours' mean velocity, zero without any.
         """
@@ -54,6 +57,7 @@ class Steering:
             return wanted, 0.0
         wanted_rad = math.atan2(wanted[1], wanted[0])
         points = nearest_points(ranges, p.sigmas)
+        pace = min(speed, max(math.hypot(*flock), PACE_M_S)) if flock.any() else speed
         azimuths = wanted_rad + TURNS
         cost = self._cost(azimuths, flock)
         nearest_m = float(np.hypot(*points.T).min(initial=np.inf))
@@ -62,7 +66,7 @@ class Steering:
             free_m = free_way(points, radius_m, azimuths)
             free_m = np.minimum(free_m, seen_way(ranges, azimuths) - radius_m)
             for share in SHORTER:
-                is_free = free_m >= min(share * speed * p.horizon_s, p.range_m - radius_m)
+                is_free = free_m >= min(share * pace * p.horizon_s, p.range_m - radius_m)
                 if is_free.any():
                     return self._taken(int(np.argmin(np.where(is_free, cost, np.inf))), wanted, free_m)
         return self._taken(int(np.argmax(free_m - cost)), wanted, free_m)

@@ -67,6 +67,17 @@ def test_where_nothing_stands_the_wanted_velocity_is_flown() -> None:
     np.testing.assert_array_equal(steered((0.0, 0.0), around(trunk(3.0, 2.5))), [0.0, 0.0])
 
 
+def test_a_drone_that_its_flock_pulls_takes_the_way_that_is_free_for_the_flocks_speed() -> None:
+    """A wall 6.5 m away: at 3 m/s the way to it is too short, at the flock's 1.2 m/s it is not. Alone it turns off."""
+    wall = around(Box(6.7, 0.0, 0.2, 6.0, 0.0, -0.5, 8.0))
+    north, east = steered((3.0, 0.0), wall, np.array([1.2, 0.0]))
+    assert abs(math.atan2(east, north)) < 0.1
+    north, east = steered((3.0, 0.0), wall)
+    assert abs(math.atan2(east, north)) > 0.7
+    north, east = steered((3.0, 0.0), wall, np.array([2.8, 0.0]))
+    assert abs(math.atan2(east, north)) > 0.7
+
+
 @pytest.mark.parametrize(("east", "side"), [(0.3, -1.0), (-0.3, 1.0), (0.0, 1.0)])
 def test_a_trunk_is_passed_on_the_nearer_side_and_in_the_middle_on_the_right(east: float, side: float) -> None:
     north, aside = steered((1.5, 0.0), around(trunk(4.0, east)))
