@@ -13,6 +13,7 @@ import numpy as np
 
 from flockd.core.config.avoidance import ObstacleParameters
 from flockd.core.messages import FloatArray, ObstacleRanges
+from flockd.flight.geometry.level import limit_norm
 from flockd.flight.obstacles.local_map import AZIMUTHS, nearest_points
 
 TURNS = np.linspace(-math.pi, math.pi, 144, endpoint=False)
@@ -47,7 +48,8 @@ class Steering:
 
         The more it turns away from the wanted one, the slower: by (1 + cos(turn)) / 2, at least `LEAST_SHARE`.
         Who has to fly away from the flock for a way around is pulled back the more, and would fly off the faster.
-        Nor does that pull ask for a longer free way: among trees none but that back would be long enough.
+        Nor does that pull ask for a longer free way: among trees none but that back would be long enough. Faster than
+        for what has to be free, it flies only where nothing is met within `horizon_s` either.
 
         `wanted` (2,) m/s; `flock` (2,) m/s is the neighbours' mean velocity, zero without any.
         """
@@ -68,8 +70,8 @@ class Steering:
             for share in SHORTER:
                 is_free = free_m >= min(share * pace * p.horizon_s, p.range_m - radius_m)
                 if is_free.any():
-                    return self._taken(int(np.argmin(np.where(is_free, cost, np.inf))), wanted, free_m)
-        return self._taken(int(np.argmax(free_m - cost)), wanted, free_m)
+                    return self._taken(int(np.argmin(np.where(is_free, cost, np.inf))), wanted, pace, free_m)
+        return self._taken(int(np.argmax(free_m - cost)), wanted, pace, free_m)
 
     def _cost(self, azimuths: FloatArray, flock: FloatArray) -> FloatArray:
         cost = np.abs(TURNS) + np.where(TURNS < 0, RIGHT_RAD, 0.0)
@@ -79,12 +81,13 @@ class Steering:
             cost = cost + FLOCK * np.abs(_wrapped(azimuths - math.atan2(flock[1], flock[0])))
         return cost
 
-    def _taken(self, index: int, wanted: FloatArray, free_m: FloatArray) -> tuple[FloatArray, float]:
-        turn = float(TURNS[index])
+    def _taken(self, index: int, wanted: FloatArray, pace: float, free_m: FloatArray) -> tuple[FloatArray, float]:
+        turn, free = float(TURNS[index]), max(float(free_m[index]), 0.0)
+        wanted = limit_norm(wanted, max(pace, free / self._parameters.horizon_s))
         turned = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ wanted
         velocity: FloatArray = max((1.0 + math.cos(turn)) / 2.0, LEAST_SHARE) * turned
         self._last_rad = math.atan2(velocity[1], velocity[0]) if abs(turn) > TURNED_RAD else None
-        return velocity, max(float(free_m[index]), 0.0)
+        return velocity, free
 
 
 def free_way(points: FloatArray, radius_m: float, azimuths: FloatArray) -> FloatArray:
