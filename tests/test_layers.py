@@ -33,7 +33,7 @@ IMPURE_MODULES = {
     "random",
 }
 
-NETWORK_LIBRARIES = {"onnxruntime"}
+NETWORK_LIBRARIES = {"onnxruntime", "openvino"}
 """Only inference runs networks."""
 SIMULATOR_LIBRARIES = {"numba", "matplotlib", "jinja2", "markupsafe"}
 """Libraries of the extra `sim`: only the simulator, campaigns and reports may need them."""

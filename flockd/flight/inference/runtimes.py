@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -93,7 +92,6 @@ class OpenVino:
             self._options["CACHE_DIR"] = str(folder)
         self.inputs: Sequence[Tensor] = _tensors(self._model.inputs)
         self.outputs: Sequence[Tensor] = _tensors(self._model.outputs)
-        self._lock = threading.Lock()
         self._idle: dict[_Shapes, list[openvino.InferRequest]] = {}
         self._running: set[openvino.InferRequest] = set()
 
@@ -112,9 +110,11 @@ class OpenVino:
     @contextmanager
     def _request(self, shapes: _Shapes) -> Iterator[openvino.InferRequest]:
         """One that no other thread has: what was compiled once computes one run at a time."""
-        with self._lock:
-            idle = self._idle.setdefault(shapes, [])
-            request = idle.pop() if idle else self._compiled(shapes)
+        idle = self._idle.setdefault(shapes, [])
+        try:
+            request = idle.pop()
+        except IndexError:  # or another thread was faster
+            request = self._compiled(shapes)
         self._running.add(request)
         try:
             yield request
