@@ -69,12 +69,10 @@ def open_runtime(file: ManifestFile, *, threads: int, provider: Provider, folder
     Raises ModelError where that cannot be: never another provider in its place.
     """
     if provider not in available():
-        missing = (
-            "OpenVINO is not installed"
-            if provider == "openvino"
-            else (f"this ONNX Runtime has no {EXECUTION_PROVIDERS[provider]}")
-        )
-        instead = "flockd[openvino]" if provider == "openvino" else "onnxruntime-gpu in its place"
+        missing, instead = "OpenVINO is not installed", "flockd[openvino]"
+        if provider != "openvino":
+            missing = f"this ONNX Runtime has no {EXECUTION_PROVIDERS[provider]}"
+            instead = "onnxruntime-gpu in its place"
         raise ModelError(f"perception.provider: {missing}; install {instead}, or write {' or '.join(available())}")
     try:
         if provider == "openvino":

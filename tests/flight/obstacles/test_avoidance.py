@@ -72,6 +72,7 @@ def test_a_drone_that_its_flock_pulls_takes_the_way_that_is_free_for_the_flocks_
     wall = around(Box(6.7, 0.0, 0.2, 6.0, 0.0, -0.5, 8.0))
     north, east = steered((3.0, 0.0), wall, np.array([1.2, 0.0]))
     assert abs(math.atan2(east, north)) < 0.1
+    assert 1.5 < math.hypot(north, east) < (6.5 - PARAMETERS.clearance_m) / PARAMETERS.horizon_s
     north, east = steered((3.0, 0.0), wall)
     assert abs(math.atan2(east, north)) > 0.7
     north, east = steered((3.0, 0.0), wall, np.array([2.8, 0.0]))

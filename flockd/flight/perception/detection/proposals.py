@@ -122,9 +122,9 @@ def propose_residuals(
 ) -> list[Proposal]:
     """Where the first stage is certain of a drone and no mask of the second explains it.
 
-    A drone that another hides in part, or passes close by, is often segmented as a part of it. Instances of too low a
-    score to be proposed are no residuals. ``masks`` are the networks' alone: by colours, one drone's would take more of
-    another that is painted alike.
+    A drone that another hides in part, or passes close by, is often segmented as a part of it. Where the
+    instances are as many as may be proposed, there are none. ``masks`` are the networks' alone: by colours, one drone's
+    would take more of another that is painted alike.
     """
     proposals = []
     for name, scene in scenes.items():
@@ -133,15 +133,12 @@ def propose_residuals(
         mask, part = masks[name], scene.labelled
         residual = np.zeros(mask.shape, np.bool_)
         residual[part] = (mask[part] == UNCLASSED) & (scene.labels[part] > 0) & ~scene.uncertain[part]
-        proposed = best_instances(scene, parameters.max_proposals)
-        if len(proposed) < len(scene.instances):
-            residual &= np.isin(scene.labels, [one.label for one in proposed])
         if residual.any():
             masked = ((mask > 0) & (mask != UNCLASSED)).astype(np.uint8)
             width = 2 * parameters.residual_distance_px + 1
             residual &= cv2.dilate(masked, np.ones((width, width), np.uint8)) == 0
             camera = rig.cameras[name]
-            most = min(parameters.max_residuals, parameters.max_proposals - len(proposed))
+            most = min(parameters.max_residuals, max(parameters.max_proposals - len(scene.instances), 0))
             blobs = largest_blobs(residual, most, parameters.residual_px)
             proposals += [
                 Proposal((name,), roi, blob)
