@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tools.training import worlds
+from tools.training.airframes import FIRST_REAL
 from tools.training.networks import MAX_FAMILIES
 from tools.training.samples import Sample
 
@@ -53,9 +54,14 @@ class CropFiles:
         names: NDArray[np.int64] = np.unique(family)
         self._of_family = [np.flatnonzero(family == one) for one in names]
         self._aimed_of_family = [np.flatnonzero((family == one) & aimed) for one in names]
-        is_none, is_family, is_shape = names == -1, (names >= 0) & (names < MAX_FAMILIES), names >= MAX_FAMILIES
+        is_none, is_family, is_real = names == -1, (names >= 0) & (names < MAX_FAMILIES), names >= FIRST_REAL
+        real = worlds.REAL_SHARE if is_real.any() else 0.0
         of_drones = np.zeros(len(names))
-        for which, of in ((is_family, 1 - worlds.SHAPES_SHARE), (is_shape, worlds.SHAPES_SHARE)):
+        for which, of in (
+            (is_family, 1 - worlds.SHAPES_SHARE),
+            (is_real, worlds.SHAPES_SHARE * real),
+            (~(is_none | is_family | is_real), worlds.SHAPES_SHARE * (1 - real)),
+        ):
             of_drones[which] = of / max(1, int(np.count_nonzero(which)))
         drones = float(of_drones.sum())
         share = _NONE_SHARE if is_none.any() and drones > 0 else float(is_none.any())
@@ -63,7 +69,7 @@ class CropFiles:
 
     def draw(self, rng: np.random.Generator) -> Sample:
         """Any of them, and now and then what is none: every family as often as any other, however many crops there are
-        of it, every shape as any other, and all shapes together ``worlds.SHAPES_SHARE`` of the drones."""
+        of it, every shape as any other, and all but the families together ``worlds.SHAPES_SHARE`` of the drones."""
         one = int(rng.choice(len(self._shares), p=self._shares))
         rows = self._of_family[one]
         if rng.random() < _AIMED_SHARE and len(self._aimed_of_family[one]):

@@ -68,7 +68,7 @@ def _surface(path: Path, size_m: float, up: str | None) -> tuple[Array, Array, A
     vertices = _in_metres(path, vertices, size_m, {"m": 1.0} if is_gltf else UNITS_M)
     for cells in CELLS:
         if len(triangles) > MOST_TRIANGLES:
-            vertices, triangles, kept = _simplified(vertices, triangles, size_m / cells)
+            vertices, triangles, kept = simplified(vertices, triangles, size_m / cells)
             colours = colours[kept]
     if len(triangles) > MOST_TRIANGLES:
         raise ValueError(
@@ -178,7 +178,7 @@ def _widest(points: Array) -> float:
     return float(np.ptp(along, axis=0).max())
 
 
-def _simplified(vertices: Array, triangles: Array, cell_m: float) -> tuple[Array, Array, Array]:
+def simplified(vertices: Array, triangles: Array, cell_m: float) -> tuple[Array, Array, Array]:
     """Corners of one cell become one; and the rows of the triangles that remain."""
     cells = np.round(vertices / cell_m).astype(np.int64)
     _, which, inverse = np.unique(cells @ [1 << 40, 1 << 20, 1], return_index=True, return_inverse=True)
@@ -231,7 +231,15 @@ def _linear(grey: Array) -> Array:
     return np.where(grey <= 0.04045, grey / 12.92, ((grey + 0.055) / 1.055) ** 2.4)
 
 
-def model_of(vertices: Array, triangles: Array, colours: Array, size_m: float) -> DroneModel:
+def model_of(
+    vertices: Array,
+    triangles: Array,
+    colours: Array,
+    size_m: float,
+    *,
+    family: int = OWN_FAMILY,
+    hubs: Array | None = None,
+) -> DroneModel:
     """A drone of corners (n, 3) in body FRD, triangles (m, 3) and their linear colours (m, 3).
 
     Each triangle is seen from both sides: in files of many programs, some face the wrong way.
@@ -239,14 +247,14 @@ def model_of(vertices: Array, triangles: Array, colours: Array, size_m: float) -
     mesh, both = Mesh(), np.vstack([triangles, triangles[:, ::-1]])
     mesh.add(vertices, both, 0, np.vstack([colours, colours]), (0.3, 0.3))
     return DroneModel(
-        family=OWN_FAMILY,
+        family=family,
         seed=0,
         vertices=vertices.astype(np.float32),
         triangles=both.astype(np.int32),
         colours=np.concatenate(mesh.tint).astype(np.float32),
         texture=np.concatenate(mesh.texture).astype(np.int32),
         uv=np.concatenate(mesh.uv),
-        hubs=np.full((4, 3), np.nan),
+        hubs=np.full((4, 3), np.nan) if hubs is None else hubs,
         extent=np.stack([vertices.min(0), vertices.max(0)]),
         size_m=size_m,
     )

@@ -1,9 +1,10 @@
 """Render crops of single drones as the distance network is shown them: many more than whole images would give.
 
-    python -m tools.training.render_drone_crops OUT --worlds 300 --scenes 300
+    python -m tools.training.render_drone_crops OUT --worlds 300 --scenes 300 --airframes AIRFRAMES
 
 Only the window of the camera's image that the crops show is drawn. Every drone stands in another place. One file
-a world, which `train.py distance --crops OUT` takes up as they appear.
+a world, which `train.py distance --crops OUT` takes up as they appear. AIRFRAMES, of `tools.training.airframes`, adds
+real airframes and shells of camera drones; with --held-out those that no network learns from fly alone, in test worlds.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -23,6 +25,7 @@ from numpy.typing import NDArray
 from flockd.sim.airframe import DroneModel
 from flockd.sim.drone_models import drone_model
 from tools.training import worlds
+from tools.training.airframes import real_models
 from tools.training.dataset import FOCAL_PX, HEIGHT, R_BODY_CAMERA, WIDTH
 from tools.training.distractions import drawn_distraction
 from tools.training.drone_generator import generated_drone
@@ -70,22 +73,36 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=300)
     parser.add_argument("--skip", type=int, default=0, help="worlds, of which there are crops already elsewhere")
     parser.add_argument("--scenes", type=int, default=400, help="drones a world")
+    parser.add_argument("--airframes", type=Path, help="folder of tools.training.airframes")
+    parser.add_argument("--held-out", action="store_true", help="the held-out ones of --airframes alone, with ranges")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     arguments = parser.parse_args()
+    if arguments.held_out and arguments.airframes is None:
+        parser.error("--held-out needs --airframes")
     # From the far end of the training worlds: other places than those of whole images.
-    seeds = worlds.TRAINING[::-1][arguments.skip :][: arguments.worlds]
-    jobs = [CropJob(arguments.out / f"{seed}.npz", seed, arguments.scenes, drones_of_training) for seed in seeds]
+    split = worlds.TEST if arguments.held_out else worlds.TRAINING
+    draw = partial(drones_held_out if arguments.held_out else drones_of_training, airframes=arguments.airframes)
+    jobs = [
+        CropJob(arguments.out / f"{seed}.npz", seed, arguments.scenes, draw, measures=arguments.held_out)
+        for seed in split[::-1][arguments.skip :][: arguments.worlds]
+    ]
     begin = time.monotonic()
     for done, total in render_crops(jobs, arguments.processes):
         print(f"{done}/{total} worlds, {time.monotonic() - begin:.0f} s", flush=True)
 
 
-def drones_of_training(rng: np.random.Generator) -> list[list[DroneModel]]:
-    """Every family of the training, and as many shapes of the generator as the drones of a world are to have."""
+def drones_held_out(rng: np.random.Generator, airframes: Path) -> list[list[DroneModel]]:
+    """The real airframes that no network learns from."""
+    return real_models(airframes, PAINTED, rng, held_out=True)
+
+
+def drones_of_training(rng: np.random.Generator, airframes: Path | None = None) -> list[list[DroneModel]]:
+    """Every family of the training, as many shapes of the generator as the drones of a world are to have, and all real
+    airframes and shells."""
     families = [[drone_model(family, _paint(rng)) for _ in range(PAINTED)] for family in worlds.FAMILIES]
     drawn = rng.choice(worlds.SHAPES, round(len(families) * worlds.SHAPES_SHARE / (1 - worlds.SHAPES_SHARE)))
     shapes = [[generated_drone(int(shape), _paint(rng)) for _ in range(SHAPES_PAINTED)] for shape in drawn]
-    return [*families, *shapes]
+    return [*families, *shapes, *(real_models(airframes, SHAPES_PAINTED, rng) if airframes else [])]
 
 
 def _paint(rng: np.random.Generator) -> int:

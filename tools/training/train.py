@@ -65,6 +65,7 @@ def main() -> None:
     parser.add_argument("--negatives", type=Path, help="what is no drone, for `distance`: file of mine_negatives.py")
     parser.add_argument("--crops", type=Path, help="drones, for `distance`: folder of render_drone_crops.py")
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
+    parser.add_argument("--times", type=int, default=1, help="so many times as large batches, beside a GPU")
     parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt, or an .onnx")
     parser.add_argument("--compile", action="store_true", help="`distance` a fifth faster; needs a C++ compiler")
     add_machine(parser)
@@ -78,6 +79,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     task = _task(arguments)
     task.rate = arguments.rate or task.rate
+    task.batch *= arguments.times
     arguments.out.mkdir(parents=True, exist_ok=True)
     if arguments.start and not (arguments.out / "checkpoint.pt").is_file():
         try:

@@ -20,7 +20,10 @@ FAMILIES = range(12)
 UNSEEN_FAMILIES = range(12, 14)
 SHAPES = range(400)
 SHAPES_SHARE = 1 / 2
-"""Share of the generator's shapes among the drones of training worlds, and among those that a training draws."""
+"""Share of the generator's shapes among the drones of training worlds, and of all but the families among those that a
+training draws."""
+REAL_SHARE = 0.7
+"""Share of real airframes and shells among the latter, where there are any."""
 
 
 def drawn_obstacles(seed: int, share: float) -> ObstaclesConfig | None:
