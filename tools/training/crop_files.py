@@ -55,14 +55,12 @@ class CropFiles:
         self._of_family = [np.flatnonzero(family == one) for one in names]
         self._aimed_of_family = [np.flatnonzero((family == one) & aimed) for one in names]
         is_none, is_family, is_real = names == -1, (names >= 0) & (names < MAX_FAMILIES), names >= FIRST_REAL
-        real = worlds.REAL_SHARE if is_real.any() else 0.0
-        of_drones = np.zeros(len(names))
-        for which, of in (
-            (is_family, 1 - worlds.SHAPES_SHARE),
-            (is_real, worlds.SHAPES_SHARE * real),
-            (~(is_none | is_family | is_real), worlds.SHAPES_SHARE * (1 - real)),
-        ):
-            of_drones[which] = of / max(1, int(np.count_nonzero(which)))
+        is_other = ~(is_none | is_family)
+        of_drones, even = np.zeros(len(names)), np.ones(len(names))
+        for which, of in ((is_real, worlds.REAL_SHARE), (is_other & ~is_real, 1 - worlds.REAL_SHARE)):
+            even[which] = of / max(1, int(np.count_nonzero(which)))
+        for which, of in ((is_family, 1 - worlds.SHAPES_SHARE), (is_other, worlds.SHAPES_SHARE)):
+            of_drones[which] = of * even[which] / max(float(even[which].sum()), 1e-9)
         drones = float(of_drones.sum())
         share = _NONE_SHARE if is_none.any() and drones > 0 else float(is_none.any())
         self._shares = np.where(is_none, share, (1 - share) * of_drones / max(drones, 1e-9))

@@ -5,7 +5,7 @@ Only glTF says its unit (metres) and which way is up (+y); of the others, the dr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -60,23 +60,17 @@ def _surface(path: Path, size_m: float, up: str | None) -> tuple[Array, Array, A
     """Corners in metres, triangles, and their colours as of ``_colours``."""
     pieces = _loaded(path)
     is_gltf = path.suffix.lower() in GLTF
-    counts = np.cumsum([0, *(len(places) for _, places in pieces)])
-    vertices = np.vstack([places for _, places in pieces])
-    triangles = np.vstack([np.asarray(piece.faces) + first for (piece, _), first in zip(pieces, counts, strict=False)])
-    colours = np.vstack([_colours(piece, is_gltf) for piece, _ in pieces])
+    parts = [(places, np.asarray(piece.faces), _colours(piece, is_gltf)) for piece, places in pieces]
+    vertices, triangles, colours = joined(parts)
     vertices = _upright(vertices, up or ("y" if is_gltf else "z"))
     vertices = _in_metres(path, vertices, size_m, {"m": 1.0} if is_gltf else UNITS_M)
-    for cells in CELLS:
-        if len(triangles) > MOST_TRIANGLES:
-            vertices, triangles, kept = simplified(vertices, triangles, size_m / cells)
-            colours = colours[kept]
+    vertices, triangles, colours = simplified(vertices, triangles, colours, size_m, MOST_TRIANGLES)
     if len(triangles) > MOST_TRIANGLES:
         raise ValueError(
             f"{path}: has {len(triangles)} triangles without small details, and at most {MOST_TRIANGLES} are drawn; "
             "simplify it where it was modelled"
         )
-    has_area = np.linalg.norm(face_normals(vertices, triangles), axis=1) > 0.5
-    return vertices, triangles[has_area], colours[has_area]
+    return vertices, triangles, colours
 
 
 def painted(model: DroneModel, seed: int) -> DroneModel:
@@ -178,7 +172,25 @@ def _widest(points: Array) -> float:
     return float(np.ptp(along, axis=0).max())
 
 
-def simplified(vertices: Array, triangles: Array, cell_m: float) -> tuple[Array, Array, Array]:
+def joined(parts: Iterable[tuple[Array, Array, Array]]) -> tuple[Array, Array, Array]:
+    """Corners (n, 3), triangles (m, 3) and colours (m, 3) of several meshes as those of one."""
+    corners, faces, colours = zip(*parts, strict=True)
+    firsts = np.cumsum([0, *(len(some) for some in corners[:-1])])
+    return np.vstack(corners), np.vstack([one + k for one, k in zip(faces, firsts, strict=True)]), np.vstack(colours)
+
+
+def simplified(
+    vertices: Array, triangles: Array, colours: Array, size_m: float, most: int
+) -> tuple[Array, Array, Array]:
+    """At most so many triangles, or what is left of them in the largest of ``CELLS``."""
+    for cells in CELLS:
+        if len(triangles) > most:
+            vertices, triangles, kept = _in_cells(vertices, triangles, size_m / cells)
+            colours = colours[kept]
+    return vertices, triangles, colours
+
+
+def _in_cells(vertices: Array, triangles: Array, cell_m: float) -> tuple[Array, Array, Array]:
     """Corners of one cell become one; and the rows of the triangles that remain."""
     cells = np.round(vertices / cell_m).astype(np.int64)
     _, which, inverse = np.unique(cells @ [1 << 40, 1 << 20, 1], return_index=True, return_inverse=True)
@@ -242,8 +254,11 @@ def model_of(
 ) -> DroneModel:
     """A drone of corners (n, 3) in body FRD, triangles (m, 3) and their linear colours (m, 3).
 
-    Each triangle is seen from both sides: in files of many programs, some face the wrong way.
+    Each triangle is seen from both sides: in files of many programs, some face the wrong way. Those without an area
+    are left out.
     """
+    has_area = np.linalg.norm(face_normals(vertices, triangles), axis=1) > 0.5
+    triangles, colours = triangles[has_area], colours[has_area]
     mesh, both = Mesh(), np.vstack([triangles, triangles[:, ::-1]])
     mesh.add(vertices, both, 0, np.vstack([colours, colours]), (0.3, 0.3))
     return DroneModel(

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from flockd.sim.airframe import DroneModel
 from flockd.sim.drone_models import drone_model
 from tools.training import worlds
-from tools.training.airframes import real_models
+from tools.training.airframes import airframe_models
 from tools.training.dataset import FOCAL_PX, HEIGHT, R_BODY_CAMERA, WIDTH
 from tools.training.distractions import drawn_distraction
 from tools.training.drone_generator import generated_drone
@@ -93,7 +93,7 @@ def main() -> None:
 
 def drones_held_out(rng: np.random.Generator, airframes: Path) -> list[list[DroneModel]]:
     """The real airframes that no network learns from."""
-    return real_models(airframes, PAINTED, rng, held_out=True)
+    return airframe_models(airframes, PAINTED, rng, held_out=True)
 
 
 def drones_of_training(rng: np.random.Generator, airframes: Path | None = None) -> list[list[DroneModel]]:
@@ -102,7 +102,7 @@ def drones_of_training(rng: np.random.Generator, airframes: Path | None = None) 
     families = [[drone_model(family, _paint(rng)) for _ in range(PAINTED)] for family in worlds.FAMILIES]
     drawn = rng.choice(worlds.SHAPES, round(len(families) * worlds.SHAPES_SHARE / (1 - worlds.SHAPES_SHARE)))
     shapes = [[generated_drone(int(shape), _paint(rng)) for _ in range(SHAPES_PAINTED)] for shape in drawn]
-    return [*families, *shapes, *(real_models(airframes, SHAPES_PAINTED, rng) if airframes else [])]
+    return [*families, *shapes, *(airframe_models(airframes, SHAPES_PAINTED, rng) if airframes else [])]
 
 
 def _paint(rng: np.random.Generator) -> int:

@@ -85,6 +85,20 @@ def airframe(folder: Path, name: str, sources: Mapping[str, Source] = AIRFRAMES)
     return made
 
 
+def save_airframe(shape: Airframe, path: Path) -> None:
+    """As arrays, for who has no reader of meshes."""
+    np.savez(
+        path,
+        vertices=shape.vertices,
+        triangles=shape.triangles,
+        colours=shape.colours,
+        hubs=np.array([rotor.hub for rotor in shape.rotors]),
+        radii=np.array([rotor.radius_m for rotor in shape.rotors]),
+        size_m=shape.size_m,
+        between_motors_m=shape.between_motors_m,
+    )
+
+
 def _assembled(folder: Path, source: Source) -> Airframe:
     made = source.made_of
     assert isinstance(made, Assembly)

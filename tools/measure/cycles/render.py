@@ -21,7 +21,7 @@ import numpy as np
 from mathutils import Matrix, Vector
 from numpy.typing import NDArray
 
-from tools.measure.cycles.airframes import Airframe, airframe
+from tools.measure.cycles.airframes import Airframe, airframe, save_airframe
 from tools.measure.cycles.jobs import PROPELLER, Job, airframe_file, read_job
 from tools.measure.cycles.lens import Lens, blender_camera, known_places
 from tools.measure.cycles.plan import Moment, Pose, blades, painted
@@ -43,7 +43,7 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     try:
         for name in sorted({one.airframe for moment in job.moments for one in moment.neighbours}):
-            _save_airframe(airframe(Path(job.meshes), name), airframe_file(out, name))
+            save_airframe(airframe(Path(job.meshes), name), airframe_file(out, name))
     except ValueError as error:
         sys.exit(str(error))
     markers(job, out / "markers.json")
@@ -53,19 +53,6 @@ def main() -> None:
             if not file.is_file():
                 _moment(job, moment, lenses, file)
                 print(file.name, flush=True)
-
-
-def _save_airframe(shape: Airframe, path: Path) -> None:
-    np.savez(
-        path,
-        vertices=shape.vertices,
-        triangles=shape.triangles,
-        colours=shape.colours,
-        hubs=np.array([rotor.hub for rotor in shape.rotors]),
-        radii=np.array([rotor.radius_m for rotor in shape.rotors]),
-        size_m=shape.size_m,
-        between_motors_m=shape.between_motors_m,
-    )
 
 
 def _moment(job: Job, moment: Moment, lenses: tuple[Lens, ...], file: Path) -> None:

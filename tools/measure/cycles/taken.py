@@ -22,7 +22,7 @@ from flockd.sim.world import World
 from tools.measure.cycles.jobs import airframe_file
 from tools.measure.cycles.plan import STEP_S, Moment, blades, painted
 from tools.training import worlds
-from tools.training.own_mesh import model_of
+from tools.training.own_mesh import joined, model_of
 
 Array = NDArray[Any]
 BAROMETER_SIGMA_M, RANGE_SIGMA_M = 0.1, 0.03
@@ -94,17 +94,11 @@ def real_models(moment: Moment, folder: Path) -> list[DroneModel]:
         rng = np.random.Generator(np.random.PCG64(neighbour.seed))
         with np.load(airframe_file(folder, neighbour.airframe)) as arrays:
             shape = dict(arrays)
-        corners, faces, colours = (
-            [shape["vertices"]],
-            [shape["triangles"]],
-            [painted(shape["colours"], neighbour.paint)],
-        )
+        parts = [(shape["vertices"], shape["triangles"], painted(shape["colours"], neighbour.paint))]
         for hub, radius_m in zip(shape["hubs"], shape["radii"], strict=True):
-            first = sum(len(part) for part in corners)
-            corners.append(blades(hub, radius_m, rng.uniform(0.0, 2.0 * math.pi)))
-            faces.append(np.array([[0, 1, 2], [0, 2, 3]]) + first)
-            colours.append(np.full((2, 3), 0.03))
-        models.append(model_of(np.vstack(corners), np.vstack(faces), np.vstack(colours), float(shape["size_m"])))
+            corners = blades(hub, radius_m, rng.uniform(0.0, 2.0 * math.pi))
+            parts.append((corners, np.array([[0, 1, 2], [0, 2, 3]]), np.full((2, 3), 0.03)))
+        models.append(model_of(*joined(parts), float(shape["size_m"])))
     return models
 
 

@@ -1,8 +1,8 @@
-"""What a distance network makes of single crops of one shape of drone whose truth is known."""
+"""What a distance network makes of single crops of drones whose truth is known."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,28 +30,42 @@ class HeldOut:
     """(n,)"""
     none: Array
     """(m, 96, 96, 3) without a drone."""
-    size_m: float
+    log_size: Array
+    """(n,) logarithm of the drone's size in metres."""
+    family: Array
+    """(n,) number of its shape."""
 
     @classmethod
-    def of(cls, folder: Path, none: Array, size_m: float) -> HeldOut:
+    def of(cls, folder: Path, none: Array | None = None) -> HeldOut:
         """Held-out crops from the files of ``render_drone_crops`` in ``folder``: whole drones, aimed at as the
         cascade's last crop is.
 
-        ``none``: crops without a drone, besides these files' own.
+        ``none``: crops without a drone, besides these files' own. Raises ValueError where the files are not such.
         """
         rows: list[dict[str, Array]] = []
         for path in sorted(folder.glob("*.npz")):
             with np.load(path) as arrays:
                 rows.append(dict(arrays))
+        if not rows or "whole" not in rows[0]:
+            raise ValueError(f"{folder}: holds no crops with ranges; make them with `render_drone_crops --held-out`")
         joined = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
         shown = joined["whole"] & is_aimed(joined)
         return cls(
             joined["picture"][shown],
             joined["target"][shown, 0],
             joined["range_m"][shown],
-            np.concatenate([joined["picture"][joined["drone"] < 0.5], none]),
-            size_m,
+            np.concatenate([joined["picture"][joined["drone"] < 0.5], *([] if none is None else [none])]),
+            (joined["apparent"] + joined["target"][:, 0])[shown],
+            joined["family"][shown],
         )
+
+    def of_family(self, family: int) -> HeldOut:
+        """The crops of one shape, and those without a drone."""
+        ours = self.family == family
+        return replace(
+            self, picture=self.picture[ours], log_range=self.log_range[ours], range_m=self.range_m[ours],
+            log_size=self.log_size[ours], family=self.family[ours],
+        )  # fmt: skip
 
 
 def measured(manifest: Path, crops: HeldOut) -> dict[str, str]:
@@ -60,7 +74,7 @@ def measured(manifest: Path, crops: HeldOut) -> dict[str, str]:
     out = _columns(model, crops.picture)
     no = _columns(model, crops.none)
     error = np.expm1(out["log_range_per_focal"] - crops.log_range)
-    by_size = np.expm1(np.log(crops.size_m) - out["log_apparent_size"] - crops.log_range)
+    by_size = np.expm1(crops.log_size - out["log_apparent_size"] - crops.log_range)
     figures: dict[str, str] = {}
     for name, errors in (("range", error), ("range by the known size", by_size)):
         for low, high in RANGES_M:

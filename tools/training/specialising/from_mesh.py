@@ -83,7 +83,7 @@ def specialise_range(arguments: argparse.Namespace, drones: list[DroneModel], be
     for line in _rendered(work, drones, Workload.of(arguments.minutes), arguments.processes):
         print(f"{line}, {time.monotonic() - begin:.0f} s", flush=True)
     negatives = _negatives(work / "pairs", work / "negatives.npy")
-    held_out = _held_out(work, arguments.size_m)
+    held_out = _held_out(work)
     task = DistanceTask(open_pairs(work / "pairs"), negatives, work / "crops")
     task.rate, task.pool_size = RATE, NONE_IN_POOL
     run = work / "run"
@@ -144,10 +144,10 @@ def _negatives(pairs: Path, file: Path) -> Path:
     return file
 
 
-def _held_out(work: Path, size_m: float) -> HeldOut:
+def _held_out(work: Path) -> HeldOut:
     pairs = open_pairs(work / "held_out_pairs")
     rows = np.load(_negatives(work / "held_out_pairs", work / "held_out_negatives.npy"))
-    return HeldOut.of(work / "held_out", _without_drones(pairs, rows), size_m)
+    return HeldOut.of(work / "held_out", _without_drones(pairs, rows))
 
 
 def _without_drones(pairs: PairSet, rows: np.ndarray) -> np.ndarray:
