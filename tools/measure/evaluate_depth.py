@@ -54,9 +54,7 @@ def main() -> None:
     networks = {"the ground everywhere, or one depth": _ground} | {
         str(one): _network(one) for one in arguments.manifests
     }
-    print(
-        "| scene | network | off by, median | nearest quarter | farthest quarter | told the height, what stands off by |"
-    )
+    print("| scene | network | off by, median | nearest quarter | farthest quarter | told the height: what stands |")
     print("|---|---|---|---|---|---|")
     for name, clip in scenes.items():
         for network, depth_of in networks.items():

@@ -40,15 +40,15 @@ def _in_full_precision(layer: Callable[[Tensor], Out], x: Tensor) -> Out:
         return layer(x.float())
 
 
-def _blocks(image: Tensor, size: int) -> Tensor:
-    """(n, h, w, 3) uint8 -> (n, 3 size^2, h / size, w / size) in -1..1, each block of pixels in one place."""
+def _blocks(image: Tensor) -> Tensor:
+    """(n, h, w, 3) uint8 -> (n, 12, h / 2, w / 2) in -1..1, each block of 2 x 2 pixels in one place."""
     n, h, w, _ = image.shape
-    x = image.reshape(n, h // size, size, w // size, size, 3).permute(0, 5, 2, 4, 1, 3)
-    return (x.reshape(n, 3 * size * size, h // size, w // size).float() - 128.0) / 127.5
+    x = image.reshape(n, h // 2, 2, w // 2, 2, 3).permute(0, 5, 2, 4, 1, 3)
+    return (x.reshape(n, 12, h // 2, w // 2).float() - 128.0) / 127.5
 
 
 def _entry(image: Tensor, *planes: Tensor) -> Tensor:
-    """What the first layers of a network that runs look at: the image's 2 x 2 blocks in grey levels less 128, planes.
+    """What the first layer of a network that runs looks at: the image's 2 x 2 blocks in grey levels less 128, planes.
 
     (n, h, w, 3) uint8 -> (n, 12 + ., h / 2, w / 2). Whole numbers from 0 to 255 less 128 are 8-bit numbers as they are:
     see ``tools.training.quantise``.
@@ -59,50 +59,27 @@ def _entry(image: Tensor, *planes: Tensor) -> Tensor:
     return torch.cat([blocks.float() - 128.0, *planes], 1) if planes else blocks.float() - 128.0
 
 
-def _on_entry(layer: nn.Sequential, entry: Tensor, size: int) -> Tensor:
-    """``layer``, trained on ``_blocks`` of this size, on what ``_entry`` gives: one convolution that steps a block."""
+def _on_entry(layer: nn.Sequential, entry: Tensor) -> Tensor:
+    """``layer``, trained on ``_blocks``, on what ``_entry`` gives."""
     convolution, norm = layer[0], layer[1]
     scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
     weight = (convolution.weight * scale[:, None, None, None]).detach()
-    step = size // 2
-    ours = _of_small_blocks(weight[:, : 3 * size * size], 3, step)
-    ours = ours.permute(0, 2, 3, 1, 4, 5).flatten(1, 3)
+    kernel = weight[:, :12].reshape(-1, 3, 2, 2, 3, 3).permute(0, 2, 3, 1, 4, 5).reshape(-1, 12, 3, 3) / 127.5
     bias = (norm.bias - norm.running_mean * scale).detach()
-    kernel = ours / 127.5
-    if convolution.in_channels > 3 * size * size:
-        planes = _of_small_blocks(weight[:, 3 * size * size :], 3, step, side=1)[:, :, 0, 0]
-        planes = planes / PLANE_STEPS
+    if convolution.in_channels > 12:
+        planes = weight[:, 12:15] / PLANE_STEPS
         kernel = torch.cat([kernel, planes, torch.zeros_like(planes[:, :1])], 1)
-    return F.relu(F.conv2d(entry, kernel.clone(), bias, stride=step, padding=step))
-
-
-def _of_small_blocks(weight: Tensor, channels: int, step: int, side: int = 2) -> Tensor:
-    """A kernel on large blocks, made of ``step`` x ``step`` small ones of ``side`` x ``side`` pixels, as one on these.
-
-    (o, channels (step side)^2, 3, 3) -> (o, channels, side, side, 3 step, 3 step).
-    """
-    parts = weight.reshape(-1, channels, step, side, step, side, 3, 3).permute(0, 1, 3, 5, 6, 2, 7, 4)
-    return parts.reshape(-1, channels, side, side, 3 * step, 3 * step)
-
-
-def _of_large_blocks(kernel: Tensor, step: int) -> Tensor:
-    """Back again."""
-    outputs, channels, side = kernel.shape[:3]
-    parts = kernel.reshape(outputs, channels, side, side, 3, step, 3, step).permute(0, 1, 5, 2, 7, 3, 4, 6)
-    return parts.reshape(outputs, channels * (step * side) ** 2, 3, 3)
+    return F.relu(F.conv2d(entry, kernel.clone(), bias, stride=convolution.stride, padding=1))
 
 
 def first_layers_of(net: nn.Module, kernels: list[tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
     """The weights that ``_on_entry`` made these kernels and biases of, without their normalisation."""
-    crops = {"stem.0": 2}
-    sizes = {"NeighboursNet": {"fine.0": 2, "stem.0": 4}, "DistanceNet": crops, "VerificationNet": crops}
+    names = ["stem.0"] if isinstance(net, NeighboursNet | DistanceNet | VerificationNet) else []
     weights: dict[str, Tensor] = {}
-    for (name, size), (kernel, bias) in zip(sizes.get(type(net).__name__, {}).items(), kernels, strict=True):
-        ours = kernel[:, :12].reshape(-1, 2, 2, 3, *kernel.shape[2:]).permute(0, 3, 1, 2, 4, 5) * 127.5
-        weight = _of_large_blocks(ours, size // 2)
+    for name, (kernel, bias) in zip(names, kernels, strict=True):
+        weight = kernel[:, :12].reshape(-1, 2, 2, 3, 3, 3).permute(0, 3, 1, 2, 4, 5).reshape(-1, 12, 3, 3) * 127.5
         if kernel.shape[1] > 12:
-            planes = kernel[:, 12:15] * PLANE_STEPS
-            weight = torch.cat([weight, _of_large_blocks(planes[:, :, None, None], size // 2)], 1)
+            weight = torch.cat([weight, kernel[:, 12:15] * PLANE_STEPS], 1)
         weights |= {f"{name}.weight": weight, f"{name}.bias": bias}
     return weights
 
@@ -118,7 +95,7 @@ class _Residual(nn.Module):
 
 
 class NeighboursNet(nn.Module):
-    """U-Net at a quarter of the image's size, with a thin branch at half: a far drone's arms are a pixel wide.
+    """U-Net that begins at a quarter of the image's size; what is finer than that its channels hold.
 
     Inputs: image (n, h, w, 3) uint8; geometry (n, 3, h/2, w/2): tangents of the pixel's ray right and down of the
     optical axis. The third plane is the inverse depth in 1/m of flat ground as attitude and height say (0: unknown or
@@ -127,17 +104,11 @@ class NeighboursNet(nn.Module):
     """
 
     widths = (32, 56, 96, 128)
-    fine_width = 16
 
     def __init__(self) -> None:
         super().__init__()
         w = self.widths
-        self.fine = _conv(12 + 3, self.fine_width)
-        self.fine_down = _conv(self.fine_width, w[0], stride=2)
-        self.fine_up = nn.Sequential(nn.Conv2d(w[0], 4 * self.fine_width, 1), nn.PixelShuffle(2))
-        self.fine_merge = _conv(self.fine_width, self.fine_width)
-        self.fine_head = nn.Conv2d(self.fine_width, 4, 1)
-        self.stem = _conv(48 + 12, w[0])
+        self.stem = _conv(12 + 3, w[0], stride=2)
         self.down = nn.ModuleList([_conv(a, b, stride=2) for a, b in pairwise(w)])
         self.body = nn.ModuleList([_Residual(b) for b in w[1:]])
         self.deep = nn.Sequential(_Residual(w[-1]), _Residual(w[-1]))
@@ -155,13 +126,10 @@ class NeighboursNet(nn.Module):
         log_ground = torch.log(ground.clamp(min=1.0 / MAX_DEPTH_M))
         planes = torch.cat([geometry[:, :2], torch.where(known, log_ground + 3.0, torch.zeros_like(ground))], 1)
         if self.training:
-            fine = self.fine(torch.cat([_blocks(image, 2), planes], 1))
-            x = self.stem(torch.cat([_blocks(image, 4), F.pixel_unshuffle(planes, 2)], 1))
+            x = self.stem(torch.cat([_blocks(image), planes], 1))
         else:
             in_steps = planes * PLANE_STEPS
-            entry = _entry(image, in_steps, in_steps[:, :1])  # sixteen channels are faster than fifteen
-            fine, x = _on_entry(self.fine, entry, 2), _on_entry(self.stem, entry, 4)
-        x = x + self.fine_down(fine)
+            x = _on_entry(self.stem, _entry(image, in_steps, in_steps[:, :1]))  # 16 channels are faster than 15
         levels = [x]
         for down, body in zip(self.down, self.body, strict=True):
             x = body(down(x))
@@ -171,9 +139,7 @@ class NeighboursNet(nn.Module):
         for i in reversed(range(len(self.merge))):
             x = F.interpolate(self.up[i](x), scale_factor=2.0, mode="nearest")
             x = self.merge[i](x + self.lateral[i](levels[i]))
-        x = self.last(x)
-        fine = self.fine_merge(F.relu(fine + self.fine_up(x)))
-        out = _in_full_precision(self.head, x) + _in_full_precision(self.fine_head, fine)
+        out = _in_full_precision(self.head, self.last(x))
         start = torch.where(known, -log_ground, torch.full_like(ground, 2.0))  # the network corrects flat ground
         depth = torch.exp((start + out[:, :1]).clamp(-3.0, 5.0)).clamp(max=MAX_DEPTH_M)
         return depth, out[:, 1:2], out[:, 2:4] * OFFSET_SCALE_PX
@@ -226,7 +192,7 @@ class DistanceNet(nn.Module):
 
         In training also a logit for each family, and log maps of the motors (n, 4, 48 * 48).
         """
-        x = self.stem(_blocks(picture, 2)) if self.training else _on_entry(self.stem, _entry(picture), 2)
+        x = self.stem(_blocks(picture)) if self.training else _on_entry(self.stem, _entry(picture))
         levels = [x]
         for i, (down, body) in enumerate(zip(self.down, self.body, strict=True), start=1):
             x = body(down(x))
@@ -277,7 +243,7 @@ class VerificationNet(nn.Module):
 
     def forward(self, crop: Tensor) -> Tensor:
         """One logit (n, 1) a crop."""
-        x = self.stem(_blocks(crop, 2)) if self.training else _on_entry(self.stem, _entry(crop), 2)
+        x = self.stem(_blocks(crop)) if self.training else _on_entry(self.stem, _entry(crop))
         for i, (down, body) in enumerate(zip(self.down, self.body, strict=True), start=1):
             x = body(down(x))
             x = self.more[str(i)](x) if str(i) in self.more else x

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from flockd.core.messages import (
     GroundEstimate,
     IntArray,
     ObstacleRanges,
-    UInt8Array,
 )
 from flockd.flight.geometry import Rig, RigCamera, RigidTransform, grid_pixels, inverse_ranges_of_rays
 from flockd.flight.perception.observation import CameraObservation, Observation
@@ -49,25 +48,29 @@ _CERTAIN_SIGMAS = 5.0
 
 @dataclass(frozen=True, eq=False)
 class _Points:
-    """Places (3, n) metres, with relative standard deviations of their ranges (n,) and labels (n,)."""
+    """Places (3, n) metres, with relative standard deviations of their ranges (n,)."""
 
     places: Float32Array
     relative_sigma: Float32Array
-    labels: UInt8Array
+    obstacle: BoolArray
+    """(n,) whether it may be one."""
+    classed: BoolArray
+    """(n,) whether it shows how far the drone sees: of what is not classed, nobody knows where it is."""
 
     def where(self, chosen: BoolArray) -> _Points:
-        return _Points(self.places[:, chosen], self.relative_sigma[chosen], self.labels[chosen])
+        return _Points(self.places[:, chosen], self.relative_sigma[chosen], self.obstacle[chosen], self.classed[chosen])
 
     @classmethod
     def concatenate(cls, parts: Sequence[_Points]) -> _Points:
         return cls(
             np.concatenate([part.places for part in parts], axis=1),
             np.concatenate([part.relative_sigma for part in parts]),
-            np.concatenate([part.labels for part in parts]),
+            np.concatenate([part.obstacle for part in parts]),
+            np.concatenate([part.classed for part in parts]),
         )
 
 
-_NOTHING = _Points(np.empty((3, 0), np.float32), np.empty(0, np.float32), np.empty(0, np.uint8))
+_NOTHING = _Points(np.empty((3, 0), np.float32), np.empty(0, np.float32), np.empty(0, bool), np.empty(0, bool))
 
 
 class ObstacleRanging:
@@ -86,22 +89,28 @@ class ObstacleRanging:
     def ranges(
         self, observation: Observation, ego: EgoMotion | None = None, ground: GroundEstimate | None = None
     ) -> ObstacleRanges:
-        """Ranges from one observation's depth, and of the flow since the one before where `ego` is known.
+        """Ranges of the flow since the observation before where `ego` is known and shows depth, else of the depth maps.
+
+        How far the drone sees is that of the depth maps everywhere.
 
         ``ground``: below the drone; None: level, at the autopilot's height.
         """
         R_ned_body = observation.vehicle.R_ned_body.astype(np.float32)
         parts = [_NOTHING]
         for name, camera in observation.cameras.items():
+            before = None if camera.flow is None else observation.previous
             origin = R_ned_body @ self._rig.cameras[name].T_body_camera.translation.astype(np.float32)
             if camera.depth is not None:
                 places = (R_ned_body @ self._rays[name]) * camera.depth[_GRID, _GRID].ravel() + origin[:, None]
                 relative = np.full(places.shape[1], self._parameters.range_sigma, np.float32)
-                parts.append(self._about_level(_Points(places, relative, camera.labels[_GRID, _GRID].ravel())))
-            if ego is not None and observation.previous is not None and camera.flow is not None:
-                moved = self._triangulations[name].points(ego, observation.previous, camera)
-                ahead = R_ned_body @ moved.places + origin[:, None]
-                parts.append(self._about_level(_Points(ahead, moved.relative_sigma, moved.labels)))
+                labels = camera.labels[_GRID, _GRID].ravel()
+                obstacle = labels == 0
+                if ego is not None and before is not None:
+                    obstacle &= _across(ego.rotation.T @ ego.translation, self._rays[name]) <= _MIN_BASELINE_M
+                parts.append(self._about_level(_Points(places, relative, obstacle, labels != UNCLASSED)))
+            if ego is not None and before is not None:
+                moved = self._triangulations[name].points(ego, before, camera)
+                parts.append(self._about_level(replace(moved, places=R_ned_body @ moved.places + origin[:, None])))
         return self._nearest(observation, _Points.concatenate(parts), ground)
 
     def _about_level(self, points: _Points) -> _Points:
@@ -115,17 +124,17 @@ class ObstacleRanging:
 
     def _nearest(self, observation: Observation, points: _Points, ground: GroundEstimate | None) -> ObstacleRanges:
         """The nearest obstacle in each sector, from places (3, n) metres NED from the drone."""
-        p, labels = self._parameters, points.labels
+        p = self._parameters
         north, east, down = points.places
         away_m = np.hypot(north, east)
         sectors = np.round(np.arctan2(east, north) * (SECTORS / (2 * math.pi))).astype(np.int64) % SECTORS
         in_band = self._in_band(down)
         above_ground = down <= _ground_down_m(observation, ground, north, east) - _GROUND_MARGIN_M
-        counts = in_band & above_ground & (labels == 0) & (away_m <= p.range_m)
+        counts = in_band & above_ground & points.obstacle & (away_m <= p.range_m)
         range_m, relative = self._agreed(
             sectors[counts], away_m[counts].astype(float), points.relative_sigma[counts].astype(float)
         )
-        level = _is_level(north, east, down) & (labels != UNCLASSED)
+        level = _is_level(north, east, down) & points.classed
         seen_m = _medians(sectors[level], np.minimum(away_m[level], p.range_m))
         found = np.isfinite(range_m)
         sigma_m = np.where(found, relative * np.where(found, range_m, 0.0), 0.0)
@@ -182,6 +191,11 @@ def _body_rays(camera: RigCamera) -> Float32Array:
     return rays.astype(np.float32)
 
 
+def _across(way: FloatArray, rays: Float32Array) -> Float32Array:
+    """(n,) metres of a way (3,) that are across unit vectors (3, n)."""
+    return np.asarray(np.linalg.norm(np.cross(way.astype(np.float32), rays.T), axis=1), np.float32)
+
+
 def _medians(sectors: IntArray, values: Float32Array) -> FloatArray:
     """(SECTORS,) of each sector's values; 0 where there are none."""
     order = np.lexsort((values, sectors))
@@ -230,4 +244,5 @@ class _Triangulation:
             certain = (baseline > _MIN_BASELINE_M) & (inverse > _CERTAIN_SIGMAS * sigma)
         places = mounted.rotation @ (ray[certain] / inverse[certain, None]).T
         relative = (sigma[certain] / inverse[certain]).astype(np.float32)
-        return _Points(places.astype(np.float32), relative, np.zeros(len(relative), np.uint8))
+        every = np.ones(len(relative), bool)
+        return _Points(places.astype(np.float32), relative, every, every)

@@ -157,6 +157,38 @@ def test_a_few_wrong_pixels_are_no_obstacle() -> None:
     assert found(RANGING.ranges(Observation(0.0, vehicle, {"front": camera}, (), None))) == {}
 
 
+def flown(
+    trunk: tuple[float, float, float],
+    way: FloatArray,
+    R_ned_body: FloatArray = LEVEL,
+    *,
+    top_m: float = -math.inf,
+    depth_map_m: float = SKY_M,
+) -> Observation:
+    """Two steps beside a trunk, with the flow between them that geometry says; level, and looking north at first.
+
+    Every depth map says ``depth_map_m`` everywhere, as of a network that knows no trunks.
+    """
+    before, now = {}, {}
+    for name, camera in RIG.cameras.items():
+        width, height = camera.camera.size
+        blank = {"image": np.zeros((height, width, 3), np.uint8), "labels": np.zeros((height, width), np.uint8)}
+        said = RangeMap(np.full((height, width), depth_map_m, np.float32))
+        pixels = grid_pixels((width, height), 1)
+        turn, origin = camera.T_body_camera.rotation, camera.T_body_camera.translation
+        rays = camera.camera.unproject(pixels, np.ones(len(pixels))) @ turn.T
+        ground = np.where(rays[:, 2] > 0, (HEIGHT_M - origin[2]) / np.maximum(rays[:, 2], 1e-9), 1e4)
+        stands = towards_trunk(origin, rays, trunk[:2], trunk[2])
+        is_trunk = origin[2] + np.where(np.isfinite(stands), stands, 0.0) * rays[:, 2] >= top_m
+        depth = np.where(is_trunk, np.minimum(ground, stands), ground)
+        points = (origin + rays * depth[:, None] - way) @ R_ned_body  # in the body now
+        flow = camera.camera.project((points - origin) @ turn) - pixels
+        before[name] = CameraObservation(depth=said, flow=None, **blank)
+        now[name] = CameraObservation(depth=said, flow=flow.reshape(height, width, 2).astype(np.float32), **blank)
+    first = Observation(0.0, VehicleState(0.0, LEVEL, HEIGHT_M), before, (), None)
+    return Observation(0.5, VehicleState(0.5, R_ned_body, HEIGHT_M - way[2]), now, (), first)
+
+
 @pytest.mark.parametrize(
     ("trunk", "way", "yaw_deg", "top_m"),
     [
@@ -170,30 +202,31 @@ def test_what_depth_does_not_show_the_flow_does(
     """The drone flies 0.6 m and yaws; depth is that of the sky, as of a network that knows no trunks."""
     way, yaw = np.array(way), math.radians(yaw_deg)
     R_ned_body = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1.0]])
-    before, now = {}, {}
-    for name, camera in RIG.cameras.items():
-        width, height = camera.camera.size
-        blank = {"image": np.zeros((height, width, 3), np.uint8), "labels": np.zeros((height, width), np.uint8)}
-        sky = RangeMap(np.full((height, width), SKY_M, np.float32))
-        pixels = grid_pixels((width, height), 1)
-        turn, origin = camera.T_body_camera.rotation, camera.T_body_camera.translation
-        rays = camera.camera.unproject(pixels, np.ones(len(pixels))) @ turn.T
-        ground = np.where(rays[:, 2] > 0, (HEIGHT_M - origin[2]) / np.maximum(rays[:, 2], 1e-9), 1e4)
-        stands = towards_trunk(origin, rays, trunk[:2], trunk[2])
-        is_trunk = origin[2] + np.where(np.isfinite(stands), stands, 0.0) * rays[:, 2] >= top_m
-        depth = np.where(is_trunk, np.minimum(ground, stands), ground)
-        points = (origin + rays * depth[:, None] - way) @ R_ned_body  # in the body now
-        flow = camera.camera.project((points - origin) @ turn) - pixels
-        before[name] = CameraObservation(depth=sky, flow=None, **blank)
-        now[name] = CameraObservation(depth=sky, flow=flow.reshape(height, width, 2).astype(np.float32), **blank)
-    first = Observation(0.0, VehicleState(0.0, LEVEL, HEIGHT_M), before, (), None)
-    observation = Observation(0.5, VehicleState(0.5, R_ned_body, HEIGHT_M - way[2]), now, (), first)
+    observation = flown(trunk, way, R_ned_body, top_m=top_m)
     assert found(RANGING.ranges(observation)) == {}
-    ego = EgoMotion(R_ned_body, way, 0.5, 100, 100, 0.01)
-    ranges = RANGING.ranges(observation, ego)
+    ranges = RANGING.ranges(observation, EgoMotion(R_ned_body, way, 0.5, 100, 100, 0.01))
     offset = np.array(trunk[:2]) - way[:2]
     sector = round(math.degrees(math.atan2(offset[1], offset[0])) / 5) % SECTORS
     away_m = float(np.hypot(*offset)) - trunk[2]
     assert ranges.range_m[sector] == pytest.approx(away_m, rel=0.07)
     assert 0.0 < ranges.sigma_m[sector] < 0.2 * away_m
     assert all((k - sector + 3) % SECTORS <= 6 for k in found(ranges))
+
+
+def test_what_depth_shows_where_the_flow_shows_nothing_counts_in_the_direction_of_flight_alone() -> None:
+    """A depth map that says 4 m everywhere: the flow contradicts it, but for 6 degrees around the way, and at rest."""
+    north = EgoMotion(LEVEL, np.array([0.5, 0.0, 0.0]), 0.5, 100, 100, 0.01)
+    observation = flown((50.0, 50.0, 0.1), north.translation, depth_map_m=4.0)
+    assert len(found(RANGING.ranges(observation))) == SECTORS
+    assert set(found(RANGING.ranges(observation, north))) == {
+        0,
+        1,
+        SECTORS - 1,
+        SECTORS // 2 - 1,
+        SECTORS // 2,
+        SECTORS // 2 + 1,
+    }
+    np.testing.assert_allclose(RANGING.ranges(observation, north).range_m[0], 4.0, rtol=0.06)
+    at_rest = EgoMotion(LEVEL, np.zeros(3), 0.5, 100, 100, 0.01)
+    observation = flown((50.0, 50.0, 0.1), at_rest.translation, depth_map_m=4.0)
+    assert len(found(RANGING.ranges(observation, at_rest))) == SECTORS

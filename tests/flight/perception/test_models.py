@@ -168,7 +168,7 @@ def test_the_twins_in_8_bits_say_what_the_float_networks_say() -> None:
     our, their = (networks.scene(frame, camera, None) for networks in (ours, theirs))
     assert isinstance(our.depth, np.ndarray)
     assert isinstance(their.depth, np.ndarray)
-    assert np.median(np.abs(our.depth / their.depth - 1)[their.depth < 50]) < 0.03
+    assert np.median(np.abs(our.depth / their.depth - 1)[their.depth < 50]) < 0.04
     both, any_ = ((f(our.labels > 0, their.labels > 0)).sum() for f in (np.logical_and, np.logical_or))
     assert both / any_ > 0.8
     windows = [image[v - 48 : v + 48, u - 48 : u + 48] for u, v in ((86, 130), (234, 190))]

@@ -73,5 +73,5 @@ def test_it_says_so_in_training_too_of_what_its_normalisations_were_settled_on()
 
 def test_the_file_of_another_network_is_refused() -> None:
     net = DistanceNet()
-    with pytest.raises(ValueError, match=r"neighbours\.onnx: its first layers are not DistanceNet's"):
+    with pytest.raises(ValueError, match=r"neighbours\.onnx: its context\.0\.weight is not DistanceNet's"):
         begin_with_onnx(net, Path(MODELS / "neighbours.onnx"), lambda: None)
