@@ -66,7 +66,9 @@ def test_a_mesh_becomes_a_distance_network_that_a_configuration_can_name(tmp_pat
     (written,) = [one for one in onnx.load(str(out / "distance.onnx")).graph.initializer if one.name == "head.bias"]
     assert onnx.numpy_helper.to_array(written) == pytest.approx((0.65 * learnt + 0.35 * begun).numpy(), abs=1e-6)
     assert onnx.numpy_helper.to_array(written) != pytest.approx(learnt.numpy(), abs=1e-6), "drawn back"
-    assert {path.name: path.read_bytes() for path in MODELS.iterdir() if path.is_file()} == before, "the general networks stay"
+    assert {path.name: path.read_bytes() for path in MODELS.iterdir() if path.is_file()} == before, (
+        "the general networks stay"
+    )
     again = run(*options)
     assert again.returncode == 2
     assert "holds a distance network already; name another folder" in again.stderr
