@@ -94,7 +94,7 @@ class _Vehicle:
     booted_s: tuple[float, float] | None = None
     """On its clock, and then on ours."""
     version: str | None = None
-    text: str = ""
+    texts: list[str] = field(default_factory=list)
     chunks: StatusText = field(default_factory=StatusText)
 
     def write(self, data: bytes) -> None:
@@ -169,7 +169,11 @@ class GroundStation:
 
     def last_text(self, number: int) -> str:
         """Its last STATUSTEXT, whole; empty if there was none."""
-        return self._vehicles[number].text
+        return next(reversed(self._vehicles[number].texts), "")
+
+    def texts(self, number: int) -> list[str]:
+        """All its STATUSTEXTs so far, whole, in turn: of two at once nobody may read the first while it is the last."""
+        return list(self._vehicles[number].texts)
 
     def version(self, number: int) -> str | None:
         """Version of its firmware, such as `1.18.0`; None while it is not known."""
@@ -276,7 +280,7 @@ def _update(vehicle: _Vehicle, message: Any, now: float) -> None:
         case "STATUSTEXT":
             text = vehicle.chunks.joined(message.to_dict())
             if text is not None:
-                vehicle.text = text.strip()
+                vehicle.texts.append(text.strip())
         case "AUTOPILOT_VERSION":
             vehicle.version = ".".join(str(message.flight_sw_version >> shift & 0xFF) for shift in (24, 16, 8))
         case _:

@@ -148,4 +148,4 @@ def test_a_long_text_of_the_autopilot_is_joined_from_its_chunks() -> None:
     for number, begin in enumerate(range(0, len(text), 50)):
         chunk = text[begin : begin + 50].encode()
         _update(vehicle, mavlink.MAVLink_statustext_message(2, chunk, id=9, chunk_seq=number), 0.0)
-    assert vehicle.text == text
+    assert vehicle.texts == [text]

@@ -136,11 +136,11 @@ async def node_killed(world: World) -> None:
         world.station.select(0, "OFFBOARD")
         if await _comes(world, _flies(world, "OFFBOARD"), 1.0):
             break
-    place = _place(world)
+    place, told = _place(world), _failsafes_told(world)
     await world.saw(story, lambda: _far(world, place) > AWAY_M, f"{AWAY_M:g} m flown by the process")
     os.killpg(companion.process.pid, signal.SIGKILL)
     await world.saw(story, _flies(world, "LOITER"), "the mode is hold")
-    await world.saw(story, _told_failsafe(world), "a ground station is told: Failsafe activated")
+    await world.saw(story, lambda: _failsafes_told(world) > told, "a ground station is told: Failsafe activated")
     world.relay.companion_port = own
     await world.until(lambda: world.link.status().heartbeat_age_s < 1.0, "a heartbeat")
     world.station.select(0, "LOITER")
@@ -224,8 +224,9 @@ def _flies(world: World, mode: Mode) -> Callable[[], bool]:
     return lambda: world.station.mode_is(0, mode)
 
 
-def _told_failsafe(world: World) -> Callable[[], bool]:
-    return lambda: "Failsafe activated" in world.station.last_text(0)
+def _failsafes_told(world: World) -> int:
+    """How often a ground station was told of one."""
+    return sum("Failsafe activated" in text for text in world.station.texts(0))
 
 
 def _place(world: World) -> FloatArray:
