@@ -83,13 +83,17 @@ class ObstacleRanging:
     def __init__(self, rig: Rig, parameters: ObstacleParameters) -> None:
         self._rig, self._parameters = rig, parameters
         self._rays = {name: _body_rays(camera) for name, camera in rig.cameras.items()}
+        self._pixel_angles = {
+            name: camera.camera.pixel_angle(camera.camera.rays(grid_pixels(camera.camera.size, _STRIDE_PX)))
+            for name, camera in rig.cameras.items()
+        }
         self._triangulations = {name: _Triangulation(camera) for name, camera in rig.cameras.items()}
         self._bins = 1 + math.ceil(_bin(parameters.range_m))
 
     def ranges(
         self, observation: Observation, ego: EgoMotion | None = None, ground: GroundEstimate | None = None
     ) -> ObstacleRanges:
-        """Ranges of the flow since the observation before where `ego` is known and shows depth, else of the depth maps.
+        """Ranges of the flow since the observation before as far as with `ego` it shows them, beyond of the depth maps.
 
         How far the drone sees is that of the depth maps everywhere.
 
@@ -106,12 +110,19 @@ class ObstacleRanging:
                 labels = camera.labels[_GRID, _GRID].ravel()
                 obstacle = labels == 0
                 if ego is not None and before is not None:
-                    obstacle &= _across(ego.rotation.T @ ego.translation, self._rays[name]) <= _MIN_BASELINE_M
+                    obstacle &= camera.depth[_GRID, _GRID].ravel() > self._flow_shows_m(name, ego)
                 parts.append(self._about_level(_Points(places, relative, obstacle, labels != UNCLASSED)))
             if ego is not None and before is not None:
                 moved = self._triangulations[name].points(ego, before, camera)
                 parts.append(self._about_level(replace(moved, places=R_ned_body @ moved.places + origin[:, None])))
         return self._nearest(observation, _Points.concatenate(parts), ground)
+
+    def _flow_shows_m(self, name: str, ego: EgoMotion) -> Float32Array:
+        """(n,) metres up to which an obstacle in a pixel that is taken would be certain by this motion's flow."""
+        way = (ego.rotation.T @ ego.translation).astype(np.float32)
+        baseline = np.linalg.norm(np.cross(way, self._rays[name].T), axis=1)
+        shows = baseline / (_CERTAIN_SIGMAS * _FLOW_SIGMA_PX * self._pixel_angles[name])
+        return np.where(baseline > _MIN_BASELINE_M, shows, 0.0).astype(np.float32)
 
     def _about_level(self, points: _Points) -> _Points:
         """Those that are in the drone's band of heights, or show how far it sees."""
@@ -189,11 +200,6 @@ def _body_rays(camera: RigCamera) -> Float32Array:
     pixels = grid_pixels(camera.camera.size, _STRIDE_PX)
     rays: FloatArray = camera.T_body_camera.rotation @ camera.camera.rays(pixels).T
     return rays.astype(np.float32)
-
-
-def _across(way: FloatArray, rays: Float32Array) -> Float32Array:
-    """(n,) metres of a way (3,) that are across unit vectors (3, n)."""
-    return np.asarray(np.linalg.norm(np.cross(way.astype(np.float32), rays.T), axis=1), np.float32)
 
 
 def _medians(sectors: IntArray, values: Float32Array) -> FloatArray:
