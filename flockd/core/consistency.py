@@ -84,17 +84,17 @@ RESPONSE_DEGRADED = Check(
     "velocity flown, with the one commanded (root mean square over ten seconds)",
     0.6,
     "m/s",
-    "gusts_strong",
+    "velocity_off",
     "config/campaigns/gusts.yaml: where no two drones touch",
-    ("safety.degraded_gusts_m_s",),
+    ("safety.degraded_velocity_error_m_s",),
 )
 RESPONSE = Check(
     "the same",
     0.8,
     "m/s",
-    "gusts_too_strong",
+    "velocity_far_off",
     "likewise",
-    ("safety.max_gusts_m_s",),
+    ("safety.max_velocity_error_m_s",),
 )
 
 CHECKS = tuple(one for one in list(globals().values()) if isinstance(one, Check))

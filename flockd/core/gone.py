@@ -12,6 +12,10 @@ COMMANDS: Mapping[str, str] = {
 KEYS: Mapping[str, str] = {
     "autopilot.max_heartbeat_age_s": "write `heartbeat_timeout_s` in the section `safety`",
     "desired": "write the section `mission`, with `kind: circle_then_tangent` for the same flight",
+    "safety.degraded_gusts_m_s": "write `degraded_velocity_error_m_s`",
+    "safety.gate.max_drift_m_s": "delete it: wind is left to the autopilot",
+    "safety.gate.response_s": "delete it, and write `reaction_s`, which contains it",
+    "safety.max_gusts_m_s": "write `max_velocity_error_m_s`",
     "safety.degraded_ego_motion_failures": "write `degraded_ego_motion_s`, in seconds instead of steps",
     "safety.max_ego_motion_failures": "write `max_ego_motion_s`, in seconds instead of steps",
 }

@@ -56,7 +56,9 @@ def _limits(config: DroneConfig) -> Iterator[str]:
     yield f"| it flies at | {_height(config)} |"
     yield f"| fence | {' and '.join(fences) or 'NONE'} |"
     yield f"| level distance to a neighbour | {gate.min_separation_m:g} m |"
-    yield f"| gusts: slower; Hold | {config.safety.degraded_gusts_m_s:g}; {config.safety.max_gusts_m_s:g} m/s |"
+    safety = config.safety
+    limits = f"{safety.degraded_velocity_error_m_s:g}; {safety.max_velocity_error_m_s:g} m/s"
+    yield f"| velocity off its setpoints: slower; Hold | {limits} |"
     if config.autopilot is not None:
         yield f"| battery counts as low at | {100 * config.autopilot.low_battery_share:.0f} % |"
     alone_s = config.safety.alone_s

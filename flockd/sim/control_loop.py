@@ -101,9 +101,9 @@ class ControlLoop:
             return FlightStatus(State.NORMAL, ())
         return FlightStatus(decision.state, tuple(reason.sentence for reason in decision.reasons))
 
-    def gusts_m_s(self, i: int) -> float:
-        """By how much wind carries a drone off its setpoints, as its gate finds; 0 without one."""
-        return self._drones[i].gate.gusts_m_s if i in self._drones else 0.0
+    def velocity_error_m_s(self, i: int) -> float:
+        """By how much a drone's velocity is off its setpoints, as its gate finds; 0 without one."""
+        return self._drones[i].gate.velocity_error_m_s if i in self._drones else 0.0
 
     def fly(self, time_s: float, vehicles: Vehicles, commands: Commands, disturbed: Disturbances = UNDISTURBED) -> None:
         """From `time_s` one step on."""
@@ -134,7 +134,8 @@ class ControlLoop:
         """What the gate of a drone makes of its order now; its supervisor may hand it over instead."""
         drone = self._drones[i]
         around = self._around(i, now_s, vehicles, order)
-        decision = drone.supervisor.step(now_s, drone.gate.gusts_m_s, around, lost=self._lost_cameras(i, now_s))
+        lost = self._lost_cameras(i, now_s)
+        decision = drone.supervisor.step(now_s, drone.gate.velocity_error_m_s, around, lost=lost)
         self._supervised[i] = decision
         if decision.state is State.ASKING:
             self._hand_over(i, now_s, vehicles, decision.reasons[0].sentence)
@@ -142,7 +143,7 @@ class ControlLoop:
         verdict = drone.gate.step(now_s, request)
         assert verdict.setpoint is not None, "all that it is told is finite and of now"
         if decision.state is not State.ASKING:
-            slowed = is_slowed(request, verdict, drone.gate.drift)
+            slowed = is_slowed(request, verdict)
             self.slowed.add(period_s, self._causes(i, request, verdict, vehicles) if slowed else frozenset())
         return verdict.setpoint
 

@@ -39,7 +39,7 @@ class Cause(StrEnum):
 
 
 _OF_EVENTS = {
-    Event.GUSTS_STRONG: Cause.WIND,
+    Event.VELOCITY_OFF: Cause.WIND,
     Event.NO_ROOM_TO_HOLD: Cause.WIND,
     Event.CAMERA_LOST: Cause.CAMERA,
     Event.FENCE_LEFT: Cause.FENCE,
@@ -72,10 +72,10 @@ class SlowedTime:
         return {str(cause): self._by_cause_s[cause] / self._flown_s for cause in Cause if self._by_cause_s[cause]}
 
 
-def is_slowed(request: Request, verdict: Verdict, drift: FloatArray) -> bool:
-    """Whether what is allowed, with the `drift` (2,) m/s that it was corrected by, is not what was asked for."""
+def is_slowed(request: Request, verdict: Verdict) -> bool:
+    """Whether what is allowed is not what was asked for."""
     asked, setpoint = request.wanted.velocity, verdict.setpoint
-    return setpoint is not None and math.hypot(*(setpoint.velocity + drift - asked)) > _SLOWED * math.hypot(*asked)
+    return setpoint is not None and math.hypot(*(setpoint.velocity - asked)) > _SLOWED * math.hypot(*asked)
 
 
 def causes_of(

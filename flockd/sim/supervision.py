@@ -24,7 +24,7 @@ _SEES = CameraHealth(age_s=0.0, period_s=1.0, unplugged=False, frozen=False, noi
 _LOST = replace(_SEES, unplugged=True)
 _WELL = Inputs(
     cameras={"one": _SEES}, dropped_share=0.0, estimate_age_s=0.0, ego_motion_age_s=0.0, network_faults=0,
-    inference_stuck=False, load=0.0, temperature_c=None, loop_lag_s=0.0, gusts_m_s=0.0, dead_tasks=(),
+    inference_stuck=False, load=0.0, temperature_c=None, loop_lag_s=0.0, velocity_error_m_s=0.0, dead_tasks=(),
     neighbours_age_s=0.0, nearest_neighbour_m=math.inf, refused_commands=0, obstacle_near=False,
     outside_fence=False, outside_heights=False, motion_age_s=0.0,
     heartbeat_age_s=0.0, message_age_s=0.0, stream_fault=None, autopilot_failsafe=False, foreign_setpoints=None,
@@ -45,13 +45,15 @@ class WindSupervisor:
         for changes in ({"armed": False, "in_air": False, "flight_mode": "hold"}, {"flight_mode": "hold"}, {}):
             self._supervisor.step(-math.inf, replace(_WELL, **changes))
 
-    def step(self, now_s: float, gusts_m_s: float, around: Surroundings, *, lost: Collection[str] = ()) -> Decision:
-        """As of `now_s`, carried off its setpoints by `gusts_m_s`; `lost`: the names of its lost cameras."""
+    def step(
+        self, now_s: float, velocity_error_m_s: float, around: Surroundings, *, lost: Collection[str] = ()
+    ) -> Decision:
+        """As of `now_s`, so far off its setpoints; `lost`: the names of its lost cameras."""
         gate = self._parameters.gate
         inputs = replace(
             _WELL,
             cameras={**self._cameras, **dict.fromkeys(lost, _LOST)},
-            gusts_m_s=gusts_m_s,
+            velocity_error_m_s=velocity_error_m_s,
             obstacle_near=around.nearest_obstacle_m < self._parameters.hold_room_m,
             outside_fence=outside_fence(gate, around.position),
             outside_heights=outside_heights(gate, around.height_m),

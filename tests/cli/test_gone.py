@@ -36,12 +36,15 @@ def test_a_key_that_is_gone_is_refused_with_its_line_and_what_to_use(
     for section in sections:
         inner = inner.get(section, {})
     assert name not in inner
+    written = [f"{'  ' * depth}{section}:" for depth, section in enumerate(sections)]
+    written.append(f"{'  ' * len(sections)}{name}: 1")
     lines = drone.splitlines()
     if sections and f"{sections[0]}:" in lines:
-        line = lines.index(f"{sections[0]}:") + 2
-        lines.insert(line - 1, f"  {name}: 1")
+        at = lines.index(f"{sections[0]}:") + 1
+        lines[at:at] = written[1:]
+        line = at + len(written) - 1
     else:
-        lines += [f"{sections[0]}:", f"  {name}: 1"] if sections else [f"{name}: 1"]
+        lines += written
         line = len(lines)
     path = tmp_path / "drone.yaml"
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

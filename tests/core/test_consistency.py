@@ -27,7 +27,7 @@ def test_its_keys_begin_with_its_limit_and_it_says_where_that_comes_from(check: 
 
 def test_reactions_that_are_events_are_in_the_supervisors_table() -> None:
     named = {check.reaction for check in CHECKS if " " not in check.reaction}
-    assert named == {RESPONSE.reaction, RESPONSE_DEGRADED.reaction} == {"gusts_strong", "gusts_too_strong"}
+    assert named == {RESPONSE.reaction, RESPONSE_DEGRADED.reaction} == {"velocity_off", "velocity_far_off"}
     assert named <= {event.value for event in rules(SafetyParameters())}
 
 

@@ -120,14 +120,14 @@ def test_a_drone_that_hovers_in_the_way_and_does_not_avoid_is_stopped_before(fly
 
 
 def test_gusts_up_to_the_limit_do_not_bring_two_drones_together(fly: Fly) -> None:
-    """Each axis deviates by 0.4 m/s, so that drift is 0.57 m/s: below `safety.degraded_gusts_m_s`."""
+    """Each axis deviates by 0.4 m/s, so that drift is 0.57 m/s: below `safety.degraded_velocity_error_m_s`."""
     met = fly(_head_on(1.5), 15.0, VehicleConfig(gust_m_s=0.4))
     assert met.apart_m.min() < NEAR_M
     assert met.apart_m.min() >= APART_M
 
 
 def test_gusts_beyond_the_limit_end_in_hold_with_the_reason(fly: Fly) -> None:
-    """1.4 m/s of drift, and `safety.max_gusts_m_s` is 0.8."""
+    """1.4 m/s of drift, and `safety.max_velocity_error_m_s` is 0.8."""
     met = fly(_head_on(1.0), 10.0, VehicleConfig(gust_m_s=1.0))
     assert met.apart_m.min() >= APART_M
     _held_for_what_carries_them_off(met)

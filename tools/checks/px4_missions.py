@@ -105,11 +105,14 @@ class Order:
         at_s = self._mission.order_at_s
         if at_s is None or flown_s < at_s or self._sent is not None:
             return
-        north, east = (f"{metres:g}" for metres in self._mission.order)
-        command = ["fleet", "goto", "all", north, east, "--listen", self._endpoint]
         self._sent = subprocess.Popen(
-            [sys.executable, "-c", _RUN, *command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
+            [sys.executable, "-c", _RUN, *self.command(), "--listen", self._endpoint],
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+
+    def command(self) -> Sequence[str]:
+        """What is typed."""
+        return "fleet", "goto", "all", *(f"{metres:g}" for metres in self._mission.order)
 
     def answers(self) -> str:
         """What the drones answered, one line each; empty without an order."""

@@ -190,7 +190,7 @@ class MadeUpDrone:
             reasons=[] if sentence is None else [ReasonMessage(event="made_up", sentence=sentence)],
             flight_mode=wanted, armed=True, in_air=True, heartbeat_age_s=0.1, heartbeats_lost=0,
             battery_share=max(0.1, 0.9 - 0.02 * self._number - time_s / 3000), height_m=height_m,
-            velocity_trim=[0.0, 0.0], gusts_m_s=0.1, silence=None, setpoints_sent=20 * self._steps,
+            velocity_trim=[0.0, 0.0], velocity_error_m_s=0.1, silence=None, setpoints_sent=20 * self._steps,
             setpoints_missed=self._number, orders=self._commands.recent(), orders_refused=self._commands.refused,
         )  # fmt: skip
 

@@ -45,16 +45,12 @@ class GateParameters(Section):
     stop in time."""
     obstacle_clearance_m: Annotated[float, Field(ge=0, le=100)] = 0.6
     """From the drone's middle to an obstacle's surface: nearer than this, no velocity towards it."""
-    reaction_s: Annotated[float, Field(ge=0, le=5)] = 0.5
-    """From seeing an obstacle until the own drone has begun to brake."""
+    reaction_s: Annotated[float, Field(gt=0, le=5)] = 0.5
+    """From seeing an obstacle until the own drone has begun to brake. Its velocity is expected to follow its setpoints
+    with this time constant."""
     neighbour_reaction_s: Annotated[float, Field(ge=0, le=5)] = 1.0
     """From a neighbour's change of velocity until the own drone has begun to brake: a step of the pilot, in which the
     change is not seen, how long the step takes, and the drone's response."""
-    response_s: Annotated[float, Field(gt=0, le=5)] = 0.25
-    """Time constant with which the drone's velocity follows a setpoint, as the report with the autopilot's log fits it.
-    Both reaction times contain it, and the dead time before it."""
-    max_drift_m_s: Annotated[float, Field(ge=0, le=20)] = 2.0
-    """By how much at most a setpoint is corrected for wind, which carries the drone off it; 0: not at all."""
     fence_radius_m: Annotated[float, Field(gt=0, le=100_000)] | None = 100.0
     """Around home, level: the drone brakes before it as before an obstacle; beyond it only inward velocity. null: no
     circle."""
@@ -69,9 +65,10 @@ class GateParameters(Section):
             raise ValueError(
                 f"command_fresh_s {self.command_fresh_s:g} is not below command_timeout_s; write a smaller one"
             )
-        for key in ("reaction_s", "neighbour_reaction_s"):
-            if getattr(self, key) < self.response_s:
-                raise ValueError(f"{key} is below response_s {self.response_s:g}, a part of it; write a larger one")
+        if self.neighbour_reaction_s < self.reaction_s:
+            raise ValueError(
+                f"neighbour_reaction_s is below reaction_s {self.reaction_s:g}, a part of it; write a larger one"
+            )
         if self.min_height_m >= self.max_height_m:
             raise ValueError(f"min_height_m {self.min_height_m:g} is not below max_height_m; write a smaller one")
         if self.degraded_speed_m_s > self.max_speed_m_s:
@@ -111,14 +108,13 @@ class SafetyParameters(Section):
     """The same, to hover."""
     max_loop_lag_s: Annotated[float, Field(gt=0, le=10)] = 0.2
     """Lag of the event loop; above it, degraded."""
-    degraded_gusts_m_s: Positive = consistency.RESPONSE_DEGRADED.limit
-    """By how much wind carries the drone off its setpoints (root mean square over ten seconds, what the gate corrects
-    included), to be degraded."""
-    max_gusts_m_s: Positive = consistency.RESPONSE.limit
+    degraded_velocity_error_m_s: Positive = consistency.RESPONSE_DEGRADED.limit
+    """By how much the drone's velocity is off its setpoints (root mean square over ten seconds), to be degraded."""
+    max_velocity_error_m_s: Positive = consistency.RESPONSE.limit
     """The same, to ask for Hold."""
     hold_room_m: Annotated[float, Field(ge=0, le=100)] = 2.0
-    """In such gusts Hold, which knows of no obstacles, is asked for where none is nearer than this to the drone's
-    middle; until then, for 30 s at most, the drone flies on, degraded."""
+    """Hold, which knows of no obstacles, is then asked for where none is nearer than this to the drone's middle; until
+    then, for 30 s at most, the drone flies on, degraded."""
     heartbeat_timeout_s: Annotated[float, Field(gt=0, le=10)] = services.HEARTBEAT.timeout
     """The link to the autopilot counts as lost without a heartbeat for this long, and flockd falls silent for good; two
     of them may be lost while other messages arrive."""
@@ -151,7 +147,7 @@ class SafetyParameters(Section):
             ("degraded_ego_motion_s", "max_ego_motion_s"),
             ("degraded_load", "max_load"),
             ("degraded_temperature_c", "max_temperature_c"),
-            ("degraded_gusts_m_s", "max_gusts_m_s"),
+            ("degraded_velocity_error_m_s", "max_velocity_error_m_s"),
         ):
             if getattr(self, mild) > getattr(self, grave):
                 raise ValueError(f"{mild} is above {grave}; write a smaller one")

@@ -59,7 +59,7 @@ class Inputs:
     """Temperature of the hottest thermal zone; None on a computer that has none."""
     loop_lag_s: float
     """How late the event loop runs."""
-    gusts_m_s: float
+    velocity_error_m_s: float
     """How strongly the drone was carried off its setpoints in the last seconds."""
     dead_tasks: tuple[str, ...]
     """Names of tasks that have ended and should not have."""
@@ -126,8 +126,8 @@ class Event(StrEnum):
     HOT = "hot"
     TOO_HOT = "too_hot"
     LOOP_LATE = "loop_late"
-    GUSTS_STRONG = "gusts_strong"
-    GUSTS_TOO_STRONG = "gusts_too_strong"
+    VELOCITY_OFF = "velocity_off"
+    VELOCITY_FAR_OFF = "velocity_far_off"
     NO_ROOM_TO_HOLD = "no_room_to_hold"
     TASK_DIED = "task_died"
     NEIGHBOURS_LOST = "neighbours_lost"
@@ -175,8 +175,8 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
     sightless = len(lost) == len(inputs.cameras) or len(lost) > p.max_lost_cameras
     temperature = inputs.temperature_c
     lost_link = link_lost(inputs.heartbeat_age_s, inputs.message_age_s, p)
-    # While another's setpoints are followed, being off the own ones is no wind.
-    too_gusty = not inputs.gusts_m_s <= p.max_gusts_m_s and inputs.foreign_setpoints is None
+    # While another's setpoints are followed, the own ones are not.
+    too_far_off = not inputs.velocity_error_m_s <= p.max_velocity_error_m_s and inputs.foreign_setpoints is None
     table = (
         (Event.SIGHT_LOST, sightless, f"too few cameras deliver images: {', '.join(lost) or 'there are none'}"),
         (Event.CAMERA_LOST, len(lost) > 0 and not sightless, f"a camera is lost: {', '.join(lost)}"),
@@ -226,20 +226,22 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (Event.FOREIGN_SETPOINTS, inputs.foreign_setpoints is not None, f"{inputs.foreign_setpoints}"),
         (Event.PARAMETER_CHANGED, inputs.parameter_fault is not None, f"{inputs.parameter_fault}"),
         (
-            Event.GUSTS_STRONG,
-            p.degraded_gusts_m_s < inputs.gusts_m_s <= p.max_gusts_m_s,
-            f"gusts carry the drone {inputs.gusts_m_s:.1f} m/s off its setpoints",
+            Event.VELOCITY_OFF,
+            p.degraded_velocity_error_m_s < inputs.velocity_error_m_s <= p.max_velocity_error_m_s,
+            f"the velocity is {inputs.velocity_error_m_s:.1f} m/s off the setpoints",
         ),
         (
-            Event.GUSTS_TOO_STRONG,
-            too_gusty and not inputs.obstacle_near,
-            f"gusts carry the drone {inputs.gusts_m_s:.1f} m/s off its setpoints, more than it can bear",
+            Event.VELOCITY_FAR_OFF,
+            too_far_off and not inputs.obstacle_near,
+            f"the velocity is {inputs.velocity_error_m_s:.1f} m/s off the setpoints, more than "
+            f"{p.max_velocity_error_m_s:g}: wind, or an autopilot that does not follow",
         ),
         (
             Event.NO_ROOM_TO_HOLD,
-            too_gusty and inputs.obstacle_near,
-            f"gusts carry the drone {inputs.gusts_m_s:.1f} m/s off its setpoints, more than it can bear; it flies on "
-            f"to where no obstacle is within {p.hold_room_m:g} m, and asks for Hold there",
+            too_far_off and inputs.obstacle_near,
+            f"the velocity is {inputs.velocity_error_m_s:.1f} m/s off the setpoints, more than "
+            f"{p.max_velocity_error_m_s:g}: wind, or an autopilot that does not follow; the drone flies "
+            f"on to where no obstacle is within {p.hold_room_m:g} m, and asks for Hold there",
         ),
         (Event.TASK_DIED, len(inputs.dead_tasks) > 0, f"ended and should not have: {', '.join(inputs.dead_tasks)}"),
         (

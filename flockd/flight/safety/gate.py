@@ -19,7 +19,7 @@ from flockd.flight.safety.approach import towards_neighbours, towards_obstacles
 from flockd.flight.safety.fence import outside_fence, towards_fence
 from flockd.flight.safety.half_planes import nearest_within
 from flockd.flight.safety.policy import Action
-from flockd.flight.safety.response import ResponseObserver
+from flockd.flight.safety.response import ResponseMonitor
 
 
 @dataclass(frozen=True)
@@ -115,28 +115,22 @@ class Gate:
     Towards a neighbour, an obstacle or the fence the drone flies no faster than it can brake before the minimum
     distance. Every change of velocity stays within the acceleration limit, except that this one wins.
 
-    These limits are on the velocity that results, not on the one that is asked for: what the measured velocity shows of
-    wind (`ResponseObserver`) is taken off the setpoint.
+    Wind is left to the autopilot, whose velocity controller integrates: a second loop around it, here, oscillated with
+    PX4's real response. A drone that is measured to be faster than a limit brakes harder, and one that does not follow
+    its setpoints (`ResponseMonitor`) is for the supervisor.
     """
 
     def __init__(self, parameters: GateParameters) -> None:
         self._parameters = parameters
         self._last: Setpoint | None = None
-        self._result = np.zeros(2)
-        """Velocity, m/s, that the last setpoint is to result in."""
-        self._response = ResponseObserver(parameters.response_s, parameters.max_drift_m_s)
+        self._response = ResponseMonitor(parameters.reaction_s)
         self.counts: Counter[Objection] = Counter()
         """Objections since the start."""
 
     @property
-    def drift(self) -> FloatArray:
-        """(2,) m/s by which the drone's velocity settles off its setpoint, as of the last step."""
-        return self._response.drift
-
-    @property
-    def gusts_m_s(self) -> float:
-        """How strong the drift was in the last seconds; see `ResponseObserver`."""
-        return self._response.gusts_m_s
+    def velocity_error_m_s(self) -> float:
+        """By how much the drone's velocity was off its setpoints in the last seconds; see `ResponseMonitor`."""
+        return self._response.error_m_s
 
     def step(self, now_s: float, request: Request) -> Verdict:
         """What may be sent at `now_s`, on the clock of the other times; never raises, whatever the numbers are."""
@@ -171,13 +165,12 @@ class Gate:
                 if (target != wanted.velocity).any():
                     objections.append(Objection.SLOWED)
         velocity = self._within_acceleration(target, now_s, around)
-        result, sent = self._within_space(velocity, permission.action, around, objections)
+        sent = self._within_space(velocity, permission.action, around, objections)
         wanted_m = request.height_m if wanted.height_m is None else wanted.height_m
         if not (all(map(math.isfinite, (*sent, wanted_m))) and _is_heading(yaw_rad)):
             objections.append(Objection.SETPOINT_NOT_FINITE)
             return None
         height_m = self._within_climb(now_s, wanted_m, request, objections)
-        self._result = result
         return Setpoint(now_s, sent, self._within_heights(height_m, objections), yaw_rad)
 
     def _slowed(self, velocity: FloatArray, age_s: float, action: Action) -> FloatArray:
@@ -219,7 +212,7 @@ class Gate:
         """The velocity nearest to the target that can be reached from the last one, or else from the measured one."""
         p, last = self._parameters, self._recent(now_s)
         if last is not None:
-            start, elapsed_s = self._result, max(now_s - last.time_s, 0.0)
+            start, elapsed_s = last.velocity, max(now_s - last.time_s, 0.0)
         elif np.isfinite(around.velocity).all():
             start, elapsed_s = limit_norm(around.velocity, p.max_speed_m_s), 0.0
         else:
@@ -247,40 +240,21 @@ class Gate:
 
     def _within_space(
         self, velocity: FloatArray, action: Action, around: Surroundings, objections: list[Objection]
-    ) -> tuple[FloatArray, FloatArray]:
-        """The velocity that is to result, (2,) m/s, without what leads too fast anywhere, and the setpoint for it.
+    ) -> FloatArray:
+        """The velocity, (2,) m/s, without what leads too fast anywhere.
 
-        A drone that is measured to be faster than a limit has to brake: the limit counts as lower by as much.
+        A drone that is measured to be faster than a limit has to brake: the limit counts as lower by as much. This feeds
+        the velocity back with a gain of one, which no lag and no dead time make unstable.
         """
         limits = self._space(action, around)
         directions = np.concatenate([towards for towards, _ in limits.values()])
         most_m_s = np.concatenate([most for _, most in limits.values()])
         names = np.repeat(np.arange(len(limits)), [len(most) for _, most in limits.values()])
-        lowered = most_m_s
         if np.isfinite(around.velocity).all():
-            lowered = np.maximum(most_m_s - np.maximum(directions @ around.velocity - most_m_s, 0.0), 0.0)
-        over = directions @ velocity > lowered
-        result = nearest_within(velocity, directions, lowered)
+            most_m_s = np.maximum(most_m_s - np.maximum(directions @ around.velocity - most_m_s, 0.0), 0.0)
+        over = directions @ velocity > most_m_s
         objections.extend(list(limits)[i] for i in np.unique(names[over]))
-        return result, self._for_result(result, directions, most_m_s, lowered)
-
-    def _for_result(
-        self, result: FloatArray, directions: FloatArray, most_m_s: FloatArray, lowered: FloatArray
-    ) -> FloatArray:
-        """The setpoint, (2,) m/s, that is to lead to a velocity within the `lowered` limits, (n,), in this drift.
-
-        The setpoint keeps the limits too, as a drift that carries the drone away from something may end at any time.
-        But it always counters what of the drift would carry the drone beyond a limit now: between a tree to which it is
-        blown and a neighbour on the other side it stands, and is not blown on.
-        """
-        drift, max_m_s = self.drift, self._parameters.max_speed_m_s
-        carried = nearest_within(drift, directions, lowered)
-        least = carried - drift  # the smallest setpoint whose result is within the limits
-        beyond = limit_norm(result - carried, max(max_m_s - math.hypot(*least), 0.0))
-        of_setpoint = np.maximum(most_m_s - directions @ least, 0.0)
-        of_result = np.maximum(lowered - directions @ carried, 0.0)
-        within = nearest_within(beyond, np.tile(directions, (2, 1)), np.concatenate([of_setpoint, of_result]))
-        return limit_norm(least + within, max_m_s)
+        return nearest_within(velocity, directions, most_m_s)
 
     def _within_climb(self, now_s: float, wanted_m: float, request: Request, objections: list[Objection]) -> float:
         """The height nearest to the one to hold that may be asked for now.

@@ -79,7 +79,7 @@ class Rule:
 
 
 ROOM_S = 30.0
-"""For how long a drone in too strong gusts flies on for room before it asks for Hold where it is."""
+"""For how long a drone whose velocity is far off its setpoints flies on for room before it asks for Hold."""
 FOREIGN_S = 0.5
 """For how long somebody else may interfere before Hold is asked for."""
 
@@ -103,8 +103,8 @@ def rules(p: SafetyParameters) -> dict[Event, Rule]:
         Event.HOT: Rule(Barrier.NONE, Reaction.DEGRADE),
         Event.TOO_HOT: Rule(Barrier.WAIT, Reaction.HOVER),
         Event.LOOP_LATE: Rule(Barrier.NONE, Reaction.DEGRADE),
-        Event.GUSTS_STRONG: Rule(Barrier.NONE, Reaction.DEGRADE),
-        Event.GUSTS_TOO_STRONG: Rule(Barrier.NONE, Reaction.HOLD),
+        Event.VELOCITY_OFF: Rule(Barrier.NONE, Reaction.DEGRADE),
+        Event.VELOCITY_FAR_OFF: Rule(Barrier.NONE, Reaction.HOLD),
         Event.NO_ROOM_TO_HOLD: Rule(Barrier.NONE, Reaction.DEGRADE, ROOM_S, Reaction.HOLD),
         Event.TASK_DIED: Rule(Barrier.WAIT, Reaction.HOLD),
         Event.NEIGHBOURS_LOST: Rule(Barrier.NONE, Reaction.NOTE, alone_s, Reaction.HOLD),

@@ -1,4 +1,4 @@
-"""How the drone follows its setpoints, by what it measures of its velocity: what carries it off, and how fast."""
+"""How well the drone's velocity follows its setpoints."""
 
 from __future__ import annotations
 
@@ -7,65 +7,48 @@ import math
 import numpy as np
 
 from flockd.core.messages import FloatArray
-from flockd.flight.geometry.level import limit_norm
 
-_POLE_PER_S = 10.0
-"""Both poles of the observer: gusts of a second are followed, and a response that is 0.2 s late, or of a time constant
-half or twice the one that is configured, stays stable."""
-_GUSTS_S = 10.0
-"""Memory of the mean strength of gusts: a few of them."""
+_MEMORY_S = 10.0
+"""Of the mean square: a few gusts."""
 _FASTEST_M_S = 100.0
 """What is measured to be faster is no velocity."""
 
 
-class ResponseObserver:
-    """The drift of one drone: the velocity at which it settles, less its setpoint.
+class ResponseMonitor:
+    """The difference between the measured velocity and the one that is expected of the setpoints.
 
-    A Luenberger observer of v' = (setpoint - v) / tau + g, with g constant: what wind, and an autopilot that is weak,
-    add (D. Luenberger, "Observers for multivariable systems", IEEE Transactions on Automatic Control 11(2), 1966). Such
-    a disturbance observer is the usual answer to wind (W. Chen et al., "Disturbance-observer-based control and related
-    methods: an overview", IEEE Transactions on Industrial Electronics 63(2), 2016).
+    Expected is a first-order lag of the setpoints. The error is a root mean square, so that wind, an autopilot that
+    does not follow and one that oscillates all show in it. It says how far the velocity is off, not why.
     """
 
-    def __init__(self, response_s: float, max_drift_m_s: float) -> None:
-        """`response_s`: tau; `max_drift_m_s`: the drift's largest norm, beyond which velocity or model is wrong."""
-        self._response_s, self._max_drift_m_s = response_s, max_drift_m_s
-        self._velocity: FloatArray | None = None
-        self._push = self.drift = np.zeros(2)
-        """(2,) m/s, north and east."""
+    def __init__(self, response_s: float) -> None:
+        """`response_s`: time constant of the lag, the vehicle's dead time included."""
+        self._response_s = response_s
+        self._expected: FloatArray | None = None
         self._mean_square = 0.0
 
     @property
-    def gusts_m_s(self) -> float:
-        """Root mean square of the drift's norm over the last ten seconds or so."""
+    def error_m_s(self) -> float:
+        """Root mean square of the difference's norm over the last ten seconds or so."""
         return math.sqrt(self._mean_square)
 
     def restart(self, velocity: FloatArray) -> None:
         """Begins anew, while something else flies the drone, with its measured `velocity` (2,) m/s."""
-        self._begin(velocity)
+        self._expected = velocity if _is_known(velocity) else None
         self._mean_square = 0.0
 
     def step(self, velocity: FloatArray, setpoint: FloatArray, elapsed_s: float) -> None:
         """With the measured `velocity` (2,) m/s, and the `setpoint` (2,) m/s that was flown for the last `elapsed_s`.
 
-        Where a velocity is not known, or no time, the drift begins anew.
+        Where a velocity is not known, or no time, what is expected begins anew.
         """
-        if self._velocity is None or not _is_known(velocity) or not elapsed_s >= 0:
-            self._begin(velocity)
-        elif elapsed_s > 0:
-            wanted = (setpoint - self._velocity) / self._response_s
-            predicted = self._velocity + elapsed_s * (wanted + self._push)
-            keep = math.exp(-_POLE_PER_S * elapsed_s)
-            error = velocity - predicted
-            self._velocity = predicted + (1 - keep**2) * error
-            self._push = self._push + (1 - keep) ** 2 / elapsed_s * error
-            square = float(np.sum((self._response_s * self._push) ** 2))
-            self._mean_square += (1 - math.exp(-elapsed_s / _GUSTS_S)) * (square - self._mean_square)
-            self.drift = limit_norm(self._response_s * self._push, self._max_drift_m_s)
-
-    def _begin(self, velocity: FloatArray) -> None:
-        self._velocity = velocity.copy() if _is_known(velocity) else None
-        self._push = self.drift = np.zeros(2)
+        if self._expected is None or not _is_known(velocity) or not elapsed_s >= 0:
+            self._expected = velocity if _is_known(velocity) else None
+            return
+        share = -math.expm1(-elapsed_s / self._response_s)
+        self._expected = self._expected + share * (setpoint - self._expected)
+        square = float(np.sum((velocity - self._expected) ** 2))
+        self._mean_square += -math.expm1(-elapsed_s / _MEMORY_S) * (square - self._mean_square)
 
 
 def _is_known(velocity: FloatArray) -> bool:

@@ -89,7 +89,7 @@ def _flight_message(components: Components, now: float) -> FlightMessage:
         battery_share=status.battery_share,
         height_m=None if vehicle is None else vehicle.height_m,
         velocity_trim=_velocity_trim(components),
-        gusts_m_s=components.gate.gusts_m_s,
+        velocity_error_m_s=components.gate.velocity_error_m_s,
         silence=stream.silence,
         setpoints_sent=stream.sent,
         setpoints_missed=stream.missed,

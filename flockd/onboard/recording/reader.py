@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ import cv2
 import numpy as np
 from pydantic import ValidationError
 
+from flockd.core import gone
 from flockd.core.config import DroneConfig
 from flockd.core.config.perception import NO_MODEL
 from flockd.core.image_header import cost_fault
@@ -292,7 +294,9 @@ def _time_of(path: Path, data: bytes) -> float:
 
 def _config(path: Path, contents: Contents) -> DroneConfig:
     try:
-        config = DroneConfig.model_validate_json(contents.configuration)
+        config = DroneConfig.model_validate_json(json.dumps(_without_gone(json.loads(contents.configuration))))
+    except json.JSONDecodeError as error:
+        raise RecordingError(f"{path}: the configuration in it is no JSON ({error}); use another copy") from error
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "the whole"
@@ -305,6 +309,13 @@ def _config(path: Path, contents: Contents) -> DroneConfig:
         return config
     flown_without = config.perception.model_copy(update={"detector": NO_MODEL})  # by a flockd that had none
     return config.model_copy(update={"perception": flown_without})
+
+
+def _without_gone(values: Any, at: str = "") -> Any:
+    """The values of an older configuration, without the keys that this version has not."""
+    if not isinstance(values, dict):
+        return values
+    return {key: _without_gone(value, f"{at}{key}.") for key, value in values.items() if f"{at}{key}" not in gone.KEYS}
 
 
 def _learned(path: Path, flight: Mapping[str, str]) -> LearnedSize | None:

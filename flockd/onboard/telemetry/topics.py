@@ -178,8 +178,8 @@ class FlightMessage(TypedDict):
     """Above home, up positive."""
     velocity_trim: list[float]
     """m/s north and east, added to the pilot's commands: the autopilot's velocity less the cameras'."""
-    gusts_m_s: float
-    """By how much wind carried the drone off its setpoints in the last ten seconds, root mean square."""
+    velocity_error_m_s: float
+    """By how much the velocity was off its setpoints in the last ten seconds, root mean square."""
     silence: str | None
     """Why no setpoint goes to the autopilot; null while they do."""
     setpoints_sent: int

@@ -19,7 +19,7 @@ FLIGHT: dict[str, Any] = {
     "time_s": 4.0, "state": "degraded", "reasons": [{"event": "x", "sentence": "the battery is low"}],
     "flight_mode": "offboard", "armed": True, "in_air": True, "heartbeat_age_s": 0.1, "heartbeats_lost": 0,
     "battery_share": 0.4,
-    "height_m": 5.1, "velocity_trim": [0.0, 0.0], "gusts_m_s": 0.1, "silence": None, "setpoints_sent": 9,
+    "height_m": 5.1, "velocity_trim": [0.0, 0.0], "velocity_error_m_s": 0.1, "silence": None, "setpoints_sent": 9,
     "setpoints_missed": 2, "orders": [], "orders_refused": 0,
 }  # fmt: skip
 

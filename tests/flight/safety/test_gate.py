@@ -14,7 +14,7 @@ from flockd.flight.safety import Action, Gate, GateParameters, Objection, Permis
 
 STILL = np.zeros(2)
 NOBODY = np.empty((0, 3))
-DRAG_FREE = GateParameters().model_copy(update={"max_acceleration_m_s2": 1e6, "max_drift_m_s": 0.0})
+DRAG_FREE = GateParameters().model_copy(update={"max_acceleration_m_s2": 1e6})
 """So that a step shows the limit it is about at once, of a drone that is not blown anywhere."""
 HOME = Surroundings(
     position=STILL,
@@ -138,7 +138,7 @@ def test_after_the_pilots_last_output_the_drone_slows_down_and_stands_still_befo
     speed_m_s: float,
 ) -> None:
     """The last command is of 1.0 s; with a step of 0.5 s the next one is missed some time after 1.5 s."""
-    gate, speeds = Gate(GateParameters(max_drift_m_s=0.0)), {}
+    gate, speeds = Gate(GateParameters()), {}
     for tick in range(0, 70):
         now_s = tick / 20
         command = wanted([speed_m_s, 0.0], time_s=min(now_s, 1.0))
@@ -292,14 +292,14 @@ def test_degraded_a_command_too_large_is_refused_all_the_same() -> None:
 
 
 def test_from_standstill_it_gathers_speed_at_the_limit() -> None:
-    stream = Stream(GateParameters(max_acceleration_m_s2=2.0, max_drift_m_s=0.0))
+    stream = Stream(GateParameters(max_acceleration_m_s2=2.0))
     speeds = [sent(stream.step([0.0, 1.0])).velocity[1] for _ in range(13)]
     # 2 m/s^2 * 0.05 s = 0.1 m/s more each step, from zero, until what was asked for
     np.testing.assert_allclose(speeds, [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.0, 1.0])
 
 
 def test_it_brakes_at_the_limit_too() -> None:
-    stream = Stream(GateParameters(max_acceleration_m_s2=2.0, max_drift_m_s=0.0))
+    stream = Stream(GateParameters(max_acceleration_m_s2=2.0))
     for _ in range(20):
         stream.step([1.0, 0.0])
     speeds = [sent(stream.step([1.0, 0.0], Action.HOVER)).velocity[0] for _ in range(3)]
@@ -308,7 +308,7 @@ def test_it_brakes_at_the_limit_too() -> None:
 
 def test_it_takes_over_at_the_velocity_that_the_drone_has() -> None:
     moving = replace(HOME, velocity=np.array([2.0, 0.0]))
-    stream = Stream(GateParameters(max_acceleration_m_s2=2.0, max_drift_m_s=0.0))
+    stream = Stream(GateParameters(max_acceleration_m_s2=2.0))
     velocities = [sent(stream.step([0.0, 0.0], around=moving)).velocity[0] for _ in range(3)]
     np.testing.assert_allclose(velocities, [2.0, 1.9, 1.8])
 
@@ -654,15 +654,12 @@ def _vector(rng: np.random.Generator, size: int, scale: float, odd: float) -> Fl
 
 
 @pytest.mark.parametrize("odd", [0.0, 0.02, 0.2])
-@pytest.mark.parametrize(("seed", "drift_m_s"), [(0, 0.0), (1, 0.0), (2, 2.0), (3, 2.0)])
+@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.filterwarnings("ignore:overflow encountered")
-def test_whatever_is_asked_for_what_is_sent_is_safe(seed: int, drift_m_s: float, odd: float) -> None:
-    """The measured velocity is random too: the drone seems to be blown about, which may change setpoints fast.
-
-    The velocity that results, which differs from the setpoint by the drift, leads to nothing that is too near.
-    """
+def test_whatever_is_asked_for_what_is_sent_is_safe(seed: int, odd: float) -> None:
+    """The measured velocity is random too: the drone seems to be blown about."""
     rng = np.random.default_rng(seed)
-    gate, last, now_s = Gate(PARAMETERS.model_copy(update={"max_drift_m_s": drift_m_s})), None, 0.0
+    gate, last, now_s = Gate(PARAMETERS), None, 0.0
     total = {"sent": 0, "moving": 0, "near": 0, "outside": 0, "climbing": 0, "stacked": 0}
     for _ in range(1000):
         now_s += float(rng.choice([0.0, 0.05, 0.05, 0.05, 0.2]))
@@ -697,17 +694,12 @@ def test_whatever_is_asked_for_what_is_sent_is_safe(seed: int, drift_m_s: float,
             assert np.isfinite([*setpoint.velocity, setpoint.height_m, setpoint.yaw_rad, setpoint.time_s]).all()
             assert np.linalg.norm(setpoint.velocity) <= 3.0 + 1e-9
             assert 2.0 <= setpoint.height_m <= 20.0
-            if (
-                last is not None
-                and not drift_m_s
-                and not {Objection.FENCE, Objection.SEPARATION} & {*verdict.objections}
-            ):
+            if last is not None and not {Objection.FENCE, Objection.SEPARATION} & {*verdict.objections}:
                 change = np.linalg.norm(setpoint.velocity - last.velocity)
                 assert change <= 4.0 * (now_s - last.time_s) + 1e-9
-            if np.linalg.norm(setpoint.velocity) <= 3.0 - 1e-9:  # else the drift is more than the limit can counter
-                result = setpoint.velocity + gate.drift
-                total["near"] += _assert_not_towards_a_near_one(result, around, 1.0 if action is Action.FLY else 1.5)
-                total["outside"] += _assert_not_outward(result, around)
+            separation_m = 1.0 if action is Action.FLY else 1.5
+            total["near"] += _assert_not_towards_a_near_one(setpoint.velocity, around, separation_m)
+            total["outside"] += _assert_not_outward(setpoint.velocity, around)
             if last is not None and action not in (Action.OFFER, Action.SILENCE):
                 climb = setpoint.height_m - last.height_m
                 spent_m = 1.5 * (now_s - last.time_s) if action in (Action.FLY, Action.FLY_DEGRADED) else 0.0

@@ -16,7 +16,7 @@ from flockd.flight.safety.approach import stopping_speed, towards_neighbours, to
 from flockd.flight.safety.half_planes import nearest_within
 
 PARAMETERS = GateParameters(obstacle_clearance_m=0.6, braking_m_s2=1.5, reaction_s=0.5).model_copy(
-    update={"max_acceleration_m_s2": 1e6, "max_drift_m_s": 0.0}
+    update={"max_acceleration_m_s2": 1e6}
 )
 
 

@@ -50,9 +50,9 @@ FAULTS = {
     Event.HOT: Fault({"temperature_c": 90.0}, "ready", Action.FLY_DEGRADED),
     Event.TOO_HOT: Fault({"temperature_c": 100.0}, "wait", Action.HOVER),
     Event.LOOP_LATE: Fault({"loop_lag_s": 0.3}, "ready", Action.FLY_DEGRADED),
-    Event.GUSTS_STRONG: Fault({"gusts_m_s": 0.7}, "ready", Action.FLY_DEGRADED),
-    Event.GUSTS_TOO_STRONG: Fault({"gusts_m_s": 0.9}, "ready", Action.ASK_HOLD),
-    Event.NO_ROOM_TO_HOLD: Fault({"gusts_m_s": 0.9, "obstacle_near": True}, "ready", Action.FLY_DEGRADED),
+    Event.VELOCITY_OFF: Fault({"velocity_error_m_s": 0.7}, "ready", Action.FLY_DEGRADED),
+    Event.VELOCITY_FAR_OFF: Fault({"velocity_error_m_s": 0.9}, "ready", Action.ASK_HOLD),
+    Event.NO_ROOM_TO_HOLD: Fault({"velocity_error_m_s": 0.9, "obstacle_near": True}, "ready", Action.FLY_DEGRADED),
     Event.TASK_DIED: Fault({"dead_tasks": ("pilot",)}, "wait", Action.ASK_HOLD),
     Event.NEIGHBOURS_LOST: Fault({"neighbours_age_s": 2.5}, "ready", Action.FLY),
     Event.NEIGHBOUR_CLOSE: Fault({"nearest_neighbour_m": 0.9}, "ready", Action.FLY),
@@ -220,7 +220,7 @@ def test_silent_stays_silent_whatever_happens_and_afterwards(event: Event) -> No
 
 CAUSE_AND_EFFECT = (
     {Event.LINK_LOST, Event.STREAM_ENDED},
-    {Event.FOREIGN_SETPOINTS, Event.GUSTS_TOO_STRONG},
+    {Event.FOREIGN_SETPOINTS, Event.VELOCITY_FAR_OFF},
     {Event.FOREIGN_SETPOINTS, Event.NO_ROOM_TO_HOLD},
 )
 
@@ -530,7 +530,7 @@ def test_outside_its_limits_it_has_three_seconds_to_come_back(limit: str) -> Non
 
 
 def test_in_too_strong_gusts_among_obstacles_hold_is_asked_for_where_there_is_room() -> None:
-    flight = flying().run(20.0, gusts_m_s=0.9, obstacle_near=True)
+    flight = flying().run(20.0, velocity_error_m_s=0.9, obstacle_near=True)
     assert flight.action is Action.FLY_DEGRADED
     assert "flies on to where no obstacle is within 2 m" in flight.sentence(Event.NO_ROOM_TO_HOLD)
     assert flight.step(obstacle_near=False).action is Action.ASK_HOLD
@@ -538,14 +538,14 @@ def test_in_too_strong_gusts_among_obstacles_hold_is_asked_for_where_there_is_ro
 
 
 def test_where_no_room_is_found_hold_is_asked_for_after_half_a_minute() -> None:
-    flight = flying().step(gusts_m_s=0.9, obstacle_near=True).run(30.0 - STEP_S)
+    flight = flying().step(velocity_error_m_s=0.9, obstacle_near=True).run(30.0 - STEP_S)
     assert flight.action is Action.FLY_DEGRADED
     assert flight.step().action is Action.ASK_HOLD
 
 
 @pytest.mark.parametrize("obstacle_near", [False, True])
 def test_being_off_the_own_setpoints_while_anothers_are_followed_is_no_wind(obstacle_near: bool) -> None:
-    foreign = {"foreign_setpoints": "3 m/s north", "gusts_m_s": 3.0, "obstacle_near": obstacle_near}
+    foreign = {"foreign_setpoints": "3 m/s north", "velocity_error_m_s": 3.0, "obstacle_near": obstacle_near}
     flight = flying().step(**foreign)
     assert flight.action is Action.FLY_DEGRADED
     assert flight.run(0.5, **foreign).action is Action.ASK_HOLD
@@ -649,8 +649,8 @@ LIMITS: list[tuple[str, float, float, Event | None, Event]] = [
     ("temperature_c", 85.0, 85.1, None, Event.HOT),
     ("temperature_c", 95.0, 95.1, Event.HOT, Event.TOO_HOT),
     ("loop_lag_s", 0.2, 0.201, None, Event.LOOP_LATE),
-    ("gusts_m_s", 0.6, 0.61, None, Event.GUSTS_STRONG),
-    ("gusts_m_s", 0.8, 0.81, Event.GUSTS_STRONG, Event.GUSTS_TOO_STRONG),
+    ("velocity_error_m_s", 0.6, 0.61, None, Event.VELOCITY_OFF),
+    ("velocity_error_m_s", 0.8, 0.81, Event.VELOCITY_OFF, Event.VELOCITY_FAR_OFF),
     ("neighbours_age_s", 2.0, 2.001, None, Event.NEIGHBOURS_LOST),
     ("nearest_neighbour_m", 1.0, 0.999, None, Event.NEIGHBOUR_CLOSE),
     ("refused_commands", 0, 1, None, Event.COMMAND_REFUSED),

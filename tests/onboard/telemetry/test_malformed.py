@@ -38,7 +38,7 @@ ROOT = Path(__file__).parents[3]
 FLIGHT = {
     "time_s": 5.0, "state": "normal", "reasons": [], "flight_mode": "offboard", "armed": True, "in_air": True,
     "heartbeat_age_s": 0.1, "heartbeats_lost": 0,
-    "battery_share": 0.5, "height_m": 4.0, "velocity_trim": [0.0, 0.0], "gusts_m_s": 0.1,
+    "battery_share": 0.5, "height_m": 4.0, "velocity_trim": [0.0, 0.0], "velocity_error_m_s": 0.1,
     "silence": None,
     "setpoints_sent": 1, "setpoints_missed": 0, "orders": [], "orders_refused": 0,
 }  # fmt: skip

@@ -1,0 +1,233 @@
+"""Flies PX4 SITL by real daemons and prints one row a flight: what was ordered, and how closely it was flown.
+
+    FLOCKD_PX4=~/PX4-Autopilot/build/px4_sitl_default python -m tools.checks.px4_rows
+    python -m tools.checks.px4_rows --only hover north --out out/px4_rows
+    python -m tools.checks.px4_rows --autopilot standin --json
+
+The first flights run at real time. Their drones have two cameras of 128 x 96 pixels and the autopilot's own velocity, so
+that two cores carry them; they see nobody, and keep apart by what each is ordered. `by_sight` and `by_sight_busy` fly on
+whole pictures, at the factor that two cores carry; beside the latter another program keeps a core busy. Exit code 1: a
+drone left offboard, or its velocity was off by more than the row's limit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from flockd.cli.sim_fleet import DEFAULT_SPEED_FACTOR, SITL
+from flockd.core.choices import AutopilotKind
+from flockd.core.config import ScenarioConfig, load_drone, load_scenario
+from flockd.core.data import data_path
+from flockd.core.errors import FlockdError
+from flockd.core.messages import FloatArray
+from flockd.flight.flocking.metrics import closest_distances
+from flockd.review.flight_log.log import FlightLog
+from flockd.sim.fleet import fly_fleet
+from flockd.sim.free_ports import free_endpoint
+from flockd.sim.start import with_drones
+from tools.checks.px4_missions import Mission, Order
+from tools.checks.px4_sitl import run_trials
+
+SETTLED_S = 5.0
+"""From then on the velocity counts: the drones begin at a standstill, and turn at corners."""
+MOST_OFF_M_S = 0.15
+CLOSEST_M = 1.0
+_LENS = {"fx": 64.0, "fy": 64.0, "cx": 64.0, "cy": 48.0}
+_RIG = {
+    "cameras": [
+        {"name": name, "size_px": [128, 96], "intrinsics": _LENS, "extrinsics": {"yaw_deg": yaw}}
+        for name, yaw in (("front", 0.0), ("back", 180.0))
+    ]
+}
+_CIRCLE = {"kind": "circle_then_tangent", "speed_m_s": 1.0, "radius_m": 10.0, "circle_until_s": 600.0}
+_CORNERS = [{"north_m": 10.0, "east_m": 0.0}, {"north_m": 10.0, "east_m": 10.0}, {"north_m": 0.0, "east_m": 10.0}]
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One flight, at real time with small pictures, or by sight."""
+
+    name: str
+    mission: Mapping[str, Any] = field(default_factory=dict)
+    drones: int = 1
+    duration_s: float = 60.0
+    operator_m_s: float | None = None
+    """North, by `flockd fleet velocity`, after ten seconds."""
+    by_sight: bool = False
+    busy: bool = False
+    most_off_m_s: float | None = MOST_OFF_M_S
+    """Limit of the root mean square; None where the velocity that is wanted changes all the time."""
+
+
+FLIGHTS = (
+    Flight("hover", {"kind": "hover"}),
+    Flight("north", {"kind": "velocity", "velocity_m_s": [1.0, 0.0]}, duration_s=30.0),
+    Flight("circle", _CIRCLE),
+    Flight("operator", {"kind": "operator"}, duration_s=40.0, operator_m_s=1.0),
+    Flight("waypoints", {"kind": "waypoints", "waypoints": _CORNERS}, most_off_m_s=None),
+    Flight("three", _CIRCLE, drones=3),
+    Flight("by_sight", drones=3, by_sight=True, most_off_m_s=None),
+    Flight("by_sight_busy", drones=3, by_sight=True, busy=True, most_off_m_s=None),
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """How a flight was flown."""
+
+    flight: str
+    speed_factor: float
+    off_m_s: float
+    """Root mean square of the level velocity, as the autopilot knows it, less what the pilot wanted a step before; of the
+    worst drone."""
+    truly_off_m_s: float
+    """The same of the true velocity; PX4's simulated estimate wanders by 0.15 m/s."""
+    order: float
+    """Of the last 20 s."""
+    closest_m: float | None
+    longest_step_s: float
+    modes: str
+    """Modes of each autopilot, in order."""
+    ended: str
+    """Why a drone did not fly to the end; empty: all did."""
+    most_off_m_s: float | None
+
+    @property
+    def kept(self) -> bool:
+        """All drones flew to the end in offboard, apart, and as closely as the flight asks."""
+        steady = all(len(modes.split(" > ")) == 1 for modes in self.modes.split(", "))
+        close = self.most_off_m_s is None or self.off_m_s <= self.most_off_m_s
+        return steady and not self.ended and close and (self.closest_m is None or self.closest_m >= CLOSEST_M)
+
+
+def fly(flight: Flight, kind: AutopilotKind, speed_factor: float, out: Path) -> Row:
+    """Flies it and measures the row. Raises FlockdError."""
+    endpoint = free_endpoint()
+    sitl = load_drone(data_path("config") / SITL)
+    sitl = sitl.model_copy(update={"telemetry": sitl.telemetry.model_copy(update={"connect": (endpoint,)})})
+    scenario = _scenario(flight, out)
+    if not flight.by_sight:
+        sitl = sitl.model_copy(update={"safety": sitl.safety.model_copy(update={"alone_s": None})})
+    progress: Callable[[int, int], None] = lambda done, total: None  # noqa: E731
+    if flight.operator_m_s is not None:
+        progress = _Velocity(flight.operator_m_s, endpoint).progress
+    with ExitStack() as stack:
+        if flight.busy:
+            loop = stack.enter_context(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
+            stack.callback(loop.kill)
+        flown = fly_fleet(
+            scenario, sitl, kind=kind, speed_factor=speed_factor, logs=out / "logs", recordings=None,
+            environment=os.environ, progress=progress,
+        )  # fmt: skip
+    return measured(flight, flown.log)
+
+
+def measured(flight: Flight, log: FlightLog) -> Row:
+    """The row of a flight."""
+    fleet = log.metadata.fleet
+    assert fleet is not None
+    known, true = (
+        np.linalg.norm(velocity[1:, :, :2] - log.command_velocity[:-1], axis=2)[log.time_s[1:] >= SETTLED_S]
+        for velocity in (log.own_velocity_estimate, log.velocity)
+    )
+    gaps = closest_distances(log.position)[:, *np.triu_indices(log.position.shape[1], 1)]
+    return Row(
+        flight=flight.name,
+        speed_factor=fleet.speed_factor,
+        off_m_s=_worst(known),
+        truly_off_m_s=_worst(true),
+        order=round(fleet.order_last_20s, 4),
+        closest_m=round(float(gaps.min()), 2) if gaps.size else None,
+        longest_step_s=round(fleet.longest_step_s, 2),
+        modes=", ".join(f"{drone} {' > '.join(modes)}" for drone, modes in fleet.modes.items()),
+        ended="; ".join(f"{drone} {why}" for drone, why in {**fleet.handed_over, **fleet.mission_over}.items()),
+        most_off_m_s=flight.most_off_m_s,
+    )
+
+
+def _worst(off_m_s: FloatArray) -> float:
+    """Root mean square over the steps of each drone of (S, N) m/s, the largest; NaN where none flew."""
+    flown = off_m_s[:, np.isfinite(off_m_s).any(axis=0)]
+    return round(float(np.sqrt(np.nanmean(flown**2, axis=0)).max(initial=0.0)), 3) if flown.size else float("nan")
+
+
+class _Velocity(Order):
+    """An operator's velocity, as `flockd fleet velocity` sends it until the flight ends."""
+
+    def __init__(self, north_m_s: float, endpoint: str) -> None:
+        super().__init__(Mission("operator", "", 0.0, 1, order_at_s=5.0), endpoint)
+        self._north_m_s = north_m_s
+
+    def command(self) -> Sequence[str]:
+        """What is typed."""
+        return "fleet", "velocity", "all", f"{self._north_m_s:g}", "0", "--seconds", "120"
+
+
+def _scenario(flight: Flight, folder: Path) -> ScenarioConfig:
+    if flight.by_sight:
+        scenario = load_scenario(data_path("config") / "px4_flight.yaml", {"duration_s": flight.duration_s})
+        return with_drones(scenario, flight.drones)
+    drone = {"rig": _RIG, "own_velocity": "autopilot", "perception": {"flow": "dis"}}
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "small.yaml").write_text(json.dumps(drone), encoding="utf-8")
+    vehicles = [{"position_m": [0.0, 8.0 * i, -4.0]} for i in range(flight.drones)]
+    written = {
+        "scenario": flight.name, "duration_s": flight.duration_s, "drone": "small.yaml", "vehicles": vehicles,
+        "mission": dict(flight.mission),
+    }  # fmt: skip
+    path = folder / "flight.yaml"
+    path.write_text(json.dumps(written), encoding="utf-8")
+    return load_scenario(path)
+
+
+def _line(row: Row) -> str:
+    closest = "-" if row.closest_m is None else f"{row.closest_m:.2f} m"
+    return (
+        f"{row.flight:15}{row.speed_factor:>5g}{row.off_m_s:>9.3f}{row.truly_off_m_s:>9.3f}{row.order:>9.4f}{closest:>9}"
+        f"{row.longest_step_s:>7.2f} s  {'kept' if row.kept else 'NOT KEPT':9} {row.modes}{'; ' * bool(row.ended)}{row.ended}"
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Prints a table, or JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--autopilot", choices=get_args(AutopilotKind), default="px4")
+    parser.add_argument(
+        "--speed-factor", type=float, default=DEFAULT_SPEED_FACTOR,
+        help="how fast time passes in the flights by sight (%(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--out", type=Path, help="keep logs in this folder")
+    return run_trials(
+        parser, FLIGHTS, _fly_all, line=_line, rows="flights", arguments=arguments,
+        header=f"{'flight':15}{'speed':>5}{'off m/s':>9}{'truly':>9}{'order':>9}{'closest':>9}{'longest':>9}  {'':9} modes",
+    )  # fmt: skip
+
+
+def _fly_all(flights: Sequence[Flight], args: argparse.Namespace, told: Callable[[Row], None]) -> list[Row]:
+    found: list[Row] = []
+    with ExitStack() as stack:
+        out = args.out or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="flockd-")))
+        for flight in flights:
+            try:
+                row = fly(flight, args.autopilot, args.speed_factor if flight.by_sight else 1.0, out / flight.name)
+            except FlockdError as error:
+                row = Row(flight.name, 0.0, np.nan, np.nan, np.nan, None, np.nan, "never flew", str(error), None)
+            found.append(row)
+            told(row)
+    return found
+
+
+if __name__ == "__main__":
+    sys.exit(main())
