@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import development as mavlink
 
 from flockd.core.config import DroneConfig
-from flockd.onboard.daemon.take_off import ARM_RETRY_S
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_telemetry import Mode
 from flockd.sim.autopilot.fake_vehicle import Demand
@@ -63,12 +63,9 @@ async def test_the_pilot_takes_over(tmp_path: Path, record_property: RecordPrope
 class _Refuses(FakeAutopilot):
     """Offboard, with a reason that takes two messages."""
 
-    asked_s = math.inf
-
     def _select(self, mode: Mode, component: int) -> bool:
         if mode != "OFFBOARD":
             return super()._select(mode, component)
-        self.asked_s = min(self.asked_s, clock())
         for number in range(2):
             part = REASON[50 * number : 50 * number + 50].encode()
             self._mav.statustext_send(2, part, id=17, chunk_seq=number)
@@ -78,21 +75,63 @@ class _Refuses(FakeAutopilot):
 async def test_offboard_is_refused_and_the_whole_reason_reported(
     tmp_path: Path, port: int, record_property: RecordProperty
 ) -> None:
-
-    autopilot = _Refuses(port, heartbeat_s=HEARTBEAT_S, clock=clock)
-    async with aboard(autopilot, port, tmp_path, arm_and_take_off=True, height_m=HOVER_M) as ship:
-        await until(lambda: bool(ship.session.info.peers_zid()), SECONDS_TO_FAIL)  # it receives events
-        with autopilot:
-            await until(lambda: ship.state() != "" and math.isfinite(autopilot.asked_s), SECONDS_TO_FAIL)
-            await ship.until_event("the autopilot was asked for offboard, which was ")
-            (refused,) = [event for event in ship.events if "asked for offboard" in event]
-            assert refused.endswith(REASON)
-            await ship.until_state("idle")
-            reacted(record_property, "offboard-refused", clock() - autopilot.asked_s)
-            assert "offboard_refused" in ship.matters()
-            sent = len(autopilot.setpoints)
+    with _Refuses(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
+        async with aboard(autopilot, port, tmp_path, change=_never_alone) as ship:
+            await ship.is_ready_in_the_air()
+            await until(lambda: autopilot.has_ground_station, SECONDS_TO_FAIL)
+            asked_s = clock()
+            autopilot.send_from_elsewhere(_offboard())
+            await ship.until_event(f"the autopilot says: {REASON}")
+            reacted(record_property, "offboard-refused", clock() - asked_s)
             await asyncio.sleep(QUIET_S)
-            assert len(autopilot.setpoints) == sent
+            assert (ship.state(), autopilot.mode) == ("ready", "LOITER")
+
+
+def _offboard() -> bytes:
+    """A ground station's request."""
+    station = mavlink.MAVLink(None, srcSystem=255, srcComponent=mavlink.MAV_COMP_ID_MISSIONPLANNER)
+    request = station.command_long_encode(1, 1, mavlink.MAV_CMD_DO_SET_MODE, 0, 1, 6, 0, 0, 0, 0, 0)
+    return bytes(request.pack(station))
+
+
+class _Noting(FakeAutopilot):
+    """The commands with which somebody has asked it to arm or to change its mode."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.asked: list[int] = []
+
+    def _obey(self, command: int, message: Any) -> int:
+        if command in {mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, mavlink.MAV_CMD_NAV_TAKEOFF}:
+            self.asked.append(command)
+        return super()._obey(command, message)
+
+
+async def test_started_in_the_air_and_landed_by_the_pilot_it_asks_for_nothing(tmp_path: Path, port: int) -> None:
+    with _Noting(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
+        async with aboard(autopilot, port, tmp_path) as ship:
+            await until(lambda: "started" in ship.matters(), SECONDS_TO_FAIL)
+            autopilot.pilot_selects("LAND")
+            await until(lambda: not autopilot.armed, SECONDS_TO_FAIL)
+            await until(lambda: "not_armed" in ship.matters() and "started" not in ship.matters(), SECONDS_TO_FAIL)
+            await asyncio.sleep(2 * QUIET_S)
+            assert (autopilot.armed, autopilot.asked, len(autopilot.setpoints)) == (False, [], 0)
+
+
+async def test_the_pilot_changes_the_mode_while_it_climbs_and_by_hand_and_it_asks_for_nothing(
+    tmp_path: Path, port: int
+) -> None:
+    with _Noting(port, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
+        async with aboard(autopilot, port, tmp_path) as ship:
+            await until(lambda: "not_armed" in ship.matters() and "started" not in ship.matters(), SECONDS_TO_FAIL)
+            autopilot.pilot_arms()
+            autopilot.pilot_selects("TAKEOFF")
+            await until(lambda: float(autopilot.state.position[2]) < -0.5 * HOVER_M, SECONDS_TO_FAIL)
+            for mode in ("LOITER", "POSCTL", "LOITER"):
+                autopilot.pilot_selects(mode)
+                await ship.until_state("ready")
+                await asyncio.sleep(QUIET_S)
+                assert (autopilot.mode, autopilot.asked) == (mode, [])
 
 
 @pytest.mark.parametrize(
@@ -233,17 +272,26 @@ async def test_a_parameter_of_the_failsafe_that_is_changed_in_flight_is_told_and
         )
 
 
+class _RefusesToLeave(FakeAutopilot):
+    refuses = True
+
+    def _select(self, mode: Mode, component: int) -> bool:
+        return not self.refuses and super()._select(mode, component)
+
+
 async def test_an_autopilot_that_refuses_without_a_word_is_told_as_such(
     tmp_path: Path, port: int, record_property: RecordProperty
 ) -> None:
-    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
-        autopilot.wordless, autopilot.failing = True, {"check_gyro_not_calibrated"}
-        async with aboard(autopilot, port, tmp_path, arm_and_take_off=True) as ship:
-            await until(lambda: bool(ship.session.info.peers_zid()), SECONDS_TO_FAIL)  # it receives events
-            sentence = "the autopilot was asked to arm, which was refused for now without a reason; wait a few seconds"
+    with _RefusesToLeave(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
+        async with aboard(autopilot, port, tmp_path, change=_never_alone) as ship:
+            await ship.is_ready_in_the_air()
+            await ship.flies()
+            assert (await ship.ask("ask/land"))["accepted"] is True
             asked_s = clock()
-            await ship.until_event(sentence)
-            reacted(record_property, "silent-autopilot", max(0.0, clock() - asked_s - ARM_RETRY_S))
+            await ship.until_event("the autopilot was asked for hold, which was refused for now without a reason")
+            reacted(record_property, "silent-autopilot", clock() - asked_s)
+            autopilot.refuses = False
+            await until(lambda: autopilot.mode == "LAND", SECONDS_TO_FAIL)
 
 
 async def test_landed_and_disarmed_after_an_operators_order_the_next_flight_may_begin(

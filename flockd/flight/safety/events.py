@@ -93,8 +93,6 @@ class Inputs:
     """The autopilot's; `OFFBOARD` or any other word. None: not known yet, as for the next two."""
     armed: bool | None
     in_air: bool | None
-    offboard_refused: bool
-    """Since the last call the autopilot has refused offboard mode when flockd asked for it, or not replied."""
     battery_low: bool
     """So says the autopilot."""
     position_lost: bool
@@ -144,7 +142,6 @@ class Event(StrEnum):
     NOT_OFFBOARD = "not_offboard"
     NOT_ARMED = "not_armed"
     NOT_IN_AIR = "not_in_air"
-    OFFBOARD_REFUSED = "offboard_refused"
     BATTERY_LOW = "battery_low"
     POSITION_LOST = "position_lost"
     SHUTDOWN_ASKED = "shutdown_asked"
@@ -270,7 +267,6 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (Event.NOT_OFFBOARD, inputs.flight_mode != OFFBOARD, f"the flight mode is {inputs.flight_mode or 'not known'}"),
         (Event.NOT_ARMED, not inputs.armed, "not armed"),
         (Event.NOT_IN_AIR, not inputs.in_air, "not in the air"),
-        (Event.OFFBOARD_REFUSED, inputs.offboard_refused, "the autopilot refused offboard mode"),
         (Event.BATTERY_LOW, inputs.battery_low, "the autopilot says that the battery is low"),
         (Event.POSITION_LOST, inputs.position_lost, "the autopilot has lost its position"),
         (Event.SHUTDOWN_ASKED, inputs.shutdown_asked, "asked to end"),

@@ -121,7 +121,6 @@ def rules(p: SafetyParameters) -> dict[Event, Rule]:
         Event.NOT_OFFBOARD: Rule(Barrier.NONE, Reaction.SILENCE),
         Event.NOT_ARMED: Rule(Barrier.WAIT, Reaction.SILENCE),
         Event.NOT_IN_AIR: Rule(Barrier.WAIT, Reaction.NOTE),
-        Event.OFFBOARD_REFUSED: Rule(Barrier.LATCH, Reaction.SILENCE),
         Event.BATTERY_LOW: Rule(Barrier.WAIT, on_battery_low),
         Event.POSITION_LOST: Rule(Barrier.WAIT, on_position_lost),
         Event.SHUTDOWN_ASKED: Rule(Barrier.LATCH, Reaction.HOLD),

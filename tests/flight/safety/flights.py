@@ -54,7 +54,6 @@ QUIET = Inputs(
     flight_mode=OFFBOARD,
     armed=True,
     in_air=True,
-    offboard_refused=False,
     battery_low=False,
     position_lost=False,
     shutdown_asked=False,
