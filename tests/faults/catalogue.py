@@ -621,6 +621,16 @@ CATALOGUE = (
         within_s=20.0,
     ),
     Fault(
+        68, "frame-jumps", "the autopilot's local frame jumps (height, level, heading)",
+        "said; home, fence, height target and goals move with it; above 1 m, or of the heading, Hold",
+        (
+            f"{_HERE}autopilot.py::test_a_small_jump_of_the_local_frame_is_said_and_flown_through",
+            f"{_HERE}autopilot.py::test_a_large_jump_of_the_local_frame_or_the_heading_ends_in_hold",
+            "tests/onboard/autopilot/test_local_frame.py",
+        ),
+        within_s=2.0,
+    ),
+    Fault(
         72, "climb-interrupted", "the pilot or a failsafe changes the mode before flockd flies, while it climbs too",
         "flockd never asks for offboard, nor for any other mode",
         (

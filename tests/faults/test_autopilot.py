@@ -256,6 +256,48 @@ async def test_setpoints_of_another_program_are_told_and_end_in_hold(
         await ship.until_event("asking: another program sends setpoints: the autopilot follows ")
 
 
+async def test_a_small_jump_of_the_local_frame_is_said_and_flown_through(
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, record_property: RecordProperty
+) -> None:
+    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
+        height_m, jumped_s = -float(fake_autopilot.state.position[2]), clock()
+        fake_autopilot.frame_off = np.array([0.0, 0.6, -0.9])
+        await ship.until_event("the autopilot's local frame jumped by ")
+        reacted(record_property, "frame-jumps", clock() - jumped_s)
+        while clock() < jumped_s + 3.0:
+            assert -float(fake_autopilot.state.position[2]) == pytest.approx(height_m, abs=0.15)
+            state = ship.heard()["state"].message
+            assert state["height_m"] == pytest.approx(height_m, abs=0.2)
+            assert state["position_ne"][1] == pytest.approx(0.0, abs=0.3), "east of home"
+            assert (ship.state() in {"normal", "degraded"}, fake_autopilot.mode) == (True, "OFFBOARD")
+            await asyncio.sleep(0.02)
+
+
+@pytest.mark.parametrize(
+    ("frame_off", "heading_off_rad"),
+    [((0.0, 0.0, -4.0), 0.0), ((0.0, 0.0, 30.0), 0.0), ((20.0, 0.0, 0.0), 0.0), ((0.0, 0.0, 0.0), 0.8)],
+    ids=["4 m up", "30 m down", "20 m north", "heading"],
+)
+async def test_a_large_jump_of_the_local_frame_or_the_heading_ends_in_hold(
+    frame_off: tuple[float, float, float], heading_off_rad: float, tmp_path: Path, port: int,
+    fake_autopilot: FakeAutopilot, record_property: RecordProperty,
+) -> None:  # fmt: skip
+    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
+        height_m, jumped_s = -float(fake_autopilot.state.position[2]), clock()
+        fake_autopilot.frame_off, fake_autopilot.heading_off_rad = np.array(frame_off), heading_off_rad
+        await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        reacted(record_property, "frame-jumps", clock() - jumped_s)
+        assert not fake_autopilot.failsafe
+        await ship.until_event("asking: the autopilot's estimate of position or heading has jumped")
+        what = "heading" if heading_off_rad else "local frame"
+        assert sum(event.startswith(f"the autopilot's {what} jumped by ") for event in ship.events) == 1
+        assert -float(fake_autopilot.state.position[2]) == pytest.approx(height_m, abs=0.4)
+
+
 async def test_a_parameter_of_the_failsafe_that_is_changed_in_flight_is_told_and_ends_in_hold(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, record_property: RecordProperty
 ) -> None:

@@ -89,6 +89,8 @@ class Inputs:
     """What was seen of setpoints of another sender; None: nothing."""
     parameter_fault: str | None
     """What is wrong with a parameter of the autopilot that was changed in flight; None: nothing."""
+    frame_jumped: bool
+    """The autopilot's local frame or heading has jumped far in this flight."""
     flight_mode: str | None
     """The autopilot's; `OFFBOARD` or any other word. None: not known yet, as for the next two."""
     armed: bool | None
@@ -139,6 +141,7 @@ class Event(StrEnum):
     AUTOPILOT_FAILSAFE = "autopilot_failsafe"
     FOREIGN_SETPOINTS = "foreign_setpoints"
     PARAMETER_CHANGED = "parameter_changed"
+    FRAME_JUMPED = "frame_jumped"
     NOT_OFFBOARD = "not_offboard"
     NOT_ARMED = "not_armed"
     NOT_IN_AIR = "not_in_air"
@@ -222,6 +225,7 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         ),
         (Event.FOREIGN_SETPOINTS, inputs.foreign_setpoints is not None, f"{inputs.foreign_setpoints}"),
         (Event.PARAMETER_CHANGED, inputs.parameter_fault is not None, f"{inputs.parameter_fault}"),
+        (Event.FRAME_JUMPED, inputs.frame_jumped, "the autopilot's estimate of position or heading has jumped"),
         (
             Event.GUSTS_STRONG,
             p.degraded_gusts_m_s < inputs.gusts_m_s <= p.max_gusts_m_s,

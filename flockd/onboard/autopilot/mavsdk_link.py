@@ -304,7 +304,7 @@ class AutopilotLink:
     def send_setpoint(self, setpoint: Setpoint) -> None:
         """Sends it, once. Raises AutopilotError when it is not finite or MAVSDK cannot send it."""
         north, east = (float(v) for v in setpoint.velocity)
-        down = (self._received.home_down_m or 0.0) - setpoint.height_m
+        down = self._received.down_m(setpoint.height_m)
         if not all(math.isfinite(number) for number in (north, east, down, setpoint.yaw_rad)):
             raise AutopilotError("a setpoint that is not finite was not sent")
         fields = {

@@ -99,6 +99,7 @@ class InputCollector:
             autopilot_failsafe=status.armed and status.failsafe,
             foreign_setpoints=status.foreign_setpoints,
             parameter_fault=status.parameter_fault,
+            frame_jumped=status.frame_jumped,
             flight_mode=None if status.flight_mode == "unknown" else status.flight_mode,
             armed=None if math.isinf(status.heartbeat_age_s) else status.armed,
             in_air=None if status.landed_state == "unknown" else status.in_air,

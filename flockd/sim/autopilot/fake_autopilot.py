@@ -99,10 +99,11 @@ class FakeAutopilot:
             clock: monotonic seconds, in the place of the computer's.
         """
         self._speed_factor, self._real = speed_factor, clock
-        self.battery_share = 1.0
-        self.estimate_ok = True
+        self.battery_share, self.estimate_ok = 1.0, True
         self.sends_motion = True
         """False: its position and velocity do not come any more, and all else does."""
+        self.frame_off, self.heading_off_rad = np.zeros(3), 0.0
+        """By what its positions (3,) in NED and its heading are off the truth, in metres and clockwise."""
         self.failing: set[str] = set()
         """PX4's names of further checks that fail; each refuses to arm."""
         self.wordless = False
@@ -259,6 +260,8 @@ class FakeAutopilot:
             self.sends_motion,
             self.battery_share,
             self.setpoints[-1][1].velocity if self._mode == "OFFBOARD" and self.setpoints else None,
+            self.frame_off,
+            self.heading_off_rad,
         )
 
     def _clock(self) -> float:
@@ -446,7 +449,8 @@ class FakeAutopilot:
         if message.type_mask != TYPE_MASK or message.coordinate_frame != 1 or not np.isfinite(numbers).all():
             self.refused_setpoints += 1
             return
-        demand = Demand(np.array([message.vx, message.vy]), down_m=message.z, yaw_rad=message.yaw)
+        down_m, yaw_rad = message.z - self.frame_off[2], message.yaw - self.heading_off_rad
+        demand = Demand(np.array([message.vx, message.vy]), down_m=down_m, yaw_rad=yaw_rad)
         self.setpoints.append((arrived_s, demand))
 
     def _obey(self, command: int, message: Any) -> int:

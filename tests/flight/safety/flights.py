@@ -51,6 +51,7 @@ QUIET = Inputs(
     autopilot_failsafe=False,
     foreign_setpoints=None,
     parameter_fault=None,
+    frame_jumped=False,
     flight_mode=OFFBOARD,
     armed=True,
     in_air=True,

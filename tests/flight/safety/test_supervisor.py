@@ -68,6 +68,7 @@ FAULTS = {
     Event.NOT_OFFBOARD: Fault({"flight_mode": "position"}, "ready", Action.SILENCE),
     Event.NOT_ARMED: Fault({"armed": False}, "wait", Action.SILENCE),
     Event.NOT_IN_AIR: Fault({"in_air": False}, "wait", Action.FLY),
+    Event.FRAME_JUMPED: Fault({"frame_jumped": True}, "ready", Action.ASK_HOLD),
     Event.BATTERY_LOW: Fault({"battery_low": True}, "wait", Action.ASK_HOLD),
     Event.POSITION_LOST: Fault({"position_lost": True}, "wait", Action.ASK_HOLD),
     Event.SHUTDOWN_ASKED: Fault({"shutdown_asked": True}, "latch", Action.ASK_HOLD),
