@@ -631,6 +631,15 @@ CATALOGUE = (
         within_s=2.0,
     ),
     Fault(
+        70, "setpoints-clipped", "the autopilot clips setpoints (`MPC_XY_VEL_MAX`)",
+        "said; no other program is accused",
+        (
+            f"{_HERE}autopilot.py::test_setpoints_that_the_autopilot_clips_are_told_and_nobody_is_accused",
+            "tests/onboard/autopilot/test_setpoint_watch.py",
+        ),
+        within_s=4.0,
+    ),
+    Fault(
         72, "climb-interrupted", "the pilot or a failsafe changes the mode before flockd flies, while it climbs too",
         "flockd never asks for offboard, nor for any other mode",
         (

@@ -256,6 +256,23 @@ async def test_setpoints_of_another_program_are_told_and_end_in_hold(
         await ship.until_event("asking: another program sends setpoints: the autopilot follows ")
 
 
+async def test_setpoints_that_the_autopilot_clips_are_told_and_nobody_is_accused(
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, record_property: RecordProperty
+) -> None:
+    fake_autopilot.parameters["MPC_XY_VEL_MAX"] = 0.5
+    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
+        await ship.is_ready_in_the_air()
+        await until(lambda: len(fake_autopilot.setpoints) > 50, SECONDS_TO_FAIL)
+        fake_autopilot.pilot_selects("OFFBOARD")
+        await until(lambda: bool(np.linalg.norm(fake_autopilot.setpoints[-1][1].velocity) > 0.8), SECONDS_TO_FAIL)
+        clipped_s = clock()
+        await ship.until_event("the autopilot flies slower than flockd asks, 0.5 instead of ")
+        reacted(record_property, "setpoints-clipped", clock() - clipped_s)
+        await asyncio.sleep(4.0)
+        assert not any("another program" in event for event in ship.events)
+        assert sum(event.startswith("the autopilot flies slower") for event in ship.events) == 1
+
+
 async def test_a_small_jump_of_the_local_frame_is_said_and_flown_through(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, record_property: RecordProperty
 ) -> None:
@@ -271,7 +288,7 @@ async def test_a_small_jump_of_the_local_frame_is_said_and_flown_through(
             state = ship.heard()["state"].message
             assert state["height_m"] == pytest.approx(height_m, abs=0.2)
             assert state["position_ne"][1] == pytest.approx(0.0, abs=0.3), "east of home"
-            assert (ship.state() in {"normal", "degraded"}, fake_autopilot.mode) == (True, "OFFBOARD")
+            assert (ship.state() in {"normal", "degraded"}, fake_autopilot.mode) == (True, "OFFBOARD"), ship.events
             await asyncio.sleep(0.02)
 
 

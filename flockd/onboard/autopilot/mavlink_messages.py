@@ -129,8 +129,8 @@ class ReceivedMessages:
         self.heartbeats_lost = 0
         """Heartbeats that did not come while other messages did."""
         self._frame = LocalFrame()
-        self.setpoints = SetpointWatch()
         self.parameters = WatchedParameters(report)
+        self.setpoints = SetpointWatch(report, self.parameters.values)
         self.check_events = CheckEvents()
         self.clock = ClockSync()
         self._stamps = StampMonitor()

@@ -81,7 +81,7 @@ MOST_OPEN = 20
 """Exchanges whose reply is waited for; older ones are lost."""
 REASON_S = 0.5
 """For how long a refusal waits for the autopilot's text, which comes after it."""
-ATTEND_S, ANNOUNCE_S, PARAMETER_S = 0.1, 1.0, 0.5
+ATTEND_S, ANNOUNCE_S, PARAMETER_S = 0.1, 1.0, 0.4
 """Between two requests for events that are missing; two announcements; and two readings of a parameter."""
 ANNOUNCEMENT = {
     "type": 6, "autopilot": 8, "base_mode": 0, "custom_mode": 0, "system_status": 4, "mavlink_version": 3

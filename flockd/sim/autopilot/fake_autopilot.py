@@ -17,6 +17,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from types import TracebackType
 from typing import Any, Self
 
@@ -124,6 +125,7 @@ class FakeAutopilot:
             "MAN_OVERRIDE_SPD": 1.0,
             "CP_DIST": -1.0,
             "MPC_Z_P": 1.0,
+            "MPC_XY_VEL_MAX": 12.0,
         }
         """An int is an INT32 parameter, a float a REAL32 one."""
         self.setpoints: deque[tuple[float, Demand]] = deque(maxlen=MAX_SETPOINTS_KEPT)
@@ -259,7 +261,7 @@ class FakeAutopilot:
             self.estimate_ok,
             self.sends_motion,
             self.battery_share,
-            self.setpoints[-1][1].velocity if self._mode == "OFFBOARD" and self.setpoints else None,
+            self._followed().velocity if self._mode == "OFFBOARD" and self.setpoints else None,
             self.frame_off,
             self.heading_off_rad,
         )
@@ -373,7 +375,7 @@ class FakeAutopilot:
     def _demand(self) -> Demand:
         match self._mode:
             case "OFFBOARD" if self.setpoints:
-                return self.setpoints[-1][1]
+                return self._followed()
             case "POSCTL":
                 return Demand(self._by_hand(), self._hold_down_m, self._hold_yaw_rad)
             case "TAKEOFF":
@@ -387,6 +389,12 @@ class FakeAutopilot:
                 )
             case _:
                 return Demand(np.zeros(2), self._hold_down_m, self._hold_yaw_rad)
+
+    def _followed(self) -> Demand:
+        """The newest setpoint, no faster than may be flown."""
+        asked = self.setpoints[-1][1]
+        speed_m_s, most_m_s = float(np.linalg.norm(asked.velocity)), self.parameters["MPC_XY_VEL_MAX"]
+        return replace(asked, velocity=asked.velocity * (most_m_s / max(speed_m_s, most_m_s)))
 
     def _by_hand(self) -> FloatArray:
         """(2,) m/s north and east that the sticks ask for; level, and at rest once they are not heard any more."""
