@@ -103,15 +103,13 @@ def _people(config: DroneConfig) -> Iterator[str]:
 
 
 def _steps(config: DroneConfig) -> Iterator[str]:
-    itself = config.autopilot is not None and config.autopilot.arm_and_take_off
     yield "## Before and after"
     yield ""
     for step in (
         "`flockd doctor` and `flockd doctor --bench` without FAILURE; WARNINGs understood",
         "propellers off: offboard selected `normal`; another mode `silent` at once; a camera unplugged `degraded`",
         "words agreed: `take over`, `land now`, `stop`",
-        "flockd arms and takes off by itself (`arm_and_take_off`): everybody behind the line" if itself
-        else "armed and brought up by the pilot to the height above; then offboard for ten seconds, and back by hand",
+        "armed and brought up by the pilot to the height above; then offboard for ten seconds, and back by hand",
         "after landing: disarmed, batteries off, `flockd report recordings`, every event understood",
     ):  # fmt: skip
         yield f"- [ ] {step}"

@@ -28,7 +28,7 @@ _WELL = Inputs(
     neighbours_age_s=0.0, nearest_neighbour_m=math.inf, refused_commands=0, obstacle_near=False,
     outside_fence=False, outside_heights=False, motion_age_s=0.0,
     heartbeat_age_s=0.0, message_age_s=0.0, stream_fault=None, autopilot_failsafe=False, foreign_setpoints=None,
-    parameter_fault=None, flight_mode=OFFBOARD, armed=True, in_air=True, offboard_refused=False, battery_low=False,
+    parameter_fault=None, frame_jumped=False, flight_mode=OFFBOARD, armed=True, in_air=True, battery_low=False,
     position_lost=False, shutdown_asked=False, hold_asked=False, land_asked=False, resume_asked=False,
 )  # fmt: skip
 

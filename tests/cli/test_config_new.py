@@ -59,8 +59,6 @@ def test_a_real_drone_hovers_at_a_metre_per_second_at_most_until_its_owner_says_
     drone = load_drone(data_path("config") / "quadrotor.yaml" if shipped else new)
     assert drone.mission.kind == "hover"
     assert drone.flocking.max_speed_m_s <= 1.0
-    assert drone.autopilot is not None
-    assert not drone.autopilot.arm_and_take_off
 
 
 def test_new_drones_of_a_flock_begin_with_first_flights_each_in_its_layer(tmp_path: Path) -> None:

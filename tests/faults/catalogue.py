@@ -171,7 +171,7 @@ CATALOGUE = (
         within_s=0.3,
     ),
     Fault(
-        14, "offboard-refused", "offboard mode is refused, or not answered", "idle; the reason is reported",
+        14, "offboard-refused", "the pilot's offboard mode is refused", "the reason is reported",
         (
             f"{_HERE}autopilot.py::test_offboard_is_refused_and_the_whole_reason_reported",
         ),
@@ -586,6 +586,7 @@ CATALOGUE = (
         "the reason is in status and log, or `without a reason`",
         (
             f"{_HERE}autopilot.py::test_an_autopilot_that_refuses_without_a_word_is_told_as_such",
+            f"{_LINK}::test_a_refusal_without_a_word_is_told_as_such",
             f"{_LINK}::test_an_autopilot_that_acts_on_the_loss_of_its_ground_station_hears_none_and_sends_no_texts",
             f"{_LINK}::test_events_that_are_lost_are_requested_and_come",
             f"{_LINK}::test_an_autopilot_that_has_started_anew_is_asked_for_its_streams_again",
@@ -618,6 +619,39 @@ CATALOGUE = (
             "tests/flight/geometry/test_rig_calibration.py::test_a_camera_that_is_upside_down_or_another_one_is_said",
         ),
         within_s=20.0,
+    ),
+    Fault(
+        68, "frame-jumps", "the autopilot's local frame jumps (height, level, heading)",
+        "said; home, fence, height target and goals move with it; above 1 m, or of the heading, Hold",
+        (
+            f"{_HERE}autopilot.py::test_a_small_jump_of_the_local_frame_is_said_and_flown_through",
+            f"{_HERE}autopilot.py::test_a_large_jump_of_the_local_frame_or_the_heading_ends_in_hold",
+            "tests/onboard/autopilot/test_local_frame.py",
+        ),
+        within_s=2.0,
+    ),
+    Fault(
+        70, "setpoints-clipped", "the autopilot clips setpoints (`MPC_XY_VEL_MAX`)",
+        "said; no other program is accused",
+        (
+            f"{_HERE}autopilot.py::test_setpoints_that_the_autopilot_clips_are_told_and_nobody_is_accused",
+            "tests/onboard/autopilot/test_setpoint_watch.py",
+        ),
+        within_s=4.0,
+    ),
+    Fault(
+        72, "climb-interrupted", "the pilot or a failsafe changes the mode before flockd flies, while it climbs too",
+        "flockd never asks for offboard, nor for any other mode",
+        (
+            f"{_HERE}autopilot.py::test_the_pilot_changes_the_mode_while_it_climbs_and_by_hand_and_it_asks_for_nothing",
+        ),
+    ),
+    Fault(
+        73, "landed-after-a-restart", "started again in the air, then landed by the pilot",
+        "flockd never arms, and asks for nothing",
+        (
+            f"{_HERE}autopilot.py::test_started_in_the_air_and_landed_by_the_pilot_it_asks_for_nothing",
+        ),
     ),
 )
 # fmt: on

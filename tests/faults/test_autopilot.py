@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import development as mavlink
 
 from flockd.core.config import DroneConfig
-from flockd.onboard.daemon.take_off import ARM_RETRY_S
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_telemetry import Mode
 from flockd.sim.autopilot.fake_vehicle import Demand
@@ -63,12 +63,9 @@ async def test_the_pilot_takes_over(tmp_path: Path, record_property: RecordPrope
 class _Refuses(FakeAutopilot):
     """Offboard, with a reason that takes two messages."""
 
-    asked_s = math.inf
-
     def _select(self, mode: Mode, component: int) -> bool:
         if mode != "OFFBOARD":
             return super()._select(mode, component)
-        self.asked_s = min(self.asked_s, clock())
         for number in range(2):
             part = REASON[50 * number : 50 * number + 50].encode()
             self._mav.statustext_send(2, part, id=17, chunk_seq=number)
@@ -78,21 +75,63 @@ class _Refuses(FakeAutopilot):
 async def test_offboard_is_refused_and_the_whole_reason_reported(
     tmp_path: Path, port: int, record_property: RecordProperty
 ) -> None:
-
-    autopilot = _Refuses(port, heartbeat_s=HEARTBEAT_S, clock=clock)
-    async with aboard(autopilot, port, tmp_path, arm_and_take_off=True, height_m=HOVER_M) as ship:
-        await until(lambda: bool(ship.session.info.peers_zid()), SECONDS_TO_FAIL)  # it receives events
-        with autopilot:
-            await until(lambda: ship.state() != "" and math.isfinite(autopilot.asked_s), SECONDS_TO_FAIL)
-            await ship.until_event("the autopilot was asked for offboard, which was ")
-            (refused,) = [event for event in ship.events if "asked for offboard" in event]
-            assert refused.endswith(REASON)
-            await ship.until_state("idle")
-            reacted(record_property, "offboard-refused", clock() - autopilot.asked_s)
-            assert "offboard_refused" in ship.matters()
-            sent = len(autopilot.setpoints)
+    with _Refuses(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
+        async with aboard(autopilot, port, tmp_path, change=_never_alone) as ship:
+            await ship.is_ready_in_the_air()
+            await until(lambda: autopilot.has_ground_station, SECONDS_TO_FAIL)
+            asked_s = clock()
+            autopilot.send_from_elsewhere(_offboard())
+            await ship.until_event(f"the autopilot says: {REASON}")
+            reacted(record_property, "offboard-refused", clock() - asked_s)
             await asyncio.sleep(QUIET_S)
-            assert len(autopilot.setpoints) == sent
+            assert (ship.state(), autopilot.mode) == ("ready", "LOITER")
+
+
+def _offboard() -> bytes:
+    """A ground station's request."""
+    station = mavlink.MAVLink(None, srcSystem=255, srcComponent=mavlink.MAV_COMP_ID_MISSIONPLANNER)
+    request = station.command_long_encode(1, 1, mavlink.MAV_CMD_DO_SET_MODE, 0, 1, 6, 0, 0, 0, 0, 0)
+    return bytes(request.pack(station))
+
+
+class _Noting(FakeAutopilot):
+    """The commands with which somebody has asked it to arm or to change its mode."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.asked: list[int] = []
+
+    def _obey(self, command: int, message: Any) -> int:
+        if command in {mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, mavlink.MAV_CMD_NAV_TAKEOFF}:
+            self.asked.append(command)
+        return super()._obey(command, message)
+
+
+async def test_started_in_the_air_and_landed_by_the_pilot_it_asks_for_nothing(tmp_path: Path, port: int) -> None:
+    with _Noting(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
+        async with aboard(autopilot, port, tmp_path) as ship:
+            await until(lambda: "started" in ship.matters(), SECONDS_TO_FAIL)
+            autopilot.pilot_selects("LAND")
+            await until(lambda: not autopilot.armed, SECONDS_TO_FAIL)
+            await until(lambda: "not_armed" in ship.matters() and "started" not in ship.matters(), SECONDS_TO_FAIL)
+            await asyncio.sleep(2 * QUIET_S)
+            assert (autopilot.armed, autopilot.asked, len(autopilot.setpoints)) == (False, [], 0)
+
+
+async def test_the_pilot_changes_the_mode_while_it_climbs_and_by_hand_and_it_asks_for_nothing(
+    tmp_path: Path, port: int
+) -> None:
+    with _Noting(port, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
+        async with aboard(autopilot, port, tmp_path) as ship:
+            await until(lambda: "not_armed" in ship.matters() and "started" not in ship.matters(), SECONDS_TO_FAIL)
+            autopilot.pilot_arms()
+            autopilot.pilot_selects("TAKEOFF")
+            await until(lambda: float(autopilot.state.position[2]) < -0.5 * HOVER_M, SECONDS_TO_FAIL)
+            for mode in ("LOITER", "POSCTL", "LOITER"):
+                autopilot.pilot_selects(mode)
+                await ship.until_state("ready")
+                await asyncio.sleep(QUIET_S)
+                assert (autopilot.mode, autopilot.asked) == (mode, [])
 
 
 @pytest.mark.parametrize(
@@ -217,6 +256,65 @@ async def test_setpoints_of_another_program_are_told_and_end_in_hold(
         await ship.until_event("asking: another program sends setpoints: the autopilot follows ")
 
 
+async def test_setpoints_that_the_autopilot_clips_are_told_and_nobody_is_accused(
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, record_property: RecordProperty
+) -> None:
+    fake_autopilot.parameters["MPC_XY_VEL_MAX"] = 0.5
+    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
+        await ship.is_ready_in_the_air()
+        await until(lambda: len(fake_autopilot.setpoints) > 50, SECONDS_TO_FAIL)
+        fake_autopilot.pilot_selects("OFFBOARD")
+        await until(lambda: bool(np.linalg.norm(fake_autopilot.setpoints[-1][1].velocity) > 0.8), SECONDS_TO_FAIL)
+        clipped_s = clock()
+        await ship.until_event("the autopilot flies slower than flockd asks, 0.5 instead of ")
+        reacted(record_property, "setpoints-clipped", clock() - clipped_s)
+        await asyncio.sleep(4.0)
+        assert not any("another program" in event for event in ship.events)
+        assert sum(event.startswith("the autopilot flies slower") for event in ship.events) == 1
+
+
+async def test_a_small_jump_of_the_local_frame_is_said_and_flown_through(
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, record_property: RecordProperty
+) -> None:
+    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
+        height_m, jumped_s = -float(fake_autopilot.state.position[2]), clock()
+        fake_autopilot.frame_off = np.array([0.0, 0.6, -0.9])
+        await ship.until_event("the autopilot's local frame jumped by ")
+        reacted(record_property, "frame-jumps", clock() - jumped_s)
+        while clock() < jumped_s + 3.0:
+            assert -float(fake_autopilot.state.position[2]) == pytest.approx(height_m, abs=0.15)
+            state = ship.heard()["state"].message
+            assert state["height_m"] == pytest.approx(height_m, abs=0.2)
+            assert state["position_ne"][1] == pytest.approx(0.0, abs=0.3), "east of home"
+            assert (ship.state() in {"normal", "degraded"}, fake_autopilot.mode) == (True, "OFFBOARD"), ship.events
+            await asyncio.sleep(0.02)
+
+
+@pytest.mark.parametrize(
+    ("frame_off", "heading_off_rad"),
+    [((0.0, 0.0, -4.0), 0.0), ((0.0, 0.0, 30.0), 0.0), ((20.0, 0.0, 0.0), 0.0), ((0.0, 0.0, 0.0), 0.8)],
+    ids=["4 m up", "30 m down", "20 m north", "heading"],
+)
+async def test_a_large_jump_of_the_local_frame_or_the_heading_ends_in_hold(
+    frame_off: tuple[float, float, float], heading_off_rad: float, tmp_path: Path, port: int,
+    fake_autopilot: FakeAutopilot, record_property: RecordProperty,
+) -> None:  # fmt: skip
+    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
+        height_m, jumped_s = -float(fake_autopilot.state.position[2]), clock()
+        fake_autopilot.frame_off, fake_autopilot.heading_off_rad = np.array(frame_off), heading_off_rad
+        await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        reacted(record_property, "frame-jumps", clock() - jumped_s)
+        assert not fake_autopilot.failsafe
+        await ship.until_event("asking: the autopilot's estimate of position or heading has jumped")
+        what = "heading" if heading_off_rad else "local frame"
+        assert sum(event.startswith(f"the autopilot's {what} jumped by ") for event in ship.events) == 1
+        assert -float(fake_autopilot.state.position[2]) == pytest.approx(height_m, abs=0.4)
+
+
 async def test_a_parameter_of_the_failsafe_that_is_changed_in_flight_is_told_and_ends_in_hold(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, record_property: RecordProperty
 ) -> None:
@@ -233,17 +331,26 @@ async def test_a_parameter_of_the_failsafe_that_is_changed_in_flight_is_told_and
         )
 
 
+class _RefusesToLeave(FakeAutopilot):
+    refuses = True
+
+    def _select(self, mode: Mode, component: int) -> bool:
+        return not self.refuses and super()._select(mode, component)
+
+
 async def test_an_autopilot_that_refuses_without_a_word_is_told_as_such(
     tmp_path: Path, port: int, record_property: RecordProperty
 ) -> None:
-    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
-        autopilot.wordless, autopilot.failing = True, {"check_gyro_not_calibrated"}
-        async with aboard(autopilot, port, tmp_path, arm_and_take_off=True) as ship:
-            await until(lambda: bool(ship.session.info.peers_zid()), SECONDS_TO_FAIL)  # it receives events
-            sentence = "the autopilot was asked to arm, which was refused for now without a reason; wait a few seconds"
+    with _RefusesToLeave(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
+        async with aboard(autopilot, port, tmp_path, change=_never_alone) as ship:
+            await ship.is_ready_in_the_air()
+            await ship.flies()
+            assert (await ship.ask("ask/land"))["accepted"] is True
             asked_s = clock()
-            await ship.until_event(sentence)
-            reacted(record_property, "silent-autopilot", max(0.0, clock() - asked_s - ARM_RETRY_S))
+            await ship.until_event("the autopilot was asked for hold, which was refused for now without a reason")
+            reacted(record_property, "silent-autopilot", clock() - asked_s)
+            autopilot.refuses = False
+            await until(lambda: autopilot.mode == "LAND", SECONDS_TO_FAIL)
 
 
 async def test_landed_and_disarmed_after_an_operators_order_the_next_flight_may_begin(

@@ -15,13 +15,13 @@ from tests.faults.catalogue import CATALOGUE, REACTION, Fault, fault_named, reac
 from tools.checks.faults import outcome
 
 ROOT = Path(__file__).parents[2]
-ROWS = tuple(range(1, 68))
 FAULT = fault_named("sigterm")
 
 
 def test_every_row_has_one_name_and_a_story() -> None:
-    assert [fault.row for fault in CATALOGUE] == list(ROWS)
-    assert len({fault.name for fault in CATALOGUE}) == len(ROWS)
+    rows = [fault.row for fault in CATALOGUE]
+    assert rows == sorted(set(rows))
+    assert len({fault.name for fault in CATALOGUE}) == len(rows)
     assert all(fault.stories for fault in CATALOGUE)
 
 

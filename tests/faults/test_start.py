@@ -54,6 +54,7 @@ def _run(folder: Path, change: Callable[[dict[str, Any]], object]) -> Ended:
     ("section", "key", "value", "told"),
     [
         ("autopilot", "adress", "udpin://x", "autopilot.adress: is not a known key; did you mean `address`?"),
+        ("autopilot", "arm_and_take_off", False, "a pilot or a ground station arms, takes off and selects offboard"),
         ("safety", "hover_s", 1e9, "safety.hover_s: 1000000000.0 is not at most 3; write "),
         ("safety", "heartbeat_timeout_s", "2 s", "safety.heartbeat_timeout_s: 2 s is not a number"),
         ("perception", "deadline_s", 1e9, "perception.deadline_s: 1000000000.0 is not "),

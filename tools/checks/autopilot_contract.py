@@ -42,6 +42,7 @@ from flockd.sim.free_ports import free_port
 from flockd.sim.ground_station import GroundStation
 from flockd.sim.processes import Program
 from flockd.sim.start import with_drones
+from tools.checks.pilots_link import PilotsLink
 
 HEIGHT_M = 4.0
 NORTH_M_S = 1.0
@@ -137,7 +138,7 @@ def _packets(data: bytes) -> Iterator[tuple[int, bytes]]:
 class World:
     """One autopilot, and flockd's link to it."""
 
-    link: AutopilotLink
+    link: PilotsLink
     streamer: SetpointStreamer
     station: GroundStation
     relay: Relay
@@ -404,7 +405,7 @@ async def _linked(
         await asyncio.sleep(0.05)
     station.request_messages()
     parameters = AutopilotParameters(address=f"udpin://127.0.0.1:{flockd_port}", max_gap_s=stories.max_gap_s)
-    link = await AutopilotLink.connect(parameters, timeout_s=START_S, clock=clock)
+    link = await PilotsLink.connect(parameters, timeout_s=START_S, clock=clock)
     streamer = SetpointStreamer(link.send_setpoint, link.status, _pass, parameters, SafetyParameters(), clock=clock)
     streamer.start()
     world = World(link, streamer, station, relay, restart, stack, speed_factor, clock)

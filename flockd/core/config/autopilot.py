@@ -33,8 +33,6 @@ class AutopilotParameters(Section):
     COM_OF_LOSS_T: PX4 returns to offboard by itself when setpoints come back."""
     on_failure: Literal["hold", "land"] = "hold"
     """The mode that flockd requests from the autopilot when it cannot go on."""
-    arm_and_take_off: bool = False
-    """By default the pilot arms, brings the drone up and switches to offboard."""
     height_m: Distance | None = None
     """Height above home to fly at; by default the height at which the flight begins."""
     max_velocity_trim_m_s: Speed = 0.5

@@ -33,6 +33,11 @@ _LIMITS = {
     "less_than": ("lt", "less than"),
     "less_than_equal": ("le", "at most"),
 }
+_GONE: dict[KeyPath, str] = {
+    ("autopilot", "arm_and_take_off"): "is gone, so leave it out: a pilot or a ground station arms, takes off and "
+    "selects offboard"
+}
+"""What to do instead, by the keys that earlier versions had."""
 
 
 def problems_of(
@@ -95,6 +100,8 @@ def _sentence(error: ErrorDetails, written: str, path: KeyPath, root: Schema) ->
     schema = _schema_at(root, path)
     wanted = _wanted(root, schema, _unit(path))
     shown = written or ("a list" if isinstance(value, tuple) else _shown(value))
+    if kind == "extra_forbidden" and path[-2:] in _GONE:
+        return _GONE[path[-2:]]
     if kind == "extra_forbidden":
         gone = KEYS.get(".".join(part for part in path if isinstance(part, str)).removeprefix("drone."))
         if gone is not None:

@@ -89,12 +89,12 @@ class Inputs:
     """What was seen of setpoints of another sender; None: nothing."""
     parameter_fault: str | None
     """What is wrong with a parameter of the autopilot that was changed in flight; None: nothing."""
+    frame_jumped: bool
+    """The autopilot's local frame or heading has jumped far in this flight."""
     flight_mode: str | None
     """The autopilot's; `OFFBOARD` or any other word. None: not known yet, as for the next two."""
     armed: bool | None
     in_air: bool | None
-    offboard_refused: bool
-    """Since the last call the autopilot has refused offboard mode when flockd asked for it, or not replied."""
     battery_low: bool
     """So says the autopilot."""
     position_lost: bool
@@ -141,10 +141,10 @@ class Event(StrEnum):
     AUTOPILOT_FAILSAFE = "autopilot_failsafe"
     FOREIGN_SETPOINTS = "foreign_setpoints"
     PARAMETER_CHANGED = "parameter_changed"
+    FRAME_JUMPED = "frame_jumped"
     NOT_OFFBOARD = "not_offboard"
     NOT_ARMED = "not_armed"
     NOT_IN_AIR = "not_in_air"
-    OFFBOARD_REFUSED = "offboard_refused"
     BATTERY_LOW = "battery_low"
     POSITION_LOST = "position_lost"
     SHUTDOWN_ASKED = "shutdown_asked"
@@ -225,6 +225,7 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         ),
         (Event.FOREIGN_SETPOINTS, inputs.foreign_setpoints is not None, f"{inputs.foreign_setpoints}"),
         (Event.PARAMETER_CHANGED, inputs.parameter_fault is not None, f"{inputs.parameter_fault}"),
+        (Event.FRAME_JUMPED, inputs.frame_jumped, "the autopilot's estimate of position or heading has jumped"),
         (
             Event.VELOCITY_OFF,
             p.degraded_velocity_error_m_s < inputs.velocity_error_m_s <= p.max_velocity_error_m_s,
@@ -272,7 +273,6 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (Event.NOT_OFFBOARD, inputs.flight_mode != OFFBOARD, f"the flight mode is {inputs.flight_mode or 'not known'}"),
         (Event.NOT_ARMED, not inputs.armed, "not armed"),
         (Event.NOT_IN_AIR, not inputs.in_air, "not in the air"),
-        (Event.OFFBOARD_REFUSED, inputs.offboard_refused, "the autopilot refused offboard mode"),
         (Event.BATTERY_LOW, inputs.battery_low, "the autopilot says that the battery is low"),
         (Event.POSITION_LOST, inputs.position_lost, "the autopilot has lost its position"),
         (Event.SHUTDOWN_ASKED, inputs.shutdown_asked, "asked to end"),

@@ -40,7 +40,7 @@ class SilentLink(AutopilotLink):
     async def _refused(self) -> None:
         raise AutopilotError("on the bench nothing is asked of the autopilot")
 
-    request_offboard = hold = land = return_home = arm = take_off = _refused
+    hold = land = return_home = _refused
 
 
 @dataclass(frozen=True)

@@ -63,13 +63,15 @@ class AutopilotStatus:
     gps_ok: bool | None
     """A three-dimensional fix."""
     position_ned: FloatArray | None
-    """(3,) metres from the estimator's origin, which is not home."""
+    """(3,) metres from where the estimator's origin was at the start of the flight, which is not home."""
     home_ned: FloatArray | None
     """(3,) metres, likewise."""
     foreign_setpoints: str | None = None
     """What was seen of setpoints that flockd did not send."""
     parameter_fault: str | None = None
     """What is wrong with a parameter that was changed since it was armed."""
+    frame_jumped: bool = False
+    """Its local frame, or its heading, has jumped far since offboard began."""
 
     @property
     def in_air(self) -> bool:

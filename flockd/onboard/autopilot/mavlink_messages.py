@@ -19,6 +19,7 @@ from flockd.core.messages import FloatArray, RangeReading, VehicleState
 from flockd.flight.geometry import rotation_from_quaternion
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus, FlightMode, LandedState, mode_of
 from flockd.onboard.autopilot.clock_sync import ClockEstimate, ClockSync, StampMonitor
+from flockd.onboard.autopilot.local_frame import LocalFrame
 from flockd.onboard.autopilot.refusals import CheckEvents, Refusal, refusals
 from flockd.onboard.autopilot.setpoint_watch import SetpointWatch
 from flockd.onboard.autopilot.watched_parameters import WatchedParameters
@@ -99,9 +100,9 @@ class ReceivedMessages:
     """The newest message of each kind. `add` is for one thread, everything else for any."""
 
     def __init__(self, report: Callable[[str], None], max_gap_s: float = services.SETPOINT.timeout) -> None:
-        """``report`` is called by `add` with one sentence on the first of each unknown value, of a home that moves in
-        flight, of a landing, of a restart, of lost heartbeats, of a clock that lies, and of what the autopilot says as
-        a warning or worse.
+        """``report`` is called by `add` with one sentence on the first of each unknown value, of a home that moves or
+        a frame that jumps in flight, of a landing, of a restart, of lost heartbeats, of a clock that lies, and of what
+        the autopilot says as a warning or worse.
         ``max_gap_s``: between setpoints, which flockd bridges.
         """
         self._report = report
@@ -127,8 +128,9 @@ class ReceivedMessages:
         """How often the autopilot has begun anew since flockd listens."""
         self.heartbeats_lost = 0
         """Heartbeats that did not come while other messages did."""
-        self.setpoints = SetpointWatch()
+        self._frame = LocalFrame()
         self.parameters = WatchedParameters(report)
+        self.setpoints = SetpointWatch(report, self.parameters.values)
         self.check_events = CheckEvents()
         self.clock = ClockSync()
         self._stamps = StampMonitor()
@@ -157,18 +159,28 @@ class ReceivedMessages:
         elif name == "POSITION_TARGET_LOCAL_NED":
             followed = [math.nan if fields.get(key) is None else float(fields[key]) for key in ("vx", "vy")]
             self.setpoints.followed(time_s, *followed, offboard=self.flight_mode() == "offboard")
+        fields = self._without_jumps(name, fields)
         if name in STAMPED:
             arrived_s, time_s = time_s, self._stamped_s(name, fields, time_s)
             if name == DISTANCE_SENSOR:
                 self._ranges.add(fields, time_s, arrived_s)
         self._newest[name] = ReceivedMessage(time_s, self._checked(name, fields))
+        self._follow(name, time_s)
+
+    def _follow(self, name: str, time_s: float) -> None:
+        """Draws the conclusions of a message that is known now."""
         if name in ("HEARTBEAT", "EXTENDED_SYS_STATE"):
             status = self.status(time_s)
             self._flies = status.in_air or (self._flies and status.armed)
             self._home_moved = self._home_moved and self._flies
+            if not self._flies:
+                self._frame.restart()
+                self._take_home()
             self._take_landing(status.landed_state)
         elif name == "HOME_POSITION":
-            self._take_home(_vector(fields, "x", "y", "z"), _vector(fields, "latitude", "longitude"))
+            self._take_home()
+        if name in ("HEARTBEAT", "CURRENT_MODE") and self.flight_mode() != "offboard":
+            self._frame.large = False  # nobody flies on with it
 
     def add_other_heartbeat(self, fields: Fields, time_s: float) -> None:
         """Takes a HEARTBEAT of another component on the link."""
@@ -259,17 +271,48 @@ class ReceivedMessages:
         """Down from the estimator's origin; None: not known yet."""
         return None if self._home is None else float(self._home[2])
 
-    def _take_home(self, home: FloatArray | None, home_e7: FloatArray | None) -> None:
+    def down_m(self, height_m: float) -> float:
+        """Down in the autopilot's own frame, of a height above home."""
+        return (self.home_down_m or 0.0) - height_m - float(self._frame.offset[2])
+
+    def _without_jumps(self, name: str, fields: Fields) -> Fields:
+        """The same with a position in a frame that does not jump in flight."""
+        jump: str | None = None
+        stamp_s = 1e-3 * float(fields.get("time_boot_ms") or 0)
+        if name == "LOCAL_POSITION_NED":
+            place, velocity = _vector(fields, "x", "y", "z"), _vector(fields, "vx", "vy", "vz")
+            if place is None or velocity is None:
+                return fields
+            jump = self._frame.move(stamp_s, place, velocity)
+            if self._flies:
+                fields = {**fields, **dict(zip("xyz", (place + self._frame.offset).tolist(), strict=True))}
+        elif name == "ATTITUDE_QUATERNION":
+            R_ned_body, rate = _attitude(fields), _vector(fields, "rollspeed", "pitchspeed", "yawspeed")
+            if R_ned_body is not None and rate is not None:
+                jump = self._frame.turn(stamp_s, R_ned_body, rate)
+        if jump is not None and self._flies:
+            self._report(jump)
+        elif jump is not None:
+            self._frame.restart()  # on the ground nothing is held yet that would have to move with it
+        return fields
+
+    def _take_home(self) -> None:
         """Home as it is until the next flight: one that moves in flight would move the height band and the fence."""
-        if home is None:
+        fields = self._fields("HOME_POSITION")
+        sent, home_e7 = _vector(fields, "x", "y", "z"), _vector(fields, "latitude", "longitude")
+        if sent is None:
             return
+        home = sent + self._frame.offset
         if self._home is None or not self._flies:
             self._home = home
             self._home_deg = None if home_e7 is None else home_e7 * 1e-7
-        elif not self._home_moved and np.linalg.norm(home - self._home) > HOME_TOLERANCE_M:
+            return
+        # PX4 may go on sending it in the frame of before a jump.
+        moved_m = min(np.linalg.norm(one - self._home) for one in (sent, home))
+        if not self._home_moved and moved_m > HOME_TOLERANCE_M:
             self._home_moved = True
             self._report(
-                f"the autopilot's home moved by {np.linalg.norm(home - self._home):.1f} m in flight; "
+                f"the autopilot's home moved by {moved_m:.1f} m in flight; "
                 "height band and fence stay where they were until it is disarmed"
             )
 
@@ -309,6 +352,7 @@ class ReceivedMessages:
             home_ned=self._home,
             foreign_setpoints=self.setpoints.seen,
             parameter_fault=self.parameters.fault(self._max_gap_s),
+            frame_jumped=self._frame.large,
         )
 
     def vehicle_state(self) -> VehicleState | None:
@@ -321,14 +365,12 @@ class ReceivedMessages:
             return None
         place = _vector(position.fields, "x", "y", "z")
         velocity = _vector(position.fields, "vx", "vy", "vz")
-        quaternion = _vector(attitude.fields, "q2", "q3", "q4", "q1")
-        if place is None or velocity is None or quaternion is None:
-            return None
-        if abs(float(np.linalg.norm(quaternion)) - 1.0) > QUATERNION_TOLERANCE:
+        R_ned_body = _attitude(attitude.fields)
+        if place is None or velocity is None or R_ned_body is None:
             return None
         return VehicleState(
             time_s=min(attitude.time_s, position.time_s),
-            R_ned_body=rotation_from_quaternion(quaternion),
+            R_ned_body=R_ned_body,
             height_m=float((self.home_down_m or 0.0) - place[2]),
             velocity_ned=velocity,
             position=None if self._home is None else (place - self._home)[:2],
@@ -468,6 +510,14 @@ def _vector(fields: Fields, *names: str) -> FloatArray | None:
     numbers = [fields.get(name) for name in names]
     vector = np.array([math.nan if number is None else number for number in numbers], dtype=float)
     return vector if np.isfinite(vector).all() else None
+
+
+def _attitude(fields: Fields) -> FloatArray | None:
+    """(3, 3) from the body to NED."""
+    quaternion = _vector(fields, "q2", "q3", "q4", "q1")
+    if quaternion is None or abs(float(np.linalg.norm(quaternion)) - 1.0) > QUATERNION_TOLERANCE:
+        return None
+    return rotation_from_quaternion(quaternion)
 
 
 def _known(value: float | None, *, scale: float, unknown: tuple[float, ...] = (-1,)) -> float | None:

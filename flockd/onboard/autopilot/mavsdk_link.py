@@ -54,7 +54,6 @@ NEAREST_OBSTACLE_CM, UNKNOWN_CM = 30, 0xFFFF
 """PX4 brakes before no obstacle that is as near as the sensor's least range: the nearest is sent 1 cm farther."""
 MAV_DISTANCE_SENSOR_UNKNOWN = 4
 MAV_AUTOPILOT_PX4 = 12
-COMMAND_ARM_DISARM = 400
 COMMAND_SET_MODE = 176
 COMMAND_SET_MESSAGE_INTERVAL = 511
 COMMAND_REQUEST_MESSAGE = 512
@@ -82,7 +81,7 @@ MOST_OPEN = 20
 """Exchanges whose reply is waited for; older ones are lost."""
 REASON_S = 0.5
 """For how long a refusal waits for the autopilot's text, which comes after it."""
-ATTEND_S, ANNOUNCE_S, PARAMETER_S = 0.1, 1.0, 0.5
+ATTEND_S, ANNOUNCE_S, PARAMETER_S = 0.1, 1.0, 0.4
 """Between two requests for events that are missing; two announcements; and two readings of a parameter."""
 ANNOUNCEMENT = {
     "type": 6, "autopilot": 8, "base_mode": 0, "custom_mode": 0, "system_status": 4, "mavlink_version": 3
@@ -305,7 +304,7 @@ class AutopilotLink:
     def send_setpoint(self, setpoint: Setpoint) -> None:
         """Sends it, once. Raises AutopilotError when it is not finite or MAVSDK cannot send it."""
         north, east = (float(v) for v in setpoint.velocity)
-        down = (self._received.home_down_m or 0.0) - setpoint.height_m
+        down = self._received.down_m(setpoint.height_m)
         if not all(math.isfinite(number) for number in (north, east, down, setpoint.yaw_rad)):
             raise AutopilotError("a setpoint that is not finite was not sent")
         fields = {
@@ -352,10 +351,6 @@ class AutopilotLink:
             with suppress(MavlinkDirectError):  # a link that cannot send says so where setpoints are sent
                 self._direct.send_message(self._message("STATUSTEXT", {"severity": int(severity), **chunk}))
 
-    async def request_offboard(self) -> None:
-        """Asks for offboard flight; setpoints must be streaming by then. Raises AutopilotError when refused."""
-        await self._set_mode("offboard")
-
     async def hold(self) -> None:
         """Asks it to stop and stay. Raises AutopilotError when refused."""
         await self._set_mode("hold")
@@ -369,14 +364,6 @@ class AutopilotLink:
         """Asks it to fly home and land. Raises AutopilotError when refused."""
         await self._leave_offboard()
         await self._set_mode("return")
-
-    async def arm(self) -> None:
-        """Starts the motors. Raises AutopilotError when refused."""
-        await self._command("to arm", COMMAND_ARM_DISARM, 1, refused="to arm")
-
-    async def take_off(self) -> None:
-        """Climbs to its own take-off height (MIS_TAKEOFF_ALT), once armed. Raises AutopilotError when refused."""
-        await self._set_mode("take-off")
 
     async def parameter(self, name: str, kind: type[T]) -> T:
         """One of its parameters, of `kind` int or float as the firmware has it. Raises AutopilotError."""

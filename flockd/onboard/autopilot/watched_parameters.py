@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 LOSS_TIME, LOSS_ACTION, GROUND_STATION_LOSS = "COM_OF_LOSS_T", "COM_OBL_RC_ACT", "NAV_DLL_ACT"
-KINDS: Mapping[str, type[int] | type[float]] = {GROUND_STATION_LOSS: int, LOSS_TIME: float, LOSS_ACTION: int}
+MOST_SPEED = "MPC_XY_VEL_MAX"
+KINDS: Mapping[str, type[int] | type[float]] = {
+    GROUND_STATION_LOSS: int, LOSS_TIME: float, LOSS_ACTION: int, MOST_SPEED: float
+}  # fmt: skip
 """As PX4 declares them."""
 LONGEST_LOSS_S = 1.0
 """PX4 flies on with the last velocity for as long as COM_OF_LOSS_T."""

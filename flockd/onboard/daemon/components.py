@@ -17,7 +17,6 @@ from flockd.onboard.daemon.operator_commands import OperatorCommands
 from flockd.onboard.daemon.pilot_loop import PilotLoop
 from flockd.onboard.daemon.refusal_watch import RefusalWatch
 from flockd.onboard.daemon.state_texts import StateTexts
-from flockd.onboard.daemon.take_off import TakeOff
 from flockd.onboard.daemon.watched_networks import WatchedNetworks
 from flockd.onboard.sources import FrameSource
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
@@ -36,7 +35,6 @@ class Components:
     control: Control
     requests: AutopilotRequests
     refusals: RefusalWatch
-    take_off: TakeOff
     distances: ObstacleDistances
     texts: StateTexts
     sinks: MessageSinks

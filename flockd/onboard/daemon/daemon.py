@@ -175,8 +175,6 @@ class Daemon:
             "telemetry": lambda: publish_status(components, self._clock),
             "service": lambda: notify_service_manager(components, self._service),
         }
-        if self._config.autopilot.arm_and_take_off:
-            concerns["take-off"] = components.take_off.run
         if self._config.autopilot.obstacle_distance:
             concerns["obstacle distances"] = components.distances.run
         async with asyncio.TaskGroup() as group:

@@ -20,14 +20,13 @@ ORDERS = frozenset({"goto", "velocity"})
 
 @dataclass
 class OperatorRequests:
-    """What operators have requested, and whether the autopilot has refused offboard mode."""
+    """What operators have requested."""
 
     shutdown: bool = False
     hold: bool = False
     land: bool = False
     resume: bool = False
     """Counts once: reset when the supervisor has seen it. So does the next."""
-    offboard_refused: bool = False
 
     def apply(self, command: str) -> None:
         """Sets the request of one command: hold, land or resume; it replaces an earlier one."""

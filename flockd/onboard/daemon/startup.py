@@ -29,7 +29,6 @@ from flockd.onboard.daemon.pilot_loop import PilotLoop
 from flockd.onboard.daemon.refusal_watch import RefusalWatch
 from flockd.onboard.daemon.state_texts import StateTexts
 from flockd.onboard.daemon.supervisor_inputs import InputCollector
-from flockd.onboard.daemon.take_off import TakeOff
 from flockd.onboard.daemon.vehicle_history import VehicleHistory
 from flockd.onboard.daemon.watched_networks import InterruptibleNetworks, WatchedNetworks, cameras_at_once
 from flockd.onboard.daemon.worker import BusyError, LateError, Worker
@@ -99,7 +98,6 @@ async def open_components(
     control = Control(
         config, link, streamer, pilot_loop, collector, requests, history, operator, on_tick, clock
     )  # fmt: skip
-    take_off = TakeOff(link, streamer, operator, lambda: control.decision, sinks.event)
     missions = MissionOrders(config, pilot_loop, link.vehicle_state, lambda: control.decision.state)
     loop = asyncio.get_running_loop()
     commands = OperatorCommands(
@@ -110,7 +108,7 @@ async def open_components(
     return Components(
         link=link, gate=gate, streamer=streamer, source=source, pilot_loop=pilot_loop, networks=networks,
         control=control,
-        requests=requests, refusals=RefusalWatch(link, sinks.event, clock), take_off=take_off, sinks=sinks,
+        requests=requests, refusals=RefusalWatch(link, sinks.event, clock), sinks=sinks,
         distances=ObstacleDistances(config, link, pilot_loop, history, clock),
         texts=StateTexts(link.send_text, clock), telemetry=telemetry, commands=commands, lag=lag,
         thermometer=thermometer, wall_clock=WallClock(sinks.event, time.monotonic), dead_tasks=dead_tasks,

@@ -99,10 +99,10 @@ class InputCollector:
             autopilot_failsafe=status.armed and status.failsafe,
             foreign_setpoints=status.foreign_setpoints,
             parameter_fault=status.parameter_fault,
+            frame_jumped=status.frame_jumped,
             flight_mode=None if status.flight_mode == "unknown" else status.flight_mode,
             armed=None if math.isinf(status.heartbeat_age_s) else status.armed,
             in_air=None if status.landed_state == "unknown" else status.in_air,
-            offboard_refused=operator.offboard_refused,
             battery_low=self._battery_low(status),
             position_lost=status.estimate_ok is False or (self._had_satellites and status.gps_ok is False),
             shutdown_asked=operator.shutdown,
@@ -113,7 +113,7 @@ class InputCollector:
         )
         self._faults_before += inputs.network_faults
         self._refused_before += inputs.refused_commands
-        operator.resume = operator.offboard_refused = False
+        operator.resume = False
         return inputs
 
     def _refused(self) -> int:

@@ -17,6 +17,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from types import TracebackType
 from typing import Any, Self
 
@@ -99,10 +100,11 @@ class FakeAutopilot:
             clock: monotonic seconds, in the place of the computer's.
         """
         self._speed_factor, self._real = speed_factor, clock
-        self.battery_share = 1.0
-        self.estimate_ok = True
+        self.battery_share, self.estimate_ok = 1.0, True
         self.sends_motion = True
         """False: its position and velocity do not come any more, and all else does."""
+        self.frame_off, self.heading_off_rad = np.zeros(3), 0.0
+        """By what its positions (3,) in NED and its heading are off the truth, in metres and clockwise."""
         self.failing: set[str] = set()
         """PX4's names of further checks that fail; each refuses to arm."""
         self.wordless = False
@@ -123,6 +125,7 @@ class FakeAutopilot:
             "MAN_OVERRIDE_SPD": 1.0,
             "CP_DIST": -1.0,
             "MPC_Z_P": 1.0,
+            "MPC_XY_VEL_MAX": 12.0,
         }
         """An int is an INT32 parameter, a float a REAL32 one."""
         self.setpoints: deque[tuple[float, Demand]] = deque(maxlen=MAX_SETPOINTS_KEPT)
@@ -258,7 +261,9 @@ class FakeAutopilot:
             self.estimate_ok,
             self.sends_motion,
             self.battery_share,
-            self.setpoints[-1][1].velocity if self._mode == "OFFBOARD" and self.setpoints else None,
+            self._followed().velocity if self._mode == "OFFBOARD" and self.setpoints else None,
+            self.frame_off,
+            self.heading_off_rad,
         )
 
     def _clock(self) -> float:
@@ -370,7 +375,7 @@ class FakeAutopilot:
     def _demand(self) -> Demand:
         match self._mode:
             case "OFFBOARD" if self.setpoints:
-                return self.setpoints[-1][1]
+                return self._followed()
             case "POSCTL":
                 return Demand(self._by_hand(), self._hold_down_m, self._hold_yaw_rad)
             case "TAKEOFF":
@@ -384,6 +389,12 @@ class FakeAutopilot:
                 )
             case _:
                 return Demand(np.zeros(2), self._hold_down_m, self._hold_yaw_rad)
+
+    def _followed(self) -> Demand:
+        """The newest setpoint, no faster than may be flown."""
+        asked = self.setpoints[-1][1]
+        speed_m_s, most_m_s = float(np.linalg.norm(asked.velocity)), self.parameters["MPC_XY_VEL_MAX"]
+        return replace(asked, velocity=asked.velocity * (most_m_s / max(speed_m_s, most_m_s)))
 
     def _by_hand(self) -> FloatArray:
         """(2,) m/s north and east that the sticks ask for; level, and at rest once they are not heard any more."""
@@ -446,7 +457,8 @@ class FakeAutopilot:
         if message.type_mask != TYPE_MASK or message.coordinate_frame != 1 or not np.isfinite(numbers).all():
             self.refused_setpoints += 1
             return
-        demand = Demand(np.array([message.vx, message.vy]), down_m=message.z, yaw_rad=message.yaw)
+        down_m, yaw_rad = message.z - self.frame_off[2], message.yaw - self.heading_off_rad
+        demand = Demand(np.array([message.vx, message.vy]), down_m=down_m, yaw_rad=yaw_rad)
         self.setpoints.append((arrived_s, demand))
 
     def _obey(self, command: int, message: Any) -> int:

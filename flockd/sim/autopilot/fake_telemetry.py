@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import socket
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import development as mavlink
 
 from flockd.core.earth import metres_a_degree
 from flockd.core.messages import FloatArray
-from flockd.flight.geometry import quaternion_from_rotation
+from flockd.flight.geometry import quaternion_from_rotation, rotation_from_vector, vector_from_rotation
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.sim.autopilot.fake_vehicle import MotionState
 
@@ -69,6 +69,10 @@ class VehicleSnapshot:
     battery_share: float
     setpoint: FloatArray | None = None
     """(2,) m/s, north and east, that it follows in offboard."""
+    frame_off: FloatArray = field(default_factory=lambda: np.zeros(3))
+    """(3,) m by which its local positions are off the truth, in NED."""
+    heading_off_rad: float = 0.0
+    """Likewise of its heading, clockwise."""
 
     @property
     def failsafe(self) -> bool:
@@ -99,6 +103,7 @@ class TelemetryStreams:
         self._due_s: dict[int, float] = {}
         self._sent_modes: tuple[Mode, Mode] | None = None
         self._now_s = started_s
+        self._attitude_before = started_s, np.eye(3)
         self._vehicle: VehicleSnapshot
 
     def send_due(self, now: float, vehicle: VehicleSnapshot) -> None:
@@ -159,12 +164,17 @@ class TelemetryStreams:
             self._mav.position_target_local_ned_send(self._boot_ms(), 1, 0, *nothing, *speeds, *nothing, math.nan, 0.0)
 
     def _send_attitude(self) -> None:
-        self._mav.attitude_quaternion_send(self._boot_ms(), *self._attitude(), 0, 0, 0)
+        R_ned_body, (before_s, before) = self._vehicle.motion.R_ned_body, self._attitude_before
+        self._attitude_before = self._now_s, R_ned_body
+        rate = vector_from_rotation(before.T @ R_ned_body) / max(self._now_s - before_s, 1e-3)
+        shown = rotation_from_vector(np.array([0.0, 0.0, self._vehicle.heading_off_rad])) @ R_ned_body
+        self._mav.attitude_quaternion_send(self._boot_ms(), *_wxyz(shown), *rate)
 
     def _send_position(self) -> None:
+        motion = self._vehicle.motion
         if self._vehicle.estimate_ok and self._vehicle.sends_motion:
             self._mav.local_position_ned_send(
-                self._boot_ms(), *self._vehicle.motion.position, *self._vehicle.motion.velocity
+                self._boot_ms(), *(motion.position + self._vehicle.frame_off), *motion.velocity
             )
 
     def _send_landed(self) -> None:
@@ -223,15 +233,11 @@ class TelemetryStreams:
 
     def _send_truth(self) -> None:
         attitude, place = (
-            self._attitude(),
+            _wxyz(self._vehicle.motion.R_ned_body),
             self._place(self._vehicle.motion.position),
         )
         speeds = [round(100.0 * speed) for speed in self._vehicle.motion.velocity]
         self._truth.hil_state_quaternion_send(0, attitude, 0, 0, 0, *place, *speeds, 0, 0, 0, 0, 0)
-
-    def _attitude(self) -> list[float]:
-        """W x y z."""
-        return list(np.roll(quaternion_from_rotation(self._vehicle.motion.R_ned_body), 1))
 
     def _place(self, position: FloatArray) -> tuple[int, int, int]:
         """Latitude and longitude in 1e-7 degrees, and millimetres above the ground, of metres from home."""
@@ -246,6 +252,11 @@ class TelemetryStreams:
         capabilities = mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2 | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
         nothing = [0] * 8
         self._mav.autopilot_version_send(capabilities, 0x00000100, 0, 0, 0, nothing, nothing, nothing, 0, 0, 0)
+
+
+def _wxyz(R_ned_body: FloatArray) -> list[float]:
+    """As a quaternion."""
+    return list(np.roll(quaternion_from_rotation(R_ned_body), 1))
 
 
 def custom_mode(mode: Mode) -> int:

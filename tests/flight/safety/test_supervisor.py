@@ -68,7 +68,7 @@ FAULTS = {
     Event.NOT_OFFBOARD: Fault({"flight_mode": "position"}, "ready", Action.SILENCE),
     Event.NOT_ARMED: Fault({"armed": False}, "wait", Action.SILENCE),
     Event.NOT_IN_AIR: Fault({"in_air": False}, "wait", Action.FLY),
-    Event.OFFBOARD_REFUSED: Fault({"offboard_refused": True}, "latch", Action.SILENCE),
+    Event.FRAME_JUMPED: Fault({"frame_jumped": True}, "ready", Action.ASK_HOLD),
     Event.BATTERY_LOW: Fault({"battery_low": True}, "wait", Action.ASK_HOLD),
     Event.POSITION_LOST: Fault({"position_lost": True}, "wait", Action.ASK_HOLD),
     Event.SHUTDOWN_ASKED: Fault({"shutdown_asked": True}, "latch", Action.ASK_HOLD),
@@ -490,13 +490,6 @@ def test_return_is_worse_than_hold_and_land_is_worse_than_return() -> None:
     assert flight.step(position_lost=True).action is Action.ASK_LAND
 
 
-def test_offboard_refused_it_is_idle_and_says_so() -> None:
-    flight = ready().step(offboard_refused=True).step(offboard_refused=False).run(5.0)
-    assert (flight.state, flight.action) == (State.IDLE, Action.SILENCE)
-    assert flight.events[0] is Event.OFFBOARD_REFUSED
-    assert flight.run(5.0, flight_mode=OFFBOARD).action is Action.SILENCE
-
-
 def test_alone_it_flies_on_for_a_while_and_then_holds() -> None:
     flight = flying().step(neighbours_age_s=5.0).run(10.0 - STEP_S)
     assert (flight.action, flight.events) == (Action.FLY, [Event.NEIGHBOURS_LOST])
@@ -709,8 +702,8 @@ def test_the_reason_says_how_bad_it_is(changes: dict[str, Any], words: str) -> N
 
 
 def test_in_waiting_what_keeps_it_from_flying_is_reported_first() -> None:
-    flight = ready().step(cameras=ONE_LOST, outside_fence=True, offboard_refused=True)
-    assert flight.events[0] is Event.OFFBOARD_REFUSED
+    flight = ready().step(cameras=ONE_LOST, outside_fence=True, hold_asked=True)
+    assert flight.events[0] is Event.HOLD_ASKED
     assert flight.events[1] is Event.FENCE_LEFT
     assert sorted(flight.events[2:]) == [Event.CAMERA_LOST, Event.NOT_OFFBOARD]
 

@@ -22,11 +22,11 @@ from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.safety import SafetyParameters
 from flockd.core.messages import Setpoint, Wanted
 from flockd.flight.safety import Action, Permission, Request, Surroundings, Verdict
-from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.onboard.daemon import clock_at, event_loop_at
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from tests import calm
+from tools.checks.pilots_link import PilotsLink
 
 CONTROL_S = 0.05
 
@@ -57,7 +57,7 @@ async def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> float
 
 @dataclass
 class Flight:
-    link: AutopilotLink
+    link: PilotsLink
     streamer: SetpointStreamer
     control: asyncio.Task[None]
 
@@ -69,9 +69,9 @@ class Flight:
 
 
 @asynccontextmanager
-async def attended(port: int, clock: Callable[[], float] = calm.clock) -> AsyncIterator[AutopilotLink]:
+async def attended(port: int, clock: Callable[[], float] = calm.clock) -> AsyncIterator[PilotsLink]:
     """A link that keeps all coming, as the daemon's does."""
-    link = await AutopilotLink.connect(AutopilotParameters(address=f"udpin://127.0.0.1:{port}"), clock=clock)
+    link = await PilotsLink.connect(AutopilotParameters(address=f"udpin://127.0.0.1:{port}"), clock=clock)
     attending = asyncio.create_task(link.attend())
     try:
         yield link

@@ -198,7 +198,7 @@ async def test_what_still_sends_over_a_closed_link_is_refused(port: int) -> None
         with pytest.raises(AutopilotError, match="could not send a setpoint"):
             link.send_setpoint(Setpoint(0.0, np.zeros(2), 2.5, 0.0))
         with pytest.raises(AutopilotError, match="could not ask the autopilot"):
-            await link.request_offboard()
+            await link.hold()
         attending.cancel()
 
 

@@ -135,8 +135,8 @@ class Service:
             )
 
     def flies(self) -> Iterator[Finding]:
-        """It takes off by itself, as it is configured to; in flight its cameras fail one after the other."""
-        self._wait_for_flight()
+        """The pilot brings it up and selects offboard; in flight its cameras fail one after the other."""
+        self._fly()
         time.sleep(WATCHED_S)
         came_s = [time_s for time_s, _ in self.autopilot.setpoints if time_s > time.monotonic() - WATCHED_S]
         hz, worst_ms = len(came_s) / WATCHED_S, 1e3 * max(after - before for before, after in pairwise(came_s))
@@ -174,7 +174,7 @@ class Service:
         """The pilot lands, it flies again, and in the air the unit's memory is cut to less than it has."""
         self.autopilot.pilot_selects("LAND")
         until(lambda: not self.autopilot.armed, "the landing")
-        self._wait_for_flight()
+        self._fly()
         restarts, cut_s = int(_shown("NRestarts")), time.monotonic()
         run("systemctl", "set-property", "--runtime", UNIT, f"MemoryMax={LITTLE_MEMORY}")
         until(lambda: self.autopilot.mode != "OFFBOARD", "the autopilot to see that setpoints stopped")
@@ -194,7 +194,7 @@ class Service:
         """The pilot lands; flockd, which saw it on the ground, flies again, and is stopped in the air."""
         self.autopilot.pilot_selects("LAND")
         until(lambda: not self.autopilot.armed, "the landing")
-        self._wait_for_flight()
+        self._fly()
         time.sleep(WATCHED_S)
         begun_s = time.monotonic()
         run("systemctl", "stop", UNIT)
@@ -252,9 +252,18 @@ class Service:
             wanted="it does",
         )
 
-    def _wait_for_flight(self) -> None:
-        until(lambda: self.autopilot.mode == "OFFBOARD", "flockd to take off")
+    def _fly(self) -> None:
+        """As its pilot would, once flockd has seen it on the ground."""
+        until(lambda: "started" not in self._reasons(), "flockd to see the vehicle on the ground")
+        self.autopilot.pilot_arms()
+        self.autopilot.pilot_selects("TAKEOFF")
+        until(lambda: self.autopilot.mode == "LOITER", "the height")
+        until(lambda: self._message("flight", time.monotonic())["state"] == "ready", "flockd to be ready")
+        self.autopilot.pilot_selects("OFFBOARD")
         until(lambda: self._message("flight", time.monotonic())["state"] == "normal", "a quiet flight")
+
+    def _reasons(self) -> list[str]:
+        return [reason["event"] for reason in self._message("flight", time.monotonic())["reasons"]]
 
     def _counts(self, camera: str) -> Mapping[str, int]:
         counts: Mapping[str, int] = self._computer()["cameras"][camera]["counts"]
