@@ -49,6 +49,8 @@ class Surroundings:
     """(m, 2) metres, north and east, relative to the drone: points of obstacles, each the nearest that it may be."""
     neighbour_margins: FloatArray | None = None
     """(n, 2) by how much each neighbour may be nearer, m, and come faster, m/s; None: exact."""
+    neighbour_unseen_s: FloatArray | None = None
+    """(n,) how long ago each neighbour was seen last: it may brake since; None: each flies as it is said to."""
 
     @property
     def nearest_obstacle_m(self) -> float:
@@ -234,7 +236,12 @@ class Gate:
         return {
             Objection.FENCE: towards_fence(p, around.position),
             Objection.SEPARATION: towards_neighbours(
-                p, around.neighbours, around.neighbour_velocities, separation_m, around.neighbour_margins
+                p,
+                around.neighbours,
+                around.neighbour_velocities,
+                separation_m,
+                around.neighbour_margins,
+                around.neighbour_unseen_s,
             ),
             Objection.OBSTACLE: towards_obstacles(
                 around.obstacles, p.obstacle_clearance_m, p.braking_m_s2, p.reaction_s
