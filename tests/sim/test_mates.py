@@ -122,4 +122,4 @@ def test_whichever_of_five_stops_its_mates_keep_a_metre_apart(
     record_property("nearest_m", {name: round(metres, 2) for name, metres in nearest_m.items()})
     record_property("speed_m_s", round(float(np.mean(speeds_m_s)), 2))
     assert min(nearest_m.values()) >= APART_M, nearest_m
-    assert np.mean(speeds_m_s) > 0.8 * SPEED_M_S, "where nobody stops they fly on"
+    assert np.mean(speeds_m_s) > 0.75 * SPEED_M_S, "where nobody stops they fly on"

@@ -32,7 +32,7 @@ def towards_neighbours(
     velocities = np.where(np.isfinite(velocities), velocities, 0.0)
     limits = [_flying_on(p, offsets, velocities, separation_m, known)]
     if unseen_s is not None:
-        limits.append(_braking(p, offsets, velocities, separation_m, known[:, 0], unseen_s))
+        limits.append(_braking(p, offsets, velocities, separation_m, known, unseen_s))
     return np.concatenate([towards for towards, _ in limits]), np.concatenate([most_m_s for _, most_m_s in limits])
 
 
@@ -41,14 +41,14 @@ def _braking(
     offsets: FloatArray,
     velocities: FloatArray,
     separation_m: float,
-    nearer_m: FloatArray,
+    margins: FloatArray,
     unseen_s: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """As of `towards_neighbours`, where each has braked since it was last seen, as hard as its gate lets it.
 
-    It stands where that ends, or will end, and the drone stops before that place, as of `stopping_speed`. A tracker
-    that does not believe it and has it fly on does no harm. But one that believes it by half has it a little farther on
-    and only just seen: so what is not seen of a change of velocity is in the reaction time once more.
+    It stands where that ends, or will end, and the drone stops before that place as before an obstacle. A tracker that
+    does not believe it and has it fly on does no harm. One that believes it by half has it too far on, by as much as it
+    errs in velocity: so the distance left is less by what it may come faster in the reaction time to neighbours.
     """
     speeds = np.hypot(velocities[:, 0], velocities[:, 1])
     since = speeds / (2 * p.max_acceleration_m_s2) - unseen_s  # s of flight from where it would be by now
@@ -56,8 +56,8 @@ def _braking(
     places[:, :2] += velocities * since[:, None]
     meets = _about_level(p, places, separation_m)
     ranges = np.hypot(places[meets, 0], places[meets, 1])
-    left_m = ranges - separation_m - nearer_m[meets]
-    return places[meets, :2] / ranges[:, None], stopping_speed(left_m, p.braking_m_s2, p.neighbour_reaction_s)
+    left_m = ranges - separation_m - margins[meets] @ [1.0, p.neighbour_reaction_s]
+    return places[meets, :2] / ranges[:, None], stopping_speed(left_m, p.braking_m_s2, p.reaction_s)
 
 
 def _about_level(p: GateParameters, offsets: FloatArray, separation_m: float) -> BoolArray:
