@@ -15,6 +15,8 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from flockd.core.angles import wrapped
+
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 UInt8Array = NDArray[np.uint8]
@@ -350,11 +352,15 @@ class Wanted:
     """(2,) m/s^2, north and east: u of Eq. 38 after limits; where who or what is near changed the velocity, what leads
     to that one in a step."""
     yaw_rad: float | None
-    """Heading, clockwise from north; None: as it is, while no good attitude is known."""
+    """Heading, clockwise from north, `wrapped`; None: as it is, while no good attitude is known."""
     trim: Vector2 | None = None
     """(2,) m/s, north and east: what of the velocity corrects the autopilot's own estimate; None: nothing."""
     height_m: float | None = None
     """As in `VehicleState`, up positive: the height that the mission wants; None: the one that the flight began at."""
+
+    def __post_init__(self) -> None:
+        if self.yaw_rad is not None:
+            object.__setattr__(self, "yaw_rad", wrapped(self.yaw_rad))
 
 
 @dataclass(frozen=True, eq=False)
@@ -368,7 +374,10 @@ class Setpoint:
     height_m: float
     """As in `VehicleState`, up positive."""
     yaw_rad: float
-    """Heading, clockwise from north."""
+    """Heading, clockwise from north, `wrapped`."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "yaw_rad", wrapped(self.yaw_rad))
 
 
 @dataclass(frozen=True, eq=False)

@@ -115,6 +115,7 @@ def _limits(p: GateParameters, action: Action, around: Surroundings, asked: Floa
         around.neighbour_velocities[chosen],
         p.min_separation_m if action is Action.FLY else p.degraded_separation_m,
         None if around.neighbour_margins is None else around.neighbour_margins[chosen],
+        None if around.neighbour_unseen_s is None else around.neighbour_unseen_s[chosen],
     )
     over_m_s = np.maximum(towards @ around.velocity - most_m_s, 0.0)  # a drone that is too fast has to brake
     return bool((towards @ asked > most_m_s - over_m_s).any())

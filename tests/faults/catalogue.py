@@ -653,5 +653,13 @@ CATALOGUE = (
             f"{_HERE}autopilot.py::test_started_in_the_air_and_landed_by_the_pilot_it_asks_for_nothing",
         ),
     ),
+    Fault(
+        75, "mate-stops", "a mate hovers, lands or is taken over, at any place of the formation",
+        "every neighbour may brake: 1 m is kept at every instant",
+        (
+            "tests/sim/test_mates.py::test_whichever_of_five_stops_its_mates_keep_a_metre_apart",
+            "tests/flight/safety/test_surroundings.py::test_one_that_goes_may_have_braked_since_it_was_seen_last",
+        ),
+    ),
 )
 # fmt: on

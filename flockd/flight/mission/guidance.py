@@ -8,6 +8,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from flockd.core.angles import wrapped
 from flockd.core.messages import FloatArray, MissionOrder
 
 SLOW_DOWN_S = 2.0
@@ -46,7 +47,7 @@ class Guidance:
     sentence: str
     """What it does, for people."""
     course_rad: float | None = None
-    """Heading to fly with, clockwise from north; None: as before."""
+    """Heading to fly with, clockwise from north, `wrapped`; None: as before."""
     height_m: float | None = None
     """Above the ground at home; None: as before."""
     goal: FloatArray | None = None
@@ -55,6 +56,10 @@ class Guidance:
     """At the last goal."""
     takeover: Literal["land", "return"] | None = None
     """What the autopilot is to be asked for, as the mission is over."""
+
+    def __post_init__(self) -> None:
+        if self.course_rad is not None:
+            object.__setattr__(self, "course_rad", wrapped(self.course_rad))
 
 
 class Mission(Protocol):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 
+from flockd.core.angles import wrapped
 from flockd.core.config.mission import MissionParameters, WaypointParameters
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray, MissionOrder, MissionStatus
@@ -48,8 +48,9 @@ class Navigator:
         height_m = None if self._height_m is None else self._height_m + self._configured.height_offset_m
         is_paper = self._parameters.kind == "circle_then_tangent"
         course_rad = guidance.course_rad if is_paper else self._turned(guidance.course_rad, moment.time_s)
-        self._course_rad, self._turned_s = course_rad, moment.time_s
-        return replace(guidance, height_m=height_m, course_rad=course_rad)
+        guidance = replace(guidance, height_m=height_m, course_rad=course_rad)
+        self._course_rad, self._turned_s = guidance.course_rad, moment.time_s
+        return guidance
 
     def pull(self, guidance: Guidance) -> FloatArray:
         """(2,) m/s: efv of Eq. 42 with the mission's own part of W_i, which is 0 for `follow`."""
@@ -79,7 +80,7 @@ class Navigator:
         if wanted_rad is None or before_rad is None:
             return before_rad if wanted_rad is None else wanted_rad
         most_rad = MAX_TURN_RAD_S * max(time_s - self._turned_s, 0.0)
-        turn_rad = (wanted_rad - before_rad + math.pi) % (2 * math.pi) - math.pi
+        turn_rad = wrapped(wanted_rad - before_rad)
         return before_rad + min(max(turn_rad, -most_rad), most_rad)
 
 

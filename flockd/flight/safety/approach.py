@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from flockd.core.config.safety import GateParameters
-from flockd.core.messages import FloatArray
+from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.geometry.level import SAME_SPOT_M
 
 NOTHING_NEAR = np.empty((0, 2)), np.empty(0)
@@ -20,11 +20,58 @@ def towards_neighbours(
     velocities: FloatArray,
     separation_m: float,
     margins: FloatArray | None = None,
+    unseen_s: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """For each neighbour about at the drone's height its direction, (n, 2), and how fast to fly there, (n,) m/s.
 
     `offsets` (k, 3) metres NED from the drone, `velocities` (k, 2) m/s over ground; `margins` (k, 2) by how much
-    each may be nearer, m, and come faster, m/s; None: exact.
+    each may be nearer, m, and come faster, m/s; None: exact. `unseen_s` (k,) is how long ago each was seen last; None:
+    each flies as it is said to. Else each counts twice: as flying on, and as braking since then.
+    """
+    known = margins if margins is not None else np.zeros((len(offsets), 2))
+    velocities = np.where(np.isfinite(velocities), velocities, 0.0)
+    limits = [_flying_on(p, offsets, velocities, separation_m, known)]
+    if unseen_s is not None:
+        limits.append(_braking(p, offsets, velocities, separation_m, known, unseen_s))
+    return np.concatenate([towards for towards, _ in limits]), np.concatenate([most_m_s for _, most_m_s in limits])
+
+
+def _braking(
+    p: GateParameters,
+    offsets: FloatArray,
+    velocities: FloatArray,
+    separation_m: float,
+    margins: FloatArray,
+    unseen_s: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """As of `towards_neighbours`, where each has braked since it was last seen, as hard as its gate lets it.
+
+    It stands where that ends, or will end, and the drone stops before that place as before an obstacle. A tracker that
+    does not believe it and has it fly on does no harm. One that believes it by half has it too far on, by as much as it
+    errs in velocity: so the distance left is less by what it may come faster in the reaction time to neighbours.
+    """
+    speeds = np.hypot(velocities[:, 0], velocities[:, 1])
+    since = speeds / (2 * p.max_acceleration_m_s2) - unseen_s  # s of flight from where it would be by now
+    places = offsets.copy()
+    places[:, :2] += velocities * since[:, None]
+    meets = _about_level(p, places, separation_m)
+    ranges = np.hypot(places[meets, 0], places[meets, 1])
+    left_m = ranges - separation_m - margins[meets] @ [1.0, p.neighbour_reaction_s]
+    return places[meets, :2] / ranges[:, None], stopping_speed(left_m, p.braking_m_s2, p.reaction_s)
+
+
+def _about_level(p: GateParameters, offsets: FloatArray, separation_m: float) -> BoolArray:
+    """(k,): which of (k, 3) m are in a direction, and about at the drone's height."""
+    ranges = np.hypot(offsets[:, 0], offsets[:, 1])
+    about_m = max(separation_m, p.vertical_separation_m)
+    meets: BoolArray = (ranges >= SAME_SPOT_M) & (ranges < math.inf) & (np.abs(offsets[:, 2]) < about_m)
+    return meets
+
+
+def _flying_on(
+    p: GateParameters, offsets: FloatArray, velocities: FloatArray, separation_m: float, margins: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """As of `towards_neighbours`, where each flies on as it is said to.
 
     Nearer than the separation: not at all. Farther, so fast that the distance left suffices if both brake, as in
     Shalev-Shwartz et al. 2017, "On a formal model of safe and scalable self-driving cars": with v towards a
@@ -34,20 +81,13 @@ def towards_neighbours(
     faster where the drone would still stop behind it if it braked unseen for r: v r + v^2 / 2b - w^2 / 2b <= distance
     left. Else no gap would ever close in a flock that flies along.
     """
-    ranges = np.hypot(offsets[:, 0], offsets[:, 1])
-    about_m = max(separation_m, p.vertical_separation_m)
-    meets = (ranges >= SAME_SPOT_M) & (ranges < math.inf) & (np.abs(offsets[:, 2]) < about_m)
-    if not meets.any():
-        return NOTHING_NEAR
-    offsets, ranges, velocities = offsets[meets], ranges[meets], velocities[meets]
-    towards = offsets[:, :2] / ranges[:, None]
-    velocities = np.where(np.isfinite(velocities), velocities, 0.0)
+    meets = _about_level(p, offsets, separation_m)
+    ranges = np.hypot(offsets[meets, 0], offsets[meets, 1])
+    towards, velocities, margins = offsets[meets, :2] / ranges[:, None], velocities[meets], margins[meets]
     goes = (velocities * towards).sum(axis=1)
     comes = -np.minimum(np.maximum(goes, -p.max_speed_m_s), p.max_speed_m_s)
-    left_m, soonest = ranges - separation_m, comes
-    if margins is not None:
-        left_m = left_m - margins[meets, 0]
-        soonest = np.minimum(comes + margins[meets, 1], p.max_speed_m_s)
+    left_m = ranges - separation_m - margins[:, 0]
+    soonest = np.minimum(comes + margins[:, 1], p.max_speed_m_s)
     lag = p.braking_m_s2 * p.neighbour_reaction_s
     square = lag**2 + 2 * p.braking_m_s2 * (left_m - soonest * p.neighbour_reaction_s) - soonest * np.abs(soonest)
     most_m_s = np.sqrt(np.maximum(square, lag**2)) - lag

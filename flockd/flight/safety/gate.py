@@ -49,6 +49,8 @@ class Surroundings:
     """(m, 2) metres, north and east, relative to the drone: points of obstacles, each the nearest that it may be."""
     neighbour_margins: FloatArray | None = None
     """(n, 2) by how much each neighbour may be nearer, m, and come faster, m/s; None: exact."""
+    neighbour_unseen_s: FloatArray | None = None
+    """(n,) how long ago each neighbour was seen last: it may brake since; None: each flies as it is said to."""
 
     @property
     def nearest_obstacle_m(self) -> float:
@@ -78,6 +80,7 @@ class Objection(StrEnum):
     SETPOINT_NOT_FINITE = "setpoint_not_finite"
     COMMAND_NOT_FINITE = "command_not_finite"
     COMMAND_TOO_LARGE = "command_too_large"
+    HEADING_NOT_FINITE = "heading_not_finite"
     POSITION_UNKNOWN = "position_unknown"
     NEIGHBOUR_UNKNOWN = "neighbour_unknown"
     OBSTACLE_UNKNOWN = "obstacle_unknown"
@@ -101,8 +104,6 @@ _COLUMN = 1.5
 widens on its way down, and neither drone stays exactly where it is."""
 _HEIGHT_NOISE_M = 0.3
 """Noise of a height over a few seconds: a difference this small between asked and own height is no climb."""
-_MOST_YAW_RAD = 2.0 * math.pi
-"""A heading from north; one of more than a whole turn is no heading."""
 
 _MOVES = frozenset({Action.FLY, Action.FLY_DEGRADED})
 _STANDS_STILL = frozenset({Action.OFFER, Action.HOVER, Action.ASK_HOLD, Action.ASK_RETURN, Action.ASK_LAND})
@@ -158,8 +159,10 @@ class Gate:
             if not abs(now_s - request.wanted_s) <= self._parameters.command_timeout_s:
                 objections.append(Objection.COMMAND_STALE)
                 return None
-            if wanted.yaw_rad is not None and _is_heading(wanted.yaw_rad):
+            if wanted.yaw_rad is not None and math.isfinite(wanted.yaw_rad):
                 yaw_rad = wanted.yaw_rad
+            elif wanted.yaw_rad is not None:
+                objections.append(Objection.HEADING_NOT_FINITE)
             if self._accepts(wanted, around, objections):
                 target = self._slowed(wanted.velocity, now_s - request.wanted_s, permission.action)
                 if (target != wanted.velocity).any():
@@ -167,7 +170,7 @@ class Gate:
         velocity = self._within_acceleration(target, now_s, around)
         sent = self._within_space(velocity, permission.action, around, objections)
         wanted_m = request.height_m if wanted.height_m is None else wanted.height_m
-        if not (all(map(math.isfinite, (*sent, wanted_m))) and _is_heading(yaw_rad)):
+        if not all(map(math.isfinite, (*sent, wanted_m, yaw_rad))):
             objections.append(Objection.SETPOINT_NOT_FINITE)
             return None
         height_m = self._within_climb(now_s, wanted_m, request, objections)
@@ -186,14 +189,9 @@ class Gate:
 
     def _accepts(self, wanted: Wanted, around: Surroundings, objections: list[Objection]) -> bool:
         """Whether what is wanted may move the drone at all."""
-        numbers = [number for number in (*wanted.velocity, wanted.yaw_rad) if number is not None]
         refusals = (
-            (Objection.COMMAND_NOT_FINITE, not all(map(math.isfinite, numbers))),
-            (
-                Objection.COMMAND_TOO_LARGE,
-                math.hypot(*wanted.velocity) > self._parameters.max_speed_m_s
-                or (wanted.yaw_rad is not None and abs(wanted.yaw_rad) > _MOST_YAW_RAD),
-            ),
+            (Objection.COMMAND_NOT_FINITE, not all(map(math.isfinite, wanted.velocity))),
+            (Objection.COMMAND_TOO_LARGE, math.hypot(*wanted.velocity) > self._parameters.max_speed_m_s),
             (
                 Objection.POSITION_UNKNOWN,
                 outside_fence(self._parameters, around.position) and not np.isfinite(around.position).all(),
@@ -231,7 +229,12 @@ class Gate:
         return {
             Objection.FENCE: towards_fence(p, around.position),
             Objection.SEPARATION: towards_neighbours(
-                p, around.neighbours, around.neighbour_velocities, separation_m, around.neighbour_margins
+                p,
+                around.neighbours,
+                around.neighbour_velocities,
+                separation_m,
+                around.neighbour_margins,
+                around.neighbour_unseen_s,
             ),
             Objection.OBSTACLE: towards_obstacles(
                 around.obstacles, p.obstacle_clearance_m, p.braking_m_s2, p.reaction_s
@@ -303,7 +306,3 @@ class Gate:
         if within != height_m:
             objections.append(Objection.HEIGHT)
         return within
-
-
-def _is_heading(yaw_rad: float) -> bool:
-    return abs(yaw_rad) <= _MOST_YAW_RAD  # false for NaN

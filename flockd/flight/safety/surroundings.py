@@ -38,7 +38,7 @@ def surroundings(
     the drone itself flew since then; `position` (2,) m from home, `velocity` (3,) m/s NED, NaN where not known;
     `obstacles` (m, 2) m from where the drone was then.
     """
-    places, velocities, margins = _motions(neighbours, age_s, moved)
+    places, velocities, margins, unseen_s = _motions(neighbours, age_s, moved)
     return Surroundings(
         position=position,
         velocity=velocity[:2],
@@ -46,6 +46,7 @@ def surroundings(
         neighbours=places,
         neighbour_velocities=velocities,
         neighbour_margins=margins,
+        neighbour_unseen_s=unseen_s,
         height_m=height_m,
         obstacles=obstacles - moved[:2],
     )
@@ -56,20 +57,24 @@ def limits_towards(neighbours: Sequence[Neighbour], p: GateParameters) -> tuple[
 
     For a pilot that is not to ask for what cannot be flown.
     """
-    places, velocities, margins = _motions(neighbours, 0.0, np.zeros(3))
-    return towards_neighbours(p, places, velocities, p.min_separation_m, margins)
+    places, velocities, margins, unseen_s = _motions(neighbours, 0.0, np.zeros(3))
+    return towards_neighbours(p, places, velocities, p.min_separation_m, margins, unseen_s)
 
 
 def _motions(
     neighbours: Sequence[Neighbour], age_s: float, moved: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Places (k, 3) m, velocities (k, 2) m/s and margins (k, 2) of all motions that neighbours may have by now."""
-    motions = [motion for one in neighbours for motion in _credible(one)]
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Of all motions that neighbours may have by now: places (k, 3) m, velocities (k, 2) m/s, margins (k, 2), and how
+    long ago each was seen last, (k,) s.
+    """
+    found = [(motion, age_s + one.unseen_s) for one in neighbours for motion in _credible(one)]
+    motions = [motion for motion, _ in found]
     k = len(motions)
     return (
         np.reshape([_by_now(one.position, age_s * one.velocity, moved) for one, _ in motions], (k, 3)),
         np.reshape([one.velocity[:2] for one, _ in motions], (k, 2)),
         np.reshape([(sigmas * one.range_sigma_m, sigmas * one.closing_sigma_m_s) for one, sigmas in motions], (k, 2)),
+        np.array([unseen_s for _, unseen_s in found]),
     )
 
 

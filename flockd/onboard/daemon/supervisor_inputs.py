@@ -22,7 +22,7 @@ from flockd.onboard.sources import CameraStatus, Count, FrameSource
 
 DROPS_WINDOW_S = 5.0
 _BAD: tuple[Count, ...] = ("time_stamp", "flagged", "corrupt", "malformed")
-_REFUSED = (Objection.COMMAND_NOT_FINITE, Objection.COMMAND_TOO_LARGE)
+_REFUSED = (Objection.COMMAND_NOT_FINITE, Objection.COMMAND_TOO_LARGE, Objection.HEADING_NOT_FINITE)
 
 
 class InputCollector:

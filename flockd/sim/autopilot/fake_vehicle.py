@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flockd.core.angles import wrapped
 from flockd.core.messages import FloatArray
 
 
@@ -60,8 +61,8 @@ class PointMass:
         self._position = self._position + self._velocity * interval_s
         if self._position[2] >= 0.0:
             self._position[2], self._velocity[2] = 0.0, min(0.0, self._velocity[2])
-        turn = (demand.yaw_rad - self._yaw_rad + math.pi) % (2 * math.pi) - math.pi
-        self._yaw_rad += turn * min(1.0, interval_s / self.TIME_CONSTANT_S)
+        turn = wrapped(demand.yaw_rad - self._yaw_rad)
+        self._yaw_rad = wrapped(self._yaw_rad + turn * min(1.0, interval_s / self.TIME_CONSTANT_S))
         cos, sin = math.cos(self._yaw_rad), math.sin(self._yaw_rad)
         R_ned_body = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         return MotionState(self._position, self._velocity, R_ned_body)

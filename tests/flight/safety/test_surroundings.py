@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -129,6 +130,29 @@ def test_obstacles_stand_still() -> None:
     np.testing.assert_allclose(around.obstacles, [[2.0, 2.0], [-1.0, -4.0]])
 
 
+@pytest.mark.parametrize(("unseen_s", "left_m"), [(0.0, 3.4), (0.5, 2.4), (1.0, 1.4), (2.0, 0.0)])
+def test_one_that_goes_may_have_braked_since_it_was_seen_last(unseen_s: float, left_m: float) -> None:
+    """2 m/s ahead at 4 m by its track: it stands 2^2 / 2 / 5 = 0.4 m farther on than where it was seen; 1 m is kept."""
+    one = replace(
+        neighbour(1, [4.0, 0.0, 0.0], [2.0, 0.0, 0.0], confirmed=True),
+        position_sigma_m=0.0,
+        velocity_sigma_m_s=0.0,
+        unseen_s=unseen_s,
+    )
+    flies_on_m_s, brakes_m_s = limits_towards([one], GateParameters())[1]
+    assert flies_on_m_s == pytest.approx(math.sqrt(1.5**2 + 2 * 1.5 * 3.0 + 2.0**2) - 1.5)
+    assert brakes_m_s == pytest.approx(math.sqrt(0.75**2 + 2 * 1.5 * left_m) - 0.75)
+    faster = replace(one, velocity_sigma_m_s=0.25)
+    left_m = max(left_m - 2 * 0.25 * 1.0, 0.0)  # two standard deviations, for the reaction time
+    assert limits_towards([faster], GateParameters())[1][1] == pytest.approx(math.sqrt(0.75**2 + 3 * left_m) - 0.75)
+    later = surroundings(
+        [replace(one, unseen_s=0.0)], unseen_s, moved=np.zeros(3), position=np.zeros(2), velocity=np.zeros(3),
+        yaw_rad=0.0, height_m=5.0, obstacles=np.empty((0, 2)),
+    )  # fmt: skip
+    assert later.neighbour_unseen_s is not None
+    np.testing.assert_allclose(later.neighbour_unseen_s, [unseen_s])
+
+
 def test_of_nobody_and_nothing_there_are_arrays_all_the_same() -> None:
     around = told([], np.empty((0, 2)))
     assert around.neighbours.shape == (0, 3)
@@ -151,11 +175,12 @@ def test_a_pilot_hears_how_fast_the_gate_lets_it_fly_towards_each() -> None:
         for at in (here, [0.0, 6.0, 3.5])
     ]
     directions, most_m_s = limits_towards(known, p)
-    np.testing.assert_allclose(directions, [[1.0, 0.0]])
-    np.testing.assert_allclose(most_m_s, [1.5])
-    (goes,) = limits_towards([replace(known[0], velocity=np.array([1.0, 0.0, 0.0]))], p)[1]
-    assert goes == pytest.approx(2.0)  # sqrt(1.5^2 + 2 * 1.5 * 3 + 1^2) - 1.5: it may brake unseen for a second
-    _, in_doubt_m_s = limits_towards([neighbour(5, here, [0.0, 0.0, 0.0], confirmed=False)], p)
-    assert in_doubt_m_s < 1.0
+    np.testing.assert_allclose(directions, [[1.0, 0.0], [1.0, 0.0]])  # as flying on, and as braking
+    assert most_m_s.min() == pytest.approx(1.5)
+    goes = limits_towards([replace(known[0], velocity=np.array([1.0, 0.0, 0.0]))], p)[1]
+    # sqrt(1.5^2 + 2 * 1.5 * 3 + 1^2) - 1.5: it may brake unseen for a second. Or it does now, and stands 0.1 m on.
+    np.testing.assert_allclose(goes, [2.0, math.sqrt(0.75**2 + 2 * 1.5 * 3.1) - 0.75])
+    in_doubt_m_s = limits_towards([neighbour(5, here, [0.0, 0.0, 0.0], confirmed=False)], p)[1]
+    assert in_doubt_m_s.min() < 1.0
     directions, most_m_s = limits_towards([], p)
     assert directions.shape == (0, 2) and most_m_s.shape == (0,)

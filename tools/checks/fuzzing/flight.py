@@ -153,7 +153,7 @@ def assert_safe(verdict: Verdict, gate: Gate, p: GateParameters, action: Action,
         return
     assert action is not Action.SILENCE, "a setpoint without permission"
     assert np.isfinite([*setpoint.velocity, setpoint.height_m, setpoint.yaw_rad]).all(), "a setpoint is not finite"
-    assert abs(setpoint.yaw_rad) <= 2 * math.pi, f"a heading of {setpoint.yaw_rad}"
+    assert abs(setpoint.yaw_rad) <= math.pi, f"a heading of {setpoint.yaw_rad}"
     assert p.min_height_m <= setpoint.height_m <= p.max_height_m, "a height outside the band"
     assert math.hypot(*setpoint.velocity) <= p.max_speed_m_s + ROUNDING, "a setpoint is too fast"
     if math.hypot(*setpoint.velocity) > p.max_speed_m_s - ROUNDING:
