@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from flockd.cli import fleet_page
 from flockd.cli.endpoint_options import add_endpoint_options, add_operator_option, endpoints
 from flockd.cli.output import complain, say, say_json
-from flockd.cli.parser import Commands, Parser, add_commands, positive_number
+from flockd.cli.parser import ALONE, Commands, Parser, add_commands, positive_number
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ def add(commands: Commands) -> None:
     parser = commands("fleet", what, examples, _NOTES)
     add_commands(parser, (_add_goto, _add_velocity, *(_plain(command) for command in PLAIN)))
     fleet_page.add_options(parser)
+    parser.usage = ALONE
 
 
 _NOTES = """\
