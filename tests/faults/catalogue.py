@@ -619,5 +619,13 @@ CATALOGUE = (
         ),
         within_s=20.0,
     ),
+    Fault(
+        78, "messages-of-any-size", "messages of any size, number and source from anyone on the network",
+        "dropped before they are in memory; under 10 MB, flown on",
+        (
+            f"{_HERE}outside.py::test_queries_of_any_size_and_number",
+            "tests/onboard/telemetry/test_hostile_peer.py",
+        ),
+    ),
 )
 # fmt: on
