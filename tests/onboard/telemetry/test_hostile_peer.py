@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import cast
 
 import pytest
 import zenoh
@@ -129,3 +130,13 @@ def test_more_peers_than_it_takes_are_refused() -> None:
         assert sum(bool(one.info.peers_zid()) for one in sessions) == MAX_PEERS
         for one in sessions:
             close_session(one)
+
+
+def test_a_session_ends_though_a_lost_peer_does_not_hear_it() -> None:
+    """As zenoh says it after ten seconds beside a peer that is stopped or out of reach."""
+
+    class Stuck:
+        def close(self) -> None:
+            raise zenoh.ZError("close operation timed out!")
+
+    close_session(cast("zenoh.Session", Stuck()))
