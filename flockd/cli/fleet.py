@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import argparse
 import math
+import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from flockd.cli import fleet_page
 from flockd.cli.endpoint_options import add_endpoint_options, add_operator_option, endpoints
 from flockd.cli.output import complain, say, say_json
-from flockd.cli.parser import Commands, Parser, add_commands, positive_number
+from flockd.cli.parser import ALONE, Commands, Parser, add_commands, positive_number
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
@@ -45,12 +46,14 @@ def add(commands: Commands) -> None:
     parser = commands("fleet", what, examples, _NOTES)
     add_commands(parser, (_add_goto, _add_velocity, *(_plain(command) for command in PLAIN)))
     fleet_page.add_options(parser)
+    parser.usage = ALONE
 
 
 _NOTES = """\
 Without a command it serves the page, and prints its address with a key: who has it may open the page.
 A drone takes only what its `telemetry.commands` allows, and no goal outside its fence. Its answer says that it tries;
-`flockd status` shows what becomes of it. Exit code 1: a drone refused, or did not answer."""
+`flockd status` shows what becomes of it. Each drone is asked as soon as it is found, whatever the others do.
+Exit code 1: a drone refused, did not answer, or was not found; 69: none was found."""
 
 
 def _add_goto(commands: Commands) -> None:
@@ -111,7 +114,7 @@ def _add_drones(parser: Parser) -> None:
 def _add_connection(parser: Parser) -> None:
     add_endpoint_options(parser)
     add_operator_option(parser)
-    parser.add_argument("--json", action="store_true", help="print the replies as JSON, by drone")
+    parser.add_argument("--json", action="store_true", help="print the last replies as JSON, by drone")
 
 
 def _number(text: str) -> float:
@@ -147,60 +150,82 @@ def _velocity(args: argparse.Namespace) -> int:
 
 
 def _ask(args: argparse.Namespace, command: str, order: MissionOrder | None, repeat_s: float = 0.0) -> int:
-    """Asks all, again and again for ``repeat_s``; says what each answered, later only what has changed."""
-    from flockd.fleet.watcher import FleetWatcher
+    """Asks each drone as soon as it is found, whatever others do, again and again for ``repeat_s``.
 
-    listen, connect = endpoints(args)
-    with FleetWatcher(args.fleet, listen=listen, connect=connect, settings=args.zenoh_config) as watcher:
-        drones = _drones(watcher, args.drones, ", ".join([*listen, *connect]))
-        began_s = time.monotonic()
-        answers = _answers(watcher, drones, command, order, args.operator)
-        _show(answers, as_json=args.json)
-        with suppress(KeyboardInterrupt):
-            while time.monotonic() + REPEAT_S <= began_s + repeat_s:
-                time.sleep(REPEAT_S)
-                before, answers = answers, _answers(watcher, drones, command, order, args.operator)
-                _show(
-                    {drone: answer for drone, answer in answers.items() if answer != before[drone]}, as_json=args.json
-                )
-    refused = any(not answer["accepted"] for answer in answers.values())
-    return ExitCode.CHECK_FAILED if refused else ExitCode.DONE
-
-
-def _drones(watcher: FleetWatcher, wanted: str, places: str) -> tuple[str, ...]:
-    """The keys `fleet/drone` of drones that are alive: as soon as all named ones are found; of all, after a while."""
-    from flockd.fleet.fleet_status import by_name
-
-    names = [] if wanted == ALL else wanted.split(",")
-    until_s = time.monotonic() + FIND_S
-    while True:
-        alive = [one for one in watcher.drones() if one.alive and (wanted == ALL or one.drone in names)]
-        missing = [name for name in names if name not in {one.drone for one in alive}]
-        if time.monotonic() >= until_s or (names and not missing):
-            break
-        time.sleep(AGAIN_S)
-    if missing or not alive:
-        who = f"{' and '.join(missing)} {'was' if len(missing) == 1 else 'were'} not" if missing else "no drone was"
-        raise UnavailableError(f"{who} found at {places}; no request was sent; check `flockd status`")
-    return tuple(sorted((f"{one.fleet}/{one.drone}" for one in alive), key=by_name))
-
-
-def _answers(
-    watcher: FleetWatcher, drones: tuple[str, ...], command: str, order: MissionOrder | None, operator: str
-) -> dict[str, dict[str, object]]:
+    Says what each answers, later only what has changed.
+    """
+    from flockd.fleet.watcher import MAX_DRONES, FleetWatcher
     from flockd.onboard.telemetry.order_messages import order_message
 
+    listen, connect = endpoints(args)
+    message = None if order is None else {**order_message(order)}
     answers: dict[str, dict[str, object]] = {}
-    for drone in drones:
-        answer = watcher.ask(drone, command, operator, None if order is None else {**order_message(order)})
-        answers[drone] = {"accepted": False, "sentence": NO_ANSWER} if answer is None else {**answer}
-    return answers
+    over = threading.Event()
+
+    def ask(drone: str) -> None:
+        until_s = time.monotonic() + repeat_s
+        while not over.is_set():
+            reply = watcher.ask(drone, command, args.operator, message)
+            answer = {"accepted": False, "sentence": NO_ANSWER} if reply is None else {**reply}
+            if answer != answers.get(drone) and not args.json:
+                (say if answer["accepted"] else complain)(f"{drone}: {answer['sentence']}")
+            answers[drone] = answer
+            if time.monotonic() + REPEAT_S > until_s or over.wait(REPEAT_S):
+                return
+
+    names = [] if args.drones == ALL else args.drones.split(",")
+    asked: dict[str, Future[None]] = {}
+    with (
+        FleetWatcher(args.fleet, listen=listen, connect=connect, settings=args.zenoh_config) as watcher,
+        ThreadPoolExecutor(MAX_DRONES) as threads,
+    ):
+        try:
+            for drone in _found(watcher, names):
+                asked[drone] = threads.submit(ask, drone)
+            for one in asked.values():
+                one.result()
+        except KeyboardInterrupt:
+            over.set()
+            if not repeat_s:
+                raise
+    return _verdict(args, answers, names, ", ".join([*listen, *connect]))
 
 
-def _show(answers: dict[str, dict[str, object]], *, as_json: bool) -> None:
-    if as_json and answers:
-        say_json(answers)
-        return
-    for drone, answer in answers.items():
-        tell = say if answer["accepted"] else complain
-        tell(f"{drone}: {answer['sentence']}")
+def _found(watcher: FleetWatcher, names: list[str]) -> Iterator[str]:
+    """The keys `fleet/drone` of drones that are alive, each when it is found.
+
+    Until all that are named are found; without names, and where some are not found, for a while.
+    """
+    found: set[str] = set()
+    until_s = time.monotonic() + FIND_S
+    while True:
+        alive = {
+            f"{one.fleet}/{one.drone}" for one in watcher.drones() if one.alive and (one.drone in names or not names)
+        }
+        yield from sorted(alive - found)
+        found |= alive
+        if time.monotonic() >= until_s or (names and not _missing(names, found)):
+            return
+        time.sleep(AGAIN_S)
+
+
+def _missing(names: list[str], drones: Iterable[str]) -> list[str]:
+    """Those that none of these keys is of."""
+    there = {drone.partition("/")[2] for drone in drones}
+    return [name for name in names if name not in there]
+
+
+def _verdict(args: argparse.Namespace, answers: dict[str, dict[str, object]], names: list[str], places: str) -> int:
+    """Says at the end who did not do it. Raises UnavailableError where nobody was found."""
+    from flockd.fleet.fleet_status import by_name
+
+    missing = _missing(names, answers)
+    who = f"{' and '.join(missing)} {'was' if len(missing) == 1 else 'were'} not" if missing else "no drone was"
+    if not answers:
+        raise UnavailableError(f"{who} found at {places}; no request was sent; check `flockd status`")
+    if args.json:
+        say_json({drone: answers[drone] for drone in sorted(answers, key=by_name)})
+    if missing:
+        complain(f"{who} found at {places}; check `flockd status`")
+    refused = any(not answer["accepted"] for answer in answers.values())
+    return ExitCode.CHECK_FAILED if refused or missing else ExitCode.DONE

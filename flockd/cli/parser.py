@@ -33,10 +33,18 @@ class Parser(argparse.ArgumentParser):
         """Which of them is meant where none is named."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As argparse does, with the default command in its place."""
+        """As argparse does, with the default command in its place; a command that is named comes first.
+
+        argparse would take options before it, and then put the command's own defaults in their place.
+        """
+        args = sys.argv[1:] if args is None else list(args)
         if self.default_command is not None and args and args[0] not in {*self.commands, "-h", "--help"}:
             args = [self.default_command, *args]
-        return super().parse_known_args(args, namespace)
+        parsed, unknown = super().parse_known_args(args, namespace)
+        if self.commands and parsed.parser is not self and args[0] not in self.commands:
+            name = parsed.parser.prog.removeprefix(self.prog).split()[0]
+            self.error(f"{args[0]} stands before the command {name}; write options behind it")
+        return parsed, unknown
 
     def error(self, message: str) -> NoReturn:
         """Reports what is wrong with the command line, with a suggestion for a misspelt command or one that is gone."""
@@ -53,6 +61,10 @@ class Parser(argparse.ArgumentParser):
         raise SystemExit(ExitCode.USAGE)
 
 
+ALONE = "%(prog)s [OPTION ...]\n       %(prog)s COMMAND ..."
+"""Usage of a parser that has commands, and does something without one."""
+
+
 class Commands(Protocol):
     """Adds a command."""
 
@@ -63,6 +75,8 @@ class Commands(Protocol):
 
 def add_commands(parser: Parser, additions: Sequence[Callable[[Commands], None]]) -> None:
     """Gives a parser its commands; without one it prints its help and exits with a usage error.
+
+    A parser that does something without a command too gets its own `run` and options afterwards, and `ALONE` as usage.
 
     What is parsed has `run`, the command's function, and `parser`, the command's own.
     """

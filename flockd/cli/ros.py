@@ -9,7 +9,7 @@ from pathlib import Path
 
 from flockd.cli.endpoint_options import add_endpoint_options, add_operator_option, endpoints
 from flockd.cli.output import complain, say
-from flockd.cli.parser import Commands, Parser, add_commands
+from flockd.cli.parser import ALONE, Commands, Parser, add_commands
 from flockd.core.errors import ExitCode
 
 _NOTES = """\
@@ -34,6 +34,7 @@ def add(commands: Commands) -> None:
     add_operator_option(parser)
     _add_network(parser)
     parser.set_defaults(run=_run)
+    parser.usage = ALONE
 
 
 def _add_network(parser: Parser) -> None:

@@ -18,10 +18,14 @@ from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
     from flockd.core.config import DroneConfig
-    from flockd.onboard.daemon import Daemon, Ending, ServiceManager
+    from flockd.onboard.daemon import Daemon, ServiceManager
 
 WAITING_EVERY_S = 5.0
 FILES_NEEDED = 128
+IGNORED = (
+    "SIGHUP is ignored; to fly with a changed configuration: `flockd config check %s`, then, with the drone on the "
+    "ground, end flockd and start it again"
+)
 ADDRESSES_NEEDED_MB = 3072
 """What a flight takes, with some to spare. With less, libraries end the process on their own, some by an abort."""
 
@@ -58,20 +62,19 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _run_daemon(args: argparse.Namespace) -> int:
-    """Until it is asked to end, with each configuration that it is asked to reload."""
+    """Until it is asked to end."""
     from flockd.onboard.daemon import ServiceManager, event_loop_at, only_instance
 
     service = ServiceManager(os.environ)
-    config: DroneConfig | None = load_to_fly(args.config, force=args.force)
+    config = load_to_fly(args.config, force=args.force)
     if args.record is not None:
         try:
             args.record.mkdir(parents=True, exist_ok=True)
         except (FileExistsError, NotADirectoryError) as error:
             raise UsageError(f"{args.record}: is no folder; name another with --record") from error
-    while config is not None:
-        event_loop = functools.partial(event_loop_at, config.speed_factor)
-        with only_instance(config.name, os.environ), asyncio.Runner(loop_factory=event_loop) as runner:
-            config = runner.run(_fly(config, args, service)).reload
+    event_loop = functools.partial(event_loop_at, config.speed_factor)
+    with only_instance(config.name, os.environ), asyncio.Runner(loop_factory=event_loop) as runner:
+        runner.run(_fly(config, args, service))
     return ExitCode.DONE
 
 
@@ -93,8 +96,8 @@ def _check_limits() -> None:
         )
 
 
-async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceManager) -> Ending:
-    """With SIGTERM and Ctrl-C for standstill, Hold and the end, and SIGHUP for the configuration."""
+async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceManager) -> None:
+    """With SIGTERM and Ctrl-C for standstill, Hold and the end. A terminal that closes ends no flight."""
     from flockd.flight.inference.hashes import model_hashes
     from flockd.flight.perception import load_networks
     from flockd.onboard.daemon import Daemon, cameras_at_once, clock_at
@@ -112,11 +115,10 @@ async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceMa
     loop = asyncio.get_running_loop()
     loop.add_signal_handler(signal.SIGTERM, daemon.ask_to_stop)
     loop.add_signal_handler(signal.SIGINT, daemon.ask_to_stop)
-    read = functools.partial(load_to_fly, args.config, force=args.force)
-    loop.add_signal_handler(signal.SIGHUP, lambda: daemon.ask_to_reload(read))
+    loop.add_signal_handler(signal.SIGHUP, logging.getLogger("flockd").warning, IGNORED, args.config)
     waiting = asyncio.create_task(_say_what_it_waits_for(daemon, WAITING_EVERY_S * config.speed_factor))
     try:
-        return await daemon.run()
+        await daemon.run()
     finally:
         waiting.cancel()
 

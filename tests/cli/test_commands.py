@@ -15,6 +15,7 @@ import pytest
 
 from flockd import __version__
 from flockd.cli import _parser, installing, main
+from flockd.cli.parser import Parser
 from flockd.core.errors import ModelError
 
 ROOT = Path(__file__).parents[2]
@@ -106,6 +107,53 @@ def test_a_slip_on_the_command_line_is_a_usage_error(
     error = _usage_error(capsys, *arguments)
     assert error.startswith(told)
     assert error.count("\n") == 1
+
+
+def _before_a_command(parser: Parser) -> Iterator[list[str]]:
+    """Each option of each parser that has commands, before each of them, in a form that is right otherwise."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, inner in action.choices.items():
+                for option in parser._actions:
+                    if option.option_strings and option.dest not in {"help", "version"}:
+                        needed = [word for one in inner._actions if one.required for word in _words(inner, one)]
+                        yield [*parser.prog.split()[1:], *_words(parser, option), name, *needed]
+                yield from _before_a_command(inner)
+
+
+def _words(parser: Parser, action: argparse.Action) -> list[str]:
+    """An option with a value that is not its default, or a positional argument."""
+    values = [] if action.nargs == 0 else [next(value for value in VALUES if _fits(parser, action, value))]
+    return [*action.option_strings[:1], *values]
+
+
+def _fits(parser: Parser, action: argparse.Action, value: str) -> bool:
+    try:
+        parser._get_values(action, [value])
+    except argparse.ArgumentError:
+        return False
+    return True
+
+
+VALUES = ("1", "640x480", "0.0.0.0", "run")
+BEFORE = [*_before_a_command(_parser()), ["fleet", "--connect=tcp/127.0.0.1:1", "hold", "drone2"]]
+
+
+@pytest.mark.parametrize("arguments", BEFORE, ids=" ".join)
+def test_an_option_before_a_command_is_refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """`flockd fleet --fleet other hold drone2` went to every fleet: the command's default replaced it."""
+    parser = _parser()
+    with pytest.raises(SystemExit) as exit_:
+        parser.parse_known_args(arguments)
+    assert exit_.value.code == 2
+    option = next(word for word in arguments if word.startswith("-"))
+    told = capsys.readouterr().err
+    assert f"{option} stands before the command " in told
+
+
+def test_options_before_commands_are_found() -> None:
+    assert {"fleet", "ros"} <= {arguments[0] for arguments in BEFORE}
+    assert ["fleet", "--fleet", "1", "goto", "1", "1", "1"] in BEFORE
 
 
 @pytest.mark.parametrize("command", [[], ["record"], ["config"], ["calibrate"]], ids=" ".join)

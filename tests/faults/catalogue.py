@@ -661,5 +661,13 @@ CATALOGUE = (
             "tests/flight/safety/test_surroundings.py::test_one_that_goes_may_have_braked_since_it_was_seen_last",
         ),
     ),
+    Fault(
+        78, "messages-of-any-size", "messages of any size, number and source from anyone on the network",
+        "dropped before they are in memory; under 10 MB, flown on",
+        (
+            f"{_HERE}outside.py::test_queries_of_any_size_and_number",
+            "tests/onboard/telemetry/test_hostile_peer.py",
+        ),
+    ),
 )
 # fmt: on

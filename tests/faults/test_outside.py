@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import json
 import subprocess
@@ -19,6 +20,7 @@ from flockd.sim.free_ports import free_endpoint
 from tests.faults.process import Process, flying
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, client
+from tests.onboard.telemetry.test_hostile_peer import MAX_COST_MB, peak_mb
 from tests.onboard.telemetry.test_malformed import FLIGHT
 
 pytestmark = pytest.mark.slow
@@ -78,6 +80,28 @@ async def test_nonsense_on_the_telemetry_bus(tmp_path: Path) -> None:
         assert (await process.ask("ask/hold"))["accepted"] is False
         await _flies_on(process)
         assert not any("asked for land" in event for event in process.events)
+        session.close()  # type: ignore[no-untyped-call]
+
+
+async def test_queries_of_any_size_and_number(tmp_path: Path) -> None:
+    """Memory is that of the drone's whole process."""
+    async with flying(tmp_path) as process:
+        await _flies_on(process)
+        session = zenoh.open(client(process.config.telemetry.listen[0]))
+        before_mb = peak_mb(process.program.process.pid)
+        for payload, count in ((bytes(200 << 20), 1), (bytes(60_000), 500)):
+            for what in ("ask/hold", "image/front", "about", "time"):
+                for _ in range(count):
+                    session.get(
+                        f"flockd/v1/test/tiny/{what}",
+                        lambda _: None,
+                        payload=payload,
+                        congestion_control=zenoh.CongestionControl.BLOCK,
+                    )
+                    await asyncio.sleep(0.0)
+        assert (await process.ask("ask/hold"))["accepted"] is False
+        await _flies_on(process)
+        assert peak_mb(process.program.process.pid) - before_mb < MAX_COST_MB
         session.close()  # type: ignore[no-untyped-call]
 
 

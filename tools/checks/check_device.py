@@ -2,12 +2,13 @@
 
 sudo python3 -m tools.checks.check_device                              # from nothing; downloads about 300 MB
 sudo python3 -m tools.checks.check_device --cache /var/cache/flockd    # keeps what it built for the next time
+sudo python3 -m tools.checks.check_device --debian 13                  # on Debian 13 (trixie), with systemd 257
 sudo python3 -m tools.checks.check_device --package                    # the Debian package: installed, upgraded,
 removed
 
 Needs Linux on x86-64 with qemu-system-x86, mmdebstrap and e2fsprogs, and no KVM: the processor is emulated. The machine
-runs Debian 12 with its own kernel and systemd; flockd is installed by the lines of docs/real_drone.md, and its unit
-runs `flockd run` with the shipped networks. The autopilot is flockd's fake; as an emulated processor is slow, the
+runs Debian 12 or 13 with its own kernel and systemd; flockd is installed by the lines of docs/real_drone.md, and its
+unit runs `flockd run` with the shipped networks. The autopilot is flockd's fake; as an emulated processor is slow, the
 images are small and the steps far apart. The machine's clock counts instructions, a nanosecond each: how busy this
 computer is changes how long the check takes, and nothing of what it measures. --package installs half a gigabyte three
 times.
@@ -48,6 +49,8 @@ PACKAGES = (
     *("linux-image-amd64", "linux-headers-amd64", "v4l2loopback-dkms", "initramfs-tools", "zstd"),
     *("gstreamer1.0-plugins-base", "gstreamer1.0-plugins-good", "gstreamer1.0-tools", "gstreamer1.0-plugins-base-apps"),
 )
+SUITES = {"12": "bookworm", "13": "trixie"}
+"""By Debian's version: its name at Debian."""
 BOOT_MODULES = ("virtio_pci", "virtio_blk", "ext4")
 PAGE, SECTION = ROOT / "docs" / "real_drone.md", "## Install it as a service"
 DRONE_FILE = "my_drone.yaml"
@@ -55,7 +58,7 @@ DRONE_FILE = "my_drone.yaml"
 FAKE_AUTOPILOT = "pymavlink>=2.4.40"
 COMPILE = "import flockd.sim.autopilot.fake_autopilot"
 """What it needs of a dozen MAVLink dialects, and no more."""
-ARCH, DEBIAN = "amd64", "debian12"
+ARCH = "amd64"
 VERSIONS = ("1", "2")
 """Versions of the package, before and after it is upgraded."""
 SYSTEM_PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
@@ -99,15 +102,16 @@ def main() -> int:
         metavar="GROUP",
         help="of capture, pipelines, sandbox, bench and service",
     )
+    parser.add_argument("--debian", choices=tuple(SUITES), default="12", help="what boots; default: %(default)s")
     parser.add_argument("--package", action="store_true", help="check the Debian package, and that alone")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     try:
         _need_all()
         signal.signal(signal.SIGTERM, _end)
-        with _folder(arguments.cache) as folder:
-            part = _package() if arguments.package else _by_hand(arguments.only)
-            return _check(folder, part, as_json=arguments.json)
+        with _folder(arguments.cache, arguments.debian) as folder:
+            part = _package(arguments.debian) if arguments.package else _by_hand(arguments.only)
+            return _check(folder, arguments.debian, part, as_json=arguments.json)
     except (UnavailableError, deb.UnavailableError) as error:
         print(f"check_device: {error}", file=sys.stderr)
         return UNAVAILABLE
@@ -123,10 +127,10 @@ class Part:
     """Puts what the checks need into a folder that the machine sees, likewise; their command."""
 
 
-def _check(folder: Path, part: Part, *, as_json: bool) -> int:
+def _check(folder: Path, debian: str, part: Part, *, as_json: bool) -> int:
     begun_s = time.monotonic()
     rows: list[dict[str, Any]] = []
-    image, wheels = _build(folder, part)
+    image, wheels = _build(folder, debian, part)
     for line in _run(folder, image, wheels, part):
         if "check" in line:
             rows.append(line)
@@ -155,11 +159,12 @@ def _need_all() -> None:
 
 
 @contextmanager
-def _folder(cache: Path | None) -> Iterator[Path]:
+def _folder(cache: Path | None, debian: str) -> Iterator[Path]:
     """Where the machine's files are."""
     if cache is not None:
-        cache.mkdir(parents=True, exist_ok=True)
-        yield cache.resolve()
+        kept = cache / f"debian{debian}"
+        kept.mkdir(parents=True, exist_ok=True)
+        yield kept.resolve()
         return
     with tempfile.TemporaryDirectory(prefix="flockd-device-", dir="/var/tmp") as folder:
         yield Path(folder)
@@ -185,27 +190,27 @@ def _by_hand(groups: list[str]) -> Part:
     return Part(lambda system, wheels: _install(system, wheels, install), share)
 
 
-def _package() -> Part:
+def _package(debian: str) -> Part:
     """The Debian package in two versions, on a Debian without flockd."""
 
     def share(shared: Path, wheels: Path) -> str:
         _note("building the package in two versions")
-        files = [deb.build(shared, ARCH, DEBIAN, version, shelf=wheels, level=1).name for version in VERSIONS]
-        paths = (f"/mnt/check/{name}" for name in files)
+        files = [deb.build(shared, ARCH, f"debian{debian}", version, shelf=wheels, level=1) for version in VERSIONS]
+        paths = (f"/mnt/check/{file.name}" for file in files)
         return " ".join(["python3 -m tools.checks.device_check.package /mnt/findings/lines", *paths])
 
     return Part(_install_fake_autopilot, share)
 
 
-def _build(folder: Path, part: Part) -> tuple[Path, Path]:
+def _build(folder: Path, debian: str, part: Part) -> tuple[Path, Path]:
     """The machine's disk, and the wheels for it. Raises UnavailableError when something cannot be fetched."""
     system = folder / "system"
     with ThreadPoolExecutor(1) as aside:
-        wheels = aside.submit(_wheels, folder)
+        wheels = aside.submit(_wheels, folder, debian)
         if not (folder / "system.done").exists():
             _note("building a Debian")
             shutil.rmtree(system, ignore_errors=True)
-            _debian(system)
+            _debian(system, debian)
             (folder / "system.done").touch()
         _note("installing")
         _empty(system)
@@ -217,7 +222,7 @@ def _build(folder: Path, part: Part) -> tuple[Path, Path]:
     return image, wheels.result()
 
 
-def _debian(system: Path) -> None:
+def _debian(system: Path, debian: str) -> None:
     """A tree of files, with a kernel that has the virtual cameras."""
     listed = r"\n".join(BOOT_MODULES)
     few_modules = (
@@ -227,16 +232,16 @@ def _debian(system: Path) -> None:
     without = [f"--dpkgopt=path-exclude=/usr/share/{what}/*" for what in ("doc", "man", "locale", "info")]
     _command(
         "mmdebstrap", "--quiet", "--variant=apt", f"--include={','.join(PACKAGES)}", "--dpkgopt=force-unsafe-io",
-        *without, f"--essential-hook={few_modules}", "bookworm", str(system),
+        *without, f"--essential-hook={few_modules}", SUITES[debian], str(system),
     )  # fmt: skip
 
 
-def _wheels(folder: Path) -> Path:
+def _wheels(folder: Path, debian: str) -> Path:
     """What the lock names and the fake autopilot needs, from the package index, for the machine's Python."""
     wheels = folder / f"wheels-{hashlib.sha256(LOCK.read_bytes() + FAKE_AUTOPILOT.encode()).hexdigest()[:8]}"
     if wheels.exists():
         return wheels
-    machine, python = deb.MACHINES[ARCH], deb.SYSTEMS[DEBIAN].python
+    machine, python = deb.MACHINES[ARCH], deb.SYSTEMS[f"debian{debian}"].python
     with tempfile.TemporaryDirectory(dir=folder) as fresh:
         try:
             download_locked(Path(fresh), machine=machine, python=python)

@@ -1,7 +1,7 @@
 """The daemon on the drone: owns time, devices, threads and failure around the pure line."""
 
 from flockd.onboard.daemon.components import Components
-from flockd.onboard.daemon.daemon import Daemon, DaemonError, Ending
+from flockd.onboard.daemon.daemon import Daemon, DaemonError
 from flockd.onboard.daemon.lock import only_instance, service_lock
 from flockd.onboard.daemon.service_manager import ServiceManager
 from flockd.onboard.daemon.simulated_loop import event_loop_at
@@ -13,7 +13,6 @@ __all__ = [
     "Components",
     "Daemon",
     "DaemonError",
-    "Ending",
     "InterruptibleNetworks",
     "ServiceManager",
     "StderrLog",

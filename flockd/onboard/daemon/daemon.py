@@ -7,7 +7,7 @@ import time
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from flockd.core.config import DroneConfig
 from flockd.core.errors import ConfigError, ConfigProblem, FlockdError
@@ -30,13 +30,6 @@ HOLD_S = 2.0
 
 class DaemonError(FlockdError):
     """The flight ended because something in flockd did; the text says what."""
-
-
-class Ending(NamedTuple):
-    """How a daemon ended that ended without an error."""
-
-    reload: DroneConfig | None
-    """The configuration to start again with; None: done."""
 
 
 class Daemon:
@@ -70,12 +63,11 @@ class Daemon:
         """
         _check_flyable(config, file)
         self._source = open_source(config, file, clock=clock)
-        self._config, self._file = config, file
+        self._config = config
         self._load_networks, self._models, self._recordings = load_networks, models, recordings
         self._service, self._clock, self._connect = service, clock, connect
         self._operator = OperatorRequests()
         self._stopping = asyncio.Event()
-        self._reload: DroneConfig | None = None
         self.components: Components | None = None
         """All parts of the flight, once they are open."""
 
@@ -94,28 +86,7 @@ class Daemon:
         self._operator.shutdown = True
         self._stopping.set()
 
-    def ask_to_reload(self, read: Callable[[], DroneConfig]) -> None:
-        """As SIGHUP does: ends, to start again with what ``read`` returns.
-
-        Refused, with an event, while the drone is armed or in the air, or when the file is wrong.
-        """
-        refusal = self._why_not_reload()
-        if refusal is None:
-            try:
-                config = read()
-                _check_flyable(config, self._file)
-                open_source(config, self._file)
-            except FlockdError as error:
-                refusal = f"the new configuration was refused, and the old one stays in use: {error}"
-            else:
-                self._reload = config
-                self._service.reloading()
-                self.ask_to_stop()
-                return
-        if self.components is not None:
-            self.components.sinks.event(refusal)
-
-    async def run(self) -> Ending:
+    async def run(self) -> None:
         """Flies until it is asked to stop.
 
         Raises FlockdError when it cannot start, DaemonError when a task died or Hold was not confirmed.
@@ -137,15 +108,6 @@ class Daemon:
             if components is not None:
                 self.components = components
                 await self._fly(components)
-        return Ending(self._reload)
-
-    def _why_not_reload(self) -> str | None:
-        if self.components is None:
-            return None
-        state, status = self.components.control.decision.state, self.components.link.status()
-        if state in FLYING or status.in_air or status.armed:
-            return "the configuration was not read again, because the drone is armed or in the air; land and disarm it"
-        return None
 
     async def _unless_stopped(self, start: Coroutine[Any, Any, Components]) -> Components | None:
         """Starts; None when asked to stop before that is done."""

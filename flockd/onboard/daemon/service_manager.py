@@ -1,4 +1,4 @@
-"""Notifications to a service manager by sd_notify(3): ready, watchdog, reloading, stopping."""
+"""Notifications to a service manager by sd_notify(3): ready, watchdog, stopping."""
 
 from __future__ import annotations
 
@@ -35,10 +35,6 @@ class ServiceManager:
     def starting(self, status: str, more_s: float) -> None:
         """Not ready yet: extends the start time-out by ``more_s``."""
         self._send(f"EXTEND_TIMEOUT_USEC={round(more_s * 1e6)}", f"STATUS={status}")
-
-    def reloading(self) -> None:
-        """The configuration is being reloaded, until `ready`."""
-        self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def stopping(self) -> None:
         """About to end."""

@@ -17,6 +17,10 @@ from flockd.onboard.telemetry.topics import PREFIX, TOPICS, AboutMessage, Answer
 from flockd.onboard.telemetry.zenoh_session import SessionOwner, open_session
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+MAX_RECEIVED_BYTES = 1 << 16
+"""Longer messages are dropped before they are whole in memory: anybody may send them. An order has less than 1 KiB."""
+MAX_PEERS = 32
+"""At once. Each of the fleet's commands is two; each may leave a message unfinished in each of zenoh's 8 priorities."""
 
 Ask = Callable[[str, bytes], AnswerMessage]
 """Takes an operator's command by name, with what its query carries, on a thread of zenoh's; returns at once."""
@@ -54,7 +58,16 @@ class ZenohTelemetry(SessionOwner):
         self._lost = 0
         self.identity = secrets.token_hex(4)
         """Of this process's drones, beside their names, which two drones may share by mistake."""
-        self._session = open_session("telemetry", listen, connect, settings=settings)
+        # Memory that another process shares counts as the drone's, and has no limit of its own.
+        self._session = open_session(
+            "telemetry",
+            listen,
+            connect,
+            settings=settings,
+            shared_memory=False,
+            max_message_bytes=MAX_RECEIVED_BYTES,
+            max_peers=MAX_PEERS,
+        )
 
     @property
     def lost(self) -> int:
@@ -78,7 +91,7 @@ class ZenohTelemetry(SessionOwner):
         self._keep(
             drone,
             self._session.liveliness().declare_token(f"{key}/alive/{self.identity}"),
-            self._session.declare_queryable(f"{key}/time", self._tell_time),
+            self._queryable(f"{key}/time", self._tell_time),
         )
 
     def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
@@ -90,12 +103,12 @@ class ZenohTelemetry(SessionOwner):
         key = f"{self._prefix}/{drone}"
         self._keep(
             drone,
-            self._session.declare_queryable(f"{key}/about", lambda query: _reply(query, about)),
-            self._session.declare_queryable(
+            self._queryable(f"{key}/about", lambda query: _reply(query, about)),
+            self._queryable(
                 f"{key}/ask/*",
                 lambda query: _reply(query, ask(str(query.key_expr).rpartition("/")[2], _payload(query))),
             ),
-            self._session.declare_queryable(f"{key}/image/*", lambda query: _send_image(query, newest_image)),
+            self._queryable(f"{key}/image/*", lambda query: _send_image(query, newest_image)),
         )
 
     def withdraw(self, drone: str) -> None:
@@ -112,10 +125,14 @@ class ZenohTelemetry(SessionOwner):
             raise ValueError(f"{keys!r} is a drone's")
         self._keep(
             keys,
-            self._session.declare_queryable(
+            self._queryable(
                 keys, lambda query: _reply(query, reply(str(query.key_expr).rpartition("/")[2], _payload(query)))
             ),
         )
+
+    def _queryable(self, keys: str, answer: Callable[[zenoh.Query], None]) -> Declared:
+        """Answers on the thread that receives: who asks faster than is answered waits, and no queue grows."""
+        return self._session.declare_queryable(keys, zenoh.handlers.Callback(answer, indirect=False))
 
     def _keep(self, what: str, *declared: Declared) -> None:
         self._kept.setdefault(what, []).extend(declared)

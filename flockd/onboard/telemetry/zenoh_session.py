@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
@@ -28,6 +29,7 @@ def open_session(
     settings: Path | None = None,
     shared_memory: bool | None = None,
     max_message_bytes: int | None = None,
+    max_peers: int | None = None,
 ) -> zenoh.Session:
     """A session that listens on and connects to these endpoints only, for ever where nobody is there yet.
 
@@ -38,6 +40,7 @@ def open_session(
         settings: a file of zenoh's own to begin with: for TLS and access control.
         shared_memory: whether large messages go through it; None: as zenoh or the settings have it.
         max_message_bytes: longer ones are not received; None: as zenoh or the settings have it.
+        max_peers: further ones are refused; None: as zenoh or the settings have it.
 
     Raises SessionError.
     """
@@ -45,6 +48,8 @@ def open_session(
         config = _config(listen, connect, settings, shared_memory)
         if max_message_bytes is not None:
             config.insert_json5("transport/link/rx/max_message_size", json.dumps(max_message_bytes))
+        if max_peers is not None:
+            config.insert_json5("transport/unicast/max_sessions", json.dumps(max_peers))
         return zenoh.open(config)
     except zenoh.ZError as error:
         endpoints = ", ".join([*listen, *connect]) or "no endpoint"
@@ -65,7 +70,8 @@ def private_keys(settings: Path) -> tuple[Path, ...]:
 
 def close_session(session: zenoh.Session) -> None:
     """Ends a session and all that was declared in it."""
-    session.close()  # type: ignore[no-untyped-call]
+    with suppress(zenoh.ZError):  # after ten seconds, where a peer that is lost does not hear that it ends
+        session.close()  # type: ignore[no-untyped-call]
 
 
 class SessionOwner:

@@ -32,7 +32,7 @@ from flockd.fleet.watcher import FleetWatcher, Heard
 from flockd.flight.geometry import RigCamera, ZMap
 from flockd.flight.perception import Crop, OneByOne, RangeEstimate, SceneMaps
 from flockd.onboard.autopilot.refusal_reasons import REASONS
-from flockd.onboard.daemon import Daemon, Ending, ServiceManager
+from flockd.onboard.daemon import Daemon, ServiceManager
 from flockd.onboard.sources import FramePublisher
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.free_ports import free_endpoint
@@ -274,7 +274,7 @@ class Aboard(Watched):
 
     perceiver: TinyPerceiver
     daemon: Daemon
-    ending: asyncio.Task[Ending]
+    ending: asyncio.Task[None]
     service: list[str]
 
     async def until_state(self, *states: str) -> None:

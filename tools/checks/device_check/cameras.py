@@ -27,6 +27,7 @@ _NEXT = 0x80000000  # V4L2_CTRL_FLAG_NEXT_CTRL
 _WHITE = 6
 """A test pattern in which the networks see nothing: in the coloured bars they see drones."""
 _COUNTERS, _NOTHING = 1, 2
+_FIRST_OUTPUT = 2
 
 
 def load() -> None:
@@ -44,20 +45,37 @@ def load() -> None:
         run("v4l2-ctl", "-d", device, "--set-dv-bt-timings", f"index={_vga(device)}")
     control(WEBCAM, "test_pattern", _WHITE)
     control(WEBCAM, "osd_text_mode", _COUNTERS)  # so that no two images are the same
-    control(CABLE, "loop_video")
+    _plug_in()
     control(CABLE, "osd_text_mode", _NOTHING)  # written over the images
+
+
+def _plug_in() -> None:
+    """Connects the cable: since Linux 6.11 each input says to which output it leads, after itself and none."""
+    with _opened(CABLE) as descriptor:
+        names = _controls(descriptor)
+    to_output = next((name for name in names if name.endswith("_is_connected_to")), None)
+    if to_output is None:
+        control(CABLE, "loop_video")
+    else:
+        control(CABLE, to_output, _FIRST_OUTPUT)
 
 
 def control(device: str, name: str, value: int = 1) -> float:
     """Sets a control, or presses it if it is a button; just before when, on the monotonic clock."""
-    descriptor = os.open(device, os.O_RDWR)
-    try:
+    with _opened(device) as descriptor:
         wanted = Control(id=_controls(descriptor)[name], value=value)
         now_s = time.monotonic()
         fcntl.ioctl(descriptor, VIDIOC_S_CTRL, wanted)
+    return now_s
+
+
+@contextmanager
+def _opened(device: str) -> Iterator[int]:
+    descriptor = os.open(device, os.O_RDWR)
+    try:
+        yield descriptor
     finally:
         os.close(descriptor)
-    return now_s
 
 
 def run(*command: str) -> str:

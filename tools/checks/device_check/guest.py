@@ -47,6 +47,7 @@ def main() -> None:
             service.starts,
             service.runs,
             service.flies,
+            service.is_asked_to_reload,
             service.hangs,
             service.runs_out_of_memory,
             service.stops,

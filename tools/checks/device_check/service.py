@@ -148,6 +148,22 @@ class Service:
         yield from self._is_unplugged()
         yield from self._falls_silent()
 
+    def is_asked_to_reload(self) -> Iterator[Finding]:
+        """In flight: by systemctl, which refuses, and by SIGHUP. After TimeoutStopSec systemd would kill it."""
+        self._wait_for_flight()
+        flies = _shown("MainPID")
+        asked = subprocess.run(["systemctl", "reload", UNIT], capture_output=True, text=True, check=False)
+        os.kill(int(flies), signal.SIGHUP)
+        time.sleep(STOPPED_S + WATCHED_S)
+        state, stays = _shown("ActiveState"), _shown("MainPID") == flies
+        yield Finding(
+            "a reload in flight",
+            asked.returncode != 0 and (state, stays, self.autopilot.mode) == ("active", True, "OFFBOARD"),
+            f"{asked.stderr.strip()!r}; {state}, {'the same' if stays else 'another'} process after "
+            f"{STOPPED_S + WATCHED_S:.0f} s; the autopilot is in {self.autopilot.mode}; {_systemd()}",
+            "refused, the flight undisturbed",
+        )
+
     def hangs(self) -> Iterator[Finding]:
         """Stopped in flight as by a debugger: nothing in it runs any more, and it ends only when it is killed."""
         stopped_s = time.monotonic()
@@ -281,6 +297,11 @@ class Service:
 
         until(lambda: bool(newest()), f"telemetry of {topic}")
         return newest()[0]
+
+
+def _systemd() -> str:
+    """Its version, as systemctl tells it."""
+    return " ".join(run("systemctl", "--version").split()[:2])
 
 
 def _second_instance() -> Finding:
