@@ -59,7 +59,8 @@ def _run(args: argparse.Namespace) -> int:
 
 def _run_daemon(args: argparse.Namespace) -> int:
     """Until it is asked to end, with each configuration that it is asked to reload."""
-    from flockd.onboard.daemon import ServiceManager, event_loop_at, only_instance
+    from flockd.onboard.autopilot.link_owner import only_owner
+    from flockd.onboard.daemon import ServiceManager, event_loop_at
 
     service = ServiceManager(os.environ)
     config: DroneConfig | None = load_to_fly(args.config, force=args.force)
@@ -70,7 +71,7 @@ def _run_daemon(args: argparse.Namespace) -> int:
             raise UsageError(f"{args.record}: is no folder; name another with --record") from error
     while config is not None:
         event_loop = functools.partial(event_loop_at, config.speed_factor)
-        with only_instance(config.name, os.environ), asyncio.Runner(loop_factory=event_loop) as runner:
+        with only_owner(config.autopilot), asyncio.Runner(loop_factory=event_loop) as runner:
             config = runner.run(_fly(config, args, service)).reload
     return ExitCode.DONE
 

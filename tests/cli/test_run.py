@@ -95,7 +95,7 @@ def _written(
 def _run(
     config: Path, folder: Path, *options: str, program: str = RUN, log: Path | None = None
 ) -> subprocess.Popen[str]:
-    environment = {"NOTIFY_SOCKET": str(folder / "notify"), "XDG_RUNTIME_DIR": str(folder), "PATH": "/usr/bin"}
+    environment = {"NOTIFY_SOCKET": str(folder / "notify"), "PATH": "/usr/bin"}
     command = [sys.executable, "-c", program, "run", "--config", str(config), *options]
     stderr = subprocess.PIPE if log is None else log.open("w")
     return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=stderr, text=True)
@@ -262,7 +262,6 @@ def test_it_flies_in_its_layer_and_reads_no_file_again_that_is_outside_the_envel
             return Ending(self._again)
 
     monkeypatch.setattr("flockd.onboard.daemon.Daemon", Grounded)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     assert main(["run", "--config", str(config), *options]) == 0
     assert (flown[0].mission.height_m, flown[0].flocking.max_speed_m_s) == (7.0, 1.0)
     told = "flocking.max_speed_m_s: 3.5 m/s is above the 2 m/s"
