@@ -155,10 +155,11 @@ def _open(device: str, speed: int) -> int:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # for programs of root, which TIOCEXCL lets through
         fcntl.ioctl(descriptor, termios.TIOCEXCL)
-        control = [b"\x00"] * len(termios.tcgetattr(descriptor)[6])
-        control[termios.VMIN] = b"\x01"
+        control: list[bytes | int] = [0] * len(termios.tcgetattr(descriptor)[6])
+        control[termios.VMIN] = 1
         flags = termios.CS8 | termios.CREAD | termios.CLOCAL
-        termios.tcsetattr(descriptor, termios.TCSANOW, [0, 0, flags, 0, speed, speed, control])
+        attributes: list[int | list[bytes | int]] = [0, 0, flags, 0, speed, speed, control]
+        termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
         termios.tcflush(descriptor, termios.TCIOFLUSH)
     except termios.error as error:
         os.close(descriptor)

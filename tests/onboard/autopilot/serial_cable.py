@@ -67,8 +67,9 @@ class SerialCable:
         while not self._closing.is_set():
             with self._lock:
                 autopilot = None if self._ends is None else self._ends[0]
-            ready, _, _ = select.select([self._socket, *([] if autopilot is None else [autopilot])], [], [], 0.05)
-            if self._socket in ready:
+            packets = self._socket.fileno()
+            ready, _, _ = select.select([packets, *([] if autopilot is None else [autopilot])], [], [], 0.05)
+            if packets in ready:
                 data, sender = self._socket.recvfrom(4096)
                 self._autopilots.add(sender)
                 self._move(data)
