@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import getpass
 import json
 import os
 import re
@@ -115,10 +116,9 @@ def test_it_gets_ready_alone_reads_its_file_again_and_ends_when_told(
             with _run(config, tmp_path) as second:
                 _, told = second.communicate(timeout=SECONDS_TO_FAIL)
             assert second.returncode == 69
-            lock = tmp_path / "flockd-tiny.lock"
             assert told.splitlines()[-1] == (
-                f"{lock}: another flockd (process {process.pid}) flies drone 'tiny'; stop it first, or give this one "
-                "another `name`"
+                f"autopilot.address: another flockd (process {process.pid} of user {getpass.getuser()}) has the link "
+                f"udpin://127.0.0.1:{port}; stop it first, or give this one its own autopilot's address"
             )
 
             row = _status(telemetry, capsys)

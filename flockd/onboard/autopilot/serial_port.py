@@ -46,7 +46,7 @@ class SerialPort:
         try:
             self._descriptor = _open(device, self._speed)
         except OSError as error:
-            raise AutopilotError(_why_not(device, error)) from error
+            raise AutopilotError(_why_not(f"serial://{device}:{baud}", error)) from error
         self._unsent = b""
         """What is left of a message that was begun."""
         self._gone_s = math.inf
@@ -183,7 +183,7 @@ def _speed(device: str, baud: int) -> int:
     return speed
 
 
-def _why_not(device: str, error: OSError) -> str:
+def _why_not(address: str, error: OSError) -> str:
     if error.errno in {errno.EBUSY, errno.EAGAIN}:
-        return f"autopilot.address: {device} is in use by another program; stop that one first"
-    return f"autopilot.address: {device} cannot be opened ({error.strerror}); check the address and the cable"
+        return f"autopilot.address: {address} is in use by another program; stop that one first"
+    return f"autopilot.address: {address} cannot be opened ({error.strerror}); check the address and the cable"
