@@ -6,16 +6,16 @@ import argparse
 import asyncio
 import functools
 import logging
-import os
 import signal
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.output import progress, say, say_json, tables_console
 from flockd.cli.parser import Commands, positive_number
 from flockd.cli.real_drone import add_force, load_to_fly
-from flockd.core.errors import ExitCode, UsageError
+from flockd.core.errors import ExitCode, UnavailableError, UsageError
 from flockd.core.printable import printable
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.ground.doctor import CHECKS, Level, plan, run_checks
+    from flockd.ground.doctor import Level
 
     config = load_to_fly(args.config, force=args.force)
     if args.minutes is not None and not args.bench:
@@ -80,21 +80,11 @@ def _run(args: argparse.Namespace) -> int:
         raise UsageError("--bench is a run of its own, and --only chooses among the checks; drop one of them")
     if args.unit is not None and not args.unit.is_file():
         raise UsageError(f"{args.unit}: is no file; name the unit with --unit")
-    checks = plan(
-        config,
-        args.config,
-        recordings=args.record,
-        unit=args.unit,
-        seconds=args.seconds,
-        environment=os.environ,
-        only=args.only or CHECKS,
-    )
     logging.getLogger("flockd.onboard.autopilot").setLevel(logging.CRITICAL)  # what MAVSDK has to tell, the findings do
     if args.bench:
         found: Mapping[str, Sequence[Finding]] = {"bench": _bench(config, args)}
     else:
-        with progress("examining", "checks") as tell:
-            found = run_checks(checks, tell)
+        found = _examine(config, args)
     if args.json:
         say_json(_as_json(config.name, found))
     else:
@@ -103,10 +93,34 @@ def _run(args: argparse.Namespace) -> int:
     return ExitCode.CHECK_FAILED if failed else ExitCode.DONE
 
 
+def _examine(config: DroneConfig, args: argparse.Namespace) -> Mapping[str, Sequence[Finding]]:
+    """As the owner of the drone's link, if no other process is it."""
+    from flockd.ground.doctor import CHECKS, plan, run_checks
+    from flockd.onboard.autopilot.link_owner import only_owner
+
+    with ExitStack() as stack:
+        taken: UnavailableError | None = None
+        try:
+            stack.enter_context(only_owner(config.autopilot))
+        except UnavailableError as error:
+            taken = error
+        checks = plan(
+            config,
+            args.config,
+            recordings=args.record,
+            unit=args.unit,
+            seconds=args.seconds,
+            taken=taken,
+            only=args.only or CHECKS,
+        )
+        return run_checks(checks, stack.enter_context(progress("examining", "checks")))
+
+
 def _bench(config: DroneConfig, args: argparse.Namespace) -> Sequence[Finding]:
     """Ctrl-C ends it early, with a report of what was seen until then."""
     from flockd.ground.doctor.bench import bench, judged
-    from flockd.onboard.daemon import event_loop_at, only_instance
+    from flockd.onboard.autopilot.link_owner import only_owner
+    from flockd.onboard.daemon import event_loop_at
 
     seconds = 60.0 * (args.minutes or BENCH_MINUTES)
     stop = asyncio.Event()
@@ -122,7 +136,7 @@ def _bench(config: DroneConfig, args: argparse.Namespace) -> Sequence[Finding]:
         return tuple(judged(config, samples, seconds))
 
     event_loop = functools.partial(event_loop_at, config.speed_factor)
-    with only_instance(config.name, os.environ), asyncio.Runner(loop_factory=event_loop) as runner:
+    with only_owner(config.autopilot), asyncio.Runner(loop_factory=event_loop) as runner:
         return runner.run(run())
 
 

@@ -63,7 +63,8 @@ def _run(args: argparse.Namespace) -> int:
 
 def _run_daemon(args: argparse.Namespace) -> int:
     """Until it is asked to end."""
-    from flockd.onboard.daemon import ServiceManager, event_loop_at, only_instance
+    from flockd.onboard.autopilot.link_owner import only_owner
+    from flockd.onboard.daemon import ServiceManager, event_loop_at
 
     service = ServiceManager(os.environ)
     config = load_to_fly(args.config, force=args.force)
@@ -73,7 +74,7 @@ def _run_daemon(args: argparse.Namespace) -> int:
         except (FileExistsError, NotADirectoryError) as error:
             raise UsageError(f"{args.record}: is no folder; name another with --record") from error
     event_loop = functools.partial(event_loop_at, config.speed_factor)
-    with only_instance(config.name, os.environ), asyncio.Runner(loop_factory=event_loop) as runner:
+    with only_owner(config.autopilot), asyncio.Runner(loop_factory=event_loop) as runner:
         runner.run(_fly(config, args, service))
     return ExitCode.DONE
 

@@ -79,7 +79,7 @@ class Daemons:
     def __init__(
         self, configs: Sequence[DroneConfig], *, folder: Path, recordings: Path, environment: Mapping[str, str]
     ) -> None:
-        """Configurations and logs go to ``folder``, recordings to ``recordings``; sockets and locks to ``folder`` too.
+        """Configurations and logs go to ``folder``, recordings to ``recordings``; sockets to ``folder`` too.
 
         Args:
             configs: of the drones.
@@ -89,7 +89,7 @@ class Daemons:
         """
         self._configs, self._folder = configs, folder
         self._recordings = recordings.resolve()  # daemons run in `folder`
-        self._environment = {**environment, **ONE_THREAD, **SMALL, "XDG_RUNTIME_DIR": str(folder)}
+        self._environment = {**environment, **ONE_THREAD, **SMALL}
         self._programs = Programs()
         self._listeners = [_Listener(folder / config.name) for config in configs]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import getpass
 import json
 import re
 import shutil
@@ -92,7 +93,7 @@ def _run(
     config: Path, folder: Path, *options: str, program: str = RUN, log: Path | None = None
 ) -> subprocess.Popen[str]:
     notify = {"NOTIFY_SOCKET": str(folder / "notify"), "WATCHDOG_USEC": "2000000"}
-    environment = {**notify, "XDG_RUNTIME_DIR": str(folder), "PATH": "/usr/bin"}
+    environment = {**notify, "PATH": "/usr/bin"}
     command = [sys.executable, "-c", program, "run", "--config", str(config), *options]
     stderr = subprocess.PIPE if log is None else log.open("w")
     return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=stderr, text=True)
@@ -112,10 +113,9 @@ def test_it_gets_ready_alone_goes_on_after_sighup_and_ends_when_told(
             with _run(config, tmp_path) as second:
                 _, told = second.communicate(timeout=SECONDS_TO_FAIL)
             assert second.returncode == 69
-            lock = tmp_path / "flockd-tiny.lock"
             assert told.splitlines()[-1] == (
-                f"{lock}: another flockd (process {process.pid}) flies drone 'tiny'; stop it first, or give this one "
-                "another `name`"
+                f"autopilot.address: another flockd (process {process.pid} of user {getpass.getuser()}) has the link "
+                f"udpin://127.0.0.1:{port}; stop it first, or give this one its own autopilot's address"
             )
 
             row = _status(telemetry, capsys)
@@ -242,7 +242,6 @@ def test_it_flies_in_its_layer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
             pass
 
     monkeypatch.setattr("flockd.onboard.daemon.Daemon", Grounded)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     assert main(["run", "--config", str(config)]) == 0
     (drone,) = flown
     assert (drone.mission.height_m, drone.flocking.max_speed_m_s) == (7.0, 1.0)

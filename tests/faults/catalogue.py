@@ -52,6 +52,7 @@ _PX4 = "tests/sitl/test_px4_modes.py::test_px4_ends_in_the_mode_that_its_paramet
 """With PX4 alone: skipped where FLOCKD_PX4 names none. So the next with `px4`."""
 _CONTRACT = "tests/sitl/test_autopilot_contract.py::test_flockd_sees_what_px4_1_18_shows"
 _LINK = "tests/onboard/autopilot/test_link.py"
+_SERIAL = "tests/onboard/autopilot/test_serial_link.py"
 
 # fmt: off
 CATALOGUE = (
@@ -668,6 +669,25 @@ CATALOGUE = (
             f"{_HERE}outside.py::test_queries_of_any_size_and_number",
             "tests/onboard/telemetry/test_hostile_peer.py",
         ),
+        ),
+    ),
+    Fault(
+        77, "serial-port", "a serial port is replugged or wanted by two, or two autopilots are on one link",
+        "on the ground it comes back, or exit code 69; in flight the link is lost; a second owner is refused with 69, "
+        "two autopilots without `system_id` with 78",
+        (
+            f"{_HERE}serial.py::test_on_the_ground_it_comes_back_or_the_daemon_ends_for_a_restart",
+            f"{_HERE}serial.py::test_in_flight_it_is_opened_again_however_long_that_takes_and_nothing_is_sent",
+            f"{_HERE}serial.py::test_with_two_autopilots_and_no_system_id_it_does_not_start",
+            f"{_SERIAL}::test_at_rest_it_costs_under_three_hundredths_of_a_core",
+            f"{_SERIAL}::test_it_comes_back_with_the_device_which_has_forgotten_its_streams",
+            f"{_SERIAL}::test_no_other_program_can_open_it_whoever_starts_it",
+            "tests/onboard/autopilot/test_two_autopilots.py::"
+            "test_a_second_one_that_comes_later_is_told_and_ends_it",
+            "tests/onboard/autopilot/test_link_owner.py::test_a_second_owner_is_refused_until_the_first_was_killed",
+            "tests/ground/doctor/test_examination.py::test_beside_a_flying_daemon_nothing_of_the_drone_is_touched",
+        ),
+        within_s=3.0,
     ),
 )
 # fmt: on

@@ -22,7 +22,8 @@ class AutopilotParameters(Section):
     ] = "udpin://127.0.0.1:14540"
     """`udpin://` waits for an autopilot that sends to this address; `serial:///dev/ttyS1:921600` is a cable."""
     system_id: Annotated[int, Field(ge=1, le=255)] | None = None
-    """The autopilot's MAV_SYS_ID; other systems are ignored. By default that of the first heartbeat received."""
+    """The autopilot's MAV_SYS_ID, another one for each drone of the fleet; other systems are ignored. By default that
+    of the only autopilot on the link: two are refused."""
     setpoint_rate_hz: Annotated[float, Field(ge=5, le=50)] = services.SETPOINT.rate_hz
     max_setpoint_age_s: Annotated[float, Field(gt=0, le=10)] = services.REQUEST.timeout
     """An older setpoint is not sent."""

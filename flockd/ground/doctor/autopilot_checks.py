@@ -45,7 +45,7 @@ async def _ask(config: DroneConfig, parameters: AutopilotParameters, heard_s: fl
     try:
         heard = link.status()
         firmware = await _firmware(link)
-        found = [judge_heartbeat(link.system_id, heard, config)]
+        found = [judge_heartbeat(link.system_id, heard, config), *judge_system_id(link.system_id, parameters)]
         signing = judge_signing(isinstance(firmware, Firmware), silent=_is_silent(link.status(), config))
         if isinstance(firmware, Firmware):
             found += [judge_firmware(firmware), signing, *await _parameters(link, config, parameters)]
@@ -124,6 +124,15 @@ def judge_heartbeat(system_id: int, status: AutopilotStatus, config: DroneConfig
     if status.armed:
         return warned("heartbeat", f"{measured}, and armed", "disarm it on the ground before you examine it")
     return passed("heartbeat", f"{measured}, disarmed, in flight mode {status.flight_mode}")
+
+
+def judge_system_id(system_id: int, parameters: AutopilotParameters) -> list[Finding]:
+    """A warning where any autopilot would do."""
+    if parameters.system_id is not None:
+        return []
+    measured = f"autopilot.system_id is not given: the only autopilot that is heard is flown, now system {system_id}"
+    fix = "give each drone of the fleet another MAV_SYS_ID, and write this one's as autopilot.system_id"
+    return [warned("system id", measured, fix)]
 
 
 def judge_signing(responds: bool, *, silent: bool) -> Finding:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.ground.doctor.finding import Finding, failed, passed, warned
-from flockd.onboard.daemon import only_instance, service_lock
 
 UNIT_FOLDERS = (Path("/etc/systemd/system"), Path("/usr/lib/systemd/system"), Path("/lib/systemd/system"))
 UNIT = "flockd.service"
@@ -20,28 +18,13 @@ BAR, MUCH = 1.5, 5.0
 """Exposure scores, from 0 to 10. systemd itself calls 5 and more at best medium."""
 
 
-def check_instance(drone: str, environment: Mapping[str, str]) -> Iterator[Finding]:
-    """Whether the drone's lock is free. ``environment`` is the process's own."""
-    lock = service_lock(drone)
-    if lock.exists() and not os.access(lock, os.R_OK | os.W_OK):
-        yield _unseen(str(lock))
+def check_instance(taken: UnavailableError | None) -> Iterator[Finding]:
+    """Whether another process owns the link to the autopilot: the error it is refused with."""
+    if taken is None:
+        yield passed("instance", "no other flockd on this computer has this drone's autopilot")
         return
-    try:
-        with only_instance(drone, environment):
-            pass
-    except UnavailableError as error:
-        measured = str(error).rpartition("; ")[0]
-        fix = "stop it while you examine (`systemctl stop flockd`): it holds the cameras and the autopilot's link"
-        yield failed("instance", measured, fix)
-    except PermissionError as error:
-        yield _unseen(str(error.filename))
-    else:
-        yield passed("instance", f"no other flockd flies {drone} on this computer")
-
-
-def _unseen(lock: str) -> Finding:
-    fix = "examine as the user that flies: `sudo -u flockd flockd doctor ...`"
-    return warned("instance", f"{lock} belongs to another user, so who holds it cannot be seen", fix)
+    fix = "stop it while you examine (`systemctl stop flockd`), if the drone does not fly"
+    yield failed("instance", str(taken).rpartition("; ")[0], fix)
 
 
 def check_unit(unit: Path | None, folders: Sequence[Path] = UNIT_FOLDERS) -> Iterator[Finding]:

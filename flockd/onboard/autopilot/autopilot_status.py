@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from flockd.core.errors import UnavailableError
+from flockd.core.errors import ExitCode, UnavailableError
 from flockd.core.messages import FloatArray
 
 FlightMode = Literal[
@@ -39,6 +39,12 @@ def mode_of(custom_mode: float) -> FlightMode:
 
 class AutopilotError(UnavailableError):
     """The autopilot is not there, did not answer, or refused; the text says which, and what to do."""
+
+
+class AutopilotSettingError(AutopilotError):
+    """The configuration's section `autopilot` does not say what it has to; a restart corrects nothing."""
+
+    exit_code = ExitCode.BAD_CONFIGURATION
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ import math
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from enum import IntEnum
@@ -32,11 +32,19 @@ from mavsdk.system import System
 from flockd.core import services
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.messages import FloatArray, RangeReading, Setpoint, VehicleState
-from flockd.onboard.autopilot.autopilot_status import MODES, AutopilotError, AutopilotStatus, Firmware, FlightMode
+from flockd.onboard.autopilot.autopilot_status import (
+    MODES,
+    AutopilotError,
+    AutopilotSettingError,
+    AutopilotStatus,
+    Firmware,
+    FlightMode,
+)
 from flockd.onboard.autopilot.clock_sync import ClockEstimate
 from flockd.onboard.autopilot.mavlink_messages import Fields, ReceivedMessages, result_text, text_chunks
 from flockd.onboard.autopilot.refusal_reasons import REMEDIES_OF_RESULTS
 from flockd.onboard.autopilot.refusals import Refusal
+from flockd.onboard.autopilot.serial_port import SerialPort, discard
 from flockd.onboard.autopilot.throttled_log import ThrottledLog
 from flockd.onboard.autopilot.watched_parameters import GROUND_STATION_LOSS, KINDS
 
@@ -88,6 +96,8 @@ ANNOUNCEMENT = {
 }  # fmt: skip
 """A HEARTBEAT of MAV_TYPE_GCS: PX4 sends its texts on no link on which it hears no ground station."""
 MOST_REPORTS = 100
+GONE_S = 10.0
+"""A serial port that is gone for longer is not waited for on the ground; an autopilot that starts anew takes 5."""
 
 _log = logging.getLogger(__name__)
 _throttled = ThrottledLog(_log)
@@ -113,15 +123,26 @@ class AutopilotLink:
     """One autopilot. Everything that is not a coroutine may be called from any thread and returns at once."""
 
     def __init__(
-        self, mavsdk: Mavsdk, system: System, executor: ThreadPoolExecutor, clock: Clock, max_gap_s: float
+        self,
+        mavsdk: Mavsdk,
+        system: System,
+        executor: ThreadPoolExecutor,
+        clock: Clock,
+        parameters: AutopilotParameters,
+        port: SerialPort | None,
+        reports: deque[str],
     ) -> None:
         """Use `connect`."""
         self._mavsdk = mavsdk
         self._executor = executor
         self._clock = clock
+        self._parameters = parameters
+        self._port = port
+        self._reports = reports
         self._system_id = int(system.get_system_id())
-        self._reports: deque[str] = deque(maxlen=MOST_REPORTS)
-        self._received = ReceivedMessages(self._reports.append, max_gap_s)
+        self._heard = {self._system_id}
+        """System ids of the autopilots on the link."""
+        self._received = ReceivedMessages(self._reports.append, parameters.max_gap_s)
         self._sent_s = -math.inf
         """When the last setpoint was sent."""
         self._param = Param(system)
@@ -145,31 +166,39 @@ class AutopilotLink:
     ) -> Self:
         """The link, once an autopilot has been heard and told what to send.
 
-        Raises AutopilotError when the address cannot be used or nobody answers within `timeout_s`.
+        Raises AutopilotError when the address cannot be used or nobody answers within `timeout_s`; where two autopilots
+        answer and `system_id` does not say which is the own, an AutopilotSettingError.
         """
         _refuse_a_taken_port(parameters.address)
         log_subscribe(_to_logging)
+        reports: deque[str] = deque(maxlen=MOST_REPORTS)
+        port = _serial_port(parameters.address, reports.append)
         executor = ThreadPoolExecutor(1, thread_name_prefix="mavsdk")  # never asyncio's own: it may be saturated
         configuration = _configuration(parameters.system_id)
         mavsdk = create(configuration)
         kept: list[object] = []
         try:
             deadline = clock() + timeout_s
-            await _open(mavsdk, parameters.address, executor)
+            await _open(mavsdk, parameters.address, port, executor)
             system = await _find_system(mavsdk, parameters, deadline, timeout_s, clock)
-            if configuration.system_id != system.get_system_id():  # again, as a computer of the autopilot's own system
-                parameters = parameters.model_copy(update={"system_id": int(system.get_system_id())})
+            system_id = int(system.get_system_id())
+            if configuration.system_id != system_id:  # again, as a computer of the autopilot's own system
                 system.destroy()
+                if port is not None:
+                    port.hand_to(discard)
                 await asyncio.get_running_loop().run_in_executor(executor, mavsdk.destroy)
-                mavsdk = create(_configuration(parameters.system_id))
-                await _open(mavsdk, parameters.address, executor)
-                system = await _find_system(mavsdk, parameters, deadline, timeout_s, clock)
+                mavsdk = create(_configuration(system_id))
+                await _open(mavsdk, parameters.address, port, executor)
+                own = parameters.model_copy(update={"system_id": system_id})
+                system = await _find_system(mavsdk, own, clock() + timeout_s, timeout_s, clock)
             kept.append(system)
-            link = cls(mavsdk, system, executor, clock, parameters.max_gap_s)
+            link = cls(mavsdk, system, executor, clock, parameters, port, reports)
             kept += [link, link._callbacks()]
-            await link._wait_for("HEARTBEAT", deadline)
+            await link._wait_for("HEARTBEAT", clock() + timeout_s)
             await link._request_streams()
         except BaseException:
+            if port is not None:
+                port.close()
             executor.submit(_destroy, mavsdk, kept)  # after a call of it that still runs, which would end the process
             executor.shutdown(wait=False)
             raise
@@ -180,6 +209,8 @@ class AutopilotLink:
 
         It is ended even where nobody waits for that so long, after a call that still runs.
         """
+        if self._port is not None:
+            self._port.close()
         ended = self._executor.submit(_destroy, self._mavsdk, (self, self._direct, self._callbacks()))
         self._direct = _Closed()
         self._executor.shutdown(wait=False)
@@ -195,6 +226,17 @@ class AutopilotLink:
     def system_id(self) -> int:
         """The autopilot's MAV_SYS_ID."""
         return self._system_id
+
+    def unusable(self) -> AutopilotError | None:
+        """Why nobody should take off with this link any more; None: it is well."""
+        if self._port is not None and self._port.gone_for_s() > GONE_S:
+            return AutopilotError(
+                f"autopilot.address: {self._parameters.address} has been gone for more than {GONE_S:g} s; "
+                "check the cable and that the autopilot is on"
+            )
+        if len(self._heard) > 1:
+            return _ambiguous(self._parameters.address, self._heard)
+        return None
 
     def status(self) -> AutopilotStatus:
         """The newest of everything that the autopilot has sent."""
@@ -254,12 +296,21 @@ class AutopilotLink:
         """Keeps all coming that an autopilot sends on request only, until cancelled.
 
         So it announces flockd as a ground station, for the autopilot's texts; requests events that are missing;
-        requests all streams anew of an autopilot that has started anew; and reads the parameters that flockd relies on.
+        requests all streams anew of an autopilot that has started or been plugged in anew; reads the parameters that
+        flockd relies on; and listens for a second autopilot where any would do.
         """
         async with asyncio.TaskGroup() as group:
             group.create_task(self._announce())
             group.create_task(self._request_what_is_missing())
             group.create_task(self._read_parameters())
+            if self._parameters.system_id is None:
+                group.create_task(self._listen_for_others())
+
+    async def _listen_for_others(self) -> None:
+        while len(self._heard) == 1:
+            await asyncio.sleep(ANNOUNCE_S)
+            self._heard |= await self._call(_autopilots, self._mavsdk)
+        self._reports.append(str(_ambiguous(self._parameters.address, self._heard)))
 
     async def _announce(self) -> None:
         while True:
@@ -277,17 +328,21 @@ class AutopilotLink:
         return acts == 0 and self._received.flight_mode() != "mission"
 
     async def _request_what_is_missing(self) -> None:
-        restarts = self._received.restarts
+        beginnings = self._beginnings()
         while True:
             while self._missing:
                 first, last = self._missing.popleft()
                 with suppress(MavlinkDirectError):
                     fields = {"first_sequence": first, "last_sequence": last}
                     self._direct.send_message(self._message("REQUEST_EVENT", fields))
-            if self._received.restarts != restarts:
-                restarts = self._received.restarts
+            if self._beginnings() != beginnings:
+                beginnings = self._beginnings()
                 await self._request_streams()
             await asyncio.sleep(ATTEND_S)
+
+    def _beginnings(self) -> int:
+        """How often it may have forgotten what it was asked to send."""
+        return self._received.restarts + (0 if self._port is None else self._port.reopened)
 
     async def _read_parameters(self) -> None:
         while True:
@@ -502,8 +557,20 @@ def _refuse_a_taken_port(address: str) -> None:
             ) from error
 
 
-async def _open(mavsdk: Mavsdk, address: str, executor: ThreadPoolExecutor) -> None:
-    result = await asyncio.get_running_loop().run_in_executor(executor, mavsdk.add_any_connection, address)
+def _serial_port(address: str, report: Callable[[str], None]) -> SerialPort | None:
+    """None where the address is of the network."""
+    kind, _, rest = address.partition("://")
+    device, _, baud = rest.rpartition(":")
+    return SerialPort(device, int(baud), report) if kind == "serial" else None
+
+
+async def _open(mavsdk: Mavsdk, address: str, port: SerialPort | None, executor: ThreadPoolExecutor) -> None:
+    if port is not None:
+        mavsdk.subscribe_raw_bytes_to_be_sent(port.send)
+    opened = address if port is None else "raw://"
+    result = await asyncio.get_running_loop().run_in_executor(executor, mavsdk.add_any_connection, opened)
+    if port is not None:
+        port.hand_to(mavsdk.pass_received_raw_bytes)
     if result != ConnectionResult.SUCCESS:
         reason = ConnectionResult(result).name.lower().replace("_", " ")
         raise AutopilotError(
@@ -514,17 +581,24 @@ async def _open(mavsdk: Mavsdk, address: str, executor: ThreadPoolExecutor) -> N
 async def _find_system(
     mavsdk: Mavsdk, parameters: AutopilotParameters, deadline: float, timeout_s: float, clock: Clock
 ) -> System:
+    """The autopilot, once all have had the time for a heartbeat where any of them would do."""
     wanted = parameters.system_id
+    first_heard_s = math.inf
     while True:
         systems = {int(system.get_system_id()): system for system in mavsdk.get_systems() if system.has_autopilot()}
         heard = sorted(systems)
+        if heard:
+            first_heard_s = min(first_heard_s, clock())
+        known = wanted is not None or clock() - first_heard_s > services.HEARTBEAT.timeout
         chosen = next(iter(systems), None) if wanted is None else wanted
-        found = None if chosen is None else systems.pop(chosen, None)
+        found = systems.pop(chosen, None) if known and chosen is not None else None
         for system in systems.values():  # now: one that is collected while MAVSDK is destroyed ends the process
             system.destroy()
+        if wanted is None and len(heard) > 1:
+            raise _ambiguous(parameters.address, heard)
         if found is not None:
             return found
-        if clock() > deadline:
+        if clock() > deadline and (wanted is not None or not heard):
             others = f"; heard instead: {', '.join(map(str, heard))}" if heard else ""
             who = "no autopilot" if wanted is None else f"no autopilot with system id {wanted}"
             raise AutopilotError(
@@ -532,6 +606,23 @@ async def _find_system(
                 "check autopilot.address, autopilot.system_id and that the autopilot is on"
             )
         await asyncio.sleep(0.05)
+
+
+def _ambiguous(address: str, heard: Iterable[int]) -> AutopilotSettingError:
+    return AutopilotSettingError(
+        f"autopilot.system_id: is missing, and the autopilots of systems {', '.join(map(str, sorted(heard)))} are "
+        f"heard at {address}; write the MAV_SYS_ID of this drone's own"
+    )
+
+
+def _autopilots(mavsdk: Mavsdk) -> set[int]:
+    """System ids of those on the link."""
+    found = set()
+    for system in mavsdk.get_systems():
+        if system.has_autopilot():
+            found.add(int(system.get_system_id()))
+        system.destroy()
+    return found
 
 
 class _Closed:
@@ -561,5 +652,6 @@ def _settle(answer: asyncio.Future[T], value: T) -> None:
 
 def _to_logging(level: LogLevel, message: str, *_: object) -> bool:
     """MAVSDK would print; this says that it is taken care of."""
-    _throttled(_LOG_LEVELS[level], message)
+    expected = message.startswith("No raw connection available. Subscription")  # `_open` subscribes before it connects
+    _throttled(logging.DEBUG if expected else _LOG_LEVELS[level], message)
     return True

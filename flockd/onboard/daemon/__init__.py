@@ -2,7 +2,6 @@
 
 from flockd.onboard.daemon.components import Components
 from flockd.onboard.daemon.daemon import Daemon, DaemonError
-from flockd.onboard.daemon.lock import only_instance, service_lock
 from flockd.onboard.daemon.service_manager import ServiceManager
 from flockd.onboard.daemon.simulated_loop import event_loop_at
 from flockd.onboard.daemon.stderr_log import StderrLog
@@ -20,6 +19,4 @@ __all__ = [
     "clock_at",
     "event_loop_at",
     "load_side_by_side",
-    "only_instance",
-    "service_lock",
 ]

@@ -68,6 +68,8 @@ class Daemon:
         self._service, self._clock, self._connect = service, clock, connect
         self._operator = OperatorRequests()
         self._stopping = asyncio.Event()
+        self._unusable: AutopilotError | None = None
+        """Why the link is not used any more."""
         self.components: Components | None = None
         """All parts of the flight, once they are open."""
 
@@ -89,7 +91,8 @@ class Daemon:
     async def run(self) -> None:
         """Flies until it is asked to stop.
 
-        Raises FlockdError when it cannot start, DaemonError when a task died or Hold was not confirmed.
+        Raises FlockdError when it cannot start, DaemonError when a task died or Hold was not confirmed, AutopilotError
+        when the link is not usable any more on the ground.
         """
         async with AsyncExitStack() as stack:
             start = open_components(
@@ -148,6 +151,8 @@ class Daemon:
             for task in tasks:
                 task.cancel()
         _raise_failure(components)
+        if self._unusable is not None:
+            raise self._unusable
 
     async def _supervised(self, name: str, run: Callable[[], Awaitable[None]], components: Components) -> None:
         """A task that ends is an event for the supervisor, which ends the flight; it does not end the other tasks."""
@@ -187,8 +192,10 @@ class Daemon:
             components.sinks.begin_recording(components.pilot_loop.learned_before)
         elif components.sinks.recording is not None and not components.link.status().armed:
             components.sinks.end_recording()
+        if now.state not in FLYING and not components.link.status().armed:
+            self._unusable = self._unusable or components.link.unusable()
         handed_over = now.state in {State.IDLE, State.SILENT} and not components.requests.asking
-        if (self._operator.shutdown or components.dead_tasks) and handed_over:
+        if self._unusable or ((self._operator.shutdown or components.dead_tasks) and handed_over):
             components.over.set()
 
 

@@ -19,6 +19,7 @@ from flockd.ground.doctor.autopilot_checks import (
     judge_firmware,
     judge_messages,
     judge_signing,
+    judge_system_id,
 )
 from flockd.onboard.autopilot.autopilot_status import Firmware
 from flockd.onboard.autopilot.clock_sync import ClockEstimate
@@ -78,9 +79,9 @@ def test_an_autopilot_that_is_set_up_well_and_left_as_it_is() -> None:
         assert fake_autopilot.refused_setpoints == 0
         assert fake_autopilot.parameters == {**fake_autopilot.parameters, **GOOD}
     assert set(fake_autopilot.asked) <= QUESTIONS, "it listens and asks, and commands nothing"
-    assert found.keys() == {"heartbeat", "firmware", "signing", "arming", "clock", "range finder", *GOOD}
+    assert found.keys() == {"heartbeat", "system id", "firmware", "signing", "arming", "clock", "range finder", *GOOD}
     del found["clock"]  # how even it is depends on how busy this computer is
-    assert {about for about, finding in found.items() if finding.level is not Level.PASS} == {"firmware"}
+    assert {about for about, finding in found.items() if finding.level is not Level.PASS} == {"firmware", "system id"}
     assert found["firmware"].measured.startswith("PX4 0.0.1 is older than 1.14"), "the fake autopilot is not PX4"
     assert "system 1 at udpin://127.0.0.1" in found["heartbeat"].measured
     assert "disarmed, in flight mode hold" in found["heartbeat"].measured
@@ -136,6 +137,19 @@ def test_a_clock_is_good_as_its_round_trips(error_s: float, level: Level, words:
     assert judge_clock(None).level is Level.WARNING
 
 
+def test_two_autopilots_are_a_failure_that_names_both_and_one_without_an_id_a_warning() -> None:
+    port = free_port()
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S), FakeAutopilot(port, system_id=7):
+        (finding,) = _examined(port).values()
+    assert (finding.level, finding.about) == (Level.FAILURE, "autopilot")
+    assert "autopilot.system_id: is missing, and the autopilots of systems 1, 7 are heard at " in finding.measured
+    assert finding.fix == "write the MAV_SYS_ID of this drone's own"
+    (finding,) = judge_system_id(7, AutopilotParameters())
+    assert (finding.level, finding.about) == (Level.WARNING, "system id")
+    assert "give each drone of the fleet another MAV_SYS_ID" in finding.fix
+    assert judge_system_id(7, AutopilotParameters(system_id=7)) == []
+
+
 def test_nobody_there_is_a_failure() -> None:
     port = free_port()
     (finding,) = _examined(port, 0.3).values()
@@ -153,6 +167,7 @@ def test_an_autopilot_that_falls_silent_under_examination_is_a_failure() -> None
         found = run_checks([check], lambda done, total: None)["autopilot"]
     assert [(finding.about, finding.level) for finding in found] == [
         ("heartbeat", Level.PASS),
+        ("system id", Level.WARNING),
         ("firmware", Level.WARNING),
         ("signing", Level.PASS),
         ("COM_OF_LOSS_T", Level.PASS),

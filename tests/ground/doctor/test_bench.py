@@ -176,7 +176,6 @@ def test_the_command_runs_it_and_ends_with_what_it_found(
     config = config_for(port, frames, free_endpoint())
     monkeypatch.setattr("flockd.ground.doctor.bench.load_networks", lambda *_, **__: TinyPerceiver())
     monkeypatch.setattr("flockd.cli.doctor.load_to_fly", lambda file, force: config)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     cameras = Cameras(frames)
     try:
         with FakeAutopilot(port, heartbeat_s=0.25) as autopilot:

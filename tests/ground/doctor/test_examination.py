@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+import sys
 import threading
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from flockd.cli import main
+from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.data import data_path
 from flockd.core.errors import ModelError
 from flockd.ground.doctor import CHECKS, Check, Finding, Level, passed, run_checks
+from flockd.onboard.autopilot.link_owner import only_owner
 
 QUADROTOR = str(data_path("config") / "quadrotor.yaml")
 
@@ -97,6 +101,34 @@ def test_json_for_machines_and_exit_code_1_when_a_check_failed(
 
     assert main(["doctor", "--config", QUADROTOR, "--only", "memory", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["ok"] is True
+
+
+TOUCHING = ["rig", "zenoh", "autopilot", "cameras", "models"]
+"""They open what the drone flies with, or take its computer's time for long."""
+
+
+def test_beside_a_flying_daemon_nothing_of_the_drone_is_touched(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    imported: list[str] = []
+
+    def noted(name: str) -> object:
+        imported.append(name.rpartition(".")[2])
+        return import_module(name)
+
+    monkeypatch.setattr(sys.modules["flockd.ground.doctor.plan"], "import_module", noted)
+    address = f"serial://{tmp_path / 'ttyUSB0'}:921600"
+    shipped = (data_path("config") / "quadrotor.yaml").read_text(encoding="utf-8")
+    (tmp_path / "drone.yaml").write_text(shipped.replace("serial:///dev/ttyAMA0:921600", address), encoding="utf-8")
+    with only_owner(AutopilotParameters(address=address)):
+        assert main(["doctor", "--config", str(tmp_path / "drone.yaml"), "--record", str(tmp_path), "--json"]) == 1
+    told = json.loads(capsys.readouterr().out)["findings"]
+    assert [row["check"] for row in told if row["measured"].startswith("not examined: another flockd has")] == TOUCHING
+    assert {row["level"] for row in told if row["check"] in TOUCHING} == {"WARNING"}
+    (instance,) = (row for row in told if row["check"] == "instance")
+    assert instance["level"] == "FAILURE"
+    assert instance["measured"].endswith(f"has the link {address}")
+    assert set(imported) <= {"limit_checks", "service_checks", "computer_checks", "secret_checks"}
 
 
 def test_a_table_for_people_with_the_worst_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from pathlib import Path
 
@@ -11,10 +10,10 @@ import pytest
 from flockd.core.config import DroneConfig, load_drone
 from flockd.core.config.telemetry import TelemetryParameters
 from flockd.core.data import data_path
-from flockd.ground.doctor import Check, Finding, Level, run_checks, service_checks
+from flockd.core.errors import UnavailableError
+from flockd.ground.doctor import Check, Finding, Level, run_checks
 from flockd.ground.doctor.service_checks import check_instance, check_unit, judge_exposure
 from flockd.ground.doctor.telemetry_checks import check_fleet
-from flockd.onboard.daemon import only_instance
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.sim.free_ports import free_endpoint
@@ -73,41 +72,12 @@ def test_an_endpoint_that_is_taken_is_a_failure() -> None:
     assert finding.fix == "name another endpoint"
 
 
-def test_a_second_instance(tmp_path: Path) -> None:
-    environment = {"XDG_RUNTIME_DIR": str(tmp_path)}
-    assert next(iter(check_instance("drone1", environment))).level is Level.PASS
-    with only_instance("drone1", environment):
-        (finding,) = check_instance("drone1", environment)
-        assert finding.level is Level.FAILURE
-        assert "flies drone 'drone1'" in finding.measured
-        assert "systemctl stop flockd" in finding.fix
-        assert next(iter(check_instance("drone2", environment))).level is Level.PASS
-    assert next(iter(check_instance("drone1", environment))).level is Level.PASS
-
-
-def test_a_lock_of_another_user_cannot_be_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def forbidden(drone: str, environment: object) -> None:
-        raise PermissionError(13, "Permission denied", f"/run/flockd/flockd-{drone}.lock")
-
-    monkeypatch.setattr(service_checks, "only_instance", forbidden)
-    (finding,) = check_instance("drone1", {})
-    assert finding.level is Level.WARNING
-    assert "/run/flockd/flockd-drone1.lock belongs to another user" in finding.measured
-
-
-def test_the_lock_of_the_service_cannot_be_seen_by_who_may_not_write_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lock = tmp_path / "flockd-drone1.lock"
-    lock.write_text("1234\n", encoding="ascii")
-    monkeypatch.setattr(service_checks, "service_lock", lambda drone: tmp_path / f"flockd-{drone}.lock")
-    access = os.access
-    monkeypatch.setattr(os, "access", lambda path, mode: path != lock and access(path, mode))
-    environment = {"XDG_RUNTIME_DIR": str(tmp_path)}
-    (finding,) = check_instance("drone1", environment)
-    assert finding.level is Level.WARNING
-    assert finding.measured.startswith(f"{lock} belongs to another user")
-    assert next(iter(check_instance("drone2", environment))).level is Level.PASS
+def test_a_second_instance() -> None:
+    assert next(iter(check_instance(None))).level is Level.PASS
+    (finding,) = check_instance(UnavailableError("autopilot.address: another flockd (process 7) has it; stop it"))
+    assert finding.level is Level.FAILURE
+    assert finding.measured == "autopilot.address: another flockd (process 7) has it"
+    assert "systemctl stop flockd" in finding.fix
 
 
 @needs_systemd

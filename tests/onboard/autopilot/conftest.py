@@ -1,14 +1,16 @@
-"""A free UDP port, and an autopilot stand-in that hovers there."""
+"""A free UDP port, an autopilot stand-in that hovers there, and its addresses: that port, and a serial device."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.free_ports import free_port
 from tests.calm import clock
+from tests.onboard.autopilot.serial_cable import SerialCable
 
 HOVER_M = 2.5
 HEARTBEAT_S = 0.25
@@ -18,6 +20,21 @@ HEARTBEAT_S = 0.25
 @pytest.fixture
 def port() -> int:
     return free_port()
+
+
+@pytest.fixture
+def cable(port: int, tmp_path: Path) -> Iterator[SerialCable]:
+    with SerialCable(port, tmp_path / "ttyUSB0") as cable:
+        yield cable
+
+
+@pytest.fixture(params=["udp", "serial"])
+def address(port: int, request: pytest.FixtureRequest) -> str:
+    """Where the autopilots are heard that send to the port."""
+    if request.param == "udp":
+        return f"udpin://127.0.0.1:{port}"
+    cable: SerialCable = request.getfixturevalue("cable")
+    return cable.address
 
 
 @pytest.fixture

@@ -69,14 +69,17 @@ class Flight:
 
 
 @asynccontextmanager
-async def attended(port: int, clock: Callable[[], float] = calm.clock) -> AsyncIterator[PilotsLink]:
+async def attended(
+    address: str, clock: Callable[[], float] = calm.clock, system_id: int | None = 1
+) -> AsyncIterator[PilotsLink]:
     """A link that keeps all coming, as the daemon's does."""
-    link = await PilotsLink.connect(AutopilotParameters(address=f"udpin://127.0.0.1:{port}"), clock=clock)
+    link = await PilotsLink.connect(AutopilotParameters(address=address, system_id=system_id), clock=clock)
     attending = asyncio.create_task(link.attend())
     try:
         yield link
     finally:
         attending.cancel()
+        await asyncio.wait({attending})
         await link.close()
 
 
@@ -110,8 +113,10 @@ class Foreigner:
 
 
 @asynccontextmanager
-async def flying(port: int, wanted: Wanted = NORTH, clock: Callable[[], float] = calm.clock) -> AsyncIterator[Flight]:
-    async with attended(port, clock) as link:
+async def flying(
+    address: str, wanted: Wanted = NORTH, clock: Callable[[], float] = calm.clock, system_id: int = 1
+) -> AsyncIterator[Flight]:
+    async with attended(address, clock, system_id) as link:
         streamer = SetpointStreamer(
             link.send_setpoint, link.status, let_pass, AutopilotParameters(), SafetyParameters(), clock=clock
         )
@@ -133,7 +138,7 @@ async def flying(port: int, wanted: Wanted = NORTH, clock: Callable[[], float] =
 
 async def main(port: int, speed_factor: float) -> None:
     clock = clock_at(speed_factor)
-    async with flying(port, clock=clock) as flight:
+    async with flying(f"udpin://127.0.0.1:{port}", clock=clock) as flight:
         await flight.enter_offboard()
         print("offboard", flush=True)  # noqa: T201
         await asyncio.sleep(3600)

@@ -33,8 +33,8 @@ from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import Foreigner, attended, flying, until
 
 
-def _parameters(port: int, system_id: int | None = None) -> AutopilotParameters:
-    return AutopilotParameters(address=f"udpin://127.0.0.1:{port}", system_id=system_id)
+def _parameters(address: str, system_id: int | None = 1) -> AutopilotParameters:
+    return AutopilotParameters(address=address, system_id=system_id)
 
 
 def test_the_type_mask_says_horizontal_velocity_height_and_yaw() -> None:
@@ -50,7 +50,7 @@ def test_the_type_mask_says_horizontal_velocity_height_and_yaw() -> None:
     assert ignored == SETPOINT_TYPE_MASK
 
 
-async def test_telemetry_is_what_the_vehicle_does(port: int) -> None:
+async def test_telemetry_is_what_the_vehicle_does(port: int, address: str) -> None:
     # Nose east, 30 degrees right side down; climbing to the north-east.
     sin, cos = math.sin(math.radians(30.0)), math.cos(math.radians(30.0))
     east_and_leaning = np.array([[0.0, -cos, sin], [1.0, 0.0, 0.0], [0.0, sin, cos]])
@@ -61,7 +61,7 @@ async def test_telemetry_is_what_the_vehicle_does(port: int) -> None:
 
     with FakeAutopilot(port, height_m=7.5, motion=still, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
         fake_autopilot.battery_share = 0.42
-        link = await AutopilotLink.connect(_parameters(port), clock=clock)
+        link = await AutopilotLink.connect(_parameters(address), clock=clock)
         await until(lambda: link.vehicle_state() is not None and link.status().battery_share is not None)
         await until(lambda: None not in {link.status().estimate_ok, link.status().gps_ok} and link.status().in_air)
         state, status = link.vehicle_state(), link.status()
@@ -87,14 +87,14 @@ async def test_telemetry_is_what_the_vehicle_does(port: int) -> None:
 
 
 async def test_a_landed_state_that_mavlink_does_not_have_is_unknown_and_counted(
-    port: int, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
+    address: str, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A vehicle in the air reports 2, then 5: MAV_LANDED_STATE ends at 4."""
 
     def sends_5(self: TelemetryStreams) -> None:
         self._mav.extended_sys_state_send(0, 5)
 
-    link = await AutopilotLink.connect(_parameters(port), clock=clock)
+    link = await AutopilotLink.connect(_parameters(address), clock=clock)
     await until(lambda: link.status().landed_state == "air")
     monkeypatch.setattr(TelemetryStreams, "_send_landed", sends_5)
     await until(lambda: link.status().landed_state == "unknown")
@@ -104,9 +104,9 @@ async def test_a_landed_state_that_mavlink_does_not_have_is_unknown_and_counted(
     await link.close()
 
 
-async def test_firmware_and_failsafe_parameters_can_be_read(port: int, fake_autopilot: FakeAutopilot) -> None:
+async def test_firmware_and_failsafe_parameters_can_be_read(address: str, fake_autopilot: FakeAutopilot) -> None:
     fake_autopilot.parameters |= {"COM_OF_LOSS_T": 0.75, "COM_OBL_RC_ACT": 4, "COM_LOW_BAT_ACT": -3}
-    link = await AutopilotLink.connect(_parameters(port), clock=clock)
+    link = await AutopilotLink.connect(_parameters(address), clock=clock)
     assert await link.parameter("COM_OF_LOSS_T", float) == 0.75
     assert await link.parameter("COM_OBL_RC_ACT", int) == 4
     assert await link.parameter("COM_LOW_BAT_ACT", int) == -3
@@ -117,9 +117,9 @@ async def test_firmware_and_failsafe_parameters_can_be_read(port: int, fake_auto
 
 
 async def test_offboard_without_setpoints_is_refused_and_the_reason_told(
-    port: int, fake_autopilot: FakeAutopilot
+    address: str, fake_autopilot: FakeAutopilot
 ) -> None:
-    async with attended(port) as link:
+    async with attended(address) as link:
         await link.ask_for_checks()
         await until(link.knows_checks)
         refused = r"asked for offboard, which was refused for now: it receives no setpoints, as flockd sends none yet; "
@@ -129,11 +129,11 @@ async def test_offboard_without_setpoints_is_refused_and_the_reason_told(
 
 
 async def test_an_autopilot_that_acts_on_the_loss_of_its_ground_station_hears_none_and_sends_no_texts(
-    port: int, fake_autopilot: FakeAutopilot
+    address: str, fake_autopilot: FakeAutopilot
 ) -> None:
     """Flockd's announcement would hide that loss. Its events tell the reason all the same."""
     fake_autopilot.parameters["NAV_DLL_ACT"] = 2
-    async with attended(port) as link:
+    async with attended(address) as link:
         await until(lambda: bool(link.parameters()))
         assert not link.announces()
         fake_autopilot.parameters["NAV_DLL_ACT"] = 0
@@ -142,17 +142,17 @@ async def test_an_autopilot_that_acts_on_the_loss_of_its_ground_station_hears_no
         await until(lambda: not fake_autopilot.has_ground_station)
 
 
-async def test_a_refusal_without_a_word_is_told_as_such(port: int, fake_autopilot: FakeAutopilot) -> None:
-    async with attended(port) as link:
+async def test_a_refusal_without_a_word_is_told_as_such(address: str, fake_autopilot: FakeAutopilot) -> None:
+    async with attended(address) as link:
         fake_autopilot.wordless = True
         fake_autopilot.failing = {"check_gyro_not_calibrated"}
         with pytest.raises(AutopilotError, match=r"which was refused for now without a reason; wait a few seconds"):
             await link.arm()
 
 
-async def test_events_that_are_lost_are_requested_and_come(port: int) -> None:
+async def test_events_that_are_lost_are_requested_and_come(port: int, address: str) -> None:
     with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
-        async with attended(port) as link:
+        async with attended(address) as link:
             await _loses_events(link, fake_autopilot)
 
 
@@ -168,9 +168,9 @@ async def _loses_events(link: AutopilotLink, fake_autopilot: FakeAutopilot) -> N
     assert link.knows_checks()
 
 
-async def test_an_autopilot_that_has_started_anew_is_asked_for_its_streams_again(port: int) -> None:
+async def test_an_autopilot_that_has_started_anew_is_asked_for_its_streams_again(port: int, address: str) -> None:
     with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
-        async with attended(port) as link:
+        async with attended(address) as link:
             await asyncio.sleep(1.5)
             rates = dict(fake_autopilot.stream_intervals_s)
             fake_autopilot.restart()
@@ -179,19 +179,19 @@ async def test_an_autopilot_that_has_started_anew_is_asked_for_its_streams_again
             assert "the autopilot has started anew" in link.take_reports()
 
 
-async def test_all_that_mavsdk_calls_is_kept_until_it_is_destroyed(port: int) -> None:
+async def test_all_that_mavsdk_calls_is_kept_until_it_is_destroyed(port: int, address: str) -> None:
     """By attributes of MAVSDK that are its own: another version may name them otherwise."""
     with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock):
-        link = await AutopilotLink.connect(_parameters(port))
+        link = await AutopilotLink.connect(_parameters(address))
         subscribed, _ = link._callbacks()
         assert len(subscribed) >= len({*RECEIVED, TIME_SYNC})
         await link.close()
 
 
-async def test_what_still_sends_over_a_closed_link_is_refused(port: int) -> None:
+async def test_what_still_sends_over_a_closed_link_is_refused(port: int, address: str) -> None:
     """MAVSDK would call memory that is free, which ends the process."""
     with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock):
-        link = await AutopilotLink.connect(_parameters(port))
+        link = await AutopilotLink.connect(_parameters(address))
         attending = asyncio.create_task(link.attend())
         await asyncio.sleep(0)
         await link.close()
@@ -202,10 +202,10 @@ async def test_what_still_sends_over_a_closed_link_is_refused(port: int) -> None
         attending.cancel()
 
 
-async def test_one_lost_heartbeat_loses_no_link_and_is_counted(port: int) -> None:
+async def test_one_lost_heartbeat_loses_no_link_and_is_counted(port: int, address: str) -> None:
     """PX4's: one a second."""
     with FakeAutopilot(port, height_m=HOVER_M, clock=clock) as fake_autopilot:
-        async with flying(port) as flight:
+        async with flying(address) as flight:
             await flight.enter_offboard()
             for lost in range(1, 4):
                 fake_autopilot.lose_heartbeats(1)
@@ -219,9 +219,9 @@ async def test_one_lost_heartbeat_loses_no_link_and_is_counted(port: int) -> Non
 
 
 async def test_setpoints_of_another_program_are_noticed_within_two_seconds(
-    port: int, fake_autopilot: FakeAutopilot
+    address: str, fake_autopilot: FakeAutopilot
 ) -> None:
-    async with flying(port) as flight:
+    async with flying(address) as flight:
         await flight.enter_offboard()
         await asyncio.sleep(2.0)
         assert flight.link.status().foreign_setpoints is None
@@ -237,9 +237,9 @@ async def test_setpoints_of_another_program_are_noticed_within_two_seconds(
 
 
 async def test_a_parameter_that_is_changed_in_flight_is_noticed_within_two_seconds(
-    port: int, fake_autopilot: FakeAutopilot
+    address: str, fake_autopilot: FakeAutopilot
 ) -> None:
-    async with attended(port) as link:
+    async with attended(address) as link:
         await until(lambda: "COM_OF_LOSS_T" in link.parameters())
         fake_autopilot.parameters["COM_OF_LOSS_T"] = 20.0
         await until(lambda: link.status().parameter_fault is not None)
@@ -252,10 +252,10 @@ async def test_a_parameter_that_is_changed_in_flight_is_noticed_within_two_secon
 
 
 async def test_the_vehicle_follows_the_velocity_and_holds_its_own_height(
-    port: int, fake_autopilot: FakeAutopilot
+    address: str, fake_autopilot: FakeAutopilot
 ) -> None:
     wanted = Wanted(np.array([0.6, -0.8]), np.zeros(2), yaw_rad=-0.5, height_m=3.0)
-    async with flying(port, wanted) as flight:
+    async with flying(address, wanted) as flight:
         await flight.enter_offboard()
         assert fake_autopilot.mode == "OFFBOARD"
         await asyncio.sleep(1.5)
@@ -268,8 +268,8 @@ async def test_the_vehicle_follows_the_velocity_and_holds_its_own_height(
         assert fake_autopilot.refused_setpoints == 0
 
 
-async def test_a_setpoint_that_is_not_finite_never_leaves(port: int, fake_autopilot: FakeAutopilot) -> None:
-    link = await AutopilotLink.connect(_parameters(port), clock=clock)
+async def test_a_setpoint_that_is_not_finite_never_leaves(address: str, fake_autopilot: FakeAutopilot) -> None:
+    link = await AutopilotLink.connect(_parameters(address), clock=clock)
     for broken in (
         Setpoint(0.0, np.array([math.nan, 0.0]), 2.5, 0.0),
         Setpoint(0.0, np.zeros(2), math.inf, 0.0),
@@ -283,9 +283,9 @@ async def test_a_setpoint_that_is_not_finite_never_leaves(port: int, fake_autopi
     await link.close()
 
 
-async def test_arming_taking_off_and_landing_from_offboard(port: int) -> None:
+async def test_arming_taking_off_and_landing_from_offboard(port: int, address: str) -> None:
     with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
-        async with flying(port) as flight:
+        async with flying(address) as flight:
             assert not flight.link.status().armed
             await flight.link.arm()
             await flight.link.take_off()
@@ -297,8 +297,8 @@ async def test_arming_taking_off_and_landing_from_offboard(port: int) -> None:
             await until(lambda: not flight.streamer.report().streaming)
 
 
-async def test_return_flies_home(port: int, fake_autopilot: FakeAutopilot) -> None:
-    async with flying(port) as flight:
+async def test_return_flies_home(address: str, fake_autopilot: FakeAutopilot) -> None:
+    async with flying(address) as flight:
         await flight.enter_offboard()
         await until(lambda: fake_autopilot.state.position[0] > 1.0)
         await flight.link.return_home()
@@ -307,11 +307,11 @@ async def test_return_flies_home(port: int, fake_autopilot: FakeAutopilot) -> No
         assert abs(fake_autopilot.state.position[0]) < 0.5
 
 
-async def test_two_links_on_two_ports_mind_their_own_vehicle(port: int, fake_autopilot: FakeAutopilot) -> None:
+async def test_two_links_on_two_ports_mind_their_own_vehicle(address: str, fake_autopilot: FakeAutopilot) -> None:
     second_port = free_port()
     with FakeAutopilot(second_port, system_id=9, height_m=4.0, heartbeat_s=HEARTBEAT_S, clock=clock) as second:
         south = Wanted(np.array([-0.5, 0.0]), np.zeros(2), 0.0, height_m=4.0)
-        async with flying(port) as one, flying(second_port, south) as two:
+        async with flying(address) as one, flying(f"udpin://127.0.0.1:{second_port}", south, system_id=9) as two:
             await asyncio.gather(one.enter_offboard(), two.enter_offboard())
             await asyncio.sleep(1.5)
             assert fake_autopilot.state.velocity[0] == pytest.approx(1.0, abs=0.15)
@@ -319,11 +319,11 @@ async def test_two_links_on_two_ports_mind_their_own_vehicle(port: int, fake_aut
             assert (one.link.system_id, two.link.system_id) == (1, 9)
 
 
-async def test_the_stand_in_runs_as_a_program_too(port: int) -> None:
+async def test_the_stand_in_runs_as_a_program_too(port: int, address: str) -> None:
     options = ["--port", str(port), "--system-id", "4", "--height", "6"]
     with subprocess.Popen([sys.executable, "-m", "flockd.sim.autopilot.fake_autopilot", *options]) as program:
         try:
-            link = await AutopilotLink.connect(_parameters(port, system_id=4))
+            link = await AutopilotLink.connect(_parameters(address, system_id=4))
             await until(lambda: link.vehicle_state() is not None)
             state = link.vehicle_state()
             assert state is not None
@@ -333,7 +333,7 @@ async def test_the_stand_in_runs_as_a_program_too(port: int) -> None:
             program.kill()
 
 
-async def test_a_stand_in_that_is_late_for_every_tick_still_hears(port: int) -> None:
+async def test_a_stand_in_that_is_late_for_every_tick_still_hears(port: int, address: str) -> None:
     """As on a busy computer: to fly on takes it longer than a tick."""
 
     def slow(demand: Demand, interval_s: float) -> MotionState:
@@ -342,24 +342,24 @@ async def test_a_stand_in_that_is_late_for_every_tick_still_hears(port: int) -> 
         return MotionState(np.array([0.0, 0.0, -2.5]), np.zeros(3), np.eye(3))
 
     with FakeAutopilot(port, height_m=2.5, motion=slow, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
-        link = await AutopilotLink.connect(_parameters(port), clock=clock)
+        link = await AutopilotLink.connect(_parameters(address), clock=clock)
         assert await link.parameter("COM_OBL_RC_ACT", int) == 5
         link.send_setpoint(Setpoint(0.0, np.zeros(2), 2.5, 0.0))
         await until(lambda: len(fake_autopilot.setpoints) == 1)
         await link.close()
 
 
-def test_nobody_there_is_told_with_what_to_check(port: int) -> None:
-    with pytest.raises(AutopilotError, match=f"no autopilot was heard at udpin://127.0.0.1:{port} within 0.3 s"):
-        asyncio.run(AutopilotLink.connect(_parameters(port), timeout_s=0.3))
+def test_nobody_there_is_told_with_what_to_check(address: str) -> None:
+    with pytest.raises(AutopilotError, match=f"no autopilot was heard at {address} within 0.3 s"):
+        asyncio.run(AutopilotLink.connect(_parameters(address, None), timeout_s=0.3))
 
 
-async def test_somebody_elses_autopilot_is_not_taken_for_the_own(port: int, fake_autopilot: FakeAutopilot) -> None:
+async def test_somebody_elses_autopilot_is_not_taken_for_the_own(address: str, fake_autopilot: FakeAutopilot) -> None:
     with pytest.raises(AutopilotError, match=r"no autopilot with system id 5 .* heard instead: 1"):
-        await AutopilotLink.connect(_parameters(port, system_id=5), timeout_s=0.7, clock=clock)
+        await AutopilotLink.connect(_parameters(address, system_id=5), timeout_s=0.7, clock=clock)
 
 
-async def test_no_system_outlives_a_search_that_fails(port: int, fake_autopilot: FakeAutopilot) -> None:
+async def test_no_system_outlives_a_search_that_fails(address: str, fake_autopilot: FakeAutopilot) -> None:
     """One that is collected while MAVSDK is destroyed, on another thread, ends the process."""
     handed_out: list[System] = []
     alive_at_the_end: list[int] = []
@@ -375,13 +375,13 @@ async def test_no_system_outlives_a_search_that_fails(port: int, fake_autopilot:
             super().destroy()
 
     with pytest.raises(AutopilotError, match="heard instead: 1"):
-        await AutopilotLink.connect(_parameters(port, system_id=5), timeout_s=0.7, clock=clock, create=Watched)
+        await AutopilotLink.connect(_parameters(address, system_id=5), timeout_s=0.7, clock=clock, create=Watched)
     await until(lambda: bool(alive_at_the_end))
     assert handed_out
     assert alive_at_the_end[0] == 0
 
 
-async def test_flockd_is_a_computer_of_the_autopilots_own_system_whatever_its_number(port: int) -> None:
+async def test_flockd_is_a_computer_of_the_autopilots_own_system_whatever_its_number(port: int, address: str) -> None:
     """PX4 takes an onboard computer of another system for a stranger, and logs no text of it."""
     senders: set[int] = set()
 
@@ -391,7 +391,7 @@ async def test_flockd_is_a_computer_of_the_autopilots_own_system_whatever_its_nu
             super()._handle(message, arrived_s, on_link=on_link)
 
     with Listening(port, system_id=3, height_m=2.5, heartbeat_s=HEARTBEAT_S, clock=clock):
-        link = await AutopilotLink.connect(_parameters(port), clock=clock)
+        link = await AutopilotLink.connect(_parameters(address, None), clock=clock)
         senders.clear()
         assert await link.firmware() == Firmware("PX4", "0.0.1")
         assert senders == {3}
@@ -415,14 +415,14 @@ LONG_TEXT = (
     ],
 )
 async def test_a_text_of_any_length_reaches_a_ground_station_that_the_autopilot_forwards_to(
-    port: int, text: str, heard: str
+    port: int, address: str, text: str, heard: str
 ) -> None:
     truth = free_port()
     with (
         FakeAutopilot(port, height_m=2.5, heartbeat_s=HEARTBEAT_S, truth_port=truth, clock=clock),
         GroundStation([truth], clock) as station,
     ):
-        link = await AutopilotLink.connect(_parameters(port), clock=clock)
+        link = await AutopilotLink.connect(_parameters(address), clock=clock)
         await until(lambda: station.is_connected(0))
         link.send_text(text, Severity.WARNING)
         await until(lambda: station.last_text(0) != "")
@@ -431,12 +431,12 @@ async def test_a_text_of_any_length_reaches_a_ground_station_that_the_autopilot_
 
 
 async def test_the_autopilot_gets_distances_in_centimetres_from_the_nose(
-    port: int, fake_autopilot: FakeAutopilot
+    address: str, fake_autopilot: FakeAutopilot
 ) -> None:
     """MAVLink: 65535 is unknown, one more than the largest distance is free; and no nearer than the sensor's least."""
     free_m = np.full(72, np.inf)
     free_m[[0, 1, 2, 3]] = 4.567, 0.1, np.nan, 14.999
-    link = await AutopilotLink.connect(_parameters(port), clock=clock)
+    link = await AutopilotLink.connect(_parameters(address), clock=clock)
     assert fake_autopilot.collision_prevention.without_data_s(clock()) == math.inf
     link.send_obstacle_distances(free_m, 15.0)
     await until(lambda: fake_autopilot.collision_prevention.without_data_s(clock()) < 1.0)
@@ -444,14 +444,16 @@ async def test_the_autopilot_gets_distances_in_centimetres_from_the_nose(
     await link.close()
 
 
-async def test_two_programs_cannot_command_one_drone(port: int, fake_autopilot: FakeAutopilot) -> None:
-    link = await AutopilotLink.connect(_parameters(port), clock=clock)
-    with pytest.raises(AutopilotError, match="is another program on it"):
-        await AutopilotLink.connect(_parameters(port), clock=clock)
+async def test_two_programs_cannot_command_one_drone(address: str, fake_autopilot: FakeAutopilot) -> None:
+    link = await AutopilotLink.connect(_parameters(address), clock=clock)
+    with pytest.raises(AutopilotError, match=r"is another program on it|in use by another program"):
+        await AutopilotLink.connect(_parameters(address), clock=clock)
     await link.close()
 
 
-async def test_the_range_finder_is_heard_along_the_bodys_down_axis_and_falls_silent_with_it(port: int) -> None:
+async def test_the_range_finder_is_heard_along_the_bodys_down_axis_and_falls_silent_with_it(
+    port: int, address: str
+) -> None:
     """Leaning by 30 degrees at 6 m: the slant range is 6 m / cos 30; out of its reach it sends no signal."""
     sin, cos = math.sin(math.radians(30.0)), math.cos(math.radians(30.0))
     leaning = np.array([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
@@ -463,7 +465,7 @@ async def test_the_range_finder_is_heard_along_the_bodys_down_axis_and_falls_sil
 
     finder = FakeRangeFinder(config, level_ground, (0,))
     with FakeAutopilot(port, height_m=6.0, motion=still, heartbeat_s=HEARTBEAT_S, range_finder=finder, clock=clock):
-        link = await AutopilotLink.connect(_parameters(port), clock=clock)
+        link = await AutopilotLink.connect(_parameters(address), clock=clock)
         await until(lambda: (state := link.vehicle_state()) is not None and state.ground_range is not None)
         reading = link.ground_range()
         assert reading is not None
@@ -475,7 +477,7 @@ async def test_the_range_finder_is_heard_along_the_bodys_down_axis_and_falls_sil
         await link.close()
 
 
-async def test_a_start_that_is_given_up_does_not_destroy_mavsdk_under_its_own_call(port: int) -> None:
+async def test_a_start_that_is_given_up_does_not_destroy_mavsdk_under_its_own_call(address: str) -> None:
     """The library then reads freed memory, which ends the process (seen)."""
     told: list[str] = []
     destroyed = asyncio.Event()
@@ -493,7 +495,7 @@ async def test_a_start_that_is_given_up_does_not_destroy_mavsdk_under_its_own_ca
             super().destroy()
             loop.call_soon_threadsafe(destroyed.set)
 
-    connecting = asyncio.create_task(AutopilotLink.connect(_parameters(port), create=Slow))
+    connecting = asyncio.create_task(AutopilotLink.connect(_parameters(address), create=Slow))
     await until(lambda: told == ["begins"])
     connecting.cancel()
     await asyncio.wait({connecting})
@@ -501,7 +503,7 @@ async def test_a_start_that_is_given_up_does_not_destroy_mavsdk_under_its_own_ca
     assert told[:3] == ["begins", "ends", "destroyed"]
 
 
-async def test_a_close_that_nobody_waits_for_still_destroys_mavsdk(port: int, fake_autopilot: FakeAutopilot) -> None:
+async def test_a_close_that_nobody_waits_for_still_destroys_mavsdk(address: str, fake_autopilot: FakeAutopilot) -> None:
     """Behind a request that the autopilot does not answer. One that is collected instead ends the process (seen)."""
     asked, answer = threading.Event(), threading.Event()
     destroyed = asyncio.Event()
@@ -516,7 +518,7 @@ async def test_a_close_that_nobody_waits_for_still_destroys_mavsdk(port: int, fa
             super().destroy()
             loop.call_soon_threadsafe(destroyed.set)
 
-    link = await AutopilotLink.connect(_parameters(port), clock=clock, create=Watched)
+    link = await AutopilotLink.connect(_parameters(address), clock=clock, create=Watched)
     asking = asyncio.create_task(link._call(ask))
     await until(asked.is_set)
     with pytest.raises(TimeoutError):

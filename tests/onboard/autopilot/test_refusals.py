@@ -274,7 +274,7 @@ REFUSING = (
 
 async def test_twelve_refusals_of_the_fake_autopilot_one_by_one_through_mavsdk(port: int) -> None:
     with FakeAutopilot(port, clock=clock) as fake_autopilot:
-        async with attended(port) as link:
+        async with attended(f"udpin://127.0.0.1:{port}") as link:
             await link.ask_for_checks()
             await until(lambda: link.knows_checks() and fake_autopilot.has_ground_station)
             for name in REFUSING:
@@ -292,7 +292,7 @@ async def test_twelve_refusals_of_the_fake_autopilot_one_by_one_through_mavsdk(p
 
 
 async def test_offboard_that_is_possible_is_not_refused_by_anything(port: int, fake_autopilot: FakeAutopilot) -> None:
-    async with flying(port) as flight:
+    async with flying(f"udpin://127.0.0.1:{port}") as flight:
         await flight.enter_offboard()
         assert flight.link.refusals() == ()
     assert fake_autopilot.armed

@@ -89,7 +89,7 @@ def test_a_stopped_process_is_so_too_and_does_not_take_the_drone_back_when_it_go
 
 async def test_the_stand_in_itself_would_return_to_offboard(port: int, fake_autopilot: FakeAutopilot) -> None:
     """Or the story above would tell nothing."""
-    async with flying(port) as flight:
+    async with flying(f"udpin://127.0.0.1:{port}") as flight:
         await flight.enter_offboard()
         flight.streamer.end("for the test")
         await until(lambda: fake_autopilot.failsafe)
@@ -108,7 +108,7 @@ def _busy(duration_s: float) -> None:
 async def test_a_blocked_event_loop_is_silence_and_failsafe(
     port: int, fake_autopilot: FakeAutopilot, block: Callable[[float], None]
 ) -> None:
-    async with flying(port) as flight:
+    async with flying(f"udpin://127.0.0.1:{port}") as flight:
         await flight.enter_offboard()
         blocked_s = clock()
         block(1.8)
@@ -122,7 +122,7 @@ async def test_a_blocked_event_loop_is_silence_and_failsafe(
 
 async def test_a_dead_control_task_is_silence_and_failsafe(port: int, fake_autopilot: FakeAutopilot) -> None:
     fake_autopilot.parameters["COM_OBL_RC_ACT"] = 4
-    async with flying(port) as flight:
+    async with flying(f"udpin://127.0.0.1:{port}") as flight:
         await flight.enter_offboard()
         died_s = clock()
         flight.control.cancel()
@@ -134,7 +134,7 @@ async def test_a_dead_control_task_is_silence_and_failsafe(port: int, fake_autop
 async def test_when_the_pilot_switches_it_is_silent_at_once_and_stays_so(
     port: int, fake_autopilot: FakeAutopilot
 ) -> None:
-    async with flying(port) as flight:
+    async with flying(f"udpin://127.0.0.1:{port}") as flight:
         await flight.enter_offboard()
         await asyncio.sleep(0.3)
         fake_autopilot.pilot_selects("POSCTL")
@@ -155,7 +155,7 @@ async def _begins_anew(flight: Flight, fake_autopilot: FakeAutopilot) -> None:
 
 
 async def test_a_lost_link_is_silence_though_the_autopilot_comes_back(port: int, fake_autopilot: FakeAutopilot) -> None:
-    async with flying(port) as flight:
+    async with flying(f"udpin://127.0.0.1:{port}") as flight:
         await flight.enter_offboard()
         fake_autopilot.silent = True
         await until(lambda: not flight.streamer.report().streaming, 4.0)

@@ -6,8 +6,6 @@ import asyncio
 import math
 import os
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections import Counter
@@ -24,7 +22,6 @@ from flockd.core.config.drone import DroneConfig
 from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.config.source import SourceParameters
 from flockd.core.data import data_path
-from flockd.core.errors import UnavailableError
 from flockd.core.messages import (
     EgoMotion,
     Frame,
@@ -45,7 +42,6 @@ from flockd.flight.safety import Action, Decision, Gate, Inputs, Permission, Req
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
 from flockd.onboard.daemon.control import Control
 from flockd.onboard.daemon.host_monitors import LoopLag, WallClock, hottest_zone_c
-from flockd.onboard.daemon.lock import only_instance
 from flockd.onboard.daemon.operator_commands import OperatorRequests
 from flockd.onboard.daemon.pilot_loop import PilotLoop, StepResult
 from flockd.onboard.daemon.service_manager import ServiceManager
@@ -163,24 +159,6 @@ def test_without_a_service_manager_or_its_watchdog_nothing_is_said_and_nothing_f
         ServiceManager(other).alive()
         with pytest.raises(BlockingIOError):
             manager.recv(999)
-
-
-def test_the_lock_is_free_again_when_its_holder_was_killed(tmp_path: Path) -> None:
-    environment = {"XDG_RUNTIME_DIR": str(tmp_path)}
-    hold = (
-        "import sys, time\nfrom flockd.onboard.daemon.lock import only_instance\n"
-        f"with only_instance('one', {environment!r}):\n    print('held', flush=True)\n    time.sleep(60)"
-    )
-    with subprocess.Popen([sys.executable, "-c", hold], stdout=subprocess.PIPE, text=True) as holder:
-        assert holder.stdout is not None
-        assert holder.stdout.readline() == "held\n"
-        told = rf"another flockd \(process {holder.pid}\) flies drone 'one'"
-        with pytest.raises(UnavailableError, match=told), only_instance("one", environment):
-            pytest.fail("two hold it")
-        with only_instance("two", environment):
-            holder.kill()
-    with only_instance("one", environment):
-        assert (tmp_path / "flockd-one.lock").read_text(encoding="utf-8") == f"{os.getpid()}\n"
 
 
 def test_the_hottest_zone_counts_and_one_that_cannot_be_read_does_not(tmp_path: Path) -> None:

@@ -1,0 +1,65 @@
+"""One owner a link: a second process is refused before it can touch anything, whoever has started it."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pwd
+import socket
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from flockd.core.config.autopilot import AutopilotParameters
+from flockd.core.errors import UnavailableError
+
+
+@contextmanager
+def only_owner(autopilot: AutopilotParameters | None) -> Iterator[None]:
+    """Owns the link to the autopilot; without one there is nothing to own.
+
+    The owner is who has bound the address's name among Linux's abstract sockets. These are the same for all users of a
+    computer, need no folder, and are gone with their process. Raises UnavailableError while another process owns it.
+    """
+    if autopilot is None:
+        yield
+        return
+    name = "\0flockd " + hashlib.sha256(_place(autopilot.address).encode()).hexdigest()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as own:
+        try:
+            own.bind(name)
+        except OSError as error:
+            raise UnavailableError(
+                f"autopilot.address: another flockd ({_owner(name)}) has the link {autopilot.address}; stop it first, "
+                "or give this one its own autopilot's address"
+            ) from error
+        own.listen()
+        yield
+
+
+def _place(address: str) -> str:
+    """What two addresses of one link have in common: a device has several names, a port several hosts."""
+    kind, _, rest = address.partition("://")
+    where, _, number = rest.rpartition(":")
+    match kind:
+        case "serial":
+            return os.path.realpath(where)
+        case "udpin" | "tcpin":
+            return f"{kind}:{number}"
+        case _:
+            return address
+
+
+def _owner(name: str) -> str:
+    """Its process and user, as far as the kernel tells them."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
+        asking.setblocking(False)
+        try:
+            asking.connect(name)
+        except OSError:
+            return "which has just ended, or does not say"
+        process, user, _ = struct.unpack("3i", asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+    try:
+        return f"process {process} of user {pwd.getpwuid(user).pw_name}"
+    except KeyError:
+        return f"process {process} of user {user}"

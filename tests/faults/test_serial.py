@@ -1,0 +1,95 @@
+"""Faults of a serial link to the autopilot, while a whole drone flies or waits on the ground."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from flockd.core.config import DroneConfig
+from flockd.core.errors import ExitCode
+from flockd.onboard.autopilot import mavsdk_link
+from flockd.onboard.autopilot.autopilot_status import AutopilotError
+from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from tests.calm import clock
+from tests.faults.catalogue import RecordProperty, reacted
+from tests.faults.conftest import InTheAir
+from tests.onboard.autopilot.conftest import HEARTBEAT_S
+from tests.onboard.autopilot.flight import until
+from tests.onboard.autopilot.serial_cable import SerialCable
+from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, aboard
+
+pytestmark = pytest.mark.slow
+GONE_S = 2.0
+QUIET_S = 1.5
+
+
+def _over(cable: SerialCable, config: DroneConfig) -> DroneConfig:
+    assert config.autopilot is not None
+    autopilot = config.autopilot.model_copy(update={"address": cable.address, "system_id": 1})
+    return config.model_copy(update={"autopilot": autopilot})
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mavsdk_link, "GONE_S", GONE_S)
+
+
+async def test_on_the_ground_it_comes_back_or_the_daemon_ends_for_a_restart(port: int, tmp_path: Path) -> None:
+    with (
+        SerialCable(port, tmp_path / "ttyUSB0") as cable,
+        FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot,
+    ):
+        async with aboard(autopilot, port, tmp_path, change=lambda config: _over(cable, config)) as ship:
+            await ship.until_state("ready", "idle")
+            cable.unplug()
+            await ship.until_event(f"the autopilot's serial port {cable.device} is gone (")
+            cable.plug_in()
+            await ship.until_event(f"the autopilot's serial port {cable.device} is back after ")
+            await until(lambda: ship.heard()["flight"].message["heartbeat_age_s"] < 1.0, SECONDS_TO_FAIL)
+            assert not ship.ending.done()
+            cable.unplug()
+            await asyncio.wait({ship.ending}, timeout=SECONDS_TO_FAIL)
+            error = ship.ending.exception()
+            assert isinstance(error, AutopilotError)
+            assert error.exit_code is ExitCode.UNAVAILABLE
+            assert "has been gone for more than 2 s; check the cable" in str(error)
+
+
+async def test_in_flight_it_is_opened_again_however_long_that_takes_and_nothing_is_sent(
+    in_the_air: InTheAir, fake_autopilot: FakeAutopilot, port: int, tmp_path: Path, record_property: RecordProperty
+) -> None:
+    with SerialCable(port, tmp_path / "ttyUSB0") as cable:
+        async with in_the_air(change=lambda config: _over(cable, config)) as ship:
+            await ship.is_ready_in_the_air()
+            await ship.flies()
+            cable.unplug()
+            fault_s = clock()
+            await ship.until_event("silent: ")
+            reacted(record_property, "serial-port", clock() - fault_s)
+            await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+            assert fake_autopilot.failsafe
+            await asyncio.sleep(3 * GONE_S)
+            assert not ship.ending.done(), "it is armed"
+            sent = len(fake_autopilot.setpoints)
+            cable.plug_in()
+            await ship.until_event(f"the autopilot's serial port {cable.device} is back after ")
+            await until(lambda: ship.heard()["flight"].message["heartbeat_age_s"] < 1.0, SECONDS_TO_FAIL)
+            await asyncio.sleep(QUIET_S)
+            assert len(fake_autopilot.setpoints) == sent
+            assert ship.state() == "silent"
+
+
+async def test_with_two_autopilots_and_no_system_id_it_does_not_start(port: int, tmp_path: Path) -> None:
+    with (
+        FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as own,
+        FakeAutopilot(port, system_id=2, height_m=2.5, clock=clock) as neighbour,
+    ):
+        async with aboard(own, port, tmp_path) as ship:
+            await asyncio.wait({ship.ending}, timeout=SECONDS_TO_FAIL)
+            error = ship.ending.exception()
+            assert isinstance(error, AutopilotError)
+            assert error.exit_code is ExitCode.BAD_CONFIGURATION
+            assert "autopilot.system_id: is missing, and the autopilots of systems 1, 2 are heard" in str(error)
+            assert not neighbour.setpoints

@@ -1,0 +1,55 @@
+"""Two autopilots on one link: which is the own one is never guessed."""
+
+from __future__ import annotations
+
+import pytest
+
+from flockd.core.config.autopilot import AutopilotParameters
+from flockd.core.errors import ExitCode
+from flockd.onboard.autopilot.autopilot_status import AutopilotError
+from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
+from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from tests.calm import clock
+from tests.onboard.autopilot.flight import attended, until
+
+TOLD = "autopilot.system_id: is missing, and the autopilots of systems 1, 2 are heard at "
+
+
+def _neighbour(port: int) -> FakeAutopilot:
+    """As PX4 does it sends a heartbeat a second."""
+    return FakeAutopilot(port, system_id=2, height_m=2.5, clock=clock)
+
+
+async def test_two_that_are_heard_are_refused_with_their_ids_and_the_key(
+    port: int, address: str, fake_autopilot: FakeAutopilot
+) -> None:
+    with _neighbour(port), pytest.raises(AutopilotError) as refused:
+        await AutopilotLink.connect(AutopilotParameters(address=address), clock=clock)
+    assert refused.value.exit_code is ExitCode.BAD_CONFIGURATION
+    assert str(refused.value) == f"{TOLD}{address}; write the MAV_SYS_ID of this drone's own"
+
+
+@pytest.mark.parametrize("own", [1, 2])
+async def test_by_its_id_either_is_flown(port: int, address: str, fake_autopilot: FakeAutopilot, own: int) -> None:
+    with _neighbour(port) as neighbour:
+        link = await AutopilotLink.connect(AutopilotParameters(address=address, system_id=own), clock=clock)
+        await link.land()
+        await until(lambda: "LAND" in {neighbour.mode, fake_autopilot.mode})
+        assert (fake_autopilot.mode, neighbour.mode) == (("LAND", "LOITER") if own == 1 else ("LOITER", "LAND"))
+        assert link.unusable() is None
+        await link.close()
+
+
+async def test_a_second_one_that_comes_later_is_told_and_ends_it(
+    port: int, address: str, fake_autopilot: FakeAutopilot
+) -> None:
+    async with attended(address, system_id=None) as link:
+        assert link.unusable() is None
+        with _neighbour(port):
+            await until(lambda: link.unusable() is not None)
+            error = link.unusable()
+            assert error is not None
+            assert error.exit_code is ExitCode.BAD_CONFIGURATION
+            await until(lambda: bool(link.take_reports() == [str(error)]))
+            assert str(error) == f"{TOLD}{address}; write the MAV_SYS_ID of this drone's own"
+            assert link.system_id == 1
