@@ -19,9 +19,8 @@ NOW_S = 1000.0
 def _drone(name: str, state: str, *, alive: bool = True, age_s: float = 0.3, **more: Any) -> Watched:
     flight = FlightMessage(
         time_s=5.0, state=state, reasons=[], flight_mode="offboard", armed=True, in_air=True, heartbeat_age_s=0.1,
-        heartbeats_lost=0,
-        battery_share=0.5, height_m=4.0, velocity_trim=[0.0, 0.0], velocity_error_m_s=0.1, silence=None, setpoints_sent=1,
-        setpoints_missed=0, orders=[], orders_refused=0,
+        heartbeats_lost=0, battery_share=0.5, height_m=4.0, velocity_trim=[0.0, 0.0], velocity_error_m_s=0.1,
+        silence=None, setpoints_sent=1, setpoints_missed=0, orders=[], orders_refused=0,
     )  # fmt: skip
     return Watched("meadow", name, alive, {"flight": Heard(NOW_S - age_s, {**flight, **more})}, announced=True)
 

@@ -663,15 +663,6 @@ CATALOGUE = (
         ),
     ),
     Fault(
-        78, "messages-of-any-size", "messages of any size, number and source from anyone on the network",
-        "dropped before they are in memory; under 10 MB, flown on",
-        (
-            f"{_HERE}outside.py::test_queries_of_any_size_and_number",
-            "tests/onboard/telemetry/test_hostile_peer.py",
-        ),
-        ),
-    ),
-    Fault(
         77, "serial-port", "a serial port is replugged or wanted by two, or two autopilots are on one link",
         "on the ground it comes back, or exit code 69; in flight the link is lost; a second owner is refused with 69, "
         "two autopilots without `system_id` with 78",
@@ -688,6 +679,14 @@ CATALOGUE = (
             "tests/ground/doctor/test_examination.py::test_beside_a_flying_daemon_nothing_of_the_drone_is_touched",
         ),
         within_s=3.0,
+    ),
+    Fault(
+        78, "messages-of-any-size", "messages of any size, number and source from anyone on the network",
+        "dropped before they are in memory; under 10 MB, flown on",
+        (
+            f"{_HERE}outside.py::test_queries_of_any_size_and_number",
+            "tests/onboard/telemetry/test_hostile_peer.py",
+        ),
     ),
 )
 # fmt: on

@@ -50,7 +50,7 @@ def test_in_calm_air_nobody_is_held_or_slowed_by_wind() -> None:
 
 
 def test_gusts_beyond_the_limit_end_in_hold_with_the_reason_and_nothing_touches() -> None:
-    """Of 0.5 m/s an axis, 0.7 m/s of drift; `safety.max_velocity_error_m_s` is 0.8. A held drone is kept where it is."""
+    """0.5 m/s an axis, 0.7 m/s off; `safety.max_velocity_error_m_s` is 0.8. A held drone is kept where it is."""
     scenario = _scenario(duration_s=60.0, vehicle__gust_m_s=0.5, seed=2)
     loop, places = _flown(scenario, Vehicles(scenario.vehicles, scenario.vehicle, seed=2))
     assert loop.handed_over.keys() == {0, 1, 2, 3, 4}
@@ -95,7 +95,7 @@ def test_a_lost_camera_is_no_wind() -> None:
 
 
 def test_in_gusts_nothing_touches_among_trees() -> None:
-    """0.3 m/s an axis among 100 trees a hectare; stronger gusts are left to the autopilot, and to whoever does not fly."""
+    """0.3 m/s an axis among 100 trees a hectare."""
     of_gusts = {"vehicle.gust_m_s": 0.3, "vehicle.gust_length_m": 10.0, "world.obstacles.trees_per_hectare": 100.0}
     scenario = load_scenario(data_path("config") / "forest.yaml", of_gusts | {"seed": 1, "duration_s": 20.0})
     log = fly(scenario, perception="truth", pictured=False).log

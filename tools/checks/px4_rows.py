@@ -4,10 +4,10 @@
     python -m tools.checks.px4_rows --only hover north --out out/px4_rows
     python -m tools.checks.px4_rows --autopilot standin --json
 
-The first flights run at real time. Their drones have two cameras of 128 x 96 pixels and the autopilot's own velocity, so
-that two cores carry them; they see nobody, and keep apart by what each is ordered. `by_sight` and `by_sight_busy` fly on
-whole pictures, at the factor that two cores carry; beside the latter another program keeps a core busy. Exit code 1: a
-drone left offboard, or its velocity was off by more than the row's limit.
+The first flights run at real time. Their drones have two cameras of 128 x 96 pixels and the autopilot's own velocity,
+so that two cores carry them; they see nobody, and keep apart by what each is ordered. `by_sight` and `by_sight_busy`
+fly on whole pictures, at the factor that two cores carry; beside the latter another program keeps a core busy. Exit
+code 1: a drone left offboard, or its velocity was off by more than the row's limit.
 """
 
 from __future__ import annotations
@@ -90,8 +90,8 @@ class Row:
     flight: str
     speed_factor: float
     off_m_s: float
-    """Root mean square of the level velocity, as the autopilot knows it, less what the pilot wanted a step before; of the
-    worst drone."""
+    """Root mean square of the level velocity, as the autopilot knows it, less what the pilot wanted a step before; of
+    the worst drone."""
     truly_off_m_s: float
     """The same of the true velocity; PX4's simulated estimate wanders by 0.15 m/s."""
     order: float
@@ -120,16 +120,14 @@ def fly(flight: Flight, kind: AutopilotKind, speed_factor: float, out: Path) -> 
     scenario = _scenario(flight, out)
     if not flight.by_sight:
         sitl = sitl.model_copy(update={"safety": sitl.safety.model_copy(update={"alone_s": None})})
-    progress: Callable[[int, int], None] = lambda done, total: None  # noqa: E731
-    if flight.operator_m_s is not None:
-        progress = _Velocity(flight.operator_m_s, endpoint).progress
+    operator = _Velocity(flight.operator_m_s, endpoint)
     with ExitStack() as stack:
         if flight.busy:
             loop = stack.enter_context(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
             stack.callback(loop.kill)
         flown = fly_fleet(
             scenario, sitl, kind=kind, speed_factor=speed_factor, logs=out / "logs", recordings=None,
-            environment=os.environ, progress=progress,
+            environment=os.environ, progress=operator.progress,
         )  # fmt: skip
     return measured(flight, flown.log)
 
@@ -166,13 +164,14 @@ def _worst(off_m_s: FloatArray) -> float:
 class _Velocity(Order):
     """An operator's velocity, as `flockd fleet velocity` sends it until the flight ends."""
 
-    def __init__(self, north_m_s: float, endpoint: str) -> None:
-        super().__init__(Mission("operator", "", 0.0, 1, order_at_s=5.0), endpoint)
+    def __init__(self, north_m_s: float | None, endpoint: str) -> None:
+        """Without a velocity none is sent."""
+        super().__init__(Mission("operator", "", 0.0, 1, order_at_s=None if north_m_s is None else 5.0), endpoint)
         self._north_m_s = north_m_s
 
     def command(self) -> Sequence[str]:
         """What is typed."""
-        return "fleet", "velocity", "all", f"{self._north_m_s:g}", "0", "--seconds", "120"
+        return "fleet", "velocity", "all", f"{self._north_m_s}", "0", "--seconds", "120"
 
 
 def _scenario(flight: Flight, folder: Path) -> ScenarioConfig:
@@ -196,7 +195,8 @@ def _line(row: Row) -> str:
     closest = "-" if row.closest_m is None else f"{row.closest_m:.2f} m"
     return (
         f"{row.flight:15}{row.speed_factor:>5g}{row.off_m_s:>9.3f}{row.truly_off_m_s:>9.3f}{row.order:>9.4f}{closest:>9}"
-        f"{row.longest_step_s:>7.2f} s  {'kept' if row.kept else 'NOT KEPT':9} {row.modes}{'; ' * bool(row.ended)}{row.ended}"
+        f"{row.longest_step_s:>7.2f} s  {'kept' if row.kept else 'NOT KEPT':9} "
+        f"{'; '.join(filter(None, (row.modes, row.ended)))}"
     )
 
 
@@ -211,7 +211,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, help="keep logs in this folder")
     return run_trials(
         parser, FLIGHTS, _fly_all, line=_line, rows="flights", arguments=arguments,
-        header=f"{'flight':15}{'speed':>5}{'off m/s':>9}{'truly':>9}{'order':>9}{'closest':>9}{'longest':>9}  {'':9} modes",
+        header=f"{'flight':15}{'speed':>5}{'off m/s':>9}{'truly':>9}{'order':>9}{'closest':>9}{'longest':>9}{'':11}modes",
     )  # fmt: skip
 
 

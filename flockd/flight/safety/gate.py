@@ -246,8 +246,8 @@ class Gate:
     ) -> FloatArray:
         """The velocity, (2,) m/s, without what leads too fast anywhere.
 
-        A drone that is measured to be faster than a limit has to brake: the limit counts as lower by as much. This feeds
-        the velocity back with a gain of one, which no lag and no dead time make unstable.
+        A drone that is measured to be faster than a limit has to brake: the limit counts as lower by as much. That
+        feeds the velocity back with a gain of one, which no lag and no dead time make unstable.
         """
         limits = self._space(action, around)
         directions = np.concatenate([towards for towards, _ in limits.values()])

@@ -150,7 +150,7 @@ class Service:
 
     def is_asked_to_reload(self) -> Iterator[Finding]:
         """In flight: by systemctl, which refuses, and by SIGHUP. After TimeoutStopSec systemd would kill it."""
-        self._wait_for_flight()
+        until(lambda: self.autopilot.mode == "OFFBOARD", "the flight")
         flies = _shown("MainPID")
         asked = subprocess.run(["systemctl", "reload", UNIT], capture_output=True, text=True, check=False)
         os.kill(int(flies), signal.SIGHUP)
