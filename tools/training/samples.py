@@ -65,7 +65,6 @@ def neighbours_sample(
         "depth": np.ascontiguousarray(depth)[None],
         "drone": (ids > 0).astype(np.float32)[None],
         "offset": np.ascontiguousarray(offset),
-        "metric": np.array(1.0, np.float32),
     }
 
 

@@ -32,7 +32,6 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from tools.training.dataset import open_pairs
 from tools.training.from_onnx import begin_with_onnx
-from tools.training.moving_cameras import MovingCameras
 from tools.training.samples import Sample
 from tools.training.tasks import Batch, DistanceTask, FlowTask, NeighboursTask, SigmaTask, Task
 
@@ -50,7 +49,7 @@ def _task(arguments: argparse.Namespace) -> Task:
     if arguments.network == "flow":
         return FlowTask(pairs)
     if arguments.network == "neighbours":
-        return NeighboursTask(pairs, MovingCameras(arguments.moving) if arguments.moving else None)
+        return NeighboursTask(pairs)
     if arguments.negatives is None or arguments.crops is None:
         raise SystemExit("the distance network needs --crops and --negatives")
     return DistanceTask(pairs, arguments.negatives, arguments.crops)
@@ -65,7 +64,6 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60.0, help="of training in all, over every resumption")
     parser.add_argument("--negatives", type=Path, help="what is no drone, for `distance`: file of mine_negatives.py")
     parser.add_argument("--crops", type=Path, help="drones, for `distance`: folder of render_drone_crops.py")
-    parser.add_argument("--moving", type=Path, help="real depth, for `neighbours`: folder of moving_cameras.py")
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
     parser.add_argument("--times", type=int, default=1, help="so many times as large batches, beside a GPU")
     parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt, or an .onnx")

@@ -116,7 +116,7 @@ def test_depth_mask_and_offsets_are_drawn_towards_the_truth() -> None:
     drone = torch.zeros(shape)
     drone[1, :, :, 4:] = 1.0
     batch = {"image": torch.zeros(0), "geometry": torch.zeros(0), "depth": torch.full(shape, 5.0), "drone": drone}
-    loss, _ = task.loss(batch | {"offset": torch.full((2, 2, 8, 8), 3.0), "metric": torch.ones(2)})
+    loss, _ = task.loss(batch | {"offset": torch.full((2, 2, 8, 8), 3.0)})
     loss.backward()
     assert depth.grad is not None
     assert logit.grad is not None
@@ -127,24 +127,3 @@ def test_depth_mask_and_offsets_are_drawn_towards_the_truth() -> None:
     beside = (drone == 0).expand_as(offset)
     assert (offset.grad[~beside] < 0).all()
     assert (offset.grad[beside] == 0).all(), "only a drone's pixels point to its centre"
-
-
-def test_depth_of_a_real_scene_counts_where_it_is_known_and_up_to_a_scale() -> None:
-    """Without a scale, ten times what geometry says is right; a pixel that is off by more than the rest is not."""
-    shape = (1, 1, 8, 8)
-    true = torch.rand(shape, generator=torch.Generator().manual_seed(0)) + 1.0
-    depth = 10.0 * true
-    depth[0, 0, 2, 3] *= 2.0
-    depth = depth.requires_grad_()
-    true[0, 0, 6, :] = torch.nan
-    task = NeighboursTask(PairSet({}, 0))
-    answer = depth, torch.zeros(shape), torch.zeros((1, 2, 8, 8))
-    task.net = lambda image, geometry: answer
-    batch = {"image": torch.zeros(0), "geometry": torch.zeros(0), "depth": true, "drone": torch.zeros(shape)}
-    loss, figures = task.loss(batch | {"offset": torch.zeros((1, 2, 8, 8)), "metric": torch.zeros(1)})
-    loss.backward()
-    assert depth.grad is not None
-    assert depth.grad[0, 0, 2, 3] > 0
-    assert (depth.grad[0, 0, 6] == 0).all(), "nobody knows it"
-    assert figures["real"] == pytest.approx(0.0, abs=1e-5)
-    assert np.isnan(figures["depth"]), "metres are not known"
