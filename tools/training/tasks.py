@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +13,10 @@ from torch.nn import functional as F
 
 from tools.training.augment import photometric
 from tools.training.crop_files import CropFiles
-from tools.training.dataset import PairSet
+from tools.training.dataset import open_pairs
 from tools.training.networks import MAX_DEPTH_M, MAX_FAMILIES, DistanceNet, FlowNet, NeighboursNet
 from tools.training.samples import Sample, flow_sample, neighbours_sample, no_drone_sample
+from tools.training.weights import begin_with
 
 Batch = dict[str, Tensor]
 WINDOW_PX = 256
@@ -26,6 +29,10 @@ class Task:
 
     def __init__(self, net: nn.Module, batch: int, rate: float) -> None:
         self.net, self.batch, self.rate = net, batch, rate
+
+    def go_on_from(self, weights: Mapping[str, Tensor]) -> None:
+        """Begin with the weights of another run."""
+        begin_with(self.net, weights)
 
     def begin(self) -> None:
         """From now on the network learns."""
@@ -47,9 +54,9 @@ class Task:
 class NeighboursTask(Task):
     """Depth, mask and centre offsets of one image."""
 
-    def __init__(self, pairs: PairSet) -> None:
+    def __init__(self, data: Path) -> None:
         super().__init__(NeighboursNet(), 12, 1.2e-3)
-        self.pairs, self.drawn = pairs, 0
+        self.pairs, self.drawn = open_pairs(data / "worlds"), 0
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """See ``Task``. Every fourth batch holds whole images, the others three times as many windows around drones."""
@@ -103,11 +110,18 @@ class DistanceTask(Task):
     """A network that saw more places: what it is sure is no drone, this one is to be as sure of (learning without
     forgetting, Li and Hoiem 2016)."""
 
-    def __init__(self, pairs: PairSet, negatives: Path, pictures: Path) -> None:
+    def __init__(self, data: Path) -> None:
         super().__init__(DistanceNet(), 64, 2e-3)
-        self.pairs, self.negatives = pairs, np.load(negatives)
-        self.drones = CropFiles(pictures)
-        self.no_drones: list[Sample] = []
+        self.pairs, self.drones = open_pairs(data / "worlds"), CropFiles(data / "crops")
+        negatives = data / "worlds" / "negatives.npy"
+        if not negatives.is_file():
+            raise FileNotFoundError(f"{negatives}: is missing; make it with `python -m tools.training.mine`")
+        self.negatives, self.no_drones = np.load(negatives), list[Sample]()
+
+    def go_on_from(self, weights: Mapping[str, Tensor]) -> None:
+        """See ``Task``. What they are sure of is not forgotten."""
+        super().go_on_from(weights)
+        self.teacher = copy.deepcopy(self.net).eval()
 
     def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
         """See ``Task``."""
@@ -180,9 +194,9 @@ class SigmaTask(Task):
     known_share = 0.8
     """What the families that the network learnt count in the loss; as many of the drawn drones are shapes."""
 
-    def __init__(self, pictures: Path) -> None:
+    def __init__(self, data: Path) -> None:
         super().__init__(DistanceNet(), 64, 1e-3)
-        self.drones = CropFiles(pictures)
+        self.drones = CropFiles(data / "crops")
         for name, weights in self.net.named_parameters():
             weights.requires_grad = name.startswith("doubt.")
 
@@ -276,9 +290,9 @@ def _motor_maps(motors: Tensor, sigma: float = 1.5) -> Tensor:
 class FlowTask(Task):
     """Where each pixel went."""
 
-    def __init__(self, pairs: PairSet) -> None:
+    def __init__(self, data: Path) -> None:
         super().__init__(FlowNet(), 16, 6e-4)
-        self.pairs = pairs
+        self.pairs = open_pairs(data / "worlds")
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """See ``Task``."""

@@ -1,11 +1,12 @@
-"""Train one network on rendered pairs; resumes from its last checkpoint.
+"""Train one network; resumes from its last checkpoint.
 
     python -m tools.training.train neighbours --data DATA --out RUNS/neighbours --minutes 40
-    python -m tools.training.train distance   --data DATA --out RUNS/distance --minutes 90 --crops P --negatives N.npy
-    python -m tools.training.train flow       --data DATA --out RUNS/flow --minutes 40
-    python -m tools.training.train sigma      --crops P --out RUNS/sigma --start RUNS/distance/checkpoint.pt
+    python -m tools.training.train sigma --data DATA --out RUNS/sigma --start RUNS/distance/checkpoint.pt
 
-`sigma` is the last part of `distance`: how far it may misjudge a drone's size, also of one that it has not seen.
+All draw from one folder: DATA/worlds of tools.training.render_training_data, DATA/crops of render_drone_crops,
+DATA/cutouts of render_cutouts, DATA/photographs without drones and DATA/labelled/* with real ones (see
+docs/networks.md), and what tools.training.mine found in them. `sigma` is the last part of `distance`: how far it may
+misjudge a drone's size, also of one that it has not seen.
 
 Writes OUT/checkpoint.pt, OUT/curve.csv and a picture of it every few minutes. Uses a GPU where there is one.
 With --start it goes on from another run's weights, or from a network of models/, and keeps them as OUT/start.pt.
@@ -15,10 +16,8 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
-import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -30,72 +29,53 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
-from tools.training.dataset import open_pairs
-from tools.training.from_onnx import begin_with_onnx
+from tools.training.picture_tasks import DetectorTask, VerificationTask
 from tools.training.samples import Sample
 from tools.training.tasks import Batch, DistanceTask, FlowTask, NeighboursTask, SigmaTask, Task
+from tools.training.weights import begin_with_onnx
 
-NETWORKS = ("neighbours", "distance", "sigma", "flow")
-
-
-def _task(arguments: argparse.Namespace) -> Task:
-    if arguments.network == "sigma":
-        if arguments.crops is None or arguments.start is None:
-            raise SystemExit("sigma needs --crops, and the distance network that it belongs to with --start")
-        return SigmaTask(arguments.crops)
-    if arguments.data is None:
-        raise SystemExit(f"{arguments.network} needs --data")
-    pairs = open_pairs(arguments.data)
-    if arguments.network == "flow":
-        return FlowTask(pairs)
-    if arguments.network == "neighbours":
-        return NeighboursTask(pairs)
-    if arguments.negatives is None or arguments.crops is None:
-        raise SystemExit("the distance network needs --crops and --negatives")
-    return DistanceTask(pairs, arguments.negatives, arguments.crops)
+TASKS: dict[str, Callable[[Path], Task]] = {
+    "neighbours": NeighboursTask, "distance": DistanceTask, "sigma": SigmaTask, "flow": FlowTask,
+    "verification": VerificationTask, "detector": DetectorTask,
+}  # fmt: skip
 
 
 def main() -> None:
     """Train until the minutes are over."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("network", choices=NETWORKS)
-    parser.add_argument("--data", type=Path, help="folder of render_training_data.py")
+    parser.add_argument("network", choices=TASKS)
+    parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--minutes", type=float, default=60.0, help="of training in all, over every resumption")
-    parser.add_argument("--negatives", type=Path, help="what is no drone, for `distance`: file of mine_negatives.py")
-    parser.add_argument("--crops", type=Path, help="drones, for `distance`: folder of render_drone_crops.py")
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
     parser.add_argument("--times", type=int, default=1, help="so many times as large batches, beside a GPU")
     parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt, or an .onnx")
-    parser.add_argument("--compile", action="store_true", help="`distance` a fifth faster; needs a C++ compiler")
-    add_machine(parser)
+    parser.add_argument("--threads", type=int, default=2, help="that learn, where there is no GPU")
+    parser.add_argument("--workers", type=int, default=0, help="processes that draw samples; 0: a thread")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    compiler = os.environ.get("CXX", "g++")
-    if arguments.compile and shutil.which(compiler) is None:
-        raise SystemExit(f"--compile needs a C++ compiler, and there is no {compiler} here; leave --compile out")
+    if arguments.network == "sigma" and arguments.start is None:
+        parser.error("sigma needs the distance network that it belongs to, with --start")
     torch.manual_seed(arguments.seed)
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(1)
-    task = _task(arguments)
+    try:
+        task = TASKS[arguments.network](arguments.data)
+    except (FileNotFoundError, ValueError) as error:
+        raise SystemExit(f"--data: {error}") from None
     task.rate = arguments.rate or task.rate
     task.batch *= arguments.times
     arguments.out.mkdir(parents=True, exist_ok=True)
-    if arguments.start and not (arguments.out / "checkpoint.pt").is_file():
+    begun_with = arguments.out / "start.pt"
+    if arguments.start and not begun_with.is_file():
         try:
             start(task, arguments.start, arguments.seed)
         except ValueError as error:
             raise SystemExit(f"--start: {error}") from None
-        torch.save({"net": task.net.state_dict()}, arguments.out / "start.pt")
-    if arguments.compile:
-        task.net.compile(dynamic=False)
+        torch.save({"net": task.net.state_dict()}, begun_with)
+    elif begun_with.is_file():
+        task.go_on_from(torch.load(begun_with, map_location="cpu")["net"])
     train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed, arguments.workers)
-
-
-def add_machine(parser: argparse.ArgumentParser) -> None:
-    """What of this machine a training may use."""
-    parser.add_argument("--threads", type=int, default=2, help="that learn, where there is no GPU")
-    parser.add_argument("--workers", type=int, default=0, help="processes that draw samples, beside a GPU; 0: a thread")
 
 
 def start(task: Task, weights: Path, seed: int) -> None:
@@ -103,21 +83,12 @@ def start(task: Task, weights: Path, seed: int) -> None:
 
     Raises ValueError where an ONNX file is of another network.
     """
-    if weights.suffix != ".onnx":
-        begin_with(task.net, torch.load(weights, map_location="cpu")["net"])
-        return
-    batch = _stack(task.batch_samples(np.random.default_rng(seed)))
-    begin_with_onnx(task.net, weights, lambda: task.loss(batch))
-
-
-def begin_with(net: nn.Module, weights: dict[str, Tensor]) -> None:
-    """Take over what fits; of a layer that has grown, the part that was there."""
-    own = net.state_dict()
-    for name, value in weights.items():
-        if name in own and own[name].dim() == value.dim():
-            part = tuple(slice(0, min(a, b)) for a, b in zip(own[name].shape, value.shape, strict=True))
-            own[name][part] = value[part]
-    net.load_state_dict(own)
+    if weights.suffix == ".onnx":
+        batch = _stack(task.batch_samples(np.random.default_rng(seed)))
+        begin_with_onnx(task.net, weights, lambda: task.loss(batch))
+        task.go_on_from(task.net.state_dict())
+    else:
+        task.go_on_from(torch.load(weights, map_location="cpu")["net"])
 
 
 def train(task: Task, out: Path, budget_s: float, seed: int, workers: int = 0) -> None:

@@ -35,7 +35,7 @@ def test_a_network_is_trained_resumed_and_exported_by_one_command_each(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data, runs, models = tmp_path / "data", tmp_path / "runs", tmp_path / "models"
-    run("render_training_data", data, "--worlds", "1", "--pairs", "2", "--processes", "1")
+    run("render_training_data", data / "worlds", "--worlds", "1", "--pairs", "2", "--processes", "1")
     training = ("flow", "--data", data, "--out", runs, "--threads", "1")
     run("train", *training, "--minutes", "0.05")
     first = (runs / "curve.csv").read_text(encoding="utf-8").splitlines()
@@ -47,7 +47,7 @@ def test_a_network_is_trained_resumed_and_exported_by_one_command_each(
     assert cv2.imread(str(runs / "curve.png")) is not None
 
     run("export", "flow", "--checkpoint", runs / "checkpoint.pt", "--out", models)
-    run("quantise", models / "flow.yaml", "--data", data, "--out", models)
+    run("quantise", models / "flow.yaml", "--data", data / "worlds", "--out", models)
 
     further = tmp_path / "further"
     run("train", "flow", "--data", data, "--out", further, "--minutes", "0.03", "--start", models / "flow.onnx")
