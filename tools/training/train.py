@@ -18,7 +18,6 @@ import argparse
 import math
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -51,7 +50,7 @@ def main() -> None:
     parser.add_argument("--times", type=int, default=1, help="so many times as large batches, beside a GPU")
     parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt, or an .onnx")
     parser.add_argument("--threads", type=int, default=2, help="that learn, where there is no GPU")
-    parser.add_argument("--workers", type=int, default=0, help="processes that draw samples; 0: a thread")
+    parser.add_argument("--workers", type=int, default=1, help="processes that draw samples")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     if arguments.network == "sigma" and arguments.start is None:
@@ -91,7 +90,7 @@ def start(task: Task, weights: Path, seed: int) -> None:
         task.go_on_from(torch.load(weights, map_location="cpu")["net"])
 
 
-def train(task: Task, out: Path, budget_s: float, seed: int, workers: int = 0) -> None:
+def train(task: Task, out: Path, budget_s: float, seed: int, workers: int) -> None:
     """One cosine-shaped run of ``budget_s`` seconds of training; so many ``workers`` (processes) draw the samples.
 
     What is kept is the mean of the weights over about the last thousand steps: each step's own errs to all sides.
@@ -110,7 +109,6 @@ def train(task: Task, out: Path, budget_s: float, seed: int, workers: int = 0) -
         mean.n_averaged.fill_(state["step"])
         optimiser.load_state_dict(state["optimiser"])
         spent, step = state["spent"], state["step"]
-    in_16_bits = is_faster_in_16_bits(device)
     task.begin()
     last_save = last_print = spent
     recent: list[dict[str, float]] = []
@@ -122,7 +120,7 @@ def train(task: Task, out: Path, budget_s: float, seed: int, workers: int = 0) -
         for group in optimiser.param_groups:
             group["lr"] = rate
         batch = {name: values.to(device) for name, values in next(upcoming).items()}
-        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=in_16_bits):
+        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=device.type == "cuda"):
             loss, figures = task.loss(batch)
         if torch.isfinite(loss):
             optimiser.zero_grad(set_to_none=True)
@@ -149,23 +147,6 @@ def train(task: Task, out: Path, budget_s: float, seed: int, workers: int = 0) -
             last_save = spent
 
 
-def is_faster_in_16_bits(device: torch.device) -> bool:
-    """Whether training with bfloat16 pays. Measured: a processor without instructions for it takes eightfold."""
-    layer = nn.Conv2d(32, 32, 3, padding=1).to(device).to(memory_format=torch.channels_last)
-    pictures = torch.randn(8, 32, 64, 64, device=device).to(memory_format=torch.channels_last)
-
-    def took_s(in_16_bits: bool) -> float:
-        begin = time.monotonic()
-        for _ in range(3):
-            with torch.autocast(device.type, dtype=torch.bfloat16, enabled=in_16_bits):
-                answer = layer(pictures)
-            float(answer.detach().sum())
-        return time.monotonic() - begin
-
-    tries = [(took_s(in_16_bits=True), took_s(in_16_bits=False)) for _ in range(3)]
-    return min(first for first, _ in tries) < min(second for _, second in tries)
-
-
 def _recent_mean(mean: Tensor, new: Tensor, count: Tensor) -> Tensor:
     """Running mean of floating-point weights; counters are taken as they are."""
     if not mean.is_floating_point():
@@ -175,23 +156,10 @@ def _recent_mean(mean: Tensor, new: Tensor, count: Tensor) -> Tensor:
 
 
 def batches(task: Task, seed: list[int], workers: int) -> Iterator[Batch]:
-    """Without end; the next ones are made while the last one is learnt from."""
-    if workers:
-        loader = DataLoader(
-            _Batches(task, seed),
-            batch_size=None,
-            num_workers=workers,
-            prefetch_factor=3,
-            multiprocessing_context="fork",
-        )
-        yield from loader
-        return
-    upcoming_of = iter(_Batches(task, seed))
-    with ThreadPoolExecutor(1) as loading:
-        upcoming = loading.submit(next, upcoming_of)
-        while True:
-            batch, upcoming = upcoming.result(), loading.submit(next, upcoming_of)
-            yield batch
+    """Without end; ``workers`` processes make the next ones while the last one is learnt from."""
+    yield from DataLoader(
+        _Batches(task, seed), batch_size=None, num_workers=workers, prefetch_factor=3, multiprocessing_context="fork"
+    )
 
 
 class _Batches(IterableDataset[Batch]):
@@ -203,7 +171,7 @@ class _Batches(IterableDataset[Batch]):
     def __iter__(self) -> Iterator[Batch]:
         """Without end."""
         worker = get_worker_info()
-        rng = np.random.Generator(np.random.PCG64([*self._seed, worker.id] if worker else self._seed))
+        rng = np.random.Generator(np.random.PCG64([*self._seed, worker.id if worker else 0]))
         while True:
             yield _stack(self._task.batch_samples(rng))
 
