@@ -7,6 +7,7 @@ import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -72,7 +73,8 @@ def test_a_network_is_trained_resumed_and_exported_by_one_command_each(
 def test_a_drone_of_a_mesh_flies_alone_and_a_network_is_measured_on_it(tmp_path: Path) -> None:
     bars = [trimesh.creation.box(size) for size in ((0.6, 0.08, 0.05), (0.08, 0.6, 0.05))]
     mesh = tmp_path / "drone.stl"
-    trimesh.util.concatenate(bars).export(mesh)
+    whole: Any = trimesh.util.concatenate(bars)
+    whole.export(mesh)
     said = run(
         "render_drone_crops", tmp_path / "crops", "--mesh", mesh, "--size-m", "0.62", "--worlds", "1",
         "--scenes", "40", "--held-out", "--processes", "1",
