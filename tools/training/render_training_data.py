@@ -13,10 +13,7 @@ row's time.
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import os
-import time
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -78,9 +75,8 @@ def main() -> None:
         )
         for i in wanted
     ]
-    begin = time.monotonic()
-    for done, total in render_pairs(jobs, arguments.processes):
-        print(f"{done}/{total} worlds, {time.monotonic() - begin:.0f} s", flush=True)
+    missing = [job for job in jobs if not (job.folder / "made.json").is_file()]
+    worlds.in_processes(render_world, missing, arguments.processes)
 
 
 @dataclass(frozen=True)
@@ -102,16 +98,8 @@ class PairJob:
     """How likely that camera sends H.264, which needs the library openh264."""
 
 
-def render_pairs(jobs: Sequence[PairJob], processes: int | None) -> Iterator[tuple[int, int]]:
-    """Write each job's part that is not there yet; yields how many of how many are done."""
-    missing = [job for job in jobs if not (job.folder / "made.json").is_file()]
-    os.environ["NUMBA_NUM_THREADS"] = "1"
-    with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        for done, _ in enumerate(pool.imap_unordered(_render_world, missing), start=1):
-            yield done, len(missing)
-
-
-def _render_world(job: PairJob) -> None:
+def render_world(job: PairJob) -> None:
+    """One part."""
     from flockd.sim.camera_simulator import FIELD_GRID_M, field_grid  # noqa: PLC0415 - numba starts in the worker
     from flockd.sim.renderer import Renderer  # noqa: PLC0415
     from flockd.sim.world import World  # noqa: PLC0415

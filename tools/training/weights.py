@@ -15,8 +15,22 @@ import torch
 from onnx import TensorProto, numpy_helper
 from torch import Tensor, nn
 
-from tools.training.halve import HALVED
 from tools.training.networks import first_layers_of
+
+BOXES = "detector."
+"""What `detector.network.Boxes`, which is exported, calls the network that is trained."""
+HALVED = "_16"
+"""Ends the names of weights that are stored in 16 bits."""
+
+
+def begin_with(net: nn.Module, weights: Mapping[str, Tensor]) -> None:
+    """Take over what fits; of a layer that has grown, the part that was there."""
+    own = net.state_dict()
+    for name, value in weights.items():
+        if name in own and own[name].dim() == value.dim():
+            part = tuple(slice(0, min(a, b)) for a, b in zip(own[name].shape, value.shape, strict=True))
+            own[name][part] = value[part]
+    net.load_state_dict(own)
 
 
 def begin_with_onnx(net: nn.Module, path: Path, run: Callable[[], object]) -> None:
@@ -29,7 +43,7 @@ def begin_with_onnx(net: nn.Module, path: Path, run: Callable[[], object]) -> No
     norms = {name: module for name, module in net.named_modules() if isinstance(module, nn.BatchNorm2d)}
     weights = _weights(path, net)
     for name, value in weights.items():
-        if name not in own and not (name.endswith(".0.bias") and _norm_after(name) in norms):
+        if name not in own and not (name.endswith(".bias") and _norm_after(name) in norms):
             raise ValueError(f"{path}: its {name} is not {type(net).__name__}'s")
         if name in own and own[name].shape != value.shape:
             raise ValueError(f"{path}: its {name} is {list(value.shape)}, not {list(own[name].shape)}")
@@ -39,10 +53,10 @@ def begin_with_onnx(net: nn.Module, path: Path, run: Callable[[], object]) -> No
     biases = {_norm_after(name): value for name, value in weights.items() if name not in own}
     if missing := norms.keys() - biases.keys():
         raise ValueError(f"{path}: nothing for {sorted(missing)[0]}; it is not {type(net).__name__}'s")
-    settle_norms(net, {norm: biases[name] for name, norm in norms.items()}, run)
+    _settle_norms(net, {norm: biases[name] for name, norm in norms.items()}, run)
 
 
-def settle_norms(net: nn.Module, biases: Mapping[nn.BatchNorm2d, Tensor], run: Callable[[], object]) -> None:
+def _settle_norms(net: nn.Module, biases: Mapping[nn.BatchNorm2d, Tensor], run: Callable[[], object]) -> None:
     """Each normalisation adds its bias and does nothing else to what it sees while ``run`` calls ``net``."""
     hooks = [norm.register_forward_pre_hook(_settled_to(bias)) for norm, bias in biases.items()]
     momenta = [norm.momentum for norm in biases]
@@ -74,7 +88,7 @@ def _weights(path: Path, net: nn.Module) -> dict[str, Tensor]:
     """Every parameter of the file, under its name in torch; a folded normalisation is its convolution's bias."""
     graph = onnx.load(str(path)).graph
     values = {
-        one.name.removesuffix(HALVED): torch.tensor(numpy_helper.to_array(one).astype(np.float32))
+        one.name.removesuffix(HALVED).removeprefix(BOXES): torch.tensor(numpy_helper.to_array(one).astype(np.float32))
         for one in graph.initializer
         if one.data_type in (TensorProto.FLOAT, TensorProto.FLOAT16)
     }
@@ -85,7 +99,10 @@ def _weights(path: Path, net: nn.Module) -> dict[str, Tensor]:
         if node.op_type != "Conv" or not folded:
             continue
         if layer := _module(node.name):
-            named |= {f"{layer}.{part}": value for part, value in zip(("weight", "bias"), folded, strict=True)}
+            named |= {
+                f"{layer.removeprefix(BOXES)}.{part}": value
+                for part, value in zip(("weight", "bias"), folded, strict=True)
+            }
         else:
             nameless.append((folded[0], folded[1]))
     try:
@@ -105,4 +122,6 @@ def _module(node: str) -> str:
 
 
 def _norm_after(bias: str) -> str:
-    return bias.removesuffix("0.bias") + "1"
+    """A unit's parts are numbered, or of the detector named."""
+    layer = bias.removesuffix(".bias")
+    return layer.removesuffix("conv") + "norm" if layer.endswith(".conv") else layer.removesuffix("0") + "1"

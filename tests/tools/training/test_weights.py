@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from torch import nn
 
 from flockd.core.data import data_path
-from tools.training.from_onnx import begin_with_onnx
+from tools.training.detector.network import Boxes, DroneDetector
 from tools.training.networks import DistanceNet, FlowNet, NeighboursNet, VerificationNet
+from tools.training.weights import begin_with_onnx
 
 MODELS = data_path("models")
 Feeds = dict[str, NDArray[Any]]
@@ -57,6 +58,18 @@ def test_a_shipped_network_says_the_same_in_torch_as_its_file_does(name: str) ->
     theirs = ort.InferenceSession(str(MODELS / f"{name}.onnx")).run(None, feeds)
     for our, their in zip(ours if isinstance(ours, tuple) else (ours,), theirs, strict=True):
         assert np.abs(our.numpy() - their).max() < 1e-3 * np.abs(their).max()
+
+
+def test_a_detector_goes_on_from_the_shipped_one() -> None:
+    image, net = picture_of_nothing(1, 64, 64, 3), Boxes()
+    given = torch.from_numpy(image)
+    begin_with_onnx(net.detector, MODELS / "detector.onnx", lambda: net(given))
+    with torch.no_grad():
+        ours = net.eval()(given).numpy()
+    (theirs,) = ort.InferenceSession(str(MODELS / "detector.onnx")).run(None, {"image": image})
+    assert np.abs(ours - theirs).max() < 1e-3 * np.abs(theirs).max()
+    with pytest.raises(ValueError, match=r"flow\.onnx: its .* is not DroneDetector's"):
+        begin_with_onnx(DroneDetector(), MODELS / "flow.onnx", lambda: None)
 
 
 def test_it_says_so_in_training_too_of_what_its_normalisations_were_settled_on() -> None:

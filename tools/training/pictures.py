@@ -1,10 +1,11 @@
-"""Training pictures of the detector: rendered drones before real photographs, real drones, worlds, and what is none."""
+"""The pictures that training draws from: rendered drones before photographs, real drones, worlds, and what is none."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,10 +22,13 @@ from tools.training.detector.network import CLASSES, NOT_JUDGED
 
 Image = NDArray[np.uint8]
 Boxes = NDArray[np.float32]
+Named = tuple[str, float, float, float, float]
+"""What something is, and left, top, right, bottom in pixels."""
+PROPOSALS = "proposals.jsonl"
 MOST_BOXES = 10
 LEAST_WIDTH_PX = 5.0
 """Of what is learnt as a drone; what is smaller is not judged."""
-_LEAST_SEEN = 0.35
+LEAST_SEEN = 0.35
 """Share of a drone's pixels that has to be seen for it to be learnt."""
 _SOLID = 64
 """Least alpha of a pixel that belongs to a drone's box: the discs of propellers are fainter."""
@@ -46,18 +50,12 @@ class Scene:
 
 
 class Cutouts:
-    """Rendered drones with transparent surroundings (tools.training.render_cutouts); more may come while it is used."""
+    """Rendered drones with transparent surroundings (tools.training.render_cutouts)."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._names: list[str] = []
+        self._names = [json.loads(line)["file"] for line in (folder / "index.jsonl").read_text().splitlines()]
         self._kept: dict[str, Image] = {}
-        self.look_for_more()
-
-    def look_for_more(self) -> None:
-        """Those that were rendered since."""
-        with (self._folder / "index.jsonl").open(encoding="utf-8") as index:
-            self._names = [json.loads(line)["file"] for line in index if line.endswith("\n")]
 
     def draw(self, rng: Generator) -> Image:
         """(h, w, 4) RGBA, alpha straight, cut to its solid pixels."""
@@ -72,43 +70,89 @@ class Cutouts:
         return self._kept[name]
 
 
-class Photographs:
-    """Pictures of everything without drones, of each kind equally often as the root of its number says.
+def pictures_in(folder: Path) -> list[tuple[str, str, list[Named]]]:
+    """File, category and boxes of each picture of a folder: with ``labels.json`` in COCO's format, or else with
+    ``index.jsonl``, a line a picture: ``file``, ``category``, and ``boxes`` of what flies in it."""
+    if not (folder / "labels.json").is_file():
+        lines = [json.loads(line) for line in (folder / "index.jsonl").read_text(encoding="utf-8").splitlines()]
+        return [(one["file"], one["category"], [tuple(box) for box in one.get("boxes", ())]) for one in lines]
+    coco = json.loads((folder / "labels.json").read_text(encoding="utf-8"))
+    names = {one["id"]: one["name"] for one in coco["categories"]}
+    boxes: dict[int, list[Named]] = defaultdict(list)
+    for one in coco["annotations"]:
+        left, top, width, height = one["bbox"]
+        boxes[one["image_id"]].append((names[one["category_id"]], left, top, left + width, top + height))
+    return [(one["file_name"], folder.name, boxes[one["id"]]) for one in coco["images"]]
 
-    ``index.jsonl`` says of each its ``file`` and ``category``, and its ``boxes`` of what flies: name, left, top, right,
-    bottom.
-    """
+
+class Photographs:
+    """Pictures of everything without drones, of each category as often as the root of its number says."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         by_category = defaultdict(list)
-        with (folder / "index.jsonl").open(encoding="utf-8") as index:
-            for line in index:
-                one = json.loads(line)
-                by_category[one["category"]].append((one["file"], one.get("boxes", ())))
+        for name, category, boxes in pictures_in(folder):
+            by_category[category].append((name, boxes))
         self._by_category = list(by_category.values())
         roots = np.sqrt([len(ones) for ones in self._by_category])
         self._shares = roots / roots.sum()
 
-    def draw(self, size: int, rng: Generator) -> Scene:
-        """A part of one, ``size`` pixels wide and high."""
+    def draw_whole(self, rng: Generator) -> tuple[Image, list[Named]]:
+        """Any of them, and what flies in it."""
         ones = self._by_category[int(rng.choice(len(self._shares), p=self._shares))]
         name, boxes = ones[int(rng.integers(len(ones)))]
-        return part_of(_read(self._folder / name), boxes, size, _SCALES, rng)
+        return read(self._folder / name), boxes
+
+    def draw(self, size: int, rng: Generator) -> Scene:
+        """A part of one, ``size`` pixels wide and high."""
+        return part_of(*self.draw_whole(rng), size, _SCALES, rng)
+
+
+class Proposals:
+    """What `tools.training.mine` found in folders of pictures, of each category as often as the root of its number."""
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        by_category: dict[str, list[tuple[Path, tuple[float, ...]]]] = defaultdict(list)
+        for folder in folders:
+            if not (folder / PROPOSALS).is_file():
+                raise FileNotFoundError(f"{folder}: has no {PROPOSALS}; make it with `python -m tools.training.mine`")
+            for line in (folder / PROPOSALS).read_text(encoding="utf-8").splitlines():
+                one = json.loads(line)
+                by_category[one["category"]] += [(folder / one["file"], tuple(box)) for box in one["boxes"]]
+        self._by_category = [ones for ones in by_category.values() if ones]
+        if not self._by_category:
+            raise ValueError(f"{', '.join(map(str, folders))}: nothing was proposed in these pictures")
+        roots = np.sqrt([len(ones) for ones in self._by_category])
+        self._shares = roots / roots.sum()
+
+    def draw_place(self, rng: Generator) -> tuple[int, int]:
+        """Category and row of one."""
+        category = int(rng.choice(len(self._shares), p=self._shares))
+        return category, int(rng.integers(len(self._by_category[category])))
+
+    def at(self, place: tuple[int, int]) -> tuple[Image, tuple[float, ...]]:
+        """Its picture, and its box there."""
+        path, box = self._by_category[place[0]][place[1]]
+        return read(path), box
 
 
 class Labelled:
-    """Real pictures with boxes: a folder with ``labels.json`` in COCO's format; those without a box are left out."""
+    """Real pictures with boxes (`pictures_in`); those without a box are left out."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        coco = json.loads((folder / "labels.json").read_text(encoding="utf-8"))
-        names = {one["id"]: one["name"] for one in coco["categories"]}
-        boxes = defaultdict(list)
-        for one in coco["annotations"]:
-            left, top, width, height = one["bbox"]
-            boxes[one["image_id"]].append((names[one["category_id"]], left, top, left + width, top + height))
-        self._pictures = [(one["file_name"], boxes[one["id"]]) for one in coco["images"] if boxes[one["id"]]]
+        self._pictures = [(name, boxes) for name, _, boxes in pictures_in(folder) if boxes]
+        self._drones = [(name, box) for name, boxes in self._pictures for kind, *box in boxes if kind == CLASSES[0]]
+
+    @property
+    def drones(self) -> int:
+        """How many there are."""
+        return len(self._drones)
+
+    def draw_drone(self, rng: Generator) -> tuple[Image, tuple[float, ...]]:
+        """A picture, and the box of a drone in it."""
+        name, box = self._drones[int(rng.integers(len(self._drones)))]
+        return read(self._folder / name), tuple(box)
 
     def draw(self, size: int, rng: Generator) -> Scene:
         """A part around one of the boxes."""
@@ -116,7 +160,7 @@ class Labelled:
         _, left, top, right, bottom = boxes[int(rng.integers(len(boxes)))]
         least = min(max(0.5, (LEAST_WIDTH_PX + 1) / max(right - left, 1.0)), 1.0)
         aim = ((left + right) / 2, (top + bottom) / 2)
-        return part_of(_read(self._folder / name), boxes, size, (least, 2.0), rng, aim)
+        return part_of(read(self._folder / name), boxes, size, (least, 2.0), rng, aim)
 
 
 class Worlds:
@@ -170,7 +214,7 @@ def part_of(
         if (inside[2:] - inside[:2]).min() < 2:
             continue
         share = np.prod(inside[2:] - inside[:2]) / np.prod(whole[2:] - whole[:2])
-        good = name in CLASSES and share > _LEAST_SEEN and inside[2] - inside[0] >= LEAST_WIDTH_PX
+        good = name in CLASSES and share > LEAST_SEEN and inside[2] - inside[0] >= LEAST_WIDTH_PX
         kept.append(inside)
         classes.append(CLASSES.index(name) if good else NOT_JUDGED)
     return Scene(np.asarray(resized, np.uint8), np.array(kept, np.float32).reshape(-1, 4), tuple(classes))
@@ -189,12 +233,12 @@ def with_drones(scene: Scene, cutouts: Cutouts, rng: Generator) -> Scene:
         if near is not None and rng.random() < 0.3:
             width = near[2] * math.exp(rng.normal(0, 0.35))
             middle = np.array(near[:2]) + rng.normal(0, 1.0, 2) * near[2]
-        box, share = _paste(image, _looked_at(cutouts.draw(rng), width, rng), middle, rng)
+        box, share = paste(image, looked_at(cutouts.draw(rng), width, rng), middle, rng)
         if box is None:
             continue
         near = (float(middle[0]), float(middle[1]), width)
-        good = share > _LEAST_SEEN and box[2] - box[0] >= LEAST_WIDTH_PX
-        hidden = [k for k, other in enumerate(boxes) if _covered(other, box) > 1 - _LEAST_SEEN]
+        good = share > LEAST_SEEN and box[2] - box[0] >= LEAST_WIDTH_PX
+        hidden = [k for k, other in enumerate(boxes) if _covered(other, box) > 1 - LEAST_SEEN]
         for k in hidden:
             classes[k] = NOT_JUDGED
         boxes.append(box)
@@ -203,7 +247,7 @@ def with_drones(scene: Scene, cutouts: Cutouts, rng: Generator) -> Scene:
     return Scene(pasted, np.array(boxes, np.float32).reshape(-1, 4), tuple(classes))
 
 
-def _looked_at(cutout: Image, width: float, rng: Generator) -> NDArray[np.float32]:
+def looked_at(cutout: Image, width: float, rng: Generator) -> NDArray[np.float32]:
     """(h, w, 4) premultiplied, 0-255, of the wanted width, turned, lit and tinted as it may be."""
     if rng.random() < 0.5:
         cutout = np.ascontiguousarray(cutout[:, ::-1])
@@ -225,7 +269,7 @@ def _looked_at(cutout: Image, width: float, rng: Generator) -> NDArray[np.float3
     return np.asarray(cv2.warpAffine(both, turn, out, flags=cv2.INTER_LINEAR), np.float32)
 
 
-def _paste(
+def paste(
     image: NDArray[np.float32], drone: NDArray[np.float32], middle: NDArray[np.float64], rng: Generator
 ) -> tuple[NDArray[np.float32] | None, float]:
     """Its box in the image, and the share of it that is seen; the image (h, w, 3) is drawn into."""
@@ -277,7 +321,8 @@ def filmed(scene: Scene, rng: Generator, *, is_photograph: bool) -> Scene:
     return Scene(image, boxes, scene.classes)
 
 
-def _read(path: Path) -> Image:
+def read(path: Path) -> Image:
+    """A picture (h, w, 3), RGB."""
     read = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
     if read is None:
         raise FileNotFoundError(f"{path}: is no picture that can be read")
