@@ -14,7 +14,6 @@ DISTRIBUTIONS = {
     "cv2": "opencv-python-headless",
     "yaml": "pyyaml",
     "zenoh": "eclipse-zenoh",
-    "rerun": "rerun-sdk",
     "rclpy": "ros-rclpy",
     "google": "protobuf",
     "foxglove": "foxglove-sdk",

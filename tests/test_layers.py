@@ -161,7 +161,6 @@ ZENOH_READERS = {
         ("foxglove", {"fleet/foxglove"}),
         ("rosbags", {"onboard/recording/ros_bag.py", "cli/record.py"}),
         ("rclpy", {"onboard/ros/ros_node.py", "onboard/sources/ros_child.py"}),
-        ("rerun", {"review/view/flock_file.py", "review/view/rerun_file.py"}),
     ],
 )
 def test_an_outside_library_sits_behind_its_adapters(library: str, adapters: set[str]) -> None:

@@ -28,7 +28,6 @@ from flockd.cli import (
     run,
     sim,
     status,
-    view,
 )  # fmt: skip
 from flockd.cli.output import complain
 from flockd.cli.parser import Parser, add_commands
@@ -41,7 +40,6 @@ EXTRAS = {
     "pyarrow": "parquet",
     "pyulog": "ulog",
     "ray": "ray",
-    "rerun": "view",
     "argcomplete": "completion",
     **dict.fromkeys(("aiohttp", "plotly"), "fleet"),
     "foxglove": "foxglove",
@@ -141,7 +139,6 @@ def _parser() -> Parser:
         report,
         record,
         replay,
-        view,
         detect,
         cameras,
         calibrate,

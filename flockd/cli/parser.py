@@ -12,6 +12,7 @@ from typing import Any, NoReturn, Protocol
 
 from flockd.cli.output import complain
 from flockd.core.errors import ExitCode
+from flockd.core.gone import COMMANDS
 
 
 class Parser(argparse.ArgumentParser):
@@ -38,9 +39,13 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        """Reports what is wrong with the command line, with a suggestion for a misspelt command."""
+        """Reports what is wrong with the command line, with a suggestion for a misspelt command or one that is gone."""
         unknown = re.match("argument COMMAND: invalid choice: '(.*?)' ", message)
-        if unknown is not None:
+        named = unknown or re.match("unknown argument (--[^=]+)", message)
+        gone = None if named is None else COMMANDS.get(f"{self.prog} {named[1]}")
+        if named is not None and gone is not None:
+            message = f"{named[1]} is gone; {gone}"
+        elif unknown is not None:
             close = difflib.get_close_matches(unknown[1], self.commands, n=1)
             hint = f"; did you mean `{self.prog} {close[0]}`?" if close else f", of {', '.join(self.commands)}"
             message = f"{unknown[1]!r} is not a command{hint}"

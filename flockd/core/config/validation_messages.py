@@ -13,6 +13,7 @@ from pydantic_core import ErrorDetails
 from flockd.core.config.base import WORDS
 from flockd.core.config.document import KeyPath, Place, core_scalar
 from flockd.core.errors import MAX_PROBLEMS_TOLD, ConfigProblem
+from flockd.core.gone import KEYS
 
 Schema = dict[str, Any]
 
@@ -95,6 +96,9 @@ def _sentence(error: ErrorDetails, written: str, path: KeyPath, root: Schema) ->
     wanted = _wanted(root, schema, _unit(path))
     shown = written or ("a list" if isinstance(value, tuple) else _shown(value))
     if kind == "extra_forbidden":
+        gone = KEYS.get(".".join(part for part in path if isinstance(part, str)).removeprefix("drone."))
+        if gone is not None:
+            return f"is gone; {gone}"
         section = _with_parts(root, _schema_at(root, path[:-1]))
         return _unknown_key(str(path[-1]), sorted(section.get("properties", {})))
     if kind == "missing" and isinstance(value, tuple):

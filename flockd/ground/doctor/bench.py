@@ -293,7 +293,7 @@ def _what_it_saw(samples: Sequence[Sample]) -> Iterator[Finding]:
     measured = (
         f"{most} {'neighbour' if most == 1 else 'neighbours'} at most, one or more in {100 * share:.0f} % of the time"
     )
-    fix = "where no drone was to be seen, they are false: look at them with `flockd detect` or `flockd view`"
+    fix = "where no drone was to be seen, they are false: look at them with `flockd detect` or `flockd report`"
     yield warned("neighbours", measured, fix) if most else passed("neighbours", "none were seen")
     known = sum(sample.own_motion for sample in samples) / len(samples)
     measured = f"estimated in {100 * known:.0f} % of the time"

@@ -40,7 +40,6 @@ from flockd.review.flight_log.from_recordings import flight_log, key_frames, rec
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.summary import summarise
 from tests.onboard.recording.made_up import HEIGHT, MODELS, WIDTH, MadeUpPilot, drone_config, rewritten
-from tests.review.view.test_view import shown_in
 
 NAMES = ("drone1", "drone2")
 STEPS, STEP_S = 12, 0.5
@@ -200,22 +199,6 @@ def test_drones_that_pass_between_two_recorded_steps_are_as_near_as_they_were(tm
     text = text_of(tmp_path / "of_both" / "report.html")
     assert "came within 0.34 m of each other" in text
     assert "drones 1 and 2 at 3.0 s" in text
-
-
-def test_a_folder_of_recordings_shows_the_flock(flight: Path, tmp_path: Path, capsys: Capture) -> None:
-    """Both drones where they truly were, and each one's neighbour where it took it to be."""
-    out = tmp_path / "flock.rrd"
-    assert main(["view", str(flight), "--save", str(out), "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert (result["drone"], result["steps"]) == ("drone1, drone2", 2 * STEPS)
-    shown = shown_in(out)
-    drones = [row["Points3D:positions"] for row in shown["/world/drones"] if "Points3D:positions" in row]
-    assert len(drones) == STEPS
-    assert drones[3][1][1] - drones[3][0][1] == pytest.approx(APART_M)
-    assert set(NAMES) == {path.rpartition("/")[2] for path in shown if path.startswith("/world/path/")}
-    known = [row["Points3D:positions"] for row in shown["/world/neighbours/drone1"] if "Points3D:positions" in row]
-    assert known[-1][0][1] - drones[-1][0][1] == pytest.approx(1.01 * APART_M, rel=1e-3)
-    assert [path for path in shown if path.startswith("/images/drone2/")]
 
 
 def test_one_drones_recording_tells_of_the_flock_and_of_its_own_sight(flight: Path, capsys: Capture) -> None:

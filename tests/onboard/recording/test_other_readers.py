@@ -1,12 +1,8 @@
-"""Recordings are sound MCAP files that others read: by the specification, by Foxglove's schemas, and by Rerun."""
+"""Recordings are sound MCAP files that others read: by the specification, and by Foxglove's schemas."""
 
 from __future__ import annotations
 
 import json
-import os
-import re
-import subprocess
-import sys
 import zlib
 from pathlib import Path
 from typing import Any
@@ -132,41 +128,3 @@ def test_foxglove_knows_its_schemas_again(files: list[Path]) -> None:
     assert (path.frame_id, path.body_frame_id) == ("local", "body")
     children = [one.child_frame_id for one in frames.transforms]
     assert children == ["body", "front", "left"]
-
-
-# --------------------------------------------------------------------------------------------------------------- Rerun
-
-
-def rerun_says(*arguments: str, home: Path) -> str:
-    environment = {**os.environ, "CI": "1", "HOME": str(home)}
-    command = [sys.executable, "-m", "rerun_cli", "mcap", *arguments]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return re.sub(r"\x1b\[\d*m", "", done.stdout + done.stderr)
-
-
-def test_reruns_own_check_finds_nothing(files: list[Path], tmp_path: Path) -> None:
-    """The cameras' clocks ran in these flights: one of the recorded faults is a time that goes back."""
-    for path in (path for path in files if path.name != "faults.mcap"):
-        rows = [line.split() for line in rerun_says("check", "--full", str(path), home=tmp_path).splitlines()]
-        streams = [row for row in rows if any(cell.startswith("/") for cell in row[3:4])]
-        assert len(streams) >= 10, path.name
-        assert {(row[0], row[-1]) for row in streams} == {("ok", "—")}, path.name
-
-
-def test_reruns_loader_shows_images_cameras_places_and_log(files: list[Path], tmp_path: Path) -> None:
-    from rerun.chunk import RrdReader
-
-    path = next(path for path in files if path.name == "one.mcap")
-    target = tmp_path / "one.rrd"
-    rerun_says("convert", str(path), "-o", str(target), home=tmp_path)
-    rows: dict[tuple[str, str], int] = {}
-    for chunk in RrdReader(target).stream():
-        for name in chunk.to_record_batch().schema.names:
-            kind = name.partition(":")[0]
-            rows[str(chunk.entity_path), kind] = rows.get((str(chunk.entity_path), kind), 0) + chunk.num_rows
-    for camera in ("front", "left"):
-        assert rows[f"/camera/{camera}/image", "EncodedImage"] >= 10
-        assert rows[f"/camera/{camera}/calibration", "Pinhole"] >= 1
-    assert rows["/tf", "Transform3D"] >= 10 * 3
-    assert rows["/log", "TextLog"] >= 10
