@@ -158,7 +158,6 @@ ZENOH_READERS = {
         ("pyulog", {"review/flight_log/ulog_file.py"}),
         ("joblib", {"campaign/process_engine.py"}),
         ("ray", {"campaign/ray_engine.py"}),
-        ("foxglove", {"fleet/foxglove"}),
         ("rosbags", {"onboard/recording/ros_bag.py", "cli/record.py"}),
         ("rclpy", {"onboard/ros/ros_node.py", "onboard/sources/ros_child.py"}),
     ],

@@ -19,7 +19,6 @@ from flockd.cli import (
     detect,
     doctor,
     fleet,
-    foxglove,
     models,
     record,
     replay,
@@ -42,7 +41,6 @@ EXTRAS = {
     "ray": "ray",
     "argcomplete": "completion",
     **dict.fromkeys(("aiohttp", "plotly"), "fleet"),
-    "foxglove": "foxglove",
     "rosbags": "bags",
 }
 
@@ -131,7 +129,6 @@ def _parser() -> Parser:
         run,
         status,
         fleet,
-        foxglove,
         ros,
         doctor,
         sim,
