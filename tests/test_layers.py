@@ -155,7 +155,6 @@ ZENOH_READERS = {
     [
         ("mavsdk", {"onboard/autopilot/mavsdk_link.py"}),
         ("pymavlink", {"sim/autopilot", "sim/ground_station.py"}),
-        ("pyulog", {"review/flight_log/ulog_file.py"}),
         ("joblib", {"campaign/process_engine.py"}),
         ("ray", {"campaign/ray_engine.py"}),
         ("rosbags", {"onboard/recording/ros_bag.py", "cli/record.py"}),

@@ -37,7 +37,6 @@ EXTRAS = {
     **dict.fromkeys(("numba", "llvmlite", "matplotlib", "jinja2", "markupsafe"), "sim"),
     "joblib": "campaign",
     "pyarrow": "parquet",
-    "pyulog": "ulog",
     "ray": "ray",
     "argcomplete": "completion",
     **dict.fromkeys(("aiohttp", "plotly"), "fleet"),

@@ -51,8 +51,8 @@ class GateParameters(Section):
     """From a neighbour's change of velocity until the own drone has begun to brake: a step of the pilot, in which the
     change is not seen, how long the step takes, and the drone's response."""
     response_s: Annotated[float, Field(gt=0, le=5)] = 0.25
-    """Time constant with which the drone's velocity follows a setpoint, as the report with the autopilot's log fits it.
-    Both reaction times contain it, and the dead time before it."""
+    """Time constant with which the drone's velocity follows a setpoint, as PX4's log shows it. Both reaction
+    times contain it, and the dead time before it."""
     max_drift_m_s: Annotated[float, Field(ge=0, le=20)] = 2.0
     """By how much at most a setpoint is corrected for wind, which carries the drone off it; 0: not at all."""
     fence_radius_m: Annotated[float, Field(gt=0, le=100_000)] | None = 100.0

@@ -1,4 +1,4 @@
-"""Files: configurations, manifests, recordings, data sets, images, campaigns, logs of autopilots."""
+"""Files: configurations, manifests, recordings, data sets, images, campaigns."""
 
 from __future__ import annotations
 
@@ -7,11 +7,8 @@ import itertools
 import json
 import shutil
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from random import Random
-from types import SimpleNamespace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -32,8 +29,7 @@ from flockd.onboard.recording.export import export_images, export_tables
 from flockd.onboard.recording.info import recording_info
 from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, McapFile, Note, Record, read_records
 from flockd.onboard.recording.reader import Recording
-from flockd.review.flight_log.ulog import autopilot_log, read_ulog
-from tools.checks.fuzzing.mutation import any_float, mutated_bytes, mutated_json, mutated_lines, nested
+from tools.checks.fuzzing.mutation import mutated_bytes, mutated_json, mutated_lines, nested
 from tools.checks.fuzzing.target import CORPUS, ROOT, Check, Target, odd_file, own_errors, removed
 
 MOST_FRAMES = 50
@@ -281,60 +277,6 @@ def _campaigns(folder: Path) -> Check:
     return check
 
 
-# --------------------------------------------------------------------------------------------------- autopilots' logs
-
-
-def _ulog_files(folder: Path) -> Check:
-    whole = (CORPUS / "log.ulg").read_bytes()
-    path = folder / "log.ulg"
-
-    def check(random: Random) -> None:
-        _put(random, path, lambda: mutated_bytes(random, whole))
-        with own_errors(), suppress(FileNotFoundError):  # as the command reports by itself
-            read_ulog(path, patience_s=4.0)
-
-    return check
-
-
-def _ulog_contents(folder: Path) -> Check:
-    """Numbers of a log that can be read: laid on a flight's time, whatever they are."""
-    whole = read_ulog(CORPUS / "log.ulg")
-    times_s = 0.5 * np.arange(20)
-    command = np.stack([np.sin(times_s), np.cos(times_s)], axis=1)[:, None]
-    computer_s = np.arange(0.0, 10.0)
-    metadata = SimpleNamespace(names=["a"], clock_at_start_s=0.0)
-    log: Any = SimpleNamespace(time_s=times_s, command_velocity=command, metadata=metadata)
-
-    def check(random: Random) -> None:
-        topics = {
-            name: {field: _spoiled(random, values) for field, values in topic.items()}
-            for name, topic in whole.topics.items()
-        }
-        texts = [one._replace(time_us=int(random.choice((0, one.time_us, 2**63, 2**64 - 1)))) for one in whole.texts]
-        ulog = dataclasses.replace(whole, topics=topics, texts=texts)
-        clock = None if random.random() < 0.5 else (computer_s, np.full(10, any_float(random)))
-        with own_errors():
-            autopilot_log(ulog, Path("log.ulg"), log, 0, clock)
-
-    return check
-
-
-def _spoiled(random: Random, values: Any) -> Any:
-    """An array with some numbers that are anything."""
-    if random.random() < 0.8:
-        return values
-    changed = np.array(values)
-    for _ in range(random.choice((1, 3))):
-        at = random.randrange(len(changed))
-        if changed.dtype.kind == "f":
-            with np.errstate(over="ignore"):
-                changed[at] = any_float(random)
-        else:
-            info = np.iinfo(changed.dtype)
-            changed[at] = random.choice((info.min, info.max, 0, 1, random.randint(int(info.min), int(info.max))))
-    return changed
-
-
 def _image(path: Path, *, depth: bool = False) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     rows, columns = np.mgrid[0:12, 0:16]
@@ -385,6 +327,4 @@ TARGETS = (
     Target("datasets", 40, _datasets),
     Target("images", 100, _images),
     Target("campaigns", 6, _campaigns),
-    Target("ulog_files", 1, _ulog_files),
-    Target("ulog_contents", 30, _ulog_contents),
 )
