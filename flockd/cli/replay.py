@@ -35,7 +35,6 @@ def add(commands: Commands) -> None:
         "flockd replay drone1.mcap --reference drone1.expected --update-reference",
         "flockd replay rgbd_folder --depth recorded --stride 3 --trajectory path.txt",
         "flockd replay flight_bag --config my_drone.yaml --vehicle /mavros/local_position/odom",
-        "flockd replay clip.mp4 --calibration K.txt --flow dis --json",
     )
     description = "Run the pilot on a recorded flight again: the same frames and vehicle states, the same code."
     parser = commands("replay", description, examples)
@@ -93,10 +92,9 @@ def _tolerance(text: str) -> tuple[str, float]:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.ground.datasets import is_dataset
     from flockd.onboard.recording.ros_bag import is_bag
 
-    if is_dataset(args.recording) and not is_bag(args.recording):
+    if args.recording.is_dir() and not is_bag(args.recording):
         return run_dataset(args)
     refuse_dataset_options(args)
     _check_options(args)

@@ -167,7 +167,7 @@ def _changed_json(random: Random, data: bytes) -> bytes:
 
 
 def _datasets(folder: Path) -> Check:
-    layouts = [layout(folder / name) for name, layout in (("tum", _tum), ("euroc", _euroc), ("rgbd", _rgbd))]
+    layouts = [layout(folder / name) for name, layout in (("tum", _tum), ("rgbd", _rgbd))]
     files = {root: sorted(path for path in root.rglob("*") if path.is_file()) for root in layouts}
     originals = {path: path.read_bytes() for paths in files.values() for path in paths}
 
@@ -176,7 +176,7 @@ def _datasets(folder: Path) -> Check:
         touched = random.sample(files[root], random.choice((1, 1, 2)))
         for path in touched:
             original = originals[path]
-            is_text = path.suffix in {".txt", ".csv", ".yaml"}
+            is_text = path.suffix in {".txt"}
             if random.random() < 0.02:
                 odd_file(random, path)
             else:
@@ -292,22 +292,6 @@ def _tum(root: Path) -> Path:
         (root / f"{kind}.txt").write_text("# time file\n" + "".join(f"{i}.5 {kind}/{i}.png\n" for i in range(3)))
     (root / "K.txt").write_text("10 0 8\n0 10 6\n0 0 1\n")
     (root / "groundtruth.txt").write_text("".join(f"{i / 20} {i} 0 1 0 0 0 1\n" for i in range(80)))
-    return root
-
-
-def _euroc(root: Path) -> Path:
-    names = [f"{index}00000000" for index in range(1, 4)]
-    for name in names:
-        _image(root / f"cam0/data/{name}.jpg")
-    (root / "cam0/data.csv").write_text("#time,file\n" + "".join(f"{name},{name}.jpg\n" for name in names))
-    (root / "cam0/sensor.yaml").write_text(
-        "%YAML:1.0\nresolution: [16, 12]\nintrinsics: [10, 10, 8, 6]\ndistortion_model: radial-tangential\n"
-        "distortion_coefficients: [0.1, 0.01, 0.0, 0.0]\nT_BS:\n  cols: 4\n  rows: 4\n"
-        "  data: [1, 0, 0, 0.1, 0, 1, 0, 0.2, 0, 0, 1, 0.3, 0, 0, 0, 1]\n"
-    )
-    truth = root / "state_groundtruth_estimate0/data.csv"
-    truth.parent.mkdir()
-    truth.write_text("#time\n" + "".join(f"{i}0000000,{i},0,0,1,0,0,0,0,0,0,0,0,0,0,0,0\n" for i in range(1, 60)))
     return root
 
 
