@@ -157,7 +157,7 @@ ZENOH_READERS = {
         ("pymavlink", {"sim/autopilot", "sim/ground_station.py"}),
         ("joblib", {"campaign/process_engine.py"}),
         ("ray", {"campaign/ray_engine.py"}),
-        ("rosbags", {"onboard/recording/ros_bag.py", "cli/record.py"}),
+        ("rosbags", {"onboard/recording/ros_bag.py"}),
         ("rclpy", {"onboard/ros/ros_node.py", "onboard/sources/ros_child.py"}),
     ],
 )

@@ -33,19 +33,21 @@ class Parser(argparse.ArgumentParser):
         """Which of them is meant where none is named."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As argparse does, with the default command in its place."""
+        """As argparse does, with the default command in its place; what is gone is refused with what to use instead."""
+        args = sys.argv[1:] if args is None else list(args)
+        for place, word in enumerate(args):
+            name = word.partition("=")[0]
+            gone = COMMANDS.get(f"{self.prog} {name}") if place == 0 or name.startswith("--") else None
+            if gone is not None:
+                self.error(f"{name} is gone; {gone}")
         if self.default_command is not None and args and args[0] not in {*self.commands, "-h", "--help"}:
             args = [self.default_command, *args]
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        """Reports what is wrong with the command line, with a suggestion for a misspelt command or one that is gone."""
+        """Reports what is wrong with the command line, with a suggestion for a misspelt command."""
         unknown = re.match("argument COMMAND: invalid choice: '(.*?)' ", message)
-        named = unknown or re.match("unknown argument (--[^=]+)", message)
-        gone = None if named is None else COMMANDS.get(f"{self.prog} {named[1]}")
-        if named is not None and gone is not None:
-            message = f"{named[1]} is gone; {gone}"
-        elif unknown is not None:
+        if unknown is not None:
             close = difflib.get_close_matches(unknown[1], self.commands, n=1)
             hint = f"; did you mean `{self.prog} {close[0]}`?" if close else f", of {', '.join(self.commands)}"
             message = f"{unknown[1]!r} is not a command{hint}"

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 COMMANDS: Mapping[str, str] = {
     "flockd foxglove": "watch live with `flockd fleet`, or in ROS 2 with `flockd ros`; Foxglove opens recordings",
+    "flockd record export --ros2": "Foxglove opens the recording itself; record a flight's topics of `flockd ros`",
     "flockd report --ulog": "open PX4's log in Flight Review or PlotJuggler",
     "flockd view": "open the recording in Foxglove, or in Rerun after `rerun mcap convert RECORDING.mcap -o X.rrd`",
 }
