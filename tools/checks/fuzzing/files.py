@@ -81,7 +81,7 @@ def _manifests(folder: Path) -> Check:
     def check(random: Random) -> None:
         _put(random, file, lambda: _text(random, texts))
         with own_errors():
-            read_manifest(file, check_roles).read_model()
+            read_manifest(file, check_roles).check_model()
 
     return check
 
