@@ -14,6 +14,7 @@ COMMANDS: Mapping[str, str] = {
 
 KEYS: Mapping[str, str] = {
     "autopilot.max_heartbeat_age_s": "write `heartbeat_timeout_s` in the section `safety`",
+    "cameras.compression.h264_mbit_s": "write `jpeg_quality`; streams are no longer simulated",
     "desired": "write the section `mission`, with `kind: circle_then_tangent` for the same flight",
     "safety.degraded_ego_motion_failures": "write `degraded_ego_motion_s`, in seconds instead of steps",
     "safety.max_ego_motion_failures": "write `max_ego_motion_s`, in seconds instead of steps",
