@@ -4,7 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+_CAMERAS = "change them in the file; `flockd cameras --write FILE` writes the sections for what is plugged in"
+
 COMMANDS: Mapping[str, str] = {
+    **{
+        f"flockd config new {kind} --{option}": instead
+        for kind, options in {
+            "drone": {
+                "name": "write `--set name=NAME`",
+                "number": "write `--set safety.first_flight_layer=N`",
+                **dict.fromkeys(("cameras", "size", "field-of-view", "source"), _CAMERAS),
+                "autopilot": "write `--set autopilot.address=ADDRESS`",
+                "fleet": "write `--set telemetry.fleet=NAME`",
+                "mission": "write `--set 'mission={kind: KIND}'`",
+                "defaults": "leave it out: nothing is asked",
+            },
+            "scenario": {
+                "name": "write `--set scenario=NAME`",
+                "drones": "leave it out, and say it to `flockd sim FILE --drones N`",
+                "duration": "write `--set duration_s=S`",
+                "mission": "write `--set 'mission={kind: KIND}'`",
+                "obstacles": "write `--set world.obstacles.kind=KIND --set obstacles.enabled=true`",
+                "drone": "write `--set drone=FILE`",
+                "defaults": "leave it out: nothing is asked",
+            },
+        }.items()
+        for option, instead in options.items()
+    },
     "flockd foxglove": "watch live with `flockd fleet`, or in ROS 2 with `flockd ros`; Foxglove opens recordings",
     "flockd record export --ros2": "Foxglove opens the recording itself; record a flight's topics of `flockd ros`",
     "flockd report --ulog": "open PX4's log in Flight Review or PlotJuggler",
