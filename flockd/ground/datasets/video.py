@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from flockd.core.image_header import MAX_IMAGE_PIXELS
+from flockd.core.jpeg_header import MAX_IMAGE_PIXELS
 from flockd.core.messages import UInt8Array
 from flockd.ground.datasets.errors import DatasetError
 

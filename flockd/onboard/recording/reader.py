@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from flockd.core.config import DroneConfig
 from flockd.core.config.perception import NO_MODEL
-from flockd.core.image_header import cost_fault
+from flockd.core.jpeg_header import cost_fault
 from flockd.core.messages import Frame, FrameSet, LearnedSize, MissionOrder, UInt8Array, VehicleState
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.codec import from_json, parsed
