@@ -487,7 +487,6 @@ CATALOGUE = (
             f"{_HERE}operators.py::test_neither_absurd_peers_nor_stuck_pictures_keep_an_order_from_a_drone",
             "tests/onboard/telemetry/test_malformed.py",
             "tests/fleet/page/test_crowded.py::test_a_drone_with_absurd_numbers_closes_no_page",
-            "tests/fleet/foxglove_server/test_strangers.py",
         ),
         within_s=60.0,
     ),

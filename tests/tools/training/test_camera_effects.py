@@ -59,9 +59,6 @@ def test_drawn_cameras_are_around_the_realistic_ones() -> None:
     rng, preset = np.random.default_rng(4), CamerasConfig(preset="realistic")
     drawn = [drawn_cameras(rng) for _ in range(300)]
     assert 0.3 < np.mean([cameras.shutter.readout_s == 0.0 for cameras in drawn]) < 0.7, "half are global shutters"
-    assert all(cameras.compression.h264_mbit_s is None for cameras in drawn)
-    streams = [drawn_cameras(rng, 0.3).compression.h264_mbit_s for _ in range(300)]
-    assert 60 < sum(mbit_s is not None and 2.0 <= mbit_s <= 32.0 for mbit_s in streams) < 120
     exposures = [cameras.shutter.exposure_s for cameras in drawn]
     assert min(exposures) < 0.2 * preset.shutter.exposure_s < preset.shutter.exposure_s * 2 < max(exposures)
 
