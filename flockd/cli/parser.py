@@ -35,7 +35,8 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As argparse does, with the default command in its place; a command that is named comes first.
 
-        What is gone is refused with what to use instead. argparse would take options before it, and then put the command's own defaults in their place.
+        What is gone is refused with what to use instead. argparse would take options before the command, and then put
+        the command's own defaults in their place.
         """
         args = sys.argv[1:] if args is None else list(args)
         for place, word in enumerate(args):

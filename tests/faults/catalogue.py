@@ -632,9 +632,9 @@ CATALOGUE = (
     ),
     Fault(
         70, "setpoints-clipped", "the autopilot clips setpoints (`MPC_XY_VEL_MAX`)",
-        "said; no other program is accused",
+        "said; flown slower to the end; no other program is accused",
         (
-            f"{_HERE}autopilot.py::test_setpoints_that_the_autopilot_clips_are_told_and_nobody_is_accused",
+            f"{_HERE}autopilot.py::test_where_the_autopilot_limits_setpoints_flockd_asks_for_no_more_and_nobody_is_accused",
             "tests/onboard/autopilot/test_setpoint_watch.py",
         ),
         within_s=4.0,
