@@ -1,0 +1,106 @@
+"""What flockd may cost: lines, files, tuned numbers, and Python calls and network runs of a step.
+
+Each budget is what there is now. A change that removes something lowers it in the same commit; one that needs more
+raises it there, and says why and what could go instead.
+"""
+
+from __future__ import annotations
+
+import ast
+import cProfile
+import pstats
+from pathlib import Path
+from typing import Any
+
+import onnxruntime
+import pytest
+
+from flockd.flight.pilot import FlockPilot
+from flockd.onboard.recording.reader import Recording
+
+ROOT = Path(__file__).parents[1]
+LINES = {
+    "flockd/core": 4_340,
+    "flockd/flight": 14_800,
+    "flockd/onboard": 11_630,
+    "flockd/fleet": 2_690,
+    "flockd/ground": 6_620,
+    "flockd/review": 4_570,
+    "flockd/sim": 12_180,
+    "flockd/campaign": 2_280,
+    "flockd/cli": 5_100,
+    "tests": 46_020,
+    "tools/checks": 7_260,
+    "tools/docs": 950,
+    "tools/measure": 1_020,
+    "tools/release": 900,
+    "tools/training": 4_860,
+}
+"""Lines of Python below a folder."""
+FILES = {"flockd": 507}
+NUMBERS_OF_FLIGHT = 529
+"""In constants of the modules of `flockd/flight`."""
+SLACK = 0.02
+"""A budget that is farther above what there is is to be lowered."""
+STEPS = {"crossing": (45_800, 20), "normal": (24_100, 15)}
+"""Python calls and network runs of a step in a recorded flight of tests/review/replay."""
+
+
+def _within(there_is: int, budget: int) -> None:
+    assert there_is <= budget, f"{there_is} is over the budget of {budget}: what could go instead?"
+    assert there_is >= (1 - SLACK) * budget, f"{there_is} is far below the budget of {budget}: lower it in this commit"
+
+
+def _python(folder: str) -> list[Path]:
+    return sorted((ROOT / folder).rglob("*.py"))
+
+
+@pytest.mark.parametrize("folder", LINES)
+def test_lines(folder: str) -> None:
+    _within(sum(path.read_text(encoding="utf-8").count("\n") for path in _python(folder)), LINES[folder])
+
+
+@pytest.mark.parametrize("folder", FILES)
+def test_files(folder: str) -> None:
+    _within(len(_python(folder)), FILES[folder])
+
+
+def test_tuned_numbers_of_flight() -> None:
+    """Of constants with names in capitals, as they stand at the head of a module or a class."""
+    numbers = 0
+    for path in _python("flockd/flight"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
+                continue
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = [name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)]
+            if any(name.lstrip("_").isupper() for name in names):
+                numbers += sum(
+                    isinstance(part, ast.Constant) and type(part.value) in (int, float) for part in ast.walk(node.value)
+                )
+    _within(numbers, NUMBERS_OF_FLIGHT)
+
+
+@pytest.mark.parametrize("flight", STEPS)
+def test_calls_and_network_runs_of_a_step(flight: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Counted, as times differ from computer to computer."""
+    runs: list[None] = []
+    run = onnxruntime.InferenceSession.run
+
+    def counted(self: Any, *args: Any) -> Any:
+        runs.append(None)
+        return run(self, *args)
+
+    recording = Recording(ROOT / f"tests/review/replay/{flight}.mcap")
+    pilot = FlockPilot(recording.config)
+    steps = list(recording.steps())
+    monkeypatch.setattr(onnxruntime.InferenceSession, "run", counted)
+    profile = cProfile.Profile()
+    for step in steps:
+        profile.enable()
+        pilot.step(step.frames, step.vehicle, order=step.order)
+        profile.disable()
+    calls = pstats.Stats(profile).total_calls  # type: ignore[attr-defined]
+    most_calls, most_runs = STEPS[flight]
+    _within(calls // len(steps), most_calls)
+    assert len(runs) <= most_runs * len(steps)
