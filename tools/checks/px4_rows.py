@@ -34,16 +34,19 @@ from flockd.core.errors import FlockdError
 from flockd.core.messages import FloatArray
 from flockd.flight.flocking.metrics import closest_distances
 from flockd.review.flight_log.log import FlightLog
+from flockd.sim.autopilots import px4_folder
 from flockd.sim.fleet import fly_fleet
 from flockd.sim.free_ports import free_endpoint
 from flockd.sim.start import with_drones
+from flockd.sim.vehicles import REFERENCE_DEG
 from tools.checks.px4_missions import Mission, Order
 from tools.checks.px4_sitl import run_trials
 
+SET_ORIGIN_S = 10
 SETTLED_S = 5.0
 """From then on the velocity counts: the drones begin at a standstill, and turn at corners."""
 MOST_OFF_M_S = 0.15
-CLOSEST_M = 1.0
+CLOSEST_M, HEIGHT_M = 1.0, 0.7
 _LENS = {"fx": 64.0, "fy": 64.0, "cx": 64.0, "cy": 48.0}
 _RIG = {
     "cameras": [
@@ -51,6 +54,7 @@ _RIG = {
         for name, yaw in (("front", 0.0), ("back", 180.0))
     ]
 }
+_JUMPED = "local frame jumped"
 _CIRCLE = {"kind": "circle_then_tangent", "speed_m_s": 1.0, "radius_m": 10.0, "circle_until_s": 600.0}
 _CORNERS = [{"north_m": 10.0, "east_m": 0.0}, {"north_m": 10.0, "east_m": 10.0}, {"north_m": 0.0, "east_m": 10.0}]
 
@@ -69,6 +73,10 @@ class Flight:
     busy: bool = False
     most_off_m_s: float | None = MOST_OFF_M_S
     """Limit of the root mean square; None where the velocity that is wanted changes all the time."""
+    origin_up_m: float = 0.0
+    """After ten seconds PX4's origin is set this much higher, as a ground station may."""
+    ends_with: str = ""
+    """What is said when the drone leaves offboard before the end; empty: it does not."""
 
 
 FLIGHTS = (
@@ -78,6 +86,8 @@ FLIGHTS = (
     Flight("operator", {"kind": "operator"}, duration_s=40.0, operator_m_s=1.0),
     Flight("waypoints", {"kind": "waypoints", "waypoints": _CORNERS}, most_off_m_s=None),
     Flight("three", _CIRCLE, drones=3),
+    Flight("origin_higher", {"kind": "hover"}, duration_s=30.0, most_off_m_s=None, origin_up_m=4.0, ends_with=_JUMPED),
+    Flight("origin_lower", {"kind": "hover"}, duration_s=30.0, most_off_m_s=None, origin_up_m=-30.0, ends_with=_JUMPED),
     Flight("by_sight", drones=3, by_sight=True, most_off_m_s=None),
     Flight("by_sight_busy", drones=3, by_sight=True, busy=True, most_off_m_s=None),
 )
@@ -103,10 +113,15 @@ class Row:
     ended: str
     """Why a drone did not fly to the end; empty: all did."""
     most_off_m_s: float | None
+    ends_with: str = ""
+    height_off_m: float = 0.0
+    """The most by which a drone's height strayed from its first."""
 
     @property
     def kept(self) -> bool:
-        """All drones flew to the end in offboard, apart, and as closely as the flight asks."""
+        """All drones flew to the end in offboard, apart, and as closely as the flight asks; or ended as it asks."""
+        if self.ends_with:
+            return self.ends_with in self.ended and self.height_off_m < HEIGHT_M
         steady = all(len(modes.split(" > ")) == 1 for modes in self.modes.split(", "))
         close = self.most_off_m_s is None or self.off_m_s <= self.most_off_m_s
         return steady and not self.ended and close and (self.closest_m is None or self.closest_m >= CLOSEST_M)
@@ -120,14 +135,19 @@ def fly(flight: Flight, kind: AutopilotKind, speed_factor: float, out: Path) -> 
     scenario = _scenario(flight, out)
     if not flight.by_sight:
         sitl = sitl.model_copy(update={"safety": sitl.safety.model_copy(update={"alone_s": None})})
-    operator = _Velocity(flight.operator_m_s, endpoint)
+    operator, origin = _Velocity(flight.operator_m_s, endpoint), _Origin(flight.origin_up_m)
+
+    def progress(flown_s: int, of_s: int) -> None:
+        operator.progress(flown_s, of_s)
+        origin.progress(flown_s)
+
     with ExitStack() as stack:
         if flight.busy:
             loop = stack.enter_context(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
             stack.callback(loop.kill)
         flown = fly_fleet(
             scenario, sitl, kind=kind, speed_factor=speed_factor, logs=out / "logs", recordings=None,
-            environment=os.environ, progress=operator.progress,
+            environment=os.environ, progress=progress,
         )  # fmt: skip
     return measured(flight, flown.log)
 
@@ -152,6 +172,8 @@ def measured(flight: Flight, log: FlightLog) -> Row:
         modes=", ".join(f"{drone} {' > '.join(modes)}" for drone, modes in fleet.modes.items()),
         ended="; ".join(f"{drone} {why}" for drone, why in {**fleet.handed_over, **fleet.mission_over}.items()),
         most_off_m_s=flight.most_off_m_s,
+        ends_with=flight.ends_with,
+        height_off_m=round(float(np.abs(log.position[..., 2] - log.position[0, :, 2]).max()), 2),
     )
 
 
@@ -172,6 +194,23 @@ class _Velocity(Order):
     def command(self) -> Sequence[str]:
         """What is typed."""
         return "fleet", "velocity", "all", f"{self._north_m_s}", "0", "--seconds", "120"
+
+
+class _Origin:
+    """Sets the origin of PX4's first instance once, which begins at sea level."""
+
+    def __init__(self, up_m: float) -> None:
+        self._up_m, self._done = up_m, up_m == 0.0
+
+    def progress(self, flown_s: int) -> None:
+        """Called again and again while it flies."""
+        if self._done or flown_s < SET_ORIGIN_S:
+            return
+        self._done = True
+        north_deg, east_deg = REFERENCE_DEG
+        program = px4_folder(os.environ) / "bin/px4-commander"
+        place = f"{north_deg:g}", f"{east_deg:g}", f"{self._up_m:g}"
+        subprocess.run([program, "--instance", "0", "set_ekf_origin", *place], check=True, capture_output=True)
 
 
 def _scenario(flight: Flight, folder: Path) -> ScenarioConfig:
