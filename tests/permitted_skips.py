@@ -47,14 +47,7 @@ PERMITTED = (
     ),
     PermittedSkip("tests/*/d*", "systemd-analyze is not here", "install systemd (tests of units in daemon and doctor)"),
     PermittedSkip("tests/review/report/*", "chromium is not here", "install chromium"),
-    PermittedSkip("tests/sim/real_cameras/*", "openh264 is not here", "install the library openh264 (libopenh264-7)"),
     PermittedSkip("tests/onboard/telemetry/*", "openssl is not here", "install the openssl command"),
-    PermittedSkip(
-        "tests/tools/training/*",
-        "this processor has 16-bit",
-        "run on a processor without bfloat16 instructions",
-    ),
-    PermittedSkip("tests/tools/training/*", "its instructions are not known", "run on Linux on an x86 processor"),
 )
 
 

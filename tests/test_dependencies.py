@@ -16,7 +16,6 @@ DISTRIBUTIONS = {
     "zenoh": "eclipse-zenoh",
     "rclpy": "ros-rclpy",
     "google": "protobuf",
-    "foxglove": "foxglove-sdk",
     "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
     "pydantic_core": "pydantic-core",
 }

@@ -155,11 +155,9 @@ ZENOH_READERS = {
     [
         ("mavsdk", {"onboard/autopilot/mavsdk_link.py"}),
         ("pymavlink", {"sim/autopilot", "sim/ground_station.py"}),
-        ("pyulog", {"review/flight_log/ulog_file.py"}),
         ("joblib", {"campaign/process_engine.py"}),
         ("ray", {"campaign/ray_engine.py"}),
-        ("foxglove", {"fleet/foxglove"}),
-        ("rosbags", {"onboard/recording/ros_bag.py", "cli/record.py"}),
+        ("rosbags", {"onboard/recording/ros_bag.py"}),
         ("rclpy", {"onboard/ros/ros_node.py", "onboard/sources/ros_child.py"}),
     ],
 )

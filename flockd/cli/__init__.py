@@ -19,7 +19,6 @@ from flockd.cli import (
     detect,
     doctor,
     fleet,
-    foxglove,
     models,
     record,
     replay,
@@ -32,17 +31,16 @@ from flockd.cli import (
 from flockd.cli.output import complain
 from flockd.cli.parser import Parser, add_commands
 from flockd.core.errors import ExitCode, FlockdError, UnavailableError, shortage_of
+from flockd.core.jpeg_header import MAX_IMAGE_PIXELS
 
 # Packages of an extra: without them a command is unavailable, not broken.
 EXTRAS = {
     **dict.fromkeys(("numba", "llvmlite", "matplotlib", "jinja2", "markupsafe"), "sim"),
     "joblib": "campaign",
     "pyarrow": "parquet",
-    "pyulog": "ulog",
     "ray": "ray",
     "argcomplete": "completion",
     **dict.fromkeys(("aiohttp", "plotly"), "fleet"),
-    "foxglove": "foxglove",
     "rosbags": "bags",
 }
 
@@ -87,6 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args, unknown = parser.parse_known_args(arguments)
     if unknown:
         args.parser.error(f"unknown argument {unknown[0]}")
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_IMAGE_PIXELS))  # before OpenCV is imported
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # before ONNX Runtime is imported: it keeps statistics
     try:
         code: int = args.run(args)
@@ -131,7 +130,6 @@ def _parser() -> Parser:
         run,
         status,
         fleet,
-        foxglove,
         ros,
         doctor,
         sim,

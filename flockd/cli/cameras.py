@@ -88,8 +88,7 @@ def run(args: argparse.Namespace, computer: Computer) -> int:
 
 def _write(file: Path, usable: Sequence[tuple[FoundCamera, Mode]], names: Sequence[str] | None, turn_deg: int) -> None:
     from flockd.cli.config_new import write_checked
-    from flockd.core.config.new_files import camera_names
-    from flockd.ground.cameras.sections import sections_text
+    from flockd.ground.cameras.sections import camera_names, sections_text
 
     if not usable:
         raise UsageError(f"{file} was not written, as no camera can be used; see what is wrong with each above")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli import config_new
+from flockd.cli.config_new import CHANGE_ME
 from flockd.cli.output import say, say_json
 from flockd.cli.parser import Commands, add_commands
 from flockd.cli.real_drone import add_force, permit
@@ -25,7 +26,7 @@ def add(commands: Commands) -> None:
     examples = (
         "flockd config check config/paper_flight.yaml",
         "flockd config show config/simulator.yaml",
-        "flockd config new scenario my_flight.yaml --drones 3 --mission waypoints",
+        "flockd config new scenario my_flight.yaml --set duration_s=30",
     )
     parser = commands("config", "Check, show, describe and begin configuration files.", examples)
     add_commands(parser, (_add_check, _add_show, _add_schema, _add_card, config_new.add))
@@ -142,8 +143,6 @@ def _check_file(file: Path, *, force: bool) -> None:
 
 def _yet_to_fill_in(config: DroneConfig, places: Mapping[KeyPath, Place]) -> list[ConfigProblem]:
     """The devices that `flockd config new drone` could not know."""
-    from flockd.core.config.new_files import CHANGE_ME
-
     fault = f"is yet to be filled in ({CHANGE_ME}); `flockd cameras --write FILE` writes what is plugged in"
     cameras = () if config.source is None else config.source.cameras
     return [

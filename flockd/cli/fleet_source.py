@@ -1,4 +1,4 @@
-"""Options of the fleet page and of the Foxglove server: where the fleet is found, and where they serve it."""
+"""Options of the fleet page: where the fleet is found, and where the page is served."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 HERE = "127.0.0.1"
-"""Where they serve unless told otherwise: for this computer alone."""
+"""Where it is served unless told otherwise: for this computer alone."""
 
 
 def add_server_options(parser: Parser, port: int) -> None:

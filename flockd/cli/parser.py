@@ -35,9 +35,15 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As argparse does, with the default command in its place; a command that is named comes first.
 
-        argparse would take options before it, and then put the command's own defaults in their place.
+        What is gone is refused with what to use instead. argparse would take options before the command, and then put
+        the command's own defaults in their place.
         """
         args = sys.argv[1:] if args is None else list(args)
+        for place, word in enumerate(args):
+            name = word.partition("=")[0]
+            gone = COMMANDS.get(f"{self.prog} {name}") if place == 0 or name.startswith("--") else None
+            if gone is not None:
+                self.error(f"{name} is gone; {gone}")
         if self.default_command is not None and args and args[0] not in {*self.commands, "-h", "--help"}:
             args = [self.default_command, *args]
         parsed, unknown = super().parse_known_args(args, namespace)

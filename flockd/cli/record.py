@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,7 +48,6 @@ def _add_export(commands: Commands) -> None:
     examples = (
         "flockd record export drone1.mcap --out tables",
         "flockd record export drone1.mcap --out tables --format parquet --images",
-        "flockd record export drone1.mcap --ros2 --out drone1_bag",
     )
     parser = _with_recording(
         commands("export", "Write a recording's messages as tables, its images as files.", examples)
@@ -57,10 +55,6 @@ def _add_export(commands: Commands) -> None:
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="a new or empty folder")
     parser.add_argument("--format", choices=("csv", "parquet"), default="csv", help="of the tables (default: csv)")
     parser.add_argument("--images", action="store_true", help="the images too, in DIR/images/CAMERA")
-    parser.add_argument(
-        "--ros2", nargs="?", const="mcap", choices=("mcap", "sqlite3"), metavar="STORAGE",
-        help="a bag of ROS 2 instead, with images and all: in mcap (default) or sqlite3",
-    )  # fmt: skip
     parser.set_defaults(run=_export)
 
 
@@ -127,8 +121,6 @@ def _export(args: argparse.Namespace) -> int:
 
     if args.out.exists() and (not args.out.is_dir() or any(args.out.iterdir())):
         raise UsageError(f"{args.out}: is not an empty folder; name a new one with --out")
-    if args.ros2:
-        return _export_bag(args)
     if args.format == "parquet":
         import pyarrow  # noqa: F401 - so that nothing is half-written when the extra is missing
     recording = opened(args.recording)
@@ -139,27 +131,4 @@ def _export(args: argparse.Namespace) -> int:
         say_json({"out": str(args.out), "tables": [path.name for path in tables], "images": images})
     else:
         say(f"{args.out}: {len(tables)} tables, {images} images")
-    return ExitCode.DONE
-
-
-def _export_bag(args: argparse.Namespace) -> int:
-    """One whole bag, or none."""
-    import rosbags  # noqa: F401 - so that nothing is half-written when the extra is missing
-
-    from flockd.onboard.recording.bag_export import export_bag
-
-    if args.images or args.format != "csv":
-        raise UsageError("--ros2 writes a bag, with the images in it; drop --format and --images")
-    recording = opened(args.recording)
-    if args.out.is_dir():
-        args.out.rmdir()  # an empty one, in whose place the bag comes
-    try:
-        count = export_bag(recording.contents.paths, recording.drone, recording.config, args.out, args.ros2)
-    except BaseException:
-        shutil.rmtree(args.out, ignore_errors=True)
-        raise
-    if args.json:
-        say_json({"out": str(args.out), "messages": count, "storage": args.ros2})
-    else:
-        say(f"{args.out}: {count} messages")
     return ExitCode.DONE

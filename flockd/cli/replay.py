@@ -35,7 +35,6 @@ def add(commands: Commands) -> None:
         "flockd replay drone1.mcap --reference drone1.expected --update-reference",
         "flockd replay rgbd_folder --depth recorded --stride 3 --trajectory path.txt",
         "flockd replay flight_bag --config my_drone.yaml --vehicle /mavros/local_position/odom",
-        "flockd replay clip.mp4 --calibration K.txt --flow dis --json",
     )
     description = "Run the pilot on a recorded flight again: the same frames and vehicle states, the same code."
     parser = commands("replay", description, examples)
@@ -61,9 +60,7 @@ def add(commands: Commands) -> None:
         help="numbers of this field, such as command.velocity, may differ by X; may be given again",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
-    group = parser.add_argument_group(
-        "bags of ROS 2", "a bag folder as RECORDING; with --config if it is not of flockd"
-    )
+    group = parser.add_argument_group("bags of ROS 2", "a bag folder as RECORDING, with --config")
     group.add_argument(
         "--vehicle", metavar="TOPIC", help="odometry, pose or IMU of the drone (default: the only one there is)"
     )
@@ -93,10 +90,9 @@ def _tolerance(text: str) -> tuple[str, float]:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.ground.datasets import is_dataset
     from flockd.onboard.recording.ros_bag import is_bag
 
-    if is_dataset(args.recording) and not is_bag(args.recording):
+    if args.recording.is_dir() and not is_bag(args.recording):
         return run_dataset(args)
     refuse_dataset_options(args)
     _check_options(args)
@@ -107,7 +103,6 @@ def _run(args: argparse.Namespace) -> int:
 @contextmanager
 def _recording(args: argparse.Namespace) -> Iterator[Recording]:
     """What is replayed; of a bag of somebody else's a recording in a temporary folder."""
-    from flockd.onboard.recording.bag_export import is_own
     from flockd.onboard.recording.ros_bag import Bag, is_bag
 
     if args.vehicle is not None and not is_bag(args.recording):
@@ -116,15 +111,12 @@ def _recording(args: argparse.Namespace) -> Iterator[Recording]:
         yield opened(args.recording)
         return
     with Bag(args.recording) as bag, TemporaryDirectory(prefix="flockd-bag-") as folder:
-        if is_own(bag):
-            yield opened(args.recording)
-            return
         from flockd.review.replay.bag_flight import recording_of_bag
 
         config = loaded_drone(args.config)
         if config is None:
             raise UsageError(
-                f"{args.recording}: is a bag of ROS 2, but none of flockd; name a drone with --config whose "
+                f"{args.recording}: is a bag of ROS 2; name a drone with --config whose "
                 "source.kind is `ros` and whose cameras name their topics"
             )
         target = Path(folder) / f"{args.recording.resolve().name}.mcap"

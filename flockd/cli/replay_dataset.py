@@ -24,7 +24,7 @@ _OF_DATASETS = ("depth", "stride", "flow", "calibration", "trajectory")
 
 def add_dataset_options(parser: Parser) -> None:
     """Adds what only replays of datasets have."""
-    group = parser.add_argument_group("datasets", "a folder with images, depth and poses, or a video, as RECORDING")
+    group = parser.add_argument_group("datasets", "a folder with images, depth and poses as RECORDING")
     group.add_argument(
         "--depth", choices=("recorded", "network"), help="the recorded depth, or that of the network (default: network)"
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
 from flockd.cli.flight_summary import show_summary
@@ -31,7 +31,6 @@ def add(commands: Commands) -> None:
         "flockd report recordings",
         "flockd report kestrel-20261120T101500Z.mcap --out reports/kestrel",
         "flockd report drone1.mcap --without-pictures --json",
-        "flockd report drone1.mcap --ulog log_12_2026-11-20-10-15-00.ulg",
         "flockd report out/calm out/windy",
         "flockd report out/short --video short.webm --drone drone2",
     )
@@ -60,9 +59,6 @@ def add(commands: Commands) -> None:
         help="do not run the networks again for the report's images",
     )
     parser.add_argument(
-        "--ulog", metavar="FILE", type=Path, help="the autopilot's own log of the flight (PX4's ULog), shown beside it"
-    )
-    parser.add_argument(
         "--video",
         metavar="FILE",
         type=Path,
@@ -74,7 +70,7 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    require(*(path for path in (args.flight, args.other, args.ulog) if path is not None))
+    require(*(path for path in (args.flight, args.other) if path is not None))
     from flockd.review.report.flight_folder import LOG_NAME, check_report_folder, prepare_report_folder, save_flight
 
     if args.other is not None:
@@ -83,9 +79,8 @@ def _run(args: argparse.Namespace) -> int:
         return _video(args)
     if args.drone is not None:
         raise UsageError("--drone is for --video; drop it")
-    ulog = None if args.ulog is None else _ulog(args.ulog)
     if (args.flight / LOG_NAME).is_file():
-        return _again(args, ulog)
+        return _again(args)
     paths = _recordings(args.flight)
     named = paths[0] if len(paths) == 1 else args.flight
     directory = args.out or named.with_name(named.resolve().name.removesuffix(".mcap") + SUFFIX)
@@ -93,8 +88,6 @@ def _run(args: argparse.Namespace) -> int:
     log, pictures = _flight(paths, pictured=not args.without_pictures)
     prepare_report_folder(directory, force=args.force)
     save_flight(directory, log, pictures)
-    if ulog is not None:
-        _save_beside(directory, log, paths, ulog, args.ulog)
     return _write(directory, log, args)
 
 
@@ -106,28 +99,7 @@ def _write(directory: Path, log: FlightLog, args: argparse.Namespace) -> int:
     return show_summary(directory, summary, as_json=args.json)
 
 
-def _ulog(path: Path) -> Any:
-    """Read first, so that a bad file costs no waiting."""
-    from flockd.review.flight_log.ulog import read_ulog
-
-    with progress("reading the autopilot's log", "files") as tell_progress:
-        ulog = read_ulog(path)
-        tell_progress(1, 1)
-    return ulog
-
-
-def _save_beside(directory: Path, log: FlightLog, recordings: Sequence[Path], ulog: Any, path: Path) -> None:
-    """Writes what the autopilot logged, on the flight's time, to where the report finds it."""
-    from flockd.review.flight_log.from_recordings import autopilot_clock
-    from flockd.review.flight_log.ulog import autopilot_log, drone_of
-    from flockd.review.report.flight_folder import AUTOPILOT_LOG_NAME
-
-    drone, recording = drone_of(ulog, path, log, [opened(one) for one in recordings])
-    clock = None if recording is None else autopilot_clock(recording)
-    autopilot_log(ulog, path, log, drone, clock).save(directory / AUTOPILOT_LOG_NAME)
-
-
-def _again(args: argparse.Namespace, ulog: Any | None) -> int:
+def _again(args: argparse.Namespace) -> int:
     """The report of a flight whose folder has its log."""
     for option in ("out", "without_pictures"):
         if getattr(args, option):
@@ -135,17 +107,13 @@ def _again(args: argparse.Namespace, ulog: Any | None) -> int:
                 f"--{option.replace('_', '-')} is for recordings, and {args.flight} is a flight's folder, whose report "
                 "is written into it; drop it"
             )
-    from flockd.review.report.flight_folder import RECORDINGS, REPORT_NAME
+    from flockd.review.report.flight_folder import REPORT_NAME
     from flockd.review.report.summary import summarise
 
     log = _log_in(args.flight)
-    if (args.flight / REPORT_NAME).is_file() and ulog is None and not args.force:
+    if (args.flight / REPORT_NAME).is_file() and not args.force:
         complain(f"{args.flight / REPORT_NAME}: is left as it was; --force writes it again")
         return show_summary(args.flight, summarise(log), as_json=args.json)
-    if ulog is not None:
-        from flockd.review.flight_log.from_recordings import recordings_in
-
-        _save_beside(args.flight, log, recordings_in(args.flight / RECORDINGS), ulog, args.ulog)
     return _write(args.flight, log, args)
 
 
@@ -154,7 +122,7 @@ def _video(args: argparse.Namespace) -> int:
     from flockd.review.flight_log.from_recordings import recordings_in
     from flockd.review.report.flight_folder import LOG_NAME, RECORDINGS
 
-    _refuse(args, ("out", "without_pictures", "ulog"), "has no meaning with --video")
+    _refuse(args, ("out", "without_pictures"), "has no meaning with --video")
     of_a_folder = (args.flight / LOG_NAME).is_file()
     recordings = recordings_in(args.flight / RECORDINGS) if of_a_folder else _recordings(args.flight)
     return report_video.write(args, _log_of(args.flight), recordings)
@@ -168,7 +136,7 @@ def _refuse(args: argparse.Namespace, options: Sequence[str], why: str) -> None:
 
 def _compare(args: argparse.Namespace) -> int:
     """The key figures of two flights side by side."""
-    _refuse(args, ("out", "without_pictures", "force", "ulog", "video", "drone"), "has no meaning with two flights")
+    _refuse(args, ("out", "without_pictures", "force", "video", "drone"), "has no meaning with two flights")
     from flockd.review.report.comparison import compare
     from flockd.review.report.summary import summarise
 

@@ -4,13 +4,43 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+_CAMERAS = "change them in the file; `flockd cameras --write FILE` writes the sections for what is plugged in"
+
 COMMANDS: Mapping[str, str] = {
+    **{
+        f"flockd config new {kind} --{option}": instead
+        for kind, options in {
+            "drone": {
+                "name": "write `--set name=NAME`",
+                "number": "write `--set safety.first_flight_layer=N`",
+                **dict.fromkeys(("cameras", "size", "field-of-view", "source"), _CAMERAS),
+                "autopilot": "write `--set autopilot.address=ADDRESS`",
+                "fleet": "write `--set telemetry.fleet=NAME`",
+                "mission": "write `--set 'mission={kind: KIND}'`",
+                "defaults": "leave it out: nothing is asked",
+            },
+            "scenario": {
+                "name": "write `--set scenario=NAME`",
+                "drones": "leave it out, and say it to `flockd sim FILE --drones N`",
+                "duration": "write `--set duration_s=S`",
+                "mission": "write `--set 'mission={kind: KIND}'`",
+                "obstacles": "write `--set world.obstacles.kind=KIND --set obstacles.enabled=true`",
+                "drone": "write `--set drone=FILE`",
+                "defaults": "leave it out: nothing is asked",
+            },
+        }.items()
+        for option, instead in options.items()
+    },
+    "flockd foxglove": "watch live with `flockd fleet`, or in ROS 2 with `flockd ros`; Foxglove opens recordings",
+    "flockd record export --ros2": "Foxglove opens the recording itself; record a flight's topics of `flockd ros`",
+    "flockd report --ulog": "open PX4's log in Flight Review or PlotJuggler",
     "flockd view": "open the recording in Foxglove, or in Rerun after `rerun mcap convert RECORDING.mcap -o X.rrd`",
 }
 """By a command, or a command and its option, as they were written on the command line."""
 
 KEYS: Mapping[str, str] = {
     "autopilot.max_heartbeat_age_s": "write `heartbeat_timeout_s` in the section `safety`",
+    "cameras.compression.h264_mbit_s": "write `jpeg_quality`; streams are no longer simulated",
     "desired": "write the section `mission`, with `kind: circle_then_tangent` for the same flight",
     "safety.degraded_gusts_m_s": "write `degraded_velocity_error_m_s`",
     "safety.gate.max_drift_m_s": "delete it: wind is left to the autopilot",

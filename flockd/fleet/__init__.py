@@ -1,1 +1,1 @@
-"""During a flight, for people: who is there, orders, the page, Foxglove."""
+"""During a flight, for people: who is there, orders, the page, ROS 2."""

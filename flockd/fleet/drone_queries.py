@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import zenoh
 
-from flockd.core.image_header import jpeg_size
+from flockd.core.jpeg_header import jpeg_size
 from flockd.onboard.telemetry.schema import completed, fault
 from flockd.onboard.telemetry.topics import PREFIX, AboutMessage, AnswerMessage, AskMessage, TimeMessage
 
@@ -85,7 +85,7 @@ class DroneQueries:
     def image(self, drone: str, camera: str) -> bytes | None:
         """A small JPEG of what a camera sees."""
         image = self._reply(f"{drone}/image/{camera}", timeout_s=PICTURE_S)
-        size_px = jpeg_size(image) if image is not None and image.startswith(b"\xff\xd8") else None
+        size_px = None if image is None else jpeg_size(image)
         return image if size_px is not None and max(size_px) <= MAX_PICTURE_PX else None
 
     def message(self, key: str, kind: type, payload: bytes = b"", *, session: zenoh.Session | None = None) -> Any:

@@ -30,23 +30,19 @@ def test_a_command_that_is_gone_is_refused_with_what_to_use(command: str, capsys
 def test_a_key_that_is_gone_is_refused_with_its_line_and_what_to_use(
     key: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    drone = (_CONFIG / "simulator.yaml").read_text(encoding="utf-8")
     *sections, name = key.split(".")
-    inner: Any = yaml.safe_load(drone)
+    file = _CONFIG / ("simulator.yaml" if sections[:1] != ["cameras"] else "square.yaml")
+    values: Any = yaml.safe_load(file.read_text(encoding="utf-8"))
+    if "drone" in values:
+        values["drone"] = str(_CONFIG / values["drone"])
+    inner = values
     for section in sections:
-        inner = inner.get(section, {})
+        inner = inner.setdefault(section, {})
     assert name not in inner
-    written = [f"{'  ' * depth}{section}:" for depth, section in enumerate(sections)]
-    written.append(f"{'  ' * len(sections)}{name}: 1")
-    lines = drone.splitlines()
-    if sections and f"{sections[0]}:" in lines:
-        at = lines.index(f"{sections[0]}:") + 1
-        lines[at:at] = written[1:]
-        line = at + len(written) - 1
-    else:
-        lines += written
-        line = len(lines)
-    path = tmp_path / "drone.yaml"
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    inner[name] = 1
+    path = tmp_path / "file.yaml"
+    text = yaml.safe_dump(values)
+    path.write_text(text, encoding="utf-8")
+    (line,) = (number for number, one in enumerate(text.splitlines(), 1) if one.strip() == f"{name}: 1")
     assert main(["config", "check", str(path)]) == 78
     assert f"{path}:{line}: {key}: is gone; {KEYS[key]}\n" in capsys.readouterr().err

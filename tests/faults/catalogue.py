@@ -487,7 +487,6 @@ CATALOGUE = (
             f"{_HERE}operators.py::test_neither_absurd_peers_nor_stuck_pictures_keep_an_order_from_a_drone",
             "tests/onboard/telemetry/test_malformed.py",
             "tests/fleet/page/test_crowded.py::test_a_drone_with_absurd_numbers_closes_no_page",
-            "tests/fleet/foxglove_server/test_strangers.py",
         ),
         within_s=60.0,
     ),
@@ -633,9 +632,9 @@ CATALOGUE = (
     ),
     Fault(
         70, "setpoints-clipped", "the autopilot clips setpoints (`MPC_XY_VEL_MAX`)",
-        "said; no other program is accused",
+        "said; flown slower to the end; no other program is accused",
         (
-            f"{_HERE}autopilot.py::test_setpoints_that_the_autopilot_clips_are_told_and_nobody_is_accused",
+            f"{_HERE}autopilot.py::test_where_the_autopilot_limits_setpoints_flockd_asks_for_no_more_and_nobody_is_accused",
             "tests/onboard/autopilot/test_setpoint_watch.py",
         ),
         within_s=4.0,

@@ -211,7 +211,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, help="keep logs in this folder")
     return run_trials(
         parser, FLIGHTS, _fly_all, line=_line, rows="flights", arguments=arguments,
-        header=f"{'flight':15}{'speed':>5}{'off m/s':>9}{'truly':>9}{'order':>9}{'closest':>9}{'longest':>9}{'':11}modes",
+        header=(
+            f"{'flight':15}{'speed':>5}{'off m/s':>9}{'truly':>9}{'order':>9}{'closest':>9}{'longest':>9}{'':11}modes"
+        ),
     )  # fmt: skip
 
 

@@ -3,11 +3,9 @@
     flockd campaign config/campaigns/large_flocks.yaml
     python -m tools.docs.docs_campaign out/large_flocks min_level_distance_m order_tail drone_collisions
     python -m tools.docs.docs_campaign out/large_flocks min_level_distance_m --picture docs/pictures/large_flocks.webp
-    python -m tools.docs.docs_campaign out/large_flocks --places 250 60 --picture docs/pictures/large_flocks_seen.webp
 
 The campaign varies one parameter, in one or several cases. Each entry of the table is the mean of a figure over the
-seeds, with half the width of its 95 % confidence interval where that is not zero in the digits shown. `--places` flies
-each case's first flight of so many drones for so many seconds, on exact states, and draws where the drones are.
+seeds, with half the width of its 95 % confidence interval where that is not zero in the digits shown.
 """
 
 from __future__ import annotations
@@ -17,22 +15,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from matplotlib import rc_context
-from matplotlib.figure import Figure as Drawing
-
 from flockd.campaign.campaign_figures import label_of, parameter_curves, shown
 from flockd.campaign.flight_plan import CASE
 from flockd.campaign.results import Results
-from flockd.core.config.campaign import DRONES, Figure
+from flockd.core.config.campaign import Figure
 from flockd.core.errors import UsageError
-from flockd.review.report.style import INK, MUTED, STYLE, colour_of
-from flockd.sim.control_level.flock_flights import FlockFlights
 
 DPI = 110
 QUALITY = 85
-REACH_M = 42.0
-"""Reach of `--places`, from the flock's middle."""
 
 
 def main() -> None:
@@ -41,7 +31,6 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="of the campaign")
     parser.add_argument("figures", nargs="*", metavar="FIGURE", help="of its `measure`; default: all")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the first figure there instead")
-    parser.add_argument("--places", nargs=2, type=int, metavar=("DRONES", "SECONDS"), help="draw where they are")
     args = parser.parse_args()
     results = Results.load(args.folder)
     if unknown := set(args.figures) - set(results.figures):
@@ -50,8 +39,7 @@ def main() -> None:
     if args.picture is None:
         print(table(results, figures))
     else:
-        drawing = places(results, *args.places) if args.places else parameter_curves(results, figures[0])
-        drawing.savefig(args.picture, dpi=DPI, pil_kwargs={"quality": QUALITY})
+        parameter_curves(results, figures[0]).savefig(args.picture, dpi=DPI, pil_kwargs={"quality": QUALITY})
         print(f"{args.picture}: {args.picture.stat().st_size / 1e3:.0f} kB")
 
 
@@ -71,24 +59,6 @@ def table(results: Results, figures: Sequence[Figure]) -> str:
         entries = ["; ".join(_entry(results, figure, one) for figure in figures) for one in chosen]
         lines.append(f"| {shown(value)} | {' | '.join(entries)} |")
     return "\n".join(lines)
-
-
-def places(results: Results, drones: int, time_s: int) -> Drawing:
-    """One panel a case, metres to the east and to the north of the flock's middle."""
-    cells = [cell for cell in results.plan.cells if cell.parameters.get(DRONES) == drones]
-    with rc_context(STYLE):
-        drawing = Drawing(figsize=(9.0, 2.7), layout="constrained")
-        for number, (cell, axes) in enumerate(zip(cells, np.ravel(drawing.subplots(1, len(cells))), strict=True)):
-            scenario = results.plan.recipe(cell, 0).scenario().model_copy(update={"duration_s": float(time_s)})
-            flights = FlockFlights([scenario])
-            for step in range(flights.steps):
-                flights.step(step, None, 1)
-            north, east = flights.states[:2, 0] - flights.states[:2, 0].mean(axis=1, keepdims=True)
-            axes.plot(east, north, ".", color=colour_of(number, len(cells)), markersize=2.5)
-            axes.set(aspect="equal", xlim=(-REACH_M, REACH_M), ylim=(-REACH_M, REACH_M))
-            axes.set_title(cell.parameters.get(CASE, ""), fontsize=9, color=INK)
-            axes.tick_params(colors=MUTED, labelsize=7)
-    return drawing
 
 
 def _entry(results: Results, figure: Figure, wanted: dict[str, Any]) -> str:

@@ -4,14 +4,14 @@
     python -m tools.docs.docs_pictures flock FLIGHT docs/pictures/flock.gif       # the flock, animated
     flockd sim --duration 5 --drones 3 --out SHORT
     python -m tools.docs.docs_pictures seen SHORT docs/pictures/seen.webp         # what a drone sees
-    python -m tools.docs.docs_pictures law docs/pictures/law_curve.svg            # Eq. 39 and 41 over distance
     python -m tools.docs.docs_pictures world config/forest.yaml docs/pictures/forest.webp      # what stands at the
     start
     python -m tools.docs.docs_pictures clip tests/review/replay/crossing.mcap docs/pictures/crossing.webm
 
     python -m tools.docs.docs_pictures above FLIGHT docs/pictures/circle.webp     # a short clip for the gallery
 
-detected.webp is what `flockd detect` draws; the other pictures in docs/pictures are drawn by hand.
+detected.webp is what `flockd detect` draws, law_curve.svg what this program drew at commit 7b9dec37; the other pictures
+are drawn by hand.
 """
 
 from __future__ import annotations
@@ -21,15 +21,12 @@ import io
 from pathlib import Path
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
 from flockd.core.config import load_scenario
-from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import FloatArray
-from flockd.flight.flocking import FlockingLaw
 from flockd.onboard.recording.reader import Recording
 from flockd.review.flight_log.from_recordings import flight_log
 from flockd.review.flight_log.key_frames import load_key_frames
@@ -38,7 +35,7 @@ from flockd.review.flight_log.moments import recorded_moments
 from flockd.review.report.filmstrip import filmstrip_figure
 from flockd.review.report.flight_folder import KEY_FRAMES_NAME, LOG_NAME
 from flockd.review.report.flight_video import write_video
-from flockd.review.report.style import GRID, INK, MUTED, PAPER, STYLE, colour_of
+from flockd.review.report.style import GRID, INK, MUTED, PAPER, colour_of
 
 FRAME_MS = 50
 SIZE_IN, DPI = (7.6, 3.23), 100
@@ -69,7 +66,6 @@ def main() -> None:
     clip = kinds.add_parser("clip")
     clip.add_argument("recording", type=Path)
     clip.add_argument("out", type=Path)
-    kinds.add_parser("law").add_argument("out", type=Path)
     args = parser.parse_args()
     if args.kind == "flock":
         save_flock(FlightLog.load(args.flight / LOG_NAME), args.out)
@@ -79,10 +75,8 @@ def main() -> None:
         save_seen(args.flight / KEY_FRAMES_NAME, args.out)
     elif args.kind == "world":
         save_world(args.scenario, args.out)
-    elif args.kind == "clip":
-        save_clip(args.recording, args.out)
     else:
-        save_law(args.out)
+        save_clip(args.recording, args.out)
     print(f"{args.out}: {args.out.stat().st_size / 1e3:.0f} kB")
 
 
@@ -213,33 +207,6 @@ def _image(figure: Figure) -> Image.Image:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=figure.dpi)
     return Image.open(buffer).convert("RGB")
-
-
-def save_law(path: Path) -> None:
-    """What one neighbour adds to the acceleration, over its distance, with the paper's parameters."""
-    paper = FlockingParameters(velocity=0.0, alignment=0.0)
-    distances = np.linspace(0.55, 8.0, 400)
-    with rc_context({**STYLE, "svg.hashsalt": "flockd", "svg.fonttype": "path"}):
-        figure = Figure(figsize=(6.4, 3.2), layout="constrained")
-        axes = figure.add_subplot()
-        axes.axhline(0.0, color=MUTED, linewidth=0.8)
-        for label, colour, parameters in (
-            ("both", "#c9d1da", paper),
-            ("cohesion (Eq. 39)", "#0072b2", paper.model_copy(update={"separation": 0.0})),
-            ("separation (Eq. 41)", "#d55e00", paper.model_copy(update={"cohesion": 0.0})),
-        ):
-            law = FlockingLaw(parameters)
-            towards = [law.acceleration([0, 0], [[d, 0]], [[0, 0]], [0, 0])[0] for d in distances]
-            axes.plot(distances, towards, color=colour, label=label, linewidth=6.0 if label == "both" else 1.5)
-        for distance, name in ((paper.separation_distance_m, "D_II"), (paper.desired_distance_m, "D_d")):
-            axes.axvline(distance, color=GRID, linewidth=1.0, zorder=0)
-            axes.text(distance + 0.06, 0.86, name.replace("_", ""), color=MUTED, va="top")
-        axes.set(
-            xlim=(0.5, 8.0), ylim=(-1.6, 0.9),
-            xlabel="distance to the neighbour, m", ylabel="acceleration towards it, m/s²",
-        )  # fmt: skip
-        axes.legend(loc="lower right")
-        figure.savefig(path, metadata={"Date": None})
 
 
 if __name__ == "__main__":

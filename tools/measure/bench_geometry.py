@@ -1,22 +1,19 @@
-"""Rigid motions between paired points: ours beside peers, on the same pairs, on one thread, in one run.
+"""Rigid motions between paired points: ours, the paper's, and OpenCV's, on the same pairs and one thread.
 
 OMP_NUM_THREADS=1 python -m tools.measure.bench_geometry        # all cases, 30 draws each: some minutes
 OMP_NUM_THREADS=1 python -m tools.measure.bench_geometry --draws 1000 --only "5000, 90 % outliers" --methods consensus
 
-The peers are for comparison alone and are not flockd's: `pip install kiss-matcher pygcransac pymagsac small_gicp`;
-those that are not installed are left out, which the table says. Milliseconds are the median of the best of three
-runs of each draw; degrees and centimetres the median and the 99th percentile; a failure is an answer off by more than
-1 degree or 5 cm (for the cases with large errors, 3 degrees or 20 cm), or none.
+Milliseconds are the median of the best of three runs of each draw; degrees and centimetres the median and the 99th
+percentile; a failure is an answer off by more than 1 degree or 5 cm (for the cases with large errors, 3 degrees or 20
+cm), or none.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import ModuleType
 
 import cv2
 import numpy as np
@@ -123,43 +120,6 @@ def _ours(method: str) -> Solve:
     return solve
 
 
-def _kiss_matcher(peer: ModuleType) -> Solve:
-    def solve(pairs: Draw, noise_m: float) -> FloatArray:
-        matcher = peer.KISSMatcher(peer.KISSMatcherConfig(voxel_size=2.0 * noise_m))
-        found = matcher.solve(np.asfortranarray(pairs.source.T), np.asfortranarray(pairs.target.T))
-        return _matrix(np.asarray(found.rotation), np.asarray(found.translation))
-
-    return solve
-
-
-def _pygcransac(peer: ModuleType) -> Solve:
-    def solve(pairs: Draw, noise_m: float) -> FloatArray:
-        both = np.ascontiguousarray(np.hstack([pairs.source, pairs.target]))
-        found, _ = peer.findRigidTransform(
-            both, [], threshold=3.0 * noise_m, max_iters=5000, use_space_partitioning=False
-        )
-        return np.asarray(found).T if found is not None else np.full((4, 4), np.nan)
-
-    return solve
-
-
-def _pymagsac(peer: ModuleType) -> Solve:
-    def solve(pairs: Draw, noise_m: float) -> FloatArray:
-        both = np.ascontiguousarray(np.hstack([pairs.source, pairs.target]))
-        found, _ = peer.findRigidTransformation(both, [], sampler=1, sigma_th=3.0 * noise_m, max_iters=5000)
-        return np.asarray(found).T if found is not None else np.full((4, 4), np.nan)
-
-    return solve
-
-
-def _small_gicp(peer: ModuleType) -> Solve:
-    def solve(pairs: Draw, noise_m: float) -> FloatArray:
-        found = peer.align(pairs.target, pairs.source, max_correspondence_distance=20.0 * noise_m, num_threads=1)
-        return np.asarray(found.T_target_source)
-
-    return solve
-
-
 def _opencv(pairs: Draw, noise_m: float) -> FloatArray:
     found, affine, _ = cv2.estimateAffine3D(pairs.source, pairs.target, ransacThreshold=3.0 * noise_m)
     if not found:
@@ -170,24 +130,7 @@ def _opencv(pairs: Draw, noise_m: float) -> FloatArray:
     return _matrix(rotation, affine[:, :3] @ middle + affine[:, 3] - rotation @ middle)
 
 
-PEERS: dict[str, tuple[str, Callable[[ModuleType], Solve]]] = {
-    "kiss-matcher": ("kiss_matcher", _kiss_matcher),
-    "pygcransac": ("pygcransac", _pygcransac),
-    "pymagsac": ("pymagsac", _pymagsac),
-    "small_gicp (no pairs used)": ("small_gicp", _small_gicp),
-}
-
-
-def methods() -> tuple[dict[str, Solve], list[str]]:
-    """What can be run here, and the peers that are not installed."""
-    found: dict[str, Solve] = {"consensus": _ours("consensus"), "paper": _ours("paper"), "OpenCV affine": _opencv}
-    missing = []
-    for name, (module, solver) in PEERS.items():
-        try:
-            found[name] = solver(importlib.import_module(module))
-        except ImportError:
-            missing.append(name)
-    return found, missing
+METHODS: dict[str, Solve] = {"consensus": _ours("consensus"), "paper": _ours("paper"), "OpenCV affine": _opencv}
 
 
 def _matrix(rotation: FloatArray, translation: FloatArray) -> FloatArray:
@@ -246,21 +189,17 @@ def main() -> None:
     )
     parser.add_argument("--draws", type=int, default=30)
     parser.add_argument("--only", nargs="+", metavar="CASE", choices=[case.name for case in CASES])
-    parser.add_argument("--methods", nargs="+", metavar="METHOD")
+    parser.add_argument("--methods", nargs="+", choices=METHODS)
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    found, missing = methods()
-    for name in missing:
-        print(f"not installed, left out: {name}")
-    if options.methods:
-        found = {name: solve for name, solve in found.items() if name in options.methods}
+    chosen = {name: METHODS[name] for name in options.methods or METHODS}
     print(
         f"{'case':36} {'method':27} {'ms':>8} {'deg':>7} {'99 %':>7} {'cm':>7} {'99 %':>7} failures of {options.draws}"
     )
     for case in CASES:
         if options.only and case.name not in options.only:
             continue
-        for name, solve in found.items():
+        for name, solve in chosen.items():
             row = measured(case, solve, options.draws)
             print(
                 f"{case.name:36} {name:27} {row.ms:8.2f} {row.degrees[0]:7.3f} {row.degrees[1]:7.3f} "

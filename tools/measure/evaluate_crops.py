@@ -1,6 +1,6 @@
-"""Measure distance networks on crops of drones that none of them has learnt from: a table of each drone.
+"""Measure distance networks on crops of drones that none of them has learnt from: one table.
 
-    python -m tools.training.render_drone_crops CROPS --airframes AIRFRAMES --held-out --worlds 8
+    python -m tools.training.render_drone_crops CROPS --held-out --worlds 8    # --mesh for a drone of your own
     python -m tools.measure.evaluate_crops CROPS models/distance_int8.yaml MINE/distance_int8.yaml
 
 Counted are whole drones in the middle of a crop that they fill, as the cascade's last crop shows them.
@@ -9,17 +9,99 @@ Counted are whole drones in the middle of a crop that they fill, as the cascade'
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tools.measure.evaluation.on_crops import HeldOut, measured
-from tools.training.airframes import name_of
-from tools.training.specialising.runs import table
+from flockd.flight.inference import OnnxModel
+from flockd.flight.perception.requirements import check_roles
+from tools.training.crop_files import is_aimed
+
+Array = NDArray[Any]
+RANGES_M = ((1.5, 5.0), (5.0, 10.0))
+_BATCH = 64
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Crops that no network has learnt from."""
+
+    picture: Array
+    """(n, 96, 96, 3) with the drone in the middle, as the cascade's last crop has it."""
+    log_range: Array
+    """(n,) true log(range / focal length)."""
+    range_m: Array
+    """(n,)"""
+    none: Array
+    """(m, 96, 96, 3) without a drone."""
+    log_size: Array
+    """(n,) logarithm of the drone's size in metres."""
+
+    @classmethod
+    def of(cls, folder: Path) -> HeldOut:
+        """Held-out crops from the files of ``render_drone_crops`` in ``folder``: whole drones, aimed at as the
+        cascade's last crop is.
+
+        Raises ValueError where the files are not such.
+        """
+        rows: list[dict[str, Array]] = []
+        for path in sorted(folder.glob("*.npz")):
+            with np.load(path) as arrays:
+                rows.append(dict(arrays))
+        if not rows or "whole" not in rows[0]:
+            raise ValueError(f"{folder}: holds no crops with ranges; make them with `render_drone_crops --held-out`")
+        joined = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+        shown = joined["whole"] & is_aimed(joined)
+        return cls(
+            joined["picture"][shown],
+            joined["target"][shown, 0],
+            joined["range_m"][shown],
+            joined["picture"][joined["drone"] < 0.5],
+            (joined["apparent"] + joined["target"][:, 0])[shown],
+        )
+
+
+def measured(manifest: Path, crops: HeldOut) -> dict[str, str]:
+    """Figures of a network by what they are; relative errors of range are of one crop, without the cascade's mean."""
+    model = OnnxModel(manifest, threads=1, check=check_roles)
+    out = _columns(model, crops.picture)
+    no = _columns(model, crops.none)
+    error = np.expm1(out["log_range_per_focal"] - crops.log_range)
+    by_size = np.expm1(crops.log_size - out["log_apparent_size"] - crops.log_range)
+    figures: dict[str, str] = {}
+    for name, errors in (("range", error), ("range by the known size", by_size)):
+        for low, high in RANGES_M:
+            at = (low <= crops.range_m) & (crops.range_m < high)
+            if at.any():
+                off = np.abs(errors[at])
+                figures[f"error of {name}, {low:g}-{high:g} m, median / p95 / bias"] = (
+                    f"{np.median(off):.2%} / {np.quantile(off, 0.95):.2%} / {np.median(errors[at]):+.2%}"
+                )
+    of_size = np.exp(out["log_size_sigma"]) if "log_size_sigma" in out else 0.0
+    sigma = np.hypot(np.exp(out["log_relative_sigma"]), of_size)
+    sigmas = np.abs(out["log_range_per_focal"] - crops.log_range) / sigma
+    figures["errors inside 1 and 2 sigma"] = f"{np.mean(sigmas < 1):.0%}, {np.mean(sigmas < 2):.0%}"
+    least = np.log(1 / (1 / model.manifest.threshold("drone_probability") - 1))
+    figures["drones called a drone"] = f"{np.mean(out['drone_logit'] > least):.1%}"
+    figures["crops without a drone called one"] = f"{np.mean(no['drone_logit'] > least):.1%}"
+    return figures
+
+
+def _columns(model: OnnxModel, pictures: Array) -> dict[str, Array]:
+    (name,) = model.manifest.inputs
+    spec = model.manifest.results["range"]
+    parts = [
+        spec.by_column(model.run({name: pictures[k : k + _BATCH]})["range"]) for k in range(0, len(pictures), _BATCH)
+    ]
+    return {column: np.concatenate([part[column] for part in parts]).astype(float) for column in spec.columns}
 
 
 def main() -> None:
-    """Print the tables."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("crops", type=Path, help="folder of tools.training.render_drone_crops --held-out")
     parser.add_argument("manifests", type=Path, nargs="+", help="of distance networks")
@@ -28,10 +110,16 @@ def main() -> None:
         crops = HeldOut.of(arguments.crops)
     except ValueError as error:
         parser.error(str(error))
-    of_each = {name_of(int(family)): crops.of_family(family) for family in np.unique(crops.family)}
-    for name, its in ({"all drones": crops} | of_each).items():
-        print(f"{name}, {len(its.picture)} crops")
-        print(table({str(manifest): measured(manifest, its) for manifest in arguments.manifests}), end="\n\n")
+    print(f"{len(crops.picture)} crops with a drone, {len(crops.none)} without")
+    print(_table({str(manifest): measured(manifest, crops) for manifest in arguments.manifests}))
+
+
+def _table(figures: Mapping[str, Mapping[str, str]]) -> str:
+    """One row a figure, one column a network."""
+    names = list(next(iter(figures.values())))
+    rows = [["", *figures], *[[name, *(column[name] for column in figures.values())] for name in names]]
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    return "\n".join("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows)
 
 
 if __name__ == "__main__":

@@ -17,19 +17,15 @@ from pathlib import Path
 import numpy as np
 
 from flockd.core.choices import ROLES
-from flockd.core.config import load_scenario
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
 from flockd.core.messages import Frame
 from flockd.flight.geometry import PinholeCamera, RigidTransform
 from flockd.flight.perception import Crop, OnnxNetworks
-from tools.measure.evaluation.on_pairs import HEIGHT_SIGMAS_M, MASK_WITHIN_M, Findings, look_at_pairs
-from tools.measure.evaluation.on_rigs import ego_motion_errors
-from tools.training import worlds
+from tools.measure.on_pairs import HEIGHT_SIGMAS_M, MASK_WITHIN_M, Findings, look_at_pairs
 from tools.training.dataset import WIDTH, PairSet, open_pairs, rig_camera
 
 RANGES_M = ((1.5, 5.0), (5.0, 10.0), (10.0, 20.0))
-RIG_WORLDS, RIG_STEPS = 12, 4
 IMAGES_TIMED = 60
 CROPS_OF_A_DRONE = (1, 1, 1)
 """As many as it takes one after another, mostly: see ``flockd.flight.perception.detection.refinement``."""
@@ -39,41 +35,6 @@ WITH: dict[str | None, str] = {
     **{given: f"attitude, height by {given} ({sigma:g} m)" for given, sigma in HEIGHT_SIGMAS_M.items()},
 }
 """What the scale of depth comes from."""
-
-WANTED: dict[str, tuple[float, float]] = {
-    "distance, whole, 1.5-5 m, median": (0, 0.6),
-    "distance, whole, 1.5-5 m, p95": (0, 2.2),
-    "distance, whole, 5-10 m, median": (0, 0.8),
-    "distance, whole, 5-10 m, p95": (0, 3),
-    "distance, whole, 10-20 m, median": (0, 2.5),
-    "distance, whole, 10-20 m, p95": (0, 7),
-    "distance, cut or hidden, within 10 m, median": (0, 1.5),
-    "distance, cut or hidden, within 10 m, p95": (0, 10),
-    "distance errors inside 1 sigma": (60, 76),
-    "distance errors inside 2 sigma": (92, 98),
-    "background depth, relative error, RGB alone, median": (0, 12),
-    "background depth of a pixel, relative error, RGB alone, median": (0, 12),
-    "own motion over 0.5 m, RGB alone, median": (0, 6),
-    "mask IoU, drones within 10 m, mean": (0.85, 1),
-    "drones whose box is at least 12 px wide, found": (99, 100),
-    "drones whose box is 6 to 12 px wide, found": (90, 100),
-    "false drones in 500 images": (0, 1),
-    "flow on background, end-point error, median": (0, 0.25),
-    "flow on drones, end-point error, median": (0, 0.3),
-    "flow, mean end-point error as a share of OpenCV DIS medium's": (0, 0.6),
-    "depth, masks and four drones' distances of an image, 2 threads": (0, 30),
-    "all networks": (0, 25),
-    **{
-        f"{figure}, {WITH[given]}, median": (0, most)
-        for given in HEIGHT_SIGMAS_M
-        for figure, most in (
-            ("background depth, relative error", 2.5),
-            ("background depth of a pixel, relative error", 2.5),
-            ("own motion over 0.5 m", 1),
-        )
-    },
-}
-"""Where the figures ought to be: what the networks are measured against, not what they reach."""
 
 
 @dataclass(frozen=True)
@@ -86,17 +47,8 @@ class Row:
     count: int
     """What it was measured on."""
 
-    @property
-    def wanted(self) -> tuple[float, float] | None:
-        """The least and the most that it ought to be."""
-        return WANTED.get(self.name)
-
     def __str__(self) -> str:
-        line = f"{self.name:88s} {self.value:10.4g} {self.unit:3s} {self.count:8d}"
-        if self.wanted is None:
-            return line
-        low, high = self.wanted
-        return f"{line}   {'met   ' if low <= self.value <= high else 'missed'} {low:g} to {high:g}"
+        return f"{self.name:88s} {self.value:10.4g} {self.unit:3s} {self.count:8d}"
 
 
 def main() -> None:
@@ -107,7 +59,6 @@ def main() -> None:
     parser.add_argument("--models", type=Path, default=data_path("models"))
     parser.add_argument("--pairs", type=int, default=10_000, help="of each folder at most this many")
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--rig-worlds", type=int, default=RIG_WORLDS, help="for the own motion; 0: leave it out")
     parser.add_argument("--float", action="store_true", help="the float networks, not their 8-bit twins")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
@@ -124,20 +75,18 @@ def main() -> None:
     rows = list(rows_of_pairs(findings(arguments.data)))
     if arguments.unseen is not None:
         rows += rows_of_unseen(findings(arguments.unseen))
-    if arguments.rig_worlds:
-        rows += rows_of_rigs(perception, arguments.rig_worlds)
     rows += rows_of_cost(perception, open_pairs(arguments.data), arguments.threads)
     files = list(arguments.models.glob("*.onnx"))
     rows.append(Row("all networks", sum(file.stat().st_size for file in files) / 1e6, "MB", len(files)))
     if arguments.json:
-        print(json.dumps([{**asdict(row), "wanted": row.wanted} for row in rows], indent=1))
+        print(json.dumps([asdict(row) for row in rows], indent=1))
         return
     for row in rows:
         print(row)
 
 
 def rows_of_pairs(found: Findings) -> Iterator[Row]:
-    """What the issue of the networks' quality asks of drones, depth, masks and flow."""
+    """Of drones, depth, masks and flow."""
     yield from _distances(found, "")
     whole = sum(drone.found and drone.whole for drone in found.drones)
     for sigmas in (1, 2):
@@ -188,16 +137,6 @@ def _distances(found: Findings, note: str) -> Iterator[Row]:
         if len(errors):
             for name, figure in figures.items():
                 yield Row(f"distance{note}, {what}, {name}", 100 * float(figure(errors)), "%", len(errors))
-
-
-def rows_of_rigs(perception: OnnxNetworks, count: int) -> Iterator[Row]:
-    """The own motion, from the four cameras of the paper's drone."""
-    drone = load_scenario(data_path("config") / "paper_flight.yaml").drone
-    errors = ego_motion_errors(drone, perception, worlds.TEST[1000 : 1000 + count], RIG_STEPS)
-    for given, name in WITH.items():
-        known = np.array(errors[given])[np.isfinite(errors[given])]
-        yield Row(f"own motion over 0.5 m, {name}, median", 100 * float(np.median(known)), "cm", len(known))
-        yield Row(f"own motion over 0.5 m, {name}, estimated", 100 * len(known) / len(errors[given]), "%", len(known))
 
 
 def rows_of_cost(perception: OnnxNetworks, pairs: PairSet, threads: int) -> Iterator[Row]:

@@ -1,11 +1,9 @@
 """Measure single-frame detection on real pictures, and print one table.
 
-python -m tools.measure.evaluate_real --data SKYDRONES --labelled towns=FOLDER --without-drones office=FOLDER [--json]
+python -m tools.measure.evaluate_real --labelled towns=FOLDER --without-drones office=FOLDER [--json]
 
-SKYDRONES holds `clips/` and `labels.json` of drones, birds, airplanes and helicopters before the sky; its clips 31-40
-and 91-100 of each kind are measured on. A labelled folder holds pictures and `labels.json`, boxes in COCO's format.
-Pictures of the other folders hold no drone: all that is found there is false. `--sheets` draws drones that were found
-and missed, and what was taken for one.
+A labelled folder holds pictures and `labels.json`, boxes in COCO's format; `flockd detect --labels` measures one such.
+Pictures of the other folders hold no drone: all that is found there is false.
 """
 
 from __future__ import annotations
@@ -33,8 +31,6 @@ from flockd.ground.pictures import Labelled, PictureDetector, PictureFile, find_
 from flockd.ground.pictures.coco_labels import read_labels
 from flockd.ground.pictures.scoring import WIDTH_CLASSES
 from flockd.ground.pictures.single_frame import Box
-from tools.measure.evaluation.on_pictures import Looks
-from tools.training.skydrones import SPLITS, split_of
 
 Image = NDArray[np.uint8]
 Picture = tuple[str, Callable[[], Image], tuple[Box, ...]]
@@ -47,7 +43,6 @@ PROBABILITIES = (0.0, 0.9, 0.95, 0.98, 0.99)
 def main() -> None:
     """Run the pipeline over every set."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, help="folder with clips/ and labels.json")
     parser.add_argument("--labelled", action="append", default=[], metavar="NAME=FOLDER")
     parser.add_argument("--without-drones", action="append", default=[], metavar="NAME=FOLDER")
     parser.add_argument("--models", type=Path, default=data_path("models"), help="folder of the networks")
@@ -57,15 +52,11 @@ def main() -> None:
     parser.add_argument("--detector", default=PerceptionConfig().detector)
     parser.add_argument("--fov", type=float, default=90.0, metavar="DEG", help="across the longer side")
     parser.add_argument("--scale", type=float, default=1.0, help="resize every picture first")
-    parser.add_argument("--split", choices=SPLITS, default="validation", help="of the clips")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--detections", type=Path, help="write every detection of every picture as JSON")
-    parser.add_argument("--sheets", type=Path, metavar="FOLDER", help="write a contact sheet of each set")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     sets: dict[str, list[Picture]] = {}
-    if arguments.data:
-        sets |= sky_pictures(arguments.data, arguments.split)
     for given in arguments.labelled:
         name, _, folder = given.partition("=")
         sets[name] = list(labelled_pictures(Path(folder)))
@@ -73,7 +64,7 @@ def main() -> None:
         name, _, folder = given.partition("=")
         sets[name] = list(free_pictures(Path(folder)))
     if not sets:
-        parser.error("give --data, --labelled or --without-drones")
+        parser.error("give --labelled or --without-drones")
     config = PerceptionConfig(
         depth=arguments.neighbours, segmentation=arguments.neighbours, distance=arguments.distance,
         verification=arguments.verification, detector=arguments.detector, models_dir=str(arguments.models),
@@ -84,10 +75,7 @@ def main() -> None:
     written: dict[str, list[dict[str, object]]] = {}
     for name, pictures in sets.items():
         shown = track(pictures, name, console=Console(stderr=True), disable=not sys.stderr.isatty())
-        results[name], measured, looks = _measured(detector, shown, arguments.fov, arguments.scale)
-        if arguments.sheets:
-            arguments.sheets.mkdir(parents=True, exist_ok=True)
-            looks.write(arguments.sheets / f"{name}.jpg")
+        results[name], measured = _measured(detector, shown, arguments.fov, arguments.scale)
         written[name] = [
             {"picture": picture, "boxes": one.boxes, "found": [asdict(drone) for drone in one.detections]}
             for (picture, _, _), one in zip(pictures, measured, strict=True)
@@ -102,10 +90,10 @@ def main() -> None:
 
 def _measured(
     detector: PictureDetector, pictures: Iterable[Picture], fov_deg: float, scale: float
-) -> tuple[dict[str, Any], list[Labelled], Looks]:
-    """One set's figures, what was found in each picture, and how the drones look."""
+) -> tuple[dict[str, Any], list[Labelled]]:
+    """One set's figures, and what was found in each picture."""
     begin = time.monotonic()
-    measured, looks, proposals = list[Labelled](), Looks(), 0
+    measured, proposals = list[Labelled](), 0
     for _, read, boxes in pictures:
         image = read()
         if scale != 1.0:
@@ -113,7 +101,6 @@ def _measured(
         resized = tuple((scale * a, scale * b, scale * c, scale * d) for a, b, c, d in boxes)
         found = detector.detect(image, fov_deg=fov_deg)
         measured.append(Labelled(found.detections, resized))
-        looks.add(image, measured[-1])
         proposals += found.proposals
     ms = 1e3 * (time.monotonic() - begin) / max(len(measured), 1)
     figures = {
@@ -121,24 +108,9 @@ def _measured(
         **summary(measured),
         "proposals_per_image": round(proposals / max(len(measured), 1), 2),
         "ms_per_image": round(ms, 1),
-        "by_look": {look: {"found": hit, "boxes": of} for look, (hit, of) in sorted(looks.counts.items())},
         "at_probability": {str(p): summary(measured, p) for p in PROBABILITIES[1:]},
     }
-    return figures, measured, looks
-
-
-def sky_pictures(folder: Path, split: str) -> dict[str, list[Picture]]:
-    """The labelled frames by kind of object; drones whose box is not known are left out."""
-    sets: dict[str, list[Picture]] = {}
-    clips = _Clips()
-    for label in json.loads((folder / "labels.json").read_text(encoding="utf-8")):
-        kind, box = label["object"], label["box"]
-        if split_of(label["clip"]) != split or (kind == "drone" and box is None):
-            continue
-        boxes: tuple[Box, ...] = (tuple(box),) if kind == "drone" else ()
-        clip, frame = folder / "clips" / label["clip"], int(label["frame"])
-        sets.setdefault(kind, []).append((f"{clip.stem}_{frame:04d}", partial(clips.frame, clip, frame), boxes))
-    return sets
+    return figures, measured
 
 
 def labelled_pictures(folder: Path) -> Iterator[Picture]:
@@ -159,26 +131,6 @@ def _image(picture: PictureFile) -> Image:
     return image
 
 
-class _Clips:
-    """Frames of videos by their number, by decoding from the beginning: seeking is not exact in every container."""
-
-    def __init__(self) -> None:
-        self._clip: Path | None = None
-        self._next = 0
-
-    def frame(self, clip: Path, number: int) -> Image:
-        """RGB; quick while frames of one clip are asked for in their order."""
-        if clip != self._clip or number < self._next:
-            self._capture, self._clip, self._next = cv2.VideoCapture(str(clip)), clip, 0
-        for _ in range(number - self._next):
-            self._capture.grab()
-        is_read, image = self._capture.read()
-        self._next = number + 1
-        if not is_read:
-            raise SystemExit(f"{clip}: frame {number} cannot be read")
-        return np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
-
-
 def _print_table(results: dict[str, dict[str, Any]]) -> None:
     table = Table("set", "images", *(f"{w} px" for w in WIDTH_CLASSES), "AP50", "false, pictures", "proposals", "ms")
     for name, all_of in results.items():
@@ -193,12 +145,6 @@ def _print_table(results: dict[str, dict[str, Any]]) -> None:
                 f"{one['false']} in {one['measured']}", str(all_of["proposals_per_image"]), str(all_of["ms_per_image"]),
             )  # fmt: skip
     Console(width=200).print(table)
-    for name, all_of in results.items():
-        said = [
-            f"{look} {100 * n['found'] / n['boxes']:.0f} % of {n['boxes']}" for look, n in all_of["by_look"].items()
-        ]
-        if said:
-            print(f"{name}, drones found by their brightness and what is around them: {'; '.join(said)}")
 
 
 if __name__ == "__main__":

@@ -77,11 +77,8 @@ def drawn_effects(scale: float, rng: np.random.Generator) -> CameraEffects:
     )
 
 
-def drawn_cameras(rng: np.random.Generator, streams_share: float = 0.0) -> CamerasConfig:
-    """A camera of whole rendered images, from better than the preset `realistic` to about three times worse.
-
-    ``streams_share`` of them send H.264 of 2 to 32 Mbit/s: two images far apart in time need more than a stream's.
-    """
+def drawn_cameras(rng: np.random.Generator) -> CamerasConfig:
+    """A camera of whole rendered images, from better than the preset `realistic` to about three times worse."""
     preset = CamerasConfig(preset="realistic")
     strength = float(np.exp(rng.uniform(math.log(0.1), math.log(3.0))))
     is_global = bool(rng.random() < 0.5)
@@ -100,8 +97,6 @@ def drawn_cameras(rng: np.random.Generator, streams_share: float = 0.0) -> Camer
         },
         "compression": {"jpeg_quality": int(rng.integers(40, 96)) if rng.random() < 0.7 else None},
     }
-    if rng.random() < streams_share:
-        values["compression"] = {"h264_mbit_s": float(np.exp(rng.uniform(math.log(2.0), math.log(32.0))))}
     return CamerasConfig.model_validate(values)
 
 

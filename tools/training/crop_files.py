@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tools.training import worlds
-from tools.training.airframes import FIRST_REAL
 from tools.training.networks import MAX_FAMILIES
 from tools.training.samples import Sample
 
@@ -54,20 +53,17 @@ class CropFiles:
         names: NDArray[np.int64] = np.unique(family)
         self._of_family = [np.flatnonzero(family == one) for one in names]
         self._aimed_of_family = [np.flatnonzero((family == one) & aimed) for one in names]
-        is_none, is_family, is_real = names == -1, (names >= 0) & (names < MAX_FAMILIES), names >= FIRST_REAL
-        is_other = ~(is_none | is_family)
-        of_drones, even = np.zeros(len(names)), np.ones(len(names))
-        for which, of in ((is_real, worlds.REAL_SHARE), (is_other & ~is_real, 1 - worlds.REAL_SHARE)):
-            even[which] = of / max(1, int(np.count_nonzero(which)))
-        for which, of in ((is_family, 1 - worlds.SHAPES_SHARE), (is_other, worlds.SHAPES_SHARE)):
-            of_drones[which] = of * even[which] / max(float(even[which].sum()), 1e-9)
+        is_none, is_family = names == -1, (names >= 0) & (names < MAX_FAMILIES)
+        of_drones = np.zeros(len(names))
+        for which, of in ((is_family, 1 - worlds.SHAPES_SHARE), (~(is_none | is_family), worlds.SHAPES_SHARE)):
+            of_drones[which] = of / max(1, int(np.count_nonzero(which)))
         drones = float(of_drones.sum())
         share = _NONE_SHARE if is_none.any() and drones > 0 else float(is_none.any())
         self._shares = np.where(is_none, share, (1 - share) * of_drones / max(drones, 1e-9))
 
     def draw(self, rng: np.random.Generator) -> Sample:
         """Any of them, and now and then what is none: every family as often as any other, however many crops there are
-        of it, every shape as any other, and all but the families together ``worlds.SHAPES_SHARE`` of the drones."""
+        of it, every shape as any other, and shapes together ``worlds.SHAPES_SHARE`` of the drones."""
         one = int(rng.choice(len(self._shares), p=self._shares))
         rows = self._of_family[one]
         if rng.random() < _AIMED_SHARE and len(self._aimed_of_family[one]):

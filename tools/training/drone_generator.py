@@ -15,7 +15,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from flockd.sim.airframe import Airframe, DroneModel, outline, oval
-from tools.training.drone_parts import add_guards, add_landing_gear, add_lights, add_payloads, hanging_rotor
+from tools.training.drone_parts import add_ducts, add_landing_gear, add_lights, add_payloads, hanging_rotor
 
 Array = NDArray[Any]
 FIRST_GENERATED = 1000
@@ -49,12 +49,13 @@ def generated_drone(shape: int, seed: int) -> DroneModel:
         raise ValueError(f"shape must not be negative: {shape}")
     craft = Airframe(np.random.default_rng([FIRST_GENERATED + shape, seed]))
     rng = np.random.default_rng([FIRST_GENERATED, shape])
-    guard = str(rng.choice(["none", "ducts", "rails", "arcs"], p=[0.76, 0.08, 0.08, 0.08]))
-    plan = _plan(rng, room=0.84 if guard == "ducts" else 1.0)
+    has_ducts = bool(rng.random() < 0.12)
+    plan = _plan(rng, room=0.84 if has_ducts else 1.0)
     _BODIES[int(rng.integers(len(_BODIES)))](craft, plan, rng)
     (_booms if plan.has_booms else _arms)(craft, plan, rng)
     _rotors(craft, plan, rng)
-    add_guards(craft, guard, plan.hubs, plan.radius)
+    if has_ducts:
+        add_ducts(craft, plan.hubs, plan.radius)
     add_landing_gear(craft, plan.hubs, plan.reach, plan.body, rng)
     add_payloads(craft, plan.reach, plan.body, rng)
     add_lights(craft, plan.hubs, plan.reach, rng)
@@ -210,28 +211,7 @@ def _egg(c: Airframe, plan: Plan, rng: Generator) -> None:
         c.ball((0.85 * half, 0.3 * side * wide, -0.1 * tall), 0.16 * wide, c.front)
 
 
-def _drum(c: Airframe, plan: Plan, rng: Generator) -> None:
-    """Round plates around a hub with a dome, as of large multirotors."""
-    round_, tall = 0.5 * (plan.body[0] + plan.body[1]), plan.body[2]
-    sides = int(rng.choice([8, 12]))
-    c.rod((0, 0, -0.5 * tall), (0, 0, 0.5 * tall), round_, [c.frame, c.body], sides)
-    rings = [oval(r * round_, r * round_, -z * tall) for r, z in ((0.3, 1.5), (0.6, 1.3), (0.85, 0.9), (0.9, 0.5))]
-    c.loft(rings, [c.body, c.body, c.body * 0.8])
-    c.box((0.95 * round_, 0, 0), (0.12 * round_, 0.3 * round_, 0.3 * tall), c.front)
-    c.box((-0.95 * round_, 0, 0), (0.12 * round_, 0.3 * round_, 0.3 * tall), c.rear)
-
-
-def _racer(c: Airframe, plan: Plan, rng: Generator) -> None:
-    """A narrow plate with a tall thin canopy."""
-    half, wide, tall = plan.body[0], 0.45 * plan.body[1], plan.body[2] * 1.3
-    c.box((0, 0, 0), (half, wide, 0.02 * plan.reach), c.frame)
-    side = [(0.9 * half, 0.8 * wide), (-0.8 * half, wide)]
-    c.loft([outline(side, z * tall, s) for z, s in ((-1.0, 0.5), (-0.5, 0.9), (0.0, 1.0))], [c.body, c.body * 0.8])
-    c.rod((0.8 * half, 0, -0.5 * tall), (1.05 * half, 0, -0.6 * tall), 0.5 * wide, [np.full(3, 0.02)], 8)
-    c.box((-0.1 * half, 0, -1.1 * tall), (0.45 * half, 0.9 * wide, 0.25 * tall), c.rear)
-
-
-_BODIES = (_plates, _crate, _sleek, _egg, _drum, _racer)
+_BODIES = (_plates, _crate, _sleek, _egg)
 
 
 def _rounded(half: float, wide: float, z: float) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from flockd.sim.airframe import Airframe, outline
+from flockd.sim.airframe import Airframe
 
 Array = NDArray[Any]
 Place = tuple[float, float, float]
@@ -35,40 +34,12 @@ def hanging_rotor(c: Airframe, place: Place, radius: float, motor: tuple[float, 
         c.mesh.box(hub + drop, half, c.rng.uniform(0, math.pi), skin, c.prop, (0.25, 0.25))
 
 
-def add_guards(c: Airframe, kind: str, hubs: Array, radius: float) -> None:
-    """`ducts` around every rotor, `rails` around all, `arcs` around each one's outer side, or `none`."""
-    if kind == "ducts":
-        for x, y, z in hubs:
-            accent = c.front if x > 0 else c.rear
-            c.ring(x, y, z - 0.1 * radius, 1.07 * radius, 1.16 * radius, 0.24 * radius, accent, c.body)
-            c.beam((x - 1.1 * radius, y, z), (x + 1.1 * radius, y, z), (0.05 * radius, 0.04 * radius), [c.frame])
-    elif kind in ("rails", "arcs"):
-        arcs = [_outer_arc(hub, 1.14 * radius) for hub in hubs[np.argsort(np.arctan2(hubs[:, 1], hubs[:, 0]))]]
-        for arc in arcs:
-            accent = c.front if arc[1][0] > 0 else c.rear
-            _chain(c, arc, 0.05 * radius, accent)
-            middle = arc[len(arc) // 2]
-            hub = (float(arc[:, 0].mean() * 0.9), float(arc[:, 1].mean() * 0.9), float(middle[2]))
-            c.rod(hub, _place(middle), 0.04 * radius, [c.frame], 5)
-        if kind == "rails":
-            for first, second in zip(arcs, [*arcs[1:], arcs[0]], strict=True):
-                c.rod(_place(first[-1]), _place(second[0]), 0.05 * radius, [c.frame], 5)
-
-
-def _outer_arc(hub: Array, radius: float) -> Array:
-    """(5, 3) points around the side of a rotor that faces away from the middle."""
-    middle = math.atan2(hub[1], hub[0])
-    angles = middle + np.radians([-80, -40, 0, 40, 80])
-    return np.column_stack([hub[0] + radius * np.cos(angles), hub[1] + radius * np.sin(angles), np.full(5, hub[2])])
-
-
-def _chain(c: Airframe, points: Array, thick: float, colour: Array) -> None:
-    for a, b in itertools.pairwise(points):
-        c.rod(_place(a), _place(b), thick, [colour], 5)
-
-
-def _place(point: Array) -> Place:
-    return float(point[0]), float(point[1]), float(point[2])
+def add_ducts(c: Airframe, hubs: Array, radius: float) -> None:
+    """Around every rotor."""
+    for x, y, z in hubs:
+        accent = c.front if x > 0 else c.rear
+        c.ring(x, y, z - 0.1 * radius, 1.07 * radius, 1.16 * radius, 0.24 * radius, accent, c.body)
+        c.beam((x - 1.1 * radius, y, z), (x + 1.1 * radius, y, z), (0.05 * radius, 0.04 * radius), [c.frame])
 
 
 def add_landing_gear(c: Airframe, hubs: Array, reach: float, body: tuple[float, float, float], rng: Generator) -> None:
@@ -116,13 +87,6 @@ def _parcel(c: Airframe, reach: float, body: tuple[float, float, float], rng: Ge
     c.box((0, 0, 0.8 * tall + sides[2]), sides, np.array([0.33, 0.21, 0.11]) * c.rng.uniform(0.6, 1.5))
 
 
-def _lidar(c: Airframe, reach: float, body: tuple[float, float, float], rng: Generator) -> None:
-    tall, wide = body[2], reach * float(rng.uniform(0.08, 0.15))
-    x, sign = body[0] * float(rng.uniform(-0.4, 0.6)), float(rng.choice([-1.0, 1.0]))
-    a, b = (x, 0.0, sign * 1.0 * tall), (x, 0.0, sign * (1.1 * tall + 1.4 * wide))
-    c.rod(*((a, b) if sign > 0 else (b, a)), wide, [c.metal, _BLACK, c.metal], 10)
-
-
 def _antennas(c: Airframe, reach: float, body: tuple[float, float, float], rng: Generator) -> None:
     half, wide, tall = body
     long = reach * float(rng.uniform(0.3, 0.6))
@@ -132,13 +96,6 @@ def _antennas(c: Airframe, reach: float, body: tuple[float, float, float], rng: 
         c.rod(root, tip, 0.012 * reach, [c.frame, c.rear], 5)
 
 
-def _satellite_mast(c: Airframe, reach: float, body: tuple[float, float, float], rng: Generator) -> None:
-    top = -body[2] - reach * float(rng.uniform(0.15, 0.4))
-    x = body[0] * float(rng.uniform(-0.8, 0.2))
-    c.rod((x, 0, -0.5 * body[2]), (x, 0, top), 0.016 * reach, [c.frame], 5)
-    c.rod((x, 0, top), (x, 0, top - 0.05 * reach), reach * float(rng.uniform(0.07, 0.12)), [c.body], 10)
-
-
 def _battery(c: Airframe, reach: float, body: tuple[float, float, float], rng: Generator) -> None:
     half, wide, tall = body
     z = -1.5 * tall
@@ -146,14 +103,7 @@ def _battery(c: Airframe, reach: float, body: tuple[float, float, float], rng: G
     c.box((-0.1 * half, 0, z), (0.08 * half, 0.47 * wide, 0.47 * tall), _BLACK)
 
 
-def _tank(c: Airframe, reach: float, body: tuple[float, float, float], rng: Generator) -> None:
-    half, wide, tall = body
-    right = [(0.6 * half, 0.6 * wide), (0.3 * half, wide), (-0.5 * half, wide), (-0.7 * half, 0.6 * wide)]
-    rings = [outline(right, tall * z, s) for z, s in ((0.5, 0.8), (0.9, 1.0), (1.9, 0.9), (2.3, 0.5))]
-    c.loft(rings, [c.front, np.full(3, 0.6), np.full(3, 0.5)])
-
-
-_PAYLOADS = (_gimbal, _gimbal, _parcel, _lidar, _antennas, _satellite_mast, _battery, _tank)
+_PAYLOADS = (_gimbal, _gimbal, _parcel, _antennas, _battery)
 
 
 def add_lights(c: Airframe, hubs: Array, reach: float, rng: Generator) -> None:

@@ -20,20 +20,9 @@ def write_manifest(document: dict[str, Any], file: Path, golden: Mapping[str, ND
     for name, value in golden.items():
         document["outputs"][name] |= {"golden_mean": float(value.mean()), "golden_deviation": float(value.std())}
     path = file.with_suffix(".yaml")
-    _write(document, path)
+    path.write_text(yaml.dump(document, Dumper=_WithoutAliases, sort_keys=False, width=110), encoding="utf-8")
     OnnxModel(path, threads=1, check=check_roles)
     return path
-
-
-def note_accuracy(path: Path, accuracy: Mapping[str, str]) -> None:
-    """Add measured figures to a manifest that was written before they could be measured."""
-    document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    document["accuracy"] = {**document["accuracy"], **accuracy}
-    _write(document, path)
-
-
-def _write(document: dict[str, Any], path: Path) -> None:
-    path.write_text(yaml.dump(document, Dumper=_WithoutAliases, sort_keys=False, width=110), encoding="utf-8")
 
 
 class _WithoutAliases(yaml.SafeDumper):

@@ -5,7 +5,7 @@ Only glTF says its unit (metres) and which way is up (+y); of the others, the dr
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,7 +53,7 @@ def read_meshes(paths: Sequence[Path], size_m: float, up: str | None = None) -> 
     surfaces = [_surface(path, size_m, up) for path in paths]
     corners = np.vstack([vertices for vertices, _, _ in surfaces])
     middle = (corners.min(0) + corners.max(0)) / 2
-    return [model_of(vertices - middle, triangles, colours, size_m) for vertices, triangles, colours in surfaces]
+    return [_model_of(vertices - middle, triangles, colours, size_m) for vertices, triangles, colours in surfaces]
 
 
 def _surface(path: Path, size_m: float, up: str | None) -> tuple[Array, Array, Array]:
@@ -61,10 +61,16 @@ def _surface(path: Path, size_m: float, up: str | None) -> tuple[Array, Array, A
     pieces = _loaded(path)
     is_gltf = path.suffix.lower() in GLTF
     parts = [(places, np.asarray(piece.faces), _colours(piece, is_gltf)) for piece, places in pieces]
-    vertices, triangles, colours = joined(parts)
+    corners, faces, tints = zip(*parts, strict=True)
+    firsts = np.cumsum([0, *(len(some) for some in corners[:-1])])
+    vertices, colours = np.vstack(corners), np.vstack(tints)
+    triangles = np.vstack([one + k for one, k in zip(faces, firsts, strict=True)])
     vertices = _upright(vertices, up or ("y" if is_gltf else "z"))
     vertices = _in_metres(path, vertices, size_m, {"m": 1.0} if is_gltf else UNITS_M)
-    vertices, triangles, colours = simplified(vertices, triangles, colours, size_m, MOST_TRIANGLES)
+    for cells in CELLS:
+        if len(triangles) > MOST_TRIANGLES:
+            vertices, triangles, kept = _in_cells(vertices, triangles, size_m / cells)
+            colours = colours[kept]
     if len(triangles) > MOST_TRIANGLES:
         raise ValueError(
             f"{path}: has {len(triangles)} triangles without small details, and at most {MOST_TRIANGLES} are drawn; "
@@ -172,24 +178,6 @@ def _widest(points: Array) -> float:
     return float(np.ptp(along, axis=0).max())
 
 
-def joined(parts: Iterable[tuple[Array, Array, Array]]) -> tuple[Array, Array, Array]:
-    """Corners (n, 3), triangles (m, 3) and colours (m, 3) of several meshes as those of one."""
-    corners, faces, colours = zip(*parts, strict=True)
-    firsts = np.cumsum([0, *(len(some) for some in corners[:-1])])
-    return np.vstack(corners), np.vstack([one + k for one, k in zip(faces, firsts, strict=True)]), np.vstack(colours)
-
-
-def simplified(
-    vertices: Array, triangles: Array, colours: Array, size_m: float, most: int
-) -> tuple[Array, Array, Array]:
-    """At most so many triangles, or what is left of them in the largest of ``CELLS``."""
-    for cells in CELLS:
-        if len(triangles) > most:
-            vertices, triangles, kept = _in_cells(vertices, triangles, size_m / cells)
-            colours = colours[kept]
-    return vertices, triangles, colours
-
-
 def _in_cells(vertices: Array, triangles: Array, cell_m: float) -> tuple[Array, Array, Array]:
     """Corners of one cell become one; and the rows of the triangles that remain."""
     cells = np.round(vertices / cell_m).astype(np.int64)
@@ -243,15 +231,7 @@ def _linear(grey: Array) -> Array:
     return np.where(grey <= 0.04045, grey / 12.92, ((grey + 0.055) / 1.055) ** 2.4)
 
 
-def model_of(
-    vertices: Array,
-    triangles: Array,
-    colours: Array,
-    size_m: float,
-    *,
-    family: int = OWN_FAMILY,
-    hubs: Array | None = None,
-) -> DroneModel:
+def _model_of(vertices: Array, triangles: Array, colours: Array, size_m: float) -> DroneModel:
     """A drone of corners (n, 3) in body FRD, triangles (m, 3) and their linear colours (m, 3).
 
     Each triangle is seen from both sides: in files of many programs, some face the wrong way. Those without an area
@@ -262,14 +242,14 @@ def model_of(
     mesh, both = Mesh(), np.vstack([triangles, triangles[:, ::-1]])
     mesh.add(vertices, both, 0, np.vstack([colours, colours]), (0.3, 0.3))
     return DroneModel(
-        family=family,
+        family=OWN_FAMILY,
         seed=0,
         vertices=vertices.astype(np.float32),
         triangles=both.astype(np.int32),
         colours=np.concatenate(mesh.tint).astype(np.float32),
         texture=np.concatenate(mesh.texture).astype(np.int32),
         uv=np.concatenate(mesh.uv),
-        hubs=np.full((4, 3), np.nan) if hubs is None else hubs,
+        hubs=np.full((4, 3), np.nan),
         extent=np.stack([vertices.min(0), vertices.max(0)]),
         size_m=size_m,
     )

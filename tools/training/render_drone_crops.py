@@ -1,23 +1,21 @@
 """Render crops of single drones as the distance network is shown them: many more than whole images would give.
 
-    python -m tools.training.render_drone_crops OUT --worlds 300 --scenes 300 --airframes AIRFRAMES
+    python -m tools.training.render_drone_crops OUT --worlds 300 --scenes 300
+    python -m tools.training.render_drone_crops OUT --mesh MY.glb --size-m 0.55 --worlds 40
 
 Only the window of the camera's image that the crops show is drawn. Every drone stands in another place. One file
-a world, which `train.py distance --crops OUT` takes up as they appear. AIRFRAMES, of `tools.training.airframes`, adds
-real airframes and shells of camera drones; with --held-out those that no network learns from fly alone, in test worlds.
+a world, which `train distance --crops OUT` takes up as they appear. With --mesh (glTF, STL or OBJ) that drone alone
+flies. With --held-out, in test worlds and with ranges, that drone, or the families that no network learns from.
 """
 
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import os
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,17 +23,17 @@ from numpy.typing import NDArray
 from flockd.sim.airframe import DroneModel
 from flockd.sim.drone_models import drone_model
 from tools.training import worlds
-from tools.training.airframes import airframe_models
 from tools.training.dataset import FOCAL_PX, HEIGHT, R_BODY_CAMERA, WIDTH
 from tools.training.distractions import drawn_distraction
 from tools.training.drone_generator import generated_drone
+from tools.training.own_mesh import UP_AXES, painted, read_meshes
 from tools.training.samples import DroneInView, crop_around, crop_at, sample_of, sample_without_drone
 from tools.training.scenes import drawn_attitude, outline_of
 
 Array = NDArray[Any]
 PICTURES_A_SCENE = 3
-PAINTED, SHAPES_PAINTED = 8, 3
-"""Drones of each family and of each generated shape in a world, painted differently."""
+PAINTED, SHAPES_PAINTED, OWN_PAINTED = 8, 3, 12
+"""Drones of each family, of each generated shape and of a mesh in a world, painted differently."""
 MOST_DRONES = 3
 MIN_PIXELS = 8
 """That much of it must be seen: a drone six pixels wide is still to be told from a bird."""
@@ -43,14 +41,6 @@ HIDDEN_SHARE = 0.02
 """Hidden share of its outline below which a drone is whole."""
 WITH_DISTRACTORS, DISTRACTOR_ALONE = 0.3, 0.1
 """Shares of the scenes: a bird or the like before or behind the drone, and in its place, where half are too far."""
-
-
-class DrawModels(Protocol):
-    """Whatever says which drones fly in a world; workers are given it."""
-
-    def __call__(self, rng: np.random.Generator) -> list[list[DroneModel]]:
-        """Shapes, each painted in several ways."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +51,9 @@ class CropJob:
     seed: int
     """Seed of the world."""
     scenes: int
-    draw_models: DrawModels
-    measures: bool = False
+    own: Sequence[DroneModel]
+    """The drone that flies alone, in several states; empty: many kinds fly."""
+    measures: bool
     """Also note `range_m`, and whether the drone is `whole`: within the image, and nothing before it."""
 
 
@@ -73,51 +64,64 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=300)
     parser.add_argument("--skip", type=int, default=0, help="worlds, of which there are crops already elsewhere")
     parser.add_argument("--scenes", type=int, default=400, help="drones a world")
-    parser.add_argument("--airframes", type=Path, help="folder of tools.training.airframes")
-    parser.add_argument("--held-out", action="store_true", help="the held-out ones of --airframes alone, with ranges")
+    add_mesh(parser)
+    parser.add_argument("--held-out", action="store_true", help="to measure on, of drones and worlds never learnt from")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     arguments = parser.parse_args()
-    if arguments.held_out and arguments.airframes is None:
-        parser.error("--held-out needs --airframes")
+    own = own_drone(parser, arguments)
+    arguments.out.mkdir(parents=True, exist_ok=True)
     # From the far end of the training worlds: other places than those of whole images.
     split = worlds.TEST if arguments.held_out else worlds.TRAINING
-    draw = partial(drones_held_out if arguments.held_out else drones_of_training, airframes=arguments.airframes)
+    files = {seed: arguments.out / f"{seed}.npz" for seed in split[::-1][arguments.skip :][: arguments.worlds]}
     jobs = [
-        CropJob(arguments.out / f"{seed}.npz", seed, arguments.scenes, draw, measures=arguments.held_out)
-        for seed in split[::-1][arguments.skip :][: arguments.worlds]
+        CropJob(file, seed, arguments.scenes, own, measures=arguments.held_out)
+        for seed, file in files.items()
+        if not file.is_file()
     ]
-    begin = time.monotonic()
-    for done, total in render_crops(jobs, arguments.processes):
-        print(f"{done}/{total} worlds, {time.monotonic() - begin:.0f} s", flush=True)
+    worlds.in_processes(_render_world, jobs, arguments.processes)
 
 
-def drones_held_out(rng: np.random.Generator, airframes: Path) -> list[list[DroneModel]]:
-    """The real airframes that no network learns from."""
-    return airframe_models(airframes, PAINTED, rng, held_out=True)
+def add_mesh(parser: argparse.ArgumentParser) -> None:
+    """What says which drone flies."""
+    parser.add_argument("--mesh", type=Path, nargs="+", help="of a drone, with propellers and colours; several: any")
+    parser.add_argument("--size-m", type=float, help="of --mesh: widest horizontal distance, propeller tip to tip, m")
+    parser.add_argument(
+        "--up", choices=UP_AXES, help="the mesh's axis that points up: by default y of glTF, z of others"
+    )
 
 
-def drones_of_training(rng: np.random.Generator, airframes: Path | None = None) -> list[list[DroneModel]]:
-    """Every family of the training, as many shapes of the generator as the drones of a world are to have, and all real
-    airframes and shells."""
-    families = [[drone_model(family, _paint(rng)) for _ in range(PAINTED)] for family in worlds.FAMILIES]
-    drawn = rng.choice(worlds.SHAPES, round(len(families) * worlds.SHAPES_SHARE / (1 - worlds.SHAPES_SHARE)))
-    shapes = [[generated_drone(int(shape), _paint(rng)) for _ in range(SHAPES_PAINTED)] for shape in drawn]
-    return [*families, *shapes, *(airframe_models(airframes, SHAPES_PAINTED, rng) if airframes else [])]
+def own_drone(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> list[DroneModel]:
+    """The drone that `add_mesh` names; none where it names none."""
+    if not arguments.mesh:
+        return []
+    if arguments.size_m is None:
+        parser.error("--mesh needs --size-m, the drone's size: a mesh's unit and a range are nothing without it")
+    try:
+        drones = read_meshes(arguments.mesh, arguments.size_m, arguments.up)
+    except ValueError as error:
+        parser.error(str(error))
+    for path, drone in zip(arguments.mesh, drones, strict=True):
+        plain = float(np.isnan(drone.colours).any(axis=1).mean())
+        print(f"{path}: has no colours for {plain:.0%} of its triangles{'; they are painted at random' * (plain > 0)}")
+    return drones
+
+
+def drawn_models(
+    own: Sequence[DroneModel], rng: np.random.Generator, *, measures: bool = False
+) -> list[list[DroneModel]]:
+    """Shapes, each painted in several ways: of ``own``, of the unseen families to measure on, or of the training's
+    families and as many shapes of the generator as the drones of a world are to have."""
+    if own:
+        return [[painted(own[k % len(own)], _paint(rng)) for k in range(OWN_PAINTED)]]
+    names = worlds.UNSEEN_FAMILIES if measures else worlds.FAMILIES
+    families = [[drone_model(family, _paint(rng)) for _ in range(PAINTED)] for family in names]
+    share = 0.0 if measures else worlds.SHAPES_SHARE
+    drawn = rng.choice(worlds.SHAPES, round(len(families) * share / (1 - share)))
+    return families + [[generated_drone(int(shape), _paint(rng)) for _ in range(SHAPES_PAINTED)] for shape in drawn]
 
 
 def _paint(rng: np.random.Generator) -> int:
     return int(rng.integers(1 << 31))
-
-
-def render_crops(jobs: Sequence[CropJob], processes: int | None) -> Iterator[tuple[int, int]]:
-    """Write each job's file that is not there yet; yields how many of how many are done."""
-    missing = [job for job in jobs if not job.file.is_file()]
-    for job in missing:
-        job.file.parent.mkdir(parents=True, exist_ok=True)
-    os.environ["NUMBA_NUM_THREADS"] = "1"
-    with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        for done, _ in enumerate(pool.imap_unordered(_render_world, missing), start=1):
-            yield done, len(missing)
 
 
 def _render_world(job: CropJob) -> None:
@@ -126,7 +130,7 @@ def _render_world(job: CropJob) -> None:
     rng = np.random.Generator(np.random.PCG64([job.seed, 1]))
     world = World.generate(job.seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
     places = world.free_points(job.scenes, rng, 2.0)
-    models = job.draw_models(rng)
+    models = drawn_models(job.own, rng, measures=job.measures)
     samples = [sample for place in places for sample in _scene(world, place, models, rng, measures=job.measures)]
     joined = {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
     draft = job.file.with_suffix(".part")

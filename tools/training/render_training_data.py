@@ -6,17 +6,13 @@ A third of the scenes have birds and the like in them. Half of the drones of tra
 shapes. With ``--families unseen`` the drones are of the families that no network is trained on. With
 ``--obstacles 0.4`` four in ten worlds have a forest or a village, with the camera between trunks and before walls.
 With ``--cameras 0.5`` half of the pairs are as real cameras take them: motion blur, rolling shutter, noise by gain and
-so on, of drawn strengths; with ``--h264 0.3`` three in ten of those send a stream. Their truth is that of the middle
-row's time.
+so on, of drawn strengths. Their truth is that of the middle row's time.
 """
 
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import os
-import time
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -58,7 +54,6 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=30, help="pairs a world")
     parser.add_argument("--obstacles", type=float, default=0.0, metavar="SHARE", help="of the worlds; default: none")
     parser.add_argument("--cameras", type=float, default=0.0, metavar="SHARE", help="of the pairs with real cameras")
-    parser.add_argument("--h264", type=float, default=0.0, metavar="SHARE", help="of those, that send a stream")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     arguments = parser.parse_args()
     seeds = {"training": worlds.TRAINING, "validation": worlds.VALIDATION, "test": worlds.TEST}[arguments.split]
@@ -74,13 +69,11 @@ def main() -> None:
             share,
             arguments.obstacles,
             arguments.cameras,
-            arguments.h264,
         )
         for i in wanted
     ]
-    begin = time.monotonic()
-    for done, total in render_pairs(jobs, arguments.processes):
-        print(f"{done}/{total} worlds, {time.monotonic() - begin:.0f} s", flush=True)
+    missing = [job for job in jobs if not (job.folder / "made.json").is_file()]
+    worlds.in_processes(render_world, missing, arguments.processes)
 
 
 @dataclass(frozen=True)
@@ -98,20 +91,10 @@ class PairJob:
     """How likely a world has a forest or a village."""
     cameras_share: float = 0.0
     """How likely a pair is taken by a real camera."""
-    streams_share: float = 0.0
-    """How likely that camera sends H.264, which needs the library openh264."""
 
 
-def render_pairs(jobs: Sequence[PairJob], processes: int | None) -> Iterator[tuple[int, int]]:
-    """Write each job's part that is not there yet; yields how many of how many are done."""
-    missing = [job for job in jobs if not (job.folder / "made.json").is_file()]
-    os.environ["NUMBA_NUM_THREADS"] = "1"
-    with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        for done, _ in enumerate(pool.imap_unordered(_render_world, missing), start=1):
-            yield done, len(missing)
-
-
-def _render_world(job: PairJob) -> None:
+def render_world(job: PairJob) -> None:
+    """One part."""
     from flockd.sim.camera_simulator import FIELD_GRID_M, field_grid  # noqa: PLC0415 - numba starts in the worker
     from flockd.sim.renderer import Renderer  # noqa: PLC0415
     from flockd.sim.world import World  # noqa: PLC0415
@@ -136,7 +119,7 @@ def _render_world(job: PairJob) -> None:
         families = np.array([drone.family for drone in drones])
         renderer = Renderer(world, drones)
         film = np.random.default_rng([seed, 7, index])
-        filmed = drawn_cameras(film, job.streams_share) if film.random() < job.cameras_share else None
+        filmed = drawn_cameras(film) if film.random() < job.cameras_share else None
         _render_pair(renderer, world, places[index], highest_m, families, part, index, rng, filmed)
     for array in part.values():
         array.flush()  # type: ignore[attr-defined]

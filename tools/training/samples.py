@@ -65,7 +65,6 @@ def neighbours_sample(
         "depth": np.ascontiguousarray(depth)[None],
         "drone": (ids > 0).astype(np.float32)[None],
         "offset": np.ascontiguousarray(offset),
-        "metric": np.array(1.0, np.float32),
     }
 
 
@@ -158,7 +157,7 @@ def _mask_of(crop: VirtualCrop, mine: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def no_drone_sample(pairs: PairSet, negative: NDArray[Any] | None, rng: np.random.Generator) -> Sample:
-    """A crop of something else: a row of mine_negatives.py, or anywhere in any image."""
+    """A crop of something else: a row of negatives.npy (tools.training.mine), or anywhere in any image."""
     if negative is not None:
         pair, k = int(negative[0]), int(negative[1])
         middle, half_px = negative[2:4] + rng.normal(0, 0.15, 2) * negative[4], negative[4]

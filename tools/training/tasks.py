@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +13,10 @@ from torch.nn import functional as F
 
 from tools.training.augment import photometric
 from tools.training.crop_files import CropFiles
-from tools.training.dataset import PairSet
-from tools.training.moving_cameras import MovingCameras
+from tools.training.dataset import open_pairs
 from tools.training.networks import MAX_DEPTH_M, MAX_FAMILIES, DistanceNet, FlowNet, NeighboursNet
 from tools.training.samples import Sample, flow_sample, neighbours_sample, no_drone_sample
+from tools.training.weights import begin_with
 
 Batch = dict[str, Tensor]
 WINDOW_PX = 256
@@ -27,6 +29,10 @@ class Task:
 
     def __init__(self, net: nn.Module, batch: int, rate: float) -> None:
         self.net, self.batch, self.rate = net, batch, rate
+
+    def go_on_from(self, weights: Mapping[str, Tensor]) -> None:
+        """Begin with the weights of another run."""
+        begin_with(self.net, weights)
 
     def begin(self) -> None:
         """From now on the network learns."""
@@ -48,12 +54,9 @@ class Task:
 class NeighboursTask(Task):
     """Depth, mask and centre offsets of one image."""
 
-    real_share = 0.5
-    """Windows of real scenes beside each window of a rendered one."""
-
-    def __init__(self, pairs: PairSet, moving: MovingCameras | None = None) -> None:
+    def __init__(self, data: Path) -> None:
         super().__init__(NeighboursNet(), 12, 1.2e-3)
-        self.pairs, self.moving, self.drawn = pairs, moving, 0
+        self.pairs, self.drawn = open_pairs(data / "worlds"), 0
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """See ``Task``. Every fourth batch holds whole images, the others three times as many windows around drones."""
@@ -65,18 +68,15 @@ class NeighboursTask(Task):
         self.drawn += 1
         if self.drawn % 4 == 0:
             return [self.sample(rng) for _ in range(self.batch // 3)]
-        real = [] if self.moving is None else [self.moving] * round(self.real_share * self.batch)
-        return [self.sample(rng) for _ in range(self.batch)] + [one.sample(rng, WINDOW_PX) for one in real]
+        return super().batch_samples(rng)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """See ``Task``."""
         depth, logit, offset = self.net(batch["image"], batch["geometry"])
         true, mask = batch["depth"], batch["drone"]
-        known = true.isfinite()
-        apart = depth.log() - torch.where(known, true, 1.0).log()
-        error = (apart - _scale(apart, known) * (1 - batch["metric"].view(-1, 1, 1, 1))).abs()
-        sky = known & (true >= MAX_DEPTH_M)
-        weight = known * torch.where(sky, 0.3, 1.0) * (1 + 3 * mask)
+        error = (depth.log() - true.log()).abs()
+        sky = true >= MAX_DEPTH_M
+        weight = torch.where(sky, 0.3, 1.0) * (1 + 3 * mask)
         depth_loss = (error * weight).sum() / weight.sum()
         bce = F.binary_cross_entropy_with_logits(logit, mask, reduction="none")
         focal = (1 - torch.exp(-bce)) ** 1.5 * bce * (1 + 3 * mask)
@@ -87,21 +87,13 @@ class NeighboursTask(Task):
         mask_loss = focal.mean() * 40 + 0.5 * dice.mean()
         distance = (offset - batch["offset"]).abs().sum(1, keepdim=True)
         offset_loss = (distance * mask).sum() / (mask.sum() + 1)
-        metric = batch["metric"].view(-1, 1, 1, 1) > 0
-        guess, near = logit > 0, known & metric & (~sky) & (mask < 0.5)
+        guess, near = logit > 0, (~sky) & (mask < 0.5)
         figures = {
-            "real": float(error[known & ~metric].median().detach()) if (~metric).any() else float("nan"),
             "depth": float(error[near].median().detach()),
             "iou": float((guess & (mask > 0.5)).sum() / ((guess | (mask > 0.5)).sum() + 1)),
             "offset": float(offset_loss.detach()),
         }
         return depth_loss + mask_loss + 0.05 * offset_loss, figures
-
-
-def _scale(apart: Tensor, known: Tensor) -> Tensor:
-    """(n, 1, 1, 1) medians of the logarithms (n, 1, h, w) by which depth is off where it is known."""
-    each = torch.where(known, apart.detach(), torch.nan).flatten(1)
-    return each.nanmedian(1).values.nan_to_num(0.0).view(-1, 1, 1, 1)
 
 
 class DistanceTask(Task):
@@ -118,11 +110,18 @@ class DistanceTask(Task):
     """A network that saw more places: what it is sure is no drone, this one is to be as sure of (learning without
     forgetting, Li and Hoiem 2016)."""
 
-    def __init__(self, pairs: PairSet, negatives: Path, pictures: Path) -> None:
+    def __init__(self, data: Path) -> None:
         super().__init__(DistanceNet(), 64, 2e-3)
-        self.pairs, self.negatives = pairs, np.load(negatives)
-        self.drones = CropFiles(pictures)
-        self.no_drones: list[Sample] = []
+        self.pairs, self.drones = open_pairs(data / "worlds"), CropFiles(data / "crops")
+        negatives = data / "worlds" / "negatives.npy"
+        if not negatives.is_file():
+            raise FileNotFoundError(f"{negatives}: is missing; make it with `python -m tools.training.mine`")
+        self.negatives, self.no_drones = np.load(negatives), list[Sample]()
+
+    def go_on_from(self, weights: Mapping[str, Tensor]) -> None:
+        """See ``Task``. What they are sure of is not forgotten."""
+        super().go_on_from(weights)
+        self.teacher = copy.deepcopy(self.net).eval()
 
     def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
         """See ``Task``."""
@@ -195,9 +194,9 @@ class SigmaTask(Task):
     known_share = 0.8
     """What the families that the network learnt count in the loss; as many of the drawn drones are shapes."""
 
-    def __init__(self, pictures: Path) -> None:
+    def __init__(self, data: Path) -> None:
         super().__init__(DistanceNet(), 64, 1e-3)
-        self.drones = CropFiles(pictures)
+        self.drones = CropFiles(data / "crops")
         for name, weights in self.net.named_parameters():
             weights.requires_grad = name.startswith("doubt.")
 
@@ -291,9 +290,9 @@ def _motor_maps(motors: Tensor, sigma: float = 1.5) -> Tensor:
 class FlowTask(Task):
     """Where each pixel went."""
 
-    def __init__(self, pairs: PairSet) -> None:
+    def __init__(self, data: Path) -> None:
         super().__init__(FlowNet(), 16, 6e-4)
-        self.pairs = pairs
+        self.pairs = open_pairs(data / "worlds")
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """See ``Task``."""

@@ -1,11 +1,12 @@
-"""Train one network on rendered pairs; resumes from its last checkpoint.
+"""Train one network; resumes from its last checkpoint.
 
     python -m tools.training.train neighbours --data DATA --out RUNS/neighbours --minutes 40
-    python -m tools.training.train distance   --data DATA --out RUNS/distance --minutes 90 --crops P --negatives N.npy
-    python -m tools.training.train flow       --data DATA --out RUNS/flow --minutes 40
-    python -m tools.training.train sigma      --crops P --out RUNS/sigma --start RUNS/distance/checkpoint.pt
+    python -m tools.training.train sigma --data DATA --out RUNS/sigma --start RUNS/distance/checkpoint.pt
 
-`sigma` is the last part of `distance`: how far it may misjudge a drone's size, also of one that it has not seen.
+All draw from one folder: DATA/worlds of tools.training.render_training_data, DATA/crops of render_drone_crops,
+DATA/cutouts of render_cutouts, DATA/photographs without drones and DATA/labelled/* with real ones (see
+docs/networks.md), and what tools.training.mine found in them. `sigma` is the last part of `distance`: how far it may
+misjudge a drone's size, also of one that it has not seen.
 
 Writes OUT/checkpoint.pt, OUT/curve.csv and a picture of it every few minutes. Uses a GPU where there is one.
 With --start it goes on from another run's weights, or from a network of models/, and keeps them as OUT/start.pt.
@@ -15,11 +16,8 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
-import shutil
 import time
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -30,74 +28,53 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
-from tools.training.dataset import open_pairs
-from tools.training.from_onnx import begin_with_onnx
-from tools.training.moving_cameras import MovingCameras
+from tools.training.picture_tasks import DetectorTask, VerificationTask
 from tools.training.samples import Sample
 from tools.training.tasks import Batch, DistanceTask, FlowTask, NeighboursTask, SigmaTask, Task
+from tools.training.weights import begin_with_onnx
 
-NETWORKS = ("neighbours", "distance", "sigma", "flow")
-
-
-def _task(arguments: argparse.Namespace) -> Task:
-    if arguments.network == "sigma":
-        if arguments.crops is None or arguments.start is None:
-            raise SystemExit("sigma needs --crops, and the distance network that it belongs to with --start")
-        return SigmaTask(arguments.crops)
-    if arguments.data is None:
-        raise SystemExit(f"{arguments.network} needs --data")
-    pairs = open_pairs(arguments.data)
-    if arguments.network == "flow":
-        return FlowTask(pairs)
-    if arguments.network == "neighbours":
-        return NeighboursTask(pairs, MovingCameras(arguments.moving) if arguments.moving else None)
-    if arguments.negatives is None or arguments.crops is None:
-        raise SystemExit("the distance network needs --crops and --negatives")
-    return DistanceTask(pairs, arguments.negatives, arguments.crops)
+TASKS: dict[str, Callable[[Path], Task]] = {
+    "neighbours": NeighboursTask, "distance": DistanceTask, "sigma": SigmaTask, "flow": FlowTask,
+    "verification": VerificationTask, "detector": DetectorTask,
+}  # fmt: skip
 
 
 def main() -> None:
     """Train until the minutes are over."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("network", choices=NETWORKS)
-    parser.add_argument("--data", type=Path, help="folder of render_training_data.py")
+    parser.add_argument("network", choices=TASKS)
+    parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--minutes", type=float, default=60.0, help="of training in all, over every resumption")
-    parser.add_argument("--negatives", type=Path, help="what is no drone, for `distance`: file of mine_negatives.py")
-    parser.add_argument("--crops", type=Path, help="drones, for `distance`: folder of render_drone_crops.py")
-    parser.add_argument("--moving", type=Path, help="real depth, for `neighbours`: folder of moving_cameras.py")
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
     parser.add_argument("--times", type=int, default=1, help="so many times as large batches, beside a GPU")
     parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt, or an .onnx")
-    parser.add_argument("--compile", action="store_true", help="`distance` a fifth faster; needs a C++ compiler")
-    add_machine(parser)
+    parser.add_argument("--threads", type=int, default=2, help="that learn, where there is no GPU")
+    parser.add_argument("--workers", type=int, default=1, help="processes that draw samples")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    compiler = os.environ.get("CXX", "g++")
-    if arguments.compile and shutil.which(compiler) is None:
-        raise SystemExit(f"--compile needs a C++ compiler, and there is no {compiler} here; leave --compile out")
+    if arguments.network == "sigma" and arguments.start is None:
+        parser.error("sigma needs the distance network that it belongs to, with --start")
     torch.manual_seed(arguments.seed)
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(1)
-    task = _task(arguments)
+    try:
+        task = TASKS[arguments.network](arguments.data)
+    except (FileNotFoundError, ValueError) as error:
+        raise SystemExit(f"--data: {error}") from None
     task.rate = arguments.rate or task.rate
     task.batch *= arguments.times
     arguments.out.mkdir(parents=True, exist_ok=True)
-    if arguments.start and not (arguments.out / "checkpoint.pt").is_file():
+    begun_with = arguments.out / "start.pt"
+    if arguments.start and not begun_with.is_file():
         try:
             start(task, arguments.start, arguments.seed)
         except ValueError as error:
             raise SystemExit(f"--start: {error}") from None
-        torch.save({"net": task.net.state_dict()}, arguments.out / "start.pt")
-    if arguments.compile:
-        task.net.compile(dynamic=False)
+        torch.save({"net": task.net.state_dict()}, begun_with)
+    elif begun_with.is_file():
+        task.go_on_from(torch.load(begun_with, map_location="cpu")["net"])
     train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed, arguments.workers)
-
-
-def add_machine(parser: argparse.ArgumentParser) -> None:
-    """What of this machine a training may use."""
-    parser.add_argument("--threads", type=int, default=2, help="that learn, where there is no GPU")
-    parser.add_argument("--workers", type=int, default=0, help="processes that draw samples, beside a GPU; 0: a thread")
 
 
 def start(task: Task, weights: Path, seed: int) -> None:
@@ -105,24 +82,15 @@ def start(task: Task, weights: Path, seed: int) -> None:
 
     Raises ValueError where an ONNX file is of another network.
     """
-    if weights.suffix != ".onnx":
-        begin_with(task.net, torch.load(weights, map_location="cpu")["net"])
-        return
-    batch = _stack(task.batch_samples(np.random.default_rng(seed)))
-    begin_with_onnx(task.net, weights, lambda: task.loss(batch))
+    if weights.suffix == ".onnx":
+        batch = _stack(task.batch_samples(np.random.default_rng(seed)))
+        begin_with_onnx(task.net, weights, lambda: task.loss(batch))
+        task.go_on_from(task.net.state_dict())
+    else:
+        task.go_on_from(torch.load(weights, map_location="cpu")["net"])
 
 
-def begin_with(net: nn.Module, weights: dict[str, Tensor]) -> None:
-    """Take over what fits; of a layer that has grown, the part that was there."""
-    own = net.state_dict()
-    for name, value in weights.items():
-        if name in own and own[name].dim() == value.dim():
-            part = tuple(slice(0, min(a, b)) for a, b in zip(own[name].shape, value.shape, strict=True))
-            own[name][part] = value[part]
-    net.load_state_dict(own)
-
-
-def train(task: Task, out: Path, budget_s: float, seed: int, workers: int = 0) -> None:
+def train(task: Task, out: Path, budget_s: float, seed: int, workers: int) -> None:
     """One cosine-shaped run of ``budget_s`` seconds of training; so many ``workers`` (processes) draw the samples.
 
     What is kept is the mean of the weights over about the last thousand steps: each step's own errs to all sides.
@@ -141,7 +109,6 @@ def train(task: Task, out: Path, budget_s: float, seed: int, workers: int = 0) -
         mean.n_averaged.fill_(state["step"])
         optimiser.load_state_dict(state["optimiser"])
         spent, step = state["spent"], state["step"]
-    in_16_bits = is_faster_in_16_bits(device)
     task.begin()
     last_save = last_print = spent
     recent: list[dict[str, float]] = []
@@ -153,7 +120,7 @@ def train(task: Task, out: Path, budget_s: float, seed: int, workers: int = 0) -
         for group in optimiser.param_groups:
             group["lr"] = rate
         batch = {name: values.to(device) for name, values in next(upcoming).items()}
-        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=in_16_bits):
+        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=device.type == "cuda"):
             loss, figures = task.loss(batch)
         if torch.isfinite(loss):
             optimiser.zero_grad(set_to_none=True)
@@ -180,23 +147,6 @@ def train(task: Task, out: Path, budget_s: float, seed: int, workers: int = 0) -
             last_save = spent
 
 
-def is_faster_in_16_bits(device: torch.device) -> bool:
-    """Whether training with bfloat16 pays. Measured: a processor without instructions for it takes eightfold."""
-    layer = nn.Conv2d(32, 32, 3, padding=1).to(device).to(memory_format=torch.channels_last)
-    pictures = torch.randn(8, 32, 64, 64, device=device).to(memory_format=torch.channels_last)
-
-    def took_s(in_16_bits: bool) -> float:
-        begin = time.monotonic()
-        for _ in range(3):
-            with torch.autocast(device.type, dtype=torch.bfloat16, enabled=in_16_bits):
-                answer = layer(pictures)
-            float(answer.detach().sum())
-        return time.monotonic() - begin
-
-    tries = [(took_s(in_16_bits=True), took_s(in_16_bits=False)) for _ in range(3)]
-    return min(first for first, _ in tries) < min(second for _, second in tries)
-
-
 def _recent_mean(mean: Tensor, new: Tensor, count: Tensor) -> Tensor:
     """Running mean of floating-point weights; counters are taken as they are."""
     if not mean.is_floating_point():
@@ -206,23 +156,10 @@ def _recent_mean(mean: Tensor, new: Tensor, count: Tensor) -> Tensor:
 
 
 def batches(task: Task, seed: list[int], workers: int) -> Iterator[Batch]:
-    """Without end; the next ones are made while the last one is learnt from."""
-    if workers:
-        loader = DataLoader(
-            _Batches(task, seed),
-            batch_size=None,
-            num_workers=workers,
-            prefetch_factor=3,
-            multiprocessing_context="fork",
-        )
-        yield from loader
-        return
-    upcoming_of = iter(_Batches(task, seed))
-    with ThreadPoolExecutor(1) as loading:
-        upcoming = loading.submit(next, upcoming_of)
-        while True:
-            batch, upcoming = upcoming.result(), loading.submit(next, upcoming_of)
-            yield batch
+    """Without end; ``workers`` processes make the next ones while the last one is learnt from."""
+    yield from DataLoader(
+        _Batches(task, seed), batch_size=None, num_workers=workers, prefetch_factor=3, multiprocessing_context="fork"
+    )
 
 
 class _Batches(IterableDataset[Batch]):
@@ -234,7 +171,7 @@ class _Batches(IterableDataset[Batch]):
     def __iter__(self) -> Iterator[Batch]:
         """Without end."""
         worker = get_worker_info()
-        rng = np.random.Generator(np.random.PCG64([*self._seed, worker.id] if worker else self._seed))
+        rng = np.random.Generator(np.random.PCG64([*self._seed, worker.id if worker else 0]))
         while True:
             yield _stack(self._task.batch_samples(rng))
 

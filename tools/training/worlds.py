@@ -7,10 +7,17 @@ are those of ``tools.training.drone_generator``: training worlds have them besid
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
 import numpy as np
 
 from flockd.core.config.obstacle_field import ObstaclesConfig
 
+Job = TypeVar("Job")
 FLIGHTS = range(0, 1_000_000)
 TRAINING = range(1_000_000, 2_000_000)
 VALIDATION = range(2_000_000, 3_000_000)
@@ -20,10 +27,7 @@ FAMILIES = range(12)
 UNSEEN_FAMILIES = range(12, 14)
 SHAPES = range(400)
 SHAPES_SHARE = 1 / 2
-"""Share of the generator's shapes among the drones of training worlds, and of all but the families among those that a
-training draws."""
-REAL_SHARE = 0.7
-"""Share of real airframes and shells among the latter, where there are any."""
+"""Share of the generator's shapes among the drones of training worlds, and among those that a training draws."""
 
 
 def drawn_obstacles(seed: int, share: float) -> ObstaclesConfig | None:
@@ -37,3 +41,12 @@ def drawn_obstacles(seed: int, share: float) -> ObstaclesConfig | None:
         return ObstaclesConfig(kind="forest", extent_m=extent_m, min_gap_m=gap_m, trees_per_hectare=trees)
     houses = float(rng.uniform(4.0, 10.0))
     return ObstaclesConfig(kind="village", extent_m=extent_m, min_gap_m=gap_m, houses_per_hectare=houses)
+
+
+def in_processes(render: Callable[[Job], None], jobs: Sequence[Job], processes: int | None) -> None:
+    """Render each job's world in a process of its own; prints how many are done."""
+    os.environ["NUMBA_NUM_THREADS"] = "1"
+    begin = time.monotonic()
+    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+        for done, _ in enumerate(pool.imap_unordered(render, jobs), start=1):
+            print(f"{done}/{len(jobs)} worlds, {time.monotonic() - begin:.0f} s", flush=True)

@@ -74,14 +74,10 @@ class LensFaultsConfig(Section):
 
 
 class CompressionConfig(Section):
-    """Compression of each image by itself, as a camera of pixel format `mjpeg` sends it, or as a stream."""
+    """Compression of each image by itself, as a camera of pixel format `mjpeg` sends it."""
 
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] | None = None
     """null: none."""
-    h264_mbit_s: Annotated[float, Field(gt=0, le=100)] | None = None
-    """H.264 instead, of so many Mbit/s at 30 images a second; needs the library openh264. Each image is predicted from
-    the one of the step before, which shows less of it than one a thirtieth of a second old would: worse than a real
-    stream of as many bits. null: none."""
 
 
 class CameraTimingConfig(Section):

@@ -1,4 +1,4 @@
-"""Where the page and the Foxglove server have the fleet from: live telemetry, or recordings."""
+"""Where the page and the bridge to ROS 2 have the fleet from: live telemetry, or recordings."""
 
 from __future__ import annotations
 

@@ -18,9 +18,8 @@ from flockd.fleet.watcher import Heard, Watched
 from flockd.onboard.recording import RecordingError
 from flockd.onboard.recording.codec import from_json, parsed
 from flockd.onboard.recording.foxglove import image_stream
-from flockd.onboard.recording.mcap_file import Entry
+from flockd.onboard.recording.mcap_file import Entry, read_records
 from flockd.onboard.recording.reader import Recording, head_of
-from flockd.onboard.recording.record_source import records_of
 from flockd.onboard.recording.streams import OUTPUT, TABLE, VEHICLE
 from flockd.onboard.telemetry import TOPICS, publish_step
 from flockd.onboard.telemetry.schema import completed, fault
@@ -175,7 +174,7 @@ def _story(path: Path, progress: Callable[[int], None]) -> _Story:
     story = _Story(config.telemetry.fleet, recording.drone, began_s, about, pictures)
     done, taking = 0, _Taking(story, (camera.name for camera in config.rig.cameras))
     for part in recording.contents.paths:
-        for record in records_of(part):
+        for record in read_records(part):
             if not isinstance(record, Entry):
                 continue
             done += len(record.data)

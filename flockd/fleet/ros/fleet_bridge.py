@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from flockd.core.image_header import jpeg_size
+from flockd.core.jpeg_header import jpeg_size
 from flockd.core.ros_frames import MAP, attitude_in_ros, camera_in_ros, flu_of_frd
 from flockd.fleet.camera_rigs import cameras_of
 from flockd.fleet.fleet_status import GONE, QUIET

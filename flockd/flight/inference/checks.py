@@ -1,4 +1,4 @@
-"""Whether a model file is what its manifest says: its weights, its tensors, and its outputs for the golden input."""
+"""Whether a model file is what its manifest says: its tensors, and its outputs for the golden input."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from flockd.core.choices import Provider
 from flockd.core.errors import FlockdError, UnavailableError, shortage_of
 from flockd.flight.inference.manifest import Fault, InputSpec, Manifest, OutputSpec, golden_deviates, listed
 from flockd.flight.inference.manifest_file import ManifestFile
-from flockd.flight.inference.weights import fault_of_weights
 
 _GOLDEN_TOLERANCE = 0.02
 """Largest difference of mean and deviation: providers round differently."""
@@ -36,16 +35,6 @@ class Tensor(Protocol):
     name: str
     type: str
     shape: Sequence[int | str | None]
-
-
-def check_weights(file: ManifestFile, content: bytes) -> None:
-    """Raises ModelError when the bytes of the ONNX file hold a weight that is no number."""
-    try:
-        fault = fault_of_weights(content)
-    except ValueError as error:
-        raise file.error(("file",), f"{file.model} cannot be loaded ({error}); restore it") from None
-    if fault:
-        raise file.error(("file",), f"{file.model}: {fault}")
 
 
 def check_tensors(file: ManifestFile, inputs: Sequence[Tensor], outputs: Sequence[Tensor]) -> None:

@@ -44,8 +44,8 @@ class ManifestFile:
             section = section[:-1]
         return ModelError(str(ConfigProblem(str(self.path), self.places[section].line, key_text(key), message)))
 
-    def read_model(self) -> bytes:
-        """The ONNX file's bytes. Raises ModelError where it is missing or differs from the manifest's SHA-256."""
+    def check_model(self) -> None:
+        """Raises ModelError where the ONNX file is missing or differs from the manifest's SHA-256."""
         model, wanted = self.model, self.manifest.sha256
         try:
             if model.exists() and not model.is_file():
@@ -65,7 +65,6 @@ class ManifestFile:
                 f"{model} has {digest[:12]}... and not {wanted[:12]}..., so the model file was changed or damaged; "
                 "restore it, or export it again with its manifest",
             )
-        return content
 
 
 def nothing_more(manifest: Manifest) -> Iterable[Fault]:
@@ -97,7 +96,7 @@ def read_manifest(path: Path, check: Check = nothing_more) -> ManifestFile:
 def load_manifest(path: Path, check: Check = nothing_more) -> tuple[Manifest, Path]:
     """The manifest at ``path`` and its model file's path, hash checked. Raises ModelError; see `read_manifest`."""
     file = read_manifest(path, check)
-    file.read_model()
+    file.check_model()
     return file.manifest, file.model
 
 

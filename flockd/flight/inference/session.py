@@ -16,7 +16,6 @@ from flockd.flight.inference.checks import (
     cannot_run,
     check_golden,
     check_tensors,
-    check_weights,
     no_deadline,
 )
 from flockd.flight.inference.feeds import golden_feeds, shapes_of
@@ -58,12 +57,10 @@ class OnnxModel:
             deadline: for the run on the golden input.
         """
         file = read_manifest(path, check)
-        content = file.read_model()
+        file.check_model()
         self.manifest = file.manifest
         self._refuse_provider(file, provider)
         provider = provider_of(self.manifest, provider)
-        check_weights(file, content)
-        del content
         self._engines = engine_folder(engines, provider, self.manifest.name, self.manifest.sha256)
         self._prepared = Prepared.load(self._engines)
         self._may_build = preparing or not is_slow_to_build(provider)

@@ -69,6 +69,8 @@ class Request:
     height_m: float
     """To hold where `wanted` names no height."""
     around: Surroundings
+    fastest_m_s: float = math.inf
+    """The speed that the autopilot itself limits setpoints to."""
 
 
 class Objection(StrEnum):
@@ -164,7 +166,8 @@ class Gate:
             elif wanted.yaw_rad is not None:
                 objections.append(Objection.HEADING_NOT_FINITE)
             if self._accepts(wanted, around, objections):
-                target = self._slowed(wanted.velocity, now_s - request.wanted_s, permission.action)
+                slowed = self._slowed(wanted.velocity, now_s - request.wanted_s, permission.action)
+                target = limit_norm(slowed, request.fastest_m_s)
                 if (target != wanted.velocity).any():
                     objections.append(Objection.SLOWED)
         velocity = self._within_acceleration(target, now_s, around)

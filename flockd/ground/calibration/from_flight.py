@@ -24,9 +24,8 @@ from flockd.ground.calibration.errors import CalibrationError
 from flockd.ground.calibration.fragment import extrinsics_of, measured_today
 from flockd.ground.calibration.rig_session import write_rig
 from flockd.onboard.recording.codec import from_json, parsed
-from flockd.onboard.recording.mcap_file import Entry, RecordingError
+from flockd.onboard.recording.mcap_file import Entry, RecordingError, read_records
 from flockd.onboard.recording.reader import Recording
-from flockd.onboard.recording.record_source import records_of
 from flockd.onboard.recording.streams import OUTPUT
 
 MAX_TURN_RAD, MAX_OFFSET_S, MAX_FOCAL = math.radians(0.5), 0.01, 0.01
@@ -38,7 +37,7 @@ def found_rig(recording: Recording) -> tuple[CameraDeviation, ...]:
     """The last that the outputs of a recording say of its cameras; none: they say nothing. Raises RecordingError."""
     last: tuple[CameraDeviation, ...] = ()
     for path in recording.contents.paths:
-        for record in records_of(path):
+        for record in read_records(path):
             if isinstance(record, Entry) and record.stream.topic == OUTPUT.topic:
                 try:
                     last = from_json(PilotOutput, parsed(record.data)).rig or last

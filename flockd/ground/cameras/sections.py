@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 
-from flockd.core.config.new_files import rig_cameras
 from flockd.core.errors import UsageError
 from flockd.ground.cameras.found import FoundCamera, Mode
 
@@ -33,7 +33,7 @@ def sections_text(cameras: Mapping[str, tuple[FoundCamera, Mode]], turn_deg: int
         "rig:",
         "  # Fill in: intrinsics and extrinsics, by `flockd calibrate camera` and `flockd calibrate rig`.",
         "  cameras:",
-        rig_cameras(sizes, FIELD_OF_VIEW_DEG),
+        _rig_cameras(sizes, FIELD_OF_VIEW_DEG),
         "source:",
         f"  kind: {'gstreamer' if as_pipelines else 'v4l2'}",
         "  cameras:",
@@ -73,3 +73,34 @@ def _controls(camera: FoundCamera) -> list[str]:
         lines.append(f"        - {{name: {name}, value: {value}}}    # {low} to {high}")
     others = [f"{one.name} {one.low} to {one.high}" for one in camera.controls if one.name not in set_by_hand]
     return [*lines, *(f"      # also: {other}" for other in others)]
+
+
+def camera_names(count: int) -> Sequence[str]:
+    """Clockwise from the one that looks forward."""
+    named = {1: ("front",), 2: ("front", "back"), 4: ("front", "right", "back", "left")}
+    return named.get(count, tuple(f"camera{number + 1}" for number in range(count)))
+
+
+def _rig_cameras(sizes: Mapping[str, tuple[int, int]], field_of_view_deg: float) -> str:
+    """The list `rig.cameras`: they look evenly around, with perfect wide-angle lenses. ``sizes`` by name, in pixels.
+
+    The field of view is that of the longer side.
+    """
+    lines = []
+    for number, (name, (width, height)) in enumerate(sizes.items()):
+        yaw_deg = 360.0 * number / len(sizes)
+        forward_m, right_m = 0.1 * math.cos(math.radians(yaw_deg)), 0.1 * math.sin(math.radians(yaw_deg))
+        focal_px = max(width, height) / 2 / math.radians(field_of_view_deg / 2)
+        lines += [
+            f"    - name: {name}",
+            f"      size_px: [{width}, {height}]",
+            f"      intrinsics: {{model: wide_angle, fx: {focal_px:.1f}, fy: {focal_px:.1f}, cx: {width / 2}, "
+            f"cy: {height / 2}}}",
+            f"      extrinsics: {{position_m: [{_plain(forward_m)}, {_plain(right_m)}, 0.0], yaw_deg: {yaw_deg:g}}}",
+        ]
+    return "\n".join((*lines, ""))
+
+
+def _plain(metres: float) -> str:
+    """To the centimetre, and never -0.0."""
+    return f"{round(metres, 2) + 0.0:g}"

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from pydantic import ValidationError
 
-from flockd.core.choices import LensModel
 from flockd.core.config import load_drone
 from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.errors import ConfigError
@@ -37,18 +35,7 @@ def read_calibration(file: Path, size: tuple[int, int]) -> CameraConfig:
         raise ConfigError.at(file, f"is no 3x3 matrix, it has {len(matrix)} rows; give it three, of three numbers each")
     if np.any(matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] != (0, 0, 0, 0, 1)):
         raise ConfigError.at(file, "is no camera matrix; write [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-    return camera_of(file, size, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
-
-
-def camera_of(
-    file: Path,
-    size: tuple[int, int],
-    intrinsics: Sequence[float],
-    distortion: Sequence[float] = (),
-    model: LensModel = "pinhole",
-) -> CameraConfig:
-    """From fx, fy, cx, cy with pixel centres at whole numbers. Raises ConfigError, which names ``file``."""
-    fx, fy, cx, cy = (float(value) for value in intrinsics)
+    fx, fy, cx, cy = (float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
     for centre, length, side in ((cx, size[0], "width"), (cy, size[1], "height")):
         if not _CENTRAL[0] * length <= centre <= _CENTRAL[1] * length:
             raise ConfigError.at(
@@ -56,15 +43,9 @@ def camera_of(
                 f"is the calibration of another size: its principal point lies at {centre:.0f} of {length} pixels of "
                 f"the images' {side}; name the one that belongs to {size[0]} x {size[1]} pixels",
             )
-    coefficients = tuple(float(value) for value in distortion)
     try:
-        camera = CameraConfig(
-            name=CAMERA,
-            size_px=size,
-            intrinsics=IntrinsicsConfig(
-                model=model, fx=fx, fy=fy, cx=cx + _HALF_PIXEL, cy=cy + _HALF_PIXEL, distortion=coefficients
-            ),
-        )
+        intrinsics = IntrinsicsConfig(fx=fx, fy=fy, cx=cx + _HALF_PIXEL, cy=cy + _HALF_PIXEL)
+        camera = CameraConfig(name=CAMERA, size_px=size, intrinsics=intrinsics)
         build_rig(RigConfig(cameras=(camera,)))
     except ValidationError as error:
         first = error.errors()[0]

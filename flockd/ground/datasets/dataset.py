@@ -1,4 +1,4 @@
-"""What every dataset gives, whatever its layout: frames with an image, and depth and pose where they are known."""
+"""What a dataset gives: frames with an image, and depth and pose where they are known."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class Entry:
 
 
 @dataclass(frozen=True, eq=False)
-class FileDataset:
-    """Each image, and each depth map, is a file."""
+class Dataset:
+    """A sequence of images of one camera; each image, and each depth map, is a file."""
 
     path: Path
     camera: CameraConfig

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from flockd.core.image_header import cost_fault, image_size
+from flockd.core.jpeg_header import cost_fault
 from flockd.core.messages import Float32Array, UInt8Array
 from flockd.ground.datasets.errors import DatasetError
 
@@ -53,8 +53,8 @@ def _decoded(path: Path, flags: int) -> cv2.typing.MatLike:
     except (OSError, ValueError) as error:  # ValueError: what a list names cannot be a path
         reason = error.strerror if isinstance(error, OSError) else error
         raise DatasetError(f"{path}: cannot be read ({reason}); restore it, or leave its frame out") from None
-    except cv2.error:  # of a header that claims more pixels than OpenCV takes
-        image, fault = None, "cannot be decoded"
+    except cv2.error:  # of a header that claims more pixels than OpenCV is to take, or of no bytes at all
+        image, fault = None, "has more pixels than any camera, or none"
     finally:
         logging.setLogLevel(before)
     if image is None:
@@ -75,8 +75,6 @@ def _fault(data: bytes) -> str | None:
     """What is wrong with a file before it is decoded, and memory taken for what it claims to hold."""
     if not data:
         return "is empty"
-    if image_size(data) is None:
-        return "is no image"
     if (costs := cost_fault(data)) is not None:
         return costs
     if data.startswith(_PNG):

@@ -28,23 +28,20 @@ def read_lines(file: Path) -> list[tuple[int, str]]:
     return [(number, line) for number, line in lines if line and not line.lstrip().startswith("#")]
 
 
-def read_rows(file: Path, *, columns: int, what: str, at_least: bool = False) -> FloatArray:
-    """(n, columns) numbers, between blanks or commas; with ``at_least`` further columns are left out.
-
-    Raises DatasetError where a line holds anything else, or there is none.
-    """
-    rows = [_row(file, number, line, columns, what, at_least) for number, line in read_lines(file)]
+def read_rows(file: Path, *, columns: int, what: str) -> FloatArray:
+    """(n, columns) numbers, between blanks or commas. Raises DatasetError where a line has others, or none is."""
+    rows = [_row(file, number, line, columns, what) for number, line in read_lines(file)]
     if not rows:
         raise DatasetError(f"{file}: is empty; it needs {what}")
     return np.array(rows, np.float64)
 
 
-def _row(file: Path, number: int, line: str, columns: int, what: str, at_least: bool) -> list[float]:
+def _row(file: Path, number: int, line: str, columns: int, what: str) -> list[float]:
     words = line.replace(",", " ").split()
     try:
         values = [float(word) for word in words]
     except ValueError:
         values = []
-    if len(values) < columns or (len(values) > columns and not at_least) or not np.isfinite(values).all():
+    if len(values) != columns or not np.isfinite(values).all():
         raise DatasetError(f"{file}:{number}: does not fit; it needs {what}")
-    return values[:columns]
+    return values

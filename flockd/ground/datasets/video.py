@@ -1,67 +1,20 @@
-"""A video file of one camera; its calibration comes from elsewhere."""
+"""Video files."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from flockd.core.config.rig import CameraConfig
-from flockd.core.errors import ConfigError
-from flockd.core.image_header import MAX_IMAGE_PIXELS
+from flockd.core.jpeg_header import MAX_IMAGE_PIXELS
 from flockd.core.messages import UInt8Array
-from flockd.ground.datasets.camera_intrinsics import read_calibration
-from flockd.ground.datasets.dataset import DatasetFrame, Moment
 from flockd.ground.datasets.errors import DatasetError
 
 SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".mpg", ".mpeg"})
-_COUNT_TOLERANCE = 2
-"""So many frames fewer than the file claims are no damage: containers count what a decoder does not show."""
-
-
-@dataclass(frozen=True, eq=False)
-class VideoDataset:
-    """Frames decoded one after the other."""
-
-    path: Path
-    camera: CameraConfig
-    claimed: int
-    """How many frames the file says it has."""
-    rate_hz: float
-    has_depth: bool = False
-    notes: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        return self.claimed
-
-    def frames(self, *, with_depth: bool) -> Iterator[DatasetFrame]:
-        """See ``FileDataset``; there is no depth."""
-        count = 0
-        for index, image in images_of_video(self.path):
-            yield DatasetFrame(Moment(index, f"{index}", index / self.rate_hz, None), image, None)
-            count = index + 1
-        if count < self.claimed - _COUNT_TOLERANCE:
-            raise DatasetError(f"{self.path}: ends after {count} of {self.claimed} frames; restore it")
-
-
-def open_video(path: Path, calibration: Path | None) -> VideoDataset:
-    """A video, its frames evenly spaced in time. Raises DatasetError and ConfigError."""
-    if not path.is_file():
-        raise DatasetError(f"{path}: does not exist; name a video")
-    with opened_video(path) as video:
-        rate_hz, claimed = video.get(cv2.CAP_PROP_FPS), int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-    _, first = next(images_of_video(path), (0, None))
-    if first is None or not rate_hz > 0 or claimed < 1:
-        raise DatasetError(f"{path}: is no video that can be decoded; restore it, or convert it to MP4")
-    if calibration is None:
-        raise ConfigError.at(path, "brings no calibration; name one with --calibration")
-    camera = read_calibration(calibration, (first.shape[1], first.shape[0]))
-    return VideoDataset(path, camera, claimed, rate_hz)
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -74,6 +75,8 @@ class AutopilotStatus:
     """(3,) metres, likewise."""
     foreign_setpoints: str | None = None
     """What was seen of setpoints that flockd did not send."""
+    fastest_m_s: float = math.inf
+    """The speed that the autopilot limits setpoints to; infinite where it is not known."""
     parameter_fault: str | None = None
     """What is wrong with a parameter that was changed since it was armed."""
     frame_jumped: bool = False

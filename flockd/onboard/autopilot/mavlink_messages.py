@@ -22,7 +22,7 @@ from flockd.onboard.autopilot.clock_sync import ClockEstimate, ClockSync, StampM
 from flockd.onboard.autopilot.local_frame import LocalFrame
 from flockd.onboard.autopilot.refusals import CheckEvents, Refusal, refusals
 from flockd.onboard.autopilot.setpoint_watch import SetpointWatch
-from flockd.onboard.autopilot.watched_parameters import WatchedParameters
+from flockd.onboard.autopilot.watched_parameters import MOST_SPEED, WatchedParameters
 
 Fields = Mapping[str, Any]
 
@@ -351,6 +351,7 @@ class ReceivedMessages:
             position_ned=_vector(self._fields("LOCAL_POSITION_NED"), "x", "y", "z"),
             home_ned=self._home,
             foreign_setpoints=self.setpoints.seen,
+            fastest_m_s=self.parameters.values.get(MOST_SPEED, math.inf),
             parameter_fault=self.parameters.fault(self._max_gap_s),
             frame_jumped=self._frame.large,
         )

@@ -152,7 +152,9 @@ class Control:
             self._streamer.begin()
         wanted, wanted_s = self._wanted(now)
         around = self._around(now, status, vehicle)
-        self._request = Request(Permission(action, now), wanted, wanted_s, self._height_m, around)
+        self._request = Request(
+            Permission(action, now), wanted, wanted_s, self._height_m, around, fastest_m_s=status.fastest_m_s
+        )
         self._streamer.offer(self._request)
         self._streamer.beat()
 

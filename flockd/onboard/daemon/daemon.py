@@ -14,6 +14,7 @@ from flockd.core.errors import ConfigError, ConfigProblem, FlockdError
 from flockd.flight.safety import Decision, Event, State
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
+from flockd.onboard.autopilot.watched_parameters import MOST_SPEED
 from flockd.onboard.daemon.components import Components
 from flockd.onboard.daemon.control import FLYING
 from flockd.onboard.daemon.operator_commands import OperatorRequests
@@ -189,6 +190,11 @@ class Daemon:
             components.sinks.event(state_sentence(now))
         components.texts.update(now)
         if now.state in FLYING and before.state not in FLYING:
+            fastest_m_s = components.link.status().fastest_m_s
+            if fastest_m_s < self._config.safety.gate.max_speed_m_s:
+                components.sinks.event(
+                    f"the autopilot's {MOST_SPEED} is {fastest_m_s:g} m/s: flockd asks for no more in this flight"
+                )
             components.sinks.begin_recording(components.pilot_loop.learned_before)
         elif components.sinks.recording is not None and not components.link.status().armed:
             components.sinks.end_recording()

@@ -12,7 +12,7 @@ import numpy as np
 from flockd.core.messages import VehicleState
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.codec import from_json, parsed
-from flockd.onboard.recording.mcap_file import Entry, McapFile, Note, RecordingError
+from flockd.onboard.recording.mcap_file import Entry, McapFile, Note, RecordingError, read_records
 from flockd.onboard.recording.reader import (
     Contents,
     Recording,
@@ -21,7 +21,6 @@ from flockd.onboard.recording.reader import (
     is_calibration,
     makes_steps,
 )
-from flockd.onboard.recording.record_source import records_of
 from flockd.onboard.recording.streams import (
     CUT,
     END_NOTE,
@@ -134,4 +133,4 @@ def _can_be_read(entry: Entry, images: bool) -> bool:
 
 
 def _entries(contents: Contents) -> Iterator[Entry]:
-    return (record for path in contents.paths for record in records_of(path) if isinstance(record, Entry))
+    return (record for path in contents.paths for record in read_records(path) if isinstance(record, Entry))

@@ -10,9 +10,8 @@ from typing import Any, Literal
 
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.codec import Json, parsed
-from flockd.onboard.recording.mcap_file import Entry, RecordingError
+from flockd.onboard.recording.mcap_file import Entry, RecordingError, read_records
 from flockd.onboard.recording.reader import Recording
-from flockd.onboard.recording.record_source import records_of
 from flockd.onboard.recording.streams import is_image
 
 Row = dict[str, Any]
@@ -71,7 +70,7 @@ def _file_name(name: str) -> str:
 
 def _entries(recording: Recording) -> Iterator[Entry]:
     paths = recording.contents.paths
-    return (record for path in paths for record in records_of(path) if isinstance(record, Entry))
+    return (record for path in paths for record in read_records(path) if isinstance(record, Entry))
 
 
 def _add(tables: Tables, table: str, fixed: Mapping[str, Any], message: Json) -> None:

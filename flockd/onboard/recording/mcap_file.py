@@ -15,10 +15,10 @@ from typing import BinaryIO, Literal, Self
 
 import lz4.frame
 import zstandard
-from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 
@@ -95,30 +95,6 @@ class Damage:
     """The file just stops: its writer was killed. Otherwise something within it is damaged."""
 
 
-class _ChunkIndices:
-    """Where each chunk of a file is, as bytes of the index at its end.
-
-    The writer of MCAP keeps an object for each, 1.3 kB with a dozen topics: with five chunks a second, 24 MB an hour.
-    """
-
-    def __init__(self) -> None:
-        self._packed = bytearray()
-
-    def append(self, index: ChunkIndex) -> None:
-        """What the writer calls when a chunk has ended."""
-        builder = RecordBuilder()
-        index.write(builder)
-        self._packed += builder.end()  # type: ignore[no-untyped-call]
-
-    def __iter__(self) -> Iterator[ChunkIndex]:
-        """When the file is finished."""
-        stream = ReadDataStream(io.BytesIO(self._packed))
-        while stream.count < len(self._packed):
-            stream.read1()  # the opcode
-            stream.read8()  # the record's length
-            yield ChunkIndex.read(stream)
-
-
 class McapFile:
     """Writes one file. Every method may raise OSError; then only `abandon` is left to call."""
 
@@ -126,7 +102,6 @@ class McapFile:
         self.path = path
         self._file = path.open("wb")
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._writer._Writer__chunk_indices = _ChunkIndices()  # type: ignore[attr-defined]
         self._channels: dict[str, int] = {}
         self._synced_s = time.monotonic()
         self._syncing: threading.Thread | None = None

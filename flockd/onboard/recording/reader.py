@@ -17,13 +17,11 @@ from pydantic import ValidationError
 from flockd.core import gone
 from flockd.core.config import DroneConfig
 from flockd.core.config.perception import NO_MODEL
-from flockd.core.image_header import cost_fault
+from flockd.core.jpeg_header import cost_fault
 from flockd.core.messages import Frame, FrameSet, LearnedSize, MissionOrder, UInt8Array, VehicleState
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.codec import from_json, parsed
-from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, Note, Record, RecordingError
-from flockd.onboard.recording.record_source import records_of
-from flockd.onboard.recording.ros_bag import is_bag
+from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, Note, Record, RecordingError, read_records
 from flockd.onboard.recording.streams import (
     CONFIGURATION,
     END_NOTE,
@@ -157,7 +155,7 @@ class Recording:
         """
         number, messages = -1, dict[str, bytes]()
         for path in self.contents.paths:
-            for record in records_of(path):
+            for record in read_records(path):
                 if isinstance(record, Entry) and makes_steps(record.stream.topic):
                     if record.sequence != number:
                         yield from self._built(number, messages, start_s, end_s)
@@ -197,7 +195,7 @@ def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
     Raises RecordingError where the file is not a recording of flockd or ends before all three, and OSError.
     """
     flight, models, configuration = None, None, None
-    for record in records_of(path):
+    for record in read_records(path):
         match record:
             case Note(name) if name == FLIGHT_NOTE:
                 flight = record
@@ -221,7 +219,7 @@ def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
 
 def check(path: Path) -> None:
     """Raises RecordingError when there is no file to read at all."""
-    if not path.is_file() and not is_bag(path):
+    if not path.is_file():
         fault = "is a folder; name a recording in it" if path.is_dir() else "does not exist; check the path"
         raise RecordingError(f"{path}: {fault}")
 
@@ -233,7 +231,7 @@ def _survey(first: Path, progress: Callable[[int, int], None]) -> Contents:
     found.paths = tuple(_all_parts(first, flight))
     total, done = sum(path.stat().st_size for path in found.paths), 0
     for path in found.paths:
-        for record in records_of(path):
+        for record in read_records(path):
             if isinstance(record, Entry):
                 done += len(record.data)
                 progress(done, total)

@@ -43,7 +43,6 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 TWIST = "geometry_msgs/msg/TwistStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
 IMU = "sensor_msgs/msg/Imu"
-TEXT = "std_msgs/msg/String"
 """Names of the types, as ROS 2 writes them."""
 OK, WARN, ERROR, STALE = range(4)
 """Levels of a DiagnosticStatus."""
@@ -120,21 +119,6 @@ def odometry(
             "twist": {"linear": vector(flu_of_frd(body)), "angular": vector((0.0, 0.0, 0.0))},
             "covariance": np.zeros(36) if known else np.concatenate([[-1.0], np.zeros(35)]),
         },
-    }
-
-
-def imu(time_ns: int, names: Names, R_ned_frd: FloatArray) -> Tree:
-    """The attitude alone: -1 says that rates and accelerations are not known."""
-    unknown = np.concatenate([[-1.0], np.zeros(8)])
-    nothing = vector((0.0, 0.0, 0.0))
-    return {
-        "header": header(time_ns, names.base_link),
-        "orientation": turn(attitude_in_ros(R_ned_frd)),
-        "orientation_covariance": np.zeros(9),
-        "angular_velocity": nothing,
-        "angular_velocity_covariance": unknown,
-        "linear_acceleration": nothing,
-        "linear_acceleration_covariance": unknown,
     }
 
 
@@ -280,12 +264,6 @@ def diagnostic(name: str, level: int, sentence: str, values: Mapping[str, object
     """A DiagnosticStatus; what is not known is left out of its values."""
     known = [{"key": key, "value": _written(value)} for key, value in values.items() if value is not None]
     return {"level": level, "name": name, "message": sentence, "hardware_id": name.partition(":")[0], "values": known}
-
-
-def twist(time_ns: int, frame: str, velocity_ned: FloatArray) -> Tree:
-    """A TwistStamped in a frame of east, north, up."""
-    motion = {"linear": vector(enu_of_ned(velocity_ned)), "angular": vector((0.0, 0.0, 0.0))}
-    return {"header": header(time_ns, frame), "twist": motion}
 
 
 def transform(time_ns: int, parent: str, child: str, place: FloatArray, R_parent_child: FloatArray) -> Tree:

@@ -9,7 +9,7 @@ from typing import Literal, Protocol
 import cv2
 import numpy as np
 
-from flockd.core.image_header import cost_fault, jpeg_size
+from flockd.core.jpeg_header import cost_fault, jpeg_size
 from flockd.core.messages import UInt8Array
 
 Decoder = Callable[[bytes], UInt8Array]

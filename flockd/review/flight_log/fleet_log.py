@@ -19,9 +19,8 @@ from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.flight.perception import load_networks
 from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.onboard.recording.codec import from_json
-from flockd.onboard.recording.mcap_file import Entry
+from flockd.onboard.recording.mcap_file import Entry, read_records
 from flockd.onboard.recording.reader import Recording
-from flockd.onboard.recording.record_source import records_of
 from flockd.onboard.recording.streams import ORDER, OUTPUT, VEHICLE
 from flockd.review.flight_log.builder import FlightLogBuilder
 from flockd.review.flight_log.capture import capture, key_frame_steps
@@ -189,7 +188,7 @@ def _outputs(recordings: Path, drone: str) -> Iterator[tuple[PilotOutput, FloatA
     for path in sorted(recordings.glob(f"{drone}-*.mcap")):
         outputs: dict[int, PilotOutput] = {}
         attitudes: dict[int, FloatArray] = {}
-        for record in records_of(path):
+        for record in read_records(path):
             if isinstance(record, Entry) and record.stream.topic == OUTPUT.topic:
                 outputs[record.sequence] = from_json(PilotOutput, json.loads(record.data))
             elif isinstance(record, Entry) and record.stream.topic == VEHICLE.topic:
@@ -202,7 +201,7 @@ def recorded_orders(recordings: Path, drone: str, zero_s: float) -> list[tuple[f
     return [
         (record.time_ns / 1e9 - zero_s, from_json(MissionOrder, json.loads(record.data)))
         for path in sorted(recordings.glob(f"{drone}-*.mcap"))
-        for record in records_of(path)
+        for record in read_records(path)
         if isinstance(record, Entry) and record.stream.topic == ORDER.topic
     ]
 

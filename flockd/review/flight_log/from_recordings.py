@@ -13,10 +13,8 @@ from flockd.core.messages import FloatArray, PilotOutput
 from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.onboard.recording import RecordingError
-from flockd.onboard.recording.codec import from_json, parsed, to_json
-from flockd.onboard.recording.mcap_file import Entry
+from flockd.onboard.recording.codec import from_json, to_json
 from flockd.onboard.recording.reader import Recording, head_of
-from flockd.onboard.recording.record_source import records_of
 from flockd.onboard.recording.truth import Truth
 from flockd.review.flight_log.builder import FlightLogBuilder
 from flockd.review.flight_log.capture import capture, key_frame_steps
@@ -25,9 +23,6 @@ from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FlightMetadata
 
 Progress = Callable[[int, int], None]
-
-CLOCK_TOPIC = "/clock"
-"""Topic of recordings with the autopilot's clock."""
 
 
 def recordings_in(folder: Path) -> tuple[Path, ...]:
@@ -105,24 +100,6 @@ def key_frames(
             frames += (replace(one, time_s=one.time_s - zero_s) for one in captured)
         progress(index + 1, steps)
     return tuple(frames)
-
-
-def autopilot_clock(recording: Recording) -> tuple[FloatArray, FloatArray] | None:
-    """The autopilot's clock as it was measured in flight; None where the recording does not hold it.
-
-    (n,) times on the drone's computer, and (n,) seconds by which the autopilot's clock was ahead then.
-    """
-    entries = (record for path in recording.contents.paths for record in records_of(path))
-    messages = [parsed(one.data) for one in entries if isinstance(one, Entry) and one.stream.topic == CLOCK_TOPIC]
-    known = [
-        (float(message["time_s"]), float(message["offset_s"]))
-        for message in messages
-        if isinstance(message, dict) and message.get("offset_s") is not None
-    ]
-    if not known:
-        return None
-    times_s, ahead_s = np.array(known).T
-    return times_s, ahead_s
 
 
 def _read(recordings: Sequence[Recording], progress: Progress) -> tuple[list[str], list[_Step]]:

@@ -19,7 +19,6 @@ from flockd.review.report.summary import summarise, write_summary
 LOG_NAME = "flight.npz"
 KEY_FRAMES_NAME = "filmstrip.npz"
 SUMMARY_NAME = "summary.json"
-AUTOPILOT_LOG_NAME = "autopilot.npz"
 REPORT_NAME = "report.html"
 FIGURES = "figures"
 FLEET_LOGS = "logs"
@@ -28,7 +27,6 @@ RECORDINGS = "recordings"
 OF_A_FLIGHT = (
     LOG_NAME,
     KEY_FRAMES_NAME,
-    AUTOPILOT_LOG_NAME,
     SUMMARY_NAME,
     REPORT_NAME,
     FIGURES,

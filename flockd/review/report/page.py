@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import functools
 import io
 import json
 from collections.abc import Callable
@@ -19,10 +18,8 @@ from matplotlib.figure import Figure
 
 from flockd.core.messages import UInt8Array
 from flockd.core.side_process import SideProcess, shared
-from flockd.review.flight_log.autopilot_log import AutopilotLog
 from flockd.review.flight_log.key_frames import KeyFrame, load_key_frames
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.report.autopilot_figure import autopilot_figure, autopilot_texts
 from flockd.review.report.curves import account_curves, error_curves, flight_curves
 from flockd.review.report.figure_files import inline_svg
 from flockd.review.report.filmstrip import filmstrip_figure
@@ -39,8 +36,8 @@ def write_report(
     """Write `report.html` and `figures/*.png` into a flight's folder and return the page's path.
 
     The folder holds `flight.npz` (FlightLog) and `summary.json` (of `summarise`); if key frames were kept
-    `filmstrip.npz`; and `autopilot.npz` (AutopilotLog) with what the autopilot logged, if that is there. Figures are
-    drawn in as many ``processes``, of which this is one. Raises FileNotFoundError if one of the first two is missing.
+    `filmstrip.npz`. Figures are drawn in as many ``processes``, of which this is one. Raises
+    FileNotFoundError if one of the first two is missing.
     """
     for name in ("flight.npz", "summary.json"):
         if not (directory / name).is_file():
@@ -66,16 +63,11 @@ def write_report(
             stack.enter_context(SideProcess("drew figures", _Drawings, log, folder)) for _ in range(1, processes)
         ]
         drawn = shared([*((name, None) for name in drawings), *strips], draw, helpers, progress)
-    embedded: dict[str, Markup | None] = {"trajectories": None, "obstacles": None, "errors": None, "autopilot": None}
+    embedded: dict[str, Markup | None] = {"trajectories": None, "obstacles": None, "errors": None}
     embedded |= zip(drawings, drawn, strict=False)
     plates = drawn[len(drawings) :]
-    beside = directory / "autopilot.npz"
-    autopilot = AutopilotLog.load(beside) if beside.is_file() else None
-    if autopilot is not None:
-        embedded["autopilot"] = _of_autopilot(log, autopilot, folder)
     page = page_template(Path(__file__).with_name("report.html")).render(
         **page_texts(summary, log),
-        **autopilot_texts(log, autopilot),
         **embedded,
         filmstrip=plates,
         plated=list(dict.fromkeys(plate["drone"] for plate in plates)),
@@ -120,13 +112,6 @@ def _flight_data(log: FlightLog) -> str:
         ],
     }
     return json.dumps(data, separators=(",", ":"))
-
-
-def _of_autopilot(log: FlightLog, autopilot: AutopilotLog, folder: Path) -> Markup | None:
-    """The figure of the autopilot's own log."""
-    draw = functools.partial(autopilot_figure, autopilot=autopilot)
-    file, what = folder / "autopilot.png", "Velocities, height and flight modes as the autopilot logged them"
-    return _embed(log, draw, file, what)
 
 
 _MAX_SVG_BYTES = 700_000

@@ -38,7 +38,7 @@ from flockd.sim.autopilot.fake_telemetry import (
     custom_mode,
     mode_by_number,
 )
-from flockd.sim.autopilot.fake_vehicle import Demand, Motion, MotionState, PointMass
+from flockd.sim.autopilot.fake_vehicle import Demand, Drift, Motion, MotionState, PointMass
 from flockd.sim.autopilot.sticks import StickOverride, stick_curve
 
 TICK_S = 0.02
@@ -63,7 +63,8 @@ class FakeAutopilot:
     """One vehicle that sends to `udpin://127.0.0.1:<port>`, on its own thread between `start` and `close`.
 
     It begins on the ground, or armed and in Hold at `height_m`. With a `motion` of the caller's, that decides where it
-    begins. What a test or a pilot does to it (`pilot_selects`, the attributes) takes effect within a tick.
+    begins. In flight its estimate drifts, and it follows setpoints by it. What a test or a pilot does to it
+    (`pilot_selects`, the attributes) takes effect within a tick.
     """
 
     def __init__(
@@ -105,6 +106,7 @@ class FakeAutopilot:
         """False: its position and velocity do not come any more, and all else does."""
         self.frame_off, self.heading_off_rad = np.zeros(3), 0.0
         """By what its positions (3,) in NED and its heading are off the truth, in metres and clockwise."""
+        self._drift = Drift(system_id)
         self.failing: set[str] = set()
         """PX4's names of further checks that fail; each refuses to arm."""
         self.wordless = False
@@ -262,7 +264,8 @@ class FakeAutopilot:
             self.sends_motion,
             self.battery_share,
             self._followed().velocity if self._mode == "OFFBOARD" and self.setpoints else None,
-            self.frame_off,
+            self.frame_off + np.append(self._drift.position, 0.0),
+            self._drift.velocity,
             self.heading_off_rad,
         )
 
@@ -359,7 +362,9 @@ class FakeAutopilot:
         self._update_mode()
         if not self._armed:
             return
-        self._state = self._motion(self._demand(), interval_s)
+        self._drift.step(interval_s)
+        demand = self._demand()
+        self._state = self._motion(replace(demand, velocity=demand.velocity - self._drift.velocity), interval_s)
         height_m = -float(self._state.position[2])
         blind = self.parameters["CP_DIST"] > 0 and self.collision_prevention.without_data_s(self._clock()) > HOLD_S
         risen = height_m > self.parameters["MIS_TAKEOFF_ALT"] - 0.1

@@ -71,6 +71,8 @@ class VehicleSnapshot:
     """(2,) m/s, north and east, that it follows in offboard."""
     frame_off: FloatArray = field(default_factory=lambda: np.zeros(3))
     """(3,) m by which its local positions are off the truth, in NED."""
+    velocity_off: FloatArray = field(default_factory=lambda: np.zeros(2))
+    """(2,) m/s likewise of its velocity, north and east."""
     heading_off_rad: float = 0.0
     """Likewise of its heading, clockwise."""
 
@@ -174,7 +176,10 @@ class TelemetryStreams:
         motion = self._vehicle.motion
         if self._vehicle.estimate_ok and self._vehicle.sends_motion:
             self._mav.local_position_ned_send(
-                self._boot_ms(), *(motion.position + self._vehicle.frame_off), *motion.velocity
+                self._boot_ms(),
+                *(motion.position + self._vehicle.frame_off),
+                *(motion.velocity[:2] + self._vehicle.velocity_off),
+                motion.velocity[2],
             )
 
     def _send_landed(self) -> None:

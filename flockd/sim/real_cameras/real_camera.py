@@ -12,7 +12,6 @@ from flockd.core.messages import FloatArray, UInt8Array
 from flockd.flight.geometry import Camera
 from flockd.sim.real_cameras.compression import jpeg
 from flockd.sim.real_cameras.glass import Glass
-from flockd.sim.real_cameras.h264 import H264Stream
 from flockd.sim.real_cameras.light import grey_levels, linear_light
 from flockd.sim.real_cameras.sensor import Automatic, NoiseTile, noisy
 from flockd.sim.real_cameras.shake import Shaking
@@ -25,7 +24,7 @@ class RealCamera:
     """One camera of one drone, with its own dirt, phases and noise. Its images depend on no other camera's."""
 
     def __init__(self, config: CamerasConfig, lens: LensField, tile: NoiseTile, seed: tuple[int, ...]) -> None:
-        """``seed`` is of this camera alone. Raises UnavailableError for an H.264 stream that cannot be."""
+        """``seed`` is of this camera alone."""
         height, width = lens.u.shape
         self._config, self._lens, self._tile = config, lens, tile
         self.clock = CameraClock(config.timing, np.random.default_rng([*seed, 0]))
@@ -33,8 +32,6 @@ class RealCamera:
         self._glass = Glass.of(config.lens, (width, height), np.random.default_rng([*seed, 2]))
         self._automatic = Automatic(config.automatic)
         self._rng = np.random.default_rng([*seed, 3])
-        size, mbit_s = (config.reduce * width, config.reduce * height), config.compression.h264_mbit_s
-        self._stream = None if mbit_s is None else H264Stream(size, mbit_s)
 
     def image(self, view: View, motion: CameraMotion, time_s: float, sun: FloatArray) -> UInt8Array:
         """What the sensor sees, in the order of light: shutter, glass, automatics, noise by gain.
@@ -60,9 +57,7 @@ class RealCamera:
     def compressed(self, image: UInt8Array) -> UInt8Array:
         """The image as the camera sends it."""
         quality, reduce = self._config.compression.jpeg_quality, self._config.reduce
-        if self._stream is not None:
-            image, _ = self._stream.passed(image)
-        elif quality is not None:
+        if quality is not None:
             return jpeg(image, quality, reduce)
         height, width = self._lens.u.shape
         return image if reduce == 1 else np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))

@@ -21,7 +21,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from flockd.sim.free_ports import free_endpoint, free_port
-from tools.measure.bench_fleet_page import (
+from tests.fleet.page.chromium import (
     BROWSERS,
     CAMERAS,
     NARROW,

@@ -18,7 +18,6 @@ from flockd.core.data import data_path
 from flockd.core.errors import ModelError
 from flockd.flight.inference import OnnxModel, load_manifest
 from flockd.flight.inference.providers import Prepared, available
-from flockd.flight.inference.weights import fault_of_weights
 from flockd.flight.perception import OnnxNetworks
 from flockd.flight.perception.requirements import check_roles
 from tests.flight.inference.foreign import SIZE, image_input, map_output, write_model
@@ -82,11 +81,11 @@ def put_in_a_nan(manifest: Path) -> None:
     [
         (flip_a_bit, "sha256: "),
         (truncate, "sha256: "),
-        (truncate_and_sign, "cannot be loaded (it ends in the middle of a field); restore it"),
+        (truncate_and_sign, "cannot be loaded"),
         (rename_an_input, "inputs: the manifest names ['image', 'rays'] but the model file has ['geometry', 'image']"),
         (change_a_dtype, "inputs.image.dtype: the manifest says float32 but the model file uint8; make them agree"),
         (change_a_shape, "inputs.geometry.shape: the manifest says [1, 4, h/2, w/2] but the model file [1, 3, h2, w2]"),
-        (put_in_a_nan, "holds NaN; restore the model or train it again"),
+        (put_in_a_nan, "output offset is not finite on the golden input; restore the model file"),
     ],
 )
 def test_a_start_with_a_damaged_model_ends_with_one_sentence(
@@ -113,49 +112,6 @@ def test_a_start_with_a_damaged_model_ends_with_one_sentence(
     assert [line for line in sentences if "perception.scale" not in line] == [sentences[-1]]
     assert sentences[-1].startswith(str(copies / "neighbours_int8.yaml"))
     assert expected in sentences[-1]
-
-
-def test_a_nan_that_no_output_shows_is_found_too() -> None:
-    """ReLU may make a number of it."""
-    weights = np.array([1.0, np.nan, 2.0], np.float32)
-    half = np.array([1.0, np.nan], np.float16)
-    listed = helper.make_tensor("listed", TensorProto.FLOAT, [3], weights.tolist())
-    halves = helper.make_tensor("halves", TensorProto.FLOAT16, [2], half.tolist())
-    brains = helper.make_tensor("brains", TensorProto.BFLOAT16, [2], [1.0, float("nan")])
-    doubles = numpy_helper.from_array(weights.astype(np.float64), "doubles")
-    for tensor in (numpy_helper.from_array(weights, "raw"), listed, halves, brains, doubles):
-        assert fault_of_weights(model_with(tensor)) == (
-            f"weight {tensor.name!r} holds NaN; restore the model or train it again"
-        )
-        constant = helper.make_node("Constant", [], ["kept"], value=tensor)
-        assert str(fault_of_weights(model_with(constant))).startswith(f"weight {tensor.name!r} holds NaN")
-        branch = helper.make_graph([constant], "branch", [], [])
-        choice = helper.make_node("If", ["x"], ["y"], then_branch=branch, else_branch=branch)
-        assert str(fault_of_weights(model_with(choice))).startswith(f"weight {tensor.name!r} holds NaN")
-
-
-def test_infinite_and_whole_numbers_are_no_fault() -> None:
-    masks = numpy_helper.from_array(np.array([0.0, -np.inf], np.float32), "mask")
-    whole = numpy_helper.from_array(np.array([2**63 - 1, -1], np.int64), "index")
-    assert fault_of_weights(model_with(masks)) is None
-    assert fault_of_weights(model_with(whole)) is None
-
-
-def test_weights_in_a_file_that_no_hash_guards_are_refused(tmp_path: Path) -> None:
-    big = numpy_helper.from_array(np.zeros(2000, np.float32), "big")
-    model = onnx.load_from_string(model_with(big))
-    onnx.save(model, str(tmp_path / "m.onnx"), save_as_external_data=True, location="m.data", size_threshold=100)
-    assert fault_of_weights((tmp_path / "m.onnx").read_bytes()) == (
-        "weight 'big' lies in another file, which no hash guards; export the model as one file"
-    )
-
-
-def model_with(part: onnx.TensorProto | onnx.NodeProto) -> bytes:
-    x, y = (helper.make_tensor_value_info(name, TensorProto.FLOAT, [3]) for name in "xy")
-    is_tensor = isinstance(part, onnx.TensorProto)
-    graph = helper.make_graph([] if is_tensor else [part], "graph", [x], [y], [part] if is_tensor else [])
-    content: bytes = helper.make_model(graph).SerializeToString()
-    return content
 
 
 @pytest.mark.skipif("cuda" in available(), reason="this computer can compute with CUDA")

@@ -122,67 +122,6 @@ def write_tum(scene: Scene, path: Path) -> Path:
     return path
 
 
-T_BODY_CAMERA = np.array(
-    [
-        [0.0149, -0.9999, 0.0041, -0.0216],
-        [0.9996, 0.0150, 0.0257, -0.0647],
-        [-0.0258, 0.0038, 0.9997, 0.0098],
-        [0.0, 0.0, 0.0, 1.0],
-    ]
-)
-"""Rounded as files are; its rotation is put right when it is used."""
-
-
-def write_euroc(scene: Scene, path: Path) -> Path:
-    camera, truth = path / "mav0" / "cam0", path / "mav0" / "state_groundtruth_estimate0"
-    (camera / "data").mkdir(parents=True)
-    truth.mkdir()
-    mount = T_BODY_CAMERA.copy()
-    u, _, vt = np.linalg.svd(mount[:3, :3])
-    mount[:3, :3] = u @ vt
-    table, states = ["#timestamp [ns],filename"], ["#timestamp,p x,p y,p z,q w,q x,q y,q z,v x,v y,v z"]
-    for k, (image, pose) in enumerate(zip(scene.images, scene.poses, strict=True)):
-        time_ns = round(times_s()[k] * 1e9)
-        table.append(f"{time_ns},{time_ns}.png")
-        cv2.imwrite(str(camera / "data" / f"{time_ns}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
-        body = pose @ np.linalg.inv(mount)
-        x, y, z, w = Rotation.from_matrix(body[:3, :3]).as_quat()
-        states.append(f"{time_ns}," + ",".join(f"{n:.9f}" for n in (*body[:3, 3], w, x, y, z, 0.1, 0.2, 0.3)))
-    (camera / "data.csv").write_text("\n".join(table) + "\n")
-    (truth / "data.csv").write_text("\n".join(states) + "\n")
-    numbers = ", ".join(f"{n:.4f}" for n in T_BODY_CAMERA.ravel())
-    (camera / "sensor.yaml").write_text(
-        "%YAML:1.0\n# Sensor\nsensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n"
-        f"  data: [{numbers}]\nrate_hz: 10\nresolution: [{WIDTH}, {HEIGHT}]\ncamera_model: pinhole\n"
-        f"intrinsics: [{FOCAL}, {FOCAL}, {WIDTH / 2 - 0.5}, {HEIGHT / 2 - 0.5}] #fu, fv, cu, cv\n"
-        "distortion_model: radial-tangential\ndistortion_coefficients: [0.0, 0.0, 0.0, 0.0]\n"
-    )
-    return path
-
-
-def write_video(scene: Scene, path: Path) -> Path:
-    """The video, and a drone's YAML beside it as its calibration."""
-    path.mkdir(parents=True, exist_ok=True)
-    video = path / "clip.avi"
-    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 1 / PERIOD_S, (WIDTH, HEIGHT))
-    for image in scene.images:
-        writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    writer.release()
-    write_camera(path / "camera.yaml", (WIDTH, HEIGHT))
-    return video
-
-
-def write_camera(file: Path, size: tuple[int, int]) -> Path:
-    """Our own kind of calibration: pixel centres at +0.5, and mounted in some odd way."""
-    width, height = size
-    file.write_text(
-        f"rig:\n  cameras:\n    - name: left\n      size_px: [{width}, {height}]\n      intrinsics: {{fx: {FOCAL}, "
-        f"fy: {FOCAL}, cx: {width / 2}, cy: {height / 2}}}\n"
-        "      extrinsics: {position_m: [0.1, 0.2, -0.3], yaw_deg: 270.0, pitch_deg: 20.0}\n"
-    )
-    return file
-
-
 def _write(path: Path, image: UInt8Array) -> None:
     cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
 

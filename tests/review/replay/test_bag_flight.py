@@ -154,7 +154,7 @@ def test_the_command_flies_the_bag_and_writes_a_recording(
 @pytest.mark.parametrize(
     ("states", "topics", "options", "changes", "sentence"),
     [
-        ("nav_msgs/msg/Odometry", ("/odom",), [], None, "none of flockd; name a drone with --config"),
+        ("nav_msgs/msg/Odometry", ("/odom",), [], None, "is a bag of ROS 2; name a drone with --config"),
         (
             "nav_msgs/msg/Odometry",
             ("/a", "/b"),

@@ -21,8 +21,6 @@ INPUTS = {
     "datasets": 80,
     "images": 15,
     "campaigns": 15,
-    "ulog_files": 1,
-    "ulog_contents": 40,
     "mavlink": 250,
     "status": 50,
     "commands": 300,

@@ -19,7 +19,7 @@ from tools.training.camera_effects import (
     through_camera,
 )
 from tools.training.dataset import ARRAYS
-from tools.training.render_training_data import PairJob, render_pairs
+from tools.training.render_training_data import PairJob, render_world
 
 SHARES = {"drawn": 0.0, "filmed": 0.5}
 PERFECT = CameraEffects(
@@ -42,9 +42,11 @@ def rise_px(image: NDArray[np.uint8]) -> float:
     return float(places[1] - places[0])
 
 
+@pytest.mark.slow
 def test_half_of_the_pairs_may_be_filmed_by_real_cameras_and_their_truth_stays(tmp_path: Path) -> None:
     jobs = [PairJob(tmp_path / name, 1_000_003, 4, range(12), cameras_share=share) for name, share in SHARES.items()]
-    assert list(render_pairs(jobs, 1))[-1] == (2, 2)
+    for job in jobs:
+        render_world(job)
     drawn, filmed = ({array: np.load(job.folder / f"{array}.npy") for array in ARRAYS} for job in jobs)
     changed = [not np.array_equal(*pair) for pair in zip(drawn["image"], filmed["image"], strict=True)]
     assert 0 < sum(changed) < 4
@@ -57,9 +59,6 @@ def test_drawn_cameras_are_around_the_realistic_ones() -> None:
     rng, preset = np.random.default_rng(4), CamerasConfig(preset="realistic")
     drawn = [drawn_cameras(rng) for _ in range(300)]
     assert 0.3 < np.mean([cameras.shutter.readout_s == 0.0 for cameras in drawn]) < 0.7, "half are global shutters"
-    assert all(cameras.compression.h264_mbit_s is None for cameras in drawn)
-    streams = [drawn_cameras(rng, 0.3).compression.h264_mbit_s for _ in range(300)]
-    assert 60 < sum(mbit_s is not None and 2.0 <= mbit_s <= 32.0 for mbit_s in streams) < 120
     exposures = [cameras.shutter.exposure_s for cameras in drawn]
     assert min(exposures) < 0.2 * preset.shutter.exposure_s < preset.shutter.exposure_s * 2 < max(exposures)
 

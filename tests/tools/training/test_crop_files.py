@@ -45,15 +45,6 @@ def test_hundreds_of_shapes_do_not_crowd_out_the_families(tmp_path: Path) -> Non
     assert len(np.unique(drawn[drawn >= 1000])) > 350
 
 
-def test_a_few_real_airframes_are_drawn_more_often_than_hundreds_of_shapes(tmp_path: Path) -> None:
-    family = np.concatenate([np.arange(12), 1000 + np.arange(400), 30_000 + np.arange(10)])
-    _write(tmp_path / "a.npz", family)
-    files, rng = CropFiles(tmp_path), np.random.default_rng(0)
-    drawn = np.array([files.draw(rng)["family"] for _ in range(3000)])
-    assert np.mean(drawn < 12) == pytest.approx(0.5, abs=0.04)
-    assert np.mean(drawn >= 30_000) == pytest.approx(0.35, abs=0.04)
-
-
 def test_where_there_are_only_shapes_nothing_else_is_drawn(tmp_path: Path) -> None:
     _write(tmp_path / "a.npz", 1000 + np.arange(3))
     files, rng = CropFiles(tmp_path), np.random.default_rng(0)

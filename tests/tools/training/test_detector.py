@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
 from tools.training.detector.loss import detection_loss
-from tools.training.detector.network import CLASSES, NO_BOX, NOT_JUDGED, DroneDetector, begin_with_coco, decoded
-from tools.training.detector.pictures import Cutouts, Scene, part_of, with_drones
+from tools.training.detector.network import CLASSES, NO_BOX, NOT_JUDGED, decoded
+from tools.training.pictures import Cutouts, Scene, part_of, with_drones
 
 CELLS = ((8, 8), (4, 4), (2, 2))
 """Rows and columns of the maps of an image of 64 x 64 pixels."""
@@ -84,35 +83,6 @@ def test_nothing_is_learnt_of_objects_in_a_box_that_is_not_judged() -> None:
     assert gradient is not None
     assert gradient[0, 4, 3:5, 3:5].abs().max() == 0
     assert gradient[0, 4, 0, 0] > 0
-
-
-def test_it_begins_as_the_network_in_the_file_with_fewer_classes(tmp_path: Path) -> None:
-    torch.manual_seed(1)
-    other, images = DroneDetector(80), torch.rand(4, 3, 64, 64) * 255
-    with torch.no_grad():
-        for _ in range(5):
-            other.train()(images)
-        expected = other.eval()(images)
-    file = tmp_path / "yolox.onnx"
-    torch.onnx.export(other, (images,), str(file), opset_version=17, dynamo=False)
-    ours = DroneDetector()
-    begin_with_coco(ours, file, images)
-    ours.train()
-    with torch.no_grad():
-        got = ours(images)
-    for our, their in zip(got, expected, strict=True):
-        assert our[:, :5].numpy() == pytest.approx(their[:, :5].numpy(), abs=2e-3)
-        assert our[:, 6].numpy() == pytest.approx(their[:, 5 + 14].numpy(), abs=2e-3)  # a bird is COCO's class 14
-    own_file, again = tmp_path / "detector.onnx", DroneDetector()
-    torch.onnx.export(ours.eval(), (images,), str(own_file), opset_version=17, dynamo=False)
-    begin_with_coco(again, own_file, images)
-    with torch.no_grad():
-        pairs = list(zip(again.train()(images), ours.train()(images), strict=True))
-    assert all(a.numpy() == pytest.approx(b.numpy(), abs=2e-3) for a, b in pairs), "all of its own classes"
-    other_file = tmp_path / "other.onnx"
-    torch.onnx.export(nn.Conv2d(3, 4, 3), (images,), str(other_file), opset_version=17, dynamo=False)
-    with pytest.raises(ValueError, match="has 1 convolutions"):
-        begin_with_coco(DroneDetector(), other_file, images)
 
 
 def test_a_part_of_a_picture_takes_its_boxes_along() -> None:

@@ -1,19 +1,35 @@
-"""What export does to weights. Needs the extra `train`."""
+"""What export does to weights and manifests. Needs the extra `train`."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 import torch
 
 from flockd.core.data import data_path
-from flockd.flight.inference import load_manifest
-from tools.training.export import NETWORKS, draw_back
+from flockd.flight.inference import OnnxModel, load_manifest
+from tools.training.export import draw_back, export
+from tools.training.networks import FlowNet
 
 
-@pytest.mark.parametrize("name", NETWORKS)
-def test_a_network_that_is_exported_again_is_judged_as_the_shipped_one(name: str) -> None:
-    manifest, _ = load_manifest(data_path("models") / f"{name}.yaml")
-    assert manifest.thresholds == NETWORKS[name].get("thresholds", {})
+def test_a_network_is_exported_as_the_shipped_one_is_used_and_in_16_bits_says_the_same(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    shipped, _ = load_manifest(data_path("models") / "flow.yaml")
+    document = shipped.model_dump(mode="json", exclude_defaults=True)
+    net = FlowNet(iterations=1)
+    whole, half = (OnnxModel(export(net, document, tmp_path / str(k), half=k == 1), threads=1) for k in (0, 1))
+    for model in (whole, half):
+        assert model.manifest.thresholds == shipped.thresholds
+        assert model.manifest.image_scale == shipped.image_scale
+        assert model.manifest.sha256 != shipped.sha256
+    sizes = [(tmp_path / folder / "flow.onnx").stat().st_size for folder in ("1", "0")]
+    assert 0.45 < sizes[0] / sizes[1] < 0.6
+    assert "flow, mean difference from 32-bit weights" in half.manifest.accuracy.keys() - whole.manifest.accuracy.keys()
+    images = np.random.default_rng(0).integers(0, 255, (2, 1, 64, 64, 3), dtype=np.uint8)
+    was, now = (model.run(dict(zip(("first", "second"), images, strict=True)))["flow"] for model in (whole, half))
+    assert 0.0 < np.abs(now - was).mean() < 0.01 * was.std()
 
 
 def test_weights_are_drawn_back_a_third_of_the_way_to_what_the_run_began_with() -> None:

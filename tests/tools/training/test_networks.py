@@ -2,23 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
 from tools.training.networks import DistanceNet
-from tools.training.train import is_faster_in_16_bits
-
-CPU = Path("/proc/cpuinfo")
-
-
-@pytest.mark.skipif(not CPU.is_file() or "flags" not in CPU.read_text(), reason="its instructions are not known")
-def test_a_processor_without_instructions_for_16_bit_numbers_trains_on_32() -> None:
-    if {"avx512_bf16", "amx_bf16", "avx_ne_convert"} & set(CPU.read_text().split()):
-        pytest.skip("this processor has 16-bit instructions")
-    assert not is_faster_in_16_bits(torch.device("cpu"))
 
 
 def test_training_on_16_bit_numbers_reads_the_motors_places_to_a_fraction_of_a_pixel() -> None:

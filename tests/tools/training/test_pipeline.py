@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from flockd.cli import main
 from flockd.core.data import data_path
 from flockd.sim.drone_models import drone_model
+from tools.measure.evaluate_crops import HeldOut, measured
 from tools.training import worlds
 from tools.training.augment import UNTOUCHED, photometric
 from tools.training.crop_files import CropFiles
 from tools.training.dataset import FOCAL_PX, HEIGHT, WIDTH
+from tools.training.own_mesh import OWN_FAMILY
+from tools.training.render_cutouts import cut_out
+from tools.training.render_drone_crops import add_mesh, own_drone
 from tools.training.samples import DroneInView, crop_around, sample_of, warped
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -35,7 +42,7 @@ def test_a_network_is_trained_resumed_and_exported_by_one_command_each(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data, runs, models = tmp_path / "data", tmp_path / "runs", tmp_path / "models"
-    run("render_training_data", data, "--worlds", "1", "--pairs", "2", "--processes", "1")
+    run("render_training_data", data / "worlds", "--worlds", "1", "--pairs", "2", "--processes", "1")
     training = ("flow", "--data", data, "--out", runs, "--threads", "1")
     run("train", *training, "--minutes", "0.05")
     first = (runs / "curve.csv").read_text(encoding="utf-8").splitlines()
@@ -47,7 +54,7 @@ def test_a_network_is_trained_resumed_and_exported_by_one_command_each(
     assert cv2.imread(str(runs / "curve.png")) is not None
 
     run("export", "flow", "--checkpoint", runs / "checkpoint.pt", "--out", models)
-    run("quantise", models / "flow.yaml", "--data", data, "--out", models)
+    run("quantise", models / "flow.yaml", "--data", data / "worlds", "--out", models)
 
     further = tmp_path / "further"
     run("train", "flow", "--data", data, "--out", further, "--minutes", "0.03", "--start", models / "flow.onnx")
@@ -60,6 +67,50 @@ def test_a_network_is_trained_resumed_and_exported_by_one_command_each(
         for suffix in ("yaml", "onnx"):
             (models / f"{name}.{suffix}").write_bytes((data_path("models") / f"{name}.{suffix}").read_bytes())
     assert main(["models", "verify", "--dir", str(models)]) == 0, capsys.readouterr()
+
+
+@pytest.mark.slow
+def test_a_drone_of_a_mesh_flies_alone_and_a_network_is_measured_on_it(tmp_path: Path) -> None:
+    bars = [trimesh.creation.box(size) for size in ((0.6, 0.08, 0.05), (0.08, 0.6, 0.05))]
+    mesh = tmp_path / "drone.stl"
+    whole: Any = trimesh.util.concatenate(bars)
+    whole.export(mesh)
+    said = run(
+        "render_drone_crops", tmp_path / "crops", "--mesh", mesh, "--size-m", "0.62", "--worlds", "1",
+        "--scenes", "40", "--held-out", "--processes", "1",
+    )  # fmt: skip
+    assert "has no colours for 100% of its triangles; they are painted at random" in said
+    (file,) = (tmp_path / "crops").glob("*.npz")
+    with np.load(file) as crops:
+        assert set(crops["family"][crops["drone"] > 0.5]) == {OWN_FAMILY}
+        sizes_m = np.exp(crops["apparent"] + crops["target"][:, 0])[crops["drone"] > 0.5]
+    assert sizes_m == pytest.approx(0.62, rel=1e-3)
+    crops = HeldOut.of(tmp_path / "crops")
+    assert crops.log_size == pytest.approx(np.log(0.62), abs=1e-3)
+    assert "drones called a drone" in measured(data_path("models") / "distance_int8.yaml", crops)
+
+
+def test_a_mesh_without_the_drones_size_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    parser = argparse.ArgumentParser()
+    add_mesh(parser)
+    with pytest.raises(SystemExit):
+        own_drone(parser, parser.parse_args(["--mesh", "my.glb"]))
+    assert "--mesh needs --size-m, the drone's size" in capsys.readouterr().err
+    assert own_drone(parser, parser.parse_args([])) == []
+
+
+@pytest.mark.slow
+def test_a_cut_out_shows_the_drone_whole_and_nothing_else() -> None:
+    from flockd.sim.world import World
+
+    rng = np.random.default_rng(0)
+    world = World.generate(worlds.TRAINING[-1], ground_relief_m=0.0, keep_out=None)
+    for _ in range(3):
+        solid = cut_out(world, drone_model(0, 0), rng)[..., 3] > 127
+        rows, columns = np.nonzero(solid)
+        assert 0.01 < solid.mean() < 0.6
+        assert min(rows.min(), columns.min()) > 0, "no border cuts it"
+        assert max(rows.max(), columns.max()) < 319
 
 
 def test_worlds_for_training_validation_test_and_flights_never_meet() -> None:

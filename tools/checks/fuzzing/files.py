@@ -1,4 +1,4 @@
-"""Files: configurations, manifests, recordings, data sets, images, campaigns, logs of autopilots."""
+"""Files: configurations, manifests, recordings, data sets, images, campaigns."""
 
 from __future__ import annotations
 
@@ -7,11 +7,8 @@ import itertools
 import json
 import shutil
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from random import Random
-from types import SimpleNamespace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -32,8 +29,7 @@ from flockd.onboard.recording.export import export_images, export_tables
 from flockd.onboard.recording.info import recording_info
 from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, McapFile, Note, Record, read_records
 from flockd.onboard.recording.reader import Recording
-from flockd.review.flight_log.ulog import autopilot_log, read_ulog
-from tools.checks.fuzzing.mutation import any_float, mutated_bytes, mutated_json, mutated_lines, nested
+from tools.checks.fuzzing.mutation import mutated_bytes, mutated_json, mutated_lines, nested
 from tools.checks.fuzzing.target import CORPUS, ROOT, Check, Target, odd_file, own_errors, removed
 
 MOST_FRAMES = 50
@@ -85,7 +81,7 @@ def _manifests(folder: Path) -> Check:
     def check(random: Random) -> None:
         _put(random, file, lambda: _text(random, texts))
         with own_errors():
-            read_manifest(file, check_roles).read_model()
+            read_manifest(file, check_roles).check_model()
 
     return check
 
@@ -171,7 +167,7 @@ def _changed_json(random: Random, data: bytes) -> bytes:
 
 
 def _datasets(folder: Path) -> Check:
-    layouts = [layout(folder / name) for name, layout in (("tum", _tum), ("euroc", _euroc), ("rgbd", _rgbd))]
+    layouts = [layout(folder / name) for name, layout in (("tum", _tum), ("rgbd", _rgbd))]
     files = {root: sorted(path for path in root.rglob("*") if path.is_file()) for root in layouts}
     originals = {path: path.read_bytes() for paths in files.values() for path in paths}
 
@@ -180,7 +176,7 @@ def _datasets(folder: Path) -> Check:
         touched = random.sample(files[root], random.choice((1, 1, 2)))
         for path in touched:
             original = originals[path]
-            is_text = path.suffix in {".txt", ".csv", ".yaml"}
+            is_text = path.suffix in {".txt"}
             if random.random() < 0.02:
                 odd_file(random, path)
             else:
@@ -281,60 +277,6 @@ def _campaigns(folder: Path) -> Check:
     return check
 
 
-# --------------------------------------------------------------------------------------------------- autopilots' logs
-
-
-def _ulog_files(folder: Path) -> Check:
-    whole = (CORPUS / "log.ulg").read_bytes()
-    path = folder / "log.ulg"
-
-    def check(random: Random) -> None:
-        _put(random, path, lambda: mutated_bytes(random, whole))
-        with own_errors(), suppress(FileNotFoundError):  # as the command reports by itself
-            read_ulog(path, patience_s=4.0)
-
-    return check
-
-
-def _ulog_contents(folder: Path) -> Check:
-    """Numbers of a log that can be read: laid on a flight's time, whatever they are."""
-    whole = read_ulog(CORPUS / "log.ulg")
-    times_s = 0.5 * np.arange(20)
-    command = np.stack([np.sin(times_s), np.cos(times_s)], axis=1)[:, None]
-    computer_s = np.arange(0.0, 10.0)
-    metadata = SimpleNamespace(names=["a"], clock_at_start_s=0.0)
-    log: Any = SimpleNamespace(time_s=times_s, command_velocity=command, metadata=metadata)
-
-    def check(random: Random) -> None:
-        topics = {
-            name: {field: _spoiled(random, values) for field, values in topic.items()}
-            for name, topic in whole.topics.items()
-        }
-        texts = [one._replace(time_us=int(random.choice((0, one.time_us, 2**63, 2**64 - 1)))) for one in whole.texts]
-        ulog = dataclasses.replace(whole, topics=topics, texts=texts)
-        clock = None if random.random() < 0.5 else (computer_s, np.full(10, any_float(random)))
-        with own_errors():
-            autopilot_log(ulog, Path("log.ulg"), log, 0, clock)
-
-    return check
-
-
-def _spoiled(random: Random, values: Any) -> Any:
-    """An array with some numbers that are anything."""
-    if random.random() < 0.8:
-        return values
-    changed = np.array(values)
-    for _ in range(random.choice((1, 3))):
-        at = random.randrange(len(changed))
-        if changed.dtype.kind == "f":
-            with np.errstate(over="ignore"):
-                changed[at] = any_float(random)
-        else:
-            info = np.iinfo(changed.dtype)
-            changed[at] = random.choice((info.min, info.max, 0, 1, random.randint(int(info.min), int(info.max))))
-    return changed
-
-
 def _image(path: Path, *, depth: bool = False) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     rows, columns = np.mgrid[0:12, 0:16]
@@ -350,22 +292,6 @@ def _tum(root: Path) -> Path:
         (root / f"{kind}.txt").write_text("# time file\n" + "".join(f"{i}.5 {kind}/{i}.png\n" for i in range(3)))
     (root / "K.txt").write_text("10 0 8\n0 10 6\n0 0 1\n")
     (root / "groundtruth.txt").write_text("".join(f"{i / 20} {i} 0 1 0 0 0 1\n" for i in range(80)))
-    return root
-
-
-def _euroc(root: Path) -> Path:
-    names = [f"{index}00000000" for index in range(1, 4)]
-    for name in names:
-        _image(root / f"cam0/data/{name}.jpg")
-    (root / "cam0/data.csv").write_text("#time,file\n" + "".join(f"{name},{name}.jpg\n" for name in names))
-    (root / "cam0/sensor.yaml").write_text(
-        "%YAML:1.0\nresolution: [16, 12]\nintrinsics: [10, 10, 8, 6]\ndistortion_model: radial-tangential\n"
-        "distortion_coefficients: [0.1, 0.01, 0.0, 0.0]\nT_BS:\n  cols: 4\n  rows: 4\n"
-        "  data: [1, 0, 0, 0.1, 0, 1, 0, 0.2, 0, 0, 1, 0.3, 0, 0, 0, 1]\n"
-    )
-    truth = root / "state_groundtruth_estimate0/data.csv"
-    truth.parent.mkdir()
-    truth.write_text("#time\n" + "".join(f"{i}0000000,{i},0,0,1,0,0,0,0,0,0,0,0,0,0,0,0\n" for i in range(1, 60)))
     return root
 
 
@@ -385,6 +311,4 @@ TARGETS = (
     Target("datasets", 40, _datasets),
     Target("images", 100, _images),
     Target("campaigns", 6, _campaigns),
-    Target("ulog_files", 1, _ulog_files),
-    Target("ulog_contents", 30, _ulog_contents),
 )

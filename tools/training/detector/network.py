@@ -6,25 +6,14 @@ An anchor-free detector: in each cell of three maps (strides 8, 16, 32) a box, a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
-import numpy as np
-import onnx
 import torch
-from numpy.typing import NDArray
-from onnx import numpy_helper
 from torch import Tensor, nn
-
-from tools.training.from_onnx import settle_norms
 
 STRIDES = (8, 16, 32)
 CLASSES = ("drone", "bird", "airplane", "helicopter")
 NO_BOX, NOT_JUDGED = -1, -2
 """Classes of a box that is none, and of one where nothing is learnt of whether there is an object."""
-COCO = {"airplane": 4, "bird": 14, "kite": 33}
-_BEGUN_WITH = (("kite", "bird", "airplane"), ("bird",), ("airplane",), ("airplane",))
-"""Of which classes of COCO each of ours takes the mean of the last layer's weights."""
 _WIDTHS = (16, 32, 64, 128, 256)
 _HEAD = 64
 _BN = {"eps": 1e-3, "momentum": 0.03}
@@ -181,54 +170,3 @@ def decoded(maps: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
 
 def _doubled(x: Tensor) -> Tensor:
     return nn.functional.interpolate(x, scale_factor=2.0, mode="nearest")
-
-
-def begin_with_coco(network: DroneDetector, path: Path, images: Tensor) -> None:
-    """Weights of an ONNX file of YOLOX-nano, and what batch norms see of ``images`` (n, 3, h, w).
-
-    Its classes are COCO's or ours.
-
-    The file has its batch norms folded into its convolutions, which come in the order in which they are run, as ours
-    do. Raises ValueError where one differs.
-    """
-    graph = onnx.load(str(path)).graph
-    stored = {one.name: numpy_helper.to_array(one) for one in graph.initializer}
-    given = [[stored[name] for name in node.input[1:]] for node in graph.node if node.op_type == "Conv"]
-    modules = _in_order(network)
-    if len(modules) != len(given):
-        raise ValueError(f"{path}: has {len(given)} convolutions, and YOLOX-nano {len(modules)}")
-    norms = {id(unit.conv): unit.norm for unit in network.modules() if isinstance(unit, Unit)}
-    heads = {id(head.cls) for head in network.heads}
-    biases: dict[nn.BatchNorm2d, Tensor] = {}
-    for conv, arrays in zip(modules, given, strict=True):
-        weight, bias = (torch.tensor(np.array(_of_our_classes(a) if id(conv) in heads else a)) for a in arrays)
-        if conv.weight.shape != weight.shape:
-            raise ValueError(f"{path}: a convolution is {list(weight.shape)}, and must be {list(conv.weight.shape)}")
-        conv.weight.data = weight
-        if conv.bias is not None:
-            conv.bias.data = bias
-        else:
-            biases[norms[id(conv)]] = bias
-    settle_norms(network, biases, lambda: network(images))
-
-
-def _of_our_classes(of_coco: NDArray[Any]) -> NDArray[Any]:
-    """(classes, ...) from the (80, ...) of COCO; those of a detector of ours stay."""
-    if len(of_coco) == len(CLASSES):
-        return of_coco
-    return np.stack([np.mean([of_coco[COCO[name]] for name in names], axis=0) for names in _BEGUN_WITH])
-
-
-def _in_order(network: DroneDetector) -> list[nn.Conv2d]:
-    """Its convolutions as they are run."""
-    order: list[nn.Conv2d] = []
-    hooks = [
-        module.register_forward_hook(lambda m, *_: order.append(m))
-        for module in network.modules()
-        if isinstance(module, nn.Conv2d)
-    ]
-    with torch.no_grad():
-        network.eval()(torch.zeros(1, 3, 64, 64))
-    for hook in hooks:
-        hook.remove()
-    return order

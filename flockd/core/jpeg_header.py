@@ -1,0 +1,42 @@
+"""What a JPEG would cost to decode, from its bytes, before memory or time is spent on its pixels."""
+
+from __future__ import annotations
+
+MAX_IMAGE_PIXELS = 1 << 26
+"""8192 x 8192: more than any camera of a drone has. The command line tells OpenCV so, which refuses what has more."""
+MAX_SCANS = 100
+"""Of a JPEG: encoders write 10 or so, and libjpeg-turbo's own tools call more than 500 an attack."""
+MAX_SCANNED_PIXELS = 1 << 30
+"""Pixels times scans: each scan of a progressive JPEG goes over all pixels, however few bytes it has. A second or
+two."""
+_STANDALONE = frozenset({0x01, *range(0xD0, 0xD8)})
+_FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_SCAN = 0xDA
+_JPEG = b"\xff\xd8"
+
+
+def cost_fault(data: bytes) -> str | None:
+    """Why a JPEG is not to be decoded, as it would take too much memory or time; None: it may be, or is none."""
+    width, height = jpeg_size(data) or (0, 0)
+    if width * height > MAX_IMAGE_PIXELS:
+        return f"claims to be {width} x {height} pixels, more than any camera has"
+    scans = data.count(b"\xff\xda") if data.startswith(_JPEG) else 0
+    if scans > MAX_SCANS or scans * width * height > MAX_SCANNED_PIXELS:
+        return f"has {scans} scans of {width} x {height} pixels, more than any camera writes"
+    return None
+
+
+def jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height of the frame header; None for what is no JPEG, or has none before the first scan."""
+    at = 2 if data.startswith(_JPEG) else len(data)
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF or marker in _STANDALONE:
+            at += 1 if marker == 0xFF else 2
+        elif marker in _FRAME_HEADERS:
+            return int.from_bytes(data[at + 7 : at + 9]), int.from_bytes(data[at + 5 : at + 7])
+        elif marker == _SCAN:
+            return None
+        else:
+            at += 2 + int.from_bytes(data[at + 2 : at + 4])
+    return None

@@ -1,1 +1,0 @@
-"""The fleet in Foxglove's app, over its WebSocket protocol: read-only."""

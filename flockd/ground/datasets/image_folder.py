@@ -1,0 +1,159 @@
+"""A folder of one camera's images, with their times, depth maps and poses where those are known.
+
+As TUM's RGB-D sets are published: `rgb.txt`, `depth.txt` and `groundtruth.txt` list files and poses by time, and
+`K.txt` is the camera's matrix. Or without lists: the files of `images/` and `depth/` in order of their names, a second
+apart, and in `poses.txt` a 4x4 camera-to-world matrix a line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from flockd.core.messages import FloatArray
+from flockd.flight.geometry import RigidTransform
+from flockd.ground.datasets.camera_intrinsics import read_calibration
+from flockd.ground.datasets.dataset import Dataset, Entry
+from flockd.ground.datasets.errors import DatasetError
+from flockd.ground.datasets.image_files import SUFFIXES, read_image
+from flockd.ground.datasets.tables import read_lines, read_rows
+
+_TUM_UNITS_PER_M, _UNITS_PER_M = 5000.0, 1000.0
+"""Of depth maps, 16 bits a pixel."""
+_MAX_OFFSET_S = 0.02
+"""An image and a depth map farther apart in time do not belong together."""
+_MAX_GAP_S = 0.1
+"""Between poses farther apart in time nothing is known."""
+_ROUNDING = 1e-2
+"""How far from a rotation a matrix of rounded numbers may be."""
+
+_Poses = Sequence[RigidTransform | None]
+
+
+def open_dataset(path: Path, calibration: Path | None = None) -> Dataset:
+    """The images in a folder; ``calibration`` comes before the folder's own `K.txt`.
+
+    Where there is depth, images without a map of their time are left out. Raises DatasetError, and ConfigError for a
+    calibration that cannot be used.
+    """
+    listed = (path / "rgb.txt").is_file()
+    if not listed and not (path / "images").is_dir():
+        raise DatasetError(f"{path}: is no folder of images; it needs images/, or rgb.txt with their times and names")
+    times_s, images = _listed(path / "rgb.txt") if listed else _counted(path / "images")
+    size = read_image(images[0]).shape[1::-1]
+    camera = read_calibration(calibration or path / "K.txt", (size[0], size[1]))
+    if listed:
+        depth, units_per_m = _depth_by_time(path / "depth.txt", times_s), _TUM_UNITS_PER_M
+        poses = _poses_by_time(path / "groundtruth.txt", times_s)
+    else:
+        depth, units_per_m = _depth_by_name(path / "depth", images), _UNITS_PER_M
+        poses = _poses_in_order(path / "poses.txt", images)
+    entries = tuple(
+        Entry(image.name, float(time_s), image, depth.get(index), pose)
+        for index, (time_s, image, pose) in enumerate(zip(times_s, images, poses, strict=True))
+        if not depth or index in depth
+    )
+    left_out = len(images) - len(entries)
+    note = f"{path}: {left_out} of {len(images)} images have no depth map within {_MAX_OFFSET_S:g} s, and are left out"
+    return Dataset(path, camera, entries, units_per_m, (note,) if left_out else ())
+
+
+def _listed(file: Path) -> tuple[FloatArray, list[Path]]:
+    """Times and files of a list."""
+    times, files = [], []
+    for number, line in read_lines(file):
+        time, _, name = line.partition(" ")
+        try:
+            times.append(float(time))
+        except ValueError:
+            name = ""
+        if not name.strip() or not np.isfinite(times[-1]):
+            raise DatasetError(f"{file}:{number}: does not fit; it needs a time in seconds and a file")
+        files.append(file.parent / name.strip())
+    if not files:
+        raise DatasetError(f"{file}: is empty; it needs a time in seconds and a file a line")
+    return _increasing(file, np.array(times)), files
+
+
+def _increasing(file: Path, times_s: FloatArray) -> FloatArray:
+    if np.any(np.diff(times_s) <= 0):
+        raise DatasetError(f"{file}: its times do not increase; sort it by time")
+    return times_s
+
+
+def _counted(folder: Path) -> tuple[FloatArray, list[Path]]:
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
+    if not files:
+        raise DatasetError(f"{folder}: holds no images; put them there")
+    return np.arange(len(files), dtype=float), files
+
+
+def _depth_by_time(file: Path, image_times_s: FloatArray) -> dict[int, Path]:
+    """By the image's index, the depth map nearest in time; none without a list."""
+    if not file.exists():
+        return {}
+    times_s, maps = _listed(file)
+    nearest = np.abs(times_s[None] - image_times_s[:, None]).argmin(axis=1)
+    close = np.abs(times_s[nearest] - image_times_s) <= _MAX_OFFSET_S
+    if not close.any():
+        raise DatasetError(f"{file}: has no depth map at the time of any image; it belongs to another rgb.txt")
+    return {int(index): maps[nearest[index]] for index in np.flatnonzero(close)}
+
+
+def _depth_by_name(folder: Path, images: Sequence[Path]) -> dict[int, Path]:
+    """Checked against the images both ways: a file too many may belong to an image that is gone."""
+    if not folder.is_dir():
+        return {}
+    maps = {file.stem: file for file in _counted(folder)[1]}
+    stems = [image.stem for image in images]
+    for stem in stems:
+        if stem not in maps:
+            raise DatasetError(f"{folder / stem}.png: is missing; each image needs its depth")
+    for alone in sorted(maps.keys() - set(stems)):
+        raise DatasetError(f"{maps[alone]}: its image is missing in {images[0].parent}; restore it, or delete both")
+    return {index: maps[stem] for index, stem in enumerate(stems)}
+
+
+def _poses_by_time(file: Path, image_times_s: FloatArray) -> _Poses:
+    """Between those of the file; None before, after and in its gaps."""
+    if not file.exists():
+        return [None] * len(image_times_s)
+    rows = read_rows(file, columns=8, what="time tx ty tz qx qy qz qw")
+    times_s = _increasing(file, rows[:, 0])
+    if np.any(np.linalg.norm(rows[:, 4:], axis=1) < 1e-6):
+        raise DatasetError(f"{file}: a quaternion is all zero; delete that line")
+    if len(times_s) < 2:
+        raise DatasetError(f"{file}: has one pose alone; it needs those of all images")
+    after = np.searchsorted(times_s, image_times_s).clip(1, len(times_s) - 1)
+    inside = (image_times_s >= times_s[0]) & (image_times_s <= times_s[-1])
+    known = inside & (times_s[after] - times_s[after - 1] <= _MAX_GAP_S) | np.isin(image_times_s, times_s)
+    if not known.any():
+        raise DatasetError(f"{file}: has no pose at the time of any image; it belongs to another")
+    at_s = image_times_s.clip(times_s[0], times_s[-1])
+    turns = Slerp(times_s, Rotation.from_quat(rows[:, 4:]))(at_s).as_matrix()
+    places = np.column_stack([np.interp(at_s, times_s, rows[:, axis]) for axis in (1, 2, 3)])
+    return [RigidTransform(*pose) if there else None for there, *pose in zip(known, turns, places, strict=True)]
+
+
+def _poses_in_order(file: Path, images: Sequence[Path]) -> _Poses:
+    if not file.exists():
+        return [None] * len(images)
+    rows = read_rows(file, columns=16, what="one 4x4 camera-to-world matrix a line, 16 numbers")
+    if len(rows) != len(images):
+        raise DatasetError(
+            f"{file}: has {len(rows)} poses, and {images[0].parent} {len(images)} images; give each image its line"
+        )
+    return [_pose_of_matrix(row.reshape(4, 4), f"{file}: pose {number}") for number, row in enumerate(rows, start=1)]
+
+
+def _pose_of_matrix(matrix: FloatArray, where: str) -> RigidTransform:
+    u, _, vt = np.linalg.svd(matrix[:3, :3])
+    rotation = u @ vt  # the nearest: the numbers were rounded when they were written
+    if np.abs(rotation - matrix[:3, :3]).max() > _ROUNDING or np.linalg.det(rotation) < 0:
+        raise DatasetError(f"{where}: its first three columns are no rotation; write a camera-to-world matrix")
+    if not np.allclose(matrix[3], (0, 0, 0, 1), atol=_ROUNDING):
+        raise DatasetError(f"{where}: its last row is not 0 0 0 1; write a camera-to-world matrix")
+    return RigidTransform(rotation, matrix[:3, 3])

@@ -1,0 +1,64 @@
+"""What the table of the networks' figures counts as found. Needs the extra `train`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flockd.core.messages import Detection
+from flockd.flight.geometry import RangeMap, ZMap, log_polar, log_polar_covariance, range_map
+from tools.measure.on_pairs import Findings, compare_drones, depth_errors, pairings
+from tools.training.dataset import HEIGHT, WIDTH, PairSet, rig_camera
+
+
+def detection(*position: float) -> Detection:
+    bearing, log_range = log_polar(np.array(position))
+    return Detection(bearing, log_range, log_polar_covariance(bearing, 0.1, 0.004), 0.9, 0.5, ("camera",), 1)
+
+
+def test_a_far_drone_keeps_its_detection_though_it_lies_within_a_near_ones_outline() -> None:
+    near, far = np.array([2.0, 0.0, 0.0]), np.array([10.0, 1.0, 0.0])
+    of_far, of_near = detection(10.5, 1.05, 0.0), detection(2.1, -0.21, 0.0)
+    found = pairings((of_far, of_near), [near, far], [0.5, 0.5])
+    assert found[0] is of_near
+    assert found[1] is of_far
+
+
+def test_one_detection_is_not_two_drones_and_none_is_found_in_another_direction() -> None:
+    near, far = np.array([2.0, 0.0, 0.0]), np.array([10.0, 0.1, 0.0])
+    assert list(pairings((detection(9.0, 0.09, 0.0),), [near, far], [0.5, 0.5])) == [1]
+    assert not pairings((detection(0.0, 2.0, 0.0),), [near, far], [0.5, 0.5])
+
+
+def test_a_drone_is_proposed_where_the_second_stage_was_asked_about_its_direction() -> None:
+    """Two drones are 10 m ahead and 2 m apart, without a detection: only the one is proposed that a proposal points
+    to."""
+    depth, ids = np.full((HEIGHT // 2, WIDTH // 2), 80.0, np.float32), np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8)
+    pairs = PairSet(
+        {
+            "focal": np.array([320.0]),
+            "drone_pixels": np.array([[[50, 50]]]),
+            "drone_family": np.array([[0, 0]]),
+            "drone_box": np.array([[[[310, 230, 330, 250], [374, 230, 394, 250]]]]),
+            "drone_centre": np.array([[[[0.0, 0.0, 10.0], [2.0, 0.0, 10.0]]]]),
+            "drone_rotation": np.broadcast_to(np.eye(3), (1, 1, 2, 3, 3)),
+        },
+        1,
+    )
+    found = Findings()
+    compare_drones((), pairs, 0, depth, ids, found, [np.array([1.0, 0.0, 0.0])])
+    assert [drone.proposed for drone in found.drones] == [True, False]
+    assert found.proposed(12, np.inf) == 0.5
+    assert found.found(12, np.inf) == 0.0
+
+
+def test_ranges_along_the_rays_are_compared_with_depths_along_the_optical_axis() -> None:
+    """A wall across the view: its corners are farther along the rays, and no error."""
+    camera, ids = rig_camera(200.0), np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8)
+    wall, true = np.full((HEIGHT, WIDTH), 5.0, np.float32), np.full(ids.shape, 5.0, np.float32)
+    ranges = range_map(ZMap(wall), camera.camera)
+    assert ranges.max() > 8.0
+    ids[:, :10] = 1  # a drone
+    errors = depth_errors(RangeMap(1.1 * ranges), camera, true, ids)
+    assert len(errors) == ids[:, 10:].size
+    assert errors == pytest.approx(0.1, abs=1e-5)

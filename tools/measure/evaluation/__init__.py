@@ -1,1 +1,0 @@
-"""How good the shipped networks are, on worlds that they never saw."""

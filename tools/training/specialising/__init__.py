@@ -1,1 +1,0 @@
-"""Fine-tuning of the second stage for a fleet's own drone; the command is ``tools.training.specialise``."""
