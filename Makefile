@@ -96,7 +96,7 @@ $(VENV)/%.installed: pyproject.toml setup.py | $(BIN)/pip
 $(ROS_VENV)/ros.installed: pyproject.toml setup.py
 	$(PYTHON) -m venv $(ROS_VENV)
 	$(ROS_VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[ros,bags,sim,fleet]' \
-		'pytest>=8' 'packaging>=24'
+		'pytest>=8' 'packaging>=24' 'hypothesis>=6.150'
 	touch $@
 
 $(BIN)/pip:
