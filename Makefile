@@ -6,6 +6,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 # ROS 2's wheels start each Python twice, to name their libraries to the loader: an environment of their own.
 ROS_VENV := .venv-ros
+LOCK := requirements/service.txt
+# Only wheels: the code of a source package would run while it is installed.
+COMPILE = $(BIN)/uv pip compile --quiet --no-header --no-annotate --only-binary=:all: pyproject.toml -
 
 .DEFAULT_GOAL := help
 .PHONY: help demo live docs lint test test-all browser coverage ros mutate mutate-all references wheel release deb container lock sbom clean
@@ -35,8 +38,7 @@ test-all: lint ## lint and all tests, those too that take minutes each
 	$(BIN)/python -m pytest -n 2
 
 ros: $(ROS_VENV)/ros.installed ## what needs ROS 2: nodes in processes of their own, cameras by topic; with the times it takes
-	$(ROS_VENV)/bin/python -m tools.release.licences --extra ros --extra bags
-	$(ROS_VENV)/bin/python -m pytest -m ros -rP tests/fleet/ros tests/onboard/sources
+	$(ROS_VENV)/bin/python -m pytest -m ros -rP tests/fleet/ros tests/onboard/sources tests/tools/release/test_licences.py
 
 browser: $(VENV)/test.installed ## the fleet page in a headless Chromium: /usr/bin/chromium, or what CHROMIUM names
 	$(BIN)/python -m pytest -m browser -rP tests/fleet/page
@@ -68,11 +70,20 @@ container: $(BIN)/pip ## build the container, install this computer's package of
 	$(BIN)/python -m tools.release.check_container --packages dist $(if $(BASE),--base $(BASE))
 
 lock: $(VENV)/release.installed ## write requirements/service.txt again, with the newest versions that pyproject.toml permits
-	$(BIN)/python -m tools.release.lock
+	echo setuptools | $(COMPILE) --universal --fork-strategy=fewest --python-version=3.11 --generate-hashes \
+		--emit-build-options --upgrade --output-file=$(LOCK).new
+	for system in x86_64 aarch64; do for python in 3.11 3.12 3.13; do echo setuptools | $(COMPILE) \
+		--constraint=$(LOCK).new --python-platform=$$system-unknown-linux-gnu --python-version=$$python > /dev/null || exit 1; \
+		done; done
+	(sed '/^#/!d' $(LOCK); cat $(LOCK).new) > $(LOCK).whole && mv $(LOCK).whole $(LOCK) && rm $(LOCK).new
 
-sbom: $(VENV)/test.installed ## write the software bill of materials to out/flockd.cdx.json
-	$(BIN)/python -m tools.release.licences
-	$(BIN)/python -m tools.release.sbom
+sbom: $(VENV)/release.installed $(VENV)/test.installed ## check licences, and write the software bill of materials to out/flockd.cdx.json
+	rm -rf $(VENV)/service && mkdir -p out
+	$(BIN)/uv venv --quiet $(VENV)/service
+	$(BIN)/uv pip install --quiet --python $(VENV)/service --require-hashes -r $(LOCK)
+	$(BIN)/python -m tools.release.licences $(VENV)/service/bin/python
+	$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible -o out/flockd.cdx.json $(VENV)/service
+	$(BIN)/python -m tools.release.sbom out/flockd.cdx.json
 
 clean: ## delete the virtual environment and what was built
 	rm -rf $(VENV) $(ROS_VENV) build dist *.egg-info
@@ -85,7 +96,7 @@ $(VENV)/%.installed: pyproject.toml setup.py | $(BIN)/pip
 $(ROS_VENV)/ros.installed: pyproject.toml setup.py
 	$(PYTHON) -m venv $(ROS_VENV)
 	$(ROS_VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[ros,bags,sim,fleet]' \
-		'pytest>=8' 'packaging>=24'
+		'pytest>=8' 'packaging>=24' 'hypothesis>=6.150'
 	touch $@
 
 $(BIN)/pip:

@@ -8,9 +8,13 @@ from collections.abc import Generator
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 from tests.coroutine_tests import run_coroutine_test
 from tests.permitted_skips import permitted
+
+settings.register_profile("many", max_examples=10_000)
+"""A hundred times as many inputs of `tests/hostile`, others each time: `--hypothesis-profile=many`."""
 
 
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:

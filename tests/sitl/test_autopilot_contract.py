@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 import pytest
 
-from tools.checks.autopilot_contract import Row, compared, main, seen
+from tests.sitl.stories import seen
 
 PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
 NO_SETPOINTS = (
@@ -64,23 +63,3 @@ def test_flockd_sees_what_px4_1_18_shows(autopilot: str) -> None:
     assert [row.story for row in rows] == [story for story, _ in SEEN], rows
     for row, (_, what) in zip(rows, SEEN, strict=True):
         assert what in row.what, row
-
-
-def test_rows_of_one_story_stand_side_by_side_and_a_difference_is_one() -> None:
-    fake = [Row("land", "accepted"), Row("land", "the mode is land", 0.1)]
-    px4 = [Row("land", "accepted"), Row("land", "the mode is land", 3.0), Row("land", "said: landing")]
-    comparisons = compared(fake, px4)
-    assert [one.alike for one in comparisons] == [True, False, False]
-    assert (comparisons[1].fake, comparisons[1].px4) == (
-        "the mode is land, after 0.1 s",
-        "the mode is land, after 3.0 s",
-    )
-    assert comparisons[2].fake == "(nothing)"
-
-
-def test_without_px4_it_says_what_to_do(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("FLOCKD_PX4", str(tmp_path))
-    assert main([]) == 69
-    assert "there is no PX4 in" in capsys.readouterr().err

@@ -39,8 +39,7 @@ from pathlib import Path
 from typing import Any
 
 from tools.release import deb
-from tools.release.lock import LOCK, ROOT
-from tools.release.wheels import copy_sources, download, download_locked
+from tools.release.wheels import LOCK, ROOT, copy_sources, download, download_locked
 
 PROGRAMS = {"qemu-system-x86_64": "qemu-system-x86", "mmdebstrap": "mmdebstrap", "mkfs.ext4": "e2fsprogs"}
 """And the Debian package of each."""

@@ -172,7 +172,7 @@ def with_progress(mutants: Sequence[Mutant]) -> Iterator[Mutant]:
 def prepare(folder: Path) -> None:
     """Copies what the tests need, tries the tests, and loads here what does not change, so that a fork is quick."""
     ignored = shutil.ignore_patterns("__pycache__", "*.so")
-    for part in ("flockd", "config", "tests/flight/safety"):
+    for part in ("flockd", "config", "tests/flight/safety", "tests/hostile"):
         shutil.copytree(ROOT / part, folder / part, ignore=ignored)
     shutil.copy(ROOT / "pyproject.toml", folder)
     os.chdir(folder)

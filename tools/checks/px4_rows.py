@@ -39,9 +39,9 @@ from flockd.sim.fleet import fly_fleet
 from flockd.sim.free_ports import free_endpoint
 from flockd.sim.start import with_drones
 from flockd.sim.vehicles import REFERENCE_DEG
-from tools.checks.px4_missions import Mission, Order
-from tools.checks.px4_sitl import run_trials
 
+ORDER_ANSWER_S = 60.0
+_RUN = "from flockd.cli import program; program()"
 SET_ORIGIN_S = 10
 SETTLED_S = 5.0
 """From then on the velocity counts: the drones begin at a standstill, and turn at corners."""
@@ -135,7 +135,9 @@ def fly(flight: Flight, kind: AutopilotKind, speed_factor: float, out: Path) -> 
     scenario = _scenario(flight, out)
     if not flight.by_sight:
         sitl = sitl.model_copy(update={"safety": sitl.safety.model_copy(update={"alone_s": None})})
-    operator, origin = _Velocity(flight.operator_m_s, endpoint), _Origin(flight.origin_up_m)
+    words = ("velocity", "all", f"{flight.operator_m_s}", "0", "--seconds", "120")
+    operator = Order(words, None if flight.operator_m_s is None else 5.0, endpoint)
+    origin = _Origin(flight.origin_up_m)
 
     def progress(flown_s: int, of_s: int) -> None:
         operator.progress(flown_s, of_s)
@@ -183,17 +185,26 @@ def _worst(off_m_s: FloatArray) -> float:
     return round(float(np.sqrt(np.nanmean(flown**2, axis=0)).max(initial=0.0)), 3) if flown.size else float("nan")
 
 
-class _Velocity(Order):
-    """An operator's velocity, as `flockd fleet velocity` sends it until the flight ends."""
+class Order:
+    """An operator's order, sent once by `flockd fleet` while the flight goes on."""
 
-    def __init__(self, north_m_s: float | None, endpoint: str) -> None:
-        """Without a velocity none is sent."""
-        super().__init__(Mission("operator", "", 0.0, 1, order_at_s=None if north_m_s is None else 5.0), endpoint)
-        self._north_m_s = north_m_s
+    def __init__(self, words: Sequence[str], at_s: float | None, endpoint: str) -> None:
+        """``words``: what is typed after `flockd fleet`; ``at_s``: when; None: never."""
+        self._words, self._at_s, self._endpoint = words, at_s, endpoint
+        self._sent: subprocess.Popen[str] | None = None
 
-    def command(self) -> Sequence[str]:
-        """What is typed."""
-        return "fleet", "velocity", "all", f"{self._north_m_s}", "0", "--seconds", "120"
+    def progress(self, flown_s: int, of_s: int) -> None:
+        """Called again and again while the fleet flies."""
+        if self._at_s is None or flown_s < self._at_s or self._sent is not None:
+            return
+        self._sent = subprocess.Popen(
+            [sys.executable, "-c", _RUN, "fleet", *self._words, "--listen", self._endpoint],
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+
+    def answers(self) -> str:
+        """What the drones answered, one line each; empty without an order."""
+        return "" if self._sent is None else self._sent.communicate(timeout=ORDER_ANSWER_S)[0].strip()
 
 
 class _Origin:
@@ -248,12 +259,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="how fast time passes in the flights by sight (%(default)s)",
     )  # fmt: skip
     parser.add_argument("--out", type=Path, help="keep logs in this folder")
-    return run_trials(
-        parser, FLIGHTS, _fly_all, line=_line, rows="flights", arguments=arguments,
-        header=(
-            f"{'flight':15}{'speed':>5}{'off m/s':>9}{'truly':>9}{'order':>9}{'closest':>9}{'longest':>9}{'':11}modes"
-        ),
-    )  # fmt: skip
+    parser.add_argument("--only", nargs="+", choices=[flight.name for flight in FLIGHTS], help="these alone")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    args = parser.parse_args(arguments)
+    try:
+        if args.autopilot == "px4":
+            px4_folder(os.environ)
+    except FlockdError as error:
+        print(error, file=sys.stderr)
+        return int(error.exit_code)
+    if not args.json:
+        columns = f"{'speed':>5}{'off m/s':>9}{'truly':>9}{'order':>9}{'closest':>9}{'longest':>9}"
+        print(f"{'flight':15}{columns}{'':11}modes", flush=True)
+    chosen = [flight for flight in FLIGHTS if args.only is None or flight.name in args.only]
+    rows = _fly_all(chosen, args, lambda row: None if args.json else print(_line(row), flush=True))
+    if args.json:
+        print(json.dumps({"flights": [{**vars(row), "kept": row.kept} for row in rows]}, indent=2))
+    return 0 if all(row.kept for row in rows) else 1
 
 
 def _fly_all(flights: Sequence[Flight], args: argparse.Namespace, told: Callable[[Row], None]) -> list[Row]:

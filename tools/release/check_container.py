@@ -19,7 +19,7 @@ from pathlib import Path
 
 from flockd import __version__
 from tools.release.deb import MACHINES
-from tools.release.lock import ROOT
+from tools.release.wheels import ROOT
 
 BUILDERS = ("podman", "buildah", "docker")
 BASE = "docker.io/library/debian:12-slim"

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from flockd import __version__
-from tools.release.lock import ROOT
+from tools.release.wheels import ROOT
 
 PICTURE = ROOT / "tests/ground/pictures/rendered/4_m_4.jpg"
 """One drone."""

@@ -27,7 +27,7 @@ from pathlib import Path
 
 from flockd import __version__
 from tools.release import wheels
-from tools.release.lock import ROOT
+from tools.release.wheels import ROOT
 
 PACKAGING = ROOT / "packaging" / "deb"
 SCRIPTS = ("preinst", "postinst", "prerm", "postrm")

@@ -6,6 +6,7 @@ Needs pip alone. Every file is checked against the hash that the lock names.
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -14,8 +15,8 @@ import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from tools.release.lock import LOCK, ROOT, pins
-
+ROOT = Path(__file__).resolve().parents[2]
+LOCK = ROOT / "requirements" / "service.txt"
 SOURCES = (
     *("flockd", "models", "config", "systemd", "requirements"),
     *("pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE", "NOTICE"),
@@ -24,6 +25,11 @@ SOURCES = (
 BUILD_ONLY = "setuptools"
 OLDEST_GLIBC, NEWEST_GLIBC = 17, 28
 """2.17 is the oldest that wheels are made for, 2.28 the newest that the locked ones need: Debian 10 has it."""
+
+
+def names_of_lock() -> list[str]:
+    """The packages that the lock names, as indexes write them: lower case, with `-`."""
+    return re.findall(r"^([a-z0-9-]+)==", LOCK.read_text(encoding="utf-8"), re.MULTILINE)
 
 
 def copy_sources(target: Path) -> None:
@@ -53,8 +59,7 @@ def download_locked(folder: Path, *, machine: str, python: str) -> None:
 
 def locked(shelf: Path) -> list[Path]:
     """The wheels in a folder that the lock names, but for what only builds flockd. Raises StopIteration without one."""
-    names = [pin.name for pin in pins(LOCK.read_text(encoding="utf-8")) if pin.name != BUILD_ONLY]
-    return [_of_package(shelf, name) for name in names]
+    return [_of_package(shelf, name) for name in names_of_lock() if name != BUILD_ONLY]
 
 
 def build_own(folder: Path, shelf: Path) -> Path:

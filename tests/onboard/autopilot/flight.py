@@ -26,7 +26,7 @@ from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.onboard.daemon import clock_at, event_loop_at
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from tests import calm
-from tools.checks.pilots_link import PilotsLink
+from tests.onboard.autopilot.pilots_link import PilotsLink
 
 CONTROL_S = 0.05
 

@@ -1,4 +1,4 @@
-"""What is damaged or hostile inside a message, behind correct checksums; found by tools/checks/fuzz.py."""
+"""What is damaged or hostile inside a message, behind correct checksums, found by changing records at random."""
 
 from __future__ import annotations
 

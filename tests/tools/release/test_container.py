@@ -10,8 +10,7 @@ import pytest
 
 from flockd import __version__
 from tools.release import check_container
-from tools.release.lock import ROOT
-from tools.release.wheels import SOURCES
+from tools.release.wheels import ROOT, SOURCES
 
 RECIPE = (ROOT / "Containerfile").read_text(encoding="utf-8")
 ROS_RECIPE = (ROOT / "packaging" / "ros" / "Containerfile").read_text(encoding="utf-8")

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tools.release import deb, wheels
-from tools.release.lock import LOCK, ROOT, pins
+from tools.release.wheels import ROOT, names_of_lock
 
 VALUES = {"VERSION": "1+debian12", "ARCH": "arm64", "SYSTEM": "Debian 12", "RELEASE": "debian 12", "PYTHON": "3.11"}
 ABSOLUTE = re.compile(r"(?<![\w/.-])/(?=(?:usr/lib|usr/bin|etc|run|var)/)")
@@ -82,7 +82,7 @@ def test_modes_are_the_same_whatever_the_umask_was(tree: Path) -> None:
 
 
 def test_it_brings_the_lock_and_nothing_that_only_builds(tmp_path: Path) -> None:
-    names = [pin.name for pin in pins(LOCK.read_text(encoding="utf-8"))]
+    names = names_of_lock()
     for name in [*names, "pymavlink"]:
         (tmp_path / f"{name.replace('-', '_')}-1.0-py3-none-any.whl").touch()
     brought = {path.name.partition("-")[0].replace("_", "-") for path in wheels.locked(tmp_path)}

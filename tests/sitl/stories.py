@@ -1,20 +1,13 @@
-"""Flies the same stories with the fake autopilot and with PX4 SITL, and compares what flockd saw of each.
+"""Stories that are flown with the fake autopilot or with PX4 SITL, and what flockd sees: messages, order, seconds.
 
-    FLOCKD_PX4=~/PX4-Autopilot/build/px4_sitl_default python -m tools.checks.autopilot_contract
-    python -m tools.checks.autopilot_contract --autopilot fake --json
-
-Prints a table, fake beside PX4, with the messages, their order, and the seconds that they took. Exit code 1: the two
-differ where no difference is known (`KNOWN`). A relay between autopilot and flockd loses what a story wants lost.
+A relay between autopilot and flockd loses what a story wants lost. `pytest -rP` prints the rows.
 """
 
 from __future__ import annotations
 
-import argparse
 import asyncio
-import json
 import os
 import socket
-import sys
 import tempfile
 import threading
 import time
@@ -30,19 +23,19 @@ from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.safety import SafetyParameters
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.data import data_path
-from flockd.core.errors import FlockdError, UnavailableError
+from flockd.core.errors import UnavailableError
 from flockd.core.messages import FloatArray, Setpoint, Wanted
 from flockd.flight.safety import Action, Permission, Request, Surroundings, Verdict
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.onboard.sources import clock_at
-from flockd.sim.autopilots import BY_HAND, Autopilots, Px4s, SimulatedAutopilots, px4_folder
+from flockd.sim.autopilots import BY_HAND, Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.free_ports import free_port
 from flockd.sim.ground_station import GroundStation
 from flockd.sim.processes import Program
 from flockd.sim.start import with_drones
-from tools.checks.pilots_link import PilotsLink
+from tests.onboard.autopilot.pilots_link import PilotsLink
 
 HEIGHT_M = 4.0
 NORTH_M_S = 1.0
@@ -53,19 +46,6 @@ STICK_S, STICK_STEP = 0.03, 100
 REMOTE_CONTROL = {**BY_HAND, "MPC_VEL_MANUAL": "3", "COM_RC_LOSS_T": "5"}
 """PX4's parameters where one is used; the last for a computer that is slow to send its sticks."""
 HEARTBEAT, EVENT = 0, 410
-ALIKE_S = 2.0
-"""Two reactions that differ by no more are alike: flockd promises them within two seconds."""
-
-KNOWN: Mapping[str, str] = {
-    "start: checks told": "PX4's estimator takes seconds to become ready; the fake has none",
-    "arm in Land mode": "PX4 tells its checks anew every two seconds at most",
-    "two events lost": "PX4 tells its checks anew every two seconds at most",
-    "take off": "PX4's motors spin up first",
-    "restart": "PX4's program takes seconds to start",
-    **dict.fromkeys(("pattern", "the same pattern"), "PX4's simulated vehicle gathers speed more slowly"),
-    "registration": "PX4 tells its checks anew every two seconds at most",
-}
-"""Stories that may take longer, and why; answers, texts and modes may not differ."""
 
 
 @dataclass(frozen=True)
@@ -373,10 +353,7 @@ def _rate(world: World) -> bool:
 class Stories:
     """What is flown, on one autopilot after the other."""
 
-    purpose: str
     told: tuple[Callable[[World], Awaitable[None]], ...]
-    asks: Mapping[str, str] = field(default_factory=dict)
-    """What somebody else's document asks for in a story."""
     remote_control: bool = False
     """A pilot holds one, and its sticks are heard."""
     max_gap_s: float = AutopilotParameters().max_gap_s
@@ -384,7 +361,6 @@ class Stories:
 
 
 CONTRACT = Stories(
-    "What flockd sees of the fake autopilot and of PX4 SITL.",
     (on_the_ground, take_off, in_flight, others_interfere, landing, starting_anew),
 )
 
@@ -511,77 +487,7 @@ def seen(autopilot: str, stories: Stories = CONTRACT, speed_factor: float = 1.0)
     """What flockd sees of one of them. Raises UnavailableError."""
     make = {"fake": _fake, "px4": _px4}[autopilot]
     with make(REMOTE_CONTROL if stories.remote_control else {}, speed_factor) as (autopilots, stack, restart):
-        return asyncio.run(_fly(stories, speed_factor, autopilots, stack, restart))
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A row of the table."""
-
-    story: str
-    fake: str
-    px4: str
-    alike: bool
-    known: str
-    """Why the two may differ; empty where no reason is known."""
-
-
-def compared(fake: list[Row], px4: list[Row]) -> list[Comparison]:
-    """Rows of the same story in their order, side by side."""
-    comparisons = []
-    for story in dict.fromkeys(row.story for row in (*fake, *px4)):
-        left = [row for row in fake if row.story == story]
-        right = [row for row in px4 if row.story == story]
-        for number in range(max(len(left), len(right))):
-            one = left[number] if number < len(left) else None
-            other = right[number] if number < len(right) else None
-            same = one is not None and other is not None and one.what == other.what
-            alike = same and abs((one.after_s or 0.0) - (other.after_s or 0.0)) <= ALIKE_S  # type: ignore[union-attr]
-            known = KNOWN.get(story, "") if same else ""
-            comparisons.append(Comparison(story, _told(one), _told(other), alike, known))
-    return comparisons
-
-
-def _told(row: Row | None) -> str:
-    if row is None:
-        return "(nothing)"
-    return row.what if row.after_s is None else f"{row.what}, after {row.after_s:.1f} s"
-
-
-def main(arguments: list[str] | None = None, stories: Stories = CONTRACT) -> int:
-    """Prints the table, or JSON; 1 where the two differ without a known reason."""
-    parser = argparse.ArgumentParser(description=stories.purpose)
-    parser.add_argument("--autopilot", choices=["both", "fake", "px4"], default="both", help="which (both)")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    args = parser.parse_args(arguments)
-    try:
-        if args.autopilot != "fake":
-            px4_folder(os.environ)
-        rows = {one: seen(one, stories) for one in ("fake", "px4") if args.autopilot in {one, "both"}}
-    except FlockdError as error:
-        print(error, file=sys.stderr)
-        return int(error.exit_code)
-    if args.autopilot != "both":
-        (only,) = rows.values()
-        if args.json:
-            print(json.dumps([vars(row) for row in only], indent=2))
-        else:
-            print("\n".join(f"{row.story:32}{_told(row)}" for row in only))
-        return 0
-    comparisons = compared(rows["fake"], rows["px4"])
-    if args.json:
-        print(json.dumps([vars(one) for one in comparisons], indent=2))
-    else:
-        columns = ["story", *(["asked for"] if stories.asks else []), "with the fake", "with PX4", ""]
-        print("| " + " | ".join(columns) + " |\n" + "|---" * len(columns) + "|")
-        story = ""
-        for one in comparisons:
-            verdict = "alike" if one.alike else f"later: {one.known}" if one.known else "DIFFERS"
-            asked = [stories.asks[one.story] if one.story != story else ""] if stories.asks else []
-            story = one.story
-            print("| " + " | ".join([one.story, *asked, one.fake, one.px4, verdict]) + " |")
-    return 0 if all(one.alike or one.known for one in comparisons) else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        rows = asyncio.run(_fly(stories, speed_factor, autopilots, stack, restart))
+    for row in rows:
+        print(f"{row.story:32}{row.what}" + ("" if row.after_s is None else f", after {row.after_s:.1f} s"))  # noqa: T201
+    return rows
