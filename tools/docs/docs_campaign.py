@@ -82,7 +82,7 @@ def places(results: Results, drones: int, time_s: int) -> Drawing:
             scenario = results.plan.recipe(cell, 0).scenario().model_copy(update={"duration_s": float(time_s)})
             flights = FlockFlights([scenario])
             for step in range(flights.steps):
-                flights.step(step, None, 1)
+                flights.step(step)
             north, east = flights.states[:2, 0] - flights.states[:2, 0].mean(axis=1, keepdims=True)
             axes.plot(east, north, ".", color=colour_of(number, len(cells)), markersize=2.5)
             axes.set(aspect="equal", xlim=(-REACH_M, REACH_M), ylim=(-REACH_M, REACH_M))
