@@ -28,7 +28,7 @@ from flockd.flight.geometry import log_polar_covariance
 from flockd.flight.pilot.weave import Weave
 from flockd.flight.tracking import Measurement
 from flockd.flight.tracking.flock_size import FlockSize, SizeEstimate
-from flockd.sim.control_level import perceived
+from flockd.sim.control_level import perceived_flock
 from flockd.sim.exact_states import ExactFlock, start_yaw
 from flockd.sim.vehicles import Vehicles
 
@@ -86,7 +86,7 @@ class Sight:
 
     def __init__(self, sizes_m: FloatArray, random: np.random.Generator, step_s: float) -> None:
         errors = load_perceived_errors(data_path("config") / "perceived" / "shipped_networks.yaml")
-        self._table, self._sizes_m, self._random = perceived.by_distance(errors), sizes_m, random
+        self._table, self._sizes_m, self._random = perceived_flock.by_distance(errors), sizes_m, random
         self._keep = np.array([math.exp(-step_s / time_s) for time_s in (errors.error_time_s,) * 3 + (ASPECT_TIME_S,)])
         self._normal = random.normal(size=(DRONES, 4))
         self._factor = math.exp(random.normal(0.0, ASSUMED_SIGMA))
@@ -102,12 +102,12 @@ class Sight:
         for j in range(1, DRONES):
             offset = positions[j] - positions[0]
             row = [np.interp(np.linalg.norm(offset), self._table[:, 0], column) for column in self._table.T]
-            if self._random.normal() < row[perceived.MISSED]:
+            if self._random.normal() < row[perceived_flock.MISSED]:
                 continue
             z = self._normal[j]
             of_range, *turns = (
                 row[column] * number + row[column + 1] * number**3
-                for column, number in zip((perceived.RANGE, *[perceived.BEARING] * 2), z[:3], strict=True)
+                for column, number in zip((perceived_flock.RANGE, *[perceived_flock.BEARING] * 2), z[:3], strict=True)
             )
             seen[j] = self._measured(offset, of_range + ASPECT_SIGMA * z[3], turns, self._sizes_m[j])
         if self._random.random() < 0.1:

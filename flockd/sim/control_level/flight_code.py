@@ -110,7 +110,7 @@ class FlightCode:
 
 
 def _by_now(known: Known, age_s: float, moved: FloatArray) -> FloatArray:
-    """(k, 3) m from the drone, which `moved` (3,) m, to its neighbours, as `flockd.flight.safety.surroundings` has it."""
+    """(k, 3) m from the drone, which `moved` (3,) m, to its neighbours, as `surroundings` has it."""
     braked = known.offsets - moved
     flown = braked + age_s * known.velocities
     through = (flown[:, :2] * braked[:, :2]).sum(axis=1) <= 0

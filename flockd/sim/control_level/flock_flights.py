@@ -17,7 +17,7 @@ from flockd.sim.control_level.many_missions import ManyMissions
 from flockd.sim.control_level.many_obstacles import FIGURES, ManyObstacles
 from flockd.sim.control_level.motion import Motion
 from flockd.sim.control_level.near import Near
-from flockd.sim.control_level.perceived import Perception, Seen
+from flockd.sim.control_level.perceived_flock import Perception, Seen
 from flockd.sim.vehicles import limit_norms
 
 Figures = dict[str, float | int | bool | None]
