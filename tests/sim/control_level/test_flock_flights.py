@@ -36,12 +36,12 @@ def _seeded(scenario: ScenarioConfig, seed: int) -> ScenarioConfig:
     return scattered(scenario.model_copy(update={"seed": seed}), 0.5)
 
 
-def _flown(flights: FlockFlights, threads: int = 1) -> tuple[FloatArray, FloatArray]:
+def _flown(flights: FlockFlights) -> tuple[FloatArray, FloatArray]:
     """Positions and velocities (S, flights, n, 3) as each step begins."""
     states = []
     for step in range(flights.steps):
         states.append(flights.states.copy())
-        flights.step(step, None, threads)
+        flights.step(step)
     moved = np.array(states).transpose(0, 2, 3, 1)
     return moved[..., :3], moved[..., 3:]
 
@@ -202,12 +202,12 @@ def test_order_of_one_that_stands_still_counts_as_in_the_metrics() -> None:
 
 
 @pytest.mark.parametrize("weight", ["uniform", "nearest"])
-def test_a_flight_is_the_same_in_any_batch_and_in_any_number_of_threads(weight: str) -> None:
+def test_a_flight_is_the_same_in_any_batch(weight: str) -> None:
     scenario = with_drones(_scenario(duration_s=5.0, drone__flocking__weight__kind=weight), 300)
     flown = [_seeded(scenario, seed) for seed in (7, 8, 3)]
     alone = [fly_flocks([one])[0] for one in flown[:2]]
     shorter = scenario.model_copy(update={"duration_s": 1.0})
-    assert fly_flocks([flown[2], flown[1], shorter, flown[0]], threads=2)[1::2] == alone[::-1]
+    assert fly_flocks([flown[2], flown[1], shorter, flown[0]])[1::2] == alone[::-1]
     assert alone[0] != alone[1]  # the seed moves the starts
 
 

@@ -50,7 +50,7 @@ def test_each_drone_flies_as_its_gate_says(keys: dict[str, Any]) -> None:
     flights = FlockFlights([scenario], gated=True)
     for step in range(flights.steps):
         np.testing.assert_allclose(flights.states[:2, 0].T, expected[step], atol=1e-9)
-        flights.step(step, None, 1)
+        flights.step(step)
 
 
 def test_drones_that_fly_at_each_other_stop_in_time() -> None:
@@ -62,10 +62,10 @@ def test_drones_that_fly_at_each_other_stop_in_time() -> None:
     assert gated["min_distance_m"] >= 0.99  # type: ignore[operator]
 
 
-def test_a_gated_flight_is_the_same_in_any_batch_and_in_any_number_of_threads() -> None:
+def test_a_gated_flight_is_the_same_in_any_batch() -> None:
     errors = load_perceived_errors(data_path("config") / "perceived" / "shipped_networks.yaml")
     flock = _scenario(130).model_copy(update={"duration_s": 1.0})
     flown = [scattered(flock.model_copy(update={"seed": seed}), 0.1) for seed in range(4)]
     alone = fly_flocks(flown[2:3], errors=errors, gated=True)
-    assert fly_flocks(flown, errors=errors, gated=True, threads=2)[2:3] == alone
+    assert fly_flocks(flown, errors=errors, gated=True)[2:3] == alone
     assert fly_flocks(flown[2:3], errors=errors) != alone

@@ -68,7 +68,7 @@ def test_each_drone_is_asked_to_fly_as_its_own_avoidance_says(kind: str, faultle
     for step in range(8):
         flights.states[3:5] += np.random.default_rng(step).normal(0.0, 0.4, flights.states[3:5].shape)
         before = flights.states.copy()
-        flights.step(step, None, 1)
+        flights.step(step)
         for flight, pair in enumerate(flocks):
             states = before[:3, flight].T, before[3:, flight].T
             expected, unseen = (flock.step(step * STEP_S, *states).velocity for flock in pair)
@@ -95,16 +95,16 @@ def test_the_shipped_forest_is_flown_as_the_simulator_flies_it(seed: int) -> Non
     flights, log = FlockFlights([scenario]), fly(scenario, perception="truth", gated=False, pictured=False).log
     for step in range(flights.steps):
         np.testing.assert_allclose(flights.states[:3, 0].T, log.position[step], atol=1e-9)
-        flights.step(step, None, 1)
+        flights.step(step)
     expected = obstacle_figures(log)
     assert {key: flights.figures()[0][key] for key in expected} == pytest.approx(expected, abs=1e-8)
 
 
-def test_a_flight_among_obstacles_is_the_same_in_any_batch_and_in_any_number_of_threads() -> None:
+def test_a_flight_among_obstacles_is_the_same_in_any_batch() -> None:
     keys = {"world__obstacles__trees_per_hectare": 400.0, "duration_s": 1.0}
     flown = [_scenario("forest", 150, seed=seed, **keys) for seed in (4, 5)]
     alone = [fly_flocks([one])[0] for one in flown]
-    assert fly_flocks(flown[::-1], threads=2) == alone[::-1]
+    assert fly_flocks(flown[::-1]) == alone[::-1]
     assert alone[0]["min_clearance_m"] != alone[1]["min_clearance_m"]  # each seed has its own forest
 
 

@@ -174,7 +174,7 @@ def test_a_flight_with_errors_is_the_same_in_any_batch() -> None:
     scenario = _scenario(40, duration_s=4.0)
     seeds = [scattered(scenario.model_copy(update={"seed": seed}), 0.5) for seed in range(3)]
     alone = fly_flocks(seeds[1:2], errors=errors)
-    assert fly_flocks(seeds, errors=errors, threads=2)[1:2] == alone
+    assert fly_flocks(seeds, errors=errors)[1:2] == alone
     assert fly_flocks(seeds[1:2]) != alone
 
 
