@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 COMMANDS: Mapping[str, str] = {
+    "flockd calibrate rig --by": "fly, and take over what the flight found with `--from-flight RECORDING`",
+    "flockd calibrate rig --max-offset": "a flight finds the time offset: `--from-flight RECORDING`",
     "flockd view": "open the recording in Foxglove, or in Rerun after `rerun mcap convert RECORDING.mcap -o X.rrd`",
 }
 """By a command, or a command and its option, as they were written on the command line."""
