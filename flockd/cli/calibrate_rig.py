@@ -1,4 +1,4 @@
-"""`flockd calibrate rig`: where cameras sit beside each other, how they are turned in the body, and their time."""
+"""`flockd calibrate rig`: where cameras sit beside each other, and what a flight found of them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from flockd.cli.calibrate_options import (
 )
 from flockd.cli.config import loaded
 from flockd.cli.output import complain, progress, say, say_json
-from flockd.cli.parser import Commands, positive_number
+from flockd.cli.parser import Commands
 from flockd.cli.recording_options import opened
 from flockd.core.errors import ExitCode, UsageError
 
@@ -25,36 +25,29 @@ if TYPE_CHECKING:
     from flockd.ground.calibration.image_sources import ImageStream
     from flockd.ground.calibration.rig_session import RigSession
 
-MAX_OFFSET_S = 0.3
-
 
 def add(commands: Commands) -> None:
     """Adds the command."""
     examples = (
         "flockd calibrate rig --config my_drone.yaml",
         "flockd calibrate rig pictures/ --config my_drone.yaml --reference front",
-        "flockd calibrate rig drone1.mcap --by motion",
         "flockd calibrate rig --from-flight drone1.mcap",
     )
     description = (
-        "Measure the cameras' mountings: relative poses, from a board that two of them see at once; or "
-        "orientation in the body and time offset, from the autopilot's attitude in a recording; or what a flight "
-        "itself found of orientation, time offset and focal length."
+        "Measure the cameras' mountings: relative poses, from a board that two of them see at once; or what a "
+        "flight found of orientation in the body, time offset and focal length."
     )
     parser = commands("rig", description, examples)
     help_of_source = (
         "a folder with a folder of images for each camera, or a recording; by default --config's cameras, live"
     )
     parser.add_argument("source", metavar="SOURCE", nargs="?", help=help_of_source)
-    parser.add_argument("--by", choices=("board", "motion"), default="board", help="default: board")
     parser.add_argument(
         "--reference", metavar="NAME", help="the camera whose mounting --config gives (default: the first)"
     )
     parser.add_argument(
         "--from-flight", metavar="RECORDING", type=Path, help="take over what this flight found of its own rig"
     )
-    help_of_offset = f"largest time offset between cameras and autopilot ({MAX_OFFSET_S:g})"
-    parser.add_argument("--max-offset", metavar="S", type=positive_number, default=MAX_OFFSET_S, help=help_of_offset)
     add_shared(parser, "the drone, with its cameras' intrinsics; a recording has its own")
     parser.set_defaults(run=_rig)
 
@@ -62,9 +55,7 @@ def add(commands: Commands) -> None:
 def _rig(args: argparse.Namespace) -> int:
     out = args.out or Path("rig.yaml")
     refuse_overwriting(args, out)
-    if args.from_flight is not None:
-        return _from_flight(args, out)
-    return _by_motion(args, out) if args.by == "motion" else _by_board(args, out)
+    return _by_board(args, out) if args.from_flight is None else _from_flight(args, out)
 
 
 def _by_board(args: argparse.Namespace, out: Path) -> int:
@@ -84,15 +75,6 @@ def _by_board(args: argparse.Namespace, out: Path) -> int:
             collector, on_image, lambda links: complain(f"boards seen together: {links}; Ctrl-C ends it")
         )
     return _report(args, session.by_board(collector.boards, reference, out))
-
-
-def _by_motion(args: argparse.Namespace, out: Path) -> int:
-    if args.source is None or Path(args.source).is_dir():
-        raise UsageError("motion is measured in a recording, which holds the autopilot's attitude; name one as SOURCE")
-    session = _session(args)
-    with progress("tracking features", "steps") as on_image:
-        alignments = session.align_cameras(args.max_offset, on_image)
-    return _report(args, session.by_motion(alignments, out))
 
 
 def _from_flight(args: argparse.Namespace, out: Path) -> int:
@@ -151,13 +133,9 @@ def _report(args: argparse.Namespace, result: Mapping[str, Any]) -> int:
             f"{name}: yaw {one['yaw_deg']:.2f} pitch {one['pitch_deg']:.2f} roll {one['roll_deg']:.2f} +- "
             f"{one['sigma_deg']:.2f} deg"
         )
-        if result["by"] == "board":
-            say(f"  position {x:.4f} {y:.4f} {z:.4f} +- {one['sigma_m']:.4f} m")
-            say(f"  residual {one['residual_px']:.3f} px rms over {one['boards']} shared boards")
-        else:
-            say(f"  residual {one['residual_deg']:.3f} deg rms over {one['turns']} turns")
-            say(f"  time offset {1000 * one['time_offset_s']:.1f} +- {1000 * one['sigma_s']:.1f} ms")
-    for board, value in result.get("dropped", {}).items():
+        say(f"  position {x:.4f} {y:.4f} {z:.4f} +- {one['sigma_m']:.4f} m")
+        say(f"  residual {one['residual_px']:.3f} px rms over {one['boards']} shared boards")
+    for board, value in result["dropped"].items():
         say(f"dropped: {board}: its residual is {value:.2f} px, it does not fit the others")
     return _written(result)
 

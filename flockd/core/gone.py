@@ -34,6 +34,8 @@ COMMANDS: Mapping[str, str] = {
     "flockd foxglove": "watch live with `flockd fleet`, or in ROS 2 with `flockd ros`; Foxglove opens recordings",
     "flockd record export --ros2": "Foxglove opens the recording itself; record a flight's topics of `flockd ros`",
     "flockd report --ulog": "open PX4's log in Flight Review or PlotJuggler",
+    "flockd calibrate rig --by": "fly, and take over what the flight found with `--from-flight RECORDING`",
+    "flockd calibrate rig --max-offset": "a flight finds the time offset: `--from-flight RECORDING`",
     "flockd view": "open the recording in Foxglove, or in Rerun after `rerun mcap convert RECORDING.mcap -o X.rrd`",
 }
 """By a command, or a command and its option, as they were written on the command line."""

@@ -57,12 +57,6 @@ def kabsch(source: FloatArray, target: FloatArray, weights: FloatArray) -> tuple
     return rotations, translations
 
 
-def fit_rotation(source: FloatArray, target: FloatArray, weights: FloatArray) -> FloatArray:
-    """(3, 3) R with the least ``sum w |target - R source|^2`` of vectors (n, 3) and weights (n,): Wahba's problem."""
-    rotation: FloatArray = _rotations(((target * weights[:, None]).T @ source)[None])[0]
-    return rotation
-
-
 def _rotations(covariances: FloatArray) -> FloatArray:
     """(b, 3, 3) the rotations R with the largest trace of ``R^T covariance``, of covariances (b, 3, 3)."""
     u, _, vt = np.linalg.svd(covariances)  # Eq. 20

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import compress
 
 import numpy as np
 
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry import Camera, RigidTransform, rotation_angle_deg
-from flockd.flight.geometry.robust.solver import LevenbergMarquardt, NormalEquations, Problem, Solution
 from flockd.ground.calibration.board import BoardDetection
 from flockd.ground.calibration.errors import CalibrationError
-from flockd.ground.calibration.poses import jacobian_of_move, moved, pose_of_board
-from flockd.ground.calibration.rejection import OutlierRejection, root_mean_square
+from flockd.ground.calibration.fitting import OutlierRejection, Unknowns, fitted, moved, root_mean_square, steps_from
+from flockd.ground.calibration.poses import first_pose, residuals_px
 
 MIN_SHARED = 3
 """Boards that two neighbours have to see together."""
@@ -60,11 +59,24 @@ class RigFit:
 
 
 @dataclass(frozen=True, eq=False)
-class _State:
-    mounts: tuple[RigidTransform, ...]
-    """``T_body_camera``, in the order of the cameras."""
-    boards: tuple[RigidTransform, ...]
+class _Placed:
+    """Cameras and boards in the body."""
+
+    boards: tuple[SharedBoard, ...]
+    mounts: Mapping[str, RigidTransform]
+    """``T_body_camera``"""
+    places: tuple[RigidTransform, ...]
     """``T_body_board``"""
+
+    def residuals(self, cameras: Mapping[str, Camera]) -> list[dict[str, FloatArray]]:
+        """For each board and each camera that saw it (n, 2) pixels, seen less predicted."""
+        return [
+            {
+                name: residuals_px(cameras[name], seen, self.mounts[name].inverse() @ place)
+                for name, seen in board.seen.items()
+            }
+            for board, place in zip(self.boards, self.places, strict=True)
+        ]
 
 
 def calibrate_rig(
@@ -75,51 +87,45 @@ def calibrate_rig(
     Raises CalibrationError where a camera shares too few boards with those that are linked to the reference, or where
     the boards contradict each other.
     """
-    names = tuple(cameras)
-    poses = [_poses(cameras, board) for board in boards]
-    shared = [index for index, found in enumerate(poses) if len(found) > 1]
-    kept, poses = [boards[index] for index in shared], [poses[index] for index in shared]
-    state = _begin(names, kept, poses, reference, T_body_reference)
-    given, dropped = len(kept), list[tuple[str, float]]()
-    fixed = names.index(reference)
+    placed = _begin(cameras, boards, reference, T_body_reference)
+    given, dropped = len(placed.boards), list[tuple[str, float]]()
     for _ in range(_REJECTION.max_rounds):
-        problem = _RigProblem(tuple(cameras.values()), names, kept, fixed)
-        solution = LevenbergMarquardt().minimise(problem, state)
-        state = solution.state
-        rms = np.array([root_mean_square(np.concatenate(list(one.values()))) for one in problem.residuals(state)])
+        placed, sigma = _fitted(cameras, placed, reference)
+        residuals = placed.residuals(cameras)
+        rms = np.array([root_mean_square(np.concatenate(list(one.values()))) for one in residuals])
         fits = _REJECTION.inliers(rms)
         if fits.all():
             break
-        dropped += [(kept[index].name, float(rms[index])) for index in np.flatnonzero(~fits)]
-        state = _State(state.mounts, tuple(compress(state.boards, fits)))
-        kept = list(compress(kept, fits))
+        dropped += [(placed.boards[index].name, float(rms[index])) for index in np.flatnonzero(~fits)]
+        placed = replace(
+            placed, boards=tuple(compress(placed.boards, fits)), places=tuple(compress(placed.places, fits))
+        )
         if len(dropped) > _REJECTION.max_dropped * given:
             raise CalibrationError(
                 f"{len(dropped)} of {given} boards contradict the others; hold the board still, let every camera take "
                 "its image at the same time, and check the cameras' intrinsics"
             )
-    return _result(names, problem, solution, reference, tuple(dropped))
-
-
-def _poses(cameras: Mapping[str, Camera], board: SharedBoard) -> dict[str, RigidTransform]:
-    found = {name: pose_of_board(cameras[name], seen) for name, seen in board.seen.items()}
-    return {name: pose for name, pose in found.items() if pose is not None}
+    mountings = {name: _mounting(name, placed.mounts[name], sigma.get(name), residuals) for name in cameras}
+    rms_px = root_mean_square(np.concatenate([r for one in residuals for r in one.values()]))
+    return RigFit(reference, mountings, rms_px, tuple(dropped))
 
 
 def _begin(
-    names: Sequence[str],
-    boards: Sequence[SharedBoard],
-    poses: Sequence[Mapping[str, RigidTransform]],
-    reference: str,
-    T_body_reference: RigidTransform,
-) -> _State:
+    cameras: Mapping[str, Camera], boards: Sequence[SharedBoard], reference: str, T_body_reference: RigidTransform
+) -> _Placed:
     """Each camera by way of the neighbour with which it shares most boards."""
+    all_poses = [
+        {name: pose for name, seen in board.seen.items() if (pose := first_pose(cameras[name], seen)[1]) is not None}
+        for board in boards
+    ]
+    shared = [(board, found) for board, found in zip(boards, all_poses, strict=True) if len(found) > 1]
+    poses = [found for _, found in shared]
     mounts = {reference: T_body_reference}
-    while len(mounts) < len(names):
+    while len(mounts) < len(cameras):
         links = [
             (sum(known in found and new in found for found in poses), known, new)
             for known in mounts
-            for new in names
+            for new in cameras
             if new not in mounts
         ]
         count, known, new = max(links)
@@ -131,11 +137,12 @@ def _begin(
             )
         steps = [found[known] @ found[new].inverse() for found in poses if known in found and new in found]
         mounts[new] = mounts[known] @ _middle(steps)
-    in_body = []
-    for board, found in zip(boards, poses, strict=True):
+    kept = tuple(SharedBoard(board.name, {name: board.seen[name] for name in found}) for board, found in shared)
+    places = []
+    for board, found in zip(kept, poses, strict=True):
         best = max(found, key=lambda name: len(board.seen[name].ids))
-        in_body.append(mounts[best] @ found[best])
-    return _State(tuple(mounts[name] for name in names), tuple(in_body))
+        places.append(mounts[best] @ found[best])
+    return _Placed(kept, mounts, tuple(places))
 
 
 def _middle(transforms: Sequence[RigidTransform]) -> RigidTransform:
@@ -148,87 +155,37 @@ def _middle(transforms: Sequence[RigidTransform]) -> RigidTransform:
     return min(transforms, key=lambda one: sum(distance(one, other) for other in transforms))
 
 
-@dataclass(frozen=True, eq=False)
-class _RigProblem(Problem[_State]):
-    """Blocks of six: the cameras but the reference, then the boards."""
+def _fitted(cameras: Mapping[str, Camera], start: _Placed, reference: str) -> tuple[_Placed, Mapping[str, FloatArray]]:
+    """With the least squares; and by camera but the reference the deviations (6,) of its turn and place."""
+    free = [name for name in cameras if name != reference]
+    mounts = [start.mounts[name] for name in free]
+    seen = [(number, name, 2 * len(s.ids)) for number, one in enumerate(start.boards) for name, s in one.seen.items()]
+    counts = [count for _, _, count in seen]
+    of_mount = np.repeat([free.index(name) if name in free else -1 for _, name, _ in seen], counts)
+    of_board = np.repeat([number for number, _, _ in seen], counts)
 
-    cameras: tuple[Camera, ...]
-    names: tuple[str, ...]
-    boards: Sequence[SharedBoard]
-    fixed: int
+    def placed(numbers: Sequence[FloatArray]) -> _Placed:
+        moved_mounts = dict(zip(free, moved(mounts, numbers[0]), strict=True))
+        return replace(start, mounts={**start.mounts, **moved_mounts}, places=tuple(moved(start.places, numbers[1])))
 
-    def linearise(self, state: _State) -> NormalEquations:
-        size = 6 * (len(state.mounts) + len(state.boards))
-        gradient, hessian, cost = np.zeros(size), np.zeros((size, size)), 0.0
-        for board, camera, residuals, jacobian in self._terms(state):
-            block = NormalEquations.of(residuals, jacobian)
-            if not block.solvable:
-                return NormalEquations.unsolvable(size - 6)
-            start = 6 * (len(state.mounts) + board)
-            own = np.r_[6 * camera : 6 * camera + 6, start : start + 6]
-            cost += block.cost
-            gradient[own] += block.gradient
-            hessian[np.ix_(own, own)] += block.hessian
-        free = np.delete(np.arange(size), slice(6 * self.fixed, 6 * self.fixed + 6))
-        return NormalEquations(cost, gradient[free], hessian[np.ix_(free, free)])
+    def residuals(numbers: Sequence[FloatArray]) -> FloatArray:
+        return np.concatenate([r.ravel() for one in placed(numbers).residuals(cameras) for r in one.values()])
 
-    def move(self, state: _State, step: FloatArray) -> _State:
-        free = [one for index, one in enumerate((*state.mounts, *state.boards)) if index != self.fixed]
-        transforms = [moved(one, own) for one, own in zip(free, step.reshape(-1, 6), strict=True)]
-        transforms.insert(self.fixed, state.mounts[self.fixed])
-        return _State(tuple(transforms[: len(state.mounts)]), tuple(transforms[len(state.mounts) :]))
-
-    def residuals(self, state: _State) -> list[dict[str, FloatArray]]:
-        """For each board and each camera that saw it (n, 2) pixels, seen less predicted."""
-        found: list[dict[str, FloatArray]] = [{} for _ in self.boards]
-        for board, camera, r, _ in self._terms(state):
-            found[board][self.names[camera]] = -r.reshape(-1, 2)
-        return found
-
-    def _terms(self, state: _State) -> Iterator[tuple[int, int, FloatArray, FloatArray]]:
-        """Board, camera, residuals (2 n,), and their derivatives (2 n, 12) by the camera's mounting and the board."""
-        for index, (board, T_body_board) in enumerate(zip(self.boards, state.boards, strict=True)):
-            for name, seen in board.seen.items():
-                camera = self.names.index(name)
-                mount = state.mounts[camera]
-                in_body = T_body_board.apply(seen.points)
-                in_camera = (in_body - mount.translation) @ mount.rotation
-                residuals = self.cameras[camera].project(in_camera) - seen.pixels
-                by_body = self.cameras[camera].jacobian(in_camera) @ mount.rotation.T
-                # A camera that turns about its own place moves what it sees the other way.
-                by_mount = -jacobian_of_move(RigidTransform.identity(), in_body - mount.translation)
-                by_board = jacobian_of_move(T_body_board, seen.points)
-                jacobian = by_body @ np.concatenate([by_mount, by_board], axis=2)
-                yield index, camera, residuals.ravel(), jacobian.reshape(-1, 12)
+    unknowns = Unknowns(steps_from(mounts), of_mount), Unknowns(steps_from(start.places), of_board)
+    found = fitted(residuals, unknowns)
+    return placed(found.numbers), dict(zip(free, found.sigma[0], strict=True))
 
 
-def _result(
-    names: Sequence[str],
-    problem: _RigProblem,
-    solution: Solution[_State],
-    reference: str,
-    dropped: tuple[tuple[str, float], ...],
-) -> RigFit:
-    residuals = problem.residuals(solution.state)
-    numbers = sum(r.size for one in residuals for r in one.values())
-    sigma = solution.sigma(numbers, len(solution.equations.gradient)).reshape(-1, 6)
-    sigma = np.insert(sigma, problem.fixed, 0.0, axis=0)
-    mountings = {}
-    for index, name in enumerate(names):
-        own = [one[name] for one in residuals if name in one]
-        mounting = Mounting(
-            T_body_camera=solution.state.mounts[index],
-            sigma_deg=math.degrees(float(sigma[index, :3].max())),
-            sigma_m=float(sigma[index, 3:].max()),
-            rms_px=root_mean_square(np.concatenate(own)) if own else 0.0,
-            boards=len(own),
+def _mounting(
+    name: str, T_body_camera: RigidTransform, sigma: FloatArray | None, residuals: Sequence[Mapping[str, FloatArray]]
+) -> Mounting:
+    """``sigma``: of its turn and place; None of the reference."""
+    sigma = np.zeros(6) if sigma is None else sigma
+    own = [one[name] for one in residuals if name in one]
+    sigma_deg, sigma_m = math.degrees(float(sigma[:3].max())), float(sigma[3:].max())
+    if not (sigma_deg < _SIGMA_DEG and sigma_m < _SIGMA_M):
+        raise CalibrationError(
+            f"the boards leave the place of camera {name!r} uncertain by {sigma_deg:.2g} degrees and "
+            f"{100 * sigma_m:.2g} cm; show the board nearer, tilted, and in more places that both see"
         )
-        if not (mounting.sigma_deg < _SIGMA_DEG and mounting.sigma_m < _SIGMA_M):
-            raise CalibrationError(
-                f"the boards leave the place of camera {name!r} uncertain by {mounting.sigma_deg:.2g} degrees and "
-                f"{100 * mounting.sigma_m:.2g} cm; show the board nearer, tilted, and in more places that both see"
-            )
-        mountings[name] = mounting
-    return RigFit(
-        reference, mountings, root_mean_square(np.concatenate([r for one in residuals for r in one.values()])), dropped
-    )
+    return Mounting(T_body_camera, sigma_deg, sigma_m, root_mean_square(np.concatenate(own)) if own else 0.0, len(own))

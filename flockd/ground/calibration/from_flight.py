@@ -60,7 +60,7 @@ def corrected_rig(recording: Recording, source: str, out: Path) -> dict[str, Any
     if not found:
         raise CalibrationError(
             f"{source}: says nothing of the rig: it is shorter than some seconds, or was recorded by an older "
-            "flockd; fly again, or try --by motion"
+            "flockd; fly again"
         )
     config = recording.config.rig
     offset_s, note = _offset_s(list(found.values()))

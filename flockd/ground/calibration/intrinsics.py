@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import compress
 
@@ -12,10 +12,9 @@ import numpy as np
 from flockd.core.choices import LensModel
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry import Camera, PinholeCamera, RigidTransform, WideAngleCamera
-from flockd.flight.geometry.robust.solver import LevenbergMarquardt, NormalEquations, Problem
 from flockd.ground.calibration.errors import CalibrationError
-from flockd.ground.calibration.poses import first_poses, jacobian_of_move, moved
-from flockd.ground.calibration.rejection import OutlierRejection, root_mean_square
+from flockd.ground.calibration.fitting import OutlierRejection, Unknowns, fitted, moved, root_mean_square, steps_from
+from flockd.ground.calibration.poses import first_pose, residuals_px
 from flockd.ground.calibration.views import View
 
 MIN_VIEWS = 6
@@ -26,7 +25,6 @@ _FIRST_FOCALS = {
 }
 """Focal lengths to begin with, in widths of the image."""
 _REJECTION = OutlierRejection(margin_px=0.1)
-_COEFFICIENT_STEP = 1e-6
 _FOCAL_SIGMA = 0.01
 """A focal length that the views leave more uncertain than this is not known."""
 _CENTRE_SIGMA = 0.01
@@ -53,7 +51,7 @@ class Lens:
 
     def residuals(self) -> list[FloatArray]:
         """For each view (n, 2) pixels, seen less predicted."""
-        return [_residuals(self.camera, view, pose) for view, pose in zip(self.views, self.poses, strict=True)]
+        return [residuals_px(self.camera, view.seen, pose) for view, pose in zip(self.views, self.poses, strict=True)]
 
     @property
     def rms_px(self) -> float:
@@ -101,29 +99,25 @@ def calibrate(views: Sequence[View], size: tuple[int, int], model: LensModel) ->
         raise CalibrationError(
             f"{len(views)} usable views of the board are too few; show it at least {MIN_VIEWS} times"
         )
-    state = _begin(views, size, model)
+    camera, poses = _begin(views, size, model)
     dropped: list[tuple[View, float]] = []
     kept = list(views)
     for _ in range(_REJECTION.max_rounds):
-        solution = LevenbergMarquardt().minimise(_LensProblem(kept), state)
-        state = solution.state
+        camera, poses, sigma = _fitted(camera, kept, poses)
         rms = np.array(
-            [root_mean_square(_residuals(state.camera, *one)) for one in zip(kept, state.poses, strict=True)]
+            [root_mean_square(residuals_px(camera, view.seen, pose)) for view, pose in zip(kept, poses, strict=True)]
         )
         fits = _REJECTION.inliers(rms)
         if fits.all():
             break
         dropped += [(kept[index], float(rms[index])) for index in np.flatnonzero(~fits)]
-        state = _State(state.camera, tuple(compress(state.poses, fits)))
-        kept = list(compress(kept, fits))
+        kept, poses = list(compress(kept, fits)), list(compress(poses, fits))
         if len(dropped) > _REJECTION.max_dropped * len(views) or len(kept) < MIN_VIEWS:
             raise CalibrationError(
                 f"{len(dropped)} of {len(views)} views contradict the others; use a flat, rigid board, focus that "
                 "stays as it is, and the board's own numbers of squares"
             )
-    corners = sum(len(view.seen.ids) for view in kept)
-    sigma = solution.sigma(2 * corners, len(solution.equations.gradient))[: 4 + _COEFFICIENTS[model]]
-    lens = Lens(model, state.camera, sigma, tuple(kept), state.poses, tuple(dropped))
+    lens = Lens(model, camera, sigma, tuple(kept), tuple(poses), tuple(dropped))
     _check_known(lens)
     return lens
 
@@ -146,7 +140,7 @@ def rough_tilts_deg(views: Sequence[View], size: tuple[int, int], model: LensMod
     """Tilts of the board before its camera is calibrated: good enough for advice."""
     if len(views) < 2:
         return [0.0] * len(views)
-    return [tilt_deg(pose) for pose in _begin(views, size, model).poses]
+    return [tilt_deg(pose) for pose in _begin(views, size, model)[1]]
 
 
 def _check_known(lens: Lens) -> None:
@@ -168,112 +162,51 @@ def _check_known(lens: Lens) -> None:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _State:
-    camera: Camera
-    poses: tuple[RigidTransform, ...]
-
-
-def _begin(views: Sequence[View], size: tuple[int, int], model: LensModel) -> _State:
+def _begin(views: Sequence[View], size: tuple[int, int], model: LensModel) -> tuple[Camera, list[RigidTransform]]:
     """The best of a few plain lenses, with the board's pose in each view."""
-    best: tuple[float, Camera, list[tuple[float, RigidTransform | None]]] | None = None
+    best: tuple[float, float, list[tuple[float, RigidTransform | None]]] | None = None
     for focal in _FIRST_FOCALS[model]:
-        camera = _camera(model, size, np.array([focal * size[0], focal * size[0], size[0] / 2, size[1] / 2]))
-        poses = [_first_pose(camera, view) for view in views]
+        camera = _camera(model, size, _first_numbers(focal, size))
+        poses = [first_pose(camera, view.seen) for view in views]
         error = float(np.median([error for error, _ in poses]))
         if best is None or error < best[0]:
-            best = error, camera, poses
+            best = error, focal, poses
     assert best is not None
     lost = [view.name for view, (_, pose) in zip(views, best[2], strict=True) if pose is None]
     if lost:
         raise CalibrationError(f"{lost[0]}: what is seen is no flat board; remove it, or check the board's squares")
-    return _State(_with_zero_distortion(best[1]), tuple(pose for _, pose in best[2] if pose is not None))
+    numbers = [*_first_numbers(best[1], size), *np.zeros(_COEFFICIENTS[model])]
+    return _camera(model, size, numbers), [pose for _, pose in best[2] if pose is not None]
 
 
-def _first_pose(camera: Camera, view: View) -> tuple[float, RigidTransform | None]:
-    """The board's likelier pose, after its residual; none, after infinity, where it fits none."""
-    found = [(root_mean_square(_residuals(camera, view, pose)), pose) for pose in first_poses(camera, view.seen)]
-    finite = [one for one in found if math.isfinite(one[0])]
-    return min(finite, key=lambda one: one[0]) if finite else (math.inf, None)
+def _fitted(
+    camera: Camera, views: Sequence[View], poses: Sequence[RigidTransform]
+) -> tuple[Camera, list[RigidTransform], FloatArray]:
+    """Camera and poses with the least squared residual, from a start; and the deviations of the camera's numbers."""
+    model: LensModel = "pinhole" if isinstance(camera, PinholeCamera) else "wide_angle"
+    of = np.repeat(np.arange(len(views)), [2 * len(view.seen.ids) for view in views])
+    pixels = np.concatenate([view.seen.pixels for view in views])
+    lens = np.array([*camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *camera.distortion])
+
+    def residuals(numbers: Sequence[FloatArray]) -> FloatArray:
+        (lens,), steps = numbers
+        if min(lens[:2]) <= 0.0:  # no camera: the step is refused
+            return np.full(pixels.size, np.nan)
+        points = [pose.apply(view.seen.points) for view, pose in zip(views, moved(poses, steps), strict=True)]
+        off: FloatArray = _camera(model, camera.size, lens).project(np.concatenate(points)) - pixels
+        return off.ravel()
+
+    found = fitted(residuals, (Unknowns(lens[None], np.zeros_like(of)), Unknowns(steps_from(poses), of)))
+    return _camera(model, camera.size, found.numbers[0][0]), moved(poses, found.numbers[1]), found.sigma[0][0]
 
 
-@dataclass(frozen=True, eq=False)
-class _LensProblem(Problem[_State]):
-    """Blocks: the lens, then six for each view."""
-
-    views: Sequence[View]
-
-    def linearise(self, state: _State) -> NormalEquations:
-        lens = len(_numbers(state.camera))
-        size = lens + 6 * len(self.views)
-        gradient, hessian, cost = np.zeros(size), np.zeros((size, size)), 0.0
-        pairs = list(zip(self.views, state.poses, strict=True))
-        points = np.concatenate([pose.apply(view.seen.points) for view, pose in pairs])
-        residuals = state.camera.project(points) - np.concatenate([view.seen.pixels for view in self.views])
-        by_point, by_lens = state.camera.jacobian(points), _jacobian_of_lens(state.camera, points)
-        if not (np.isfinite(residuals).all() and np.isfinite(by_point).all() and np.isfinite(by_lens).all()):
-            return NormalEquations.unsolvable(size)
-        start = 0
-        for index, (view, pose) in enumerate(pairs):
-            part = slice(start, start + len(view.seen.ids))
-            start = part.stop
-            by_pose = by_point[part] @ jacobian_of_move(pose, view.seen.points)
-            block = NormalEquations.of(
-                residuals[part].ravel(), np.concatenate([by_lens[part], by_pose], axis=2).reshape(-1, lens + 6)
-            )
-            own = np.r_[:lens, lens + 6 * index : lens + 6 * index + 6]
-            cost += block.cost
-            gradient[own] += block.gradient
-            hessian[np.ix_(own, own)] += block.hessian
-        return NormalEquations(cost, gradient, hessian)
-
-    def move(self, state: _State, step: FloatArray) -> _State:
-        numbers = _numbers(state.camera)
-        changed = numbers + step[: len(numbers)]
-        # A focal length that shrinks to nothing or turns its sign is no camera; the step is refused by its cost.
-        changed[:2] = np.maximum(changed[:2], 0.2 * numbers[:2])
-        steps = step[len(numbers) :].reshape(-1, 6)
-        poses = tuple(moved(pose, own) for pose, own in zip(state.poses, steps, strict=True))
-        return _State(_camera_like(state.camera, changed), poses)
+def _first_numbers(focal: float, size: tuple[int, int]) -> list[float]:
+    """``focal``: in widths of the image."""
+    return [focal * size[0], focal * size[0], size[0] / 2, size[1] / 2]
 
 
-def _jacobian_of_lens(camera: Camera, points: FloatArray) -> FloatArray:
-    """(n, 2, 4 + coefficients) derivative of the pixels by fx, fy, cx, cy and the distortion."""
-    numbers = _numbers(camera)
-    derivative = np.zeros((len(points), 2, len(numbers)))
-    pixels = camera.project(points)
-    derivative[:, [0, 1], [0, 1]] = (pixels - numbers[2:4]) / numbers[:2]
-    derivative[:, [0, 1], [2, 3]] = 1.0
-    for index in range(4, len(numbers)):
-        step = np.zeros(len(numbers))
-        step[index] = _COEFFICIENT_STEP
-        more, less = _camera_like(camera, numbers + step), _camera_like(camera, numbers - step)
-        derivative[:, :, index] = (more.project(points) - less.project(points)) / (2 * _COEFFICIENT_STEP)
-    return derivative
-
-
-def _numbers(camera: Camera) -> FloatArray:
-    m = camera.matrix
-    return np.array([m[0, 0], m[1, 1], m[0, 2], m[1, 2], *camera.distortion])
-
-
-def _camera_like(camera: Camera, numbers: FloatArray) -> Camera:
-    return _camera("pinhole" if isinstance(camera, PinholeCamera) else "wide_angle", camera.size, numbers)
-
-
-def _camera(model: LensModel, size: tuple[int, int], numbers: FloatArray) -> Camera:
+def _camera(model: LensModel, size: tuple[int, int], numbers: Iterable[float]) -> Camera:
     fx, fy, cx, cy, *distortion = (float(number) for number in numbers)
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     kind = PinholeCamera if model == "pinhole" else WideAngleCamera
     return kind(matrix, size, tuple(distortion))
-
-
-def _with_zero_distortion(camera: Camera) -> Camera:
-    """The same lens, with coefficients to be fitted."""
-    numbers = _numbers(camera)
-    model: LensModel = "pinhole" if isinstance(camera, PinholeCamera) else "wide_angle"
-    return _camera(model, camera.size, np.concatenate([numbers, np.zeros(_COEFFICIENTS[model])]))
-
-
-def _residuals(camera: Camera, view: View, pose: RigidTransform) -> FloatArray:
-    return view.seen.pixels - camera.project(pose.apply(view.seen.points))

@@ -1,4 +1,4 @@
-"""Photographs of a board and of a room by lenses that are known exactly: each pixel's ray, traced.
+"""Photographs of a board by lenses that are known exactly: each pixel's ray, traced.
 
 Lenses are written down here a second time, from OpenCV's documentation, and inverted by search: nothing of the code
 under test is used but the board's picture.
@@ -153,39 +153,3 @@ def sight(lens: Lens, count: int, seed: int = 0, tilt_deg: float = 35.0) -> list
         tilt, about, roll = rng.uniform(5.0, tilt_deg), rng.uniform(0.0, 360.0), rng.uniform(-40.0, 40.0)
         places.append(facing(middle.tolist(), tilt, about, roll))
     return places
-
-
-_ROOM = np.array([3.0, 2.5, 1.6], np.float32)
-"""Half its length, width and height, metres; its middle is the origin."""
-_WALL_PX = 512
-
-
-@cache
-def _walls() -> UInt8Array:
-    """(6, h, w) patterns of all sizes."""
-    rng = np.random.default_rng(99)
-    walls = np.zeros((6, _WALL_PX, _WALL_PX), np.float32)
-    for cells in (8, 32, 96):
-        for number in range(len(walls)):
-            patches = rng.uniform(0.0, 255.0, (cells, cells)).astype(np.float32)
-            walls[number] += np.asarray(cv2.resize(patches, (_WALL_PX, _WALL_PX), interpolation=cv2.INTER_CUBIC)) / 3.0
-    return np.clip(walls, 0, 255).astype(np.uint8)
-
-
-def photograph_room(lens: Lens, R_room_camera: FloatArray, position: FloatArray, *, seed: int = 0) -> UInt8Array:
-    """(h, w, 3) RGB from within a room whose walls are full of patterns."""
-    seen = rays(lens) @ R_room_camera.T.astype(np.float32)
-    at = position.astype(np.float32)
-    with np.errstate(divide="ignore"):
-        reach = np.where(seen > 0, _ROOM - at, -_ROOM - at) / seen
-    wall = np.argmin(reach, axis=-1)
-    hit = at + np.take_along_axis(reach, wall[..., None], axis=-1) * seen
-    light: Float32Array = np.zeros(seen.shape[:2], np.float32)
-    for axis in range(3):
-        for side in range(2):
-            u, v = (hit[..., other] / _ROOM[other] for other in ((axis + 1) % 3, (axis + 2) % 3))
-            maps = [((c + 1) / 2 * (_WALL_PX - 1)).astype(np.float32) for c in (u, v)]
-            picture = cv2.remap(_walls()[2 * axis + side], maps[0], maps[1], cv2.INTER_LINEAR)
-            here = (wall == axis) & ((seen[..., axis] > 0) == bool(side))
-            light[here] = np.asarray(picture)[here]
-    return developed(light, seed=seed, noise=2.0, blur_px=0.5)

@@ -8,7 +8,6 @@ from typing import TypeVar
 import numpy as np
 
 from flockd.core.messages import FloatArray
-from flockd.flight.geometry.rigid_fit import fit_rotation
 from flockd.flight.geometry.robust.kernels import Kernel
 
 Fit = TypeVar("Fit")
@@ -43,22 +42,3 @@ def reweighted(
     if found is None:
         raise ValueError("at least one round is needed")
     return found, weights
-
-
-def robust_rotation(
-    source: FloatArray, target: FloatArray, kernel: Callable[[FloatArray], Kernel], *, rounds: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(3, 3) R that takes most of ``source`` (n, 3) to ``target`` (n, 3); the lengths (n,) left, and their weights."""
-
-    def left_over(rotation: FloatArray) -> FloatArray:
-        left: FloatArray = np.linalg.norm(target - source @ rotation.T, axis=1)
-        return left
-
-    rotation, weights = reweighted(
-        lambda weights, _: fit_rotation(source, target, weights),
-        left_over,
-        kernel,
-        np.ones(len(source)),
-        rounds=rounds,
-    )
-    return rotation, left_over(rotation), weights

@@ -1,14 +1,13 @@
-"""Nonlinear least squares on normal equations: Gauss-Newton, and its damped form by Levenberg and Marquardt.
+"""Nonlinear least squares on normal equations, by Gauss and Newton.
 
-A `Problem` has the residuals, their derivatives and the robust kernel; an optimiser, `GaussNewton` or
-`LevenbergMarquardt`, has the damping and when to stop. Any of one goes with any of the other.
+A `Problem` has the residuals, their derivatives and the robust kernel; `GaussNewton` has when to stop.
 """
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -85,25 +84,9 @@ class Solution(Generic[State]):
 
     state: State
     equations: NormalEquations
-    """The last that were made: at ``state`` (Levenberg-Marquardt), or one step before it (Gauss-Newton)."""
+    """The last that were made, one step before ``state``."""
     converged: bool
     """Whether the last step was too small to matter; else the steps were used up or led to no solution."""
-
-    def sigma(self, residuals: int, parameters: int) -> FloatArray:
-        """(n,) standard deviations of the state's ``parameters``, from ``residuals`` numbers that the fit left over.
-
-        Infinite where the residuals say nothing of a parameter.
-        """
-        variance = self.equations.cost / max(residuals - parameters, 1)
-        scale = np.sqrt(np.diag(self.equations.hessian))
-        if not (scale > 0.0).all():
-            return np.where(scale > 0.0, 0.0, math.inf)
-        values, vectors = np.linalg.eigh(self.equations.hessian / np.outer(scale, scale))
-        with np.errstate(divide="ignore"):
-            # Relative to the largest, which is at most n for a scaled hessian: less than this is rounding.
-            inverse = np.where(values > 1e-13, 1.0 / values, math.inf)
-            spread: FloatArray = np.sqrt(variance * np.minimum((vectors**2) @ inverse, 1e300)) / scale
-        return spread
 
 
 @dataclass(frozen=True)
@@ -145,42 +128,3 @@ class GaussNewton:
             return equations.step()
         except np.linalg.LinAlgError:
             return None
-
-
-@dataclass(frozen=True)
-class LevenbergMarquardt:
-    """Takes only steps that lower the cost, and damps them until they do; each parameter in its own scale.
-
-    Marquardt, An algorithm for least-squares estimation of nonlinear parameters, 1963: the damping falls and rises by
-    factors of ten.
-    """
-
-    max_steps: int = 60
-    first_damping: float = 1e-4
-    min_damping: float = 1e-12
-    max_damping: float = 1e9
-    relative_gain: float = 1e-10
-    """Relative decrease of the cost: a step that gains less has converged."""
-
-    def minimise(self, problem: Problem[State], state: State) -> Solution[State]:
-        """Goes downhill from ``state``."""
-        equations, damping = problem.linearise(state), self.first_damping
-        for _ in range(self.max_steps):
-            scale = np.sqrt(np.maximum(np.diag(equations.hessian), 1e-30))
-            scaled = replace(
-                equations, gradient=equations.gradient / scale, hessian=equations.hessian / np.outer(scale, scale)
-            )
-            while damping < self.max_damping:
-                step = problem.limited(scaled.damped(np.full(len(scale), damping)).step() / scale)
-                candidate = problem.move(state, step)
-                there = problem.linearise(candidate)
-                if there.cost < equations.cost:
-                    break
-                damping *= 10.0
-            else:
-                return Solution(state, equations, converged=equations.solvable)
-            gain = (equations.cost - there.cost) / equations.cost
-            state, equations, damping = candidate, there, max(damping / 10.0, self.min_damping)
-            if gain < self.relative_gain:
-                return Solution(state, equations, converged=True)
-        return Solution(state, equations, converged=False)

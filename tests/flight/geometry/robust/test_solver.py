@@ -8,13 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry.robust.kernels import Cauchy, Tukey
 from flockd.flight.geometry.robust.line import ransac_line
-from flockd.flight.geometry.robust.reweighting import robust_rotation
-from flockd.flight.geometry.robust.solver import GaussNewton, LevenbergMarquardt, NormalEquations, Problem
+from flockd.flight.geometry.robust.solver import GaussNewton, NormalEquations, Problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,19 +49,13 @@ NOISY = 3.0 * np.exp(-0.7 * T) + 0.05 * np.random.default_rng(0).normal(size=40)
 SPOILT = np.where(np.arange(40) % 8 == 3, 6.0, NOISY)
 
 
-@pytest.mark.parametrize(
-    ("optimizer", "start"),
-    [(GaussNewton(max_steps=20, tolerance=1e-9), (2.0, 0.5)), (LevenbergMarquardt(), (30.0, 5.0))],
-)
-def test_the_least_squares_are_scipys(optimizer: GaussNewton | LevenbergMarquardt, start: tuple[float, float]) -> None:
+def test_the_least_squares_are_scipys() -> None:
     problem = Decay(T, NOISY)
-    found = optimizer.minimise(problem, np.array(start))
+    found = GaussNewton(max_steps=20, tolerance=1e-9).minimise(problem, np.array([2.0, 0.5]))
     theirs = least_squares(problem.residuals, np.array([3.0, 0.7]), xtol=1e-14, ftol=1e-14, gtol=1e-14)
     assert found.converged
     assert found.state == pytest.approx(theirs.x, abs=1e-6)
     assert found.equations.cost == pytest.approx(2.0 * theirs.cost, rel=1e-6)
-    covariance = np.linalg.inv(theirs.jac.T @ theirs.jac) * 2.0 * theirs.cost / (40 - 2)
-    assert found.sigma(40, 2) == pytest.approx(np.sqrt(np.diag(covariance)), rel=1e-4)
 
 
 def test_reweighted_steps_minimise_the_kernels_loss() -> None:
@@ -76,12 +68,6 @@ def test_reweighted_steps_minimise_the_kernels_loss() -> None:
     assert 0.5 * 0.1**2 * loss == pytest.approx(theirs.cost, rel=1e-8)
 
 
-def test_levenberg_marquardt_goes_downhill_where_gauss_newton_is_lost() -> None:
-    far = np.array([30.0, 5.0])
-    assert not GaussNewton(max_steps=20, tolerance=1e-9).minimise(Decay(T, NOISY), far).converged
-    assert LevenbergMarquardt().minimise(Decay(T, NOISY), far).state == pytest.approx([3.0, 0.7], abs=0.1)
-
-
 def test_a_step_is_no_longer_than_it_may_be() -> None:
     limited = GaussNewton(max_steps=1, tolerance=0.0).minimise(Decay(T, NOISY, longest=0.01), np.array([2.0, 0.5]))
     assert np.abs(limited.state - [2.0, 0.5]).max() == pytest.approx(0.01)
@@ -89,17 +75,17 @@ def test_a_step_is_no_longer_than_it_may_be() -> None:
 
 
 def test_before_its_least_number_of_steps_nothing_has_converged() -> None:
-    problem, best = Decay(T, NOISY), LevenbergMarquardt().minimise(Decay(T, NOISY), np.array([3.0, 0.7])).state
+    problem = Decay(T, NOISY)
+    best = GaussNewton(max_steps=20, tolerance=1e-9).minimise(problem, np.array([3.0, 0.7])).state
     assert GaussNewton(max_steps=3, tolerance=1e-3).minimise(problem, best).converged
     assert not GaussNewton(max_steps=3, tolerance=1e-3, min_steps=4).minimise(problem, best).converged
 
 
 def test_what_is_no_solution_is_distinguished() -> None:
     nowhere = np.array([math.nan, 0.5])
-    for optimizer in (GaussNewton(max_steps=5, tolerance=1e-3), LevenbergMarquardt()):
-        found = optimizer.minimise(Decay(T, NOISY), nowhere)
-        assert not found.equations.solvable
-        assert not found.converged
+    found = GaussNewton(max_steps=5, tolerance=1e-3).minimise(Decay(T, NOISY), nowhere)
+    assert not found.equations.solvable
+    assert not found.converged
     # Without any fall a decay's time says nothing of its rate: the matrix is singular.
     undetermined = Decay(np.zeros(40), NOISY)
     found = GaussNewton(max_steps=5, tolerance=1e-3, max_condition=1e12).minimise(undetermined, np.array([2.0, 0.5]))
@@ -108,8 +94,6 @@ def test_what_is_no_solution_is_distinguished() -> None:
     for max_condition, solvable in ((1e4, False), (1e12, True)):
         optimizer = GaussNewton(max_steps=1, tolerance=1e-3, max_condition=max_condition)
         assert optimizer.minimise(Decay(1e-3 * T, NOISY), np.array([2.0, 0.5])).equations.solvable is solvable
-    solution = LevenbergMarquardt().minimise(undetermined, np.array([2.0, 0.5]))
-    assert np.isinf(solution.sigma(40, 2)[1])
 
 
 def test_a_damped_parameter_moves_less() -> None:
@@ -123,24 +107,6 @@ def test_kernels_weigh_as_the_literature_says(kernel: Cauchy | Tukey, half: floa
     assert kernel.weight(np.array([0.0, half**2])) == pytest.approx([1.0, 0.5])
     far = kernel.weight(np.array([4.0 * 2.0**2]))[0]
     assert far == pytest.approx(0.0 if isinstance(kernel, Tukey) else 1.0 / 5.0)
-
-
-def test_a_rotation_is_found_although_a_third_of_the_vectors_are_wrong() -> None:
-    rng = np.random.default_rng(1)
-    true = Rotation.from_euler("ZYX", [20.0, -5.0, 3.0], degrees=True).as_matrix()
-    source = rng.normal(size=(90, 3))
-    target = source @ true.T + 1e-3 * rng.normal(size=(90, 3))
-    target[::3] = rng.normal(size=(30, 3))
-
-    def kernel(left: FloatArray) -> Tukey:
-        return Tukey(6.0 * float(np.median(left)))
-
-    rotation, left, weights = robust_rotation(source, target, kernel, rounds=10)
-    good = np.arange(90) % 3 > 0
-    assert Rotation.from_matrix(rotation.T @ true).magnitude() < 1e-3
-    assert left[good].max() < 0.01
-    assert np.median(weights[good]) > 0.9
-    assert weights[~good].max() < 0.1
 
 
 @pytest.mark.parametrize("intercept", [True, False])
