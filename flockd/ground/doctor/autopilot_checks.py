@@ -211,18 +211,17 @@ def judge_loss_action(value: int, config: DroneConfig) -> Finding:
         6: "Terminate: the motors stop in the air",
         7: "Disarm: the motors stop in the air",
     }
-    measured = f"{value} ({what.get(value, 'not known')}) when setpoints stop"
-    return _judge_action("COM_OBL_RC_ACT", value, measured, (5, 4, 3), warned if value == 0 else failed)
+    blame = warned if value == 0 else failed
+    return _judge_action("COM_OBL_RC_ACT", value, what, "when setpoints stop", (5, 4, 3), blame)
 
 
 def judge_low_battery(value: int, config: DroneConfig) -> Finding:
     """COM_LOW_BAT_ACT."""
     what = {0: "only warns", 1: "Return", 2: "Land", 3: "Return, and Land when nearly empty"}
-    measured = f"{value} ({what.get(value, 'not known')}) when the battery is low"
-    if value not in {1, 2, 3}:
-        low = config.safety.on_battery_low
-        measured += f": flockd asks for {low} (safety.on_battery_low), and nothing does while it is down"
-    return _judge_action("COM_LOW_BAT_ACT", value, measured, (3, 2, 1), warned)
+    low = config.safety.on_battery_low
+    own = f": flockd asks for {low} (safety.on_battery_low), and nothing does while it is down"
+    when = f"when the battery is low{'' if value in {1, 2, 3} else own}"
+    return _judge_action("COM_LOW_BAT_ACT", value, what, when, (3, 2, 1), warned)
 
 
 def judge_fence_action(value: int, config: DroneConfig) -> Finding:
@@ -235,18 +234,23 @@ def judge_fence_action(value: int, config: DroneConfig) -> Finding:
         4: "Terminate: motors stop at the fence",
         5: "Land",
     }
-    return _judge_action(
-        "GF_ACTION", value, f"{value} ({what.get(value, 'not known')}) at PX4's fence", (2, 3, 5), warned
-    )
+    return _judge_action("GF_ACTION", value, what, "at PX4's fence", (2, 3, 5), warned)
 
 
 def _judge_action(
-    name: str, value: int, measured: str, good: Sequence[int], blame: Callable[[str, str, str], Finding]
+    name: str,
+    value: int,
+    what: Mapping[int, str],
+    when: str,
+    good: Sequence[int],
+    blame: Callable[[str, str, str], Finding],
 ) -> Finding:
-    """``good``: the values that a drone may have, the best first."""
-    if value in good:
-        return passed(name, measured)
-    return blame(name, measured, f"set {name} to {good[0]}, {good[1]} or {good[2]}")
+    """``what``: PX4's values in words; ``good``: those that a drone may have, the best first."""
+    measured = f"{value} ({what.get(value, 'not known')}) {when}"
+    best, second, third = (f"{one} ({what[one]})" for one in good)
+    return (
+        passed(name, measured) if value in good else blame(name, measured, f"set {name} to {best}, {second} or {third}")
+    )
 
 
 def judge_fence_radius(value: float, config: DroneConfig) -> Finding:
