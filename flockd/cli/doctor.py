@@ -95,7 +95,7 @@ def _run(args: argparse.Namespace) -> int:
 
 def _examine(config: DroneConfig, args: argparse.Namespace) -> Mapping[str, Sequence[Finding]]:
     """As the owner of the drone's link, if no other process is it."""
-    from flockd.ground.doctor import CHECKS, plan, run_checks
+    from flockd.ground.doctor import CHECKS, Examined, plan, run_checks
     from flockd.onboard.autopilot.link_owner import only_owner
 
     with ExitStack() as stack:
@@ -104,15 +104,8 @@ def _examine(config: DroneConfig, args: argparse.Namespace) -> Mapping[str, Sequ
             stack.enter_context(only_owner(config.autopilot))
         except UnavailableError as error:
             taken = error
-        checks = plan(
-            config,
-            args.config,
-            recordings=args.record,
-            unit=args.unit,
-            seconds=args.seconds,
-            taken=taken,
-            only=args.only or CHECKS,
-        )
+        drone = Examined(config, args.config, args.record, args.unit, args.seconds, taken)
+        checks = plan(drone, args.only or CHECKS)
         return run_checks(checks, stack.enter_context(progress("examining", "checks")))
 
 

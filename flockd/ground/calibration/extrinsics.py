@@ -13,7 +13,14 @@ from flockd.core.messages import FloatArray
 from flockd.flight.geometry import Camera, RigidTransform, rotation_angle_deg
 from flockd.ground.calibration.board import BoardDetection
 from flockd.ground.calibration.errors import CalibrationError
-from flockd.ground.calibration.fitting import OutlierRejection, Unknowns, fitted, moved, root_mean_square, steps_from
+from flockd.ground.calibration.least_squares import (
+    OutlierRejection,
+    Unknowns,
+    fitted,
+    moved,
+    root_mean_square,
+    steps_from,
+)
 from flockd.ground.calibration.poses import first_pose, residuals_px
 
 MIN_SHARED = 3

@@ -11,7 +11,7 @@ from flockd.core.messages import FloatArray
 from flockd.flight.geometry import Camera, RigidTransform
 from flockd.flight.geometry.rotations import rotation_from_vector
 from flockd.ground.calibration.board import BoardDetection
-from flockd.ground.calibration.fitting import root_mean_square
+from flockd.ground.calibration.least_squares import root_mean_square
 
 _NEAREST_ANGLE = 0.15
 """Cosine of the largest angle from the board's middle at which a corner still helps to find a first pose."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 
 from flockd.core.config import DroneConfig
 from flockd.core.config.autopilot import AutopilotParameters
@@ -44,15 +45,16 @@ async def _ask(config: DroneConfig, parameters: AutopilotParameters, heard_s: fl
     link = await AutopilotLink.connect(parameters, timeout_s=heard_s)
     try:
         heard = link.status()
-        firmware = await _firmware(link)
         found = [judge_heartbeat(link.system_id, heard, config), *judge_system_id(link.system_id, parameters)]
-        signing = judge_signing(isinstance(firmware, Firmware), silent=_is_silent(link.status(), config))
-        if isinstance(firmware, Firmware):
-            found += [judge_firmware(firmware), signing, *await _parameters(link, config, parameters)]
-        elif signing.level is Level.FAILURE:
-            found += [failed_from_error("firmware", str(firmware)), signing]
-        else:
-            found += [failed_from_error("firmware", str(firmware)), *await _parameters(link, config, parameters)]
+        responds = True
+        try:
+            found.append(judge_firmware(await link.firmware()))
+        except AutopilotError as error:
+            responds = False
+            found.append(failed_from_error("firmware", str(error)))
+        signing = judge_signing(responds, silent=_is_silent(link.status(), config))
+        found += [signing] if responds or signing.level is Level.FAILURE else []
+        found += [] if signing.level is Level.FAILURE else await _parameters(link, config)
         if not _is_silent(link.status(), config):
             found += judge_refusals(await _refusals(link))
             found.append(judge_clock(await _clock(link)))
@@ -88,18 +90,11 @@ async def _range_finder(link: AutopilotLink, config: DroneConfig) -> list[Findin
     return judge_range_finder(link.ground_range(), link.range_finders(), config)
 
 
-async def _firmware(link: AutopilotLink) -> Firmware | AutopilotError:
-    try:
-        return await link.firmware()
-    except AutopilotError as error:
-        return error
-
-
-async def _parameters(link: AutopilotLink, config: DroneConfig, parameters: AutopilotParameters) -> list[Finding]:
+async def _parameters(link: AutopilotLink, config: DroneConfig) -> list[Finding]:
     found = []
-    for name, kind in KINDS.items():
+    for name, wanted in PARAMETERS.items():
         try:
-            value = await link.parameter(name, kind)
+            value = await link.parameter(name, wanted.kind)
         except AutopilotError as error:
             fix = f"check whether this firmware has {name}, and whether the link loses messages"
             found.append(failed(name, str(error), fix))
@@ -107,7 +102,7 @@ async def _parameters(link: AutopilotLink, config: DroneConfig, parameters: Auto
                 found.append(judge_heartbeat(link.system_id, link.status(), config))
                 break
         else:
-            found.append(JUDGES[name](value, config))
+            found.append(wanted.judge(value, config))
     return found
 
 
@@ -203,54 +198,59 @@ def judge_loss_time(value: float, config: DroneConfig) -> Finding:
     return passed(name, f"{measured} without setpoints, then its failsafe")
 
 
-_ON_LOSS = {3: "Return", 4: "Land", 5: "Hold"}
-_FATAL_ON_LOSS = {
-    -1: "disabled: it flies on with the last velocity",
-    1: "Altitude: it keeps its height, and drifts on",
-    2: "Stabilized: it keeps level, and drifts on and down",
-    6: "Terminate: the motors stop in the air",
-    7: "Disarm: the motors stop in the air",
-}
-
-
 def judge_loss_action(value: int, config: DroneConfig) -> Finding:
     """COM_OBL_RC_ACT: what it does when setpoints stop."""
-    name, fix = "COM_OBL_RC_ACT", "set COM_OBL_RC_ACT to 5 (Hold), 4 (Land) or 3 (Return)"
-    if value in _ON_LOSS:
-        return passed(name, f"{value} ({_ON_LOSS[value]}) when setpoints stop")
-    if value == 0:
-        measured = "0 (Position) when setpoints stop: the sticks then fly it; with no remote control it returns home"
-        return warned(name, measured, fix)
-    return failed(name, f"{value} ({_FATAL_ON_LOSS.get(value, 'not known')}) when setpoints stop", fix)
-
-
-_ON_LOW_BATTERY = {1: "Return", 2: "Land", 3: "Return, and Land when nearly empty"}
+    what = {
+        -1: "disabled: it flies on with the last velocity",
+        0: "Position: the sticks then fly it; with no remote control it returns home",
+        1: "Altitude: it keeps its height, and drifts on",
+        2: "Stabilized: it keeps level, and drifts on and down",
+        3: "Return",
+        4: "Land",
+        5: "Hold",
+        6: "Terminate: the motors stop in the air",
+        7: "Disarm: the motors stop in the air",
+    }
+    blame = warned if value == 0 else failed
+    return _judge_action("COM_OBL_RC_ACT", value, what, "when setpoints stop", (5, 4, 3), blame)
 
 
 def judge_low_battery(value: int, config: DroneConfig) -> Finding:
     """COM_LOW_BAT_ACT."""
-    name = "COM_LOW_BAT_ACT"
-    if value in _ON_LOW_BATTERY:
-        return passed(name, f"{value} ({_ON_LOW_BATTERY[value]}) when the battery is low")
-    what = "only warns" if value == 0 else "not known"
-    own = f"flockd asks for {config.safety.on_battery_low} (safety.on_battery_low), and nothing does while it is down"
-    return warned(name, f"{value} ({what}) when the battery is low: {own}", f"set {name} to 3 or 2 (Land)")
-
-
-_AT_FENCE = {2: "Hold", 3: "Return", 5: "Land"}
+    what = {0: "only warns", 1: "Return", 2: "Land", 3: "Return, and Land when nearly empty"}
+    low = config.safety.on_battery_low
+    own = f": flockd asks for {low} (safety.on_battery_low), and nothing does while it is down"
+    when = f"when the battery is low{'' if value in {1, 2, 3} else own}"
+    return _judge_action("COM_LOW_BAT_ACT", value, what, when, (3, 2, 1), warned)
 
 
 def judge_fence_action(value: int, config: DroneConfig) -> Finding:
     """GF_ACTION."""
-    name, fix = "GF_ACTION", "set GF_ACTION to 2 (Hold), 3 (Return) or 5 (Land)"
-    if value in _AT_FENCE:
-        return passed(name, f"{value} ({_AT_FENCE[value]}) at PX4's fence")
-    off = {
+    what = {
         0: "None: PX4 has no fence",
         1: "Warning: PX4's fence stops nothing",
+        2: "Hold",
+        3: "Return",
         4: "Terminate: motors stop at the fence",
+        5: "Land",
     }
-    return warned(name, f"{value} ({off.get(value, 'not known')})", fix)
+    return _judge_action("GF_ACTION", value, what, "at PX4's fence", (2, 3, 5), warned)
+
+
+def _judge_action(
+    name: str,
+    value: int,
+    what: Mapping[int, str],
+    when: str,
+    good: Sequence[int],
+    blame: Callable[[str, str, str], Finding],
+) -> Finding:
+    """``what``: PX4's values in words; ``good``: those that a drone may have, the best first."""
+    measured = f"{value} ({what.get(value, 'not known')}) {when}"
+    best, second, third = (f"{one} ({what[one]})" for one in good)
+    return (
+        passed(name, measured) if value in good else blame(name, measured, f"set {name} to {best}, {second} or {third}")
+    )
 
 
 def judge_fence_radius(value: float, config: DroneConfig) -> Finding:
@@ -310,25 +310,23 @@ def _reach_m(gate: GateParameters) -> float | None:
     return min([*limits, *([] if gate.fence_radius_m is None else [gate.fence_radius_m])], default=None)
 
 
-KINDS: dict[str, type[int] | type[float]] = {
-    "COM_OF_LOSS_T": float,
-    "COM_OBL_RC_ACT": int,
-    "COM_LOW_BAT_ACT": int,
-    "GF_ACTION": int,
-    "GF_MAX_HOR_DIST": float,
-    "GF_MAX_VER_DIST": float,
-    "CP_DIST": float,
-    "MPC_Z_P": float,
+@dataclass(frozen=True)
+class Parameter:
+    """One of PX4's that is judged."""
+
+    kind: type[int] | type[float]
+    """As PX4 declares it."""
+    judge: Callable[..., Finding]
+    """Takes the value and the drone's configuration."""
+
+
+PARAMETERS = {
+    "COM_OF_LOSS_T": Parameter(float, judge_loss_time),
+    "COM_OBL_RC_ACT": Parameter(int, judge_loss_action),
+    "COM_LOW_BAT_ACT": Parameter(int, judge_low_battery),
+    "GF_ACTION": Parameter(int, judge_fence_action),
+    "GF_MAX_HOR_DIST": Parameter(float, judge_fence_radius),
+    "GF_MAX_VER_DIST": Parameter(float, judge_fence_height),
+    "CP_DIST": Parameter(float, judge_collision_prevention),
+    "MPC_Z_P": Parameter(float, judge_height_gain),
 }
-"""As PX4 declares them."""
-JUDGES: dict[str, Callable[..., Finding]] = {
-    "COM_OF_LOSS_T": judge_loss_time,
-    "COM_OBL_RC_ACT": judge_loss_action,
-    "COM_LOW_BAT_ACT": judge_low_battery,
-    "GF_ACTION": judge_fence_action,
-    "GF_MAX_HOR_DIST": judge_fence_radius,
-    "GF_MAX_VER_DIST": judge_fence_height,
-    "CP_DIST": judge_collision_prevention,
-    "MPC_Z_P": judge_height_gain,
-}
-"""Each takes the value and the drone's configuration."""

@@ -95,9 +95,6 @@ async def bench(
     Raises FlockdError for what cannot be opened, and where no frame comes.
     """
 
-    def with_networks() -> InterruptibleNetworks:
-        return load_networks(config.perception, within(GOLDEN_S), at_once=cameras_at_once(config))
-
     daemon = Daemon(
         config,
         file,

@@ -13,7 +13,7 @@ from flockd.core.config.scenario import RangeFinderConfig
 from flockd.core.data import data_path
 from flockd.ground.doctor import Check, Finding, Level, run_checks
 from flockd.ground.doctor.autopilot_checks import (
-    JUDGES,
+    PARAMETERS,
     check_autopilot,
     judge_clock,
     judge_firmware,
@@ -213,7 +213,7 @@ def test_no_autopilot_is_only_for_the_simulator() -> None:
     ],
 )
 def test_what_is_made_of_each_value(name: str, value: float, level: Level) -> None:
-    finding = JUDGES[name](value, _config(14540))
+    finding = PARAMETERS[name].judge(value, _config(14540))
     assert (finding.about, finding.level) == (name, level)
     assert (finding.fix == "") == (level is Level.PASS)
 
@@ -223,22 +223,22 @@ def test_collision_prevention_is_on_where_flockd_sends_for_it(value: float, leve
     config = _config(14540)
     assert config.autopilot is not None
     sending = config.autopilot.model_copy(update={"obstacle_distance": True})
-    finding = JUDGES["CP_DIST"](value, config.model_copy(update={"autopilot": sending}))
+    finding = PARAMETERS["CP_DIST"].judge(value, config.model_copy(update={"autopilot": sending}))
     assert (finding.about, finding.level) == ("CP_DIST", level)
 
 
 def test_where_nobody_weaves_any_gain_of_height_is_well() -> None:
     config = _config(14540)
     still = config.model_copy(update={"flocking": config.flocking.model_copy(update={"size": "off"})})
-    assert JUDGES["MPC_Z_P"](0.5, still).level is Level.PASS
+    assert PARAMETERS["MPC_Z_P"].judge(0.5, still).level is Level.PASS
 
 
 def test_a_fence_with_corners_reaches_as_far_as_the_farthest_inside_the_circle() -> None:
     gate = GateParameters(fence_radius_m=None, fence_corners_m=((30.0, 40.0), (0.0, 10.0), (-10.0, 0.0)))
     config = _config(14540).model_copy(update={"safety": SafetyParameters(gate=gate)})
-    assert "50 m" in JUDGES["GF_MAX_HOR_DIST"](49.0, config).measured
+    assert "50 m" in PARAMETERS["GF_MAX_HOR_DIST"].judge(49.0, config).measured
     free = SafetyParameters(gate=GateParameters(fence_radius_m=None))
-    endless = JUDGES["GF_MAX_HOR_DIST"](0.0, config.model_copy(update={"safety": free}))
+    endless = PARAMETERS["GF_MAX_HOR_DIST"].judge(0.0, config.model_copy(update={"safety": free}))
     assert endless.fix == "set GF_MAX_HOR_DIST to where it must never fly"
 
 

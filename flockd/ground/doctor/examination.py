@@ -1,0 +1,170 @@
+"""The examination: which checks there are, and each bounded in time: one that hangs or breaks is a failure."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Collection, Iterable, Sequence
+from concurrent.futures import Future, wait
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flockd.core.errors import FlockdError
+from flockd.ground.doctor.finding import Finding, failed, failed_from_error, warned
+
+if TYPE_CHECKING:
+    from flockd.core.config import DroneConfig
+    from flockd.core.errors import UnavailableError
+
+
+_LIMITS_S = {
+    "limits": 5.0,
+    "rig": 60.0,
+    "instance": 5.0,
+    "memory": 5.0,
+    "disk": 20.0,
+    "temperature": 10.0,
+    "clock": 10.0,
+    "unit": 30.0,
+    "secrets": 5.0,
+    "zenoh": 20.0,
+    "autopilot": 60.0,
+    "cameras": 20.0,
+    "models": 180.0,
+}
+"""How long each may take, the cameras beside what they are watched. Memory before the models are loaded, and those
+last, as they heat up the computer."""
+CHECKS = tuple(_LIMITS_S)
+BESIDE_A_FLIGHT = frozenset({"limits", "instance", "memory", "disk", "temperature", "clock", "unit", "secrets"})
+"""They leave alone what a drone flies with: its autopilot, cameras and endpoints, and its computer's time."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One check of the doctor."""
+
+    name: str
+    run: Callable[[], Iterable[Finding]]
+    """Changes nothing; what it finds counts even if it hangs later."""
+    limit_s: float
+    """Much longer than it should take."""
+
+
+@dataclass(frozen=True)
+class Examined:
+    """A drone, and what its checks need to know."""
+
+    config: DroneConfig
+    file: Path
+    """Its configuration's."""
+    recordings: Path | None
+    """Where flights are recorded; None: in the service's folder, where there is one."""
+    unit: Path | None
+    """The systemd unit to judge; None: the installed one, else the one that comes with flockd."""
+    seconds: float
+    """How long the cameras are watched."""
+    taken: UnavailableError | None
+    """Why this process may not own the drone's link, which another does; None: it owns it. What would touch the drone
+    is then not examined."""
+
+
+def plan(drone: Examined, only: Collection[str] = CHECKS) -> tuple[Check, ...]:
+    """The checks of these names, of `CHECKS`, in their order."""
+    return tuple(
+        Check(name, partial(_check, name, drone), limit_s + (drone.seconds if name == "cameras" else 0.0))
+        for name, limit_s in _LIMITS_S.items()
+        if name in only
+    )
+
+
+def _check(name: str, drone: Examined) -> Iterable[Finding]:
+    """Imports what checks only when it runs: a library that does not load fails its check alone."""
+    config = drone.config
+    if drone.taken is not None and name not in BESIDE_A_FLIGHT:
+        fix = "see `instance`, and examine again once that process has ended"
+        return (warned(name, "not examined: another flockd has this drone, and may be flying it", fix),)
+    match name:
+        case "limits":
+            from flockd.ground.doctor.limit_checks import check_limits
+
+            return check_limits(config)
+        case "rig":
+            from flockd.ground.doctor.rig_checks import check_rig
+
+            return check_rig(config, drone.recordings)
+        case "instance" | "unit":
+            from flockd.ground.doctor.service_checks import check_instance, check_unit
+
+            return check_unit(drone.unit) if name == "unit" else check_instance(drone.taken)
+        case "memory" | "disk" | "temperature" | "clock":
+            from flockd.ground.doctor import computer_checks as computer
+
+            if name == "disk":
+                return computer.check_disk(config, drone.recordings)
+            if name == "clock":
+                return computer.check_clock()
+            return computer.check_memory(config) if name == "memory" else computer.check_temperature(config)
+        case "secrets":
+            from flockd.ground.doctor.secret_checks import check_secrets
+
+            return check_secrets(config, drone.file)
+        case "zenoh":
+            from flockd.ground.doctor.telemetry_checks import check_fleet
+
+            return check_fleet(config)
+        case "autopilot":
+            from flockd.ground.doctor.autopilot_checks import check_autopilot
+
+            return check_autopilot(config)
+        case "cameras":
+            from flockd.ground.doctor.camera_checks import check_cameras
+
+            return check_cameras(config, drone.seconds)
+        case _:
+            from flockd.ground.doctor.model_checks import check_models
+
+            return check_models(config)
+
+
+def run_checks(checks: Sequence[Check], on_done: Callable[[int, int], None]) -> dict[str, tuple[Finding, ...]]:
+    """What each check found, by its name; ``on_done`` is called with how many of how many are done."""
+    found = {}
+    for number, check in enumerate(checks, start=1):
+        found[check.name] = _bounded(check)
+        on_done(number, len(checks))
+    return found
+
+
+def _bounded(check: Check) -> tuple[Finding, ...]:
+    found: list[Finding] = []
+    ended: Future[None] = Future()
+
+    def run() -> None:
+        try:
+            found.extend(check.run())
+        except BaseException as error:  # noqa: BLE001 - reported below, whatever it is
+            ended.set_exception(error)
+        else:
+            ended.set_result(None)
+
+    threading.Thread(target=run, name=f"check {check.name}", daemon=True).start()
+    if not wait([ended], check.limit_s).done:
+        measured = f"the check has not ended within {check.limit_s:g} s"
+        fix = "a device or service does not respond: read this check's other findings and the kernel's log (`dmesg`)"
+        return (*found, failed(check.name, measured, fix))
+    error = ended.exception()
+    return tuple(found) if error is None else (*found, _of_error(check.name, error))
+
+
+def _of_error(about: str, error: BaseException) -> Finding:
+    """The failure that an error means."""
+    if isinstance(error, FlockdError):
+        return failed_from_error(about, str(error))
+    if isinstance(error, ImportError):
+        return failed(about, f"a library cannot be loaded ({error})", "install flockd again, for this computer")
+    if isinstance(error, OSError):
+        return failed(about, f"{error.filename or 'the system'}: {error.strerror or error}", "check that it responds")
+    return failed(
+        about, f"the check itself failed ({error!r})", "report it to flockd's developers, with your configuration"
+    )
