@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 from collections.abc import Callable, Sequence
@@ -35,8 +34,6 @@ OF_A_FLIGHT = (
 )
 """All that a flight leaves in its folder."""
 INTERRUPTED = "interrupted"
-MAX_PROCESSES = 4
-"""That draw a report's figures: more would have begun when the others are done."""
 
 Progress = Callable[[int, int], None]
 
@@ -118,7 +115,7 @@ def write_report_files(
     """Writes the summary and the report beside the flight's log, and returns the summary."""
     summary = summarise(log)
     write_summary(summary, directory / SUMMARY_NAME)
-    write_report(directory, progress, min(os.cpu_count() or 1, MAX_PROCESSES))
+    write_report(directory, progress)
     return summary
 
 
