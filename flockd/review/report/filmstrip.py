@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flockd.core.messages import BoolArray, UInt8Array
 from flockd.review.flight_log.key_frames import KeyFrame
-from flockd.review.report.drawing import INK, MUTED, PLATE, line, rgb, rig_place, width_of, write
+from flockd.review.report.plate_drawing import INK, MUTED, PLATE, line, rgb, rig_place, width_of, write
 from flockd.review.report.style import FEW, colour_of
 
 _DEPTH_NORM = LogNorm(1.0, 50.0)

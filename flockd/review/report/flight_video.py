@@ -16,7 +16,7 @@ from flockd.core.errors import UnavailableError, UsageError
 from flockd.core.messages import FloatArray, UInt8Array
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.moments import Moment, Outline
-from flockd.review.report.drawing import INK, MUTED, PLATE, line, rgb, rig_place, ring, write
+from flockd.review.report.plate_drawing import INK, MUTED, PLATE, line, rgb, rig_place, ring, write
 from flockd.review.report.style import FEW, colour_of
 
 CODECS = {".webm": "VP90", ".mp4": "vp09"}
