@@ -155,8 +155,8 @@ ZENOH_READERS = {
     [
         ("mavsdk", {"onboard/autopilot/mavsdk_link.py"}),
         ("pymavlink", {"sim/autopilot", "sim/ground_station.py"}),
-        ("joblib", {"campaign/process_engine.py"}),
-        ("ray", {"campaign/ray_engine.py"}),
+        ("joblib", {"campaign/engine.py"}),
+        ("ray", {"campaign/engine.py"}),
         ("rosbags", {"onboard/recording/ros_bag.py"}),
         ("rclpy", {"onboard/ros/ros_node.py", "onboard/sources/ros_child.py"}),
     ],

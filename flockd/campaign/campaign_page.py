@@ -23,8 +23,7 @@ from flockd.campaign.intervals import Interval
 from flockd.campaign.results import Results, Row
 from flockd.campaign.schedule import is_known
 from flockd.campaign.verdicts import LEVEL, Comparison, Verdict
-from flockd.review.report.figure_files import inline_svg
-from flockd.review.report.templates import page_template
+from flockd.review.report.figure_files import inline_svg, page_template
 
 MOST_ROWS = 200
 """The most rows of a table; the Parquet files have all."""

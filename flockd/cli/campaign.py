@@ -94,7 +94,7 @@ def _add_report(commands: Commands) -> None:
 def _run(args: argparse.Namespace) -> int:
     from flockd.campaign.campaign_page import write_campaign_page
     from flockd.campaign.conduct import conduct
-    from flockd.campaign.engines import ENGINES
+    from flockd.campaign.engine import ENGINES
     from flockd.campaign.flight_plan import Plan
     from flockd.campaign.folder import REPORT_NAME, CampaignFolder
     from flockd.campaign.results import Results

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.output import complain, progress, say, say_json, tables_console
+from flockd.cli.output import complain, progress, say, say_json, say_table
 from flockd.cli.parser import Commands, positive_count, positive_number
 from flockd.cli.picture_options import PictureCameras, add_picture_options, perception_of
 from flockd.core.errors import ExitCode, UsageError
@@ -187,27 +187,25 @@ def _result(detected: Sequence[_Detected], *, measure: bool) -> dict[str, Any]:
 
 
 def _say(detected: Sequence[_Detected], result: Mapping[str, Any]) -> None:
-    from rich.table import Table
-
-    console = tables_console()
     names = _short_names([one.name for one in detected])
-    table = Table("picture", "box, px", "probability", "range, m", "size, m", box=None, pad_edge=False)
+    rows = []
     for one in detected:
         for found in one.detections:
             box = " ".join(f"{value:.0f}" for value in found.box)
             range_m, size_m = (f"{v:.2f} +- {s:.2f}" for v, s in _values(found))
-            table.add_row(names[one.name], box, f"{found.probability:.2f}", range_m, size_m)
-    if table.row_count:
-        console.print(table)
+            rows.append((names[one.name], box, f"{found.probability:.2f}", range_m, size_m))
+    if rows:
+        say_table(("picture", "box, px", "probability", "range, m", "size, m"), rows)
     drones = sum(len(one.detections) for one in detected)
     cost = f"{result['proposals_per_image']:g} proposals and {result['ms_per_image']:g} ms a picture"
     say(f"{drones} {'detection' if drones == 1 else 'detections'} in {_pictures(result['images'])}; {cost}")
     if "boxes" not in result:
         return
-    widths = Table("box width, px", "boxes", "found", "found, IoU 0.3", box=None, pad_edge=False)
-    for width, counts in result["by_width"].items():
-        widths.add_row(width, str(counts["boxes"]), *(_share(counts, key) for key in ("found", "found_iou30")))
-    console.print(widths)
+    widths = [
+        (width, str(counts["boxes"]), _share(counts, "found"), _share(counts, "found_iou30"))
+        for width, counts in result["by_width"].items()
+    ]
+    say_table(("box width, px", "boxes", "found", "found, IoU 0.3"), widths)
     ap50 = "unknown" if result["ap50"] is None else f"{100 * result['ap50']:.1f} %"
     say(f"{result['boxes']} boxes; AP50 {ap50}; {_false(result)}")
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.output import Phases, say, say_json, tables_console
+from flockd.cli.output import Phases, say, say_json, say_table
 from flockd.core.errors import ExitCode
 
 if TYPE_CHECKING:
@@ -37,14 +37,7 @@ def show_summary(directory: Path, summary: Mapping[str, Any], *, as_json: bool) 
     if as_json:
         say_json(summary)
         return ExitCode.DONE
-    from rich.table import Table
-
-    table = Table(box=None, show_header=False, pad_edge=False)
-    table.add_column(justify="left")
-    table.add_column(justify="right")
-    for name, value in _key_figures(summary).items():
-        table.add_row(name, value)
-    tables_console().print(table)
+    say_table((), _key_figures(summary).items(), right=True)
     say(f"report: {directory / REPORT_NAME}")
     return ExitCode.DONE
 

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.output import noted_table, progress, say, say_json, tables_console
+from flockd.cli.output import noted_table, progress, say, say_json, say_table, tables_console
 from flockd.cli.parser import Commands, Parser, add_commands, positive_count
 from flockd.core.choices import PROVIDERS, Provider
 from flockd.core.errors import ExitCode, ModelError, UnavailableError
@@ -143,8 +143,6 @@ class _Timing:
 
 
 def _bench(args: argparse.Namespace) -> int:
-    from rich.table import Table
-
     timings = []
     providers = _providers(args.provider)
     manifests = _manifests(args.dir)
@@ -155,11 +153,11 @@ def _bench(args: argparse.Namespace) -> int:
     if args.json:
         say_json([asdict(timing) for timing in timings])
     else:
-        table = Table("model", "provider", "threads", "ms, median", "least", "input", box=None, pad_edge=False)
+        rows = []
         for t in timings:
             cells = [f"{t.median_ms:.1f}", f"{t.least_ms:.1f}", t.input] if t.fault is None else ["-", "-", t.fault]
-            table.add_row(t.model, t.provider, str(t.threads), *cells)
-        tables_console().print(table)
+            rows.append([t.model, t.provider, str(t.threads), *cells])
+        say_table(("model", "provider", "threads", "ms, median", "least", "input"), rows)
     return ExitCode.CHECK_FAILED if any(timing.fault for timing in timings) else ExitCode.DONE
 
 

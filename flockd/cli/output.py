@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from time import monotonic
 from typing import Self
@@ -33,6 +33,18 @@ PIPED_COLUMNS = 1000
 def tables_console() -> Console:
     """Where tables are printed. Not on a terminal there is no width to fit; rich would assume 80 columns and cut."""
     return Console(markup=False, highlight=False, width=None if sys.stdout.isatty() else PIPED_COLUMNS)
+
+
+def say_table(heads: Sequence[str], rows: Iterable[Sequence[str]], *, right: bool = False) -> None:
+    """Prints rows below their heads, if they have any; ``right``: what follows the first column ends at the right."""
+    from rich.table import Table
+
+    table = Table(*heads, box=None, pad_edge=False, show_header=bool(heads))
+    for row in rows:
+        table.add_row(*row)
+    for column in table.columns[1:]:
+        column.justify = "right" if right else "left"
+    tables_console().print(table)
 
 
 def noted_table(heads: Sequence[str], rows: Sequence[tuple[Sequence[str], Sequence[str]]]) -> Text:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.output import cell, say, say_json, tables_console
+from flockd.cli.output import cell, say, say_json, say_table
 from flockd.cli.parser import Commands, Parser, add_commands
 from flockd.cli.recording_options import add_stretch, opened, refuse_existing, stretch
 from flockd.core.errors import ExitCode, UsageError
@@ -72,8 +72,6 @@ def _info(args: argparse.Namespace) -> int:
     if args.json:
         say_json(facts)
         return ExitCode.DONE
-    from rich.table import Table
-
     for name in ("drone", "began", "version", "steps", "duration_s", "bytes", "images", "finished", "lost"):
         say(f"{name:12}{facts[name]}")
     for name, sha256 in facts["models"].items():
@@ -82,12 +80,16 @@ def _info(args: argparse.Namespace) -> int:
         say(f"{'gap':12}steps {gap['first_step']} to {gap['last_step']} are missing")
     for damage in facts["damages"]:
         say(f"{'damage':12}{damage['file']} at byte {damage['byte']}: {damage['reason']}")
-    table = Table("stream", "schema", "messages", "rate", box=None, pad_edge=False)
-    for stream in facts["streams"]:
-        rate = "" if stream["rate_hz"] is None else f"{stream['rate_hz']:.2f} Hz"
-        table.add_row(cell(stream["topic"]), cell(stream["schema"]), f"{stream['messages']}", rate)
-    tables_console().print(table)
+    rows = [
+        (cell(one["topic"]), cell(one["schema"]), f"{one['messages']}", _rate(one["rate_hz"]))
+        for one in facts["streams"]
+    ]
+    say_table(("stream", "schema", "messages", "rate"), rows)
     return ExitCode.DONE
+
+
+def _rate(rate_hz: float | None) -> str:
+    return "" if rate_hz is None else f"{rate_hz:.2f} Hz"
 
 
 def _recover(args: argparse.Namespace) -> int:

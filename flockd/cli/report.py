@@ -9,16 +9,18 @@ from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
 from flockd.cli.flight_summary import show_summary
-from flockd.cli.output import complain, progress, say, say_json, tables_console
+from flockd.cli.output import complain, progress, say, say_json, say_table
 from flockd.cli.parser import Commands
 from flockd.cli.recording_options import opened, require
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
+    from flockd.onboard.recording.reader import Recording
     from flockd.review.flight_log.key_frames import KeyFrame
     from flockd.review.flight_log.log import FlightLog
+    from flockd.review.flight_log.moments import Moment
 
 SUFFIX = ".report"
 """Ending of the folder beside a recording that its report goes to."""
@@ -71,61 +73,36 @@ def add(commands: Commands) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     require(*(path for path in (args.flight, args.other) if path is not None))
-    from flockd.review.report.flight_folder import LOG_NAME, check_report_folder, prepare_report_folder, save_flight
-
     if args.other is not None:
+        _refuse(args, ("out", "without_pictures", "force", "video", "drone"), "has no meaning with two flights")
         return _compare(args)
     if args.video is not None:
+        _refuse(args, ("out", "without_pictures"), "has no meaning with --video")
         return _video(args)
-    if args.drone is not None:
-        raise UsageError("--drone is for --video; drop it")
-    if (args.flight / LOG_NAME).is_file():
-        return _again(args)
-    paths = _recordings(args.flight)
-    named = paths[0] if len(paths) == 1 else args.flight
-    directory = args.out or named.with_name(named.resolve().name.removesuffix(".mcap") + SUFFIX)
-    check_report_folder(directory, force=args.force)
-    log, pictures = _flight(paths, pictured=not args.without_pictures)
-    prepare_report_folder(directory, force=args.force)
-    save_flight(directory, log, pictures)
-    return _write(directory, log, args)
+    _refuse(args, ("drone",), "is for --video")
+    from flockd.review.report.flight_folder import REPORT_NAME, prepare_report_folder, save_flight
+    from flockd.review.report.summary import summarise
 
-
-def _write(directory: Path, log: FlightLog, args: argparse.Namespace) -> int:
+    directory: Path = args.flight
+    if _is_flight(directory):
+        why = f"is for recordings, and {directory} is a flight's folder, whose report is written into it"
+        _refuse(args, ("out", "without_pictures"), why)
+        log = _log_of(directory)
+        if (directory / REPORT_NAME).is_file() and not args.force:
+            complain(f"{directory / REPORT_NAME}: is left as it was; --force writes it again")
+            return show_summary(directory, summarise(log), as_json=args.json)
+    else:
+        paths = _recordings(directory)
+        named = paths[0] if len(paths) == 1 else directory
+        directory = args.out or named.with_name(named.resolve().name.removesuffix(".mcap") + SUFFIX)
+        with prepare_report_folder(directory, force=args.force):
+            log, pictures = _flight(paths, pictured=not args.without_pictures)
+        save_flight(directory, log, pictures)
     from flockd.review.report.flight_folder import write_report_files
 
     with progress("writing the report", "figures") as tell_progress:
         summary = write_report_files(directory, log, tell_progress)
     return show_summary(directory, summary, as_json=args.json)
-
-
-def _again(args: argparse.Namespace) -> int:
-    """The report of a flight whose folder has its log."""
-    for option in ("out", "without_pictures"):
-        if getattr(args, option):
-            raise UsageError(
-                f"--{option.replace('_', '-')} is for recordings, and {args.flight} is a flight's folder, whose report "
-                "is written into it; drop it"
-            )
-    from flockd.review.report.flight_folder import REPORT_NAME
-    from flockd.review.report.summary import summarise
-
-    log = _log_in(args.flight)
-    if (args.flight / REPORT_NAME).is_file() and not args.force:
-        complain(f"{args.flight / REPORT_NAME}: is left as it was; --force writes it again")
-        return show_summary(args.flight, summarise(log), as_json=args.json)
-    return _write(args.flight, log, args)
-
-
-def _video(args: argparse.Namespace) -> int:
-    from flockd.cli import report_video
-    from flockd.review.flight_log.from_recordings import recordings_in
-    from flockd.review.report.flight_folder import LOG_NAME, RECORDINGS
-
-    _refuse(args, ("out", "without_pictures"), "has no meaning with --video")
-    of_a_folder = (args.flight / LOG_NAME).is_file()
-    recordings = recordings_in(args.flight / RECORDINGS) if of_a_folder else _recordings(args.flight)
-    return report_video.write(args, _log_of(args.flight), recordings)
 
 
 def _refuse(args: argparse.Namespace, options: Sequence[str], why: str) -> None:
@@ -136,7 +113,6 @@ def _refuse(args: argparse.Namespace, options: Sequence[str], why: str) -> None:
 
 def _compare(args: argparse.Namespace) -> int:
     """The key figures of two flights side by side."""
-    _refuse(args, ("out", "without_pictures", "force", "video", "drone"), "has no meaning with two flights")
     from flockd.review.report.comparison import compare
     from flockd.review.report.summary import summarise
 
@@ -145,31 +121,66 @@ def _compare(args: argparse.Namespace) -> int:
     if args.json:
         say_json({"flights": [str(flight) for flight in flights], "rows": [asdict(row) for row in rows]})
         return ExitCode.DONE
-    from rich.table import Table
-
     for name, flight in zip(("first", "second"), flights, strict=True):
         say(f"{name}: {flight}")
-    table = Table("figure", "first", "second", "difference", box=None, pad_edge=False)
-    for row in rows:
-        table.add_row(row.name, *row.cells)
-    tables_console().print(table)
+    say_table(("figure", "first", "second", "difference"), [(row.name, *row.cells) for row in rows])
     return ExitCode.DONE
+
+
+def _video(args: argparse.Namespace) -> int:
+    """A video of the recordings, or of the folder's key frames."""
+    from flockd.review.flight_log.from_recordings import recordings_in
+    from flockd.review.report.flight_folder import RECORDINGS
+    from flockd.review.report.flight_video import check_video_path, write_video
+
+    check_video_path(args.video, force=args.force)
+    paths = recordings_in(args.flight / RECORDINGS) if _is_flight(args.flight) else _recordings(args.flight)
+    log = _log_of(args.flight)
+    drone, moments = _moments(args, log, [opened(path) for path in paths])
+    with progress("writing the video", "steps") as tell_progress:
+        count = write_video(args.video, log, drone, moments, tell_progress)
+    seconds = count * log.metadata.step_s
+    if args.json:
+        say_json({"video": str(args.video), "frames": count, "seconds": seconds})
+    else:
+        say(f"{args.video}: {count} frames, {seconds:g} s")
+    return ExitCode.DONE
+
+
+def _moments(args: argparse.Namespace, log: FlightLog, recordings: Sequence[Recording]) -> tuple[int, Iterator[Moment]]:
+    """Number of the drone that --drone names, and what its cameras saw."""
+    from flockd.review.flight_log.key_frames import load_key_frames
+    from flockd.review.flight_log.moments import held_moments, recorded_moments
+    from flockd.review.report.flight_folder import KEY_FRAMES_NAME
+
+    if not recordings:
+        if args.drone is not None:
+            raise UsageError(f"--drone {args.drone}: {args.flight} has no recordings; drop it, or fly with --record")
+        path = args.flight / KEY_FRAMES_NAME
+        frames = load_key_frames(path) if path.is_file() else ()
+        return (frames[0].drone if frames else 0), held_moments(log.time_s.tolist(), frames)
+    names = log.metadata.names or [recording.drone for recording in recordings]
+    wanted = args.drone or recordings[0].drone
+    recording = next((one for one in recordings if one.drone == wanted), None)
+    if recording is None or wanted not in names:
+        raise UsageError(f"--drone {wanted}: has no recording; name one of {', '.join(r.drone for r in recordings)}")
+    return names.index(wanted), recorded_moments(recording)
+
+
+def _is_flight(folder: Path) -> bool:
+    from flockd.review.report.flight_folder import LOG_NAME
+
+    return (folder / LOG_NAME).is_file()
 
 
 def _log_of(flight: Path) -> FlightLog:
     """The log in a flight's folder, or the one that recordings make."""
-    from flockd.review.report.flight_folder import LOG_NAME
-
-    if (flight / LOG_NAME).is_file():
-        return _log_in(flight)
-    return _flight(_recordings(flight), pictured=False)[0]
-
-
-def _log_in(folder: Path) -> FlightLog:
     from flockd.review.flight_log.log import FlightLog
     from flockd.review.report.flight_folder import LOG_NAME
 
-    path = folder / LOG_NAME
+    if not _is_flight(flight):
+        return _flight(_recordings(flight), pictured=False)[0]
+    path = flight / LOG_NAME
     try:
         return FlightLog.load(path)
     except (ValueError, EOFError, BadZipFile) as error:

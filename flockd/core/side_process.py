@@ -12,11 +12,8 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import traceback
-from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
@@ -105,43 +102,6 @@ class SideProcess:
         return UnavailableError(
             f"the process that {self._task} {how}; if nobody ended it, free some memory, and try again"
         )
-
-
-def shared(
-    jobs: Sequence[tuple[Any, ...]],
-    work: Callable[..., Any],
-    helpers: Iterable[SideProcess],
-    progress: Callable[[int, int], None],
-) -> list[Any]:
-    """What ``work`` gives for each job, in their order: done here and by the helpers, each taking the next one.
-
-    ``progress`` is called with (jobs done, jobs in all).
-    """
-    left, lock = deque(enumerate(jobs)), threading.Lock()
-    done: dict[int, Any] = {}
-    progress(0, len(jobs))
-
-    def taken() -> tuple[int, tuple[Any, ...]] | None:
-        with lock:
-            return left.popleft() if left else None
-
-    def take(do: Callable[..., Any]) -> None:
-        while (next_one := taken()) is not None:
-            number, job = next_one
-            result = do(*job)
-            with lock:
-                done[number] = result
-                progress(len(done), len(jobs))
-
-    with ThreadPoolExecutor() as threads:
-        others = [threads.submit(take, helper.ask) for helper in helpers]
-        try:
-            take(work)
-            for other in others:
-                other.result()
-        finally:
-            left.clear()
-    return [done[number] for number in range(len(jobs))]
 
 
 def with_package(environment: Mapping[str, str]) -> dict[str, str]:

@@ -18,8 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from flockd.campaign.conduct import conduct, task_of
-from flockd.campaign.engine import Engine
-from flockd.campaign.engines import ENGINES
+from flockd.campaign.engine import ENGINES, Engine
 from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.folder import CampaignFolder

@@ -1,4 +1,4 @@
-"""A side process answers, raises what its work raised, and says how it ended; work is shared with it."""
+"""A side process answers, raises what its work raised, and says how it ended."""
 
 from __future__ import annotations
 
@@ -11,17 +11,7 @@ from functools import partial
 import pytest
 
 from flockd.core.errors import UnavailableError
-from flockd.core.side_process import SideProcess, shared
-
-
-def test_jobs_are_shared_and_come_back_in_their_order() -> None:
-    told: list[tuple[int, int]] = []
-    with SideProcess("added", operator.methodcaller, "__mul__", 3) as helper:
-        assert helper.ask(14) == 42
-        assert shared([(k,) for k in range(50)], lambda k: 3 * k, [helper], lambda *done: told.append(done)) == list(
-            range(0, 150, 3)
-        )
-    assert told == [(done, 50) for done in range(51)]
+from flockd.core.side_process import SideProcess
 
 
 def test_it_raises_what_its_work_raised_with_the_place() -> None:
@@ -54,15 +44,3 @@ def test_one_that_hangs_is_named_with_its_task() -> None:
     assert str(caught.value) == (
         "the process that flew drone2 has not answered for 2 s; try again, with less else for this computer to do"
     )
-
-
-def test_an_error_here_ends_the_shared_work() -> None:
-    done: list[int] = []
-
-    def fail(number: int) -> None:
-        done.append(number)
-        raise ValueError(f"job {number}")
-
-    with pytest.raises(ValueError, match="job 0"):
-        shared([(k,) for k in range(5)], fail, [], lambda done, total: None)
-    assert done == [0]

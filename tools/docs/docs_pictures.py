@@ -32,7 +32,7 @@ from flockd.review.flight_log.from_recordings import flight_log
 from flockd.review.flight_log.key_frames import load_key_frames
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.moments import recorded_moments
-from flockd.review.report.filmstrip import filmstrip_figure
+from flockd.review.report.filmstrip import filmstrip
 from flockd.review.report.flight_folder import KEY_FRAMES_NAME, LOG_NAME
 from flockd.review.report.flight_video import write_video
 from flockd.review.report.style import GRID, INK, MUTED, PAPER, colour_of
@@ -200,7 +200,7 @@ def _draw_drone(axes: Axes, position: FloatArray, R_ned_body: FloatArray, colour
 
 def save_seen(key_frames: Path, path: Path) -> None:
     """The last key frame of a flight: images with detections, depth, optical flow."""
-    _image(filmstrip_figure(load_key_frames(key_frames)[-1])).save(path, quality=72, method=6)
+    Image.fromarray(filmstrip(load_key_frames(key_frames)[-1])).save(path, quality=72, method=6)
 
 
 def _image(figure: Figure) -> Image.Image:

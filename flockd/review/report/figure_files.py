@@ -1,11 +1,13 @@
-"""Figures as the report's page holds them: SVG elements that follow the reader's colour scheme."""
+"""What pages are made of: their template, and SVG elements that follow the reader's colour scheme."""
 
 from __future__ import annotations
 
 import io
 import re
+from pathlib import Path
 from typing import Final
 
+import jinja2
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
@@ -19,6 +21,15 @@ _THEMED: Final = {
     PAPER: "var(--paper)",
     BAND: "var(--blue)",
 }
+
+
+def page_template(path: Path) -> jinja2.Template:
+    """The page at a path, which may include `page.css`. What is filled in is escaped, and nothing may be missing."""
+    loader = jinja2.FileSystemLoader([path.parent, Path(__file__).parent])
+    environment = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.get_template(path.name)
 
 
 def inline_svg(figure: Figure, name: str, description: str) -> str:

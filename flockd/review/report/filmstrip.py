@@ -1,196 +1,132 @@
-"""Figures of a flight's key frames: what one drone's cameras saw, with detections, depth and optical flow."""
+"""Plates of a flight's key frames: what one drone's cameras saw, with detections, depth and optical flow."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
-from matplotlib import colormaps, patheffects, rc_context
-from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm, hsv_to_rgb, to_rgb
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib import colormaps
+from matplotlib.colors import LogNorm, hsv_to_rgb
 from numpy.typing import NDArray
 
-from flockd.core.messages import BoolArray, FloatArray
+from flockd.core.messages import BoolArray, UInt8Array
 from flockd.review.flight_log.key_frames import KeyFrame
-from flockd.review.report.style import FEW, STYLE, colour_of
+from flockd.review.report.plate_drawing import INK, MUTED, PLATE, line, rgb, rig_place, width_of, write
+from flockd.review.report.style import FEW, colour_of
 
-RIG_ORDER = ("left", "front", "right", "back")
-"""Reading order of the cameras: a turn to the right. Cameras of other names follow in their own order."""
-
-
-# A plate as dark as film under either scheme of the page, so that the images appear alike in both.
-
-_PLATE = "#14181f"
-_INK = "#e8ecf1"
-_MUTED = "#98a3b0"
-_SKY = "#26303d"
 _DEPTH_NORM = LogNorm(1.0, 50.0)
-_DEPTH_COLOURS = colormaps["magma_r"].with_extremes(bad=_SKY)
+_DEPTH_COLOURS = colormaps["magma_r"].with_extremes(bad="#26303d")
 _DEPTH_TICKS_M = (1, 2, 5, 10, 20, 50)
-_HALO = (patheffects.withStroke(linewidth=2.0, foreground="#000000b0"),)
-
-# Inches of the plate.
-_WIDTH = 8.6
-_LEFT, _RIGHT, _TOP, _BOTTOM, _GAP = 0.3, 0.78, 0.62, 0.14, 0.05
-
-
-def filmstrip_figure(frame: KeyFrame) -> Figure:
-    """One moment: a row of camera images with the drones found in them, a row of depth, a row of flow."""
-    cameras = sorted(frame.cameras, key=_rig_place)
-    cell_w = min((_WIDTH - _LEFT - _RIGHT - _GAP * (len(cameras) - 1)) / len(cameras), 3.2)
-    cell_h = cell_w * max(image.shape[0] / image.shape[1] for image in frame.images.values())
-    width = _LEFT + _RIGHT + len(cameras) * (cell_w + _GAP) - _GAP
-    height = _TOP + _BOTTOM + 3 * (cell_h + _GAP) - _GAP
-    with rc_context({**STYLE, "text.color": _INK}):
-        figure = Figure(figsize=(width, height), dpi=160, facecolor=_PLATE)
-        # One system of axes in inches from the plate's upper left corner: one an image would take twice as long.
-        axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0), autoscale_on=False)
-        axes.set_axis_off()
-
-        def cell(row: int, column: int, image: NDArray[np.generic]) -> _Cell:
-            scale = cell_w / image.shape[1]
-            left, top = _LEFT + column * (cell_w + _GAP), _TOP + row * (cell_h + _GAP)
-            return _Cell(axes, left, top + (cell_h - scale * image.shape[0]) / 2, scale, (*image.shape[:2],))
-
-        axes.text(
-            _LEFT, 0.12, f"{frame.title}, t = {frame.time_s:.1f} s",
-            ha="left", va="top", fontsize=11, fontweight="bold",
-        )  # fmt: skip
-        for row, name in enumerate(("image", "depth", "flow")):
-            middle = _TOP + row * (cell_h + _GAP) + cell_h / 2
-            axes.text(0.16, middle, name, rotation=90, ha="center", va="center", color=_MUTED, fontsize=9)
-        p95_px = _typical_flow(frame)
-        for column, camera in enumerate(cameras):
-            seen = cell(0, column, frame.images[camera])
-            axes.text(seen.left, seen.top - 0.04, camera, color=_MUTED, fontsize=9)
-            _draw_seen(seen, frame, camera)
-            if camera in frame.depth:
-                depth = np.ma.masked_invalid(frame.depth[camera])
-                cell(1, column, depth).show(depth, cmap=_DEPTH_COLOURS, norm=_DEPTH_NORM, interpolation="nearest")
-            if camera in frame.flow:
-                _draw_flow(cell(2, column, frame.flow[camera]), frame, camera, p95_px)
-        key = _LEFT + len(cameras) * (cell_w + _GAP)
-        if frame.depth:
-            _draw_depth_key(axes, key, _TOP + cell_h + _GAP, cell_h)
-        if p95_px > 0:
-            _draw_flow_key(axes, key, _TOP + 2 * (cell_h + _GAP), p95_px)
-    return figure
-
-
-@dataclass(frozen=True, eq=False)
-class _Cell:
-    """Where an image is on the plate: what is drawn into it comes in the image's pixels and is cut at its borders."""
-
-    axes: Axes
-    left: float
-    """Inches, as ``top``."""
-    top: float
-    scale: float
-    """Inches a pixel."""
-    shape: tuple[int, int]
-    """(h, w) pixels."""
-
-    @property
-    def border(self) -> Rectangle:
-        """Border of the image."""
-        size = self.scale * self.shape[1], self.scale * self.shape[0]
-        return Rectangle((self.left, self.top), *size, transform=self.axes.transData)
-
-    def x(self, columns: FloatArray) -> FloatArray:
-        """Inches across the plate."""
-        return self.left + self.scale * columns
-
-    def y(self, rows: FloatArray) -> FloatArray:
-        """Inches down the plate."""
-        return self.top + self.scale * rows
-
-    def show(self, image: NDArray[np.generic], **style: object) -> None:
-        """Fills the cell."""
-        box = self.border.get_bbox()
-        self.axes.imshow(image, extent=(box.x0, box.x1, box.y1, box.y0), aspect="auto", **style)  # type: ignore[arg-type]
-
-
-def _rig_place(camera: str) -> int:
-    return RIG_ORDER.index(camera) if camera in RIG_ORDER else len(RIG_ORDER)
-
-
-def _draw_seen(cell: _Cell, frame: KeyFrame, camera: str) -> None:
-    image = frame.images[camera]
-    labels = frame.labels.get(camera, np.zeros(image.shape[:2], np.uint8))
-    tinted = image.astype(np.float32)
-    found = [int(label) for label in np.unique(labels) if label != 0]
-    for label in found:
-        colour = 255 * np.array(to_rgb(_track_colour(frame, label)))
-        tinted[labels == label] = 0.55 * tinted[labels == label] + 0.45 * colour
-    cell.show(tinted.astype(np.uint8), interpolation="bilinear")
-    taken: list[_Box] = []
-    for label in found:
-        _outline(cell, labels == label, _track_colour(frame, label))
-        taken.append(_name(cell, labels == label, _caption(frame, label), taken))
-
-
-def _track_colour(frame: KeyFrame, label: int) -> str:
-    return colour_of(frame.track_ids[label], FEW) if label in frame.track_ids else "#ffffff"
-
-
-def _caption(frame: KeyFrame, label: int) -> str:
-    track = f"#{frame.track_ids[label]}" if label in frame.track_ids else "new"
-    return f"{track}  {frame.ranges[label]:.2f} m" if label in frame.ranges else track
-
-
-def _outline(cell: _Cell, mask: BoolArray, colour: str) -> None:
-    # Of the mask's own rectangle, not of the whole image. A border of nothing closes an outline that the image's edge
-    # cuts.
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    padded = np.pad(mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], 1).astype(float)
-    x = cell.x(np.arange(columns[0] - 0.5, columns[-1] + 2))
-    y = cell.y(np.arange(rows[0] - 0.5, rows[-1] + 2))
-    cell.axes.contour(x, y, padded, levels=[0.5], colors=[colour], linewidths=0.8).set_clip_path(cell.border)
-
-
-_Box = tuple[float, float, float, float]
-"""Left, top, right, bottom in pixels."""
-
-
-def _name(cell: _Cell, mask: BoolArray, caption: str, taken: Sequence[_Box]) -> _Box:
-    """Written as near to the drone as there is room, within the image and clear of the names already there."""
-    height, width = mask.shape
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    half, line = 0.018 * width * len(caption), 0.034 * height
-    x = float(np.clip((columns[0] + columns[-1] + 1) / 2, half, width - half))
-    tops = [rows[0] - 1.3 * line, rows[-1] + 0.3 * line]
-    tops += [rows[0] - lines * line for lines in (2.3, 3.3)] + [rows[-1] + lines * line for lines in (1.3, 2.3)]
-    boxes = [(x - half, float(top), x + half, float(top) + line) for top in tops if 0 <= top <= height - line]
-    free = (box for box in boxes if not any(_overlap(box, other) for other in taken))
-    box = next(free, boxes[0])
-    cell.axes.text(
-        float(cell.x(np.array(x))), float(cell.y(np.array(box[1] + line / 2))), caption, ha="center", va="center",
-        color="#ffffff", fontsize=7, fontweight="bold", path_effects=_HALO,
-    )  # fmt: skip
-    return box
-
-
-def _overlap(one: _Box, other: _Box) -> bool:
-    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
-
-
-def _draw_depth_key(axes: Axes, left: float, top: float, height: float) -> None:
-    """The colours of depths, near below."""
-    low, high = _DEPTH_NORM.vmin or 1.0, _DEPTH_NORM.vmax or 1.0
-    bar = np.geomspace(high, low, 256)[:, None]
-    extent = (left, left + 0.12, top + height, top)
-    axes.imshow(bar, extent=extent, aspect="auto", cmap=_DEPTH_COLOURS, norm=_DEPTH_NORM)
-    for depth_m in _DEPTH_TICKS_M:
-        down = 1.0 - float(_DEPTH_NORM(depth_m))
-        axes.text(left + 0.17, top + down * height, f"{depth_m} m", va="center", fontsize=8.5)
-
-
+_WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM, _GAP = 1376, 48, 125, 99, 22, 8
+"""Pixels of the plate: as wide as four cameras make it, and its margins."""
+_WIDEST = 512
+"""Pixels across one camera's image."""
 _ARROWS_ACROSS = 14
 """The flow is drawn once in each of this many cells across the image, and once for each drone."""
+
+
+def filmstrip(frame: KeyFrame) -> UInt8Array:
+    """(h, w, 3) RGB of one moment: a row of camera images with the drones found in them, one of depth, one of flow."""
+    cameras = sorted(frame.cameras, key=rig_place)
+    across = min((_WIDTH - _LEFT - _RIGHT - _GAP * (len(cameras) - 1)) // len(cameras), _WIDEST)
+    down = round(across * max(image.shape[0] / image.shape[1] for image in frame.images.values()))
+    key = _LEFT + len(cameras) * (across + _GAP)
+    plate = np.full((_TOP + _BOTTOM + 3 * (down + _GAP) - _GAP, key + _RIGHT - _GAP, 3), rgb(PLATE), np.uint8)
+    write(plate, _LEFT, 40, f"{frame.title}, t = {frame.time_s:.1f} s", 0.9, INK)
+    tops = [_TOP + row * (down + _GAP) for row in range(3)]
+    for top, name in zip(tops, ("image", "depth", "flow"), strict=True):
+        aside = np.full((_LEFT - _GAP, down, 3), rgb(PLATE), np.uint8)
+        write(aside, (down - width_of(name, 0.6)) / 2, 26, name, 0.6, MUTED)
+        plate[top : top + down, : _LEFT - _GAP] = np.rot90(aside)
+    p95_px = _typical_flow(frame)
+    for column, camera in enumerate(cameras):
+        height, width = frame.images[camera].shape[:2]
+        size = (across, round(across * height / width))
+        labels = frame.labels.get(camera, np.zeros((height, width), np.uint8))
+        masks = {
+            int(n): cv2.resize(np.where(labels == n, 255, 0).astype(np.uint8), size) > 127
+            for n in np.unique(labels[labels > 0])
+        }
+        left = _LEFT + column * (across + _GAP)
+        cells = [_seen(frame, camera, masks, size)]
+        cells.append(_depth(frame.depth[camera], size) if camera in frame.depth else cells[0][:0])
+        cells.append(_flow(frame, camera, masks, size, p95_px) if camera in frame.flow else cells[0][:0])
+        write(plate, left, tops[0] + (down - size[1]) // 2 - 10, camera, 0.6, MUTED)
+        for top, cell in zip(tops, cells, strict=True):
+            upper = top + (down - len(cell)) // 2
+            plate[upper : upper + len(cell), left : left + across] = cell
+    if frame.depth:
+        _draw_depth_key(plate, key, tops[1], down)
+    if p95_px > 0:
+        _draw_flow_key(plate, key, tops[2], p95_px)
+    return plate
+
+
+def _seen(frame: KeyFrame, camera: str, masks: dict[int, BoolArray], size: tuple[int, int]) -> UInt8Array:
+    image = np.asarray(cv2.resize(frame.images[camera], size, interpolation=cv2.INTER_AREA), np.uint8)
+    taken: list[tuple[float, float]] = []
+    for label, mask in masks.items():
+        colour = colour_of(frame.track_ids[label], FEW) if label in frame.track_ids else "#ffffff"
+        image[mask] = (0.55 * image[mask] + 0.45 * np.array(rgb(colour))).astype(np.uint8)
+        _outline(image, mask, colour)
+        track = f"#{frame.track_ids[label]}" if label in frame.track_ids else "new"
+        _name(image, mask, f"{track}  {frame.ranges[label]:.2f} m" if label in frame.ranges else track, taken)
+    return image
+
+
+def _outline(image: UInt8Array, mask: BoolArray, colour: str) -> None:
+    for contour in cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]:
+        cv2.polylines(image, [contour], True, rgb(colour), 1, cv2.LINE_AA)
+
+
+def _name(image: UInt8Array, mask: BoolArray, caption: str, taken: list[tuple[float, float]]) -> None:
+    """Written as near to the drone as there is room, within the image and on lines that no name nearby has."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    wide, high = width_of(caption, 0.5), 18
+    left = float(np.clip((columns[0] + columns[-1] - wide) / 2, 0, max(image.shape[1] - wide, 0)))
+    bases = [float(rows[0] - 6), float(rows[-1] + high)]
+    bases += [rows[0] - 6 - n * high for n in (1, 2)] + [rows[-1] + n * high for n in (2, 3)]
+    inside = [base for base in bases if high <= base <= len(image) - 4] or bases[:1]
+    free = (base for base in inside if all(abs(base - y) >= high or abs(left - x) >= 1.5 * wide for x, y in taken))
+    taken.append((left, next(free, inside[0])))
+    write(image, *taken[-1], caption, 0.5)
+
+
+def _depth(depth_m: NDArray[np.floating], size: tuple[int, int]) -> UInt8Array:
+    coloured = _DEPTH_COLOURS(_DEPTH_NORM(np.ma.masked_invalid(depth_m)), bytes=True)[..., :3]
+    return np.asarray(cv2.resize(np.ascontiguousarray(coloured), size, interpolation=cv2.INTER_NEAREST), np.uint8)
+
+
+def _flow(
+    frame: KeyFrame, camera: str, masks: dict[int, BoolArray], size: tuple[int, int], p95_px: float
+) -> UInt8Array:
+    """Arrows on the darkened image, the fastest 1.6 times as long as they are apart; a thick one for each drone."""
+    flow = frame.flow[camera]
+    grey = cv2.cvtColor(cv2.resize(frame.images[camera], size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+    cell = np.asarray(cv2.cvtColor((grey * 0.45).astype(np.uint8), cv2.COLOR_GRAY2RGB), np.uint8)
+    scale = size[0] / flow.shape[1]
+    spacing = max(flow.shape[1] // _ARROWS_ACROSS, 1)
+    longer = scale * 1.6 * spacing / p95_px if p95_px > 0 else 0.0
+    for row in range(spacing // 2, flow.shape[0], spacing):
+        for column in range(spacing // 2, flow.shape[1], spacing):
+            _arrow(cell, scale * (np.array([column, row]) + 0.5), longer * flow[row, column], 2)
+    for label, mask in masks.items():
+        _outline(cell, mask, "#ffffff")
+        own = flow[(frame.labels[camera] == label) & np.isfinite(flow).all(axis=2)]
+        if len(own):
+            rows, columns = np.nonzero(mask)
+            _arrow(cell, np.array([columns.mean(), rows.mean()]), longer * np.median(own, axis=0), 4)
+    return cell
+
+
+def _arrow(cell: UInt8Array, start: NDArray[np.floating], along: NDArray[np.floating], thick: int) -> None:
+    length = float(np.hypot(*along))
+    if not length >= 1.0:  # too short to be seen, or unknown
+        return
+    colour = "#{:02x}{:02x}{:02x}".format(*(255 * _direction_colours(*along)).astype(int))
+    tip, back = start + along, along / length * min(3.0 * thick + 2.0, length)
+    across = 0.5 * np.array([-back[1], back[0]])
+    line(cell, np.stack([start, tip]), colour, thick)
+    line(cell, np.stack([tip - back + across, tip, tip - back - across]), colour, thick)
 
 
 def _typical_flow(frame: KeyFrame) -> float:
@@ -202,57 +138,24 @@ def _typical_flow(frame: KeyFrame) -> float:
 
 
 def _direction_colours(u: NDArray[np.floating], v: NDArray[np.floating]) -> NDArray[np.floating]:
-    """(n, 3) a hue for each direction, light enough to be seen on dark."""
+    """(..., 3) a hue for each direction, light enough to be seen on dark."""
     hue = (np.arctan2(-v, u) / (2 * np.pi)) % 1.0
     return hsv_to_rgb(np.stack([hue, np.full_like(hue, 0.62), np.ones_like(hue)], axis=-1))
 
 
-def _draw_flow(cell: _Cell, frame: KeyFrame, camera: str, p95_px: float) -> None:
-    flow = frame.flow[camera]
-    grey = cv2.cvtColor(np.ascontiguousarray(frame.images[camera]), cv2.COLOR_RGB2GRAY)
-    cell.show(grey, cmap="gray", vmin=0, vmax=560, interpolation="bilinear")
-    if p95_px == 0:
-        return
-    spacing = max(flow.shape[1] // _ARROWS_ACROSS, 1)
-    scale = p95_px / (1.6 * spacing)
-    rows, columns = (
-        axis.ravel()
-        for axis in np.mgrid[spacing // 2 : flow.shape[0] : spacing, spacing // 2 : flow.shape[1] : spacing]
-    )
-    _arrows(cell, columns + 0.5, rows + 0.5, flow[rows, columns], scale)
-    labels = frame.labels.get(camera, np.zeros(flow.shape[:2], np.uint8))
-    for label in np.unique(labels[labels > 0]):
-        mask = labels == label
-        _outline(cell, mask, "#ffffff")
-        own = flow[mask & np.isfinite(flow).all(axis=2)]
-        if len(own):
-            rows, columns = np.nonzero(mask)
-            middle = np.median(own, axis=0)[None]
-            _arrows(cell, columns.mean(keepdims=True) + 0.5, rows.mean(keepdims=True) + 0.5, middle, scale, width=0.014)
+def _draw_depth_key(plate: UInt8Array, left: int, top: int, height: int) -> None:
+    """The colours of depths, near below."""
+    plate[top : top + height, left : left + 19] = _depth(np.geomspace(50.0, 1.0, height)[:, None], (19, height))
+    for depth_m in _DEPTH_TICKS_M:
+        middle = top + (1.0 - float(_DEPTH_NORM(depth_m))) * height
+        write(plate, left + 27, np.clip(middle + 6, top + 12, top + height), f"{depth_m} m", 0.5, INK)
 
 
-def _arrows(
-    cell: _Cell, x: FloatArray, y: FloatArray, flow: NDArray[np.floating], scale: float, *, width: float = 0.007
-) -> None:
-    """`flow` (n, 2) camera pixels; `scale` is how many of them one of these pixels shows; `width` a share of the
-    image's."""
-    u, v = flow.T
-    known = np.isfinite(u) & np.isfinite(v)
-    arrows = cell.axes.quiver(
-        cell.x(x[known]), cell.y(y[known]), u[known], v[known],
-        color=_direction_colours(u[known], v[known]), angles="xy", scale_units="xy", scale=scale / cell.scale,
-        units="inches", width=width * cell.scale * cell.shape[1],
-        headwidth=3.4, headlength=4.0, headaxislength=3.4, minlength=0.3,
-    )  # fmt: skip
-    arrows.set_clip_path(cell.border)
-
-
-def _draw_flow_key(axes: Axes, left: float, top: float, p95_px: float) -> None:
+def _draw_flow_key(plate: UInt8Array, left: int, top: int, p95_px: float) -> None:
     """A wheel of directions and how long the arrows are."""
-    x, y = np.meshgrid(np.linspace(-1, 1, 96), np.linspace(-1, 1, 96))
-    radius = np.hypot(x, y)
-    opacity = np.clip(48 * np.minimum(1 - radius, radius - 0.45), 0, 1)
-    middle, size = left + (_RIGHT - _GAP) / 2, 0.5
-    extent = (middle - size / 2, middle + size / 2, top + size, top)
-    axes.imshow(np.dstack([_direction_colours(x, y), opacity]), extent=extent, aspect="auto")
-    axes.text(middle, top + size + 0.06, f"95 % under\n{p95_px:.1f} px", ha="center", va="top", fontsize=8)
+    x, y = np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-1, 1, 80))
+    opacity = np.clip(40 * np.minimum(1 - np.hypot(x, y), np.hypot(x, y) - 0.45), 0, 1)[..., None]
+    wheel = opacity * 255 * _direction_colours(x, y) + (1 - opacity) * np.array(rgb(PLATE))
+    plate[top : top + 80, left + 18 : left + 98] = wheel
+    for row, text in enumerate(("95 % under", f"{p95_px:.1f} px")):
+        write(plate, left + 58 - width_of(text, 0.5) / 2, top + 102 + 20 * row, text, 0.5, INK)

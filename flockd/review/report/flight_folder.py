@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -35,8 +35,6 @@ OF_A_FLIGHT = (
 )
 """All that a flight leaves in its folder."""
 INTERRUPTED = "interrupted"
-MAX_PROCESSES = 4
-"""That draw a report's figures: more would have begun when the others are done."""
 
 Progress = Callable[[int, int], None]
 
@@ -71,17 +69,18 @@ def prepare_folder(directory: Path, *, force: bool = False) -> Path | None:
     return moved
 
 
-def check_report_folder(directory: Path, *, force: bool = False) -> None:
-    """Raises UsageError when a folder cannot take a report of recordings: see `prepare_report_folder`."""
+@contextmanager
+def prepare_report_folder(directory: Path, *, force: bool = False) -> Iterator[None]:
+    """Makes the folder for a report of recordings once what is done meanwhile went well.
+
+    A flight or report that is there is removed with ``force`` only. Raises UsageError at once for a folder in the way.
+    """
     _check_no_other_files(directory)
-    if _holds_something(directory) and not force:
+    held = _holds_something(directory)
+    if held and not force:
         raise _in_the_way(directory)
-
-
-def prepare_report_folder(directory: Path, *, force: bool = False) -> None:
-    """Makes the folder for a report of recordings; a flight or report that is there is removed with ``force`` only."""
-    check_report_folder(directory, force=force)
-    if _holds_something(directory):
+    yield
+    if held:
         _remove_flight(directory)
     directory.mkdir(parents=True, exist_ok=True)
 
@@ -118,7 +117,7 @@ def write_report_files(
     """Writes the summary and the report beside the flight's log, and returns the summary."""
     summary = summarise(log)
     write_summary(summary, directory / SUMMARY_NAME)
-    write_report(directory, progress, min(os.cpu_count() or 1, MAX_PROCESSES))
+    write_report(directory, progress)
     return summary
 
 

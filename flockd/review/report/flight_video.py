@@ -16,21 +16,16 @@ from flockd.core.errors import UnavailableError, UsageError
 from flockd.core.messages import FloatArray, UInt8Array
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.moments import Moment, Outline
-from flockd.review.report.filmstrip import RIG_ORDER
+from flockd.review.report.plate_drawing import INK, MUTED, PLATE, line, rgb, rig_place, ring, write
 from flockd.review.report.style import FEW, colour_of
 
 CODECS = {".webm": "VP90", ".mp4": "vp09"}
 """VP9 in both: free of royalties, in OpenCV's own build, and shown by every browser."""
-_PLATE, _PANEL, _INK, _MUTED = "#14181f", "#1c222b", "#e8ecf1", "#98a3b0"
+_PANEL, _GRID = "#1c222b", "#2c3440"
 _HEAD_PX, _GAP_PX, _MAP_PX = 36, 6, 640
 """Heights of the line above and of the gaps between the parts, and each side of the map."""
 _TRAIL_S = 20.0
 _LEAST_REACH_M = 6.0
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
-_SHIFT = 4
-"""Fractional bits of the pixels that OpenCV draws at."""
-Colour = tuple[int, int, int]
-"""RGB."""
 Progress = Callable[[int, int], None]
 
 
@@ -115,7 +110,7 @@ class _Plate:
     def __init__(self, log: FlightLog, drone: int) -> None:
         self._log, self._drone = log, drone
         self._known = bool(np.isfinite(log.position[:, drone]).any())
-        self._colours = [_rgb(colour_of(number, log.position.shape[1])) for number in range(log.position.shape[1])]
+        self._colours = [colour_of(number, log.position.shape[1]) for number in range(log.position.shape[1])]
         self._middle, self._reach_m = self._extent()
 
     def draw(self, moment: Moment) -> UInt8Array:
@@ -124,14 +119,14 @@ class _Plate:
         seen = _tiles(moment)
         height = _HEAD_PX + _MAP_PX + _GAP_PX
         width = seen.shape[1] + _MAP_PX + 3 * _GAP_PX
-        image = np.full((height + height % 2, width + width % 2, 3), _rgb(_PLATE), np.uint8)
+        image = np.full((height + height % 2, width + width % 2, 3), rgb(PLATE), np.uint8)
         image[_HEAD_PX : _HEAD_PX + _MAP_PX, _GAP_PX : _GAP_PX + seen.shape[1]] = seen
         left = seen.shape[1] + 2 * _GAP_PX
         image[_HEAD_PX : _HEAD_PX + _MAP_PX, left : left + _MAP_PX] = self._map(row)
         names = self._log.metadata.names
         name = names[self._drone] if names else f"drone {self._drone + 1}"
         held = f"   images of {moment.taken_s:.1f} s" if moment.taken_s < moment.time_s - 1e-6 else ""
-        _write(image, (_GAP_PX + 2, 24), f"{_ascii(name)}   t = {moment.time_s:.1f} s{held}", _rgb(_INK), 0.6)
+        write(image, _GAP_PX + 2, 24, f"{name}   t = {moment.time_s:.1f} s{held}", 0.6, INK)
         return image
 
     def _extent(self) -> tuple[FloatArray, float]:
@@ -148,28 +143,28 @@ class _Plate:
     def _map(self, row: int) -> UInt8Array:
         """The flock from above, north up, with the drone's tracks as rings."""
         log, own = self._log, self._drone
-        image = np.full((_MAP_PX, _MAP_PX, 3), _rgb(_PANEL), np.uint8)
+        image = np.full((_MAP_PX, _MAP_PX, 3), rgb(_PANEL), np.uint8)
         self._grid(image)
         since = int(np.searchsorted(log.time_s, log.time_s[row] - _TRAIL_S))
         for number, colour in enumerate(self._colours):
             trail = log.position[since : row + 1, number, :2]
             trail = trail[np.isfinite(trail).all(axis=1)]
             if len(trail):
-                _line(image, self._pixels(trail), colour, 1)
-                _disc(image, self._pixels(trail[-1:])[0], colour)
+                line(image, self._pixels(trail), colour, 1)
+                ring(image, self._pixels(trail[-1:])[0], 5, colour, -1)
         origin = log.position[row, own, :2] if np.isfinite(log.position[row, own, :2]).all() else np.zeros(2)
         here = self._pixels(origin[None])[0]
-        cv2.circle(image, *_at(here, 10), _rgb(_INK), 1, cv2.LINE_AA, _SHIFT)
+        ring(image, here, 10, INK, 1)
         if not self._known:
-            _disc(image, here, self._colours[own])
+            ring(image, here, 5, self._colours[own], -1)
         for track in log.tracked[(log.tracked[:, 0] == row) & (log.tracked[:, 1] == own)]:
             place = self._pixels((origin + track[3:5])[None])[0]
-            cv2.circle(image, *_at(place, 7), _rgb(colour_of(int(track[2]), FEW)), 2, cv2.LINE_AA, _SHIFT)
+            ring(image, place, 7, colour_of(int(track[2]), FEW), 2)
         command = log.command_velocity[row, own]
         if np.isfinite(command).all():
-            _line(image, self._pixels(np.stack([origin, origin + 2.0 * command])), _rgb(_INK), 1)
+            line(image, self._pixels(np.stack([origin, origin + 2.0 * command])), INK, 1)
         told = "paths, tracks (rings), command (line, 2 s)" if self._known else "tracks around the drone, command"
-        _write(image, (8, _MAP_PX - 10), told, _rgb(_MUTED), 0.42)
+        write(image, 8, _MAP_PX - 10, told, 0.42, MUTED)
         return image
 
     def _grid(self, image: UInt8Array) -> None:
@@ -179,8 +174,8 @@ class _Plate:
             for at_m in np.arange(first, self._middle[axis] + self._reach_m, step_m):
                 ends = np.stack([self._middle - self._reach_m, self._middle + self._reach_m])
                 ends[:, axis] = at_m
-                _line(image, self._pixels(ends), (44, 52, 64), 1)
-        _write(image, (8, 20), f"north up, grid {step_m} m", _rgb(_MUTED), 0.42)
+                line(image, self._pixels(ends), _GRID, 1)
+        write(image, 8, 20, f"north up, grid {step_m} m", 0.42, MUTED)
 
     def _pixels(self, plan: FloatArray) -> FloatArray:
         """(n, 2) across and down of (n, 2) metres north and east."""
@@ -191,15 +186,15 @@ class _Plate:
 
 def _tiles(moment: Moment) -> UInt8Array:
     """All images, in reading order of a turn to the right, with gaps; as high together as the map."""
-    cameras = sorted(moment.images, key=lambda name: RIG_ORDER.index(name) if name in RIG_ORDER else len(RIG_ORDER))
+    cameras = sorted(moment.images, key=rig_place)
     if not cameras:
-        return np.full((_MAP_PX, _MAP_PX, 3), _rgb(_PANEL), np.uint8)
+        return np.full((_MAP_PX, _MAP_PX, 3), rgb(_PANEL), np.uint8)
     across = math.ceil(math.sqrt(len(cameras)))
     down = math.ceil(len(cameras) / across)
     height = (_MAP_PX - (down - 1) * _GAP_PX) // down
     tiles = [_tile(moment.images[name], name, moment.outlines, height) for name in cameras]
     width = max(tile.shape[1] for tile in tiles)
-    image = np.full((_MAP_PX, across * (width + _GAP_PX) - _GAP_PX, 3), _rgb(_PLATE), np.uint8)
+    image = np.full((_MAP_PX, across * (width + _GAP_PX) - _GAP_PX, 3), rgb(PLATE), np.uint8)
     for number, tile in enumerate(tiles):
         top, left = number // across * (height + _GAP_PX), number % across * (width + _GAP_PX)
         image[top : top + height, left : left + tile.shape[1]] = tile
@@ -211,45 +206,14 @@ def _tile(image: UInt8Array, camera: str, outlines: Mapping[str, Iterable[Outlin
     size = (round(scale * image.shape[1]), height)
     tile = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     for outline in outlines.get(camera, ()):
-        colour = _rgb(colour_of(outline.track, FEW)) if outline.track is not None else (255, 255, 255)
+        colour = colour_of(outline.track, FEW) if outline.track is not None else "#ffffff"
         pixels = scale * outline.pixels
-        _line(tile, pixels, colour, 2)
+        line(tile, pixels, colour, 2)
         name = "new" if outline.track is None else f"#{outline.track}"
         caption = name if outline.range_m is None else f"{name} {outline.range_m:.1f} m"
         wide = 8 * len(caption)
         left = float(np.clip(pixels[:, 0].mean() - wide / 2, 2, max(size[0] - wide, 2)))
         top = float(pixels[:, 1].min()) - 6
-        _write(tile, (round(left), round(top if top > 14 else pixels[:, 1].max() + 16)), caption, (255, 255, 255), 0.42)
-    _write(tile, (6, size[1] - 8), _ascii(camera), (255, 255, 255), 0.42)
+        write(tile, left, top if top > 14 else float(pixels[:, 1].max()) + 16, caption, 0.42)
+    write(tile, 6, size[1] - 8, camera, 0.42)
     return tile
-
-
-def _rgb(colour: str) -> Colour:
-    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
-
-
-def _at(pixel: FloatArray, radius_px: float) -> tuple[tuple[int, int], int]:
-    """Centre and radius as OpenCV wants them, in parts of pixels."""
-    scale = 1 << _SHIFT
-    return (round(float(pixel[0] - 0.5) * scale), round(float(pixel[1] - 0.5) * scale)), round(radius_px * scale)
-
-
-def _disc(image: UInt8Array, pixel: FloatArray, colour: Colour) -> None:
-    cv2.circle(image, *_at(pixel, 5), colour, -1, cv2.LINE_AA, _SHIFT)
-
-
-def _line(image: UInt8Array, pixels: FloatArray, colour: Colour, thick: int) -> None:
-    points = np.round((pixels - 0.5) * (1 << _SHIFT)).astype(np.int32)
-    cv2.polylines(image, [points], isClosed=False, color=colour, thickness=thick, lineType=cv2.LINE_AA, shift=_SHIFT)
-
-
-def _write(image: UInt8Array, place: tuple[int, int], text: str, colour: Colour, size: float) -> None:
-    """With a dark rim, to be read on anything; ``place`` is the lower left corner."""
-    for across, down in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        cv2.putText(image, text, (place[0] + across, place[1] + down), _FONT, size, (0, 0, 0), 1, cv2.LINE_AA)
-    cv2.putText(image, text, place, _FONT, size, colour, 1, cv2.LINE_AA)
-
-
-def _ascii(text: str) -> str:
-    """The font has no other letters."""
-    return text.encode("ascii", "replace").decode()

@@ -6,38 +6,44 @@ import base64
 import io
 import json
 from collections.abc import Callable
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from markupsafe import Markup
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from flockd.core.messages import UInt8Array
-from flockd.core.side_process import SideProcess, shared
 from flockd.review.flight_log.key_frames import KeyFrame, load_key_frames
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.curves import account_curves, error_curves, flight_curves
-from flockd.review.report.figure_files import inline_svg
-from flockd.review.report.filmstrip import filmstrip_figure
+from flockd.review.report.figure_files import inline_svg, page_template
+from flockd.review.report.filmstrip import filmstrip
 from flockd.review.report.obstacle_figures import in_the_way, obstacle_figure
 from flockd.review.report.page_texts import page_texts
 from flockd.review.report.style import colour_of
-from flockd.review.report.templates import page_template
 from flockd.review.report.trajectories import trajectories
 
+Drawing = tuple[Callable[[FlightLog], Figure | None], str, str]
+DRAWINGS_OF_TRUTH: dict[str, Drawing] = {
+    "trajectories": (trajectories, "trajectories", "Paths and formation from above"),
+    "obstacles": (obstacle_figure, "obstacles", "Clearance over time, and what a drone knew of the obstacles"),
+    "curves": (flight_curves, "curves", "Airspeed, course, heights, distances and deviations over time"),
+    "errors": (error_curves, "errors", "Errors of the estimates over time"),
+}
+"""By their name in the template: the figure's function, its file's name, and what it shows."""
+DRAWINGS_OF_ACCOUNT: dict[str, Drawing] = {
+    "curves": (account_curves, "account", "Airspeed, course and distances over time, as the drone knew them"),
+}
+_MAX_SVG_BYTES = 700_000
+"""Long flights of many drones make SVG elements larger than the PNG file."""
 
-def write_report(
-    directory: Path, progress: Callable[[int, int], None] = lambda done, total: None, processes: int = 1
-) -> Path:
+
+def write_report(directory: Path, progress: Callable[[int, int], None] = lambda done, total: None) -> Path:
     """Write `report.html` and `figures/*.png` into a flight's folder and return the page's path.
 
     The folder holds `flight.npz` (FlightLog) and `summary.json` (of `summarise`); if key frames were kept
-    `filmstrip.npz`. Figures are drawn in as many ``processes``, of which this is one. Raises
-    FileNotFoundError if one of the first two is missing.
+    `filmstrip.npz`. Raises FileNotFoundError if one of the first two is missing.
     """
     for name in ("flight.npz", "summary.json"):
         if not (directory / name).is_file():
@@ -46,29 +52,25 @@ def write_report(
     summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
     strip = directory / "filmstrip.npz"
     frames = [frame for frame in load_key_frames(strip) if frame.cameras] if strip.is_file() else []
-
     folder = directory / "figures"
     folder.mkdir(exist_ok=True)
     for old in folder.glob("*.png"):
         old.unlink()
-    drawings = _DRAWINGS_OF_TRUTH if log.has_truth else _DRAWINGS_OF_ACCOUNT
-    # As files only the first drone's: 1.4 MB each.
-    files = [folder / f"filmstrip_{number}.png" for number in range(1, len(frames) + 1)]
-    strips = [
-        (frame, file if frame.drone == frames[0].drone else None) for frame, file in zip(frames, files, strict=True)
-    ]
-    draw = _Drawings(log, folder)
-    with ExitStack() as stack:
-        helpers = [
-            stack.enter_context(SideProcess("drew figures", _Drawings, log, folder)) for _ in range(1, processes)
-        ]
-        drawn = shared([*((name, None) for name in drawings), *strips], draw, helpers, progress)
-    embedded: dict[str, Markup | None] = {"trajectories": None, "obstacles": None, "errors": None}
-    embedded |= zip(drawings, drawn, strict=False)
-    plates = drawn[len(drawings) :]
+    drawings = DRAWINGS_OF_TRUTH if log.has_truth else DRAWINGS_OF_ACCOUNT
+    total = len(drawings) + len(frames)
+    progress(0, total)
+    embedded: dict[str, Markup | None] = dict.fromkeys(DRAWINGS_OF_TRUTH)
+    for done, (name, (draw, file, what)) in enumerate(drawings.items(), 1):
+        embedded[name] = _embed(draw(log), folder / f"{file}.png", what)
+        progress(done, total)
+    plates = []
+    for number, frame in enumerate(frames, 1):
+        # As files only the first drone's: 1.4 MB each.
+        plates.append(_plate(frame, folder / f"filmstrip_{number}.png" if frame.drone == frames[0].drone else None))
+        progress(len(drawings) + number, total)
     page = page_template(Path(__file__).with_name("report.html")).render(
         **page_texts(summary, log),
-        **embedded,
+        figures=embedded,
         filmstrip=plates,
         plated=list(dict.fromkeys(plate["drone"] for plate in plates)),
         player=Markup(_flight_data(log)) if log.has_truth else None,
@@ -79,33 +81,14 @@ def write_report(
     return path
 
 
-_Draw = Callable[..., Figure | None]
-_DRAWINGS_OF_TRUTH: dict[str, tuple[_Draw, str, str]] = {
-    "trajectories": (trajectories, "trajectories", "Paths and formation from above"),
-    "obstacles": (obstacle_figure, "obstacles", "Clearance over time, and what a drone knew of the obstacles"),
-    "curves": (flight_curves, "curves", "Airspeed, course, heights, distances and deviations over time"),
-    "errors": (error_curves, "errors", "Errors of the estimates over time"),
-}
-"""By their name in the template: the figure's function, its file's name, and what it shows."""
-_DRAWINGS_OF_ACCOUNT: dict[str, tuple[_Draw, str, str]] = {
-    "curves": (
-        account_curves,
-        "account",
-        "Airspeed, course and distances of neighbours over time, as the drone knew them",
-    ),
-}
-
-
 def _flight_data(log: FlightLog) -> str:
     """What the page plays: times, and of each drone metres north, east and up, to the centimetre; the obstacles
     as in the log, and whether they are in the way."""
     drones = log.position.shape[1]
-    up = log.position * (1.0, 1.0, -1.0)
     data = {
         "time": np.round(log.time_s, 3).tolist(),
-        "position": (np.round(up, 2) + 0.0).tolist(),
+        "position": (np.round(log.position * (1.0, 1.0, -1.0), 2) + 0.0).tolist(),
         "colours": [colour_of(number, drones) for number in range(drones)],
-        "names": [f"{number + 1}" for number in range(drones)],
         "obstacles": [
             [*np.round(row[:5], 3).tolist(), bool(near)]
             for row, near in zip(log.obstacles, in_the_way(log), strict=True)
@@ -114,29 +97,8 @@ def _flight_data(log: FlightLog) -> str:
     return json.dumps(data, separators=(",", ":"))
 
 
-_MAX_SVG_BYTES = 700_000
-"""Long flights of many drones make SVG elements larger than the PNG file."""
-
-
-class _Drawings:
-    """Draws what it is asked for."""
-
-    def __init__(self, log: FlightLog, folder: Path) -> None:
-        """PNG files go to the folder."""
-        self._log, self._folder = log, folder
-
-    def __call__(self, what: str | KeyFrame, file: Path | None) -> Markup | dict[str, Any] | None:
-        """A figure by its name, or a key frame's plate with a file or without."""
-        if isinstance(what, KeyFrame):
-            return _plate(what, file)
-        drawings = _DRAWINGS_OF_TRUTH if self._log.has_truth else _DRAWINGS_OF_ACCOUNT
-        draw, name, description = drawings[what]
-        return _embed(self._log, draw, self._folder / f"{name}.png", description)
-
-
-def _embed(log: FlightLog, draw: _Draw, path: Path, description: str) -> Markup | None:
-    """A drawing as SVG, or as PNG if that is less; also as a PNG file."""
-    figure = draw(log)
+def _embed(figure: Figure | None, path: Path, description: str) -> Markup | None:
+    """A figure as SVG, or as PNG if that is less; also as a PNG file."""
     if figure is None:
         return None
     element = inline_svg(figure, path.stem, description)
@@ -150,21 +112,14 @@ def _embed(log: FlightLog, draw: _Draw, path: Path, description: str) -> Markup 
 
 
 def _plate(frame: KeyFrame, file: Path | None) -> dict[str, Any]:
-    """The filmstrip's figure as a PNG file and, for the page, as WebP, a sixth of the size."""
-    canvas = FigureCanvasAgg(filmstrip_figure(frame))
-    canvas.draw()  # type: ignore[no-untyped-call]
-    image: UInt8Array = np.asarray(canvas.buffer_rgba())[..., 2::-1]  # type: ignore[no-untyped-call]
+    """A key frame's plate as a PNG file and, for the page, as WebP, a sixth of the size."""
+    image = filmstrip(frame)[..., ::-1]
     if file is not None:
         file.write_bytes(cv2.imencode(".png", image)[1].tobytes())
     small = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, 82])[1].tobytes()
-    return {
-        "drone": frame.title,
-        "time_s": f"{frame.time_s:.3f}",
-        "source": _data_url("image/webp", small),
-        "width": image.shape[1],
-        "height": image.shape[0],
-        "text": f"Images, depth and flow of {frame.title} at {frame.time_s:.1f} s",
-    }
+    height, width = image.shape[:2]
+    source = _data_url("image/webp", small)
+    return {"drone": frame.title, "time_s": frame.time_s, "source": source, "width": width, "height": height}
 
 
 def _data_url(kind: str, data: bytes) -> str:

@@ -1,8 +1,9 @@
-"""What the report's page says: its sentences and its tables, formatted."""
+"""What the report's page says of a flight: its sentences, key figures and tables, formatted."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any
 
@@ -16,38 +17,35 @@ from flockd.review.report.style import FEW
 from flockd.review.report.summary import causes_text, sizes_text
 
 Summary = Mapping[str, Any]
+Rows = list[dict[str, Any]]
+
+_WORDS = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten", "Eleven", "Twelve")
+_TOUCH_M = 1.0
+"""Two drones of the paper's size (collision radius 0.5 m) touch below this."""
+_NONE = "–"
+_SCALES = {
+    "network": "metric scale from the images alone",
+    "height": "metric scale from attitude and height above ground",
+}
 
 
 def page_texts(summary: Summary, log: FlightLog) -> dict[str, Any]:
-    """All texts and table cells of the page, by their name in its template."""
-    by_sight = summary["perception"] != EXACT_STATES
+    """What the page's template fills in, by name: the summary's own values, and the texts and cells made of them."""
     return {
-        "title": f"flockd flight report: {_setting(summary)}",
+        **summary,
         "setting": _setting(summary),
-        "truth": summary["has_truth"],
-        "recomputed": summary["recorded"] is not None,
         "headline": _headline(summary),
         "colophon": _colophon(summary),
-        "of_five": _of_five(summary),
-        "table2_columns": _TABLE_2_NAMES,
-        "table3_columns": _TABLE_3_NAMES,
         "lead": _lead(summary),
-        "facts": _facts(summary, log),
-        "by_sight": by_sight,
+        "facts": list(_facts(summary, log)),
+        "by_sight": summary["perception"] != EXACT_STATES,
         "companion": log.companion is not None,
-        "drones": summary["drones"],
-        "distance_note": (
-            "Distances here are horizontal and wear the colours of both drones; the closest distance above is in 3D."
-            if summary["drones"] <= FEW
-            else "Distances here are horizontal, each drone’s to its nearest; the closest distance above is in 3D."
-        ),
-        "circle_until": f"{summary['circle_until_s']:g}",
+        "few": FEW,
         "table2": _table2(summary),
         "table3": _table3(summary["table3"]),
-        "flock": _flock(summary["flock"]) if summary["drones"] > 1 and summary["has_truth"] else [],
-        "neighbours": _neighbours(summary["neighbours"]) if _knows_neighbours(summary) else [],
+        "flock": _rows(summary["flock"], _FLOCK) if summary["drones"] > 1 and summary["has_truth"] else [],
+        "neighbours": _rows(summary["neighbours"], _NEIGHBOURS) if _knows_neighbours(summary) else [],
         "stages": _stages(summary["stages_ms"]),
-        "definitions": _definitions(summary),
     }
 
 
@@ -56,70 +54,31 @@ def _setting(summary: Summary) -> str:
     parts = [summary["scenario"]]
     if summary["seed"] is not None:
         parts.append(f"seed {summary['seed']}")
-    if summary["recorded"] is not None:
-        names = [name for name in summary["recorded"] if name != summary["scenario"]]
-        parts += [f"recorded by {', '.join(names)}"] * bool(names)
-    return ", ".join(parts)
+    names = [name for name in summary["recorded"] or () if name != summary["scenario"]]
+    return ", ".join([*parts, *[f"recorded by {', '.join(names)}"] * bool(names)])
 
 
 def _colophon(summary: Summary) -> str:
     """When it was flown, and with which flockd."""
-    parts = [f"begun {_minute(summary['began'])}"] if summary["began"] else []
-    parts += [f"flockd {summary['version']}"] * bool(summary["version"])
-    parts += ["interrupted before its end"] * bool(summary["interrupted"])
-    return ", ".join(parts)
-
-
-def _minute(iso: str) -> str:
-    """An ISO 8601 time as people write it."""
-    try:
-        return f"{datetime.fromisoformat(iso).astimezone(UTC):%Y-%m-%d %H:%M} UTC"
-    except ValueError:  # of a recording by another writer
-        return iso
-
-
-def _of_five(summary: Summary) -> str:
-    """Where the paper's figures are of another flock."""
-    drones = summary["drones"]
-    if drones == _PAPERS_DRONES:
-        return ""
-    return f" The paper’s are of {_PAPERS_DRONES} drones, this flight is of {drones}."
-
-
-_PAPERS_DRONES = 5
-
-
-_WORDS = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten", "Eleven", "Twelve")
-
-# Two drones of the paper's size (collision radius 0.5 m) touch below this.
-_TOUCH_M = 1.0
+    began = summary["began"]
+    with suppress(ValueError):  # of a recording by another writer: as it is there
+        began = began and f"{datetime.fromisoformat(began).astimezone(UTC):%Y-%m-%d %H:%M} UTC"
+    parts = [f"begun {began}"] * bool(began) + [f"flockd {summary['version']}"] * bool(summary["version"])
+    return ", ".join(parts + ["interrupted before its end"] * bool(summary["interrupted"]))
 
 
 def _headline(summary: Summary) -> str:
     drones, flock = summary["drones"], summary["flock"]
+    means = "with exact states" if summary["perception"] == EXACT_STATES else "by sight"
+    means += f" ({summary['perception']})" * (summary["perception"] not in {EXACT_STATES, "learned"})
+    means += ", without safety gates" * (summary["gated"] is False)
     count = _WORDS[drones] if drones < len(_WORDS) else str(drones)
-    start = f"{count} {'drone' if drones == 1 else 'drones'} flew {summary['duration_s']:g} s {_means(summary)}"
+    start = f"{count} {'drone' if drones == 1 else 'drones'} flew {summary['duration_s']:g} s {means}"
     if drones == 1 or not summary["has_truth"]:
         return start
     if flock["min_distance_m"] < _TOUCH_M:
         return f"{start}, but came within {flock['min_distance_m']:.2f} m of each other"
-    if flock["union_tail"] < 1:
-        return f"{start}, but did not stay one flock"
-    return f"{start} and stayed one flock"
-
-
-def _means(summary: Summary) -> str:
-    gates = ", without safety gates" if summary["gated"] is False else ""
-    if summary["perception"] == EXACT_STATES:
-        return f"with exact states{gates}"
-    sight = "by sight" if summary["perception"] == "learned" else f"by sight ({summary['perception']})"
-    return sight + gates
-
-
-_SCALES = {
-    "network": "metric scale from the images alone",
-    "height": "metric scale from attitude and height above ground",
-}
+    return f"{start}, but did not stay one flock" if flock["union_tail"] < 1 else f"{start} and stayed one flock"
 
 
 def _lead(summary: Summary) -> str:
@@ -147,70 +106,48 @@ def _whose(summary: Summary) -> str:
     return f" What was estimated and timed here is by {', '.join(recorded)} alone; the truth is of all drones."
 
 
-def _facts(summary: Summary, log: FlightLog) -> list[dict[str, str]]:
-    flock, neighbours = summary["flock"], summary["neighbours"]
-    facts = []
+def _facts(summary: Summary, log: FlightLog) -> Iterator[dict[str, str]]:
+    flock, neighbours, obstacles = summary["flock"], summary["neighbours"], summary["obstacles"]
+    mission, held = summary["mission"], summary["handed_over"]
     if summary["drones"] > 1 and summary["has_truth"]:
-        facts += [
-            _fact("Closest two drones", _number(flock["min_distance_m"], 2), f"in 3D, {_closest(log)}", "m"),
-            _fact(
-                "Order",
-                _number(flock["order_tail"], 3),
-                "the flock hovers" if flock["order_tail"] is None else "1 is all flying one way",
-            ),
-            _fact("Union", _number(flock["union_tail"], 2), "1 is one connected flock"),
-        ]
+        yield _fact("Closest two drones", flock["min_distance_m"], 2, f"in 3D, {_closest(log)}", "m")
+        hovers = flock["order_tail"] is None
+        yield _fact("Order", flock["order_tail"], 3, "the flock hovers" if hovers else "1 is all flying one way")
+        yield _fact("Union", flock["union_tail"], 2, "1 is one connected flock")
     if summary["has_truth"]:
         heights = -log.position[..., 2]
-        facts.append(_fact("Heights", f"{heights.min():.1f}–{heights.max():.1f}", "above the start’s ground", "m"))
-    mission = summary["mission"]
+        yield _fact("Heights", f"{heights.min():.1f}–{heights.max():.1f}", 1, "above the start’s ground", "m")
     if mission["arrived"] is not None:
         when = "never reached" if mission["time_s"] is None else f"reached at {mission['time_s']:g} s"
-        facts.append(
-            _fact(
-                "From the last goal",
-                _number(mission["final_error_m"], 2),
-                f"{mission['who'].rstrip(',')}, at the end; {when}",
-                "m",
-            )
-        )
-    obstacles = summary["obstacles"]
+        remark = f"{mission['who'].rstrip(',')}, at the end; {when}"
+        yield _fact("From the last goal", mission["final_error_m"], 2, remark, "m")
     if obstacles["collisions"] is not None:
-        near = f"{obstacles['time_within_1m_s']:g} s within 1 m, all drones together"
-        facts += [
-            _fact("Collisions", _number(obstacles["collisions"], 0), "with obstacles, once per contact"),
-            _fact("Clearance", _number(obstacles["min_clearance_m"], 2), f"the smallest to an obstacle; {near}", "m"),
-        ]
+        yield _fact("Collisions", obstacles["collisions"], 0, "with obstacles, once per contact")
+        near = f"the smallest to an obstacle; {obstacles['time_within_1m_s']:g} s within 1 m, all drones together"
+        yield _fact("Clearance", obstacles["min_clearance_m"], 2, near, "m")
     if summary["slowed_share"]:
         remark = f"of the time, by safety gates: {causes_text(summary)}"
-        facts.append(_fact("Slowed", _number(100 * summary["slowed_share"], 1), remark, "%"))
-    held = summary["handed_over"]
+        yield _fact("Slowed", 100 * summary["slowed_share"], 1, remark, "%")
     if held["drones"]:
         remark = f"drones; the first at {held['first_s']:.1f} s: {held['reasons'][0]}"
-        facts.append(_fact("Asked for Hold", _number(held["drones"], 0), remark))
+        yield _fact("Asked for Hold", held["drones"], 0, remark)
     if neighbours["recall_within_10m"] is not None:
-        facts += [
-            _fact("Neighbours known", _number(100 * neighbours["recall_within_10m"], 1), "of those within 10 m", "%"),
-            _fact("False neighbours", _number(neighbours["false_per_drone_minute"], 2), "per drone and minute"),
-        ]
+        yield _fact("Neighbours known", 100 * neighbours["recall_within_10m"], 1, "of those within 10 m", "%")
+        yield _fact("False neighbours", neighbours["false_per_drone_minute"], 2, "per drone and minute")
     if learned := sizes_text(summary):
         size, _, remark = learned.partition(" m, ")
-        facts.append(_fact("Size learned", size, f"of the others, tip to tip, {remark}", "m"))
+        yield _fact("Size learned", size, 2, f"of the others, tip to tip, {remark}", "m")
     if not summary["has_truth"]:
-        account = summary["own_account"]
-        known = account["own_motion_ratio"]
-        most = account["most_neighbours_tracked"]
-        facts += [
-            _fact("Own motion", _number(known and 100 * known, 1), "of the steps, from the second on", "%"),
-            _fact("Neighbours tracked", _number(most, 0), "at most at one time"),
-        ]
+        known, most = summary["own_account"]["own_motion_ratio"], summary["own_account"]["most_neighbours_tracked"]
+        yield _fact("Own motion", known and 100 * known, 1, "of the steps, from the second on", "%")
+        yield _fact("Neighbours tracked", most, 0, "at most at one time")
     if summary["realtime_factor"] is not None:
-        facts.append(_fact("Speed", _number(summary["realtime_factor"], 2), "of real time", "×"))
-    return facts
+        yield _fact("Speed", summary["realtime_factor"], 2, "of real time", "×")
 
 
-def _fact(name: str, value: str, remark: str, unit: str = "") -> dict[str, str]:
-    return {"name": name, "value": value, "remark": remark, "unit": unit if value != _NONE else ""}
+def _fact(name: str, value: float | str | None, digits: int, remark: str, unit: str = "") -> dict[str, str]:
+    shown = value if isinstance(value, str) else _number(value, digits)
+    return {"name": name, "value": shown, "remark": remark, "unit": unit if shown != _NONE else ""}
 
 
 def _closest(log: FlightLog) -> str:
@@ -221,77 +158,57 @@ def _closest(log: FlightLog) -> str:
     return f"drones {one + 1} and {other + 1} at {log.time_s[step]:.1f} s"
 
 
-_NONE = "–"
-
-
 def _number(value: float | None, digits: int) -> str:
     return _NONE if value is None else f"{value:.{digits}f}"
 
 
-def _table2(summary: Summary) -> list[dict[str, Any]]:
-    """Ours beside the paper's maxima; only the windows in which something was estimated."""
-    until = f"{summary['circle_until_s']:g}"
-    windows = []
-    after = f"Straight on, t ≥ {until} s" if summary["circle_until_s"] > 0 else "The whole flight"
-    for window, name in (("before", f"On the circle, t < {until} s"), ("after", after)):
-        columns = summary["table2"][window]
-        if all(columns[key]["max"] is None for key in _TABLE_2_COLUMNS):
-            continue
-        rows = [
-            {
-                "name": label,
-                "cells": [_cell(columns[key][statistic], TABLE_2[window][key]) for key in _TABLE_2_COLUMNS],
-                "kind": "main" if statistic == "max" else "",
-            }
-            for statistic, label in _STATISTICS.items()
-        ]
-        paper = [_cell(TABLE_2[window][key]) for key in _TABLE_2_COLUMNS]
-        windows.append(
-            {"name": name, "rows": [*rows, {"name": "the paper’s maximum", "cells": paper, "kind": "paper"}]}
-        )
-    return windows
-
-
-_TABLE_2_COLUMNS = ("translation_x_m", "translation_y_m", "yaw_deg", "pitch_deg", "roll_deg", "distance_m")
-_TABLE_2_NAMES = ("x, m", "y, m", "yaw, °", "pitch, °", "roll, °", "distance, m")
-_TABLE_3_NAMES = ("obj1 time, s", "obj1 error", "obj1 bias", "obj2 time, s", "obj2 error", "obj2 bias")
 _STATISTICS = {"mean": "mean", "median": "median", "p95": "95th percentile", "max": "maximum"}
 
 
-def _table3(table: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _table2(summary: Summary) -> Rows:
+    """Ours beside the paper's maxima; only the windows in which something was estimated."""
+    until = f"{summary['circle_until_s']:g}"
+    after = f"Straight on, t ≥ {until} s" if summary["circle_until_s"] > 0 else "The whole flight"
+    windows = []
+    for window, name in (("before", f"On the circle, t < {until} s"), ("after", after)):
+        ours, paper = summary["table2"][window], TABLE_2[window]
+        if all(ours[key]["max"] is None for key in paper):
+            continue
+        rows: Rows = [
+            _row(
+                label, [_cell(ours[key][statistic], most) for key, most in paper.items()], "main" * (label == "maximum")
+            )
+            for statistic, label in _STATISTICS.items()
+        ]
+        rows.append(_row("the paper’s maximum", [_cell(most) for most in paper.values()], "paper"))
+        windows.append({"name": name, "rows": rows})
+    return windows
+
+
+def _table3(table: Mapping[str, Any]) -> Rows:
     """Both ways of steering, ours and the paper's; only the flights that went on long enough to converge."""
-    rows: list[dict[str, Any]] = []
+    rows: Rows = []
+    kinds = [(total, kind) for total in ("obj1", "obj2") for kind in ("time_s", "error", "shape_bias")]
     for flight, name in (("truth", "With exact states"), ("vision", "By sight")):
         ours, paper = table[flight], TABLE_3[flight]
-        if ours["obj1"]["error"] is None:
-            continue
-        kinds = [(total, statistic) for total in ("obj1", "obj2") for statistic in ("time_s", "error", "shape_bias")]
-        rows.append(
-            {
-                "name": name,
-                "cells": [_convergence_cell(kind, ours[total][kind], paper[total].get(kind)) for total, kind in kinds],
-                "kind": "main",
-            }
-        )
-        rows.append(
-            {
-                "name": "the paper’s",
-                "cells": [_convergence_cell(kind, paper[total].get(kind)) for total, kind in kinds],
-                "kind": "paper",
-            }
-        )
+        if ours["obj1"]["error"] is not None:
+            cells = [_cell(ours[total][kind], paper[total].get(kind), kind) for total, kind in kinds]
+            rows.append(_row(name, cells, "main"))
+            rows.append(
+                _row("the paper’s", [_cell(paper[total].get(kind), None, kind) for total, kind in kinds], "paper")
+            )
     return rows
 
 
-def _convergence_cell(kind: str, value: float | None, paper: float | None = None) -> dict[str, Any]:
-    if kind != "time_s":
-        return _cell(value, paper)
-    return {**_cell(value, paper), "text": "never" if value is None else f"{value:.1f}"}
+def _row(name: str, cells: Rows, kind: str) -> dict[str, Any]:
+    return {"name": name, "cells": cells, "kind": kind}
 
 
-def _cell(value: float | None, paper: float | None = None) -> dict[str, Any]:
+def _cell(value: float | None, paper: float | None = None, kind: str = "error") -> dict[str, Any]:
     # The paper prints four digits, so ours is rounded to four before it is measured against them.
     met = value is not None and paper is not None and round(value, 4) <= paper
+    if kind == "time_s":
+        return {"text": "never" if value is None else f"{value:.1f}", "met": met}
     return {"text": _number(value, 4), "met": met}
 
 
@@ -299,101 +216,28 @@ def _knows_neighbours(summary: Summary) -> bool:
     return summary["perception"] != EXACT_STATES and summary["drones"] > 1 and bool(summary["has_truth"])
 
 
-def _rows(values: Mapping[str, Any], names: Sequence[tuple[str, str, int]]) -> list[dict[str, str]]:
-    return [{"name": name, "value": _number(values[key], digits)} for key, name, digits in names]
+_FLOCK = {
+    "min_distance_m": ("smallest distance in 3D, m", 3),
+    "min_distance_after_10s_m": ("smallest distance in 3D after 10 s, m", 3),
+    "order_tail": ("order, last 10 s", 4),
+    "union_tail": ("union, last 10 s", 4),
+    "connectivity_tail": ("connectivity, last 10 s", 4),
+    "safety": ("safety", 4),
+}
+_NEIGHBOURS = {
+    "recall_within_10m": ("share known of those within 10 m", 4),
+    "false_per_drone_minute": ("false neighbours per drone and minute", 3),
+}
+"""By their key in the summary: name and digits."""
 
 
-def _flock(flock: Mapping[str, Any]) -> list[dict[str, str]]:
-    return _rows(
-        flock,
-        (
-            ("min_distance_m", "smallest distance in 3D, m", 3),
-            ("min_distance_after_10s_m", "smallest distance in 3D after 10 s, m", 3),
-            ("order_tail", "order, last 10 s", 4),
-            ("union_tail", "union, last 10 s", 4),
-            ("connectivity_tail", "connectivity, last 10 s", 4),
-            ("safety", "safety", 4),
-        ),
-    )
+def _rows(values: Mapping[str, Any], names: Mapping[str, tuple[str, int]]) -> Rows:
+    return [{"name": name, "value": _number(values[key], digits)} for key, (name, digits) in names.items()]
 
 
-def _neighbours(neighbours: Mapping[str, Any]) -> list[dict[str, str]]:
-    return _rows(
-        neighbours,
-        (
-            ("recall_within_10m", "share known of those within 10 m", 4),
-            ("false_per_drone_minute", "false neighbours per drone and minute", 3),
-        ),
-    )
-
-
-def _stages(stages: Mapping[str, Mapping[str, float]]) -> list[dict[str, Any]]:
-    longest = max((stage["p95"] for stage in stages.values()), default=0.0)
+def _stages(stages: Mapping[str, Mapping[str, float]]) -> Rows:
+    longest = max((stage["p95"] for stage in stages.values()), default=0.0) or 1.0
     return [
-        {
-            "name": name.replace("_", " "),
-            "p50": _number(stage["p50"], 1),
-            "p95": _number(stage["p95"], 1),
-            "share": f"{100 * stage['p95'] / longest if longest > 0 else 0:.1f}",
-        }
+        {"name": name.replace("_", " "), "p50": stage["p50"], "p95": stage["p95"], "share": stage["p95"] / longest}
         for name, stage in stages.items()
     ]
-
-
-def _definitions(summary: Summary) -> list[tuple[str, str]]:
-    drones, distance_m = summary["drones"], summary["desired_distance_m"]
-    of_flock = ""
-    if drones == _PAPERS_DRONES and distance_m == _PAPERS_DISTANCE_M:
-        of_flock = " Five drones cannot all be 3.5 m apart: their sum settles at 15.27, not 0."
-    elif drones > _MOST_EQUIDISTANT:
-        of_flock = f" {drones} drones cannot all be {distance_m:g} m apart in a plane: their sum does not settle at 0."
-    return [(term, meaning.format(obj2_of_flock=of_flock)) for term, meaning in _DEFINITIONS]
-
-
-_PAPERS_DISTANCE_M = 3.5
-_MOST_EQUIDISTANT = 3
-"""Points in a plane that can all be equally far from each other."""
-
-_DEFINITIONS = (
-    (
-        "x, y, yaw, pitch, roll",
-        "Error of a drone’s own motion over one step, R_FC and T_FC with P_C = R_FC P_F + T_FC, in the body axes at "
-        "the start of the step.",
-    ),
-    ("distance", "Error of the horizontal distance to a tracked neighbour."),
-    (
-        "obj1",
-        "Eq. 44: before the circle ends −V·e / (2 |e|²), which is −0.5 at the desired velocity e; then the L1 distance "
-        "from it.",
-    ),
-    (
-        "obj2",
-        "Eq. 45: over all others within the observation distance, how far the distance is from the desired one plus "
-        "the L1 difference in velocity.{obj2_of_flock}",
-    ),
-    (
-        "convergence",
-        "The tail is the last 10 s. Time: the first from which the sum stays within 0.05 (obj1) or 0.2 (obj2) of its "
-        "tail mean. Error: the mean absolute deviation from the tail mean over the tail. Bias: the tail mean less that "
-        "of the flight with exact states.",
-    ),
-    ("closest", "Distances are between the drones’ middles, in three dimensions."),
-    (
-        "order",
-        "Mean cosine between the velocities of all pairs over the last 10 s: 1 is all flying one way. A flock that "
-        "hovers, slower than 0.1 m/s on the mean, has none.",
-    ),
-    ("union", "(N − groups) / (N − 1) over the last 10 s, linked within the observation distance: 1 is one flock."),
-    (
-        "connectivity",
-        "Second eigenvalue of the same graph’s Laplacian over N: 1 where all are linked to all.",
-    ),
-    ("safety", "1 less the share of pairs closer than 1 m, twice a collision radius of 0.5 m, over all steps."),
-    ("separation", "Below D_II two drones push each other away (Eq. 41)."),
-    (
-        "neighbours known",
-        "Of the true drones within 10 m, at all steps, the share of which there was a confirmed track.",
-    ),
-    ("false neighbours", "New confirmed tracks that belong to no drone."),
-    ("speed", "Flight time over computing time for the whole simulated flock."),
-)

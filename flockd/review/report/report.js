@@ -71,7 +71,7 @@ for (const player of document.querySelectorAll(".player")) {
       const aside = [0, -1, 1, -2, 2, -3, 3].map((n) => n * line).find((shift) => isFree(i, left, v + shift)) ?? 0;
       taken.push([left, v + aside]);
       pen.textAlign = isLeft ? "right" : "left";
-      pen.fillText(`${flight.names[i]}, ${places[i][2].toFixed(1)} m`, u + (isLeft ? -11 : 11), v + aside);
+      pen.fillText(`${i + 1}, ${places[i][2].toFixed(1)} m`, u + (isLeft ? -11 : 11), v + aside);
     }
   };
 

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from markupsafe import Markup
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
@@ -22,7 +21,7 @@ from flockd.review.flight_log.key_frames import KeyFrame, load_key_frames, save_
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FlightMetadata, MissionMetadata
 from flockd.review.report.curves import error_curves, flight_curves
-from flockd.review.report.filmstrip import filmstrip_figure
+from flockd.review.report.filmstrip import filmstrip
 from flockd.review.report.obstacle_figures import obstacle_figure
 from flockd.review.report.page import write_report
 from flockd.review.report.summary import summarise, write_summary
@@ -128,12 +127,12 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("flockd.review.report.page._embed", lambda *_, **__: Markup("<svg></svg>"))
 
 
-def _report(folder: Path, log: FlightLog, *moments: KeyFrame, processes: int = 1) -> str:
+def _report(folder: Path, log: FlightLog, *moments: KeyFrame) -> str:
     log.save(folder / "flight.npz")
     write_summary(summarise(log), folder / "summary.json")
     if moments:
         save_key_frames(folder / "filmstrip.npz", moments)
-    page = write_report(folder, processes=processes)
+    page = write_report(folder)
     assert page == folder / "report.html"
     return page.read_text(encoding="utf-8")
 
@@ -288,15 +287,6 @@ def test_figures_are_also_files(five: Path) -> None:
         picture = cv2.imread(str(five / "figures" / name))
         assert picture is not None
         assert picture.std() > 5, f"{name} is empty"
-
-
-def test_the_same_flight_gives_the_same_page_in_however_many_processes(five: Path, tmp_path: Path) -> None:
-    again = _report(tmp_path, _flight(), _moment(), _moment(time_s=50.0), processes=2)
-    assert again == (five / "report.html").read_text(encoding="utf-8")
-    files = sorted((five / "figures").iterdir())
-    assert len(files) == 5
-    for file in files:
-        assert (tmp_path / "figures" / file.name).read_bytes() == file.read_bytes(), file.name
 
 
 def test_a_flight_with_exact_states_says_what_it_lacks(tmp_path: Path) -> None:
@@ -487,31 +477,40 @@ def test_a_filmstrip_survives_its_file(tmp_path: Path) -> None:
     assert np.abs(colour).mean() < 3.0
 
 
-def test_a_moment_shows_its_cameras_in_rig_order_with_named_drones() -> None:
-    figure = filmstrip_figure(_moment())
-    names = [text.get_text() for axes in figure.axes for text in axes.texts]
+@pytest.fixture
+def written(monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, float, str]]:
+    """What a plate says: left and base in pixels of the part it is written on, and the text."""
+    kept: list[tuple[float, float, str]] = []
+    monkeypatch.setattr(
+        "flockd.review.report.filmstrip.write", lambda _, left, base, text, *__: kept.append((left, base, text))
+    )
+    return kept
+
+
+def test_a_moment_shows_its_cameras_in_rig_order_with_named_drones(written: list[tuple[float, float, str]]) -> None:
+    filmstrip(_moment())
+    names = [text for *_, text in written]
     assert [name for name in names if name in {"left", "back"}] == ["left", "back"]
     assert names.count("#4  3.21 m") == 2
 
 
 def test_an_arrow_ends_at_the_border_of_its_image() -> None:
-    """At the left border of each image everything moves 100 px to the left, which is drawn 6 px long."""
-    moment = _moment()
+    """At the left border of each image everything moves 100 px to the left."""
     flow = np.ones((96, 64, 2), np.float32)
     flow[:, :4] = -100.0, 0.0
-    canvas = FigureCanvasAgg(filmstrip_figure(KeyFrame(**{**vars(moment), "flow": {"left": flow, "back": flow}})))
-    canvas.draw()  # type: ignore[no-untyped-call]
-    drawn = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
-    plate = drawn[-700:, :, :3]  # 160 pixels an inch: within the row of the flow
-    assert np.ptp(plate[:, 49:560].astype(int)) > 100
-    for beside in (plate[:, 40:47], plate[:, 561:567]):
+    drawn = filmstrip(replace(_moment(), flow={"left": flow, "back": flow}))
+    plate = drawn[-700:]  # within the row of the flow
+    assert np.ptp(plate[:, 48:560].astype(int)) > 100
+    for beside in (plate[:, 40:48], plate[:, 560:568]):
         assert np.array_equal(np.unique(beside.reshape(-1, 3), axis=0), [(0x14, 0x18, 0x1F)])
 
 
 def test_a_camera_may_lack_a_map() -> None:
     moment = _moment()
     bare = KeyFrame(**{**vars(moment), "flow": {}, "depth": {"left": moment.depth["left"]}, "labels": {}})
-    assert filmstrip_figure(bare).axes
+    plate = filmstrip(bare)
+    assert plate.shape == filmstrip(moment).shape
+    assert len(np.unique(plate[-700:, 48:560].reshape(-1, 3), axis=0)) == 1, "no flow is drawn"
 
 
 def test_maps_of_another_size_are_refused() -> None:
@@ -520,15 +519,11 @@ def test_maps_of_another_size_are_refused() -> None:
         KeyFrame(**{**vars(moment), "depth": {"left": moment.depth["left"][::2, ::2]}})
 
 
-def test_names_of_close_drones_do_not_cover_each_other() -> None:
+def test_names_of_close_drones_do_not_cover_each_other(written: list[tuple[float, float, str]]) -> None:
     moment = _moment()
     labels = np.zeros((96, 64), np.uint8)
     labels[50:56, 20:28], labels[50:56, 32:40] = 1, 2
-    figure = filmstrip_figure(
-        KeyFrame(**{**vars(moment), "labels": {"left": labels}, "ranges": {1: 3.0, 2: 3.1}, "track_ids": {2: 4}})
-    )
-    figure.canvas.draw()
-    names = [text for axes in figure.axes for text in axes.texts if text.get_text().startswith(("#", "new"))]
-    assert sorted(name.get_text() for name in names) == ["#4  3.10 m", "new  3.00 m"]
-    one, other = (name.get_window_extent() for name in names)
-    assert not one.overlaps(other)
+    filmstrip(replace(moment, labels={"left": labels}, ranges={1: 3.0, 2: 3.1}, track_ids={2: 4}))
+    (_, one, first), (_, other, second) = [name for name in written if name[2].startswith(("#", "new"))]
+    assert (first, second) == ("new  3.00 m", "#4  3.10 m")
+    assert abs(one - other) >= 18, "a line apart"

@@ -289,7 +289,7 @@ def test_without_truth_nothing_is_made_up(alone: Path, capsys: Capture) -> None:
         "begun 20",
         "The recording holds no truth, so all of this is the drone’s own estimate.",
         "The recording holds no truth, so the true path is not known.",
-        "The recording holds no truth, so the paper&#8217;s deviations and their convergence are not known",
+        "The recording holds no truth, so the paper’s deviations and their convergence are not known",
         "The recording holds no truth to compare the estimates with.",
         "The recording holds no truth of the flock.",
         "The recording holds no truth of the neighbours.",
