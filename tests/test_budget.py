@@ -20,24 +20,24 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 4_340,
-    "flockd/flight": 14_800,
+    "flockd/core": 4_300,
+    "flockd/flight": 14_740,
     "flockd/onboard": 11_630,
     "flockd/fleet": 2_690,
-    "flockd/ground": 6_620,
-    "flockd/review": 4_570,
-    "flockd/sim": 12_180,
-    "flockd/campaign": 2_280,
-    "flockd/cli": 5_100,
-    "tests": 46_020,
-    "tools/checks": 7_260,
+    "flockd/ground": 6_000,
+    "flockd/review": 4_290,
+    "flockd/sim": 11_570,
+    "flockd/campaign": 2_220,
+    "flockd/cli": 5_020,
+    "tests": 48_510,
+    "tools/checks": 3_840,
     "tools/docs": 950,
     "tools/measure": 1_020,
-    "tools/release": 900,
+    "tools/release": 620,
     "tools/training": 4_860,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 507}
+FILES = {"flockd": 499}
 NUMBERS_OF_FLIGHT = 529
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
