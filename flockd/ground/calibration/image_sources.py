@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from flockd.core.config import DroneConfig
 from flockd.core.errors import UnavailableError, UsageError
-from flockd.core.messages import UInt8Array, VehicleState
+from flockd.core.messages import UInt8Array
 from flockd.ground.calibration.errors import CalibrationError
 from flockd.ground.datasets.image_files import SUFFIXES, read_image
 from flockd.ground.datasets.video import images_of_video, opened_video
@@ -31,9 +31,6 @@ class ImageSet:
     name: str
     images: Mapping[str, UInt8Array]
     """(h, w, 3) RGB by camera."""
-    times_s: Mapping[str, float] = field(default_factory=dict)
-    """Time of each camera's frame, where it is known."""
-    vehicle: VehicleState | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,8 +90,6 @@ def from_recording(recording: Recording, every: int) -> tuple[ImageStream, Drone
         ImageSet(
             f"{step.frames.time_s - recording.start_s:.2f} s",
             {name: frame.image for name, frame in step.frames.frames.items()},
-            {name: frame.time_s for name, frame in step.frames.frames.items()},
-            step.vehicle,
         )
         for step in recording.steps()
         if step.number % every == 0
@@ -170,8 +165,7 @@ def _frames(source: FrameSource, seconds: float, enough: Callable[[], bool]) -> 
             frames = source.newest(FRAME_WAIT_S)
             if frames is not None:
                 seen = True
-                stamps = {name: frame.time_s for name, frame in frames.frames.items()}
-                yield ImageSet(f"{since_s:.1f} s", {name: one.image for name, one in frames.frames.items()}, stamps)
+                yield ImageSet(f"{since_s:.1f} s", {name: one.image for name, one in frames.frames.items()})
             elif not seen and since_s > FIRST_FRAME_S:
                 break
         if not seen:
