@@ -106,6 +106,8 @@ class FakeAutopilot:
         """False: its position and velocity do not come any more, and all else does."""
         self.frame_off, self.heading_off_rad = np.zeros(3), 0.0
         """By what its positions (3,) in NED and its heading are off the truth, in metres and clockwise."""
+        self.drifts = True
+        """False: its estimate is the truth."""
         self._drift = Drift(system_id)
         self.failing: set[str] = set()
         """PX4's names of further checks that fail; each refuses to arm."""
@@ -362,7 +364,8 @@ class FakeAutopilot:
         self._update_mode()
         if not self._armed:
             return
-        self._drift.step(interval_s)
+        if self.drifts:
+            self._drift.step(interval_s)
         demand = self._demand()
         self._state = self._motion(replace(demand, velocity=demand.velocity - self._drift.velocity), interval_s)
         height_m = -float(self._state.position[2])

@@ -60,7 +60,7 @@ async def test_telemetry_is_what_the_vehicle_does(port: int, address: str) -> No
         return truth
 
     with FakeAutopilot(port, height_m=7.5, motion=still, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
-        fake_autopilot.battery_share = 0.42
+        fake_autopilot.battery_share, fake_autopilot.drifts = 0.42, False
         link = await AutopilotLink.connect(_parameters(address), clock=clock)
         await until(lambda: link.vehicle_state() is not None and link.status().battery_share is not None)
         await until(lambda: None not in {link.status().estimate_ok, link.status().gps_ok} and link.status().in_air)

@@ -12,8 +12,8 @@ from tools.release.wheels import names_of_lock
 
 BAGS = ("rosbags", "ruamel-yaml")
 """What the extra `bags` brings, with what says its licence; apsw's LICENSE file alone says Zlib's terms."""
-ROS = {"ros-fastdds", "ros-fastcdr"}
-"""Apache-2.0, by their LICENSE files."""
+ROS = {"ros-fastdds", "ros-fastcdr", "ros-wheels-bootstrapper"}
+"""Apache-2.0, by the LICENSE files of the first two and the metadata of the last, which has no package.xml."""
 SAID = {"Apache License, Version 2.0", "Apache 2.0", "BSD", "BSD-3-Clause", "3-Clause BSD License"}
 """As the package.xml of ROS have it."""
 
