@@ -41,6 +41,7 @@ async def test_a_pilot_is_stopped_before_what_flockd_sees_and_where_it_has_not_l
         FakeAutopilot(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, truth_port=truth, clock=clock) as autopilot,
         GroundStation([truth], clock) as station,
     ):
+        autopilot.drifts = False
         async with aboard(autopilot, port, tmp_path, change=telling) as ship:
             await until(lambda: autopilot.collision_prevention.without_data_s(clock()) < 1.0, SECONDS_TO_FAIL)
             autopilot.parameters["CP_DIST"] = NEAR_M

@@ -86,6 +86,7 @@ async def test_eyes_that_lie_about_the_own_motion_add_half_a_metre_a_second_at_m
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
     """They see a standstill, whatever is flown: the trim is at its limit, and no farther."""
+    fake_autopilot.drifts = False
     async with aboard(fake_autopilot, port, tmp_path, own_velocity="vision") as ship:
         await ship.is_ready_in_the_air()
         await until(lambda: len(fake_autopilot.setpoints) > 5, SECONDS_TO_FAIL)
