@@ -62,14 +62,13 @@ def test_gusts_beyond_the_limit_end_in_hold_with_the_reason_and_nothing_touches(
     assert loop.slowed.by_cause["wind"] > 0.1
 
 
-def test_a_drone_whose_setpoints_have_no_effect_is_slowed_and_held_where_it_is_far_off() -> None:
+def test_a_drone_whose_setpoints_have_no_effect_is_held_where_it_is_far_off() -> None:
     """Each drone stands. One is asked for 1 m/s, which is 0.8 m/s off after ten seconds; the others for less."""
     scenario = _scenario(duration_s=20.0)
     still = [start.model_copy(update={"velocity_m_s": (0.0, 0.0)}) for start in scenario.vehicles]
     loop, places = _flown(scenario, _Deaf(still, scenario.vehicle))
     assert loop.handed_over
     assert max(held.time_s for held in loop.handed_over.values()) < 15.0
-    assert loop.slowed.by_cause["wind"] > 0.0
     np.testing.assert_allclose(places, np.broadcast_to(places[0], places.shape))
 
 
