@@ -54,7 +54,7 @@ _RIG = {
         for name, yaw in (("front", 0.0), ("back", 180.0))
     ]
 }
-_JUMPED = "local frame jumped"
+_JUMPED = "has jumped"
 _CIRCLE = {"kind": "circle_then_tangent", "speed_m_s": 1.0, "radius_m": 10.0, "circle_until_s": 600.0}
 _CORNERS = [{"north_m": 10.0, "east_m": 0.0}, {"north_m": 10.0, "east_m": 10.0}, {"north_m": 0.0, "east_m": 10.0}]
 
