@@ -107,7 +107,7 @@ class FakeAutopilot:
         self.frame_off, self.heading_off_rad = np.zeros(3), 0.0
         """By what its positions (3,) in NED and its heading are off the truth, in metres and clockwise."""
         self.drifts, self._drift = True, Drift(system_id)
-        """``drifts``, False: its estimate is the truth."""
+        # `drifts`, False: its estimate is the truth.
         self.failing: set[str] = set()
         """PX4's names of further checks that fail; each refuses to arm."""
         self.wordless = False
