@@ -82,7 +82,8 @@ def test_two_daemons_fly_from_rendered_frames_and_the_report_is_the_simulators(
     log = FlightLog.load(out / "flight.npz")
     assert len(log.time_s) == summary["fleet"]["frame_sets"] >= 4
     np.testing.assert_allclose(log.position[0, :, 2], -1.5, atol=0.2)  # MIS_TAKEOFF_ALT
-    np.testing.assert_allclose(log.position[0, 1, :2] - log.position[0, 0, :2], [0.0, 6.0], atol=0.1)
+    # Each holds its place on an estimate that wanders by 0.15 m (standard deviation).
+    np.testing.assert_allclose(log.position[0, 1, :2] - log.position[0, 0, :2], [0.0, 6.0], atol=0.6)
     np.testing.assert_allclose(log.velocity[-1, :, :2], [[1.0, 0.0]] * 2, atol=0.4)  # Eq. 43, slowed by late steps
     assert log.recorded.any(axis=0).all()
     assert {path.name for path in (out / "logs").iterdir()} == {
