@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import pytest
 
-from flockd.sim.world import World
+from flockd.sim.world.world import World
 
 generate_anew = World.generate
 KEPT = 3
@@ -17,7 +17,7 @@ KEPT = 3
 
 @pytest.fixture(scope="session", autouse=True)
 def worlds_once() -> Iterator[None]:
-    """The same arguments give the same world, which nothing changes: see `tests/sim/test_renderer.py`."""
+    """The same arguments give the same world, which nothing changes: see `tests/sim/renderer/test_renderer.py`."""
 
     @lru_cache(KEPT)
     def generated(arguments: bytes) -> World:

@@ -22,7 +22,7 @@ from flockd.core.config.perception import PerceptionConfig
 from flockd.core.errors import FlockdError
 from flockd.flight.inference.hashes import model_hashes
 from flockd.sim.control_level import fly_flocks
-from flockd.sim.swarm import fly
+from flockd.sim.flock.swarm import fly
 
 Fly = Callable[[Sequence[ScenarioConfig], Sequence[Figure], ControlLevel], Sequence[Figures]]
 """Flies scenarios of one cell that differ in what follows from their seeds, and gives the wanted figures of each."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from flockd.core.config import ScenarioConfig
 from flockd.core.config.campaign import DRONES
-from flockd.sim.start import scattered, with_drones
+from flockd.sim.flock.start import scattered, with_drones
 
 Values = dict[str, Any]
 

@@ -150,7 +150,7 @@ def _rerun(args: argparse.Namespace) -> int:
     from flockd.cli.flight_summary import report_flight
     from flockd.core.config.scenario import MAX_DRONES
     from flockd.review.report.flight_folder import prepare_folder
-    from flockd.sim.swarm import fly
+    from flockd.sim.flock.swarm import fly
 
     folder, name = args.flight.parent, args.flight.name
     plan = load_plan(folder)

@@ -12,7 +12,7 @@ from flockd.cli.output import Phases, say, say_json, say_table
 from flockd.core.errors import ExitCode
 
 if TYPE_CHECKING:
-    from flockd.sim.swarm import Flight
+    from flockd.sim.flock.swarm import Flight
 
 
 def report_flight(directory: Path, flight: Flight, args: argparse.Namespace) -> int:

@@ -205,14 +205,14 @@ def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespac
             complain(line)
     if args.autopilot is not None:
         return sim_fleet.fly(args, scenario, directory)
-    from flockd.sim.swarm import fly
+    from flockd.sim.flock.swarm import fly
 
     with ExitStack() as stack:
         shown = None
         if args.telemetry:
             from flockd.onboard.telemetry.publisher import ZenohTelemetry
-            from flockd.sim.repeater import Repeater
-            from flockd.sim.shown_flock import ShownFlock
+            from flockd.sim.flock.repeater import Repeater
+            from flockd.sim.flock.shown_flock import ShownFlock
 
             endpoint = args.telemetry_at or ENDPOINT
             zenoh = stack.enter_context(ZenohTelemetry(_plain(scenario.scenario), listen=[endpoint]))
@@ -294,7 +294,7 @@ def _scenario(args: argparse.Namespace) -> ScenarioConfig:
     """The scenario with the options over it."""
     from flockd.core.config import load_scenario
     from flockd.core.data import data_path
-    from flockd.sim.start import with_drones
+    from flockd.sim.flock.start import with_drones
 
     overrides: Overrides = {
         key: getattr(args, option) for option, key in OPTIONS.items() if getattr(args, option) is not None

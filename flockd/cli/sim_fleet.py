@@ -47,7 +47,7 @@ def fly(args: argparse.Namespace, scenario: ScenarioConfig, directory: Path) -> 
     from flockd.core.config import load_drone
     from flockd.core.data import data_path
     from flockd.review.report.flight_folder import FLEET_LOGS, RECORDINGS
-    from flockd.sim.fleet import fly_fleet
+    from flockd.sim.sitl.fleet import fly_fleet
 
     with ExitStack() as stack:
         stack.enter_context(_ended_in_order())

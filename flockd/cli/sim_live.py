@@ -57,10 +57,10 @@ def fly(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) -> int:
     from flockd.fleet.simulation import SimulationLink, key_of
     from flockd.fleet.watcher import FleetWatcher
     from flockd.onboard.telemetry.publisher import ZenohTelemetry
-    from flockd.sim.live_controls import LiveControls, answered
-    from flockd.sim.live_flight import fly_live
-    from flockd.sim.repeater import Repeater
-    from flockd.sim.shown_flock import ShownFlock
+    from flockd.sim.flock.live_controls import LiveControls, answered
+    from flockd.sim.flock.live_flight import fly_live
+    from flockd.sim.flock.repeater import Repeater
+    from flockd.sim.flock.shown_flock import ShownFlock
 
     endpoint = args.telemetry_at or ENDPOINT
     with suppress(KeyboardInterrupt), ExitStack() as stack:

@@ -402,7 +402,7 @@ def test_an_interrupted_flight_leaves_its_report_and_can_be_flown_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from flockd.review.flight_log.log import FlightLog
-    from flockd.sim.vehicles import Vehicles
+    from flockd.sim.vehicles.vehicles import Vehicles
 
     step, steps = Vehicles.step, iter(range(1000))
 
@@ -443,7 +443,7 @@ def test_wind_speed_and_radius_are_what_is_flown(capsys: pytest.CaptureFixture[s
 
 def test_two_flights_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from flockd.core.config import load_scenario
-    from flockd.sim.swarm import fly
+    from flockd.sim.flock.swarm import fly
 
     for name, seed in (("a", 0), ("b", 1)):
         (tmp_path / name).mkdir()

@@ -20,7 +20,7 @@ from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.reader import Recording
 from flockd.review.flight_log.from_recordings import flight_log, recordings_in
 from flockd.review.flight_log.log import FlightLog
-from flockd.sim.start import with_drones
+from flockd.sim.flock.start import with_drones
 from tests.onboard.recording.made_up import MODELS, MadeUpPilot, drone_config, record
 from tests.worlds import worlds_once
 
@@ -232,7 +232,7 @@ class Flight(NamedTuple):
 @pytest.fixture(scope="module", params=["dis", "flow"])
 def flight(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Flight:
     from flockd.flight.inference.hashes import model_hashes
-    from flockd.sim.swarm import fly
+    from flockd.sim.flock.swarm import fly
 
     flown, folder = scenario({"drone.perception.flow": request.param}), tmp_path_factory.mktemp("flight")
     models = model_hashes(flown.drone.perception)

@@ -18,7 +18,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.errors import UnavailableError
 from flockd.fleet.watcher import FleetWatcher
 from flockd.review.flight_log.log import FlightLog
-from flockd.sim.free_ports import free_endpoint
+from flockd.sim.sitl.free_ports import free_endpoint
 
 ROOT = Path(__file__).parents[2]
 RUN = "from flockd.cli import program; program()"
@@ -33,7 +33,7 @@ def test_the_daemons_of_a_simulation_connect_where_they_are_told(
         connected.append(sitl.telemetry.connect)
         raise UnavailableError("no autopilot for this test; end here")
 
-    monkeypatch.setattr("flockd.sim.fleet.fly_fleet", fly_fleet)
+    monkeypatch.setattr("flockd.sim.sitl.fleet.fly_fleet", fly_fleet)
     flight = ["sim", "--autopilot", "standin", "--drones", "2", "--out"]
     assert main([*flight, str(tmp_path / "one")]) == 69
     assert main([*flight, str(tmp_path / "two"), "--telemetry-at", "tcp/127.0.0.1:7999"]) == 69

@@ -383,7 +383,7 @@ CATALOGUE = (
         "its daemons and autopilots end with it",
         (
             f"{_HERE}simulator.py::test_the_simulator_is_killed_in_flight",
-            "tests/sim/test_orphans.py",
+            "tests/sim/sitl/test_orphans.py",
         ),
         within_s=5.0,
     ),
@@ -446,7 +446,7 @@ CATALOGUE = (
         48, "head-on", "two drones meet head-on", "at least 1.0 m apart at every instant",
         (
             f"{_HERE}encounters.py::test_two_drones_that_meet_head_on_stay_apart[2.0]",
-            "tests/sim/test_encounters.py",
+            "tests/sim/flock/test_encounters.py",
         ),
     ),
     Fault(
@@ -657,7 +657,7 @@ CATALOGUE = (
         75, "mate-stops", "a mate hovers, lands or is taken over, at any place of the formation",
         "every neighbour may brake: 1 m is kept at every instant",
         (
-            "tests/sim/test_mates.py::test_whichever_of_five_stops_its_mates_keep_a_metre_apart",
+            "tests/sim/flock/test_mates.py::test_whichever_of_five_stops_its_mates_keep_a_metre_apart",
             "tests/flight/safety/test_surroundings.py::test_one_that_goes_may_have_braked_since_it_was_seen_last",
         ),
     ),

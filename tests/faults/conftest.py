@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from flockd.sim.free_ports import free_port
+from flockd.sim.sitl.free_ports import free_port
 from tests import calm
 from tests.coroutine_tests import run_coroutine_test
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M

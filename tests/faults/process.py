@@ -18,9 +18,9 @@ from flockd.core.config import DroneConfig
 from flockd.core.messages import UInt8Array
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
-from flockd.sim.daemons import Daemons
-from flockd.sim.free_ports import free_endpoint, free_port
-from flockd.sim.processes import Program
+from flockd.sim.sitl.daemons import Daemons
+from flockd.sim.sitl.free_ports import free_endpoint, free_port
+from flockd.sim.sitl.processes import Program
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import CAMERAS, HEIGHT, WIDTH, Cameras, Watched, config_for, watched

@@ -17,7 +17,7 @@ import yaml
 from flockd.core.config import DroneConfig
 from flockd.onboard.daemon import DaemonError
 from flockd.onboard.daemon.host_monitors import WallClock
-from flockd.sim.free_ports import free_endpoint, free_port
+from flockd.sim.sitl.free_ports import free_endpoint, free_port
 from tests.calm import SPEED_FACTOR, clock
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.conftest import InTheAir

@@ -22,9 +22,9 @@ from flockd.core.config.scenario import StartConfig, VehicleConfig
 from flockd.core.data import data_path
 from flockd.core.messages import FloatArray
 from flockd.review.flight_log.metadata import FleetMetadata
-from flockd.sim import autopilots, fleet
-from flockd.sim.ground_station import GroundStation, Poses
-from flockd.sim.vehicles import Vehicles
+from flockd.sim.sitl import autopilots, fleet
+from flockd.sim.sitl.ground_station import GroundStation, Poses
+from flockd.sim.vehicles.vehicles import Vehicles
 from tests.faults.catalogue import RecordProperty
 
 pytestmark = pytest.mark.slow

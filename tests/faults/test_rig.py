@@ -26,9 +26,9 @@ from flockd.ground.doctor.rig_checks import check_rig
 from flockd.onboard.daemon.pilot_loop import RigReports
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.reader import Recording
-from flockd.sim import camera_simulator
-from flockd.sim.swarm import fly
-from flockd.sim.true_rigs import true_rigs
+from flockd.sim.cameras import camera_simulator
+from flockd.sim.cameras.true_rigs import true_rigs
+from flockd.sim.flock.swarm import fly
 from tests.faults.catalogue import RecordProperty, reacted
 
 pytestmark = pytest.mark.slow

@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from flockd.core.data import data_path
-from flockd.sim.free_ports import free_endpoint, free_port
+from flockd.sim.sitl.free_ports import free_endpoint, free_port
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import flying
 from tests.onboard.autopilot.flight import until

@@ -24,7 +24,7 @@ from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.daemon.operator_commands import OperatorCommands, OperatorRequests
 from flockd.onboard.telemetry.schema import fault
 from flockd.onboard.telemetry.topics import TOPICS
-from flockd.sim.live_controls import LiveControls
+from flockd.sim.flock.live_controls import LiveControls
 from tests.hostile import ABSURD_TEXTS, absurd, assert_readable, hostile, mutated_bytes, mutated_json, nested
 
 COMMANDS = ("hold", "land", "goto", "velocity", "resume", "HOLD", "hold ", "hold/land", "__init__")

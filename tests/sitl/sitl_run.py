@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from typing import Self
 
 from flockd.core.errors import UnavailableError
-from flockd.sim.autopilots import px4_folder
+from flockd.sim.sitl.autopilots import px4_folder
 
 
 class SitlRun(ABC):

@@ -30,11 +30,11 @@ from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.onboard.sources import clock_at
-from flockd.sim.autopilots import BY_HAND, Autopilots, Px4s, SimulatedAutopilots
-from flockd.sim.free_ports import free_port
-from flockd.sim.ground_station import GroundStation
-from flockd.sim.processes import Program
-from flockd.sim.start import with_drones
+from flockd.sim.flock.start import with_drones
+from flockd.sim.sitl.autopilots import BY_HAND, Autopilots, Px4s, SimulatedAutopilots
+from flockd.sim.sitl.free_ports import free_port
+from flockd.sim.sitl.ground_station import GroundStation
+from flockd.sim.sitl.processes import Program
 from tests.onboard.autopilot.pilots_link import PilotsLink
 
 HEIGHT_M = 4.0

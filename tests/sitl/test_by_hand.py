@@ -19,7 +19,7 @@ from flockd.core import services
 from flockd.core.messages import SECTORS, ObstacleRanges
 from flockd.flight.obstacles import free_ahead, nearest_points
 from flockd.onboard.autopilot.mavsdk_link import Severity
-from flockd.sim.ground_station import GroundStation
+from flockd.sim.sitl.ground_station import GroundStation
 from tests.sitl.stories import Row, Stories, World, landing, seen, take_off
 
 GROUND_STATION_PORT = 14550

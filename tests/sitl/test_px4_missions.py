@@ -23,9 +23,9 @@ from flockd.core.messages import FloatArray
 from flockd.flight.flocking.metrics import closest_distances
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.flight_folder import save_flight, write_report_files
-from flockd.sim.fleet import fly_fleet
-from flockd.sim.free_ports import free_endpoint
-from flockd.sim.start import with_drones
+from flockd.sim.flock.start import with_drones
+from flockd.sim.sitl.fleet import fly_fleet
+from flockd.sim.sitl.free_ports import free_endpoint
 from tools.checks.px4_rows import Order
 from tools.checks.px4_rows import main as px4_rows
 

@@ -22,14 +22,14 @@ from flockd.core.config import DroneConfig, ScenarioConfig, load, load_scenario
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.onboard.sources import clock_at
-from flockd.sim.autopilots import Autopilots, Ports, Px4s, SimulatedAutopilots
-from flockd.sim.camera_simulator import CameraSimulator
-from flockd.sim.daemons import Daemons, fleet_configs
-from flockd.sim.frame_server import FrameServer
-from flockd.sim.free_ports import free_endpoint
-from flockd.sim.ground_station import GroundStation
-from flockd.sim.processes import Program, Programs
-from flockd.sim.start import with_drones
+from flockd.sim.cameras.camera_simulator import CameraSimulator
+from flockd.sim.flock.start import with_drones
+from flockd.sim.sitl.autopilots import Autopilots, Ports, Px4s, SimulatedAutopilots
+from flockd.sim.sitl.daemons import Daemons, fleet_configs
+from flockd.sim.sitl.frame_server import FrameServer
+from flockd.sim.sitl.free_ports import free_endpoint
+from flockd.sim.sitl.ground_station import GroundStation
+from flockd.sim.sitl.processes import Program, Programs
 from tests.sitl.companion import HEIGHT_M
 from tests.sitl.sitl_run import SitlRun
 from tools.checks.soak import small

@@ -25,10 +25,10 @@ from flockd.core.errors import UnavailableError
 from flockd.fleet.fleet_status import status_rows
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.autopilot.refusal_reasons import NOT_STREAMING, REASONS, SEVERAL_SENDERS
-from flockd.sim.autopilots import Px4s
-from flockd.sim.daemons import Daemons
-from flockd.sim.free_ports import free_endpoint
-from flockd.sim.start import with_drones
+from flockd.sim.flock.start import with_drones
+from flockd.sim.sitl.autopilots import Px4s
+from flockd.sim.sitl.daemons import Daemons
+from flockd.sim.sitl.free_ports import free_endpoint
 from tests.sitl.sitl_run import SitlRun
 
 FLEET = "reasons"

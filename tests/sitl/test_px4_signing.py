@@ -15,8 +15,8 @@ from flockd.core.config import DroneConfig, load, load_scenario
 from flockd.core.data import data_path
 from flockd.ground.doctor.autopilot_checks import check_autopilot
 from flockd.ground.doctor.finding import Level
-from flockd.sim.autopilots import Px4s
-from flockd.sim.start import with_drones
+from flockd.sim.flock.start import with_drones
+from flockd.sim.sitl.autopilots import Px4s
 
 PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
 SPEED_FACTOR, START_S, TIMES, PAUSE_S = 0.5, 120.0, 5, 0.5

@@ -34,11 +34,11 @@ from flockd.core.errors import FlockdError
 from flockd.core.messages import FloatArray
 from flockd.flight.flocking.metrics import closest_distances
 from flockd.review.flight_log.log import FlightLog
-from flockd.sim.autopilots import px4_folder
-from flockd.sim.fleet import fly_fleet
-from flockd.sim.free_ports import free_endpoint
-from flockd.sim.start import with_drones
-from flockd.sim.vehicles import REFERENCE_DEG
+from flockd.sim.flock.start import with_drones
+from flockd.sim.sitl.autopilots import px4_folder
+from flockd.sim.sitl.fleet import fly_fleet
+from flockd.sim.sitl.free_ports import free_endpoint
+from flockd.sim.vehicles.vehicles import REFERENCE_DEG
 
 ORDER_ANSWER_S = 60.0
 _RUN = "from flockd.cli import program; program()"

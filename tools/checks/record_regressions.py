@@ -38,7 +38,7 @@ from flockd.flight.pilot import FlockPilot
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.truth import Truth
-from flockd.sim.swarm import fly
+from flockd.sim.flock.swarm import fly
 
 Step = tuple[FrameSet, VehicleState]
 Starts = Mapping[tuple[float, float, float], tuple[float, float]]

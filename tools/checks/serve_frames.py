@@ -14,11 +14,11 @@ from pathlib import Path
 
 from flockd.core.config import load_scenario
 from flockd.onboard.sources import clock_at
-from flockd.sim.autopilots import TRUTH_PORT
-from flockd.sim.camera_simulator import CameraSimulator
-from flockd.sim.frame_server import FrameServer
-from flockd.sim.ground_station import GroundStation
-from flockd.sim.start import with_drones
+from flockd.sim.cameras.camera_simulator import CameraSimulator
+from flockd.sim.flock.start import with_drones
+from flockd.sim.sitl.autopilots import TRUTH_PORT
+from flockd.sim.sitl.frame_server import FrameServer
+from flockd.sim.sitl.ground_station import GroundStation
 
 ENDPOINT = "tcp/127.0.0.1:7448"
 RATE_HZ = 2.0

@@ -37,11 +37,11 @@ from flockd.core.messages import FloatArray, Frame, FrameSet, VehicleState
 from flockd.fleet.watcher import FleetWatcher
 from flockd.flight.pilot import FlockPilot
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from flockd.sim.camera_simulator import CameraSimulator
-from flockd.sim.daemons import Daemons
-from flockd.sim.frame_server import FrameServer
-from flockd.sim.free_ports import free_endpoint, free_port
-from flockd.sim.ground_station import Poses
+from flockd.sim.cameras.camera_simulator import CameraSimulator
+from flockd.sim.sitl.daemons import Daemons
+from flockd.sim.sitl.frame_server import FrameServer
+from flockd.sim.sitl.free_ports import free_endpoint, free_port
+from flockd.sim.sitl.ground_station import Poses
 from tools.measure.bench_daemon import at, of_the_unit
 
 SHRINK = 4

@@ -88,9 +88,9 @@ def save_clip(recording_file: Path, path: Path) -> None:
 
 def save_world(scenario_file: Path, path: Path) -> None:
     """What the first drone of a scenario sees as it starts, from its left to its right."""
-    from flockd.sim.camera_simulator import CameraSimulator  # noqa: PLC0415 - numba takes its time
-    from flockd.sim.exact_states import start_yaw  # noqa: PLC0415
-    from flockd.sim.vehicles import Vehicles  # noqa: PLC0415
+    from flockd.sim.cameras.camera_simulator import CameraSimulator  # noqa: PLC0415 - numba takes its time
+    from flockd.sim.flock.exact_states import start_yaw  # noqa: PLC0415
+    from flockd.sim.vehicles.vehicles import Vehicles  # noqa: PLC0415
 
     scenario = load_scenario(scenario_file)
     vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=start_yaw(scenario), seed=scenario.seed)

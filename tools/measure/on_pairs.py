@@ -16,7 +16,7 @@ from flockd.flight.geometry import RangeMap, Rig, RigCamera, z_map
 from flockd.flight.perception import DisFlow, OnnxNetworks, Perception
 from flockd.flight.perception.detection.detector import DetectionTrace
 from flockd.flight.pilot.ground import level_ground
-from flockd.sim.drone_models import FAMILIES, drone_model
+from flockd.sim.renderer.drone_models import FAMILIES, drone_model
 from tools.training.dataset import HEIGHT, R_BODY_CAMERA, WIDTH, PairSet, rig_camera
 from tools.training.scenes import outline_of
 

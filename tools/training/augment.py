@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flockd.sim.real_cameras.compression import jpeg
+from flockd.sim.cameras.compression import jpeg
 from tools.training.camera_effects import drawn_effects, through_camera
 
 Image = NDArray[np.uint8]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.core.config.imperfect_cameras import CamerasConfig
-from flockd.sim.real_cameras.compression import jpeg
+from flockd.sim.cameras.compression import jpeg
 
 Image = NDArray[np.uint8]
 _LEAST_SIDE_PX = 8

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockd.sim.distractors import Distractor, Placed, bag, balloon, bird, kite, mast
+from flockd.sim.renderer.distractors import Distractor, Placed, bag, balloon, bird, kite, mast
 from tools.training.dataset import HEIGHT, WIDTH
 from tools.training.scenes import attitude
 

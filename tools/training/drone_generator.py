@@ -14,7 +14,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from flockd.sim.airframe import Airframe, DroneModel, outline, oval
+from flockd.sim.renderer.airframe import Airframe, DroneModel, outline, oval
 from tools.training.drone_parts import add_ducts, add_landing_gear, add_lights, add_payloads, hanging_rotor
 
 Array = NDArray[Any]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from flockd.sim.airframe import Airframe
+from flockd.sim.renderer.airframe import Airframe
 
 Array = NDArray[Any]
 Place = tuple[float, float, float]

@@ -19,8 +19,8 @@ from trimesh.visual.color import uv_to_color
 from trimesh.visual.material import PBRMaterial
 
 from flockd.core.config.perception import MAX_DRONE_SIZE_M, MIN_DRONE_SIZE_M
-from flockd.sim.airframe import MACHINE_TEXTURES, Airframe, DroneModel
-from flockd.sim.mesh import Mesh, face_normals
+from flockd.sim.renderer.airframe import MACHINE_TEXTURES, Airframe, DroneModel
+from flockd.sim.world.mesh import Mesh, face_normals
 
 Array = NDArray[Any]
 GLTF = (".glb", ".gltf")

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flockd.sim.airframe import DroneModel
+from flockd.sim.renderer.airframe import DroneModel
 from tools.training import worlds
 from tools.training.dataset import R_BODY_CAMERA
 from tools.training.render_drone_crops import add_mesh, drawn_models, own_drone
@@ -66,7 +66,7 @@ def _file(job: CutoutJob, number: int) -> Path:
 
 
 def _render(job: CutoutJob) -> None:
-    from flockd.sim.world import World  # noqa: PLC0415 - numba starts in the worker
+    from flockd.sim.world.world import World  # noqa: PLC0415 - numba starts in the worker
 
     rng = np.random.Generator(np.random.PCG64([job.seed, 2]))
     world = World.generate(job.seed, ground_relief_m=0.0, keep_out=None)
@@ -79,7 +79,7 @@ def _render(job: CutoutJob) -> None:
 
 def cut_out(world: object, drone: DroneModel, rng: np.random.Generator) -> NDArray[np.uint8]:
     """(320, 320, 4) RGBA of a drone from anywhere, alpha straight."""
-    from flockd.sim.renderer import Renderer  # noqa: PLC0415
+    from flockd.sim.renderer.renderer import Renderer  # noqa: PLC0415
 
     side = FINER * SIZE_PX
     range_m = float(np.exp(rng.uniform(*np.log(RANGES_M))))

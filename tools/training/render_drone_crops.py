@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockd.sim.airframe import DroneModel
-from flockd.sim.drone_models import drone_model
+from flockd.sim.renderer.airframe import DroneModel
+from flockd.sim.renderer.drone_models import drone_model
 from tools.training import worlds
 from tools.training.dataset import FOCAL_PX, HEIGHT, R_BODY_CAMERA, WIDTH
 from tools.training.distractions import drawn_distraction
@@ -125,7 +125,7 @@ def _paint(rng: np.random.Generator) -> int:
 
 
 def _render_world(job: CropJob) -> None:
-    from flockd.sim.world import World  # noqa: PLC0415 - numba starts in the worker
+    from flockd.sim.world.world import World  # noqa: PLC0415 - numba starts in the worker
 
     rng = np.random.Generator(np.random.PCG64([job.seed, 1]))
     world = World.generate(job.seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
@@ -143,7 +143,7 @@ def _scene(
     world: Any, place: Array, models: list[list[DroneModel]], rng: np.random.Generator, *, measures: bool
 ) -> list[dict[str, Array]]:
     """Pictures of one drone from one camera; other drones and distractors may stand before or behind it."""
-    from flockd.sim.renderer import Renderer  # noqa: PLC0415
+    from flockd.sim.renderer.renderer import Renderer  # noqa: PLC0415
 
     focal = FOCAL_PX * float(np.exp(rng.normal(0, 0.08)))
     ground = float(world.height_at(place[:1], place[1:2])[0])

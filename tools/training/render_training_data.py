@@ -24,10 +24,10 @@ from flockd.core.config.imperfect_cameras import CamerasConfig
 from flockd.core.config.obstacle_field import ObstaclesConfig
 from flockd.core.errors import UsageError
 from flockd.flight.geometry import PinholeCamera, vector_from_rotation
-from flockd.sim.airframe import DroneModel
-from flockd.sim.drone_models import drone_model
-from flockd.sim.worlds.obstacle_worlds import LOWEST_CROWN_M, generate_obstacles
-from flockd.sim.worlds.obstacles import Obstacles
+from flockd.sim.renderer.airframe import DroneModel
+from flockd.sim.renderer.drone_models import drone_model
+from flockd.sim.world.obstacle_worlds import LOWEST_CROWN_M, generate_obstacles
+from flockd.sim.world.obstacles import Obstacles
 from tools.training import worlds
 from tools.training.camera_effects import drawn_cameras
 from tools.training.dataset import FOCAL_PX, HEIGHT, MAX_DRONES, R_BODY_CAMERA, WIDTH, create_part, note
@@ -95,9 +95,9 @@ class PairJob:
 
 def render_world(job: PairJob) -> None:
     """One part."""
-    from flockd.sim.camera_simulator import FIELD_GRID_M, field_grid  # noqa: PLC0415 - numba starts in the worker
-    from flockd.sim.renderer import Renderer  # noqa: PLC0415
-    from flockd.sim.world import World  # noqa: PLC0415
+    from flockd.sim.cameras.camera_simulator import FIELD_GRID_M, field_grid  # noqa: PLC0415 - numba starts in the worker
+    from flockd.sim.renderer.renderer import Renderer  # noqa: PLC0415
+    from flockd.sim.world.world import World  # noqa: PLC0415
 
     folder, seed, count = job.folder, job.seed, job.pairs
     rng = np.random.Generator(np.random.PCG64(seed))
@@ -165,8 +165,8 @@ def _render_pair(
     rng: np.random.Generator,
     filmed: CamerasConfig | None,
 ) -> None:
-    from flockd.sim.real_cameras import CameraMotion, LensField, NoiseTile, RealCamera  # noqa: PLC0415
-    from flockd.sim.renderer import true_flow  # noqa: PLC0415
+    from flockd.sim.cameras import CameraMotion, LensField, NoiseTile, RealCamera  # noqa: PLC0415
+    from flockd.sim.renderer.renderer import true_flow  # noqa: PLC0415
     from tools.training.distractions import drawn_distractions  # noqa: PLC0415
 
     focal = FOCAL_PX * float(np.exp(rng.normal(0, 0.08)))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.flight.geometry import Rig, VirtualCrop, virtual_crop
-from flockd.sim.airframe import DroneModel
+from flockd.sim.renderer.airframe import DroneModel
 from tools.training.augment import as_filmed, motion_blur, photometric
 from tools.training.dataset import (
     HEIGHT,

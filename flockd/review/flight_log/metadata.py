@@ -149,7 +149,7 @@ class FlightMetadata(BaseModel):
     settings: dict[str, str] = {}
     """What the command line set otherwise than the scenario's file, by option."""
     slowed_by: dict[str, float] = {}
-    """The same by cause (`flockd.sim.slowing.Cause`); a moment may have several."""
+    """The same by cause (`flockd.sim.flock.slowing.Cause`); a moment may have several."""
     handed_over: dict[int, HandedOver] = {}
     """By the number of a simulated drone, from 0: when and why it did not fly on."""
     sizes: dict[int, LearnedSize] = {}

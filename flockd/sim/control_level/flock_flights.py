@@ -18,7 +18,7 @@ from flockd.sim.control_level.many_obstacles import FIGURES, ManyObstacles
 from flockd.sim.control_level.motion import Motion
 from flockd.sim.control_level.near import Near
 from flockd.sim.control_level.perceived_flock import Perception, Seen
-from flockd.sim.vehicles import limit_norms
+from flockd.sim.vehicles.vehicles import limit_norms
 
 Figures = dict[str, float | int | bool | None]
 _PAIRS = 1_000_000
@@ -40,7 +40,7 @@ def fly_flocks(
     bit for bit whatever others are flown with it.
 
     Args:
-        scenarios: with any number of vehicles (`flockd.sim.start`). The seed rules gusts,
+        scenarios: with any number of vehicles (`flockd.sim.flock.start`). The seed rules gusts,
             obstacles and the errors of perception. Rig and sensors do not count.
         errors: of what the drones perceive of each other; None: they are given exact states. Ranges to obstacles are
             exact in any case.

@@ -8,9 +8,9 @@ import numpy as np
 
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FloatArray, ObstacleRanges
-from flockd.sim.clearances import clearances
-from flockd.sim.worlds.obstacle_worlds import obstacles_of
-from flockd.sim.worlds.obstacles import true_ranges
+from flockd.sim.world.clearances import clearances
+from flockd.sim.world.obstacle_worlds import obstacles_of
+from flockd.sim.world.obstacles import true_ranges
 
 FIGURES = "collisions", "min_clearance_m", "time_within_1m_s"
 NEAR_M = 1.0

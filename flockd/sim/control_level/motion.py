@@ -1,7 +1,7 @@
 """The vehicles' flight towards their commands, for all drones of many flights.
 
-The same motion as `flockd.sim.vehicles.Vehicles`, which a test holds equal: a first-order lag of limited acceleration,
-heights as by a critically damped controller. Attitudes move nothing and are left out.
+The same motion as `flockd.sim.vehicles.vehicles.Vehicles`, which a test holds equal: a first-order lag of limited
+acceleration, heights as by a critically damped controller. Attitudes move nothing and are left out.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import numpy as np
 
 from flockd.core.config.scenario import VehicleConfig
 from flockd.core.messages import FloatArray
-from flockd.sim.vehicles import CLIMB_TIME_S, MAX_CLIMB_M_S, MAX_LEAN_M_S2, limit_norms
-from flockd.sim.wind import GustField
+from flockd.sim.vehicles.vehicles import CLIMB_TIME_S, MAX_CLIMB_M_S, MAX_LEAN_M_S2, limit_norms
+from flockd.sim.vehicles.wind import GustField
 
 _MAX_SUBSTEP_S = 0.02
 

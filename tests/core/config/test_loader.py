@@ -478,7 +478,7 @@ def test_a_scenario_may_hold_its_drone(tmp_path: Path) -> None:
 
 def test_the_configuration_knows_how_many_families_the_simulator_has() -> None:
     from flockd.core.config.scenario import DRONE_FAMILIES
-    from flockd.sim.drone_models import FAMILIES
+    from flockd.sim.renderer.drone_models import FAMILIES
 
     assert DRONE_FAMILIES == FAMILIES
 

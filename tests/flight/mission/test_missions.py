@@ -19,7 +19,7 @@ from flockd.flight.mission import Guidance, MissionParameters, Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
 from flockd.flight.safety import outside_fence
 from flockd.onboard.telemetry.order_messages import order_message, parse_order
-from flockd.sim.exact_states import fly_exact_states
+from flockd.sim.flock.exact_states import fly_exact_states
 from tests.core.config.test_loader import CONFIG, DRONE, SCENARIO
 
 GATE = GateParameters()

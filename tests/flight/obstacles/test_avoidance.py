@@ -18,9 +18,9 @@ from flockd.core.messages import FloatArray, ObstacleRanges
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.obstacles import Avoidance
 from flockd.flight.obstacles.steering import Steering, free_way
-from flockd.sim.exact_states import ExactFlock
-from flockd.sim.vehicles import Vehicles
-from flockd.sim.worlds.obstacles import Box, Frustum, Obstacles, Solid, true_ranges
+from flockd.sim.flock.exact_states import ExactFlock
+from flockd.sim.vehicles.vehicles import Vehicles
+from flockd.sim.world.obstacles import Box, Frustum, Obstacles, Solid, true_ranges
 
 PARAMETERS = ObstacleParameters(enabled=True)
 GATE = GateParameters()

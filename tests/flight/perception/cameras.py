@@ -8,9 +8,9 @@ import numpy as np
 from flockd.core.messages import FloatArray, UInt8Array
 from flockd.flight.geometry import PinholeCamera, RigCamera, RigidTransform
 from flockd.flight.perception import Crop
-from flockd.sim.drone_models import drone_model
-from flockd.sim.renderer import Renderer, View
-from flockd.sim.world import World
+from flockd.sim.renderer.drone_models import drone_model
+from flockd.sim.renderer.renderer import Renderer, View
+from flockd.sim.world.world import World
 
 
 def pinhole(focal_px: float, size: tuple[int, int]) -> PinholeCamera:

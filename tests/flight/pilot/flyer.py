@@ -14,9 +14,9 @@ from flockd.core.messages import Float32Array, Frame, FrameSet, PilotOutput, UIn
 from flockd.flight.geometry import RigCamera
 from flockd.flight.perception import Crop, Perception, RangeEstimate, SceneMaps
 from flockd.flight.pilot import FlockPilot
-from flockd.sim.camera_simulator import CameraSimulator
-from flockd.sim.truth_perception import TruthPerception
-from flockd.sim.vehicles import Vehicles
+from flockd.sim.cameras.camera_simulator import CameraSimulator
+from flockd.sim.flock.truth_perception import TruthPerception
+from flockd.sim.vehicles.vehicles import Vehicles
 from tests.flight.perception.shipped import SECOND_STAGE
 
 STEP_S = 0.5

@@ -16,7 +16,7 @@ from flockd.flight.inference.manifest_file import models_folder
 from flockd.flight.perception import OnnxNetworks
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.recording.reader import Recording
-from flockd.sim.camera_faults import noisy_image
+from flockd.sim.cameras.camera_faults import noisy_image
 
 CAMERA = "left"
 NOISE_BEGINS, NOISE_ENDS, STEPS = 2, 6, 8

@@ -15,7 +15,7 @@ from flockd.core.messages import SECTORS, FrameSet, ObstacleRanges, PilotOutput,
 from flockd.flight.perception import Observation
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.recording.codec import from_json, parsed, to_json
-from flockd.sim.worlds.obstacles import Box, Obstacles, true_ranges
+from flockd.sim.world.obstacles import Box, Obstacles, true_ranges
 
 WALL = Obstacles([Box(3.0, 0.0, 0.2, 30.0, 0.0, -0.5, 8.0)])
 """Its surface is 2.8 m north."""

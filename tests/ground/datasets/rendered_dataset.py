@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
 from flockd.flight.geometry import RigCamera, ZMap
 from flockd.flight.perception import Crop, DisFlow, OneByOne, RangeEstimate, SceneMaps
-from flockd.sim.renderer import Renderer
-from flockd.sim.world import World
+from flockd.sim.renderer.renderer import Renderer
+from flockd.sim.world.world import World
 from tests.flight.perception.shipped import SECOND_STAGE
 
 WIDTH, HEIGHT = 320, 240

@@ -46,9 +46,9 @@ def render() -> None:
     import numpy as np
 
     from flockd.flight.geometry import rotation_from_euler
-    from flockd.sim.drone_models import drone_model
-    from flockd.sim.renderer import Renderer
-    from flockd.sim.world import World
+    from flockd.sim.renderer.drone_models import drone_model
+    from flockd.sim.renderer.renderer import Renderer
+    from flockd.sim.world.world import World
 
     matrix = np.array([[FOCAL_PX, 0.0, SIZE[0] / 2], [0.0, FOCAL_PX, SIZE[1] / 2], [0.0, 0.0, 1.0]])
     R_ned_camera = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

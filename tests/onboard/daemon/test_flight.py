@@ -21,7 +21,7 @@ from flockd.onboard.daemon import DaemonError
 from flockd.onboard.recording.codec import to_json
 from flockd.onboard.recording.reader import Recording
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from flockd.sim.free_ports import free_port
+from flockd.sim.sitl.free_ports import free_port
 from tests.calm import clock
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import until

@@ -16,7 +16,7 @@ import zenoh
 from flockd.onboard.telemetry.publisher import MAX_PEERS, ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
-from flockd.sim.free_ports import free_endpoint
+from flockd.sim.sitl.free_ports import free_endpoint
 
 ROOT = Path(__file__).parents[3]
 KEY = "flockd/v1/meadow/tiny"

@@ -20,8 +20,8 @@ from flockd.flight.flocking.metrics import closest_distances, order, safety, uni
 from flockd.sim.control_level import fly_flocks
 from flockd.sim.control_level.flock_figures import orders
 from flockd.sim.control_level.flock_flights import FlockFlights
-from flockd.sim.exact_states import fly_exact_states
-from flockd.sim.start import scattered, with_drones
+from flockd.sim.flock.exact_states import fly_exact_states
+from flockd.sim.flock.start import scattered, with_drones
 
 UNIFORM = WeightParameters(kind="uniform")
 

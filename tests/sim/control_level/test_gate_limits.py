@@ -13,8 +13,8 @@ from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.data import data_path
 from flockd.sim.control_level import fly_flocks
 from flockd.sim.control_level.flock_flights import FlockFlights
-from flockd.sim.exact_states import fly_exact_states
-from flockd.sim.start import scattered, with_drones
+from flockd.sim.flock.exact_states import fly_exact_states
+from flockd.sim.flock.start import scattered, with_drones
 
 TICKS, TICK_S = 10, 0.05
 

@@ -15,9 +15,9 @@ from flockd.core.data import data_path
 from flockd.review.report.summary import obstacle_figures
 from flockd.sim.control_level import fly_flocks
 from flockd.sim.control_level.flock_flights import FlockFlights
-from flockd.sim.exact_states import ExactFlock
-from flockd.sim.start import scattered, with_drones
-from flockd.sim.swarm import fly
+from flockd.sim.flock.exact_states import ExactFlock
+from flockd.sim.flock.start import scattered, with_drones
+from flockd.sim.flock.swarm import fly
 
 STEP_S = 0.5
 

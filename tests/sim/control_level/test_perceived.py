@@ -18,7 +18,7 @@ from flockd.core.errors import ConfigError
 from flockd.core.messages import FloatArray
 from flockd.sim.control_level import fly_flocks
 from flockd.sim.control_level.flock_flights import FlockFlights
-from flockd.sim.start import scattered, with_drones
+from flockd.sim.flock.start import scattered, with_drones
 
 NONE = {"median": 0.0, "p95": 0.0}
 FAULTLESS: dict[str, Any] = {

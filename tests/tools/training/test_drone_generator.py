@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flockd.sim.airframe import DroneModel
-from flockd.sim.drone_models import FAMILIES
+from flockd.sim.renderer.airframe import DroneModel
+from flockd.sim.renderer.drone_models import FAMILIES
 from tools.training.drone_generator import FIRST_GENERATED, SIZES_M, generated_drone
 from tools.training.samples import four_motors
 

@@ -11,7 +11,7 @@ import trimesh
 from PIL import Image
 from trimesh.visual.material import PBRMaterial
 
-from flockd.sim.airframe import DroneModel
+from flockd.sim.renderer.airframe import DroneModel
 from tools.training.own_mesh import MOST_TRIANGLES, UP_AXES, _colours, _upright, painted, read_meshes
 
 RED = [255, 0, 0, 255]

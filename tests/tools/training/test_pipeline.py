@@ -16,7 +16,7 @@ import trimesh
 
 from flockd.cli import main
 from flockd.core.data import data_path
-from flockd.sim.drone_models import drone_model
+from flockd.sim.renderer.drone_models import drone_model
 from tools.measure.evaluate_crops import HeldOut, measured
 from tools.training import worlds
 from tools.training.augment import UNTOUCHED, photometric
@@ -101,7 +101,7 @@ def test_a_mesh_without_the_drones_size_is_refused(capsys: pytest.CaptureFixture
 
 @pytest.mark.slow
 def test_a_cut_out_shows_the_drone_whole_and_nothing_else() -> None:
-    from flockd.sim.world import World
+    from flockd.sim.world.world import World
 
     rng = np.random.default_rng(0)
     world = World.generate(worlds.TRAINING[-1], ground_relief_m=0.0, keep_out=None)

@@ -13,7 +13,7 @@ from flockd.core.config.perception import PerceptionConfig
 from flockd.flight.perception import Perception, RangeEstimate
 from flockd.flight.perception.maps import KnownSize
 from flockd.flight.tracking import Prediction
-from flockd.sim.truth_perception import _SIZE_M
+from flockd.sim.flock.truth_perception import _SIZE_M
 from tests.flight.pilot.flyer import Flyer, scenario_with
 
 ESTIMATE = RangeEstimate(math.log(4.0), 0.03, np.array([48.0, 48.0]), size_m=0.8, drone_probability=0.9)

@@ -16,7 +16,7 @@ from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, Reaso
 from flockd.flight.geometry import rotation_from_euler
 from flockd.flight.pilot.ground import GroundFilter
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
-from flockd.sim.hills import hills
+from flockd.sim.world.hills import hills
 
 STEP_S = 0.5
 LIE = Reason(ReasonKind.HEIGHT, "height: the range contradicts the barometer; the barometer's is used")

@@ -1,0 +1,235 @@
+"""Simulates the cameras of all drones: rendered frame sets, and the truth behind each."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from flockd.core.config.mission import MissionParameters
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.messages import FloatArray, Frame, FrameSet, UInt8Array
+from flockd.flight.geometry import build_rig, rotation_from_vector
+from flockd.flight.mission import Moment, Navigator
+from flockd.sim.cameras import CameraMotion, Shot, real_cameras
+from flockd.sim.cameras.camera_faults import CameraFaults
+from flockd.sim.cameras.lens_views import lens_view
+from flockd.sim.cameras.pose_trail import FlockPose, PoseTrail
+from flockd.sim.cameras.true_rigs import true_rigs
+from flockd.sim.flock.truth_perception import RenderTruth
+from flockd.sim.renderer.drone_models import FAMILIES, drone_model
+from flockd.sim.renderer.renderer import Renderer, View
+from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
+from flockd.sim.vehicles.vehicles import REFERENCE_DEG
+from flockd.sim.world.obstacle_worlds import obstacles_of
+from flockd.sim.world.world import World
+
+
+class FlockPoses(Protocol):
+    """Poses of all drones."""
+
+    @property
+    def position(self) -> FloatArray:
+        """(n, 3) metres NED."""
+
+    @property
+    def R_ned_body(self) -> FloatArray:  # noqa: N802 - the field's own notation
+        """(n, 3, 3)"""
+
+
+class CameraSimulator:
+    """The world of a scenario, the models of its drones, and their cameras."""
+
+    def __init__(self, scenario: ScenarioConfig, threads: int | None = None) -> None:
+        """Draws a drone's images on ``threads``; 0: on the calling one; None: as many as there are processors."""
+        self.rig, self._rigs = build_rig(scenario.drone.rig), true_rigs(scenario)
+        obstacles = obstacles_of(scenario)
+        field, path = scenario.world.obstacles, planned_path(scenario)
+        clearance_m = scenario.world.clearance_m + _spread(scenario)
+        world = World.generate(
+            scenario.seed,
+            ground_relief_m=scenario.world.ground_relief_m,
+            keep_out=path if field is None else np.concatenate([path, field_grid(field.extent_m)]),
+            clearance_m=clearance_m if field is None else max(clearance_m, FIELD_GRID_M),
+            obstacles=obstacles if obstacles.solids else None,
+            hills_m=scenario.world.hills_m,
+            hills_slope=scenario.world.hills_slope,
+        )
+        rng = np.random.default_rng([scenario.seed, 1])
+        drawn, wanted = int(rng.integers(FAMILIES)), scenario.world.drone_family
+        family = drawn if wanted == "any" else wanted
+        self._count = len(scenario.vehicles)
+        models = [drone_model(family, int(rng.integers(1 << 31))) for _ in range(self._count)]
+        self._world = world
+        self._renderer = Renderer(world, models)
+        by_gain = scenario.cameras is not None and scenario.cameras.noise.gain > 0
+        self._scenario, self._image_noise = scenario, 0.0 if by_gain else scenario.sensors.image_noise
+        self.begin_again()
+        count = os.cpu_count() if threads is None else threads
+        self._executor = ThreadPoolExecutor(count, thread_name_prefix="camera") if count else None
+
+    def begin_again(self) -> None:
+        """For another flight from the beginning in the same world."""
+        scenario, self._real = self._scenario, None
+        self._noise = ImageNoise(self._image_noise, scenario.seed)
+        self._faults = CameraFaults(scenario.faults, scenario.seed)
+        self._captured = PoseTrail()
+        if scenario.cameras is not None:
+            lenses = {name: mounted.camera for name, mounted in self.rig.cameras.items()}
+            self._real = real_cameras(scenario.cameras, lenses, self._count, scenario.seed)
+
+    def ground_height(self, north: FloatArray, east: FloatArray) -> FloatArray:
+        """(n,) metres above z = 0 of the ground that is drawn, at points (n,) north and east."""
+        return self._world.height_at(north, east)
+
+    def capture(
+        self,
+        drone: int,
+        step: int,
+        time_s: float,
+        vehicles: FlockPoses,
+        trail: PoseTrail | None = None,
+        disturbed: Disturbances = UNDISTURBED,
+    ) -> tuple[FrameSet, RenderTruth]:
+        """The frame set of one drone, and the truth behind it.
+
+        ``trail`` holds where the flock was until then, for what is late and for motion; None: what was captured before
+        is taken, so that a flock's motion between two captures is even.
+        """
+        if trail is None:
+            trail = self._captured
+            trail.add(FlockPose(time_s, vehicles.position, vehicles.R_ned_body))
+        others = [i for i in range(self._count) if i != drone and i not in disturbed.removed]
+        off = disturbed.cameras_off_of(drone)
+        cameras, flock = self._rigs[drone].cameras, dict.fromkeys(self.rig.cameras, vehicles)
+        shots = {name: Shot(time_s, time_s, comes=True) for name in cameras}
+        if self._real is not None:
+            shots = {name: self._real[drone, name].clock.shot(time_s) for name in cameras}
+            flock = {name: trail.at(shot.shown_s) for name, shot in shots.items()}
+        turns = {name: self._turn(drone, name, shots[name], flock[name]) for name in cameras}
+        places = {
+            name: flock[name].position[drone] + flock[name].R_ned_body[drone] @ mounted.T_body_camera.translation
+            for name, mounted in cameras.items()
+        }
+
+        def view(name: str) -> tuple[View, UInt8Array]:
+            def draw(matrix: FloatArray, size: tuple[int, int], R_lens_part: FloatArray) -> View:
+                return self._renderer.render(
+                    matrix, size, turns[name] @ R_lens_part, places[name],
+                    drone_rotations=flock[name].R_ned_body, drone_positions=flock[name].position, shown=others,
+                )  # fmt: skip
+
+            seen = lens_view(cameras[name].camera, draw)
+            if self._real is None:
+                return seen, seen.rgb
+            motion = self._motion(drone, name, shots[name].shown_s, turns[name], trail)
+            sun = self._world.light[0] @ turns[name]
+            return seen, self._real[drone, name].image(seen, motion, time_s, sun)
+
+        # Side by side; noise and faults are drawn in the cameras' order, so that the images do not depend on that.
+        drawn = map(view, cameras) if self._executor is None else self._executor.map(view, cameras)
+        views, frames = {}, {}
+        for name, (seen, sensed) in zip(cameras, drawn, strict=True):
+            views[name] = seen
+            image = self._noise.add(sensed)
+            if self._real is not None:
+                image = self._real[drone, name].compressed(image)
+            image = self._faults.applied(drone, name, time_s, image)
+            if shots[name].comes and name not in off:
+                frames[name] = Frame(name, image, shots[name].stamp_s, step)
+        R_ned_body, position = vehicles.R_ned_body[drone], vehicles.position[drone]
+        truth = RenderTruth(
+            self._rigs[drone],
+            views,
+            turns,
+            places,
+            R_ned_body,
+            position,
+            vehicles.R_ned_body,
+            vehicles.position,
+            others,
+        )
+        return FrameSet(time_s, frames), truth
+
+    def _turn(self, drone: int, name: str, shot: Shot, flock: FlockPoses) -> FloatArray:
+        """(3, 3) from a camera's axes to NED, shaken."""
+        R_ned_camera: FloatArray = flock.R_ned_body[drone] @ self._rigs[drone].cameras[name].T_body_camera.rotation
+        if self._real is None:
+            return R_ned_camera
+        angles = self._real[drone, name].shaking.at(np.array([shot.shown_s]))[0]
+        shaken: FloatArray = R_ned_camera @ rotation_from_vector(angles) if angles.any() else R_ned_camera
+        return shaken
+
+    def _motion(
+        self, drone: int, name: str, shown_s: float, R_ned_camera: FloatArray, trail: PoseTrail
+    ) -> CameraMotion:
+        """How a camera moves around the time of its image."""
+        assert self._real is not None
+        flock, mounted = trail.motion_at(shown_s), self._rigs[drone].cameras[name].T_body_camera
+        R_ned_body = trail.at(shown_s).R_ned_body[drone]
+        lever = R_ned_body @ np.cross(flock.turn[drone], mounted.translation)
+        return CameraMotion(
+            velocity=(flock.velocity[drone] + lever) @ R_ned_camera,
+            turn=flock.turn[drone] @ mounted.rotation,
+            shake=self._real[drone, name].shaking.around(shown_s),
+            drones={i + 1: flock.velocity[i] @ R_ned_camera for i in range(self._count) if i != drone},
+        )
+
+
+FIELD_GRID_M = 3.0
+
+
+def field_grid(extent_m: float) -> FloatArray:
+    """(n, 2) m north and east all over the area of obstacles, where nothing else is to stand: `World.keep_out`."""
+    axis = np.arange(-extent_m, extent_m + FIELD_GRID_M, FIELD_GRID_M)
+    return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+
+
+class ImageNoise:
+    """Noise that differs from image to image: a seeded crop of one large tile of normal noise."""
+
+    def __init__(self, sigma: float, seed: int) -> None:
+        self._rng = np.random.default_rng([seed, 2])
+        self._tile = sigma * self._rng.standard_normal((1031, 1033, 3), dtype=np.float32) if sigma > 0 else None
+
+    def add(self, image: UInt8Array) -> UInt8Array:
+        """The image (h, w, 3) with it."""
+        if self._tile is None:
+            return image
+        (height, width), (tall, wide) = image.shape[:2], self._tile.shape[:2]
+        top = int(self._rng.integers(max(tall - height, 1)))
+        left = int(self._rng.integers(max(wide - width, 1)))
+        noise = self._tile[top : top + height, left : left + width]
+        if noise.shape != image.shape:
+            rows, columns = np.arange(top, top + height) % tall, np.arange(left, left + width) % wide
+            noise = self._tile[rows[:, None], columns]
+        return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+
+
+def planned_path(scenario: ScenarioConfig) -> FloatArray:
+    """(n, 2) north and east of the flock's middle if it flies exactly as each of its missions wants, one after the
+    other, and on for a few metres."""
+    missions = {vehicle.mission or scenario.drone.mission for vehicle in scenario.vehicles}
+    ordered = sorted(missions, key=lambda mission: mission.model_dump_json())
+    return np.concatenate([_path_of(scenario, mission) for mission in ordered])
+
+
+def _path_of(scenario: ScenarioConfig, mission: MissionParameters) -> FloatArray:
+    """The same of one mission."""
+    navigator = Navigator(mission, scenario.drone.safety.gate)
+    start = np.mean([vehicle.position_m[:2] for vehicle in scenario.vehicles], axis=0)
+    flown, path = np.zeros(2), []
+    for time_s in np.arange(0.0, scenario.duration_s + 5.0, 0.5):
+        moment = Moment(float(time_s), start + flown, home_deg=np.array(REFERENCE_DEG))
+        flown = flown + navigator.step(moment).velocity * 0.5
+        path.append(start + flown)
+    return np.array(path)
+
+
+def _spread(scenario: ScenarioConfig) -> float:
+    """How far from their middle the outermost vehicles start, beyond the four metres of a flock of five."""
+    starts = np.array([vehicle.position_m[:2] for vehicle in scenario.vehicles])
+    return max(0.0, float(np.linalg.norm(starts - starts.mean(0), axis=1).max()) - 4.0)

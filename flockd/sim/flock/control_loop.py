@@ -1,0 +1,201 @@
+"""The daemon's control loop in simulated time: each drone's gate turns what its pilot asks for into setpoints."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from flockd.core.config.safety import GateParameters
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.messages import FloatArray, Setpoint, Wanted
+from flockd.flight.obstacles import nearest_points
+from flockd.flight.safety import Decision, Gate, Permission, Request, State, Surroundings, Verdict
+from flockd.flight.safety.surroundings import surroundings
+from flockd.review.flight_log.metadata import HandedOver
+from flockd.sim.flock.commands import Commands
+from flockd.sim.flock.made_up_detections import lost_cameras
+from flockd.sim.flock.slowing import Cause, SlowedTime, causes_of, is_slowed, which_are_drones
+from flockd.sim.flock.supervision import WindSupervisor
+from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
+from flockd.sim.vehicles.handover import Handover
+from flockd.sim.vehicles.vehicles import Vehicles
+
+PERIOD_S = 0.05
+"""Between two setpoints, as `autopilot.setpoint_rate_hz` is by default."""
+_SAME_TIME_S = 1e-9
+
+
+class _Order(NamedTuple):
+    """What pilots asked for, and when and where the drones were as they looked."""
+
+    time_s: float
+    places: FloatArray
+    commands: Commands
+    velocity: FloatArray
+    """(n, 2) m/s, and heights (n,) m, as asked for or as the autopilots that took over fly."""
+    height_m: FloatArray
+
+
+class _Drone(NamedTuple):
+    """What of its daemon's control loop each gated drone has."""
+
+    gate: Gate
+    supervisor: WindSupervisor
+    parameters: GateParameters
+
+
+class FlightStatus(NamedTuple):
+    """Who flies a drone, and why, as in telemetry."""
+
+    state: State
+    reasons: tuple[str, ...]
+
+
+class ControlLoop:
+    """Flies all drones of a flight from one step of their pilots to the next.
+
+    Each has a gate, and a supervisor that knows of wind, fence, heights and, with made-up detections, lost cameras:
+    it flies slower, or asks for Hold. A person's drone, and one whose autopilot has taken over, fly without them.
+    """
+
+    def __init__(self, scenario: ScenarioConfig, *, gated: bool = True) -> None:
+        """Not `gated`: setpoints are what the pilots ask for."""
+        self._step_s, self._sigmas = scenario.drone.step_s, scenario.drone.obstacles.sigmas
+        self._handover = Handover(scenario)
+        self._drones = {
+            i: _drone(scenario, i) for i, vehicle in enumerate(scenario.vehicles) if gated and not vehicle.by_hand
+        }
+        self._start_m = [-vehicle.position_m[2] for vehicle in scenario.vehicles]
+        self._scenario = scenario
+        self._latency_s = scenario.detections.latency_s if scenario.detections is not None else 0.0
+        self._in_force: _Order | None = None
+        self._disturbed = UNDISTURBED
+        self._supervised: dict[int, Decision] = {}
+        self.slowed = SlowedTime()
+        """How long gates let drones fly otherwise than their pilots asked for."""
+        self.handed_over: dict[int, HandedOver] = {}
+        """By the drone's number, from 0."""
+
+    def hold(self, i: int, time_s: float, vehicles: Vehicles) -> None:
+        """An operator asks for Hold: the drone's autopilot takes over and holds its place."""
+        self._hand_over(i, time_s, vehicles, "an operator asked for Hold")
+
+    def resume(self, i: int) -> None:
+        """An operator has a drone that its autopilot holds fly on as its pilot asks."""
+        if i not in self._handover.taken:
+            return
+        self._handover.resume(i)
+        self._supervised.pop(i, None)
+        if i in self._drones:
+            self._drones[i] = _drone(self._scenario, i)
+
+    def status(self, i: int) -> FlightStatus:
+        """Who flies a drone, and why."""
+        if i in self._handover.taken:
+            reasons = (self.handed_over[i].reason,) if i in self.handed_over else ()
+            return FlightStatus(State.ASKING, reasons)
+        decision = self._supervised.get(i)
+        if decision is None:
+            return FlightStatus(State.NORMAL, ())
+        return FlightStatus(decision.state, tuple(reason.sentence for reason in decision.reasons))
+
+    def velocity_error_m_s(self, i: int) -> float:
+        """By how much a drone's velocity is off its setpoints, as its gate finds; 0 without one."""
+        return self._drones[i].gate.velocity_error_m_s if i in self._drones else 0.0
+
+    def fly(self, time_s: float, vehicles: Vehicles, commands: Commands, disturbed: Disturbances = UNDISTURBED) -> None:
+        """From `time_s` one step on."""
+        self._disturbed = disturbed
+        velocity, height_m = self._handover.applied(
+            commands.takeovers, vehicles.position, commands.velocity, commands.height_m
+        )
+        coming = _Order(time_s, vehicles.position, commands, velocity, height_m)
+        order = self._in_force or coming
+        periods = max(round(self._step_s / PERIOD_S), 1) if self._drones or self._latency_s else 1
+        period_s = self._step_s / periods
+        for period in range(periods):
+            now_s = time_s + period * period_s
+            if now_s - time_s >= self._latency_s - _SAME_TIME_S:
+                order = coming
+            setpoints, heights = order.velocity.copy(), order.height_m.copy()
+            for i in self._drones.keys() - self._handover.taken - disturbed.removed:
+                setpoint = self._setpoint(i, now_s, period_s, vehicles, order)
+                setpoints[i] = setpoint.velocity
+                if math.isfinite(order.height_m[i]):
+                    heights[i] = setpoint.height_m
+            for i, (back, held_m) in self._handover.holding(vehicles.position).items():
+                setpoints[i], heights[i] = back, held_m
+            vehicles.step(setpoints, order.commands.yaw_rad, period_s, heights)
+        self._in_force = coming
+
+    def _setpoint(self, i: int, now_s: float, period_s: float, vehicles: Vehicles, order: _Order) -> Setpoint:
+        """What the gate of a drone makes of its order now; its supervisor may hand it over instead."""
+        drone = self._drones[i]
+        around = self._around(i, now_s, vehicles, order)
+        lost = self._lost_cameras(i, now_s)
+        decision = drone.supervisor.step(now_s, drone.gate.velocity_error_m_s, around, lost=lost)
+        self._supervised[i] = decision
+        if decision.state is State.ASKING:
+            self._hand_over(i, now_s, vehicles, decision.reasons[0].sentence)
+        request = self._request(i, Permission(decision.action, now_s), around, order)
+        verdict = drone.gate.step(now_s, request)
+        assert verdict.setpoint is not None, "all that it is told is finite and of now"
+        if decision.state is not State.ASKING:
+            slowed = is_slowed(request, verdict)
+            self.slowed.add(period_s, self._causes(i, request, verdict, vehicles) if slowed else frozenset())
+        return verdict.setpoint
+
+    def _hand_over(self, i: int, now_s: float, vehicles: Vehicles, why: str) -> None:
+        self._handover.hold(i, vehicles.position[i], vehicles.velocity[i])
+        self.handed_over[i] = HandedOver(time_s=now_s, reason=why)
+
+    def _lost_cameras(self, i: int, now_s: float) -> frozenset[str]:
+        """Those that are off, and those of a drone that flies on made-up detections that have a fault."""
+        off = self._disturbed.cameras_off_of(i)
+        return off if self._scenario.detections is None else off | lost_cameras(self._scenario, i, now_s)
+
+    def _causes(self, i: int, request: Request, verdict: Verdict, vehicles: Vehicles) -> frozenset[Cause]:
+        truth = _truth(i, vehicles)
+        is_drone = which_are_drones(request.around.neighbours, truth.neighbours)
+        drone = self._drones[i]
+        return causes_of(drone.parameters, request, verdict, truth, is_drone, drone.supervisor.degraded_by)
+
+    def _around(self, i: int, now_s: float, vehicles: Vehicles, order: _Order) -> Surroundings:
+        here, commands = vehicles.position[i], order.commands
+        ranges = commands.obstacles[i]
+        return surroundings(
+            commands.neighbours[i],
+            now_s - order.time_s,
+            moved=here - order.places[i],
+            position=here[:2],
+            velocity=vehicles.velocity[i],
+            yaw_rad=float(commands.yaw_rad[i]),
+            height_m=float(-here[2]),
+            obstacles=np.empty((0, 2)) if ranges is None else nearest_points(ranges, self._sigmas),
+        )
+
+    def _request(self, i: int, permission: Permission, around: Surroundings, order: _Order) -> Request:
+        height_m, commands = float(order.commands.height_m[i]), order.commands
+        wanted = Wanted(commands.velocity[i], commands.acceleration[i], float(commands.yaw_rad[i]))
+        held_m = height_m if math.isfinite(height_m) else self._start_m[i]
+        return Request(permission, wanted, order.time_s, held_m, around)
+
+
+def _drone(scenario: ScenarioConfig, i: int) -> _Drone:
+    safety, cameras = scenario.drone_of(i).safety, [camera.name for camera in scenario.drone.rig.cameras]
+    return _Drone(Gate(safety.gate), WindSupervisor(safety, cameras), safety.gate)
+
+
+def _truth(i: int, vehicles: Vehicles) -> Surroundings:
+    """Where the other drones truly are."""
+    others = np.arange(len(vehicles.position)) != i
+    return Surroundings(
+        position=vehicles.position[i, :2],
+        velocity=vehicles.velocity[i, :2],
+        yaw_rad=0.0,
+        neighbours=vehicles.position[others] - vehicles.position[i],
+        neighbour_velocities=vehicles.velocity[others, :2],
+        height_m=float(-vehicles.position[i, 2]),
+    )

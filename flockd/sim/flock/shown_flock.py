@@ -1,0 +1,275 @@
+"""A simulated flock as watchers find a real one: states, pictures on request, and orders that it flies."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+
+from flockd import __version__
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, VehicleState, Wanted
+from flockd.flight.geometry import build_rig
+from flockd.flight.mission import order_fault
+from flockd.flight.safety import State
+from flockd.onboard.daemon.operator_commands import ORDERS, taken_message
+from flockd.onboard.daemon.order_checks import OrderChecks
+from flockd.onboard.telemetry import TelemetrySink, publish_step
+from flockd.onboard.telemetry.order_messages import parse_ask, parse_order
+from flockd.onboard.telemetry.preview import Previews
+from flockd.onboard.telemetry.publisher import Ask, NewestImage
+from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage, FlightMessage, ReasonMessage
+from flockd.sim.cameras.camera_simulator import CameraSimulator
+from flockd.sim.flock.commands import Commands
+from flockd.sim.flock.control_loop import ControlLoop
+from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
+from flockd.sim.vehicles.vehicles import REFERENCE_DEG, Vehicles
+
+
+class Announcer(Protocol):
+    """Where the flock is announced: `flockd.onboard.telemetry.publisher.ZenohTelemetry`."""
+
+    @property
+    def identity(self) -> str:
+        """Of all drones that are announced there."""
+
+    def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
+        """A drone is alive, and replies to queries."""
+
+    def withdraw(self, drone: str) -> None:
+        """A drone is there no more."""
+
+
+class RepeatingSink(TelemetrySink, Protocol):
+    """Where messages go, and are sent again: `flockd.sim.flock.repeater.Repeater`."""
+
+    def forget(self, drone: str) -> None:
+        """Nothing of a drone is sent again."""
+
+
+REQUESTS = frozenset({"hold", "resume"})
+"""Of an operator, beside orders: to the drone's autopilot, and back."""
+
+
+class ShownFlock:
+    """Publishes what the drones do, and keeps the orders that they are given until their pilots take them.
+
+    Of what an autopilot does it has Hold alone. Queries come on threads of zenoh's.
+    """
+
+    def __init__(self, scenario: ScenarioConfig, announcer: Announcer, sink: RepeatingSink) -> None:
+        self._scenario, self._announcer, self._sink = scenario, announcer, sink
+        self._drones = [i for i, vehicle in enumerate(scenario.vehicles) if not vehicle.by_hand]
+        self._lock = threading.Lock()
+        self._orders: dict[int, MissionOrder] = {}
+        self._requests: dict[int, str] = {}
+        self._refused = dict.fromkeys(self._drones, 0)
+        self._reasons: dict[int, tuple[str, ...]] = {}
+        self._disturbed = UNDISTURBED
+        self._checks = {i: OrderChecks(announcer.identity, time.monotonic) for i in self._drones}
+        self._states: dict[int, VehicleState] = {}
+        self._stepped: dict[int, tuple[FrameSet, PilotOutput]] = {}
+        self._drawn: _DrawnOnRequest | None = None
+        self._rig = build_rig(scenario.drone.rig)
+        for i in self._drones:
+            self._announce(i)
+
+    def _announce(self, i: int) -> None:
+        about = AboutMessage(
+            version=__version__,
+            configuration=self._scenario.drone_of(i).model_dump(mode="json"),
+            commands=sorted(ORDERS | REQUESTS),
+        )
+        previews = Previews(self._rig, partial(self._newest, i))
+        self._announcer.announce(f"drone{i + 1}", about, partial(self._ask, i), previews.picture)
+
+    def begin_again(self) -> None:
+        """Another flight begins, with all drones."""
+        with self._lock:
+            self._orders, self._requests, self._states, self._stepped, self._reasons = {}, {}, {}, {}, {}
+        if self._drawn is not None:
+            self._drawn.begin_again()
+        self.disturb(UNDISTURBED)
+
+    def disturb(self, disturbed: Disturbances) -> None:
+        """Drones that are removed are there no more; those that are not any more are there again."""
+        before, self._disturbed = self._disturbed, disturbed
+        for i in disturbed.removed - before.removed:
+            self._announcer.withdraw(f"drone{i + 1}")
+            self._sink.forget(f"drone{i + 1}")
+        for i in before.removed - disturbed.removed:
+            self._announce(i)
+        if self._drawn is not None:
+            self._drawn.disturbed = disturbed
+
+    def take_requests(self, time_s: float, loop: ControlLoop, vehicles: Vehicles) -> None:
+        """Has drones held, or fly on, as operators have asked since the last step."""
+        with self._lock:
+            requests, self._requests = self._requests, {}
+        for i, command in requests.items():
+            if command == "hold":
+                loop.hold(i, time_s, vehicles)
+            else:
+                loop.resume(i)
+
+    def show_flight(self, time_s: float, loop: ControlLoop) -> None:
+        """Publishes who flies each drone, and why."""
+        now_s = time.monotonic()
+        for i in self._there():
+            status, reasons = loop.status(i), self._reasons.get(i, ())
+            held = status.state is State.ASKING
+            state = State.DEGRADED if status.state is State.NORMAL and reasons else status.state
+            message = FlightMessage(
+                time_s=time_s,
+                state=state.value,
+                reasons=[ReasonMessage(event="simulated", sentence=one) for one in (*status.reasons, *reasons)],
+                flight_mode="hold" if held else "simulated",
+                armed=True, in_air=True, heartbeat_age_s=None, heartbeats_lost=0, battery_share=None,
+                height_m=self._states[i].height_m, velocity_trim=[0.0, 0.0],
+                velocity_error_m_s=loop.velocity_error_m_s(i),
+                silence="its autopilot holds position" if held else None, setpoints_sent=0, setpoints_missed=0,
+                orders=[taken_message(order, now_s) for order in self._checks[i].recent()],
+                orders_refused=self._refused[i],
+            )  # fmt: skip
+            self._sink.publish(f"drone{i + 1}", "flight", {**message})
+
+    def _there(self) -> list[int]:
+        return [i for i in self._drones if i not in self._disturbed.removed]
+
+    def take_order(self, drone: int) -> MissionOrder | None:
+        """An operator's that no step has taken yet; it is taken now."""
+        with self._lock:
+            return self._orders.pop(drone, None)
+
+    def show(self, drone: int, frames: FrameSet, vehicle: VehicleState, output: PilotOutput) -> None:
+        """Publishes a step of a pilot that sees."""
+        with self._lock:
+            self._states[drone], self._stepped[drone] = vehicle, (frames, output)
+            self._reasons[drone] = tuple(reason.text for reason in output.reasons)
+        publish_step(self._sink, f"drone{drone + 1}", vehicle, output)
+
+    def show_exact(self, step: int, time_s: float, vehicles: Vehicles, commands: Commands) -> None:
+        """Publishes a step of all drones that fly on exact states; pictures of it are drawn when someone asks."""
+        if self._drawn is None:
+            self._drawn = _DrawnOnRequest(self._scenario, self._disturbed)
+        self._drawn.poses = _Poses(step, time_s, vehicles.position.copy(), vehicles.R_ned_body.copy())
+        for i in self._there():
+            position, velocity = vehicles.position[i], vehicles.velocity[i]
+            state = VehicleState(
+                time_s, vehicles.R_ned_body[i], float(-position[2]), velocity, position[:2], np.array(REFERENCE_DEG)
+            )
+            wanted = Wanted(commands.velocity[i], commands.acceleration[i], float(commands.yaw_rad[i]))
+            output = PilotOutput(
+                time_s, None, velocity, (), (), {}, commands.neighbours[i], wanted,
+                mission=commands.missions[i], obstacles=commands.obstacles[i],
+            )  # fmt: skip
+            with self._lock:
+                self._states[i] = state
+            publish_step(self._sink, f"drone{i + 1}", state, output)
+
+    def _newest(self, drone: int) -> tuple[FrameSet | None, tuple[FrameSet, PilotOutput] | None]:
+        if self._drawn is not None:
+            return self._drawn.frames(drone), None
+        with self._lock:
+            stepped = self._stepped.get(drone)
+        return (None, None) if stepped is None else (stepped[0], stepped)
+
+    def _ask(self, drone: int, command: str, payload: bytes) -> AnswerMessage:
+        try:
+            self._take(drone, command, payload)
+        except ValueError as error:
+            self._refused[drone] += 1
+            return AnswerMessage(accepted=False, sentence=str(error))
+        return AnswerMessage(accepted=True, sentence=f"{command} is being tried; the drone's state shows the result")
+
+    def _take(self, drone: int, command: str, payload: bytes) -> None:
+        """Raises ValueError with the reason for which it is refused."""
+        if command not in ORDERS | REQUESTS:
+            raise ValueError(f"{command:.40} is an autopilot's, and simulated drones have Hold alone")
+        ask = parse_ask(payload)
+        order = parse_order(command, ask["order"]) if command in ORDERS else None
+        with self._lock:
+            state = self._states.get(drone)
+        checks = self._checks[drone]
+        fault = checks.fault(command, ask)
+        if fault is None and order is not None:
+            fault = order_fault(self._scenario.drone_of(drone), order, state)
+        if fault is not None:
+            raise ValueError(fault)
+        checks.take(command, ask)
+        with self._lock:
+            if order is None:
+                self._requests[drone] = command
+            else:
+                self._orders[drone] = order
+
+
+class RealTime:
+    """Waits until as much real time has passed as simulated time."""
+
+    def __init__(
+        self, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
+    ) -> None:
+        self._clock, self._sleep = clock, sleep
+        self._began_s: float | None = None
+
+    def wait(self, time_s: float) -> None:
+        """Until `time_s` of the flight."""
+        if self._began_s is None:
+            self._began_s = self._clock() - time_s
+        self._sleep(max(0.0, self._began_s + time_s - self._clock()))
+
+
+class _Poses:
+    """Where all drones were in one step."""
+
+    def __init__(self, step: int, time_s: float, position: np.ndarray, R_ned_body: np.ndarray) -> None:
+        self.step, self.time_s, self.position, self.R_ned_body = step, time_s, position, R_ned_body
+
+
+class _DrawnOnRequest:
+    """Camera images of a flight whose drones look at none. The world is built when the first is asked for."""
+
+    def __init__(self, scenario: ScenarioConfig, disturbed: Disturbances) -> None:
+        self._scenario, self.disturbed = scenario, disturbed
+        self.poses: _Poses | None = None
+        self._cameras: CameraSimulator | None = None
+        self._building: threading.Thread | None = None
+        self._lock = threading.Lock()
+        self._frames: dict[int, FrameSet] = {}
+
+    def frames(self, drone: int) -> FrameSet | None:
+        """Of the newest step; None while the world is being built."""
+        with self._lock:
+            poses, cameras = self.poses, self._cameras
+            if cameras is None or poses is None:
+                if self._building is None:
+                    self._building = threading.Thread(target=self._build, name="world", daemon=True)
+                    self._building.start()
+                return None
+            known = self._frames.get(drone)
+            if known is None or known.time_s != poses.time_s:
+                self._frames[drone] = cameras.capture(drone, poses.step, poses.time_s, poses, disturbed=self.disturbed)[
+                    0
+                ]
+            return self._frames[drone]
+
+    def begin_again(self) -> None:
+        """For another flight from the beginning in the same world."""
+        with self._lock:
+            self._frames, self.poses = {}, None
+            if self._cameras is not None:
+                self._cameras.begin_again()
+
+    def _build(self) -> None:
+        self._cameras = CameraSimulator(self._scenario, threads=1)
+
+
+def orders_of(shown: ShownFlock | None, drones: Sequence[int]) -> dict[int, MissionOrder]:
+    """What operators have ordered since the last step, by drone."""
+    taken = {} if shown is None else {i: shown.take_order(i) for i in drones}
+    return {i: order for i, order in taken.items() if order is not None}

@@ -1,0 +1,323 @@
+"""The swarm loop in lockstep: render each drone's frames, step its pilot, step the vehicles."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+
+import numpy as np
+
+from flockd import __version__
+from flockd.core.choices import TRUTH_ROLES, SimulatedPerception
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.errors import UsageError
+from flockd.core.messages import NO_STATUS, FloatArray
+from flockd.flight.mission.circle_then_tangent import desired_of
+from flockd.onboard.recording import Recorder
+from flockd.onboard.recording.truth import TrueDrone, Truth
+from flockd.review.flight_log.builder import FlightLogBuilder
+from flockd.review.flight_log.capture import key_frame_steps
+from flockd.review.flight_log.key_frames import KeyFrame
+from flockd.review.flight_log.log import FlightLog
+from flockd.review.flight_log.metadata import FlightMetadata, MissionMetadata
+from flockd.sim.cameras import LateAttitude
+from flockd.sim.cameras.camera_simulator import CameraSimulator
+from flockd.sim.flock.commands import Commands
+from flockd.sim.flock.control_loop import ControlLoop
+from flockd.sim.flock.exact_states import ExactFlock, HandPilot, fly_exact_states, start_yaw, step_times
+from flockd.sim.flock.pilot_pool import PilotPool
+from flockd.sim.flock.pilots import Stepped
+from flockd.sim.flock.shown_flock import RealTime, ShownFlock, orders_of
+from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
+from flockd.sim.vehicles.vehicles import SimulatedAutopilot, Vehicles
+from flockd.sim.world.clearances import with_obstacles
+
+_KEY_FRAME_DRONES = 8
+"""Key frames are kept of the first drones only, this many."""
+_LEAST_STEPS = 2
+"""A flight interrupted before has nothing to report."""
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """A finished flight: its log, and key frames of its drones, one after the other."""
+
+    log: FlightLog
+    key_frames: tuple[KeyFrame, ...]
+
+
+def fly(
+    scenario: ScenarioConfig,
+    *,
+    perception: SimulatedPerception = "learned",
+    swap: frozenset[str] = frozenset(),
+    gated: bool = True,
+    shown: ShownFlock | None = None,
+    recorders: Sequence[Recorder] = (),
+    processes: int | None = None,
+    pictured: bool = True,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    preparing: Callable[[int, int], None] = lambda done, total: None,
+) -> Flight:
+    """Fly a scenario. The same scenario gives the same flight, bit for bit, except for the times it took.
+
+    KeyboardInterrupt ends the flight early: after its second step the log of what was flown is returned.
+
+    Args:
+        scenario: what to fly.
+        perception: `learned` flies from rendered images; `truth` from exact relative states.
+        swap: roles of perception that take the truth instead of a network's estimate.
+        gated: whether each drone's gate turns what its pilot asks for into setpoints, as in the daemon.
+        shown: where every drone's output is published; operators' orders come from there. A flight on exact states
+            then takes as long as it takes in the air.
+        recorders: one a drone, or none; nothing comes back from there.
+        processes: for pilots that see, beside this one, which draws the images; 1: they step in this one; 0: they step,
+            and the images are drawn, on the calling thread; None: as many as there are processors, and no more than
+            drones.
+        pictured: keep key frames for the report.
+        progress: called with (steps done, steps in all).
+        preparing: the same, of what is done before the first step: the companion, the networks, the world.
+    """
+    unknown = swap - set(TRUTH_ROLES)
+    if unknown:
+        raise UsageError(
+            f"there is no role {sorted(unknown)[0]!r} to swap for truth; choose from {', '.join(TRUTH_ROLES)}"
+        )
+    begin, began = time.perf_counter(), datetime.now(UTC)
+    times = step_times(scenario)
+    builder = FlightLogBuilder(times, len(scenario.vehicles))
+    preparing(0, _PREPARATIONS)
+    loop = ControlLoop(scenario, gated=gated)
+    vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=start_yaw(scenario), seed=scenario.seed)
+    chosen = key_frame_steps(len(times)) if pictured else set()
+    key_frames: list[KeyFrame] = []
+    flown, pace = 0, RealTime()
+    with ExitStack() as stack:
+        pool = stack.enter_context(PilotPool(scenario, swap, processes)) if perception == "learned" else None
+        companion = None
+        pilots: ExactStatePilots | VisionPilots = ExactStatePilots(scenario, shown, gated=gated)
+        if pool is not None:
+            companion = fly_exact_states(scenario, gated=gated)[1:]
+            pilots = VisionPilots(scenario, pool, shown, recorders, companion, preparing)
+        preparing(_PREPARATIONS, _PREPARATIONS)
+        try:
+            for step, time_s in enumerate(times):
+                if shown is not None and pool is None:
+                    pace.wait(float(time_s))
+                builder.add_truth(step, vehicles.position, vehicles.velocity, vehicles.R_ned_body)
+                commands = pilots.step(step, float(time_s), vehicles, builder, pictured=step in chosen)
+                builder.add_missions(step, commands.desired, commands.missions)
+                key_frames += pilots.key_frames()
+                if shown is not None:
+                    shown.take_requests(float(time_s), loop, vehicles)
+                loop.fly(float(time_s), vehicles, commands)
+                if shown is not None:
+                    shown.show_flight(float(time_s), loop)
+                flown = step + 1
+                progress(flown, len(times))
+        except KeyboardInterrupt:
+            if flown < _LEAST_STEPS:
+                raise
+            builder.cut(flown)
+            companion = companion and (companion[0][:flown], companion[1][:flown])
+    metadata = FlightMetadata.of_configuration(
+        scenario.drone,
+        scenario=scenario.scenario,
+        drones=len(scenario.vehicles),
+        mission=MissionMetadata.of(scenario),
+        duration_s=scenario.duration_s if flown == len(times) else flown * scenario.drone.step_s,
+        interrupted=flown < len(times),
+        began=began.isoformat(timespec="seconds"),
+        version=__version__,
+        seed=scenario.seed,
+        perception=perception if not swap else f"learned, true {', '.join(sorted(swap))}",
+        flow="none" if perception == "truth" else "truth" if "flow" in swap else scenario.drone.perception.flow,
+        wall_s=time.perf_counter() - begin,
+        gated=gated,
+        slowed_share=loop.slowed.share,
+        slowed_by=loop.slowed.by_cause,
+        handed_over=loop.handed_over,
+    )
+    key_frames = sorted((frame for frame in key_frames if frame.time_s < metadata.duration_s), key=lambda f: f.drone)
+    return Flight(with_obstacles(builder.build(metadata, companion or builder.true_path), scenario), tuple(key_frames))
+
+
+_PREPARATIONS = 4
+"""The companion on exact states, the world, the networks, the pilots."""
+
+
+class ExactStatePilots:
+    """The flocking law on the exact states of all drones."""
+
+    def __init__(self, scenario: ScenarioConfig, shown: ShownFlock | None, *, gated: bool) -> None:
+        self._scenario, self._gated, self._shown = scenario, gated, shown
+        self.begin_again()
+        self._by_hand = [vehicle.by_hand for vehicle in scenario.vehicles]
+
+    def begin_again(self) -> None:
+        """For another flight from the beginning."""
+        self._flock = ExactFlock(self._scenario, passes=self._gated)
+
+    def step(
+        self,
+        step: int,
+        time_s: float,
+        vehicles: Vehicles,
+        builder: FlightLogBuilder | None,
+        *,
+        pictured: bool,
+        disturbed: Disturbances = UNDISTURBED,
+    ) -> Commands:
+        """Commands for all drones; there are no images. ``builder``: None where nothing is kept."""
+        positions, velocities = vehicles.position, vehicles.velocity
+        orders = orders_of(self._shown, range(len(positions)))
+        commands = self._flock.step(time_s, positions, velocities, orders, disturbed)
+        if self._shown is not None:
+            self._shown.show_exact(step, time_s, vehicles, commands)
+        if builder is None:
+            return commands
+        for i in (i for i, by_hand in enumerate(self._by_hand) if not by_hand):
+            others = np.arange(len(positions)) != i
+            relative = positions[others] - positions[i]
+            command, acceleration = commands.velocity[i], commands.acceleration[i]
+            builder.add_exact_states(step, i, others, relative, velocities, command, acceleration)
+            if (seen := commands.obstacles[i]) is not None:
+                builder.add_obstacles(step, i, seen)
+        return commands
+
+    def key_frames(self) -> list[KeyFrame]:
+        """None."""
+        return []
+
+
+class VisionPilots:
+    """One pilot a drone, each given only its own images and its own autopilot's readings."""
+
+    def __init__(
+        self,
+        scenario: ScenarioConfig,
+        pool: PilotPool,
+        shown: ShownFlock | None,
+        recorders: Sequence[Recorder],
+        companion: tuple[FloatArray, FloatArray] | None,
+        preparing: Callable[[int, int], None],
+    ) -> None:
+        """``companion``: for what is recorded; None where nothing is."""
+        self._companion = companion
+        preparing(1, _PREPARATIONS)
+        self._shown, self._recorders = shown, recorders
+        self._cameras = CameraSimulator(scenario, threads=0 if pool.on_this_thread else None)
+        preparing(2, _PREPARATIONS)
+        pool.wait_until_ready()
+        preparing(3, _PREPARATIONS)
+        self._pool, self._drones = pool, pool.drones
+        self._scenario, self._yaw_rad = scenario, start_yaw(scenario)
+        self._begin()
+
+    def begin_again(self) -> None:
+        """For another flight from the beginning, in the same world and with the same networks."""
+        self._cameras.begin_again()
+        self._begin()
+
+    def _begin(self) -> None:
+        scenario = self._scenario
+        self._hands = {i: HandPilot(scenario, i) for i in range(len(scenario.vehicles)) if i not in self._drones}
+        ground = self._cameras.ground_height
+        self._autopilots = {
+            i: SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=i, ground=ground) for i in self._drones
+        }
+        late = None if scenario.cameras is None else scenario.cameras.attitude
+        self._attitudes = {} if late is None else {i: LateAttitude(late, scenario.seed, i) for i in self._drones}
+        self._stepped: dict[int, Stepped] = {}
+        self._begins = set(self._drones)
+
+    def step(
+        self,
+        step: int,
+        time_s: float,
+        vehicles: Vehicles,
+        builder: FlightLogBuilder | None,
+        *,
+        pictured: bool,
+        disturbed: Disturbances = UNDISTURBED,
+    ) -> Commands:
+        """Commands for all drones. Each steps as soon as its images are drawn. ``builder``: as of exact states."""
+        steps = {}
+        render_ms = {}
+        flying = [i for i in self._drones if i not in disturbed.removed]
+        orders = orders_of(self._shown, flying)
+        turn_rates = vehicles.trail.motion_at(time_s).turn
+        for i in flying:
+            begin = time.perf_counter()
+            frames, seen = self._cameras.capture(i, step, time_s, vehicles, vehicles.trail, disturbed)
+            render_ms[i] = 1e3 * (time.perf_counter() - begin)
+            state = self._autopilots[i].read(
+                time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i], turn_rates[i]
+            )
+            if self._attitudes:
+                state = self._attitudes[i].heard(state, vehicles.trail)
+            with_pictures = pictured and i in self._drones[:_KEY_FRAME_DRONES]
+            steps[i] = (
+                frames,
+                state,
+                self._pool.step(
+                    i, frames, state, seen, pictured=with_pictures, order=orders.get(i), begins=i in self._begins
+                ),
+            )
+        self._begins = set()
+        self._stepped = {i: future.result() for i, (_, _, future) in steps.items()}
+        truth = None if self._companion is None else self._truth(step, time_s, vehicles, self._companion)
+        for i, stepped in self._stepped.items():
+            frames, state, _ = steps[i]
+            output = stepped.output
+            if self._shown is not None:
+                self._shown.show(i, frames, state, output)
+            if self._recorders and truth is not None:
+                recorder = self._recorders[self._drones.index(i)]
+                recorder.drain()  # simulated time stands still, so nothing need ever be dropped
+                recorder.step(frames, state, output, truth, orders.get(i))
+            if builder is not None:
+                builder.add_output(step, i, output, state.R_ned_body, {"render": render_ms[i], **output.stages_ms})
+        return self._commands(time_s, vehicles)
+
+    def _commands(self, time_s: float, vehicles: Vehicles) -> Commands:
+        """Commands of the pilots, and of the people who fly drones by hand."""
+        count = len(self._scenario.vehicles)
+        commands = Commands.of(count)
+        missions = [NO_STATUS] * count
+        obstacles, neighbours = list(commands.obstacles), list(commands.neighbours)
+        for i, stepped in self._stepped.items():
+            output, command = stepped.output, stepped.output.command
+            commands.velocity[i], commands.acceleration[i] = command.velocity, command.acceleration
+            commands.yaw_rad[i] = self._yaw_rad if command.yaw_rad is None else command.yaw_rad
+            commands.height_m[i] = np.nan if command.height_m is None else command.height_m
+            missions[i], obstacles[i], neighbours[i] = output.mission, output.obstacles, output.neighbours
+            commands.desired[i] = desired_of(self._scenario.drone_of(i).mission, time_s, output.mission)
+        for i, hand in self._hands.items():
+            flown = hand.step(time_s, vehicles.position[i, :2])
+            commands.velocity[i] = commands.desired[i] = flown.velocity
+            commands.height_m[i], missions[i] = flown.height_m, flown.status
+            commands.yaw_rad[i] = self._yaw_rad
+        return replace(commands, missions=tuple(missions), obstacles=tuple(obstacles), neighbours=tuple(neighbours))
+
+    def _truth(self, step: int, time_s: float, vehicles: Vehicles, companion: tuple[FloatArray, FloatArray]) -> Truth:
+        """For recordings only: no pilot gets it."""
+        drones = (
+            TrueDrone(
+                name=f"drone{i + 1}",
+                position=vehicles.position[i],
+                velocity=vehicles.velocity[i],
+                R_ned_body=vehicles.R_ned_body[i],
+                exact_position=companion[0][step, i],
+                exact_velocity=companion[1][step, i],
+            )
+            for i in range(len(vehicles.position))
+        )
+        return Truth(time_s, tuple(drones))
+
+    def key_frames(self) -> list[KeyFrame]:
+        """What the pilots worked with in the last step, where that was asked for."""
+        return [frame for stepped in self._stepped.values() for frame in stepped.key_frames]

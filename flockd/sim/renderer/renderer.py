@@ -1,0 +1,241 @@
+"""Camera images of a world with drones in it: colour, exact metric depth and instance ids, on the CPU.
+
+Triangles become homogeneous edge functions (no clipping), the nearest one of each pixel is found, and only what is seen
+is shaded. An image is drawn on the thread that asks for it; several may be drawn side by side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockd.core.messages import BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
+from flockd.sim.renderer import _raster, _shading
+from flockd.sim.renderer.airframe import DroneModel, machine_texels
+from flockd.sim.renderer.distractors import Distractor, Placed
+from flockd.sim.renderer.sky import SKY_BITS
+from flockd.sim.world import textures
+from flockd.sim.world.mesh import face_normals
+from flockd.sim.world.world import GROUND_MAP_BITS, World
+
+Indices = NDArray[np.int32]
+_DISTRACTOR = 255
+"""Id of distractors while an image is drawn; afterwards they count as background."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What one camera sees."""
+
+    rgb: UInt8Array
+    """(h, w, 3)"""
+    depth: Float32Array
+    """(h, w) metres along the optical axis at the pixel's centre; inf for sky."""
+    ids: UInt8Array
+    """(h, w) 0 for the world, sky and distractors, k for drone k - 1."""
+    distractors: BoolArray
+    """(h, w) where something in the air is seen that is no drone."""
+
+
+class Renderer:
+    """Draws one world and one flock from any camera. Holds no state that changes between images."""
+
+    def __init__(self, world: World, drones: Sequence[DroneModel]) -> None:
+        if len(drones) >= _DISTRACTOR:
+            raise ValueError(f"ids are bytes: at most {_DISTRACTOR - 1} drones, not {len(drones)}")
+        self._world = world
+        self._drones = tuple(drones)
+        self._machine = machine_texels()
+        self._normals = [face_normals(d.vertices.astype(np.float64), d.triangles) for d in self._drones]
+        codes = world.tone.astype(np.float64)
+        # The middle of the linear values that show as each byte.
+        self._linear = np.interp(
+            np.arange(256), codes[: 1 + int(codes.argmax())], (np.arange(1 + int(codes.argmax())) / 1024.0) ** 2
+        )
+
+    def render(
+        self,
+        matrix: FloatArray,
+        size: tuple[int, int],
+        R_ned_camera: FloatArray,
+        position_ned: FloatArray,
+        *,
+        drone_rotations: FloatArray,
+        drone_positions: FloatArray,
+        shown: BoolArray | Sequence[int] | IntArray,
+        distractors: Sequence[Placed] = (),
+    ) -> View:
+        """One image.
+
+        ``matrix`` (3, 3) is the pinhole K for pixel centres at +0.5, ``size`` (width, height), ``R_ned_camera`` (3, 3)
+        takes optical RDF axes to NED, ``position_ned`` (3,) m. ``drone_rotations`` (n, 3, 3) are R_ned_body and
+        ``drone_positions`` (n, 3) NED m, one of each drone of the constructor. ``shown``: a mask (n,) or indices; the
+        others are not seen, but every drone with a finite position casts its shadow. Poses of another number than the
+        drones raise ``ValueError``. ``distractors`` are seen like drones, but have no id and no shadow.
+        """
+        world = self._world
+        width, height = size
+        count = len(self._drones)
+        rotations = np.asarray(drone_rotations, dtype=np.float64).reshape(-1, 3, 3)
+        positions = np.asarray(drone_positions, dtype=np.float64).reshape(-1, 3)
+        if len(rotations) != count or len(positions) != count:
+            raise ValueError(
+                f"{count} drones need {count} poses, not {len(rotations)} rotations and {len(positions)} positions"
+            )
+        K: FloatArray = np.ascontiguousarray(matrix, dtype=np.float64)
+        R = np.ascontiguousarray(R_ned_camera, dtype=np.float64)
+        origin: FloatArray = np.ascontiguousarray(position_ned, dtype=np.float64)
+        inverse_K: FloatArray = np.asarray(np.linalg.inv(K), dtype=np.float64)
+        focal = float(np.sqrt(K[0, 0] * K[1, 1]))
+        P = np.ascontiguousarray(K @ R.T)
+
+        blobs = self._shadows(positions, P, origin, width, height)
+        depth = np.empty((height, width), dtype=np.float32)
+        sharp = np.empty((height, width, 3), dtype=np.uint8)
+        q = _raster.project_vertices(world.vertices, P, origin)
+        rows, planes = _set_up(q, world.triangles, width, height)
+        hit, _ = _fill(rows, planes, width, height)
+        _shading.shade_scene(
+            hit, planes, K, inverse_K, R, origin, focal, world.normals, world.texture, world.uv, world.level,
+            world.tint, world.texels, textures.TEXTURE_BITS, world.ground_map, GROUND_MAP_BITS, world.ground_kind,
+            world.ground_detail, world.extent_m, world.shadow_map, world.shadow_frame, world.light,
+            world.fog_per_m, world.sky, SKY_BITS, world.tone, blobs, sharp, depth,
+        )  # fmt: skip
+        view = View(
+            rgb=sharp.copy(),
+            depth=depth,
+            ids=np.zeros((height, width), dtype=np.uint8),
+            distractors=np.zeros((height, width), dtype=np.bool_),
+        )
+        _raster.smooth_edges(hit, world.texture, planes, self._linear, world.tone, sharp, view.rgb)
+        chosen = np.arange(count)[np.asarray(shown)] if len(np.asarray(shown)) else np.arange(0)
+        things: list[tuple[int, DroneModel | Distractor, FloatArray, FloatArray, FloatArray]] = [
+            (int(k) + 1, self._drones[k], self._normals[k], rotations[k], positions[k]) for k in chosen
+        ]
+        for placed in distractors:
+            normals = face_normals(placed.thing.vertices.astype(np.float64), placed.thing.triangles)
+            things.append((_DISTRACTOR, placed.thing, normals, placed.rotation, placed.position))
+        distance = np.array([np.linalg.norm(position - origin) for *_, position in things])
+        for i in np.argsort(-distance, kind="stable"):
+            identity, model, normals, rotation, position = things[i]
+            self._draw(identity, model, normals, rotation, position, K, inverse_K, R, origin, focal, view)
+        if distractors:
+            np.equal(view.ids, _DISTRACTOR, out=view.distractors)
+            view.ids[view.distractors] = 0
+        return view
+
+    def _draw(
+        self,
+        identity: int,
+        model: DroneModel | Distractor,
+        normals: FloatArray,
+        rotation: FloatArray,
+        position: FloatArray,
+        K: FloatArray,
+        inverse_K: FloatArray,
+        R: FloatArray,
+        origin: FloatArray,
+        focal: float,
+        view: View,
+    ) -> None:
+        """Lay one thing over the view, supersampled within its bounding rectangle."""
+        world = self._world
+        height, width = view.ids.shape
+        vertices = np.ascontiguousarray(model.vertices.astype(np.float64) @ rotation.T + (position - origin))
+        P = K @ R.T
+        left, top, right, bottom = _bounds(vertices @ P.T, width, height)
+        if left >= right or top >= bottom:
+            return
+        s = _raster.SUBSAMPLES
+        zoom = np.array([[s, 0.0, -s * left], [0.0, s, -s * top], [0.0, 0.0, 1.0]])
+        wide, high = s * (right - left), s * (bottom - top)
+        q = _raster.project_vertices(vertices, np.ascontiguousarray(zoom @ P), np.zeros(3))
+        rows, planes = _set_up(q, model.triangles, wide, high)
+        hit, inverse_depth = _fill(rows, planes, wide, high)
+        _raster.shade_drone(
+            hit, inverse_depth, planes, left, top, inverse_K, R, origin, focal, np.ascontiguousarray(rotation),
+            position, normals @ rotation.T, model.texture, model.uv, model.colours, self._machine,
+            textures.TEXTURE_BITS, world.shadow_map, world.shadow_frame, world.light, world.fog_per_m, world.tone,
+            self._linear, identity, view.rgb, view.depth, view.ids,
+        )  # fmt: skip
+
+    def _shadows(self, positions: FloatArray, P: FloatArray, origin: FloatArray, width: int, height: int) -> FloatArray:
+        """(k, 9) discs that stand for the drones in the sun, and where in the image their shadows may be."""
+        world = self._world
+        sun = world.light[0]
+        blobs = []
+        for model, position in zip(self._drones, positions, strict=True):
+            if not np.isfinite(position).all():
+                continue
+            # A quadrotor fills roughly half of the disc around it.
+            radius = 0.36 * model.size_m
+            ground = -world.height_at(position[:1], position[1:2])[0]
+            foot = position - sun * (max(0.0, ground - position[2]) / -sun[2])
+            reach = 2.0 * radius + 0.02 * (ground - position[2])
+            spread = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-0.4, 0.4)]) * reach / -sun[2]
+            blobs.append((*position, radius, 0.6, *_bounds((foot + spread - origin) @ P.T, width, height)))
+        return np.array(blobs, dtype=np.float64).reshape(-1, 9)
+
+
+def _set_up(q: FloatArray, triangles: Indices, width: int, height: int) -> tuple[Indices, FloatArray]:
+    rows = np.empty((len(triangles), 2), dtype=np.int32)
+    planes = np.empty((len(triangles), 12))
+    _raster.set_up_triangles(q, triangles, width, height, rows, planes)
+    return rows, planes
+
+
+def _fill(rows: Indices, planes: FloatArray, width: int, height: int) -> tuple[Indices, Float32Array]:
+    inverse_depth = np.empty((height, width), dtype=np.float32)
+    hit = np.empty((height, width), dtype=np.int32)
+    _raster.fill(_raster.list_visible(rows), rows, planes, inverse_depth, hit)
+    return hit, inverse_depth
+
+
+def _bounds(q: FloatArray, width: int, height: int) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom (exclusive) of homogeneous points, within the image; all of it when one is behind."""
+    if (q[:, 2] <= 0).all():
+        return 0, 0, 0, 0
+    if (q[:, 2] <= 1e-3).any():
+        return 0, 0, width, height
+    pixels = q[:, :2] / q[:, 2:]
+    low = np.clip(np.floor(pixels.min(0)), 0, (width, height)).astype(int)
+    high = np.clip(np.ceil(pixels.max(0)) + 1, 0, (width, height)).astype(int)
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+def true_flow(
+    first: View,
+    second: View,
+    matrix: FloatArray,
+    *,
+    R_ned_camera: tuple[FloatArray, FloatArray],
+    position_ned: tuple[FloatArray, FloatArray],
+    drone_rotations: tuple[FloatArray, FloatArray],
+    drone_positions: tuple[FloatArray, FloatArray],
+) -> tuple[Float32Array, BoolArray]:
+    """Where every pixel of the first image went in the second: flow (h, w, 2) in pixels, valid (h, w).
+
+    Poses come in pairs (first, second), shaped as for ``Renderer.render``. Sky moves as a point at infinity. Valid: in
+    front of the second camera, within its image, and seen there (same id, and a depth that agrees); never on a
+    distractor, which moves as it likes.
+    """
+    h, w = first.ids.shape
+    K = np.asarray(matrix, dtype=np.float64)
+    flow = np.empty((h, w, 2), dtype=np.float32)
+    valid = np.empty((h, w), dtype=np.bool_)
+    # From the first camera's axes to the second's, for the world (0) and for each drone (k + 1): p2 = A p1 + b.
+    count = len(drone_positions[0])
+    A = np.empty((count + 1, 3, 3))
+    b = np.empty((count + 1, 3))
+    (R1, R2), (p1, p2) = R_ned_camera, position_ned
+    A[0], b[0] = R2.T @ R1, R2.T @ (p1 - p2)
+    for k in range(count):
+        turn = drone_rotations[1][k] @ drone_rotations[0][k].T
+        A[k + 1] = R2.T @ turn @ R1
+        b[k + 1] = R2.T @ (turn @ (p1 - drone_positions[0][k]) + drone_positions[1][k] - p2)
+    inverse_K = np.linalg.inv(K)
+    _raster.flow(first.depth, first.ids, second.depth, second.ids, K @ A @ inverse_K, b @ K.T, flow, valid)
+    return flow, valid & ~first.distractors

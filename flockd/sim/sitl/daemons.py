@@ -1,0 +1,162 @@
+"""The daemons of a simulated fleet: real `flockd run` processes, each with a configuration of its own."""
+
+from __future__ import annotations
+
+import re
+import socket
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import yaml
+
+from flockd.core.config import DroneConfig
+from flockd.core.config.mission import MissionParameters
+from flockd.core.config.recording import RecordingConfig
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.errors import ConfigError, ConfigProblem
+from flockd.sim.sitl.autopilots import Ports
+from flockd.sim.sitl.processes import Program, Programs
+
+READY, STATUS = "READY=1", "STATUS="
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+SMALL = {"MALLOC_ARENA_MAX": "2"}
+"""As systemd's unit sets it: fewer, fuller pools of memory."""
+RECORDING = RecordingConfig(images="jpeg", jpeg_quality=80, file_mb=20000.0, quota_mb=100000.0)
+"""One file for a flight, which costs the daemon little."""
+_RUN = "from flockd.cli import program; program()"
+
+
+def fleet_configs(
+    scenario: ScenarioConfig, sitl: DroneConfig, *, ports: Sequence[Ports], endpoint: str, speed_factor: float
+) -> tuple[DroneConfig, ...]:
+    """What each drone of a scenario that is not flown by hand flies with.
+
+    The pilot is the scenario's, with the mission's places counted from the drone's own home, which is below its start;
+    source, autopilot, safety and telemetry are those of ``sitl``. Raises ConfigError where ``sitl`` lacks one of them.
+    """
+    if sitl.source is None or sitl.source.kind != "shared_memory":
+        raise ConfigError(
+            [ConfigProblem("px4_sitl.yaml", 0, "source", "has to be of kind `shared_memory`; write it so")]
+        )
+    if sitl.autopilot is None:
+        raise ConfigError([ConfigProblem("px4_sitl.yaml", 0, "autopilot", "is missing; add it")])
+    configs = []
+    for i, port in enumerate(ports):
+        if scenario.vehicles[i].by_hand:
+            continue
+        name = f"drone{i + 1}"
+        frames = {"drone": name, "connect": (endpoint,), "speed_factor": speed_factor}
+        shared_memory = sitl.source.shared_memory.model_copy(update=frames)
+        address = {"address": f"udpin://127.0.0.1:{port.offboard}", "system_id": i + 1}
+        parts = {
+            "name": name,
+            "source": sitl.source.model_copy(update={"shared_memory": shared_memory}),
+            "autopilot": sitl.autopilot.model_copy(update=address),
+            "mission": _from_home(scenario, i),
+            "safety": sitl.safety,
+            "telemetry": sitl.telemetry.model_copy(
+                update={"fleet": re.sub(r"[^A-Za-z0-9_.-]+", "-", scenario.scenario)}
+            ),
+            "recording": RECORDING,
+        }
+        configs.append(scenario.drone.model_copy(update=parts))
+    return tuple(configs)
+
+
+def _from_home(scenario: ScenarioConfig, vehicle: int) -> MissionParameters:
+    """A vehicle's mission, whose places count from the world's origin in the scenario."""
+    mission = scenario.drone_of(vehicle).mission
+    north_m, east_m, _ = scenario.vehicles[vehicle].position_m
+    return mission.model_copy(update={"origin_m": (mission.origin_m[0] - north_m, mission.origin_m[1] - east_m)})
+
+
+class Daemons:
+    """One `flockd run` for each configuration, between ``__enter__`` and ``__exit__``; listens as systemd would."""
+
+    def __init__(
+        self, configs: Sequence[DroneConfig], *, folder: Path, recordings: Path, environment: Mapping[str, str]
+    ) -> None:
+        """Configurations and logs go to ``folder``, recordings to ``recordings``; sockets to ``folder`` too.
+
+        Args:
+            configs: of the drones.
+            folder: an existing one, whose path is short enough for a socket.
+            recordings: an existing one.
+            environment: this process's own.
+        """
+        self._configs, self._folder = configs, folder
+        self._recordings = recordings.resolve()  # daemons run in `folder`
+        self._environment = {**environment, **ONE_THREAD, **SMALL}
+        self._programs = Programs()
+        self._listeners = [_Listener(folder / config.name) for config in configs]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._programs.__exit__(kind, error, trace)
+        for listener in self._listeners:
+            listener.close()
+
+    def start(self) -> None:
+        """Starts all."""
+        for config, listener in zip(self._configs, self._listeners, strict=True):
+            file = self._folder / f"{config.name}.yaml"
+            values = config.model_dump(mode="json", exclude_defaults=True)
+            file.write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
+            options = ["--config", str(file), "--record", str(self._recordings), "--force"]  # a study may go beyond
+            self._programs.start(
+                config.name,
+                [sys.executable, "-c", _RUN, "run", *options],
+                {**self._environment, "NOTIFY_SOCKET": str(listener.path)},
+                self._folder,
+                self._folder / f"{config.name}.log",
+            )
+
+    def programs(self) -> tuple[Program, ...]:
+        """In the order of the configurations."""
+        return tuple(self._programs)
+
+    def status(self, number: int) -> str:
+        """Its last status line; empty before it has started."""
+        return self._listeners[number].listen().status
+
+    def is_ready(self, number: int) -> bool:
+        """Its networks are loaded, its autopilot is connected and frames arrive."""
+        return self._listeners[number].listen().ready
+
+    def end(self) -> dict[str, int]:
+        """Ends all as SIGTERM does: standstill, Hold, the end of the recording. Exit codes by name."""
+        self._programs.end()
+        return {program.name: program.process.returncode for program in self._programs}
+
+
+class _Listener:
+    """The notifications of one daemon, as for a service manager."""
+
+    def __init__(self, base: Path) -> None:
+        self.path = base.with_suffix(".notify")
+        self.ready, self.status = False, ""
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(self.path))
+        self._socket.setblocking(False)
+
+    def listen(self) -> Self:
+        """Takes in all that has come."""
+        while True:
+            try:
+                lines = self._socket.recv(4096).decode(errors="replace").splitlines()
+            except BlockingIOError:
+                return self
+            self.ready = self.ready or READY in lines
+            for line in lines:
+                if line.startswith(STATUS):
+                    self.status = line.removeprefix(STATUS)
+
+    def close(self) -> None:
+        self._socket.close()

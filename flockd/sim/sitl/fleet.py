@@ -1,0 +1,379 @@
+"""Flies a scenario with real daemons: autopilots, `flockd run` processes, and a server of their camera frames."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from flockd.core.choices import AutopilotKind
+from flockd.core.config import DroneConfig
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.errors import UnavailableError
+from flockd.onboard.sources import clock_at
+from flockd.review.flight_log.fleet_log import FleetFrame, FleetRun, fleet_key_frames, fleet_log, recorded_orders
+from flockd.sim.cameras.camera_simulator import CameraSimulator
+from flockd.sim.flock.exact_states import HandPilot, exact_states_at
+from flockd.sim.flock.swarm import Flight
+from flockd.sim.sitl.autopilots import Autopilots, Px4s, SimulatedAutopilots
+from flockd.sim.sitl.daemons import Daemons, fleet_configs
+from flockd.sim.sitl.frame_server import FrameServer
+from flockd.sim.sitl.free_ports import free_endpoint
+from flockd.sim.sitl.ground_station import GroundStation, Mode
+from flockd.sim.sitl.processes import Program
+from flockd.sim.world.clearances import with_obstacles
+
+Progress = Callable[[int, int], None]
+
+AUTOPILOT_START_S, DAEMON_START_S = 90.0, 180.0
+"""Real seconds; a computer that loads networks for five drones takes its time."""
+ARM_S, CLIMB_S, READY_S, OFFBOARD_S, LAND_S = 60.0, 60.0, 60.0, 10.0, 60.0
+"""Simulated seconds for each step of bringing a fleet up and down."""
+POLL_S = 0.05
+REQUEST_AGAIN_S = 1.0
+ON_GROUND_M, AT_HEIGHT_M = 0.5, 1.0
+LEVEL_M_S, LEVEL_S = 0.1, 1.0
+"""PX4 says that it has climbed while it still climbs: a drone is at its height when it rises no more for so long."""
+REASON_S = 0.5
+"""Real seconds after a drone has left offboard, within which its daemon and its autopilot say why."""
+LEAST_FRAME_SETS = 2
+"""A flight interrupted before has nothing to report."""
+
+
+def fly_fleet(
+    scenario: ScenarioConfig,
+    sitl: DroneConfig,
+    *,
+    kind: AutopilotKind,
+    speed_factor: float,
+    logs: Path,
+    recordings: Path | None,
+    environment: Mapping[str, str],
+    progress: Progress = lambda done, total: None,
+) -> Flight:
+    """Flies a scenario from when all drones are in offboard; every program that it starts has ended when it returns.
+
+    Args:
+        scenario: what to fly; its drones begin at a standstill.
+        sitl: the configuration whose source, autopilot, safety and telemetry the daemons have.
+        kind: of the autopilots.
+        speed_factor: how fast simulated time passes.
+        logs: a folder for the logs and configurations of all programs; those of an earlier fleet are overwritten.
+        recordings: a folder for the daemons' recordings; None: they are deleted.
+        environment: this process's own.
+        progress: called with (simulated seconds done, seconds in all).
+
+    Raises UnavailableError when a program does not come up or a drone not into the air, in time.
+    """
+    scenario = _at_standstill(scenario)
+    clock = clock_at(speed_factor)
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="flockd-")))
+        stack.enter_context(_kept(folder, logs))
+        recorded = recordings or folder / "recordings"
+        recorded.mkdir(parents=True, exist_ok=True)
+        cameras = CameraSimulator(scenario)  # takes seconds
+        autopilots: Autopilots = (
+            Px4s(scenario, speed_factor, environment, folder)
+            if kind == "px4"
+            else SimulatedAutopilots(scenario, speed_factor, cameras.ground_height)
+        )
+        stack.enter_context(autopilots)
+        ports, endpoint = autopilots.ports, free_endpoint()
+        configs = fleet_configs(scenario, sitl, ports=ports, endpoint=endpoint, speed_factor=speed_factor)
+        names = [None if vehicle.by_hand else f"drone{i + 1}" for i, vehicle in enumerate(scenario.vehicles)]
+        assert configs[0].source is not None
+        station = stack.enter_context(GroundStation([port.truth for port in ports], clock))
+        server = stack.enter_context(
+            FrameServer(
+                cameras, names, endpoint=endpoint, rate_hz=configs[0].source.shared_memory.rate_hz,
+                poses=station.poses, clock=clock, speed_factor=speed_factor,
+            )
+        )  # fmt: skip
+        daemons = stack.enter_context(Daemons(configs, folder=folder, recordings=recorded, environment=environment))
+        fleet = _Fleet(scenario, speed_factor, clock, autopilots, station, server, daemons)
+        fleet.come_up()
+        fleet.take_off()
+        run = fleet.fly(progress)
+        fleet.land(run)
+        times = np.array([frame.time_s - run.frames[0].time_s for frame in run.frames])
+        orders = {
+            i: recorded_orders(recorded, config.name, run.frames[0].time_s)
+            for i, config in zip(fleet.drones, configs, strict=True)
+        }
+        companion = exact_states_at(times, scenario, orders)
+        log = fleet_log(scenario, configs, run, recorded, speed_factor, companion)
+        return Flight(with_obstacles(log, scenario), fleet_key_frames(recorded, run))
+
+
+class _Fleet:
+    """Starts a fleet, flies and lands it, as its ground pilots would."""
+
+    def __init__(
+        self, scenario: ScenarioConfig, speed_factor: float, clock: Callable[[], float], autopilots: Autopilots,
+        station: GroundStation, server: FrameServer, daemons: Daemons,
+    ) -> None:  # fmt: skip
+        self._scenario, self._speed_factor, self._clock = scenario, speed_factor, clock
+        self._autopilots, self._station, self._server, self._daemons = autopilots, station, server, daemons
+        self._all = range(len(scenario.vehicles))
+        self._hands = {i: HandPilot(scenario, i) for i in self._all if scenario.vehicles[i].by_hand}
+        self.drones = [i for i in self._all if i not in self._hands]
+        """Those with a daemon, in the order of the daemons."""
+        self._needed: Sequence[Program] = ()
+        """Programs that have to run now; `_poll` raises when one has ended."""
+        self._left_s: dict[int, float] = {}
+        """When a drone was first seen out of offboard, in seconds of the flight."""
+        self._began_s = 0.0
+        """When the drones began to take off."""
+        self._climbed_s = dict.fromkeys(self._all, -np.inf)
+        """When a drone rose or sank last."""
+
+    def come_up(self) -> None:
+        """Starts all programs and waits until they are connected."""
+        self._autopilots.start()
+        self._needed = self._autopilots.programs()
+        self._wait_for(
+            self._station.is_connected,
+            AUTOPILOT_START_S * self._speed_factor,
+            lambda i: f"{self._autopilots.name} {i + 1} sent nothing for {AUTOPILOT_START_S:g} s",
+        )
+        self._station.request_messages()
+        self._server.start()
+        self._daemons.start()
+        self._needed = (*self._autopilots.programs(), *self._daemons.programs())
+        self._wait_for(
+            lambda i: self._daemons.is_ready(self.drones.index(i)),
+            DAEMON_START_S * self._speed_factor,
+            lambda i: f"the daemon of drone{i + 1} was not ready after {DAEMON_START_S:g} s ({self._last_messages(i)})",
+            of=self.drones,
+        )
+
+    def take_off(self) -> None:
+        """Arms, climbs to the drone's own height, and selects offboard when flockd is ready."""
+        station = self._station
+        self._began_s, apart_s = self._clock(), self._scenario.take_off_apart_s * (len(self._all) - 1)
+        up_s = ARM_S + CLIMB_S + apart_s
+        self._request(self._is_up, self._request_climb, up_s, "could not be armed or did not reach its height")
+        self._wait_for(
+            lambda i: self._status(i).startswith("ready") and station.mode_is(i, "LOITER"),
+            READY_S,
+            lambda i: f"flockd was not ready to fly drone{i + 1} after {READY_S:g} s ({self._last_messages(i)})",
+            of=self.drones,
+        )
+        modes: dict[int, Mode] = {i: "POSCTL" if i in self._hands else "OFFBOARD" for i in self._all}
+        self._request(
+            lambda i: station.mode_is(i, modes[i]),
+            lambda i: station.select(i, modes[i]),
+            OFFBOARD_S,
+            "did not go into offboard, or one that is flown by hand into Position mode",
+        )
+
+    def fly(self, progress: Progress) -> FleetRun:
+        """Monitors the flight until its time is over, or until KeyboardInterrupt once there is something to report."""
+        run = FleetRun(self._clock(), began=datetime.now(UTC).isoformat(timespec="seconds"))
+        wall_s, cpu_s, booted = time.monotonic(), self._cpu_s(), [self._station.uptime_s(i) for i in self._all]
+        total_s = self._scenario.duration_s
+        try:
+            while (flying_s := self._clock() - run.began_s) < total_s:
+                progress(int(flying_s), int(total_s))
+                self._note_handovers(run, flying_s)
+                self._note_modes(run)
+                self._fly_by_hand(flying_s)
+                self._server.frames()
+                time.sleep(POLL_S)
+            progress(int(total_s), int(total_s))
+        except KeyboardInterrupt:
+            if len(self._frames_of(run, self._clock())) < LEAST_FRAME_SETS:
+                raise
+            run.interrupted = True
+        self._note_handovers(run, np.inf)
+        run.ended_s, run.wall_s = self._clock(), time.monotonic() - wall_s
+        run.cores = {kind: (after - cpu_s[kind]) / run.wall_s for kind, after in self._cpu_s().items()}
+        run.clock_rates = [rate for i in self._all if (rate := _rate(booted[i], self._station.uptime_s(i))) is not None]
+        version = self._station.version(0)
+        is_fake = self._autopilots.name == SimulatedAutopilots.name
+        run.autopilot = self._autopilots.name if is_fake or version is None else f"{self._autopilots.name} {version}"
+        run.frames = self._frames_of(run, run.ended_s)
+        return run
+
+    def _frames_of(self, run: FleetRun, until_s: float) -> tuple[FleetFrame, ...]:
+        return tuple(s for s in self._server.frames() if run.began_s <= s.time_s < until_s)
+
+    def land(self, run: FleetRun) -> None:
+        """Ends the daemons, which leaves the drones in Hold, and lands all whose autopilot still runs."""
+        run.notes += self._server.notes()
+        run.exit_codes = self._daemons.end()
+        ended = [program.name for program in self._autopilots.programs() if program.ended is not None]
+        run.notes += [f"{name} had ended, so that its drone was not landed" for name in ended]
+        self._needed = ()
+        try:
+            self._request(
+                lambda i: self._autopilot_ended(i) or not self._station.is_armed(i),
+                lambda i: self._station.select(i, "LAND"), LAND_S, "did not land",
+            )  # fmt: skip
+        except UnavailableError as error:  # the flight is over, and worth its report
+            run.notes.append(str(error))
+
+    def _status(self, i: int) -> str:
+        """What a drone's daemon said of itself last."""
+        return self._daemons.status(self.drones.index(i))
+
+    def _fly_by_hand(self, flying_s: float | None) -> None:
+        """Moves the sticks of who is flown by hand: along their missions, or, before the flight, not at all."""
+        for i, hand in self._hands.items():
+            velocity = np.zeros(2)
+            if flying_s is not None:
+                velocity = hand.step(flying_s, self._station.poses().position[i, :2]).velocity
+            self._station.steer(i, velocity)
+
+    def _autopilot_ended(self, i: int) -> bool:
+        autopilots = self._autopilots.programs()
+        return bool(autopilots) and autopilots[i].ended is not None
+
+    def _note_handovers(self, run: FleetRun, flying_s: float) -> None:
+        """Notes each drone that is not in offboard any more, or of which a program has ended.
+
+        The reason is read when its daemon and its autopilot have had time to tell it.
+        """
+        for i, program in zip(self.drones, self._daemons.programs(), strict=True):
+            if program.name in run.handed_over:
+                continue
+            if program.ended is None and not self._autopilot_ended(i) and self._station.mode_is(i, "OFFBOARD"):
+                if i not in self._left_s:
+                    continue
+            elif i not in self._left_s:
+                self._left_s[i] = min(flying_s, self._clock() - run.began_s)
+            if flying_s - self._left_s[i] >= REASON_S * self._speed_factor:
+                run.handed_over[program.name] = f"after {self._left_s[i]:.1f} s {self._why(i, program)}"
+
+    def _note_modes(self, run: FleetRun) -> None:
+        for i in self._all:
+            mode, flown = self._station.mode(i), run.modes.setdefault(f"drone{i + 1}", [])
+            if [mode] != flown[-1:]:
+                flown.append(mode)
+
+    def _why(self, i: int, program: Program) -> str:
+        if program.ended is not None:
+            return f"its daemon ended with exit code {program.ended} ({program.last_output()})"
+        if self._autopilot_ended(i):
+            autopilot = self._autopilots.programs()[i]
+            return f"its autopilot ended with exit code {autopilot.ended} ({autopilot.last_output()})"
+        return f"it left offboard ({self._last_messages(i)})"
+
+    def _height_m(self, i: int) -> float:
+        return -float(self._station.poses().position[i, 2])
+
+    def _is_up(self, i: int) -> bool:
+        now = self._clock()
+        if abs(float(self._station.poses().velocity[i, 2])) > LEVEL_M_S:
+            self._climbed_s[i] = now
+        error_m = self._height_m(i) + self._scenario.vehicles[i].position_m[2]
+        level = now - self._climbed_s[i] >= LEVEL_S
+        return level and abs(error_m) < AT_HEIGHT_M and self._station.mode_is(i, "LOITER")
+
+    def _request_climb(self, i: int) -> None:
+        """When its turn has come; once it has left the ground, another take-off would lead higher."""
+        if self._clock() - self._began_s < i * self._scenario.take_off_apart_s:
+            return
+        if not self._station.is_armed(i):
+            self._station.arm(i)
+        elif self._height_m(i) < ON_GROUND_M:
+            self._station.select(i, "TAKEOFF")
+
+    def _last_messages(self, i: int) -> str:
+        """The last messages of a drone's daemon and autopilot."""
+        messages = []
+        if i in self.drones:
+            output = self._daemons.programs()[self.drones.index(i)].last_output
+            messages.append(f"flockd: {self._status(i) or output()}")
+        if self._station.last_text(i):
+            messages.append(f"autopilot: {self._station.last_text(i)}")
+        return "; ".join(messages)
+
+    def _request(
+        self, done: Callable[[int], bool], request: Callable[[int], None], timeout_s: float, otherwise: str
+    ) -> None:
+        """Sends a request to all drones, and again to those that have not complied; raises after the timeout."""
+        until_s, sent_s = self._clock() + timeout_s, -np.inf
+        while (pending := [i for i in self._all if not done(i)]) and self._clock() < until_s:
+            if self._clock() - sent_s >= REQUEST_AGAIN_S:
+                sent_s = self._clock()
+                for i in pending:
+                    request(i)
+            self._poll()
+        if pending:
+            first = pending[0]
+            raise UnavailableError(
+                f"drone{first + 1} {otherwise} within {timeout_s:g} s ({self._last_messages(first)})"
+            )
+
+    def _wait_for(
+        self,
+        done: Callable[[int], bool],
+        timeout_s: float,
+        otherwise: Callable[[int], str],
+        of: Sequence[int] | None = None,
+    ) -> None:
+        until_s = self._clock() + timeout_s
+        while pending := [i for i in (self._all if of is None else of) if not done(i)]:
+            if self._clock() >= until_s:
+                raise UnavailableError(f"{otherwise(pending[0])}; see its log")
+            self._poll()
+
+    def _poll(self) -> None:
+        """Waits for `POLL_S`. Raises UnavailableError when a program that the flight needs has ended."""
+        self._server.frames()
+        self._fly_by_hand(None)
+        for program in self._needed:
+            if program.ended is not None:
+                raise UnavailableError(f"{program.name} ended with exit code {program.ended} ({program.last_output()})")
+        time.sleep(POLL_S)
+
+    def _cpu_s(self) -> dict[str, float]:
+        def used(programs: Sequence[Program]) -> float:
+            return sum(program.cpu_s() for program in programs)
+
+        own = os.times()
+        return {
+            "daemons": used(self._daemons.programs()),
+            "autopilots": used(self._autopilots.programs()),
+            "simulator": own.user + own.system,
+        }
+
+
+def _at_standstill(scenario: ScenarioConfig) -> ScenarioConfig:
+    """With all drones hovering at the start, as autopilots begin in Hold."""
+    vehicles = tuple(vehicle.model_copy(update={"velocity_m_s": (0.0, 0.0)}) for vehicle in scenario.vehicles)
+    return scenario.model_copy(update={"vehicles": vehicles})
+
+
+@contextmanager
+def _kept(folder: Path, logs: Path) -> Iterator[None]:
+    """Copies the programs' logs and configurations to ``logs`` at the end, also after an error."""
+    try:
+        yield
+    finally:
+        written = _logs_in(folder)
+        if written:
+            logs.mkdir(parents=True, exist_ok=True)
+        for earlier in _logs_in(logs):
+            earlier.unlink()
+        for path in written:
+            shutil.copy(path, logs)
+
+
+def _logs_in(folder: Path) -> list[Path]:
+    return [*folder.glob("*.log"), *folder.glob("drone*.yaml")]
+
+
+def _rate(before: tuple[float, float] | None, after: tuple[float, float] | None) -> float | None:
+    if before is None or after is None or after[1] <= before[1]:
+        return None
+    return (after[0] - before[0]) / (after[1] - before[1])

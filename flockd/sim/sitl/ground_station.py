@@ -1,0 +1,334 @@
+"""A ground station for a fleet of simulated autopilots, which also receives their true poses.
+
+Poses come over the MAVLink stream on which PX4 SITL sends its true state to a simulator; `flockd.onboard.autopilot`'s
+simulated autopilot sends the same.
+"""
+
+from __future__ import annotations
+
+import math
+import select
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import numpy as np
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import development as mavlink
+
+from flockd.core.earth import metres_a_degree
+from flockd.core.errors import UnavailableError
+from flockd.core.messages import FloatArray
+from flockd.flight.geometry import rotation_from_euler, rotation_from_quaternion
+from flockd.onboard.autopilot.mavlink_messages import StatusText
+from flockd.sim.autopilot.sticks import stick_curve
+from flockd.sim.sitl.leftovers import described, user_of_port
+from flockd.sim.vehicles.vehicles import REFERENCE_DEG
+
+Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "ACRO", "OFFBOARD"]
+"""By pymavlink's names; LOITER is Hold."""
+
+SYSTEM_ID = 255
+HEARTBEAT_S = 1.0
+POLL_S = 0.05
+MODE_HZ = 20.0
+FULL_STICK_M_S = 3.0
+"""MPC_VEL_MANUAL of vehicles that are flown by hand: what a stick at its end asks for."""
+_STICK = 1000
+_DEFLECTIONS = np.linspace(0.0, 1.0, _STICK + 1)
+_NEUTRAL_THROTTLE = 500
+MAX_FORWARD_S = 0.2
+"""A pose is extrapolated by no more than this."""
+FURTHER_MODES = {10 << 16: "TERMINATION"}
+"""Those of PX4's modes, by number, that pymavlink has no name for."""
+_RECEIVED = {
+    name: int(getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
+    for name in (
+        "HEARTBEAT",
+        "HIL_STATE_QUATERNION",
+        "CURRENT_MODE",
+        "SYSTEM_TIME",
+        "STATUSTEXT",
+        "AUTOPILOT_VERSION",
+    )
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Where a flock of n drones is, NED metres from the world's origin."""
+
+    position: FloatArray
+    """(n, 3)"""
+    velocity: FloatArray
+    """(n, 3) m/s."""
+    R_ned_body: FloatArray
+    """(n, 3, 3)"""
+
+
+@dataclass(frozen=True, eq=False)
+class _Pose:
+    time_s: float
+    position: FloatArray
+    velocity: FloatArray
+    R_ned_body: FloatArray
+    turn_rad_s: FloatArray
+
+
+@dataclass
+class _Vehicle:
+    """One autopilot, by its last messages."""
+
+    number: int
+    socket: socket.socket
+    mav: Any = None
+    address: tuple[str, int] | None = None
+    pose: _Pose | None = None
+    mode: int | None = None
+    armed: bool = False
+    booted_s: tuple[float, float] | None = None
+    """On its clock, and then on ours."""
+    version: str | None = None
+    texts: list[str] = field(default_factory=list)
+    chunks: StatusText = field(default_factory=StatusText)
+
+    def write(self, data: bytes) -> None:
+        if self.address is not None:
+            self.socket.sendto(data, self.address)
+
+
+class GroundStation:
+    """Receives the true poses of all vehicles on ``ports`` and commands them, between ``__enter__`` and ``__exit__``.
+
+    Times are on ``clock``. Vehicles are counted from 0, and vehicle i has the MAV_SYS_ID i + 1.
+    """
+
+    def __init__(self, ports: Sequence[int], clock: Callable[[], float]) -> None:
+        """Raises UnavailableError for a port that is taken."""
+        self._clock = clock
+        self._vehicles = [_Vehicle(number, _bound(port)) for number, port in enumerate(ports)]
+        for vehicle in self._vehicles:
+            vehicle.mav = mavlink.MAVLink(vehicle, srcSystem=SYSTEM_ID, srcComponent=mavlink.MAV_COMP_ID_MISSIONPLANNER)
+            vehicle.mav.robust_parsing = True
+        self._closing = threading.Event()
+        self._lock = threading.Lock()
+        self._thread = threading.Thread(target=self._run, name="ground station", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._closing.set()
+        self._thread.join()
+        for vehicle in self._vehicles:
+            vehicle.socket.close()
+
+    def is_connected(self, number: int) -> bool:
+        """Its pose and its mode have been received."""
+        vehicle = self._vehicles[number]
+        return vehicle.pose is not None and vehicle.mode is not None
+
+    def request_messages(self) -> None:
+        """Requests mode, system time and version from all autopilots."""
+        for vehicle in self._vehicles:
+            self._command(vehicle, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, _RECEIVED["CURRENT_MODE"], 1e6 / MODE_HZ)
+            self._command(vehicle, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, _RECEIVED["SYSTEM_TIME"], 1e6)
+            self._command(vehicle, mavlink.MAV_CMD_REQUEST_MESSAGE, _RECEIVED["AUTOPILOT_VERSION"])
+
+    def poses(self) -> Poses:
+        """Poses of all as of now, extrapolated from the last messages."""
+        now = self._clock()
+        with self._lock:
+            received = [vehicle.pose for vehicle in self._vehicles]
+        assert all(pose is not None for pose in received), "wait until all are connected"
+        extrapolated = [_extrapolated(pose, now) for pose in received if pose is not None]
+        return Poses(*(np.array([getattr(pose, name) for pose in extrapolated]) for name in Poses.__annotations__))
+
+    def mode_is(self, number: int, mode: Mode) -> bool:
+        """It flies in this mode."""
+        _, main, sub = mavutil.px4_map[mode]
+        return bool(self._vehicles[number].mode == main << 16 | sub << 24)
+
+    def mode(self, number: int) -> str:
+        """The mode it flies in, by pymavlink's name or PX4's number; empty while it is not known."""
+        flown = self._vehicles[number].mode
+        named: dict[int, str] = {main << 16 | sub << 24: name for name, (_, main, sub) in mavutil.px4_map.items()}
+        return "" if flown is None else {**named, **FURTHER_MODES}.get(flown, str(flown))
+
+    def is_armed(self, number: int) -> bool:
+        """Its motors run."""
+        return self._vehicles[number].armed
+
+    def last_text(self, number: int) -> str:
+        """Its last STATUSTEXT, whole; empty if there was none."""
+        return next(reversed(self._vehicles[number].texts), "")
+
+    def texts(self, number: int) -> list[str]:
+        """All its STATUSTEXTs so far, whole, in turn: of two at once nobody may read the first while it is the last."""
+        return list(self._vehicles[number].texts)
+
+    def version(self, number: int) -> str | None:
+        """Version of its firmware, such as `1.18.0`; None while it is not known."""
+        return self._vehicles[number].version
+
+    def uptime_s(self, number: int) -> tuple[float, float] | None:
+        """Seconds since it started by its own clock, and when it said so on ours; None where it does not say."""
+        return self._vehicles[number].booted_s
+
+    def arm(self, number: int) -> None:
+        """Sends the request to arm; see `is_armed`."""
+        self._command(self._vehicles[number], mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
+
+    def select(self, number: int, mode: Mode) -> None:
+        """Sends the request for a mode; see `mode_is`."""
+        _, main, sub = mavutil.px4_map[mode]
+        self._command(self._vehicles[number], mavlink.MAV_CMD_DO_SET_MODE, 1, main, sub)
+
+    def steer(self, number: int, velocity: FloatArray) -> None:
+        """Moves the sticks of a vehicle in Position mode, for a velocity (2,) m/s north and east at its height.
+
+        It stops half a second after the last call.
+        """
+        vehicle = self._vehicles[number]
+        R = np.eye(3) if vehicle.pose is None else vehicle.pose.R_ned_body
+        yaw_rad = math.atan2(R[1, 0], R[0, 0])
+        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+        ahead = np.array([cos * velocity[0] + sin * velocity[1], -sin * velocity[0] + cos * velocity[1]])
+        sticks = np.sign(ahead) * np.interp(np.abs(ahead) / FULL_STICK_M_S, stick_curve(_DEFLECTIONS), _DEFLECTIONS)
+        x, y = (int(stick) for stick in np.round(sticks * _STICK))
+        with self._lock:
+            vehicle.mav.manual_control_send(number + 1, x, y, _NEUTRAL_THROTTLE, 0, 0)
+
+    def push_sticks(self, number: int, *, forward: int) -> None:
+        """Sends the position of a joystick's sticks once: in the middle but for `forward`, -1000 to 1000."""
+        vehicle = self._vehicles[number]
+        with self._lock:
+            vehicle.mav.manual_control_send(vehicle.number + 1, forward, 0, 500, 0, 0)
+
+    def set_parameter(self, number: int, name: str, value: int | float) -> None:
+        """Sends a parameter: an int for an INT32, a float for a REAL32."""
+        vehicle = self._vehicles[number]
+        kind = mavlink.MAV_PARAM_TYPE_INT32 if isinstance(value, int) else mavlink.MAV_PARAM_TYPE_REAL32
+        # PX4 takes an integer's bytes where MAVLink has a float.
+        wire = struct.unpack("<f", struct.pack("<i", value))[0] if isinstance(value, int) else value
+        with self._lock:
+            vehicle.mav.param_set_send(vehicle.number + 1, 1, name.encode(), wire, kind)
+
+    def send_velocity(self, number: int, velocity: FloatArray) -> None:
+        """Sends a setpoint once, as flockd does: a velocity (2,) m/s north and east, at a height of 4 m."""
+        vehicle = self._vehicles[number]
+        with self._lock:
+            vehicle.mav.set_position_target_local_ned_send(
+                0, vehicle.number + 1, 1, 1, 2531, 0, 0, -4.0, *velocity, 0, 0, 0, 0, 0, 0
+            )
+
+    def _command(self, vehicle: _Vehicle, command: int, *numbers: float) -> None:
+        values = (*numbers, *[0.0] * (7 - len(numbers)))
+        with self._lock:
+            vehicle.mav.command_long_send(vehicle.number + 1, 1, command, 0, *values)
+
+    def _run(self) -> None:
+        by_socket = {vehicle.socket: vehicle for vehicle in self._vehicles}
+        due_s = time.monotonic()
+        while not self._closing.is_set():
+            for ready in select.select(list(by_socket), [], [], POLL_S)[0]:
+                self._receive(by_socket[ready])
+            if time.monotonic() >= due_s:
+                due_s = time.monotonic() + HEARTBEAT_S
+                self._send_heartbeats()
+
+    def _send_heartbeats(self) -> None:
+        with self._lock:
+            for vehicle in self._vehicles:
+                vehicle.mav.heartbeat_send(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0)
+
+    def _receive(self, vehicle: _Vehicle) -> None:
+        data, vehicle.address = vehicle.socket.recvfrom(65536)
+        now = self._clock()
+        with self._lock:
+            for packet in _packets(data):
+                for message in vehicle.mav.parse_buffer(packet) or ():
+                    if message.get_srcSystem() == vehicle.number + 1:
+                        _update(vehicle, message, now)
+
+
+def home_deg(position: FloatArray) -> tuple[float, float]:
+    """Latitude and longitude of a place, metres NED from the world's origin."""
+    north_m, east_m = metres_a_degree(REFERENCE_DEG[0])
+    return REFERENCE_DEG[0] + float(position[0]) / north_m, REFERENCE_DEG[1] + float(position[1]) / east_m
+
+
+def _update(vehicle: _Vehicle, message: Any, now: float) -> None:
+    match message.get_type():
+        case "HIL_STATE_QUATERNION":
+            vehicle.pose = _pose(message, now)
+        case "HEARTBEAT":
+            vehicle.mode = int(message.custom_mode)
+            vehicle.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        case "CURRENT_MODE":
+            vehicle.mode = int(message.custom_mode)
+        case "SYSTEM_TIME":
+            vehicle.booted_s = message.time_boot_ms * 1e-3, now
+        case "STATUSTEXT":
+            text = vehicle.chunks.joined(message.to_dict())
+            if text is not None:
+                vehicle.texts.append(text.strip())
+        case "AUTOPILOT_VERSION":
+            vehicle.version = ".".join(str(message.flight_sw_version >> shift & 0xFF) for shift in (24, 16, 8))
+        case _:
+            pass
+
+
+def _pose(message: Any, now: float) -> _Pose:
+    north_m, east_m = metres_a_degree(REFERENCE_DEG[0])
+    north = (message.lat * 1e-7 - REFERENCE_DEG[0]) * north_m
+    east = (message.lon * 1e-7 - REFERENCE_DEG[1]) * east_m
+    return _Pose(
+        time_s=now,
+        position=np.array([north, east, -message.alt * 1e-3]),
+        velocity=np.array([message.vx, message.vy, message.vz]) * 1e-2,
+        R_ned_body=rotation_from_quaternion(np.roll(message.attitude_quaternion, -1)),
+        turn_rad_s=np.array([message.rollspeed, message.pitchspeed, message.yawspeed]),
+    )
+
+
+def _extrapolated(pose: _Pose, now: float) -> _Pose:
+    """Where it is now if neither velocity nor turn has changed."""
+    elapsed_s = min(max(now - pose.time_s, 0.0), MAX_FORWARD_S)
+    return _Pose(
+        now,
+        pose.position + elapsed_s * pose.velocity,
+        pose.velocity,
+        pose.R_ned_body @ rotation_from_euler(*(elapsed_s * pose.turn_rad_s)),
+        pose.turn_rad_s,
+    )
+
+
+def _packets(data: bytes) -> Iterator[bytes]:
+    """The MAVLink 2 packets of a datagram with messages that are used; the others cost too much to decode."""
+    begin = 0
+    while begin + 12 <= len(data) and data[begin] == mavlink.PROTOCOL_MARKER_V2:
+        end = begin + 12 + data[begin + 1] + (13 if data[begin + 2] & 1 else 0)
+        if int.from_bytes(data[begin + 7 : begin + 10], "little") in _RECEIVED.values():
+            yield data[begin:end]
+        begin = end
+
+
+def _bound(port: int) -> socket.socket:
+    bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        bound.bind(("127.0.0.1", port))
+    except OSError as error:
+        bound.close()
+        user = user_of_port(port)
+        advice = "end the other simulation that uses it" if user is None else f"it is used by {described(user)}"
+        raise UnavailableError(f"UDP port {port} cannot be used ({error.strerror}); {advice}") from error
+    return bound

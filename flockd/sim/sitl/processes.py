@@ -1,0 +1,124 @@
+"""Programs that run beside the simulator, and that never outlive it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Self
+
+from flockd.core.side_process import with_package
+from flockd.sim.sitl.bound_to_parent import bound
+
+END_S = 30.0
+"""To end after SIGTERM, before it is killed."""
+INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_LAST_LINE_BYTES = 4000
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """One that was started."""
+
+    name: str
+    log: Path
+    """What it writes."""
+    process: subprocess.Popen[bytes]
+
+    @property
+    def ended(self) -> int | None:
+        """Its exit code; None while it runs."""
+        return self.process.poll()
+
+    def last_output(self) -> str:
+        """The last line of its log."""
+        with self.log.open("rb") as file:
+            file.seek(max(0, self.log.stat().st_size - _LAST_LINE_BYTES))
+            lines = file.read().decode(errors="replace").split("\n")
+        return next((line.strip() for line in reversed(lines) if line.strip()), "nothing")
+
+    def cpu_s(self) -> float:
+        """Seconds of processor time it has used so far; 0 once it has ended."""
+        try:
+            numbers = Path(f"/proc/{self.process.pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+        except OSError:
+            return 0.0
+        return (int(numbers[11]) + int(numbers[12])) / os.sysconf("SC_CLK_TCK")
+
+
+class Programs:
+    """All of one kind, between ``__enter__`` and ``__exit__``.
+
+    Each has a session of its own, so that Ctrl-C reaches the simulator alone, which then ends them in order. One whose
+    simulator was killed gets SIGTERM from Linux.
+    """
+
+    def __init__(self) -> None:
+        self._programs: list[Program] = []
+        self._files: list[IO[bytes]] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.end()
+        for file in self._files:
+            file.close()
+
+    def __iter__(self) -> Iterator[Program]:
+        return iter(self._programs)
+
+    def start(
+        self, name: str, command: Sequence[str], environment: Mapping[str, str], folder: Path, log: Path
+    ) -> Program:
+        """Starts one in ``folder``; all it writes goes to the file ``log``. For the main thread, as `end`."""
+        with _uninterrupted():
+            file = log.open("wb")
+            self._files.append(file)
+            process = subprocess.Popen(
+                bound(list(command)),
+                cwd=folder,
+                env=with_package(environment),
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+            self._programs.append(Program(name, log, process))
+        return self._programs[-1]
+
+    def end(self) -> None:
+        """Terminates all that run and waits for them; one that does not end is killed, with all it has started."""
+        with _uninterrupted():
+            running = [program for program in self._programs if program.ended is None]
+            for program in running:
+                program.process.terminate()
+            until_s = time.monotonic() + END_S
+            for program in running:
+                try:
+                    program.process.wait(max(0.0, until_s - time.monotonic()))
+                except subprocess.TimeoutExpired:
+                    os.killpg(program.process.pid, signal.SIGKILL)
+                    program.process.wait()
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Ctrl-C and its like wait until the end of this: between them and a program there is nothing to end it."""
+    came: list[int] = []
+    before = {number: signal.signal(number, lambda number, _: came.append(number)) for number in INTERRUPTS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if came:
+            signal.raise_signal(came[0])

@@ -1,0 +1,1 @@
+"""What flies: vehicles and the wind, and fake autopilots apart from them."""

@@ -1,0 +1,215 @@
+"""Simulated multirotors that follow velocity setpoints, and what their autopilots say of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from flockd.core.config.scenario import SensorConfig, StartConfig, VehicleConfig
+from flockd.core.messages import FloatArray, VehicleState
+from flockd.flight.geometry import rotation_from_euler
+from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, Ground, level_ground
+from flockd.sim.cameras.pose_trail import KEPT_S, FlockPose, PoseTrail
+from flockd.sim.vehicles.disturbances import Disturbances
+from flockd.sim.vehicles.wind import GustField
+
+GRAVITY_M_S2 = 9.81
+MAX_LEAN_M_S2 = GRAVITY_M_S2 * math.tan(math.radians(45.0))
+"""The largest acceleration, at PX4's default of MPC_TILTMAX_AIR."""
+_MAX_SUBSTEP_S = 0.02
+_AWAY_M = 1e5
+"""To the north of the origin: nobody sees one that is so far away."""
+_DRAG_PER_S = 0.3
+"""Deceleration by the air for each m/s against it: what a multirotor leans against to hold its speed."""
+MAX_CLIMB_M_S = 1.5
+CLIMB_TIME_S = 1.0
+"""From a height error to the climb that is asked for; that one is answered in a quarter of it: no overshoot."""
+_ATTITUDE_ERROR_TIME_S = 30.0
+_VELOCITY_ERROR_TIME_S = 10.0
+_POSITION_ERROR_TIME_S = 60.0
+REFERENCE_DEG = (1.0, 1.0)
+"""Latitude and longitude of the world's origin. PX4 keeps its home as float32, whose steps are a centimetre here, and
+0.4 m in Europe."""
+
+
+class Vehicles:
+    """All vehicles of a flight.
+
+    Horizontal velocity follows a setpoint as a first-order lag of limited acceleration. With the same time constant it
+    comes back from what gusts add, as hard as the vehicle can lean: an autopilot limits what it does for a setpoint,
+    and leans against wind as far as need be. Height is held, or changed as by a critically damped controller of limited
+    climb, down to the ground at z = 0. The attitude is the one whose thrust gives the horizontal acceleration. The
+    arrays are replaced by `step`, never changed in place: `position` (n, 3) m and `velocity` (n, 3) m/s in NED,
+    `R_ned_body` (n, 3, 3). `trail` has them of the last second, as if the flight had begun a second before.
+    """
+
+    def __init__(self, starts: Sequence[StartConfig], config: VehicleConfig, *, yaw_rad: float = 0.0, seed: int = 0):
+        """Start in level flight at the configured velocities, all heading `yaw_rad`; `seed` rules the gusts."""
+        n = len(starts)
+        self._config = config
+        self._seed, self._gust_m_s = seed, config.gust_m_s
+        self._gusts, self._time_s = GustField.of(config, seed), 0.0
+        self._blown = np.zeros((n, 2))
+        """What of the velocity gusts added, m/s."""
+        self._wind = np.array(config.wind_m_s)
+        self._yaw = np.full(n, yaw_rad)
+        self.position = np.array([start.position_m for start in starts])
+        self.velocity = np.array([[*start.velocity_m_s, 0.0] for start in starts])
+        self._thrust = self._drag(self.velocity[:, :2])
+        self.R_ned_body = attitude(self._thrust, self._yaw)
+        self.trail = PoseTrail()
+        self.trail.add(FlockPose(-KEPT_S, self.position - KEPT_S * self.velocity, self.R_ned_body))
+        self.trail.add(FlockPose(0.0, self.position, self.R_ned_body))
+
+    def disturb(self, disturbed: Disturbances) -> None:
+        """From now on other gusts blow, and drones are gone: far away, at a standstill."""
+        gust_m_s = self._config.gust_m_s if disturbed.gust_m_s is None else disturbed.gust_m_s
+        if gust_m_s != self._gust_m_s:
+            self._gust_m_s = gust_m_s
+            self._gusts = GustField.of(self._config.model_copy(update={"gust_m_s": gust_m_s}), self._seed)
+        if disturbed.removed:
+            gone = list(disturbed.removed)
+            self.position, self.velocity = self.position.copy(), self.velocity.copy()
+            self.position[gone, 0] = _AWAY_M * (1.0 + np.array(gone))
+            self.velocity[gone] = 0.0
+
+    def step(
+        self, setpoints: FloatArray, yaw_setpoints: FloatArray, interval_s: float, heights: FloatArray | None = None
+    ) -> None:
+        """Fly on for `interval_s` towards velocities (n, 2) m/s north and east and headings (n,) rad.
+
+        `heights` (n,) m, up positive, are flown to; NaN, or None for all: as high as now.
+        """
+        substeps = math.ceil(interval_s / _MAX_SUBSTEP_S - 1e-9)
+        climbs = heights is not None and not (np.isnan(heights).all() and self._is_level)
+        for _ in range(substeps):
+            self._substep(setpoints, yaw_setpoints, interval_s / substeps)
+            if climbs and heights is not None:
+                self._climb(heights, interval_s / substeps)
+            self.R_ned_body = attitude(self._thrust, self._yaw)
+            self.trail.add(FlockPose(self._time_s, self.position, self.R_ned_body))
+
+    def _substep(self, setpoints: FloatArray, yaw_setpoints: FloatArray, dt: float) -> None:
+        config = self._config
+        velocity = self.velocity[:, :2]
+        # The exact mean acceleration of a first-order lag over dt, then its limit.
+        answer_per_s = -math.expm1(-dt / config.velocity_time_constant_s) / dt
+        followed = limit_norms((setpoints - (velocity - self._blown)) * answer_per_s, config.max_acceleration_m_s2)
+        steered = limit_norms(followed - self._blown * answer_per_s, MAX_LEAN_M_S2)
+        push = self._gusts.push(self._time_s, self.position)
+        self._blown = self._blown + (steered - followed + push) * dt
+        acceleration = steered + push
+        self._time_s += dt
+        self.position = self.position.copy()
+        self.position[:, :2] += velocity * dt + acceleration * (dt**2 / 2)
+        self.velocity = np.column_stack([velocity + acceleration * dt, self.velocity[:, 2]])
+
+        lean = 1.0 if config.tilt_time_constant_s == 0 else -math.expm1(-dt / config.tilt_time_constant_s)
+        self._thrust = self._thrust + lean * (steered + self._drag(self.velocity[:, :2]) - self._thrust)
+        error = (yaw_setpoints - self._yaw + math.pi) % (2 * math.pi) - math.pi
+        limit = math.radians(config.max_yaw_rate_deg_s) * dt
+        self._yaw = self._yaw + np.clip(-math.expm1(-dt / config.yaw_time_constant_s) * error, -limit, limit)
+
+    def _climb(self, heights: FloatArray, dt: float) -> None:
+        down, sink = self.position[:, 2], self.velocity[:, 2]
+        wanted = np.clip(np.nan_to_num((-heights - down) / CLIMB_TIME_S), -MAX_CLIMB_M_S, MAX_CLIMB_M_S)
+        sink = sink + (wanted - sink) * min(1.0, 4.0 * dt / CLIMB_TIME_S)
+        down = down + sink * dt
+        sink = np.where(down >= 0.0, np.minimum(sink, 0.0), sink)
+        self.position = np.column_stack([self.position[:, :2], np.minimum(down, 0.0)])
+        self.velocity = np.column_stack([self.velocity[:, :2], sink])
+
+    @property
+    def _is_level(self) -> bool:
+        """Whether all fly level, off the ground."""
+        return bool((self.velocity[:, 2] == 0.0).all() and (self.position[:, 2] < 0.0).all())
+
+    def _drag(self, velocity: FloatArray) -> FloatArray:
+        """(n, 2) m/s^2 of thrust that the air takes up, with wind."""
+        return np.asarray(_DRAG_PER_S * (velocity - self._wind), dtype=float)
+
+
+class SimulatedAutopilot:
+    """One drone's autopilot: the truth with seeded errors that change slowly, and noise on the barometer."""
+
+    def __init__(self, config: SensorConfig, *, seed: int, drone: int, ground: Ground = level_ground) -> None:
+        """``ground`` is what its range finder measures to, if it has one."""
+        self._config = config
+        self._random = np.random.default_rng([seed, drone])
+        self._time_s: float | None = None
+        self._height_error = np.zeros(1)  # the barometer is set to zero at take-off
+        self._tilt_error = math.radians(config.attitude_error_deg) * self._random.normal(size=3)
+        self._velocity_error = config.velocity_error_m_s * self._random.normal(size=3)
+        # A generator of its own: the position came later, and the other errors are as they were without it.
+        self._of_position = np.random.default_rng([seed, drone, 1])
+        self._position_error = config.position_error_m * self._of_position.normal(size=2)
+        ranger = config.range_finder
+        self._range_finder = None if ranger is None else FakeRangeFinder(ranger, ground, (seed, drone, 2))
+
+    def read(
+        self,
+        time_s: float,
+        position: FloatArray,
+        velocity: FloatArray,
+        R_ned_body: FloatArray,
+        turn_rate: FloatArray | None = None,
+    ) -> VehicleState:
+        """What it says at `time_s`, not before the last, of a drone at `position` (3,) m NED, ground at z = 0.
+
+        Home is the world's origin. Yaw errs as roll and pitch do.
+        """
+        config = self._config
+        elapsed_s = 0.0 if self._time_s is None else time_s - self._time_s
+        self._time_s = time_s
+        self._height_error = self._drift(
+            self._height_error, config.barometer_drift_m, config.barometer_drift_time_s, elapsed_s
+        )
+        self._tilt_error = self._drift(
+            self._tilt_error, math.radians(config.attitude_error_deg), _ATTITUDE_ERROR_TIME_S, elapsed_s
+        )
+        self._velocity_error = self._drift(
+            self._velocity_error, config.velocity_error_m_s, _VELOCITY_ERROR_TIME_S, elapsed_s
+        )
+        keep = math.exp(-elapsed_s / _POSITION_ERROR_TIME_S)
+        kick = math.sqrt(1 - keep**2) * config.position_error_m * self._of_position.normal(size=2)
+        self._position_error = keep * self._position_error + kick
+        noise = config.barometer_noise_m * self._random.normal()
+        ranger = self._range_finder
+        ground_range = None if ranger is None else ranger.read(time_s, position, velocity, R_ned_body)
+        return VehicleState(
+            time_s=time_s,
+            R_ned_body=rotation_from_euler(*self._tilt_error) @ R_ned_body,
+            height_m=float(-position[2] + self._height_error[0] + noise),
+            velocity_ned=velocity + self._velocity_error,
+            position=position[:2] + self._position_error,
+            home_deg=np.array(REFERENCE_DEG),
+            ground_range=ground_range,
+            turn_rate=turn_rate,
+        )
+
+    def _drift(self, error: FloatArray, sigma: float, time_constant_s: float, elapsed_s: float) -> FloatArray:
+        """A Gauss-Markov process after `elapsed_s`."""
+        keep = math.exp(-elapsed_s / time_constant_s)
+        return keep * error + math.sqrt(1 - keep**2) * sigma * self._random.normal(size=error.shape)
+
+
+def limit_norms(vectors: FloatArray, most: float) -> FloatArray:
+    """(n, 2), each shorter where it is longer than `most`."""
+    norms = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors * np.minimum(1.0, most / np.maximum(norms, 1e-12)), dtype=float)
+
+
+def attitude(thrust: FloatArray, yaw: FloatArray) -> FloatArray:
+    """R_ned_body (n, 3, 3) of vehicles whose thrust gives (n, 2) m/s^2 north and east beside holding altitude.
+
+    `yaw` (n,) rad. To the north at yaw 0 the nose goes down (negative pitch), to the east the right side (positive
+    roll).
+    """
+    down = np.column_stack([-thrust, np.full(len(yaw), GRAVITY_M_S2)])
+    down /= np.linalg.norm(down, axis=1, keepdims=True)
+    forward = np.cos(yaw) * down[:, 0] + np.sin(yaw) * down[:, 1]
+    right = np.cos(yaw) * down[:, 1] - np.sin(yaw) * down[:, 0]
+    roll, pitch = -np.arcsin(right), np.arctan2(forward, down[:, 2])
+    return rotation_from_euler(roll, pitch, yaw)

@@ -1,0 +1,486 @@
+"""What stands and lies on the ground: textures, roads, buildings, trees and street furniture, drawn from a seed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+
+from flockd.core.messages import Float32Array, FloatArray
+from flockd.sim.world import textures
+from flockd.sim.world.mesh import Mesh
+from flockd.sim.world.terrain import grid_height
+
+Spot = tuple[float, float, float]
+"""Along a place's heading, across it, and down."""
+
+
+class Scenery:
+    """One world's things, in a fixed order of draws. Read its attributes, change none.
+
+    ``textures``: the ground's kinds first. ``obstacles`` as in ``World``. Each row of ``roads`` is a point (n, e), a
+    direction, half width, sway, sway per metre, phase, kind, style (0 track, 1 path, 2 marked); of ``patches`` a
+    centre, a direction, half sizes, kind. ``zone_limits`` part the noise into zones.
+    """
+
+    def __init__(
+        self,
+        rng: Generator,
+        heights: FloatArray,
+        extent: float,
+        keep_out: FloatArray | None,
+        clearance: float,
+        first_vertex: int,
+    ) -> None:
+        self.rng = rng
+        self.heights = heights
+        self.extent = extent
+        self.keep_out = keep_out
+        self.clearance = clearance
+        self.mesh = Mesh(first_vertex)
+        self.obstacles: list[tuple[float, float, float, float, float, float]] = []
+        self.textures: list[Float32Array] = []
+        self._choose_textures()
+        self._choose_ground()
+        self._populate()
+        self._horizon()
+
+    def _choose_textures(self) -> None:
+        rng = self.rng
+        names = rng.permutation(len(textures.GROUNDS))[: int(rng.integers(3, 5))]
+        self.ground_names = [textures.GROUNDS[i].__name__ for i in names]
+        self.ground_kinds = len(names)
+        self.textures = [textures.GROUNDS[i](rng) for i in names]
+        self.leaves = [self.add_texture(textures.leaves(rng)) for _ in range(2)]
+        self.bark = self.add_texture(textures.bark(rng))
+        walls = [textures.WALLS[i](rng) for i in rng.permutation(len(textures.WALLS))[:3]]
+        self.walls = [self.add_texture(w) for w in walls]
+        self.roofs = [self.add_texture(textures.ROOFS[i](rng)) for i in rng.permutation(len(textures.ROOFS))[:2]]
+        self.facades = [
+            self.add_texture(textures.facade(rng, walls[int(rng.integers(0, 3))], paint_colour(rng))) for _ in range(4)
+        ]
+        self.planks = self.add_texture(textures.planks(rng))
+        self.rock = self.add_texture(textures.soil(rng))
+
+    def add_texture(self, texture: Float32Array) -> int:
+        """Its number."""
+        self.textures.append(texture)
+        return len(self.textures) - 1
+
+    def _choose_ground(self) -> None:
+        """Zones, roads and paved rectangles, and their colours."""
+        rng = self.rng
+        count = int(rng.integers(1, 5))
+        self.zone_limits = np.sort(rng.uniform(-0.9, 0.9, count - 1))
+        self.zone_kinds = rng.integers(0, self.ground_kinds, count)
+        self.zone_colours = np.array([_ground_colour(rng, self.ground_names[k]) for k in self.zone_kinds])
+        roads = []
+        for _ in range(int(rng.choice([0, 1, 1, 2, 2, 3]))):
+            heading = rng.uniform(0, math.pi)
+            style = float(rng.integers(0, 3))  # track, path, marked road
+            half_width = {0.0: rng.uniform(0.8, 1.8), 1.0: rng.uniform(0.6, 2.0), 2.0: rng.uniform(2.2, 4.5)}[style]
+            n, e = rng.uniform(-0.6, 0.6, 2) * self.extent
+            sway = rng.uniform(0.0, 4.0) if rng.random() < 0.6 else 0.0
+            wave, phase, kind = (
+                2 * math.pi / rng.uniform(25, 90),
+                rng.uniform(0, 6.28),
+                rng.integers(0, self.ground_kinds),
+            )
+            roads.append((n, e, math.cos(heading), math.sin(heading), half_width, sway, wave, phase, kind, style))
+        self.roads = np.array(roads, dtype=float).reshape(-1, 10)
+        self.road_colours = np.array([_ground_colour(rng, self.ground_names[int(r[8])]) for r in roads]).reshape(-1, 3)
+        patches = []
+        for _ in range(int(rng.choice([0, 0, 1, 3, 8, 20]))):
+            heading = rng.uniform(0, math.pi)
+            n, e = rng.uniform(-0.9, 0.9, 2) * self.extent
+            a, b = np.exp(rng.uniform(math.log(0.6), math.log(12.0), 2))
+            patches.append((n, e, math.cos(heading), math.sin(heading), a, b, rng.integers(0, self.ground_kinds)))
+        self.patches = np.array(patches, dtype=float).reshape(-1, 7)
+        self.patch_colours = np.array([_ground_colour(rng, self.ground_names[int(p[6])]) for p in patches]).reshape(
+            -1, 3
+        )
+
+    def _populate(self) -> None:
+        """Fill the world: how much of each thing is drawn first, so that worlds differ in kind."""
+        rng = self.rng
+
+        def some(most: int, chance: float) -> int:
+            return int(most * rng.random() ** 1.5) + 1 if rng.random() < chance else 0
+
+        self.tree_styles = [_TreeStyle.draw(rng, self.leaves) for _ in range(int(rng.integers(1, 4)))]
+        for _ in range(some(30, 0.75)):
+            self._building()
+        for _ in range(some(14, 0.45)):
+            self._container()
+        for _ in range(some(16, 0.6)):
+            self._fence()
+        for _ in range(some(24, 0.4)):
+            self._car()
+        for _ in range(some(24, 0.55)):
+            self._pole()
+        for _ in range(some(130, 0.85)):
+            self._tree()
+        for _ in range(some(90, 0.65)):
+            self._bush()
+        for _ in range(some(50, 0.5)):
+            self._rock()
+        for _ in range(some(120, 0.5)):
+            self._pebble()
+
+    def _place(
+        self, half_length: float, half_width: float, top: float, *, off_road: bool = False, gap: float = 0.5
+    ) -> _Place | None:
+        """A spot for a footprint that keeps clear of the path and of what stands already; None if none was found."""
+        rng = self.rng
+        reach = math.hypot(half_length, half_width)
+        for _ in range(12):
+            n, e = rng.uniform(-1, 1, 2) * (self.extent - 4.0 - reach)
+            heading = rng.uniform(0, math.pi)
+            footprint = np.array([[n, e, half_length, half_width, heading, top]])
+            if self.keep_out is not None and footprint_distance(footprint, self.keep_out).min() < self.clearance + 0.05:
+                continue
+            if off_road and any(
+                abs(-(n - r[0]) * r[3] + (e - r[1]) * r[2]) < r[4] + r[5] + min(half_length, half_width)
+                for r in self.roads
+            ):
+                continue
+            if self.obstacles:
+                standing = np.array(self.obstacles)
+                if (footprint_distance(standing, np.array([[n, e]])) < min(half_length, half_width) + gap).any():
+                    continue
+                distance = np.hypot(standing[:, 0] - n, standing[:, 1] - e)
+                bound = np.minimum(
+                    np.hypot(standing[:, 2], standing[:, 3]), 1.3 * np.minimum(standing[:, 2], standing[:, 3]) + 0.5
+                )
+                if (distance < bound + reach).any():
+                    continue
+            self.obstacles.append((n, e, half_length, half_width, heading, top))
+            return _Place(n, e, heading)
+        return None
+
+    def _ground_z(self, place: _Place) -> float:
+        return -float(grid_height(self.heights, self.extent, np.array([place.north]), np.array([place.east]))[0])
+
+    def _box(
+        self,
+        place: _Place,
+        at: Spot,
+        half: Spot,
+        texture: int,
+        tint: FloatArray,
+        tile: tuple[float, float] = (2.0, 2.0),
+    ) -> None:
+        """A box with its middle at ``at`` in the place's axes, turned as the place is."""
+        self.mesh.box(place.at(*at), half, place.heading, texture, tint, tile)
+
+    def _blob(
+        self, place: _Place, at: Spot, radii: Spot, rough: float, texture: int, tint: FloatArray, tile: float
+    ) -> None:
+        """A lump with its middle at ``at`` in the place's axes."""
+        self.mesh.blob(place.at(*at), np.array(radii), rough, self.rng, texture, tint, tile)
+
+    def _building(self) -> None:
+        rng = self.rng
+        floors = int(rng.integers(1, 4)) if rng.random() < 0.8 else int(rng.integers(3, 6))
+        floor_m = rng.uniform(2.5, 3.6)
+        a, b = rng.uniform(2.5, 9.0), rng.uniform(2.0, 5.5)
+        wall_m = floors * floor_m
+        overhang = rng.uniform(0.05, 0.6)
+        roof_m = rng.uniform(0.25, 0.8) * b
+        place = self._place(a + overhang, b + overhang, wall_m + roof_m, off_road=True, gap=1.0)
+        if place is None:
+            return
+        z = self._ground_z(place)
+        windows = rng.random() < 0.75
+        paint = paint_colour(rng)
+        facade = int(rng.choice(self.facades)) if windows else int(rng.choice(self.walls))
+        tint = np.full(3, 0.5) * rng.uniform(0.75, 1.2) if windows else paint
+        bay_m = rng.uniform(2.2, 4.0)
+        foundation = 0.6
+        for side, (length, turn, out) in enumerate(
+            ((a, 0.0, b), (b, math.pi / 2, a), (a, math.pi, b), (b, -math.pi / 2, a))
+        ):
+            wall = _Place(place.north, place.east, place.heading + turn)
+            corners = np.array(
+                [
+                    wall.at(x, out, z + d)
+                    for x, d in ((-length, foundation), (length, foundation), (length, -wall_m), (-length, -wall_m))
+                ]
+            )
+            bays = max(1, round(2 * length / bay_m))
+            tile = (4 * length / bays, 2 * floor_m) if windows else (3.0, 3.0)
+            self.mesh.add(
+                corners, np.array([(0, 1, 2), (0, 2, 3)]), facade, tint, tile, wall.at(length, out, z - wall_m)
+            )
+            if side == 0 and rng.random() < 0.7:
+                entrance = rng.uniform(-0.6, 0.6) * length, out, z - 1.0
+                self._box(wall, entrance, (0.5, 0.04, 1.05), self.planks, paint_colour(rng), (1.0, 2.0))
+        roof_tint = roof_colour(rng)
+        roof = int(rng.choice(self.roofs))
+        top = z - wall_m
+        if rng.random() < 0.35:
+            half = (a + 0.5 * overhang, b + 0.5 * overhang, 0.13)
+            self._box(place, (0, 0, top - 0.12), half, self.walls[0], roof_tint, (3.0, 3.0))
+            for _ in range(int(rng.integers(0, 4))):
+                x, y = rng.uniform(-0.7, 0.7) * a, rng.uniform(-0.6, 0.6) * b
+                half = tuple(rng.uniform(0.3, 0.9, 3))
+                self._box(place, (x, y, top - 0.2 - half[2]), half, self.roofs[1], paint_colour(rng))
+            return
+        la, lb = a + overhang, b + overhang
+        ridge = la if rng.random() < 0.6 else la * rng.uniform(0.0, 0.6)
+        eave = top + overhang * roof_m / lb * 0.5
+        eaves = [place.at(x * la, y * lb, eave) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+        v = np.array([*eaves, place.at(-ridge, 0, top - roof_m), place.at(ridge, 0, top - roof_m)])
+        tile_m = rng.uniform(1.5, 3.0)
+        tile = (tile_m, tile_m)
+        self.mesh.add(v, np.array([(0, 5, 1), (0, 4, 5), (2, 4, 3), (2, 5, 4)]), roof, roof_tint, tile, v[4])
+        self.mesh.add(
+            v,
+            np.array([(1, 5, 2), (3, 4, 0)]),
+            roof if ridge < la else self.walls[1],
+            roof_tint if ridge < la else paint,
+            tile,
+            v[4],
+        )
+        self.mesh.add(v, np.array([(0, 1, 2), (0, 2, 3)]), self.planks, paint * 0.6, (2.0, 2.0))
+        if rng.random() < 0.6:
+            wide = rng.uniform(0.2, 0.45)
+            spot = rng.uniform(-0.5, 0.5) * ridge, rng.uniform(-0.4, 0.4) * b, top - roof_m
+            half = wide, wide, rng.uniform(0.7, 1.3)
+            self._box(place, spot, half, self.walls[0], paint_colour(rng), (1.5, 1.5))
+
+    def _container(self) -> None:
+        rng = self.rng
+        a, b, h = rng.uniform(0.5, 3.2), rng.uniform(0.5, 1.25), rng.uniform(0.4, 1.3)
+        place = self._place(a, b, 2 * h)
+        if place is not None:
+            texture = int(rng.choice([*self.walls, *self.roofs]))
+            middle = 0, 0, self._ground_z(place) - h + 0.1
+            self._box(place, middle, (a, b, h + 0.1), texture, paint_colour(rng), (2.4, 2.4))
+
+    def _fence(self) -> None:
+        rng = self.rng
+        a, h = rng.uniform(3.0, 14.0), rng.uniform(0.5, 1.1)
+        place = self._place(a, 0.25, 2 * h)
+        if place is None:
+            return
+        tint, style = paint_colour(rng), rng.random()
+        sections = max(2, int(a))
+        for k in range(sections):
+            x = (2 * (k + 0.5) / sections - 1) * a
+            middle = place.at(x, 0, 0)
+            piece = _Place(middle[0], middle[1], place.heading)
+            z = self._ground_z(piece)
+            half = a / sections
+            if style < 0.35:  # wall
+                self._box(piece, (0, 0, z - h + 0.2), (half, 0.12, h + 0.2), self.walls[1], tint)
+            elif style < 0.55:  # hedge
+                inside = 0, 0, z - h + 0.2
+                self._box(piece, inside, (half, 0.24, h + 0.2), self.leaves[0], leaf_colour(rng), (1.2, 1.2))
+            else:
+                self._box(piece, (half, 0, z - h + 0.2), (0.06, 0.06, h + 0.25), self.planks, tint, (1.0, 1.0))
+                rails = (0.35, 1.0, 1.65) if style < 0.8 else (0.95,)
+                thick = 0.08 if style < 0.8 else 0.75 * h
+                for level in rails:
+                    rail = 0, 0, z - level * h - 0.05
+                    self._box(piece, rail, (half, 0.025, thick), self.planks, tint, (1.0, 1.0))
+
+    def _car(self) -> None:
+        rng = self.rng
+        length, width = rng.uniform(1.8, 2.5), rng.uniform(0.8, 0.95)
+        place = self._place(length, width, 1.6)
+        if place is None:
+            return
+        z = self._ground_z(place)
+        paint = paint_colour(rng)
+        cabin, roof = (0.55 * length, 0.88 * width, 0.26), (0.5 * length, 0.85 * width, 0.04)
+        self._box(place, (0, 0, z - 0.58), (length, width, 0.3), self.rock, paint, (4.0, 4.0))
+        self._box(place, (-0.15 * length, 0, z - 1.14), cabin, self.facades[0], np.full(3, 0.12), (9.0, 9.0))
+        self._box(place, (-0.15 * length, 0, z - 1.43), roof, self.rock, paint, (4.0, 4.0))
+        for x in (-0.62, 0.62):
+            for y in (-1.0, 1.0):
+                hub = place.at(x * length, y * (width - 0.12), z - 0.31)
+                out = place.at(x * length, y * (width + 0.03), z - 0.31)
+                self.mesh.frustum(hub, out, (0.32, 0.32), 10, self.rock, np.full(3, 0.05))
+
+    def _pole(self) -> None:
+        rng = self.rng
+        h, r = rng.uniform(2.0, 8.0), rng.uniform(0.04, 0.13)
+        place = self._place(0.5, 0.5, h)
+        if place is None:
+            return
+        z = self._ground_z(place)
+        tint = paint_colour(rng)
+        self.mesh.frustum(place.at(0, 0, z + 0.3), place.at(0, 0, z - h), (r, 0.7 * r), 8, self.rock, tint)
+        style = rng.random()
+        if style < 0.4:
+            self._box(place, (0.25, 0, z - h), (0.35, 0.1, 0.06), self.rock, tint)
+        elif style < 0.75:
+            sign = r, 0, z - h + 0.4
+            self._box(place, sign, (0.02, 0.35, 0.35), self.facades[1], paint_colour(rng), (0.9, 0.9))
+        else:
+            self._blob(place, (0, 0, z - h), (0.2, 0.2, 0.2), 0.0, self.rock, np.full(3, 0.5), 2.0)
+
+    def _tree(self) -> None:
+        rng = self.rng
+        style = self.tree_styles[int(rng.integers(0, len(self.tree_styles)))]
+        height = style.height * rng.uniform(0.7, 1.3)
+        crown = min(style.crown * height, 3.5) * rng.uniform(0.8, 1.2)
+        place = self._place(crown, crown, height, off_road=rng.random() < 0.9, gap=-0.4 * crown)
+        if place is None:
+            return
+        z = self._ground_z(place)
+        mesh = self.mesh
+        tint = style.colour * rng.uniform(0.75, 1.25)
+        trunk_tint = np.array([0.22, 0.15, 0.1]) * rng.uniform(0.6, 1.8)
+        r = 0.02 * height + 0.06
+        bare = style.bare * height
+        top = place.at(0, 0, z - max(bare + 0.3, 0.75 * height))
+        mesh.frustum(place.at(0, 0, z + 0.3), top, (r, 0.5 * r), 7, self.bark, trunk_tint)
+        if style.shape == "cone":
+            layers = style.layers
+            for k in range(layers):
+                low = bare + (height - bare) * k / layers * 0.85
+                high = low + (height - low) * (0.75 if k < layers - 1 else 1.0)
+                foot, tip = place.at(0, 0, z - low), place.at(0, 0, z - high)
+                radii = (crown * (1 - 0.75 * k / layers), 0.0)
+                mesh.frustum(foot, tip, radii, 9, style.texture, tint * (1 + 0.1 * k), (1.5, 1.5))
+        elif style.shape in ("column", "round"):
+            share, rough, tile = (0.45, 0.12, 1.6) if style.shape == "column" else (0.9, 0.14, 2.0)
+            radius, middle = share * crown, (0, 0, z - (bare + height) / 2)
+            self._blob(place, middle, (radius, radius, (height - bare) / 2), rough, style.texture, tint, tile)
+        elif style.shape == "cloud":
+            for _ in range(style.layers + 2):
+                x, y = rng.uniform(-0.55, 0.55, 2) * crown
+                size = rng.uniform(0.35, 0.55) * crown
+                up = rng.uniform(bare + 0.5 * size, max(bare + 0.6 * size, height - size))
+                shade = tint * rng.uniform(0.85, 1.15)
+                self._blob(place, (x, y, z - up), (size, size, 0.8 * size), 0.16, style.texture, shade, 1.6)
+        else:  # bare branches
+            for _ in range(9):
+                foot = place.at(0, 0, z - rng.uniform(0.35, 0.72) * height)
+                angle = rng.uniform(0, 6.28)
+                tip = foot + np.array([math.cos(angle), math.sin(angle), -rng.uniform(0.3, 1.2)]) * 0.8 * crown
+                mesh.frustum(foot, tip, (0.35 * r, 0.1 * r), 5, self.bark, trunk_tint)
+
+    def _bush(self) -> None:
+        rng = self.rng
+        r = rng.uniform(0.25, 1.1)
+        place = self._place(r, r, 1.3 * r, gap=-0.3)
+        if place is not None:
+            middle, radii = (0, 0, self._ground_z(place) - 0.5 * r), (0.8 * r, 0.8 * r, 0.7 * r)
+            self._blob(place, middle, radii, 0.2, int(rng.choice(self.leaves)), leaf_colour(rng), 1.2)
+
+    def _rock(self) -> None:
+        rng = self.rng
+        r = rng.uniform(0.15, 0.8)
+        place = self._place(r, r, r, gap=-0.2)
+        if place is not None:
+            radii = tuple(r * rng.uniform(0.55, 0.8, 3))
+            colour = np.full(3, rng.uniform(0.15, 0.5)) * rng.uniform(0.85, 1.1, 3)
+            self._blob(place, (0, 0, self._ground_z(place) - 0.2 * r), radii, 0.2, self.rock, colour, 1.5)
+
+    def _pebble(self) -> None:
+        """Low things may lie under the path too."""
+        rng = self.rng
+        place = _Place(rng.uniform(-0.9, 0.9) * self.extent, rng.uniform(-0.9, 0.9) * self.extent, 0.0)
+        size = rng.uniform(0.05, 0.2)
+        middle = 0, 0, self._ground_z(place)
+        if rng.random() < 0.6:
+            stone = np.full(3, rng.uniform(0.1, 0.6))
+            self._blob(place, middle, (size, size, 0.7 * size), 0.2, self.rock, stone, 0.8)
+        else:
+            self._blob(place, middle, (size, size, 0.8 * size), 0.25, self.leaves[1], leaf_colour(rng), 0.8)
+
+    def _horizon(self) -> None:
+        """Far woods and hills beyond the extent: a ring of lumps, none nearer than 1.3 extents."""
+        rng = self.rng
+        for _ in range(int(rng.choice([0, 12, 25, 40]))):
+            bearing, away = rng.uniform(0, 2 * math.pi), self.extent * rng.uniform(1.9, 4.5)
+            wide, high = rng.uniform(8, 35), rng.uniform(4, 16)
+            centre = np.array([away * math.cos(bearing), away * math.sin(bearing), 0.2 * high])
+            self.mesh.blob(centre, np.array([wide, wide, high]), 0.12, rng, self.leaves[0], leaf_colour(rng) * 0.8, 6.0)
+
+
+def footprint_distance(obstacles: FloatArray, points: FloatArray) -> FloatArray:
+    """Horizontal metres (n,) from points (n, 2) to the nearest of the rectangles; 0 inside."""
+    if len(obstacles) == 0:
+        return np.full(len(points), np.inf)
+    nearest = np.full(len(points), np.inf)
+    for north, east, half_length, half_width, heading, _ in obstacles:
+        dn, de = points[:, 0] - north, points[:, 1] - east
+        along = np.abs(dn * math.cos(heading) + de * math.sin(heading)) - half_length
+        across = np.abs(-dn * math.sin(heading) + de * math.cos(heading)) - half_width
+        nearest = np.minimum(nearest, np.hypot(np.maximum(along, 0.0), np.maximum(across, 0.0)))
+    return nearest
+
+
+@dataclass(frozen=True)
+class _Place:
+    north: float
+    east: float
+    heading: float
+
+    def at(self, along: float, across: float, down: float) -> FloatArray:
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        return np.array([self.north + along * c - across * s, self.east + along * s + across * c, down])
+
+
+@dataclass(frozen=True, eq=False)
+class _TreeStyle:
+    shape: str
+    height: float
+    crown: float
+    bare: float
+    layers: int
+    texture: int
+    colour: FloatArray
+
+    @staticmethod
+    def draw(rng: Generator, leaves: list[int]) -> _TreeStyle:
+        return _TreeStyle(
+            shape=str(rng.choice(["cone", "round", "cloud", "cloud", "column", "bare"])),
+            height=float(rng.uniform(2.5, 10.0)),
+            crown=float(rng.uniform(0.2, 0.45)),
+            bare=float(rng.uniform(0.08, 0.4)),
+            layers=int(rng.integers(2, 5)),
+            texture=int(rng.choice(leaves)),
+            colour=leaf_colour(rng),
+        )
+
+
+def leaf_colour(rng: Generator) -> FloatArray:
+    """Green mostly; sometimes autumn or blossom."""
+    if rng.random() < 0.8:
+        return np.array([rng.uniform(0.05, 0.2), rng.uniform(0.14, 0.32), rng.uniform(0.02, 0.09)])
+    return np.array([rng.uniform(0.25, 0.5), rng.uniform(0.1, 0.32), rng.uniform(0.03, 0.2)])
+
+
+def paint_colour(rng: Generator) -> FloatArray:
+    """Any wall's or machine's colour: mostly muted, sometimes strong."""
+    grey = rng.uniform(0.06, 0.7)
+    strength = rng.uniform(0.0, 0.25) if rng.random() < 0.65 else rng.uniform(0.4, 0.85)
+    return np.asarray(np.clip(grey * (1 - strength) + strength * grey * 2.2 * rng.random(3), 0.02, 0.8))
+
+
+def roof_colour(rng: Generator) -> FloatArray:
+    """Red, grey, brown or green."""
+    base = np.array([(0.4, 0.14, 0.08), (0.2, 0.2, 0.22), (0.3, 0.22, 0.15), (0.15, 0.22, 0.2)])[
+        int(rng.integers(0, 4))
+    ]
+    return np.asarray(np.clip(base * rng.uniform(0.6, 1.6) * rng.uniform(0.85, 1.15, 3), 0.03, 0.7))
+
+
+def _ground_colour(rng: Generator, kind: str) -> FloatArray:
+    base = {
+        "grass": (0.16, 0.22, 0.06),
+        "soil": (0.27, 0.19, 0.12),
+        "gravel": (0.32, 0.3, 0.27),
+        "asphalt": (0.14, 0.14, 0.15),
+        "paving": (0.34, 0.32, 0.3),
+        "bricks": (0.3, 0.18, 0.14),
+        "stone_cells": (0.33, 0.3, 0.25),
+    }[kind]
+    return np.asarray(np.clip(np.array(base) * rng.uniform(0.55, 1.4) * rng.uniform(0.85, 1.15, 3), 0.02, 0.7))

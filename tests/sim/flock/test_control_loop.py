@@ -1,0 +1,124 @@
+"""The simulator's control loop: a supervisor that knows of wind, and what each gate slowed its drone down for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockd.core.config import load_scenario
+from flockd.core.config.scenario import CameraFaultConfig, ScenarioConfig
+from flockd.core.data import data_path
+from flockd.core.messages import FloatArray
+from flockd.flight.flocking.metrics import min_distance
+from flockd.sim.flock.commands import Commands
+from flockd.sim.flock.control_loop import ControlLoop
+from flockd.sim.flock.exact_states import ExactFlock, step_times
+from flockd.sim.flock.swarm import fly
+from flockd.sim.vehicles.vehicles import Vehicles
+
+
+def _scenario(**keys: Any) -> ScenarioConfig:
+    return load_scenario(data_path("config") / "paper_flight.yaml", {k.replace("__", "."): v for k, v in keys.items()})
+
+
+class _Deaf(Vehicles):
+    """Obeys no setpoint."""
+
+    def step(
+        self, setpoints: FloatArray, yaw_setpoints: FloatArray, interval_s: float, heights: FloatArray | None = None
+    ) -> None:
+        super().step(np.zeros_like(setpoints), yaw_setpoints, interval_s, heights)
+
+
+def _flown(scenario: ScenarioConfig, vehicles: Vehicles) -> tuple[ControlLoop, FloatArray]:
+    """The loop after the flight, and the places (S, N, 3) m at each step."""
+    loop, flock, places = ControlLoop(scenario), ExactFlock(scenario), []
+    for time_s in step_times(scenario):
+        places.append(vehicles.position)
+        commands = flock.step(float(time_s), vehicles.position, vehicles.velocity)
+        loop.fly(float(time_s), vehicles, commands)
+    return loop, np.array(places)
+
+
+def test_in_calm_air_nobody_is_held_or_slowed_by_wind() -> None:
+    scenario = _scenario(duration_s=20.0)
+    loop, _ = _flown(scenario, Vehicles(scenario.vehicles, scenario.vehicle))
+    assert loop.handed_over == {}
+    assert "wind" not in loop.slowed.by_cause
+
+
+def test_gusts_beyond_the_limit_end_in_hold_with_the_reason_and_nothing_touches() -> None:
+    """0.5 m/s an axis, 0.7 m/s off; `safety.max_velocity_error_m_s` is 0.8. A held drone is kept where it is."""
+    scenario = _scenario(duration_s=60.0, vehicle__gust_m_s=0.5, seed=2)
+    loop, places = _flown(scenario, Vehicles(scenario.vehicles, scenario.vehicle, seed=2))
+    assert loop.handed_over.keys() == {0, 1, 2, 3, 4}
+    for i, held in loop.handed_over.items():
+        assert "off the setpoints" in held.reason
+        after = places[int(held.time_s / 0.5) + 4 :, i, :2]
+        assert np.linalg.norm(after - after.mean(axis=0), axis=1).max() < 3.0
+    assert min(min_distance(step) for step in places) > 0.7
+    assert loop.slowed.by_cause["wind"] > 0.1
+
+
+def test_a_drone_whose_setpoints_have_no_effect_is_held_where_it_is_far_off() -> None:
+    """Each drone stands. One is asked for 1 m/s, which is 0.8 m/s off after ten seconds; the others for less."""
+    scenario = _scenario(duration_s=20.0)
+    still = [start.model_copy(update={"velocity_m_s": (0.0, 0.0)}) for start in scenario.vehicles]
+    loop, places = _flown(scenario, _Deaf(still, scenario.vehicle))
+    assert loop.handed_over
+    assert max(held.time_s for held in loop.handed_over.values()) < 15.0
+    np.testing.assert_allclose(places, np.broadcast_to(places[0], places.shape))
+
+
+def test_gates_leave_a_flock_the_shape_that_the_law_gives_it() -> None:
+    """A regular pentagon: in a flock that flies along, gaps close too."""
+    scenario = _scenario(duration_s=62.0)
+    _, places = _flown(scenario, Vehicles(scenario.vehicles, scenario.vehicle))
+    plan = places[-1, :, :2]
+    apart_m = np.sort(np.linalg.norm(plan[:, None] - plan[None], axis=2)[np.triu_indices(5, 1)])
+    assert np.ptp(apart_m[:5]) < 0.015, "sides"
+    assert np.ptp(apart_m[5:]) < 0.015, "diagonals"
+
+
+def test_a_lost_camera_is_no_wind() -> None:
+    """Drone 1, which wants 2 m/s, flies at the 1 m/s of a degraded one, until 2 s after its camera is back."""
+    fault = CameraFaultConfig(drone=1, camera="left", kind="uniform", begin_s=2.0, end_s=6.0)
+    scenario = load_scenario(data_path("config") / "encounter.yaml", {"duration_s": 10.0})
+    far = scenario.vehicles[1].model_copy(update={"position_m": (30.0, 30.0, -5.0)})
+    scenario = scenario.model_copy(update={"faults": (fault,), "vehicles": (scenario.vehicles[0], far)})
+    loop, _ = _flown(scenario, Vehicles(scenario.vehicles, scenario.vehicle))
+    assert "wind" not in loop.slowed.by_cause
+    assert loop.slowed.by_cause["camera"] == pytest.approx(6.0 / 20.0, abs=0.02)
+
+
+def test_in_gusts_nothing_touches_among_trees() -> None:
+    """0.3 m/s an axis among 100 trees a hectare."""
+    of_gusts = {"vehicle.gust_m_s": 0.3, "vehicle.gust_length_m": 10.0, "world.obstacles.trees_per_hectare": 100.0}
+    scenario = load_scenario(data_path("config") / "forest.yaml", of_gusts | {"seed": 1, "duration_s": 20.0})
+    log = fly(scenario, perception="truth", pictured=False).log
+    assert log.clearance is not None
+    assert log.clearance.min() > scenario.vehicle.radius_m
+
+
+def test_a_held_drone_takes_no_command_any_more() -> None:
+    scenario = _scenario(duration_s=30.0)
+    loop, vehicles = ControlLoop(scenario), Vehicles(scenario.vehicles, scenario.vehicle)
+    loop._handover.hold(1, vehicles.position[1], vehicles.velocity[1])
+    place = vehicles.position[1]
+    asked = Commands.of(5)
+    asked.velocity[:] = [1.0, 0.0]
+    for step in range(20):
+        loop.fly(0.5 * step, vehicles, asked)
+    stop_m = 1.0 / (2 * 3.0)  # from 1 m/s at PX4's 3 m/s^2
+    np.testing.assert_allclose(vehicles.position[1] - place, [stop_m, 0.0, 0.0], atol=0.02)
+    assert vehicles.position[0, 0] - scenario.vehicles[0].position_m[0] == pytest.approx(10.0, abs=0.3)
+
+
+def test_a_log_says_who_was_held_when_and_why() -> None:
+    scenario = _scenario(duration_s=40.0, vehicle__gust_m_s=0.5, seed=2)
+    metadata = fly(scenario, perception="truth", pictured=False).log.metadata
+    assert metadata.handed_over
+    assert all("off the setpoints" in held.reason for held in metadata.handed_over.values())
+    assert metadata.slowed_by["wind"] > 0.1

@@ -1,0 +1,86 @@
+"""A flock that flies live by sight: begun again it flies the same once more, and a camera that is off shows nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pytest
+
+from flockd.core.config import Overrides, load_scenario
+from flockd.core.data import data_path
+from flockd.onboard.telemetry.publisher import Ask, NewestImage
+from flockd.onboard.telemetry.topics import AboutMessage
+from flockd.sim.flock.live_controls import LiveControls
+from flockd.sim.flock.live_flight import fly_live
+from flockd.sim.flock.shown_flock import ShownFlock
+from flockd.sim.flock.start import with_drones
+from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
+
+STEPS = 3
+FRONT_OFF = Disturbances(cameras_off=frozenset({(0, "front")}), removed=frozenset({1}))
+
+
+class Watching:
+    """What watchers would be told, and which drones are there."""
+
+    identity = "f10c"
+
+    def __init__(self) -> None:
+        self.commands: list[tuple[str, Mapping[str, object]]] = []
+        self.reasons: dict[str, object] = {}
+        self.images: dict[str, NewestImage] = {}
+
+    def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
+        self.images[drone] = newest_image
+
+    def withdraw(self, drone: str) -> None:
+        del self.images[drone]
+
+    def forget(self, drone: str) -> None:
+        """Nothing is sent again here."""
+
+    def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
+        if topic == "command":
+            self.commands.append((drone, message))
+        if topic == "flight":
+            self.reasons[drone] = message["reasons"]
+
+
+class ThreeFlights(LiveControls):
+    """As fast as they are computed: two undisturbed ones of a few steps, and one with a camera off and a drone gone."""
+
+    flight = 0
+    seen: Watching
+
+    def begin(self) -> None:
+        super().begin()
+        self.flight += 1
+        if self.flight == 2:
+            assert sorted(self.seen.images) == ["drone1", "drone2"]
+
+    def wait(self, time_s: float) -> bool:
+        if self.flight == 3 and time_s == 1.0:
+            raise KeyboardInterrupt
+        return time_s < 0.5 * STEPS
+
+    @property
+    def disturbed(self) -> Disturbances:
+        return FRONT_OFF if self.flight == 3 else UNDISTURBED
+
+
+def test_a_flight_begun_again_is_the_same_and_a_camera_that_is_off_shows_nothing() -> None:
+    overrides: Overrides = {"duration_s": 5.0, "seed": 5, "drone.perception.flow": "dis"}
+    flown = with_drones(load_scenario(data_path("config") / "paper_flight.yaml", overrides), 2)
+    watching, controls = Watching(), ThreeFlights(flown, "f10c", by_sight=True)
+    controls.seen = watching
+    with pytest.raises(KeyboardInterrupt):
+        fly_live(flown, ShownFlock(flown, watching, watching), controls)
+    of_one = 2 * STEPS
+    first, again, disturbed = (watching.commands[begin : begin + of_one] for begin in (0, of_one, 2 * of_one))
+    assert first == again, "the same world, the same noise, and pilots that know nothing of the first flight"
+    assert [drone for drone, _ in disturbed] == ["drone1", "drone1"], "drone2 is not there any more"
+    assert sorted(watching.images) == ["drone1"]
+    assert (watching.images["drone1"]("front"), watching.images["drone1"]("back") is None) == (None, False)
+    told = [reason["sentence"] for reason in watching.reasons["drone1"]]  # type: ignore[attr-defined]
+    assert told[0] == "a camera is lost: front unplugged"
+    assert "camera front: no frame" in told

@@ -1,0 +1,126 @@
+"""Detections made up from the truth, and the flights on them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flockd.core.config import load_scenario
+from flockd.core.config.scenario import CameraFaultConfig, DetectionsConfig, ScenarioConfig
+from flockd.core.errors import ConfigError
+from flockd.sim.flock.commands import Commands
+from flockd.sim.flock.control_loop import ControlLoop
+from flockd.sim.flock.exact_states import fly_exact_states
+from flockd.sim.flock.made_up_detections import TrackedNeighbours
+from flockd.sim.vehicles.vehicles import Vehicles
+
+CONFIG = Path(__file__).parents[3] / "config"
+ENCOUNTER = load_scenario(CONFIG / "encounter.yaml")
+AHEAD = np.array([[0.0, 0.0, -5.0], [8.0, 6.0, -5.0]])
+
+
+def known(seed: int = 0, steps: int = 20, positions: np.ndarray = AHEAD, **changes: float) -> list[np.ndarray]:
+    """Where the second drone, which hovers as the first does, is known to be after each step; NaN: nowhere."""
+    config = DetectionsConfig(**changes)
+    tracked = TrackedNeighbours(ENCOUNTER.model_copy(update={"seed": seed}), config, 0)
+    found = [tracked.step(0.5 * i, positions, np.zeros((2, 3))) for i in range(steps)]
+    return [one[0].position if one else np.full(3, np.nan) for one in found]
+
+
+def test_who_is_near_is_tracked_to_within_the_errors() -> None:
+    finals = np.array([known(seed, range_error=0.1, bearing_error_rad=0.01)[-1] for seed in range(20)])
+    errors = finals - [8.0, 6.0, 0.0]
+    assert 0.02 < np.sqrt(np.mean(errors**2)) < 0.5  # one detection: 1 m along, 0.1 m across
+    assert np.abs(errors.mean(axis=0)).max() < 0.3
+
+
+def test_nobody_is_known_beyond_the_range_nor_when_all_are_missed() -> None:
+    assert np.isnan(known(range_m=9.9)).all()
+    assert np.isfinite(known(range_m=10.1)[0]).all()
+    assert np.isnan(known(missed=1.0)).all()
+
+
+def test_nobody_is_detected_in_the_view_of_a_camera_that_has_a_fault() -> None:
+    """8 m north and 6 m east of a drone that faces north: 37 degrees right of ahead, which the front camera shows."""
+    for camera, yaw_deg, seen in (("front", 0.0, False), ("back", 0.0, True), ("left", 90.0, False)):
+        fault = CameraFaultConfig(drone=1, camera=camera, kind="uniform", begin_s=2.0, end_s=4.0)
+        scenario = ENCOUNTER.model_copy(update={"faults": (fault,)})
+        tracked = TrackedNeighbours(scenario, DetectionsConfig(missed=0.0), 0)
+        others = TrackedNeighbours(scenario, DetectionsConfig(missed=0.0), 1)
+        unseen_s = []
+        for i in range(12):
+            found = tracked.step(0.5 * i, AHEAD, np.zeros((2, 3)), np.radians(yaw_deg))
+            unseen_s.append(max((one.unseen_s for one in found), default=9.0))
+            assert others.step(0.5 * i, AHEAD, np.zeros((2, 3)))[0].unseen_s == 0.0, "of another drone"
+        assert (max(unseen_s[4:8]) == 0.0) == seen
+        assert max(unseen_s[:4]) == max(unseen_s[8:]) == 0.0
+
+
+def test_a_drone_that_lost_a_camera_flies_degraded() -> None:
+    fault = CameraFaultConfig(drone=1, camera="back", kind="uniform", begin_s=0.5, end_s=9.0)
+    scenario = ENCOUNTER.model_copy(update={"faults": (fault,), "detections": DetectionsConfig(latency_s=0.0)})
+    loop, vehicles = ControlLoop(scenario), Vehicles(scenario.vehicles, scenario.vehicle)
+    speeds_m_s = []
+    for time_s in (0.0, 0.5, 1.0, 1.5):
+        loop.fly(time_s, vehicles, replace(Commands.of(2), velocity=np.array([[2.0, 0.0], [-2.0, 0.0]])))
+        speeds_m_s.append(np.abs(vehicles.velocity[:, 0]))
+    np.testing.assert_allclose(speeds_m_s[0], 2.0)
+    np.testing.assert_allclose(speeds_m_s[-1], [scenario.drone.safety.gate.degraded_speed_m_s, 2.0], atol=0.05)
+
+
+def test_the_same_seed_gives_the_same_and_each_drone_its_own() -> None:
+    np.testing.assert_array_equal(known(3), known(3))
+    assert not np.array_equal(known(3), known(4))
+
+
+def _nearest_m(scenario: ScenarioConfig) -> float:
+    positions = fly_exact_states(scenario)[1]
+    return float(np.linalg.norm(positions[:, 0] - positions[:, 1], axis=1).min())
+
+
+def test_two_meet_head_on_and_stay_apart_and_would_not_if_they_were_blind() -> None:
+    assert _nearest_m(ENCOUNTER) >= 1.0
+    blind = DetectionsConfig(missed=1.0)
+    assert _nearest_m(ENCOUNTER.model_copy(update={"detections": blind})) < 0.1
+
+
+@pytest.mark.parametrize("gated", [True, False])
+def test_commands_come_late(*, gated: bool) -> None:
+    """Asked for a metre a second to the north, and a step later to the east instead."""
+    east_m = []
+    for latency_s in (0.0, 0.3, 0.45):
+        scenario = ENCOUNTER.model_copy(update={"detections": DetectionsConfig(latency_s=latency_s)})
+        loop, vehicles = ControlLoop(scenario, gated=gated), Vehicles(scenario.vehicles, scenario.vehicle)
+        for time_s, velocity in ((0.0, [1.0, 0.0]), (0.5, [0.0, 1.0])):
+            loop.fly(time_s, vehicles, replace(Commands.of(2), velocity=np.tile(velocity, (2, 1))))
+        east_m.append(float(vehicles.position[0, 1]))
+    assert east_m[0] > 2 * east_m[1] > 4 * east_m[2] > 0.0
+
+
+def test_a_latency_of_a_step_is_refused(tmp_path: Path) -> None:
+    text = (CONFIG / "encounter.yaml").read_text(encoding="utf-8")
+    text = text.replace("simulator.yaml", str(CONFIG / "simulator.yaml")).replace("missed: 0.05", "latency_s: 0.5")
+    (tmp_path / "late.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"detections\.latency_s.*is not below a step of 0\.5 s"):
+        load_scenario(tmp_path / "late.yaml")
+
+
+def limited(scenario: ScenarioConfig, time_s: float) -> ScenarioConfig:
+    flocking = scenario.drone.flocking.model_copy(update={"cohesion_time_s": time_s})
+    return scenario.model_copy(update={"drone": scenario.drone.model_copy(update={"flocking": flocking})})
+
+
+def test_who_pulls_away_at_the_start_is_followed() -> None:
+    """Three drones of which one knows the goal, seen up to 11 m: new neighbours pull little, but soon enough."""
+    scenario = load_scenario(CONFIG / "one_knows.yaml", {"duration_s": 30.0})
+    three = scenario.model_copy(
+        update={"vehicles": scenario.vehicles[:3], "detections": DetectionsConfig(missed=0.05, range_m=11.0)}
+    )
+    positions = fly_exact_states(limited(three, 5.0))[1]
+    apart = np.linalg.norm(positions[:, None] - positions[:, :, None], axis=-1)
+    assert apart[-1].max() < 11.0
+    positions = fly_exact_states(limited(three, 20.0))[1]
+    assert np.linalg.norm(positions[-1, 0] - positions[-1, 1:], axis=-1).min() > 11.0

@@ -1,0 +1,125 @@
+"""One of five stops, alone and at once: its mates, who know it by tracks of made-up detections, keep 1 m apart.
+
+Trackers take mates to fly on with the flock: one that stops is not found where it is looked for.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Collection
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockd.core.config.mission import MissionParameters
+from flockd.core.config.scenario import ScenarioConfig, StartConfig
+from flockd.core.messages import FloatArray
+from flockd.flight.safety import Action, Decision, Event, State
+from flockd.sim.flock.control_loop import ControlLoop
+from flockd.sim.flock.exact_states import ExactFlock
+from flockd.sim.vehicles.vehicles import Vehicles
+from tests.faults.catalogue import RecordProperty
+from tests.sim.flock.test_encounters import ENCOUNTER
+
+APART_M = 1.0
+"""What fault 75 promises, at every instant."""
+SPEED_M_S, SIDE_M = 2.0, 2.0
+BEGINS_S, FLIES_S, STANDS_S = 5.0, 12.0, 3.0
+SEEDS = range(6)
+PAIRS = np.triu_indices(5, 1)
+
+
+class _Watched(Vehicles):
+    """Notes places, (5, 3) m, and velocities, (5, 3) m/s, at 20 Hz."""
+
+    def __init__(self, scenario: ScenarioConfig) -> None:
+        super().__init__(scenario.vehicles, scenario.vehicle, seed=scenario.seed)
+        self.places, self.velocities = [self.position], [self.velocity]
+
+    def step(
+        self, setpoints: FloatArray, yaw_setpoints: FloatArray, interval_s: float, heights: FloatArray | None = None
+    ) -> None:
+        super().step(setpoints, yaw_setpoints, interval_s, heights)
+        self.places.append(self.position)
+        self.velocities.append(self.velocity)
+
+    def nearest_m(self) -> float:
+        """How near any two have come."""
+        places = np.array(self.places)
+        return float(np.linalg.norm(places[:, PAIRS[0]] - places[:, PAIRS[1]], axis=2).min())
+
+
+class _Flight:
+    """A pentagon that flies north, each drone seen at 2 Hz and 0.3 s late. The first is foremost, 2 and 3 are last."""
+
+    def __init__(self, range_error: float, seed: int) -> None:
+        mission = MissionParameters(kind="velocity", velocity_m_s=(SPEED_M_S, 0.0))
+        radius_m = SIDE_M / (2 * math.sin(math.pi / 5))
+        places = [(radius_m * math.cos(k * math.tau / 5), radius_m * math.sin(k * math.tau / 5)) for k in range(5)]
+        vehicles = tuple(
+            StartConfig(position_m=(*place, -5.0), velocity_m_s=(SPEED_M_S, 0.0), mission=mission) for place in places
+        )
+        assert ENCOUNTER.detections is not None
+        assert ENCOUNTER.detections.latency_s == 0.3
+        detections = ENCOUNTER.detections.model_copy(update={"range_error": range_error})
+        scenario = ENCOUNTER.model_copy(update={"vehicles": vehicles, "seed": seed, "detections": detections})
+        self._flock, self.loop, self.vehicles = ExactFlock(scenario), ControlLoop(scenario), _Watched(scenario)
+        self.time_s, self._step_s = 0.0, scenario.drone.step_s
+
+    def fly(self, duration_s: float) -> None:
+        for _ in range(round(duration_s / self._step_s)):
+            commands = self._flock.step(self.time_s, self.vehicles.position, self.vehicles.velocity)
+            self.loop.fly(self.time_s, self.vehicles, commands)
+            self.time_s += self._step_s
+
+
+class _Hovers:
+    degraded_by: Collection[Event] = ()
+
+    def step(self, *_: Any, **__: Any) -> Decision:
+        return Decision(State.HOVER, Action.HOVER, ())
+
+
+def _hovers(flight: _Flight, one: int) -> None:
+    """Its own gate brakes it, as hard as it may: 5 m/s^2."""
+    flight.loop._drones[one] = flight.loop._drones[one]._replace(supervisor=_Hovers())  # type: ignore[arg-type]
+
+
+def _is_taken_over(flight: _Flight, one: int) -> None:
+    flight.loop.hold(one, flight.time_s, flight.vehicles)
+
+
+def _lands(flight: _Flight, one: int) -> None:
+    flight.loop._handover._taken[one] = "land"
+
+
+STOPS: dict[str, tuple[int, Callable[[_Flight, int], None]]] = {
+    "the foremost hovers": (0, _hovers),
+    "one beside hovers": (1, _hovers),
+    "the last hovers": (2, _hovers),
+    "one beside is taken over": (4, _is_taken_over),
+    "the foremost lands": (0, _lands),
+}
+
+
+@pytest.mark.parametrize("range_error", [0.02, 0.06])
+def test_whichever_of_five_stops_its_mates_keep_a_metre_apart(
+    range_error: float, record_property: RecordProperty
+) -> None:
+    nearest_m, speeds_m_s = dict.fromkeys(STOPS, math.inf), []
+    for seed in SEEDS:
+        flight = _Flight(range_error, seed)
+        flight.fly(FLIES_S)
+        speeds_m_s.append(np.array(flight.vehicles.velocities)[round(BEGINS_S / 0.05) :, :, 0].mean())
+        for name, (one, stops) in STOPS.items():
+            then = copy.deepcopy(flight)
+            stops(then, one)
+            then.fly(STANDS_S)
+            assert np.hypot(*then.vehicles.velocity[one, :2]) < 0.1, "it has stopped"
+            nearest_m[name] = min(nearest_m[name], then.vehicles.nearest_m())
+    record_property("nearest_m", {name: round(metres, 2) for name, metres in nearest_m.items()})
+    record_property("speed_m_s", round(float(np.mean(speeds_m_s)), 2))
+    assert min(nearest_m.values()) >= APART_M, nearest_m
+    assert np.mean(speeds_m_s) > 0.75 * SPEED_M_S, "where nobody stops they fly on"

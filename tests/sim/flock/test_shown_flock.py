@@ -1,0 +1,130 @@
+"""A flock on exact states that watchers see as a real one: states, pictures on request, and orders that it flies."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockd.core.config import load_scenario
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.data import data_path
+from flockd.onboard.telemetry.publisher import Ask, NewestImage
+from flockd.onboard.telemetry.topics import AboutMessage
+from flockd.sim.flock.shown_flock import RealTime, ShownFlock
+from flockd.sim.flock.start import with_drones
+from flockd.sim.flock.swarm import fly
+
+SECONDS_TO_FAIL = 120.0
+
+
+class Watching:
+    """Announcements and messages, as zenoh would pass them on."""
+
+    identity = "f10c"
+
+    def __init__(self) -> None:
+        self.about: dict[str, AboutMessage] = {}
+        self.ask: dict[str, Ask] = {}
+        self.image: dict[str, NewestImage] = {}
+        self.states: dict[str, list[Mapping[str, object]]] = {}
+        self.flights: dict[str, list[Mapping[str, Any]]] = {}
+        self.asked = 0
+
+    def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
+        self.about[drone], self.ask[drone], self.image[drone] = about, ask, newest_image
+
+    def withdraw(self, drone: str) -> None:
+        del self.ask[drone]
+
+    def forget(self, drone: str) -> None:
+        del self.states[drone]
+
+    def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
+        if topic == "state":
+            self.states.setdefault(drone, []).append(message)
+        if topic == "flight":
+            self.flights.setdefault(drone, []).append(message)
+
+    def goto(self, drone: str, north_m: float, east_m: float) -> tuple[bool, str]:
+        return self.command(drone, "goto", {"north_m": north_m, "east_m": east_m})
+
+    def command(self, drone: str, command: str, order: dict[str, float] | None = None) -> tuple[bool, str]:
+        self.asked += 1
+        asked = {
+            "operator": "anna", "session": "s", "sequence": self.asked, "time_s": time.monotonic(),
+            "identity": self.identity, "order": order,
+        }  # fmt: skip
+        answer = self.ask[drone](command, json.dumps(asked).encode())
+        return answer["accepted"], answer["sentence"]
+
+
+def scenario(duration_s: float) -> ScenarioConfig:
+    overrides = {"duration_s": duration_s, "drone.safety.gate.fence_radius_m": 30.0}
+    return with_drones(load_scenario(data_path("config") / "paper_flight.yaml", overrides), 2)
+
+
+def test_a_flock_on_exact_states_is_seen_and_goes_where_it_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RealTime, "wait", lambda self, time_s: None)
+    watching = Watching()
+    flown = scenario(60.0)
+    shown = ShownFlock(flown, watching, watching)
+    assert not watching.goto("drone1", 1.0, 2.0)[0], "not before it knows where it is"
+
+    def order_when_due(done: int, total: int) -> None:
+        if done == 20:
+            assert watching.goto("drone1", -10.0, -12.0) == (
+                True,
+                "goto is being tried; the drone's state shows the result",
+            )
+            assert watching.goto("drone2", -10.0, -12.0)[0]
+            accepted, why = watching.goto("drone1", 100.0, 0.0)
+            assert not accepted
+            assert "fence" in why
+
+    log = fly(flown, perception="truth", shown=shown, progress=order_when_due).log
+    assert set(watching.about) == set(watching.states) == {"drone1", "drone2"}
+    assert watching.about["drone1"]["commands"] == ["goto", "hold", "resume", "velocity"]
+    assert [state["position_ne"] for state in watching.states["drone2"]] == log.position[:, 1, :2].tolist()
+    assert np.linalg.norm(log.position[-1, :, :2].mean(axis=0) - [-10.0, -12.0]) < 1.0
+    assert watching.command("drone1", "land") == (False, "land is an autopilot's, and simulated drones have Hold alone")
+    assert watching.flights["drone1"][-1]["orders_refused"] == 2, "before it knew where it was, and out of the fence"
+    began_s = time.monotonic()
+    while (picture := watching.image["drone1"]("front")) is None:
+        assert time.monotonic() - began_s < SECONDS_TO_FAIL, "the world is built when a picture is asked for"
+        time.sleep(0.1)
+    assert picture[:2] == b"\xff\xd8", "a JPEG"
+
+
+def test_real_time_is_waited_for_and_never_caught_up_with() -> None:
+    slept: list[float] = []
+    clock = iter((100.0, 100.0, 100.2, 101.7))
+    pace = RealTime(lambda: next(clock), slept.append)
+    for time_s in (0.0, 0.5, 1.0):
+        pace.wait(time_s)
+    assert slept == pytest.approx([0.0, 0.3, 0.0])
+
+
+def test_a_drone_is_held_where_it_would_stop_and_flies_on_when_it_is_resumed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RealTime, "wait", lambda self, time_s: None)
+    watching, flown = Watching(), scenario(30.0)
+
+    def ask_when_due(done: int, total: int) -> None:
+        if done in {20, 40}:
+            assert watching.command("drone1", "hold" if done == 20 else "resume")[0]
+
+    log = fly(flown, perception="truth", shown=ShownFlock(flown, watching, watching), progress=ask_when_due).log
+    told = [(one["state"], one["flight_mode"]) for one in watching.flights["drone1"]]
+    assert told == [("normal", "simulated")] * 20 + [("asking", "hold")] * 20 + [("normal", "simulated")] * 20
+    (why,) = watching.flights["drone1"][30]["reasons"]
+    assert why["sentence"] == "an operator asked for Hold"
+    speed_m_s = np.linalg.norm(log.velocity[:, 0, :2], axis=1)
+    assert speed_m_s[20] > 0.8
+    assert speed_m_s[30:40].max() < 0.05
+    assert np.linalg.norm(log.position[40, 0] - log.position[20, 0]) < 1.0, "at 1 m/s, braking with 3 m/s^2 or less"
+    assert speed_m_s[-1] > 0.8
+    assert {one["state"] for one in watching.flights["drone2"]} == {"normal"}

@@ -1,0 +1,151 @@
+"""What the simulator notes of its fleet, with autopilots and daemons whose every state the test decides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import development as mavlink
+
+from flockd.core.config import load_scenario
+from flockd.core.data import data_path
+from flockd.review.flight_log.fleet_log import FleetRun
+from flockd.sim.flock.start import with_drones
+from flockd.sim.sitl import fleet as fleet_module
+from flockd.sim.sitl.fleet import _Fleet
+from flockd.sim.sitl.ground_station import _update, _Vehicle
+
+
+@dataclass
+class _Program:
+    name: str
+    ended: int | None = None
+
+    def last_output(self) -> str:
+        return f"last line of {self.name}"
+
+
+@dataclass
+class _World:
+    """A fleet of two at 3 m above the ground, and its clock."""
+
+    now_s: float = 0.0
+    modes: list[str] = field(default_factory=lambda: ["OFFBOARD", "OFFBOARD"])
+    armed: list[bool] = field(default_factory=lambda: [True, True])
+    climb_m_s: float = 0.0
+    up: float = 1.0
+    """The share of their heights at which they are."""
+    statuses: list[str] = field(default_factory=lambda: ["normal", "normal"])
+    daemons: list[_Program] = field(default_factory=lambda: [_Program("drone1"), _Program("drone2")])
+    px4s: list[_Program] = field(default_factory=lambda: [_Program("PX4 instance 0"), _Program("PX4 instance 1")])
+    selected: list[tuple[int, str]] = field(default_factory=list)
+
+    def select(self, i: int, mode: str) -> None:
+        self.selected.append((i, mode))
+        if mode == "LAND" and self.px4s[i].ended is None:
+            self.armed[i] = False
+
+    def fleet(self, apart_s: float = 0.0) -> _Fleet:
+        scenario = with_drones(load_scenario(data_path("config") / "paper_flight.yaml"), 2)
+        scenario = scenario.model_copy(update={"take_off_apart_s": apart_s})
+        height_m = np.array([-vehicle.position_m[2] for vehicle in scenario.vehicles])
+        station = SimpleNamespace(
+            mode_is=lambda i, mode: self.modes[i] == mode,
+            mode=lambda i: self.modes[i],
+            is_armed=lambda i: self.armed[i],
+            last_text=lambda i: "",
+            select=self.select,
+            arm=lambda i: self.armed.__setitem__(i, True),
+            poses=lambda: SimpleNamespace(
+                position=np.column_stack([np.zeros((2, 2)), -self.up * height_m]),
+                velocity=np.full((2, 3), -self.climb_m_s),
+            ),
+        )
+        daemons = SimpleNamespace(
+            programs=lambda: self.daemons, status=lambda i: self.statuses[i], end=lambda: {"drone1": 0, "drone2": 0}
+        )
+        autopilots = SimpleNamespace(programs=lambda: self.px4s, name="PX4 SITL")
+        server = SimpleNamespace(notes=tuple, frames=tuple)
+        parts = cast("Any", (autopilots, station, server, daemons))
+        return _Fleet(scenario, 1.0, lambda: self.now_s, *parts)
+
+
+def test_the_reason_is_read_after_a_drone_has_left_offboard_and_not_before() -> None:
+    world = _World()
+    fleet, run = world.fleet(), FleetRun(0.0)
+    fleet._note_handovers(run, 7.0)
+    world.modes[0], world.now_s = "LOITER", 7.05
+    fleet._note_handovers(run, 7.05)
+    assert run.handed_over == {}, "the daemon's status line is still the one from before"
+    world.statuses[0], world.now_s = "idle: too few cameras deliver images: front, back", 7.6
+    fleet._note_handovers(run, 7.6)
+    why = "after 7.0 s it left offboard (flockd: idle: too few cameras deliver images: front, back)"
+    assert run.handed_over == {"drone1": why}
+    world.statuses[0] = "ready"
+    fleet._note_handovers(run, 20.0)
+    assert run.handed_over == {"drone1": why}
+
+
+def test_a_drone_that_leaves_at_the_very_end_is_noted_too() -> None:
+    world = _World(now_s=19.9)
+    fleet, run = world.fleet(), FleetRun(0.0)
+    world.daemons[1].ended = 70
+    fleet._note_handovers(run, 19.9)
+    assert run.handed_over == {}
+    fleet._note_handovers(run, np.inf)
+    assert run.handed_over == {"drone2": "after 19.9 s its daemon ended with exit code 70 (last line of drone2)"}
+
+
+def test_each_change_of_a_flight_mode_is_noted_once() -> None:
+    world = _World()
+    fleet, run = world.fleet(), FleetRun(0.0)
+    for mode in ("OFFBOARD", "LOITER", "LOITER", "OFFBOARD"):
+        world.modes[1] = mode
+        fleet._note_modes(run)
+    assert run.modes == {"drone1": ["OFFBOARD"], "drone2": ["OFFBOARD", "LOITER", "OFFBOARD"]}
+
+
+def test_drones_land_though_another_ones_autopilot_is_dead(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet_module, "POLL_S", 0.0)
+    world = _World(modes=["LOITER", "LOITER"])
+    world.px4s[0].ended = -9
+    run = FleetRun(0.0)
+    world.fleet().land(run)
+    assert world.armed == [True, False]
+    assert (1, "LAND") in world.selected
+    assert run.notes == ["PX4 instance 0 had ended, so that its drone was not landed"]
+
+
+def test_a_drone_that_still_climbs_is_not_at_its_height() -> None:
+    """PX4 says Hold 0.4 m below the height, and climbs on."""
+    world = _World(modes=["LOITER", "LOITER"], climb_m_s=0.4)
+    fleet = world.fleet()
+    assert not fleet._is_up(0)
+    world.climb_m_s, world.now_s = 0.02, 0.5
+    assert not fleet._is_up(0), "level for half a second"
+    world.now_s = 1.5
+    assert fleet._is_up(0)
+
+
+def test_one_drone_arms_and_takes_off_so_long_after_the_other() -> None:
+    world = _World(armed=[False, False], up=0.0)
+    fleet, done = world.fleet(apart_s=5.0), []
+    for world.now_s in (0.0, 1.0, 4.9, 5.0, 6.0):
+        for i in range(2):
+            fleet._request_climb(i)
+        done.append((list(world.armed), list(world.selected)))
+    first, both = (0, "TAKEOFF"), [(0, "TAKEOFF"), (1, "TAKEOFF")]
+    assert [armed for armed, _ in done] == [[True, False]] * 3 + [[True, True]] * 2
+    assert [selected for _, selected in done] == [[], [first], [first] * 2, [first] * 3, [first] * 3 + both]
+
+
+def test_a_long_text_of_the_autopilot_is_joined_from_its_chunks() -> None:
+    text = "Preflight Fail: ekf2 missing data, and then what makes this longer than fifty characters"
+    vehicle = _Vehicle(0, cast("Any", None))
+    for number, begin in enumerate(range(0, len(text), 50)):
+        chunk = text[begin : begin + 50].encode()
+        _update(vehicle, mavlink.MAVLink_statustext_message(2, chunk, id=9, chunk_seq=number), 0.0)
+    assert vehicle.texts == [text]

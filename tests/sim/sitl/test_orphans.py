@@ -1,0 +1,100 @@
+"""No program outlives the simulator that has started it, even one that was killed; what is left over is named."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from flockd.core.errors import UnavailableError
+from flockd.sim.sitl.ground_station import GroundStation
+from flockd.sim.sitl.leftovers import described, px4_instance, user_of_port
+
+PARENT = """\
+import os, sys, time
+from pathlib import Path
+from flockd.sim.sitl.processes import Programs
+folder = Path(sys.argv[1])
+programs = Programs()
+for name in ("one", "two"):
+    programs.start(name, ["sleep", "60"], os.environ, folder, folder / f"{name}.log")
+print(*(program.process.pid for program in programs), flush=True)
+time.sleep(60)
+"""
+
+
+def _runs(pid: int) -> bool:
+    """It is no zombie either: who should wait for it is gone, and not every init waits for others' children."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def _until_gone(pids: list[int], timeout_s: float = 20.0) -> None:
+    until_s = time.monotonic() + timeout_s
+    while (left := [pid for pid in pids if _runs(pid)]) and time.monotonic() < until_s:
+        time.sleep(0.02)
+    for pid in left:
+        os.kill(pid, signal.SIGKILL)
+    assert not left
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_what_a_killed_simulator_has_started_ends_with_it(number: signal.Signals, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", PARENT, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        pids = [int(word) for word in parent.stdout.readline().split()]
+        until_s = time.monotonic() + 20.0
+        while any(b"bound_to_parent" in Path(f"/proc/{pid}/cmdline").read_bytes() for pid in pids):
+            assert time.monotonic() < until_s
+            time.sleep(0.02)
+        assert [_runs(pid) for pid in pids] == [True, True]
+        parent.send_signal(number)
+    _until_gone(pids)
+
+
+def test_a_program_whose_parent_has_ended_already_does_not_start(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "flockd.sim.sitl.bound_to_parent", "1", "touch", str(tmp_path / "started")]
+    ended = subprocess.run(command, check=False, cwd=Path(__file__).parents[3])
+    assert ended.returncode == 128 + signal.SIGTERM
+    assert not (tmp_path / "started").exists()
+
+
+def test_who_uses_a_port_is_named_with_what_to_do() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+        assert user_of_port(port) == os.getpid()
+        with pytest.raises(UnavailableError) as refused:
+            GroundStation([port], time.monotonic)
+    assert f"UDP port {port} cannot be used (Address already in use); it is used by process {os.getpid()}: " in str(
+        refused.value
+    )
+    assert str(refused.value).endswith(f"end it with `kill {os.getpid()}`, and start again")
+    assert user_of_port(port) is None
+
+
+def test_an_instance_of_px4_that_was_left_over_is_found(tmp_path: Path) -> None:
+    """A script stands for it: only its name and its option count."""
+    px4 = tmp_path / "px4"
+    px4.write_text("#!/bin/sh\nsleep 60 & wait\n", encoding="ascii")
+    px4.chmod(0o755)
+    process = subprocess.Popen([str(px4), "-i", "97", "-d", "etc"], start_new_session=True)
+    try:
+        until_s = time.monotonic() + 20.0
+        while (found := px4_instance(97)) is None and time.monotonic() < until_s:
+            time.sleep(0.02)
+        assert found == process.pid
+        assert described(process.pid).endswith(f"; end it with `kill {process.pid}`, and start again")
+        assert px4_instance(9) is None
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
