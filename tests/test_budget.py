@@ -24,7 +24,7 @@ LINES = {
     "flockd/flight": 14_740,
     "flockd/onboard": 11_630,
     "flockd/fleet": 2_690,
-    "flockd/ground": 6_000,
+    "flockd/ground": 5_990,
     "flockd/review": 4_290,
     "flockd/sim": 11_570,
     "flockd/campaign": 2_220,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_860,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 499}
+FILES = {"flockd": 503}
 NUMBERS_OF_FLIGHT = 529
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
