@@ -28,7 +28,7 @@ from flockd.onboard.sources.device_source import Devices
 from tests.ground.calibration import darkroom
 from tests.ground.calibration.darkroom import PINHOLE, WIDE, facing, photograph
 from tests.ground.calibration.test_rig import MOUNTS, boards_between, in_camera
-from tests.onboard.recording.made_up import filled
+from tests.make import filled
 from tests.onboard.sources.fake_kernel import FakeCamera, FakeKernel
 
 Capture = pytest.CaptureFixture[str]

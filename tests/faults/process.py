@@ -21,6 +21,7 @@ from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.sim.sitl.daemons import Daemons
 from flockd.sim.sitl.free_ports import free_endpoint, free_port
 from flockd.sim.sitl.processes import Program
+from tests.make import changed
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import CAMERAS, HEIGHT, WIDTH, Cameras, Watched, config_for, watched
@@ -104,7 +105,7 @@ async def drone(
     """
     port, frames, telemetry = free_port(), free_endpoint(), free_endpoint()
     config = config_for(port, frames, telemetry)
-    config = change(config.model_copy(update={"safety": config.safety.model_copy(update={"alone_s": None})}))
+    config = change(changed(config, safety__alone_s=None))
     cameras = Cameras(frames, view)
     known = {**os.environ, **(environment or {})}
     try:

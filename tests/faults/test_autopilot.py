@@ -19,6 +19,7 @@ from flockd.sim.autopilot.fake_vehicle import Demand
 from tests.calm import clock
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import flying
+from tests.make import changed
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import Foreigner, until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, Watched, aboard
@@ -138,7 +139,7 @@ async def test_the_pilot_changes_the_mode_while_it_climbs_and_by_hand_and_it_ask
     ("what", "value", "event", "configured", "mode"),
     [
         ("battery_share", 0.05, "battery_low", {}, "LOITER"),
-        ("battery_share", 0.05, "battery_low", {"on_battery_low": "return"}, "RTL"),
+        ("battery_share", 0.05, "battery_low", {"safety__on_battery_low": "return"}, "RTL"),
         ("estimate_ok", False, "position_lost", {}, "LOITER"),
     ],
     ids=["battery", "battery, to return", "estimate"],
@@ -147,10 +148,7 @@ async def test_the_battery_is_low_or_the_position_lost(
     what: str, value: float, event: str, configured: dict[str, Any], mode: Mode, tmp_path: Path,
     record_property: RecordProperty,
 ) -> None:  # fmt: skip
-    def change(config: DroneConfig) -> DroneConfig:
-        return config.model_copy(update={"safety": config.safety.model_copy(update=configured)})
-
-    async with flying(tmp_path, change=change) as process:
+    async with flying(tmp_path, change=lambda config: changed(config, **configured)) as process:
         setattr(process.fake_autopilot, what, value)
         fault_s = time.monotonic()
         await until(lambda: process.fake_autopilot.mode == mode, SECONDS_TO_FAIL)
@@ -213,7 +211,7 @@ def _heartbeats_lost(ship: Watched) -> int:
 
 
 def _never_alone(config: DroneConfig) -> DroneConfig:
-    return config.model_copy(update={"safety": config.safety.model_copy(update={"alone_s": None})})
+    return changed(config, safety__alone_s=None)
 
 
 async def test_after_the_autopilots_failsafe_it_says_what_to_select_and_is_not_ready_before(

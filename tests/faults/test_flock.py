@@ -20,21 +20,16 @@ from tests.calm import clock
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.conftest import InTheAir
 from tests.faults.process import flying
+from tests.make import changed, neighbour
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL
 
 pytestmark = pytest.mark.slow
 
 
-def _neighbour(north_m: float, east_m: float, down_m: float = 0.0, north_m_s: float = 0.0) -> Neighbour:
-    return Neighbour(
-        track=1, position=np.array([north_m, east_m, down_m]), velocity=np.array([north_m_s, 0.0, 0.0]),
-        position_sigma_m=0.05, velocity_sigma_m_s=0.1, age_s=5.0, unseen_s=0.0, hits=10, confirmed=True,
-    )  # fmt: skip
-
-
-def _changed(config: DroneConfig, **safety: Any) -> DroneConfig:
-    return config.model_copy(update={"safety": config.safety.model_copy(update={"alone_s": None, **safety})})
+def _company(config: DroneConfig) -> DroneConfig:
+    """Flying alone is no fault."""
+    return changed(config, safety__alone_s=None)
 
 
 async def test_a_neighbour_comes_too_near(
@@ -44,10 +39,10 @@ async def test_a_neighbour_comes_too_near(
     seen: list[Neighbour] = []
     monkeypatch.setattr(Tracker, "neighbours", lambda _: tuple(seen))
 
-    async with in_the_air(change=_changed) as ship:
+    async with in_the_air(change=_company) as ship:
         await ship.is_ready_in_the_air()
         await ship.flies()
-        seen.append(_neighbour(0.6, 0.0))
+        seen.append(neighbour([0.6, 0.0, 0.0]))
         fault_s = clock()
         await until(lambda: ship.fake_autopilot.setpoints[-1][1].velocity[0] <= 0.01, SECONDS_TO_FAIL)
         reacted(record_property, "neighbour-too-near", clock() - fault_s)
@@ -66,11 +61,11 @@ async def test_all_neighbours_are_lost(
     in_the_air: InTheAir, record_property: RecordProperty, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It flies on as desired, to the north, and not after the one that was last seen in the east; then Hold."""
-    seen = [_neighbour(0.0, 3.5, north_m_s=1.0)]
+    seen = [neighbour([0.0, 3.5, 0.0], [1.0, 0.0, 0.0])]
     monkeypatch.setattr(Tracker, "neighbours", lambda _: tuple(seen))
 
     def change(config: DroneConfig) -> DroneConfig:
-        return _changed(config, neighbours_timeout_s=1.0, alone_s=3.0)
+        return changed(config, safety__neighbours_timeout_s=1.0, safety__alone_s=3.0)
 
     async with in_the_air(change=change) as ship:
         await ship.until_state("idle")
@@ -108,7 +103,7 @@ async def test_a_command_that_cannot_be_flown(
 
     monkeypatch.setattr(FlockPilot, "step", spoiled)
 
-    async with in_the_air(change=_changed) as ship:
+    async with in_the_air(change=_company) as ship:
         await ship.is_ready_in_the_air()
         await ship.flies()
         wrong.append(True)
@@ -128,8 +123,7 @@ async def test_the_fence_is_left(tmp_path: Path, record_property: RecordProperty
     """It wants to go on to the north, stops before the fence 4 m from home, and is carried over it."""
 
     def fenced(config: DroneConfig) -> DroneConfig:
-        gate = config.safety.gate.model_copy(update={"fence_radius_m": 4.0})
-        return _changed(config, gate=gate)
+        return changed(_company(config), safety__gate__fence_radius_m=4.0)
 
     async with flying(tmp_path, change=fenced) as process:
         autopilot = process.fake_autopilot
@@ -158,13 +152,12 @@ async def test_two_drones_at_one_spot_part(
 
     def other(_: Tracker) -> tuple[Neighbour, ...]:
         away = -fake_autopilot.state.position
-        return (_neighbour(float(away[0]), float(away[1]) + 0.0005, -0.8),)
+        return (neighbour([away[0], away[1] + 0.0005, -0.8]),)
 
     monkeypatch.setattr(Tracker, "neighbours", other)
 
     def still(config: DroneConfig) -> DroneConfig:
-        mission = config.mission.model_copy(update={"speed_m_s": 0.0})
-        return _changed(config).model_copy(update={"mission": mission})
+        return changed(_company(config), mission__speed_m_s=0.0)
 
     async with in_the_air(change=still) as ship:
         await ship.until_state("idle")

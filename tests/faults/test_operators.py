@@ -23,6 +23,7 @@ from flockd.sim.sitl.free_ports import free_endpoint
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import Process, flying
 from tests.fleet.page.test_access import opened, served
+from tests.make import changed
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL
 from tests.onboard.telemetry.test_malformed import FLIGHT
@@ -43,7 +44,7 @@ def connecting(endpoint: str) -> Any:
     """The drone connects to who watches, as strangers may."""
 
     def change(config: DroneConfig) -> DroneConfig:
-        return config.model_copy(update={"telemetry": config.telemetry.model_copy(update={"connect": (endpoint,)})})
+        return changed(config, telemetry__connect=(endpoint,))
 
     return change
 

@@ -18,6 +18,7 @@ from flockd.core.config import DroneConfig
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
 from flockd.sim.sitl.free_ports import free_endpoint
 from tests.faults.process import Process, flying
+from tests.make import changed
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, client
 from tests.onboard.telemetry.test_hostile_peer import MAX_COST_MB, peak_mb
@@ -51,7 +52,7 @@ async def test_the_router_of_the_telemetry_goes_and_comes_back(tmp_path: Path) -
     endpoint = free_endpoint()
 
     def through_a_router(config: DroneConfig) -> DroneConfig:
-        return config.model_copy(update={"telemetry": config.telemetry.model_copy(update={"connect": (endpoint,)})})
+        return changed(config, telemetry__connect=(endpoint,))
 
     router, keys = _router(endpoint)
     async with flying(tmp_path, change=through_a_router) as process:

@@ -20,6 +20,7 @@ from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.sim.autopilot.fake_vehicle import Demand
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import Process, drone, started
+from tests.make import changed
 from tests.onboard.autopilot.conftest import HOVER_M
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL
@@ -48,7 +49,7 @@ class _Lying(FakeRangeFinder):
 
 def _by(source: HeightSource) -> Callable[[DroneConfig], DroneConfig]:
     def change(config: DroneConfig) -> DroneConfig:
-        return config.model_copy(update={"perception": config.perception.model_copy(update={"height": source})})
+        return changed(config, perception__height=source)
 
     return change
 

@@ -6,21 +6,12 @@ import cv2
 import numpy as np
 
 from flockd.core.messages import FloatArray, UInt8Array
-from flockd.flight.geometry import PinholeCamera, RigCamera, RigidTransform
+from flockd.flight.geometry import RigidTransform
 from flockd.flight.perception import Crop
 from flockd.sim.renderer.drone_models import drone_model
 from flockd.sim.renderer.renderer import Renderer, View
 from flockd.sim.world.world import World
-
-
-def pinhole(focal_px: float, size: tuple[int, int]) -> PinholeCamera:
-    width, height = size
-    matrix = np.array([[focal_px, 0.0, width / 2], [0.0, focal_px, height / 2], [0.0, 0.0, 1.0]])
-    return PinholeCamera(matrix, size)
-
-
-def camera_of(focal_px: float, size: tuple[int, int]) -> RigCamera:
-    return RigCamera("front", pinhole(focal_px, size), RigidTransform(np.eye(3), np.zeros(3)))
+from tests.make import pinhole
 
 
 def crop_of(image: UInt8Array, focal_px: float, *, mirrored: bool = False) -> Crop:

@@ -16,7 +16,7 @@ from flockd.flight.inference import OnnxModel
 from flockd.flight.inference.fitting import fit
 from flockd.flight.perception import OnnxFlow, OnnxNetworks, OpenDepth
 from tests.flight.inference.foreign import SIZE, constant_flow, one_channel_depth
-from tests.flight.perception.cameras import camera_of
+from tests.make import rig_camera
 
 WIDTH, HEIGHT = SIZE
 
@@ -46,7 +46,7 @@ def test_an_image_enters_in_the_order_range_and_normalisation_of_the_manifest(
 ) -> None:
     imagenet = {"mean": [0.485, 0.456, 0.406], "deviation": [0.229, 0.224, 0.225]}
     path = one_channel_depth(tmp_path, channel=channel, output={}, colour=colour, **imagenet)
-    seen = perception_with(path, scale="network").scene(front(plain((200, 100, 50))), camera_of(40.0, SIZE), None)
+    seen = perception_with(path, scale="network").scene(front(plain((200, 100, 50))), rig_camera(40.0, SIZE), None)
     assert isinstance(seen.depth, np.ndarray)
     np.testing.assert_allclose(seen.depth, expected, rtol=1e-5)
 
@@ -70,7 +70,7 @@ def test_what_lies_right_in_the_image_lies_right_in_the_map_although_its_input_w
     path = one_channel_depth(tmp_path, output={})
     image = plain((0, 0, 0), (64, 64))  # half as wide again is black border in an input of 48 x 32
     image[:, 32:] = 255
-    seen = perception_with(path, scale="network").scene(front(image), camera_of(40.0, (64, 64)), None)
+    seen = perception_with(path, scale="network").scene(front(image), rig_camera(40.0, (64, 64)), None)
     assert isinstance(seen.depth, np.ndarray)
     assert seen.depth.shape == (64, 64)
     np.testing.assert_allclose(seen.depth[:, :30], 0.0, atol=1e-6)
@@ -90,7 +90,7 @@ def test_depth_becomes_metres_of_the_camera(
 ) -> None:
     path = one_channel_depth(tmp_path, output=output)
     image = plain((red, 0, 0), size)
-    seen = perception_with(path, scale="network").scene(front(image), camera_of(focal_px, size), None)
+    seen = perception_with(path, scale="network").scene(front(image), rig_camera(focal_px, size), None)
     assert isinstance(seen.depth, np.ndarray)
     np.testing.assert_allclose(seen.depth, expected, rtol=1e-3)
 
@@ -100,7 +100,7 @@ def test_a_relative_network_is_refused_where_nothing_fixes_its_scale(tmp_path: P
     path = one_channel_depth(tmp_path, output=relative)
     with pytest.raises(ModelError, match=r"perception\.scale: .* has no metric scale .* write height, or choose"):
         perception_with(path, scale="network")
-    seen = perception_with(path, scale="height").scene(front(plain((51, 0, 0))), camera_of(40.0, SIZE), None)
+    seen = perception_with(path, scale="height").scene(front(plain((51, 0, 0))), rig_camera(40.0, SIZE), None)
     assert isinstance(seen.depth, OpenDepth)
     assert seen.depth.shift
     np.testing.assert_allclose(seen.depth.inverse, 0.2, rtol=1e-5)
@@ -109,7 +109,7 @@ def test_a_relative_network_is_refused_where_nothing_fixes_its_scale(tmp_path: P
 def test_a_metric_network_leaves_its_scale_to_the_autopilot_where_that_is_asked_for(tmp_path: Path) -> None:
     path = one_channel_depth(tmp_path, output={})
     # it takes no ground as an input, so height has to align what it says
-    seen = perception_with(path, scale="height").scene(front(plain((51, 0, 0))), camera_of(40.0, SIZE), None)
+    seen = perception_with(path, scale="height").scene(front(plain((51, 0, 0))), rig_camera(40.0, SIZE), None)
     assert isinstance(seen.depth, OpenDepth)
     assert not seen.depth.shift
     np.testing.assert_allclose(seen.depth.inverse, 5.0, rtol=1e-5)

@@ -21,7 +21,8 @@ from flockd.flight.perception import DisFlow, OnnxFlow, OnnxNetworks
 from flockd.flight.perception.flow import grid_flow
 from flockd.flight.perception.onnx import CROPS_PER_RUN
 from flockd.ground.pictures.scoring import intersection_over_union
-from tests.flight.perception.cameras import camera_of, crop_of, rendered
+from tests.flight.perception.cameras import crop_of, rendered
+from tests.make import rig_camera
 
 MODELS = data_path("models")
 NETWORKS = ("distance", "flow", "neighbours", "verification")
@@ -45,7 +46,7 @@ def test_a_model_opens_and_gives_its_golden_output(name: str) -> None:
 def test_the_detector_finds_a_drone_in_the_whole_image_and_its_evidence_is_for_it() -> None:
     view = rendered(222.0, (480, 352), (3.0, 0.3, -3.6))
     networks = OnnxNetworks(PerceptionConfig(flow="dis"), MODELS)
-    maps = networks.scene(Frame("front", view.rgb, 0.0, 0), camera_of(222.0, (480, 352)), None)
+    maps = networks.scene(Frame("front", view.rgb, 0.0, 0), rig_camera(222.0, (480, 352)), None)
     (drone,) = [one for one in maps.instances if one.boxed]
     rows, columns = np.nonzero(view.ids == 1)
     seen = (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
@@ -164,7 +165,7 @@ def test_the_twins_in_8_bits_say_what_the_float_networks_say() -> None:
     roles |= {name: name for name in ("flow", "distance", "verification")}
     twins = PerceptionConfig.model_validate({role: f"{name}_int8" for role, name in roles.items()})
     ours, theirs = (OnnxNetworks(config, MODELS) for config in (twins, PerceptionConfig.model_validate(roles)))
-    camera, frame = camera_of(222.0, (320, 320)), Frame("camera", image, 0.0, 0)
+    camera, frame = rig_camera(222.0, (320, 320)), Frame("camera", image, 0.0, 0)
     our, their = (networks.scene(frame, camera, None) for networks in (ours, theirs))
     assert isinstance(our.depth, np.ndarray)
     assert isinstance(their.depth, np.ndarray)

@@ -16,6 +16,7 @@ from flockd.flight.perception import Observation
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.recording.codec import from_json, parsed, to_json
 from flockd.sim.world.obstacles import Box, Obstacles, true_ranges
+from tests.make import frames, vehicle
 
 WALL = Obstacles([Box(3.0, 0.0, 0.2, 30.0, 0.0, -0.5, 8.0)])
 """Its surface is 2.8 m north."""
@@ -55,8 +56,7 @@ def flown(config: DroneConfig, sees: Sequence[bool]) -> list[PilotOutput]:
     pilot = FlockPilot(config, networks, observer=observer)
     outputs = []
     for step, observer.sees in enumerate(sees):
-        state = VehicleState(0.5 * step, np.eye(3), 4.0, np.zeros(3), np.zeros(2))
-        outputs.append(pilot.step(FrameSet(0.5 * step, {}), state))
+        outputs.append(pilot.step(frames(0.5 * step), vehicle(0.5 * step, 4.0)))
     return outputs
 
 

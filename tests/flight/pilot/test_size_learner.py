@@ -31,6 +31,7 @@ from flockd.flight.pilot import FlockPilot
 from flockd.flight.pilot.weave import Weave
 from flockd.flight.tracking.flock_size import FlockSize, SizeEstimate
 from flockd.flight.tracking.weave_path import DURATION_S, PERIOD_S
+from tests.make import frames, neighbour, vehicle
 
 STEP_S = 0.5
 SIZE_M, JUDGED_M = 0.4, 0.56
@@ -100,8 +101,7 @@ class Flight:
         outputs = []
         for _ in range(round(duration_s / STEP_S)):
             height_m = HEIGHT_M - self.below_m
-            state = VehicleState(self.time_s, np.eye(3), height_m, np.zeros(3), np.zeros(2))
-            outputs.append(self._pilot.step(FrameSet(self.time_s, {}), state))
+            outputs.append(self._pilot.step(frames(self.time_s), vehicle(self.time_s, height_m)))
             asked_m = outputs[-1].command.height_m
             self.below_m -= climb_m_s * STEP_S
             if asked_m is not None:
@@ -384,8 +384,7 @@ class Weaving:
 
 
 def at(north_m: float, climb_m_s: float = 0.0) -> Neighbour:
-    place, velocity = np.array([north_m, 0.0, 0.0]), np.array([0.0, 0.0, -climb_m_s])
-    return Neighbour(1, place, velocity, 0.1, 0.1, 5.0, 0.0, 10, confirmed=True)
+    return neighbour([north_m, 0.0, 0.0], [0.0, 0.0, -climb_m_s], position_sigma_m=0.1)
 
 
 def test_it_goes_up_and_down_twice_and_ends_where_it_began() -> None:

@@ -12,6 +12,7 @@ from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray, Neighbour, PossibleMotion
 from flockd.flight.safety import Surroundings
 from flockd.flight.safety.surroundings import BEYOND, limits_towards, surroundings
+from tests.make import neighbour
 
 
 def told(neighbours: list[Neighbour], obstacles: FloatArray) -> Surroundings:
@@ -28,24 +29,15 @@ def told(neighbours: list[Neighbour], obstacles: FloatArray) -> Surroundings:
     )
 
 
-def neighbour(number: int, position: list[float], velocity: list[float], *, confirmed: bool) -> Neighbour:
-    return Neighbour(
-        number,
-        np.array(position),
-        np.array(velocity),
-        position_sigma_m=0.1 * number,
-        velocity_sigma_m_s=0.2 * number,
-        age_s=1.0,
-        unseen_s=0.0,
-        hits=3,
-        confirmed=confirmed,
-    )
+def known(number: int, position: list[float], velocity: list[float], *, confirmed: bool) -> Neighbour:
+    sigma = {"position_sigma_m": 0.1 * number, "velocity_sigma_m_s": 0.2 * number}
+    return neighbour(position, velocity, track=number, age_s=1.0, hits=3, confirmed=confirmed, **sigma)
 
 
 def test_neighbours_fly_on_and_the_drone_has_moved() -> None:
     both = [
-        neighbour(1, [5.0, 0.0, 0.0], [2.0, 4.0, 6.0], confirmed=True),
-        neighbour(2, [0.0, 8.0, -1.0], [0.0, -2.0, 1.0], confirmed=False),
+        known(1, [5.0, 0.0, 0.0], [2.0, 4.0, 6.0], confirmed=True),
+        known(2, [0.0, 8.0, -1.0], [0.0, -2.0, 1.0], confirmed=False),
     ]
     around = told(both, np.empty((0, 2)))
     np.testing.assert_allclose(around.neighbours, [[5.0, 4.0, 3.5], [-1.0, 9.0, 0.0]])
@@ -57,7 +49,7 @@ def test_neighbours_fly_on_and_the_drone_has_moved() -> None:
 def test_one_that_is_as_likely_not_there_counts_by_half() -> None:
     """By tables: 0.0228 of 0.5 are 0.0455, beyond 1.690 deviations; of 0.02 it is more than all, and nothing counts."""
     doubted = [
-        replace(neighbour(1, [5.0, 0.0, 0.0], [2.0, 0.0, 0.0], confirmed=False), existence_probability=probability)
+        replace(known(1, [5.0, 0.0, 0.0], [2.0, 0.0, 0.0], confirmed=False), existence_probability=probability)
         for probability in (0.5, 0.02)
     ]
     margins = told(doubted, np.empty((0, 2))).neighbour_margins
@@ -77,7 +69,7 @@ def test_one_that_may_move_in_two_ways_counts_as_both_each_by_its_probability() 
         )
         for share, north_m_s in ((0.9, 2.0), (0.1, -4.0))
     )
-    one = replace(neighbour(1, [6.0, 0.0, 0.0], [1.4, 0.0, 0.0], confirmed=False), possible=(mate, comes))
+    one = replace(known(1, [6.0, 0.0, 0.0], [1.4, 0.0, 0.0], confirmed=False), possible=(mate, comes))
     around = told([one], np.empty((0, 2)))
     np.testing.assert_allclose(around.neighbours, [[6.0, 2.0, 0.5], [3.0, 2.0, 0.5]])
     np.testing.assert_allclose(around.neighbour_velocities, [[2.0, 0.0], [-4.0, 0.0]])
@@ -93,7 +85,7 @@ def test_a_motion_less_probable_than_its_share_of_the_doubt_does_not_count() -> 
             PossibleMotion(probability, here, still, range_sigma_m=0.5, closing_sigma_m_s=1.0)
             for probability in (1 - share, share)
         )
-        one = replace(neighbour(1, [6.0, 0.0, 0.0], [0.0, 0.0, 0.0], confirmed=True), possible=motions)
+        one = replace(known(1, [6.0, 0.0, 0.0], [0.0, 0.0, 0.0], confirmed=True), possible=motions)
         assert len(told([one], np.empty((0, 2))).neighbours) == count
 
 
@@ -110,18 +102,18 @@ def test_a_motion_less_probable_than_its_share_of_the_doubt_does_not_count() -> 
 def test_a_neighbour_that_would_have_flown_through_the_drone_has_braked(
     velocity: list[float], by_now: list[float]
 ) -> None:
-    around = told([neighbour(1, [6.0, -2.0, -0.5], velocity, confirmed=False)], np.empty((0, 2)))
+    around = told([known(1, [6.0, -2.0, -0.5], velocity, confirmed=False)], np.empty((0, 2)))
     np.testing.assert_allclose(around.neighbours, [by_now])
 
 
 def test_one_that_passes_below_at_the_drones_place_has_braked_too() -> None:
     """The gate takes one that is above or below by less than `vertical_separation_m` for one at its height."""
-    around = told([neighbour(1, [6.0, -2.0, 2.0], [-16.0, 0.0, 0.0], confirmed=True)], np.empty((0, 2)))
+    around = told([known(1, [6.0, -2.0, 2.0], [-16.0, 0.0, 0.0], confirmed=True)], np.empty((0, 2)))
     np.testing.assert_allclose(around.neighbours, [[5.0, 0.0, 2.5]])
 
 
 def test_one_that_the_drone_itself_has_passed_is_behind() -> None:
-    around = told([neighbour(1, [0.5, -2.0, -0.5], [-2.0, 0.0, 0.0], confirmed=True)], np.empty((0, 2)))
+    around = told([known(1, [0.5, -2.0, -0.5], [-2.0, 0.0, 0.0], confirmed=True)], np.empty((0, 2)))
     np.testing.assert_allclose(around.neighbours, [[-1.5, 0.0, 0.0]])
 
 
@@ -134,7 +126,7 @@ def test_obstacles_stand_still() -> None:
 def test_one_that_goes_may_have_braked_since_it_was_seen_last(unseen_s: float, left_m: float) -> None:
     """2 m/s ahead at 4 m by its track: it stands 2^2 / 2 / 5 = 0.4 m farther on than where it was seen; 1 m is kept."""
     one = replace(
-        neighbour(1, [4.0, 0.0, 0.0], [2.0, 0.0, 0.0], confirmed=True),
+        known(1, [4.0, 0.0, 0.0], [2.0, 0.0, 0.0], confirmed=True),
         position_sigma_m=0.0,
         velocity_sigma_m_s=0.0,
         unseen_s=unseen_s,
@@ -170,17 +162,17 @@ def test_the_drone_itself_is_where_it_is_now() -> None:
 def test_a_pilot_hears_how_fast_the_gate_lets_it_fly_towards_each() -> None:
     """4 m ahead, 3 m left: sqrt(0.75^2 + 1.5 * 3) - 0.75 = 1.5 m/s, as if it began to come now; below, no limit."""
     p, here = GateParameters(), [4.0, 0.0, 0.0]
-    known = [
-        replace(neighbour(1, at, [0.0, 0.0, 0.0], confirmed=True), position_sigma_m=0.0, velocity_sigma_m_s=0.0)
+    stands = [
+        replace(known(1, at, [0.0, 0.0, 0.0], confirmed=True), position_sigma_m=0.0, velocity_sigma_m_s=0.0)
         for at in (here, [0.0, 6.0, 3.5])
     ]
-    directions, most_m_s = limits_towards(known, p)
+    directions, most_m_s = limits_towards(stands, p)
     np.testing.assert_allclose(directions, [[1.0, 0.0], [1.0, 0.0]])  # as flying on, and as braking
     assert most_m_s.min() == pytest.approx(1.5)
-    goes = limits_towards([replace(known[0], velocity=np.array([1.0, 0.0, 0.0]))], p)[1]
+    goes = limits_towards([replace(stands[0], velocity=np.array([1.0, 0.0, 0.0]))], p)[1]
     # sqrt(1.5^2 + 2 * 1.5 * 3 + 1^2) - 1.5: it may brake unseen for a second. Or it does now, and stands 0.1 m on.
     np.testing.assert_allclose(goes, [2.0, math.sqrt(0.75**2 + 2 * 1.5 * 3.1) - 0.75])
-    in_doubt_m_s = limits_towards([neighbour(5, here, [0.0, 0.0, 0.0], confirmed=False)], p)[1]
+    in_doubt_m_s = limits_towards([known(5, here, [0.0, 0.0, 0.0], confirmed=False)], p)[1]
     assert in_doubt_m_s.min() < 1.0
     directions, most_m_s = limits_towards([], p)
     assert directions.shape == (0, 2) and most_m_s.shape == (0,)

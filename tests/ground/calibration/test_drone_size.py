@@ -21,7 +21,7 @@ from flockd.ground.calibration.errors import CalibrationError
 from flockd.ground.datasets.image_files import read_image
 from flockd.onboard.recording import Recorder
 from tests.ground.pictures.photographs import DRONE_SIZE_M, FOCAL_PX, FOV_DEG, RENDERED, SIZE, truth
-from tests.onboard.recording.made_up import filled
+from tests.make import filled
 
 Capture = pytest.CaptureFixture[str]
 FOV = ("--fov", f"{FOV_DEG:g}")

@@ -22,7 +22,8 @@ from flockd.onboard.daemon.pilot_loop import RigReports
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.mcap_file import RecordingError
 from flockd.onboard.recording.reader import Recording
-from tests.onboard.recording.made_up import drone_config, filled, inputs
+from tests.make import filled
+from tests.onboard.recording.made_up import drone_config, inputs
 
 NAME = "drone1-20261124T120000000000Z.mcap"
 TURN = np.radians([0.3, -1.9, 0.5])

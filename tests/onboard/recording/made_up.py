@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import is_dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from types import UnionType
-from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -23,13 +21,12 @@ from flockd.core.messages import (
     Neighbour,
     PilotOutput,
     RangeReading,
-    Reason,
-    ReasonKind,
     VehicleState,
     Wanted,
 )
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.mcap_file import Damage, McapFile, Record, read_records
+from tests.make import filled
 
 WIDTH, HEIGHT = 160, 120
 MODELS = {"flow": "ab" * 32}
@@ -78,25 +75,6 @@ class MadeUpPilot:
             neighbours=(replace(filled(Neighbour, m), velocity_sigma_m_s=math.inf),),
             command=Wanted(np.array([m, -m]), np.array([0.1 * m, 0.2]), m),
         )
-
-
-def filled(kind: Any, number: float) -> Any:
-    """A message of this type with something in every field, whatever fields it has."""
-    origin, parts = get_origin(kind), get_args(kind)
-    if kind is Reason:
-        return Reason(ReasonKind.RECORDED, "front")
-    if is_dataclass(kind) and isinstance(kind, type):
-        return kind(
-            **{field: filled(hint, number) for field, hint in get_type_hints(kind, include_extras=True).items()}
-        )
-    if origin is Annotated:
-        return np.full(parts[1].sizes, number)
-    if origin in (Union, UnionType, tuple):
-        inner = filled(parts[0], number)
-        return (inner,) if origin is tuple else inner
-    if origin is not None:
-        return {filled(parts[0], number): filled(parts[1], number)}
-    return {float: number, int: 3, bool: True, str: "front"}[kind]
 
 
 def inputs(

@@ -10,8 +10,9 @@ import pytest
 from flockd.core.config import load_scenario
 from flockd.core.data import data_path
 from flockd.core.messages import UNCLASSED, BoolArray, Detection, Float32Array, FloatArray, UInt8Array
-from flockd.flight.geometry import Rig, RigCamera, build_rig, log_polar, log_polar_covariance, virtual_crop
+from flockd.flight.geometry import Rig, RigCamera, build_rig, virtual_crop
 from flockd.flight.perception.detection.masks import CropMask, MaskRenderer
+from tests import make
 
 SIZE = 96
 RIG: Rig = build_rig(load_scenario(data_path("config") / "paper_flight.yaml").drone.rig)
@@ -26,9 +27,8 @@ COLOUR_WEIGHT = 4.0
 
 
 def detection(label: int, position: FloatArray, *cameras: str) -> Detection:
-    bearing, log_range = log_polar(position)
-    covariance = log_polar_covariance(bearing, 0.1 / np.exp(log_range), 0.004)
-    return Detection(bearing, log_range, covariance, 0.9, 0.5, cameras or ("front",), label)
+    sigma = 0.1 / float(np.linalg.norm(position))
+    return make.detection(position, sigma, 0.004, cameras=cameras or ("front",), label=label)
 
 
 def mask_of(position: FloatArray, half_angle: float, *, radius: float = RADIUS, height: float = 5.0) -> CropMask:

@@ -9,12 +9,12 @@ from flockd.core.messages import UNCLASSED
 from flockd.flight.geometry import Rig, ZMap
 from flockd.flight.perception import Instance, SceneMaps, group_instances
 from flockd.flight.perception.detection.proposals import propose_instances, propose_residuals
-from tests.flight.perception.cameras import camera_of
 from tests.flight.perception.shipped import SECOND_STAGE
+from tests.make import rig_camera
 
 RULES = SECOND_STAGE.rules
 SIZE = (160, 120)
-RIG = Rig({"front": camera_of(100.0, SIZE)})
+RIG = Rig({"front": rig_camera(100.0, SIZE)})
 
 
 def scene_of(*scores: float) -> SceneMaps:

@@ -10,11 +10,11 @@ import pytest
 from flockd.flight.geometry import Rig, RigCamera, WideAngleCamera
 from flockd.flight.perception import Instance
 from flockd.flight.perception.detection.roi import Roi, angle_between, roi_of_instance, take_crop
-from tests.flight.perception.cameras import camera_of
 from tests.flight.perception.shipped import SECOND_STAGE
+from tests.make import rig_camera
 
 RULES = SECOND_STAGE.rules
-CAMERA = camera_of(320.0, (640, 480))
+CAMERA = rig_camera(320.0, (640, 480))
 
 
 def test_of_a_drone_that_the_images_border_cuts_a_wider_region_is_taken() -> None:
@@ -58,7 +58,7 @@ def test_a_region_suits_a_drones_size_and_stays_near_the_last_one() -> None:
 @pytest.mark.parametrize("fov_deg", [25.0, 40.0, 60.0, 90.0])
 def test_the_crop_of_a_small_drone_shows_the_same_pixels_whatever_the_lens_is_said_to_be(fov_deg: float) -> None:
     """A drone 8 px wide; before the crop was at least 2 degrees wide, 32 px of a lens of 40 degrees."""
-    camera = camera_of(320.0 / math.tan(math.radians(fov_deg / 2)), (640, 480))
+    camera = rig_camera(320.0 / math.tan(math.radians(fov_deg / 2)), (640, 480))
     drone = Instance(1, np.array([320.0, 240.0]), np.array([316.0, 237.0, 324.0, 243.0]), 40.0)
     roi = roi_of_instance(camera, drone, RULES)
     assert roi is not None

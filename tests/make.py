@@ -1,0 +1,142 @@
+"""What tests fly with: messages, cameras and configurations that are fine, from the little that a test is about.
+
+Every builder takes the fields that matter to a test, by name; the others are those of one quiet drone 5 m above home.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import is_dataclass, replace
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+from pydantic import BaseModel
+
+from flockd.core.config import DroneConfig, ScenarioConfig, load_scenario
+from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
+from flockd.core.data import data_path
+from flockd.core.messages import (
+    Detection,
+    FloatArray,
+    Frame,
+    FrameSet,
+    Neighbour,
+    PilotOutput,
+    Reason,
+    ReasonKind,
+    UInt8Array,
+    VehicleState,
+    Wanted,
+)
+from flockd.flight.geometry import PinholeCamera, RigCamera, RigidTransform, log_polar_covariance
+
+Section = TypeVar("Section", bound=BaseModel)
+
+
+def vehicle(time_s: float = 0.0, height_m: float = 5.0, **fields: Any) -> VehicleState:
+    """Level, heading north, hovering above home, as the autopilot says; sequences become arrays."""
+    state = VehicleState(time_s, np.eye(3), height_m, velocity_ned=np.zeros(3), position=np.zeros(2))
+    return replace(state, **_arrays(fields))
+
+
+def neighbour(
+    position: Sequence[float] | FloatArray, velocity: Sequence[float] | FloatArray = (0.0, 0.0, 0.0), **fields: Any
+) -> Neighbour:
+    """Followed for long and confirmed, metres and m/s in NED from the own drone."""
+    known = Neighbour(
+        track=1, position=np.array(position, float), velocity=np.array(velocity, float), position_sigma_m=0.05,
+        velocity_sigma_m_s=0.1, age_s=5.0, unseen_s=0.0, hits=10, confirmed=True,
+    )  # fmt: skip
+    return replace(known, **_arrays(fields))
+
+
+def detection(
+    position: Sequence[float] | FloatArray, range_sigma: float = 0.02, angle_sigma_rad: float = 0.005, **fields: Any
+) -> Detection:
+    """At a place in body FRD, its log range and its bearing this uncertain."""
+    range_m = float(np.linalg.norm(position))
+    bearing = np.asarray(position, float) / range_m
+    seen = Detection(
+        bearing=bearing, log_range=math.log(range_m),
+        covariance=log_polar_covariance(bearing, range_sigma, angle_sigma_rad),
+        drone_probability=0.95, size_m=0.5, cameras=("front",), label=1,
+    )  # fmt: skip
+    return replace(seen, **_arrays(fields))
+
+
+def wanted(velocity: Sequence[float] | FloatArray = (0.0, 0.0), yaw_rad: float | None = 0.0, **fields: Any) -> Wanted:
+    """A level velocity, m/s north and east."""
+    return replace(Wanted(np.array(velocity, float), np.zeros(2), yaw_rad), **_arrays(fields))
+
+
+def output(time_s: float = 0.0, **fields: Any) -> PilotOutput:
+    """Of a step in which nothing was seen and nothing is wanted."""
+    nothing = PilotOutput(time_s, None, None, (), (), {}, (), wanted())
+    return replace(nothing, **fields)
+
+
+def frames(time_s: float, images: Mapping[str, UInt8Array] | None = None, sequence: int = 0) -> FrameSet:
+    """The images of these cameras, all taken at one time; none without any."""
+    return FrameSet(time_s, {name: Frame(name, one, time_s, sequence) for name, one in (images or {}).items()})
+
+
+def pinhole(focal_px: float, size: tuple[int, int]) -> PinholeCamera:
+    """Without distortion, its principal point in the middle; size as (width, height)."""
+    width, height = size
+    return PinholeCamera(np.array([[focal_px, 0.0, width / 2], [0.0, focal_px, height / 2], [0.0, 0.0, 1.0]]), size)
+
+
+def rig_camera(focal_px: float, size: tuple[int, int], name: str = "front") -> RigCamera:
+    """A pinhole whose optical axes are the body's."""
+    return RigCamera(name, pinhole(focal_px, size), RigidTransform(np.eye(3), np.zeros(3)))
+
+
+def camera(
+    name: str = "front", size_px: tuple[int, int] = (64, 48), focal_px: float = 32.0, **extrinsics: Any
+) -> CameraConfig:
+    """A pinhole's configuration: 90 degrees wide, looking forward unless ``extrinsics`` says otherwise."""
+    lens = IntrinsicsConfig(fx=focal_px, fy=focal_px, cx=size_px[0] / 2, cy=size_px[1] / 2)
+    return CameraConfig(name=name, size_px=size_px, intrinsics=lens, extrinsics=ExtrinsicsConfig(**extrinsics))
+
+
+def drone(*cameras: CameraConfig, **sections: Any) -> DroneConfig:
+    """With these cameras, or one that looks ahead."""
+    return DroneConfig(rig=RigConfig(cameras=cameras or (camera(),)), **sections)
+
+
+def scenario(overrides: Mapping[str, Any] | None = None, name: str = "paper_flight") -> ScenarioConfig:
+    """A shipped one, with single values set over the file's by dotted key."""
+    return load_scenario(data_path("config") / f"{name}.yaml", dict(overrides or {}))
+
+
+def changed(section: Section, **keys: Any) -> Section:
+    """A copy of a configuration with other values, by dotted path with `__`: ``safety__gate__max_speed_m_s=1.0``."""
+    for path, value in keys.items():
+        head, _, rest = path.partition("__")
+        section = section.model_copy(update={head: changed(getattr(section, head), **{rest: value}) if rest else value})
+    return section
+
+
+def filled(kind: Any, number: float) -> Any:
+    """A message of this type with something in every field, whatever fields it has."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if kind is Reason:
+        return Reason(ReasonKind.RECORDED, "front")
+    if is_dataclass(kind) and isinstance(kind, type):
+        hints = get_type_hints(kind, include_extras=True)
+        return kind(**{field: filled(hint, number) for field, hint in hints.items()})
+    if origin is Annotated:
+        return np.full(parts[1].sizes, number)
+    if origin in (Union, UnionType, tuple):
+        inner = filled(parts[0], number)
+        return (inner,) if origin is tuple else inner
+    if origin is not None:
+        return {filled(parts[0], number): filled(parts[1], number)}
+    return {float: number, int: 3, bool: True, str: "front"}[kind]
+
+
+def _arrays(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Lists of numbers as the arrays that messages hold."""
+    return {name: np.array(value, float) if isinstance(value, list) else value for name, value in fields.items()}
