@@ -175,6 +175,7 @@ def prepare(folder: Path) -> None:
     for part in ("flockd", "config", "tests/flight/safety", "tests/hostile"):
         shutil.copytree(ROOT / part, folder / part, ignore=ignored)
     shutil.copy(ROOT / "pyproject.toml", folder)
+    shutil.copy(ROOT / "tests" / "make.py", folder / "tests")
     os.chdir(folder)
     tried = subprocess.run([sys.executable, "-m", "pytest", "tests/flight/safety"], check=False)
     if tried.returncode != 0:
