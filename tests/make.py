@@ -14,7 +14,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_typ
 import numpy as np
 from pydantic import BaseModel
 
-from flockd.core.config import DroneConfig, ScenarioConfig, load_scenario
+from flockd.core.config import DroneConfig
 from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
 from flockd.core.data import data_path
 from flockd.core.messages import (
@@ -31,6 +31,7 @@ from flockd.core.messages import (
     Wanted,
 )
 from flockd.flight.geometry import PinholeCamera, RigCamera, RigidTransform, log_polar_covariance
+from flockd.sim.scenario import ScenarioConfig, load_scenario
 
 Section = TypeVar("Section", bound=BaseModel)
 

@@ -11,12 +11,12 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from flockd.campaign.campaign_file import Figure as FigureName
 from flockd.campaign.figures import MEASURES
 from flockd.campaign.flight_plan import CASE
 from flockd.campaign.intervals import mean_interval
 from flockd.campaign.results import Results
 from flockd.campaign.verdicts import Comparison
-from flockd.core.config.campaign import Figure as FigureName
 from flockd.review.report.style import BAND, DRONE_COLOURS, INK, MUTED, STYLE
 
 BINS: Final = 8

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from flockd.core.config.campaign import Figure
+from flockd.campaign.campaign_file import Figure
 from flockd.core.messages import FloatArray
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.summary import TAIL_S, estimation_errors, objective_sums, summarise

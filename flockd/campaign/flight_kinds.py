@@ -12,17 +12,17 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import lru_cache
 
+from flockd.campaign.campaign_file import Figure, FlightKindName
 from flockd.campaign.figures import Figures, figures_of
 from flockd.campaign.flight_plan import ControlLevel, Run
 from flockd.campaign.recipe import Recipe
 from flockd.core.choices import SimulatedPerception
-from flockd.core.config import ScenarioConfig
-from flockd.core.config.campaign import Figure, FlightKindName
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.errors import FlockdError
 from flockd.flight.inference.hashes import model_hashes
 from flockd.sim.control_level import fly_flocks
 from flockd.sim.flock.swarm import fly
+from flockd.sim.scenario import ScenarioConfig
 
 Fly = Callable[[Sequence[ScenarioConfig], Sequence[Figure], ControlLevel], Sequence[Figures]]
 """Flies scenarios of one cell that differ in what follows from their seeds, and gives the wanted figures of each."""

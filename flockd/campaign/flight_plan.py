@@ -17,17 +17,16 @@ import numpy as np
 from pydantic import ValidationError
 
 from flockd import __version__
+from flockd.campaign.campaign_file import DRONES, MAX_CONTROL_DRONES, CampaignConfig, Figure, Variation, load_campaign
 from flockd.campaign.recipe import Recipe, Values, merged
 from flockd.core.choices import ROLES
-from flockd.core.config import CampaignConfig, ScenarioConfig, load_campaign, load_with_places
-from flockd.core.config.campaign import DRONES, MAX_CONTROL_DRONES, Figure, Variation
 from flockd.core.config.document import KeyPath, Place, key_text
-from flockd.core.config.loader import PATHS, load_perceived_errors
-from flockd.core.config.perceived import PerceivedErrors
-from flockd.core.config.scenario import MAX_DRONES
+from flockd.core.config.loader import PATHS
 from flockd.core.config.validation_messages import problems_of
 from flockd.core.errors import ConfigError, ConfigProblem, UsageError
 from flockd.flight.inference.hashes import model_hashes
+from flockd.sim.scenario import MAX_DRONES, ScenarioConfig, load_with_places
+from flockd.sim.scenario.perceived import PerceivedErrors, load_perceived_errors
 
 CASE = "case"
 """The parameter whose values are the names of `cases`."""

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from flockd.core.config import ScenarioConfig
-from flockd.core.config.campaign import DRONES
+from flockd.campaign.campaign_file import DRONES
 from flockd.sim.flock.start import scattered, with_drones
+from flockd.sim.scenario import ScenarioConfig
 
 Values = dict[str, Any]
 

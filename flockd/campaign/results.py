@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from flockd.campaign.campaign_file import Figure
 from flockd.campaign.figures import MEASURES
 from flockd.campaign.flight_plan import Plan
 from flockd.campaign.flight_table import FlightTable, read_table
 from flockd.campaign.folder import FLIGHTS_NAME, TIMINGS_NAME, load_plan
 from flockd.campaign.intervals import Interval, mean_interval
-from flockd.core.config.campaign import Figure
 from flockd.core.errors import UsageError
 
 Row = Mapping[str, Any]

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 
+from flockd.campaign.campaign_file import StopRule
 from flockd.campaign.figures import MEASURES
 from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.intervals import mean_interval
-from flockd.core.config.campaign import StopRule
 
 
 class Schedule:

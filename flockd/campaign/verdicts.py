@@ -9,15 +9,15 @@ from typing import Any, Literal
 
 import numpy as np
 
+from flockd.campaign.campaign_file import DRONES, Figure
 from flockd.campaign.differences import differences
 from flockd.campaign.figures import MEASURES
 from flockd.campaign.intervals import Interval, mean_interval
 from flockd.campaign.recipe import merged
 from flockd.campaign.results import Results
-from flockd.core.config import ScenarioConfig
-from flockd.core.config.campaign import DRONES, Figure
 from flockd.core.errors import UsageError
 from flockd.core.messages import FloatArray
+from flockd.sim.scenario import ScenarioConfig
 
 LEVEL = 0.05
 """Significance level for all figures together: at most this often, one is called different where none is."""

@@ -148,9 +148,9 @@ def _rerun(args: argparse.Namespace) -> int:
     from flockd.campaign.flight_plan import Run
     from flockd.campaign.folder import RERUNS, load_plan
     from flockd.cli.flight_summary import report_flight
-    from flockd.core.config.scenario import MAX_DRONES
     from flockd.review.report.flight_folder import prepare_folder
     from flockd.sim.flock.swarm import fly
+    from flockd.sim.scenario import MAX_DRONES
 
     folder, name = args.flight.parent, args.flight.name
     plan = load_plan(folder)

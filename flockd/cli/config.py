@@ -99,10 +99,13 @@ def _check_file(file: Path, *, force: bool) -> None:
 
     Of a real drone also for what is outside the proven envelope, unless that is forced.
     """
-    from flockd.core.config import ScenarioConfig, kind_of, load_with_places, outside_envelope
+    from flockd.core.config import outside_envelope
+    from flockd.core.config.document import read_document
+    from flockd.core.config.loader import kind_of
     from flockd.flight.inference.manifest_file import manifest_path, models_folder, models_for, read_manifest
+    from flockd.sim.scenario import ScenarioConfig, load_with_places
 
-    if kind_of(file) == "campaign":
+    if kind_of(read_document(file)) == "campaign":
         from flockd.campaign.flight_plan import Plan
 
         Plan.load(file)
@@ -155,7 +158,7 @@ def _yet_to_fill_in(config: DroneConfig, places: Mapping[KeyPath, Place]) -> lis
 def _show(args: argparse.Namespace) -> int:
     import yaml
 
-    from flockd.core.config import load
+    from flockd.sim.scenario import load
 
     values = load(args.file).model_dump(mode="json")
     if args.json:
@@ -166,15 +169,18 @@ def _show(args: argparse.Namespace) -> int:
 
 
 def _schema(args: argparse.Namespace) -> int:
-    from flockd.core.config import schema_of
+    from flockd.campaign.campaign_file import CampaignConfig
+    from flockd.core.config import DroneConfig
+    from flockd.sim.scenario import scenario_schema
 
-    say_json(schema_of(args.kind))
+    kinds = {"drone": DroneConfig.model_json_schema, "campaign": CampaignConfig.model_json_schema}
+    say_json(kinds.get(args.kind, scenario_schema)())
     return ExitCode.DONE
 
 
 def loaded(file: Path | None) -> DroneConfig | None:
     """The drone of --config, which may also name a scenario. Raises ConfigError."""
-    from flockd.core.config import ScenarioConfig, load
+    from flockd.sim.scenario import ScenarioConfig, load
 
     if file is None:
         return None

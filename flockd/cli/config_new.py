@@ -75,7 +75,7 @@ def write_checked(file: Path, text: str, settings: Sequence[tuple[str, str]] = (
 
     The draft stands beside it: paths count from there.
     """
-    from flockd.core.config import load
+    from flockd.sim.scenario import load
 
     draft = file.with_name(f".{file.name}.draft.yaml")
     try:

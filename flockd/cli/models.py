@@ -204,8 +204,8 @@ def _times_ms(model: OnnxModel, feeds: Any, runs: int) -> list[float]:
 
 
 def _prepare(args: argparse.Namespace) -> int:
-    from flockd.core.config import ScenarioConfig, load
     from flockd.flight.inference import manifests_of
+    from flockd.sim.scenario import ScenarioConfig, load
 
     loaded = load(args.config)
     config = loaded.drone if isinstance(loaded, ScenarioConfig) else loaded

@@ -21,8 +21,9 @@ from flockd.core.choices import TRUTH_ROLES, AutopilotKind, CameraPreset, Height
 from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.core.config import Overrides, ScenarioConfig
+    from flockd.core.config import Overrides
     from flockd.onboard.recording import Recorder
+    from flockd.sim.scenario import ScenarioConfig
 
 SCENARIO = "paper_flight.yaml"
 COSTS = """\
@@ -166,7 +167,7 @@ def _wind(text: str) -> tuple[float, float]:
 
 
 def _flock_size(text: str) -> int:
-    from flockd.core.config.scenario import MAX_DRONES
+    from flockd.sim.scenario import MAX_DRONES
 
     count = positive_count(text)
     if count > MAX_DRONES:
@@ -292,9 +293,9 @@ def _check_options(args: argparse.Namespace) -> None:
 
 def _scenario(args: argparse.Namespace) -> ScenarioConfig:
     """The scenario with the options over it."""
-    from flockd.core.config import load_scenario
     from flockd.core.data import data_path
     from flockd.sim.flock.start import with_drones
+    from flockd.sim.scenario import load_scenario
 
     overrides: Overrides = {
         key: getattr(args, option) for option, key in OPTIONS.items() if getattr(args, option) is not None

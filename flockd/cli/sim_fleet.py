@@ -16,7 +16,7 @@ from flockd.cli.output import Phases, complain
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.core.config import ScenarioConfig
+    from flockd.sim.scenario import ScenarioConfig
 
 SITL = "px4_sitl.yaml"
 DEFAULT_SPEED_FACTOR = 0.25

@@ -22,8 +22,8 @@ from flockd.cli.output import Phases, complain, say
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.core.config import ScenarioConfig
     from flockd.fleet.page.page_server import PageServer
+    from flockd.sim.scenario import ScenarioConfig
 
 _KEEPS = {
     "telemetry": "--live has --telemetry in it; drop one of them",

@@ -6,15 +6,15 @@ import random
 from collections.abc import Sequence
 from pathlib import Path
 
+from flockd.campaign.campaign_file import Figure
 from flockd.campaign.conduct import Conducted, conduct
 from flockd.campaign.engine import Flown
 from flockd.campaign.figures import Figures
 from flockd.campaign.flight_kinds import Task, fly_task
 from flockd.campaign.flight_plan import Plan
 from flockd.campaign.folder import CampaignFolder
-from flockd.core.config import ScenarioConfig
-from flockd.core.config.campaign import Figure
 from flockd.core.data import data_path
+from flockd.sim.scenario import ScenarioConfig
 
 PAPER = data_path("config") / "paper_flight.yaml"
 HEAD = f"""\

@@ -442,8 +442,8 @@ def test_wind_speed_and_radius_are_what_is_flown(capsys: pytest.CaptureFixture[s
 
 
 def test_two_flights_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from flockd.core.config import load_scenario
     from flockd.sim.flock.swarm import fly
+    from flockd.sim.scenario import load_scenario
 
     for name, seed in (("a", 0), ("b", 1)):
         (tmp_path / name).mkdir()

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from flockd.cli import main
-from flockd.core.config import load_drone, load_real_drone, load_scenario
+from flockd.core.config import load_drone, load_real_drone
 from flockd.core.data import data_path
+from flockd.sim.scenario import load_scenario
 
 
 def new(kind: str, file: Path, *settings: str) -> int:

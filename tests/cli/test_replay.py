@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from flockd.cli import main
-from flockd.core.config import Overrides, ScenarioConfig, load_scenario
+from flockd.core.config import Overrides
 from flockd.core.data import data_path
 from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, VehicleState
 from flockd.onboard.recording import Recorder
@@ -21,6 +21,7 @@ from flockd.onboard.recording.reader import Recording
 from flockd.review.flight_log.from_recordings import flight_log, recordings_in
 from flockd.review.flight_log.log import FlightLog
 from flockd.sim.flock.start import with_drones
+from flockd.sim.scenario import ScenarioConfig, load_scenario
 from tests.onboard.recording.made_up import MODELS, MadeUpPilot, drone_config, record
 from tests.worlds import worlds_once
 

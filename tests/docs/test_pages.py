@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from flockd.cli import _parser
-from flockd.core.config import schema_of
+from flockd.core.config import DroneConfig
 from tools.docs import docs_reference
 
 ROOT = Path(__file__).parents[2]
@@ -131,7 +131,7 @@ def has_key(schema: dict[str, Any], path: list[str]) -> bool:
 
 @by_name
 def test_configuration_keys_exist(page: Path) -> None:
-    drone = schema_of("drone")
+    drone = DroneConfig.model_json_schema()
     sections = {key for key, value in drone["properties"].items() if docs_reference._inner(drone, value)[0]}
     for name in re.findall(r"`([a-z_]+(?:\.[a-z_0-9]+)+)\b(?!\.\w)[^`]*`", prose_of(page)):
         path = name.split(".")

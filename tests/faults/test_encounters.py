@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flockd.core.config import load_drone, load_scenario
+from flockd.core.config import load_drone
 from flockd.core.config.mission import MissionParameters
-from flockd.core.config.scenario import StartConfig, VehicleConfig
 from flockd.core.data import data_path
 from flockd.core.messages import FloatArray
 from flockd.review.flight_log.metadata import FleetMetadata
+from flockd.sim.scenario import StartConfig, VehicleConfig, load_scenario
 from flockd.sim.sitl import autopilots, fleet
 from flockd.sim.sitl.ground_station import GroundStation, Poses
 from flockd.sim.vehicles.vehicles import Vehicles

@@ -13,11 +13,11 @@ import pytest
 
 from flockd.core.choices import HeightSource
 from flockd.core.config import DroneConfig
-from flockd.core.config.scenario import RangeFinderConfig
 from flockd.core.messages import FloatArray, RangeReading
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.sim.autopilot.fake_vehicle import Demand
+from flockd.sim.scenario import RangeFinderConfig
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import Process, drone, started
 from tests.make import changed

@@ -10,7 +10,7 @@ import pytest
 
 from flockd.cli import main
 from flockd.core.choices import TRUTH_ROLES
-from flockd.core.config import ScenarioConfig, load_drone, load_scenario
+from flockd.core.config import load_drone
 from flockd.core.data import data_path
 from flockd.core.messages import PilotOutput
 from flockd.flight.geometry import (
@@ -29,6 +29,7 @@ from flockd.onboard.recording.reader import Recording
 from flockd.sim.cameras import camera_simulator
 from flockd.sim.cameras.true_rigs import true_rigs
 from flockd.sim.flock.swarm import fly
+from flockd.sim.scenario import ScenarioConfig, load_scenario
 from tests.faults.catalogue import RecordProperty, reacted
 
 pytestmark = pytest.mark.slow

@@ -14,7 +14,6 @@ import numpy as np
 from rich.console import Console
 
 from flockd.cli.status import _table
-from flockd.core.config import load_scenario
 from flockd.core.data import data_path
 from flockd.core.messages import MissionOrder
 from flockd.fleet.fleet_status import status_rows
@@ -25,6 +24,7 @@ from flockd.onboard.daemon.operator_commands import OperatorCommands, OperatorRe
 from flockd.onboard.telemetry.schema import fault
 from flockd.onboard.telemetry.topics import TOPICS
 from flockd.sim.flock.live_controls import LiveControls
+from flockd.sim.scenario import load_scenario
 from tests.hostile import ABSURD_TEXTS, absurd, assert_readable, hostile, mutated_bytes, mutated_json, nested
 
 COMMANDS = ("hold", "land", "goto", "velocity", "resume", "HOLD", "hold ", "hold/land", "__init__")

@@ -18,10 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from flockd.core.config import load_scenario
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.safety import SafetyParameters
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.core.messages import FloatArray, Setpoint, Wanted
@@ -31,6 +29,7 @@ from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.onboard.sources import clock_at
 from flockd.sim.flock.start import with_drones
+from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.sitl.autopilots import BY_HAND, Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.sitl.free_ports import free_port
 from flockd.sim.sitl.ground_station import GroundStation

@@ -17,13 +17,14 @@ import numpy as np
 import pytest
 
 from flockd.cli.sim_fleet import DEFAULT_SPEED_FACTOR, SITL
-from flockd.core.config import ScenarioConfig, load_drone, load_scenario
+from flockd.core.config import load_drone
 from flockd.core.data import data_path
 from flockd.core.messages import FloatArray
 from flockd.flight.flocking.metrics import closest_distances
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.flight_folder import save_flight, write_report_files
 from flockd.sim.flock.start import with_drones
+from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.sitl.fleet import fly_fleet
 from flockd.sim.sitl.free_ports import free_endpoint
 from tools.checks.px4_rows import Order

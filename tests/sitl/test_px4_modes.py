@@ -18,12 +18,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flockd.core.config import DroneConfig, ScenarioConfig, load, load_scenario
+from flockd.core.config import DroneConfig
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.onboard.sources import clock_at
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.start import with_drones
+from flockd.sim.scenario import ScenarioConfig, load, load_scenario
 from flockd.sim.sitl.autopilots import Autopilots, Ports, Px4s, SimulatedAutopilots
 from flockd.sim.sitl.daemons import Daemons, fleet_configs
 from flockd.sim.sitl.frame_server import FrameServer

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from pymavlink import mavutil
 
-from flockd.core.config import DroneConfig, load, load_scenario
+from flockd.core.config import DroneConfig
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
@@ -26,6 +26,7 @@ from flockd.fleet.fleet_status import status_rows
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.autopilot.refusal_reasons import NOT_STREAMING, REASONS, SEVERAL_SENDERS
 from flockd.sim.flock.start import with_drones
+from flockd.sim.scenario import load, load_scenario
 from flockd.sim.sitl.autopilots import Px4s
 from flockd.sim.sitl.daemons import Daemons
 from flockd.sim.sitl.free_ports import free_endpoint

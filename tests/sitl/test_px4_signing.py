@@ -11,11 +11,12 @@ from typing import Any
 import pytest
 from pymavlink import mavutil
 
-from flockd.core.config import DroneConfig, load, load_scenario
+from flockd.core.config import DroneConfig
 from flockd.core.data import data_path
 from flockd.ground.doctor.autopilot_checks import check_autopilot
 from flockd.ground.doctor.finding import Level
 from flockd.sim.flock.start import with_drones
+from flockd.sim.scenario import load, load_scenario
 from flockd.sim.sitl.autopilots import Px4s
 
 PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")

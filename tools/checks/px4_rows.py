@@ -28,13 +28,14 @@ import numpy as np
 
 from flockd.cli.sim_fleet import DEFAULT_SPEED_FACTOR, SITL
 from flockd.core.choices import AutopilotKind
-from flockd.core.config import ScenarioConfig, load_drone, load_scenario
+from flockd.core.config import load_drone
 from flockd.core.data import data_path
 from flockd.core.errors import FlockdError
 from flockd.core.messages import FloatArray
 from flockd.flight.flocking.metrics import closest_distances
 from flockd.review.flight_log.log import FlightLog
 from flockd.sim.flock.start import with_drones
+from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.sitl.autopilots import px4_folder
 from flockd.sim.sitl.fleet import fly_fleet
 from flockd.sim.sitl.free_ports import free_endpoint

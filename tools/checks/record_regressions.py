@@ -27,10 +27,9 @@ import numpy as np
 import yaml
 
 from flockd.cli import main as flockd
-from flockd.core.config import DroneConfig, ScenarioConfig, load_scenario
+from flockd.core.config import DroneConfig
 from flockd.core.config.recording import RecordingConfig
 from flockd.core.config.rig import CameraConfig
-from flockd.core.config.scenario import StartConfig
 from flockd.core.data import data_path
 from flockd.core.messages import Frame, FrameSet, MissionOrder, PilotOutput, UInt8Array, VehicleState
 from flockd.flight.inference.hashes import model_hashes
@@ -39,6 +38,7 @@ from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.truth import Truth
 from flockd.sim.flock.swarm import fly
+from flockd.sim.scenario import ScenarioConfig, StartConfig, load_scenario
 
 Step = tuple[FrameSet, VehicleState]
 Starts = Mapping[tuple[float, float, float], tuple[float, float]]

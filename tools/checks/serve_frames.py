@@ -12,10 +12,10 @@ import argparse
 import time
 from pathlib import Path
 
-from flockd.core.config import load_scenario
 from flockd.onboard.sources import clock_at
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.start import with_drones
+from flockd.sim.scenario import load_scenario
 from flockd.sim.sitl.autopilots import TRUTH_PORT
 from flockd.sim.sitl.frame_server import FrameServer
 from flockd.sim.sitl.ground_station import GroundStation

@@ -31,13 +31,14 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from flockd.core.config import DroneConfig, ScenarioConfig, load_scenario
+from flockd.core.config import DroneConfig
 from flockd.core.data import data_path
 from flockd.core.messages import FloatArray, Frame, FrameSet, VehicleState
 from flockd.fleet.watcher import FleetWatcher
 from flockd.flight.pilot import FlockPilot
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.cameras.camera_simulator import CameraSimulator
+from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.sitl.daemons import Daemons
 from flockd.sim.sitl.frame_server import FrameServer
 from flockd.sim.sitl.free_ports import free_endpoint, free_port

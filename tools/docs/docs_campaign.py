@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from flockd.campaign.campaign_figures import label_of, parameter_curves, shown
+from flockd.campaign.campaign_file import Figure
 from flockd.campaign.flight_plan import CASE
 from flockd.campaign.results import Results
-from flockd.core.config.campaign import Figure
 from flockd.core.errors import UsageError
 
 DPI = 110

@@ -25,7 +25,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
-from flockd.core.config import load_scenario
 from flockd.core.messages import FloatArray
 from flockd.onboard.recording.reader import Recording
 from flockd.review.flight_log.from_recordings import flight_log
@@ -36,6 +35,7 @@ from flockd.review.report.filmstrip import filmstrip
 from flockd.review.report.flight_folder import KEY_FRAMES_NAME, LOG_NAME
 from flockd.review.report.flight_video import write_video
 from flockd.review.report.style import GRID, INK, MUTED, PAPER, colour_of
+from flockd.sim.scenario import load_scenario
 
 FRAME_MS = 50
 SIZE_IN, DPI = (7.6, 3.23), 100

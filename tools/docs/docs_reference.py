@@ -16,14 +16,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from flockd.campaign.campaign_file import CampaignConfig
 from flockd.cli import _parser
-from flockd.core.config import schema_of
+from flockd.core.config import DroneConfig
 from flockd.core.config.safety import SafetyParameters
 from flockd.core.consistency import CHECKS
 from flockd.core.services import SERVICES
 from flockd.flight.safety.policy import Barrier, Reaction, rules
 from flockd.onboard.autopilot.refusal_reasons import REASONS
 from flockd.onboard.telemetry import topics
+from flockd.sim.scenario import scenario_schema
 
 FOLDER = Path(__file__).parents[2] / "docs" / "reference"
 NOTICE = "<!-- Written by tools/docs/docs_reference.py; do not edit. -->"
@@ -106,11 +108,11 @@ def configuration_page() -> str:
         "## Drone files",
         "",
     ]
-    drone = schema_of("drone")
+    drone = DroneConfig.model_json_schema()
     lines += _described(drone) + _section(drone, drone, "")
-    scenario = schema_of("scenario")
+    scenario = scenario_schema()
     lines += ["## Scenario files", "", *_described(scenario), *_section(scenario, scenario, "", level=3)]
-    campaign = schema_of("campaign")
+    campaign = CampaignConfig.model_json_schema()
     lines += ["## Campaign files", "", *_described(campaign), *_section(campaign, campaign, "", level=3)]
     return "\n".join(lines).rstrip() + "\n"
 

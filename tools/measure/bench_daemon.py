@@ -21,13 +21,14 @@ from pathlib import Path
 
 import numpy as np
 
-from flockd.core.config import DroneConfig, load
+from flockd.core.config import DroneConfig
 from flockd.core.data import data_path
 from flockd.core.messages import Frame
 from flockd.flight.inference.feeds import golden_image
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.sources import FramePublisher
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from flockd.sim.scenario import load
 from flockd.sim.sitl.daemons import Daemons
 from flockd.sim.sitl.free_ports import free_endpoint, free_port
 

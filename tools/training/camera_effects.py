@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flockd.core.config.imperfect_cameras import CamerasConfig
 from flockd.sim.cameras.compression import jpeg
+from flockd.sim.scenario.imperfect_cameras import CamerasConfig
 
 Image = NDArray[np.uint8]
 _LEAST_SIDE_PX = 8

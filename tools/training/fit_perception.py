@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from flockd.core.config.loader import load_perceived_errors
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.truth_matching import match_neighbours
 from flockd.review.report.flight_folder import LOG_NAME
+from flockd.sim.scenario.perceived import load_perceived_errors
 
 EDGES_M = (0.0, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 9.5, 13.0, 17.0, 20.0)
 LEAST_SAMPLES = 30

@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockd.core.config.imperfect_cameras import CamerasConfig
-from flockd.core.config.obstacle_field import ObstaclesConfig
 from flockd.core.errors import UsageError
 from flockd.flight.geometry import PinholeCamera, vector_from_rotation
 from flockd.sim.renderer.airframe import DroneModel
 from flockd.sim.renderer.drone_models import drone_model
+from flockd.sim.scenario import ObstaclesConfig
+from flockd.sim.scenario.imperfect_cameras import CamerasConfig
 from flockd.sim.world.obstacle_worlds import LOWEST_CROWN_M, generate_obstacles
 from flockd.sim.world.obstacles import Obstacles
 from tools.training import worlds

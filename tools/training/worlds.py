@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from flockd.core.config.obstacle_field import ObstaclesConfig
+from flockd.sim.scenario import ObstaclesConfig
 
 Job = TypeVar("Job")
 FLIGHTS = range(0, 1_000_000)

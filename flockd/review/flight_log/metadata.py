@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final, Self
 
 from pydantic import BaseModel, ConfigDict
 
 from flockd.core.config import DroneConfig
-from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.config.mission import MissionParameters
 
 EXACT_STATES: Final = "truth"
 """`FlightMetadata.perception` of a flight whose drones were given the others' true states."""
@@ -95,15 +96,12 @@ class MissionMetadata(BaseModel):
     """The number from 0 of the drone whose goals these are, where only one that is flown by hand has any."""
 
     @classmethod
-    def of(cls, scenario: ScenarioConfig) -> Self:
-        """The missions of all vehicles of a scenario."""
-        vehicles = range(len(scenario.vehicles))
-        kinds = [
-            f"{scenario.drone_of(i).mission.kind}{' by hand' if scenario.vehicles[i].by_hand else ''}" for i in vehicles
-        ]
-        reached_m = max(scenario.drone_of(i).mission.reached_m for i in vehicles)
-        with_goals = [i for i in vehicles if scenario.drone_of(i).mission.kind in _WITH_GOALS]
-        led_by = next((i for i in with_goals if all(scenario.vehicles[j].by_hand for j in with_goals)), None)
+    def of(cls, flown: Sequence[tuple[MissionParameters, bool]]) -> Self:
+        """The missions of all vehicles, each with whether it is flown by hand."""
+        kinds = [f"{mission.kind}{' by hand' if by_hand else ''}" for mission, by_hand in flown]
+        with_goals = [number for number, (mission, _) in enumerate(flown) if mission.kind in _WITH_GOALS]
+        led_by = next((number for number in with_goals if all(flown[other][1] for other in with_goals)), None)
+        reached_m = max(mission.reached_m for mission, _ in flown)
         return cls(kind=", ".join(dict.fromkeys(kinds)), reached_m=reached_m, led_by=led_by)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from flockd.core.messages import FloatArray, RangeReading
 
 if TYPE_CHECKING:  # the fake autopilot runs as a program of its own, which begins sooner without the configuration
-    from flockd.core.config.scenario import RangeFinderConfig
+    from flockd.sim.scenario import RangeFinderConfig
 
 Ground = Callable[[FloatArray, FloatArray], FloatArray]
 """Height above z = 0 of the ground at points (n,) north and (n,) east, metres."""

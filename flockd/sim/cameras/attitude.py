@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from flockd.core.config.imperfect_cameras import LateAttitudeConfig
 from flockd.core.messages import VehicleState
 from flockd.flight.geometry import rotation_from_vector
 from flockd.sim.cameras.pose_trail import PoseTrail
+from flockd.sim.scenario.imperfect_cameras import LateAttitudeConfig
 
 
 class LateAttitude:

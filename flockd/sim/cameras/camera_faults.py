@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flockd.core.config.scenario import CameraFaultConfig
 from flockd.core.messages import UInt8Array
+from flockd.sim.scenario import CameraFaultConfig
 
 _BANDS, _BAND_SHARE = 4, 8
 """Bands of interference in an image, each an eighth of it high; they may overlap."""

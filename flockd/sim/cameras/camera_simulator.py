@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 
 from flockd.core.config.mission import MissionParameters
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FloatArray, Frame, FrameSet, UInt8Array
 from flockd.flight.geometry import build_rig, rotation_from_vector
 from flockd.flight.mission import Moment, Navigator
@@ -22,6 +21,7 @@ from flockd.sim.cameras.true_rigs import true_rigs
 from flockd.sim.flock.truth_perception import RenderTruth
 from flockd.sim.renderer.drone_models import FAMILIES, drone_model
 from flockd.sim.renderer.renderer import Renderer, View
+from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
 from flockd.sim.vehicles.vehicles import REFERENCE_DEG
 from flockd.sim.world.obstacle_worlds import obstacles_of

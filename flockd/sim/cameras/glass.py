@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from flockd.core.config.imperfect_cameras import LensFaultsConfig
 from flockd.core.messages import BoolArray, Float32Array, FloatArray
 from flockd.sim.cameras.shutter import LensField
+from flockd.sim.scenario.imperfect_cameras import LensFaultsConfig
 
 _SPECK_SHARE, _DROP_SHARE = (0.008, 0.03), (0.02, 0.07)
 """Smallest and largest radius, as shares of the image's longer side: a speck of a tenth of a millimetre on a lens

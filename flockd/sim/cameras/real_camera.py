@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
-from flockd.core.config.imperfect_cameras import CamerasConfig
 from flockd.core.messages import FloatArray, UInt8Array
 from flockd.flight.geometry import Camera
 from flockd.sim.cameras.compression import jpeg
@@ -18,6 +17,7 @@ from flockd.sim.cameras.shake import Shaking
 from flockd.sim.cameras.shutter import CameraMotion, LensField, exposed
 from flockd.sim.cameras.timing import CameraClock
 from flockd.sim.renderer.renderer import View
+from flockd.sim.scenario.imperfect_cameras import CamerasConfig
 
 
 class RealCamera:

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from flockd.core.config.imperfect_cameras import AutomaticConfig, SensorNoiseConfig
 from flockd.core.messages import BoolArray, Float32Array, FloatArray
+from flockd.sim.scenario.imperfect_cameras import AutomaticConfig, SensorNoiseConfig
 
 _TARGET = 0.18
 """Mean of the linear light that exposure meters aim at."""

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from flockd.core.config.imperfect_cameras import ShakeConfig
 from flockd.core.messages import FloatArray
+from flockd.sim.scenario.imperfect_cameras import ShakeConfig
 
 _PROPELLERS, _SPREAD = 4, 0.1
 _OF_REVOLUTIONS = 0.8

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from flockd.core.config.imperfect_cameras import ShutterConfig
 from flockd.core.messages import BoolArray, Float32Array, FloatArray
 from flockd.flight.geometry import Camera
 from flockd.sim.renderer.renderer import View
+from flockd.sim.scenario.imperfect_cameras import ShutterConfig
 
 _MOST_SAMPLES = 16
 """Instants of an exposure, one for each pixel of the longest way."""

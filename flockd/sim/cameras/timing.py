@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flockd.core.config.imperfect_cameras import CameraTimingConfig
+from flockd.sim.scenario.imperfect_cameras import CameraTimingConfig
 
 
 @dataclass(frozen=True)

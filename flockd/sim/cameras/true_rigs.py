@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from flockd.core.config.rig_errors import RigErrorsConfig
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry import Rig, RigCamera, RigidTransform, build_rig, rotation_from_vector
 from flockd.flight.geometry.camera_motion import scaled_focal
+from flockd.sim.scenario import ScenarioConfig
+from flockd.sim.scenario.imperfect_cameras import RigErrorsConfig
 
 
 def true_rigs(scenario: ScenarioConfig) -> list[Rig]:

@@ -7,8 +7,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from flockd.core.config.perceived import PerceivedErrors
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FloatArray
 from flockd.flight.flocking import FlockingLaw, level_offsets, lookahead_s
 from flockd.sim.control_level.flight_code import FlightCode, Known
@@ -18,6 +16,8 @@ from flockd.sim.control_level.many_obstacles import FIGURES, ManyObstacles
 from flockd.sim.control_level.motion import Motion
 from flockd.sim.control_level.near import Near
 from flockd.sim.control_level.perceived_flock import Perception, Seen
+from flockd.sim.scenario import ScenarioConfig
+from flockd.sim.scenario.perceived import PerceivedErrors
 from flockd.sim.vehicles.vehicles import limit_norms
 
 Figures = dict[str, float | int | bool | None]

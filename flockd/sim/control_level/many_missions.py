@@ -9,7 +9,6 @@ import numpy as np
 
 from flockd.core.config.mission import MissionParameters
 from flockd.core.config.safety import GateParameters
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.errors import UsageError
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.mission import Moment, Navigator
@@ -17,6 +16,7 @@ from flockd.flight.mission.guidance import SLOW_DOWN_S
 from flockd.flight.mission.places import place_of_waypoint
 from flockd.flight.mission.waypoints import PATIENCE_S, PROGRESS
 from flockd.flight.safety.fence import outside_fence
+from flockd.sim.scenario import ScenarioConfig
 
 HOME_DEG = (1.0, 1.0)
 """Latitude and longitude of the world's origin, as in the simulator."""

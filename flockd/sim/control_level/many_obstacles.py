@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FloatArray, ObstacleRanges
+from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.world.clearances import clearances
 from flockd.sim.world.obstacle_worlds import obstacles_of
 from flockd.sim.world.obstacles import true_ranges

@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
-from flockd.core.config.scenario import VehicleConfig
 from flockd.core.messages import FloatArray
+from flockd.sim.scenario import VehicleConfig
 from flockd.sim.vehicles.vehicles import CLIMB_TIME_S, MAX_CLIMB_M_S, MAX_LEAN_M_S2, limit_norms
 from flockd.sim.vehicles.wind import GustField
 

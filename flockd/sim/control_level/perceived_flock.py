@@ -13,9 +13,9 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from flockd.core.config.perceived import PerceivedErrors, Spread
 from flockd.core.messages import BoolArray, FloatArray, IntArray
 from flockd.sim.control_level.near import Near
+from flockd.sim.scenario.perceived import PerceivedErrors, Spread
 
 DISTANCE, MISSED, BIAS, RANGE, BEARING, VELOCITY = 0, 1, 2, 3, 5, 7
 """Columns of `by_distance`; an error takes two: of z and of z^3, for a normal number z."""

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from flockd.core.config.safety import GateParameters
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FloatArray, Setpoint, Wanted
 from flockd.flight.obstacles import nearest_points
 from flockd.flight.safety import Decision, Gate, Permission, Request, State, Surroundings, Verdict
@@ -18,6 +17,7 @@ from flockd.sim.flock.commands import Commands
 from flockd.sim.flock.made_up_detections import lost_cameras
 from flockd.sim.flock.slowing import Cause, SlowedTime, causes_of, is_slowed, which_are_drones
 from flockd.sim.flock.supervision import WindSupervisor
+from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
 from flockd.sim.vehicles.handover import Handover
 from flockd.sim.vehicles.vehicles import Vehicles

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FloatArray, MissionOrder, MissionStatus, Neighbour, ObstacleRanges
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.flocking.passing import Passing
@@ -20,6 +19,7 @@ from flockd.flight.safety.surroundings import limits_towards
 from flockd.sim.flock.commands import Commands
 from flockd.sim.flock.control_loop import ControlLoop
 from flockd.sim.flock.made_up_detections import TrackedNeighbours
+from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
 from flockd.sim.vehicles.vehicles import REFERENCE_DEG, Vehicles
 from flockd.sim.world.obstacle_worlds import obstacles_of

@@ -8,11 +8,11 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.fleet.simulation import SimulationMessage, checked_control
 from flockd.onboard.daemon.order_checks import OrderChecks
 from flockd.onboard.telemetry.order_messages import parse_ask
 from flockd.onboard.telemetry.topics import AnswerMessage
+from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
 
 _REACHED_OVER_S = 4.0

@@ -7,13 +7,13 @@ from collections.abc import Callable
 from contextlib import ExitStack
 
 from flockd.core.choices import SimulatedPerception
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.sim.flock.control_loop import ControlLoop
 from flockd.sim.flock.exact_states import start_yaw
 from flockd.sim.flock.live_controls import LiveControls
 from flockd.sim.flock.pilot_pool import PilotPool
 from flockd.sim.flock.shown_flock import ShownFlock
 from flockd.sim.flock.swarm import ExactStatePilots, VisionPilots
+from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.vehicles import Vehicles
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from flockd.core.config.scenario import DetectionsConfig, ScenarioConfig
 from flockd.core.messages import BoolArray, FloatArray, Neighbour
 from flockd.flight.geometry import build_rig, rotation_from_euler
 from flockd.flight.tracking import Measurement, Tracker
+from flockd.sim.scenario import DetectionsConfig, ScenarioConfig
 
 _OWN_MOTION_ERROR_M = 0.02
 """Standard deviation, each axis and step, that the tracker is told of its own motion, which is exact."""

@@ -10,11 +10,11 @@ from functools import partial
 from types import TracebackType
 from typing import Self
 
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FrameSet, MissionOrder, VehicleState
 from flockd.core.side_process import SideProcess
 from flockd.sim.flock.pilots import Pilots, Stepped
 from flockd.sim.flock.truth_perception import RenderTruth, TruthPerception
+from flockd.sim.scenario import ScenarioConfig
 
 
 class PilotPool:

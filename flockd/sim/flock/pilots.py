@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, VehicleState
 from flockd.flight.perception import ImageNetworks, load_networks
 from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.review.flight_log.capture import capture
 from flockd.review.flight_log.key_frames import KeyFrame
+from flockd.sim.scenario import ScenarioConfig
 
 if TYPE_CHECKING:  # a process of pilots does not load the renderer, unless truths need it
     from flockd.sim.flock.truth_perception import RenderTruth, TruthPerception

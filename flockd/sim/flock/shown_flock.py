@@ -11,7 +11,6 @@ from typing import Protocol
 import numpy as np
 
 from flockd import __version__
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, VehicleState, Wanted
 from flockd.flight.geometry import build_rig
 from flockd.flight.mission import order_fault
@@ -26,6 +25,7 @@ from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage, FlightM
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.commands import Commands
 from flockd.sim.flock.control_loop import ControlLoop
+from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
 from flockd.sim.vehicles.vehicles import REFERENCE_DEG, Vehicles
 

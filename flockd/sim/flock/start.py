@@ -8,9 +8,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from flockd.core.config.scenario import MIN_START_DISTANCE_M, ScenarioConfig, StartConfig
 from flockd.core.errors import UsageError
 from flockd.flight.flocking.metrics import min_distance
+from flockd.sim.scenario import MIN_START_DISTANCE_M, ScenarioConfig, StartConfig
 
 SPACING_M = 3.5
 MIN_DISTANCE_M = 3.0

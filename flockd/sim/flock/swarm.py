@@ -12,7 +12,6 @@ import numpy as np
 
 from flockd import __version__
 from flockd.core.choices import TRUTH_ROLES, SimulatedPerception
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.errors import UsageError
 from flockd.core.messages import NO_STATUS, FloatArray
 from flockd.flight.mission.circle_then_tangent import desired_of
@@ -31,6 +30,7 @@ from flockd.sim.flock.exact_states import ExactFlock, HandPilot, fly_exact_state
 from flockd.sim.flock.pilot_pool import PilotPool
 from flockd.sim.flock.pilots import Stepped
 from flockd.sim.flock.shown_flock import RealTime, ShownFlock, orders_of
+from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
 from flockd.sim.vehicles.vehicles import SimulatedAutopilot, Vehicles
 from flockd.sim.world.clearances import with_obstacles
@@ -127,7 +127,7 @@ def fly(
         scenario.drone,
         scenario=scenario.scenario,
         drones=len(scenario.vehicles),
-        mission=MissionMetadata.of(scenario),
+        mission=MissionMetadata.of(scenario.missions),
         duration_s=scenario.duration_s if flown == len(times) else flown * scenario.drone.step_s,
         interrupted=flown < len(times),
         began=began.isoformat(timespec="seconds"),

@@ -12,12 +12,12 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from flockd.core.config.scenario import ScenarioConfig, StartConfig, VehicleConfig
 from flockd.core.errors import UnavailableError, UsageError
 from flockd.core.messages import FloatArray
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, Ground
 from flockd.sim.autopilot.fake_vehicle import DeadTime, Demand, MotionState, PointMass
+from flockd.sim.scenario import ScenarioConfig, StartConfig, VehicleConfig
 from flockd.sim.sitl.free_ports import free_port
 from flockd.sim.sitl.ground_station import FULL_STICK_M_S, home_deg
 from flockd.sim.sitl.leftovers import described, px4_instance, user_of_port

@@ -15,8 +15,8 @@ import yaml
 from flockd.core.config import DroneConfig
 from flockd.core.config.mission import MissionParameters
 from flockd.core.config.recording import RecordingConfig
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.errors import ConfigError, ConfigProblem
+from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.sitl.autopilots import Ports
 from flockd.sim.sitl.processes import Program, Programs
 

@@ -15,15 +15,15 @@ import numpy as np
 
 from flockd.core.choices import AutopilotKind
 from flockd.core.config import DroneConfig
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.errors import UnavailableError
 from flockd.onboard.sources import clock_at
-from flockd.review.flight_log.fleet_log import FleetFrame, FleetRun, fleet_key_frames, fleet_log, recorded_orders
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.exact_states import HandPilot, exact_states_at
 from flockd.sim.flock.swarm import Flight
+from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.sitl.autopilots import Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.sitl.daemons import Daemons, fleet_configs
+from flockd.sim.sitl.fleet_log import FleetFrame, FleetRun, fleet_key_frames, fleet_log, recorded_orders
 from flockd.sim.sitl.frame_server import FrameServer
 from flockd.sim.sitl.free_ports import free_endpoint
 from flockd.sim.sitl.ground_station import GroundStation, Mode

@@ -8,8 +8,8 @@ from types import TracebackType
 from typing import Self
 
 from flockd.onboard.sources import FramePublisher
-from flockd.review.flight_log.fleet_log import FleetFrame
 from flockd.sim.cameras.camera_simulator import CameraSimulator
+from flockd.sim.sitl.fleet_log import FleetFrame
 from flockd.sim.sitl.ground_station import Poses
 
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FloatArray
+from flockd.sim.scenario import ScenarioConfig
 
 RETURN_M_S = 2.0
 _THERE_M = 0.5

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flockd.core.config.scenario import SensorConfig, StartConfig, VehicleConfig
 from flockd.core.messages import FloatArray, VehicleState
 from flockd.flight.geometry import rotation_from_euler
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, Ground, level_ground
 from flockd.sim.cameras.pose_trail import KEPT_S, FlockPose, PoseTrail
+from flockd.sim.scenario import SensorConfig, StartConfig, VehicleConfig
 from flockd.sim.vehicles.disturbances import Disturbances
 from flockd.sim.vehicles.wind import GustField
 

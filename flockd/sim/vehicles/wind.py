@@ -7,8 +7,8 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from flockd.core.config.scenario import VehicleConfig
 from flockd.core.messages import FloatArray
+from flockd.sim.scenario import VehicleConfig
 
 GUST_TIME_S = 2.0
 """How long a gust lasts at one place: its length over the mean wind that carries the field along."""

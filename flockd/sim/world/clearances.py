@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FloatArray
 from flockd.review.flight_log.log import FlightLog
+from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.world.obstacle_worlds import obstacles_of
 from flockd.sim.world.obstacles import POINTS_A_STEP, Obstacles
 

@@ -8,10 +8,9 @@ import math
 import numpy as np
 from numpy.random import Generator
 
-from flockd.core.config.obstacle_field import ObstaclesConfig
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.errors import UsageError
 from flockd.core.messages import FloatArray
+from flockd.sim.scenario import ObstaclesConfig, ScenarioConfig
 from flockd.sim.world.obstacles import Box, Capsule, Frustum, Material, Obstacles, Solid
 
 DEPTH_M = 0.6

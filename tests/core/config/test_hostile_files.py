@@ -6,8 +6,8 @@ import shutil
 from pathlib import Path
 from random import Random
 
-from flockd.core.config import load_with_places
 from flockd.flight.geometry import build_rig
+from flockd.sim.scenario import load_with_places
 from tests.hostile import CORPUS, ROOT, hostile, own_errors, put, text_of
 
 

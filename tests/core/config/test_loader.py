@@ -8,10 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from flockd.core.config import Overrides, load_campaign, load_drone, load_scenario, schema_of
+from flockd.campaign.campaign_file import load_campaign
+from flockd.core.config import DroneConfig, Overrides, load_drone
 from flockd.core.config.document import core_scalar
 from flockd.core.errors import ConfigError, ConfigProblem, ModelError
 from flockd.flight.perception import load_networks
+from flockd.sim.scenario import load_scenario, scenario_schema
 
 CONFIG = Path(__file__).parents[3] / "config"
 
@@ -350,9 +352,9 @@ def test_a_wrong_override_is_reported_as_such() -> None:
 
 
 def test_the_schema_describes_the_file_and_not_the_merged_model() -> None:
-    drone = schema_of("scenario")["properties"]["drone"]
+    drone = scenario_schema()["properties"]["drone"]
     assert drone["anyOf"] == [{"type": "string"}, {"$ref": "#/$defs/DroneConfig"}], "a path, or the drone itself"
-    assert schema_of("drone")["required"] == ["rig"]
+    assert DroneConfig.model_json_schema()["required"] == ["rig"]
 
 
 @pytest.mark.parametrize(
@@ -477,8 +479,8 @@ def test_a_scenario_may_hold_its_drone(tmp_path: Path) -> None:
 
 
 def test_the_configuration_knows_how_many_families_the_simulator_has() -> None:
-    from flockd.core.config.scenario import DRONE_FAMILIES
     from flockd.sim.renderer.drone_models import FAMILIES
+    from flockd.sim.scenario import DRONE_FAMILIES
 
     assert DRONE_FAMILIES == FAMILIES
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flockd.cli import main
-from flockd.core.config import DroneConfig, load_drone, load_scenario
+from flockd.core.config import DroneConfig, load_drone
 from flockd.core.config.mission import fault_of_place
 from flockd.core.config.safety import GateParameters
 from flockd.core.errors import ConfigError
@@ -20,6 +20,7 @@ from flockd.flight.mission.navigator import middle_of
 from flockd.flight.safety import outside_fence
 from flockd.onboard.telemetry.order_messages import order_message, parse_order
 from flockd.sim.flock.exact_states import fly_exact_states
+from flockd.sim.scenario import load_scenario
 from tests.core.config.test_loader import CONFIG, DRONE, SCENARIO
 
 GATE = GateParameters()

@@ -7,18 +7,17 @@ import math
 import numpy as np
 import pytest
 
-from flockd.core.config import load_scenario
 from flockd.core.config.avoidance import ObstacleParameters
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.config.mission import MissionParameters
 from flockd.core.config.safety import GateParameters
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.data import data_path
 from flockd.core.messages import FloatArray, ObstacleRanges
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.obstacles import Avoidance
 from flockd.flight.obstacles.steering import Steering, free_way
 from flockd.sim.flock.exact_states import ExactFlock
+from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.vehicles.vehicles import Vehicles
 from flockd.sim.world.obstacles import Box, Frustum, Obstacles, Solid, true_ranges
 

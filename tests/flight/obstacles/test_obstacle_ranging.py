@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from flockd.core.config import load_scenario
 from flockd.core.config.avoidance import ObstacleParameters
 from flockd.core.data import data_path
 from flockd.core.messages import SECTORS, UNCLASSED, EgoMotion, FloatArray, ObstacleRanges, VehicleState
 from flockd.flight.geometry import RangeMap, Rig, build_rig, grid_pixels
 from flockd.flight.obstacles import ObstacleRanging
 from flockd.flight.perception import CameraObservation, Observation
+from flockd.sim.scenario import load_scenario
 
 RIG = build_rig(load_scenario(data_path("config") / "square.yaml").drone.rig)
 PARAMETERS = ObstacleParameters(range_m=12.0, range_sigma=0.1, min_pixels=4)

@@ -8,7 +8,6 @@ from typing import Any, cast
 import numpy as np
 
 from flockd.core.choices import ROLES
-from flockd.core.config import ScenarioConfig, load_scenario
 from flockd.core.data import data_path
 from flockd.core.messages import Float32Array, Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
 from flockd.flight.geometry import RigCamera
@@ -16,6 +15,7 @@ from flockd.flight.perception import Crop, Perception, RangeEstimate, SceneMaps
 from flockd.flight.pilot import FlockPilot
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.truth_perception import TruthPerception
+from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.vehicles.vehicles import Vehicles
 from tests.flight.perception.shipped import SECOND_STAGE
 

@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
-from flockd.core.config.scenario import CameraFaultConfig
 from flockd.core.messages import FrameSet, PilotOutput, UInt8Array, VehicleState
 from flockd.flight.inference.manifest_file import models_folder
 from flockd.flight.perception import OnnxNetworks
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.recording.reader import Recording
 from flockd.sim.cameras.camera_faults import noisy_image
+from flockd.sim.scenario import CameraFaultConfig
 
 CAMERA = "left"
 NOISE_BEGINS, NOISE_ENDS, STEPS = 2, 6, 8

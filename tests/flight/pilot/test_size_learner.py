@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.core.config import DroneConfig, load_scenario
+from flockd.core.config import DroneConfig
 from flockd.core.data import data_path
 from flockd.core.messages import (
     Detection,
@@ -31,6 +31,7 @@ from flockd.flight.pilot import FlockPilot
 from flockd.flight.pilot.weave import Weave
 from flockd.flight.tracking.flock_size import FlockSize, SizeEstimate
 from flockd.flight.tracking.weave_path import DURATION_S, PERIOD_S
+from flockd.sim.scenario import load_scenario
 from tests.make import frames, neighbour, vehicle
 
 STEP_S = 0.5

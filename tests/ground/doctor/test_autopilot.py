@@ -9,7 +9,6 @@ import pytest
 from flockd.core.config import DroneConfig, load_drone
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.safety import GateParameters, SafetyParameters
-from flockd.core.config.scenario import RangeFinderConfig
 from flockd.core.data import data_path
 from flockd.ground.doctor import Check, Finding, Level, run_checks
 from flockd.ground.doctor.autopilot_checks import (
@@ -25,6 +24,7 @@ from flockd.onboard.autopilot.autopilot_status import Firmware
 from flockd.onboard.autopilot.clock_sync import ClockEstimate
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
+from flockd.sim.scenario import RangeFinderConfig
 from flockd.sim.sitl.free_ports import free_port
 from tests.onboard.autopilot.conftest import HEARTBEAT_S
 

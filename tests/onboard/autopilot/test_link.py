@@ -18,7 +18,6 @@ from mavsdk.system import System
 from pymavlink.dialects.v20 import common as mavlink
 
 from flockd.core.config.autopilot import AutopilotParameters
-from flockd.core.config.scenario import RangeFinderConfig
 from flockd.core.messages import Setpoint, Wanted
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, Firmware
 from flockd.onboard.autopilot.mavsdk_link import RECEIVED, SETPOINT_TYPE_MASK, TIME_SYNC, AutopilotLink, Severity
@@ -26,6 +25,7 @@ from flockd.sim.autopilot.fake_autopilot import TICK_S, FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.sim.autopilot.fake_telemetry import TelemetryStreams
 from flockd.sim.autopilot.fake_vehicle import Demand, MotionState
+from flockd.sim.scenario import RangeFinderConfig
 from flockd.sim.sitl.free_ports import free_port
 from flockd.sim.sitl.ground_station import GroundStation
 from tests.calm import clock

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flockd.core.config import load_scenario
 from flockd.core.data import data_path
 from flockd.review.flight_log.metadata import FleetMetadata, FlightMetadata, Percentiles
+from flockd.sim.scenario import load_scenario
 
 
 def test_metadata_of_a_fleet_comes_back(tmp_path: Path) -> None:

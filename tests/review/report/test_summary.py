@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flockd.core.config import load_scenario
 from flockd.core.data import data_path
 from flockd.core.messages import PilotOutput, SizeStatus, Wanted
 from flockd.review.flight_log.builder import FlightLogBuilder
@@ -23,6 +22,7 @@ from flockd.review.flight_log.truth_matching import match_neighbours
 from flockd.review.report.page_texts import page_texts
 from flockd.review.report.paper_results import TABLE_2, TABLE_3
 from flockd.review.report.summary import causes_text, sizes_text, summarise, write_summary
+from flockd.sim.scenario import load_scenario
 
 Array = NDArray[np.float64]
 STEPS, DRONES = 30, 2
@@ -383,9 +383,9 @@ def test_a_goal_counts_from_when_it_was_ordered() -> None:
 def test_where_a_person_leads_it_is_the_persons_drone_that_arrives() -> None:
     """The first drone is at the goal at the end, the flock's middle 2 m beside it."""
     scenario = load_scenario(data_path("config") / "led_by_hand.yaml")
-    assert MissionMetadata.of(scenario).led_by == 0
+    assert MissionMetadata.of(scenario.missions).led_by == 0
     knowing = load_scenario(data_path("config") / "one_knows.yaml")
-    assert MissionMetadata.of(knowing).led_by is None
+    assert MissionMetadata.of(knowing.missions).led_by is None
     log = _hand_made()
     goal = np.tile(log.position[-1, 0, :2] + [0.1, 0.0], (STEPS, 1))
     for led_by, arrived in ((0, True), (None, False)):

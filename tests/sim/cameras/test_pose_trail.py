@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from flockd.core.config.scenario import StartConfig, VehicleConfig
 from flockd.flight.geometry import rotation_from_euler
 from flockd.sim.cameras.pose_trail import FlockPose, PoseTrail
+from flockd.sim.scenario import StartConfig, VehicleConfig
 from flockd.sim.vehicles.vehicles import Vehicles
 
 

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from flockd.campaign.flight_plan import Plan
-from flockd.core.config import ScenarioConfig, load_drone, load_scenario
-from flockd.core.config.imperfect_cameras import CamerasConfig
+from flockd.core.config import load_drone
 from flockd.core.data import data_path
 from flockd.core.messages import Frame
 from flockd.flight.geometry import build_rig
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.cameras.lens_views import lens_view
 from flockd.sim.renderer.renderer import Renderer
+from flockd.sim.scenario import ScenarioConfig, load_scenario
+from flockd.sim.scenario.imperfect_cameras import CamerasConfig
 from flockd.sim.vehicles.vehicles import Vehicles
 
 CONFIG = data_path("config")

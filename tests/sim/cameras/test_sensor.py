@@ -7,15 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from flockd.core.config.imperfect_cameras import (
-    AutomaticConfig,
-    CamerasConfig,
-    CameraTimingConfig,
-    LateAttitudeConfig,
-    LensFaultsConfig,
-    SensorNoiseConfig,
-    ShakeConfig,
-)
 from flockd.core.messages import Float32Array, VehicleState
 from flockd.flight.geometry import PinholeCamera, rotation_from_euler
 from flockd.sim.cameras.attitude import LateAttitude
@@ -29,6 +20,15 @@ from flockd.sim.cameras.shake import Shaking
 from flockd.sim.cameras.shutter import CameraMotion, LensField
 from flockd.sim.cameras.timing import CameraClock
 from flockd.sim.renderer.renderer import View
+from flockd.sim.scenario.imperfect_cameras import (
+    AutomaticConfig,
+    CamerasConfig,
+    CameraTimingConfig,
+    LateAttitudeConfig,
+    LensFaultsConfig,
+    SensorNoiseConfig,
+    ShakeConfig,
+)
 
 SIZE = (320, 240)
 CAMERA = PinholeCamera(np.array([[160.0, 0.0, 160.0], [0.0, 160.0, 120.0], [0.0, 0.0, 1.0]]), SIZE)

@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from flockd.core.config.imperfect_cameras import ShakeConfig, ShutterConfig
 from flockd.core.messages import Float32Array, FloatArray
 from flockd.flight.geometry import Camera, PinholeCamera, WideAngleCamera, rotation_from_vector
 from flockd.sim.cameras.lens_views import lens_view
@@ -18,6 +17,7 @@ from flockd.sim.cameras.shake import Shaking
 from flockd.sim.cameras.shutter import CameraMotion, LensField, Shake, exposed
 from flockd.sim.renderer.drone_models import drone_model
 from flockd.sim.renderer.renderer import Renderer, View
+from flockd.sim.scenario.imperfect_cameras import ShakeConfig, ShutterConfig
 from flockd.sim.world.world import World
 
 SIZE = (320, 240)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flockd.core.config import ScenarioConfig, load_scenario
 from flockd.core.data import data_path
 from flockd.flight.geometry import build_rig, rotation_angle_deg
 from flockd.sim.cameras.true_rigs import true_rigs
+from flockd.sim.scenario import ScenarioConfig, load_scenario
 
 NONE = {"cameras.rig.mounting_deg": 0.0}
 OFF = {"cameras.rig.mounting_deg": 2.0, "cameras.rig.mounting_m": 0.02, "cameras.rig.focal": 0.03}

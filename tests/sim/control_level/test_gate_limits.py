@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.core.config import load_scenario
-from flockd.core.config.loader import load_perceived_errors
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.data import data_path
 from flockd.sim.control_level import fly_flocks
 from flockd.sim.control_level.flock_flights import FlockFlights
 from flockd.sim.flock.exact_states import fly_exact_states
 from flockd.sim.flock.start import scattered, with_drones
+from flockd.sim.scenario import ScenarioConfig, load_scenario
+from flockd.sim.scenario.perceived import load_perceived_errors
 
 TICKS, TICK_S = 10, 0.05
 

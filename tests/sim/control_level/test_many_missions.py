@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from flockd.core.config import load_scenario
 from flockd.core.data import data_path
 from flockd.flight.mission import Moment, Navigator
 from flockd.flight.safety import GateParameters
 from flockd.sim.control_level.many_missions import HOME_DEG, ManyMissions
+from flockd.sim.scenario import load_scenario
 
 
 def test_waypoints_count_as_reached_for_the_same_drones_at_the_same_time() -> None:

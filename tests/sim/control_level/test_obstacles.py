@@ -7,10 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.core.config import load_scenario
-from flockd.core.config.loader import load_perceived_errors
-from flockd.core.config.perceived import PerceivedErrors
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.data import data_path
 from flockd.review.report.summary import obstacle_figures
 from flockd.sim.control_level import fly_flocks
@@ -18,6 +14,8 @@ from flockd.sim.control_level.flock_flights import FlockFlights
 from flockd.sim.flock.exact_states import ExactFlock
 from flockd.sim.flock.start import scattered, with_drones
 from flockd.sim.flock.swarm import fly
+from flockd.sim.scenario import ScenarioConfig, load_scenario
+from flockd.sim.scenario.perceived import PerceivedErrors, load_perceived_errors
 
 STEP_S = 0.5
 

@@ -9,16 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.core.config import load_scenario
-from flockd.core.config.loader import load_perceived_errors
-from flockd.core.config.perceived import PerceivedErrors
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.data import data_path
 from flockd.core.errors import ConfigError
 from flockd.core.messages import FloatArray
 from flockd.sim.control_level import fly_flocks
 from flockd.sim.control_level.flock_flights import FlockFlights
 from flockd.sim.flock.start import scattered, with_drones
+from flockd.sim.scenario import ScenarioConfig, load_scenario
+from flockd.sim.scenario.perceived import PerceivedErrors, load_perceived_errors
 
 NONE = {"median": 0.0, "p95": 0.0}
 FAULTLESS: dict[str, Any] = {

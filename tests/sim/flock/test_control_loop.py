@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.core.config import load_scenario
-from flockd.core.config.scenario import CameraFaultConfig, ScenarioConfig
 from flockd.core.data import data_path
 from flockd.core.messages import FloatArray
 from flockd.flight.flocking.metrics import min_distance
@@ -16,6 +14,7 @@ from flockd.sim.flock.commands import Commands
 from flockd.sim.flock.control_loop import ControlLoop
 from flockd.sim.flock.exact_states import ExactFlock, step_times
 from flockd.sim.flock.swarm import fly
+from flockd.sim.scenario import CameraFaultConfig, ScenarioConfig, load_scenario
 from flockd.sim.vehicles.vehicles import Vehicles
 
 

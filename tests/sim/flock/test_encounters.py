@@ -8,13 +8,12 @@ from typing import Any
 import pytest
 
 from flockd.campaign.flight_plan import CASE, Cell, Plan
-from flockd.core.config import load_scenario
 from flockd.core.config.envelope import PROVEN_M_S
 from flockd.core.config.mission import MissionParameters
-from flockd.core.config.scenario import ScenarioConfig, StartConfig
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.flocking.metrics import closest_distances
 from flockd.sim.flock.exact_states import fly_exact_states
+from flockd.sim.scenario import ScenarioConfig, StartConfig, load_scenario
 
 CONFIG = Path(__file__).parents[3] / "config"
 ENCOUNTER = load_scenario(CONFIG / "encounter.yaml")

@@ -9,11 +9,10 @@ import time
 
 import pytest
 
-from flockd.core.config import load_scenario
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.data import data_path
 from flockd.sim.flock.live_controls import LiveControls
 from flockd.sim.flock.start import with_drones
+from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
 from flockd.sim.vehicles.vehicles import Vehicles
 

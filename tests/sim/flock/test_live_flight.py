@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import pytest
 
-from flockd.core.config import Overrides, load_scenario
+from flockd.core.config import Overrides
 from flockd.core.data import data_path
 from flockd.onboard.telemetry.publisher import Ask, NewestImage
 from flockd.onboard.telemetry.topics import AboutMessage
@@ -14,6 +14,7 @@ from flockd.sim.flock.live_controls import LiveControls
 from flockd.sim.flock.live_flight import fly_live
 from flockd.sim.flock.shown_flock import ShownFlock
 from flockd.sim.flock.start import with_drones
+from flockd.sim.scenario import load_scenario
 from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
 
 STEPS = 3

@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flockd.core.config import load_scenario
-from flockd.core.config.scenario import CameraFaultConfig, DetectionsConfig, ScenarioConfig
 from flockd.core.errors import ConfigError
 from flockd.sim.flock.commands import Commands
 from flockd.sim.flock.control_loop import ControlLoop
 from flockd.sim.flock.exact_states import fly_exact_states
 from flockd.sim.flock.made_up_detections import TrackedNeighbours
+from flockd.sim.scenario import CameraFaultConfig, DetectionsConfig, ScenarioConfig, load_scenario
 from flockd.sim.vehicles.vehicles import Vehicles
 
 CONFIG = Path(__file__).parents[3] / "config"

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from flockd.core.config.mission import MissionParameters
-from flockd.core.config.scenario import ScenarioConfig, StartConfig
 from flockd.core.messages import FloatArray
 from flockd.flight.safety import Action, Decision, Event, State
 from flockd.sim.flock.control_loop import ControlLoop
 from flockd.sim.flock.exact_states import ExactFlock
+from flockd.sim.scenario import ScenarioConfig, StartConfig
 from flockd.sim.vehicles.vehicles import Vehicles
 from tests.faults.catalogue import RecordProperty
 from tests.sim.flock.test_encounters import ENCOUNTER

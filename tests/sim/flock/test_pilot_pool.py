@@ -10,17 +10,18 @@ from pathlib import Path
 
 import pytest
 
-from flockd.core.config import Overrides, ScenarioConfig, load_scenario
+from flockd.core.config import Overrides
 from flockd.core.data import data_path
 from flockd.core.errors import ModelError, UnavailableError
 from flockd.core.side_process import SideProcess
 from flockd.sim.flock.pilots import Pilots
 from flockd.sim.flock.swarm import fly
+from flockd.sim.scenario import ScenarioConfig, load_scenario
 from tests.sim.sitl.test_orphans import _until_gone
 
 FLIGHT = """\
 import os, sys
-from flockd.core.config import load_scenario
+from flockd.sim.scenario import load_scenario
 from flockd.core.side_process import SideProcess
 from flockd.sim.flock.pilots import Pilots
 process = SideProcess("flew", Pilots, load_scenario(sys.argv[1]), [0], None)

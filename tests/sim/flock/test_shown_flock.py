@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.core.config import load_scenario
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.data import data_path
 from flockd.onboard.telemetry.publisher import Ask, NewestImage
 from flockd.onboard.telemetry.topics import AboutMessage
 from flockd.sim.flock.shown_flock import RealTime, ShownFlock
 from flockd.sim.flock.start import with_drones
 from flockd.sim.flock.swarm import fly
+from flockd.sim.scenario import ScenarioConfig, load_scenario
 
 SECONDS_TO_FAIL = 120.0
 

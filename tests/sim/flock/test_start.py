@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from flockd.core.config import load_scenario
 from flockd.sim.flock.start import with_drones
+from flockd.sim.scenario import load_scenario
 
 PAPER = load_scenario(Path(__file__).parents[3] / "config" / "paper_flight.yaml")
 

@@ -8,7 +8,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from flockd.core.config import Overrides, ScenarioConfig, load_scenario
+from flockd.core.config import Overrides
 from flockd.core.data import data_path
 from flockd.onboard.telemetry import TelemetrySink
 from flockd.onboard.telemetry.publisher import Ask, NewestImage, ZenohTelemetry
@@ -18,6 +18,7 @@ from flockd.sim.flock.repeater import Repeater
 from flockd.sim.flock.shown_flock import ShownFlock
 from flockd.sim.flock.start import with_drones
 from flockd.sim.flock.swarm import Flight, fly
+from flockd.sim.scenario import ScenarioConfig, load_scenario
 
 STEPS = 3
 

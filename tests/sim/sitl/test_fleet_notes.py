@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
-from flockd.core.config import load_scenario
 from flockd.core.data import data_path
-from flockd.review.flight_log.fleet_log import FleetRun
 from flockd.sim.flock.start import with_drones
+from flockd.sim.scenario import load_scenario
 from flockd.sim.sitl import fleet as fleet_module
 from flockd.sim.sitl.fleet import _Fleet
+from flockd.sim.sitl.fleet_log import FleetRun
 from flockd.sim.sitl.ground_station import _update, _Vehicle
 
 

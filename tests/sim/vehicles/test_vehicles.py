@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from flockd.core.config.drone import DroneConfig
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
-from flockd.core.config.scenario import ScenarioConfig, SensorConfig, StartConfig, VehicleConfig
 from flockd.flight.flocking.metrics import min_distance, obj2, pair_distances
 from flockd.flight.geometry import rotation_from_euler
 from flockd.sim.flock.exact_states import fly_exact_states
+from flockd.sim.scenario import ScenarioConfig, SensorConfig, StartConfig, VehicleConfig
 from flockd.sim.vehicles.vehicles import SimulatedAutopilot, Vehicles, attitude
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from flockd.core.config.scenario import StartConfig, VehicleConfig
+from flockd.sim.scenario import StartConfig, VehicleConfig
 from flockd.sim.vehicles.vehicles import MAX_LEAN_M_S2, Vehicles
 from flockd.sim.vehicles.wind import GUST_TIME_S, GustField, push_sigma_m_s2
 

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from flockd.core.config.scenario import RangeFinderConfig, SensorConfig
 from flockd.core.messages import FloatArray, RangeReading
 from flockd.flight.geometry import rotation_from_euler
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground, range_to_ground
 from flockd.sim.renderer.renderer import Renderer
+from flockd.sim.scenario import RangeFinderConfig, SensorConfig
 from flockd.sim.vehicles.vehicles import SimulatedAutopilot
 from flockd.sim.world.hills import hills
 from flockd.sim.world.world import World

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from flockd.core.config.obstacle_field import ClearingConfig, ObstaclesConfig
 from flockd.core.errors import UsageError
 from flockd.core.messages import SECTORS
+from flockd.sim.scenario import ClearingConfig, ObstaclesConfig
 from flockd.sim.world.clearances import clearances
 from flockd.sim.world.obstacle_worlds import generate_obstacles
 from flockd.sim.world.obstacles import Box, Capsule, Frustum, Obstacles, true_ranges

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flockd.core.config.imperfect_cameras import CamerasConfig
+from flockd.sim.scenario.imperfect_cameras import CamerasConfig
 from tools.training.camera_effects import (
     CameraEffects,
     demosaiced,

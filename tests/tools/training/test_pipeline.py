@@ -167,7 +167,7 @@ def test_images_from_before_they_had_masks_are_refused_by_name(tmp_path: Path) -
 
 
 def test_a_place_too_small_for_the_drawn_houses_gets_fewer() -> None:
-    from flockd.core.config.obstacle_field import ObstaclesConfig
+    from flockd.sim.scenario import ObstaclesConfig
     from tools.training.render_training_data import _standing
 
     drawn = ObstaclesConfig(kind="village", extent_m=28.0, min_gap_m=2.0, houses_per_hectare=16.0)

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from flockd.core.config import load_scenario
 from flockd.core.data import data_path
 from flockd.core.messages import UNCLASSED, BoolArray, Detection, Float32Array, FloatArray, UInt8Array
 from flockd.flight.geometry import Rig, RigCamera, build_rig, virtual_crop
 from flockd.flight.perception.detection.masks import CropMask, MaskRenderer
+from flockd.sim.scenario import load_scenario
 from tests import make
 
 SIZE = 96

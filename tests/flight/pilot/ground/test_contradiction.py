@@ -11,11 +11,11 @@ from scipy.interpolate import RegularGridInterpolator
 
 from flockd.core.choices import HeightSource
 from flockd.core.config.perception import RangeFinderParameters
-from flockd.core.config.scenario import RangeFinderConfig
 from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, Reason, ReasonKind, VehicleState
 from flockd.flight.geometry import rotation_from_euler
 from flockd.flight.pilot.ground import GroundFilter
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
+from flockd.sim.scenario import RangeFinderConfig
 from flockd.sim.world.hills import hills
 
 STEP_S = 0.5

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from flockd.core.config import load_scenario
 from flockd.core.data import data_path
 from flockd.core.messages import MissionOrder
 from flockd.onboard.recording import Recorder
-from flockd.review.flight_log.fleet_log import FleetFrame, FleetRun, fleet_log, recorded_orders
+from flockd.sim.scenario import load_scenario
+from flockd.sim.sitl.fleet_log import FleetFrame, FleetRun, fleet_log, recorded_orders
 from tests.onboard.recording.made_up import MODELS, MadeUpPilot, drone_config, inputs, record
 
 

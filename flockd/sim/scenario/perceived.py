@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
 from flockd.core.config.base import Distance, Duration, NonNegative, Section, Share, refuse
+from flockd.core.config.document import read_document
+from flockd.core.config.loader import validated
 
 _Angle = Annotated[float, Field(ge=0, le=90)]
 
@@ -92,3 +95,9 @@ class PerceivedErrors(Section):
                 faults["by_distance", number, "distance_m"] = f"is not above the one before, {near:g}; sort the list"
         refuse(self, faults)
         return self
+
+
+def load_perceived_errors(path: Path | str) -> PerceivedErrors:
+    """How perception errs, as `tools.training.fit_perception` writes it. Raises ConfigError with every problem
+    found."""
+    return validated(PerceivedErrors, read_document(Path(path)))

@@ -1,12 +1,16 @@
-"""The typed file of a campaign: which flights are flown, what is measured, and when a cell is known well enough."""
+"""A campaign's file: which flights are flown, what is measured, and when a cell is known well enough."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from flockd.core.config.base import Name, NonNegative, Positive, Section, refuse
+from flockd.core.config.document import KeyPath, Place, read_document
+from flockd.core.config.loader import require, validated
 
 FlightKindName = Literal["truth", "sight", "control"]
 """How the flights of a campaign are flown."""
@@ -168,3 +172,10 @@ class CampaignConfig(Section):
             faults["stop", "batch"] = f"is above `seeds`, {self.seeds}; write {self.seeds} or less"
         refuse(self, faults)
         return self
+
+
+def load_campaign(path: Path | str) -> tuple[CampaignConfig, Mapping[KeyPath, Place]]:
+    """A campaign's file, and the place of each value in it; of its scenario only the path. Raises ConfigError."""
+    document = read_document(Path(path), "campaign")
+    require(document, "campaign")
+    return validated(CampaignConfig, document), document.places

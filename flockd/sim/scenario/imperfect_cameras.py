@@ -9,7 +9,6 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 
 from flockd.core.choices import CameraPreset
 from flockd.core.config.base import NonNegative, Positive, Section, Share
-from flockd.core.config.rig_errors import RigErrorsConfig
 
 MAX_LATE_S = 0.3
 """Most that an image or an attitude may be late: what was longer ago is not kept."""
@@ -103,6 +102,20 @@ class LateAttitudeConfig(Section):
     """Standard deviation about each axis, anew each time."""
 
 
+class RigErrorsConfig(Section):
+    """What each camera of each drone is off, in a direction of its own, drawn from the seed; pilots do not know of it.
+
+    Time stamps that are off: `timing.delay_s`.
+    """
+
+    mounting_deg: Annotated[float, Field(ge=0, le=20)] = 0.0
+    """Its mounting is turned by so much about some axis, ..."""
+    mounting_m: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    """... and moved so far."""
+    focal: Annotated[float, Field(ge=0, le=0.2)] = 0.0
+    """Its focal lengths are longer or shorter by this share."""
+
+
 _PRESETS: Mapping[CameraPreset, Mapping[str, Mapping[str, Any]]] = {
     "ideal": {},
     "realistic": {
@@ -136,7 +149,7 @@ class CamerasConfig(Section):
 
     preset: CameraPreset = "ideal"
     """`ideal`: none of it. `realistic`: a cheap USB camera with a rolling shutter on a small drone by day, from data
-    sheets (sources in `flockd/core/config/imperfect_cameras.py`)."""
+    sheets (sources in `flockd/sim/scenario/imperfect_cameras.py`)."""
     shutter: ShutterConfig = ShutterConfig()
     shake: ShakeConfig = ShakeConfig()
     noise: SensorNoiseConfig = SensorNoiseConfig()

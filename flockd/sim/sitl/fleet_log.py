@@ -12,7 +12,6 @@ import numpy as np
 from flockd import __version__
 from flockd.core.config import DroneConfig
 from flockd.core.config.flocking import FlockingParameters
-from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import NO_STATUS, FloatArray, MissionOrder, MissionStatus, PilotOutput
 from flockd.flight.flocking.metrics import order, union
 from flockd.flight.mission.circle_then_tangent import desired_of
@@ -27,6 +26,7 @@ from flockd.review.flight_log.capture import capture, key_frame_steps
 from flockd.review.flight_log.key_frames import KeyFrame
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FleetMetadata, FlightMetadata, MissionMetadata, Percentiles
+from flockd.sim.scenario import ScenarioConfig
 
 END_OF_FLIGHT_S = 20.0
 """Over which order and union at the end are averaged."""
@@ -117,7 +117,7 @@ def fleet_log(
         drone,
         scenario=scenario.scenario,
         drones=len(scenario.vehicles),
-        mission=MissionMetadata.of(scenario),
+        mission=MissionMetadata.of(scenario.missions),
         duration_s=float(times[-1]) + drone.step_s if run.interrupted else scenario.duration_s,
         interrupted=run.interrupted,
         began=run.began or None,
