@@ -20,15 +20,15 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 4_300,
+    "flockd/core": 3_390,
     "flockd/flight": 14_740,
     "flockd/onboard": 11_630,
     "flockd/fleet": 2_690,
     "flockd/ground": 5_990,
-    "flockd/review": 4_290,
-    "flockd/sim": 11_570,
-    "flockd/campaign": 2_220,
-    "flockd/cli": 5_020,
+    "flockd/review": 4_060,
+    "flockd/sim": 12_540,
+    "flockd/campaign": 2_400,
+    "flockd/cli": 5_030,
     "tests": 48_610,
     "tools/checks": 3_840,
     "tools/docs": 950,
