@@ -11,7 +11,7 @@ from flockd.core.config.document import Document, KeyPath, Place, read_document
 from flockd.core.config.drone import DroneConfig
 from flockd.core.config.loader import Overrides, drone_document, kind_of, override, require, validated
 from flockd.core.errors import ConfigError
-from flockd.sim.scenario.sections import ScenarioConfig
+from flockd.sim.scenario.scenario_config import ScenarioConfig
 
 _BESIDE_DRONE = ("mission", "obstacles")
 """Sections of a drone that its scenario may have instead."""
