@@ -11,10 +11,12 @@ LOCK := requirements/service.txt
 COMPILE = $(BIN)/uv pip compile --quiet --no-header --no-annotate --only-binary=:all: pyproject.toml -
 
 .DEFAULT_GOAL := help
-.PHONY: help demo live docs lint test test-all browser coverage ros mutate mutate-all references wheel release deb container lock sbom clean
+.PHONY: help demo live docs lint test test-all browser training ray coverage ros mutate mutate-all references wheel release deb container lock sbom clean
 
-help: ## print this list
-	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
+help:
+	@sed -n 's/^\([a-z-]*\):.* ## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
+	@echo 'For who changes flockd:'
+	@sed -n 's/^\([a-z-]*\):.* ### /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
 
 demo: $(VENV)/sim.installed ## fly the paper's flight in the simulator and write its report
 	$(BIN)/flockd sim
@@ -26,50 +28,56 @@ docs: $(VENV)/docs.installed ## build the documentation as a site in out/site
 	$(BIN)/python -m tools.docs.docs_reference
 	$(BIN)/mkdocs build --strict
 
-lint: $(VENV)/test.installed ## ruff and mypy
+lint: $(VENV)/test.installed ### ruff and mypy
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
 test: lint ## lint and all tests but the slow ones, on two cores in about 10 minutes
-	$(BIN)/python -m pytest -n 2 -m "not slow and not browser and not ros" --durations=10 --durations-min=1
+	$(BIN)/python -m pytest -n 2 -m "not slow and not browser and not ros and not ray and not training" --durations=10 --durations-min=1
 
-test-all: lint ## lint and all tests, those too that take minutes each
+test-all: lint ### lint and all tests, those too that take minutes each
 	$(BIN)/python -m pytest -n 2
 
-ros: $(ROS_VENV)/ros.installed ## what needs ROS 2: nodes in processes of their own, cameras by topic; with the times it takes
+ros: $(ROS_VENV)/ros.installed ### what needs ROS 2: nodes in processes of their own, cameras by topic; with the times it takes
 	$(ROS_VENV)/bin/python -m pytest -m ros -rP tests/fleet/ros tests/onboard/sources tests/tools/release/test_licences.py
 
-browser: $(VENV)/test.installed ## the fleet page in a headless Chromium: /usr/bin/chromium, or what CHROMIUM names
+training: $(VENV)/test.installed $(VENV)/train.installed ### the tests of the networks' training, with torch (0.9 GB; with CUDA several)
+	$(BIN)/python -m pytest -m training tests/tools/training
+
+ray: $(VENV)/test.installed $(VENV)/ray.installed ### a campaign on a Ray cluster of which one node is killed (0.3 GB)
+	$(BIN)/python -m pytest -m ray tests/campaign
+
+browser: $(VENV)/test.installed $(VENV)/browser.installed ### the fleet page in a headless Chromium: /usr/bin/chromium, or what CHROMIUM names
 	$(BIN)/python -m pytest -m browser -rP tests/fleet/page
 
-coverage: $(VENV)/test.installed ## which branches of the safety layer its tests take; fails below all of them
+coverage: $(VENV)/test.installed ### which branches of the safety layer its tests take; fails below all of them
 	$(BIN)/python -m coverage run --branch --source=flockd/flight/safety -m pytest tests/flight/safety
 	$(BIN)/python -m coverage report --show-missing --fail-under=100
 
-mutate: $(VENV)/test.installed ## try the safety layer's tests on a sample of its mutants, in about a minute
+mutate: $(VENV)/test.installed ### try the safety layer's tests on a sample of its mutants, in about a minute
 	$(BIN)/python -m tools.checks.mutate_safety --sample 60
 
-mutate-all: $(VENV)/test.installed ## try them on every mutant, in about a quarter of an hour
+mutate-all: $(VENV)/test.installed ### try them on every mutant, in about a quarter of an hour
 	$(BIN)/python -m tools.checks.mutate_safety
 
-references: $(VENV)/test.installed ## write what the recorded flights of tests/review/replay are expected to give again
+references: $(VENV)/test.installed ### write what the recorded flights of tests/review/replay are expected to give again
 	$(BIN)/python -m tools.checks.record_regressions --only references
 
-wheel: $(VENV)/test.installed ## build sdist and wheel in dist, check them, install the wheel alone, and fly it
+wheel: $(VENV)/test.installed ### build sdist and wheel in dist, check them, install the wheel alone, and fly it
 	$(BIN)/python -m tools.release.check_wheel --out dist
 
-release: wheel ## that; then sbom, deb and container
+release: wheel ### that; then sbom, deb and container
 	$(MAKE) sbom deb container
 
-deb: $(BIN)/pip ## build Debian packages for amd64 and arm64 in dist; SYSTEM=debian13 or ubuntu24.04 for others than Debian 12
+deb: $(BIN)/pip ### build Debian packages for amd64 and arm64 in dist; SYSTEM=debian13 or ubuntu24.04 for others than Debian 12
 	$(BIN)/python -m tools.release.deb --arch amd64 --system $(SYSTEM) --out dist
 	$(BIN)/python -m tools.release.deb --arch arm64 --system $(SYSTEM) --out dist
 
-container: $(BIN)/pip ## build the container, install this computer's package of dist in another, and run both; BASE=IMAGE for another Debian 12
+container: $(BIN)/pip ### build the container, install this computer's package of dist in another, and run both; BASE=IMAGE for another Debian 12
 	$(BIN)/python -m tools.release.check_container --packages dist $(if $(BASE),--base $(BASE))
 
-lock: $(VENV)/release.installed ## write requirements/service.txt again, with the newest versions that pyproject.toml permits
+lock: $(VENV)/release.installed ### write requirements/service.txt again, with the newest versions that pyproject.toml permits
 	echo setuptools | $(COMPILE) --universal --fork-strategy=fewest --python-version=3.11 --generate-hashes \
 		--emit-build-options --upgrade --output-file=$(LOCK).new
 	for system in x86_64 aarch64; do for python in 3.11 3.12 3.13; do echo setuptools | $(COMPILE) \
@@ -77,7 +85,7 @@ lock: $(VENV)/release.installed ## write requirements/service.txt again, with th
 		done; done
 	(sed '/^#/!d' $(LOCK); cat $(LOCK).new) > $(LOCK).whole && mv $(LOCK).whole $(LOCK) && rm $(LOCK).new
 
-sbom: $(VENV)/release.installed $(VENV)/test.installed ## check licences, and write the software bill of materials to out/flockd.cdx.json
+sbom: $(VENV)/release.installed $(VENV)/test.installed ### check licences, and write the software bill of materials to out/flockd.cdx.json
 	rm -rf $(VENV)/service && mkdir -p out
 	$(BIN)/uv venv --quiet $(VENV)/service
 	$(BIN)/uv pip install --quiet --python $(VENV)/service --require-hashes -r $(LOCK)
@@ -85,7 +93,7 @@ sbom: $(VENV)/release.installed $(VENV)/test.installed ## check licences, and wr
 	$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible -o out/flockd.cdx.json $(VENV)/service
 	$(BIN)/python -m tools.release.sbom out/flockd.cdx.json
 
-clean: ## delete the virtual environment and what was built
+clean: ### delete the virtual environment and what was built
 	rm -rf $(VENV) $(ROS_VENV) build dist *.egg-info
 
 # The extra of this name, installed; again only when what it installs has changed.

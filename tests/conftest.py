@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections import Counter
 from collections.abc import Generator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,6 +16,17 @@ from tests.permitted_skips import permitted
 
 settings.register_profile("many", max_examples=10_000)
 """A hundred times as many inputs of `tests/hostile`, others each time: `--hypothesis-profile=many`."""
+
+OWN_EXTRAS = {"tools/training/test_learning.py": "training", "fleet/page/test_browser.py": "browser"}
+"""Files whose imports need more than `make test` installs, and the marker by which their own target asks for them."""
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Such a file is not even imported where its marker is not asked for."""
+    tests = Path(__file__).parent
+    place = collection_path.relative_to(tests).as_posix() if tests in collection_path.parents else ""
+    marker = OWN_EXTRAS.get(place)
+    return True if marker not in (None, config.option.markexpr) else None
 
 
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:

@@ -170,7 +170,7 @@ def names_in(out: Path) -> set[str]:
     return names
 
 
-@pytest.mark.slow
+@pytest.mark.ray
 def test_a_ray_cluster_of_two_nodes_of_which_one_is_killed(tmp_path: Path) -> None:
     """The rest of its flights is flown on the other one; the results are those of this process."""
     from ray.cluster_utils import Cluster
