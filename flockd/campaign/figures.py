@@ -57,6 +57,16 @@ def _distance_error(percentile: float) -> Callable[[FlightLog, dict[str, Any]], 
     return error
 
 
+def _of_tracks(figure: str) -> Callable[[FlightLog, dict[str, Any]], Any]:
+    return lambda _, summary: (summary["neighbours"]["associated_error_m"] or {}).get(figure)
+
+
+def _convergence_time(log: FlightLog, summary: dict[str, Any]) -> float | None:
+    """Of obj2; None where it never stays, or the flight ends too early to tell."""
+    time_s: float | None = summary["table3"]["vision" if log.metadata.by_sight else "truth"]["obj2"]["time_s"]
+    return time_s
+
+
 def _of_control_level(_: FlightLog, __: dict[str, Any]) -> None:
     """Nothing: only `flockd.sim.control_level` has this figure."""
 
@@ -88,6 +98,11 @@ MEASURES: dict[Figure, Measure] = {
     ),
     "distance_error_median_m": Measure("distance error, median", "m", "lower", _distance_error(50.0)),
     "distance_error_p95_m": Measure("distance error, 95th percentile", "m", "lower", _distance_error(95.0)),
+    "false_share": Measure("time with a false neighbour", "of 1", "lower", _in("neighbours", "false_share")),
+    "associated_error_median_m": Measure("error of all tracks, median", "m", "lower", _of_tracks("median")),
+    "associated_error_p95_m": Measure("error of all tracks, 95th percentile", "m", "lower", _of_tracks("p95")),
+    "associated_error_max_m": Measure("error of all tracks, largest", "m", "lower", _of_tracks("max")),
+    "convergence_time_s": Measure("time from which the shape stays", "s", "lower", _convergence_time),
     "min_distance_tail_m": Measure("nearest distance at the end", "m", "higher", _of_control_level),
     "min_level_distance_m": Measure("nearest level distance", "m", "higher", _of_control_level),
     "drone_collisions": Measure("collisions of drones", "", "lower", _of_control_level),

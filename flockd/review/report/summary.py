@@ -13,6 +13,7 @@ from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.flocking.metrics import closest_distances, connectivity, obj1, obj2, order, safety, union
 from flockd.review.flight_log.log import FlightLog
+from flockd.review.flight_log.truth_matching import match_neighbours
 
 TAIL_S = 10.0
 """The end of a flight, over which the flock counts as converged."""
@@ -21,6 +22,8 @@ CONVERGENCE_BAND = {"obj1": 0.05, "obj2": 0.2}
 RECALL_RANGE_M = 10.0
 HOVERS_M_S = 0.1
 """Slower on the mean, a flock has no direction of flight that its drones could share."""
+ASSOCIATED_M = 3.0
+"""A track so near to a drone is that drone's, however wrong: no large error of a distance is left out."""
 SAME_GOAL_M = 1e-6
 NEAR_M = 1.0
 """To an obstacle."""
@@ -36,8 +39,9 @@ def summarise(log: FlightLog) -> Json:
     on for 10 s after the circle. `flock`: the smallest distances between drone centres in three dimensions, between
     steps too (`closest_distances`), and `safety` at all steps; order (null of a flock that hovers), union and
     connectivity are horizontal means over the last 10 s, with the law's observation distance as interaction distance.
-    `neighbours`: the share of all drones within 10 m, at all steps, of which there was a confirmed track, and new
-    false tracks; of drones and steps that were recorded. A flight whose perception is "truth" has no perception:
+    `neighbours`: the share of all drones within 10 m, at all steps, of which there was a confirmed track, new false
+    tracks, how much of the time a drone has one, and errors of the distances of all tracks within 3 m of a drone, one
+    to one; of drones and steps that were recorded. A flight whose perception is "truth" has no perception:
     its `neighbours` are null and it is itself Table 3's "truth". Of a recording without truth (`has_truth`) all of
     these are null. `mission` is `mission_figures`, `obstacles` is `obstacle_figures`. `own_account` needs no truth:
     the recorded drones' own estimates. `gated`, `slowed_share`, `slowed_by` and `sizes` are as in `FlightMetadata`.
@@ -288,16 +292,35 @@ def _flock(log: FlightLog) -> Json:
 
 def _neighbours(log: FlightLog) -> Json:
     if not (log.metadata.by_sight and log.has_truth):
-        return {"recall_within_10m": None, "false_per_drone_minute": None}
+        return dict.fromkeys(("recall_within_10m", "false_per_drone_minute", "false_share", "associated_error_m"))
     drones = log.position.shape[1]
     distances = np.linalg.norm(_relative_positions(log), axis=-1)
     near = (distances <= RECALL_RANGE_M) & ~np.eye(drones, dtype=bool) & log.recorded[..., None]
     seen = np.asarray(np.isfinite(log.neighbour_position).all(axis=-1))
     drone_minutes = log.recorded.sum() * log.metadata.step_s / 60
+    errors_m, has_false = _tracks(log)
     return {
         "recall_within_10m": _mean(seen[near]),
+        "false_share": _mean(has_false[log.recorded]),
+        "associated_error_m": _spread(np.abs(errors_m)),
         "false_per_drone_minute": float(log.false_tracks.sum() / drone_minutes) if drone_minutes else None,
     }
+
+
+def _tracks(log: FlightLog) -> tuple[FloatArray, BoolArray]:
+    """Errors (k,) m of the distances of all tracks within `ASSOCIATED_M` of a drone, and (S, N) which drones have a
+    track that is no drone's."""
+    errors: list[float] = []
+    has_false = np.zeros(log.position.shape[:2], bool)
+    relative = _relative_positions(log)
+    rows = log.tracked[np.lexsort((log.tracked[:, 1], log.tracked[:, 0]))]
+    keys, starts = np.unique(rows[:, :2].astype(int), axis=0, return_index=True)
+    for (step, observer), tracks in zip(keys, np.split(rows[:, 3:], starts)[1:], strict=True):
+        true = np.delete(relative[step, observer], observer, axis=0)
+        has_false[step, observer] = len(match_neighbours(tracks, true)) < len(tracks)
+        for track, drone in match_neighbours(tracks, true, ASSOCIATED_M):
+            errors.append(float(np.linalg.norm(tracks[track]) - np.linalg.norm(true[drone])))
+    return np.array(errors), has_false
 
 
 def _own_account(log: FlightLog) -> Json:

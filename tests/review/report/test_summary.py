@@ -218,11 +218,27 @@ def test_neighbours_by_hand() -> None:
     assert neighbours["false_per_drone_minute"] == pytest.approx(2 / (2 * 0.25))
 
 
+def test_every_track_near_a_drone_counts_with_its_error_and_any_other_as_false() -> None:
+    """drone2 is 4 m away, tracked 2.5 m too far, which recall does not count, and every other step a ghost."""
+    log = _hand_made()
+    steps = np.arange(12, 30)
+    relative = (log.position[:, 1] - log.position[:, 0])[steps]
+    far = relative * (1 + 2.5 / np.linalg.norm(relative, axis=1, keepdims=True))
+    ghosts = np.array([(step, 0, 9, -20.0, 0.0, 0.0) for step in steps[::2]])
+    tracked = np.vstack([ghosts, np.column_stack([steps, 0 * steps, 0 * steps + 1, far])])
+    neighbours = summarise(replace(log, tracked=tracked))["neighbours"]
+    assert neighbours["associated_error_m"] == pytest.approx(dict.fromkeys(("mean", "median", "p95", "max"), 2.5))
+    assert neighbours["false_share"] == pytest.approx(18 / 60), "beyond 1 m the far one is false as well"
+    first = summarise(replace(log, tracked=tracked[9:]))["neighbours"]
+    assert first["false_share"] == pytest.approx(18 / 60)
+
+
 def test_where_no_step_was_recorded_nothing_is_said_of_neighbours() -> None:
     log = _hand_made()
     nothing = np.full_like(log.command_velocity, np.nan)
     summary = summarise(replace(log, tracked=log.tracked[:0], command_velocity=nothing))
-    assert summary["neighbours"] == {"recall_within_10m": None, "false_per_drone_minute": None}
+    assert summary["neighbours"]["recall_within_10m"] is None
+    assert summary["neighbours"]["false_share"] is None
     json.dumps(summary, allow_nan=False)
 
 
@@ -239,7 +255,7 @@ def test_a_flight_with_exact_states_has_no_estimates_and_is_the_truth() -> None:
     summary = summarise(replace(log, metadata=log.metadata.model_copy(update={"perception": "truth"})))
     nothing = dict.fromkeys(("mean", "median", "p95", "max"))
     assert all(column == nothing for window in summary["table2"].values() for column in window.values())
-    assert summary["neighbours"] == {"recall_within_10m": None, "false_per_drone_minute": None}
+    assert set(summary["neighbours"].values()) == {None}
     assert summary["table3"]["truth"]["obj2"] == pytest.approx({"time_s": 3.0, "error": 0.02, "shape_bias": 0.0})
     assert summary["table3"]["vision"]["obj1"] == {"time_s": None, "error": None, "shape_bias": None}
 
@@ -266,12 +282,13 @@ def test_what_a_short_flight_cannot_tell_is_null(steps: int) -> None:
 
 def test_a_single_drone_has_no_distances() -> None:
     log = _hand_made()
-    alone: dict[str, Any] = {}
+    alone: dict[str, Any] = {"tracked": log.tracked[:0]}
+    shared = ("time_s", "desired", "goal", "obstacles", "obstacle_range", "stages_ms", "metadata", *alone)
     for name in log.__dataclass_fields__:
         value = getattr(log, name)
         if name in ("neighbour_position", "neighbour_velocity", "detection_position"):
             alone[name] = value[:, :1, :1]
-        elif name not in ("time_s", "desired", "goal", "obstacles", "obstacle_range", "stages_ms", "metadata"):
+        elif name not in shared:
             alone[name] = value[:, :1]
     summary = summarise(replace(log, **alone, metadata=log.metadata.model_copy(update={"drones": 1})))
     assert summary["flock"]["min_distance_m"] is None

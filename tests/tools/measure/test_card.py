@@ -1,0 +1,115 @@
+"""Which flights the card flies, how it goes on, and what it says of them: on figures made up for each flight."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from flockd.core.config import load_scenario
+from flockd.core.data import data_path
+from tools.measure.card import (
+    EYES,
+    FIGURES,
+    SCENARIOS,
+    SEEDS,
+    Flight,
+    Line,
+    document,
+    flights_of,
+    flown,
+    read_lines,
+    run,
+    seeds_of,
+    spread,
+    table_of,
+)
+
+COMMIT = "0123456789abcdef"
+
+
+def made_up(flight: Flight) -> Line:
+    figures = {"order_tail": flight.seed / SEEDS, "associated_error_p95_m": None if flight.eyes == "blind" else 0.5}
+    scenario, eyes, seed = flight.key
+    return {"scenario": scenario, "eyes": eyes, "seed": seed, "figures": figures, "wall_s": 1.0, "failed": None}
+
+
+def test_seeds_follow_from_the_commit_and_are_the_same_for_all_eyes() -> None:
+    flights = flights_of(COMMIT, quick=False)
+    for scenario in SCENARIOS:
+        of_eyes = [[one.seed for one in flights if (one.scenario, one.eyes) == (scenario, eyes)] for eyes in EYES]
+        assert of_eyes[0] == of_eyes[1] == of_eyes[2]
+        assert len(set(of_eyes[0])) == 20
+        assert all(0 <= seed < SEEDS for seed in of_eyes[0])
+    assert not set(seeds_of(COMMIT, "forest", 20)) & set(seeds_of("f" * 16, "forest", 20))
+    assert len({one.key for one in flights}) == len(flights)
+
+
+@pytest.mark.parametrize("quick", [True, False])
+def test_every_flight_of_the_list_can_be_configured(quick: bool) -> None:
+    for flight in {(one.scenario, one.eyes): one for one in flights_of(COMMIT, quick=quick)}.values():
+        duration = {} if flight.duration_s is None else {"duration_s": flight.duration_s}
+        load_scenario(data_path("config") / flight.file, {**flight.overrides, **duration, "seed": flight.seed})
+
+
+def test_a_run_that_was_stopped_goes_on_and_flights_that_failed_are_tried_again(tmp_path: Path) -> None:
+    flights, results = flights_of(COMMIT, quick=True), tmp_path / "card" / "a.jsonl"
+    tried: list[Flight] = []
+
+    def stops(flight: Flight) -> Line:
+        if len(tried) == 3:
+            raise KeyboardInterrupt
+        tried.append(flight)
+        return made_up(flight) | ({"failed": "no world", "figures": {}} if len(tried) == 2 else {})
+
+    with pytest.raises(KeyboardInterrupt):
+        run(flights, results, 1, stops)
+    with results.open("a", encoding="utf-8") as file:
+        file.write('{"scenario": "cut sh')
+    assert len(read_lines(results)) == 3
+
+    def notes(flight: Flight) -> Line:
+        tried.append(flight)
+        return made_up(flight)
+
+    lines = run(flights, results, 1, notes)
+    assert [(line["scenario"], line["eyes"], line["seed"]) for line in lines] == [one.key for one in flights]
+    assert all(line["failed"] is None for line in lines)
+    assert tried[3:] == [flights[1], *flights[3:]]
+    assert run(flights, results, 1, notes) == lines
+    assert len(tried) == len(flights) + 2, "nothing was flown twice"
+
+
+def test_median_interval_and_worst_by_hand() -> None:
+    """Of twenty values the ranks 6 and 15 hold the median with 95.9 % (Conover 1999, Table A3)."""
+    values = [float(k) for k in range(1, 21)]
+    of_twenty = spread(values[::-1], higher_is_better=True)
+    assert of_twenty == {"median": 10.5, "interval": [6.0, 15.0], "worst": 1.0, "count": 20}
+    assert spread([0.00123456, 2.0], higher_is_better=False) == {
+        "median": 1.001, "interval": [0.001235, 2.0], "worst": 2.0, "count": 2,
+    }  # fmt: skip
+
+
+def test_the_document_names_commit_networks_and_what_each_scenario_gave() -> None:
+    lines = [made_up(one) for one in flights_of(COMMIT, quick=True)]
+    lines[0] |= {"failed": "no world", "figures": {}}
+    found = document(COMMIT, "2026-11-28", lines, quick=True)
+    json.dumps(found, allow_nan=False)
+    assert {"commit", "date", "machine", "networks", "command", "flown_s"} <= found.keys()
+    assert all(len(sha256) == 64 for sha256 in found["networks"].values())
+    paper = found["scenarios"]["the paper's five drones"]
+    assert (paper["sight"]["flights"], paper["sight"]["failed"]) == (2, 1)
+    assert paper["sight"]["figures"]["order_tail"]["count"] == 1
+    assert "associated_error_p95_m" not in paper["blind"]["figures"]
+    assert set(table_of(lines)) == set(SCENARIOS)
+
+
+@pytest.mark.parametrize("eyes", ["blind", "exact"])
+def test_a_flight_is_flown_and_measured(eyes: str) -> None:
+    flight = Flight("head-on", eyes, 5, "head_on.yaml", None, EYES[eyes].overrides)
+    line = flown(flight)
+    assert line["failed"] is None
+    assert set(line["figures"]) == set(FIGURES)
+    # Two that meet head-on and see each other evade; blind ones meet.
+    assert (line["figures"]["min_distance_m"] < 0.5) == (eyes == "blind")

@@ -1,0 +1,278 @@
+"""Fly the published scenarios on seeds of this commit, by sight, blind and on exact states; write docs/figures.json.
+
+python -m tools.measure.card --quick     # for who changes something: 20 minutes on two cores
+python -m tools.measure.card             # for a release: some 30 hours on two cores
+
+Seeds follow from the commit's hash, so that nobody can have tuned to them. Beside each flight by sight stand, on the
+same seed, a blind one, whose drones detect nobody, and an exact one, on the true states of all: what the blind flock
+matches is no achievement. A run that was stopped goes on: RESULTS/COMMIT-quick.jsonl or -whole.jsonl has a line for
+each flight.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import math
+import multiprocessing
+import os
+import platform
+import subprocess
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from scipy.stats import binom
+
+from flockd.campaign.figures import MEASURES, figures_of
+from flockd.core.choices import SimulatedPerception
+from flockd.core.config import Overrides, load_scenario
+from flockd.core.config.campaign import Figure
+from flockd.core.data import data_path
+from flockd.core.errors import FlockdError
+from flockd.flight.inference.hashes import model_hashes
+from flockd.ground.doctor.computer import Computer
+from flockd.sim.swarm import fly
+
+ROOT = Path(__file__).resolve().parents[2]
+SEEDS = 1_000_000
+"""Worlds of flights have seeds below this: `tools.training.worlds` keeps those of training apart."""
+CONFIDENCE = 0.95
+FIGURES: tuple[Figure, ...] = (
+    "min_distance_after_10s_m", "order_tail", "shape_deviation_tail", "convergence_time_s", "recall_within_10m",
+    "false_share", "associated_error_median_m", "associated_error_p95_m", "associated_error_max_m",
+    "distance_error_median_m", "distance_error_p95_m", "slowed_share", "drones_held", "collisions", "min_distance_m",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Eyes:
+    """What drones know each other by."""
+
+    perception: SimulatedPerception
+    overrides: Overrides = field(default_factory=dict)
+
+
+EYES = {
+    "sight": Eyes("learned"),
+    "blind": Eyes("truth", {"detections.missed": 1.0, "detections.latency_s": 0.0}),
+    "exact": Eyes("truth"),
+}
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What is flown, how often, and for how long; `quick` and `whole`: flights and seconds, None: the file's."""
+
+    file: str
+    quick: tuple[int, float | None]
+    whole: tuple[int, float | None] = (20, None)
+    overrides: Overrides = field(default_factory=dict)
+
+
+SCENARIOS = {
+    "the paper's five drones": Scenario("paper_flight.yaml", (2, 30.0)),
+    "other airframes": Scenario("paper_flight.yaml", (2, 20.0), overrides={"world.drone_family": "any"}),
+    "forest": Scenario("forest.yaml", (1, 20.0)),
+    "fisheye": Scenario("fisheye_flight.yaml", (1, 15.0)),
+    "head-on": Scenario("head_on.yaml", (2, None)),
+}
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One flight of the list."""
+
+    scenario: str
+    eyes: str
+    seed: int
+    file: str
+    duration_s: float | None
+    overrides: Overrides
+
+    @property
+    def key(self) -> tuple[str, str, int]:
+        """What tells it from the others of a run."""
+        return self.scenario, self.eyes, self.seed
+
+
+Line = dict[str, Any]
+"""Of one flight: `scenario`, `eyes`, `seed`, `figures` (null where there is none), `wall_s`, and `failed`, the reason
+why it could not be flown, or null."""
+
+
+def flights_of(commit: str, *, quick: bool) -> list[Flight]:
+    """All flights of a run, those by sight first: they take longest."""
+    found: list[Flight] = []
+    for eyes, of in EYES.items():
+        for name, scenario in SCENARIOS.items():
+            count, duration_s = scenario.quick if quick else scenario.whole
+            overrides = {**scenario.overrides, **of.overrides}
+            seeds = seeds_of(commit, name, count)
+            found += [Flight(name, eyes, seed, scenario.file, duration_s, overrides) for seed in seeds]
+    return found
+
+
+def seeds_of(commit: str, scenario: str, count: int) -> list[int]:
+    """Seeds that nobody chose."""
+    hashes = (hashlib.sha256(f"{commit} {scenario} {k}".encode()).digest() for k in range(count))
+    return [int.from_bytes(one[:8]) % SEEDS for one in hashes]
+
+
+def flown(flight: Flight) -> Line:
+    """Fly it on this process alone; a flight that cannot be flown has its reason."""
+    begin, reason, figures = time.monotonic(), None, dict[Figure, float | None]()
+    overrides: Overrides = {**flight.overrides, "seed": flight.seed, "drone.perception.threads": 1}
+    if flight.duration_s is not None:
+        overrides = {**overrides, "duration_s": flight.duration_s}
+    try:
+        scenario = load_scenario(data_path("config") / flight.file, overrides)
+        log = fly(scenario, perception=EYES[flight.eyes].perception, processes=0, pictured=False).log
+        figures = figures_of(log, FIGURES)
+    except FlockdError as error:
+        reason = str(error)
+    who = dict(zip(("scenario", "eyes", "seed"), flight.key, strict=True))
+    return {**who, "figures": figures, "wall_s": round(time.monotonic() - begin, 1), "failed": reason}
+
+
+def run(
+    flights: Sequence[Flight], results: Path, workers: int, fly_one: Callable[[Flight], Line] = flown
+) -> list[Line]:
+    """Fly what ``results`` does not have yet, add it there, and give all lines; flights that failed are tried again."""
+    lines = {_key(line): line for line in read_lines(results) if line["failed"] is None}
+    missing = [flight for flight in flights if flight.key not in lines]
+    results.parent.mkdir(parents=True, exist_ok=True)
+    draft = results.with_suffix(".new")
+    draft.write_text("".join(json.dumps(line) + "\n" for line in lines.values()), encoding="utf-8")
+    draft.replace(results)
+    with results.open("a", encoding="utf-8") as file:
+        for done, line in enumerate(_each(missing, workers, fly_one), start=len(flights) - len(missing) + 1):
+            file.write(json.dumps(line) + "\n")
+            file.flush()
+            lines[_key(line)] = line
+            said = line["failed"] or f"{line['wall_s']:.0f} s"
+            print(f"{done}/{len(flights)}: {line['scenario']}, {line['eyes']}, seed {line['seed']}: {said}", flush=True)
+    return [lines[flight.key] for flight in flights]
+
+
+def _each(flights: Sequence[Flight], workers: int, fly_one: Callable[[Flight], Line]) -> Iterator[Line]:
+    if workers == 1:
+        yield from map(fly_one, flights)
+        return
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+        yield from (future.result() for future in as_completed([pool.submit(fly_one, one) for one in flights]))
+
+
+def read_lines(results: Path) -> list[Line]:
+    """The flights of a file of results; a last line that was cut short is left out."""
+    if not results.is_file():
+        return []
+    whole, _, _ = results.read_text(encoding="utf-8").rpartition("\n")
+    return [json.loads(line) for line in whole.splitlines()]
+
+
+def _key(line: Line) -> tuple[str, str, int]:
+    return line["scenario"], line["eyes"], line["seed"]
+
+
+def table_of(lines: Iterable[Line]) -> dict[str, Any]:
+    """By scenario and eyes: how many flights, how many failed, their seeds, and each figure's `Spread` as a mapping."""
+    groups: dict[tuple[str, str], list[Line]] = {}
+    for line in lines:
+        groups.setdefault((line["scenario"], line["eyes"]), []).append(line)
+    table: dict[str, Any] = {}
+    for (scenario, eyes), of_group in groups.items():
+        good = [line["figures"] for line in of_group if line["failed"] is None]
+        figures = {}
+        for figure in FIGURES:
+            known = [one[figure] for one in good if one.get(figure) is not None]
+            if known:
+                figures[figure] = spread(known, higher_is_better=MEASURES[figure].better == "higher")
+        table.setdefault(scenario, {})[eyes] = {
+            "flights": len(of_group), "failed": len(of_group) - len(good),
+            "seeds": sorted(line["seed"] for line in of_group), "figures": figures,
+        }  # fmt: skip
+    return table
+
+
+def spread(values: Sequence[float], *, higher_is_better: bool) -> dict[str, Any]:
+    """Median with its interval at 95 % (of ranks, by the binomial distribution; of few values the whole range), worst,
+    and how many flights have a value."""
+    ordered, n = sorted(values), len(values)
+    rank = max(int(binom.ppf((1.0 - CONFIDENCE) / 2.0, n, 0.5)) - 1, 0)
+    middle = (ordered[(n - 1) // 2] + ordered[n // 2]) / 2.0
+    return {
+        "median": _rounded(middle), "interval": [_rounded(ordered[rank]), _rounded(ordered[n - 1 - rank])],
+        "worst": _rounded(ordered[0] if higher_is_better else ordered[-1]), "count": n,
+    }  # fmt: skip
+
+
+def _rounded(value: float) -> float:
+    """To four digits."""
+    return value if value == 0.0 else round(value, 3 - math.floor(math.log10(abs(value))))
+
+
+def document(commit: str, date: str, lines: Sequence[Line], *, quick: bool) -> dict[str, Any]:
+    """What docs/figures.json holds."""
+    computer = Computer.this()
+    files = {name: one.file for name, one in SCENARIOS.items()}
+    networks: dict[str, str] = {}
+    for file in sorted(set(files.values())):
+        networks |= model_hashes(load_scenario(data_path("config") / file).drone.perception)
+    return {
+        "commit": commit,
+        "date": date,
+        "quick": quick,
+        "command": f"python -m tools.measure.card{' --quick' * quick}",
+        "machine": f"{computer.name}, {computer.cores} cores, Python {platform.python_version()}",
+        "networks": networks,
+        "flown_s": round(sum(line["wall_s"] for line in lines)),
+        "figures": {figure: {"name": MEASURES[figure].name, "unit": MEASURES[figure].unit} for figure in FIGURES},
+        "files": files,
+        "scenarios": table_of(lines),
+    }
+
+
+def commit_of(root: Path) -> str:
+    """The commit that is checked out. Raises SystemExit where what flies differs from it."""
+    changed = _git(root, "status", "--porcelain", "--", "flockd", "models", "config")
+    if changed:
+        raise SystemExit(f"flockd, models or config differ from the commit; commit first:\n{changed}")
+    return _git(root, "rev-parse", "HEAD")
+
+
+def _git(root: Path, *words: str) -> str:
+    return subprocess.run(["git", *words], cwd=root, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def main() -> None:
+    """Fly what is missing and write the file."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="few and short flights")
+    parser.add_argument("--results", type=Path, default=ROOT / "out" / "card", help="default: out/card")
+    parser.add_argument("--out", type=Path, help="default: docs/figures.json; with --quick RESULTS/figures.json")
+    parser.add_argument("--only", nargs="+", choices=SCENARIOS, metavar="SCENARIO", help="fly these, and write nothing")
+    parser.add_argument("--workers", type=int, default=os.cpu_count(), help="flights at once")
+    arguments = parser.parse_args()
+    commit = commit_of(ROOT)
+    flights = flights_of(commit, quick=arguments.quick)
+    if arguments.only:
+        flights = [one for one in flights if one.scenario in arguments.only]
+    name = f"{commit[:12]}-{'quick' if arguments.quick else 'whole'}.jsonl"
+    lines = run(flights, arguments.results / name, arguments.workers)
+    if arguments.only:
+        print(json.dumps(table_of(lines), indent=1))
+        return
+    out = arguments.out or (arguments.results if arguments.quick else ROOT / "docs") / "figures.json"
+    date = datetime.now(UTC).date().isoformat()
+    out.write_text(json.dumps(document(commit, date, lines, quick=arguments.quick), indent=1) + "\n", encoding="utf-8")
+    print(out)
+
+
+if __name__ == "__main__":
+    main()
