@@ -29,15 +29,16 @@ from typing import Any
 
 from scipy.stats import binom
 
+from flockd.campaign.campaign_file import Figure
 from flockd.campaign.figures import MEASURES, figures_of
 from flockd.core.choices import SimulatedPerception
-from flockd.core.config import Overrides, load_scenario
-from flockd.core.config.campaign import Figure
+from flockd.core.config.loader import Overrides
 from flockd.core.data import data_path
 from flockd.core.errors import FlockdError
 from flockd.flight.inference.hashes import model_hashes
 from flockd.ground.doctor.computer import Computer
-from flockd.sim.swarm import fly
+from flockd.sim.flock.swarm import fly
+from flockd.sim.scenario import load_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 SEEDS = 1_000_000

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from flockd.flight.inference import OnnxModel
 from flockd.flight.perception.requirements import check_roles
-from tools.training.crop_files import is_aimed
+from tools.training.pictures import is_aimed
 
 Array = NDArray[Any]
 RANGES_M = ((1.5, 5.0), (5.0, 10.0))

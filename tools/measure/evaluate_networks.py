@@ -3,33 +3,44 @@
 python -m tools.training.render_training_data DATA/test   --split test --worlds 25 --pairs 12
 python -m tools.training.render_training_data DATA/unseen --split test --worlds 25 --pairs 12 --families unseen
 python -m tools.measure.evaluate_networks --data DATA/test --unseen DATA/unseen [--json]
+
+How long they take says `flockd models bench`.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from flockd.core.choices import ROLES
+from flockd.core.choices import ROLES, ScaleSource
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
-from flockd.core.messages import Frame
-from flockd.flight.geometry import PinholeCamera, RigidTransform
-from flockd.flight.perception import Crop, OnnxNetworks
-from tools.measure.on_pairs import HEIGHT_SIGMAS_M, MASK_WITHIN_M, Findings, look_at_pairs
-from tools.training.dataset import WIDTH, PairSet, open_pairs, rig_camera
+from flockd.core.messages import UNCLASSED, Detection, Frame, FrameSet, VehicleState
+from flockd.flight.geometry import RangeMap, Rig, RigCamera, z_map
+from flockd.flight.perception import DisFlow, OnnxNetworks, Perception
+from flockd.flight.perception.detection.detector import DetectionTrace
+from flockd.flight.pilot.ground import level_ground
+from flockd.sim.renderer.drone_models import FAMILIES, drone_model
+from tools.training.dataset import HEIGHT, R_BODY_CAMERA, WIDTH, PairSet, open_pairs, rig_camera
+from tools.training.worlds import outline_of
 
+Array = NDArray[Any]
+SIZES_M = [drone_model(family, 0).size_m for family in range(FAMILIES)]
+MIN_PIXELS = 6
+"""Drones of which less is to be seen do not count, neither as found nor as missed."""
+MASK_WITHIN_M = 10.0
+HEIGHT_SIGMAS_M = {"barometer": 0.1, "range finder": 0.03}
+"""Standard deviations of the height above ground that an autopilot gives, by what it measures it with."""
+WHOLE_HIDES = 0.02
+"""A drone is whole when it is inside the image and no more of its outline is hidden than this."""
 RANGES_M = ((1.5, 5.0), (5.0, 10.0), (10.0, 20.0))
-IMAGES_TIMED = 60
-CROPS_OF_A_DRONE = (1, 1, 1)
-"""As many as it takes one after another, mostly: see ``flockd.flight.perception.detection.refinement``."""
-
 WITH: dict[str | None, str] = {
     None: "RGB alone",
     **{given: f"attitude, height by {given} ({sigma:g} m)" for given, sigma in HEIGHT_SIGMAS_M.items()},
@@ -74,8 +85,7 @@ def main() -> None:
 
     rows = list(rows_of_pairs(findings(arguments.data)))
     if arguments.unseen is not None:
-        rows += rows_of_unseen(findings(arguments.unseen))
-    rows += rows_of_cost(perception, open_pairs(arguments.data), arguments.threads)
+        rows += list(_distances(findings(arguments.unseen), ", unseen families"))
     files = list(arguments.models.glob("*.onnx"))
     rows.append(Row("all networks", sum(file.stat().st_size for file in files) / 1e6, "MB", len(files)))
     if arguments.json:
@@ -119,11 +129,6 @@ def rows_of_pairs(found: Findings) -> Iterator[Row]:
     )
 
 
-def rows_of_unseen(found: Findings) -> list[Row]:
-    """Distances of drones of families that no network was trained on."""
-    return list(_distances(found, ", unseen families"))
-
-
 def _distances(found: Findings, note: str) -> Iterator[Row]:
     parts = [(low, high, True) for low, high in RANGES_M] + [(0.0, 10.0, False)]
     figures: dict[str, Callable[..., float]] = {
@@ -139,22 +144,187 @@ def _distances(found: Findings, note: str) -> Iterator[Row]:
                 yield Row(f"distance{note}, {what}, {name}", 100 * float(figure(errors)), "%", len(errors))
 
 
-def rows_of_cost(perception: OnnxNetworks, pairs: PairSet, threads: int) -> Iterator[Row]:
-    """Time of an image with up to four drones; their crops are cut beforehand."""
-    camera = rig_camera(WIDTH / 2)
-    side = perception.second_stage.crop_size if perception.second_stage else 0
-    times = []
-    for pair in range(min(pairs.count, IMAGES_TIMED)):
-        image = np.asarray(pairs["image"][pair][0])
-        pinhole = PinholeCamera(np.array([[60.0, 0, side / 2], [0, 60.0, side / 2], [0, 0, 1.0]]), (side, side))
-        crop = Crop(np.ascontiguousarray(image[:side, :side]), pinhole, RigidTransform(np.eye(3), np.zeros(3)))
-        begin = time.perf_counter()
-        perception.scene(Frame("camera", image, 0.0, 0), camera, None)
-        for crops in CROPS_OF_A_DRONE:
-            perception.ranges([crop] * 4 * crops)
-        times.append(time.perf_counter() - begin)
-    name = f"depth, masks and four drones' distances of an image, {threads} threads"
-    yield Row(name, 1e3 * float(np.median(times)), "ms", len(times))
+@dataclass(frozen=True)
+class Drone:
+    """One drone in one image, and what was made of it."""
+
+    range_m: float
+    width_px: float
+    whole: bool
+    found: bool
+    error: float
+    """Relative error of its range; 0 where it was not found."""
+    sigma: float
+    """What was said of that error's standard deviation."""
+    proposed: bool = True
+    """Whether the second stage was asked about it: some proposal is no farther from it than the drone is large."""
+
+
+class Findings:
+    """Everything that is gathered over all pairs."""
+
+    def __init__(self) -> None:
+        self.images = 0
+        self.false = 0
+        """Detections that are no drone's, or a drone's second one."""
+        self.drones: list[Drone] = []
+        self.iou: list[float] = []
+        self.depth: dict[str | None, list[float]] = {given: [] for given in (None, *HEIGHT_SIGMAS_M)}
+        """Mean relative error of the background's depth in each image, by what measured the height, None: RGB alone."""
+        self.depth_pixels: dict[str | None, list[Array]] = {given: [] for given in self.depth}
+        """The same of every sixteenth pixel."""
+        self.flow: dict[tuple[str, bool], list[Array]] = {}
+        """End-point errors, px, of ("network" or "dis", on drones)."""
+
+    def errors(self, low_m: float, high_m: float, *, whole: bool) -> Array:
+        """Relative range errors of the drones that were found."""
+        return np.array([d.error for d in self.drones if d.found and d.whole is whole and low_m <= d.range_m < high_m])
+
+    def inside(self, sigmas: float) -> float:
+        """Share of the whole drones' range errors that are within so many of their own standard deviations."""
+        return float(np.mean([abs(d.error) < sigmas * d.sigma for d in self.drones if d.found and d.whole]))
+
+    def found(self, low_px: float, high_px: float) -> float:
+        """Share of the drones whose box is so wide."""
+        return float(np.mean([d.found for d in self.drones if low_px <= d.width_px < high_px]))
+
+    def proposed(self, low_px: float, high_px: float) -> float:
+        """The same of those that the first stage proposed, or that were found."""
+        return float(np.mean([d.found or d.proposed for d in self.drones if low_px <= d.width_px < high_px]))
+
+    def flow_errors(self, name: str, *, on_drones: bool) -> Array:
+        """All of them."""
+        return np.concatenate(self.flow[name, on_drones])
+
+
+def look_at_pairs(pairs: PairSet, networks: OnnxNetworks, indices: Iterable[int]) -> Findings:
+    """The second stage and all, on each pair's first image; the flow on both. The autopilot's height errs.
+
+    Drones are what they are with a barometer.
+    """
+    rng = np.random.Generator(np.random.PCG64(0))
+    dis, found = DisFlow(), Findings()
+    for index in indices:
+        rig = Rig({"camera": rig_camera(float(pairs["focal"][index]))})
+        images = np.asarray(pairs["image"][index])
+        R_ned_camera = np.asarray(pairs["R_ned_camera"][index, 0], np.float64)
+        height, wrong = float(pairs["height"][index, 0]), float(rng.standard_normal())
+        frames = FrameSet(0.0, {"camera": Frame("camera", images[0], 0.0, 0)})
+        depth, ids = np.asarray(pairs["depth"][index][0], np.float32), np.asarray(pairs["ids"][index][0])
+        for given in (None, "range finder", "barometer"):
+            scale: ScaleSource = "network" if given is None else "height"
+            measured_m = height + HEIGHT_SIGMAS_M.get(given or "", 0.0) * wrong
+            vehicle = VehicleState(0.0, R_ned_camera @ R_BODY_CAMERA.T, measured_m)
+            trace = DetectionTrace()
+            perception = Perception(rig, networks, PerceptionConfig(scale=scale))
+            view = perception.observe(frames, vehicle, level_ground(vehicle), trace=trace)
+            ranges = view.cameras["camera"].depth
+            assert ranges is not None
+            off = depth_errors(RangeMap(ranges), rig.cameras["camera"], depth, ids)
+            found.depth[given].append(float(off.mean()) if off.size else 0.0)
+            found.depth_pixels[given].append(off[::16])
+        labels = view.cameras["camera"].labels
+        _masks(((labels > 0) & (labels != UNCLASSED))[1::2, 1::2], ids, pairs, index, found)
+        proposed = [proposal.roi.direction for proposal in trace.proposals]
+        compare_drones(view.detections, pairs, index, depth, ids, found, proposed)
+        flow = np.asarray(pairs["flow"][index], np.float32)
+        valid = np.asarray(pairs["flow_valid"][index])
+        first, second = (Frame("camera", images[k], 0.5 * k, k) for k in (0, 1))
+        ours = networks.flow(first, second, labels)
+        for name, guess in (("network", ours), ("dis", dis.flow(images[0], images[1]))):
+            error = np.linalg.norm(np.moveaxis(guess[1::2, 1::2], 2, 0) - flow, axis=0)
+            for on_drones in (False, True):
+                found.flow.setdefault((name, on_drones), []).append(error[valid & ((ids > 0) == on_drones)])
+    return found
+
+
+def depth_errors(ranges: RangeMap, camera: RigCamera, true: Array, ids: Array) -> Array:
+    """(n,) relative errors of ranges (h, w) where the background of a rendered pair is near.
+
+    ``true`` (h / 2, w / 2) metres along the optical axis, as rendered; ``ids`` alike, 0 where there is no drone.
+    """
+    guess = z_map(ranges, camera.camera)[1::2, 1::2]
+    near = (ids == 0) & (true < 60.0)
+    return np.asarray(np.abs(guess[near] - true[near]) / true[near])
+
+
+def _masks(guess: Array, ids: Array, pairs: PairSet, index: int, found: Findings) -> None:
+    """IoU of every near drone, over its box with a margin."""
+    for drone in np.flatnonzero(pairs["drone_pixels"][index, 0] > 30):
+        if np.linalg.norm(pairs["drone_centre"][index, 0, drone]) > MASK_WITHIN_M:
+            continue
+        left, top, right, bottom = (pairs["drone_box"][index, 0, drone] / 2).astype(int)
+        part = np.s_[max(0, top - 3) : bottom + 3, max(0, left - 3) : right + 3]
+        other = (ids[part] > 0) & (ids[part] != drone + 1)
+        mine, said = (ids[part] == drone + 1), guess[part] & ~other
+        found.iou.append(float((mine & said).sum() / max((mine | said).sum(), 1)))
+
+
+def compare_drones(
+    detections: tuple[Detection, ...],
+    pairs: PairSet,
+    index: int,
+    depth: Array,
+    ids: Array,
+    found: Findings,
+    proposed: Sequence[Array] = (),
+) -> None:
+    """Note every drone of a pair's first image: a detection is a drone's if it lies in its direction, at any range.
+
+    ``proposed``: unit vectors (3,) towards what the second stage was asked about.
+    """
+    found.images += 1
+    seen = np.flatnonzero(pairs["drone_pixels"][index, 0] >= MIN_PIXELS)
+    places = [R_BODY_CAMERA @ np.asarray(pairs["drone_centre"][index, 0, drone], np.float64) for drone in seen]
+    sizes_m = [SIZES_M[int(pairs["drone_family"][index, drone])] for drone in seen]
+    detection_of = pairings(detections, places, sizes_m)
+    for row, (drone, true, size_m) in enumerate(zip(seen, places, sizes_m, strict=True)):
+        range_m, best = float(np.linalg.norm(true)), detection_of.get(row)
+        left, top, right, bottom = pairs["drone_box"][index, 0, drone]
+        inside = left > 1 and top > 1 and right < WIDTH - 1 and bottom < HEIGHT - 1
+        error, sigma = 0.0, 1.0
+        if best is not None:
+            distance = float(np.linalg.norm(best.position))
+            error, sigma = distance / range_m - 1.0, best.range_sigma_m / distance
+        whole = inside and _hidden_share(pairs, index, int(drone), depth, ids) < WHOLE_HIDES
+        drone_found, asked = best is not None, any(_angle(one, true) <= size_m / range_m for one in proposed)
+        found.drones.append(Drone(range_m, float(right - left), bool(whole), drone_found, error, sigma, asked))
+    found.false += len(detections) - len(detection_of)
+
+
+def pairings(
+    detections: Sequence[Detection], places: Sequence[Array], sizes_m: Sequence[float]
+) -> dict[int, Detection]:
+    """The detection of each drone that was found: first those that lie nearest to each other."""
+    away = sorted(
+        (_angle(detection.position, place) / (size_m / 2 / float(np.linalg.norm(place))), drone, number)
+        for number, detection in enumerate(detections)
+        for drone, (place, size_m) in enumerate(zip(places, sizes_m, strict=True))
+    )
+    pairings: dict[int, int] = {}
+    for share, drone, number in away:
+        if share <= 1.0 and drone not in pairings and number not in pairings.values():
+            pairings[drone] = number
+    return {drone: detections[number] for drone, number in pairings.items()}
+
+
+def _angle(a: Array, b: Array) -> float:
+    return float(np.arccos(np.clip(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), -1, 1)))
+
+
+def _hidden_share(pairs: PairSet, index: int, drone: int, depth: Array, ids: Array) -> float:
+    """How much of the drone's outline, as if a thread ran around it, something nearer hides; what is cut off apart."""
+    family = int(pairs["drone_family"][index, drone])
+    centre = np.asarray(pairs["drone_centre"][index, 0, drone], np.float64)
+    corners = drone_model(family, 0).vertices @ np.asarray(pairs["drone_rotation"][index, 0, drone], np.float64).T
+    half = float(pairs["focal"][index]) / 2
+    outline = outline_of(
+        corners + centre, np.array([[half, 0, WIDTH / 4], [0, half, HEIGHT / 4], [0, 0, 1]]), ids.shape
+    )
+    nearer = depth < centre[2] - SIZES_M[family] / 2
+    others = np.flatnonzero(pairs["drone_centre"][index, 0, :, 2] < centre[2]) + 1
+    nearer |= np.isin(ids, others)
+    return float((nearer & outline).sum() / max(int(outline.sum()), 1))
 
 
 if __name__ == "__main__":

@@ -8,17 +8,19 @@ again the way the pipeline does.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from flockd.sim.cameras.compression import jpeg
-from flockd.sim.scenario.imperfect_cameras import CamerasConfig
 
 Image = NDArray[np.uint8]
 _LEAST_SIDE_PX = 8
+UNTOUCHED = 0.5
+"""Share of the images that stay as they are, as a good camera in good light gives them."""
 
 
 @dataclass(frozen=True)
@@ -77,27 +79,14 @@ def drawn_effects(scale: float, rng: np.random.Generator) -> CameraEffects:
     )
 
 
-def drawn_cameras(rng: np.random.Generator) -> CamerasConfig:
-    """A camera of whole rendered images, from better than the preset `realistic` to about three times worse."""
-    preset = CamerasConfig(preset="realistic")
-    strength = float(np.exp(rng.uniform(math.log(0.1), math.log(3.0))))
-    is_global = bool(rng.random() < 0.5)
-    values = {
-        "shutter": {
-            "exposure_s": preset.shutter.exposure_s * strength,
-            "readout_s": 0.0 if is_global else preset.shutter.readout_s * float(rng.uniform(0.3, 2.0)),
-        },
-        "shake": {"rms_deg": preset.shake.rms_deg * strength * float(rng.uniform(0.0, 2.0))},
-        "noise": {"gain": preset.noise.gain * float(np.exp(rng.uniform(math.log(0.25), math.log(4.0))))},
-        "automatic": {"exposure": float(rng.random()), "white_balance": float(rng.random())},
-        "lens": {
-            "flare": float(rng.exponential(preset.lens.flare)),
-            "dirt": float(rng.exponential(preset.lens.dirt)),
-            "drops": float(rng.exponential(0.02)) if rng.random() < 0.1 else 0.0,
-        },
-        "compression": {"jpeg_quality": int(rng.integers(40, 96)) if rng.random() < 0.7 else None},
-    }
-    return CamerasConfig.model_validate(values)
+def as_filmed(images: Sequence[Image], rng: np.random.Generator) -> list[Image]:
+    """``UNTOUCHED`` of the time as they are; else as one camera shows them (h, w, 3), each smeared in its own way."""
+    if rng.random() < UNTOUCHED:
+        return list(images)
+    effects = drawn_effects(float(np.exp(rng.uniform(math.log(0.5), 0.0))), rng)
+    smears = [(effects.smear_px * rng.uniform(0.0, 2.0), rng.uniform(0, math.pi)) for _ in images]
+    each = [replace(effects, smear_px=length_px, smear_angle=angle) for length_px, angle in smears]
+    return [through_camera(image, one, rng) for image, one in zip(images, each, strict=True)]
 
 
 def through_camera(sharp: Image, effects: CameraEffects, rng: np.random.Generator) -> Image:

@@ -16,6 +16,10 @@ from flockd.flight.geometry import PinholeCamera, RigCamera, RigidTransform
 HEIGHT, WIDTH = 640, 480
 MAX_DRONES = 6
 FOCAL_PX = 222.0
+MAX_DEPTH_M = 80.0
+"""What the depth output says of the sky."""
+MAX_FAMILIES = 16
+"""Room for this many drone shapes in the distance network's training hints."""
 R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """Rotation of a camera that looks forward: optical RDF to body FRD."""
 

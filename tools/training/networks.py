@@ -16,16 +16,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tools.training.dataset import MAX_DEPTH_M, MAX_FAMILIES
+
 Out = TypeVar("Out")
-MAX_DEPTH_M = 80.0
-"""What the depth output says of the sky."""
 PLANE_STEPS = torch.tensor([64.0, 64.0, 32.0])[:, None, None]
 """Steps of the geometry's planes: in a network that runs, a step of 8-bit numbers is one over this."""
 OFFSET_SCALE_PX = 16.0
 """Centre offsets leave the network in units of this many pixels of the half-size map."""
-
-MAX_FAMILIES = 16
-"""Room for this many drone shapes in the distance network's training hints."""
 
 
 def _conv(inputs: int, outputs: int, stride: int = 1, kernel: int = 3) -> nn.Sequential:

@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from trimesh.visual.color import uv_to_color
 from trimesh.visual.material import PBRMaterial
 
@@ -80,31 +78,15 @@ def _surface(path: Path, size_m: float, up: str | None) -> tuple[Array, Array, A
 
 
 def painted(model: DroneModel, seed: int) -> DroneModel:
-    """The same drone in another light and wear; what has no colour in its file is painted, each part in one colour."""
+    """The same drone in another light and wear; what has no colour in its file gets one."""
     rng = np.random.default_rng([model.family, seed])
     colours = model.colours * np.exp(rng.normal(0, 0.15)) * np.exp(rng.normal(0, 0.04, 3))
     plain = np.isnan(model.colours).any(axis=1)
     if plain.any():
-        parts = _parts(model)
         craft = Airframe(rng)
-        paints = np.array([craft.body, craft.frame, craft.metal, craft.front, craft.rear])
-        drawn = rng.choice(len(paints), int(parts.max()) + 1, p=_SHARES)
-        colours[plain] = paints[drawn][parts[plain]]
+        colours[plain] = craft.body if rng.random() < 0.5 else craft.frame
     texture = np.full(len(model.triangles), int(rng.integers(MACHINE_TEXTURES)), np.int32)
     return replace(model, seed=seed, colours=np.clip(colours, 0.01, 0.9).astype(np.float32), texture=texture)
-
-
-def _parts(model: DroneModel) -> Array:
-    """(m,) numbers from 0 up, the same of triangles that hang together by their corners' places."""
-    places, corner = np.unique(np.round(model.vertices, 5), axis=0, return_inverse=True)
-    a, b, c = corner.reshape(-1)[model.triangles].T
-    edges = (np.ones(2 * len(a)), (np.concatenate([a, b]), np.concatenate([b, c])))
-    _, part = connected_components(coo_matrix(edges, shape=(len(places), len(places))), directed=False)
-    return np.asarray(part[a])
-
-
-_SHARES = (0.35, 0.35, 0.1, 0.1, 0.1)
-"""Shares of body, frame, metal, front and rear colours."""
 
 
 def _loaded(path: Path) -> list[tuple[Any, Array]]:

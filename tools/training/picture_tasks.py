@@ -17,16 +17,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from tools.training.augment import photometric
-from tools.training.camera_effects import drawn_effects, through_camera
-from tools.training.crop_files import CropFiles
+from tools.training.camera_effects import as_filmed, drawn_effects, through_camera
 from tools.training.dataset import open_pairs
-from tools.training.detector.loss import detection_loss
-from tools.training.detector.network import NO_BOX, DroneDetector
+from tools.training.detector import DroneDetector, detection_loss
 from tools.training.networks import VerificationNet
 from tools.training.pictures import (
     LEAST_SEEN,
     MOST_BOXES,
+    NO_BOX,
+    CropFiles,
     Cutouts,
     Image,
     Labelled,
@@ -66,10 +65,6 @@ _SENSOR_SIGMA, _TEXTURE_SIGMA = 6.0, 30.0
 _SURELY_VISIBLE = 40.0
 """Energy of what a drone changes in the camera's image, over the variance of what hides it. Less counts less, in
 proportion: who is taught drones that cannot be seen learns to see them everywhere."""
-HARD_PROBABILITY, HARD_SHARE, HARD_ONES, FEWEST_HARD = 0.3, 0.35, 4000, 200
-"""A negative of more than this probability is remembered, the last so many are, and drawn so often."""
-NO_PLACE = np.array([-1, -1])
-"""The place of a sample that is no proposal."""
 
 
 class DetectorTask(Task):
@@ -126,29 +121,6 @@ def _sample(scene: Scene) -> Sample:
     return {"image": scene.image, "boxes": boxes, "classes": classes}
 
 
-class HardOnes:
-    """Places of the negatives that were last taken for drones; processes that draw samples see what another adds."""
-
-    def __init__(self) -> None:
-        self._places = torch.zeros(HARD_ONES, 2, dtype=torch.int64).share_memory_()
-        self._added = torch.zeros(1, dtype=torch.int64).share_memory_()
-
-    @property
-    def count(self) -> int:
-        """How many there are."""
-        return min(int(self._added), HARD_ONES)
-
-    def add(self, places: Tensor) -> None:
-        """(n, 2) category and row; the oldest ones give way."""
-        self._places[(self._added + torch.arange(len(places))) % HARD_ONES] = places.cpu()
-        self._added += len(places)
-
-    def draw(self, rng: Generator) -> tuple[int, int]:
-        """Any of them."""
-        category, row = self._places[int(rng.integers(self.count))].tolist()
-        return category, row
-
-
 class VerificationTask(Task):
     """Crops of drones and of what is none: rendered, rendered before photographs, and real."""
 
@@ -158,7 +130,6 @@ class VerificationTask(Task):
         self.photographs = Photographs(data / "photographs")
         self.drones = [one for one in _labelled(data) if one.drones]
         self.proposals = Proposals([data / "photographs", *sorted((data / "labelled").glob("*/"))])
-        self.hard = HardOnes()
 
     def batch_samples(self, rng: Generator) -> list[Sample]:
         """As many of each kind as ``CROPS`` says."""
@@ -169,7 +140,7 @@ class VerificationTask(Task):
         }  # fmt: skip
         times = self.batch // sum(CROPS.values())
         return [
-            {"place": NO_PLACE} | of_kind[kind](rng) | {"kind": np.array(number)}
+            of_kind[kind](rng) | {"kind": np.array(number)}
             for number, kind in enumerate(KINDS)
             for _ in range(times * CROPS[kind])
         ]
@@ -178,7 +149,7 @@ class VerificationTask(Task):
         """As it is, or as a real camera shows it."""
         drawn = self.rendered.draw(rng)
         if rng.random() < 0.5:
-            (picture,) = photometric([drawn["picture"]], rng)
+            (picture,) = as_filmed([drawn["picture"]], rng)
             return _crop(picture, float(drawn["drone"]))
         is_drone, weight = drawn["drone"] > 0.5, 1.0
         scale = min(1.0, _drawn_width(rng) / (float(np.exp(drawn["apparent"])) if is_drone else 70.0))
@@ -194,9 +165,7 @@ class VerificationTask(Task):
         """A cut-out before a part of a photograph, through a real camera."""
         image, scale, seen = np.zeros((CROP_PX, CROP_PX, 3), np.uint8), 1.0, 0.0
         for _ in range(_TRIES):
-            behind, camera_px = (
-                self._anywhere(rng) if rng.random() < 0.6 else self._proposal(self.proposals.draw_place(rng), rng)
-            )
+            behind, camera_px = self._anywhere(rng) if rng.random() < 0.6 else self._proposal(rng)
             fill, off = drawn_fill(rng)
             width = CROP_PX / fill
             # A background that is softer than the drone before it would give the drone away.
@@ -219,19 +188,16 @@ class VerificationTask(Task):
         return _crop(_perhaps_softer(crop_of(image, middle, half), 2 * half / CROP_PX, (0.6, 1.0), rng), 1.0)
 
     def _negative(self, rng: Generator) -> Sample:
-        """Often one that was taken for a drone when it was shown before."""
         if rng.random() < _NOISE_SHARE:
             picture = self._anywhere(rng)[0] + rng.normal(0, rng.uniform(40.0, 120.0), (CROP_PX, CROP_PX, 3))
             return _crop(np.clip(picture, 0, 255).astype(np.uint8), 0.0)
         if rng.random() < _PLACES_SHARE:
             return _crop(_perhaps_softer(*self._anywhere(rng), (0.4, 1.0), rng), 0.0)
-        is_hard = self.hard.count >= FEWEST_HARD and rng.random() < HARD_SHARE
-        place = self.hard.draw(rng) if is_hard else self.proposals.draw_place(rng)
-        return _crop(_perhaps_softer(*self._proposal(place, rng), (0.4, 1.0), rng), 0.0) | {"place": np.array(place)}
+        return _crop(_perhaps_softer(*self._proposal(rng), (0.4, 1.0), rng), 0.0)
 
-    def _proposal(self, place: tuple[int, int], rng: Generator) -> tuple[Image, float]:
+    def _proposal(self, rng: Generator) -> tuple[Image, float]:
         """A crop as the pipeline may aim it in one of its iterations, and camera pixels per crop pixel."""
-        image, box = self.proposals.at(place)
+        image, box = self.proposals.draw(rng)
         share = float(np.exp(rng.uniform(*np.log(_CROP_SHARE))))
         half = max(share * 0.5 * math.hypot(box[2] - box[0], box[3] - box[1]), 4.0)
         middle = np.array([box[0] + box[2], box[1] + box[3]]) / 2 + rng.uniform(-0.25, 0.25, 2) * half
@@ -250,8 +216,6 @@ class VerificationTask(Task):
         logits, there, kind = self.net(crops)[:, 0], batch["drone"], batch["kind"]
         loss = F.binary_cross_entropy_with_logits(logits, there, weight=batch["exists_weight"])
         probability = torch.sigmoid(logits.detach())
-        mistaken = (batch["place"][:, 0] >= 0) & (probability > HARD_PROBABILITY)
-        self.hard.add(batch["place"][mistaken])
         figures = {"rendered none": float((probability[(kind == 0) & (there < 0.5)] > 0.8).float().mean())}
         for number, name in enumerate(KINDS):
             mine = (kind == number) & (there > 0.5) if name != "negative" else kind == number

@@ -15,15 +15,18 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from tools.training.augment import as_filmed
-from tools.training.camera_effects import drawn_effects, through_camera
-from tools.training.dataset import PairSet
-from tools.training.detector.network import CLASSES, NOT_JUDGED
+from tools.training import worlds
+from tools.training.camera_effects import as_filmed, drawn_effects, through_camera
+from tools.training.dataset import MAX_FAMILIES, PairSet
+from tools.training.samples import Sample
 
 Image = NDArray[np.uint8]
 Boxes = NDArray[np.float32]
 Named = tuple[str, float, float, float, float]
 """What something is, and left, top, right, bottom in pixels."""
+CLASSES = ("drone", "bird", "airplane", "helicopter")
+NO_BOX, NOT_JUDGED = -1, -2
+"""Classes of a box that is none, and of one where nothing is learnt of whether there is an object."""
 PROPOSALS = "proposals.jsonl"
 MOST_BOXES = 10
 LEAST_WIDTH_PX = 5.0
@@ -35,6 +38,13 @@ _SOLID = 64
 _SCALES = (0.35, 1.4)
 """A photograph is resized by, unless it would not fill the picture then."""
 _IN_MEMORY = 6000
+_LOOK_EVERY = 200
+"""Calls between two looks into the folder."""
+_AIMED_SHARE = 0.6
+"""At least so many of the drones are in the middle and fill their crop: the last crop of a drone is what counts."""
+_NONE_SHARE = 0.08
+"""Share of what is drawn that is no drone, however many families there are."""
+_AIMED_OFF_PX, _AIMED_PX = 4.0, (60.0, 84.0)
 
 
 @dataclass(frozen=True)
@@ -125,14 +135,10 @@ class Proposals:
         roots = np.sqrt([len(ones) for ones in self._by_category])
         self._shares = roots / roots.sum()
 
-    def draw_place(self, rng: Generator) -> tuple[int, int]:
-        """Category and row of one."""
-        category = int(rng.choice(len(self._shares), p=self._shares))
-        return category, int(rng.integers(len(self._by_category[category])))
-
-    def at(self, place: tuple[int, int]) -> tuple[Image, tuple[float, ...]]:
-        """Its picture, and its box there."""
-        path, box = self._by_category[place[0]][place[1]]
+    def draw(self, rng: Generator) -> tuple[Image, tuple[float, ...]]:
+        """The picture of one, and its box there."""
+        ones = self._by_category[int(rng.choice(len(self._shares), p=self._shares))]
+        path, box = ones[int(rng.integers(len(ones)))]
         return read(path), box
 
 
@@ -182,6 +188,68 @@ class Worlds:
             _, left, top, right, bottom = boxes[int(rng.integers(len(boxes)))]
             aim = ((left + right) / 2, (top + bottom) / 2)
         return part_of(pairs["image"][index][k], boxes, size, (0.8, 1.3), rng, aim)
+
+
+class CropFiles:
+    """Every sample of every file of ``render_drone_crops.py``, in memory."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._files: dict[Path, Sample] = {}
+        self._ends = np.zeros(0, np.int64)
+        self._of_family: list[NDArray[np.int64]] = []
+        self._aimed_of_family: list[NDArray[np.int64]] = []
+        self._calls = 0
+        self.look_for_more()
+
+    def look_for_more(self) -> None:
+        """Take up files that have appeared; looks only now and then."""
+        self._calls += 1
+        if self._calls % _LOOK_EVERY != 1:
+            return
+        for path in sorted(self._folder.glob("*.npz")):
+            if path not in self._files:
+                with np.load(path) as arrays:
+                    self._files[path] = dict(arrays)
+                if "mask" not in self._files[path]:
+                    raise ValueError(f"{path}: its crops have no masks; make the folder anew")
+        if not self._files:
+            raise FileNotFoundError(
+                f"{self._folder}: no crops here; make them with `python -m tools.training.render_drone_crops`"
+            )
+        self._ends = np.cumsum([len(file["drone"]) for file in self._files.values()])
+        family = np.concatenate([np.where(file["drone"] > 0.5, file["family"], -1) for file in self._files.values()])
+        aimed = np.concatenate([is_aimed(file) for file in self._files.values()])
+        names: NDArray[np.int64] = np.unique(family)
+        self._of_family = [np.flatnonzero(family == one) for one in names]
+        self._aimed_of_family = [np.flatnonzero((family == one) & aimed) for one in names]
+        is_none, is_family = names == -1, (names >= 0) & (names < MAX_FAMILIES)
+        of_drones = np.zeros(len(names))
+        for which, of in ((is_family, 1 - worlds.SHAPES_SHARE), (~(is_none | is_family), worlds.SHAPES_SHARE)):
+            of_drones[which] = of / max(1, int(np.count_nonzero(which)))
+        drones = float(of_drones.sum())
+        share = _NONE_SHARE if is_none.any() and drones > 0 else float(is_none.any())
+        self._shares = np.where(is_none, share, (1 - share) * of_drones / max(drones, 1e-9))
+
+    def draw(self, rng: np.random.Generator) -> Sample:
+        """Any of them, and now and then what is none: every family as often as any other, however many crops there are
+        of it, every shape as any other, and shapes together ``worlds.SHAPES_SHARE`` of the drones."""
+        one = int(rng.choice(len(self._shares), p=self._shares))
+        rows = self._of_family[one]
+        if rng.random() < _AIMED_SHARE and len(self._aimed_of_family[one]):
+            rows = self._aimed_of_family[one]
+        index = int(rows[int(rng.integers(len(rows)))])
+        which = int(np.searchsorted(self._ends, index, side="right"))
+        file = list(self._files.values())[which]
+        row = index - int(self._ends[which])
+        return {name: values[row] for name, values in file.items()}
+
+
+def is_aimed(file: Sample) -> NDArray[np.bool_]:
+    """(n,) which crops of a file show their drone as a cascade's last crop does: in the middle, and filling it."""
+    low, high = np.log(_AIMED_PX)
+    off = np.linalg.norm(file["target"][:, 1:3], axis=1)
+    return np.asarray((off < _AIMED_OFF_PX) & (low < file["apparent"]) & (file["apparent"] < high))
 
 
 def part_of(
@@ -313,7 +381,9 @@ def _covered(box: Any, by: Any) -> float:
 
 def filmed(scene: Scene, rng: Generator, *, is_photograph: bool) -> Scene:
     """As a camera delivers it, left and right exchanged half of the time."""
-    image = through_camera(scene.image, drawn_effects(1.0, rng), rng) if is_photograph else as_filmed(scene.image, rng)
+    (image,) = as_filmed([scene.image], rng)
+    if is_photograph:
+        image = through_camera(scene.image, drawn_effects(1.0, rng), rng)
     boxes = scene.boxes
     if rng.random() < 0.5:
         image, boxes = np.ascontiguousarray(image[:, ::-1]), boxes.copy()

@@ -24,7 +24,6 @@ from flockd.sim.renderer.airframe import DroneModel
 from tools.training import worlds
 from tools.training.dataset import R_BODY_CAMERA
 from tools.training.render_drone_crops import add_mesh, drawn_models, own_drone
-from tools.training.scenes import attitude, drawn_attitude
 
 SIZE_PX, FINER = 320, 3
 """Rendered so many times as large, for soft edges."""
@@ -86,11 +85,11 @@ def cut_out(world: object, drone: DroneModel, rng: np.random.Generator) -> NDArr
     focal = side * rng.uniform(*FILL) * range_m / drone.size_m
     matrix = np.array([[focal, 0.0, side / 2], [0.0, focal, side / 2], [0.0, 0.0, 1.0]])
     pitch = np.arcsin(rng.uniform(-1.0, 1.0)) if rng.random() < 0.2 else rng.uniform(-0.9, 0.9)
-    R_ned_camera = attitude(rng.uniform(-np.pi, np.pi), np.array([rng.normal(0, 0.15), pitch])) @ R_BODY_CAMERA
+    R_ned_camera = worlds.attitude(rng.uniform(-np.pi, np.pi), np.array([rng.normal(0, 0.15), pitch])) @ R_BODY_CAMERA
     place = np.array([0.0, 0.0, -rng.uniform(*HEIGHTS_M)])
     view = Renderer(world, [drone]).render(  # type: ignore[arg-type]
         matrix, (side, side), R_ned_camera, place - range_m * R_ned_camera[:, 2],
-        drone_rotations=drawn_attitude(rng)[None], drone_positions=place[None], shown=[0],
+        drone_rotations=worlds.drawn_attitude(rng)[None], drone_positions=place[None], shown=[0],
     )  # fmt: skip
     mine = (view.ids == 1).astype(np.float32)[:, :, None]
     both = np.concatenate([view.rgb * mine, 255.0 * mine], 2)

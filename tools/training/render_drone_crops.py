@@ -24,11 +24,9 @@ from flockd.sim.renderer.airframe import DroneModel
 from flockd.sim.renderer.drone_models import drone_model
 from tools.training import worlds
 from tools.training.dataset import FOCAL_PX, HEIGHT, R_BODY_CAMERA, WIDTH
-from tools.training.distractions import drawn_distraction
 from tools.training.drone_generator import generated_drone
 from tools.training.own_mesh import UP_AXES, painted, read_meshes
 from tools.training.samples import DroneInView, crop_around, crop_at, sample_of, sample_without_drone
-from tools.training.scenes import drawn_attitude, outline_of
 
 Array = NDArray[Any]
 PICTURES_A_SCENE = 3
@@ -102,7 +100,7 @@ def own_drone(parser: argparse.ArgumentParser, arguments: argparse.Namespace) ->
         parser.error(str(error))
     for path, drone in zip(arguments.mesh, drones, strict=True):
         plain = float(np.isnan(drone.colours).any(axis=1).mean())
-        print(f"{path}: has no colours for {plain:.0%} of its triangles{'; they are painted at random' * (plain > 0)}")
+        print(f"{path}: has no colours for {plain:.0%} of its triangles{'; they get a drawn one' * (plain > 0)}")
     return drones
 
 
@@ -148,13 +146,13 @@ def _scene(
     focal = FOCAL_PX * float(np.exp(rng.normal(0, 0.08)))
     ground = float(world.height_at(place[:1], place[1:2])[0])
     position = np.array([place[0], place[1], -(ground + rng.uniform(1.5, 8.0))])
-    R_ned_camera = drawn_attitude(rng) @ R_BODY_CAMERA
+    R_ned_camera = worlds.drawn_attitude(rng) @ R_BODY_CAMERA
     count = int(rng.choice([1, 2, MOST_DRONES], p=[0.6, 0.25, 0.15]))
     shapes = rng.choice(len(models), count)
     drones = [models[shape][int(rng.integers(len(models[shape])))] for shape in shapes]
     positions = _places(position, R_ned_camera, focal, count, rng)
     positions[:, 2] = np.minimum(positions[:, 2], -(ground + 0.5))
-    rotations = np.array([drawn_attitude(rng) for _ in range(count)])
+    rotations = np.array([worlds.drawn_attitude(rng) for _ in range(count)])
     seen = DroneInView(focal, R_ned_camera.T @ (positions[0] - position), R_ned_camera.T @ rotations[0], drones[0])
     if seen.centre[2] < 0.3:
         return []
@@ -162,7 +160,7 @@ def _scene(
     others = []
     if alone or beside:
         ray = positions[0] - position + (0.0 if alone else 0.25) * rng.normal(0, 0.5, 3)
-        others = [drawn_distraction(position, ray / np.linalg.norm(ray), ground, rng).at(0.0)]
+        others = [worlds.drawn_distraction(position, ray / np.linalg.norm(ray), ground, rng).at(0.0)]
     if alone:
         positions[:] = np.nan  # nobody, and nobody's shadow
         centre = R_ned_camera.T @ (others[0].position - position)
@@ -202,7 +200,7 @@ def _is_whole(drone: DroneInView, view: Any, matrix: Array, corner: tuple[int, i
     pixels = pixels[:, :2] / pixels[:, 2:] + corner
     if (pixels < 1).any() or (pixels > (WIDTH - 1, HEIGHT - 1)).any():
         return False
-    outline = outline_of(places, matrix, view.ids.shape)
+    outline = worlds.outline_of(places, matrix, view.ids.shape)
     before = (view.depth < drone.centre[2] - drone.model.size_m / 2) | view.distractors | (view.ids > 1)
     return bool((before & outline).sum() < HIDDEN_SHARE * outline.sum())
 

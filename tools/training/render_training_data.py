@@ -5,8 +5,6 @@ python -m tools.training.render_training_data OUT --worlds 120 --pairs 30 --spli
 A third of the scenes have birds and the like in them. Half of the drones of training worlds are of generated
 shapes. With ``--families unseen`` the drones are of the families that no network is trained on. With
 ``--obstacles 0.4`` four in ten worlds have a forest or a village, with the camera between trunks and before walls.
-With ``--cameras 0.5`` half of the pairs are as real cameras take them: motion blur, rolling shutter, noise by gain and
-so on, of drawn strengths. Their truth is that of the middle row's time.
 """
 
 from __future__ import annotations
@@ -21,18 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.core.errors import UsageError
-from flockd.flight.geometry import PinholeCamera, vector_from_rotation
 from flockd.sim.renderer.airframe import DroneModel
 from flockd.sim.renderer.drone_models import drone_model
 from flockd.sim.scenario import ObstaclesConfig
-from flockd.sim.scenario.imperfect_cameras import CamerasConfig
 from flockd.sim.world.obstacle_worlds import LOWEST_CROWN_M, generate_obstacles
 from flockd.sim.world.obstacles import Obstacles
 from tools.training import worlds
-from tools.training.camera_effects import drawn_cameras
 from tools.training.dataset import FOCAL_PX, HEIGHT, MAX_DRONES, R_BODY_CAMERA, WIDTH, create_part, note
 from tools.training.drone_generator import generated_drone
-from tools.training.scenes import attitude, drawn_attitude
 
 Array = NDArray[Any]
 SHAPES_A_WORLD = 24
@@ -53,7 +47,6 @@ def main() -> None:
     parser.add_argument("--skip", type=int, default=0, help="worlds of the split, which are rendered already")
     parser.add_argument("--pairs", type=int, default=30, help="pairs a world")
     parser.add_argument("--obstacles", type=float, default=0.0, metavar="SHARE", help="of the worlds; default: none")
-    parser.add_argument("--cameras", type=float, default=0.0, metavar="SHARE", help="of the pairs with real cameras")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     arguments = parser.parse_args()
     seeds = {"training": worlds.TRAINING, "validation": worlds.VALIDATION, "test": worlds.TEST}[arguments.split]
@@ -61,15 +54,7 @@ def main() -> None:
     share = worlds.SHAPES_SHARE if (arguments.split, arguments.families) == ("training", "training") else 0.0
     wanted = range(arguments.skip, arguments.skip + arguments.worlds)
     jobs = [
-        PairJob(
-            arguments.out / f"part-{i:04d}",
-            seeds[i],
-            arguments.pairs,
-            families,
-            share,
-            arguments.obstacles,
-            arguments.cameras,
-        )
+        PairJob(arguments.out / f"part-{i:04d}", seeds[i], arguments.pairs, families, share, arguments.obstacles)
         for i in wanted
     ]
     missing = [job for job in jobs if not (job.folder / "made.json").is_file()]
@@ -89,8 +74,6 @@ class PairJob:
     """Share of the drones that are of the generator's shapes instead."""
     obstacles_share: float = 0.0
     """How likely a world has a forest or a village."""
-    cameras_share: float = 0.0
-    """How likely a pair is taken by a real camera."""
 
 
 def render_world(job: PairJob) -> None:
@@ -118,9 +101,7 @@ def render_world(job: PairJob) -> None:
         drones = [_drawn_drone(job, shapes, rng) for _ in range(MAX_DRONES)]
         families = np.array([drone.family for drone in drones])
         renderer = Renderer(world, drones)
-        film = np.random.default_rng([seed, 7, index])
-        filmed = drawn_cameras(film) if film.random() < job.cameras_share else None
-        _render_pair(renderer, world, places[index], highest_m, families, part, index, rng, filmed)
+        _render_pair(renderer, world, places[index], highest_m, families, part, index, rng)
     for array in part.values():
         array.flush()  # type: ignore[attr-defined]
     note(
@@ -163,38 +144,31 @@ def _render_pair(
     part: dict[str, Array],
     index: int,
     rng: np.random.Generator,
-    filmed: CamerasConfig | None,
 ) -> None:
-    from flockd.sim.cameras import CameraMotion, LensField, NoiseTile, RealCamera  # noqa: PLC0415
     from flockd.sim.renderer.renderer import true_flow  # noqa: PLC0415
-    from tools.training.distractions import drawn_distractions  # noqa: PLC0415
 
     focal = FOCAL_PX * float(np.exp(rng.normal(0, 0.08)))
     matrix = np.array([[focal, 0.0, WIDTH / 2], [0.0, focal, HEIGHT / 2], [0.0, 0.0, 1.0]])
     height = float(rng.uniform(1.5, highest_m))
     ground = float(world.height_at(place[:1], place[1:2])[0])
     position = np.array([place[0], place[1], -(ground + height)])
-    start = drawn_attitude(rng)
+    start = worlds.drawn_attitude(rng)
     interval = float(rng.uniform(0.1, 0.5))
     velocity = np.append(_direction(rng) * rng.uniform(0, 2.0), rng.normal(0, 0.2))
-    turn = attitude(rng.normal(0, np.radians(10)) * interval, rng.normal(0, np.radians(4), 2) * interval)
+    turn = worlds.attitude(rng.normal(0, np.radians(10)) * interval, rng.normal(0, np.radians(4), 2) * interval)
     positions = [position, position + velocity * interval]
     attitudes = [start, start @ turn]
     shown = np.arange(MAX_DRONES) < rng.choice([0, 1, 2, 3, 4, 5, 6], p=[0.05, 0.15, 0.2, 0.2, 0.15, 0.15, 0.1])
     places = _drone_places(position, start, focal, rng)
     places[:, 2] = np.minimum(places[:, 2], -(ground + 0.5))
     moves = (velocity + rng.normal(0, 0.4, (MAX_DRONES, 3))) * interval
-    turns = [drawn_attitude(rng) for _ in range(MAX_DRONES)]
-    wobble = [attitude(rng.normal(0, 0.1) * interval, rng.normal(0, 0.07, 2)) for _ in range(MAX_DRONES)]
+    turns = [worlds.drawn_attitude(rng) for _ in range(MAX_DRONES)]
+    wobble = [worlds.attitude(rng.normal(0, 0.1) * interval, rng.normal(0, 0.07, 2)) for _ in range(MAX_DRONES)]
     places[~shown] = np.nan
     drone_positions = [places, places + moves]
     drone_rotations = [np.array(turns), np.array([r @ w for r, w in zip(turns, wobble, strict=True)])]
     count = int(rng.integers(1, 5)) if rng.random() < WITH_DISTRACTORS else 0
-    others = drawn_distractions(count, position, start @ R_BODY_CAMERA, focal, ground, rng)
-    camera = None
-    if filmed is not None:
-        lens = LensField.of(PinholeCamera(matrix, (WIDTH, HEIGHT)))
-        camera = RealCamera(filmed, lens, NoiseTile(index), (index, 8))
+    others = worlds.drawn_distractions(count, position, start @ R_BODY_CAMERA, focal, ground, rng)
     views = []
     for k in range(2):
         R_ned_camera = attitudes[k] @ R_BODY_CAMERA
@@ -205,15 +179,6 @@ def _render_pair(
         )  # fmt: skip
         views.append(view)
         part["image"][index, k] = view.rgb
-        if filmed is not None and camera is not None:
-            move = CameraMotion(
-                velocity=velocity @ R_ned_camera,
-                turn=vector_from_rotation(turn) @ R_BODY_CAMERA / interval,
-                shake=camera.shaking.around(k * interval),
-                drones={d + 1: moves[d] @ R_ned_camera / interval for d in np.nonzero(shown)[0].tolist()},
-            )
-            sensed = camera.image(view, move, k * interval, world.light[0] @ R_ned_camera)
-            part["image"][index, k] = camera.compressed(sensed)
         part["depth"][index, k] = np.minimum(view.depth[1::2, 1::2], 1000.0)
         part["ids"][index, k] = view.ids[1::2, 1::2]
         part["R_ned_camera"][index, k] = R_ned_camera

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from flockd.flight.geometry import Rig, VirtualCrop, virtual_crop
 from flockd.sim.renderer.airframe import DroneModel
-from tools.training.augment import as_filmed, motion_blur, photometric
+from tools.training.camera_effects import as_filmed
 from tools.training.dataset import (
     HEIGHT,
+    MAX_DEPTH_M,
     R_BODY_CAMERA,
     WIDTH,
     PairSet,
@@ -22,7 +23,6 @@ from tools.training.dataset import (
     ray_tangents,
     rig_camera,
 )
-from tools.training.networks import MAX_DEPTH_M
 
 Sample = dict[str, NDArray[Any]]
 
@@ -53,7 +53,7 @@ def neighbours_sample(
         half = np.s_[..., top // 2 : (top + crop_px) // 2, left // 2 : (left + crop_px) // 2]
         depth, ids, offset, geometry = depth[half], ids[half], offset[half], geometry[half]
     depth = np.minimum(depth.astype(np.float32), MAX_DEPTH_M)
-    image = as_filmed(image, rng)
+    (image,) = as_filmed([image], rng)
     if rng.random() < 0.5:
         image, depth, ids = image[:, ::-1], depth[:, ::-1], ids[:, ::-1]
         geometry, offset = geometry[:, :, ::-1].copy(), offset[:, :, ::-1].copy()
@@ -202,7 +202,7 @@ def flow_sample(pairs: PairSet, index: int, rng: np.random.Generator, size: tupl
     else:
         flow = _pairwise(pairs["flow"][index].astype(np.float32)).mean((-3, -1)) / 4.0
         valid = np.asarray(_pairwise(pairs["flow_valid"][index]).all((-3, -1)))
-    first, second = motion_blur(photometric([first, second], rng), rng)
+    first, second = as_filmed([first, second], rng)
     if rng.random() < 0.5:
         first, second, valid, ids = first[:, ::-1], second[:, ::-1], valid[:, ::-1], ids[:, ::-1]
         flow = flow[:, :, ::-1] * np.array([-1, 1], np.float32)[:, None, None]

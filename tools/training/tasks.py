@@ -11,10 +11,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tools.training.augment import photometric
-from tools.training.crop_files import CropFiles
-from tools.training.dataset import open_pairs
-from tools.training.networks import MAX_DEPTH_M, MAX_FAMILIES, DistanceNet, FlowNet, NeighboursNet
+from tools.training.camera_effects import as_filmed
+from tools.training.dataset import MAX_DEPTH_M, MAX_FAMILIES, open_pairs
+from tools.training.networks import DistanceNet, FlowNet, NeighboursNet
+from tools.training.pictures import CropFiles
 from tools.training.samples import Sample, flow_sample, neighbours_sample, no_drone_sample
 from tools.training.weights import begin_with
 
@@ -136,7 +136,7 @@ class DistanceTask(Task):
         """See ``Task``."""
         from_pool = rng.random() < self.no_drone_share
         drawn = self.no_drones[int(rng.integers(self.pool_size))] if from_pool else self.drones.draw(rng)
-        (picture,) = photometric([drawn["picture"]], rng)
+        (picture,) = as_filmed([drawn["picture"]], rng)
         return {**drawn, "picture": picture}
 
     def _no_drone(self, rng: np.random.Generator) -> Sample:
@@ -208,7 +208,7 @@ class SigmaTask(Task):
         """See ``Task``."""
         self.drones.look_for_more()
         drawn = self.drones.draw(rng)
-        (picture,) = photometric([drawn["picture"]], rng)
+        (picture,) = as_filmed([drawn["picture"]], rng)
         return {**drawn, "picture": picture}
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:

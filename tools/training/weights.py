@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from tools.training.networks import first_layers_of
 
 BOXES = "detector."
-"""What `detector.network.Boxes`, which is exported, calls the network that is trained."""
+"""What `detector.Boxes`, which is exported, calls the network that is trained."""
 HALVED = "_16"
 """Ends the names of weights that are stored in 16 bits."""
 

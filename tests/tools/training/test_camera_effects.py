@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flockd.sim.scenario.imperfect_cameras import CamerasConfig
 from tools.training.camera_effects import (
     CameraEffects,
     demosaiced,
-    drawn_cameras,
     drawn_effects,
     smear_kernel,
     through_camera,
 )
-from tools.training.dataset import ARRAYS
-from tools.training.render_training_data import PairJob, render_world
 
-SHARES = {"drawn": 0.0, "filmed": 0.5}
 PERFECT = CameraEffects(
     scale=1.0, blur_px=0.0, smear_px=0.0, smear_angle=0.0, gains=(1.0, 1.0, 1.0), gamma=1.0, offset=0.0,
     has_mosaic=False, noise=0.0, denoising=0.0, sharpening=0.0, quality=None, resampling=1.0,
@@ -40,27 +34,6 @@ def rise_px(image: NDArray[np.uint8]) -> float:
     low, high = row[:8].mean(), row[-8:].mean()
     places = np.interp([0.1, 0.9], np.maximum.accumulate((row - low) / (high - low)), np.arange(len(row)))
     return float(places[1] - places[0])
-
-
-@pytest.mark.slow
-def test_half_of_the_pairs_may_be_filmed_by_real_cameras_and_their_truth_stays(tmp_path: Path) -> None:
-    jobs = [PairJob(tmp_path / name, 1_000_003, 4, range(12), cameras_share=share) for name, share in SHARES.items()]
-    for job in jobs:
-        render_world(job)
-    drawn, filmed = ({array: np.load(job.folder / f"{array}.npy") for array in ARRAYS} for job in jobs)
-    changed = [not np.array_equal(*pair) for pair in zip(drawn["image"], filmed["image"], strict=True)]
-    assert 0 < sum(changed) < 4
-    differences = np.abs(drawn["image"].astype(int) - filmed["image"])[changed].mean(axis=(1, 2, 3, 4))
-    assert ((differences > 1.0) & (differences < 80.0)).all(), "it is still a picture of the same"
-    assert all(np.array_equal(drawn[array], filmed[array], equal_nan=True) for array in ARRAYS if array != "image")
-
-
-def test_drawn_cameras_are_around_the_realistic_ones() -> None:
-    rng, preset = np.random.default_rng(4), CamerasConfig(preset="realistic")
-    drawn = [drawn_cameras(rng) for _ in range(300)]
-    assert 0.3 < np.mean([cameras.shutter.readout_s == 0.0 for cameras in drawn]) < 0.7, "half are global shutters"
-    exposures = [cameras.shutter.exposure_s for cameras in drawn]
-    assert min(exposures) < 0.2 * preset.shutter.exposure_s < preset.shutter.exposure_s * 2 < max(exposures)
 
 
 def test_a_camera_without_faults_changes_nothing() -> None:

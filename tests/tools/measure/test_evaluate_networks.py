@@ -7,7 +7,7 @@ import pytest
 
 from flockd.core.messages import Detection
 from flockd.flight.geometry import RangeMap, ZMap, log_polar, log_polar_covariance, range_map
-from tools.measure.on_pairs import Findings, compare_drones, depth_errors, pairings
+from tools.measure.evaluate_networks import Findings, compare_drones, depth_errors, pairings
 from tools.training.dataset import HEIGHT, WIDTH, PairSet, rig_camera
 
 

@@ -1,1 +1,0 @@
-"""The detector of drones: YOLOX-nano, begun with weights of COCO, taught with drones before real photographs."""
