@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -78,14 +78,13 @@ def _scaled(model: DroneModel, factor: float) -> DroneModel:
 
 def _plan(rng: Generator, room: float) -> Plan:
     """Layout and sizes; ``room``: of the propellers as a share of what there is."""
-    names, shares = zip(*_LAYOUTS, strict=True)
-    layout = names[int(rng.choice(len(names), p=np.array(shares) / sum(shares)))]
-    places = np.asarray(layout(rng), float)
-    is_coaxial = layout in (_y6, _x8)
+    shares = np.array([one.share for one in _LAYOUTS])
+    layout = _LAYOUTS[int(rng.choice(len(_LAYOUTS), p=shares / shares.sum()))]
+    places = np.asarray(layout.places(rng), float)
     apart = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=2)
     nearest = float((apart + 1e9 * np.eye(len(places))).min())
     radius = nearest * float(rng.uniform(0.35, 0.47)) * room
-    if is_coaxial:
+    if layout.is_coaxial:
         radius = min(radius, 0.62)
     scale = DRAWN_SIZE_M / float((apart + 2 * radius).max())
     hubs, radius = places * scale, radius * scale
@@ -93,20 +92,13 @@ def _plan(rng: Generator, room: float) -> Plan:
     half = reach * rng.uniform(0.27, 0.46)
     wide = half * rng.uniform(0.5, 0.95)
     hubs[:, 2] -= reach * rng.choice([0.0, rng.uniform(-0.05, 0.14)])
-    return Plan(hubs, radius, is_coaxial, layout in (_h4, _h6, _h8), reach, (half, wide, half * rng.uniform(0.22, 0.5)))
+    body = (half, wide, half * rng.uniform(0.22, 0.5))
+    return Plan(hubs, radius, layout.is_coaxial, layout.has_booms, reach, body)
 
 
 def _on_circle(count: int, first: float) -> Array:
     angles = first + 2 * np.pi * np.arange(count) / count
     return np.column_stack([np.cos(angles), np.sin(angles), np.zeros(count)])
-
-
-def _x4(rng: Generator) -> Array:
-    return _on_circle(4, np.pi / 4)
-
-
-def _plus4(rng: Generator) -> Array:
-    return _on_circle(4, 0.0)
 
 
 def _long_x(rng: Generator) -> Array:
@@ -130,43 +122,31 @@ def _in_two_rows(rows: int, apart: float) -> Array:
     return np.array([[x, side * apart, 0.0] for x in np.linspace(1.0, -1.0, rows) for side in (1.0, -1.0)])
 
 
-def _h4(rng: Generator) -> Array:
-    return _in_two_rows(2, rng.uniform(0.75, 1.2))
+class _Layout(NamedTuple):
+    """Where the arms of a kind of drone end; half-length of an arm about 1."""
+
+    places: Callable[[Generator], Array]
+    share: float
+    """How often it is drawn."""
+    is_coaxial: bool = False
+    has_booms: bool = False
 
 
-def _h6(rng: Generator) -> Array:
-    return _in_two_rows(3, rng.uniform(0.55, 0.9))
-
-
-def _h8(rng: Generator) -> Array:
-    return _in_two_rows(4, rng.uniform(0.45, 0.7))
-
-
-def _x6(rng: Generator) -> Array:
-    return _on_circle(6, np.pi / 6)
-
-
-def _plus6(rng: Generator) -> Array:
-    return _on_circle(6, 0.0)
-
-
-def _y6(rng: Generator) -> Array:
-    return _on_circle(3, float(rng.choice([0.0, np.pi / 3])))
-
-
-def _x8(rng: Generator) -> Array:
-    return _on_circle(4, np.pi / 4)
-
-
-def _octo(rng: Generator) -> Array:
-    return _on_circle(8, float(rng.choice([0.0, np.pi / 8])))
-
-
-_LAYOUTS: tuple[tuple[Callable[[Generator], Array], float], ...] = (
-    (_x4, 0.2), (_plus4, 0.06), (_long_x, 0.12), (_folding, 0.13), (_dead_cat, 0.12), (_h4, 0.08), (_h6, 0.03),
-    (_h8, 0.02), (_x6, 0.07), (_plus6, 0.03), (_y6, 0.04), (_x8, 0.05), (_octo, 0.05),
-)  # fmt: skip
-"""And how often each is drawn; half-length of an arm about 1."""
+_LAYOUTS = (
+    _Layout(lambda _: _on_circle(4, np.pi / 4), 0.2),
+    _Layout(lambda _: _on_circle(4, 0.0), 0.06),
+    _Layout(_long_x, 0.12),
+    _Layout(_folding, 0.13),
+    _Layout(_dead_cat, 0.12),
+    _Layout(lambda rng: _in_two_rows(2, rng.uniform(0.75, 1.2)), 0.08, has_booms=True),
+    _Layout(lambda rng: _in_two_rows(3, rng.uniform(0.55, 0.9)), 0.03, has_booms=True),
+    _Layout(lambda rng: _in_two_rows(4, rng.uniform(0.45, 0.7)), 0.02, has_booms=True),
+    _Layout(lambda _: _on_circle(6, np.pi / 6), 0.07),
+    _Layout(lambda _: _on_circle(6, 0.0), 0.03),
+    _Layout(lambda rng: _on_circle(3, float(rng.choice([0.0, np.pi / 3]))), 0.04, is_coaxial=True),
+    _Layout(lambda _: _on_circle(4, np.pi / 4), 0.05, is_coaxial=True),
+    _Layout(lambda rng: _on_circle(8, float(rng.choice([0.0, np.pi / 8]))), 0.05),
+)
 
 
 def _plates(c: Airframe, plan: Plan, rng: Generator) -> None:
