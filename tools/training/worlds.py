@@ -1,8 +1,8 @@
 """Which worlds and which drones are for what, how they are held, and what else flies.
 
 Training, validation and test worlds never meet; flights use seeds below all of them. Families are rows of
-``flockd.sim.renderer.drone_models``: the unseen ones are left out of training, to test on drones that no network knows. Shapes
-are those of ``tools.training.drone_generator``: training worlds have them besides the families.
+``flockd.sim.renderer.drone_models``: the unseen ones are left out of training, to test on drones that no network knows.
+Shapes are those of ``tools.training.drone_generator``: training worlds have them besides the families.
 """
 
 from __future__ import annotations
