@@ -25,16 +25,16 @@ LINES = {
     "flockd/onboard": 11_630,
     "flockd/fleet": 2_690,
     "flockd/ground": 5_990,
-    "flockd/review": 4_060,
+    "flockd/review": 4_090,
     "flockd/sim": 12_540,
-    "flockd/campaign": 2_400,
+    "flockd/campaign": 2_420,
     "flockd/cli": 5_030,
-    "tests": 48_610,
+    "tests": 48_600,
     "tools/checks": 3_840,
     "tools/docs": 950,
-    "tools/measure": 1_020,
+    "tools/measure": 1_220,
     "tools/release": 620,
-    "tools/training": 4_860,
+    "tools/training": 4_620,
 }
 """Lines of Python below a folder."""
 FILES = {"flockd": 503}
