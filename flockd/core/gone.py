@@ -41,6 +41,7 @@ COMMANDS: Mapping[str, str] = {
 """By a command, or a command and its option, as they were written on the command line."""
 
 KEYS: Mapping[str, str] = {
+    "autopilot.arm_and_take_off": "leave it out: a pilot or a ground station arms, takes off and selects offboard",
     "autopilot.max_heartbeat_age_s": "write `heartbeat_timeout_s` in the section `safety`",
     "cameras.compression.h264_mbit_s": "write `jpeg_quality`; streams are no longer simulated",
     "desired": "write the section `mission`, with `kind: circle_then_tangent` for the same flight",

@@ -8,10 +8,10 @@ documents) is refused.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -49,8 +49,6 @@ class Document:
     values: dict[str, Value] = field(default_factory=dict)
     places: dict[KeyPath, Place] = field(default_factory=dict)
     problems: list[ConfigProblem] = field(default_factory=list)
-    spoiled: set[KeyPath] = field(default_factory=set)
-    """Paths whose value is not known because of a problem already listed."""
 
 
 def read_document(path: Path, what: str = "configuration") -> Document:
@@ -60,15 +58,24 @@ def read_document(path: Path, what: str = "configuration") -> Document:
     lesser faults are listed in the document's `problems`.
     """
     text = _read_text(path, what)
-    document = Document(str(path))
     try:
-        _Builder(document, text, what).build()
+        top = _Loader(text, str(path), what).get_single_node()
     except yaml.MarkedYAMLError as error:
         raise ConfigError([_syntax_problem(str(path), text, error)]) from error
     except yaml.reader.ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         message = f"holds the control character {error.character:#04x}; delete it"
         raise ConfigError.at(path, message, line=line) from error
+    if top is None or (isinstance(top, yaml.ScalarNode) and not top.value):
+        raise ConfigError.at(path, f"is empty; write the {what} into it")
+    document = Document(str(path))
+    if not isinstance(top, yaml.MappingNode):
+        kind = "a list" if isinstance(top, yaml.SequenceNode) else "a single value"
+        message = f"is {kind} at its top level; write keys with values, such as `seed: 0`"
+        raise ConfigError.at(path, message, line=_line(top))
+    values = _value(document, top, (), 1)
+    assert isinstance(values, dict)
+    document.values = values
     return document
 
 
@@ -104,107 +111,76 @@ def _read_text(path: Path, what: str) -> str:
         raise fault("is not UTF-8 text; save the file in UTF-8", line=line) from error
 
 
-class _Builder:
-    """Walks the parser's events once; depth is bounded, so no input can exhaust the stack."""
+class _Loader(yaml.SafeLoader):
+    """Composes nodes; refuses what invites mistakes, and what is endless before it is read through."""
 
-    def __init__(self, document: Document, text: str, what: str) -> None:
-        self._document, self._what = document, what
-        self._events: Iterator[yaml.Event] = yaml.parse(text, Loader=yaml.SafeLoader)
+    def __init__(self, text: str, file: str, what: str) -> None:
+        super().__init__(text)
+        self._file, self._what = file, what
+        self._path: KeyPath = ()
         self._count = 0
 
-    def build(self) -> None:
-        """Fills the document."""
-        if isinstance(self._next_of(yaml.DocumentStartEvent, yaml.StreamEndEvent), yaml.StreamEndEvent):
-            raise self._fatal(0, f"is empty; write the {self._what} into it")
-        top = next(self._events)
-        if isinstance(top, yaml.ScalarEvent) and not top.value:
-            raise self._fatal(0, f"is empty; write the {self._what} into it")
-        if not isinstance(top, yaml.MappingStartEvent):
-            kind = "a list" if isinstance(top, yaml.SequenceStartEvent) else "a single value"
-            raise self._fatal(_line(top), f"is {kind} at its top level; write keys with values, such as `seed: 0`")
-        values = self._value(top, (), 1)
-        assert isinstance(values, dict)
-        self._document.values = values
-        after = self._next_of(yaml.DocumentStartEvent, yaml.StreamEndEvent)
-        if isinstance(after, yaml.DocumentStartEvent):
-            self._complain((), _line(after), "a second document begins here; keep one in a file")
-
-    def _next_of(self, *kinds: type[yaml.Event]) -> yaml.Event:
-        return next(event for event in self._events if isinstance(event, kinds))
-
-    def _value(self, event: yaml.Event, path: KeyPath, line: int) -> Value:
-        """The value that begins with this event; its place is the line of its key or its dash."""
-        self._count += 1
-        if self._count > MAX_VALUES:
-            raise self._fatal(line, f"holds more than {MAX_VALUES} values, which no {self._what} does; check the path")
-        if len(path) > MAX_DEPTH:
-            raise self._fatal(line, f"is nested more than {MAX_DEPTH} levels deep; flatten it")
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """As PyYAML does. Raises ConfigError."""
+        event: Any = self.peek_event()  # type: ignore[no-untyped-call]
+        outside = self._path
+        if index is not None:
+            self._path = (*outside, index.value if isinstance(index, yaml.Node) else index)
+            self._count += 1
+        fault = ""
         if isinstance(event, yaml.AliasEvent):
-            self._remember(path, line, f"*{event.anchor}")
-            self._spoil(path, line, f"the alias `*{event.anchor}` is not supported; write the value out")
-            return None
-        assert isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent)
-        if event.anchor is not None:
-            self._complain(path, line, f"the anchor `&{event.anchor}` is not supported; delete it")
-        if event.tag is not None:
-            self._spoil(path, line, f"the tag `{event.tag}` is not supported; delete it")
-        if isinstance(event, yaml.ScalarEvent):
-            return self._scalar(event, path, line)
-        self._remember(path, line)
-        return self._mapping(path) if isinstance(event, yaml.MappingStartEvent) else self._sequence(path)
+            fault = f"the alias `*{event.anchor}` is not supported; write the value out"
+        elif event.anchor is not None:
+            fault = f"the anchor `&{event.anchor}` is not supported; delete it"
+        elif event.tag is not None:
+            fault = f"the tag `{event.tag}` is not supported; delete it"
+        elif index is None and parent is not None and not isinstance(event, yaml.ScalarEvent):
+            fault = "a key must be a plain word"
+        elif self._count > MAX_VALUES:
+            fault = f"holds more than {MAX_VALUES} values, which no {self._what} does; check the path"
+        elif len(self._path) > MAX_DEPTH:
+            fault = f"is nested more than {MAX_DEPTH} levels deep; flatten it"
+        if fault:
+            key = "" if len(self._path) > MAX_DEPTH or self._count > MAX_VALUES else key_text(self._path)
+            raise ConfigError.at(self._file, fault, key, event.start_mark.line + 1)
+        node = super().compose_node(parent, index)
+        self._path = outside
+        return node
 
-    def _mapping(self, path: KeyPath) -> dict[str, Value]:
+
+def _value(document: Document, node: yaml.Node, path: KeyPath, line: int) -> Value:
+    """What a node holds; its place is the line of its key or its item."""
+
+    def complain(message: str, at: KeyPath = path, line: int = line) -> None:
+        document.problems.append(ConfigProblem(document.file, line, key_text(at), message))
+
+    plain = isinstance(node, yaml.ScalarNode) and node.style is None
+    written = _shortened(node.value) if isinstance(node, yaml.ScalarNode) else ""
+    shown = written if plain or not isinstance(node, yaml.ScalarNode) else f"'{written}'"
+    document.places[path] = Place(document.file, line, key_text(path), shown)
+    if isinstance(node, yaml.MappingNode):
         values: dict[str, Value] = {}
-        ignored = (*path, "?")
-        while not isinstance(event := next(self._events), yaml.MappingEndEvent):
-            line = _line(event)
-            if not isinstance(event, yaml.ScalarEvent) or event.tag is not None or event.anchor is not None:
-                self._complain(path, line, "a key must be a plain word, without anchor, alias or tag")
-                self._value(event, ignored, line)
-                self._value(next(self._events), ignored, line)
-            elif event.value in values:
-                first = self._document.places[*path, event.value].line
-                self._complain((*path, event.value), line, f"is given twice, first in line {first}; delete one")
-                self._value(next(self._events), ignored, line)
+        for key, inner in node.value:
+            here: KeyPath = (*path, key.value)
+            if key.value in values:
+                first = document.places[here].line
+                complain(f"is given twice, first in line {first}; delete one", here, _line(key))
             else:
-                values[event.value] = self._value(next(self._events), (*path, event.value), line)
+                values[key.value] = _value(document, inner, here, _line(key))
         return values
-
-    def _sequence(self, path: KeyPath) -> tuple[Value, ...]:
-        values: list[Value] = []
-        while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
-            values.append(self._value(event, (*path, len(values)), _line(event)))
-        return tuple(values)
-
-    def _scalar(self, event: yaml.ScalarEvent, path: KeyPath, line: int) -> Value:
-        if event.style is not None:  # quoted, or a block of text
-            self._remember(path, line, f"'{_shortened(event.value)}'")
-            if (odd := _UNUSABLE.search(event.value)) is not None:
-                self._spoil(path, line, f"holds the character {ord(odd[0]):#06x}, which no program takes; delete it")
-            return event.value
-        value = core_scalar(event.value)
-        self._remember(path, line, _shortened(event.value))
-        if isinstance(value, int) and abs(value) > LARGEST_INT:
-            self._spoil(path, line, f"{_shortened(event.value)} is too large; write a number up to {LARGEST_INT}")
-        return value
-
-    def _remember(self, path: KeyPath, line: int, written: str = "") -> None:
-        self._document.places[path] = Place(self._document.file, line, key_text(path), written)
-
-    def _complain(self, path: KeyPath, line: int, message: str) -> None:
-        self._document.problems.append(ConfigProblem(self._document.file, line, key_text(path), message))
-
-    def _spoil(self, path: KeyPath, line: int, message: str) -> None:
-        self._complain(path, line, message)
-        self._document.spoiled.add(path)
-
-    def _fatal(self, line: int, message: str) -> ConfigError:
-        return ConfigError([*self._document.problems, ConfigProblem(self._document.file, line, "", message)])
+    if isinstance(node, yaml.SequenceNode):
+        return tuple(_value(document, one, (*path, index), _line(one)) for index, one in enumerate(node.value))
+    value = core_scalar(node.value) if plain else node.value
+    if not plain and (odd := _UNUSABLE.search(node.value)) is not None:
+        complain(f"holds the character {ord(odd[0]):#06x}, which no program takes; delete it")
+    if isinstance(value, int) and abs(value) > LARGEST_INT:
+        complain(f"{written} is too large; write a number up to {LARGEST_INT}")
+        return None
+    return value
 
 
-def _line(event: yaml.Event) -> int:
-    assert event.start_mark is not None
-    return event.start_mark.line + 1
+def _line(node: yaml.Node) -> int:
+    return int(node.start_mark.line) + 1
 
 
 _UNUSABLE = re.compile("[\0\ud800-\udfff]")
@@ -270,12 +246,10 @@ def _syntax_problem(file: str, text: str, error: yaml.MarkedYAMLError) -> Config
     elif "quoted scalar" in (error.context or ""):
         line, message = opened, "a quote is opened here and never closed; close it"
     elif "flow" in (error.context or ""):
-        line, message = (
-            opened,
-            "a bracket is opened here and not closed properly; check the commas and the closing bracket",
-        )
-    elif "found duplicate anchor" in problem or "undefined alias" in problem:
-        message = "anchors and aliases are not supported; write the value out"
+        line = opened
+        message = "a bracket is opened here and not closed properly; check the commas and the closing bracket"
+    elif "another document" in problem:
+        message = "a second document begins here; keep one in a file"
     elif "incompatible YAML document" in problem:
         message = "the `%YAML` line asks for another YAML version; delete it"
     else:

@@ -14,7 +14,7 @@ from flockd.core.config.document import Document, Place, Value, read_document
 from flockd.core.config.drone import DroneConfig
 from flockd.core.config.envelope import outside_envelope
 from flockd.core.config.first_flight import as_flown
-from flockd.core.config.validation_messages import path_in_file, problems_of
+from flockd.core.config.validation_messages import problems_of
 from flockd.core.errors import ConfigError, ConfigProblem
 
 PATHS = {("perception", key) for key in ("models_dir", "engines_dir", *ROLES)} | {("telemetry", "zenoh_config")}
@@ -121,8 +121,6 @@ def override(document: Document, overrides: Overrides) -> None:
     """Sets single values; a problem with one names the override, not the file."""
     for key, value in overrides.items():
         path = tuple(key.split("."))
-        if _is_under(path[:-1], document.spoiled):
-            continue
         values = document.values
         for length in range(1, len(path)):
             document.places.setdefault(path[:length], replace(document.places[path[: length - 1]], key=key))
@@ -133,7 +131,6 @@ def override(document: Document, overrides: Overrides) -> None:
         else:
             values[path[-1]] = value
             document.places[path] = Place(OVERRIDE, 0, key, "")
-            document.spoiled.discard(path)
 
 
 def validated(model: type[Model], document: Document) -> Model:
@@ -142,16 +139,11 @@ def validated(model: type[Model], document: Document) -> Model:
     try:
         config = model.model_validate(document.values)
     except ValidationError as error:
-        remaining = [
-            detail
-            for detail in error.errors()
-            if not _is_under(path_in_file(detail, document.places), document.spoiled)
-        ]
-        raise ConfigError([*document.problems, *problems_of(remaining, model, document.places)]) from error
+        problems = problems_of(error.errors(), model, document.places)
+        # A value that could not be read is told already, and not also that there is none.
+        told = {(one.line, one.key) for one in document.problems}
+        fresh = [one for one in problems if (one.line, one.key) not in told]
+        raise ConfigError([*document.problems, *fresh]) from error
     if document.problems:
         raise ConfigError(document.problems)
     return config
-
-
-def _is_under(path: tuple[str | int, ...], spoiled: set[tuple[str | int, ...]]) -> bool:
-    return any(path[:length] in spoiled for length in range(len(path) + 1))

@@ -33,11 +33,6 @@ _LIMITS = {
     "less_than": ("lt", "less than"),
     "less_than_equal": ("le", "at most"),
 }
-_GONE: dict[KeyPath, str] = {
-    ("autopilot", "arm_and_take_off"): "is gone, so leave it out: a pilot or a ground station arms, takes off and "
-    "selects offboard"
-}
-"""What to do instead, by the keys that earlier versions had."""
 
 
 def problems_of(
@@ -52,21 +47,17 @@ def problems_of(
     for error in errors:
         if error["type"] == "too_short" and len(error["input"]) >= error["ctx"]["min_length"]:
             continue  # only because entries were refused, which is told of each
-        grouped.setdefault(path_in_file(error, places), []).append(error)
-    in_order = sorted(grouped.items(), key=lambda one: _order(_place(one[0], places)))
-    told, others = in_order[:MAX_PROBLEMS_TOLD], in_order[MAX_PROBLEMS_TOLD:]
+        grouped.setdefault(_path_in_file(error, places), []).append(error)
+    told = [(_place(path, places), path, group) for path, group in grouped.items()]
+    told.sort(key=lambda one: (one[0].file, one[0].line, one[0].key))  # as problems are sorted
+    more = "cannot be so; correct the problems before it first"
     return [
-        *(_problem(path, group, root, places) for path, group in told),
-        *(_place(path, places).problem("cannot be so; correct the problems before it first") for path, _ in others),
+        place.problem(_sentence(group, place.written, path, root) if number < MAX_PROBLEMS_TOLD else more)
+        for number, (place, path, group) in enumerate(told)
     ]
 
 
-def _order(place: Place) -> tuple[str, int, str]:
-    """As problems are sorted."""
-    return place.file, place.line, place.key
-
-
-def path_in_file(error: ErrorDetails, places: Mapping[KeyPath, Place]) -> KeyPath:
+def _path_in_file(error: ErrorDetails, places: Mapping[KeyPath, Place]) -> KeyPath:
     """The path an error is about; for a missing key one that is not in the file, for a list too short the list's."""
     path: KeyPath = tuple(error["loc"])
     rest: KeyPath = ()
@@ -75,15 +66,6 @@ def path_in_file(error: ErrorDetails, places: Mapping[KeyPath, Place]) -> KeyPat
     while path not in places:  # pydantic appends the branch of a union
         path = path[:-1]
     return path + rest
-
-
-def _problem(
-    path: KeyPath, errors: Sequence[ErrorDetails], root: Schema, places: Mapping[KeyPath, Place]
-) -> ConfigProblem:
-    place = _place(path, places)
-    # Of a union's branches, one that fits the type but not the limits says most.
-    error = next((error for error in errors if error["type"] in _LIMITS), errors[0])
-    return place.problem(_sentence(error, place.written, path, root))
 
 
 def _place(path: KeyPath, places: Mapping[KeyPath, Place]) -> Place:
@@ -95,13 +77,13 @@ def _place(path: KeyPath, places: Mapping[KeyPath, Place]) -> Place:
     return Place(section.file, section.line, key, "")
 
 
-def _sentence(error: ErrorDetails, written: str, path: KeyPath, root: Schema) -> str:
+def _sentence(errors: Sequence[ErrorDetails], written: str, path: KeyPath, root: Schema) -> str:
+    # Of a union's branches, one that fits the type but not the limits says most.
+    error = next((error for error in errors if error["type"] in _LIMITS), errors[0])
     kind, value, context = error["type"], error["input"], error.get("ctx", {})
     schema = _schema_at(root, path)
     wanted = _wanted(root, schema, _unit(path))
     shown = written or ("a list" if isinstance(value, tuple) else _shown(value))
-    if kind == "extra_forbidden" and path[-2:] in _GONE:
-        return _GONE[path[-2:]]
     if kind == "extra_forbidden":
         gone = KEYS.get(".".join(part for part in path if isinstance(part, str)).removeprefix("drone."))
         if gone is not None:

@@ -66,47 +66,31 @@ def _scenario_document(path: Path, overrides: Overrides) -> Document:
 def _merge_drone(document: Document, folder: Path) -> None:
     """Puts the drone's values and places where the scenario's file names the drone's file.
 
-    A scenario may also hold the drone's values itself, as `flockd config show` prints them.
+    A scenario may also hold the drone's values itself, as `flockd config show` prints them. Raises ConfigError.
     """
-    key = ("drone",)
-    if key in document.spoiled:
-        return
-    place = document.places.get(key, replace(document.places[()], key="drone"))
+    place = document.places.get(("drone",), replace(document.places[()], key="drone"))
     name = document.values.get("drone")
     if isinstance(name, dict):
         return
     if not isinstance(name, str) or not name:
         fault = "must be the path of the drone's own YAML file" if "drone" in document.values else "is missing"
-        document.problems.append(place.problem(f"{fault}; write it as in `drone: simulator.yaml`"))
-        document.spoiled.add(key)
-        return
+        raise ConfigError([place.problem(f"{fault}; write it as in `drone: simulator.yaml`")])
     try:
         drone = drone_document(folder / name, {})
     except ConfigError as error:
-        document.problems.append(place.problem(f"names {name}, which cannot be used; correct it or name another"))
-        document.problems.extend(error.problems)
-        document.spoiled.add(key)
-        return
+        told = place.problem(f"names {name}, which cannot be used; correct it or name another")
+        raise ConfigError([told, *error.problems]) from error
     document.values["drone"] = drone.values
-    document.places.update({(*key, *path): place for path, place in drone.places.items()})
+    document.places.update({("drone", *path): place for path, place in drone.places.items()})
     document.problems.extend(drone.problems)
-    document.spoiled.update((*key, *path) for path in drone.spoiled)
 
 
 def _merge_section(document: Document, key: str) -> None:
     """Puts a scenario's section in place of its drone's, with its places: one drone's file flies many missions."""
-    drone = document.values.get("drone")
-    if ("drone",) in document.spoiled:
-        document.values.pop(key, None)  # what it would be put into is not known, which is told already
-        return
+    drone = document.values["drone"]
     if not isinstance(drone, dict) or key not in document.values:
         return
-    section = document.values.pop(key)
-    old = [path for path in document.places if path[:2] == ("drone", key)]
-    for path in old:
-        del document.places[path]
-    document.spoiled -= {path for path in document.spoiled if path[:2] == ("drone", key)}
-    of_scenario = [path for path in document.places if path[:1] == (key,)]
-    document.places.update({("drone", *path): document.places.pop(path) for path in of_scenario})
-    document.spoiled |= {("drone", *path) for path in document.spoiled if path[:1] == (key,)}
-    document.values["drone"] = {**drone, key: section}
+    document.values["drone"] = {**drone, key: document.values.pop(key)}
+    places = {path: place for path, place in document.places.items() if path[:2] != ("drone", key)}
+    document.places.clear()
+    document.places.update({("drone", *path) if path[:1] == (key,) else path: at for path, at in places.items()})
