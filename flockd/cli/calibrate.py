@@ -1,9 +1,33 @@
-"""`flockd calibrate`: measures the cameras of a drone, and the drone."""
+"""`flockd calibrate`: measures the lenses of cameras and their places in the rig, by a board, and the drones' size."""
 
 from __future__ import annotations
 
-from flockd.cli import calibrate_camera, calibrate_drone, calibrate_rig
-from flockd.cli.parser import Commands, add_commands
+import argparse
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+from flockd.cli.options import loaded, opened, refuse_overwriting
+from flockd.cli.output import complain, progress, say, say_json
+from flockd.cli.parser import Commands, Parser, add_commands, flag, option, positive_count, positive_number, size
+from flockd.cli.picture_options import PictureCameras, add_picture_options, perception_of
+from flockd.core.choices import LENS_MODELS, PixelFormat
+from flockd.core.errors import ExitCode, UsageError
+
+if TYPE_CHECKING:
+    from flockd.core.config import DroneConfig
+    from flockd.core.messages import UInt8Array
+    from flockd.flight.geometry import Camera
+    from flockd.ground.calibration.board import BoardSpec
+    from flockd.ground.calibration.drone_size import DroneSize, Photograph
+    from flockd.ground.calibration.image_sources import ImageStream
+    from flockd.ground.calibration.rig_session import RigSession
+    from flockd.ground.calibration.views import Collector
+
+    Taken = tuple[str, float, UInt8Array, Camera]
+    """A picture's name, its distance in metres, the image and its camera."""
 
 
 def add(commands: Commands) -> None:
@@ -17,4 +41,488 @@ def add(commands: Commands) -> None:
     parser = commands(
         "calibrate", "Measure the cameras (lenses, mountings, time offsets) and the drones' size.", examples
     )
-    add_commands(parser, (calibrate_camera.add, calibrate_rig.add, calibrate_drone.add))
+    add_commands(parser, (_add_camera, _add_rig, _add_drone))
+
+
+SECONDS = 120.0
+MARKER_SHARE = 0.75
+
+
+def _add_shared(parser: Parser, help_of_config: str) -> None:
+    """Adds what both commands have."""
+    option(parser, "--config FILE", help_of_config, Path)
+    option(parser, "--out FILE", "where the result goes (CAMERA.yaml or rig.yaml)", Path)
+    flag(parser, "--force", "overwrite what is there")
+    option(parser, "--every N", "take every Nth frame (1)", positive_count, default=1)
+    option(parser, "--seconds S", "of a live camera (120)", positive_number, default=SECONDS)
+    flag(parser, "--json", "print the result as JSON")
+    board = parser.add_argument_group("the board", "as it was printed; measure it, printers shrink")
+    option(board, "--squares CxR", "columns x rows (7x5)", size, default=(7, 5))
+    option(board, "--square-mm MM", "of a square's side (36)", positive_number, default=36.0)
+    option(board, "--marker-mm MM", "of a marker's side (0.75 of a square)", positive_number)
+    option(board, "--dictionary NAME", "of the markers (4x4_50)", default="4x4_50")
+
+
+def _board_of(args: argparse.Namespace) -> BoardSpec:
+    """The board of the options. Raises UsageError for one that cannot be."""
+    from flockd.ground.calibration.board import BoardSpec
+    from flockd.ground.calibration.errors import CalibrationError
+
+    square_m = args.square_mm / 1000.0
+    marker_m = args.marker_mm / 1000.0 if args.marker_mm else MARKER_SHARE * square_m
+    try:
+        return BoardSpec(args.squares[0], args.squares[1], square_m, marker_m, args.dictionary)
+    except CalibrationError as error:
+        raise UsageError(str(error)) from None
+
+
+@contextmanager
+def _ended_by_ctrl_c(live: bool) -> Iterator[None]:
+    """What was seen until then is enough."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if not live:
+            raise
+
+
+def _source_name(args: argparse.Namespace) -> str:
+    """Where the images come from."""
+    return str(args.source or args.config)
+
+
+MOST_VIEWS = 60
+NAMED = 6
+"""How many of the refused images are named one by one."""
+
+
+def _add_camera(commands: Commands) -> None:
+    """Adds the command."""
+    examples = (
+        "flockd calibrate camera --print-board board.pdf",
+        "flockd calibrate camera pictures/ --camera front --picture coverage.png",
+        "flockd calibrate camera clip.mp4 --every 5 --model wide_angle",
+        "flockd calibrate camera drone1.mcap --camera left",
+        "flockd calibrate camera /dev/video0 --size 640x480",
+        "flockd calibrate camera --config my_drone.yaml --camera front",
+    )
+    description = "Measure a camera's lens from views of a ChArUco board."
+    parser = commands("camera", description, examples)
+    help_of_source = "a folder of images, a video, a recording or a /dev/video; by default --config's own camera, live"
+    option(parser, "SOURCE", help_of_source, nargs="?")
+    option(parser, "--camera NAME", "the camera's name in the rig")
+    option(parser, "--model", "default: pinhole, unless the other fits clearly better", choices=LENS_MODELS)
+    option(parser, "--views N", "use N views at most (60)", positive_count, default=MOST_VIEWS)
+    option(parser, "--max-blur PX", "widest edge of a sharp view (4)", positive_number)
+    option(parser, "--serial TEXT", "the camera's serial number, where the device does not give it")
+    option(parser, "--picture FILE", "draw the coverage and the residuals (.png)", Path)
+    option(parser, "--size WxH", "of a /dev/video (640x480)", size, default=(640, 480))
+    option(parser, "--pixel-format", "of a /dev/video (mjpeg)", choices=get_args(PixelFormat), default="mjpeg")
+    option(
+        parser,
+        "--turn-deg",
+        "of a /dev/video: clockwise, what makes up up in its images, as in the drone's file; --size is as turned",
+        int,
+        choices=(0, 90, 180, 270),
+        default=0,
+    )
+    option(parser, "--print-board FILE", "write the board to print (.pdf, .png)", Path)
+    _add_shared(parser, "the drone, for its camera's device and serial")
+    parser.set_defaults(run=_camera)
+
+
+def _camera(args: argparse.Namespace) -> int:
+    board = _board_of(args)
+    if args.print_board is not None:
+        return _print_board(args, board)
+    from flockd.ground.calibration.board import BoardFinder
+    from flockd.ground.calibration.fragment import measured_today
+    from flockd.ground.calibration.intrinsics import simplest_that_fits
+    from flockd.ground.calibration.lens_session import CalibratedLens, collect_views, fit_lenses, is_enough
+    from flockd.ground.calibration.views import Collector
+
+    collector = Collector(BoardFinder(board), args.views, args.max_blur)
+    name, images = _images(args, lambda: is_enough(collector))
+    out = args.out or Path(f"{name}.yaml")
+    refuse_overwriting(args, out, args.picture)
+    with progress("detecting the board", "images") as on_image, _ended_by_ctrl_c(images.live):
+        collect_views(images, name, collector, on_image, complain)
+    lenses = fit_lenses(collector, args.model, _source_name(args))
+    lens = simplest_that_fits(lenses)
+    measured = measured_today(
+        camera=args.serial or images.identities[name],
+        source=_source_name(args),
+        views=len(lens.views),
+        residual_px=round(lens.rms_px, 4),
+    )
+    calibrated = CalibratedLens(name, collector, lens, lenses, measured)
+    calibrated.write(out, args.picture)
+    result = calibrated.as_json(out)
+    if args.json:
+        say_json(result)
+    else:
+        _say_lens(result, collector)
+    return ExitCode.DONE
+
+
+def _print_board(args: argparse.Namespace, board: BoardSpec) -> int:
+    from flockd.ground.calibration.errors import CalibrationError
+    from flockd.ground.calibration.paper import board_file, page_of
+    from flockd.onboard.recording.editing import written_whole
+
+    file: Path = args.print_board
+    refuse_overwriting(args, file)
+    try:
+        data = board_file(board, file.suffix)
+    except CalibrationError as error:
+        raise UsageError(f"{file}: {error}") from None
+    with written_whole(file) as draft:
+        draft.write_bytes(data)
+    if args.json:
+        say_json({"board": str(file), "page": page_of(board)})
+    else:
+        say(
+            f"{file}: print it at 100 % on {page_of(board)}, glue it to something flat, and measure a square: "
+            f"{args.square_mm:g} mm, or say with --square-mm how large it became"
+        )
+    return ExitCode.DONE
+
+
+def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, ImageStream]:
+    """The images of the one camera that is meant, and its name."""
+    from flockd.ground.calibration import image_sources
+    from flockd.ground.datasets.video import SUFFIXES
+
+    config = loaded(args.config)
+    path = None if args.source is None else Path(args.source)
+    if path is None:
+        if config is None:
+            raise UsageError("no SOURCE was given; name images, a recording or a device, or --config for its camera")
+        name = _name_in(config, args, str(args.config))
+        return name, image_sources.from_cameras(
+            image_sources.with_one_camera(config, name), str(args.config), args.seconds, enough
+        )
+    if path.suffix.lower() == ".mcap":
+        found, recorded = image_sources.from_recording(opened(path), args.every)
+        return _name_in(recorded, args, str(path)), found
+    name = args.camera or "camera" if config is None else _name_in(config, args, str(args.config))
+    if not re.fullmatch("[a-z0-9_-]+", name):
+        raise UsageError(f"--camera {name}: a camera's name has small letters, digits, _ and - only")
+    if path.is_relative_to("/dev"):
+        live = image_sources.device_config(str(path), name, args.size, args.pixel_format, args.turn_deg)
+        return name, image_sources.from_cameras(live, str(path), args.seconds, enough)
+    if path.is_dir():
+        return name, image_sources.from_folder(path, name)
+    if path.suffix.lower() in SUFFIXES and path.is_file():
+        return name, image_sources.from_video(path, name, args.every)
+    fault = "is no folder, video or recording; name one of these" if path.exists() else "does not exist; check the path"
+    raise UsageError(f"{path}: {fault}")
+
+
+def _name_in(config: DroneConfig, args: argparse.Namespace, where: str) -> str:
+    names = [camera.name for camera in config.rig.cameras]
+    name: str | None = args.camera or (names[0] if len(names) == 1 else None)
+    if name is None or name not in names:
+        said = "has several cameras" if name is None else f"has no camera {name!r}"
+        raise UsageError(f"{where}: {said}; choose with --camera from {', '.join(names)}")
+    return name
+
+
+def _say_lens(result: Mapping[str, Any], collector: Collector) -> None:
+    lens, rms = result["intrinsics"], result["residual_px"]
+    views = rms["views"].values()
+    say(f"{result['camera']}: {result['views']} views of the board, {' x '.join(map(str, result['size_px']))} pixels")
+    _say_refused(collector)
+    for view, value in result["dropped"].items():
+        say(f"dropped: {view}: its residual is {value:.2f} px, it does not fit the others")
+    others = [f"{name} {one['rms_px']:.3f} px" for name, one in result["models"].items() if name != lens["model"]]
+    beside = f" (residual with {', '.join(others)})" if others else ""
+    say(f"model: {lens['model']}{beside}")
+    for key, value in result["sigma_px"].items():
+        say(f"  {key} {lens[key]:.2f} +- {value:.2f} px")
+    say(f"  distortion {' '.join(f'{k:.5f}' for k in lens['distortion'])}")
+    across, down = (f"{angle:.1f}" if angle is not None else "?" for angle in result["field_of_view_deg"])
+    say(f"  field of view {across} x {down} degrees")
+    say(f"residual: rms {rms['rms']:.3f} px; of a view {min(views):.3f} to {max(views):.3f}; max {rms['max']:.2f}")
+    assert collector.coverage is not None
+    say(f"coverage: {100 * result['coverage']:.0f} % of the image; ## where corners of the board were seen")
+    for line in collector.coverage.text:
+        say(f"  {line}")
+    for sentence in result["advice"]:
+        say(f"better: {sentence}")
+    say(f"written: {result['out']}; copy its intrinsics into your drone's file, then run flockd config check on that")
+
+
+def _say_refused(collector: Collector) -> None:
+    for reason, count in collector.counts().items():
+        names = [
+            one.name if one.edge_px is None else f"{one.name} (edges {one.edge_px:.1f} px wide)"
+            for one in collector.refused
+            if one.why == reason
+        ]
+        more = f" and {count - NAMED} more" if count > NAMED else ""
+        limit = f", as edges wider than {collector.max_edge_px:.1f} px are" if reason == "blurred" else ""
+        say(f"refused: {count} {reason}{limit}: {', '.join(names[:NAMED])}{more}")
+
+
+def _add_rig(commands: Commands) -> None:
+    """Adds the command."""
+    examples = (
+        "flockd calibrate rig --config my_drone.yaml",
+        "flockd calibrate rig pictures/ --config my_drone.yaml --reference front",
+        "flockd calibrate rig --from-flight drone1.mcap",
+    )
+    description = (
+        "Measure the cameras' mountings: relative poses, from a board that two of them see at once; or what a "
+        "flight found of orientation in the body, time offset and focal length."
+    )
+    parser = commands("rig", description, examples)
+    help_of_source = (
+        "a folder with a folder of images for each camera, or a recording; by default --config's cameras, live"
+    )
+    option(parser, "SOURCE", help_of_source, nargs="?")
+    option(parser, "--reference NAME", "the camera whose mounting --config gives (default: the first)")
+    option(parser, "--from-flight RECORDING", "take over what this flight found of its own rig", Path)
+    _add_shared(parser, "the drone, with its cameras' intrinsics; a recording has its own")
+    parser.set_defaults(run=_rig)
+
+
+def _rig(args: argparse.Namespace) -> int:
+    out = args.out or Path("rig.yaml")
+    refuse_overwriting(args, out)
+    return _by_board(args, out) if args.from_flight is None else _from_flight(args, out)
+
+
+def _by_board(args: argparse.Namespace, out: Path) -> int:
+    from flockd.ground.calibration.board import BoardFinder
+    from flockd.ground.calibration.shared import SharedCollector
+
+    session = _session(args)
+    names = [camera.name for camera in session.config.rig.cameras]
+    if len(names) < 2:
+        raise UsageError(f"{session.where}: has one camera; a rig that is calibrated by a board has two or more")
+    reference = args.reference or names[0]
+    if reference not in names:
+        raise UsageError(f"{session.where}: has no camera {reference!r}; choose --reference from {', '.join(names)}")
+    collector = SharedCollector(BoardFinder(_board_of(args)))
+    with progress("detecting the board", "images") as on_image, _ended_by_ctrl_c(session.images.live):
+        session.collect_boards(
+            collector, on_image, lambda links: complain(f"boards seen together: {links}; Ctrl-C ends it")
+        )
+    return _say_rig(args, session.by_board(collector.boards, reference, out))
+
+
+def _from_flight(args: argparse.Namespace, out: Path) -> int:
+    from flockd.core.errors import ConfigError
+    from flockd.ground.calibration.from_flight import corrected_rig
+
+    if args.source is not None:
+        raise UsageError("--from-flight names the recording; drop SOURCE")
+    recording, config = opened(args.from_flight), loaded(args.config)
+    if config is not None and config.rig != recording.config.rig:
+        message = f"is not the rig that {args.from_flight} was flown with, which is what it found the errors of"
+        raise ConfigError.at(str(args.config), f"{message}; drop --config", "rig")
+    result = corrected_rig(recording, str(args.from_flight), out)
+    if args.json:
+        say_json(result)
+        return ExitCode.DONE
+    for name, one in result["cameras"].items():
+        taken = " and ".join(one["taken"]) or "nothing"
+        say(f"{name}: {one['found']}; taken over: {taken}")
+    return _written(result)
+
+
+def _session(args: argparse.Namespace) -> RigSession:
+    from flockd.ground.calibration.rig_session import RigSession
+
+    config, images = _rig_images(args)
+    return RigSession(config, str(args.config or args.source), _source_name(args), images)
+
+
+def _rig_images(args: argparse.Namespace) -> tuple[DroneConfig, ImageStream]:
+    """And the drone they are of: that of --config before that of the recording."""
+    from flockd.ground.calibration import image_sources
+
+    config = loaded(args.config)
+    path = None if args.source is None else Path(args.source)
+    if path is not None and not path.is_dir():
+        found, recorded = image_sources.from_recording(opened(path), args.every)
+        return config or recorded, found
+    if config is None:
+        raise UsageError("the cameras' intrinsics are not known; name the drone's file with --config")
+    if path is None:
+        return config, image_sources.from_cameras(config, str(args.config), args.seconds, lambda: False)
+    return config, image_sources.from_folders(path, [camera.name for camera in config.rig.cameras])
+
+
+def _say_rig(args: argparse.Namespace, result: Mapping[str, Any]) -> int:
+    if args.json:
+        say_json(result)
+        return ExitCode.DONE
+    for name, one in result["cameras"].items():
+        x, y, z = one["position_m"]
+        if name == result["reference"]:
+            say(f"{name}: is the reference and keeps its mounting")
+            continue
+        say(
+            f"{name}: yaw {one['yaw_deg']:.2f} pitch {one['pitch_deg']:.2f} roll {one['roll_deg']:.2f} +- "
+            f"{one['sigma_deg']:.2f} deg"
+        )
+        say(f"  position {x:.4f} {y:.4f} {z:.4f} +- {one['sigma_m']:.4f} m")
+        say(f"  residual {one['residual_px']:.3f} px rms over {one['boards']} shared boards")
+    for board, value in result["dropped"].items():
+        say(f"dropped: {board}: its residual is {value:.2f} px, it does not fit the others")
+    return _written(result)
+
+
+def _written(result: Mapping[str, Any]) -> int:
+    if result["time_offset_s"] is not None:
+        say(f"time offset of the rig: {1000 * result['time_offset_s']:.1f} ms")
+    for note in result["notes"]:
+        say(f"note: {note}")
+    say(f"written: {result['out']}; put it in place of rig in your drone's file, then run flockd config check on that")
+    return ExitCode.DONE
+
+
+RECORDING = ".mcap"
+NOTES = """\
+A distance is from the lens to the drone's middle. Photograph the drone alone, from several sides and at two or more
+distances, at least 30 pixels wide. Of a recording, the drone stays at that distance all the time."""
+
+
+def _add_drone(commands: Commands) -> None:
+    """Adds the command."""
+    examples = (
+        "flockd calibrate drone --distance 3.0 a.jpg b.jpg --distance 5.0 c.jpg d.jpg --fov 70",
+        "flockd calibrate drone distances.yaml --config my_drone.yaml --camera front",
+        "flockd calibrate drone --distance 4.0 hover.mcap --every 10",
+    )
+    parser = commands("drone", "Measure the drones' size, as the networks see it.", examples, NOTES)
+    parser.add_argument("source", metavar="DISTANCES", nargs="?", type=Path, help="YAML: `pictures`, file, distance_m")
+    parser.add_argument(
+        "--distance",
+        metavar=("M", "PICTURE"),
+        nargs="+",
+        action="append",
+        default=[],
+        help="metres, and the images, folders, videos or recordings taken there; may be given again",
+    )
+    option(parser, "--every N", "take every Nth frame (1)", positive_count, default=1)
+    option(parser, "--out FILE", "where the result goes (drone_size.yaml)", Path)
+    flag(parser, "--force", "overwrite what is there")
+    flag(parser, "--json", "print the result as JSON")
+    add_picture_options(parser)
+    parser.set_defaults(run=_drone)
+
+
+def _drone(args: argparse.Namespace) -> int:
+    from flockd.ground.calibration.drone_size import fit_size
+    from flockd.onboard.recording.editing import written_whole
+
+    out = args.out or Path("drone_size.yaml")
+    refuse_overwriting(args, out)
+    size = fit_size(list(_photographs(args, _distances(args))))
+    source = str(args.source) if args.source else ", ".join(f"{one[0]} m: {len(one) - 1}" for one in args.distance)
+    with written_whole(out) as draft:
+        draft.write_text(size.fragment(source), encoding="utf-8")
+    if args.json:
+        say_json({**size.as_json(), "out": str(out)})
+    else:
+        _say_drone(size, out)
+    return ExitCode.DONE
+
+
+def _distances(args: argparse.Namespace) -> list[tuple[float, Path]]:
+    from flockd.ground.calibration.distances import MAX_DISTANCE_M, read_distances
+
+    if (args.source is None) == (not args.distance):
+        raise UsageError("name the pictures and their distances, either in a YAML file or with --distance M PICTURE...")
+    if args.source is not None:
+        return read_distances(args.source)
+    listed = []
+    for text, *pictures in args.distance:
+        try:
+            distance_m = positive_number(text)
+        except argparse.ArgumentTypeError as error:
+            raise UsageError(f"--distance: {error}; write metres, then the pictures taken there") from None
+        if distance_m > MAX_DISTANCE_M:
+            raise UsageError(f"--distance: {text} is more than {MAX_DISTANCE_M:g} m; write metres")
+        if not pictures:
+            raise UsageError(f"--distance {text}: names no picture; write the pictures taken there after the metres")
+        listed += [(distance_m, Path(picture)) for picture in pictures]
+    return listed
+
+
+def _photographs(args: argparse.Namespace, distances: Sequence[tuple[float, Path]]) -> Iterator[Photograph]:
+    """With what is detected in each picture, of unknown size."""
+    from flockd.ground.calibration.drone_size import Photograph, SizeCandidate
+    from flockd.ground.pictures import PictureDetector
+
+    recordings = [path for _, path in distances if path.suffix == RECORDING]
+    cameras = None
+    if args.config is not None or args.fov is not None or len(recordings) < len(distances):
+        cameras = PictureCameras(args)
+    detector = PictureDetector(perception_of(args, None if cameras is None else cameras.config, drone_size_m=None))
+    with progress("detecting", "pictures") as tell:
+        for number, (name, distance_m, image, camera) in enumerate(_taken(args, distances, cameras), start=1):
+            found = detector.detect(image, camera).detections
+            tell(number, max(number, len(distances)))
+            yield Photograph(
+                name,
+                distance_m,
+                tuple(
+                    SizeCandidate(
+                        distance_m * one.size_m / one.range_m, one.range_sigma_m / one.range_m, one.probability
+                    )
+                    for one in found
+                ),
+            )
+
+
+def _taken(
+    args: argparse.Namespace, distances: Sequence[tuple[float, Path]], cameras: PictureCameras | None
+) -> Iterator[Taken]:
+    from flockd.ground.pictures import find_pictures
+
+    for distance_m, path in distances:
+        if path.suffix == RECORDING:
+            yield from _of_recording(args, distance_m, path, None if cameras is None else cameras.config)
+            continue
+        assert cameras is not None
+        for picture in find_pictures([path]):
+            for name, image in picture.images(args.every):
+                yield name, distance_m, image, cameras.of(name, (image.shape[1], image.shape[0]))
+
+
+def _of_recording(
+    args: argparse.Namespace, distance_m: float, path: Path, config: DroneConfig | None
+) -> Iterator[Taken]:
+    """Frames of every camera, or of --camera."""
+    from flockd.flight.geometry import build_rig
+
+    recording = opened(path)
+    rig = build_rig((config or recording.config).rig)
+    if args.camera is not None and args.camera not in rig.cameras:
+        raise UsageError(f"{path}: has no camera {args.camera!r}; choose --camera from {', '.join(rig.cameras)}")
+    for step in recording.steps():
+        if step.number % args.every:
+            continue
+        for name, frame in step.frames.frames.items():
+            if name in rig.cameras and args.camera in {None, name}:
+                label = f"{path} {step.frames.time_s - recording.start_s:.2f} s, {name}"
+                yield label, distance_m, frame.image, rig.cameras[name].camera
+
+
+def _say_drone(size: DroneSize, out: Path) -> None:
+    for one in size.pictures:
+        residual = one.residual(size.size_m)
+        note = "" if one.used else "; dropped: it does not fit the others"
+        say(
+            f"{one.name}: {one.distance_m:g} m, size {one.size_m:.3f} m, "
+            f"range {100 * residual:+.1f} % ({residual * one.distance_m:+.2f} m){note}"
+        )
+    if size.missed:
+        say(f"nothing detected: {', '.join(size.missed)}")
+    used = sum(one.used for one in size.pictures)
+    say(f"drone_size_m: {size.size_m:.4f} +- {size.sigma_m:.4f} m, from {used} pictures")
+    say(f"written: {out}; copy its keys to perception in your drone's file, then run flockd config check on that")

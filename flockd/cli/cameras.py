@@ -8,8 +8,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flockd.cli.config import write_checked
+from flockd.cli.options import refuse_overwriting
 from flockd.cli.output import cell, complain, say, say_json
-from flockd.cli.parser import Commands, positive_number, size
+from flockd.cli.parser import Commands, flag, option, positive_number, size
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
@@ -34,20 +36,22 @@ def add(commands: Commands) -> None:
     )
     description = "List the cameras of this computer, measure what they give, and write the configuration of them."
     parser = commands("cameras", description, examples)
-    parser.add_argument("--measure", action="store_true", help="run all cameras and measure what comes")
-    parser.add_argument(
-        "--seconds", metavar="S", type=positive_number, default=SECONDS, help=f"measure this long ({SECONDS:g})"
+    flag(parser, "--measure", "run all cameras and measure what comes")
+    option(parser, "--seconds S", f"measure this long ({SECONDS:g})", positive_number, default=SECONDS)
+    option(parser, "--picture FOLDER", "save an image of each camera; measures too", Path)
+    option(parser, "--size WxH", "of an image, the nearest to this", size, default=(640, 480))
+    option(parser, "--write FILE", "write the sections `rig` and `source` for them", Path)
+    option(
+        parser,
+        "--turn-deg",
+        "clockwise, what makes up up in their images: 90 for cameras on their sides, tops to the right",
+        int,
+        choices=(0, 90, 180, 270),
+        default=0,
     )
-    parser.add_argument("--picture", metavar="FOLDER", type=Path, help="save an image of each camera; measures too")
-    parser.add_argument("--size", metavar="WxH", type=size, default=(640, 480), help="of an image, the nearest to this")
-    parser.add_argument("--write", metavar="FILE", type=Path, help="write the sections `rig` and `source` for them")
-    parser.add_argument(
-        "--turn-deg", type=int, choices=(0, 90, 180, 270), default=0,
-        help="clockwise, what makes up up in their images: 90 for cameras on their sides, tops to the right",
-    )  # fmt: skip
-    parser.add_argument("--names", metavar="NAME", nargs="+", help="of the cameras in the rig, in the listed order")
-    parser.add_argument("--force", action="store_true", help="overwrite the file if it exists")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    option(parser, "--names NAME", "of the cameras in the rig, in the listed order", nargs="+")
+    flag(parser, "--force", "overwrite the file if it exists")
+    flag(parser, "--json", "print JSON")
     parser.set_defaults(run=_run)
 
 
@@ -61,8 +65,7 @@ def run(args: argparse.Namespace, computer: Computer) -> int:
     """The command on a computer."""
     from flockd.ground.cameras.listing import list_cameras
 
-    if args.write is not None and args.write.exists() and not args.force:
-        raise UsageError(f"{args.write} exists; name another file, or overwrite it with --force")
+    refuse_overwriting(args, args.write)
     found = list_cameras(computer)
     if not found:
         raise UnavailableError(NONE_FOUND)
@@ -87,7 +90,6 @@ def run(args: argparse.Namespace, computer: Computer) -> int:
 
 
 def _write(file: Path, usable: Sequence[tuple[FoundCamera, Mode]], names: Sequence[str] | None, turn_deg: int) -> None:
-    from flockd.cli.config_new import write_checked
     from flockd.ground.cameras.sections import camera_names, sections_text
 
     if not usable:

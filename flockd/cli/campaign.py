@@ -9,9 +9,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flockd.cli.options import require
 from flockd.cli.output import Phases, complain, say, say_json
-from flockd.cli.parser import Commands, add_commands, positive_count
-from flockd.cli.recording_options import require
+from flockd.cli.parser import Commands, add_commands, flag, option, positive_count
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -49,20 +49,19 @@ def _add_run(commands: Commands) -> None:
         "flockd campaign config/campaigns/separation.yaml --engine ray --address 10.0.0.5:6379",
     )
     parser = commands(RUN, "Fly what is missing of a campaign, and write its report.", examples, COSTS)
-    parser.add_argument("file", metavar="FILE", type=Path, help="of the campaign")
-    parser.add_argument("--out", metavar="FOLDER", type=Path, help="default: out/NAME, by the campaign's name")
-    parser.add_argument("--workers", metavar="N", type=positive_count, help="flights at once (default: processors)")
-    parser.add_argument(
+    option(parser, "FILE", "of the campaign", Path)
+    option(parser, "--out FOLDER", "default: out/NAME, by the campaign's name", Path)
+    option(parser, "--workers N", "flights at once (default: processors)", positive_count)
+    option(
+        parser,
         "--engine",
+        "what flies them: processes of this computer, or a Ray cluster (default: processes)",
         choices=("processes", "ray"),
         default="processes",
-        help="what flies them: processes of this computer, or a Ray cluster (default: processes)",
     )
-    parser.add_argument(
-        "--address", metavar="HOST:PORT", help="with --engine ray: a running cluster (default: a new one)"
-    )
-    parser.add_argument("--dry-run", action="store_true", help="print how many flights and hours it is; keep nothing")
-    parser.add_argument("--json", action="store_true", help="print what was flown as JSON")
+    option(parser, "--address HOST:PORT", "with --engine ray: a running cluster (default: a new one)")
+    flag(parser, "--dry-run", "print how many flights and hours it is; keep nothing")
+    flag(parser, "--json", "print what was flown as JSON")
     parser.set_defaults(run=_run)
 
 
@@ -73,21 +72,19 @@ def _add_rerun(commands: Commands) -> None:
     )
     parser = commands("rerun", "Fly one flight of a campaign again, with its full report.", examples)
     parser.add_argument("flight", metavar="RUN", type=Path, help="the campaign's folder and the flight's name")
-    parser.add_argument("--out", metavar="DIR", type=Path, help="default: FOLDER/reruns/NAME")
-    parser.add_argument("--force", action="store_true", help="overwrite an earlier flight in that folder")
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    option(parser, "--out DIR", "default: FOLDER/reruns/NAME", Path)
+    flag(parser, "--force", "overwrite an earlier flight in that folder")
+    flag(parser, "--json", "print the summary as JSON")
     parser.set_defaults(run=_rerun, quiet=False, verbose=False, settings={})
 
 
 def _add_report(commands: Commands) -> None:
     examples = ("flockd campaign report out/separation", "flockd campaign report out/old_networks out/new_networks")
     parser = commands("report", "Write the report of a campaign, or compare a second one with it.", examples)
-    parser.add_argument("folder", metavar="FOLDER", type=Path, help="of a campaign")
-    parser.add_argument("other", nargs="?", metavar="OTHER", type=Path, help="is compared with it: is this one better?")
-    parser.add_argument(
-        "--out", metavar="FILE", type=Path, help="default: report.html, or OTHER/versus_NAME.html of two"
-    )
-    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
+    option(parser, "FOLDER", "of a campaign", Path)
+    option(parser, "OTHER", "is compared with it: is this one better?", Path, nargs="?")
+    option(parser, "--out FILE", "default: report.html, or OTHER/versus_NAME.html of two", Path)
+    flag(parser, "--json", "print the figures as JSON")
     parser.set_defaults(run=_report)
 
 

@@ -1,24 +1,27 @@
-"""`flockd config`: checks, shows and describes configuration files."""
+"""`flockd config`: checks, shows and describes configuration files, and writes new ones."""
 
 from __future__ import annotations
 
 import argparse
+import re
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli import config_new
-from flockd.cli.config_new import CHANGE_ME
+from flockd.cli.options import add_force, permit, refuse_overwriting
 from flockd.cli.output import say, say_json
-from flockd.cli.parser import Commands, add_commands
-from flockd.cli.real_drone import add_force, permit
-from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, ModelError
+from flockd.cli.parser import Commands, Parser, add_commands, flag, option
+from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, ModelError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from flockd.core.config import DroneConfig
     from flockd.core.config.document import KeyPath, Place
+
+CHANGE_ME = "CHANGE-ME"
+"""Stands in a new file for what only its owner knows."""
 
 
 def add(commands: Commands) -> None:
@@ -29,14 +32,14 @@ def add(commands: Commands) -> None:
         "flockd config new scenario my_flight.yaml --set duration_s=30",
     )
     parser = commands("config", "Check, show, describe and begin configuration files.", examples)
-    add_commands(parser, (_add_check, _add_show, _add_schema, _add_card, config_new.add))
+    add_commands(parser, (_add_check, _add_show, _add_schema, _add_card, _add_new))
 
 
 def _add_check(commands: Commands) -> None:
     examples = ("flockd config check my_flight.yaml", "flockd config check --json config/*.yaml")
     parser = commands("check", "Report all errors in files of drones, scenarios and campaigns.", examples)
     parser.add_argument("files", nargs="+", metavar="FILE", type=Path, help="of drones, scenarios or campaigns")
-    parser.add_argument("--json", action="store_true", help="print the problems as JSON")
+    flag(parser, "--json", "print the problems as JSON")
     add_force(parser)
     parser.set_defaults(run=_check)
 
@@ -44,8 +47,8 @@ def _add_check(commands: Commands) -> None:
 def _add_show(commands: Commands) -> None:
     examples = ("flockd config show config/paper_flight.yaml", "flockd config show --json config/simulator.yaml")
     parser = commands("show", "Show a file with every default filled in, a scenario with its drone.", examples)
-    parser.add_argument("file", metavar="FILE", type=Path, help="of a drone or a scenario")
-    parser.add_argument("--json", action="store_true", help="print JSON instead of YAML")
+    option(parser, "FILE", "of a drone or a scenario", Path)
+    flag(parser, "--json", "print JSON instead of YAML")
     parser.set_defaults(run=_show)
 
 
@@ -60,7 +63,7 @@ def _add_card(commands: Commands) -> None:
     examples = ("flockd config card my_drone.yaml", "flockd config card /etc/flockd/drone.yaml > card.md")
     description = "Print the card of a flight day, as Markdown: limits, heights, what each fault does, who does what."
     parser = commands("card", description, examples)
-    parser.add_argument("file", metavar="FILE", type=Path, help="of a drone")
+    option(parser, "FILE", "of a drone", Path)
     parser.set_defaults(run=_card)
 
 
@@ -178,11 +181,102 @@ def _schema(args: argparse.Namespace) -> int:
     return ExitCode.DONE
 
 
-def loaded(file: Path | None) -> DroneConfig | None:
-    """The drone of --config, which may also name a scenario. Raises ConfigError."""
-    from flockd.sim.scenario import ScenarioConfig, load
+def _add_new(commands: Commands) -> None:
+    """Adds the command."""
+    examples = ("flockd config new drone my_drone.yaml", "flockd config new scenario my_flight.yaml")
+    parser = commands("new", "Write a commented file of a drone or a scenario, to be filled in.", examples)
+    add_commands(parser, (_add_new_drone, _add_new_scenario))
 
-    if file is None:
-        return None
-    config = load(file)
-    return config.drone if isinstance(config, ScenarioConfig) else config
+
+def _add_new_drone(commands: Commands) -> None:
+    examples = (
+        "flockd config new drone my_drone.yaml",
+        "flockd config new drone my_drone.yaml --set name=kite2 --set safety.first_flight_layer=2",
+    )
+    _add_new_options(commands("drone", "Write the configuration of a real drone.", examples), "drone")
+
+
+def _add_new_scenario(commands: Commands) -> None:
+    examples = (
+        "flockd config new scenario my_flight.yaml",
+        "flockd config new scenario woods.yaml --set world.obstacles.kind=forest --set obstacles.enabled=true",
+    )
+    _add_new_options(commands("scenario", "Write the configuration of a simulated flight.", examples), "scenario")
+
+
+def _add_new_options(parser: Parser, kind: str) -> None:
+    option(parser, "FILE", "to write", Path)
+    flag(parser, "--force", "overwrite the file if it exists")
+    option(
+        parser,
+        "--set KEY=VALUE",
+        "write this value, as in `--set seed=3` or `--set 'mission={kind: hover}'`; may be given again",
+        _setting,
+        action="append",
+        default=[],
+        dest="settings",
+    )
+    parser.set_defaults(run=_new, kind=kind)
+
+
+def _setting(text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not equals or re.fullmatch(r"\w+(\.\w+)*", key) is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a key and its value, as in seed=3")
+    return key, value
+
+
+def _new(args: argparse.Namespace) -> int:
+    from flockd.core.data import data_path
+
+    file: Path = args.file
+    refuse_overwriting(args, file)
+    folder = data_path("config")
+    own = [("scenario", file.stem), ("drone", str(folder / "simulator.yaml"))] if args.kind == "scenario" else []
+    template = folder / "templates" / f"{args.kind}.yaml"
+    write_checked(file, template.read_text(encoding="utf-8"), [*own, *args.settings])
+    return ExitCode.DONE
+
+
+def write_checked(file: Path, text: str, settings: Sequence[tuple[str, str]] = ()) -> None:
+    """Writes the file, with these values by key, if it checks, else leaves all as it was. Raises UsageError.
+
+    The draft stands beside it: paths count from there.
+    """
+    from flockd.sim.scenario import load
+
+    draft = file.with_name(f".{file.name}.draft.yaml")
+    try:
+        draft.write_text(text, encoding="utf-8")
+        for key, value in settings:
+            _set(draft, key, value)
+        load(draft)
+        draft.replace(file)
+    except ConfigError as error:
+        reasons = "; ".join(f"{problem.key}: {problem.message}" for problem in error.problems)
+        raise UsageError(f"{file} was not written, as it would not check ({reasons}); change the options") from error
+    finally:
+        draft.unlink(missing_ok=True)
+    say(f"{file}: written; `flockd config check {file}` checks it again after each change")
+
+
+def _set(file: Path, key: str, value: str) -> None:
+    """Changes the line of a key, or adds one below its section's; comments stay."""
+    from flockd.core.config.document import read_document
+
+    path: KeyPath = tuple(key.split("."))
+    places, lines = read_document(file).places, file.read_text(encoding="utf-8").splitlines()
+    there = next(length for length in range(len(path), -1, -1) if path[:length] in places)
+    line = places[path[:there]].line if there else len(lines)
+    if there == len(path):
+        head = re.fullmatch(r"( *)([^#]*?:)( [^#]*?)?( *#.*)?", lines[line - 1])
+        if head is None or head[2] != f"{path[-1]}:":
+            raise UsageError(f"{key} shares its line of the template with others; write the file and change it there")
+        end = line
+        while end < len(lines) and lines[end].startswith(f"{head[1]} "):  # what the section held
+            end += 1
+        lines[line - 1 : end] = [f"{head[1]}{head[2]} {value}{head[4] or ''}"]
+    else:
+        sections = [f"{'  ' * depth}{path[depth]}:" for depth in range(there, len(path))]
+        lines[line:line] = [*sections[:-1], f"{sections[-1]} {value}"]
+    file.write_text("\n".join([*lines, ""]), encoding="utf-8")

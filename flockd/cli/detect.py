@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flockd.cli.output import complain, progress, say, say_json, say_table
-from flockd.cli.parser import Commands, positive_count, positive_number
+from flockd.cli.parser import Commands, flag, number, option, positive_count, positive_number
 from flockd.cli.picture_options import PictureCameras, add_picture_options, perception_of
 from flockd.core.errors import ExitCode, UsageError
 
@@ -38,32 +37,22 @@ def add(commands: Commands) -> None:
         "flockd detect photograph.jpg --fov 70 --drone-size 0.35",
     )
     parser = commands("detect", "Detect drones in pictures, with the code that flies.", examples, NOTES)
-    parser.add_argument("pictures", metavar="PICTURES", nargs="+", type=Path, help="images, folders of them, videos")
-    parser.add_argument(
-        "--out", metavar="FOLDER", type=Path, help="write copies of the pictures with the detections drawn in"
+    option(parser, "PICTURES", "images, folders of them, videos", Path, nargs="+")
+    option(parser, "--out FOLDER", "write copies of the pictures with the detections drawn in", Path)
+    flag(parser, "--force", "overwrite what is there")
+    option(parser, "--labels FILE", "COCO boxes of category `drone`: measures how many are found", Path)
+    option(
+        parser,
+        "--min-probability P",
+        "leave out what is less probable (0)",
+        number("a probability, 0 to 1", 0, 1),
+        default=0.0,
     )
-    parser.add_argument("--force", action="store_true", help="overwrite what is there")
-    parser.add_argument(
-        "--labels", metavar="FILE", type=Path, help="COCO boxes of category `drone`: measures how many are found"
-    )
-    parser.add_argument(
-        "--min-probability", metavar="P", type=_probability, default=0.0, help="leave out what is less probable (0)"
-    )
-    parser.add_argument("--drone-size", metavar="M", type=positive_number, help="of every drone, tip to tip, if known")
-    parser.add_argument("--every", metavar="N", type=positive_count, default=1, help="every Nth frame of a video (1)")
-    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    option(parser, "--drone-size M", "of every drone, tip to tip, if known", positive_number)
+    option(parser, "--every N", "every Nth frame of a video (1)", positive_count, default=1)
+    flag(parser, "--json", "print the result as JSON")
     add_picture_options(parser)
     parser.set_defaults(run=_run)
-
-
-def _probability(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a probability, 0 to 1")
-    return value
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flockd.cli.options import add_force, load_to_fly
 from flockd.cli.output import progress, say, say_json, tables_console
-from flockd.cli.parser import Commands, positive_number
-from flockd.cli.real_drone import add_force, load_to_fly
+from flockd.cli.parser import Commands, flag, option, positive_number
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 from flockd.core.printable import printable
 
@@ -44,28 +44,18 @@ def add(commands: Commands) -> None:
         "never arms, switches modes or sends setpoints."
     )
     parser = commands("doctor", description, examples)
-    parser.add_argument("--config", metavar="FILE", type=Path, required=True, help="the drone's configuration")
-    parser.add_argument("--record", metavar="DIR", type=Path, help="where `flockd run` is to record flights")
-    parser.add_argument("--unit", metavar="FILE", type=Path, help="the systemd unit; by default the installed one")
-    parser.add_argument(
-        "--seconds",
-        metavar="S",
-        type=positive_number,
-        default=SECONDS,
-        help=f"watch the cameras this long ({SECONDS:g})",
-    )
-    parser.add_argument(
-        "--only", metavar="CHECK", action="append", choices=CHECKS, help=f"only this one, of {', '.join(CHECKS)}"
-    )
-    parser.add_argument(
+    option(parser, "--config FILE", "the drone's configuration", Path, required=True)
+    option(parser, "--record DIR", "where `flockd run` is to record flights", Path)
+    option(parser, "--unit FILE", "the systemd unit; by default the installed one", Path)
+    option(parser, "--seconds S", f"watch the cameras this long ({SECONDS:g})", positive_number, default=SECONDS)
+    option(parser, "--only CHECK", f"only this one, of {', '.join(CHECKS)}", action="append", choices=CHECKS)
+    flag(
+        parser,
         "--bench",
-        action="store_true",
-        help="propellers off: run the whole line, from cameras to commands, send nothing, and report on it",
+        "propellers off: run the whole line, from cameras to commands, send nothing, and report on it",
     )
-    parser.add_argument(
-        "--minutes", metavar="M", type=positive_number, help=f"how long --bench runs ({BENCH_MINUTES:g})"
-    )
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    option(parser, "--minutes M", f"how long --bench runs ({BENCH_MINUTES:g})", positive_number)
+    flag(parser, "--json", "print JSON")
     add_force(parser)
     parser.set_defaults(run=_run)
 

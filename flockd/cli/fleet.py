@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
+import ipaddress
 import math
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli import fleet_page
-from flockd.cli.endpoint_options import add_endpoint_options, add_operator_option, endpoints
-from flockd.cli.output import complain, say, say_json
-from flockd.cli.parser import ALONE, Commands, Parser, add_commands, positive_number
+from flockd.cli.options import ENDPOINT, add_endpoint_options, add_operator_option, endpoints
+from flockd.cli.output import complain, progress, say, say_json
+from flockd.cli.parser import ALONE, Commands, Parser, add_commands, flag, number, option, port_number, positive_number
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
     from flockd.core.messages import MissionOrder
+    from flockd.fleet.page.fleet_source import FleetSource
+    from flockd.fleet.page.page_connections import PageConnections
+    from flockd.fleet.page.page_server import PageServer
     from flockd.fleet.watcher import FleetWatcher
 
 ALL = "all"
@@ -45,7 +52,7 @@ def add(commands: Commands) -> None:
     what = "Show the fleet on a page in the browser; with a command: ask drones to fly elsewhere, hold, land, or go on."
     parser = commands("fleet", what, examples, _NOTES)
     add_commands(parser, (_add_goto, _add_velocity, *(_plain(command) for command in PLAIN)))
-    fleet_page.add_options(parser)
+    _add_page(parser)
     parser.usage = ALONE
 
 
@@ -69,14 +76,12 @@ def _add_goto(commands: Commands) -> None:
     )
     parser = commands("goto", "Send drones to a place: they lead the centre of their flock there.", examples, notes)
     _add_drones(parser)
-    parser.add_argument("north", metavar="NORTH", type=_number, help="metres north of the mission's origin")
-    parser.add_argument("east", metavar="EAST", type=_number, help="metres east of it")
-    parser.add_argument("--degrees", action="store_true", help="NORTH and EAST are latitude and longitude")
-    parser.add_argument(
-        "--height", metavar="M", type=_number, help="height above the ground at home (default: the present one)"
-    )
-    parser.add_argument("--speed", metavar="V", type=positive_number, help="in m/s (default: the mission's)")
-    parser.add_argument("--repeat", action="store_true", help="send it every second until Ctrl-C")
+    option(parser, "NORTH", "metres north of the mission's origin", _number)
+    option(parser, "EAST", "metres east of it", _number)
+    flag(parser, "--degrees", "NORTH and EAST are latitude and longitude")
+    option(parser, "--height M", "height above the ground at home (default: the present one)", _number)
+    option(parser, "--speed V", "in m/s (default: the mission's)", positive_number)
+    flag(parser, "--repeat", "send it every second until Ctrl-C")
     _add_connection(parser)
     parser.set_defaults(run=_goto)
 
@@ -85,14 +90,10 @@ def _add_velocity(commands: Commands) -> None:
     examples = ("flockd fleet velocity drone1 0.5 0 --seconds 10", "flockd fleet velocity all 0 -1 --height 6")
     parser = commands("velocity", "Make drones fly at a velocity for as long as it is sent.", examples)
     _add_drones(parser)
-    parser.add_argument("north", metavar="NORTH", type=_number, help="m/s to the north")
-    parser.add_argument("east", metavar="EAST", type=_number, help="m/s to the east")
-    parser.add_argument(
-        "--height", metavar="M", type=_number, help="height above the ground at home (default: the present one)"
-    )
-    parser.add_argument(
-        "--seconds", metavar="S", type=positive_number, help="repeat it every second for S seconds (default: once)"
-    )
+    option(parser, "NORTH", "m/s to the north", _number)
+    option(parser, "EAST", "m/s to the east", _number)
+    option(parser, "--height M", "height above the ground at home (default: the present one)", _number)
+    option(parser, "--seconds S", "repeat it every second for S seconds (default: once)", positive_number)
     _add_connection(parser)
     parser.set_defaults(run=_velocity)
 
@@ -108,23 +109,16 @@ def _plain(command: str) -> Callable[[Commands], None]:
 
 
 def _add_drones(parser: Parser) -> None:
-    parser.add_argument("drones", metavar="DRONES", help=f"names with commas between them, or `{ALL}`")
+    option(parser, "DRONES", f"names with commas between them, or `{ALL}`")
 
 
 def _add_connection(parser: Parser) -> None:
     add_endpoint_options(parser)
     add_operator_option(parser)
-    parser.add_argument("--json", action="store_true", help="print the last replies as JSON, by drone")
+    flag(parser, "--json", "print the last replies as JSON, by drone")
 
 
-def _number(text: str) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number")
-    return number
+_number = number("a number")
 
 
 def _goto(args: argparse.Namespace) -> int:
@@ -229,3 +223,143 @@ def _verdict(args: argparse.Namespace, answers: dict[str, dict[str, object]], na
         complain(f"{who} found at {places}; check `flockd status`")
     refused = any(not answer["accepted"] for answer in answers.values())
     return ExitCode.CHECK_FAILED if refused or missing else ExitCode.DONE
+
+
+PORT = 8470
+
+
+def _add_page(parser: Parser) -> None:
+    """Adds the page's options, and those that say where its data come from."""
+    _add_server(parser, PORT)
+    flag(parser, "--watch-only", "the page passes no command on")
+    option(
+        parser,
+        "--key-file FILE",
+        "keep the key of the page's address in it, so that open pages go on after a new start (default: a new key "
+        "at each start)",
+        Path,
+    )
+    add_operator_option(parser)
+    parser.set_defaults(run=_show_page)
+
+
+def _show_page(args: argparse.Namespace) -> int:
+    import aiohttp.web  # noqa: F401 - before anything is opened: it is of an extra
+
+    with ExitStack() as stack:
+        source = open_source(args, stack)
+        with suppress(KeyboardInterrupt):
+            asyncio.run(_serve(args, source))
+    return ExitCode.DONE
+
+
+async def _serve(args: argparse.Namespace, source: FleetSource) -> None:
+    from flockd.fleet.page.page_access import PageAccess, lasting_key
+    from flockd.fleet.page.page_server import PageServer
+
+    access = PageAccess(None if args.key_file is None else lasting_key(args.key_file))
+    page = PageServer(source, access, may_command=not args.watch_only, operator=args.operator)
+
+    def served(port: int) -> None:
+        sentence = f"the fleet page is at http://{{host}}:{port}/?key={access.key}"
+        announce(args, sentence, "whoever has this address with its key may do what this computer may")
+
+    await serve_page(page, args.server_address, args.port, served)
+
+
+async def serve_page(page: PageServer, address: str, port: int, served: Callable[[int], None]) -> None:
+    """Until it is cancelled, as Ctrl-C does. ``served``: is told the port, once there is somebody at it.
+
+    Raises UnavailableError for an address or a port that cannot be used.
+    """
+    from aiohttp import web
+
+    from flockd.fleet.page.page_connections import PageConnections
+
+    runner = web.AppRunner(page.application(), access_log=None, shutdown_timeout=1.0)
+    await runner.setup()
+    try:
+        assert runner.server is not None
+        connections = PageConnections(runner.server, page.trusted)
+        served(await _listen(connections, address, port))
+        await connections.run()
+    finally:
+        await runner.cleanup()
+
+
+async def _listen(connections: PageConnections, address: str, port: int) -> int:
+    """The port on which it listens."""
+    try:
+        server = await asyncio.get_running_loop().create_server(connections, address, port)
+    except OSError as error:
+        raise UnavailableError(f"the page cannot use {address} port {port} ({error.strerror}); name others") from error
+    bound: int = server.sockets[0].getsockname()[1]
+    return bound
+
+
+HERE = "127.0.0.1"
+"""Where it is served unless told otherwise: for this computer alone."""
+
+
+def _add_server(parser: Parser, port: int) -> None:
+    """Where it serves, and where its data come from: telemetry, or recordings."""
+    option(parser, "--port N", f"(default: {port}; 0: any)", port_number, default=port)
+    option(
+        parser,
+        "--listen ADDRESS",
+        f"of the server, such as 0.0.0.0 for other computers too (default: {HERE})",
+        ip_address,
+        default=HERE,
+        dest="server_address",
+    )
+    option(parser, "--recordings FOLDER", "show the recordings in it on one time line, not telemetry", Path)
+    add_endpoint_options(parser, "--drones-at")
+
+
+def open_source(args: argparse.Namespace, stack: ExitStack) -> FleetSource:
+    """As the options say; what has to be closed is left to ``stack``."""
+    from flockd.fleet.page.live_fleet import LiveFleet
+    from flockd.fleet.page.recorded_fleet import RecordedFleet
+    from flockd.fleet.watcher import FleetWatcher
+
+    if args.recordings is not None:
+        if args.connect or args.drones_at or args.fleet or args.zenoh_config:
+            raise UsageError(
+                "--recordings goes without telemetry; drop --connect, --drones-at, --fleet, --zenoh-config"
+            )
+        with progress("reading", "MB") as tell_progress:
+            return RecordedFleet(args.recordings, lambda done, total: tell_progress(done >> 20, total >> 20))
+    listen, connect = endpoints(args)
+    watcher = FleetWatcher(args.fleet, listen=listen, connect=connect, settings=args.zenoh_config)
+    return stack.enter_context(LiveFleet(stack.enter_context(watcher)))
+
+
+def announce(args: argparse.Namespace, sentence: str, warning: str) -> None:
+    """Says where it is served, once it is.
+
+    ``sentence`` has a place `{host}`; ``warning`` says what those who reach it may do, where other computers can.
+    """
+    where = ipaddress.ip_address(args.server_address)
+    # For all addresses of this computer, the one at which it reaches itself.
+    host = HERE if where.is_unspecified else f"[{where}]" if where.version == 6 else str(where)
+    say(sentence.format(host=host))
+    if not where.is_loopback:
+        complain(f"{warning}; it travels unencrypted, so use a network that you trust")
+        say(f"on other computers: the same with this computer's address in the place of {host}")
+    if args.recordings is None and not args.connect and not args.drones_at:
+        say(
+            f"it looks for drones at {ENDPOINT}; for those that connect to this computer, as those of "
+            f"`flockd sim --autopilot` do, start it with --drones-at {ENDPOINT}"
+        )
+    say("Ctrl-C ends it")
+    sys.stdout.flush()  # whoever reads a pipe needs the address now
+
+
+def ip_address(text: str) -> str:
+    """The IP address that an option names, at which something is served."""
+    try:
+        return str(ipaddress.ip_address(text))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not an IP address such as 127.0.0.1 or 0.0.0.0; for zenoh endpoints there is --drones-at"
+        ) from error

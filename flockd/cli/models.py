@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flockd.cli.output import noted_table, progress, say, say_json, say_table, tables_console
-from flockd.cli.parser import Commands, Parser, add_commands, positive_count
+from flockd.cli.parser import Commands, Parser, add_commands, flag, option, positive_count, size
 from flockd.core.choices import PROVIDERS, Provider
 from flockd.core.errors import ExitCode, ModelError, UnavailableError
 
@@ -51,12 +51,10 @@ def _add_bench(commands: Commands) -> None:
     )
     description = "Time each model, for each provider and number of threads: milliseconds a run, the median."
     parser = _add_options(commands("bench", description, examples), _bench)
-    parser.add_argument(
-        "--provider", metavar="NAME,...", help=f"{', '.join(PROVIDERS)} (default: all that are installed)"
-    )
-    parser.add_argument("--threads", metavar="N,...", type=_counts, default=(1, 2), help="on the CPU (default: 1,2)")
-    parser.add_argument("--size", metavar="WxH", type=_size, default=(640, 480), help="of the image (default: 640x480)")
-    parser.add_argument("--runs", metavar="N", type=positive_count, default=RUNS, help=f"to time (default: {RUNS})")
+    option(parser, "--provider NAME,...", f"{', '.join(PROVIDERS)} (default: all that are installed)")
+    option(parser, "--threads N,...", "on the CPU (default: 1,2)", _counts, default=(1, 2))
+    option(parser, "--size WxH", "of the image (default: 640x480)", size, default=(640, 480))
+    option(parser, "--runs N", f"to time (default: {RUNS})", positive_count, default=RUNS)
 
 
 def _add_prepare(commands: Commands) -> None:
@@ -66,27 +64,20 @@ def _add_prepare(commands: Commands) -> None:
         "a flight with it is refused before; OpenVINO starts sooner; CPU and CUDA have nothing to build."
     )
     parser = commands("prepare", description, examples)
-    parser.add_argument("--config", metavar="FILE", type=Path, required=True, help="the drone's configuration")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    option(parser, "--config FILE", "the drone's configuration", Path, required=True)
+    flag(parser, "--json", "print JSON")
     parser.set_defaults(run=_prepare)
 
 
 def _add_options(parser: Parser, run: Any) -> Parser:
-    parser.add_argument("--dir", type=Path, help="folder of the manifests; by default the one that comes with flockd")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    option(parser, "--dir", "folder of the manifests; by default the one that comes with flockd", Path)
+    flag(parser, "--json", "print JSON")
     parser.set_defaults(run=run)
     return parser
 
 
 def _counts(text: str) -> tuple[int, ...]:
     return tuple(positive_count(part) for part in text.split(","))
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, x, height = text.partition("x")
-    if not (x and width.isdecimal() and height.isdecimal() and int(width) >= 32 and int(height) >= 32):
-        raise argparse.ArgumentTypeError(f"{text!r} is no size of at least 32x32, as in 640x480")
-    return int(width), int(height)
 
 
 def _list(args: argparse.Namespace) -> int:

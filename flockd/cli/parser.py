@@ -14,6 +14,8 @@ from flockd.cli.output import complain
 from flockd.core.errors import ExitCode
 from flockd.core.gone import COMMANDS
 
+Number = Callable[[str], float]
+
 
 class Parser(argparse.ArgumentParser):
     """With examples below the help, no abbreviated options, and errors of one sentence."""
@@ -111,29 +113,55 @@ def _print_help(parser: Parser) -> int:
     return ExitCode.USAGE
 
 
-def positive_number(text: str) -> float:
-    """An option's value as a finite number above 0."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not (math.isfinite(number) and number > 0):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
-    return number
+def option(
+    parser: argparse._ActionsContainer, spelling: str, what: str, kind: Callable[[str], Any] = str, **more: Any
+) -> None:
+    """Adds an option, spelled as in `--out FILE`, or an argument, as in `FILE`.
+
+    ``what``: its help; ``kind``: makes its value of the text; ``more``: as argparse takes it.
+    """
+    name, _, value = spelling.partition(" ")
+    if not name.startswith("-"):
+        name, value = name.lower(), name
+    if value:
+        more["metavar"] = value
+    parser.add_argument(name, help=what, type=kind, **more)
 
 
-def positive_count(text: str) -> int:
-    """An option's value as a whole number above 0."""
-    if not (_is_whole(text) and int(text) > 0):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive whole number")
-    return int(text)
+def flag(parser: argparse._ActionsContainer, name: str, what: str) -> None:
+    """Adds an option without a value, false unless it is given."""
+    parser.add_argument(name, help=what, action="store_true")
 
 
-def seed(text: str) -> int:
-    """An option's value as a whole number, 0 or more."""
-    if not _is_whole(text):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, 0 or more")
-    return int(text)
+def number(words: str, low: float = -math.inf, high: float = math.inf, *, above: float = -math.inf) -> Number:
+    """The kind of options whose value is a finite number within these limits: ``words`` say what it is not else."""
+
+    def parsed(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not (math.isfinite(value) and low <= value <= high and value > above):
+            raise argparse.ArgumentTypeError(f"{text!r} is not {words}")
+        return value
+
+    return parsed
+
+
+def whole_number(words: str, low: int = 0, high: int = 10**18) -> Callable[[str], int]:
+    """The same, of whole numbers."""
+
+    def parsed(text: str) -> int:
+        if re.fullmatch("[0-9]{1,18}", text) is None or not low <= int(text) <= high:
+            raise argparse.ArgumentTypeError(f"{text!r} is not {words}")
+        return int(text)
+
+    return parsed
+
+
+positive_number = number("a positive number", above=0)
+positive_count = whole_number("a positive whole number", 1)
+port_number = whole_number("a port, a whole number from 0 to 65535", 0, 65535)
 
 
 def size(text: str) -> tuple[int, int]:
@@ -142,7 +170,3 @@ def size(text: str) -> tuple[int, int]:
     if match is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not two numbers such as 640x480")
     return int(match[1]), int(match[2])
-
-
-def _is_whole(text: str) -> bool:
-    return re.fullmatch("[0-9]{1,18}", text) is not None

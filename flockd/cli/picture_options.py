@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.config import loaded
-from flockd.cli.parser import Parser, positive_number
+from flockd.cli.options import loaded
+from flockd.cli.parser import Parser, option, positive_number, whole_number
 from flockd.core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -21,21 +21,21 @@ MAX_FOV_DEG = 170.0
 def add_picture_options(parser: Parser) -> None:
     """Adds the camera and the networks."""
     camera = parser.add_argument_group("the camera of the pictures, one of")
-    camera.add_argument(
-        "--fov",
-        metavar="DEG",
-        type=_fov,
-        help="field of view across the longer side, of a lens without distortion; above 100, of a fisheye",
+    option(
+        camera,
+        "--fov DEG",
+        "field of view across the longer side, of a lens without distortion; above 100, of a fisheye",
+        _fov,
     )
-    camera.add_argument("--config", metavar="FILE", type=Path, help="this drone's camera, networks and settings")
-    camera.add_argument("--camera", metavar="NAME", help="which of --config's cameras, where it has several")
+    option(camera, "--config FILE", "this drone's camera, networks and settings", Path)
+    option(camera, "--camera NAME", "which of --config's cameras, where it has several")
     networks = parser.add_argument_group("the networks", "by default those of --config, else flockd's own")
-    networks.add_argument("--models", metavar="FOLDER", type=Path, help="folder of the manifests")
-    networks.add_argument("--first-stage", metavar="NAME", help="the model for depth and segmentation")
-    networks.add_argument("--detector", metavar="NAME", help="the model for boxes of drones, or `none`")
-    networks.add_argument("--second-stage", metavar="NAME", help="the model for the distance")
-    networks.add_argument("--verification", metavar="NAME", help="the model that verifies detections, or `none`")
-    networks.add_argument("--threads", metavar="N", type=_threads, help="processor threads (2)")
+    option(networks, "--models FOLDER", "folder of the manifests", Path)
+    option(networks, "--first-stage NAME", "the model for depth and segmentation")
+    option(networks, "--detector NAME", "the model for boxes of drones, or `none`")
+    option(networks, "--second-stage NAME", "the model for the distance")
+    option(networks, "--verification NAME", "the model that verifies detections, or `none`")
+    option(networks, "--threads N", "processor threads (2)", whole_number("a number of threads, 1 to 64", 1, 64))
 
 
 def _fov(text: str) -> float:
@@ -45,12 +45,6 @@ def _fov(text: str) -> float:
             f"{text} degrees are more than {MAX_FOV_DEG:g}; name such a camera with --config"
         )
     return angle
-
-
-def _threads(text: str) -> int:
-    if not (text.isdecimal() and 1 <= int(text) <= 64):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of threads, 1 to 64")
-    return int(text)
 
 
 class PictureCameras:

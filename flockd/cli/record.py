@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flockd.cli.options import add_stretch, opened, refuse_existing, stretch
 from flockd.cli.output import cell, say, say_json, say_table
-from flockd.cli.parser import Commands, Parser, add_commands
-from flockd.cli.recording_options import add_stretch, opened, refuse_existing, stretch
+from flockd.cli.parser import Commands, Parser, add_commands, flag, option
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def _add_recover(commands: Commands) -> None:
     examples = ("flockd record recover drone1.mcap", "flockd record recover drone1.mcap --out whole.mcap")
     description = "Recover a recording that is damaged, or was cut off by a kill or a power loss."
     parser = _with_recording(commands("recover", description, examples))
-    parser.add_argument("--out", metavar="FILE", type=Path, help="default: NAME.recovered.mcap")
+    option(parser, "--out FILE", "default: NAME.recovered.mcap", Path)
     parser.set_defaults(run=_recover)
 
 
@@ -40,7 +40,7 @@ def _add_cut(commands: Commands) -> None:
     examples = ("flockd record cut drone1.mcap --start 20 --end 30 --out turn.mcap",)
     parser = _with_recording(commands("cut", "Copy a part of a recording to a new one.", examples))
     add_stretch(parser)
-    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="the new recording")
+    option(parser, "--out FILE", "the new recording", Path, required=True)
     parser.set_defaults(run=_cut)
 
 
@@ -52,15 +52,15 @@ def _add_export(commands: Commands) -> None:
     parser = _with_recording(
         commands("export", "Write a recording's messages as tables, its images as files.", examples)
     )
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="a new or empty folder")
-    parser.add_argument("--format", choices=("csv", "parquet"), default="csv", help="of the tables (default: csv)")
-    parser.add_argument("--images", action="store_true", help="the images too, in DIR/images/CAMERA")
+    option(parser, "--out DIR", "a new or empty folder", Path, required=True)
+    option(parser, "--format", "of the tables (default: csv)", choices=("csv", "parquet"), default="csv")
+    flag(parser, "--images", "the images too, in DIR/images/CAMERA")
     parser.set_defaults(run=_export)
 
 
 def _with_recording(parser: Parser) -> Parser:
-    parser.add_argument("recording", metavar="RECORDING", type=Path, help="an MCAP file of flockd")
-    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    option(parser, "RECORDING", "an MCAP file of flockd", Path)
+    flag(parser, "--json", "print the result as JSON")
     return parser
 
 

@@ -1,4 +1,4 @@
-"""`flockd replay`: computes a recorded flight or a dataset again, and compares the outputs."""
+"""`flockd replay`: computes a recorded flight or a dataset again, compares the outputs, and says where time goes."""
 
 from __future__ import annotations
 
@@ -10,18 +10,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.config import loaded as loaded_drone
+from flockd.cli.options import add_stretch, loaded, opened, refuse, refuse_existing, stretch
 from flockd.cli.output import complain, progress, say, say_json
-from flockd.cli.parser import Commands
-from flockd.cli.profile_table import say_profile
-from flockd.cli.recording_options import add_stretch, opened, refuse_existing, stretch
-from flockd.cli.replay_dataset import add_dataset_options, refuse_dataset_options, run_dataset
+from flockd.cli.parser import Commands, Parser, flag, number, option, positive_count
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from flockd.core.config import DroneConfig
+    from flockd.ground.datasets import Dataset
     from flockd.onboard.recording.difference import Comparison
     from flockd.onboard.recording.reader import Recording
+    from flockd.review.replay.dataset_flight import Depth
 
 
 def add(commands: Commands) -> None:
@@ -38,44 +37,34 @@ def add(commands: Commands) -> None:
     )
     description = "Run the pilot on a recorded flight again: the same frames and vehicle states, the same code."
     parser = commands("replay", description, examples)
-    parser.add_argument("recording", metavar="RECORDING", type=Path, help="a recording, or a dataset (see below)")
-    parser.add_argument(
-        "--speed", metavar="X", type=_speed, default=0.0, help="times real time; 0: as fast as it goes (default)"
+    option(parser, "RECORDING", "a recording, or a dataset (see below)", Path)
+    option(
+        parser,
+        "--speed X",
+        "times real time; 0: as fast as it goes (default)",
+        number("a number, 0 or more", 0),
+        default=0.0,
     )
     add_stretch(parser)
-    parser.add_argument("--config", metavar="FILE", type=Path, help="fly with this drone's or scenario's settings")
-    parser.add_argument("--out", metavar="FILE", type=Path, help="write a new recording")
-    parser.add_argument("--diff", action="store_true", help="compare every output with what was recorded")
-    parser.add_argument(
-        "--profile", action="store_true", help="say where time goes on this computer, and which step_s it can keep"
-    )
-    parser.add_argument("--reference", metavar="FILE", type=Path, help="compare with this file instead")
-    parser.add_argument("--update-reference", action="store_true", help="write the outputs to the reference")
-    parser.add_argument(
-        "--tolerance",
-        metavar="FIELD=X",
-        type=_tolerance,
+    option(parser, "--config FILE", "fly with this drone's or scenario's settings", Path)
+    option(parser, "--out FILE", "write a new recording", Path)
+    flag(parser, "--diff", "compare every output with what was recorded")
+    flag(parser, "--profile", "say where time goes on this computer, and which step_s it can keep")
+    option(parser, "--reference FILE", "compare with this file instead", Path)
+    flag(parser, "--update-reference", "write the outputs to the reference")
+    option(
+        parser,
+        "--tolerance FIELD=X",
+        "numbers of this field, such as command.velocity, may differ by X; may be given again",
+        _tolerance,
         action="append",
         default=[],
-        help="numbers of this field, such as command.velocity, may differ by X; may be given again",
     )
-    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    flag(parser, "--json", "print the result as JSON")
     group = parser.add_argument_group("bags of ROS 2", "a bag folder as RECORDING, with --config")
-    group.add_argument(
-        "--vehicle", metavar="TOPIC", help="odometry, pose or IMU of the drone (default: the only one there is)"
-    )
-    add_dataset_options(parser)
+    option(group, "--vehicle TOPIC", "odometry, pose or IMU of the drone (default: the only one there is)")
+    _add_dataset(parser)
     parser.set_defaults(run=_run)
-
-
-def _speed(text: str) -> float:
-    try:
-        speed = float(text)
-    except ValueError:
-        speed = math.nan
-    if not (math.isfinite(speed) and speed >= 0):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number, 0 or more")
-    return speed
 
 
 def _tolerance(text: str) -> tuple[str, float]:
@@ -93,8 +82,8 @@ def _run(args: argparse.Namespace) -> int:
     from flockd.onboard.recording.ros_bag import is_bag
 
     if args.recording.is_dir() and not is_bag(args.recording):
-        return run_dataset(args)
-    refuse_dataset_options(args)
+        return _run_dataset(args)
+    _refuse_dataset(args)
     _check_options(args)
     with _recording(args) as recording:
         return _replay(args, recording)
@@ -113,7 +102,7 @@ def _recording(args: argparse.Namespace) -> Iterator[Recording]:
     with Bag(args.recording) as bag, TemporaryDirectory(prefix="flockd-bag-") as folder:
         from flockd.review.replay.bag_flight import recording_of_bag
 
-        config = loaded_drone(args.config)
+        config = loaded(args.config)
         if config is None:
             raise UsageError(
                 f"{args.recording}: is a bag of ROS 2; name a drone with --config whose "
@@ -163,7 +152,7 @@ def _replay(args: argparse.Namespace, recording: Recording) -> int:
     else:
         _say_result(args, comparison, result)
         if watch is not None:
-            say_profile(result["profile"])
+            _say_profile(result["profile"])
     return ExitCode.CHECK_FAILED if comparison is not None and comparison.first else ExitCode.DONE
 
 
@@ -197,7 +186,7 @@ def _config(args: argparse.Namespace, recording: Recording) -> DroneConfig:
     """The settings to fly with: the recorded ones, or those of --config, for the same cameras."""
     if args.config is None:
         return recording.config
-    config = loaded_drone(args.config)
+    config = loaded(args.config)
     assert config is not None
     recorded = {camera.name: camera.size_px for camera in recording.config.rig.cameras}
     for camera in config.rig.cameras:
@@ -241,3 +230,149 @@ def _say_result(args: argparse.Namespace, comparison: Comparison | None, result:
         say(f"  {name}: in {len(difference.steps)} of {comparison.steps} steps{size}")
     if args.reference is not None:
         say(f"if this is meant: flockd replay {args.recording} --reference {args.reference} --update-reference")
+
+
+_OF_RECORDINGS = ("speed", "start", "end", "out", "diff", "reference", "update_reference", "tolerance")
+_OF_DATASETS = ("depth", "stride", "flow", "calibration", "trajectory")
+
+
+def _add_dataset(parser: Parser) -> None:
+    """Adds what only replays of datasets have."""
+    group = parser.add_argument_group("datasets", "a folder with images, depth and poses as RECORDING")
+    option(
+        group,
+        "--depth",
+        "the recorded depth, or that of the network (default: network)",
+        choices=("recorded", "network"),
+    )
+    option(group, "--stride N", "pair frame i with frame i + N (default: 1)", positive_count)
+    option(group, "--flow NAME", "use this flow model, or `dis`")
+    option(group, "--calibration FILE", "K.txt, or a drone's YAML with one camera", Path)
+    option(group, "--trajectory FILE", "write the integrated path in TUM format", Path)
+
+
+def _refuse_dataset(args: argparse.Namespace) -> None:
+    """Raises UsageError where a recording is to be replayed like a dataset."""
+    refuse(args, _OF_DATASETS, "is for datasets; a recording of flockd holds it, or --config gives it")
+
+
+def _run_dataset(args: argparse.Namespace) -> int:
+    """Runs the command for a dataset."""
+    refuse(args, _OF_RECORDINGS, "is for recordings of flockd, and this is none; leave it out")
+    if args.trajectory is not None:
+        refuse_existing(args.trajectory, "--trajectory")
+    from flockd.ground.datasets import open_dataset
+    from flockd.review.replay.dataset_flight import dataset_config, dataset_result, replay_dataset, write_trajectory
+
+    stride = args.stride or 1
+    depth: Depth = args.depth or "network"
+    dataset = open_dataset(args.recording, args.calibration)
+    _check_dataset(dataset, stride, depth)
+    given = loaded(args.config)
+    config = dataset_config(dataset, given, depth, args.flow)
+    for note in (*dataset.notes, *_notes(args.config, given)):
+        complain(note)
+    with progress("replaying", "pairs") as show_progress:
+        pairs = replay_dataset(dataset, config, stride, depth, show_progress)
+    result = {**dataset_result(pairs), "stride": stride, "depth": depth, "flow": config.perception.flow}
+    if args.trajectory is not None:
+        broken = write_trajectory(args.trajectory, pairs, stride)
+        if broken is not None:
+            complain(
+                f"{args.trajectory}: ends at frame {broken.before.index}, as the motion to frame {broken.after.index} "
+                f"could not be estimated: {broken.reason}"
+            )
+    if args.json:
+        say_json(result)
+    else:
+        _say_dataset(args, result)
+    if not any(pair.found for pair in pairs):
+        complain(f"{dataset.path}: no motion could be estimated: {pairs[0].reason}")
+        return ExitCode.CHECK_FAILED
+    return ExitCode.DONE
+
+
+def _notes(file: Path | None, config: DroneConfig | None) -> list[str]:
+    if config is None or config.perception.scale == "network":
+        return []
+    scale = config.perception.scale
+    return [f"{file}: perception.scale: {scale} needs an autopilot, which a dataset lacks; scale is the network's"]
+
+
+def _check_dataset(dataset: Dataset, stride: int, depth: str) -> None:
+    if depth == "recorded" and not dataset.has_depth:
+        raise UsageError(f"{dataset.path}: has no recorded depth; replay it with --depth network")
+    if stride >= len(dataset):
+        raise UsageError(f"{dataset.path}: has {len(dataset)} frames, and none {stride} after another; lower --stride")
+
+
+def _say_dataset(args: argparse.Namespace, result: Mapping[str, Any]) -> None:
+    pairs = result["pairs"]
+    estimated = [pair for pair in pairs if pair["estimated"]]
+    say(
+        f"{args.recording}: {len(pairs)} pairs of frames, {result['stride']} apart; flow {result['flow']}, depth "
+        f"{result['depth']}"
+    )
+    say(f"estimated: {len(estimated)} ({100 * result['estimated_ratio']:.1f} %)")
+    for name, unit, factor in (("rotation_error_deg", "deg", 1), ("translation_error_m", "cm", 100)):
+        spread = {key: value for key, value in result[name].items() if value is not None}
+        if spread:
+            shown = ", ".join(f"{key} {factor * value:.2f} {unit}" for key, value in spread.items())
+            say(f"{name.partition('_')[0]} error: {shown}")
+    for pair in pairs:
+        if not pair["estimated"]:
+            say(f"not estimated: {pair['from']} to {pair['to']}: {pair['reason']}")
+    if args.trajectory is not None:
+        say(f"trajectory: {args.trajectory}")
+
+
+def _say_profile(profile: Mapping[str, Any]) -> None:
+    """A table of stages, the computer, and the step time that it can keep; ``profile`` as `profile_result` gives it."""
+    say(f"\n{'stage':<20}{'p50 ms':>8}{'p95 ms':>8}{'share':>8}")
+    for stage, row in profile["stages"].items():
+        say(f"{stage:<20}{row['p50_ms']:>8.1f}{row['p95_ms']:>8.1f}{100 * row['share']:>7.0f}%")
+    say(f"\n{_computer(profile['computer'])}")
+    say(_instructions(profile["computer"]))
+    cameras = ", ".join(f"{name} {width}x{height}" for name, (width, height) in profile["cameras"].items())
+    say(f"cameras: {cameras}")
+    say(f"networks: {', '.join(profile['networks'])} on {profile['provider']}, perception.threads {profile['threads']}")
+    say(f"a step takes {profile['processor_ms']:.0f} ms of processor time: {profile['cores_busy']:.1f} cores busy")
+    say(f"memory: {profile['memory_mb']:.0f} MB at most; load before: {profile['load_before']:.1f}")
+    say(f"temperature: {_temperature(profile)}")
+    say("; ".join(f"{name} {version}" for name, version in profile["versions"].items()))
+    say(f"\n{_advice(profile)}")
+
+
+def _computer(computer: Mapping[str, Any]) -> str:
+    memory = "" if computer["memory_mb"] is None else f", {computer['memory_mb'] / 1e3:.1f} GB of memory"
+    cores = computer["cores"]
+    return (
+        f"computer: {computer['name']}, {computer['architecture']}, {cores} {'core' if cores == 1 else 'cores'}{memory}"
+    )
+
+
+def _instructions(computer: Mapping[str, Any]) -> str:
+    eight_bit = ", ".join(computer["eight_bit"]) or "none known, so the 8-bit networks save little"
+    return f"instructions for 8-bit numbers: {eight_bit}; others: {', '.join(computer['vector']) or 'none known'}"
+
+
+def _temperature(profile: Mapping[str, Any]) -> str:
+    if profile["temperature_c"] is None:
+        text = "this computer reports none"
+    else:
+        start, most, end = profile["temperature_c"]
+        text = f"{start:.0f} °C at the start, {most:.0f} at most, {end:.0f} at the end ({profile['zone']})"
+    if profile["clock_mhz"] is not None:
+        text += "; clock {:.0f} to {:.0f} MHz".format(*profile["clock_mhz"])
+    if profile["slowed_by"]:
+        text += f"; THE PROCESSOR WAS SLOWED DOWN ({', '.join(profile['slowed_by'])}): cool it, and measure again"
+    return text
+
+
+def _advice(profile: Mapping[str, Any]) -> str:
+    share = 100 * profile["stages"]["step"]["p95_ms"] / (1e3 * profile["step_s"])
+    text = f"step_s {profile['step_s']:g} is configured: a step takes {share:.0f} % of it (p95)"
+    least = profile["least_step_s"]
+    if least > profile["step_s"]:
+        return f"{text}. Too long: configure step_s: {least:g} or more here"
+    return f"{text}. The least that leaves a fifth for cameras, recording and telemetry: step_s: {least:g}"

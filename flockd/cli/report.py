@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
 from flockd.cli.flight_summary import show_summary
+from flockd.cli.options import opened, refuse, require
 from flockd.cli.output import complain, progress, say, say_json, say_table
-from flockd.cli.parser import Commands
-from flockd.cli.recording_options import opened, require
+from flockd.cli.parser import Commands, flag, option
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -44,49 +44,39 @@ def add(commands: Commands) -> None:
         type=Path,
         help="a recording, a folder of them (each drone's newest), or what `flockd sim` wrote",
     )
-    parser.add_argument(
-        "other",
-        nargs="?",
-        metavar="OTHER",
-        type=Path,
-        help="another flight: the key figures of both are printed, and nothing is written",
+    option(
+        parser, "OTHER", "another flight: the key figures of both are printed, and nothing is written", Path, nargs="?"
     )
-    parser.add_argument("--force", action="store_true", help="overwrite an earlier report, or a flight in --out")
-    parser.add_argument(
-        "--out", metavar="DIR", type=Path, help=f"of a recording's report; default: NAME{SUFFIX} beside it"
+    flag(parser, "--force", "overwrite an earlier report, or a flight in --out")
+    option(parser, "--out DIR", f"of a recording's report; default: NAME{SUFFIX} beside it", Path)
+    flag(parser, "--without-pictures", "do not run the networks again for the report's images")
+    option(
+        parser,
+        "--video FILE",
+        "write a video instead, .webm or .mp4: a drone's images with its detections, beside the map",
+        Path,
     )
-    parser.add_argument(
-        "--without-pictures",
-        action="store_true",
-        help="do not run the networks again for the report's images",
-    )
-    parser.add_argument(
-        "--video",
-        metavar="FILE",
-        type=Path,
-        help="write a video instead, .webm or .mp4: a drone's images with its detections, beside the map",
-    )
-    parser.add_argument("--drone", metavar="NAME", help="whose images the video shows; default: the first recorded")
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    option(parser, "--drone NAME", "whose images the video shows; default: the first recorded")
+    flag(parser, "--json", "print the summary as JSON")
     parser.set_defaults(run=_run)
 
 
 def _run(args: argparse.Namespace) -> int:
     require(*(path for path in (args.flight, args.other) if path is not None))
     if args.other is not None:
-        _refuse(args, ("out", "without_pictures", "force", "video", "drone"), "has no meaning with two flights")
+        refuse(args, ("out", "without_pictures", "force", "video", "drone"), "has no meaning with two flights; drop it")
         return _compare(args)
     if args.video is not None:
-        _refuse(args, ("out", "without_pictures"), "has no meaning with --video")
+        refuse(args, ("out", "without_pictures"), "has no meaning with --video; drop it")
         return _video(args)
-    _refuse(args, ("drone",), "is for --video")
+    refuse(args, ("drone",), "is for --video; drop it")
     from flockd.review.report.flight_folder import REPORT_NAME, prepare_report_folder, save_flight
     from flockd.review.report.summary import summarise
 
     directory: Path = args.flight
     if _is_flight(directory):
-        why = f"is for recordings, and {directory} is a flight's folder, whose report is written into it"
-        _refuse(args, ("out", "without_pictures"), why)
+        why = f"is for recordings, and {directory} is a flight's folder, whose report is written into it; drop it"
+        refuse(args, ("out", "without_pictures"), why)
         log = _log_of(directory)
         if (directory / REPORT_NAME).is_file() and not args.force:
             complain(f"{directory / REPORT_NAME}: is left as it was; --force writes it again")
@@ -103,12 +93,6 @@ def _run(args: argparse.Namespace) -> int:
     with progress("writing the report", "figures") as tell_progress:
         summary = write_report_files(directory, log, tell_progress)
     return show_summary(directory, summary, as_json=args.json)
-
-
-def _refuse(args: argparse.Namespace, options: Sequence[str], why: str) -> None:
-    for option in options:
-        if getattr(args, option):
-            raise UsageError(f"--{option.replace('_', '-')} {why}; drop it")
 
 
 def _compare(args: argparse.Namespace) -> int:

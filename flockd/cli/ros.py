@@ -7,9 +7,9 @@ import sys
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from flockd.cli.endpoint_options import add_endpoint_options, add_operator_option, endpoints
+from flockd.cli.options import add_endpoint_options, add_operator_option, endpoints
 from flockd.cli.output import complain, say
-from flockd.cli.parser import ALONE, Commands, Parser, add_commands
+from flockd.cli.parser import ALONE, Commands, Parser, add_commands, flag, option
 from flockd.core.errors import ExitCode
 
 _NOTES = """\
@@ -28,9 +28,7 @@ def add(commands: Commands) -> None:
     parser = commands("ros", what, examples, _NOTES)
     add_commands(parser, (_add_perceive,))
     add_endpoint_options(parser, "--drones-at")
-    parser.add_argument(
-        "--orders", action="store_true", help="offer services and topics that order drones (default: watch only)"
-    )
+    flag(parser, "--orders", "offer services and topics that order drones (default: watch only)")
     add_operator_option(parser)
     _add_network(parser)
     parser.set_defaults(run=_run)
@@ -38,9 +36,7 @@ def add(commands: Commands) -> None:
 
 
 def _add_network(parser: Parser) -> None:
-    parser.add_argument(
-        "--network", action="store_true", help="let other computers find it in ROS 2 (default: this computer alone)"
-    )
+    flag(parser, "--network", "let other computers find it in ROS 2 (default: this computer alone)")
 
 
 def _add_perceive(commands: Commands) -> None:
@@ -55,8 +51,8 @@ def _add_perceive(commands: Commands) -> None:
     parser = commands(
         "perceive", "See drones in the images of topics, and publish them; command nothing.", examples, notes
     )
-    parser.add_argument("--config", metavar="FILE", type=Path, required=True, help="a drone's, with its source")
-    parser.add_argument("--vehicle", metavar="TOPIC", help="odometry, pose or IMU of the vehicle, in REP 103's axes")
+    option(parser, "--config FILE", "a drone's, with its source", Path, required=True)
+    option(parser, "--vehicle TOPIC", "odometry, pose or IMU of the vehicle, in REP 103's axes")
     _add_network(parser)
     parser.set_defaults(run=_perceive)
 

@@ -12,8 +12,8 @@ import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.parser import Commands
-from flockd.cli.real_drone import add_force, load_to_fly
+from flockd.cli.options import add_force, load_to_fly
+from flockd.cli.parser import Commands, option
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
@@ -38,12 +38,12 @@ def add(commands: Commands) -> None:
     )
     description = "Fly this drone: from camera frames to setpoints for its autopilot, until SIGTERM or Ctrl-C."
     parser = commands("run", description, examples)
-    parser.add_argument("--config", metavar="FILE", type=Path, required=True, help="the drone's configuration")
-    parser.add_argument(
-        "--record",
-        metavar="DIR",
-        type=Path,
-        help="write a recording of each flight to this folder, which is made; see `recording` in the configuration",
+    option(parser, "--config FILE", "the drone's configuration", Path, required=True)
+    option(
+        parser,
+        "--record DIR",
+        "write a recording of each flight to this folder, which is made; see `recording` in the configuration",
+        Path,
     )
     add_force(parser)
     parser.set_defaults(run=_run)

@@ -1,27 +1,36 @@
-"""`flockd sim`: flies a simulated flock and reports on it."""
+"""`flockd sim`: flies a simulated flock and reports on it; live on the fleet page, or with real daemons."""
 
 from __future__ import annotations
 
 import argparse
+import asyncio
+import html
 import math
+import os
 import re
-from contextlib import ExitStack, suppress
+import signal
+import sys
+import tempfile
+import threading
+import webbrowser
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, get_args
 
-from flockd.cli import sim_fleet, sim_live
-from flockd.cli.endpoint_options import ENDPOINT, add_operator_option
-from flockd.cli.fleet_page import PORT
-from flockd.cli.fleet_source import port_number
+from flockd.cli.fleet import HERE, PORT, serve_page
 from flockd.cli.flight_summary import report_flight
-from flockd.cli.output import Phases, complain
-from flockd.cli.parser import Commands, positive_count, positive_number, seed
+from flockd.cli.options import ENDPOINT, add_operator_option
+from flockd.cli.output import Phases, complain, say
+from flockd.cli.parser import Commands, flag, option, port_number, positive_count, positive_number, whole_number
 from flockd.core.choices import TRUTH_ROLES, AutopilotKind, CameraPreset, HeightSource, ScaleSource, SimulatedPerception
 from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, UsageError
 
 if TYPE_CHECKING:
     from flockd.core.config import Overrides
+    from flockd.fleet.page.page_server import PageServer
     from flockd.onboard.recording import Recorder
     from flockd.sim.scenario import ScenarioConfig
 
@@ -66,53 +75,51 @@ def add(commands: Commands) -> None:
         "flockd sim config/px4_flight.yaml --autopilot px4",
     )
     parser = commands("sim", "Fly a simulated flock, and write a report of the flight.", examples, COSTS)
-    parser.add_argument("scenario", nargs="?", metavar="SCENARIO", type=Path, help="by default the paper's flight")
-    parser.add_argument(
+    option(parser, "SCENARIO", "by default the paper's flight", Path, nargs="?")
+    option(
+        parser,
         "--perception",
+        "fly on networks, or on the exact states of all drones (default: learned)",
         choices=get_args(SimulatedPerception),
         default="learned",
-        help="fly on networks, or on the exact states of all drones (default: learned)",
     )
-    parser.add_argument(
+    option(
+        parser,
         "--autopilot",
-        choices=get_args(AutopilotKind),
-        help="fly with a real `flockd run` for each drone, and this autopilot (default: with the simulator's own "
+        "fly with a real `flockd run` for each drone, and this autopilot (default: with the simulator's own "
         "pilots); `px4` needs FLOCKD_PX4, the SITL build folder of PX4",
+        choices=get_args(AutopilotKind),
     )
-    parser.add_argument(
-        "--speed-factor",
-        metavar="F",
-        type=positive_number,
-        help=f"with --autopilot: how fast simulated time passes (default: {sim_fleet.DEFAULT_SPEED_FACTOR})",
+    option(
+        parser,
+        "--speed-factor F",
+        f"with --autopilot: how fast simulated time passes (default: {DEFAULT_SPEED_FACTOR})",
+        positive_number,
     )
-    parser.add_argument("--flow", metavar="NAME", help="the model for optical flow, or `dis`")
-    parser.add_argument("--scale", choices=get_args(ScaleSource), help="where the background's scale comes from")
-    parser.add_argument(
-        "--height", choices=get_args(HeightSource), help="what measures the height above ground that gives the scale"
+    option(parser, "--flow NAME", "the model for optical flow, or `dis`")
+    option(parser, "--scale", "where the background's scale comes from", choices=get_args(ScaleSource))
+    option(
+        parser, "--height", "what measures the height above ground that gives the scale", choices=get_args(HeightSource)
     )
-    parser.add_argument(
-        "--cameras", choices=get_args(CameraPreset), help="as bad as real ones, or without any of their faults"
-    )
-    parser.add_argument("--drones", metavar="N", type=_flock_size, help="size of the flock")
-    parser.add_argument("--duration", metavar="S", type=positive_number, help="seconds to fly; it changes the world")
-    parser.add_argument("--wind", metavar="N,E", type=_wind, help="mean wind in m/s, to the north and to the east")
-    parser.add_argument("--speed", metavar="V", type=positive_number, help="desired speed of the flock in m/s")
-    parser.add_argument(
-        "--radius", metavar="R", type=positive_number, help="of the circle in m, measured at the flock's centre"
-    )
-    parser.add_argument("--seed", metavar="N", type=seed, help="of the world and of all noise")
-    parser.add_argument(
-        "--swap",
-        metavar="ROLE,...",
-        type=_roles,
+    option(parser, "--cameras", "as bad as real ones, or without any of their faults", choices=get_args(CameraPreset))
+    option(parser, "--drones N", "size of the flock", _flock_size)
+    option(parser, "--duration S", "seconds to fly; it changes the world", positive_number)
+    option(parser, "--wind N,E", "mean wind in m/s, to the north and to the east", _wind)
+    option(parser, "--speed V", "desired speed of the flock in m/s", positive_number)
+    option(parser, "--radius R", "of the circle in m, measured at the flock's centre", positive_number)
+    option(parser, "--seed N", "of the world and of all noise", whole_number("a whole number, 0 or more"))
+    option(
+        parser,
+        "--swap ROLE,...",
+        f"use the exact values of these roles instead of a network's: {', '.join(TRUTH_ROLES)}",
+        _roles,
         default=frozenset(),
-        help=f"use the exact values of these roles instead of a network's: {', '.join(TRUTH_ROLES)}",
     )
-    parser.add_argument(
-        "--out",
-        metavar="DIR",
-        type=Path,
-        help="a new folder; default: out/SCENARIO-PERCEPTION-seedN, or -AUTOPILOT-, with -2, -3, ... if there is one",
+    option(
+        parser,
+        "--out DIR",
+        "a new folder; default: out/SCENARIO-PERCEPTION-seedN, or -AUTOPILOT-, with -2, -3, ... if there is one",
+        Path,
     )
     parser.add_argument(
         "--no-gate",
@@ -120,39 +127,33 @@ def add(commands: Commands) -> None:
         action="store_false",
         help="fly what the pilots ask for, without their safety gates: to study the flocking law alone",
     )
-    parser.add_argument("--force", action="store_true", help="overwrite an earlier flight in that folder")
-    parser.add_argument(
+    flag(parser, "--force", "overwrite an earlier flight in that folder")
+    flag(
+        parser,
         "--live",
-        action="store_true",
-        help="fly on the fleet page in the browser, in real time where the computer can: send drones places, pause, "
+        "fly on the fleet page in the browser, in real time where the computer can: send drones places, pause, "
         "slow down, disturb, begin again; until Ctrl-C, without a report",
     )
-    parser.add_argument(
-        "--port", metavar="N", type=port_number, help=f"with --live: of the page (default: {PORT}; 0: any)"
-    )
+    option(parser, "--port N", f"with --live: of the page (default: {PORT}; 0: any)", port_number)
     parser.add_argument(
         "--no-browser", dest="browser", action="store_false", help="with --live: print the address, and open no browser"
     )
     add_operator_option(parser)
-    parser.add_argument(
+    flag(
+        parser,
         "--telemetry",
-        action="store_true",
-        help="publish over zenoh while flying, with pictures, and take orders; with --perception truth in real time",
+        "publish over zenoh while flying, with pictures, and take orders; with --perception truth in real time",
     )
-    parser.add_argument(
-        "--telemetry-at", metavar="ENDPOINT",
-        help="where --telemetry and --live listen, or where the daemons of --autopilot connect to "
-        f"(default: {ENDPOINT})",
-    )  # fmt: skip
-    parser.add_argument(
-        "--record",
-        action="store_true",
-        help="write a recording of each drone to DIR/recordings, 4.5 MB a drone and simulated second",
+    option(
+        parser,
+        "--telemetry-at ENDPOINT",
+        f"where --telemetry and --live listen, or where the daemons of --autopilot connect to (default: {ENDPOINT})",
     )
+    flag(parser, "--record", "write a recording of each drone to DIR/recordings, 4.5 MB a drone and simulated second")
     told = parser.add_mutually_exclusive_group()
-    told.add_argument("--quiet", action="store_true", help="print only the path of the report, and no progress")
-    told.add_argument("--verbose", action="store_true", help="say what is flown, and each phase with its time")
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    flag(told, "--quiet", "print only the path of the report, and no progress")
+    flag(told, "--verbose", "say what is flown, and each phase with its time")
+    flag(parser, "--json", "print the summary as JSON")
     parser.set_defaults(run=_run)
 
 
@@ -188,7 +189,7 @@ def _run(args: argparse.Namespace) -> int:
     args.settings = _settings_of(args)
     scenario = _scenario(args)
     if args.live:
-        return sim_live.fly(args, scenario, _plain(scenario.scenario))
+        return _fly_live(args, scenario, _plain(scenario.scenario))
     directory = _folder(scenario, args)
     try:
         return _fly_into(directory, scenario, args)
@@ -205,7 +206,7 @@ def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespac
         for line in _settings(scenario, directory, args):
             complain(line)
     if args.autopilot is not None:
-        return sim_fleet.fly(args, scenario, directory)
+        return _fly_fleet(args, scenario, directory)
     from flockd.sim.flock.swarm import fly
 
     with ExitStack() as stack:
@@ -283,8 +284,8 @@ def _recorders(
 
 
 def _check_options(args: argparse.Namespace) -> None:
-    sim_live.check_options(args)
-    sim_fleet.check_options(args)
+    _check_live(args)
+    _check_fleet(args)
     if args.perception == "truth":
         idle = [option for option in ("flow", "scale", "height", "cameras", "swap", "record") if getattr(args, option)]
         if idle:
@@ -361,3 +362,206 @@ def _as_text(value: object) -> str:
 def _plain(name: str) -> str:
     """A scenario's name as part of a path and of a telemetry key."""
     return re.sub(r"[^A-Za-z0-9_]+", "-", name).strip("-") or "flight"
+
+
+_KEEPS = {
+    "telemetry": "--live has --telemetry in it; drop one of them",
+    "record": "--live keeps nothing; _fly_live with --record and without --live",
+    "json": "--live has no summary; drop --json",
+    "out": "--live writes nothing; drop --out",
+    "force": "--live writes nothing; drop --force",
+    "autopilot": "--live flies with the simulator's own pilots; drop --autopilot",
+    "duration": "--live flies on until Ctrl-C; drop --duration",
+}
+"""Options that do not go with it, and what to do."""
+
+
+def _check_live(args: argparse.Namespace) -> None:
+    """Raises UsageError for options that go without --live, or with it, only."""
+    if args.live:
+        for option, sentence in _KEEPS.items():
+            if getattr(args, option):
+                raise UsageError(sentence)
+    elif args.port is not None or not args.browser:
+        raise UsageError(f"--{'no-browser' if not args.browser else 'port'} is for --live; add that, or drop it")
+
+
+def _fly_live(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) -> int:
+    """Until Ctrl-C."""
+    import aiohttp.web  # noqa: F401 - before anything is opened: it is of an extra
+
+    from flockd.fleet.page.live_fleet import LiveFleet
+    from flockd.fleet.page.page_access import PageAccess
+    from flockd.fleet.page.page_server import PageServer
+    from flockd.fleet.simulation import SimulationLink, key_of
+    from flockd.fleet.watcher import FleetWatcher
+    from flockd.onboard.telemetry.publisher import ZenohTelemetry
+    from flockd.sim.flock.live_controls import LiveControls, answered
+    from flockd.sim.flock.live_flight import fly_live
+    from flockd.sim.flock.repeater import Repeater
+    from flockd.sim.flock.shown_flock import ShownFlock
+
+    endpoint = args.telemetry_at or ENDPOINT
+    with suppress(KeyboardInterrupt), ExitStack() as stack:
+        zenoh = stack.enter_context(ZenohTelemetry(fleet, listen=[endpoint]))
+        controls = LiveControls(scenario, zenoh.identity, by_sight=args.perception != "truth")
+        zenoh.reply_to(f"{key_of(fleet)}/**", answered(controls))
+        shown = ShownFlock(scenario, zenoh, stack.enter_context(Repeater(zenoh)))
+        watcher = stack.enter_context(FleetWatcher(fleet, listen=[], connect=[endpoint]))
+        source = stack.enter_context(LiveFleet(watcher))
+        access, link = PageAccess(), stack.enter_context(SimulationLink(fleet, watcher))
+        page = PageServer(source, access, may_command=True, operator=args.operator, simulation=link)
+        port = stack.enter_context(_served(page, PORT if args.port is None else args.port))
+        address = f"http://{HERE}:{port}/?key={access.key}"
+        say(f"the flock is at {address}")
+        if not args.quiet:
+            complain(f"other programs find it at {endpoint}; Ctrl-C ends it")
+        sys.stdout.flush()  # whoever reads a pipe needs the address now
+        if args.browser and _has_screen():
+            stack.enter_context(_opened(address))
+        with Phases(quiet=args.quiet, verbose=args.verbose) as phases:
+            fly_live(
+                scenario,
+                shown,
+                controls,
+                perception=args.perception,
+                swap=args.swap,
+                gated=args.gated,
+                preparing=phases.of("loading networks and building the world", "parts"),
+            )
+    return ExitCode.DONE
+
+
+def _has_screen() -> bool:
+    """Whether a browser has somewhere to open: not a text browser in this terminal."""
+    return sys.platform in {"darwin", "win32"} or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+@contextmanager
+def _opened(address: str) -> Iterator[None]:
+    """Opens the address in the browser by a page that this user alone may read, while this lasts.
+
+    The address has the key in it, and all users of a computer may see the command lines of all its processes.
+    """
+    with tempfile.NamedTemporaryFile("w", prefix="flockd-", suffix=".html", encoding="utf-8") as page:
+        page.write(f'<meta http-equiv="refresh" content="0; url={html.escape(address)}">')
+        page.flush()
+        webbrowser.open(Path(page.name).as_uri())
+        yield
+
+
+@contextmanager
+def _served(page: PageServer, port: int) -> Iterator[int]:
+    """Serves the page on a thread of its own. Gives its port; raises what its start did."""
+    loop = asyncio.new_event_loop()
+    begun: list[int] = []
+    failed: list[BaseException] = []
+    known = threading.Event()
+
+    def served(at: int) -> None:
+        begun.append(at)
+        known.set()
+
+    async def serve() -> None:
+        try:
+            await serve_page(page, HERE, port, served)
+        except Exception as error:  # noqa: BLE001 - raised again where it was started
+            failed.append(error)
+        finally:
+            known.set()
+
+    task = loop.create_task(serve())
+
+    def run() -> None:
+        asyncio.set_event_loop(loop)
+        with suppress(asyncio.CancelledError):
+            loop.run_until_complete(task)
+        loop.close()
+
+    thread = threading.Thread(target=run, name="fleet page server", daemon=True)
+    thread.start()
+    known.wait()
+    if failed:
+        raise failed[0]
+    try:
+        yield begun[0]
+    finally:
+        loop.call_soon_threadsafe(task.cancel)
+        thread.join()
+
+
+SITL = "px4_sitl.yaml"
+DEFAULT_SPEED_FACTOR = 0.25
+"""Two cores then keep up with five drones."""
+SPEED_FACTORS = (0.02, 10.0)
+"""What a daemon's configuration allows."""
+
+
+def _check_fleet(args: argparse.Namespace) -> None:
+    """Raises UsageError for options that go with the simulator's own pilots, or with daemons, only."""
+    if args.autopilot is None:
+        if args.speed_factor is not None:
+            raise UsageError("--speed-factor is for real daemons; drop it, or name their --autopilot")
+        if args.telemetry_at is not None and not (args.telemetry or args.live):
+            raise UsageError("--telemetry-at is for --telemetry, --live and --autopilot; add one of them, or drop it")
+        return
+    slowest, fastest = SPEED_FACTORS
+    if args.speed_factor is not None and not slowest <= args.speed_factor <= fastest:
+        raise UsageError(f"--speed-factor {args.speed_factor:g} is not from {slowest:g} to {fastest:g}; choose another")
+    own = {"--perception truth": args.perception == "truth", "--swap": args.swap, "--telemetry": args.telemetry}
+    idle = [option for option, given in own.items() if given]
+    if idle:
+        raise UsageError(f"{idle[0]} has no meaning with real daemons, which have their own; drop it")
+
+
+def _fly_fleet(args: argparse.Namespace, scenario: ScenarioConfig, directory: Path) -> int:
+    """Flies, writes the same report as the simulator, and says whether all flew to the end."""
+    from flockd.core.config import load_drone
+    from flockd.core.data import data_path
+    from flockd.review.report.flight_folder import FLEET_LOGS, RECORDINGS
+    from flockd.sim.sitl.fleet import fly_fleet
+
+    with ExitStack() as stack:
+        stack.enter_context(_ended_in_order())
+        phases = stack.enter_context(Phases(quiet=args.quiet, verbose=args.verbose))
+        phases.say("starting autopilots and daemons, and taking off")
+        sitl = load_drone(data_path("config") / SITL)
+        if args.telemetry_at is not None:
+            telemetry = sitl.telemetry.model_copy(update={"connect": (args.telemetry_at,)})
+            sitl = sitl.model_copy(update={"telemetry": telemetry})
+        flight = fly_fleet(
+            scenario,
+            sitl,
+            kind=args.autopilot,
+            speed_factor=args.speed_factor or DEFAULT_SPEED_FACTOR,
+            logs=directory / FLEET_LOGS,
+            recordings=directory / RECORDINGS if args.record else None,
+            environment=os.environ,
+            progress=phases.of("flying", "s"),
+        )
+    code = report_flight(directory, flight, args)
+    fleet = flight.log.metadata.fleet
+    assert fleet is not None
+    faults = [f"{drone} did not _fly_fleet to the end: {why}" for drone, why in fleet.handed_over.items()]
+    faults += [f"the daemon of {drone} ended with exit code {code}" for drone, code in fleet.exit_codes.items() if code]
+    for sentence in [*faults, *fleet.notes]:
+        complain(f"{sentence}; see {directory / FLEET_LOGS}" if sentence in faults else sentence)
+    if flight.log.metadata.interrupted:
+        complain("interrupted; the report is of what was flown")
+        return ExitCode.INTERRUPTED
+    return ExitCode.CHECK_FAILED if faults else code
+
+
+@contextmanager
+def _ended_in_order() -> Iterator[None]:
+    """SIGTERM and a closed terminal end the fleet as Ctrl-C does."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

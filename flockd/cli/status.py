@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.endpoint_options import add_endpoint_options, endpoints
+from flockd.cli.options import add_endpoint_options, endpoints
 from flockd.cli.output import cell, noted_table, say_json, tables_console
-from flockd.cli.parser import Commands, positive_number
+from flockd.cli.parser import Commands, flag, option, positive_number
 from flockd.core.errors import ExitCode, UnavailableError
 
 if TYPE_CHECKING:
@@ -35,10 +35,8 @@ def add(commands: Commands) -> None:
     )
     parser = commands("status", "Show how each drone of a fleet is doing, the worst first.", examples)
     add_endpoint_options(parser)
-    parser.add_argument(
-        "--seconds", metavar="S", type=positive_number, help="listen this long and print once, also on a terminal"
-    )
-    parser.add_argument("--json", action="store_true", help="print JSON, once")
+    option(parser, "--seconds S", "listen this long and print once, also on a terminal", positive_number)
+    flag(parser, "--json", "print JSON, once")
     parser.set_defaults(run=_run)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from flockd.cli import main
-from flockd.cli.fleet_source import announce
+from flockd.cli.fleet import announce
 
 RECORDING = Path(__file__).parents[1] / "review" / "replay" / "crossing.mcap"
 

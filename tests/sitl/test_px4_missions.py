@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from flockd.cli.sim_fleet import DEFAULT_SPEED_FACTOR, SITL
+from flockd.cli.sim import DEFAULT_SPEED_FACTOR, SITL
 from flockd.core.config import load_drone
 from flockd.core.data import data_path
 from flockd.core.messages import FloatArray

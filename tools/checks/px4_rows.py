@@ -26,7 +26,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from flockd.cli.sim_fleet import DEFAULT_SPEED_FACTOR, SITL
+from flockd.cli.sim import DEFAULT_SPEED_FACTOR, SITL
 from flockd.core.choices import AutopilotKind
 from flockd.core.config import load_drone
 from flockd.core.data import data_path

@@ -1,0 +1,152 @@
+"""Options that several commands have, and what they are made into."""
+
+from __future__ import annotations
+
+import argparse
+import getpass
+import socket
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flockd.cli.output import complain, progress
+from flockd.cli.parser import Parser, flag, number, option, positive_number
+from flockd.core.errors import ConfigError, ConfigProblem, FlockdError, UsageError
+from flockd.core.printable import printable
+
+if TYPE_CHECKING:
+    from flockd.core.config import DroneConfig
+    from flockd.onboard.recording.reader import Recording
+
+ENDPOINT = "tcp/127.0.0.1:7447"
+LONGEST_OPERATOR = 40
+"""The page adds its number, and where it is open."""
+
+
+def add_endpoint_options(parser: Parser, listen: str = "--listen") -> None:
+    """Adds the fleet's name and the endpoints; ``listen``: the option for where drones connect to."""
+    option(parser, "--fleet NAME", "only this one; by default every fleet that is heard")
+    option(parser, "--connect ENDPOINT", f"of a drone or a router; by default {ENDPOINT}", action="append")
+    parser.add_argument(listen, metavar="ENDPOINT", action="append", dest="drones_at", help="where drones connect to")
+    option(parser, "--zenoh-config FILE", "zenoh's own settings, as for TLS", Path)
+
+
+def add_operator_option(parser: Parser) -> None:
+    """Adds who gives orders."""
+    option(
+        parser,
+        "--operator NAME",
+        "who gives orders, as drones show and log it (default: USER@COMPUTER)",
+        _operator,
+        default=_this_person(),
+    )
+
+
+def _operator(text: str) -> str:
+    if not 0 < len(text) <= LONGEST_OPERATOR or printable(text, lines=False) != text:
+        raise argparse.ArgumentTypeError(f"{text!r} is no name of 1 to {LONGEST_OPERATOR} printable characters")
+    return text
+
+
+def _this_person() -> str:
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # of a number without a name
+        user = "somebody"
+    return printable(f"{user}@{socket.gethostname()}", lines=False)[:LONGEST_OPERATOR]
+
+
+def endpoints(args: argparse.Namespace) -> tuple[list[str], list[str]]:
+    """Where to listen and what to connect to, as the options say; else the default alone."""
+    listen, connect = args.drones_at or [], args.connect or []
+    return listen, connect if connect or listen else [ENDPOINT]
+
+
+def require(*paths: Path) -> None:
+    """Raises FlockdError for what is not there, before anything is imported that takes seconds."""
+    for path in paths:
+        if not path.exists():
+            raise FlockdError(f"{path}: does not exist; check the path")
+
+
+def add_stretch(parser: Parser) -> None:
+    """Adds --start and --end, in seconds from the recording's first step."""
+    option(parser, "--start S", "seconds from the first step", number("a number, 0 or more", 0), default=0.0)
+    option(parser, "--end S", "seconds from the first step", positive_number)
+
+
+def stretch(recording: Recording, args: argparse.Namespace) -> tuple[float, float]:
+    """From when to when, on the recording's clock, --start and --end ask for. Raises UsageError for nothing."""
+    rounding_s = 1e-6
+    end_s = recording.duration_s if args.end is None else args.end
+    begin, end = recording.start_s + args.start - rounding_s, recording.start_s + end_s + rounding_s
+    if not any(begin <= time_s <= end for _, time_s in recording.contents.steps):
+        raise UsageError(
+            f"{recording.path}: has no step from {args.start:g} s to {end_s:g} s, as it is "
+            f"{recording.duration_s:g} s long; choose --start and --end within it"
+        )
+    return begin, end
+
+
+def opened(path: Path) -> Recording:
+    """The recording, checked as a whole, with a progress bar. Raises RecordingError."""
+    from flockd.onboard.recording.reader import Recording
+
+    with progress("checking", "bytes") as tell:
+        return Recording(path, tell)
+
+
+def refuse_existing(path: Path, option: str = "--out") -> None:
+    """Raises UsageError when there is something at `path`, or no folder for it."""
+    if path.exists():
+        raise UsageError(f"{path}: exists; name a new file with {option}")
+    if not path.parent.is_dir():
+        raise UsageError(f"{path.parent}: is no folder; make it first, or name another file with {option}")
+
+
+def add_force(parser: Parser) -> None:
+    """Adds the option."""
+    flag(parser, "--force", "take speeds beyond those that were shown to be safe")
+
+
+def load_to_fly(file: Path, *, force: bool) -> DroneConfig:
+    """What the drone flies with. Raises ConfigError, also for what is outside the envelope, unless that is forced."""
+    from flockd.core.config import load_real_drone
+
+    config, outside = load_real_drone(file)
+    permit(outside, force=force)
+    return config
+
+
+def permit(outside: Sequence[ConfigProblem], *, force: bool) -> None:
+    """Warns of what is outside the envelope where that is forced, else raises it as ConfigError."""
+    if outside and not force:
+        raise ConfigError(outside)
+    for problem in outside:
+        complain(f"warning: {str(problem).rpartition('; ')[0]}; --force goes beyond it")
+
+
+def loaded(file: Path | None) -> DroneConfig | None:
+    """The drone of --config, which may also name a scenario. Raises ConfigError."""
+    from flockd.sim.scenario import ScenarioConfig, load
+
+    if file is None:
+        return None
+    config = load(file)
+    return config.drone if isinstance(config, ScenarioConfig) else config
+
+
+def refuse(args: argparse.Namespace, options: Sequence[str], why: str) -> None:
+    """Raises UsageError where one of these options is given."""
+    for name in options:
+        if getattr(args, name):
+            raise UsageError(f"--{name.replace('_', '-')} {why}")
+
+
+def refuse_overwriting(args: argparse.Namespace, *files: Path | None) -> None:
+    """Raises UsageError where a result would take a file's place without --force: before the work, not after it."""
+    for file in files:
+        if file is not None and file.exists() and not args.force:
+            raise UsageError(f"{file}: exists; name another file, or overwrite it with --force")
+        if file is not None and not file.parent.is_dir():
+            raise UsageError(f"{file.parent}: is no folder; make it first, or name another file")
