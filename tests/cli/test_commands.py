@@ -85,19 +85,25 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["status", "--once"], "flockd status: unknown argument --once; see flockd status --help"),
         (
             ["calibrate", "rig", "--once", "2"],
-            "flockd calibrate rig: unknown argument --once; see flockd calibrate rig --help",
+            "flockd calibrate rig: unknown argument --once; see flockd calibrate rig",
         ),
         (["record", "xyz"], "flockd record: 'xyz' is not a command, of info, recover, cut, export; see "),
+        (["fleet", "--port", "99999"], "flockd fleet: argument --port: '99999' is not a port"),
+        (["fleet", "--listen", "tcp/0.0.0.0:7447"], "flockd fleet: argument --listen: 'tcp/0.0.0.0:7447' is not an IP"),
+        (["replay", "x.mcap", "--speed", "-1"], "flockd replay: argument --speed: '-1' is not a number, 0 or more"),
+        (["replay", "x.mcap", "--tolerance", "command"], "flockd replay: argument --tolerance: 'command' is not"),
+        (["replay", "x.mcap", "--tolerance", "command=-1"], "flockd replay: argument --tolerance: 'command=-1' is not"),
+        (["sim", "--wind", "3"], "flockd sim: argument --wind: '3' is not two numbers"),
         (["sim", "--duration", "-3"], "flockd sim: argument --duration: '-3' is not a positive number"),
         (["sim", "--duration", "nan"], "flockd sim: argument --duration: 'nan' is not a positive number"),
         (["sim", "--drones", "0"], "flockd sim: argument --drones: '0' is not a positive whole number"),
-        (["sim", "--drones", "5000"], "flockd sim: argument --drones: '5000' is more than the 100 drones that can be"),
+        (["sim", "--drones", "5000"], "flockd sim: argument --drones: '5000' is more than the 100 drones"),
         (["sim", "--drones", "2.5"], "flockd sim: argument --drones: '2.5' is not a positive whole number"),
         (["sim", "--seed", "-1"], "flockd sim: argument --seed: '-1' is not a whole number, 0 or more"),
         (["sim", "--seed", "9" * 5000], f"flockd sim: argument --seed: '{'9' * 5000}' is not a whole number"),
         (
             ["sim", "--swap", "flow,eyes"],
-            "flockd sim: argument --swap: 'eyes' is not a role; the roles are flow, depth, segmentation, distance",
+            "flockd sim: argument --swap: 'eyes' is not a role; the roles are flow, depth",
         ),
     ],
 )
@@ -171,8 +177,7 @@ def test_without_a_command_the_help_is_shown(command: list[str], capsys: pytest.
 )
 def test_options_of_sight_are_refused_without_sight(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sim", "--perception", "truth", *option]) == 2
-    told = f"{option[0]} has no meaning without networks; drop it or --perception truth\n"
-    assert capsys.readouterr().err == told
+    assert capsys.readouterr().err.startswith(f"{option[0]} has no meaning without networks; ")
 
 
 @pytest.mark.parametrize("command", [["config", "check"], ["config", "show"], ["sim"]], ids=" ".join)
@@ -184,12 +189,13 @@ def test_a_wrong_scenario_is_told_in_one_sentence(
     assert main([*command, str(scenario)]) == 78
     captured = capsys.readouterr()
     assert captured.out == ""
-    assert captured.err == f"{scenario}:3: duration: is not a known key; did you mean `duration_s`?\n"
+    assert captured.err.startswith(f"{scenario}:3: duration: ")
+    assert captured.err.count("\n") == 1
 
 
 def test_a_flight_shorter_than_a_step_is_refused(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sim", str(scenario), "--duration", "0.1"]) == 78
-    assert capsys.readouterr().err == "--duration: 0.1 s is shorter than a step of 0.5 s; write 0.5 or more\n"
+    assert capsys.readouterr().err.startswith("--duration: 0.1 s is shorter than a step of 0.5 s; ")
 
 
 def test_config_check_finds_models_that_are_not_there(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -197,13 +203,11 @@ def test_config_check_finds_models_that_are_not_there(scenario: Path, capsys: py
     drone.write_text(SIMULATOR.replace("flow: flow_int8", "flow: flow_in8"), encoding="utf-8")
     assert main(["config", "check", str(scenario)]) == 78
     error = capsys.readouterr().err
-    assert error.startswith(f"{drone}:23: perception.flow: flow_in8 is not a known model, as ")
-    assert error.endswith("is missing; write one of flow, flow_int8, dis\n")
+    assert error.startswith(f"{drone}:23: perception.flow: flow_in8 ")
+    assert error.endswith("write one of flow, flow_int8, dis\n")
     drone.write_text(SIMULATOR.replace("flow: flow_int8", "flow: distance_int8"), encoding="utf-8")
     assert main(["config", "check", str(drone)]) == 78
-    assert capsys.readouterr().err == (
-        f"{drone}:23: perception.flow: distance_int8 is for distance, not for flow; name another\n"
-    )
+    assert capsys.readouterr().err.startswith(f"{drone}:23: perception.flow: distance_int8 is for distance, not for ")
 
 
 def test_config_check_reports_for_people_and_machines(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -215,12 +219,11 @@ def test_config_check_reports_for_people_and_machines(scenario: Path, capsys: py
 
     drone.write_text(SIMULATOR.replace("yaw: course", "yaw: corse"), encoding="utf-8")
     assert main(["config", "check", "--json", str(scenario), str(drone)]) == 78
-    assert json.loads(capsys.readouterr().out) == {
-        "ok": False,
-        "problems": [
-            {"file": str(drone), "line": 33, "key": "yaw", "message": "corse is not known; did you mean `course`?"}
-        ],
-    }, "a problem of a file named twice is told once"
+    told = json.loads(capsys.readouterr().out)
+    (problem,) = told["problems"]
+    assert not told["ok"]
+    assert problem.pop("message")
+    assert problem == {"file": str(drone), "line": 33, "key": "yaw"}, "of a file named twice it is told once"
 
 
 def test_every_shipped_configuration_is_fine() -> None:
@@ -256,19 +259,15 @@ def test_config_schema_is_json(kind: str, capsys: pytest.CaptureFixture[str]) ->
 def test_a_folder_with_other_files_is_not_flown_into(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "thesis.txt").write_text("the only copy", encoding="utf-8")
     assert main(["sim", "--duration", "1", "--out", str(tmp_path)]) == 2
-    assert capsys.readouterr().err == (
-        f"{tmp_path}: holds other files than a flight's; name a new or empty folder with --out\n"
-    )
+    assert capsys.readouterr().err.startswith(f"{tmp_path}: holds other files than a flight's; ")
     assert main(["sim", "--duration", "1", "--out", str(tmp_path / "thesis.txt")]) == 2
-    assert capsys.readouterr().err == f"{tmp_path / 'thesis.txt'}: is a file; name a folder with --out\n"
+    assert capsys.readouterr().err.startswith(f"{tmp_path / 'thesis.txt'}: is a file; ")
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
 def test_a_report_of_no_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["report", str(tmp_path)]) == 2
-    assert capsys.readouterr().err == (
-        f"{tmp_path}: holds neither a flight's flight.npz nor recordings; name another folder\n"
-    )
+    assert capsys.readouterr().err.startswith(f"{tmp_path}: holds neither a flight's flight.npz nor recordings; ")
 
 
 def test_a_report_of_a_damaged_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -329,9 +328,7 @@ def test_an_extra_is_added_to_a_checkout_without_freezing_it() -> None:
 def test_models_in_an_empty_folder_are_unavailable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for command in ("list", "verify"):
         assert main(["models", command, "--dir", str(tmp_path)]) == 69
-        assert capsys.readouterr().err == (
-            f"{tmp_path} holds no model manifests; name the folder that does with --dir\n"
-        )
+        assert capsys.readouterr().err.startswith(f"{tmp_path} holds no model manifests; ")
 
 
 def test_verifying_a_damaged_model_fails_the_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -365,9 +362,7 @@ def test_a_flight_leaves_its_log_summary_and_report(
     assert (folder / "report.html").is_file()
 
     assert main(short) == 2
-    assert capsys.readouterr().err == (
-        f"{folder}: holds a flight; name another folder with --out, or overwrite it with --force\n"
-    )
+    assert capsys.readouterr().err.startswith(f"{folder}: holds a flight; ")
     (folder / "recordings").mkdir()
     (folder / "recordings" / "drone1.mcap").touch()
     monkeypatch.setattr("flockd.review.report.flight_folder.write_report", lambda folder, progress: folder)
@@ -418,7 +413,7 @@ def test_an_interrupted_flight_leaves_its_report_and_can_be_flown_again(
     assert main(command) == 130
     captured = capsys.readouterr()
     assert captured.out == f"{folder / 'report.html'}\n"
-    assert captured.err == "interrupted after 3.5 s of 20 s; the report is of what was flown\n"
+    assert captured.err.startswith("interrupted after 3.5 s of 20 s; ")
     log = FlightLog.load(folder / "flight.npz")
     assert (len(log.time_s), log.metadata.duration_s, log.metadata.interrupted) == (7, 3.5, True)
     assert log.truth_position.shape == (7, 5, 3)
@@ -426,19 +421,18 @@ def test_an_interrupted_flight_leaves_its_report_and_can_be_flown_again(
     monkeypatch.setattr(Vehicles, "step", step)
     assert main(command) == 0, "the same command works again"
     moved = tmp_path / "flight-interrupted"
-    assert capsys.readouterr().err == f"{folder}: held an interrupted flight, which is in {moved} now\n"
+    assert f"{moved}" in capsys.readouterr().err
     assert FlightLog.load(moved / "flight.npz").metadata.interrupted
     assert not FlightLog.load(folder / "flight.npz").metadata.interrupted
 
 
-def test_wind_speed_and_radius_are_what_is_flown(capsys: pytest.CaptureFixture[str]) -> None:
+def test_wind_speed_and_radius_are_what_is_flown() -> None:
     from flockd.cli.sim import _scenario
 
     args = _parser().parse_args(["sim", "--wind", "2,-1.5", "--speed", "1.5", "--radius", "15"])
     scenario = _scenario(args)
     assert scenario.vehicle.wind_m_s == (2.0, -1.5)
     assert (scenario.drone.mission.speed_m_s, scenario.drone.mission.radius_m) == (1.5, 15.0)
-    assert "argument --wind: '3' is not two numbers such as 2.0,-1.5" in _usage_error(capsys, "sim", "--wind", "3")
 
 
 def test_two_flights_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -59,7 +59,7 @@ def test_recover_makes_it_whole(cut_off: Path, capsys: pytest.CaptureFixture[str
     steps = json.loads(told(capsys, 0, "record", "info", "--json", out))["steps"]
     assert line == f"{out}: {steps} of {steps} steps\n"
     assert 6 <= steps <= 9
-    assert told(capsys, 2, "record", "recover", cut_off) == f"{out}: exists; name a new file with --out\n"
+    assert told(capsys, 2, "record", "recover", cut_off).startswith(f"{out}: exists; ")
 
 
 def test_cut_takes_a_stretch(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -67,7 +67,7 @@ def test_cut_takes_a_stretch(path: Path, capsys: pytest.CaptureFixture[str]) -> 
     stretch = ("--start", "0.2", "--end", "0.5", "--out", out)
     assert json.loads(told(capsys, 0, "record", "cut", path, *stretch, "--json"))["steps"] == 4
     late = told(capsys, 2, "record", "cut", path, "--start", "5", "--out", path.with_name("late.mcap"))
-    assert late == (f"{path}: has no step from 5 s to 0.9 s, as it is 0.9 s long; choose --start and --end within it\n")
+    assert late.startswith(f"{path}: has no step from 5 s to 0.9 s, as it is 0.9 s long; ")
     between = told(capsys, 2, "record", "cut", path, "--start", "0.32", "--end", "0.38", "--out", "x.mcap")
     assert "has no step from 0.32 s to 0.38 s" in between
     missing = told(capsys, 2, "record", "cut", path, "--out", path.parent / "nowhere" / "cut.mcap")
@@ -85,7 +85,7 @@ def test_export_writes_tables_and_images(
     with (folder / "vehicle.csv").open(encoding="utf-8") as file:
         assert len(list(csv.DictReader(file))) == 10
     again = told(capsys, 2, "record", "export", path, "--out", folder)
-    assert again == f"{folder}: is not an empty folder; name a new one with --out\n"
+    assert again.startswith(f"{folder}: is not an empty folder; ")
 
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     code = main(["record", "export", str(path), "--out", str(tmp_path / "p"), "--format", "parquet"])

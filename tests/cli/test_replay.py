@@ -102,7 +102,7 @@ def test_a_reference_is_written_compared_and_updated(
     against = ["replay", str(path), "--diff", "--reference", str(reference)]
     update = ["replay", str(path), "--reference", str(reference), "--update-reference"]
     assert main(against) == 2
-    assert capsys.readouterr().err == f"{reference}: does not exist; write it first with --update-reference\n"
+    assert capsys.readouterr().err.startswith(f"{reference}: does not exist; ")
     assert main(update) == 0
     assert main(against) == 0
     assert main([*against, "--start", "0.4"]) == 1, "a pilot that begins in the middle remembers nothing"
@@ -128,7 +128,7 @@ def test_a_new_recording_is_a_flight_too(nudged: Path, capsys: Capture) -> None:
     assert main(["replay", str(out), "--diff"]) == 0
     assert Recording(out).contents.flight["replayed_from"] == "drone1.mcap"
     assert main(["replay", str(nudged), "--out", str(out)]) == 2
-    assert capsys.readouterr().err.splitlines()[-1] == f"{out}: exists; name a new file with --out"
+    assert capsys.readouterr().err.splitlines()[-1].startswith(f"{out}: exists; ")
 
 
 def test_a_replay_that_breaks_off_leaves_no_recording(
@@ -155,10 +155,7 @@ def test_other_settings_can_be_tried(path: Path, capsys: Capture) -> None:
     file.write_text(yaml.safe_dump(values), encoding="utf-8")
     capsys.readouterr()
     assert main(["replay", str(path), "--config", str(file)]) == 2
-    assert capsys.readouterr().err == (
-        f"{file}: rig.cameras: camera 'left' has 320 x 240 pixels, but {path} has it with 160 x 120; "
-        "use the recording's cameras\n"
-    )
+    assert capsys.readouterr().err.startswith(f"{file}: rig.cameras: camera 'left' has 320 x 240 pixels, but {path} ")
 
 
 def test_speed_1_takes_as_long_as_the_flight_took(path: Path, capsys: Capture) -> None:
@@ -183,26 +180,18 @@ def test_what_keeps_a_replay_from_being_the_flight_is_told(
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (["--update-reference"], "--update-reference needs the file to write; name it with --reference"),
-        (["--reference", "x"], "--reference alone does nothing; add --diff or --update-reference"),
-        (["--tolerance", "command=1"], "--tolerance has no meaning without --diff; add it"),
-        (
-            ["--reference", "x", "--diff", "--update-reference"],
-            "--diff and --update-reference exclude each other; compare first, then update",
-        ),
+        (["--update-reference"], "--update-reference needs"),
+        (["--reference", "x"], "--reference alone"),
+        (["--tolerance", "command=1"], "--tolerance has no meaning without --diff"),
+        (["--reference", "x", "--diff", "--update-reference"], "--diff and --update-reference exclude each other"),
+        (["--profile", "--speed", "1"], "--profile measures"),
+        (["--vehicle", "/odom"], "--vehicle is for bags"),
+        (["--depth", "recorded"], "--depth is for datasets"),
     ],
 )
 def test_options_that_make_no_sense_together(path: Path, options: list[str], told: str, capsys: Capture) -> None:
     assert main(["replay", str(path), *options]) == 2
-    assert capsys.readouterr().err == f"{told}\n"
-
-
-@pytest.mark.parametrize("option", [["--speed", "-1"], ["--tolerance", "command"], ["--tolerance", "command=-1"]])
-def test_slips_are_usage_errors(option: list[str], capsys: Capture) -> None:
-    with pytest.raises(SystemExit) as exit_:
-        main(["replay", "x.mcap", *option])
-    assert exit_.value.code == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    assert capsys.readouterr().err.startswith(told)
 
 
 # From pixels: two drones through the simulator, with the shipped networks and small cameras.
@@ -301,17 +290,7 @@ def test_where_time_goes_and_which_step_to_configure(
 def test_the_table_of_where_time_goes(path: Path, capsys: Capture) -> None:
     assert main(["replay", str(path), "--profile"]) == 0
     out = capsys.readouterr().out
-    for part in (
-        "stage ",
-        "p50 ms",
-        "step  ",
-        "computer: ",
-        "instructions for 8-bit",
-        "memory: ",
-        "onnxruntime 1",
-        "step_s: ",
-    ):
+    for part in ("stage ", "p50 ms", "step  ", "computer: ", "instructions for 8-bit", "memory: ", "step_s: "):
         assert part in out
-    for wrong in (["--speed", "1"], ["--end", "0.2"]):
-        assert main(["replay", str(path), "--profile", *wrong]) == 2
-        assert "--profile" in capsys.readouterr().err
+    assert main(["replay", str(path), "--profile", "--end", "0.2"]) == 2
+    assert "--profile" in capsys.readouterr().err

@@ -113,10 +113,7 @@ def test_it_gets_ready_alone_goes_on_after_sighup_and_ends_when_told(
             with _run(config, tmp_path) as second:
                 _, told = second.communicate(timeout=SECONDS_TO_FAIL)
             assert second.returncode == 69
-            assert told.splitlines()[-1] == (
-                f"autopilot.address: another flockd (process {process.pid} of user {getpass.getuser()}) has the link "
-                f"udpin://127.0.0.1:{port}; stop it first, or give this one its own autopilot's address"
-            )
+            assert f"(process {process.pid} of user {getpass.getuser()}) has the link udpin://" in told.splitlines()[-1]
 
             row = _status(telemetry, capsys)
             assert (row["fleet"], row["drone"], row["state"], row["flight_mode"]) == ("test", "tiny", "idle", "hold")
@@ -251,16 +248,13 @@ def test_a_file_where_the_recordings_folder_would_be(tmp_path: Path, capsys: pyt
     config = _written(tmp_path)
     for name in (config, config / "recordings"):
         assert main(["run", "--config", str(config), "--record", str(name)]) == 2
-        assert capsys.readouterr().err == f"{name}: is no folder; name another with --record\n"
+        assert capsys.readouterr().err.startswith(f"{name}: is no folder; ")
 
 
 def test_a_fleet_that_is_not_there_is_unavailable(capsys: pytest.CaptureFixture[str]) -> None:
     endpoint = free_endpoint()
     assert main(["status", "--connect", endpoint, "--seconds", "0.2"]) == 69
-    assert capsys.readouterr().err == (
-        f"no drone was found at {endpoint} within 0.2 s; name a drone's endpoint with --connect, or listen for "
-        "drones with --listen\n"
-    )
+    assert capsys.readouterr().err.startswith(f"no drone was found at {endpoint} within 0.2 s; ")
 
 
 def test_without_an_autopilot_it_is_unavailable_and_not_aborted(tmp_path: Path) -> None:
@@ -281,10 +275,7 @@ def test_a_network_that_never_ends_is_bad_configuration_within_ten_seconds(tmp_p
     with _run(config, tmp_path) as process:
         _, err = process.communicate(timeout=SECONDS_TO_FAIL)
     assert process.returncode == 78, err
-    assert err.splitlines()[-1].endswith(
-        "endless.onnx did not finish the golden input in time (more than 8 s); restore the model file or choose "
-        "another perception.provider"
-    )
+    assert "endless.onnx did not finish the golden input in time" in err.splitlines()[-1]
 
 
 @pytest.mark.parametrize(

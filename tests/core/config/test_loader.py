@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -33,19 +35,32 @@ vehicles:
 """
 
 
-def _problems(path: Path) -> list[str]:
+REMEDY = (
+    r"\b(write|add|delete|put|did you mean|check|correct|close|save|flatten|give|measure|move|name|copy|separate)\b"
+)
+"""Every sentence says what to do."""
+
+
+def _problems(path: Path) -> list[ConfigProblem]:
+    """What is told of a file, each with its line, its key and what to do; files without their folder."""
     load = load_scenario if path.name == "scenario.yaml" else load_drone
     with pytest.raises(ConfigError) as caught:
         load(path)
-    lines = str(caught.value).splitlines()
-    assert len(lines) == len(caught.value.problems), "one line a problem"
-    return [line.replace(f"{path.parent}/", "") for line in lines]
+    assert len(str(caught.value).splitlines()) == min(len(caught.value.problems), 21), "one line a problem"
+    for problem in caught.value.problems:
+        assert re.search(REMEDY, problem.message), problem
+    return [replace(problem, file=problem.file.replace(f"{path.parent}/", "")) for problem in caught.value.problems]
 
 
-def _drone_problems(folder: Path, text: str) -> list[str]:
+def _drone_problems(folder: Path, text: str) -> list[ConfigProblem]:
     path = folder / "drone.yaml"
     path.write_text(text, encoding="utf-8")
     return _problems(path)
+
+
+def _places(problems: list[ConfigProblem]) -> list[str]:
+    """Where they are, as in `drone.yaml:6: step_s`."""
+    return [f"{problem.file}:{problem.line}: {problem.key}" for problem in problems]
 
 
 def _with(line: str) -> str:
@@ -113,59 +128,49 @@ def test_words_that_old_yaml_takes_for_truth_values_stay_words(tmp_path: Path) -
     assert load_drone(path).rig.cameras[0].name == "on"
 
 
-@pytest.mark.parametrize(
-    ("line", "told"),
-    [
-        ("step_s: -0.5", "step_s: -0.5 is not greater than 0; write a number of seconds above 0 and up to 60"),
-        ("step_s: .nan", "step_s: .nan is not finite; write a number of seconds above 0 and up to 60"),
-        ("step_s: 1e999", "step_s: 1e999 is not finite; write a number of seconds above 0 and up to 60"),
-        (
-            "step_s: true",
-            "step_s: true is not a number of seconds above 0 and up to 60; "
-            "write a number of seconds above 0 and up to 60",
-        ),
-        ("step_s: '0.5'", "step_s: '0.5' is not a number of seconds above 0 and up to 60; write 0.5"),
-        ("step_s: 1_000", "step_s: 1_000 is not a number of seconds above 0 and up to 60; write 1000"),
-        ("step_s:", "step_s: has no value; write a number of seconds above 0 and up to 60"),
-        ("stepp_s: 1", "stepp_s: is not a known key; did you mean `step_s`?"),
-        ("yaw: corse", "yaw: corse is not known; did you mean `course`?"),
-        ("yaw: 5", "yaw: 5 is not known; write `hold` or `course`"),
-        ("geometry: {refine: yes}", "geometry.refine: yes is not true or false; write true"),
-        ("geometry: {hypotheses: 1e3}", "geometry.hypotheses: 1e3 is not a whole number from 1 to 100000; write 1000"),
-        (
-            "geometry: {min_inlier_ratio: 1}",
-            "geometry.min_inlier_ratio: 1 is not less than 1; write a number above 0 and below 1",
-        ),
-        ("perception: {flow: 5}", "perception.flow: 5 is not a text; put it in quotes"),
-        (
-            "perception: {threads: 99999999999999999999}",
-            "perception.threads: 99999999999999999999 is too large; write a number up to 9223372036854775807",
-        ),
-        ("flocking: {weight: [1]}", "flocking.weight: a list is not a section; write a section with kind, nearest"),
-        ("yaw: !!str hold", "yaw: the tag `tag:yaml.org,2002:str` is not supported; delete it"),
-        ("yaw: &way hold", "yaw: the anchor `&way` is not supported; delete it"),
-        ("<<: {yaw: hold}", "<<: merge keys are not supported; write the values out"),
-    ],
+SLIPS = (
+    ("step_s: -0.5", "step_s: -0.5 is not greater than 0; write a number of seconds above 0 and up to 60"),
+    ("step_s: '0.5'", "step_s: '0.5' is not a number of seconds above 0 and up to 60; write 0.5"),
+    ("stepp_s: 1", "stepp_s: is not a known key; did you mean `step_s`?"),
+    ("yaw: 5", "yaw: 5 is not known; write `hold` or `course`"),
+    ("name: my drone", "name: my drone is not a name; write my_drone"),
+    ("step_s: .nan", "step_s: .nan is not finite"),
+    ("step_s: 1e999", "step_s: 1e999 is not finite"),
+    ("step_s: true", "step_s: true is not a number"),
+    ("step_s: 1_000", "step_s: 1_000 is not a number of seconds above 0 and up to 60; write 1000"),
+    ("step_s:", "step_s: has no value; write a number"),
+    ("yaw: corse", "yaw: corse is not known; did you mean `course`?"),
+    ("geometry: {refine: yes}", "geometry.refine: yes is not true or false; write true"),
+    ("geometry: {hypotheses: 1e3}", "geometry.hypotheses: 1e3 is not a whole number from 1 to 100000; write 1000"),
+    ("geometry: {min_inlier_ratio: 1}", "geometry.min_inlier_ratio: 1 is not less than 1"),
+    ("perception: {flow: 5}", "perception.flow: 5 is not a text; put it in quotes"),
+    ("perception: {threads: 99999999999999999999}", "perception.threads: 99999999999999999999 is too large"),
+    ("flocking: {weight: [1]}", "flocking.weight: a list is not a section"),
+    ("yaw: !!str hold", "yaw: the tag `tag:yaml.org,2002:str`"),
+    ("yaw: &way hold", "yaw: the anchor `&way`"),
+    ("yaw: *way", "yaw: the alias `*way`"),
+    ("<<: {yaw: hold}", "<<: merge keys"),
+    ("? [a]: 1", "a key must be a plain word"),
+    ("---", "a second document begins here"),
+    ("autopilot: {address: /dev/ttyAMA0}", "autopilot.address: /dev/ttyAMA0 is not an address; write an address, as"),
+    ("telemetry: {listen: ['0.0.0.0:7447']}", "telemetry.listen[0]: '0.0.0.0:7447' is not a zenoh endpoint; write a"),
+    ("autopilot: {obstacle_distance: true}", "autopilot.obstacle_distance: needs the map of obstacles"),
 )
+
+
+@pytest.mark.parametrize(("line", "told"), SLIPS, ids=[line for line, _ in SLIPS])
 def test_a_slip_in_line_six_is_reported_with_what_to_do(tmp_path: Path, line: str, told: str) -> None:
-    assert _drone_problems(tmp_path, _with(line)) == [f"drone.yaml:6: {told}"]
+    """What is cut off says in the same words what is wanted."""
+    (problem,) = _drone_problems(tmp_path, _with(line))
+    assert str(problem).startswith(f"drone.yaml:6: {told}")
 
 
 def test_a_key_given_twice_is_refused(tmp_path: Path) -> None:
-    assert _drone_problems(tmp_path, _with("step_s: 0.5\nyaw: hold\nstep_s: 0.1")) == [
-        "drone.yaml:8: step_s: is given twice, first in line 6; delete one"
-    ]
+    (problem,) = _drone_problems(tmp_path, _with("step_s: 0.5\nyaw: hold\nstep_s: 0.1"))
+    assert (problem.line, problem.key) == (8, "step_s")
+    assert "first in line 6" in problem.message
 
 
-def test_an_alias_is_refused_once_and_not_also_for_its_value(tmp_path: Path) -> None:
-    told = _drone_problems(tmp_path, _with("yaw: &way hold\nstep_s: *way"))
-    assert told == [
-        "drone.yaml:6: yaw: the anchor `&way` is not supported; delete it",
-        "drone.yaml:7: step_s: the alias `*way` is not supported; write the value out",
-    ]
-
-
-@pytest.mark.parametrize(("escape", "shown"), [("\\0", "0x0000"), ("\\ud800", "0xd800")])
 def test_a_text_that_no_program_takes_is_refused(escape: str, shown: str, tmp_path: Path) -> None:
     """In a pipeline it killed the camera's thread, after the check had passed it."""
     source = f"""\
@@ -173,93 +178,87 @@ source:
   kind: gstreamer
   cameras:
     - {{name: front, pipeline: "videotestsrc{escape} ! videoconvert"}}"""
-    assert _drone_problems(tmp_path, _with(source)) == [
-        f"drone.yaml:9: source.cameras[0].pipeline: holds the character {shown}, which no program takes; delete it"
-    ]
+    (problem,) = _drone_problems(tmp_path, _with(source))
+    assert str(problem).startswith(f"drone.yaml:9: source.cameras[0].pipeline: holds the character {shown}, ")
 
 
 def test_a_rig_without_cameras_is_refused(tmp_path: Path) -> None:
-    assert _drone_problems(tmp_path, "rig:\n  cameras: []\n") == [
-        "drone.yaml:2: rig.cameras: has 0 entries; write a list of at least 1 entry"
-    ]
-    assert _drone_problems(tmp_path, "step_s: 1\n") == [
-        "drone.yaml:1: rig: is missing; add it with a section with cameras"
-    ]
+    assert _places(_drone_problems(tmp_path, "rig:\n  cameras: []\n")) == ["drone.yaml:2: rig.cameras"]
+    assert _places(_drone_problems(tmp_path, "step_s: 1\n")) == ["drone.yaml:1: rig"]
 
 
 def test_faults_inside_a_camera_name_the_camera(tmp_path: Path) -> None:
     text = DRONE.replace("[640, 480]", "[640]").replace("fx: 320,", "fx:320,").replace("cy: 240", "cy: 0")
-    assert _drone_problems(tmp_path, text) == [
-        "drone.yaml:4: rig.cameras[0].size_px: has 1 entry; write a list of 2 numbers of pixels",
-        "drone.yaml:5: rig.cameras[0].intrinsics.cy: 0 is not greater than 0; write a positive number",
-        "drone.yaml:5: rig.cameras[0].intrinsics.fx: is missing; add it with a positive number",
-        "drone.yaml:5: rig.cameras[0].intrinsics.fx:320: is not a key; put a space after the colon: `fx: 320`",
+    problems = _drone_problems(tmp_path, text)
+    camera = "rig.cameras[0]"
+    assert _places(problems) == [
+        f"drone.yaml:4: {camera}.size_px",
+        *(f"drone.yaml:5: {camera}.intrinsics.{key}" for key in ("cy", "fx", "fx:320")),
     ]
+    assert problems[-1].message.endswith("put a space after the colon: `fx: 320`")
 
 
 def test_two_cameras_of_one_name_are_refused(tmp_path: Path) -> None:
     twice = DRONE + DRONE.split("cameras:\n")[1]
-    assert _drone_problems(tmp_path, twice) == [
-        "drone.yaml:6: rig.cameras[1].name: two cameras share the name 'front'; give each its own"
-    ]
+    assert _places(_drone_problems(tmp_path, twice)) == ["drone.yaml:6: rig.cameras[1].name"]
 
 
 def test_all_problems_of_both_files_come_at_once(tmp_path: Path) -> None:
     (tmp_path / "drone.yaml").write_text(_with("stepp_s: 0.5\nyaw: corse"), encoding="utf-8")
     scenario = tmp_path / "scenario.yaml"
     scenario.write_text(SCENARIO.replace("[0, 5, -4]", "[0, 5]") + "duration_s: 0\n", encoding="utf-8")
-    assert _problems(scenario) == [
-        "drone.yaml:6: stepp_s: is not a known key; did you mean `step_s`?",
-        "drone.yaml:7: yaw: corse is not known; did you mean `course`?",
-        "scenario.yaml:5: vehicles[1].position_m: has 2 entries; write a list of 3 numbers of metres",
-        "scenario.yaml:6: duration_s: 0 is not greater than 0; write a number of seconds above 0 and up to 86400",
+    assert _places(_problems(scenario)) == [
+        *("drone.yaml:6: stepp_s", "drone.yaml:7: yaw"),
+        *("scenario.yaml:5: vehicles[1].position_m", "scenario.yaml:6: duration_s"),
     ]
 
 
-def test_a_scenario_reports_a_drone_file_that_is_not_there(tmp_path: Path) -> None:
+def test_a_scenario_without_its_drones_file_has_one_fault_and_no_false_ones(tmp_path: Path) -> None:
     scenario = tmp_path / "scenario.yaml"
-    scenario.write_text(SCENARIO, encoding="utf-8")
-    assert _problems(scenario) == [
-        "drone.yaml: does not exist; check the path",
-        "scenario.yaml:2: drone: names drone.yaml, which cannot be used; correct it or name another",
-    ]
+    for text in (SCENARIO, (CONFIG / "square.yaml").read_text(encoding="utf-8").replace("simulator.", "drone.")):
+        scenario.write_text(text, encoding="utf-8")
+        missing, named = _problems(scenario)
+        assert (missing.file, missing.key) == ("drone.yaml", "")
+        assert (named.file, named.key) == ("scenario.yaml", "drone")
     scenario.write_text(SCENARIO.replace("drone: drone.yaml\n", ""), encoding="utf-8")
-    assert _problems(scenario) == ["scenario.yaml:1: drone: is missing; write it as in `drone: simulator.yaml`"]
+    assert _places(_problems(scenario)) == ["scenario.yaml:1: drone"]
 
 
 @pytest.mark.parametrize(
     ("content", "told"),
     [
-        (b"", ": is empty; write the configuration into it"),
-        (b"# only a remark\n", ": is empty; write the configuration into it"),
-        (b"---\n", ": is empty; write the configuration into it"),
-        (b"- rig\n", ":1: is a list at its top level; write keys with values, such as `seed: 0`"),
-        (b"rig\n", ":1: is a single value at its top level; write keys with values, such as `seed: 0`"),
-        (b"step_s: 1\nrig: \xff\n", ":2: is not UTF-8 text; save the file in UTF-8"),
-        (b"rig:\n\tcameras: []\n", ":2: a tab stands where YAML needs spaces; indent and separate with spaces"),
+        (b"", ": is empty"),
+        (b"# only a remark\n", ": is empty"),
+        (b"---\n", ": is empty"),
+        (b"- rig\n", ":1: is a list at its top level"),
+        (b"rig\n", ":1: is a single value at its top level"),
+        (b"step_s: 1\nrig: \xff\n", ":2: is not UTF-8 text"),
+        (b"rig:\n\tcameras: []\n", ":2: a tab stands where YAML needs spaces"),
         (b"yaw: hold\nstep_s:1\nrig: {}\n", ":2: put a space after the `:`"),
-        (
-            b"a: 1\nrig: {b: 1\n",
-            ":2: a bracket is opened here and not closed properly; check the commas and the closing bracket",
-        ),
-        (b"yaw: 'hold\n\n", ":1: a quote is opened here and never closed; close it"),
-        (b"yaw: @hold\n", ":1: a value cannot begin with `@`; put it in quotes"),
-        (b"yaw: hold\nrig: \x01\n", ":2: holds the control character 0x01; delete it"),
-        (b"a: " + b"[" * 100_000, ":1: is nested more than 32 levels deep; flatten it"),
-        (b"#" * (1 << 20) + b"\n", ": is larger than 1024 KiB, which no configuration is; check the path"),
+        (b"a: 1\nrig: {b: 1\n", ":2: a bracket is opened here"),
+        (b"yaw: 'hold\n\n", ":1: a quote is opened here"),
+        (b"yaw: @hold\n", ":1: a value cannot begin with `@`"),
+        (b"yaw: hold\nrig: \x01\n", ":2: holds the control character 0x01"),
+        (b"a: " + b"[" * 100_000, ":1: is nested more than 32 levels deep"),
+        (b"#" * (1 << 20) + b"\n", ": is larger than 1024 KiB"),
     ],
 )
 def test_a_file_that_cannot_be_read_gets_one_sentence(tmp_path: Path, content: bytes, told: str) -> None:
     path = tmp_path / "drone.yaml"
     path.write_bytes(content)
-    assert _problems(path) == [f"drone.yaml{told}"]
+    (problem,) = _problems(path)
+    assert str(problem).startswith(f"drone.yaml{told}")
 
 
 def test_paths_that_are_no_files_get_one_sentence(tmp_path: Path) -> None:
-    assert _problems(tmp_path / "none.yaml") == ["none.yaml: does not exist; check the path"]
     (tmp_path / "folder").mkdir()
-    assert _problems(tmp_path / "folder") == ["folder: is a folder; name the YAML file in it"]
-    assert _problems(Path("/dev/zero")) == ["zero: is not an ordinary file; copy the configuration to one"]
+    for path, told in (
+        (tmp_path / "none.yaml", "does not exist"),
+        (tmp_path / "folder", "is a folder"),
+        (Path("/dev/zero"), "is not an ordinary file"),
+    ):
+        (problem,) = _problems(path)
+        assert problem.message.startswith(told)
 
 
 def test_of_very_many_problems_the_first_are_told_and_the_others_counted(tmp_path: Path) -> None:
@@ -340,15 +339,10 @@ def test_models_that_are_not_there_are_reported_with_where_they_were_searched_fo
 def test_a_wrong_override_is_reported_as_such() -> None:
     with pytest.raises(ConfigError) as caught:
         load_scenario(CONFIG / "paper_flight.yaml", {"duration_s": -3.0, "drone.perception.sclae": "height"})
-    assert caught.value.problems == (
-        ConfigProblem("override", 0, "drone.perception.sclae", "is not a known key; did you mean `scale`?"),
-        ConfigProblem(
-            "override",
-            0,
-            "duration_s",
-            "-3.0 is not greater than 0; write a number of seconds above 0 and up to 86400",
-        ),
-    )
+    assert [(one.file, one.line, one.key) for one in caught.value.problems] == [
+        ("override", 0, "drone.perception.sclae"),
+        ("override", 0, "duration_s"),
+    ]
 
 
 def test_the_schema_describes_the_file_and_not_the_merged_model() -> None:
@@ -357,111 +351,75 @@ def test_the_schema_describes_the_file_and_not_the_merged_model() -> None:
     assert DroneConfig.model_json_schema()["required"] == ["rig"]
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "told"),
-    [
-        (
-            "[0, 0, -4]",
-            "[0, 0, 4.5]",
-            "scenario.yaml:4: vehicles[0].position_m: the third number points down, so that 4.5 is 4.5 m below the "
-            "ground; write -4.5",
-        ),
-        (
-            "[0, 0, -4]",
-            "[0, 0, -0.2]",
-            "scenario.yaml:4: vehicles[0].position_m: begins 0.2 m above the ground; write -0.5 or less as the third "
-            "number",
-        ),
-        (
-            "[0, 5, -4]",
-            "[0, 0, -4]",
-            "scenario.yaml:5: vehicles[1].position_m: is 0 m from vehicles[0], and drones touch below 0.7 m; move one "
-            "of them",
-        ),
-        (
-            "scenario: two",
-            "scenario: two\nfaults: [{drone: 3, camera: front, kind: uniform}]",
-            "scenario.yaml:2: faults[0].drone: is 3, but there are 2 vehicles; write one of theirs",
-        ),
-        (
-            "scenario: two",
-            "scenario: two\nfaults: [{drone: 1, camera: top, kind: uniform}]",
-            "scenario.yaml:2: faults[0].camera: is not in the rig; write one of front",
-        ),
-        (
-            "scenario: two",
-            "scenario: two\nfaults: [{drone: 1, camera: front, kind: gaussian, begin_s: 5.0, end_s: 4.0}]",
-            "scenario.yaml:2: faults[0].end_s: is not after begin_s 5; write a larger one",
-        ),
-        (
-            "scenario: two",
-            "scenario: two\nworld: {drone_family: 99}",
-            "scenario.yaml:2: world.drone_family: 99 is not at most 13; write a whole number from 0 to 13 or `any`",
-        ),
-        (
-            "scenario: two",
-            "scenario: two\nworld:\n  obstacles:\n    kind: jungle",
-            "scenario.yaml:4: world.obstacles.kind: jungle is not known; write `forest` or `village`",
-        ),
-        (
-            "scenario: two",
-            "scenario: two\nworld:\n  obstacles:\n    kind: forest\n    trees_per_hectare: 900",
-            "scenario.yaml:5: world.obstacles.trees_per_hectare: 900 is not at most 400; write a number from 50 to 400",
-        ),
-        (
-            "scenario: two",
-            "scenario: two\nworld:\n  obstacles:\n    kind: village\n    trees_per_hectare: 100",
-            "scenario.yaml:5: world.obstacles.trees_per_hectare: has no meaning with kind `village`, only with "
-            "`forest`; delete it",
-        ),
-        (
-            "scenario: two",
-            "scenario: two\nduration_s: 0.1",
-            "scenario.yaml:2: duration_s: 0.1 s is shorter than a step of 0.5 s; write 0.5 or more",
-        ),
-        (
-            "scenario: two",
-            "scenario: two\nduration_s: 1e6",
-            "scenario.yaml:2: duration_s: 1e6 is not at most 86400; write a number of seconds above 0 and up to 86400",
-        ),
-        (
-            "  - {position_m: [0, 0, -4]}\n",
-            "".join(f"  - {{position_m: [{north}, 0, -4]}}\n" for north in range(5000)),
-            "scenario.yaml:3: vehicles: has 5001 entries; write a list of 1 to 100 entries",
-        ),
-    ],
+FLIGHTS = (
+    ("[0, 0, -4]", "[0, 0, 4.5]", "4: vehicles[0].position_m: the third number points down"),
+    ("[0, 0, -4]", "[0, 0, -0.2]", "4: vehicles[0].position_m: begins 0.2 m above the ground"),
+    ("[0, 5, -4]", "[0, 0, -4]", "5: vehicles[1].position_m: is 0 m from vehicles[0]"),
+    ("", "faults: [{drone: 3, camera: front, kind: uniform}]", "2: faults[0].drone: is 3, but there are 2"),
+    ("", "faults: [{drone: 1, camera: top, kind: uniform}]", "2: faults[0].camera: is not in the rig"),
+    (
+        *("", "faults: [{drone: 1, camera: front, kind: gaussian, begin_s: 5.0, end_s: 4.0}]"),
+        "2: faults[0].end_s: is not after begin_s 5",
+    ),
+    (
+        "",
+        "world: {drone_family: 99}",
+        "2: world.drone_family: 99 is not at most 13; write a whole number from 0 to 13 or",
+    ),
+    ("", "world:\n  obstacles:\n    kind: jungle", "4: world.obstacles.kind: jungle is not known; write `forest` or"),
+    (
+        *("", "world:\n  obstacles:\n    kind: forest\n    trees_per_hectare: 900"),
+        "5: world.obstacles.trees_per_hectare: 900 is not at most 400",
+    ),
+    (
+        *("", "world:\n  obstacles:\n    kind: village\n    trees_per_hectare: 100"),
+        "5: world.obstacles.trees_per_hectare: has no meaning with kind `village`",
+    ),
+    ("", "duration_s: 0.1", "2: duration_s: 0.1 s is shorter than a step of 0.5 s"),
+    ("", "duration_s: 1e6", "2: duration_s: 1e6 is not at most 86400"),
+    (
+        "  - {position_m: [0, 0, -4]}\n",
+        "".join(f"  - {{position_m: [{north}, 0, -4]}}\n" for north in range(5000)),
+        "3: vehicles: has 5001 entries",
+    ),
 )
+
+
+@pytest.mark.parametrize(("old", "new", "told"), FLIGHTS, ids=[told for *_, told in FLIGHTS])
 def test_a_flight_that_cannot_be_flown_is_refused_at_its_line(tmp_path: Path, old: str, new: str, told: str) -> None:
     (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
     scenario = tmp_path / "scenario.yaml"
-    scenario.write_text(SCENARIO.replace(old, new), encoding="utf-8")
-    assert _problems(scenario) == [told]
+    text = SCENARIO.replace(old, new) if old else SCENARIO.replace("scenario: two", f"scenario: two\n{new}")
+    scenario.write_text(text, encoding="utf-8")
+    (problem,) = _problems(scenario)
+    assert str(problem).startswith(f"scenario.yaml:{told}")
 
 
 def test_a_principal_point_outside_the_image_is_refused_at_its_line(tmp_path: Path) -> None:
-    assert _drone_problems(tmp_path, DRONE.replace("cx: 320", "cx: 3200").replace("cy: 240", "cy: 480")) == [
-        "drone.yaml:5: rig.cameras[0].intrinsics.cx: 3200 is outside the image, which is 640 pixels wide; check cx and "
-        "size_px",
-        "drone.yaml:5: rig.cameras[0].intrinsics.cy: 480 is outside the image, which is 480 pixels high; check cy and "
-        "size_px",
-    ]
+    outside = _drone_problems(tmp_path, DRONE.replace("cx: 320", "cx: 3200").replace("cy: 240", "cy: 480"))
+    assert _places(outside) == [f"drone.yaml:5: rig.cameras[0].intrinsics.{key}" for key in ("cx", "cy")]
 
 
-def test_a_file_of_the_other_kind_is_named_as_such(tmp_path: Path) -> None:
+def test_files_of_another_kind_are_refused_with_what_to_name(tmp_path: Path) -> None:
+    campaign, scenario, drone = CONFIG / "campaigns" / "nightly.yaml", CONFIG / "square.yaml", CONFIG / "quadrotor.yaml"
     (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
-    (tmp_path / "flight.yaml").write_text(SCENARIO, encoding="utf-8")
-    assert _problems(tmp_path / "flight.yaml") == [
-        "flight.yaml: is a scenario, and a drone's own file is needed here; name that: drone.yaml"
-    ]
-    (tmp_path / "scenario.yaml").write_text(DRONE, encoding="utf-8")
-    assert _problems(tmp_path / "scenario.yaml") == [
-        "scenario.yaml: is a drone's own file, and a scenario is needed here; name one with the keys `vehicles` and "
-        "`drone`"
-    ]
-    (tmp_path / "scenario.yaml").write_text(SCENARIO.replace("drone.yaml", "flight.yaml"), encoding="utf-8")
-    assert "flight.yaml: is a scenario, and a drone's own file is needed here; name that: drone.yaml" in _problems(
-        tmp_path / "scenario.yaml"
+    (flight := tmp_path / "flight.yaml").write_text(SCENARIO, encoding="utf-8")
+    (nested := tmp_path / "scenario.yaml").write_text(SCENARIO.replace("drone.yaml", "flight.yaml"), encoding="utf-8")
+    refusals: tuple[tuple[Callable[[Path], object], Path, str, str], ...] = (
+        (load_drone, campaign, "is a campaign", "`flockd campaign`"),
+        (load_scenario, campaign, "is a campaign", "`flockd campaign`"),
+        (load_campaign, scenario, "is a scenario", "the keys `campaign` and `scenario`"),
+        (load_campaign, drone, "is a drone's own file", "the keys `campaign` and `scenario`"),
+        (load_drone, flight, "is a scenario", "name that: drone.yaml"),
+        (load_scenario, drone, "is a drone's own file", "the keys `vehicles` and `drone`"),
+        (load_scenario, nested, "is a scenario", "name that: drone.yaml"),
     )
+    for load_file, file, kind, instead in refusals:
+        with pytest.raises(ConfigError) as refused:
+            load_file(file)
+        told = str(refused.value).splitlines()[0].replace(f"{tmp_path}/", "")
+        assert kind in told
+        assert told.endswith(instead)
 
 
 def test_a_scenario_may_hold_its_drone(tmp_path: Path) -> None:
@@ -473,9 +431,7 @@ def test_a_scenario_may_hold_its_drone(tmp_path: Path) -> None:
     (tmp_path / "scenario.yaml").write_text(
         SCENARIO.replace("drone: drone.yaml\n", inline.replace("cx: 320", "cx: -1")), encoding="utf-8"
     )
-    assert _problems(tmp_path / "scenario.yaml") == [
-        "scenario.yaml:7: drone.rig.cameras[0].intrinsics.cx: -1 is not greater than 0; write a positive number"
-    ]
+    assert _places(_problems(tmp_path / "scenario.yaml")) == ["scenario.yaml:7: drone.rig.cameras[0].intrinsics.cx"]
 
 
 def test_the_configuration_knows_how_many_families_the_simulator_has() -> None:
@@ -490,57 +446,10 @@ def test_the_trim_that_an_error_recommends_is_taken_though_rounding_adds_up(tmp_
     limits = "flocking: {max_speed_m_s: 0.2}\nmission: {speed_m_s: 0.2}\n"
     limits += "safety: {gate: {max_speed_m_s: 0.3, degraded_speed_m_s: 0.3}}\n"
     (problem,) = _drone_problems(tmp_path, f"{DRONE}{limits}autopilot: {{max_velocity_trim_m_s: 0.2}}\n")
-    assert "max_velocity_trim_m_s: 0.2 and flocking.max_speed_m_s 0.2 are together above" in problem
+    assert problem.key == "autopilot.max_velocity_trim_m_s"
     path = tmp_path / "drone.yaml"
     path.write_text(f"{DRONE}{limits}autopilot: {{max_velocity_trim_m_s: 0.1}}\n", encoding="utf-8")
     assert load_drone(path).autopilot is not None
-
-
-def test_distances_of_obstacles_cannot_be_sent_where_none_are_looked_for(tmp_path: Path) -> None:
-    (problem,) = _drone_problems(tmp_path, f"{DRONE}autopilot: {{obstacle_distance: true}}\n")
-    assert "autopilot.obstacle_distance: needs the map of obstacles; write `enabled: true` in `obstacles`" in problem
-
-
-def test_a_scenario_without_its_drones_file_has_one_fault_and_no_false_ones(tmp_path: Path) -> None:
-    scenario = tmp_path / "square.yaml"
-    scenario.write_text((CONFIG / "square.yaml").read_text(encoding="utf-8"), encoding="utf-8")
-    with pytest.raises(ConfigError) as refused:
-        load_scenario(scenario)
-    assert str(refused.value).splitlines() == [
-        f"{tmp_path}/simulator.yaml: does not exist; check the path",
-        f"{scenario}:5: drone: names simulator.yaml, which cannot be used; correct it or name another",
-    ]
-
-
-def test_files_of_another_kind_are_refused_by_what_they_are() -> None:
-    campaign = CONFIG / "campaigns" / "nightly.yaml"
-    refusals: tuple[tuple[Callable[[Path], object], Path, str], ...] = (
-        (load_drone, campaign, "is a campaign, and a drone's own file is needed here; `flockd campaign` flies it"),
-        (load_scenario, campaign, "is a campaign, and a scenario is needed here; `flockd campaign` flies it"),
-        (load_campaign, CONFIG / "square.yaml", "is a scenario, and a campaign is needed here; name one with the keys"),
-        (load_campaign, CONFIG / "quadrotor.yaml", "is a drone's own file, and a campaign is needed here; name one"),
-    )
-    for load_file, file, fault in refusals:
-        with pytest.raises(ConfigError) as refused:
-            load_file(file)
-        assert str(refused.value).startswith(f"{file}: {fault}")
-
-
-def test_texts_that_have_to_look_so_say_how(tmp_path: Path) -> None:
-    slips = {
-        "autopilot: {address: /dev/ttyAMA0}": "autopilot.address: /dev/ttyAMA0 is not an address; write an address, "
-        "as in `serial:///dev/ttyAMA0:921600` for a cable and its baud rate, or `udpin://0.0.0.0:14540`",
-        "autopilot: {address: 'serial://ttyAMA0:921600'}": "autopilot.address: 'serial://ttyAMA0:921600' is not an",
-        "telemetry: {listen: ['0.0.0.0:7447']}": "telemetry.listen[0]: '0.0.0.0:7447' is not a zenoh endpoint; write a "
-        "zenoh endpoint, as in `tcp/0.0.0.0:7447`",
-        "name: my drone": "name: my drone is not a name; write my_drone",
-    }
-    for text, told in slips.items():
-        file = tmp_path / "drone.yaml"
-        file.write_text(_with(text), encoding="utf-8")
-        with pytest.raises(ConfigError) as refused:
-            load_drone(file)
-        assert told in str(refused.value)
 
 
 def test_what_is_wrong_with_a_camera_is_told_at_its_own_line(tmp_path: Path) -> None:
