@@ -135,7 +135,7 @@ class _Loader(yaml.SafeLoader):
         elif event.tag is not None:
             fault = f"the tag `{event.tag}` is not supported; delete it"
         elif index is None and parent is not None and not isinstance(event, yaml.ScalarEvent):
-            fault = "a key must be a plain word"
+            fault = "a key must be a plain word; write one, as in `seed: 0`"
         elif self._count > MAX_VALUES:
             fault = f"holds more than {MAX_VALUES} values, which no {self._what} does; check the path"
         elif len(self._path) > MAX_DEPTH:

@@ -36,7 +36,7 @@ vehicles:
 
 
 REMEDY = (
-    r"\b(write|add|delete|put|did you mean|check|correct|close|save|flatten|give|measure|move|name|copy|separate)\b"
+    r"\b(write|add|delete|put|did you mean|check|correct|close|save|flatten|give|measure|move|name|copy|separate|keep)\b"
 )
 """Every sentence says what to do."""
 
@@ -419,7 +419,7 @@ def test_files_of_another_kind_are_refused_with_what_to_name(tmp_path: Path) -> 
             load_file(file)
         told = str(refused.value).splitlines()[0].replace(f"{tmp_path}/", "")
         assert kind in told
-        assert told.endswith(instead)
+        assert instead in told
 
 
 def test_a_scenario_may_hold_its_drone(tmp_path: Path) -> None:
