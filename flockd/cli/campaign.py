@@ -75,7 +75,7 @@ def _add_rerun(commands: Commands) -> None:
     option(parser, "--out DIR", "default: FOLDER/reruns/NAME", Path)
     flag(parser, "--force", "overwrite an earlier flight in that folder")
     flag(parser, "--json", "print the summary as JSON")
-    parser.set_defaults(run=_rerun, quiet=False, verbose=False, settings={})
+    parser.set_defaults(run=_rerun, quiet=False, settings={})
 
 
 def _add_report(commands: Commands) -> None:

@@ -21,7 +21,7 @@ def report_flight(directory: Path, flight: Flight, args: argparse.Namespace) -> 
 
     metadata = flight.log.metadata.model_copy(update={"settings": args.settings})
     log = replace(flight.log, metadata=metadata)
-    with Phases(quiet=args.quiet, verbose=args.verbose) as phases:
+    with Phases(quiet=args.quiet) as phases:
         save_flight(directory, log, flight.key_frames)
         summary = write_report_files(directory, log, phases.of("writing the report", "figures"))
     if args.quiet and not args.json:

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from flockd.cli.options import loaded
 from flockd.cli.output import noted_table, progress, say, say_json, say_table, tables_console
 from flockd.cli.parser import Commands, Parser, add_commands, flag, option, positive_count, size
 from flockd.core.choices import PROVIDERS, Provider
@@ -196,10 +197,9 @@ def _times_ms(model: OnnxModel, feeds: Any, runs: int) -> list[float]:
 
 def _prepare(args: argparse.Namespace) -> int:
     from flockd.flight.inference import manifests_of
-    from flockd.sim.scenario import ScenarioConfig, load
 
-    loaded = load(args.config)
-    config = loaded.drone if isinstance(loaded, ScenarioConfig) else loaded
+    config = loaded(args.config)
+    assert config is not None
     paths = manifests_of(config.perception)
     prepared = []
     with progress("preparing", "models") as tell:

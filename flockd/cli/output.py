@@ -92,11 +92,11 @@ def progress(label: str, unit: str, clock: Callable[[], float] = monotonic) -> I
 class Phases:
     """Progress of phases one after the other, with a unit and the time left: a bar on a terminal, else lines.
 
-    ``quiet``: nothing. ``verbose``: also a line for each phase that is done, with the time it took.
+    ``quiet``: nothing.
     """
 
-    def __init__(self, *, quiet: bool = False, verbose: bool = False, clock: Callable[[], float] = monotonic) -> None:
-        self._quiet, self._verbose, self._clock = quiet, verbose, clock
+    def __init__(self, *, quiet: bool = False, clock: Callable[[], float] = monotonic) -> None:
+        self._quiet, self._clock = quiet, clock
         self._bar: Progress | None = None
         self._label = ""
         self._task: TaskID | None = None
@@ -151,12 +151,8 @@ class Phases:
             complain(f"{label}: {done} of {total} {unit}, {left} left")
 
     def _end_phase(self) -> None:
-        if not self._label:
-            return
         if self._bar is not None and self._task is not None:
             self._bar.remove_task(self._task)
-        if self._verbose:
-            complain(f"{self._label}: done in {_duration(self._clock() - self._began_s)}")
         self._label, self._task = "", None
 
 

@@ -150,9 +150,7 @@ def add(commands: Commands) -> None:
         f"where --telemetry and --live listen, or where the daemons of --autopilot connect to (default: {ENDPOINT})",
     )
     flag(parser, "--record", "write a recording of each drone to DIR/recordings, 4.5 MB a drone and simulated second")
-    told = parser.add_mutually_exclusive_group()
-    flag(told, "--quiet", "print only the path of the report, and no progress")
-    flag(told, "--verbose", "say what is flown, and each phase with its time")
+    flag(parser, "--quiet", "print only the path of the report, and no progress")
     flag(parser, "--json", "print the summary as JSON")
     parser.set_defaults(run=_run)
 
@@ -202,9 +200,6 @@ def _run(args: argparse.Namespace) -> int:
 def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespace) -> int:
     from flockd.review.report.flight_folder import RECORDINGS
 
-    if args.verbose:
-        for line in _settings(scenario, directory, args):
-            complain(line)
     if args.autopilot is not None:
         return _fly_fleet(args, scenario, directory)
     from flockd.sim.flock.swarm import fly
@@ -221,7 +216,7 @@ def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespac
             shown = ShownFlock(scenario, zenoh, stack.enter_context(Repeater(zenoh)))
             if not args.quiet:
                 complain(f"the flock is at {endpoint}: `flockd fleet` shows it in a browser and sends it places")
-        phases = stack.enter_context(Phases(quiet=args.quiet, verbose=args.verbose))
+        phases = stack.enter_context(Phases(quiet=args.quiet))
         flight = fly(
             scenario,
             perception=args.perception,
@@ -240,22 +235,6 @@ def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespac
         )
         return ExitCode.INTERRUPTED
     return code
-
-
-def _settings(scenario: ScenarioConfig, directory: Path, args: argparse.Namespace) -> list[str]:
-    """What is flown, for --verbose."""
-    from flockd.core.config.mission import describe
-
-    drone, wind = scenario.drone, scenario.vehicle.wind_m_s
-    missions = ", ".join(dict.fromkeys(describe(vehicle.mission or drone.mission) for vehicle in scenario.vehicles))
-    networks = ", ".join(f"{role} {name}" for role, name in drone.perception.networks.items())
-    lines = [
-        f"scenario: {scenario.scenario}, seed {scenario.seed}, {scenario.duration_s:g} s, "
-        f"{len(scenario.vehicles)} drones, a step every {drone.step_s:g} s",
-        f"mission: {missions}; wind {wind[0]:g} m/s north, {wind[1]:g} m/s east",
-        f"folder: {directory}",
-    ]
-    return lines if args.perception == "truth" else [*lines, f"networks: {networks}"]
 
 
 def _recorders(
@@ -419,7 +398,7 @@ def _fly_live(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) ->
         sys.stdout.flush()  # whoever reads a pipe needs the address now
         if args.browser and _has_screen():
             stack.enter_context(_opened(address))
-        with Phases(quiet=args.quiet, verbose=args.verbose) as phases:
+        with Phases(quiet=args.quiet) as phases:
             fly_live(
                 scenario,
                 shown,
@@ -523,7 +502,7 @@ def _fly_fleet(args: argparse.Namespace, scenario: ScenarioConfig, directory: Pa
 
     with ExitStack() as stack:
         stack.enter_context(_ended_in_order())
-        phases = stack.enter_context(Phases(quiet=args.quiet, verbose=args.verbose))
+        phases = stack.enter_context(Phases(quiet=args.quiet))
         phases.say("starting autopilots and daemons, and taking off")
         sitl = load_drone(data_path("config") / SITL)
         if args.telemetry_at is not None:

@@ -35,9 +35,7 @@ vehicles:
 """
 
 
-REMEDY = (
-    r"\b(write|add|delete|put|did you mean|check|correct|close|save|flatten|give|measure|move|name|copy|separate|keep)\b"
-)
+REMEDY = r"\b(write|add|delete|put|did you mean|check|correct|close|save|flatten|give|move|name|copy|separate|keep)\b"
 """Every sentence says what to do."""
 
 
