@@ -248,6 +248,17 @@ def test_drones_beyond_ten_metres_do_not_count_for_recall() -> None:
     position[:15, 1, 1] = 10.5
     neighbours = summarise(replace(log, position=position))["neighbours"]
     assert neighbours["recall_within_10m"] == 1.0
+    position[:15, 1, 1] = 9.9
+    neighbours = summarise(replace(log, position=position))["neighbours"]
+    assert neighbours["recall_within_10m"] == pytest.approx(57 / 60)
+
+
+def test_each_false_track_of_a_step_counts() -> None:
+    log = _hand_made()
+    false_tracks = log.false_tracks.copy()
+    false_tracks[4, 0] = 3
+    neighbours = summarise(replace(log, false_tracks=false_tracks))["neighbours"]
+    assert neighbours["false_per_drone_minute"] == pytest.approx(4 / (2 * 0.25))
 
 
 def test_a_flight_with_exact_states_has_no_estimates_and_is_the_truth() -> None:

@@ -36,6 +36,14 @@ def test_who_is_near_is_tracked_to_within_the_errors() -> None:
     assert np.abs(errors.mean(axis=0)).max() < 0.3
 
 
+def test_a_single_detection_is_off_by_the_errors_that_are_configured() -> None:
+    """10 m away: 10 % along the line of sight, 0.02 rad across it."""
+    found = np.array([known(seed, 1, missed=0.0, range_error=0.1, bearing_error_rad=0.02)[0] for seed in range(200)])
+    ranges = np.linalg.norm(found, axis=1)
+    assert np.std(np.log(ranges)) == pytest.approx(0.1, rel=0.2)
+    assert np.std(found[:, 2] / ranges) == pytest.approx(0.02, rel=0.2)
+
+
 def test_nobody_is_known_beyond_the_range_nor_when_all_are_missed() -> None:
     assert np.isnan(known(range_m=9.9)).all()
     assert np.isfinite(known(range_m=10.1)[0]).all()

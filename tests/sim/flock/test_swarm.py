@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 import pytest
 
 from flockd.core.config import Overrides
 from flockd.core.data import data_path
+from flockd.core.messages import FrameSet, VehicleState
 from flockd.onboard.telemetry import TelemetrySink
 from flockd.onboard.telemetry.publisher import Ask, NewestImage, ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage
 from flockd.review.flight_log.log import FlightLog
+from flockd.sim.flock.pilot_pool import PilotPool
 from flockd.sim.flock.repeater import Repeater
 from flockd.sim.flock.shown_flock import ShownFlock
 from flockd.sim.flock.start import with_drones
@@ -53,10 +56,22 @@ def flown(telemetry: TelemetrySink) -> FlightLog:
     return log
 
 
+TOLD: list[tuple[int, VehicleState]] = []
+"""The vehicles' states that the pilots of `cut` got, by drone."""
+
+
 @pytest.fixture(scope="module")
 def cut() -> Flight:
     """A flight in one process, in which all telemetry is cut."""
-    return fly(scenario(), processes=1)
+    step = PilotPool.step
+
+    def noted(self: PilotPool, drone: int, frames: FrameSet, vehicle: VehicleState, *rest: Any, **more: Any) -> Any:
+        TOLD.append((drone, vehicle))
+        return step(self, drone, frames, vehicle, *rest, **more)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PilotPool, "step", noted)
+        return fly(scenario(), processes=1)
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +94,21 @@ def test_the_same_seed_is_the_same_flight_in_however_many_processes(cut: Flight)
             ours, theirs = getattr(one, maps), getattr(other, maps)
             assert {camera: a.tobytes() for camera, a in ours.items()} == {c: a.tobytes() for c, a in theirs.items()}
         assert (one.track_ids, one.ranges) == (other.track_ids, other.ranges)
+
+
+def test_pilots_get_what_their_autopilots_say_and_not_the_truth(alone: FlightLog) -> None:
+    """Of each step and drone: attitude, velocity and position are off, by about what is configured."""
+    sensors, count = scenario().sensors, alone.position.shape[1]
+    assert [drone for drone, _ in TOLD] == list(range(count)) * STEPS
+    for number, (drone, state) in enumerate(TOLD):
+        step = number // count
+        off = {
+            "attitude": np.abs(state.R_ned_body - alone.attitude[step, drone]).max() / np.radians(0.2),
+            "velocity": np.abs(state.velocity_ned - alone.velocity[step, drone]).max() / sensors.velocity_error_m_s,
+            "position": np.abs(state.position - alone.position[step, drone, :2]).max() / sensors.position_error_m,
+            "height": abs(state.height_m + alone.position[step, drone, 2]) / sensors.barometer_noise_m,
+        }
+        assert all(0.001 < errors < 6.0 for errors in off.values()), off
 
 
 class Tampering:

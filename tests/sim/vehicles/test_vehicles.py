@@ -166,21 +166,25 @@ def test_an_autopilot_without_errors_gives_true_values() -> None:
 
 
 def test_an_autopilots_errors_are_as_large_as_configured() -> None:
-    config = SensorConfig(barometer_drift_m=0.1, barometer_drift_time_s=100.0, barometer_noise_m=0.02)
+    config = SensorConfig(
+        barometer_drift_m=0.1, barometer_drift_time_s=100.0, barometer_noise_m=0.02, position_error_m=0.3
+    )
     position, velocity, level = np.array([0.0, 0.0, -4.0]), np.zeros(3), np.eye(3)
-    heights, angles_deg, velocities = [], [], []
+    heights, angles_deg, velocities, places = [], [], [], []
     for drone in range(400):
         autopilot = SimulatedAutopilot(config, seed=7, drone=drone)
         states = [autopilot.read(t, position, velocity, level) for t in (0.0, 0.5, 500.0)]
         heights.append([state.height_m - 4.0 for state in states])
         angles_deg.append(_yaw_pitch_roll_deg(states[2].R_ned_body))
         velocities.append([np.asarray(state.velocity_ned, dtype=float) for state in states[:2]])
+        places.append(states[2].position)
     at_start, soon, late = np.std(heights, axis=0)
     assert at_start == pytest.approx(0.02, rel=0.15)  # noise alone
     assert soon == pytest.approx(math.sqrt(0.02**2 + 0.1**2 * (1 - math.exp(-0.01))), rel=0.15)
     assert late == pytest.approx(math.hypot(0.1, 0.02), rel=0.15)
     np.testing.assert_allclose(np.std(angles_deg, axis=0), 0.2, rtol=0.15)
     assert np.std(velocities) == pytest.approx(0.1, rel=0.1)
+    np.testing.assert_allclose(np.std(places, axis=0), 0.3, rtol=0.15)
     changes = np.diff(np.array(velocities), axis=1)
     assert np.std(changes) == pytest.approx(0.1 * math.sqrt(2 * (1 - math.exp(-0.05))), rel=0.1)  # slow
 
