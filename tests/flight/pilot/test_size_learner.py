@@ -28,8 +28,10 @@ from flockd.flight.geometry import log_polar_covariance
 from flockd.flight.perception import Observation
 from flockd.flight.perception.maps import KnownSize
 from flockd.flight.pilot import FlockPilot
+from flockd.flight.pilot.size_learner import SizeLearner
 from flockd.flight.pilot.weave import Weave
 from flockd.flight.tracking.flock_size import FlockSize, SizeEstimate
+from flockd.flight.tracking.measurement import Measurement
 from flockd.flight.tracking.weave_path import DURATION_S, PERIOD_S
 from flockd.sim.scenario import load_scenario
 from tests.make import frames, neighbour, vehicle
@@ -280,6 +282,19 @@ def test_an_own_size_that_is_not_plausible_is_not_used(monkeypatch: pytest.Monke
     assert any("0.40 m large" in one.mission.sentence for one in outputs)
     assert not any("3.00" in one.mission.sentence for one in outputs)
     assert max(float(np.linalg.norm(one.position)) for one in outputs[-1].neighbours) < 6.0
+
+
+@pytest.mark.parametrize(("size_m", "judged_m", "range_m"), [(0.4, 0.56, 4.2), (0.7, 0.7, 3.0)])
+def test_a_size_that_is_in_use_is_undone_before_it_is_judged_again(
+    size_m: float, judged_m: float, range_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else what was learned from ranges would confirm itself; a neighbour's own size is as the networks judge it."""
+    judged: list[Measurement] = []
+    monkeypatch.setattr(FlockSize, "step", lambda _, interval_s, way, measured: judged.extend(measured.values()))
+    learner = SizeLearner(drone(), LearnedSize(0.4, 0.05, 0.56, doubted=False))
+    one = Measurement(np.array([1.0, 0.0, 0.0]), math.log(3.0), 1e-4 * np.eye(3), size_m)
+    learner.see(STEP_S, np.zeros(3), {1: one}, [at(3.0)])
+    assert (judged[0].size_m, judged[0].range_m) == pytest.approx((judged_m, range_m))
 
 
 def test_a_size_that_the_networks_judge_well_stays_theirs() -> None:

@@ -102,6 +102,7 @@ def test_pilots_get_what_their_autopilots_say_and_not_the_truth(alone: FlightLog
     assert [drone for drone, _ in TOLD] == list(range(count)) * STEPS
     for number, (drone, state) in enumerate(TOLD):
         step = number // count
+        assert state.velocity_ned is not None and state.position is not None
         off = {
             "attitude": np.abs(state.R_ned_body - alone.attitude[step, drone]).max() / np.radians(0.2),
             "velocity": np.abs(state.velocity_ned - alone.velocity[step, drone]).max() / sensors.velocity_error_m_s,

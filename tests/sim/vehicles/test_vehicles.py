@@ -177,7 +177,7 @@ def test_an_autopilots_errors_are_as_large_as_configured() -> None:
         heights.append([state.height_m - 4.0 for state in states])
         angles_deg.append(_yaw_pitch_roll_deg(states[2].R_ned_body))
         velocities.append([np.asarray(state.velocity_ned, dtype=float) for state in states[:2]])
-        places.append(states[2].position)
+        places.append(np.asarray(states[2].position, dtype=float))
     at_start, soon, late = np.std(heights, axis=0)
     assert at_start == pytest.approx(0.02, rel=0.15)  # noise alone
     assert soon == pytest.approx(math.sqrt(0.02**2 + 0.1**2 * (1 - math.exp(-0.01))), rel=0.15)
