@@ -14,8 +14,8 @@ from flockd.core.messages import Frame
 from tests.sim.cameras.test_scenario_cameras import flown_frames, scenario_with
 
 FAULTS: Mapping[str, tuple[Mapping[str, Mapping[str, Any]], float]] = {
-    "exposure": ({"shutter": {"exposure_s": 0.03}}, 0.2),
-    "readout": ({"shutter": {"readout_s": 0.05}}, 0.2),
+    "exposure": ({"shutter": {"exposure_s": 0.03}}, 0.1),
+    "readout": ({"shutter": {"readout_s": 0.05}}, 0.1),
     "shake": ({"shake": {"rms_deg": 2.0, "frequency_hz": 40.0}}, 1.0),
     "shake in the exposure": ({"shake": {"rms_deg": 2.0, "frequency_hz": 200.0}, "shutter": {"exposure_s": 0.01}}, 1.0),
     "noise": ({"noise": {"gain": 8.0}}, 1.0),
