@@ -11,7 +11,7 @@ LOCK := requirements/service.txt
 COMPILE = $(BIN)/uv pip compile --quiet --no-header --no-annotate --only-binary=:all: pyproject.toml -
 
 .DEFAULT_GOAL := help
-.PHONY: help demo live docs lint test test-all browser training ray coverage ros mutate mutate-all references wheel release deb container lock sbom clean
+.PHONY: help demo live docs lint test test-all browser training ray coverage ros faults breakages mutants references wheel release deb container lock sbom clean
 
 help:
 	@sed -n 's/^\([a-z-]*\):.* ## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -33,7 +33,7 @@ lint: $(VENV)/test.installed ### ruff and mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: lint ## lint and all tests but the slow ones, on two cores in about 10 minutes
+test: lint ## lint and all tests but the slow ones, on two cores in about 6 minutes
 	$(BIN)/python -m pytest -n 2 -m "not slow and not browser and not ros and not ray and not training" --durations=10 --durations-min=1
 
 test-all: lint ### lint and all tests, those too that take minutes each
@@ -41,6 +41,9 @@ test-all: lint ### lint and all tests, those too that take minutes each
 
 ros: $(ROS_VENV)/ros.installed ### what needs ROS 2: nodes in processes of their own, cameras by topic; with the times it takes
 	$(ROS_VENV)/bin/python -m pytest -m ros -rP tests/fleet/ros tests/onboard/sources tests/tools/release/test_licences.py
+
+faults: $(VENV)/test.installed ### the slow stories of faults, most of a whole daemon, and 20 s of flight from pixels
+	$(BIN)/python -m pytest -n 2 -m "slow and (fault or whole_flight) and not browser and not ros" --durations=10
 
 training: $(VENV)/test.installed $(VENV)/train.installed ### the tests of the networks' training, with torch (0.9 GB; with CUDA several)
 	$(BIN)/python -m pytest -m training tests/tools/training
@@ -55,11 +58,12 @@ coverage: $(VENV)/test.installed ### which branches of the safety layer its test
 	$(BIN)/python -m coverage run --branch --source=flockd/flight/safety -m pytest tests/flight/safety
 	$(BIN)/python -m coverage report --show-missing --fail-under=100
 
-mutate: $(VENV)/test.installed ### try the safety layer's tests on a sample of its mutants, in about a minute
-	$(BIN)/python -m tools.checks.mutate_safety --sample 60
+breakages: $(VENV)/test.installed ### break flockd on purpose in 68 places, and see that a test notices each, in about 3 minutes
+	$(BIN)/python -m tools.checks.breakages
 
-mutate-all: $(VENV)/test.installed ### try them on every mutant, in about a quarter of an hour
-	$(BIN)/python -m tools.checks.mutate_safety
+MUTANTS ?= 0
+mutants: $(VENV)/test.installed ### the same with every small change of the safety layer, in about a quarter of an hour; MUTANTS=60: some
+	$(BIN)/python -m tools.checks.breakages --mutants $(MUTANTS)
 
 references: $(VENV)/test.installed ### write what the recorded flights of tests/review/replay are expected to give again
 	$(BIN)/python -m tools.checks.record_regressions --only references

@@ -8,12 +8,17 @@ busy the computer is, and a bound that a test asserts is the requirement's.
 from __future__ import annotations
 
 import asyncio
+import inspect
 import math
 import selectors
 import threading
 import time
 from collections.abc import Callable, Coroutine
 from typing import Any
+
+import pytest
+
+Story = Callable[[], Coroutine[Any, Any, None]]
 
 SPEED_FACTOR = 2.0
 """These flights wait much and compute little."""
@@ -76,13 +81,22 @@ class _SteppedSelector(selectors.DefaultSelector):
         return ready
 
 
-def run_stepped(story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+def run_stepped(story: Story) -> None:
     """Runs a coroutine that waits for nothing outside of it: each sleep and time-out passes at once."""
     with asyncio.Runner(loop_factory=_SteppedLoop) as runner:
         runner.run(story())
 
 
-def run(story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+def run(story: Story) -> None:
     """Runs the coroutine on an event loop whose sleeps and time-outs are by `clock`."""
     with asyncio.Runner(loop_factory=_Loop) as runner:
         runner.run(story())
+
+
+def run_coroutine_test(test: pytest.Function, run_it: Callable[[Story], None]) -> bool | None:
+    """Runs an `async def test_...`, with fixtures and parameters as other tests have them; None for another test."""
+    if not inspect.iscoroutinefunction(test.obj):
+        return None
+    given = {name: test.funcargs[name] for name in inspect.signature(test.obj).parameters}
+    run_it(lambda: test.obj(**given))
+    return True

@@ -1,17 +1,18 @@
-"""Fails a skip that `permitted_skips.py` does not list, and runs tests that are coroutines."""
+"""Fails a skip that `permitted_skips.py` does not list, runs tests that are coroutines, and knows stories of faults."""
 
 from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import settings
 
-from tests.coroutine_tests import run_coroutine_test
+from tests.calm import run_coroutine_test
+from tests.faults.stories import REACTION, Reacted, limits
 from tests.permitted_skips import permitted
 
 settings.register_profile("many", max_examples=10_000)
@@ -27,6 +28,32 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     place = collection_path.relative_to(tests).as_posix() if tests in collection_path.parents else ""
     marker = OWN_EXTRAS.get(place)
     return True if marker not in (None, config.option.markexpr) else None
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--fault", metavar="NAME", help="run the stories of one fault of docs/reference/faults.md")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """A story is of a fault that is in the list."""
+    wanted = config.getoption("fault")
+    left_out = [item for item in items if wanted not in {None, *limits(item)}]
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in left_out]
+
+
+@pytest.fixture
+def reacted(request: pytest.FixtureRequest, record_property: Callable[[str, object], None]) -> Reacted:
+    """Notes how long the reaction to a fault took; an assertion fails when that was too long."""
+
+    def note(fault: str, seconds: float) -> None:
+        limit_s = limits(request.node)[fault]
+        assert limit_s is not None, f"its marker says of {fault} no `within_s`"
+        record_property(f"{REACTION}{fault}", (round(seconds, 3), limit_s))
+        assert 0.0 <= seconds <= limit_s, f"the reaction to {fault} took {seconds:.2f} s"
+
+    return note
 
 
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
@@ -76,3 +103,13 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     for entry, count in entries.items():
         if entry is not None:
             terminalreporter.line(f"{count} of {entry.tests}: {entry.reason}; to run: {entry.to_run}")
+    reactions: dict[str, tuple[float, float]] = {}
+    for report in (*stats.get("passed", []), *stats.get("failed", [])):
+        for name, value in report.user_properties if report.when == "call" else ():
+            if str(name).startswith(REACTION):
+                fault = str(name).removeprefix(REACTION)
+                reactions[fault] = max(tuple(value), reactions.get(fault, (0.0, 0.0)))
+    if reactions:
+        terminalreporter.section("reactions to faults")
+    for fault, (seconds, limit_s) in sorted(reactions.items()):
+        terminalreporter.line(f"{fault}: {seconds:.2f} of {limit_s:g} s")

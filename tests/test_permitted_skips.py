@@ -7,45 +7,44 @@ from pathlib import Path
 
 import pytest
 
-from tests.inner_pytest import ROOT, pytest_with_our_hooks
 from tests.permitted_skips import PERMITTED, permitted
 
+ROOT = Path(__file__).parents[1]
+OURS = ("-p", "tests.conftest")
 WAYS = {
     "call": "import pytest\ndef test_it(): pytest.skip('no reason')\n",
     "mark": "import pytest\n@pytest.mark.skipif(True, reason='no reason')\ndef test_it(): pass\n",
-    "fixture": ("import pytest\n@pytest.fixture\ndef absent(): pytest.skip('no reason')\ndef test_it(absent): pass\n"),
+    "fixture": "import pytest\n@pytest.fixture\ndef absent(): pytest.skip('no reason')\ndef test_it(absent): pass\n",
     "module": "import pytest\npytest.skip('no reason', allow_module_level=True)\ndef test_it(): pass\n",
     "import": "import pytest\npytest.importorskip('not_there_at_all', reason='no reason')\ndef test_it(): pass\n",
 }
 
 
-@pytest.mark.parametrize("options", [(), ("-n", "1")], ids=["alone", "xdist"])
 @pytest.mark.parametrize("way", WAYS)
-def test_a_skip_that_is_not_permitted_fails_and_is_named(way: str, options: tuple[str, ...], tmp_path: Path) -> None:
-    (tmp_path / "test_it.py").write_text(WAYS[way], encoding="utf-8")
-    done = pytest_with_our_hooks(tmp_path, *options)
-    assert done.returncode != 0, done.stdout
-    assert "test_it.py" in done.stdout
-    assert "tests/permitted_skips.py does not permit it: " in done.stdout
-    assert "no reason" in done.stdout
-    assert "skipped in" not in done.stdout
+def test_a_skip_that_is_not_permitted_fails_and_is_named(way: str, pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(WAYS[way])
+    done = pytester.runpytest_inprocess(*OURS)
+    outcomes = done.parseoutcomes()
+    assert "skipped" not in outcomes
+    assert outcomes.get("failed", 0) + outcomes.get("error", outcomes.get("errors", 0)) == 1
+    assert "tests/permitted_skips.py does not permit it: " in done.stdout.str()
 
 
 @pytest.mark.parametrize("options", [(), ("-n", "1")], ids=["alone", "xdist"])
-def test_a_permitted_skip_is_counted_with_the_way_to_run_it(options: tuple[str, ...], tmp_path: Path) -> None:
-    folder = tmp_path / "tests" / "sitl"
-    folder.mkdir(parents=True)
-    reason = "FLOCKD_PX4 names no SITL build folder of PX4"
-    (folder / "test_it.py").write_text(
-        f"import pytest\n@pytest.mark.parametrize('n', [1, 2])\ndef test_it(n): pytest.skip('{reason}')\n"
-        "@pytest.mark.xfail\ndef test_fails(): assert False\n",
-        encoding="utf-8",
+def test_a_permitted_skip_is_counted_with_the_way_to_run_it(
+    options: tuple[str, ...], pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    folder = pytester.mkdir("tests") / "sitl"
+    folder.mkdir()
+    text = (
+        "import pytest\n@pytest.mark.parametrize('n', [1, 2])\ndef test_it(n): pytest.skip('FLOCKD_PX4 names no build')"
     )
-    done = pytest_with_our_hooks(tmp_path, *options)
-    assert done.returncode == 0, done.stdout
-    assert "2 permitted skips" in done.stdout
-    assert "2 of tests/sitl/*: FLOCKD_PX4 names no; to run: build PX4 SITL" in done.stdout
-    assert "2 skipped, 1 xfailed in" in done.stdout.splitlines()[-1]
+    (folder / "test_it.py").write_text(text, encoding="utf-8")
+    (folder / "test_not.py").write_text(WAYS["call"], encoding="utf-8")
+    done = pytester.runpytest_subprocess(*OURS, *options)
+    assert done.parseoutcomes() == {"skipped": 2, "failed": 1}
+    assert "2 of tests/sitl/*: FLOCKD_PX4 names no; to run: build PX4 SITL" in done.stdout.str()
 
 
 def test_a_permitted_reason_is_so_for_its_own_tests_only() -> None:

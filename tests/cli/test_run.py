@@ -146,6 +146,7 @@ def _status(telemetry: str, capsys: pytest.CaptureFixture[str]) -> dict[str, Any
         assert time.monotonic() < until_s, rows
 
 
+@pytest.mark.fault("event-loop-stuck")
 @pytest.mark.slow
 def test_a_stall_of_the_computer_ends_in_the_autopilots_failsafe_and_is_named(tmp_path: Path, manager: Manager) -> None:
     """Stopped for 0.3 s, setpoints keep PX4's 2 Hz and it flies on; for 3 s, the autopilot has taken over meanwhile."""
@@ -269,6 +270,7 @@ def test_without_an_autopilot_it_is_unavailable_and_not_aborted(tmp_path: Path) 
     assert f"autopilot.address: serial://{tmp_path / 'none'}:921600 cannot be opened" in err.splitlines()[-1]
 
 
+@pytest.mark.fault("endless-network")
 def test_a_network_that_never_ends_is_bad_configuration_within_ten_seconds(tmp_path: Path) -> None:
     """The daemon waits for an autopilot meanwhile, and none is there."""
     config = _written(tmp_path, perception={"flow": str(endless(tmp_path))})

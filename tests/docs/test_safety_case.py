@@ -1,4 +1,4 @@
-"""The safety case names tests that exist, all faults of the list, and every hazard's requirements."""
+"""The safety case names tests that exist, and every hazard's requirements."""
 
 from __future__ import annotations
 
@@ -8,12 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.catalogue import CATALOGUE
-
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "safety.md").read_text(encoding="utf-8")
-FAULTS = (*range(1, 69), 70, 72, 73, 75, 77, 78)
-"""Rows of the list of faults that flockd has to survive."""
 OPEN = "not shown yet"
 
 
@@ -33,7 +29,7 @@ def functions_in(file: Path) -> set[str]:
     }
 
 
-@pytest.mark.parametrize("row", [*rows("Requirements"), *rows("Faults")], ids=lambda row: row[0])
+@pytest.mark.parametrize("row", rows("Requirements"), ids=lambda row: row[0])
 def test_each_row_is_shown_by_tests_that_exist(row: list[str]) -> None:
     named = re.findall(r"`([^`]+)`", row[2])
     assert named or row[2] == OPEN, f"{row[0]} {row[1]}: names no test"
@@ -42,11 +38,6 @@ def test_each_row_is_shown_by_tests_that_exist(row: list[str]) -> None:
         assert (ROOT / file).is_file(), test
         assert functions_in(ROOT / file), f"{test}: holds no test"
         assert not function or function in functions_in(ROOT / file), test
-
-
-def test_every_fault_of_the_list_is_named_once() -> None:
-    assert [row[0] for row in rows("Faults")] == [str(number) for number in FAULTS]
-    assert {fault.row for fault in CATALOGUE} <= set(FAULTS)
 
 
 def test_requirements_are_numbered_and_only_they_are_open_that_say_so() -> None:

@@ -12,7 +12,6 @@ import pytest
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.sitl.free_ports import free_port
 from tests import calm
-from tests.coroutine_tests import run_coroutine_test
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.daemon.aboard import Aboard, aboard
 
@@ -21,7 +20,7 @@ InTheAir = Callable[..., AbstractAsyncContextManager[Aboard]]
 
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     """See `tests.calm`; by its fixtures a test says where its drone flies."""
-    return run_coroutine_test(pyfuncitem, calm.run) if "port" in pyfuncitem.fixturenames else None
+    return calm.run_coroutine_test(pyfuncitem, calm.run) if "port" in pyfuncitem.fixturenames else None
 
 
 @pytest.fixture

@@ -17,8 +17,8 @@ from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_telemetry import Mode
 from flockd.sim.autopilot.fake_vehicle import Demand
 from tests.calm import clock
-from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import flying
+from tests.faults.stories import Reacted
 from tests.make import changed
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import Foreigner, until
@@ -30,12 +30,13 @@ QUIET_S = 1.5
 REASON = "Arming and offboard are denied: the estimator of this vehicle has not converged yet"
 
 
-async def test_the_link_is_lost_and_comes_back(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("link-lost", within_s=3.5)
+async def test_the_link_is_lost_and_comes_back(tmp_path: Path, reacted: Reacted) -> None:
     async with flying(tmp_path) as process:
         process.fake_autopilot.silent = True
         fault_s = time.monotonic()
         await process.until_event("silent: no position and velocity from the autopilot for 2.")
-        reacted(record_property, "link-lost", time.monotonic() - fault_s)
+        reacted("link-lost", time.monotonic() - fault_s)
         await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
         assert process.fake_autopilot.failsafe
         process.fake_autopilot.silent = False
@@ -46,13 +47,14 @@ async def test_the_link_is_lost_and_comes_back(tmp_path: Path, record_property: 
         assert process.state() == "silent"
 
 
-async def test_the_pilot_takes_over(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("pilot-takes-over", within_s=0.3)
+async def test_the_pilot_takes_over(tmp_path: Path, reacted: Reacted) -> None:
     async with flying(tmp_path) as process:
         fault_s = time.monotonic()
         process.fake_autopilot.pilot_selects("POSCTL")
         await process.until_event("silent: the flight mode is position")
         await asyncio.sleep(QUIET_S)
-        reacted(record_property, "pilot-takes-over", max(0.0, process.last_setpoint_s() - fault_s))
+        reacted("pilot-takes-over", max(0.0, process.last_setpoint_s() - fault_s))
         sent = len(process.fake_autopilot.setpoints)
         process.fake_autopilot.pilot_selects("LOITER")
         await asyncio.sleep(QUIET_S)
@@ -73,9 +75,9 @@ class _Refuses(FakeAutopilot):
         return False
 
 
-async def test_offboard_is_refused_and_the_whole_reason_reported(
-    tmp_path: Path, port: int, record_property: RecordProperty
-) -> None:
+@pytest.mark.fault("offboard-refused", within_s=2.0)
+@pytest.mark.fault("text-in-chunks")
+async def test_offboard_is_refused_and_the_whole_reason_reported(tmp_path: Path, port: int, reacted: Reacted) -> None:
     with _Refuses(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
         async with aboard(autopilot, port, tmp_path, change=_never_alone) as ship:
             await ship.is_ready_in_the_air()
@@ -83,7 +85,7 @@ async def test_offboard_is_refused_and_the_whole_reason_reported(
             asked_s = clock()
             autopilot.send_from_elsewhere(_offboard())
             await ship.until_event(f"the autopilot says: {REASON}")
-            reacted(record_property, "offboard-refused", clock() - asked_s)
+            reacted("offboard-refused", clock() - asked_s)
             await asyncio.sleep(QUIET_S)
             assert (ship.state(), autopilot.mode) == ("ready", "LOITER")
 
@@ -108,6 +110,7 @@ class _Noting(FakeAutopilot):
         return super()._obey(command, message)
 
 
+@pytest.mark.fault("landed-after-a-restart")
 async def test_started_in_the_air_and_landed_by_the_pilot_it_asks_for_nothing(tmp_path: Path, port: int) -> None:
     with _Noting(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
         async with aboard(autopilot, port, tmp_path) as ship:
@@ -119,6 +122,7 @@ async def test_started_in_the_air_and_landed_by_the_pilot_it_asks_for_nothing(tm
             assert (autopilot.armed, autopilot.asked, len(autopilot.setpoints)) == (False, [], 0)
 
 
+@pytest.mark.fault("climb-interrupted")
 async def test_the_pilot_changes_the_mode_while_it_climbs_and_by_hand_and_it_asks_for_nothing(
     tmp_path: Path, port: int
 ) -> None:
@@ -135,6 +139,7 @@ async def test_the_pilot_changes_the_mode_while_it_climbs_and_by_hand_and_it_ask
                 assert (autopilot.mode, autopilot.asked) == (mode, [])
 
 
+@pytest.mark.fault("battery-or-estimate", within_s=3.0)
 @pytest.mark.parametrize(
     ("what", "value", "event", "configured", "mode"),
     [
@@ -146,13 +151,13 @@ async def test_the_pilot_changes_the_mode_while_it_climbs_and_by_hand_and_it_ask
 )
 async def test_the_battery_is_low_or_the_position_lost(
     what: str, value: float, event: str, configured: dict[str, Any], mode: Mode, tmp_path: Path,
-    record_property: RecordProperty,
+    reacted: Reacted,
 ) -> None:  # fmt: skip
     async with flying(tmp_path, change=lambda config: changed(config, **configured)) as process:
         setattr(process.fake_autopilot, what, value)
         fault_s = time.monotonic()
         await until(lambda: process.fake_autopilot.mode == mode, SECONDS_TO_FAIL)
-        reacted(record_property, "battery-or-estimate", time.monotonic() - fault_s)
+        reacted("battery-or-estimate", time.monotonic() - fault_s)
         await process.until_event("silent: ")
         await until(lambda: event in process.matters(), SECONDS_TO_FAIL)
         sent = len(process.fake_autopilot.setpoints)
@@ -160,8 +165,9 @@ async def test_the_battery_is_low_or_the_position_lost(
         assert len(process.fake_autopilot.setpoints) == sent
 
 
+@pytest.mark.fault("heartbeats-lost", within_s=2.5)
 async def test_forty_heartbeats_are_lost_one_at_a_time_and_no_flight_ends(
-    tmp_path: Path, port: int, record_property: RecordProperty
+    tmp_path: Path, port: int, reacted: Reacted
 ) -> None:
     """Of PX4's, one a second; each of the forty could end a flight."""
     with FakeAutopilot(port, height_m=HOVER_M, clock=clock) as autopilot:
@@ -176,7 +182,7 @@ async def test_forty_heartbeats_are_lost_one_at_a_time_and_no_flight_ends(
                 slowest_s = max(slowest_s, clock() - lost_s)
                 assert autopilot.mode == "OFFBOARD"
                 assert ship.state() in {"normal", "degraded"}
-            reacted(record_property, "heartbeats-lost", slowest_s - 1.0)
+            reacted("heartbeats-lost", slowest_s - 1.0)
             assert _heartbeats_lost(ship) == 40
             assert sum(event.startswith("the autopilot's heartbeat did not come") for event in ship.events) <= 1
 
@@ -214,8 +220,10 @@ def _never_alone(config: DroneConfig) -> DroneConfig:
     return changed(config, safety__alone_s=None)
 
 
+@pytest.mark.fault("failsafe-then-resume", within_s=2.0)
+@pytest.mark.fault("own-stall", within_s=2.0)
 async def test_after_the_autopilots_failsafe_it_says_what_to_select_and_is_not_ready_before(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, record_property: RecordProperty
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, reacted: Reacted
 ) -> None:
     async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
         await ship.is_ready_in_the_air()
@@ -223,7 +231,7 @@ async def test_after_the_autopilots_failsafe_it_says_what_to_select_and_is_not_r
         time.sleep(2.0)  # the loop is stuck, and the autopilot's failsafe acts
         awake_s = clock()
         await ship.until_event("silent: setpoints ended: the control loop is late, for more than 0.5 s")
-        reacted(record_property, "own-stall", clock() - awake_s)
+        reacted("own-stall", clock() - awake_s)
         await until(lambda: ship.heard()["flight"].message["state"] == "silent", SECONDS_TO_FAIL)
         reasons = [reason["event"] for reason in ship.heard()["flight"].message["reasons"]]
         assert reasons.index("stream_ended") == 0
@@ -231,7 +239,7 @@ async def test_after_the_autopilots_failsafe_it_says_what_to_select_and_is_not_r
         assert (await ship.ask("ask/resume"))["accepted"] is True
         resumed_s, sent = clock(), len(fake_autopilot.setpoints)
         await until(lambda: ship.state() == "idle" and "autopilot_failsafe" in ship.matters(), SECONDS_TO_FAIL)
-        reacted(record_property, "failsafe-then-resume", clock() - resumed_s)
+        reacted("failsafe-then-resume", clock() - resumed_s)
         await asyncio.sleep(QUIET_S)
         assert (ship.state(), len(fake_autopilot.setpoints)) == ("idle", sent)
         fake_autopilot.pilot_selects("LOITER")
@@ -239,8 +247,9 @@ async def test_after_the_autopilots_failsafe_it_says_what_to_select_and_is_not_r
         await ship.flies()
 
 
+@pytest.mark.fault("others-interfere", within_s=2.0)
 async def test_setpoints_of_another_program_are_told_and_end_in_hold(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, record_property: RecordProperty
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, reacted: Reacted
 ) -> None:
     async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
         await ship.is_ready_in_the_air()
@@ -248,14 +257,15 @@ async def test_setpoints_of_another_program_are_told_and_end_in_hold(
         began_s = clock()
         with Foreigner(fake_autopilot, north_m_s=0.0, east_m_s=3.0):
             await until(lambda: "foreign_setpoints" in ship.matters(), SECONDS_TO_FAIL)
-            reacted(record_property, "others-interfere", clock() - began_s)
+            reacted("others-interfere", clock() - began_s)
             await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
         assert not fake_autopilot.failsafe
         await ship.until_event("asking: another program sends setpoints: the autopilot follows ")
 
 
+@pytest.mark.fault("setpoints-clipped", within_s=4.0)
 async def test_where_the_autopilot_limits_setpoints_flockd_asks_for_no_more_and_nobody_is_accused(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, record_property: RecordProperty
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, reacted: Reacted
 ) -> None:
     fake_autopilot.parameters["MPC_XY_VEL_MAX"] = 0.5
     async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
@@ -264,7 +274,7 @@ async def test_where_the_autopilot_limits_setpoints_flockd_asks_for_no_more_and_
         fake_autopilot.pilot_selects("OFFBOARD")
         selected_s = clock()
         await ship.until_event("the autopilot's MPC_XY_VEL_MAX is 0.5 m/s: flockd asks for no more in this flight")
-        reacted(record_property, "setpoints-clipped", clock() - selected_s)
+        reacted("setpoints-clipped", clock() - selected_s)
         await until(lambda: bool(np.linalg.norm(fake_autopilot.setpoints[-1][1].velocity) > 0.45), SECONDS_TO_FAIL)
         await asyncio.sleep(12.0)  # the memory of the velocity's error, and more
         fastest_m_s = max(np.linalg.norm(demand.velocity) for _, demand in fake_autopilot.setpoints)
@@ -273,8 +283,9 @@ async def test_where_the_autopilot_limits_setpoints_flockd_asks_for_no_more_and_
         assert not any("another program" in event or "off the setpoints" in event for event in ship.events)
 
 
+@pytest.mark.fault("frame-jumps", within_s=2.0)
 async def test_a_small_jump_of_the_local_frame_is_said_and_flown_through(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, record_property: RecordProperty
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, reacted: Reacted
 ) -> None:
     async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
         await ship.is_ready_in_the_air()
@@ -282,7 +293,7 @@ async def test_a_small_jump_of_the_local_frame_is_said_and_flown_through(
         height_m, jumped_s = -float(fake_autopilot.state.position[2]), clock()
         fake_autopilot.frame_off = np.array([0.0, 0.6, -0.9])
         await ship.until_event("the autopilot's local frame jumped by ")
-        reacted(record_property, "frame-jumps", clock() - jumped_s)
+        reacted("frame-jumps", clock() - jumped_s)
         while clock() < jumped_s + 3.0:
             assert -float(fake_autopilot.state.position[2]) == pytest.approx(height_m, abs=0.15)
             state = ship.heard()["state"].message
@@ -292,6 +303,7 @@ async def test_a_small_jump_of_the_local_frame_is_said_and_flown_through(
             await asyncio.sleep(0.02)
 
 
+@pytest.mark.fault("frame-jumps", within_s=2.0)
 @pytest.mark.parametrize(
     ("frame_off", "heading_off_rad"),
     [((0.0, 0.0, -4.0), 0.0), ((0.0, 0.0, 30.0), 0.0), ((20.0, 0.0, 0.0), 0.0), ((0.0, 0.0, 0.0), 0.8)],
@@ -299,7 +311,7 @@ async def test_a_small_jump_of_the_local_frame_is_said_and_flown_through(
 )
 async def test_a_large_jump_of_the_local_frame_or_the_heading_ends_in_hold(
     frame_off: tuple[float, float, float], heading_off_rad: float, tmp_path: Path, port: int,
-    fake_autopilot: FakeAutopilot, record_property: RecordProperty,
+    fake_autopilot: FakeAutopilot, reacted: Reacted,
 ) -> None:  # fmt: skip
     async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
         await ship.is_ready_in_the_air()
@@ -307,7 +319,7 @@ async def test_a_large_jump_of_the_local_frame_or_the_heading_ends_in_hold(
         height_m, jumped_s = -float(fake_autopilot.state.position[2]), clock()
         fake_autopilot.frame_off, fake_autopilot.heading_off_rad = np.array(frame_off), heading_off_rad
         await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted(record_property, "frame-jumps", clock() - jumped_s)
+        reacted("frame-jumps", clock() - jumped_s)
         assert not fake_autopilot.failsafe
         await ship.until_event("asking: the autopilot's estimate of position or heading has jumped")
         what = "heading" if heading_off_rad else "local frame"
@@ -315,8 +327,9 @@ async def test_a_large_jump_of_the_local_frame_or_the_heading_ends_in_hold(
         assert -float(fake_autopilot.state.position[2]) == pytest.approx(height_m, abs=0.4)
 
 
+@pytest.mark.fault("others-interfere", within_s=2.0)
 async def test_a_parameter_of_the_failsafe_that_is_changed_in_flight_is_told_and_ends_in_hold(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, record_property: RecordProperty
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, reacted: Reacted
 ) -> None:
     async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
         await ship.is_ready_in_the_air()
@@ -324,7 +337,7 @@ async def test_a_parameter_of_the_failsafe_that_is_changed_in_flight_is_told_and
         await asyncio.sleep(2.0)  # all have been read
         changed_s, fake_autopilot.parameters["COM_OBL_RC_ACT"] = clock(), -1
         await ship.until_event("the autopilot's COM_OBL_RC_ACT was changed in flight from 5 to -1")
-        reacted(record_property, "others-interfere", clock() - changed_s)
+        reacted("others-interfere", clock() - changed_s)
         await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
         await ship.until_event(
             "asking: COM_OBL_RC_ACT was changed in flight from 5 to -1: the autopilot would not stop"
@@ -338,8 +351,9 @@ class _RefusesToLeave(FakeAutopilot):
         return not self.refuses and super()._select(mode, component)
 
 
+@pytest.mark.fault("silent-autopilot", within_s=2.0)
 async def test_an_autopilot_that_refuses_without_a_word_is_told_as_such(
-    tmp_path: Path, port: int, record_property: RecordProperty
+    tmp_path: Path, port: int, reacted: Reacted
 ) -> None:
     with _RefusesToLeave(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
         async with aboard(autopilot, port, tmp_path, change=_never_alone) as ship:
@@ -348,13 +362,14 @@ async def test_an_autopilot_that_refuses_without_a_word_is_told_as_such(
             assert (await ship.ask("ask/land"))["accepted"] is True
             asked_s = clock()
             await ship.until_event("the autopilot was asked for hold, which was refused for now without a reason")
-            reacted(record_property, "silent-autopilot", clock() - asked_s)
+            reacted("silent-autopilot", clock() - asked_s)
             autopilot.refuses = False
             await until(lambda: autopilot.mode == "LAND", SECONDS_TO_FAIL)
 
 
+@pytest.mark.fault("landed-after-an-order", within_s=2.0)
 async def test_landed_and_disarmed_after_an_operators_order_the_next_flight_may_begin(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, record_property: RecordProperty
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, reacted: Reacted
 ) -> None:
     async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
         await ship.is_ready_in_the_air()
@@ -363,13 +378,14 @@ async def test_landed_and_disarmed_after_an_operators_order_the_next_flight_may_
         await until(lambda: not fake_autopilot.armed, SECONDS_TO_FAIL)
         disarmed_s = clock()
         await until(lambda: "not_armed" in ship.matters() and "land_asked" not in ship.matters(), SECONDS_TO_FAIL)
-        reacted(record_property, "landed-after-an-order", clock() - disarmed_s)
+        reacted("landed-after-an-order", clock() - disarmed_s)
         fake_autopilot.pilot_arms()
         fake_autopilot.pilot_selects("TAKEOFF")
         await ship.until_state("ready")
         await ship.flies()
 
 
+@pytest.mark.fault("absurd-mavlink")
 async def test_messages_with_absurd_values(tmp_path: Path) -> None:
     """None of them ends a task, and the drone flies on."""
     async with flying(tmp_path) as process:
@@ -396,15 +412,16 @@ async def test_messages_with_absurd_values(tmp_path: Path) -> None:
         assert "\x1b" not in process.log()
 
 
+@pytest.mark.fault("timesync-lies", within_s=5.0)
 @pytest.mark.parametrize("ahead_s", [0.9, -0.9])
-async def test_timesync_lies(ahead_s: float, tmp_path: Path, record_property: RecordProperty) -> None:
+async def test_timesync_lies(ahead_s: float, tmp_path: Path, reacted: Reacted) -> None:
     """Its replies jump, as somebody else's would; the stamps of attitudes stay. It is not used, and the drone flies."""
     async with flying(tmp_path) as process:
         await until(lambda: process.heard()["clock"].message["offset_s"] is not None, SECONDS_TO_FAIL)
         process.fake_autopilot.clock_offset_s += ahead_s
         fault_s = time.monotonic()
         await process.until_event("the autopilot's clock, by TIMESYNC, is 0.9")
-        reacted(record_property, "timesync-lies", time.monotonic() - fault_s)
+        reacted("timesync-lies", time.monotonic() - fault_s)
         await until(lambda: process.heard()["clock"].message["offset_s"] is None, SECONDS_TO_FAIL)
         steps = process.heard()["computer"].message["steps"]
         await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
@@ -412,7 +429,8 @@ async def test_timesync_lies(ahead_s: float, tmp_path: Path, record_property: Re
         await process.until_state("normal", "degraded")
 
 
-async def test_the_ground_is_reached_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("ground-reached", within_s=6.0)
+async def test_the_ground_is_reached_in_flight(tmp_path: Path, reacted: Reacted) -> None:
     """The vehicle sinks whatever it is told; its barometer says zero and less. Landing is reported and recorded."""
     async with flying(tmp_path) as process:
         autopilot = process.fake_autopilot
@@ -420,7 +438,7 @@ async def test_the_ground_is_reached_in_flight(tmp_path: Path, record_property: 
         await until(lambda: float(autopilot.state.position[2]) > -0.1, SECONDS_TO_FAIL)
         fault_s = time.monotonic()
         await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted(record_property, "ground-reached", time.monotonic() - fault_s)
+        reacted("ground-reached", time.monotonic() - fault_s)
         await until(lambda: process.heard()["flight"].message["in_air"] is False, SECONDS_TO_FAIL)
         assert any("land" in event or "ground" in event for event in process.events), process.events
         steps = process.heard()["computer"].message["steps"]

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from flockd.core.messages import Frame
-from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import Process, flying
+from tests.faults.stories import Reacted
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import CAMERAS, SECONDS_TO_FAIL
 
@@ -37,26 +37,29 @@ async def _is_held_and_stays_so(process: Process, fault_s: float, *, repair: Cal
     await process.until_state("ready")
 
 
-async def test_no_camera_delivers_any_more(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("camera-unplugged", within_s=3.0)
+async def test_no_camera_delivers_any_more(tmp_path: Path, reacted: Reacted) -> None:
     async with flying(tmp_path) as process:
         process.cameras.silent |= set(CAMERAS)
         fault_s = time.monotonic()
         await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted(record_property, "camera-unplugged", time.monotonic() - fault_s)
+        reacted("camera-unplugged", time.monotonic() - fault_s)
         await _is_held_and_stays_so(process, fault_s, repair=process.cameras.silent.clear)
 
 
-async def test_all_cameras_freeze(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("frozen-frames", within_s=3.0)
+async def test_all_cameras_freeze(tmp_path: Path, reacted: Reacted) -> None:
     async with flying(tmp_path) as process:
         process.cameras.spoil = lambda frame: replace(frame, sequence=17)
         fault_s = time.monotonic()
         await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted(record_property, "frozen-frames", time.monotonic() - fault_s)
+        reacted("frozen-frames", time.monotonic() - fault_s)
         await process.until_event("hover: too few cameras deliver images: front frozen, back frozen")
         await _is_held_and_stays_so(process, fault_s, repair=lambda: _good_again(process))
 
 
-async def test_time_stamps_are_repeated_and_run_backwards(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("time-stamps-backwards", within_s=5.0)
+async def test_time_stamps_are_repeated_and_run_backwards(tmp_path: Path, reacted: Reacted) -> None:
     """Half of the frames: they are dropped and counted, and the drone flies on, slower, by the others."""
 
     def stamped_badly(frame: Frame) -> Frame:
@@ -66,7 +69,7 @@ async def test_time_stamps_are_repeated_and_run_backwards(tmp_path: Path, record
         process.cameras.spoil = stamped_badly
         fault_s = time.monotonic()
         await until(lambda: "frames_dropped" in process.matters(), SECONDS_TO_FAIL)
-        reacted(record_property, "time-stamps-backwards", time.monotonic() - fault_s)
+        reacted("time-stamps-backwards", time.monotonic() - fault_s)
         assert process.fake_autopilot.mode == "OFFBOARD"
         steps = process.heard()["computer"].message["steps"]
         await until(lambda: process.heard()["computer"].message["steps"] > steps + 3, SECONDS_TO_FAIL)
@@ -76,12 +79,13 @@ async def test_time_stamps_are_repeated_and_run_backwards(tmp_path: Path, record
         await process.until_state("normal")
 
 
-async def test_one_of_two_cameras_is_gone_and_comes_back(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("one-camera-gone", within_s=2.0)
+async def test_one_of_two_cameras_is_gone_and_comes_back(tmp_path: Path, reacted: Reacted) -> None:
     async with flying(tmp_path) as process:
         process.cameras.silent.add("back")
         fault_s = time.monotonic()
         await process.until_event("degraded: a camera is lost: back silent")
-        reacted(record_property, "one-camera-gone", time.monotonic() - fault_s)
+        reacted("one-camera-gone", time.monotonic() - fault_s)
         steps = process.heard()["computer"].message["steps"]
         await until(lambda: process.heard()["computer"].message["steps"] > steps + 3, SECONDS_TO_FAIL)
         assert process.fake_autopilot.mode == "OFFBOARD"
@@ -91,10 +95,9 @@ async def test_one_of_two_cameras_is_gone_and_comes_back(tmp_path: Path, record_
         await process.until_state("normal")
 
 
+@pytest.mark.fault("time-stamps-jump", within_s=4.0)
 @pytest.mark.parametrize("ahead_s", [3.0, 86_400.0, -86_400.0, 1e300], ids=["3 s", "a day", "a day ago", "absurd"])
-async def test_a_frame_of_another_time_silences_nobody(
-    ahead_s: float, tmp_path: Path, record_property: RecordProperty
-) -> None:
+async def test_a_frame_of_another_time_silences_nobody(ahead_s: float, tmp_path: Path, reacted: Reacted) -> None:
     """Three frames of one camera; all good ones after it are used at once."""
     spoiled: list[float] = []
 
@@ -111,12 +114,13 @@ async def test_a_frame_of_another_time_silences_nobody(
         await until(lambda: _counted(process, "front", "time_stamp") == 3, SECONDS_TO_FAIL)
         await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
         await until(lambda: _all_see(process), SECONDS_TO_FAIL)
-        reacted(record_property, "time-stamps-jump", time.monotonic() - spoiled[-1])
+        reacted("time-stamps-jump", time.monotonic() - spoiled[-1])
         assert process.fake_autopilot.mode == "OFFBOARD"
         await process.until_state("normal")
 
 
-async def test_images_are_damaged(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("damaged-images", within_s=6.0)
+async def test_images_are_damaged(tmp_path: Path, reacted: Reacted) -> None:
     """Every second image is cut off: dropped and counted; the drone flies on by the others."""
 
     def cut_off(frame: Frame) -> Frame:
@@ -126,7 +130,7 @@ async def test_images_are_damaged(tmp_path: Path, record_property: RecordPropert
         process.cameras.spoil = cut_off
         fault_s = time.monotonic()
         await until(lambda: "frames_dropped" in process.matters(), SECONDS_TO_FAIL)
-        reacted(record_property, "damaged-images", time.monotonic() - fault_s)
+        reacted("damaged-images", time.monotonic() - fault_s)
         assert sum(_counted(process, "front", what) for what in ("malformed", "corrupt")) > 0
         assert process.fake_autopilot.mode == "OFFBOARD"
         _good_again(process)
@@ -134,7 +138,8 @@ async def test_images_are_damaged(tmp_path: Path, record_property: RecordPropert
         await process.until_state("normal")
 
 
-async def test_a_camera_shows_noise(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("noisy-camera", within_s=4.0)
+async def test_a_camera_shows_noise(tmp_path: Path, reacted: Reacted) -> None:
     """It counts as lost, invents no neighbour, and the command stays what the other camera gives: 1 m/s north."""
     async with flying(tmp_path) as process:
         await until(lambda: _speed_north(process) > 0.97, SECONDS_TO_FAIL)
@@ -146,7 +151,7 @@ async def test_a_camera_shows_noise(tmp_path: Path, record_property: RecordPrope
             assert abs(_speed_north(process) - 1.0) < 0.1
             if not lost and any(event.startswith("degraded: a camera is lost: back") for event in process.events):
                 lost = True
-                reacted(record_property, "noisy-camera", time.monotonic() - fault_s)
+                reacted("noisy-camera", time.monotonic() - fault_s)
             assert time.monotonic() < fault_s + SECONDS_TO_FAIL
             await asyncio.sleep(0.05)
         assert process.fake_autopilot.mode == "OFFBOARD"
@@ -154,7 +159,8 @@ async def test_a_camera_shows_noise(tmp_path: Path, record_property: RecordPrope
         await until(lambda: "camera_lost" not in process.matters(), SECONDS_TO_FAIL)
 
 
-async def test_a_lens_is_covered(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("lens-covered", within_s=8.0)
+async def test_a_lens_is_covered(tmp_path: Path, reacted: Reacted) -> None:
     """It counts as blind, which is said, while the drone flies on by the other camera; once clear, it sees again."""
 
     def covered(frame: Frame) -> Frame:
@@ -169,7 +175,7 @@ async def test_a_lens_is_covered(tmp_path: Path, record_property: RecordProperty
         process.cameras.spoil = covered
         fault_s = time.monotonic()
         await process.until_event("camera back: its lens is covered, dirty, fogged or in the sun")
-        reacted(record_property, "lens-covered", time.monotonic() - fault_s)
+        reacted("lens-covered", time.monotonic() - fault_s)
         await process.until_event("degraded: a camera is lost: back")
         assert process.fake_autopilot.mode == "OFFBOARD"
         _good_again(process)

@@ -19,9 +19,9 @@ from flockd.onboard.daemon import DaemonError
 from flockd.onboard.daemon.host_monitors import WallClock
 from flockd.sim.sitl.free_ports import free_endpoint, free_port
 from tests.calm import SPEED_FACTOR, clock
-from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.conftest import InTheAir
 from tests.faults.process import flying
+from tests.faults.stories import Reacted
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, Aboard, config_for
 
@@ -39,22 +39,22 @@ def _alone(config: DroneConfig, **safety: object) -> DroneConfig:
     return config.model_copy(update={"safety": changed})
 
 
-async def test_a_networks_output_is_not_finite(in_the_air: InTheAir, record_property: RecordProperty) -> None:
+@pytest.mark.fault("network-not-finite", within_s=2.0)
+async def test_a_networks_output_is_not_finite(in_the_air: InTheAir, reacted: Reacted) -> None:
     async with in_the_air(change=_alone) as ship:
         await _flies(ship)
         await ship.until_state("normal")
         ship.perceiver.not_finite = 2
         fault_s = clock()
         await ship.until_event("degraded: a network's output is not finite or not plausible")
-        reacted(record_property, "network-not-finite", clock() - fault_s)
+        reacted("network-not-finite", clock() - fault_s)
         assert ship.fake_autopilot.mode == "OFFBOARD"
         await ship.until_state("normal")
         assert ship.heard()["computer"].message["steps_failed"] == 0, "one camera's flow was left out"
 
 
-async def test_a_step_ends_in_an_error_that_nobody_expects(
-    in_the_air: InTheAir, record_property: RecordProperty
-) -> None:
+@pytest.mark.fault("step-exception", within_s=5.0)
+async def test_a_step_ends_in_an_error_that_nobody_expects(in_the_air: InTheAir, reacted: Reacted) -> None:
     """One such step is lost, and the flight goes on; three in a row end in Hold."""
     async with in_the_air(change=_alone) as ship:
         await _flies(ship)
@@ -68,7 +68,7 @@ async def test_a_step_ends_in_an_error_that_nobody_expects(
         ship.perceiver.unexpected = 3
         fault_s = clock()
         await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted(record_property, "step-exception", clock() - fault_s)
+        reacted("step-exception", clock() - fault_s)
         assert not ship.fake_autopilot.failsafe
         with pytest.raises(
             DaemonError,
@@ -77,7 +77,8 @@ async def test_a_step_ends_in_an_error_that_nobody_expects(
             await ship.ending
 
 
-async def test_a_network_never_returns(in_the_air: InTheAir, record_property: RecordProperty) -> None:
+@pytest.mark.fault("network-stuck", within_s=2.0)
+async def test_a_network_never_returns(in_the_air: InTheAir, reacted: Reacted) -> None:
     """Not even when it is told to: hover and Hold first, then the watchdog of the service manager is not fed."""
     async with in_the_air(change=_alone) as ship:
         await _flies(ship)
@@ -86,7 +87,7 @@ async def test_a_network_never_returns(in_the_air: InTheAir, record_property: Re
         fault_s = clock()
         await ship.until_event("a step failed: a network call took longer than 0.5 s")
         # A network's deadlines pass in real time, which the flight's clock outruns.
-        reacted(record_property, "network-stuck", (clock() - fault_s) / SPEED_FACTOR)
+        reacted("network-stuck", (clock() - fault_s) / SPEED_FACTOR)
         await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
         assert not ship.fake_autopilot.failsafe
         fed = ship.service.count("WATCHDOG=1")
@@ -102,7 +103,8 @@ def _is_not_fed(ship: Aboard) -> bool:
     return components is not None and components.networks.hopeless
 
 
-async def test_steps_take_longer_than_they_may(in_the_air: InTheAir, record_property: RecordProperty) -> None:
+@pytest.mark.fault("overrun", within_s=8.0)
+async def test_steps_take_longer_than_they_may(in_the_air: InTheAir, reacted: Reacted) -> None:
     """Frames are not queued: each step takes the newest; the drone hovers and asks for Hold."""
     change = functools.partial(_alone, degraded_load=1.05, max_load=1.1)
 
@@ -111,7 +113,7 @@ async def test_steps_take_longer_than_they_may(in_the_air: InTheAir, record_prop
         ship.perceiver.slow_s = 0.15
         fault_s = clock()
         await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted(record_property, "overrun", clock() - fault_s)
+        reacted("overrun", clock() - fault_s)
         assert not ship.fake_autopilot.failsafe
         (hover,) = [event for event in ship.events if event.startswith("hover: ")]
         assert "a step takes " in hover
@@ -119,9 +121,8 @@ async def test_steps_take_longer_than_they_may(in_the_air: InTheAir, record_prop
         assert counts["superseded"] > 0, "the newest frame wins"
 
 
-async def test_it_gets_too_hot(
-    in_the_air: InTheAir, record_property: RecordProperty, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.fault("overrun", within_s=8.0)
+async def test_it_gets_too_hot(in_the_air: InTheAir, reacted: Reacted, monkeypatch: pytest.MonkeyPatch) -> None:
     temperature_c = [50.0]
     monkeypatch.setattr("flockd.onboard.daemon.host_monitors.hottest_zone_c", lambda _: temperature_c[0])
 
@@ -133,17 +134,18 @@ async def test_it_gets_too_hot(
         temperature_c[0] = 97.0
         fault_s = clock()
         await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted(record_property, "overrun", clock() - fault_s)
+        reacted("overrun", clock() - fault_s)
         assert not ship.fake_autopilot.failsafe
 
 
-async def test_the_event_loop_is_stuck(in_the_air: InTheAir, record_property: RecordProperty) -> None:
+@pytest.mark.fault("event-loop-stuck", within_s=0.5)
+async def test_the_event_loop_is_stuck(in_the_air: InTheAir, reacted: Reacted) -> None:
     async with in_the_air(change=_alone) as ship:
         await _flies(ship)
         ship.service.clear()
         stuck_s = clock()
         time.sleep(2.0)
-        reacted(record_property, "event-loop-stuck", max(0.0, ship.fake_autopilot.setpoints[-1][0] - stuck_s))
+        reacted("event-loop-stuck", max(0.0, ship.fake_autopilot.setpoints[-1][0] - stuck_s))
         assert ship.fake_autopilot.failsafe
         assert ship.service == [], "the watchdog of systemd acts after two seconds"
         sent = len(ship.fake_autopilot.setpoints)
@@ -152,9 +154,8 @@ async def test_the_event_loop_is_stuck(in_the_air: InTheAir, record_property: Re
         assert len(ship.fake_autopilot.setpoints) == sent
 
 
-async def test_a_task_dies(
-    in_the_air: InTheAir, record_property: RecordProperty, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.fault("task-dies", within_s=2.0)
+async def test_a_task_dies(in_the_air: InTheAir, reacted: Reacted, monkeypatch: pytest.MonkeyPatch) -> None:
     async with in_the_air(change=_alone) as ship:
         await _flies(ship)
 
@@ -164,13 +165,14 @@ async def test_a_task_dies(
         monkeypatch.setattr("flockd.onboard.daemon.status_messages._computer_message", dies)
         fault_s = clock()
         await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted(record_property, "task-dies", clock() - fault_s)
+        reacted("task-dies", clock() - fault_s)
         assert not ship.fake_autopilot.failsafe
         with pytest.raises(DaemonError, match="telemetry: ArithmeticError") as ended:
             await ship.ending
         assert ended.value.exit_code != 0
 
 
+@pytest.mark.fault("clock-jump")
 async def test_the_wall_clock_is_set(in_the_air: InTheAir, monkeypatch: pytest.MonkeyPatch) -> None:
     ahead_s = [0.0]
     watch = functools.partial(WallClock, wall=lambda: time.time() + ahead_s[0])
@@ -187,13 +189,14 @@ async def test_the_wall_clock_is_set(in_the_air: InTheAir, monkeypatch: pytest.M
         assert ship.state() == "normal"
 
 
-async def test_the_memory_is_used_up_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("out-of-memory", within_s=6.0)
+async def test_the_memory_is_used_up_in_flight(tmp_path: Path, reacted: Reacted) -> None:
     """No more can be had, so nothing is commanded; then Linux kills the process, and a new one is idle."""
     async with flying(tmp_path) as process:
         fault_s = time.monotonic()
         resource.prlimit(process.program.process.pid, resource.RLIMIT_AS, (1, 1))
         await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted(record_property, "out-of-memory", time.monotonic() - fault_s)
+        reacted("out-of-memory", time.monotonic() - fault_s)
         process.signal(signal.SIGKILL)
         assert await process.ended() == -signal.SIGKILL
         sent = len(process.fake_autopilot.setpoints)
@@ -205,13 +208,14 @@ async def test_the_memory_is_used_up_in_flight(tmp_path: Path, record_property: 
         assert len(process.fake_autopilot.setpoints) == sent
 
 
-async def test_the_computer_stalls_for_seconds(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("computer-stalls", within_s=0.5)
+async def test_the_computer_stalls_for_seconds(tmp_path: Path, reacted: Reacted) -> None:
     """Stopped for 3 s: the failsafe acts, and when it goes on it stays silent and says what happened."""
     async with flying(tmp_path) as process:
         stopped_s = process.signal(signal.SIGSTOP)
         await asyncio.sleep(3.0)
         process.signal(signal.SIGCONT)
-        reacted(record_property, "computer-stalls", max(0.0, process.last_setpoint_s() - stopped_s))
+        reacted("computer-stalls", max(0.0, process.last_setpoint_s() - stopped_s))
         assert process.fake_autopilot.failsafe
         await process.until_event("silent: ")
         sent = len(process.fake_autopilot.setpoints)
@@ -220,6 +224,7 @@ async def test_the_computer_stalls_for_seconds(tmp_path: Path, record_property: 
         assert any("stall" in event or "stopped" in event or "late" in event for event in process.events)
 
 
+@pytest.mark.fault("nothing-left-at-start")
 def test_no_descriptors_are_left_at_the_start(tmp_path: Path) -> None:
     """One sentence and exit code 69, however few there are; never an abort."""
     config = config_for(free_port(), free_endpoint(), free_endpoint())

@@ -25,7 +25,6 @@ from flockd.sim.scenario import StartConfig, VehicleConfig, load_scenario
 from flockd.sim.sitl import autopilots, fleet
 from flockd.sim.sitl.ground_station import GroundStation, Poses
 from flockd.sim.vehicles.vehicles import Vehicles
-from tests.faults.catalogue import RecordProperty
 
 pytestmark = pytest.mark.slow
 SPEED_FACTOR = 0.2
@@ -53,7 +52,7 @@ Fly = Callable[..., Encounter]
 
 
 @pytest.fixture
-def fly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record_property: RecordProperty) -> Fly:
+def fly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record_property: Callable[[str, object], None]) -> Fly:
     """Flies two drones for some seconds."""
     stations: list[GroundStation] = []
 
@@ -102,6 +101,8 @@ def _head_on(speed_m_s: float) -> tuple[StartConfig, StartConfig]:
     return _drone(-START_M, speed_m_s), _drone(START_M, -speed_m_s)
 
 
+@pytest.mark.fault("neighbour-too-near")
+@pytest.mark.fault("head-on")
 @pytest.mark.parametrize("speed_m_s", [1.5, 2.0])
 def test_two_drones_that_meet_head_on_stay_apart(speed_m_s: float, fly: Fly) -> None:
     met = fly(_head_on(speed_m_s), START_M / speed_m_s + 7.0)
@@ -111,6 +112,7 @@ def test_two_drones_that_meet_head_on_stay_apart(speed_m_s: float, fly: Fly) -> 
     assert met.fleet.handed_over == {}
 
 
+@pytest.mark.fault("one-that-does-not-avoid")
 def test_a_drone_that_hovers_in_the_way_and_does_not_avoid_is_stopped_before(fly: Fly) -> None:
     met = fly((_drone(-START_M, 2.0), _drone(0.0, 0.0, by_hand=True)), 14.0)
     assert met.fastest_m_s > 1.6
@@ -119,6 +121,7 @@ def test_a_drone_that_hovers_in_the_way_and_does_not_avoid_is_stopped_before(fly
     assert met.fleet.handed_over == {}
 
 
+@pytest.mark.fault("gusts")
 def test_gusts_up_to_the_limit_do_not_bring_two_drones_together(fly: Fly) -> None:
     """Each axis deviates by 0.4 m/s, so that drift is 0.57 m/s: below `safety.degraded_velocity_error_m_s`."""
     met = fly(_head_on(1.5), 15.0, VehicleConfig(gust_m_s=0.4))
@@ -126,6 +129,7 @@ def test_gusts_up_to_the_limit_do_not_bring_two_drones_together(fly: Fly) -> Non
     assert met.apart_m.min() >= APART_M
 
 
+@pytest.mark.fault("gusts")
 def test_gusts_beyond_the_limit_end_in_hold_with_the_reason(fly: Fly) -> None:
     """1.4 m/s of drift, and `safety.max_velocity_error_m_s` is 0.8."""
     met = fly(_head_on(1.0), 10.0, VehicleConfig(gust_m_s=1.0))
@@ -151,6 +155,7 @@ class _Late(Vehicles):
         super().step(self._obeyed, yaw_setpoints, interval_s, heights)
 
 
+@pytest.mark.fault("autopilot-obeys-late")
 def test_two_drones_whose_autopilots_obey_a_little_late_and_weakly_stay_apart(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -160,6 +165,7 @@ def test_two_drones_whose_autopilots_obey_a_little_late_and_weakly_stay_apart(
     assert met.apart_m.min() >= APART_M
 
 
+@pytest.mark.fault("autopilot-obeys-late")
 def test_an_autopilot_that_obeys_a_second_late_and_weakly_ends_in_hold_with_the_reason(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:

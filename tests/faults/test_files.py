@@ -26,6 +26,7 @@ def _flockd(*arguments: str) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
+@pytest.mark.fault("hostile-recording")
 @pytest.mark.parametrize("damage", ["middle", "sizes", "end", "header"])
 def test_a_recording_is_hostile(damage: str, tmp_path: Path) -> None:
     path = tmp_path / "drone1.mcap"
@@ -49,6 +50,7 @@ def test_a_recording_is_hostile(damage: str, tmp_path: Path) -> None:
             assert f"{path}" in ended.stderr
 
 
+@pytest.mark.fault("huge-image")
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
 def test_an_image_claims_to_be_huge(suffix: str, tmp_path: Path) -> None:
     images = tmp_path / "images"

@@ -17,9 +17,9 @@ from flockd.flight.pilot import FlockPilot
 from flockd.flight.tracking.tracker import Tracker
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from tests.calm import clock
-from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.conftest import InTheAir
 from tests.faults.process import flying
+from tests.faults.stories import Reacted
 from tests.make import changed, neighbour
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL
@@ -32,8 +32,9 @@ def _company(config: DroneConfig) -> DroneConfig:
     return changed(config, safety__alone_s=None)
 
 
+@pytest.mark.fault("neighbour-too-near", within_s=1.5)
 async def test_a_neighbour_comes_too_near(
-    in_the_air: InTheAir, record_property: RecordProperty, monkeypatch: pytest.MonkeyPatch
+    in_the_air: InTheAir, reacted: Reacted, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In the way that it wants to fly: whatever the law says, no velocity towards it is sent."""
     seen: list[Neighbour] = []
@@ -45,7 +46,7 @@ async def test_a_neighbour_comes_too_near(
         seen.append(neighbour([0.6, 0.0, 0.0]))
         fault_s = clock()
         await until(lambda: ship.fake_autopilot.setpoints[-1][1].velocity[0] <= 0.01, SECONDS_TO_FAIL)
-        reacted(record_property, "neighbour-too-near", clock() - fault_s)
+        reacted("neighbour-too-near", clock() - fault_s)
         await until(lambda: "neighbour_close" in ship.matters(), SECONDS_TO_FAIL)
         near_s = clock()
         await until(lambda: clock() > near_s + 1.0, SECONDS_TO_FAIL)
@@ -57,9 +58,8 @@ async def test_a_neighbour_comes_too_near(
         assert ship.fake_autopilot.mode == "OFFBOARD"
 
 
-async def test_all_neighbours_are_lost(
-    in_the_air: InTheAir, record_property: RecordProperty, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.fault("alone", within_s=6.0)
+async def test_all_neighbours_are_lost(in_the_air: InTheAir, reacted: Reacted, monkeypatch: pytest.MonkeyPatch) -> None:
     """It flies on as desired, to the north, and not after the one that was last seen in the east; then Hold."""
     seen = [neighbour([0.0, 3.5, 0.0], [1.0, 0.0, 0.0])]
     monkeypatch.setattr(Tracker, "neighbours", lambda _: tuple(seen))
@@ -80,16 +80,17 @@ async def test_all_neighbours_are_lost(
         velocity = ship.fake_autopilot.setpoints[-1][1].velocity
         np.testing.assert_allclose(velocity, [1.0, 0.0], atol=0.2)
         await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted(record_property, "alone", clock() - fault_s)
+        reacted("alone", clock() - fault_s)
         assert not ship.fake_autopilot.failsafe
         await ship.until_event("asking: no neighbour seen for ")
 
 
+@pytest.mark.fault("command-not-finite", within_s=1.0)
 @pytest.mark.parametrize("velocity", [(np.nan, 0.0), (np.inf, 0.0), (1e6, 0.0)], ids=["NaN", "infinite", "too large"])
 async def test_a_command_that_cannot_be_flown(
     velocity: tuple[float, float],
     in_the_air: InTheAir,
-    record_property: RecordProperty,
+    reacted: Reacted,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     wrong: list[bool] = []
@@ -111,7 +112,7 @@ async def test_a_command_that_cannot_be_flown(
         await until(
             lambda: float(np.linalg.norm(ship.fake_autopilot.setpoints[-1][1].velocity)) < 0.05, SECONDS_TO_FAIL
         )
-        reacted(record_property, "command-not-finite", clock() - fault_s)
+        reacted("command-not-finite", clock() - fault_s)
         await ship.until_event("degraded: a command was not finite or far too large")
         assert ship.fake_autopilot.refused_setpoints == 0, "it never left"
         wrong.clear()
@@ -119,7 +120,8 @@ async def test_a_command_that_cannot_be_flown(
         assert ship.fake_autopilot.mode == "OFFBOARD"
 
 
-async def test_the_fence_is_left(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("fence-left", within_s=6.0)
+async def test_the_fence_is_left(tmp_path: Path, reacted: Reacted) -> None:
     """It wants to go on to the north, stops before the fence 4 m from home, and is carried over it."""
 
     def fenced(config: DroneConfig) -> DroneConfig:
@@ -133,7 +135,7 @@ async def test_the_fence_is_left(tmp_path: Path, record_property: RecordProperty
             await asyncio.sleep(0.01)
         fault_s = time.monotonic()
         await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted(record_property, "fence-left", time.monotonic() - fault_s)
+        reacted("fence-left", time.monotonic() - fault_s)
         assert not autopilot.failsafe
         assert float(autopilot.state.position[0]) < 5.5
         late = [setpoint.velocity[0] for at_s, setpoint in list(autopilot.setpoints) if at_s > fault_s + 1.0]
@@ -142,6 +144,7 @@ async def test_the_fence_is_left(tmp_path: Path, record_property: RecordProperty
         assert any("outside the fence" in event for event in process.events)
 
 
+@pytest.mark.fault("one-spot")
 async def test_two_drones_at_one_spot_part(
     in_the_air: InTheAir, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -20,8 +20,8 @@ from flockd.fleet.page.live_fleet import LiveFleet
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
 from flockd.sim.sitl.free_ports import free_endpoint
-from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import Process, flying
+from tests.faults.stories import Reacted
 from tests.fleet.page.test_access import opened, served
 from tests.make import changed
 from tests.onboard.autopilot.flight import until
@@ -70,8 +70,10 @@ def silent_drones(session: zenoh.Session) -> Iterator[None]:
             one.undeclare()
 
 
+@pytest.mark.fault("hostile-peers", within_s=60.0)
+@pytest.mark.fault("stuck-pictures", within_s=1.0)
 async def test_neither_absurd_peers_nor_stuck_pictures_keep_an_order_from_a_drone(
-    tmp_path: Path, record_property: RecordProperty
+    tmp_path: Path, reacted: Reacted
 ) -> None:
     endpoint = free_endpoint()
     async with flying(tmp_path, change=connecting(endpoint)) as process:
@@ -94,7 +96,7 @@ async def test_neither_absurd_peers_nor_stuck_pictures_keep_an_order_from_a_dron
             assert rows["test/tiny"]["state"] in {"normal", "degraded"}
             assert rows["test/absurd"]["speed_m_s"] is None
             assert list(rows).index("test/tiny") < 3, "invented names stand last"
-            reacted(record_property, "hostile-peers", time.monotonic() - began_s)
+            reacted("hostile-peers", time.monotonic() - began_s)
             with silent_drones(silent):
                 async with served(fleet=fleet) as (client, access, _):
                     own = await opened(client, access)
@@ -110,7 +112,7 @@ async def test_neither_absurd_peers_nor_stuck_pictures_keep_an_order_from_a_dron
                     order = {"drones": ["test/tiny"], "command": "land"}
                     answer = await (await client.post("/ask", json=order, headers=own)).json()
                     assert answer["test/tiny"]["accepted"], answer
-                    reacted(record_property, "stuck-pictures", time.monotonic() - began_s)
+                    reacted("stuck-pictures", time.monotonic() - began_s)
                     assert {(await picture).status for picture in pictures} == {204}
             await until(lambda: process.fake_autopilot.mode == "LAND", SECONDS_TO_FAIL)
             del tokens
@@ -127,7 +129,10 @@ async def _answer(process: Process, command: str, **ask: object) -> dict[str, An
     return answer
 
 
-async def test_orders_that_are_old_or_ambiguous_or_without_end(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("one-name-twice", within_s=5.0)
+@pytest.mark.fault("order-replayed", within_s=3.0)
+@pytest.mark.fault("orders-without-end", within_s=3.0)
+async def test_orders_that_are_old_or_ambiguous_or_without_end(tmp_path: Path, reacted: Reacted) -> None:
     async with flying(tmp_path) as process:
         # Two drones of one name.
         (drone,) = process.watcher.drones()
@@ -138,7 +143,7 @@ async def test_orders_that_are_old_or_ambiguous_or_without_end(tmp_path: Path, r
             began_s = time.monotonic()
             other = impostor.liveliness().declare_token("flockd/v1/test/tiny/alive/another")
             await until(lambda: any(len(one.identities) == 2 for one in both.drones()), SECONDS_TO_FAIL)
-            reacted(record_property, "one-name-twice", time.monotonic() - began_s)
+            reacted("one-name-twice", time.monotonic() - began_s)
             (row,) = status_rows(both.drones(), time.monotonic())
             assert "2 drones call themselves tiny" in row["matters"][0]
             refused = await asyncio.to_thread(both.ask, key, "land", "anna")
@@ -160,7 +165,7 @@ async def test_orders_that_are_old_or_ambiguous_or_without_end(tmp_path: Path, r
             lambda: [one["operator"] for one in process.heard()["flight"].message["orders"]][:2] == ["bert", "anna"],
             SECONDS_TO_FAIL,
         )
-        reacted(record_property, "order-replayed", time.monotonic() - began_s)
+        reacted("order-replayed", time.monotonic() - began_s)
         await process.until_event("an operator asked for resume: bert, order 1")
         assert process.fake_autopilot.mode == "OFFBOARD"
 
@@ -172,7 +177,7 @@ async def test_orders_that_are_old_or_ambiguous_or_without_end(tmp_path: Path, r
             await asyncio.sleep(0.0)
         began_s = time.monotonic()
         assert (await _answer(process, "land", sequence=9))["accepted"]
-        reacted(record_property, "orders-without-end", time.monotonic() - began_s)
+        reacted("orders-without-end", time.monotonic() - began_s)
         await until(lambda: process.fake_autopilot.mode == "LAND", SECONDS_TO_FAIL)
         await until(lambda: process.heard()["flight"].message["orders_refused"] >= refusals, SECONDS_TO_FAIL)
         assert process.heard()["computer"].message["messages_lost"] == lost

@@ -48,6 +48,7 @@ def _router(endpoint: str) -> tuple[Any, list[str]]:
     return session, keys
 
 
+@pytest.mark.fault("telemetry-router-gone")
 async def test_the_router_of_the_telemetry_goes_and_comes_back(tmp_path: Path) -> None:
     endpoint = free_endpoint()
 
@@ -68,6 +69,7 @@ async def test_the_router_of_the_telemetry_goes_and_comes_back(tmp_path: Path) -
         router.close()
 
 
+@pytest.mark.fault("malformed-telemetry")
 async def test_nonsense_on_the_telemetry_bus(tmp_path: Path) -> None:
     """The drone reads nothing but questions; `hold` is not among `telemetry.commands` of this one."""
     async with flying(tmp_path) as process:
@@ -84,6 +86,7 @@ async def test_nonsense_on_the_telemetry_bus(tmp_path: Path) -> None:
         session.close()  # type: ignore[no-untyped-call]
 
 
+@pytest.mark.fault("messages-of-any-size")
 async def test_queries_of_any_size_and_number(tmp_path: Path) -> None:
     """Memory is that of the drone's whole process."""
     async with flying(tmp_path) as process:
@@ -106,6 +109,7 @@ async def test_queries_of_any_size_and_number(tmp_path: Path) -> None:
         session.close()  # type: ignore[no-untyped-call]
 
 
+@pytest.mark.fault("wrong-types-of-a-peer")
 def test_status_shows_a_peer_that_publishes_nonsense() -> None:
     """A real `flockd status`, piped and as JSON: it ends well, and nothing steers the terminal."""
     endpoint = free_endpoint()

@@ -18,8 +18,8 @@ from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.sim.autopilot.fake_vehicle import Demand
 from flockd.sim.scenario import RangeFinderConfig
-from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import Process, drone, started
+from tests.faults.stories import Reacted
 from tests.make import changed
 from tests.onboard.autopilot.conftest import HOVER_M
 from tests.onboard.autopilot.flight import until
@@ -72,13 +72,14 @@ async def _flies_by_range(process: Process) -> None:
     assert not heights or heights[-1] == WORKS, heights
 
 
+@pytest.mark.fault("range-finder-lies", within_s=3.0)
 @pytest.mark.parametrize(
     ("lie", "climbs"),
     [(lambda range_m: HOVER_M, True), (lambda range_m: 0.3, False), (lambda range_m: range_m + 3.0, False)],
     ids=["stuck in a climb", "landing gear in the beam", "a jump"],
 )
 async def test_the_range_finder_lies(
-    lie: Callable[[float], float], climbs: bool, tmp_path: Path, record_property: RecordProperty
+    lie: Callable[[float], float], climbs: bool, tmp_path: Path, reacted: Reacted
 ) -> None:
     sensor = _Lying()
     async with drone(tmp_path, change=_by("best"), range_finder=sensor) as process:
@@ -90,7 +91,7 @@ async def test_the_range_finder_lies(
             await until(lambda: -autopilot.state.position[2] > HOVER_M + NOTICED_M, SECONDS_TO_FAIL)
         fault_s = time.monotonic()
         await process.until_event(f"{LIE}; the barometer's is used")
-        reacted(record_property, "range-finder-lies", time.monotonic() - fault_s)
+        reacted("range-finder-lies", time.monotonic() - fault_s)
         assert WORKS not in process.events[told:]
         steps = process.heard()["computer"].message["steps"]
         await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
@@ -102,16 +103,15 @@ async def test_the_range_finder_lies(
         assert all(np.linalg.norm(sent.velocity[:2]) <= limit_m_s + 1e-6 for _, sent in autopilot.setpoints)
 
 
-async def test_without_the_barometer_a_lie_is_no_scale_and_ends_in_hold(
-    tmp_path: Path, record_property: RecordProperty
-) -> None:
+@pytest.mark.fault("range-finder-lies", within_s=3.0)
+async def test_without_the_barometer_a_lie_is_no_scale_and_ends_in_hold(tmp_path: Path, reacted: Reacted) -> None:
     sensor = _Lying()
     async with drone(tmp_path, change=_by("range_finder"), range_finder=sensor) as process:
         await _flies_by_range(process)
         sensor.lie = lambda range_m: 0.3
         fault_s = time.monotonic()
         await process.until_event(f"{LIE}; there is no scale")
-        reacted(record_property, "range-finder-lies", time.monotonic() - fault_s)
+        reacted("range-finder-lies", time.monotonic() - fault_s)
         await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
         await process.until_event("silent: ")
         sensor.lie = None

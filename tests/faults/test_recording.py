@@ -13,8 +13,8 @@ import pytest
 
 from flockd.cli import main
 from flockd.onboard.recording.reader import Recording
-from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import Process, flying
+from tests.faults.stories import Reacted
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL
 
@@ -32,13 +32,14 @@ async def _has_recorded(process: Process, bytes_: int) -> Path:
     return _recording(process)
 
 
-async def test_sigterm_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("sigterm", within_s=2.0)
+async def test_sigterm_in_flight(tmp_path: Path, reacted: Reacted) -> None:
     async with flying(tmp_path) as process:
         path = _recording(process)
         await asyncio.sleep(2.0)
         asked_s = process.signal(signal.SIGTERM)
         await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted(record_property, "sigterm", time.monotonic() - asked_s)
+        reacted("sigterm", time.monotonic() - asked_s)
         assert not process.fake_autopilot.failsafe, "Hold was asked for"
         assert process.standing_still(asked_s + 0.3) or process.last_setpoint_s() < asked_s + 0.3
         assert await process.ended() == 0
@@ -47,8 +48,9 @@ async def test_sigterm_in_flight(tmp_path: Path, record_property: RecordProperty
         assert len(list(recording.steps())) > 3
 
 
+@pytest.mark.fault("killed-while-recording", within_s=2.0)
 async def test_it_is_killed_while_it_records(
-    tmp_path: Path, record_property: RecordProperty, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, reacted: Reacted, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """As for a loss of power: the autopilot's failsafe acts, and what was written can be read."""
     found: list[Path] = []
@@ -56,7 +58,7 @@ async def test_it_is_killed_while_it_records(
         found.append(await _has_recorded(process, 150_000))
         killed_s = process.signal(signal.SIGKILL)
         await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted(record_property, "killed-while-recording", time.monotonic() - killed_s)
+        reacted("killed-while-recording", time.monotonic() - killed_s)
         assert process.fake_autopilot.failsafe, "nobody was there to ask for Hold"
     whole = tmp_path / "whole.mcap"
     assert main(["record", "recover", str(found[0]), "--out", str(whole)]) == 0, capsys.readouterr()
@@ -65,7 +67,8 @@ async def test_it_is_killed_while_it_records(
     assert len(list(recording.steps())) > 3
 
 
-async def test_the_disk_is_full(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("disk-full", within_s=5.0)
+async def test_the_disk_is_full(tmp_path: Path, reacted: Reacted) -> None:
     """No file of the process may grow any more, which to it is the same as a full disk."""
     async with flying(tmp_path) as process:
         path = await _has_recorded(process, 50_000)
@@ -73,13 +76,14 @@ async def test_the_disk_is_full(tmp_path: Path, record_property: RecordProperty)
         full_s = time.monotonic()
         resource.prlimit(process.program.process.pid, resource.RLIMIT_FSIZE, (size, size))
         await until(lambda: any("recording" in event and "file too large" in event for event in process.events))
-        reacted(record_property, "disk-full", time.monotonic() - full_s)
+        reacted("disk-full", time.monotonic() - full_s)
         steps = process.heard()["computer"].message["steps"]
         await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
         assert process.fake_autopilot.mode == "OFFBOARD"
         assert "file too large" in process.heard()["computer"].message["recording"]
 
 
+@pytest.mark.fault("foreign-recordings")
 async def test_foreign_things_lie_among_the_recordings(tmp_path: Path) -> None:
     (tmp_path / "tiny-folder.mcap").mkdir()
     (tmp_path / "tiny-link.mcap").symlink_to(tmp_path / "nowhere")

@@ -30,7 +30,7 @@ from flockd.sim.cameras import camera_simulator
 from flockd.sim.cameras.true_rigs import true_rigs
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import ScenarioConfig, load_scenario
-from tests.faults.catalogue import RecordProperty, reacted
+from tests.faults.stories import Reacted
 
 pytestmark = pytest.mark.slow
 CAMERAS = ("front", "right", "back", "left")
@@ -72,9 +72,8 @@ def flown(flight: ScenarioConfig, path: Path) -> tuple[PilotOutput, ...]:
     return recorder.outputs
 
 
-def test_a_rig_is_not_as_configured(
-    tmp_path: Path, record_property: RecordProperty, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.fault("rig-off", within_s=20.0)
+def test_a_rig_is_not_as_configured(tmp_path: Path, reacted: Reacted, capsys: pytest.CaptureFixture[str]) -> None:
     """Two degrees, 2 cm, 30 ms and 2 %: said in flight with the correction, and flown on as configured."""
     flight = scenario(2.0, 0.03, 0.02)
     outputs = flown(flight, tmp_path / NAME)
@@ -86,7 +85,7 @@ def test_a_rig_is_not_as_configured(
         for fault in FAULTS:
             (text,) = [text for text in told if text.startswith(f"camera {camera}: {fault}")]
             assert "it is flown on as configured" in text
-            reacted(record_property, "rig-off", told[text])
+            reacted("rig-off", told[text])
 
     # Before the next flight the doctor compares them ...
     recording = Recording(tmp_path / NAME)
@@ -114,6 +113,7 @@ def test_a_rig_is_not_as_configured(
     assert "is another than in the last flight" in finding.measured
 
 
+@pytest.mark.fault("camera-elsewhere", within_s=20.0)
 @pytest.mark.parametrize(
     "axes",
     [{"front": (math.pi, 0.0, 0.0)}, {"left": (0.0, 0.0, math.pi), "right": (0.0, 0.0, math.pi)}],
@@ -122,7 +122,7 @@ def test_a_rig_is_not_as_configured(
 def test_a_camera_is_upside_down_or_two_are_swapped(
     axes: dict[str, tuple[float, float, float]],
     tmp_path: Path,
-    record_property: RecordProperty,
+    reacted: Reacted,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     flight = scenario(0.0, 0.0, 0.0)
@@ -139,7 +139,7 @@ def test_a_camera_is_upside_down_or_two_are_swapped(
     for name in axes:
         (text,) = [text for text in told if text.startswith(f"camera {name}: it moves otherwise than the drone")]
         assert text.endswith("turned as configured? The drone flies without it.")
-        reacted(record_property, "camera-elsewhere", told[text])
+        reacted("camera-elsewhere", told[text])
     assert len([text for text in told if "moves otherwise" in text]) == len(axes)
     assert set(outputs[-1].noisy_cameras) == set(axes)
     found = [one for one in check_rig(flight.drone, tmp_path) if one.level is Level.FAILURE]
@@ -147,6 +147,7 @@ def test_a_camera_is_upside_down_or_two_are_swapped(
     assert all("flockd cameras --picture" in one.fix for one in found)
 
 
+@pytest.mark.fault("rig-off")
 def test_a_rig_as_configured_is_flown_without_a_word(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     flight = scenario(0.0, 0.0, 0.0)
     outputs = flown(flight, tmp_path / NAME)

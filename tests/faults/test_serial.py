@@ -13,8 +13,8 @@ from flockd.onboard.autopilot import mavsdk_link
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from tests.calm import clock
-from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.conftest import InTheAir
+from tests.faults.stories import Reacted
 from tests.onboard.autopilot.conftest import HEARTBEAT_S
 from tests.onboard.autopilot.flight import until
 from tests.onboard.autopilot.serial_cable import SerialCable
@@ -36,6 +36,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mavsdk_link, "GONE_S", GONE_S)
 
 
+@pytest.mark.fault("serial-port")
 async def test_on_the_ground_it_comes_back_or_the_daemon_ends_for_a_restart(port: int, tmp_path: Path) -> None:
     with (
         SerialCable(port, tmp_path / "ttyUSB0") as cable,
@@ -57,8 +58,9 @@ async def test_on_the_ground_it_comes_back_or_the_daemon_ends_for_a_restart(port
             assert "has been gone for more than 2 s; check the cable" in str(error)
 
 
+@pytest.mark.fault("serial-port", within_s=3.0)
 async def test_in_flight_it_is_opened_again_however_long_that_takes_and_nothing_is_sent(
-    in_the_air: InTheAir, fake_autopilot: FakeAutopilot, port: int, tmp_path: Path, record_property: RecordProperty
+    in_the_air: InTheAir, fake_autopilot: FakeAutopilot, port: int, tmp_path: Path, reacted: Reacted
 ) -> None:
     with SerialCable(port, tmp_path / "ttyUSB0") as cable:
         async with in_the_air(change=lambda config: _over(cable, config)) as ship:
@@ -67,7 +69,7 @@ async def test_in_flight_it_is_opened_again_however_long_that_takes_and_nothing_
             cable.unplug()
             fault_s = clock()
             await ship.until_event("silent: ")
-            reacted(record_property, "serial-port", clock() - fault_s)
+            reacted("serial-port", clock() - fault_s)
             await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
             assert fake_autopilot.failsafe
             await asyncio.sleep(3 * GONE_S)
@@ -81,6 +83,7 @@ async def test_in_flight_it_is_opened_again_however_long_that_takes_and_nothing_
             assert ship.state() == "silent"
 
 
+@pytest.mark.fault("serial-port")
 async def test_with_two_autopilots_and_no_system_id_it_does_not_start(port: int, tmp_path: Path) -> None:
     with (
         FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as own,

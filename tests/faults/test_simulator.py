@@ -11,14 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.catalogue import RecordProperty, reacted
+from tests.faults.stories import Reacted
 from tests.sitl.test_fleet import _left_behind, _processes, _scenario
 
 pytestmark = pytest.mark.slow
 SECONDS_TO_START = 180.0
 
 
-def test_the_simulator_is_killed_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("simulator-killed", within_s=5.0)
+def test_the_simulator_is_killed_in_flight(tmp_path: Path, reacted: Reacted) -> None:
     """SIGKILL: it can end nothing any more. Its two daemons end by themselves, and what they recorded is whole."""
     scenario = _scenario(tmp_path, drones=2)
     scenario.write_text(scenario.read_text(encoding="utf-8").replace('"duration_s": 3.0', '"duration_s": 60.0'))
@@ -42,4 +43,4 @@ def test_the_simulator_is_killed_in_flight(tmp_path: Path, record_property: Reco
     while (left := _left_behind(str(tmp_path))) and time.monotonic() < killed_s + 60.0:
         time.sleep(0.05)
     assert left == []
-    reacted(record_property, "simulator-killed", time.monotonic() - killed_s)
+    reacted("simulator-killed", time.monotonic() - killed_s)

@@ -16,8 +16,8 @@ import yaml
 
 from flockd.core.data import data_path
 from flockd.sim.sitl.free_ports import free_endpoint, free_port
-from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import flying
+from tests.faults.stories import Reacted
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, config_for
 
@@ -50,6 +50,8 @@ def _run(folder: Path, change: Callable[[dict[str, Any]], object]) -> Ended:
     return Ended(ended.returncode, time.monotonic() - began_s, ended.stderr.strip().splitlines()[-1])
 
 
+@pytest.mark.fault("wrong-configuration", within_s=30.0)
+@pytest.mark.fault("absurd-limits")
 @pytest.mark.parametrize(
     ("section", "key", "value", "told"),
     [
@@ -61,13 +63,13 @@ def _run(folder: Path, change: Callable[[dict[str, Any]], object]) -> Ended:
     ],
 )
 def test_the_configuration_is_wrong(
-    section: str, key: str, value: object, told: str, tmp_path: Path, record_property: RecordProperty
+    section: str, key: str, value: object, told: str, tmp_path: Path, reacted: Reacted
 ) -> None:
     ended = _run(tmp_path, lambda values: values.setdefault(section, {}).update({key: value}))
     assert ended.code == 78
     assert told in ended.last
     assert ended.last.startswith(f"{tmp_path / 'drone.yaml'}:")
-    reacted(record_property, "wrong-configuration", ended.took_s)
+    reacted("wrong-configuration", ended.took_s)
 
 
 def _models(folder: Path) -> Path:
@@ -82,7 +84,8 @@ def _models(folder: Path) -> Path:
     return models
 
 
-def test_a_model_was_changed(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("model-changed", within_s=15.0)
+def test_a_model_was_changed(tmp_path: Path, reacted: Reacted) -> None:
     models = _models(tmp_path)
     flow = bytearray((models / "flow_int8.onnx").read_bytes())
     flow[len(flow) // 2] ^= 1
@@ -91,7 +94,7 @@ def test_a_model_was_changed(tmp_path: Path, record_property: RecordProperty) ->
     ended = _run(tmp_path, lambda values: values["perception"].update(models_dir=str(models)))
     assert ended.code == 78
     assert "flow_int8.yaml:5: sha256: " in ended.last
-    reacted(record_property, "model-changed", ended.took_s)
+    reacted("model-changed", ended.took_s)
 
 
 def _aliases(path: Path) -> None:
@@ -110,6 +113,7 @@ def _fifo(path: Path) -> None:
     os.mkfifo(path)
 
 
+@pytest.mark.fault("hostile-manifest", within_s=15.0)
 @pytest.mark.parametrize(
     "spoil",
     [
@@ -121,24 +125,23 @@ def _fifo(path: Path) -> None:
     ],
     ids=["aliases", "zero", "fifo", "depth", "not UTF-8"],
 )
-def test_a_manifest_is_hostile(
-    spoil: Callable[[Path], object], tmp_path: Path, record_property: RecordProperty
-) -> None:
+def test_a_manifest_is_hostile(spoil: Callable[[Path], object], tmp_path: Path, reacted: Reacted) -> None:
     models = _models(tmp_path)
     spoil(models / "flow_int8.yaml")
     ended = _run(tmp_path, lambda values: values["perception"].update(models_dir=str(models)))
     assert ended.code == 78
     assert ended.last.startswith(f"{models / 'flow_int8.yaml'}:")
-    reacted(record_property, "hostile-manifest", ended.took_s)
+    reacted("hostile-manifest", ended.took_s)
 
 
-async def test_a_second_instance_is_started_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
+@pytest.mark.fault("second-instance", within_s=15.0)
+async def test_a_second_instance_is_started_in_flight(tmp_path: Path, reacted: Reacted) -> None:
     async with flying(tmp_path) as process:
         began_s = time.monotonic()
         first = process.program
         process.daemons.start()
         assert await process.ended() == 69
-        reacted(record_property, "second-instance", time.monotonic() - began_s)
+        reacted("second-instance", time.monotonic() - began_s)
         assert f"another flockd (process {first.process.pid} of user " in process.log()
         steps = process.heard()["computer"].message["steps"]
         await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)

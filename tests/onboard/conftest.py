@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 
 from tests import calm
-from tests.coroutine_tests import run_coroutine_test
 
 
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     """See `tests.calm`."""
-    return run_coroutine_test(pyfuncitem, calm.run)
+    return calm.run_coroutine_test(pyfuncitem, calm.run)

@@ -50,6 +50,7 @@ def endless(folder: Path) -> Path:
     )  # fmt: skip
 
 
+@pytest.mark.fault("endless-network")
 def test_an_endless_network_is_refused_in_one_sentence(tmp_path: Path) -> None:
     path = endless(tmp_path)
     with pytest.raises(

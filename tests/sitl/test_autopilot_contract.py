@@ -56,6 +56,10 @@ SEEN = (
 """Of PX4 1.18 (release/1.18, 83c4f4e580) on 24 November 2026: the story, and what is seen."""
 
 
+@pytest.mark.fault("heartbeats-lost")
+@pytest.mark.fault("failsafe-then-resume")
+@pytest.mark.fault("others-interfere")
+@pytest.mark.fault("silent-autopilot")
 @pytest.mark.slow
 @pytest.mark.parametrize("autopilot", ["fake", pytest.param("px4", marks=PX4)])
 def test_flockd_sees_what_px4_1_18_shows(autopilot: str) -> None:

@@ -253,6 +253,7 @@ def test_px4_flies_by_sight(tmp_path: Path) -> None:
     np.testing.assert_allclose(speed, 1.0, atol=0.3)
 
 
+@pytest.mark.fault("computer-stalls")
 @PX4
 @pytest.mark.slow
 def test_px4_enters_its_failsafe_when_its_daemon_is_frozen(tmp_path: Path) -> None:

@@ -290,6 +290,11 @@ class Px4Flight(SitlRun):
 PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
 
 
+@pytest.mark.fault("link-lost")
+@pytest.mark.fault("pilot-takes-over")
+@pytest.mark.fault("battery-or-estimate")
+@pytest.mark.fault("fence-left")
+@pytest.mark.fault("out-of-memory")
 @PX4
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)

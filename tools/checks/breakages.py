@@ -2,7 +2,7 @@
 
 python -m tools.checks.breakages                # the fixed list of breakages.yaml, a few minutes: what CI runs
 python -m tools.checks.breakages --only fence   # those whose name or file contains the word
-python -m tools.checks.breakages --mutants 60   # so many small changes of the safety layer, others with each change of it
+python -m tools.checks.breakages --mutants 60   # so many small changes of the safety layer, drawn by its sources
 python -m tools.checks.breakages --mutants 0    # all of them, about a quarter of an hour
 
 A fixed breakage names a folder, a text that occurs there exactly once, what replaces it, and the tests that must fail

@@ -13,8 +13,8 @@ images are small and the steps far apart. The machine's clock counts instruction
 computer is changes how long the check takes, and nothing of what it measures. --package installs half a gigabyte three
 times.
 
-Exit code 0, 1 a check failed, 69 something needed is not there. A check that is a row of the catalogue of faults
-(`python -m tools.checks.faults --list`) says which.
+Exit code 0, 1 a check failed, 69 something needed is not there. A check that is a row of the list of faults
+(`docs/reference/faults.md`) says which.
 """
 
 from __future__ import annotations

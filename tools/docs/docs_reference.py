@@ -26,6 +26,7 @@ from flockd.flight.safety.policy import Barrier, Reaction, rules
 from flockd.onboard.autopilot.refusal_reasons import REASONS
 from flockd.onboard.telemetry import topics
 from flockd.sim.scenario import scenario_schema
+from tests.faults.stories import faults, stories
 
 FOLDER = Path(__file__).parents[2] / "docs" / "reference"
 NOTICE = "<!-- Written by tools/docs/docs_reference.py; do not edit. -->"
@@ -394,7 +395,28 @@ def faults_page() -> str:
         reaction = f"`{check.reaction}`" if check.reaction in events else check.reaction
         keys = ", ".join(f"`{key}`" for key in check.keys)
         lines.append(f"| {check.compared} | {check.limit:g} {check.unit} | {reaction} | {check.source} | {keys} |")
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_stories()]) + "\n"
+
+
+def _stories() -> list[str]:
+    """The list of faults, and the tests that their markers name."""
+    lines = [
+        "",
+        "## Stories",
+        "",
+        "The faults that flockd has to survive, by the name that `pytest -m fault --fault NAME` takes, and the tests",
+        "that inject each. Seconds: the longest reaction that they allow.",
+        "",
+        "| | fault | what happens | what flockd does | s | shown by |",
+        "|---|---|---|---|---|---|",
+    ]
+    told = stories()
+    for name, fault in faults().items():
+        limits = [story.within_s for story in told if story.fault == name and story.within_s is not None]
+        tests = ", ".join(f"`{story.test.removeprefix('tests/')}`" for story in told if story.fault == name)
+        within = f"{max(limits):g}" if limits else ""
+        lines.append(f"| {fault.row} | `{name}` | {fault.fault} | {fault.reaction} | {within} | {tests} |")
+    return lines
 
 
 def _reaction(reaction: Reaction) -> str:

@@ -201,6 +201,7 @@ def test_two_cameras_of_one_name_are_refused(tmp_path: Path) -> None:
     assert _places(_drone_problems(tmp_path, twice)) == ["drone.yaml:6: rig.cameras[1].name"]
 
 
+@pytest.mark.fault("wrong-configuration")
 def test_all_problems_of_both_files_come_at_once(tmp_path: Path) -> None:
     (tmp_path / "drone.yaml").write_text(_with("stepp_s: 0.5\nyaw: corse"), encoding="utf-8")
     scenario = tmp_path / "scenario.yaml"

@@ -6,6 +6,7 @@ import asyncio
 import threading
 from collections.abc import Mapping
 
+import pytest
 from aiohttp import web
 
 from flockd.fleet.page.drone_rows import Row
@@ -15,6 +16,8 @@ from flockd.fleet.page.page_pictures import EVERY_S, SILENT_S, PagePictures
 from flockd.fleet.page.page_server import PageServer
 from flockd.onboard.telemetry.topics import AnswerMessage
 from tests.fleet.page.test_access import Asked, opened, served
+
+pytestmark = pytest.mark.fault("stuck-pictures")
 
 
 class Stuck(Asked):
@@ -125,6 +128,7 @@ async def test_connections_that_ask_for_nothing_lock_nobody_out() -> None:
     await runner.cleanup()
 
 
+@pytest.mark.fault("hostile-peers")
 async def test_a_drone_with_absurd_numbers_closes_no_page() -> None:
     """What the watcher would have refused: even so, the others are shown."""
 

@@ -140,6 +140,7 @@ def test_a_neighbour_exactly_below_pushes_south_and_nothing_overflows() -> None:
     assert np.isfinite(law.acceleration(STILL, [[1e308, 1e308]], np.zeros((1, 2)), STILL)).all()
 
 
+@pytest.mark.fault("one-spot")
 @pytest.mark.parametrize("noise_m", [0.0, 1e-163, 0.02])
 def test_two_drones_at_one_level_spot_part_each_to_its_own_right(noise_m: float) -> None:
     """One 0.8 m above the other, both on the same course: they come apart by the separation distance of 1.5 m."""

@@ -12,6 +12,8 @@ from flockd.core.messages import FloatArray
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.flocking.passing import HORIZON_S, Passing, clear_of
 
+pytestmark = pytest.mark.fault("one-that-does-not-avoid")
+
 PARAMETERS = FlockingParameters()
 NORTH = np.array([2.0, 0.0])
 NOBODY = np.empty((0, 3))

@@ -26,6 +26,8 @@ from flockd.flight.geometry import (
 from flockd.flight.geometry.camera_motion import camera_motion, scaled_focal
 from tests.flight.geometry.synthetic_world import EXACT, Flaws, World, boxes_around, four_camera_rig, seen_twice
 
+pytestmark = pytest.mark.fault("rig-off")
+
 STEP_S = 0.5
 FLAWS = Flaws(flow_sigma_px=0.3, depth_sigma=0.1, object_bias=0.1, outliers=0.03)
 TIGHT = 1e-6
@@ -315,6 +317,7 @@ def test_what_says_nothing_changes_nothing() -> None:
     assert all(np.linalg.norm(one.turn) == 0.0 for one in calibration.deviations())
 
 
+@pytest.mark.fault("camera-elsewhere")
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [

@@ -15,6 +15,8 @@ from flockd.core.errors import ModelError
 from flockd.flight.inference import load_manifest, read_manifest
 from tests.flight.inference.foreign import one_channel_depth
 
+pytestmark = pytest.mark.fault("hostile-manifest")
+
 LIMIT_S = 2.0
 """Limit of the processor's time: what waits or reads for ever never ends, whatever else runs."""
 

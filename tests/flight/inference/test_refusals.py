@@ -76,6 +76,7 @@ def put_in_a_nan(manifest: Path) -> None:
     sign_again(manifest)
 
 
+@pytest.mark.fault("model-changed")
 @pytest.mark.parametrize(
     ("damage", "expected"),
     [

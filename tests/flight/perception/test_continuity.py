@@ -12,6 +12,8 @@ from flockd.flight.geometry.rotations import rotation_from_euler
 from flockd.flight.perception.continuity import ContinuityMonitor
 from tests.flight.perception.test_image_noise import SIZE, scene
 
+pytestmark = pytest.mark.fault("noisy-camera")
+
 STEP_S = 0.5
 CAMERAS = ("front", "right", "left")
 WORLD = scene(1.2, 40.0, size=(SIZE[0], 2 * SIZE[1]))

@@ -16,6 +16,8 @@ from flockd.flight.geometry import build_rig, rotation_from_euler
 from flockd.flight.perception.lens import LensMonitor
 from tests.flight.perception.test_image_noise import scene
 
+pytestmark = pytest.mark.fault("lens-covered")
+
 RIG = build_rig(load_drone(data_path("config") / "quadrotor.yaml").rig)
 CAMERAS = tuple(RIG.cameras)
 FIRST, *OTHERS = CAMERAS

@@ -18,6 +18,8 @@ from flockd.onboard.recording.reader import Recording
 from flockd.sim.cameras.camera_faults import noisy_image
 from flockd.sim.scenario import CameraFaultConfig
 
+pytestmark = pytest.mark.fault("noisy-camera")
+
 CAMERA = "left"
 NOISE_BEGINS, NOISE_ENDS, STEPS = 2, 6, 8
 Step = tuple[FrameSet, VehicleState]

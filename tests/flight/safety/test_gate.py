@@ -165,6 +165,7 @@ def test_a_daemon_that_stalls_is_silenced_in_time_for_the_half_second() -> None:
 # Numbers that cannot be.
 
 
+@pytest.mark.fault("command-not-finite")
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_command_that_is_not_finite_is_refused_and_brings_standstill(bad: float, axis: int) -> None:
@@ -568,6 +569,7 @@ def test_an_uncertain_neighbour_counts_as_nearer_and_faster() -> None:
     np.testing.assert_allclose(sent(Stream(parameters).second([1.0, 0.0], around=ahead)).velocity, [1.0, 0.0])
 
 
+@pytest.mark.fault("neighbour-too-near")
 @pytest.mark.parametrize(("lag_s", "period_s", "least_m"), [(0.0, 0.05, 1.0), (0.35, 0.5, 0.999)])
 def test_two_that_fly_at_each_other_at_3_m_s_stop_before_the_minimum_distance(
     lag_s: float, period_s: float, least_m: float

@@ -47,6 +47,7 @@ def test_limits_of_the_supervisor(limits: dict[str, Any], words: str) -> None:
         SafetyParameters(**limits)
 
 
+@pytest.mark.fault("absurd-limits")
 @pytest.mark.parametrize(
     ("key", "value"),
     [

@@ -13,6 +13,8 @@ from flockd.core.messages import FloatArray, Wanted
 from flockd.flight.safety import Action, Gate, GateParameters, Permission, Request, Surroundings
 from flockd.flight.safety.response import ResponseMonitor
 
+pytestmark = pytest.mark.fault("gusts")
+
 TICK_S = 0.05
 FREE = GateParameters(fence_radius_m=None)
 NOWHERE = Surroundings(np.zeros(2), np.zeros(2), 0.0, np.empty((0, 3)), np.empty((0, 2)), 5.0)

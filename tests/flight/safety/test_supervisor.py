@@ -327,6 +327,7 @@ def test_link_lost_and_regained_does_not_restart_offboard_by_itself() -> None:
     assert flight.action is Action.SILENCE
 
 
+@pytest.mark.fault("own-stall")
 def test_flockds_own_stall_is_told_before_the_mode_that_followed_from_it() -> None:
     flight = flying().step(stream_fault="the thread was stopped", flight_mode="hold").step(stream_fault=None)
     assert flight.events == [Event.STREAM_ENDED, Event.NOT_OFFBOARD]
@@ -490,6 +491,7 @@ def test_return_is_worse_than_hold_and_land_is_worse_than_return() -> None:
     assert flight.step(position_lost=True).action is Action.ASK_LAND
 
 
+@pytest.mark.fault("alone")
 def test_alone_it_flies_on_for_a_while_and_then_holds() -> None:
     flight = flying().step(neighbours_age_s=5.0).run(10.0 - STEP_S)
     assert (flight.action, flight.events) == (Action.FLY, [Event.NEIGHBOURS_LOST])
@@ -513,6 +515,7 @@ def test_a_drone_configured_to_fly_alone_does_so_for_ever() -> None:
     assert flight.action is Action.FLY
 
 
+@pytest.mark.fault("fence-left")
 @pytest.mark.parametrize("limit", ["outside_fence", "outside_heights"])
 def test_outside_its_limits_it_has_three_seconds_to_come_back(limit: str) -> None:
     flight = flying()

@@ -105,6 +105,7 @@ TOUCHING = ["rig", "zenoh", "autopilot", "cameras", "models"]
 """They open what the drone flies with, or take its computer's time for long."""
 
 
+@pytest.mark.fault("serial-port")
 def test_beside_a_flying_daemon_nothing_of_the_drone_is_touched(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -175,6 +175,7 @@ LIES: dict[str, Callable[[float], float]] = {
 }
 
 
+@pytest.mark.fault("timesync-lies")
 @pytest.mark.parametrize("lie", LIES.values(), ids=LIES.keys())
 def test_a_lying_timesync_is_not_used_and_said(lie: Callable[[float], float]) -> None:
     """A jump of 0.9 s gave attitudes 53 degrees off in such a turn, a creep of 20 ms a second 35 degrees."""

@@ -86,6 +86,7 @@ async def test_telemetry_is_what_the_vehicle_does(port: int, address: str) -> No
         await link.close()
 
 
+@pytest.mark.fault("absurd-mavlink")
 async def test_a_landed_state_that_mavlink_does_not_have_is_unknown_and_counted(
     address: str, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -128,6 +129,7 @@ async def test_offboard_without_setpoints_is_refused_and_the_reason_told(
         assert fake_autopilot.mode == "LOITER"
 
 
+@pytest.mark.fault("silent-autopilot")
 async def test_an_autopilot_that_acts_on_the_loss_of_its_ground_station_hears_none_and_sends_no_texts(
     address: str, fake_autopilot: FakeAutopilot
 ) -> None:
@@ -142,6 +144,7 @@ async def test_an_autopilot_that_acts_on_the_loss_of_its_ground_station_hears_no
         await until(lambda: not fake_autopilot.has_ground_station)
 
 
+@pytest.mark.fault("silent-autopilot")
 async def test_a_refusal_without_a_word_is_told_as_such(address: str, fake_autopilot: FakeAutopilot) -> None:
     async with attended(address) as link:
         fake_autopilot.wordless = True
@@ -150,6 +153,7 @@ async def test_a_refusal_without_a_word_is_told_as_such(address: str, fake_autop
             await link.arm()
 
 
+@pytest.mark.fault("silent-autopilot")
 async def test_events_that_are_lost_are_requested_and_come(port: int, address: str) -> None:
     with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
         async with attended(address) as link:
@@ -168,6 +172,7 @@ async def _loses_events(link: AutopilotLink, fake_autopilot: FakeAutopilot) -> N
     assert link.knows_checks()
 
 
+@pytest.mark.fault("silent-autopilot")
 async def test_an_autopilot_that_has_started_anew_is_asked_for_its_streams_again(port: int, address: str) -> None:
     with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
         async with attended(address) as link:
@@ -202,6 +207,7 @@ async def test_what_still_sends_over_a_closed_link_is_refused(port: int, address
         attending.cancel()
 
 
+@pytest.mark.fault("heartbeats-lost")
 async def test_one_lost_heartbeat_loses_no_link_and_is_counted(port: int, address: str) -> None:
     """PX4's: one a second."""
     with FakeAutopilot(port, height_m=HOVER_M, clock=clock) as fake_autopilot:

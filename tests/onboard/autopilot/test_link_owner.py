@@ -43,6 +43,8 @@ def _held(address: str, *, uid: int | None = None) -> Iterator[int]:
             holder.kill()
 
 
+@pytest.mark.fault("second-instance")
+@pytest.mark.fault("serial-port")
 def test_a_second_owner_is_refused_until_the_first_was_killed() -> None:
     one, other = f"udpin://127.0.0.1:{free_port()}", f"udpin://127.0.0.1:{free_port()}"
     with _held(one) as process:

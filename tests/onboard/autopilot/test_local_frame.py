@@ -13,6 +13,8 @@ from flockd.flight.geometry import quaternion_from_rotation, rotation_from_vecto
 from flockd.onboard.autopilot.local_frame import LocalFrame
 from flockd.onboard.autopilot.mavlink_messages import ReceivedMessages
 
+pytestmark = pytest.mark.fault("frame-jumps")
+
 
 def _moves(frame: LocalFrame, place: FloatArray, *, hz: float = 30.0, m_s: float = 4.0, seconds: float = 4.0) -> None:
     """In a circle of 3 m through ``place``, as tight as 5.3 m/s^2, with an estimator's noise and stamps of 1 ms."""

@@ -9,6 +9,8 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from flockd.onboard.autopilot.mavlink_messages import ENUMERATIONS, RESULTS, ReceivedMessages, result_text
 
+pytestmark = pytest.mark.fault("absurd-mavlink")
+
 
 def _received(*messages: tuple[str, dict[str, Any]]) -> tuple[ReceivedMessages, list[str]]:
     log: list[str] = []
@@ -102,6 +104,7 @@ def _home(north_m: float, down_m: float) -> tuple[str, dict[str, Any]]:
     return "HOME_POSITION", {"x": north_m, "y": 0.0, "z": down_m}
 
 
+@pytest.mark.fault("home-moved")
 def test_home_stays_while_armed_whatever_landed_state_and_home_say_and_moves_after() -> None:
     position = ("LOCAL_POSITION_NED", {"x": 0.0, "y": 0.0, "z": -5.0, "vx": 0.0, "vy": 0.0, "vz": 0.0})
     attitude = ("ATTITUDE_QUATERNION", {"q1": 1.0, "q2": 0.0, "q3": 0.0, "q4": 0.0})
@@ -136,6 +139,7 @@ def _text(chunk: str, number: int = 0, sequence: int = 0) -> tuple[str, dict[str
     return "STATUSTEXT", {"severity": 4, "text": chunk, "id": number, "chunk_seq": sequence}
 
 
+@pytest.mark.fault("text-in-chunks")
 def test_a_text_in_chunks_is_seen_whole_and_not_before() -> None:
     sentence = "Preflight Fail: the battery is far below what a take-off needs, and the compass disagrees with the yaw"
     received, _ = _received(_text("short"), _text(sentence[:50], 7, 0), _text(sentence[50:100], 7, 1))

@@ -38,6 +38,7 @@ def _spent_s(but: set[int]) -> float:
     return total / os.sysconf("SC_CLK_TCK")
 
 
+@pytest.mark.fault("serial-port")
 async def test_at_rest_it_costs_under_three_hundredths_of_a_core(
     fake_autopilot: FakeAutopilot, cable: SerialCable
 ) -> None:
@@ -49,6 +50,7 @@ async def test_at_rest_it_costs_under_three_hundredths_of_a_core(
         assert _spent_s(others) - spent_s < ALLOWED_SHARE * (time.monotonic() - began_s)
 
 
+@pytest.mark.fault("serial-port")
 async def test_it_comes_back_with_the_device_which_has_forgotten_its_streams(
     fake_autopilot: FakeAutopilot, cable: SerialCable
 ) -> None:
@@ -84,6 +86,7 @@ async def test_without_its_device_for_long_it_is_not_usable(
         await until(lambda: link.unusable() is None)
 
 
+@pytest.mark.fault("serial-port")
 async def test_no_other_program_can_open_it_whoever_starts_it(
     fake_autopilot: FakeAutopilot, cable: SerialCable
 ) -> None:

@@ -8,6 +8,8 @@ import pytest
 
 from flockd.onboard.autopilot.setpoint_watch import SetpointWatch
 
+pytestmark = pytest.mark.fault("setpoints-clipped")
+
 TURN_RAD_S = 1.0
 
 

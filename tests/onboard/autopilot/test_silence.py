@@ -154,6 +154,7 @@ async def _begins_anew(flight: Flight, fake_autopilot: FakeAutopilot) -> None:
     await until(lambda: flight.streamer.report().offboard)
 
 
+@pytest.mark.fault("link-lost")
 async def test_a_lost_link_is_silence_though_the_autopilot_comes_back(port: int, fake_autopilot: FakeAutopilot) -> None:
     async with flying(f"udpin://127.0.0.1:{port}") as flight:
         await flight.enter_offboard()

@@ -140,6 +140,7 @@ def test_a_short_stumble_of_the_loop_is_forgiven(in_offboard: Story) -> None:
     assert in_offboard.go_on(1.0) == 20
 
 
+@pytest.mark.fault("computer-stalls")
 def test_after_a_long_one_nothing_brings_the_stream_back_but_a_new_beginning(in_offboard: Story) -> None:
     in_offboard.go_on(1.5, beating=False)
     assert in_offboard.go_on(5.0) == 0
@@ -187,6 +188,7 @@ def test_a_link_without_any_message_is_lost_sooner(in_offboard: Story) -> None:
     assert in_offboard.silence == "no message from the autopilot for 2.1 s"
 
 
+@pytest.mark.fault("own-stall")
 def test_a_stall_stays_the_cause_though_the_autopilot_has_left_offboard_meanwhile(in_offboard: Story) -> None:
     in_offboard.now += 3.0
     in_offboard.autopilot(flight_mode="hold")

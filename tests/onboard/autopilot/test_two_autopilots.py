@@ -40,6 +40,7 @@ async def test_by_its_id_either_is_flown(port: int, address: str, fake_autopilot
         await link.close()
 
 
+@pytest.mark.fault("serial-port")
 async def test_a_second_one_that_comes_later_is_told_and_ends_it(
     port: int, address: str, fake_autopilot: FakeAutopilot
 ) -> None:

@@ -111,6 +111,7 @@ async def test_eyes_that_lie_about_the_own_motion_add_half_a_metre_a_second_at_m
         assert np.linalg.norm(hover[-1].velocity) < 0.1, "standstill at last, however late it was noticed"
 
 
+@pytest.mark.fault("battery-or-estimate")
 async def test_a_position_and_velocity_that_come_no_more_are_not_flown_by(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
@@ -153,6 +154,7 @@ async def test_one_camera_gone_is_a_slower_flight_and_all_gone_a_hover_and_then_
         assert ship.state() == "silent", "no re-entry by itself"
 
 
+@pytest.mark.fault("noisy-camera")
 async def test_a_noisy_camera_is_lost_and_said_so_until_it_is_good_again(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
@@ -174,6 +176,7 @@ async def test_a_noisy_camera_is_lost_and_said_so_until_it_is_good_again(
         assert not fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
 
 
+@pytest.mark.fault("home-moved")
 async def test_a_second_sender_with_the_autopilots_ids_moves_neither_height_band_nor_fence(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
@@ -206,6 +209,7 @@ class _Sender:
         self._wire.sendto(data, ("127.0.0.1", self._port))
 
 
+@pytest.mark.fault("network-not-finite")
 async def test_networks_not_finite_or_stuck_degrade_and_sigterm_ends_in_hold(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
@@ -308,6 +312,7 @@ async def test_at_its_end_a_mission_hands_over_to_the_autopilot(
         await ship.until_state("silent", "idle")
 
 
+@pytest.mark.fault("task-dies")
 @pytest.mark.parametrize(
     ("task", "function"),
     [
@@ -332,6 +337,7 @@ async def test_a_dead_task_is_held_by_the_last_resort(
             await ship.ending
 
 
+@pytest.mark.fault("event-loop-stuck")
 async def test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:

@@ -19,6 +19,8 @@ from flockd.onboard.daemon.order_checks import LATEST_S, MOST_SESSIONS, RECENT_S
 from flockd.onboard.telemetry.topics import AnswerMessage
 from tests.onboard.daemon.aboard import config_for
 
+pytestmark = [pytest.mark.fault("order-replayed"), pytest.mark.fault("orders-without-end")]
+
 ALLOWED = ("hold", "land", "resume", "goto")
 GOAL = {"north_m": 3.0, "east_m": 1.0}
 

@@ -81,6 +81,7 @@ def _raises_timeout() -> None:
     raise TimeoutError("the job's own")
 
 
+@pytest.mark.fault("network-stuck")
 def test_a_stuck_network_is_ended_then_abandoned_then_hopeless() -> None:
     tiny = TinyPerceiver()
     networks = WatchedNetworks(tiny, deadline_s=0.5)

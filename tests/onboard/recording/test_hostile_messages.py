@@ -18,6 +18,8 @@ from flockd.onboard.recording.mcap_file import Entry, Record
 from flockd.onboard.recording.reader import Recording
 from tests.onboard.recording.made_up import record, rewritten
 
+pytestmark = pytest.mark.fault("hostile-recording")
+
 STEPS = 3
 DEEP = b"[" * 100_000
 

@@ -139,6 +139,7 @@ def test_a_file_cut_off_anywhere_is_refused_or_played_as_far_as_it_goes(tmp_path
     assert (outcomes[0], outcomes[-1]) == (0, 10)
 
 
+@pytest.mark.fault("hostile-recording")
 def test_damage_within_is_reported_and_recovered_from(tmp_path: Path, whole: Path) -> None:
     content = bytearray(whole.read_bytes())
     at = len(content) // 2
@@ -173,6 +174,7 @@ _BOMB = zstandard.compress(b"\0" * (300 << 20))
 _LZ4 = lz4.frame.compress(bytes(range(256)) * 100)
 
 
+@pytest.mark.fault("hostile-recording")
 @pytest.mark.parametrize(
     ("record_bytes", "reason"),
     [
@@ -202,6 +204,7 @@ def test_a_hostile_chunk_is_damage_and_takes_little_memory(
     assert len(list(Recording(path).steps())) == len(list(Recording(whole).steps()))
 
 
+@pytest.mark.fault("huge-image")
 def test_an_image_that_claims_to_be_huge_is_not_decoded(tmp_path: Path, whole: Path) -> None:
     """A PNG's width and height are bytes 16 to 24; zlib packs an all-black image of 60000x60000 into some megabytes."""
 
@@ -281,6 +284,7 @@ for _, _, (reading, writing) in children:
 """
 
 
+@pytest.mark.fault("killed-while-recording")
 @pytest.mark.slow
 def test_a_kill_at_any_moment_loses_half_a_second_at_most(tmp_path: Path) -> None:
     flown = subprocess.run(

@@ -179,6 +179,7 @@ def test_files_turn_over_and_stay_within_the_quota(tmp_path: Path) -> None:
     assert Recording(files[-1]).config == drone_config(), "each file is complete in itself"
 
 
+@pytest.mark.fault("foreign-recordings")
 def test_what_is_no_readable_file_in_the_folder_is_skipped_with_a_warning(tmp_path: Path) -> None:
     (tmp_path / "folder.mcap").mkdir()
     (tmp_path / "dangling.mcap").symlink_to(tmp_path / "nowhere")
@@ -241,6 +242,7 @@ def small_disk(folder: Path, kind: str) -> Iterator[None]:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
+@pytest.mark.fault("disk-full")
 @pytest.mark.parametrize(("kind", "reason"), [("tmpfs", "no space left on device"), ("limit", "file too large")])
 def test_a_full_disk_ends_the_recording_and_not_the_flight(tmp_path: Path, kind: str, reason: str) -> None:
     told: list[str] = []

@@ -114,6 +114,7 @@ def test_numbers_count_periods_so_that_what_is_missing_shows() -> None:
     assert [one.time_s for one in read if one is not None] == pytest.approx([1.0, 1.02, 1.04, 1.14, 1.159])
 
 
+@pytest.mark.fault("damaged-images")
 @pytest.mark.parametrize(
     ("pipeline", "count"),
     [("short", "corrupt"), ("flagged", "flagged"), ("old", "time_stamp"), ("untimed", "time_stamp")],
@@ -136,6 +137,7 @@ def test_a_silent_pipeline_is_started_again_and_comes_back(start: Start, tmp_pat
     assert _next(source).frames
 
 
+@pytest.mark.fault("frozen-frames")
 def test_a_frozen_pipeline_counts_as_silent(start: Start) -> None:
     source = start("caps:64x48 3 same:500 stall", silence_s=1.0)
     assert _fault(source) == "camera0: the image is frozen; restart its camera or program"
@@ -178,6 +180,7 @@ def test_each_way_to_fail_is_one_sentence_and_is_tried_again(start: Start, pipel
     _until(source, lambda status: status.counts.get("opened", 0) >= 2)
 
 
+@pytest.mark.fault("camera-unplugged")
 def test_a_crash_is_followed_by_images_when_the_driver_is_back(start: Start, tmp_path: Path) -> None:
     source = start(f"caps:64x48 once:{tmp_path / 'has_crashed'} crash 500 stall")
     assert _next(source).frames

@@ -36,6 +36,7 @@ def test_a_jpeg_may_leave_out_the_tables_that_all_cameras_share_and_end_in_zeros
     np.testing.assert_array_equal(MjpegFormat(SIZE).decode(bare + bytes(513)), MjpegFormat(SIZE).decode(whole))
 
 
+@pytest.mark.fault("damaged-images")
 @pytest.mark.parametrize(
     ("damage", "reason"),
     [

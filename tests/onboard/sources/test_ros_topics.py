@@ -174,6 +174,7 @@ def test_numbers_count_periods_so_that_what_is_missing_shows(start: Start) -> No
     assert status.counts["lost"] == 3
 
 
+@pytest.mark.fault("damaged-images")
 @pytest.mark.parametrize(
     ("message", "count"),
     [
@@ -217,6 +218,7 @@ def test_a_lens_that_nobody_calibrated_contradicts_nothing(start: Start) -> None
     assert source.status()["front"].fault is None
 
 
+@pytest.mark.fault("camera-unplugged")
 def test_a_silent_topic_is_opened_again(start: Start) -> None:
     source = start(("imag", image()), silence_s=0.2)
     assert "/front/image_raw gave no usable image for 0.2 s" in str(until(source, lambda status: status.fault).fault)

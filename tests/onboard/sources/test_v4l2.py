@@ -211,6 +211,7 @@ def test_uncompressed_images_may_have_padded_rows(start: Start) -> None:
     np.testing.assert_allclose(image[:, 340:630].mean((0, 1)), (0, 0, 255), atol=2)
 
 
+@pytest.mark.fault("damaged-images")
 @pytest.mark.parametrize(
     ("data", "flags", "offset_s", "count"),
     [
@@ -286,6 +287,7 @@ def test_a_stamp_that_does_not_increase_is_dropped(start: Start) -> None:
     assert _next(source).frames["front"].sequence == 0
 
 
+@pytest.mark.fault("camera-unplugged")
 def test_an_unplugged_camera_is_reported_at_once_and_comes_back_when_plugged_in(start: Start) -> None:
     kernel = FakeKernel(front=FakeCamera(), back=FakeCamera())
     source = start(kernel, _camera("front", controls=BY_HAND), _camera("back"))
@@ -331,6 +333,7 @@ def test_a_silent_camera_is_noticed_and_opened_again(start: Start) -> None:
     assert source.status()["front"].counts["opened"] == 2
 
 
+@pytest.mark.fault("frozen-frames")
 def test_a_frozen_camera_counts_as_silent(start: Start) -> None:
     kernel = FakeKernel(front=FakeCamera())
     source = start(kernel, _camera(), silence_s=0.2)

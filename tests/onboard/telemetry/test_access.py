@@ -99,6 +99,7 @@ def test_settings_that_are_not_there_are_reported(tmp_path: Path) -> None:
         open_session("telemetry", [], [], settings=tmp_path / "none")
 
 
+@pytest.mark.fault("malformed-telemetry")
 def test_what_is_no_message_is_counted_and_not_taken() -> None:
     endpoint = free_endpoint()
     with FleetWatcher(None, listen=[endpoint], connect=[]) as watcher:

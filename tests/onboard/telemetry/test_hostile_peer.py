@@ -18,6 +18,8 @@ from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
 from flockd.sim.sitl.free_ports import free_endpoint
 
+pytestmark = pytest.mark.fault("messages-of-any-size")
+
 ROOT = Path(__file__).parents[3]
 KEY = "flockd/v1/meadow/tiny"
 DRONE = """

@@ -34,6 +34,8 @@ from flockd.onboard.telemetry.topics import (
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
 from flockd.sim.sitl.free_ports import free_endpoint
 
+pytestmark = [pytest.mark.fault("wrong-types-of-a-peer"), pytest.mark.fault("hostile-peers")]
+
 ROOT = Path(__file__).parents[3]
 FLIGHT = {
     "time_s": 5.0, "state": "normal", "reasons": [], "flight_mode": "offboard", "armed": True, "in_air": True,
@@ -196,6 +198,7 @@ def test_one_that_says_much_displaces_none_of_the_others_events(take: tuple[Flee
     assert heard[1:] == [("loud", f"{number}") for number in range(5000 - MAX_EVENTS_OF_ONE, 5000)]
 
 
+@pytest.mark.fault("one-name-twice")
 def test_two_drones_of_one_name_are_told_apart_by_identity_and_neither_gets_an_order() -> None:
     """Each answers for itself while it is alone; the order names the identity, which the other refuses."""
     endpoint, asked = free_endpoint(), list[str]()

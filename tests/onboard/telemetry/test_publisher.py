@@ -139,6 +139,7 @@ def test_attitude_angles_are_those_of_scipy() -> None:
     assert state["velocity_ned"] is None
 
 
+@pytest.mark.fault("telemetry-router-gone")
 def test_nobody_listening_costs_nothing_and_a_closed_session_counts_its_losses(endpoint: str) -> None:
     telemetry = ZenohTelemetry("meadow", listen=[endpoint])
     telemetry.publish("1", "events", {"time_s": 0.0, "event": "take-off"})

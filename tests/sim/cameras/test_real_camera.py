@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from flockd.core.config.imperfect_cameras import CamerasConfig
+
 from flockd.core.messages import Frame
 from tests.sim.cameras.test_scenario_cameras import flown_frames, scenario_with
 

@@ -15,6 +15,8 @@ from flockd.flight.flocking.metrics import closest_distances
 from flockd.sim.flock.exact_states import fly_exact_states
 from flockd.sim.scenario import ScenarioConfig, StartConfig, load_scenario
 
+pytestmark = pytest.mark.fault("head-on")
+
 CONFIG = Path(__file__).parents[3] / "config"
 ENCOUNTER = load_scenario(CONFIG / "encounter.yaml")
 RECIPROCAL = Plan.load(CONFIG / "campaigns/reciprocal.yaml")
@@ -67,6 +69,7 @@ def test_ranges_that_err_much_and_many_misses_bring_nobody_together(range_error:
     assert min(apart_m) >= 1.0
 
 
+@pytest.mark.fault("one-that-does-not-avoid")
 @pytest.mark.parametrize("cell", RECIPROCAL.cells[:11], ids=lambda cell: cell.parameters[CASE])
 def test_reciprocal_encounters(cell: Cell) -> None:
     """One flight of each way that two can meet, and some of five; `config/campaigns/reciprocal.yaml` has the others."""

@@ -20,7 +20,6 @@ from flockd.sim.flock.control_loop import ControlLoop
 from flockd.sim.flock.exact_states import ExactFlock
 from flockd.sim.scenario import ScenarioConfig, StartConfig
 from flockd.sim.vehicles.vehicles import Vehicles
-from tests.faults.catalogue import RecordProperty
 from tests.sim.flock.test_encounters import ENCOUNTER
 
 APART_M = 1.0
@@ -104,9 +103,10 @@ STOPS: dict[str, tuple[int, Callable[[_Flight, int], None]]] = {
 }
 
 
+@pytest.mark.fault("mate-stops")
 @pytest.mark.parametrize("range_error", [0.02, 0.06])
 def test_whichever_of_five_stops_its_mates_keep_a_metre_apart(
-    range_error: float, record_property: RecordProperty
+    range_error: float, record_property: Callable[[str, object], None]
 ) -> None:
     nearest_m, speeds_m_s = dict.fromkeys(STOPS, math.inf), []
     for seed in SEEDS:

@@ -148,6 +148,19 @@ def test_each_drone_decides_from_its_own_images_alone() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.whole_flight
+def test_twenty_seconds_from_pixels() -> None:
+    """As of the whole flight; of a flock that sees nobody, two come within 1.3 m after 10 s."""
+    from flockd.review.report.summary import summarise
+
+    summary = summarise(fly(load_scenario(data_path("config") / "paper_flight.yaml", {"duration_s": 20.0})).log)
+    assert summary["flock"]["min_distance_after_10s_m"] >= 1.5
+    assert summary["flock"]["union_tail"] == 1.0
+    assert summary["neighbours"]["recall_within_10m"] >= 0.97
+    assert summary["neighbours"]["false_per_drone_minute"] < 1.0
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_papers_flight_from_pixels(seed: int) -> None:
     """Nobody closer than 1 m, order 0.98, union 1, recall 0.97, under one false neighbour a drone and minute."""

@@ -16,6 +16,8 @@ from flockd.core.errors import UnavailableError
 from flockd.sim.sitl.ground_station import GroundStation
 from flockd.sim.sitl.leftovers import described, px4_instance, user_of_port
 
+pytestmark = pytest.mark.fault("simulator-killed")
+
 PARENT = """\
 import os, sys, time
 from pathlib import Path

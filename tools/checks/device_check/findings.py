@@ -19,7 +19,7 @@ class Finding:
     measured: str
     wanted: str
     row: int | None = None
-    """Row of the catalogue of faults (`tests/faults/catalogue.py`), where it is one of those."""
+    """Row of the list of faults (`tests/faults/faults.yaml`), where it is one of those."""
 
 
 Check = Callable[[], Iterator[Finding]]

@@ -18,6 +18,8 @@ from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.sim.scenario import RangeFinderConfig
 from flockd.sim.world.hills import hills
 
+pytestmark = pytest.mark.fault("range-finder-lies")
+
 STEP_S = 0.5
 LIE = Reason(ReasonKind.HEIGHT, "height: the range contradicts the barometer; the barometer's is used")
 STUCK = Reason(ReasonKind.HEIGHT, "height: the range stays the same while the height changes; the barometer's is used")
