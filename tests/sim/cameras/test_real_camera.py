@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flockd.core.config.imperfect_cameras import CamerasConfig
 
 from flockd.core.messages import Frame
+from flockd.sim.scenario.imperfect_cameras import CamerasConfig
 from tests.sim.cameras.test_scenario_cameras import flown_frames, scenario_with
 
 FAULTS: Mapping[str, tuple[Mapping[str, Mapping[str, Any]], float]] = {

@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tools.checks import breakages
 from tools.checks.breakages import LIST, Breakage, StaleError, fixed, report, small_changes
-from tools.checks.mutants import FILES, mutants_of, sample
+from tools.checks.mutants import FILES, ROOT, mutants_of, sample
 
 MUTANTS = list(mutants_of(next(path for path in FILES if path.name == "half_planes.py")))
 LISTED = yaml.safe_load(LIST.read_text(encoding="utf-8"))
@@ -37,7 +36,7 @@ def test_a_seed_draws_the_same_mutants_again_and_another_seed_others() -> None:
     assert drawn != sample(MUTANTS, 20, "b")
     assert sample(MUTANTS, 10_000, "a") == MUTANTS
     tried = small_changes(5, "a", LISTED["tests of mutants"])
-    assert all((breakages.ROOT / test).is_file() for one in tried for test in one.tests)
+    assert all((ROOT / test).is_file() for one in tried for test in one.tests)
 
 
 def test_a_survivor_fails_unless_it_is_known_to_mean_the_same() -> None:
