@@ -103,7 +103,7 @@ def _bench(config: DroneConfig, args: argparse.Namespace) -> Sequence[Finding]:
     """Ctrl-C ends it early, with a report of what was seen until then."""
     from flockd.ground.doctor.bench import bench, judged
     from flockd.onboard.autopilot.link_owner import only_owner
-    from flockd.onboard.daemon import event_loop_at
+    from flockd.onboard.simulated_time import event_loop_at
 
     seconds = 60.0 * (args.minutes or BENCH_MINUTES)
     stop = asyncio.Event()

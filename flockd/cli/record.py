@@ -65,7 +65,7 @@ def _with_recording(parser: Parser) -> Parser:
 
 
 def _info(args: argparse.Namespace) -> int:
-    from flockd.onboard.recording.info import recording_info
+    from flockd.onboard.recording.reader import recording_info
 
     recording = opened(args.recording)
     facts = recording_info(recording)

@@ -64,7 +64,8 @@ def _run(args: argparse.Namespace) -> int:
 def _run_daemon(args: argparse.Namespace) -> int:
     """Until it is asked to end."""
     from flockd.onboard.autopilot.link_owner import only_owner
-    from flockd.onboard.daemon import ServiceManager, event_loop_at
+    from flockd.onboard.daemon import ServiceManager
+    from flockd.onboard.simulated_time import event_loop_at
 
     service = ServiceManager(os.environ)
     config = load_to_fly(args.config, force=args.force)
@@ -101,8 +102,9 @@ async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceMa
     """With SIGTERM and Ctrl-C for standstill, Hold and the end. A terminal that closes ends no flight."""
     from flockd.flight.inference.hashes import model_hashes
     from flockd.flight.perception import load_networks
-    from flockd.onboard.daemon import Daemon, cameras_at_once, clock_at
+    from flockd.onboard.daemon import Daemon, cameras_at_once
     from flockd.onboard.deadline import GOLDEN_S, within
+    from flockd.onboard.simulated_time import clock_at
 
     daemon = Daemon(
         config,

@@ -16,7 +16,7 @@ import yaml
 
 from flockd.core.config import DroneConfig
 from flockd.onboard.daemon import DaemonError
-from flockd.onboard.daemon.host_monitors import WallClock
+from flockd.onboard.daemon.supervisor_inputs import WallClock
 from flockd.sim.sitl.free_ports import free_endpoint, free_port
 from tests.calm import SPEED_FACTOR, clock
 from tests.faults.conftest import InTheAir
@@ -124,7 +124,7 @@ async def test_steps_take_longer_than_they_may(in_the_air: InTheAir, reacted: Re
 @pytest.mark.fault("overrun", within_s=8.0)
 async def test_it_gets_too_hot(in_the_air: InTheAir, reacted: Reacted, monkeypatch: pytest.MonkeyPatch) -> None:
     temperature_c = [50.0]
-    monkeypatch.setattr("flockd.onboard.daemon.host_monitors.hottest_zone_c", lambda _: temperature_c[0])
+    monkeypatch.setattr("flockd.onboard.daemon.supervisor_inputs.hottest_zone_c", lambda _: temperature_c[0])
 
     async with in_the_air(change=_alone) as ship:
         await _flies(ship)
@@ -162,7 +162,7 @@ async def test_a_task_dies(in_the_air: InTheAir, reacted: Reacted, monkeypatch: 
         def dies(*_: object) -> None:
             raise ArithmeticError("for the test")
 
-        monkeypatch.setattr("flockd.onboard.daemon.status_messages._computer_message", dies)
+        monkeypatch.setattr("flockd.onboard.daemon.status._computer_message", dies)
         fault_s = clock()
         await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
         reacted("task-dies", clock() - fault_s)

@@ -10,7 +10,7 @@ import numpy as np
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.messages import Setpoint
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
-from flockd.onboard.sources import clock_at
+from flockd.onboard.simulated_time import clock_at
 
 HEIGHT_M = 4.0
 SETPOINTS_HZ = 20.0

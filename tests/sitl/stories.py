@@ -27,7 +27,7 @@ from flockd.flight.safety import Action, Permission, Request, Surroundings, Verd
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
-from flockd.onboard.sources import clock_at
+from flockd.onboard.simulated_time import clock_at
 from flockd.sim.flock.start import with_drones
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.sitl.autopilots import BY_HAND, Autopilots, Px4s, SimulatedAutopilots

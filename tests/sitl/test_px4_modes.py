@@ -21,7 +21,7 @@ import pytest
 from flockd.core.config import DroneConfig
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
-from flockd.onboard.sources import clock_at
+from flockd.onboard.simulated_time import clock_at
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.start import with_drones
 from flockd.sim.scenario import ScenarioConfig, load, load_scenario

@@ -12,7 +12,7 @@ import argparse
 import time
 from pathlib import Path
 
-from flockd.onboard.sources import clock_at
+from flockd.onboard.simulated_time import clock_at
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.start import with_drones
 from flockd.sim.scenario import load_scenario

@@ -16,8 +16,8 @@ from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon import load_side_by_side
 from flockd.onboard.ros import message_trees as trees
 from flockd.onboard.ros.message_trees import Names, ros_name
+from flockd.onboard.ros.ros_input import STATES, NearestState, stamp_ns, vehicle_state
 from flockd.onboard.ros.ros_node import Delivery, RosNode
-from flockd.onboard.ros.vehicle_states import STATES, NearestState, stamp_ns, vehicle_state
 from flockd.onboard.sources import FrameSource
 from flockd.onboard.telemetry.step_messages import neighbour_message
 

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 
 from flockd.ground.cameras.found import FoundCamera, Mode
-from flockd.onboard.sources.gstreamer_formats import FORMATS
+from flockd.onboard.sources.gstreamer_device import FORMATS
 
 MONITOR = ("gst-device-monitor-1.0", "Video/Source")
 _OTHERS = ("v4l2src", "pipewiresrc", "ximagesrc")

@@ -19,10 +19,8 @@ from flockd.core.messages import FloatArray, RangeReading, VehicleState
 from flockd.flight.geometry import rotation_from_quaternion
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus, FlightMode, LandedState, mode_of
 from flockd.onboard.autopilot.clock_sync import ClockEstimate, ClockSync, StampMonitor
-from flockd.onboard.autopilot.local_frame import LocalFrame
 from flockd.onboard.autopilot.refusals import CheckEvents, Refusal, refusals
-from flockd.onboard.autopilot.setpoint_watch import SetpointWatch
-from flockd.onboard.autopilot.watched_parameters import MOST_SPEED, WatchedParameters
+from flockd.onboard.autopilot.watches import MOST_SPEED, LocalFrame, SetpointWatch, WatchedParameters
 
 Fields = Mapping[str, Any]
 

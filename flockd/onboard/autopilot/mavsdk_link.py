@@ -11,6 +11,7 @@ import json
 import logging
 import math
 import socket
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -45,8 +46,7 @@ from flockd.onboard.autopilot.mavlink_messages import Fields, ReceivedMessages, 
 from flockd.onboard.autopilot.refusal_reasons import REMEDIES_OF_RESULTS
 from flockd.onboard.autopilot.refusals import Refusal
 from flockd.onboard.autopilot.serial_port import SerialPort, discard
-from flockd.onboard.autopilot.throttled_log import ThrottledLog
-from flockd.onboard.autopilot.watched_parameters import GROUND_STATION_LOSS, KINDS
+from flockd.onboard.autopilot.watches import GROUND_STATION_LOSS, KINDS
 
 T = TypeVar("T")
 Clock = Callable[[], float]
@@ -100,8 +100,6 @@ GONE_S = 10.0
 """A serial port that is gone for longer is not waited for on the ground; an autopilot that starts anew takes 5."""
 
 _log = logging.getLogger(__name__)
-_throttled = ThrottledLog(_log)
-"""MAVSDK sends a heartbeat a second, and complains of each that an autopilot which is gone does not take."""
 _LOG_LEVELS = {
     LogLevel.DEBUG: logging.DEBUG,
     LogLevel.INFO: logging.INFO,
@@ -655,3 +653,35 @@ def _to_logging(level: LogLevel, message: str, *_: object) -> bool:
     expected = message.startswith("No raw connection available. Subscription")  # `_open` subscribes before it connects
     _throttled(logging.DEBUG if expected else _LOG_LEVELS[level], message)
     return True
+
+
+AGAIN_S = 60.0
+MAX_TEXTS = 100
+"""Texts remembered; a library that puts numbers into its texts never repeats one."""
+
+
+class ThrottledLog:
+    """May be called on any thread."""
+
+    def __init__(self, log: logging.Logger, clock: Callable[[], float] = time.monotonic) -> None:
+        self._log, self._clock = log, clock
+        self._lock = threading.Lock()
+        self._told: dict[str, tuple[float, int]] = {}
+        """When each text was written last, and how often it has come since."""
+
+    def __call__(self, level: int, text: str) -> None:
+        """Writes the text, or counts it."""
+        with self._lock:
+            now = self._clock()
+            told_s, count = self._told.get(text, (-AGAIN_S, 0))
+            if now - told_s < AGAIN_S:
+                self._told[text] = told_s, count + 1
+                return
+            if len(self._told) >= MAX_TEXTS:
+                self._told.clear()
+            self._told[text] = now, 0
+        self._log.log(level, "%s", f"{text} ({count} times more in {now - told_s:.0f} s)" if count else text)
+
+
+_throttled = ThrottledLog(_log)
+"""MAVSDK sends a heartbeat a second, and complains of each that an autopilot which is gone does not take."""

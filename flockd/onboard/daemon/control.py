@@ -29,11 +29,10 @@ from flockd.flight.safety.surroundings import surroundings
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
-from flockd.onboard.daemon.autopilot_requests import AutopilotRequests, Takeover
-from flockd.onboard.daemon.operator_commands import OperatorRequests
-from flockd.onboard.daemon.pilot_loop import PilotLoop
+from flockd.onboard.daemon.autopilot_tasks import AutopilotRequests, Takeover
+from flockd.onboard.daemon.orders import OperatorRequests
+from flockd.onboard.daemon.pilot_loop import PilotLoop, VehicleHistory
 from flockd.onboard.daemon.supervisor_inputs import InputCollector, position_from_home
-from flockd.onboard.daemon.vehicle_history import VehicleHistory
 
 PERIOD_S = services.CONTROL.period_s
 FLYING = frozenset({State.NORMAL, State.DEGRADED, State.HOVER, State.ASKING})

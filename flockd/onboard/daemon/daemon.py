@@ -14,14 +14,12 @@ from flockd.core.errors import ConfigError, ConfigProblem, FlockdError
 from flockd.flight.safety import Decision, Event, State
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
-from flockd.onboard.autopilot.watched_parameters import MOST_SPEED
-from flockd.onboard.daemon.components import Components
+from flockd.onboard.autopilot.watches import MOST_SPEED
+from flockd.onboard.daemon.autopilot_tasks import state_sentence
 from flockd.onboard.daemon.control import FLYING
-from flockd.onboard.daemon.operator_commands import OperatorRequests
-from flockd.onboard.daemon.service_manager import ServiceManager
-from flockd.onboard.daemon.startup import Connect, open_components
-from flockd.onboard.daemon.state_texts import state_sentence
-from flockd.onboard.daemon.status_messages import notify_service_manager, publish_status
+from flockd.onboard.daemon.orders import OperatorRequests
+from flockd.onboard.daemon.startup import Components, Connect, open_components
+from flockd.onboard.daemon.status import ServiceManager, notify_service_manager, publish_status
 from flockd.onboard.daemon.watched_networks import InterruptibleNetworks
 from flockd.onboard.sources import open_source
 

@@ -1,14 +1,16 @@
-"""Sends every message of the daemon to its sinks: telemetry, the recording of the flight, and the log."""
+"""Every message of the daemon goes to its sinks: telemetry, the recording of the flight, and the log."""
 
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
 from flockd.core.config import DroneConfig
 from flockd.core.messages import FrameSet, LearnedSize, MissionOrder, PilotOutput, VehicleState
+from flockd.core.printable import printable
 from flockd.onboard.daemon.worker import BusyError, Worker
 from flockd.onboard.recording import Recorder
 from flockd.onboard.telemetry import TelemetrySink, publish_step
@@ -104,3 +106,45 @@ class MessageSinks:
             self._worker.submit(job, *arguments)
         except BusyError:
             self.lost += 1
+
+
+MOST_LINES = 1000
+"""Lines that may wait."""
+LAST_LINES_S = 1.0
+"""Given at the end to whoever reads them."""
+STDERR = 2
+
+
+class StderrLog(logging.Handler):
+    """Writes log lines from a thread of its own; those that come while too many wait are lost, and counted.
+
+    A write to a full pipe, to a journal that hangs or to a file on a busy disk takes as long as the other side likes.
+    Lines contain texts of the autopilot and of operators: they are made fit for terminals.
+    """
+
+    def __init__(self, descriptor: int = STDERR) -> None:
+        super().__init__()
+        self._descriptor = descriptor
+        self._worker = Worker("log", MOST_LINES)
+        self._lost = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """One line, from any thread; does not wait."""
+        lost = f"({self._lost} lines were lost: nobody read them)\n" if self._lost else ""
+        try:
+            self._worker.submit(self._write, f"{lost}{printable(self.format(record))}\n")
+        except BusyError:
+            self._lost += 1
+        else:
+            self._lost = 0
+
+    def close(self) -> None:
+        """Waits a moment for the lines that are left."""
+        self._worker.leave(LAST_LINES_S)
+        super().close()
+
+    def _write(self, text: str) -> None:
+        # Not by sys.stderr, whose lock the process would wait for when it ends.
+        data = text.encode("utf-8", "backslashreplace")
+        while data:
+            data = data[os.write(self._descriptor, data) :]

@@ -6,6 +6,7 @@ import asyncio
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from contextlib import AsyncExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,19 +18,12 @@ from flockd.flight.geometry import build_rig
 from flockd.flight.safety import Decision, Gate
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
-from flockd.onboard.daemon.autopilot_requests import AutopilotRequests
-from flockd.onboard.daemon.components import Components
+from flockd.onboard.daemon.autopilot_tasks import AutopilotRequests, ObstacleDistances, RefusalWatch, StateTexts
 from flockd.onboard.daemon.control import Control
-from flockd.onboard.daemon.host_monitors import LoopLag, Thermometer, WallClock
 from flockd.onboard.daemon.message_sinks import MessageSinks
-from flockd.onboard.daemon.mission_orders import MissionOrders
-from flockd.onboard.daemon.obstacle_distances import ObstacleDistances
-from flockd.onboard.daemon.operator_commands import OperatorCommands, OperatorRequests
-from flockd.onboard.daemon.pilot_loop import PilotLoop
-from flockd.onboard.daemon.refusal_watch import RefusalWatch
-from flockd.onboard.daemon.state_texts import StateTexts
-from flockd.onboard.daemon.supervisor_inputs import InputCollector
-from flockd.onboard.daemon.vehicle_history import VehicleHistory
+from flockd.onboard.daemon.orders import MissionOrders, OperatorCommands, OperatorRequests
+from flockd.onboard.daemon.pilot_loop import PilotLoop, VehicleHistory
+from flockd.onboard.daemon.supervisor_inputs import InputCollector, LoopLag, Thermometer, WallClock
 from flockd.onboard.daemon.watched_networks import InterruptibleNetworks, WatchedNetworks, cameras_at_once
 from flockd.onboard.daemon.worker import BusyError, LateError, Worker
 from flockd.onboard.sources import FrameSource
@@ -163,3 +157,30 @@ async def _close_async(close: Callable[[], Awaitable[None]]) -> None:
             await close()
     except (TimeoutError, LateError, BusyError):
         return
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """Created and connected by `startup.open_components`."""
+
+    link: AutopilotLink
+    gate: Gate
+    streamer: SetpointStreamer
+    source: FrameSource
+    pilot_loop: PilotLoop
+    networks: WatchedNetworks
+    control: Control
+    requests: AutopilotRequests
+    refusals: RefusalWatch
+    distances: ObstacleDistances
+    texts: StateTexts
+    sinks: MessageSinks
+    telemetry: ZenohTelemetry
+    commands: OperatorCommands
+    lag: LoopLag
+    thermometer: Thermometer
+    wall_clock: WallClock
+    dead_tasks: dict[str, str]
+    """Why each task that has ended did, by name."""
+    over: asyncio.Event = field(default_factory=asyncio.Event)
+    """Set when the flight is over and the tasks may end."""

@@ -36,10 +36,10 @@ from flockd.onboard.recording.streams import (
     TRUTH,
     VEHICLE,
     StepFrames,
+    Truth,
     is_image,
     part_path,
 )
-from flockd.onboard.recording.truth import Truth
 
 _WHAT_TO_DO = "`flockd record recover` makes a recording without it"
 _CALIBRATION_SUFFIX = "/calibration"
@@ -350,3 +350,38 @@ def decoded_image(message: bytes) -> UInt8Array:
     if bgr is None:
         raise ValueError(f"a {kind} image does not decode")
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def recording_info(recording: Recording) -> dict[str, Any]:
+    """What a recording contains, as JSON: flight, duration, models, gaps, damages and the rate of each stream."""
+    contents = recording.contents
+    return {
+        **contents.flight,
+        "files": [str(path) for path in contents.paths],
+        "bytes": sum(_bytes(path) for path in contents.paths),
+        "finished": contents.finished,
+        "steps": len(contents.steps),
+        "start_s": recording.start_s,
+        "duration_s": recording.duration_s,
+        "lost": contents.lost,
+        "models": dict(contents.models),
+        "gaps": [{"first_step": first, "last_step": last} for first, last in contents.gaps],
+        "damages": [
+            {"file": str(path), "byte": damage.offset, "reason": damage.reason} for path, damage in contents.damages
+        ],
+        "streams": [
+            {
+                "topic": stream.topic,
+                "schema": stream.schema,
+                "messages": stream.messages,
+                "rate_hz": stream.rate_hz,
+                "bytes": stream.bytes,
+            }
+            for stream in contents.streams.values()
+        ],
+    }
+
+
+def _bytes(path: Path) -> int:
+    """Of a file, or of all in a bag's folder."""
+    return sum(one.stat().st_size for one in path.iterdir()) if path.is_dir() else path.stat().st_size

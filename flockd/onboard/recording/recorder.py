@@ -21,12 +21,11 @@ from flockd import __version__
 from flockd.core.config import DroneConfig
 from flockd.core.config.recording import RecordingConfig
 from flockd.core.config.rig import RigConfig
-from flockd.core.messages import Frame, FrameSet, LearnedSize, MissionOrder, PilotOutput, VehicleState
+from flockd.core.messages import FloatArray, Frame, FrameSet, LearnedSize, MissionOrder, PilotOutput, VehicleState
 from flockd.core.secrets import masked
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.codec import to_json
 from flockd.onboard.recording.mcap_file import Entry, Inclosure, McapFile, Note, RecordingError
-from flockd.onboard.recording.own_path import OwnPath
 from flockd.onboard.recording.reader import head_of
 from flockd.onboard.recording.streams import (
     CONFIGURATION,
@@ -44,10 +43,10 @@ from flockd.onboard.recording.streams import (
     VEHICLE,
     FrameEntry,
     StepFrames,
+    Truth,
     nanoseconds,
     part_path,
 )
-from flockd.onboard.recording.truth import Truth
 from flockd.onboard.telemetry import publish_step
 
 FLUSH_EVERY_S = 0.2
@@ -479,3 +478,18 @@ def _json_entry(stream: Any, time_s: float, sequence: int, message: object) -> E
 def _log_entry(time_s: float, level: Literal["INFO", "WARNING"], text: str) -> Entry:
     stamp = nanoseconds(time_s)
     return Entry(foxglove.LOG, stamp, 0, foxglove.log(stamp, level, text))
+
+
+class OwnPath:
+    """Begins at the first step, north and east of which it counts; the height is the autopilot's."""
+
+    def __init__(self) -> None:
+        self._north_east = np.zeros(2)
+        self._time_s: float | None = None
+
+    def go_on(self, time_s: float, velocity: FloatArray | None, height_m: float) -> FloatArray:
+        """(3,) m NED at this step; ``velocity`` (3,) m/s NED since the last one, None: stand still."""
+        if velocity is not None and self._time_s is not None:
+            self._north_east = self._north_east + velocity[:2] * (time_s - self._time_s)
+        self._time_s = time_s
+        return np.array([*self._north_east, -height_m])

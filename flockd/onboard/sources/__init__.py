@@ -5,12 +5,11 @@ from collections.abc import Callable
 
 from flockd.core.config import DroneConfig
 from flockd.core.errors import ConfigError
-from flockd.onboard.sources.clock import clock_at
 from flockd.onboard.sources.device_source import Devices, DeviceSource
 from flockd.onboard.sources.frames import CameraStatus, Count, FrameSource
 from flockd.onboard.sources.shared_memory import FramePublisher, SharedMemorySource
 
-__all__ = ["CameraStatus", "Count", "FramePublisher", "FrameSource", "clock_at", "open_source"]
+__all__ = ["CameraStatus", "Count", "FramePublisher", "FrameSource", "open_source"]
 
 
 def open_source(config: DroneConfig, file: str, *, clock: Callable[[], float] = time.monotonic) -> FrameSource:

@@ -17,7 +17,7 @@ from abc import abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from flockd.onboard.sources.devices import CameraDevice, CameraError, CapturedBuffer
+from flockd.onboard.sources.frames import CameraDevice, CameraError, CapturedBuffer
 from flockd.onboard.sources.gstreamer_child import DAMAGED, END, ERROR, HEADER
 
 _PIPE_BYTES = 1 << 20

@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 from flockd.core.config.rig import IntrinsicsConfig
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
 from flockd.core.secrets import masked
-from flockd.onboard.sources.devices import CameraDevice, CameraError, CapturedBuffer
-from flockd.onboard.sources.frame_receiver import FrameReceiver, ReceivedFrames
-from flockd.onboard.sources.frames import Count, RawFrame
+from flockd.onboard.sources.assembler import FrameReceiver, ReceivedFrames
+from flockd.onboard.sources.frames import CameraDevice, CameraError, CapturedBuffer, Count, RawFrame
 from flockd.onboard.sources.gstreamer_device import CHILD, GstreamerDevice
 from flockd.onboard.sources.image_formats import CorruptImageError, ImageFormat
 from flockd.onboard.sources.ros_device import CHILD as ROS_CHILD

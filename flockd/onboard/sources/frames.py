@@ -1,13 +1,15 @@
-"""Frames as a camera sent them, and the camera's state as other parts see it."""
+"""Frames as cameras send them, the devices that they come from, and the cameras' state as other parts see it."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, Self
 
+from flockd.core.errors import UnavailableError
 from flockd.core.messages import FrameSet
-from flockd.onboard.sources.image_formats import Decoder
+from flockd.onboard.sources.image_formats import Decoder, ImageFormat
 
 Count = Literal[
     "received",  # came from the device or the network, whatever they were worth
@@ -71,3 +73,43 @@ class FrameSource(Protocol):
 
     def stop(self) -> None:
         """Closes everything; returns within a fraction of a second."""
+
+
+class CameraError(UnavailableError):
+    """Why a camera gives no frames, in one sentence."""
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedBuffer:
+    """What the driver handed over: one image, its time and its number."""
+
+    data: bytes
+    time_s: float
+    sequence: int
+    flagged: bool
+    """The driver says that the data may be damaged."""
+
+
+class CameraDevice(ABC):
+    """An open camera that streams; a context manager that closes it. Every method raises CameraError when it fails."""
+
+    start_s: float
+    """How long it may take to its first frame."""
+
+    @abstractmethod
+    def read(self, timeout_s: float) -> CapturedBuffer | None:
+        """The next image; None if there is none within the time."""
+
+    @abstractmethod
+    def image_format(self) -> ImageFormat:
+        """Format of the image that `read` gave last."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stops the camera and gives it back."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -5,18 +5,31 @@ Such are those on the CSI ports of a Jetson or a Raspberry Pi, network cameras, 
 
 from __future__ import annotations
 
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
+import numpy as np
+
 from flockd.core.config.source import CameraDeviceParameters
+from flockd.core.messages import UInt8Array
 from flockd.core.secrets import masked
 from flockd.onboard.sources import gstreamer_child
 from flockd.onboard.sources.child_device import ChildDevice, ChildMessage
-from flockd.onboard.sources.devices import CameraError, CapturedBuffer
+from flockd.onboard.sources.frames import CameraError, CapturedBuffer
 from flockd.onboard.sources.gstreamer_child import CAPS, IMAGE, packed_text
-from flockd.onboard.sources.gstreamer_formats import caps, format_of
-from flockd.onboard.sources.image_formats import ImageFormat
+from flockd.onboard.sources.image_formats import (
+    PACKED,
+    ImageFormat,
+    MjpegFormat,
+    PackedFormat,
+    check_length,
+    plausible,
+    up_to,
+)
 
 CHILD = (sys.executable, "-I", str(Path(gstreamer_child.__file__)))
 PACKAGES = "libgstreamer1.0-0, gstreamer1.0-plugins-base and the plugins that its pipeline needs"
@@ -65,3 +78,66 @@ class GstreamerDevice(ChildDevice):
         return CameraError(
             f"{self._name}: its pipeline {masked(reason)}; try it with `gst-launch-1.0 PIPELINE ! fakesink`"
         )
+
+
+_PLANAR: Mapping[str, int] = {"NV12": cv2.COLOR_YUV2RGB_NV12, "I420": cv2.COLOR_YUV2RGB_I420}
+FORMATS = (*_PLANAR, *PACKED)
+"""Cheapest first: a pipeline that can choose gives the first."""
+_FIELD = re.compile(r"(format|width|height)=\(\w+\)([^,;\s]+)")
+
+
+@dataclass(frozen=True)
+class PlanarFormat:
+    """Brightness first, then the colours of two by two pixels each; by BT.601, luma from 16 to 235."""
+
+    name: str
+    size: tuple[int, int]
+    """Width, height."""
+
+    def check(self, data: bytes) -> None:
+        """See ``ImageFormat``: size."""
+        width, height = self._padded()
+        check_length(data, width * height + self._colour_line() * height // 2)
+
+    def decode(self, data: bytes) -> UInt8Array:
+        """See ``ImageFormat``."""
+        self.check(data)
+        width, height = self._padded()
+        planes = np.frombuffer(data, np.uint8)
+        colours = planes[width * height :].reshape(-1, self._colour_line() // (1 if self.name == "NV12" else 2))
+        used = np.ascontiguousarray(colours[:, : width if self.name == "NV12" else width // 2])
+        joined = np.concatenate([planes[: width * height], used.reshape(-1)]).reshape(height * 3 // 2, width)
+        image = np.asarray(cv2.cvtColor(joined, _PLANAR[self.name]), np.uint8)
+        return plausible(np.ascontiguousarray(image[: self.size[1], : self.size[0]]))
+
+    def _padded(self) -> tuple[int, int]:
+        return up_to(4, self.size[0]), up_to(2, self.size[1])
+
+    def _colour_line(self) -> int:
+        """Bytes for the colours of two rows."""
+        width = self._padded()[0]
+        return width if self.name == "NV12" else 2 * up_to(4, up_to(2, self.size[0]) // 2)
+
+
+def caps(size: tuple[int, int], rate_hz: float) -> str:
+    """What a pipeline is asked for: all that can be decoded, in the rig's size and rate where it can choose."""
+    formats = f"format=(string){{{','.join(FORMATS)}}}"
+    kinds = ("image/jpeg", f"video/x-raw,{formats}")
+    in_size = f",width={size[0]},height={size[1]}"
+    at_rate = f",framerate={round(rate_hz * 1000)}/1000"
+    return ";".join(kind + limits for limits in (in_size + at_rate, in_size, "") for kind in kinds)
+
+
+def format_of(text: str) -> tuple[ImageFormat, tuple[int, int]] | None:
+    """How to decode images of these caps, and their size; None for what was not asked for."""
+    fields = dict(_FIELD.findall(text))
+    try:
+        size = int(fields["width"]), int(fields["height"])
+    except (KeyError, ValueError):
+        return None
+    if text.startswith("image/jpeg"):
+        return MjpegFormat(size), size
+    name = fields.get("format", "")
+    if name in PACKED:
+        return PackedFormat(name, size), size
+    return (PlanarFormat(name, size), size) if name in _PLANAR else None

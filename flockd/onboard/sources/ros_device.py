@@ -9,10 +9,10 @@ from pathlib import Path
 from flockd.core.config.rig import IntrinsicsConfig
 from flockd.core.config.source import CameraDeviceParameters
 from flockd.core.ros_frames import CENTRE_PX
-from flockd.onboard.ros.cdr_images import RosCameraInfo, read_camera_info, read_compressed_image, read_image
+from flockd.onboard.ros.ros_input import RosCameraInfo, read_camera_info, read_compressed_image, read_image
 from flockd.onboard.sources import ros_child
 from flockd.onboard.sources.child_device import ChildDevice, ChildMessage
-from flockd.onboard.sources.devices import CameraError, CapturedBuffer
+from flockd.onboard.sources.frames import CameraError, CapturedBuffer
 from flockd.onboard.sources.image_formats import ImageFormat, MjpegFormat, PackedFormat
 from flockd.onboard.sources.ros_child import COMPRESSED, IMAGE, INFO
 

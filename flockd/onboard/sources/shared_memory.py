@@ -18,7 +18,7 @@ from zenoh import shm
 from flockd.core import services
 from flockd.core.config.source import SourceParameters
 from flockd.core.messages import Frame
-from flockd.onboard.sources.frame_receiver import FrameReceiver, ReceivedFrames
+from flockd.onboard.sources.assembler import FrameReceiver, ReceivedFrames
 from flockd.onboard.sources.frames import RawFrame
 from flockd.onboard.sources.image_formats import RgbFormat
 from flockd.onboard.telemetry.zenoh_session import SessionError, SessionOwner, close_session, open_session

@@ -16,7 +16,7 @@ from fractions import Fraction
 
 from flockd.core.choices import PixelFormat
 from flockd.core.config.source import CameraDeviceParameters, ControlParameters
-from flockd.onboard.sources.devices import CameraDevice, CameraError, CapturedBuffer
+from flockd.onboard.sources.frames import CameraDevice, CameraError, CapturedBuffer
 from flockd.onboard.sources.image_formats import ImageFormat, MjpegFormat, PackedFormat, TurnedFormat
 from flockd.onboard.sources.v4l2_kernel import (
     VIDIOC_DQBUF,

@@ -32,9 +32,17 @@ from flockd.onboard.recording.streams import (
     StepFrames,
     nanoseconds,
 )
-from flockd.onboard.ros.cdr_images import RosImage, read_compressed_image, read_image
 from flockd.onboard.ros.message_trees import COMPRESSED_IMAGE, IMU
-from flockd.onboard.ros.vehicle_states import LONGEST_GAP_S, STATES, NearestState, stamp_ns, vehicle_state
+from flockd.onboard.ros.ros_input import (
+    LONGEST_GAP_S,
+    STATES,
+    NearestState,
+    RosImage,
+    read_compressed_image,
+    read_image,
+    stamp_ns,
+    vehicle_state,
+)
 from flockd.onboard.sources.assembler import Assembler, RawFrameSet
 from flockd.onboard.sources.frames import RawFrame
 from flockd.onboard.sources.image_formats import CorruptImageError, PackedFormat

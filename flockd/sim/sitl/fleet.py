@@ -16,7 +16,7 @@ import numpy as np
 from flockd.core.choices import AutopilotKind
 from flockd.core.config import DroneConfig
 from flockd.core.errors import UnavailableError
-from flockd.onboard.sources import clock_at
+from flockd.onboard.simulated_time import clock_at
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.exact_states import HandPilot, exact_states_at
 from flockd.sim.flock.swarm import Flight

@@ -23,7 +23,7 @@ from flockd.core.config.safety import SafetyParameters
 from flockd.core.messages import Setpoint, Wanted
 from flockd.flight.safety import Action, Permission, Request, Surroundings, Verdict
 from flockd.onboard.autopilot.streamer import SetpointStreamer
-from flockd.onboard.daemon import clock_at, event_loop_at
+from flockd.onboard.simulated_time import clock_at, event_loop_at
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from tests import calm
 from tests.onboard.autopilot.pilots_link import PilotsLink

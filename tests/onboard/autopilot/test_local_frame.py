@@ -10,8 +10,8 @@ import pytest
 
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry import quaternion_from_rotation, rotation_from_vector
-from flockd.onboard.autopilot.local_frame import LocalFrame
 from flockd.onboard.autopilot.mavlink_messages import ReceivedMessages
+from flockd.onboard.autopilot.watches import LocalFrame
 
 pytestmark = pytest.mark.fault("frame-jumps")
 

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from flockd.onboard.autopilot.setpoint_watch import SetpointWatch
+from flockd.onboard.autopilot.watches import SetpointWatch
 
 pytestmark = pytest.mark.fault("setpoints-clipped")
 

@@ -6,7 +6,7 @@ import logging
 
 import pytest
 
-from flockd.onboard.autopilot.throttled_log import MAX_TEXTS, ThrottledLog
+from flockd.onboard.autopilot.mavsdk_link import MAX_TEXTS, ThrottledLog
 
 
 def test_a_line_a_second_for_ever_is_one_a_minute(caplog: pytest.LogCaptureFixture) -> None:

@@ -41,11 +41,10 @@ from flockd.flight.perception import ImagePair
 from flockd.flight.safety import Action, Decision, Gate, Inputs, Permission, Request, State, Surroundings
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
 from flockd.onboard.daemon.control import Control
-from flockd.onboard.daemon.host_monitors import LoopLag, WallClock, hottest_zone_c
-from flockd.onboard.daemon.operator_commands import OperatorRequests
+from flockd.onboard.daemon.orders import OperatorRequests
 from flockd.onboard.daemon.pilot_loop import PilotLoop, StepResult
-from flockd.onboard.daemon.service_manager import ServiceManager
-from flockd.onboard.daemon.supervisor_inputs import CameraMonitor, InputCollector
+from flockd.onboard.daemon.status import ServiceManager
+from flockd.onboard.daemon.supervisor_inputs import CameraMonitor, InputCollector, LoopLag, WallClock, hottest_zone_c
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
 from flockd.onboard.daemon.worker import BusyError, LateError, Worker
 from flockd.onboard.sources import CameraStatus, Count
@@ -248,7 +247,7 @@ def test_a_camera_whose_images_are_noise_for_three_of_its_periods_is_lost() -> N
 
 
 def test_frames_get_the_vehicle_state_of_their_time() -> None:
-    from flockd.onboard.daemon.vehicle_history import VehicleHistory
+    from flockd.onboard.daemon.pilot_loop import VehicleHistory
 
     history = VehicleHistory()
     assert history.at(1.0) is None
@@ -268,7 +267,7 @@ def test_frames_get_the_vehicle_state_of_their_time() -> None:
 
 def test_frames_get_the_range_that_was_taken_nearest_to_them() -> None:
     """Between two ranges there is none: over an edge, their mean would be of nothing."""
-    from flockd.onboard.daemon.vehicle_history import VehicleHistory
+    from flockd.onboard.daemon.pilot_loop import VehicleHistory
 
     history, level = VehicleHistory(), np.eye(3)
     for time_s, reading in (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Any, cast
 
-from flockd.onboard.daemon.autopilot_requests import AutopilotRequests
+from flockd.onboard.daemon.autopilot_tasks import AutopilotRequests
 from tests.calm import run_stepped
 
 SILENT = "has not responded yet"

@@ -14,9 +14,9 @@ import pytest
 from flockd.core.config import load_drone
 from flockd.core.errors import ConfigError
 from flockd.core.messages import Frame, FrameSet, VehicleState
-from flockd.onboard.daemon import clock_at, event_loop_at
 from flockd.onboard.daemon.pilot_loop import PilotLoop
 from flockd.onboard.daemon.watched_networks import WatchedNetworks
+from flockd.onboard.simulated_time import clock_at, event_loop_at
 from flockd.onboard.sources import CameraStatus
 from tests.calm import clock, run
 from tests.onboard.daemon.aboard import STEP_S, TinyPerceiver, config_for

@@ -6,7 +6,7 @@ from flockd.flight.safety import Action, Decision, Event, State
 from flockd.flight.safety.supervisor import Reason
 from flockd.onboard.autopilot.mavlink_messages import text_chunks
 from flockd.onboard.autopilot.mavsdk_link import Severity
-from flockd.onboard.daemon.state_texts import SEVERITIES, StateTexts
+from flockd.onboard.daemon.autopilot_tasks import SEVERITIES, StateTexts
 
 ALONE = Reason(Event.NEIGHBOURS_LOST, "no neighbour was seen for 3 s")
 BLIND = Reason(Event.SIGHT_LOST, "no camera works")

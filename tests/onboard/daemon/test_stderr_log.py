@@ -8,7 +8,7 @@ import re
 import threading
 import time
 
-from flockd.onboard.daemon.stderr_log import BACKLOG, StderrLog
+from flockd.onboard.daemon.message_sinks import MOST_LINES, StderrLog
 
 PIPE_BYTES = 1 << 16
 """What Linux keeps for a reader that does not come."""
@@ -30,7 +30,7 @@ def _all_of(reader: int) -> list[str]:
 
 def test_a_reader_that_does_not_come_stops_nobody_and_what_was_lost_is_counted() -> None:
     reader, writer = os.pipe()
-    log, many = StderrLog(writer), 2 * BACKLOG
+    log, many = StderrLog(writer), 2 * MOST_LINES
     said = threading.Thread(target=_logged, args=(log, LINE, many), daemon=True)
     said.start()
     said.join(30.0)
@@ -48,7 +48,7 @@ def test_a_reader_that_does_not_come_stops_nobody_and_what_was_lost_is_counted()
     reading.join(30.0)
     os.close(reader)
     whole = lines.count(LINE)
-    assert BACKLOG <= whole <= BACKLOG + PIPE_BYTES // len(LINE) + 1
+    assert MOST_LINES <= whole <= MOST_LINES + PIPE_BYTES // len(LINE) + 1
     lost = [int(match[1]) for line in lines if (match := LOST.fullmatch(line))]
     assert sum(lost) == many - whole, "each lost line is counted, once"
     assert lines[-1] == "the last"

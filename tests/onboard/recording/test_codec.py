@@ -13,8 +13,7 @@ import pytest
 
 from flockd.core.messages import PilotOutput, VehicleState
 from flockd.onboard.recording.codec import from_json, json_schema, to_json
-from flockd.onboard.recording.streams import StepFrames
-from flockd.onboard.recording.truth import Truth
+from flockd.onboard.recording.streams import StepFrames, Truth
 from tests.onboard.recording.made_up import MadeUpPilot, drone_config, inputs
 
 

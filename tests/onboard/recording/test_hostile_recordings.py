@@ -10,9 +10,8 @@ from random import Random
 
 from flockd.onboard.recording.editing import recover
 from flockd.onboard.recording.export import export_images, export_tables
-from flockd.onboard.recording.info import recording_info
 from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, McapFile, Note, Record, read_records
-from flockd.onboard.recording.reader import Recording
+from flockd.onboard.recording.reader import Recording, recording_info
 from tests.hostile import CORPUS, hostile, mutated_bytes, mutated_json, nested, odd_file, own_errors, removed
 
 

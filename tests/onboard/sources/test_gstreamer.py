@@ -16,10 +16,9 @@ from flockd.core.config.source import CameraDeviceParameters, SourceParameters
 from flockd.core.messages import FrameSet, UInt8Array
 from flockd.onboard.sources import CameraStatus
 from flockd.onboard.sources.device_source import Devices, DeviceSource
-from flockd.onboard.sources.devices import CameraDevice, CameraError
+from flockd.onboard.sources.frames import CameraDevice, CameraError
 from flockd.onboard.sources.gstreamer_child import HEADER, Buffer
-from flockd.onboard.sources.gstreamer_device import CHILD, GstreamerDevice
-from flockd.onboard.sources.gstreamer_formats import FORMATS, caps, format_of
+from flockd.onboard.sources.gstreamer_device import CHILD, FORMATS, GstreamerDevice, caps, format_of
 from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat
 
 FAKE = (sys.executable, "-IS", str(Path(__file__).with_name("fake_pipeline.py")))

@@ -19,8 +19,8 @@ from flockd.fleet.ros.order_requests import Whereabouts, goal_of, velocity_of
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.mcap_file import RecordingError
 from flockd.onboard.recording.reader import decoded_image
-from flockd.onboard.ros.cdr_images import RosImage, read_camera_info, read_compressed_image, read_image
 from flockd.onboard.ros.message_trees import Names
+from flockd.onboard.ros.ros_input import RosImage, read_camera_info, read_compressed_image, read_image
 from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat, PackedFormat
 from flockd.onboard.sources.ros_device import ENCODINGS
 from flockd.onboard.sources.shared_memory import SharedMemorySource

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from flockd.core.config.rig import IntrinsicsConfig
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
 from flockd.core.messages import FrameSet
-from flockd.onboard.ros.cdr_images import read_camera_info, read_compressed_image, read_image
+from flockd.onboard.ros.ros_input import read_camera_info, read_compressed_image, read_image
 from flockd.onboard.sources import CameraStatus, ros_child
 from flockd.onboard.sources.device_source import Devices, DeviceSource
 from flockd.onboard.sources.ros_device import info_topic_of

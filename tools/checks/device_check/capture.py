@@ -13,8 +13,7 @@ from statistics import median
 from flockd.core.choices import PixelFormat
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
 from flockd.onboard.sources.device_source import DeviceSource
-from flockd.onboard.sources.devices import CameraError, CapturedBuffer
-from flockd.onboard.sources.frames import CameraStatus, Count
+from flockd.onboard.sources.frames import CameraError, CameraStatus, CapturedBuffer, Count
 from flockd.onboard.sources.v4l2_device import V4l2Device
 from tools.checks.device_check import camera_images
 from tools.checks.device_check.cameras import CABLE, LOOPBACK, WEBCAM, cable, control, feeding, loopback

@@ -14,8 +14,7 @@ import numpy as np
 
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
 from flockd.onboard.sources.device_source import DeviceSource
-from flockd.onboard.sources.devices import CameraError, CapturedBuffer
-from flockd.onboard.sources.frames import CameraStatus
+from flockd.onboard.sources.frames import CameraError, CameraStatus, CapturedBuffer
 from flockd.onboard.sources.gstreamer_device import GstreamerDevice
 from tools.checks.device_check import datagrams
 from tools.checks.device_check.datagrams import DatagramCamera

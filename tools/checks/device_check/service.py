@@ -21,7 +21,7 @@ import numpy as np
 from flockd.core.config.source import CameraDeviceParameters
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.recording.reader import Recording
-from flockd.onboard.sources.devices import CameraError
+from flockd.onboard.sources.frames import CameraError
 from flockd.onboard.sources.image_formats import MjpegFormat
 from flockd.onboard.sources.v4l2_device import V4l2Device
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot

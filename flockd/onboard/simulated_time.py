@@ -1,12 +1,12 @@
-"""An asyncio event loop in simulated time: sleeps and time-outs count simulated seconds."""
+"""Simulated time: the computer's own made slower or faster, so that all of its programs have the same."""
 
 from __future__ import annotations
 
 import asyncio
 import selectors
+import time
+from collections.abc import Callable
 from typing import Any
-
-from flockd.onboard.sources.clock import clock_at
 
 
 def event_loop_at(speed_factor: float) -> asyncio.AbstractEventLoop:
@@ -32,3 +32,8 @@ class _SimulatedSelector(selectors.DefaultSelector):
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, Any]]:
         return super().select(None if timeout is None else timeout / self._speed_factor)
+
+
+def clock_at(speed_factor: float) -> Callable[[], float]:
+    """Seconds on the monotonic clock times ``speed_factor``; at 1 the clock itself."""
+    return time.monotonic if speed_factor == 1.0 else lambda: speed_factor * time.monotonic()

@@ -1,13 +1,18 @@
-"""Reads ROS 2's Image, CompressedImage and CameraInfo from the bytes that travel (CDR), without ROS.
-
-So rclpy need not turn megabytes into Python's numbers, and what reads a camera needs no ROS of its own.
-"""
+"""Reads ROS 2's images and vehicle states, of a bag or a node, without ROS."""
 
 from __future__ import annotations
 
 import struct
+import threading
+from bisect import bisect, insort
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
+
+from flockd.core.messages import FloatArray, VehicleState
+from flockd.core.ros_frames import attitude_of_ros, frd_of_flu, ned_of_enu, rotation_of
+from flockd.onboard.ros.message_trees import IMU, ODOMETRY, POSE
 
 _NS = 1_000_000_000
 _HEAD = 4
@@ -106,3 +111,69 @@ class _Cdr:
             raise ValueError("it ends too early")
         self._at += length
         return self._data[self._at - length : self._at]
+
+
+STATES = (ODOMETRY, POSE, IMU)
+"""What a vehicle's state may come from, the best first."""
+LONGEST_GAP_S = 0.2
+"""Between the state and the images that it is of."""
+
+
+def stamp_ns(message: Any) -> int:
+    """Of a message with a header."""
+    return int(message.header.stamp.sec) * _NS + int(message.header.stamp.nanosec)
+
+
+def vehicle_state(kind: str, message: Any, time_s: float) -> VehicleState | None:
+    """None for a message whose orientation nobody filled in. An Imu knows no height, so that it is 0.
+
+    ``message``: of rclpy or `rosbags`, whose fields have the same names.
+    """
+    pose = message.pose.pose if kind == ODOMETRY else message.pose if kind == POSE else message
+    try:
+        R_ned_body = attitude_of_ros(rotation_of(_values(pose.orientation, "xyzw")))
+    except ValueError:
+        return None
+    if kind == IMU:
+        return VehicleState(time_s, R_ned_body, 0.0)
+    place, velocity = ned_of_enu(_values(pose.position, "xyz")), None
+    if not np.isfinite(place).all():
+        return None
+    if kind == ODOMETRY and message.twist.covariance[0] >= 0:
+        velocity = R_ned_body @ frd_of_flu(_values(message.twist.twist.linear, "xyz"))
+    return VehicleState(time_s, R_ned_body, -float(place[2]), velocity, place[:2])
+
+
+class NearestState:
+    """Keeps the newest states, from any thread, and gives the one that is nearest in time."""
+
+    def __init__(self, kept: int | None = 500) -> None:
+        """``kept``: so many of the newest; None: all."""
+        self._kept = kept
+        self._states: list[VehicleState] = []
+        """In the order of their times."""
+        self._lock = threading.Lock()
+
+    def add(self, state: VehicleState | None) -> None:
+        """One more; None is none."""
+        if state is not None:
+            with self._lock:
+                insort(self._states, state, key=_time_s)
+                if self._kept is not None:
+                    del self._states[: -self._kept]
+
+    def at(self, time_s: float) -> VehicleState | None:
+        """None where none is within `LONGEST_GAP_S`."""
+        with self._lock:
+            after = bisect(self._states, time_s, key=_time_s)
+            around = self._states[max(after - 1, 0) : after + 1]
+        nearest = min(around, key=lambda state: abs(state.time_s - time_s), default=None)
+        return None if nearest is None or abs(nearest.time_s - time_s) > LONGEST_GAP_S else nearest
+
+
+def _time_s(state: VehicleState) -> float:
+    return state.time_s
+
+
+def _values(message: Any, names: str) -> FloatArray:
+    return np.array([getattr(message, name) for name in names], np.float64)

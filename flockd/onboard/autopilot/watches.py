@@ -1,0 +1,190 @@
+"""What the link watches in flight: parameters, whose setpoints are followed, jumps of the local frame; pure."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.core import services
+from flockd.core.messages import FloatArray
+from flockd.flight.geometry import rotation_from_vector
+
+LOSS_TIME, LOSS_ACTION, GROUND_STATION_LOSS = "COM_OF_LOSS_T", "COM_OBL_RC_ACT", "NAV_DLL_ACT"
+MOST_SPEED = "MPC_XY_VEL_MAX"
+KINDS: Mapping[str, type[int] | type[float]] = {
+    GROUND_STATION_LOSS: int, LOSS_TIME: float, LOSS_ACTION: int, MOST_SPEED: float
+}  # fmt: skip
+"""As PX4 declares them."""
+LONGEST_LOSS_S = 1.0
+"""PX4 flies on with the last velocity for as long as COM_OF_LOSS_T."""
+SAFE_ACTIONS: Mapping[int, str] = {0: "Position", 3: "Return", 4: "Land", 5: "Hold"}
+"""Values of COM_OBL_RC_ACT with which the autopilot stays where it is, lands or returns."""
+
+
+class WatchedParameters:
+    """The newest values, and what is wrong with those that were changed while the autopilot was armed."""
+
+    def __init__(self, report: Callable[[str], None]) -> None:
+        """``report`` is called with one sentence on each change in flight."""
+        self._report = report
+        self.values: dict[str, float] = {}
+        self._before: dict[str, float] = {}
+        """As they were while it was disarmed, or when they were read first."""
+
+    def take(self, name: str, value: float, *, armed: bool) -> None:
+        """Takes a value that was read."""
+        known = self.values.get(name, value)
+        self.values[name] = value
+        if not armed or name not in self._before:
+            self._before[name] = value
+        if armed and value != known:
+            self._report(f"the autopilot's {name} was changed in flight from {known:g} to {value:g}")
+
+    def fault(self, max_gap_s: float) -> str | None:
+        """What is wrong with a change in flight; None: nothing. ``max_gap_s``: of setpoints, that flockd bridges."""
+        for name, value in list(self.values.items()):
+            if value == self._before.get(name, value):
+                continue
+            changed = f"{name} was changed in flight from {self._before[name]:g} to {value:g}"
+            if name == LOSS_TIME and not max_gap_s < value <= LONGEST_LOSS_S:
+                return f"{changed}: the autopilot's failsafe would act that long after the last setpoint"
+            if name == LOSS_ACTION and value not in SAFE_ACTIONS:
+                return f"{changed}: the autopilot would not stop the drone when setpoints stop"
+        return None
+
+
+SENT_S = services.POSITION_TARGET.timeout + LONGEST_LOSS_S
+"""A setpoint of flockd's may be followed for this long after it was sent, and the next for as long not yet: for as long
+as PX4 flies on with the last one that arrived, and as a message that tells of it may take."""
+TOLERANCE_M_S = 0.3
+"""What the autopilot changes of a setpoint itself: a reset of its estimator."""
+WINDOW, MOST_FOREIGN = 20, 2
+"""Of so many messages, two seconds' worth, so few may name another setpoint."""
+
+
+class SetpointWatch:
+    """Compares what is followed with what was sent. `sent` and `followed` may be called on different threads."""
+
+    def __init__(self, report: Callable[[str], None], parameters: Mapping[str, float]) -> None:
+        """``report`` is called with one sentence where setpoints are clipped, once in a flight; ``parameters``: the
+        newest values of the autopilot's.
+        """
+        self._report, self._parameters = report, parameters
+        self._told = False
+        self._sent: deque[tuple[float, float, float]] = deque(maxlen=200)
+        self._foreign: deque[bool] = deque(maxlen=WINDOW)
+        self.seen: str | None = None
+        """What was seen of another sender in the last seconds; None: nothing."""
+
+    def sent(self, time_s: float, north_m_s: float, east_m_s: float) -> None:
+        """Flockd has sent this setpoint."""
+        self._sent.append((time_s, north_m_s, east_m_s))
+
+    def followed(self, time_s: float, north_m_s: float, east_m_s: float, *, offboard: bool) -> None:
+        """The autopilot follows this one; NaN: it does not follow a velocity. ``offboard``: it is in that mode."""
+        sent = list(self._sent)
+        recent = [one for one in sent if time_s - one[0] <= SENT_S]
+        if not offboard or not recent or time_s - sent[0][0] <= SENT_S:
+            self._foreign.clear()
+            self.seen, self._told = None, self._told and offboard
+            return
+        off_m_s = min(math.hypot(north_m_s - north, east_m_s - east) for _, north, east in recent)
+        own = off_m_s <= TOLERANCE_M_S or self._is_clipped(north_m_s, east_m_s, recent)
+        self._foreign.append(not own)
+        if sum(self._foreign) <= MOST_FOREIGN:
+            self.seen = None
+        elif self._foreign[-1]:
+            what = f"{north_m_s:.1f} m/s north and {east_m_s:.1f} m/s east"
+            if not math.isfinite(off_m_s):
+                what = "a setpoint without a velocity"
+            self.seen = f"another program sends setpoints: the autopilot follows {what}, which flockd did not send"
+
+    def _is_clipped(self, north_m_s: float, east_m_s: float, recent: list[tuple[float, float, float]]) -> bool:
+        """Whether it is one of flockd's, but shorter, and as long as the autopilot's limit where that is known."""
+        flown_m_s, limit_m_s = math.hypot(north_m_s, east_m_s), self._parameters.get(MOST_SPEED)
+        if not flown_m_s > TOLERANCE_M_S or (limit_m_s is not None and abs(flown_m_s - limit_m_s) > TOLERANCE_M_S):
+            return False
+        for _, north, east in recent:
+            asked_m_s = math.hypot(north, east)
+            share = flown_m_s / max(asked_m_s, flown_m_s)
+            if math.hypot(north_m_s - share * north, east_m_s - share * east) <= TOLERANCE_M_S:
+                if not self._told:
+                    known = "may limit it" if limit_m_s is None else f"is {limit_m_s:g}"
+                    self._report(
+                        f"the autopilot flies slower than flockd asks, {flown_m_s:.1f} instead of {asked_m_s:.1f} m/s: "
+                        f"its {MOST_SPEED} {known}"
+                    )
+                self._told = True
+                return True
+        return False
+
+
+JUMP_M, JUMP_RAD = 0.3, math.radians(10.0)
+"""What an estimator's corrections from one message to the next stay below by far; less is not noticed."""
+MOST_ACCELERATION = 20.0
+"""Of a drone, m/s^2 and rad/s^2: by so much its velocity may have changed unseen between two messages."""
+LARGEST_M = 1.0
+"""A larger jump, or one of the heading, is not flown on with."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    stamp_s: float
+    value: FloatArray
+    rate: FloatArray
+
+
+class LocalFrame:
+    """Notices jumps. `offset` may be read on any thread."""
+
+    def __init__(self) -> None:
+        self.offset = np.zeros(3)
+        """(3,) m NED to be added to the autopilot's own positions."""
+        self.large = False
+        """One was larger than `LARGEST_M`, or of the heading; whoever has acted on it sets it back."""
+        self._place: _Sample | None = None
+        self._attitude: _Sample | None = None
+
+    def restart(self) -> None:
+        """The autopilot's own frame counts from now on."""
+        self.offset, self.large = np.zeros(3), False
+
+    def move(self, stamp_s: float, place: FloatArray, velocity: FloatArray) -> str | None:
+        """Takes a position and velocity (3,) of the autopilot's, by its own clock; one sentence on a jump."""
+        before, self._place = self._place, _Sample(stamp_s, place, velocity)
+        if before is None or stamp_s < before.stamp_s:
+            return None
+        interval_s = stamp_s - before.stamp_s
+        jump = place - before.value - 0.5 * interval_s * (before.rate + velocity)
+        if not JUMP_M + _unseen(interval_s) < np.linalg.norm(jump) < math.inf:
+            return None
+        self.offset = self.offset - jump
+        self.large |= float(max(math.hypot(jump[0], jump[1]), abs(jump[2]))) > LARGEST_M
+        north, east, down = np.round(jump, 1) + 0.0
+        return (
+            f"the autopilot's local frame jumped by {north:.1f} m north, {east:.1f} m east and {down:.1f} m down; "
+            "home, fence, height and goals move with it"
+        )
+
+    def turn(self, stamp_s: float, R_ned_body: FloatArray, rate: FloatArray) -> str | None:
+        """The same of attitudes (3, 3) and rates (3,) in rad/s of the body: only the heading is looked at."""
+        before, self._attitude = self._attitude, _Sample(stamp_s, R_ned_body, rate)
+        if before is None or stamp_s < before.stamp_s:
+            return None
+        interval_s = stamp_s - before.stamp_s
+        reckoned = before.value @ rotation_from_vector(0.5 * interval_s * (before.rate + rate))
+        off = R_ned_body @ reckoned.T
+        jump_rad = math.atan2(off[1, 0] - off[0, 1], off[0, 0] + off[1, 1])
+        if abs(jump_rad) <= JUMP_RAD + _unseen(interval_s):
+            return None
+        self.large = True
+        return f"the autopilot's heading jumped by {math.degrees(jump_rad):.0f} degrees"
+
+
+def _unseen(interval_s: float) -> float:
+    """How far off the mean of two velocities may lead."""
+    return 0.25 * MOST_ACCELERATION * interval_s**2

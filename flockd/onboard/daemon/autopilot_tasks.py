@@ -1,0 +1,239 @@
+"""What the daemon tells and asks the autopilot beside setpoints: takeovers, the map, its state, why it would refuse."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+
+from flockd.core import services
+from flockd.core.config import DroneConfig
+from flockd.core.messages import FloatArray, Neighbour
+from flockd.flight.obstacles import free_ahead, nearest_points
+from flockd.flight.safety import Decision, State
+from flockd.onboard.autopilot.autopilot_status import AutopilotError
+from flockd.onboard.autopilot.mavsdk_link import AutopilotLink, Severity
+from flockd.onboard.autopilot.refusals import Refusal
+from flockd.onboard.daemon.pilot_loop import PilotLoop, VehicleHistory
+
+Takeover = Literal["hold", "return", "land"]
+
+POLL_S = 0.02
+REPLY_S = 1.0
+"""How long the autopilot may take to answer one request; its own repetitions are within."""
+RETRY_S = 0.3
+"""Between two requests for the same, where the first changed nothing."""
+SAME_AGAIN_S = 30.0
+"""Until the same answer is logged again: an autopilot that has died is asked about once a second, for ever."""
+
+
+class AutopilotRequests:
+    """Repeats the request that the control loop has set until the autopilot has complied."""
+
+    def __init__(self, link: AutopilotLink, log_event: Callable[[str], None]) -> None:
+        self._link, self._log_event = link, log_event
+        self._logged, self._logged_s = "", -math.inf
+        self.takeover: Takeover | None = None
+        """The mode to request, set by the control loop; None: none."""
+        self.asking = False
+        """A request is under way; a landing takes two, and the first already ends offboard."""
+
+    async def run(self) -> None:
+        """Sends requests until cancelled."""
+        asks: dict[Takeover, Callable[[], Awaitable[None]]] = {
+            "hold": self._link.hold,
+            "return": self._link.return_home,
+            "land": self._link.land,
+        }
+        while True:
+            takeover = self.takeover
+            if takeover is None:
+                self._logged = ""
+                await asyncio.sleep(POLL_S)
+                continue
+            await self._ask(takeover, asks[takeover])
+            await self._wait_for_another(takeover)
+
+    async def _ask(self, takeover: Takeover, ask: Callable[[], Awaitable[None]]) -> None:
+        self.asking = True
+        try:
+            async with asyncio.timeout(REPLY_S):
+                await ask()
+        except AutopilotError as error:
+            self._log(str(error))
+        except TimeoutError:
+            self._log(f"the autopilot was asked for {takeover} and has not responded yet")
+        else:
+            self._log(f"the autopilot was asked for {takeover}, and agreed")
+        finally:
+            self.asking = False
+
+    def _log(self, answer: str) -> None:
+        """An event for an answer, unless it is the last one's repetition."""
+        now_s = asyncio.get_running_loop().time()
+        if answer != self._logged or now_s - self._logged_s >= SAME_AGAIN_S:
+            self._logged, self._logged_s = answer, now_s
+            self._log_event(answer)
+
+    async def _wait_for_another(self, takeover: Takeover) -> None:
+        loop = asyncio.get_running_loop()
+        until = loop.time() + RETRY_S
+        while self.takeover == takeover and loop.time() < until:
+            await asyncio.sleep(POLL_S)
+
+
+class ObstacleDistances:
+    """Sends the local map to the autopilot, whose Collision Prevention stops a pilot who flies by hand.
+
+    In every mode: with CP_DIST set and no map, PX4 refuses a pilot's takeover into Position mode and holds. Nothing is
+    sent of a map that is old or whose place is not known: PX4 then stops in Position mode.
+    """
+
+    def __init__(
+        self,
+        config: DroneConfig,
+        link: AutopilotLink,
+        pilot_loop: PilotLoop,
+        history: VehicleHistory,
+        clock: Callable[[], float],
+    ) -> None:
+        self._parameters, self._timeout_s = config.obstacles, config.safety.estimate_timeout_s
+        self._link, self._pilot_loop, self._history, self._clock = link, pilot_loop, history, clock
+
+    async def run(self) -> None:
+        """Sends until cancelled."""
+        while True:
+            free_m = self._free_ahead(self._clock())
+            if free_m is not None:
+                self._link.send_obstacle_distances(free_m, self._parameters.range_m)
+            await asyncio.sleep(services.OBSTACLE_DISTANCE.period_s)
+
+    def _free_ahead(self, now_s: float) -> FloatArray | None:
+        """Of now, see `free_ahead`; None: nothing is known for sure."""
+        result, vehicle = self._pilot_loop.newest, self._link.vehicle_state()
+        if result is None or vehicle is None or result.output.obstacles is None:
+            return None
+        age_s = now_s - result.time_s
+        if age_s > self._timeout_s or now_s - vehicle.time_s > services.MOTION.timeout:
+            return None
+        p, ranges, R = self._parameters, result.output.obstacles, vehicle.R_ned_body
+        moved = self._history.moved_since(result.time_s)
+        drones = _drones(result.output.neighbours, age_s, moved, p.height_band_m, p.sigmas)
+        points = np.concatenate([nearest_points(ranges, p.sigmas) - moved[:2], drones])
+        yaw_rad = math.atan2(R[1, 0], R[0, 0])
+        return free_ahead(points, ranges.seen_m, float(np.linalg.norm(moved[:2])), yaw_rad, p.range_m)
+
+
+def _drones(
+    neighbours: Sequence[Neighbour], age_s: float, moved: FloatArray, band_m: float, sigmas: float
+) -> FloatArray:
+    """(m, 2) metres north and east: neighbours at the drone's height, each as near as it may be by now.
+
+    The map leaves detected drones out.
+    """
+    points = np.empty((0, 2))
+    for one in neighbours:
+        place = one.position + age_s * one.velocity - moved
+        away_m = float(np.hypot(*place[:2]))
+        if one.confirmed and abs(place[2]) <= band_m and away_m > 0.0:
+            nearest_m = max(away_m - sigmas * one.position_sigma_m, 0.0)
+            points = np.vstack([points, nearest_m / away_m * place[:2]])
+    return points
+
+
+EVERY_S = 2.0
+"""Between two texts, but for a graver one: a state that comes and goes meanwhile is not told."""
+
+SEVERITIES: Mapping[State, Severity] = {
+    State.IDLE: Severity.INFO,
+    State.READY: Severity.INFO,
+    State.NORMAL: Severity.INFO,
+    State.DEGRADED: Severity.NOTICE,
+    State.HOVER: Severity.WARNING,
+    State.ASKING: Severity.CRITICAL,
+    State.SILENT: Severity.WARNING,
+}
+
+
+class StateTexts:
+    """Tells each new state once, the newest where several came too quickly."""
+
+    def __init__(self, send: Callable[[str, Severity], None], clock: Callable[[], float]) -> None:
+        self._send, self._clock = send, clock
+        self._told: State | None = None
+        self._told_s = -math.inf
+
+    def update(self, decision: Decision) -> None:
+        """Takes what the supervisor has decided; call it at each tick."""
+        state, now_s = decision.state, self._clock()
+        if state is self._told:
+            return
+        severity = SEVERITIES[state]
+        graver = self._told is None or severity < SEVERITIES[self._told]
+        if graver or now_s - self._told_s >= EVERY_S:
+            self._told, self._told_s = state, now_s
+            self._send(f"flockd {state_sentence(decision)}", severity)
+
+
+def state_sentence(decision: Decision) -> str:
+    """The state, and why it is so."""
+    reasons = "; ".join(reason.sentence for reason in decision.reasons)
+    return f"{decision.state}: {reasons}" if reasons else str(decision.state)
+
+
+CHECKS_POLL_S = 0.5
+ASK_AGAIN_S = 10.0
+"""Between two requests for the list of failed checks, where the first brought none."""
+LOG_AGAIN_S = 60.0
+"""Until a reason that comes and goes is logged again."""
+
+
+class RefusalWatch:
+    """Asks for the list of failed checks where it is missing, and logs each new reason."""
+
+    def __init__(self, link: AutopilotLink, log_event: Callable[[str], None], clock: Callable[[], float]) -> None:
+        self._link, self._clock = link, clock
+        self._log = RefusalLog(log_event)
+        self._asked_s = -math.inf
+        self.current: tuple[Refusal, ...] = ()
+        """As of the last half second, the cause first."""
+
+    async def run(self) -> None:
+        """Watches until cancelled."""
+        while True:
+            now = self._clock()
+            self.current = self._link.refusals()
+            self._log.update(self.current, now)
+            if self._must_ask(now):
+                self._asked_s = now
+                await self._ask()
+            await asyncio.sleep(CHECKS_POLL_S)
+
+    def _must_ask(self, now_s: float) -> bool:
+        """In flight nothing is asked: the list is for those who want to begin one."""
+        return not self._link.knows_checks() and not self._link.status().armed and now_s - self._asked_s >= ASK_AGAIN_S
+
+    async def _ask(self) -> None:
+        try:
+            async with asyncio.timeout(ASK_AGAIN_S):
+                await self._link.ask_for_checks()
+        except (AutopilotError, TimeoutError):
+            return  # a firmware without such a list; single messages tell the reasons then
+
+
+class RefusalLog:
+    """Logs each reason when it comes, and not again while it comes and goes."""
+
+    def __init__(self, log_event: Callable[[str], None]) -> None:
+        self._log_event = log_event
+        self._seen_s: dict[str, float] = {}
+
+    def update(self, refusals: Iterable[Refusal], now_s: float) -> None:
+        """Takes all that hold now."""
+        for refusal in refusals:
+            if now_s - self._seen_s.get(refusal.reason, -math.inf) >= LOG_AGAIN_S:
+                self._log_event(refusal.sentence)
+            self._seen_s[refusal.reason] = now_s
