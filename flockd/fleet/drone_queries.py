@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import zenoh
 
 from flockd.core.jpeg_header import jpeg_size
-from flockd.onboard.telemetry.schema import completed, fault
+from flockd.onboard.message_json import from_json, parsed
 from flockd.onboard.telemetry.topics import PREFIX, AboutMessage, AnswerMessage, AskMessage, TimeMessage
 
 ANSWER_S = 3.0
@@ -94,10 +94,9 @@ class DroneQueries:
         if raw is None:
             return None
         try:
-            message = completed(json.loads(raw), kind)
-        except (ValueError, RecursionError):
+            return from_json(kind, parsed(raw))
+        except ValueError:
             return None
-        return None if fault(message, kind) else message
 
     def _reply(
         self, key: str, payload: bytes = b"", *, timeout_s: float = ANSWER_S, session: zenoh.Session | None = None

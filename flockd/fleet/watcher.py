@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections import deque
@@ -14,7 +13,7 @@ from typing import Any
 import zenoh
 
 from flockd.fleet.drone_queries import DroneQueries
-from flockd.onboard.telemetry.schema import completed, fault
+from flockd.onboard.message_json import from_json, parsed
 from flockd.onboard.telemetry.topics import PREFIX, TOPICS, AnswerMessage, checked_name, is_name
 from flockd.onboard.telemetry.zenoh_session import SessionOwner, close_session, open_session
 
@@ -273,8 +272,10 @@ def _parsed(payload: zenoh.ZBytes, topic: str) -> tuple[dict[str, Any], str | No
     if len(raw) > MAX_BYTES:
         return {}, f"it is longer than {MAX_BYTES >> 10} KiB"
     try:
-        message = json.loads(raw)
-    except (ValueError, RecursionError):
+        message = parsed(raw)
+    except ValueError:
         return {}, "it is not JSON"
-    message = completed(message, TOPICS[topic].type)
-    return message, fault(message, TOPICS[topic].type)
+    try:
+        return from_json(TOPICS[topic].type, message), None
+    except ValueError as error:
+        return {}, str(error)

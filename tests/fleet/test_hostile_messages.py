@@ -21,7 +21,7 @@ from flockd.fleet.page.drone_rows import drone_rows, history_row
 from flockd.fleet.simulation import CONTROLS, MAX_GUST_M_S, MAX_SPEED, MIN_SPEED, SimulationMessage
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.daemon.orders import OperatorCommands, OperatorRequests
-from flockd.onboard.telemetry.schema import fault
+from flockd.onboard.message_json import from_json
 from flockd.onboard.telemetry.topics import TOPICS
 from flockd.sim.flock.live_controls import LiveControls
 from flockd.sim.scenario import load_scenario
@@ -146,7 +146,7 @@ def test_a_changed_control_of_a_simulation_is_refused_or_within_its_bounds() -> 
         assert_readable(answer["sentence"])
         assert control in CONTROLS or not answer["accepted"]
         state = controls.state()
-        assert fault(json.loads(json.dumps(state, allow_nan=False)), SimulationMessage) is None
+        from_json(SimulationMessage, json.loads(json.dumps(state, allow_nan=False)))
         assert MIN_SPEED <= state["speed"] <= MAX_SPEED
         assert 0.0 <= state["gust_m_s"] <= MAX_GUST_M_S
 

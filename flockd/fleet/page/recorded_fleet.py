@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -15,14 +16,13 @@ from flockd.fleet.page.drone_rows import Known, Row, drone_rows, history_row
 from flockd.fleet.page.fleet_source import Event
 from flockd.fleet.page.recorded_pictures import RecordedPictures
 from flockd.fleet.watcher import Heard, Watched
+from flockd.onboard.message_json import from_json, parsed
 from flockd.onboard.recording import RecordingError
-from flockd.onboard.recording.codec import from_json, parsed
 from flockd.onboard.recording.foxglove import image_stream
 from flockd.onboard.recording.mcap_file import Entry, read_records
 from flockd.onboard.recording.reader import Recording, head_of
 from flockd.onboard.recording.streams import OUTPUT, TABLE, VEHICLE
 from flockd.onboard.telemetry import TOPICS, publish_step
-from flockd.onboard.telemetry.schema import completed, fault
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
 
 ONE_CLOCK_S = 5.0
@@ -210,10 +210,9 @@ class _Taking:
             publish_step(story, story.drone, self._vehicle, output)
             story.pictures.take_step(output.time_s, output.detections)
         elif topic in _OWN:
-            kind = TOPICS[_OWN[topic]].type
-            message = completed(parsed(entry.data), kind)
-            if fault(message, kind) is None:  # else of another version, or damaged
-                story.publish(story.drone, _OWN[topic], message)
+            message = parsed(entry.data)
+            with suppress(ValueError):  # of another version, or damaged
+                story.publish(story.drone, _OWN[topic], from_json(TOPICS[_OWN[topic]].type, message))
 
 
 def _tell(progress: Callable[[int, int], None], before: int, total: int, done: int) -> None:

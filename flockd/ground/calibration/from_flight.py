@@ -23,7 +23,7 @@ from flockd.flight.geometry import (
 from flockd.ground.calibration.errors import CalibrationError
 from flockd.ground.calibration.fragment import extrinsics_of, measured_today
 from flockd.ground.calibration.rig_session import write_rig
-from flockd.onboard.recording.codec import from_json, parsed
+from flockd.onboard.message_json import from_json, parsed
 from flockd.onboard.recording.mcap_file import Entry, RecordingError, read_records
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.streams import OUTPUT

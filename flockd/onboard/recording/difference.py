@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from flockd.onboard.recording.codec import Json
+from flockd.onboard.message_json import Json
 from flockd.onboard.recording.editing import written_whole
 from flockd.onboard.recording.mcap_file import RecordingError
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from flockd.core.messages import VehicleState
+from flockd.onboard.message_json import from_json, parsed
 from flockd.onboard.recording import foxglove
-from flockd.onboard.recording.codec import from_json, parsed
 from flockd.onboard.recording.mcap_file import Entry, McapFile, Note, RecordingError, read_records
 from flockd.onboard.recording.reader import (
     Contents,

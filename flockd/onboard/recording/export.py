@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+from flockd.onboard.message_json import Json, parsed
 from flockd.onboard.recording import foxglove
-from flockd.onboard.recording.codec import Json, parsed
 from flockd.onboard.recording.mcap_file import Entry, RecordingError, read_records
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.streams import is_image

@@ -19,8 +19,8 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.perception import NO_MODEL
 from flockd.core.jpeg_header import cost_fault
 from flockd.core.messages import Frame, FrameSet, LearnedSize, MissionOrder, UInt8Array, VehicleState
+from flockd.onboard.message_json import from_json, parsed
 from flockd.onboard.recording import foxglove
-from flockd.onboard.recording.codec import from_json, parsed
 from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, Note, Record, RecordingError, read_records
 from flockd.onboard.recording.streams import (
     CONFIGURATION,

@@ -23,8 +23,8 @@ from flockd.core.config.recording import RecordingConfig
 from flockd.core.config.rig import RigConfig
 from flockd.core.messages import FloatArray, Frame, FrameSet, LearnedSize, MissionOrder, PilotOutput, VehicleState
 from flockd.core.secrets import masked
+from flockd.onboard.message_json import to_json
 from flockd.onboard.recording import foxglove
-from flockd.onboard.recording.codec import to_json
 from flockd.onboard.recording.mcap_file import Entry, Inclosure, McapFile, Note, RecordingError
 from flockd.onboard.recording.reader import head_of
 from flockd.onboard.recording.streams import (
@@ -47,7 +47,6 @@ from flockd.onboard.recording.streams import (
     nanoseconds,
     part_path,
 )
-from flockd.onboard.telemetry import publish_step
 
 FLUSH_EVERY_S = 0.2
 _VERSIONS = {
@@ -276,7 +275,6 @@ class Recorder:
         self._time_s = step.frames.time_s
         for entry in _step_entries(step, self._settings, self._track, self._tell):
             self._parts.write(entry)
-        publish_step(_Direct(self._write_message), self._drone, step.vehicle, step.output)
         for reason in step.output.reasons:
             self._parts.write(_log_entry(step.frames.time_s, "WARNING", reason.text))
         early, self._early = self._early, []
@@ -294,16 +292,6 @@ class Recorder:
         self._parts.write(_json_entry(TABLE[item.topic], time_s, 0, {"time_s": time_s, **item.message}))
         if item.topic == "events":
             self._parts.write(_log_entry(time_s, "INFO", str(item.message.get("event", ""))))
-
-
-@dataclass(frozen=True)
-class _Direct:
-    """A telemetry sink within the recorder's own thread."""
-
-    take: Callable[[_Message], None]
-
-    def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
-        self.take(_Message(topic, message))
 
 
 class _Track:

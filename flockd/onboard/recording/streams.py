@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from flockd.core.messages import Matrix3, MissionOrder, PilotOutput, Vector3, VehicleState
-from flockd.onboard.recording.codec import json_schema
+from flockd.onboard.message_json import json_schema
 from flockd.onboard.recording.mcap_file import Stream
 from flockd.onboard.telemetry import TOPICS
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from flockd.core.messages import FloatArray, MissionOrder
 from flockd.core.printable import printable
-from flockd.onboard.telemetry.schema import fault
+from flockd.onboard.message_json import from_json, parsed
 from flockd.onboard.telemetry.topics import AskMessage, OrderMessage
 
 _OF_GOTO = frozenset({"north_m", "east_m", "latitude_deg", "longitude_deg", "height_m", "speed_m_s"})
@@ -22,11 +21,12 @@ LONGEST_NAME = 120
 
 def parse_ask(payload: bytes) -> AskMessage:
     """What a query for a command carries. Raises ValueError, with a sentence for its sender, for what is none."""
-    message: Any = _object(payload)
-    wrong = fault(message, AskMessage)
-    if wrong is not None:
-        raise ValueError(f"an order has to say who gives it, its number and its time ({wrong}); see docs/telemetry.md")
-    ask: AskMessage = message
+    message = _object(payload)
+    try:
+        ask: AskMessage = from_json(AskMessage, message)
+    except ValueError as error:
+        told = f"an order has to say who gives it, its number and its time ({error}); see docs/telemetry.md"
+        raise ValueError(told) from error
     names = ask["operator"], ask["session"]
     if not all(name and len(name) <= LONGEST_NAME and printable(name, lines=False) == name for name in names):
         raise ValueError(
@@ -84,8 +84,8 @@ def _object(payload: bytes) -> dict[str, Any]:
     if len(payload) > _LONGEST:
         raise ValueError(f"an order has {_LONGEST} bytes at most")
     try:
-        message = json.loads(payload)
-    except (ValueError, RecursionError) as error:
+        message = parsed(payload)
+    except ValueError as error:
         raise ValueError("an order has to be a JSON object") from error
     if not isinstance(message, dict):
         raise ValueError("an order has to be a JSON object")  # noqa: TRY004 - of the message, not of the caller

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-import math
 import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
 import zenoh
 
+from flockd.onboard.message_json import to_telemetry
 from flockd.onboard.telemetry.topics import PREFIX, TOPICS, AboutMessage, AnswerMessage, TimeMessage, checked_name
 from flockd.onboard.telemetry.zenoh_session import SessionOwner, open_session
 
@@ -79,7 +78,7 @@ class ZenohTelemetry(SessionOwner):
 
         Raises ValueError for a topic that is not in `TOPICS` or a drone's name that does not fit into a key.
         """
-        payload = json.dumps(_finite(message), allow_nan=False).encode()
+        payload = json.dumps(to_telemetry(message), allow_nan=False).encode()
         try:
             self._publisher(drone, topic).put(payload)
         except zenoh.ZError:  # telemetry never ends a flight
@@ -161,7 +160,9 @@ def _payload(query: zenoh.Query) -> bytes:
 
 def _reply(query: zenoh.Query, message: Mapping[str, object]) -> None:
     """Replies under the key of the query; a query for several at once, as with `*`, gets one reply."""
-    query.reply(query.key_expr, json.dumps(_finite(message), allow_nan=False), encoding=zenoh.Encoding.APPLICATION_JSON)
+    query.reply(
+        query.key_expr, json.dumps(to_telemetry(message), allow_nan=False), encoding=zenoh.Encoding.APPLICATION_JSON
+    )
 
 
 def _send_image(query: zenoh.Query, newest_image: NewestImage) -> None:
@@ -171,23 +172,3 @@ def _send_image(query: zenoh.Query, newest_image: NewestImage) -> None:
         query.reply_err(f"camera {camera!r} has no image", encoding=zenoh.Encoding.TEXT_PLAIN)
     else:
         query.reply(query.key_expr, image, encoding=zenoh.Encoding.IMAGE_JPEG)
-
-
-_PLAIN = frozenset({str, int, bool, type(None)})
-
-
-def _finite(value: object) -> object:
-    """The same value in plain types, with null for every number that JSON cannot say."""
-    if type(value) is float:  # most are: this runs for every number of every message
-        return value if math.isfinite(value) else None
-    if type(value) in _PLAIN:
-        return value
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        return {key: _finite(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(inner) for inner in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

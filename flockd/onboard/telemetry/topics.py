@@ -312,6 +312,7 @@ class Topic:
     stale_after_s: float | None
     """Older than this, a message says nothing of now; None: it keeps its meaning."""
     recorded: bool
+    """By itself; what follows from a step is recorded as that step's input and output."""
 
 
 _STEP = services.STEP_TOPIC.rate_hz, services.STEP_TOPIC.timeout
@@ -320,14 +321,14 @@ _COMPUTER = services.COMPUTER_TOPIC.rate_hz, services.COMPUTER_TOPIC.timeout
 TOPICS = {
     topic.key: topic
     for topic in (
-        Topic("state", StateMessage, *_STEP, recorded=True),
-        Topic("neighbours", NeighboursMessage, *_STEP, recorded=True),
+        Topic("state", StateMessage, *_STEP, recorded=False),
+        Topic("neighbours", NeighboursMessage, *_STEP, recorded=False),
         Topic("obstacles", ObstaclesMessage, *_STEP, recorded=False),
-        Topic("command", CommandMessage, *_STEP, recorded=True),
-        Topic("mission", MissionMessage, *_STEP, recorded=True),
-        Topic("health", HealthMessage, *_STEP, recorded=True),
+        Topic("command", CommandMessage, *_STEP, recorded=False),
+        Topic("mission", MissionMessage, *_STEP, recorded=False),
+        Topic("health", HealthMessage, *_STEP, recorded=False),
         Topic("events", EventMessage, rate_hz=None, stale_after_s=None, recorded=True),
-        Topic("timings", TimingsMessage, *_STEP, recorded=True),
+        Topic("timings", TimingsMessage, *_STEP, recorded=False),
         Topic("flight", FlightMessage, *_STEP, recorded=True),
         Topic("computer", ComputerMessage, *_COMPUTER, recorded=True),
         Topic("clock", ClockMessage, *_COMPUTER, recorded=True),

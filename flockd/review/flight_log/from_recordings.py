@@ -12,8 +12,8 @@ import numpy as np
 from flockd.core.messages import FloatArray, PilotOutput
 from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.flight.pilot import FlockPilot, StepTrace
+from flockd.onboard.message_json import from_json, to_json
 from flockd.onboard.recording import RecordingError
-from flockd.onboard.recording.codec import from_json, to_json
 from flockd.onboard.recording.reader import Recording, head_of
 from flockd.onboard.recording.streams import Truth
 from flockd.review.flight_log.builder import FlightLogBuilder

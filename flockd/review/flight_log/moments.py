@@ -10,7 +10,7 @@ import numpy as np
 
 from flockd.core.messages import Detection, FloatArray, PilotOutput, UInt8Array
 from flockd.flight.geometry import Rig, build_rig
-from flockd.onboard.recording.codec import from_json
+from flockd.onboard.message_json import from_json
 from flockd.onboard.recording.reader import Recording
 from flockd.review.flight_log.key_frames import KeyFrame
 

@@ -16,8 +16,8 @@ from flockd.core.config import DroneConfig
 from flockd.core.errors import UsageError
 from flockd.core.messages import UInt8Array, VehicleState
 from flockd.flight.inference.hashes import model_hashes
+from flockd.onboard.message_json import to_json
 from flockd.onboard.recording import RecordingError, foxglove
-from flockd.onboard.recording.codec import to_json
 from flockd.onboard.recording.mcap_file import Entry, Inclosure, McapFile, Note
 from flockd.onboard.recording.ros_bag import Bag, BagMessage
 from flockd.onboard.recording.streams import (

@@ -14,8 +14,8 @@ from flockd.core.config.recording import RecordingConfig
 from flockd.flight.inference.hashes import model_hashes
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon import load_side_by_side
+from flockd.onboard.message_json import to_json
 from flockd.onboard.recording import Recorder, RecordingError
-from flockd.onboard.recording.codec import to_json
 from flockd.onboard.recording.difference import Comparison, compare
 from flockd.onboard.recording.editing import written_whole
 from flockd.onboard.recording.reader import RecordedStep, Recording

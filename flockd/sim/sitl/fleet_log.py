@@ -17,7 +17,7 @@ from flockd.flight.flocking.metrics import order, union
 from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.flight.perception import load_networks
 from flockd.flight.pilot import FlockPilot, StepTrace
-from flockd.onboard.recording.codec import from_json
+from flockd.onboard.message_json import from_json
 from flockd.onboard.recording.mcap_file import Entry, read_records
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.streams import ORDER, OUTPUT, VEHICLE

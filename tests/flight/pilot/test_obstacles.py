@@ -14,7 +14,7 @@ from flockd.core.data import data_path
 from flockd.core.messages import SECTORS, FrameSet, ObstacleRanges, PilotOutput, VehicleState
 from flockd.flight.perception import Observation
 from flockd.flight.pilot import FlockPilot
-from flockd.onboard.recording.codec import from_json, parsed, to_json
+from flockd.onboard.message_json import from_json, parsed, to_json
 from flockd.sim.scenario import load_scenario
 from flockd.sim.world.obstacles import Box, Obstacles, true_ranges
 from tests.make import frames, vehicle

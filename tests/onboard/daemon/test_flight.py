@@ -18,7 +18,7 @@ from flockd.core.messages import LearnedSize
 from flockd.fleet.fleet_status import status_rows
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon import DaemonError
-from flockd.onboard.recording.codec import to_json
+from flockd.onboard.message_json import to_json
 from flockd.onboard.recording.reader import Recording
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.sitl.free_ports import free_port

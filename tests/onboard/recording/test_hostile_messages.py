@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
+from flockd.onboard.message_json import from_json, parsed
 from flockd.onboard.recording import RecordingError, foxglove
-from flockd.onboard.recording.codec import from_json, parsed
 from flockd.onboard.recording.editing import recover
 from flockd.onboard.recording.export import export_images, export_tables
 from flockd.onboard.recording.mcap_file import Entry, Record

@@ -20,8 +20,8 @@ import pytest
 import zstandard
 from mcap.writer import Writer
 
+from flockd.onboard.message_json import to_json
 from flockd.onboard.recording import RecordingError
-from flockd.onboard.recording.codec import to_json
 from flockd.onboard.recording.editing import cut, recover
 from flockd.onboard.recording.export import export_images, export_tables
 from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, McapFile, Note, Record, read_records
@@ -318,7 +318,7 @@ def test_a_cut_holds_its_stretch_and_what_is_needed_to_play_it(tmp_path: Path, w
         assert np.array_equal(step.frames.frames["front"].image, original.frames.frames["front"].image)
     assert [step.number for step in piece.steps()] == [3, 4, 5, 6]
     assert piece.contents.streams["/camera/front/calibration"].messages == 1
-    assert piece.contents.streams["/health"].messages == 4
+    assert piece.contents.streams["/odometry"].messages == 4
     with pytest.raises(RecordingError, match="holds no whole step there; nothing was written"):
         cut(recording, tmp_path / "none.mcap", 0.0, 1.0)
     assert [path.name for path in tmp_path.iterdir()] == ["cut.mcap"]

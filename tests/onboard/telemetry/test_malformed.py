@@ -21,8 +21,8 @@ from flockd.core.printable import printable
 from flockd.fleet.fleet_status import status_rows
 from flockd.fleet.watcher import MAX_BYTES, MAX_DRONES, MAX_EVENTS_OF_ONE, FleetWatcher, Heard, Watched
 from flockd.onboard.daemon.orders import OperatorCommands, OperatorRequests
+from flockd.onboard.message_json import from_json
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
-from flockd.onboard.telemetry.schema import completed, fault
 from flockd.onboard.telemetry.topics import (
     TOPICS,
     AboutMessage,
@@ -37,6 +37,17 @@ from flockd.sim.sitl.free_ports import free_endpoint
 pytestmark = [pytest.mark.fault("wrong-types-of-a-peer"), pytest.mark.fault("hostile-peers")]
 
 ROOT = Path(__file__).parents[3]
+
+
+def fault(message: object, kind: type) -> str | None:
+    """What `from_json` says of a message; None: it is one."""
+    try:
+        from_json(kind, message)
+    except ValueError as error:
+        return str(error)
+    return None
+
+
 FLIGHT = {
     "time_s": 5.0, "state": "normal", "reasons": [], "flight_mode": "offboard", "armed": True, "in_air": True,
     "heartbeat_age_s": 0.1, "heartbeats_lost": 0,
@@ -91,7 +102,7 @@ def test_what_is_nested_is_looked_into() -> None:
     assert fault(computer, ComputerMessage) == "cameras.front.counts.used is no whole number"
     assert fault({**computer, "cameras": [camera]}, ComputerMessage) == "cameras is no object"
     assert fault({"time_s": 0.0, "neighbours": [3]}, NeighboursMessage) == "neighbours[0] is no object"
-    assert fault({**computer, "cameras": {"\ud800": camera}}, ComputerMessage) == "cameras has a name that is no text"
+    assert fault({**computer, "cameras": {"\ud800": camera}}, ComputerMessage) == "a name in cameras is no text"
     state = {**dict.fromkeys(StateMessage.__annotations__, 0.0), "velocity_ned": None, "position_ne": None}
     assert fault({**state, "home_deg": [1e308, 8.0]}, StateMessage) == "home_deg[0] is beyond 360"
     assert fault({**state, "home_deg": [47.0, -180.0]}, StateMessage) is None
@@ -103,14 +114,14 @@ def test_a_drone_of_an_earlier_version_is_shown_without_what_it_lacks() -> None:
     old: dict[str, Any] = {
         "time_s": 5.0, "height_m": 4.0, "roll_deg": 0.0, "pitch_deg": 0.0, "yaw_deg": 90.0, "velocity_ned": None
     }  # fmt: skip
-    state, places = completed(old, StateMessage), {"position_ne": None, "home_deg": None}
-    assert state == {**old, **places}
-    assert fault(state, StateMessage) is None
-    computer = completed({"cameras": {"front": {"counts": {}}}, "steps": 3}, ComputerMessage)
-    assert computer["cameras"] == {"front": {"counts": {}, "age_s": None, "fault": None}}
-    assert fault(computer, ComputerMessage) == "time_s is missing", "what cannot be null has to be there"
-    assert completed([], StateMessage) == []
-    assert completed({"cameras": 3}, ComputerMessage)["cameras"] == 3
+    assert from_json(StateMessage, old) == {**old, "position_ne": None, "home_deg": None}
+    computer: dict[str, Any] = dict.fromkeys(ComputerMessage.__annotations__, 0)
+    computer |= {"cameras": {"front": {"counts": {}}}, "later": {}}
+    known = from_json(ComputerMessage, {**computer, "recording": None})
+    assert known["cameras"] == {"front": {"counts": {}, "age_s": None, "fault": None}}
+    assert known["later"] == {}
+    del computer["load"]
+    assert fault(computer, ComputerMessage) == "load is missing", "what cannot be null has to be there"
     drone = Watched("f", "d", alive=True, malformed={"computer": "load is missing"}, seen=True)
     (row,) = status_rows([drone], 0.0)
     told = "its message `computer` is malformed: load is missing; it may run another version of flockd"
