@@ -166,7 +166,7 @@ def _exact(value: float | str, key: str) -> float:
     try:
         return float(value)
     except (ValueError, OverflowError) as error:
-        raise ValueError(f"{key} is no number") from error
+        raise ValueError(f"{key or 'it'} is no number") from error
 
 
 def _in_bounds(value: float | None, key: str) -> float | None:

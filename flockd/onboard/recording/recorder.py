@@ -9,6 +9,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -71,17 +72,6 @@ class _Step:
     order: MissionOrder | None
 
 
-@dataclass(frozen=True, eq=False)
-class _Message:
-    topic: str
-    message: Mapping[str, object]
-
-
-@dataclass(frozen=True, eq=False)
-class _Close:
-    pass
-
-
 class Recorder:
     """Writes `PATH`, and when that is full `PATH` with a number before its suffix, each file complete in itself.
 
@@ -126,7 +116,8 @@ class Recorder:
         )
         self._parts = _Parts(path, flight, head, config.rig, self._settings, self._tell)
         self._track = _Track(config.rig)
-        self._queue: queue.SimpleQueue[_Step | _Message | _Close] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[tuple[int, Callable[[], None]] | None] = queue.SimpleQueue()
+        """Bytes held, and what writes them; None at the end."""
         self._lock = threading.Condition()
         self._held_bytes = 0
         self._steps = 0
@@ -135,7 +126,7 @@ class Recorder:
         self._closed = False
         self._failure: str | None = None
         self._time_s: float | None = None
-        self._early: list[_Message] = []
+        self._early: list[tuple[str, Mapping[str, object]]] = []
         self._thread = threading.Thread(target=self._write_all, name=f"recorder {drone}", daemon=True)
         self._thread.start()
 
@@ -163,7 +154,8 @@ class Recorder:
         """
         number, self._steps = self._steps, self._steps + 1
         size = sum(frame.image.nbytes for frame in frames.frames.values())
-        self._put(_Step(number, frames, vehicle, output, truth, order), size + _SMALL_BYTES)
+        step = _Step(number, frames, vehicle, output, truth, order)
+        self._put(size + _SMALL_BYTES, lambda: self._write_step(step))
 
     def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
         """Takes one telemetry message, if the table of topics marks it as recorded; a `TelemetrySink`.
@@ -171,7 +163,7 @@ class Recorder:
         For what does not follow from a step, such as events: all that does is written with the step.
         """
         if drone == self._drone and topic in TABLE:
-            self._put(_Message(topic, message), _SMALL_BYTES)
+            self._put(_SMALL_BYTES, lambda: self._write_message(topic, message))
 
     def drain(self) -> None:
         """Waits until all is written: only for those whose time stands still meanwhile, such as a simulator."""
@@ -183,7 +175,7 @@ class Recorder:
         if self._closed:
             return
         self._closed = True
-        self._queue.put(_Close())
+        self._queue.put(None)
         self._thread.join(timeout_s)
         if self._thread.is_alive():
             self._on_event(
@@ -196,7 +188,7 @@ class Recorder:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _put(self, item: _Step | _Message, size: int) -> None:
+    def _put(self, size: int, write: Callable[[], None]) -> None:
         with self._lock:
             fits = self._held_bytes == 0 or self._held_bytes + size <= self._settings.queue_mb * _MB
             if self._closed or self._failure is not None or not fits:
@@ -205,7 +197,7 @@ class Recorder:
                 self._told_full = self._told_full or not fits
             else:
                 self._held_bytes += size
-                self._queue.put(item)
+                self._queue.put((size, write))
                 news = False
         if news:
             self._tell("recording: the disk is too slow, so that steps are dropped; record smaller or fewer images")
@@ -214,7 +206,7 @@ class Recorder:
         """Into the file and to the subscribers."""
         with self._lock:
             self._held_bytes += _SMALL_BYTES
-            self._queue.put(_Message("events", {"event": event}))
+            self._queue.put((_SMALL_BYTES, lambda: self._write_message("events", {"event": event})))
         self._on_event(event)
 
     def _write_all(self) -> None:
@@ -233,7 +225,7 @@ class Recorder:
             self._failure = sentence
             self._held_bytes = 0
             while not self._queue.empty():  # the thread that takes these has failed
-                self._lost += isinstance(self._queue.get(), _Step | _Message)
+                self._lost += self._queue.get() is not None
             self._lock.notify_all()
         self._parts.abandon()
         self._on_event(sentence)
@@ -243,33 +235,24 @@ class Recorder:
         flushed_s = time.monotonic()
         closing = unflushed = False
         while not (closing and self._queue.empty()):  # events of closing belong into the file too
-            try:
+            size = 0
+            with suppress(queue.Empty):
                 item = self._queue.get(timeout=FLUSH_EVERY_S)
-            except queue.Empty:
-                item = None
-            match item:
-                case _Step():
-                    self._write_step(item)
-                case _Message():
-                    self._write_message(item)
-                case _Close():
-                    closing = True
-            unflushed = unflushed or item is not None
-            if unflushed and (item is None or time.monotonic() - flushed_s >= FLUSH_EVERY_S):
+                closing = closing or item is None
+                if item is not None:
+                    size, write = item
+                    write()
+                    unflushed = True
+                    del item, write  # or the last frames would stay in memory until the next
+            if unflushed and (size == 0 or time.monotonic() - flushed_s >= FLUSH_EVERY_S):
                 self._parts.flush()
                 flushed_s, unflushed = time.monotonic(), False
-            if isinstance(item, _Step | _Message):
+            if size:
                 self._parts.turn_page()
-                self._release(item)
-
-    def _release(self, item: _Step | _Message) -> None:
-        size = _SMALL_BYTES
-        if isinstance(item, _Step):
-            size += sum(frame.image.nbytes for frame in item.frames.frames.values())
-        with self._lock:
-            self._held_bytes -= size
-            if self._held_bytes == 0:
-                self._lock.notify_all()
+            with self._lock:
+                self._held_bytes -= size
+                if self._held_bytes == 0:
+                    self._lock.notify_all()
 
     def _write_step(self, step: _Step) -> None:
         self._time_s = step.frames.time_s
@@ -278,20 +261,18 @@ class Recorder:
         for reason in step.output.reasons:
             self._parts.write(_log_entry(step.frames.time_s, "WARNING", reason.text))
         early, self._early = self._early, []
-        for item in early:  # from before there was a time
-            self._write_message(item)
+        for topic, message in early:  # from before there was a time
+            self._write_message(topic, message)
 
-    def _write_message(self, item: _Message) -> None:
-        if item.topic not in TABLE:
-            return
-        stamp = item.message.get("time_s", self._time_s)  # without one: the recorder's own events
+    def _write_message(self, topic: str, message: Mapping[str, object]) -> None:
+        stamp = message.get("time_s", self._time_s)  # without one: the recorder's own events
         if not isinstance(stamp, int | float):
-            self._early.append(item)
+            self._early.append((topic, message))
             return
         time_s = float(stamp)
-        self._parts.write(_json_entry(TABLE[item.topic], time_s, 0, {"time_s": time_s, **item.message}))
-        if item.topic == "events":
-            self._parts.write(_log_entry(time_s, "INFO", str(item.message.get("event", ""))))
+        self._parts.write(_json_entry(TABLE[topic], time_s, 0, {"time_s": time_s, **message}))
+        if topic == "events":
+            self._parts.write(_log_entry(time_s, "INFO", str(message.get("event", ""))))
 
 
 class _Track:

@@ -112,5 +112,5 @@ def test_json_from_outside_is_parsed_or_refused() -> None:
     for data in (DEEP, b"{", b"\xff"):
         with pytest.raises(ValueError, match=r"."):
             parsed(data)
-    with pytest.raises(ValueError, match="a number has 401 digits"):
+    with pytest.raises(ValueError, match="it is no number"):
         from_json(float, 10**400)
