@@ -194,7 +194,7 @@ def test_no_drone_gets_the_truth() -> None:
     from flockd.flight.pilot import FlockPilot
 
     for path in set(MODULES) - set(_of("sim", "onboard/recording", "review")):
-        assert "flockd.onboard.recording.streams" not in _imports(path), path
+        assert "flockd.onboard.recording.truth" not in _imports(path), path
     assert list(inspect.signature(FlockPilot.step).parameters) == ["self", "frames", "vehicle", "trace", "order"]
 
 

@@ -20,7 +20,7 @@ from flockd.fleet.fleet_status import status_rows
 from flockd.fleet.page.drone_rows import drone_rows, history_row
 from flockd.fleet.simulation import CONTROLS, MAX_GUST_M_S, MAX_SPEED, MIN_SPEED, SimulationMessage
 from flockd.fleet.watcher import FleetWatcher
-from flockd.onboard.daemon.orders import OperatorCommands, OperatorRequests
+from flockd.onboard.daemon.operator_orders import OperatorCommands, OperatorRequests
 from flockd.onboard.message_json import from_json
 from flockd.onboard.telemetry.topics import TOPICS
 from flockd.sim.flock.live_controls import LiveControls

@@ -13,7 +13,8 @@ import pytest
 
 from flockd.core.messages import PilotOutput, VehicleState
 from flockd.onboard.message_json import from_json, json_schema, to_json
-from flockd.onboard.recording.streams import StepFrames, Truth
+from flockd.onboard.recording.streams import StepFrames
+from flockd.onboard.recording.truth import Truth
 from tests.onboard.recording.made_up import MadeUpPilot, drone_config, inputs
 
 

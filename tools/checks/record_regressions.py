@@ -36,7 +36,7 @@ from flockd.flight.inference.hashes import model_hashes
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.reader import Recording
-from flockd.onboard.recording.streams import Truth
+from flockd.onboard.recording.truth import Truth
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import ScenarioConfig, StartConfig, load_scenario
 

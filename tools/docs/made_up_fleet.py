@@ -32,7 +32,7 @@ from flockd.core.messages import (
     VehicleState,
     Wanted,
 )
-from flockd.onboard.daemon.orders import OperatorCommands, OperatorRequests
+from flockd.onboard.daemon.operator_orders import OperatorCommands, OperatorRequests
 from flockd.onboard.telemetry import publish_step
 from flockd.onboard.telemetry.publisher import DEFAULT_ENDPOINT, ZenohTelemetry
 from flockd.onboard.telemetry.topics import (

@@ -30,7 +30,7 @@ from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.onboard.daemon.autopilot_tasks import AutopilotRequests, Takeover
-from flockd.onboard.daemon.orders import OperatorRequests
+from flockd.onboard.daemon.operator_orders import OperatorRequests
 from flockd.onboard.daemon.pilot_loop import PilotLoop, VehicleHistory
 from flockd.onboard.daemon.supervisor_inputs import InputCollector, position_from_home
 

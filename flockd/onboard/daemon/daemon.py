@@ -17,7 +17,7 @@ from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.watches import MOST_SPEED
 from flockd.onboard.daemon.autopilot_tasks import state_sentence
 from flockd.onboard.daemon.control import FLYING
-from flockd.onboard.daemon.orders import OperatorRequests
+from flockd.onboard.daemon.operator_orders import OperatorRequests
 from flockd.onboard.daemon.startup import Components, Connect, open_components
 from flockd.onboard.daemon.status import ServiceManager, notify_service_manager, publish_status
 from flockd.onboard.daemon.watched_networks import InterruptibleNetworks

@@ -21,7 +21,7 @@ from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.onboard.daemon.autopilot_tasks import AutopilotRequests, ObstacleDistances, RefusalWatch, StateTexts
 from flockd.onboard.daemon.control import Control
 from flockd.onboard.daemon.message_sinks import MessageSinks
-from flockd.onboard.daemon.orders import MissionOrders, OperatorCommands, OperatorRequests
+from flockd.onboard.daemon.operator_orders import MissionOrders, OperatorCommands, OperatorRequests
 from flockd.onboard.daemon.pilot_loop import PilotLoop, VehicleHistory
 from flockd.onboard.daemon.supervisor_inputs import InputCollector, LoopLag, Thermometer, WallClock
 from flockd.onboard.daemon.watched_networks import InterruptibleNetworks, WatchedNetworks, cameras_at_once

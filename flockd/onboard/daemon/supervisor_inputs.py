@@ -17,7 +17,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.messages import FloatArray, VehicleState
 from flockd.flight.safety import CameraHealth, Gate, Inputs, MissionEnd, Objection, outside_fence, outside_heights
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
-from flockd.onboard.daemon.orders import OperatorRequests
+from flockd.onboard.daemon.operator_orders import OperatorRequests
 from flockd.onboard.daemon.pilot_loop import PilotLoop
 from flockd.onboard.daemon.watched_networks import WatchedNetworks
 from flockd.onboard.daemon.worker import LateError, Worker

@@ -32,9 +32,9 @@ from flockd.onboard.recording.streams import (
     TRUTH,
     VEHICLE,
     StepFrames,
-    Truth,
     is_image,
 )
+from flockd.onboard.recording.truth import Truth
 
 _KINDS = {VEHICLE.topic: VehicleState, TRUTH.topic: Truth}
 

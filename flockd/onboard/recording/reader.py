@@ -36,10 +36,10 @@ from flockd.onboard.recording.streams import (
     TRUTH,
     VEHICLE,
     StepFrames,
-    Truth,
     is_image,
     part_path,
 )
+from flockd.onboard.recording.truth import Truth
 
 _WHAT_TO_DO = "`flockd record recover` makes a recording without it"
 _CALIBRATION_SUFFIX = "/calibration"

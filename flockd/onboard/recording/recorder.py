@@ -44,10 +44,10 @@ from flockd.onboard.recording.streams import (
     VEHICLE,
     FrameEntry,
     StepFrames,
-    Truth,
     nanoseconds,
     part_path,
 )
+from flockd.onboard.recording.truth import Truth
 
 FLUSH_EVERY_S = 0.2
 _VERSIONS = {

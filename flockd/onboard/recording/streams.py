@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flockd.core.messages import Matrix3, MissionOrder, PilotOutput, Vector3, VehicleState
+from flockd.core.messages import MissionOrder, PilotOutput, VehicleState
 from flockd.onboard.message_json import json_schema
 from flockd.onboard.recording.mcap_file import Stream
+from flockd.onboard.recording.truth import Truth
 from flockd.onboard.telemetry import TOPICS
 
 FORMAT = "1"
@@ -43,32 +44,6 @@ class StepFrames:
     """Counted from 0 over the whole recording; a missing number is a step that was dropped."""
     time_s: float
     frames: tuple[FrameEntry, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class TrueDrone:
-    """Where one drone of the flock truly was, by a simulator: to evaluate its flight. Nothing that flies reads it."""
-
-    name: str
-    position: Vector3
-    """(3,) m NED, from the world's origin."""
-    velocity: Vector3
-    """(3,) m/s NED."""
-    R_ned_body: Matrix3
-    """(3, 3)"""
-    exact_position: Vector3 | None = None
-    """(3,) m NED in the companion flight, in which all drones had all exact states; None in such a flight."""
-    exact_velocity: Vector3 | None = None
-    """(3,) likewise."""
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """The whole flock as one step began, the own drone among it."""
-
-    time_s: float
-    drones: tuple[TrueDrone, ...]
-    """In the same order in every step and every drone's recording."""
 
 
 def _json_stream(topic: str, kind: Any) -> Stream:

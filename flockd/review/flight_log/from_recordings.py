@@ -15,7 +15,7 @@ from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.onboard.message_json import from_json, to_json
 from flockd.onboard.recording import RecordingError
 from flockd.onboard.recording.reader import Recording, head_of
-from flockd.onboard.recording.streams import Truth
+from flockd.onboard.recording.truth import Truth
 from flockd.review.flight_log.builder import FlightLogBuilder
 from flockd.review.flight_log.capture import capture, key_frame_steps
 from flockd.review.flight_log.key_frames import KeyFrame

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from flockd.fleet.simulation import SimulationMessage, checked_control
-from flockd.onboard.daemon.orders import OrderChecks
+from flockd.onboard.daemon.operator_orders import OrderChecks
 from flockd.onboard.telemetry.order_messages import parse_ask
 from flockd.onboard.telemetry.topics import AnswerMessage
 from flockd.sim.scenario import ScenarioConfig

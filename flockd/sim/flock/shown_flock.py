@@ -15,7 +15,7 @@ from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, VehicleSta
 from flockd.flight.geometry import build_rig
 from flockd.flight.mission import order_fault
 from flockd.flight.safety import State
-from flockd.onboard.daemon.orders import ORDERS, OrderChecks, taken_message
+from flockd.onboard.daemon.operator_orders import ORDERS, OrderChecks, taken_message
 from flockd.onboard.telemetry import TelemetrySink, publish_step
 from flockd.onboard.telemetry.order_messages import parse_ask, parse_order
 from flockd.onboard.telemetry.preview import Previews

@@ -16,7 +16,7 @@ from flockd.core.errors import UsageError
 from flockd.core.messages import NO_STATUS, FloatArray
 from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.onboard.recording import Recorder
-from flockd.onboard.recording.streams import TrueDrone, Truth
+from flockd.onboard.recording.truth import TrueDrone, Truth
 from flockd.review.flight_log.builder import FlightLogBuilder
 from flockd.review.flight_log.capture import key_frame_steps
 from flockd.review.flight_log.key_frames import KeyFrame

@@ -14,7 +14,7 @@ import pytest
 
 from flockd.core.messages import MissionOrder
 from flockd.onboard.daemon.message_sinks import BACKLOG, MessageSinks
-from flockd.onboard.daemon.orders import LATEST_S, MOST_SESSIONS, RECENT_S, OperatorCommands, OperatorRequests
+from flockd.onboard.daemon.operator_orders import LATEST_S, MOST_SESSIONS, RECENT_S, OperatorCommands, OperatorRequests
 from flockd.onboard.telemetry.topics import AnswerMessage
 from tests.onboard.daemon.aboard import config_for
 

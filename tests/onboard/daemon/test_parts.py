@@ -41,7 +41,7 @@ from flockd.flight.perception import ImagePair
 from flockd.flight.safety import Action, Decision, Gate, Inputs, Permission, Request, State, Surroundings
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
 from flockd.onboard.daemon.control import Control
-from flockd.onboard.daemon.orders import OperatorRequests
+from flockd.onboard.daemon.operator_orders import OperatorRequests
 from flockd.onboard.daemon.pilot_loop import PilotLoop, StepResult
 from flockd.onboard.daemon.status import ServiceManager
 from flockd.onboard.daemon.supervisor_inputs import CameraMonitor, InputCollector, LoopLag, WallClock, hottest_zone_c

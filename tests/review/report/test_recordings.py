@@ -35,7 +35,7 @@ from flockd.onboard.recording import Recorder, RecordingError
 from flockd.onboard.recording.editing import cut
 from flockd.onboard.recording.mcap_file import Note, Record
 from flockd.onboard.recording.reader import Recording
-from flockd.onboard.recording.streams import TrueDrone, Truth
+from flockd.onboard.recording.truth import TrueDrone, Truth
 from flockd.review.flight_log.from_recordings import flight_log, key_frames, recordings_in
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.summary import summarise

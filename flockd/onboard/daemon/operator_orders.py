@@ -214,7 +214,7 @@ _TAKES_ORDERS = frozenset({State.NORMAL, State.DEGRADED, State.HOVER})
 
 
 class MissionOrders:
-    """See `flockd.onboard.daemon.orders.Missions`."""
+    """See `flockd.onboard.daemon.operator_orders.Missions`."""
 
     def __init__(
         self,
