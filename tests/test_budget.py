@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_340,
     "flockd/flight": 14_740,
-    "flockd/onboard": 11_330,
+    "flockd/onboard": 11_340,
     "flockd/fleet": 2_690,
     "flockd/ground": 5_990,
     "flockd/review": 4_090,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_620,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 467}
+FILES = {"flockd": 468}
 NUMBERS_OF_FLIGHT = 529
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
