@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from flockd.core.messages import SECTORS, FloatArray, Neighbour, ObstacleRanges
-from flockd.onboard.daemon.obstacle_distances import ObstacleDistances
-from flockd.onboard.daemon.vehicle_history import VehicleHistory
+from flockd.onboard.daemon.autopilot_tasks import ObstacleDistances
+from flockd.onboard.daemon.pilot_loop import VehicleHistory
 from tests.make import drone, neighbour, output, vehicle
 
 NORTH, EAST = 0, SECTORS // 4

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flockd.flight.geometry import rotation_from_euler
-from flockd.onboard.daemon.vehicle_history import VehicleHistory
+from flockd.onboard.daemon.pilot_loop import VehicleHistory
 from tests.make import vehicle
 
 

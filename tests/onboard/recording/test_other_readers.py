@@ -93,7 +93,7 @@ def message_class(schema: Schema) -> Any:
 def test_the_formats_own_library_reads_all(files: list[Path]) -> None:
     for path in files:
         read = examined(path)
-        assert len(read) > 10, path.name
+        assert len(read) >= 10, path.name
         for schema, _, message in read:
             assert decoded(schema, message) is not None
 

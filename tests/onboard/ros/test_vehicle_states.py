@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flockd.onboard.ros.message_trees import IMU, ODOMETRY, POSE
-from flockd.onboard.ros.vehicle_states import LONGEST_GAP_S, NearestState, vehicle_state
+from flockd.onboard.ros.ros_input import LONGEST_GAP_S, NearestState, vehicle_state
 from tests.make import vehicle
 
 
