@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from flockd.cli.options import loaded, opened, refuse_overwriting
-from flockd.cli.output import complain, progress, say, say_json
+from flockd.cli.output import complain, progress, say, say_json, say_result
 from flockd.cli.parser import Commands, Parser, add_commands, flag, option, positive_count, positive_number, size
 from flockd.cli.picture_options import PictureCameras, add_picture_options, perception_of
 from flockd.core.choices import LENS_MODELS, PixelFormat
@@ -29,6 +29,16 @@ if TYPE_CHECKING:
     Taken = tuple[str, float, UInt8Array, Camera]
     """A picture's name, its distance in metres, the image and its camera."""
 
+SECONDS = 120.0
+MARKER_SHARE = 0.75
+MOST_VIEWS = 60
+NAMED = 6
+"""How many of the refused images are named one by one."""
+_RECORDING = ".mcap"
+_DRONE_NOTES = """\
+A distance is from the lens to the drone's middle. Photograph the drone alone, from several sides and at two or more
+distances, at least 30 pixels wide. Of a recording, the drone stays at that distance all the time."""
+
 
 def add(commands: Commands) -> None:
     """Adds the command."""
@@ -42,10 +52,6 @@ def add(commands: Commands) -> None:
         "calibrate", "Measure the cameras (lenses, mountings, time offsets) and the drones' size.", examples
     )
     add_commands(parser, (_add_camera, _add_rig, _add_drone))
-
-
-SECONDS = 120.0
-MARKER_SHARE = 0.75
 
 
 def _add_shared(parser: Parser, help_of_config: str) -> None:
@@ -89,11 +95,6 @@ def _ended_by_ctrl_c(live: bool) -> Iterator[None]:
 def _source_name(args: argparse.Namespace) -> str:
     """Where the images come from."""
     return str(args.source or args.config)
-
-
-MOST_VIEWS = 60
-NAMED = 6
-"""How many of the refused images are named one by one."""
 
 
 def _add_camera(commands: Commands) -> None:
@@ -178,14 +179,11 @@ def _print_board(args: argparse.Namespace, board: BoardSpec) -> int:
         raise UsageError(f"{file}: {error}") from None
     with written_whole(file) as draft:
         draft.write_bytes(data)
-    if args.json:
-        say_json({"board": str(file), "page": page_of(board)})
-    else:
-        say(
-            f"{file}: print it at 100 % on {page_of(board)}, glue it to something flat, and measure a square: "
-            f"{args.square_mm:g} mm, or say with --square-mm how large it became"
-        )
-    return ExitCode.DONE
+    told = (
+        f"{file}: print it at 100 % on {page_of(board)}, glue it to something flat, and measure a square: "
+        f"{args.square_mm:g} mm, or say with --square-mm how large it became"
+    )
+    return say_result(args, {"board": str(file), "page": page_of(board)}, told)
 
 
 def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, ImageStream]:
@@ -384,12 +382,6 @@ def _written(result: Mapping[str, Any]) -> int:
     return ExitCode.DONE
 
 
-RECORDING = ".mcap"
-NOTES = """\
-A distance is from the lens to the drone's middle. Photograph the drone alone, from several sides and at two or more
-distances, at least 30 pixels wide. Of a recording, the drone stays at that distance all the time."""
-
-
 def _add_drone(commands: Commands) -> None:
     """Adds the command."""
     examples = (
@@ -397,7 +389,7 @@ def _add_drone(commands: Commands) -> None:
         "flockd calibrate drone distances.yaml --config my_drone.yaml --camera front",
         "flockd calibrate drone --distance 4.0 hover.mcap --every 10",
     )
-    parser = commands("drone", "Measure the drones' size, as the networks see it.", examples, NOTES)
+    parser = commands("drone", "Measure the drones' size, as the networks see it.", examples, _DRONE_NOTES)
     parser.add_argument("source", metavar="DISTANCES", nargs="?", type=Path, help="YAML: `pictures`, file, distance_m")
     parser.add_argument(
         "--distance",
@@ -458,7 +450,7 @@ def _photographs(args: argparse.Namespace, distances: Sequence[tuple[float, Path
     from flockd.ground.calibration.drone_size import Photograph, SizeCandidate
     from flockd.ground.pictures import PictureDetector
 
-    recordings = [path for _, path in distances if path.suffix == RECORDING]
+    recordings = [path for _, path in distances if path.suffix == _RECORDING]
     cameras = None
     if args.config is not None or args.fov is not None or len(recordings) < len(distances):
         cameras = PictureCameras(args)
@@ -485,7 +477,7 @@ def _taken(
     from flockd.ground.pictures import find_pictures
 
     for distance_m, path in distances:
-        if path.suffix == RECORDING:
+        if path.suffix == _RECORDING:
             yield from _of_recording(args, distance_m, path, None if cameras is None else cameras.config)
             continue
         assert cameras is not None

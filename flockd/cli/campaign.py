@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.options import require
-from flockd.cli.output import Phases, complain, say, say_json
+from flockd.cli.output import Phases, complain, say_result
 from flockd.cli.parser import Commands, add_commands, flag, option, positive_count
 from flockd.core.errors import ExitCode, UsageError
 
@@ -101,7 +101,7 @@ def _run(args: argparse.Namespace) -> int:
     workers = args.workers or os.cpu_count() or 1
     plan = Plan.load(args.file)
     if args.dry_run:
-        return _dry_run(plan, workers, as_json=args.json)
+        return _dry_run(args, plan, workers)
     path = args.out or Path("out") / plan.config.campaign
     try:
         with (
@@ -114,30 +114,25 @@ def _run(args: argparse.Namespace) -> int:
         complain(f"interrupted; every finished flight is in {path}, and the same command goes on with the others")
         return ExitCode.INTERRUPTED
     write_campaign_page(Results.load(path), path / REPORT_NAME)
-    if args.json:
-        say_json(
-            {"folder": str(path), "flown": conducted.flown, "failed": conducted.failed, "before": conducted.before}
-        )
-    else:
-        before = f", {conducted.before} were there already" if conducted.before else ""
-        say(f"{conducted.flown} flights flown, {conducted.failed} of them failed{before}")
-        say(f"report: {path / REPORT_NAME}")
+    before = f", {conducted.before} were there already" if conducted.before else ""
+    told = f"{conducted.flown} flights flown, {conducted.failed} of them failed{before}"
+    say_result(args, {"folder": str(path), **asdict(conducted)}, told, f"report: {path / REPORT_NAME}")
     return ExitCode.CHECK_FAILED if conducted.failed else ExitCode.DONE
 
 
-def _dry_run(plan: Plan, workers: int, *, as_json: bool) -> int:
+def _dry_run(args: argparse.Namespace, plan: Plan, workers: int) -> int:
     from flockd.campaign.trial import estimate
 
     with Phases() as phases:
         found = estimate(plan, phases.of("trial flights", "cells"))
     hours = found.core_hours / workers
-    if as_json:
-        say_json({"cells": found.cells, "most_flights": found.flights, "flight_s": found.flight_s, "most_hours": hours})
-        return ExitCode.DONE
     most = "at most " if plan.config.stop is not None else ""
-    say(f"{found.cells} cells, {most}{found.flights} flights of {found.flight_s:.2g} s on one core")
-    say(f"{most}{hours:.2g} h with {workers} at once, if each has a core of its own")
-    return ExitCode.DONE
+    return say_result(
+        args,
+        {"cells": found.cells, "most_flights": found.flights, "flight_s": found.flight_s, "most_hours": hours},
+        f"{found.cells} cells, {most}{found.flights} flights of {found.flight_s:.2g} s on one core",
+        f"{most}{hours:.2g} h with {workers} at once, if each has a core of its own",
+    )
 
 
 def _rerun(args: argparse.Namespace) -> int:
@@ -188,24 +183,14 @@ def _report(args: argparse.Namespace) -> int:
     if args.other is None:
         path = args.out or args.folder / REPORT_NAME
         write_campaign_page(results, path)
-        if args.json:
-            say_json(_cell_figures(results))
-        else:
-            say(f"report: {path}")
-        return ExitCode.DONE
+        return say_result(args, _cell_figures(results), f"report: {path}")
     comparison = compare(results, Results.load(args.other))
     path = args.out or args.other / f"versus_{args.folder.resolve().name}.html"
     write_comparison_page(comparison, path)
-    if args.json:
-        say_json(
-            [{**asdict(one), "difference": one.difference._asdict(), "says": one.says} for one in comparison.verdicts]
-        )
-    else:
-        say(f"{comparison.sentence}.")
-        for one in comparison.verdicts:
-            say(f"  {_verdict_line(one)}")
-        say(f"report: {path}")
-    return ExitCode.DONE
+    verdicts = comparison.verdicts
+    facts = [{**asdict(one), "difference": one.difference._asdict(), "says": one.says} for one in verdicts]
+    lines = (f"  {_verdict_line(one)}" for one in verdicts)
+    return say_result(args, facts, f"{comparison.sentence}.", *lines, f"report: {path}")
 
 
 def _verdict_line(verdict: Verdict) -> str:

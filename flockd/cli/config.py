@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.options import add_force, permit, refuse_overwriting
-from flockd.cli.output import say, say_json
+from flockd.cli.output import say, say_json, say_result
 from flockd.cli.parser import Commands, Parser, add_commands, flag, option
 from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, ModelError, UsageError
 
@@ -164,11 +164,8 @@ def _show(args: argparse.Namespace) -> int:
     from flockd.sim.scenario import load
 
     values = load(args.file).model_dump(mode="json")
-    if args.json:
-        say_json(values)
-    else:
-        say(yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100).rstrip())
-    return ExitCode.DONE
+    text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
+    return say_result(args, values, text.rstrip())
 
 
 def _schema(args: argparse.Namespace) -> int:

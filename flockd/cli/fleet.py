@@ -37,6 +37,15 @@ PLAIN = {
     "land": "Make the drones' autopilots land them where they are.",
     "resume": "Make drones ready again after their flight was ended in the air; their pilots then select offboard.",
 }
+_NOTES = """\
+Without a command it serves the page, and prints its address with a key: who has it may open the page.
+A drone takes only what its `telemetry.commands` allows, and no goal outside its fence. Its answer says that it tries;
+`flockd status` shows what becomes of it. Each drone is asked as soon as it is found, whatever the others do.
+Exit code 1: a drone refused, did not answer, or was not found; 69: none was found."""
+_number = number("a number")
+PORT = 8470
+HERE = "127.0.0.1"
+"""Where it is served unless told otherwise: for this computer alone."""
 
 
 def add(commands: Commands) -> None:
@@ -54,13 +63,6 @@ def add(commands: Commands) -> None:
     add_commands(parser, (_add_goto, _add_velocity, *(_plain(command) for command in PLAIN)))
     _add_page(parser)
     parser.usage = ALONE
-
-
-_NOTES = """\
-Without a command it serves the page, and prints its address with a key: who has it may open the page.
-A drone takes only what its `telemetry.commands` allows, and no goal outside its fence. Its answer says that it tries;
-`flockd status` shows what becomes of it. Each drone is asked as soon as it is found, whatever the others do.
-Exit code 1: a drone refused, did not answer, or was not found; 69: none was found."""
 
 
 def _add_goto(commands: Commands) -> None:
@@ -116,9 +118,6 @@ def _add_connection(parser: Parser) -> None:
     add_endpoint_options(parser)
     add_operator_option(parser)
     flag(parser, "--json", "print the last replies as JSON, by drone")
-
-
-_number = number("a number")
 
 
 def _goto(args: argparse.Namespace) -> int:
@@ -225,12 +224,19 @@ def _verdict(args: argparse.Namespace, answers: dict[str, dict[str, object]], na
     return ExitCode.CHECK_FAILED if refused or missing else ExitCode.DONE
 
 
-PORT = 8470
-
-
 def _add_page(parser: Parser) -> None:
     """Adds the page's options, and those that say where its data come from."""
-    _add_server(parser, PORT)
+    option(parser, "--port N", f"(default: {PORT}; 0: any)", port_number, default=PORT)
+    option(
+        parser,
+        "--listen ADDRESS",
+        f"of the server, such as 0.0.0.0 for other computers too (default: {HERE})",
+        _ip_address,
+        default=HERE,
+        dest="server_address",
+    )
+    option(parser, "--recordings FOLDER", "show the recordings in it on one time line, not telemetry", Path)
+    add_endpoint_options(parser, "--drones-at")
     flag(parser, "--watch-only", "the page passes no command on")
     option(
         parser,
@@ -247,7 +253,7 @@ def _show_page(args: argparse.Namespace) -> int:
     import aiohttp.web  # noqa: F401 - before anything is opened: it is of an extra
 
     with ExitStack() as stack:
-        source = open_source(args, stack)
+        source = _open_source(args, stack)
         with suppress(KeyboardInterrupt):
             asyncio.run(_serve(args, source))
     return ExitCode.DONE
@@ -260,11 +266,7 @@ async def _serve(args: argparse.Namespace, source: FleetSource) -> None:
     access = PageAccess(None if args.key_file is None else lasting_key(args.key_file))
     page = PageServer(source, access, may_command=not args.watch_only, operator=args.operator)
 
-    def served(port: int) -> None:
-        sentence = f"the fleet page is at http://{{host}}:{port}/?key={access.key}"
-        announce(args, sentence, "whoever has this address with its key may do what this computer may")
-
-    await serve_page(page, args.server_address, args.port, served)
+    await serve_page(page, args.server_address, args.port, lambda port: announce(args, port, access.key))
 
 
 async def serve_page(page: PageServer, address: str, port: int, served: Callable[[int], None]) -> None:
@@ -297,26 +299,7 @@ async def _listen(connections: PageConnections, address: str, port: int) -> int:
     return bound
 
 
-HERE = "127.0.0.1"
-"""Where it is served unless told otherwise: for this computer alone."""
-
-
-def _add_server(parser: Parser, port: int) -> None:
-    """Where it serves, and where its data come from: telemetry, or recordings."""
-    option(parser, "--port N", f"(default: {port}; 0: any)", port_number, default=port)
-    option(
-        parser,
-        "--listen ADDRESS",
-        f"of the server, such as 0.0.0.0 for other computers too (default: {HERE})",
-        ip_address,
-        default=HERE,
-        dest="server_address",
-    )
-    option(parser, "--recordings FOLDER", "show the recordings in it on one time line, not telemetry", Path)
-    add_endpoint_options(parser, "--drones-at")
-
-
-def open_source(args: argparse.Namespace, stack: ExitStack) -> FleetSource:
+def _open_source(args: argparse.Namespace, stack: ExitStack) -> FleetSource:
     """As the options say; what has to be closed is left to ``stack``."""
     from flockd.fleet.page.live_fleet import LiveFleet
     from flockd.fleet.page.recorded_fleet import RecordedFleet
@@ -334,17 +317,17 @@ def open_source(args: argparse.Namespace, stack: ExitStack) -> FleetSource:
     return stack.enter_context(LiveFleet(stack.enter_context(watcher)))
 
 
-def announce(args: argparse.Namespace, sentence: str, warning: str) -> None:
-    """Says where it is served, once it is.
-
-    ``sentence`` has a place `{host}`; ``warning`` says what those who reach it may do, where other computers can.
-    """
+def announce(args: argparse.Namespace, port: int, key: str) -> None:
+    """Says where it is served, once it is, and where other computers reach it, what they may do."""
     where = ipaddress.ip_address(args.server_address)
     # For all addresses of this computer, the one at which it reaches itself.
     host = HERE if where.is_unspecified else f"[{where}]" if where.version == 6 else str(where)
-    say(sentence.format(host=host))
+    say(f"the fleet page is at http://{host}:{port}/?key={key}")
     if not where.is_loopback:
-        complain(f"{warning}; it travels unencrypted, so use a network that you trust")
+        complain(
+            "whoever has this address with its key may do what this computer may; it travels unencrypted, so use a "
+            "network that you trust"
+        )
         say(f"on other computers: the same with this computer's address in the place of {host}")
     if args.recordings is None and not args.connect and not args.drones_at:
         say(
@@ -355,7 +338,7 @@ def announce(args: argparse.Namespace, sentence: str, warning: str) -> None:
     sys.stdout.flush()  # whoever reads a pipe needs the address now
 
 
-def ip_address(text: str) -> str:
+def _ip_address(text: str) -> str:
     """The IP address that an option names, at which something is served."""
     try:
         return str(ipaddress.ip_address(text))

@@ -14,13 +14,14 @@ from flockd.cli.options import loaded
 from flockd.cli.output import noted_table, progress, say, say_json, say_table, tables_console
 from flockd.cli.parser import Commands, Parser, add_commands, flag, option, positive_count, size
 from flockd.core.choices import PROVIDERS, Provider
-from flockd.core.errors import ExitCode, ModelError, UnavailableError
+from flockd.core.errors import ExitCode, ModelError, UnavailableError, UsageError
 
 if TYPE_CHECKING:
     from flockd.core.config import DroneConfig
     from flockd.flight.inference import OnnxModel
 
 THREADS = 2
+LEAST_PX = 32
 RUNS = 9
 """Timed after one run that is not counted."""
 
@@ -135,6 +136,8 @@ class _Timing:
 
 
 def _bench(args: argparse.Namespace) -> int:
+    if min(args.size) < LEAST_PX:
+        raise UsageError(f"--size: networks take images of at least {LEAST_PX}x{LEAST_PX}; name a larger one")
     timings = []
     providers = _providers(args.provider)
     manifests = _manifests(args.dir)
@@ -154,7 +157,6 @@ def _bench(args: argparse.Namespace) -> int:
 
 
 def _providers(text: str | None) -> Sequence[Provider]:
-    from flockd.core.errors import UsageError
     from flockd.flight.inference.providers import available
 
     if text is None:

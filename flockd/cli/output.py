@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import functools
 import json
 import sys
@@ -22,6 +23,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
+from flockd.core.errors import ExitCode
 from flockd.core.printable import printable
 
 PLAIN_LINE_EVERY_S = 10.0
@@ -80,6 +82,16 @@ def cell(text: str) -> str:
 def say_json(value: object) -> None:
     """Writes one JSON document on stdout."""
     say(json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False))
+
+
+def say_result(args: argparse.Namespace, facts: object, *lines: str) -> int:
+    """Writes a command's result: its facts as --json says, or else lines for people."""
+    if args.json:
+        say_json(facts)
+    else:
+        for line in lines:
+            say(line)
+    return ExitCode.DONE
 
 
 @contextmanager

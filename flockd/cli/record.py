@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.options import add_stretch, opened, refuse_existing, stretch
-from flockd.cli.output import cell, say, say_json, say_table
+from flockd.cli.output import cell, say, say_json, say_result, say_table
 from flockd.cli.parser import Commands, Parser, add_commands, flag, option
 from flockd.core.errors import ExitCode, UsageError
 
@@ -111,11 +111,8 @@ def _cut(args: argparse.Namespace) -> int:
 
 def _report_copy(args: argparse.Namespace, recording: Recording, out: Path, steps: int) -> int:
     of = len(recording.contents.steps)
-    if args.json:
-        say_json({"recording": str(args.recording), "out": str(out), "steps": steps, "of_steps": of})
-    else:
-        say(f"{out}: {steps} of {of} steps")
-    return ExitCode.DONE
+    facts = {"recording": str(args.recording), "out": str(out), "steps": steps, "of_steps": of}
+    return say_result(args, facts, f"{out}: {steps} of {of} steps")
 
 
 def _export(args: argparse.Namespace) -> int:
@@ -129,8 +126,5 @@ def _export(args: argparse.Namespace) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     tables = export_tables(recording, args.out, args.format)
     images = export_images(recording, args.out / "images") if args.images else 0
-    if args.json:
-        say_json({"out": str(args.out), "tables": [path.name for path in tables], "images": images})
-    else:
-        say(f"{args.out}: {len(tables)} tables, {images} images")
-    return ExitCode.DONE
+    facts = {"out": str(args.out), "tables": [path.name for path in tables], "images": images}
+    return say_result(args, facts, f"{args.out}: {len(tables)} tables, {images} images")

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from flockd.onboard.recording.reader import Recording
     from flockd.review.replay.dataset_flight import Depth
 
+_OF_RECORDINGS = ("speed", "start", "end", "out", "diff", "reference", "update_reference", "tolerance")
+_OF_DATASETS = ("depth", "stride", "flow", "calibration", "trajectory")
+
 
 def add(commands: Commands) -> None:
     """Adds the command."""
@@ -230,10 +233,6 @@ def _say_result(args: argparse.Namespace, comparison: Comparison | None, result:
         say(f"  {name}: in {len(difference.steps)} of {comparison.steps} steps{size}")
     if args.reference is not None:
         say(f"if this is meant: flockd replay {args.recording} --reference {args.reference} --update-reference")
-
-
-_OF_RECORDINGS = ("speed", "start", "end", "out", "diff", "reference", "update_reference", "tolerance")
-_OF_DATASETS = ("depth", "stride", "flow", "calibration", "trajectory")
 
 
 def _add_dataset(parser: Parser) -> None:

@@ -10,7 +10,7 @@ from zipfile import BadZipFile
 
 from flockd.cli.flight_summary import show_summary
 from flockd.cli.options import opened, refuse, require
-from flockd.cli.output import complain, progress, say, say_json, say_table
+from flockd.cli.output import complain, progress, say, say_json, say_result, say_table
 from flockd.cli.parser import Commands, flag, option
 from flockd.core.errors import ExitCode, UsageError
 
@@ -124,11 +124,8 @@ def _video(args: argparse.Namespace) -> int:
     with progress("writing the video", "steps") as tell_progress:
         count = write_video(args.video, log, drone, moments, tell_progress)
     seconds = count * log.metadata.step_s
-    if args.json:
-        say_json({"video": str(args.video), "frames": count, "seconds": seconds})
-    else:
-        say(f"{args.video}: {count} frames, {seconds:g} s")
-    return ExitCode.DONE
+    facts = {"video": str(args.video), "frames": count, "seconds": seconds}
+    return say_result(args, facts, f"{args.video}: {count} frames, {seconds:g} s")
 
 
 def _moments(args: argparse.Namespace, log: FlightLog, recordings: Sequence[Recording]) -> tuple[int, Iterator[Moment]]:

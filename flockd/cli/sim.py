@@ -56,6 +56,21 @@ OPTIONS = {
     "cameras": "cameras.preset",
 }
 """Which key of the configuration an option sets."""
+_NOT_LIVE = {
+    "telemetry": "--live has --telemetry in it; drop one of them",
+    "record": "--live keeps nothing; fly with --record and without --live",
+    "json": "--live has no summary; drop --json",
+    "out": "--live writes nothing; drop --out",
+    "force": "--live writes nothing; drop --force",
+    "autopilot": "--live flies with the simulator's own pilots; drop --autopilot",
+    "duration": "--live flies on until Ctrl-C; drop --duration",
+}
+"""Options that do not go with it, and what to do."""
+SITL = "px4_sitl.yaml"
+DEFAULT_SPEED_FACTOR = 0.25
+"""Two cores then keep up with five drones."""
+SPEED_FACTORS = (0.02, 10.0)
+"""What a daemon's configuration allows."""
 
 
 def add(commands: Commands) -> None:
@@ -343,22 +358,10 @@ def _plain(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_]+", "-", name).strip("-") or "flight"
 
 
-_KEEPS = {
-    "telemetry": "--live has --telemetry in it; drop one of them",
-    "record": "--live keeps nothing; _fly_live with --record and without --live",
-    "json": "--live has no summary; drop --json",
-    "out": "--live writes nothing; drop --out",
-    "force": "--live writes nothing; drop --force",
-    "autopilot": "--live flies with the simulator's own pilots; drop --autopilot",
-    "duration": "--live flies on until Ctrl-C; drop --duration",
-}
-"""Options that do not go with it, and what to do."""
-
-
 def _check_live(args: argparse.Namespace) -> None:
     """Raises UsageError for options that go without --live, or with it, only."""
     if args.live:
-        for option, sentence in _KEEPS.items():
+        for option, sentence in _NOT_LIVE.items():
             if getattr(args, option):
                 raise UsageError(sentence)
     elif args.port is not None or not args.browser:
@@ -469,13 +472,6 @@ def _served(page: PageServer, port: int) -> Iterator[int]:
         thread.join()
 
 
-SITL = "px4_sitl.yaml"
-DEFAULT_SPEED_FACTOR = 0.25
-"""Two cores then keep up with five drones."""
-SPEED_FACTORS = (0.02, 10.0)
-"""What a daemon's configuration allows."""
-
-
 def _check_fleet(args: argparse.Namespace) -> None:
     """Raises UsageError for options that go with the simulator's own pilots, or with daemons, only."""
     if args.autopilot is None:
@@ -521,7 +517,7 @@ def _fly_fleet(args: argparse.Namespace, scenario: ScenarioConfig, directory: Pa
     code = report_flight(directory, flight, args)
     fleet = flight.log.metadata.fleet
     assert fleet is not None
-    faults = [f"{drone} did not _fly_fleet to the end: {why}" for drone, why in fleet.handed_over.items()]
+    faults = [f"{drone} did not fly to the end: {why}" for drone, why in fleet.handed_over.items()]
     faults += [f"the daemon of {drone} ended with exit code {code}" for drone, code in fleet.exit_codes.items() if code]
     for sentence in [*faults, *fleet.notes]:
         complain(f"{sentence}; see {directory / FLEET_LOGS}" if sentence in faults else sentence)

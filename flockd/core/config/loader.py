@@ -12,8 +12,7 @@ from pydantic import BaseModel, ValidationError
 from flockd.core.choices import ROLES
 from flockd.core.config.document import Document, Place, Value, read_document
 from flockd.core.config.drone import DroneConfig
-from flockd.core.config.envelope import outside_envelope
-from flockd.core.config.first_flight import as_flown
+from flockd.core.config.real_drone import as_flown, outside_envelope
 from flockd.core.config.validation_messages import problems_of
 from flockd.core.errors import ConfigError, ConfigProblem
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from flockd.core.config import DroneConfig
 from flockd.core.config.document import key_text
-from flockd.core.config.envelope import beyond_envelope
+from flockd.core.config.real_drone import beyond_envelope
 from flockd.ground.doctor.finding import Finding, passed, warned
 
 

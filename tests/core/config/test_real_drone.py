@@ -11,7 +11,7 @@ import pytest
 
 from flockd.cli import main
 from flockd.core.config import DroneConfig, load_drone, load_real_drone
-from flockd.core.config.envelope import PROVEN_M_S
+from flockd.core.config.real_drone import PROVEN_M_S
 from flockd.core.errors import ConfigError
 
 CONFIG = Path(__file__).parents[3] / "config"

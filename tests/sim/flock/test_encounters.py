@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from flockd.campaign.flight_plan import CASE, Cell, Plan
-from flockd.core.config.envelope import PROVEN_M_S
 from flockd.core.config.mission import MissionParameters
+from flockd.core.config.real_drone import PROVEN_M_S
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.flocking.metrics import closest_distances
 from flockd.sim.flock.exact_states import fly_exact_states
