@@ -28,7 +28,7 @@ LINES = {
     "flockd/review": 4_090,
     "flockd/sim": 12_530,
     "flockd/campaign": 2_420,
-    "flockd/cli": 4_740,
+    "flockd/cli": 4_700,
     "tests": 48_370,
     "tools/checks": 3_780,
     "tools/docs": 970,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_620,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 468}
+FILES = {"flockd": 467}
 NUMBERS_OF_FLIGHT = 529
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
