@@ -72,7 +72,7 @@ class Weave:
             return None
         return (
             f"weave: the drone rises and sinks by {self._unlike[-1]:.0%} of what it should, and weaves no more; "
-            "its autopilot should follow heights as theirs do (PX4: MPC_Z_P 1.0)"
+            "its autopilot should follow vertical velocities as theirs do"
         )
 
     @property

@@ -17,8 +17,8 @@ DURATION_S = 12.0
 SETTLES_S = 3.0
 """So long afterwards it is still on its way back."""
 HEIGHT_GAIN_PER_S, _ANSWERS_S = 1.0, 0.25
-"""A height controller asks for so much climb for each metre that is missing (PX4's default of MPC_Z_P), which the drone
-takes up with this time constant: it moves by 0.34 m up and down. Autopilots differ: `AMPLITUDE_SIGMA`."""
+"""A setpoint asks for so much climb for each metre that is missing, which the drone takes up with this time constant:
+it moves by 0.34 m up and down. Autopilots differ: `AMPLITUDE_SIGMA`."""
 AMPLITUDE_SIGMA = 0.06
 """By how much the amplitude of another's weave may differ, as a share: a standard deviation."""
 _TABLE_S = 0.01

@@ -11,7 +11,6 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.safety import GateParameters
 from flockd.flight.safety import link_lost
-from flockd.flight.tracking.weave_path import HEIGHT_GAIN_PER_S
 from flockd.ground.doctor.finding import Finding, Level, failed, failed_from_error, passed, warned
 from flockd.ground.doctor.range_checks import WATCHED_S, judge_range_finder
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware
@@ -28,8 +27,6 @@ CHECKS_S = 2.0
 OLDEST_TRIED = (1, 14)
 """Before PX4 1.14, COM_OBL_RC_ACT held only with a remote control, and COM_OBL_ACT without."""
 LONGEST_LOSS_S = 1.0
-MOST_GAIN_OFF_PER_S = 0.11
-"""Within it a weave is at most 6 % larger or smaller, as those who see it reckon with."""
 
 
 def check_autopilot(config: DroneConfig, heard_s: float = HEARD_S) -> Iterator[Finding]:
@@ -279,18 +276,6 @@ def judge_collision_prevention(value: float, config: DroneConfig) -> Finding:
     return passed(name, f"{value:g}: PX4 stops no pilot before obstacles")
 
 
-def judge_height_gain(value: float, config: DroneConfig) -> Finding:
-    """MPC_Z_P, in 1/s: by it others know how far a drone moves that weaves (`tracking.weave_path`)."""
-    name = "MPC_Z_P"
-    if config.flocking.size == "off":
-        return passed(name, f"{value:g}: nobody weaves (flocking.size)")
-    if abs(value - HEIGHT_GAIN_PER_S) <= MOST_GAIN_OFF_PER_S:
-        return passed(name, f"{value:g}: a weave moves the drone as far as the others take it to")
-    measured = f"{value:g}: a weave moves the drone otherwise than the others take it to, who then judge ranges wrong"
-    fix = f"set {name} to {HEIGHT_GAIN_PER_S:g} on every drone of the fleet, or flocking.size to off"
-    return warned(name, measured, fix)
-
-
 def _judge_limit(name: str, value: float, own_m: float | None, what: str) -> Finding:
     """PX4's limit should lie a little outside flockd's own, as a second line."""
     outside = "where it must never fly" if own_m is None else f"{1.2 * own_m:.0f} m, a little outside flockd's own"
@@ -328,5 +313,4 @@ PARAMETERS = {
     "GF_MAX_HOR_DIST": Parameter(float, judge_fence_radius),
     "GF_MAX_VER_DIST": Parameter(float, judge_fence_height),
     "CP_DIST": Parameter(float, judge_collision_prevention),
-    "MPC_Z_P": Parameter(float, judge_height_gain),
 }

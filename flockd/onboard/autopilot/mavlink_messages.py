@@ -269,9 +269,11 @@ class ReceivedMessages:
         """Down from the estimator's origin; None: not known yet."""
         return None if self._home is None else float(self._home[2])
 
-    def down_m(self, height_m: float) -> float:
-        """Down in the autopilot's own frame, of a height above home."""
-        return (self.home_down_m or 0.0) - height_m - float(self._frame.offset[2])
+    @property
+    def height_m(self) -> float:
+        """Above home as the newest position says; NaN before the first."""
+        place = _vector(self._fields("LOCAL_POSITION_NED"), "x", "y", "z")
+        return math.nan if place is None else float((self.home_down_m or 0.0) - place[2])
 
     def _without_jumps(self, name: str, fields: Fields) -> Fields:
         """The same with a position in a frame that does not jump in flight."""

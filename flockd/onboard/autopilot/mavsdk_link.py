@@ -33,6 +33,7 @@ from mavsdk.system import System
 from flockd.core import services
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.messages import FloatArray, RangeReading, Setpoint, VehicleState
+from flockd.flight.tracking.weave_path import HEIGHT_GAIN_PER_S
 from flockd.onboard.autopilot.autopilot_status import (
     MODES,
     AutopilotError,
@@ -52,8 +53,8 @@ T = TypeVar("T")
 Clock = Callable[[], float]
 
 AUTOPILOT_COMPONENT = 1
-SETPOINT_TYPE_MASK = 2531
-"""SET_POSITION_TARGET_LOCAL_NED: velocity in x and y, position in z, and yaw; the rest is ignored."""
+SETPOINT_TYPE_MASK = 2503
+"""SET_POSITION_TARGET_LOCAL_NED: velocity and yaw; the rest is ignored."""
 MAV_FRAME_LOCAL_NED = 1
 MAV_FRAME_BODY_FRD = 12
 """Of OBSTACLE_DISTANCE: PX4 1.18 lets the last of several sectors win that overlap one of its own, which are those of
@@ -355,9 +356,13 @@ class AutopilotLink:
         return [self._reports.popleft() for _ in range(len(self._reports))]
 
     def send_setpoint(self, setpoint: Setpoint) -> None:
-        """Sends it, once. Raises AutopilotError when it is not finite or MAVSDK cannot send it."""
+        """Sends it, once. Raises AutopilotError when it is not finite or MAVSDK cannot send it.
+
+        The height is asked for as a vertical velocity: PX4's frame may jump, and a height of the old frame, sent
+        once too often, makes PX4 climb or sink by as much.
+        """
         north, east = (float(v) for v in setpoint.velocity)
-        down = self._received.down_m(setpoint.height_m)
+        down = HEIGHT_GAIN_PER_S * (self._received.height_m - setpoint.height_m)
         if not all(math.isfinite(number) for number in (north, east, down, setpoint.yaw_rad)):
             raise AutopilotError("a setpoint that is not finite was not sent")
         fields = {
@@ -366,10 +371,10 @@ class AutopilotLink:
             "type_mask": SETPOINT_TYPE_MASK,
             "vx": north,
             "vy": east,
-            "z": down,
+            "vz": down,
             "yaw": setpoint.yaw_rad,
         }
-        unused = dict.fromkeys(("x", "y", "vz", "afx", "afy", "afz", "yaw_rate"), 0.0)
+        unused = dict.fromkeys(("x", "y", "z", "afx", "afy", "afz", "yaw_rate"), 0.0)
         try:
             self._direct.send_message(self._message("SET_POSITION_TARGET_LOCAL_NED", {**unused, **fields}))
         except MavlinkDirectError as error:

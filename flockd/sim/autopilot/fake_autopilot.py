@@ -38,14 +38,14 @@ from flockd.sim.autopilot.fake_telemetry import (
     custom_mode,
     mode_by_number,
 )
-from flockd.sim.autopilot.fake_vehicle import Demand, Drift, Motion, MotionState, PointMass
+from flockd.sim.autopilot.fake_vehicle import Asked, Demand, Drift, Motion, MotionState, PointMass
 from flockd.sim.autopilot.sticks import StickOverride, stick_curve
 
 TICK_S = 0.02
 MAX_STEP_S = 0.2
 """After a longer pause of this computer the vehicle has stood still."""
-TYPE_MASK = 2531
-"""The one kind of setpoint it takes: horizontal velocity, height and yaw."""
+TYPE_MASK = 2503
+"""The one kind of setpoint it takes: velocity and yaw."""
 DISARM_AFTER_LANDING_S = 2.0
 ARRIVED_M = 0.3
 STICKS_FRESH_S = 0.5
@@ -127,11 +127,10 @@ class FakeAutopilot:
             "MAN_DEADZONE": 0.1,
             "MAN_OVERRIDE_SPD": 1.0,
             "CP_DIST": -1.0,
-            "MPC_Z_P": 1.0,
             "MPC_XY_VEL_MAX": 12.0,
         }
         """An int is an INT32 parameter, a float a REAL32 one."""
-        self.setpoints: deque[tuple[float, Demand]] = deque(maxlen=MAX_SETPOINTS_KEPT)
+        self.setpoints: deque[tuple[float, Asked]] = deque(maxlen=MAX_SETPOINTS_KEPT)
         """When each came by the kernel's stamp, on ``clock`` times the speed factor, and what it said."""
         self.refused_setpoints = 0
 
@@ -401,7 +400,8 @@ class FakeAutopilot:
         """The newest setpoint, no faster than may be flown."""
         asked = self.setpoints[-1][1]
         speed_m_s, most_m_s = float(np.linalg.norm(asked.velocity)), self.parameters["MPC_XY_VEL_MAX"]
-        return replace(asked, velocity=asked.velocity * (most_m_s / max(speed_m_s, most_m_s)))
+        down_m = float(self._state.position[2]) + asked.sink_m_s  # the vehicle flies a metre that is missing at 1 m/s
+        return Demand(asked.velocity * (most_m_s / max(speed_m_s, most_m_s)), down_m, asked.yaw_rad)
 
     def _by_hand(self) -> FloatArray:
         """(2,) m/s north and east that the sticks ask for; level, and at rest once they are not heard any more."""
@@ -460,13 +460,12 @@ class FakeAutopilot:
                 pass
 
     def _take_setpoint(self, message: Any, arrived_s: float) -> None:
-        numbers = (message.vx, message.vy, message.z, message.yaw)
+        numbers = (message.vx, message.vy, message.vz, message.yaw)
         if message.type_mask != TYPE_MASK or message.coordinate_frame != 1 or not np.isfinite(numbers).all():
             self.refused_setpoints += 1
             return
-        down_m, yaw_rad = message.z - self.frame_off[2], message.yaw - self.heading_off_rad
-        demand = Demand(np.array([message.vx, message.vy]), down_m=down_m, yaw_rad=yaw_rad)
-        self.setpoints.append((arrived_s, demand))
+        asked = Asked(np.array([message.vx, message.vy]), message.vz, message.yaw - self.heading_off_rad)
+        self.setpoints.append((arrived_s, asked))
 
     def _obey(self, command: int, message: Any) -> int:
         done: bool

@@ -26,6 +26,16 @@ class Demand:
 
 
 @dataclass(frozen=True, eq=False)
+class Asked:
+    """What a setpoint asks for."""
+
+    velocity: FloatArray
+    """(2,) m/s, north and east."""
+    sink_m_s: float
+    yaw_rad: float
+
+
+@dataclass(frozen=True, eq=False)
 class MotionState:
     """Where the vehicle is, in NED with the ground at 0."""
 

@@ -223,11 +223,11 @@ class GroundStation:
             vehicle.mav.param_set_send(vehicle.number + 1, 1, name.encode(), wire, kind)
 
     def send_velocity(self, number: int, velocity: FloatArray) -> None:
-        """Sends a setpoint once, as flockd does: a velocity (2,) m/s north and east, at a height of 4 m."""
+        """Sends a setpoint once, as flockd does: a velocity (2,) m/s north and east, level."""
         vehicle = self._vehicles[number]
         with self._lock:
             vehicle.mav.set_position_target_local_ned_send(
-                0, vehicle.number + 1, 1, 1, 2531, 0, 0, -4.0, *velocity, 0, 0, 0, 0, 0, 0
+                0, vehicle.number + 1, 1, 1, 2503, 0, 0, 0, *velocity, 0, 0, 0, 0, 0, 0
             )
 
     def _command(self, vehicle: _Vehicle, command: int, *numbers: float) -> None:

@@ -36,7 +36,6 @@ GOOD: dict[str, float | int] = {
     "GF_MAX_HOR_DIST": 60.0,
     "GF_MAX_VER_DIST": 15.0,
     "CP_DIST": -1.0,
-    "MPC_Z_P": 1.0,
 }
 """For the quadrotor's own fence of 50 m and 10 m of height."""
 QUESTIONS = {511, 512, 401}
@@ -208,8 +207,6 @@ def test_no_autopilot_is_only_for_the_simulator() -> None:
         ("GF_MAX_VER_DIST", 12.0, Level.PASS),
         ("CP_DIST", -1.0, Level.PASS),
         ("CP_DIST", 2.0, Level.WARNING),
-        *[("MPC_Z_P", value, Level.PASS) for value in (0.9, 1.0, 1.1)],
-        *[("MPC_Z_P", value, Level.WARNING) for value in (0.7, 1.5)],  # a weave is 20 % smaller and larger
     ],
 )
 def test_what_is_made_of_each_value(name: str, value: float, level: Level) -> None:
@@ -225,12 +222,6 @@ def test_collision_prevention_is_on_where_flockd_sends_for_it(value: float, leve
     sending = config.autopilot.model_copy(update={"obstacle_distance": True})
     finding = PARAMETERS["CP_DIST"].judge(value, config.model_copy(update={"autopilot": sending}))
     assert (finding.about, finding.level) == ("CP_DIST", level)
-
-
-def test_where_nobody_weaves_any_gain_of_height_is_well() -> None:
-    config = _config(14540)
-    still = config.model_copy(update={"flocking": config.flocking.model_copy(update={"size": "off"})})
-    assert PARAMETERS["MPC_Z_P"].judge(0.5, still).level is Level.PASS
 
 
 def test_a_fence_with_corners_reaches_as_far_as_the_farthest_inside_the_circle() -> None:

@@ -104,7 +104,7 @@ class Foreigner:
         north, east = self._velocity
         sender = mavlink.MAVLink(self, srcSystem=255, srcComponent=190)
         while not self._closing.wait(0.05 / calm.SPEED_FACTOR):
-            sender.set_position_target_local_ned_send(0, 1, 1, 1, 2531, 0, 0, -2.5, north, east, 0, 0, 0, 0, 0, 0)
+            sender.set_position_target_local_ned_send(0, 1, 1, 1, 2503, 0, 0, 0, north, east, 0, 0, 0, 0, 0, 0)
             self.sent += 1
 
     def write(self, data: bytes) -> None:

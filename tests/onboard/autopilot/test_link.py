@@ -37,11 +37,11 @@ def _parameters(address: str, system_id: int | None = 1) -> AutopilotParameters:
     return AutopilotParameters(address=address, system_id=system_id)
 
 
-def test_the_type_mask_says_horizontal_velocity_height_and_yaw() -> None:
+def test_the_type_mask_says_velocity_and_yaw() -> None:
     ignored = (
         mavlink.POSITION_TARGET_TYPEMASK_X_IGNORE
         | mavlink.POSITION_TARGET_TYPEMASK_Y_IGNORE
-        | mavlink.POSITION_TARGET_TYPEMASK_VZ_IGNORE
+        | mavlink.POSITION_TARGET_TYPEMASK_Z_IGNORE
         | mavlink.POSITION_TARGET_TYPEMASK_AX_IGNORE
         | mavlink.POSITION_TARGET_TYPEMASK_AY_IGNORE
         | mavlink.POSITION_TARGET_TYPEMASK_AZ_IGNORE

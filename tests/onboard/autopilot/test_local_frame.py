@@ -91,13 +91,13 @@ def test_heights_above_home_and_setpoints_go_on_through_a_jump_and_start_anew_on
     air = "EXTENDED_SYS_STATE", {"landed_state": 2}
     for name, fields in (_home(-1.0), armed, air, attitude, _position(1000, -6.0)):
         received.add(name, fields, 0.0)
-    assert received.down_m(5.0) == -6.0
+    assert received.height_m == 5.0
     for down_m in (-6.0, 24.0, 24.0):  # the origin is set 30 m higher
         received.add(*_position(1033, down_m), 1.0)
         vehicle = received.vehicle_state()
         assert vehicle is not None
         assert vehicle.height_m == pytest.approx(5.0)
-    assert received.down_m(5.0) == pytest.approx(24.0)
+    assert received.height_m == pytest.approx(5.0)
     assert received.status(1.0).frame_jumped
     received.add(*_home(-1.0), 1.1)  # as PX4 goes on saying
     received.add(*_home(29.0), 1.2)  # and as another may
@@ -106,4 +106,5 @@ def test_heights_above_home_and_setpoints_go_on_through_a_jump_and_start_anew_on
     assert not received.status(2.0).frame_jumped, "the autopilot holds"
     received.add("HEARTBEAT", {"base_mode": 0, "custom_mode": 4 << 16 | 3 << 24}, 3.0)
     received.add("EXTENDED_SYS_STATE", {"landed_state": 1}, 3.0)
-    assert (received.home_down_m, received.down_m(0.0)) == (29.0, 29.0)
+    received.add(*_position(1066, 24.0), 3.1)
+    assert (received.home_down_m, received.height_m) == (29.0, 5.0)

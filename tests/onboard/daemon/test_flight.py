@@ -51,8 +51,8 @@ async def test_from_the_ground_into_the_air_and_back_into_the_pilots_hands(tmp_p
                 fake_autopilot.state.velocity[:2], [SPEED_M_S, 0.0], atol=0.2
             )  # north: Eq. 43 at 0 s
             assert -float(fake_autopilot.state.position[2]) == pytest.approx(height_m, abs=0.2)
-            sent_m = [-sent.down_m for _, sent in list(fake_autopilot.setpoints)[-5:]]
-            np.testing.assert_allclose(sent_m, height_m, atol=0.1)
+            sunk_m_s = [sent.sink_m_s for _, sent in list(fake_autopilot.setpoints)[-5:]]
+            np.testing.assert_allclose(sunk_m_s, 0.0, atol=0.1)
             _tells_what_it_does(ship.heard())
             assert ship.service.count("WATCHDOG=1") >= 4
 
@@ -184,7 +184,6 @@ async def test_a_second_sender_with_the_autopilots_ids_moves_neither_height_band
     async with aboard(fake_autopilot, port, tmp_path) as ship:
         await ship.is_ready_in_the_air()
         await ship.flies()
-        held_m = fake_autopilot.setpoints[-1][1].down_m
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
             forged = mavlink.MAVLink(_Sender(wire, port), srcSystem=1, srcComponent=1)
             for _ in range(10):
@@ -196,7 +195,7 @@ async def test_a_second_sender_with_the_autopilots_ids_moves_neither_height_band
         assert not {"fence_left", "heights_left"} & ship.matters()
         assert ship.state() in {"normal", "degraded"}
         assert fake_autopilot.mode == "OFFBOARD"
-        assert fake_autopilot.setpoints[-1][1].down_m == pytest.approx(held_m, abs=0.01)
+        assert fake_autopilot.setpoints[-1][1].sink_m_s == pytest.approx(0.0, abs=0.05)
 
 
 class _Sender:
