@@ -109,7 +109,7 @@ class DroneConfig(Section):
         for number, name in enumerate(devices):
             if name not in rig:
                 faults["source", "cameras", number, "name"] = (
-                    f"{name} is no camera of the rig, which has {', '.join(rig)}"
+                    f"{name} is no camera of the rig; write one of {', '.join(rig)}"
                 )
             elif name in devices[:number]:
                 faults["source", "cameras", number, "name"] = f"{name} has an entry already; keep one"

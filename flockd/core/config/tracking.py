@@ -102,6 +102,6 @@ class TrackingParameters(Section):
         if not self.drop_probability <= self.keep_probability <= self.confirm_probability:
             raise ValueError(
                 "drop_probability, keep_probability and confirm_probability must not decrease in this order, "
-                f"as {self.drop_probability:g}, {self.keep_probability:g}, {self.confirm_probability:g} do"
+                f"as {self.drop_probability:g}, {self.keep_probability:g}, {self.confirm_probability:g} do; sort them"
             )
         return self

@@ -455,20 +455,10 @@ def test_what_is_wrong_with_a_camera_is_told_at_its_own_line(tmp_path: Path) -> 
     quadrotor = (CONFIG / "quadrotor.yaml").read_text(encoding="utf-8")
     rig, source, rest = quadrotor.partition("\nsource:")
     line = 1 + (rig + source + rest[: rest.index("- name: back")]).count("\n")
-    twice = 1 + rig[: rig.index("- name: right")].count("\n")
-    slips = {
-        rig + source + rest.replace("- name: back", "- name: bak", 1): f"{line}: source.cameras[2].name: "
-        "bak is no camera of the rig, which has front, right, back, left",
-        rig + source + rest.replace("- name: back", "- name: left", 1): "source.cameras[3].name: left has an entry",
-        rig.replace("- name: right", "- name: front")
-        + source
-        + rest: f"{twice}: rig.cameras[1].name: two cameras share",
-        quadrotor.replace(
-            "usb-0:2:1.0", "usb-0:1:1.0"
-        ): "source.cameras[1].device: two cameras share /dev/v4l/by-path/",
-    }
-    for text, told in slips.items():
-        (tmp_path / "drone.yaml").write_text(text, encoding="utf-8")
-        with pytest.raises(ConfigError) as refused:
-            load_drone(tmp_path / "drone.yaml")
-        assert told in str(refused.value)
+    for text, told in (
+        (rig + source + rest.replace("- name: back", "- name: bak", 1), f"{line}: source.cameras[2].name"),
+        (rig + source + rest.replace("- name: back", "- name: left", 1), "source.cameras[3].name"),
+        (rig.replace("- name: right", "- name: front") + source + rest, "rig.cameras[1].name"),
+        (quadrotor.replace("usb-0:2:1.0", "usb-0:1:1.0"), "source.cameras[1].device"),
+    ):
+        assert any(told in place for place in _places(_drone_problems(tmp_path, text)))

@@ -159,7 +159,7 @@ def test_slips_inside_the_optional_section_are_reported_with_what_to_do(tmp_path
     [
         (
             "source:\n  kind: v4l2\n" + TWO.replace("back", "rear"),
-            "drone.yaml:9: source.cameras[1].name: rear is no camera of the rig, which has front, back",
+            "drone.yaml:9: source.cameras[1].name: rear is no camera of the rig; write one of front, back",
         ),
         (
             "source:\n  kind: v4l2\n",
