@@ -133,7 +133,6 @@ class VerificationTask(Task):
 
     def batch_samples(self, rng: Generator) -> list[Sample]:
         """As many of each kind as ``CROPS`` says."""
-        self.rendered.look_for_more()
         of_kind = {
             "rendered": self._rendered, "composite": self._composite, "real drone": self._real_drone,
             "negative": self._negative,

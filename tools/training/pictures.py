@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -21,6 +21,7 @@ from tools.training.dataset import MAX_FAMILIES, PairSet
 from tools.training.samples import Sample
 
 Image = NDArray[np.uint8]
+One = TypeVar("One")
 Boxes = NDArray[np.float32]
 Named = tuple[str, float, float, float, float]
 """What something is, and left, top, right, bottom in pixels."""
@@ -38,8 +39,6 @@ _SOLID = 64
 _SCALES = (0.35, 1.4)
 """A photograph is resized by, unless it would not fill the picture then."""
 _IN_MEMORY = 6000
-_LOOK_EVERY = 200
-"""Calls between two looks into the folder."""
 _AIMED_SHARE = 0.6
 """At least so many of the drones are in the middle and fill their crop: the last crop of a drone is what counts."""
 _NONE_SHARE = 0.08
@@ -95,22 +94,33 @@ def pictures_in(folder: Path) -> list[tuple[str, str, list[Named]]]:
     return [(one["file_name"], folder.name, boxes[one["id"]]) for one in coco["images"]]
 
 
+class _ByCategory(Generic[One]):
+    """Things, of each category as often as the root of its number says."""
+
+    def __init__(self, things: Iterable[tuple[str, One]]) -> None:
+        by_category = defaultdict[str, list[One]](list)
+        for category, one in things:
+            by_category[category].append(one)
+        self._groups = list(by_category.values())
+        roots = np.sqrt([len(ones) for ones in self._groups])
+        self._shares = roots / roots.sum()
+
+    def draw(self, rng: Generator) -> One:
+        """Any of them."""
+        ones = self._groups[int(rng.choice(len(self._shares), p=self._shares))]
+        return ones[int(rng.integers(len(ones)))]
+
+
 class Photographs:
     """Pictures of everything without drones, of each category as often as the root of its number says."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        by_category = defaultdict(list)
-        for name, category, boxes in pictures_in(folder):
-            by_category[category].append((name, boxes))
-        self._by_category = list(by_category.values())
-        roots = np.sqrt([len(ones) for ones in self._by_category])
-        self._shares = roots / roots.sum()
+        self._pictures = _ByCategory((category, (name, boxes)) for name, category, boxes in pictures_in(folder))
 
     def draw_whole(self, rng: Generator) -> tuple[Image, list[Named]]:
         """Any of them, and what flies in it."""
-        ones = self._by_category[int(rng.choice(len(self._shares), p=self._shares))]
-        name, boxes = ones[int(rng.integers(len(ones)))]
+        name, boxes = self._pictures.draw(rng)
         return read(self._folder / name), boxes
 
     def draw(self, size: int, rng: Generator) -> Scene:
@@ -122,23 +132,20 @@ class Proposals:
     """What `tools.training.mine` found in folders of pictures, of each category as often as the root of its number."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
-        by_category: dict[str, list[tuple[Path, tuple[float, ...]]]] = defaultdict(list)
+        found: list[tuple[str, tuple[Path, tuple[float, ...]]]] = []
         for folder in folders:
             if not (folder / PROPOSALS).is_file():
                 raise FileNotFoundError(f"{folder}: has no {PROPOSALS}; make it with `python -m tools.training.mine`")
             for line in (folder / PROPOSALS).read_text(encoding="utf-8").splitlines():
                 one = json.loads(line)
-                by_category[one["category"]] += [(folder / one["file"], tuple(box)) for box in one["boxes"]]
-        self._by_category = [ones for ones in by_category.values() if ones]
-        if not self._by_category:
+                found += [(one["category"], (folder / one["file"], tuple(box))) for box in one["boxes"]]
+        if not found:
             raise ValueError(f"{', '.join(map(str, folders))}: nothing was proposed in these pictures")
-        roots = np.sqrt([len(ones) for ones in self._by_category])
-        self._shares = roots / roots.sum()
+        self._found = _ByCategory(found)
 
     def draw(self, rng: Generator) -> tuple[Image, tuple[float, ...]]:
         """The picture of one, and its box there."""
-        ones = self._by_category[int(rng.choice(len(self._shares), p=self._shares))]
-        path, box = ones[int(rng.integers(len(ones)))]
+        path, box = self._found.draw(rng)
         return read(path), box
 
 
@@ -191,58 +198,45 @@ class Worlds:
 
 
 class CropFiles:
-    """Every sample of every file of ``render_drone_crops.py``, in memory."""
+    """Every sample of every file of ``render_drone_crops``, in memory."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._files: dict[Path, Sample] = {}
-        self._ends = np.zeros(0, np.int64)
-        self._of_family: list[NDArray[np.int64]] = []
-        self._aimed_of_family: list[NDArray[np.int64]] = []
-        self._calls = 0
-        self.look_for_more()
-
-    def look_for_more(self) -> None:
-        """Take up files that have appeared; looks only now and then."""
-        self._calls += 1
-        if self._calls % _LOOK_EVERY != 1:
-            return
-        for path in sorted(self._folder.glob("*.npz")):
-            if path not in self._files:
-                with np.load(path) as arrays:
-                    self._files[path] = dict(arrays)
-                if "mask" not in self._files[path]:
-                    raise ValueError(f"{path}: its crops have no masks; make the folder anew")
-        if not self._files:
+        files: list[Sample] = []
+        for path in sorted(folder.glob("*.npz")):
+            with np.load(path) as arrays:
+                files.append(dict(arrays))
+            if "mask" not in files[-1]:
+                raise ValueError(f"{path}: its crops have no masks; make the folder anew")
+        if not files:
             raise FileNotFoundError(
-                f"{self._folder}: no crops here; make them with `python -m tools.training.render_drone_crops`"
+                f"{folder}: no crops here; make them with `python -m tools.training.render_drone_crops`"
             )
-        self._ends = np.cumsum([len(file["drone"]) for file in self._files.values()])
-        family = np.concatenate([np.where(file["drone"] > 0.5, file["family"], -1) for file in self._files.values()])
-        aimed = np.concatenate([is_aimed(file) for file in self._files.values()])
-        names: NDArray[np.int64] = np.unique(family)
-        self._of_family = [np.flatnonzero(family == one) for one in names]
-        self._aimed_of_family = [np.flatnonzero((family == one) & aimed) for one in names]
-        is_none, is_family = names == -1, (names >= 0) & (names < MAX_FAMILIES)
-        of_drones = np.zeros(len(names))
-        for which, of in ((is_family, 1 - worlds.SHAPES_SHARE), (~(is_none | is_family), worlds.SHAPES_SHARE)):
-            of_drones[which] = of / max(1, int(np.count_nonzero(which)))
-        drones = float(of_drones.sum())
-        share = _NONE_SHARE if is_none.any() and drones > 0 else float(is_none.any())
-        self._shares = np.where(is_none, share, (1 - share) * of_drones / max(drones, 1e-9))
+        self._samples = {name: np.concatenate([file[name] for file in files]) for name in files[0]}
+        family = np.where(self._samples["drone"] > 0.5, self._samples["family"], -1)
+        aimed, names = is_aimed(self._samples), np.unique(family)
+        probability = np.zeros(len(family))
+        for name, share in zip(names, _shares_of(names), strict=True):
+            mine = family == name
+            centred = mine & aimed if (mine & aimed).any() else mine
+            for chosen, part in ((mine, 1 - _AIMED_SHARE), (centred, _AIMED_SHARE)):
+                probability[chosen] += share * part / np.count_nonzero(chosen)
+        self._up_to = np.cumsum(probability) / probability.sum()
 
-    def draw(self, rng: np.random.Generator) -> Sample:
+    def draw(self, rng: Generator) -> Sample:
         """Any of them, and now and then what is none: every family as often as any other, however many crops there are
         of it, every shape as any other, and shapes together ``worlds.SHAPES_SHARE`` of the drones."""
-        one = int(rng.choice(len(self._shares), p=self._shares))
-        rows = self._of_family[one]
-        if rng.random() < _AIMED_SHARE and len(self._aimed_of_family[one]):
-            rows = self._aimed_of_family[one]
-        index = int(rows[int(rng.integers(len(rows)))])
-        which = int(np.searchsorted(self._ends, index, side="right"))
-        file = list(self._files.values())[which]
-        row = index - int(self._ends[which])
-        return {name: values[row] for name, values in file.items()}
+        row = int(np.searchsorted(self._up_to, rng.random(), side="right"))
+        return {name: values[row] for name, values in self._samples.items()}
+
+
+def _shares_of(names: NDArray[np.int64]) -> NDArray[np.float64]:
+    """How often each family is drawn, -1 being none and those from ``MAX_FAMILIES`` on shapes; not scaled."""
+    is_none, is_family = names == -1, (names >= 0) & (names < MAX_FAMILIES)
+    shares = np.zeros(len(names))
+    for which, of in ((is_family, 1 - worlds.SHAPES_SHARE), (~(is_none | is_family), worlds.SHAPES_SHARE)):
+        shares[which] = of / max(1, np.count_nonzero(which))
+    shares[is_none] = _NONE_SHARE / (1 - _NONE_SHARE) * shares.sum() if shares.any() else 1.0
+    return shares
 
 
 def is_aimed(file: Sample) -> NDArray[np.bool_]:

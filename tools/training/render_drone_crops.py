@@ -3,9 +3,9 @@
     python -m tools.training.render_drone_crops OUT --worlds 300 --scenes 300
     python -m tools.training.render_drone_crops OUT --mesh MY.glb --size-m 0.55 --worlds 40
 
-Only the window of the camera's image that the crops show is drawn. Every drone stands in another place. One file
-a world, which `train distance --crops OUT` takes up as they appear. With --mesh (glTF, STL or OBJ) that drone alone
-flies. With --held-out, in test worlds and with ranges, that drone, or the families that no network learns from.
+Only the window of the camera's image that the crops show is drawn. Every drone stands in another place. One file a
+world. With --mesh (glTF, STL or OBJ) that drone alone flies. With --held-out, in test worlds and with ranges, that
+drone, or the families that no network learns from.
 """
 
 from __future__ import annotations

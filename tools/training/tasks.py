@@ -99,7 +99,7 @@ class NeighboursTask(Task):
 class DistanceTask(Task):
     """Range of the drone in the middle of a crop, and which pixels are its own.
 
-    Drones come from the files of render_drone_crops.py, as many as there are by now. Most of what is no drone is cut
+    Drones come from the files of render_drone_crops.py. Most of what is no drone is cut
     from whole images, into a pool that is renewed a little with every batch: cutting costs more than learning from it.
     """
 
@@ -125,7 +125,6 @@ class DistanceTask(Task):
 
     def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
         """See ``Task``."""
-        self.drones.look_for_more()
         while len(self.no_drones) < self.pool_size:
             self.no_drones.append(self._no_drone(rng))
         for _ in range(self.renewed_in_a_batch):
@@ -206,7 +205,6 @@ class SigmaTask(Task):
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """See ``Task``."""
-        self.drones.look_for_more()
         drawn = self.drones.draw(rng)
         (picture,) = as_filmed([drawn["picture"]], rng)
         return {**drawn, "picture": picture}
