@@ -34,7 +34,6 @@ from flockd.campaign.figures import MEASURES, figures_of
 from flockd.core.choices import SimulatedPerception
 from flockd.core.config.loader import Overrides
 from flockd.core.data import data_path
-from flockd.core.errors import FlockdError
 from flockd.flight.inference.hashes import model_hashes
 from flockd.ground.doctor.computer import Computer
 from flockd.sim.flock.swarm import fly
@@ -135,8 +134,8 @@ def flown(flight: Flight) -> Line:
         scenario = load_scenario(data_path("config") / flight.file, overrides)
         log = fly(scenario, perception=EYES[flight.eyes].perception, processes=0, pictured=False).log
         figures = figures_of(log, FIGURES)
-    except FlockdError as error:
-        reason = str(error)
+    except Exception as error:  # noqa: BLE001 - whatever it is, it is one flight's result
+        reason = f"{type(error).__name__}: {error}"
     who = dict(zip(("scenario", "eyes", "seed"), flight.key, strict=True))
     return {**who, "figures": figures, "wall_s": round(time.monotonic() - begin, 1), "failed": reason}
 
