@@ -34,7 +34,7 @@ LINES = {
     "tools/docs": 970,
     "tools/measure": 1_220,
     "tools/release": 620,
-    "tools/training": 4_620,
+    "tools/training": 4_610,
 }
 """Lines of Python below a folder."""
 FILES = {"flockd": 467}
