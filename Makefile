@@ -42,7 +42,7 @@ test-all: lint ### lint and all tests, those too that take minutes each
 ros: $(ROS_VENV)/ros.installed ### what needs ROS 2: nodes in processes of their own, cameras by topic; with the times it takes
 	$(ROS_VENV)/bin/python -m pytest -m ros -rP tests/fleet/ros tests/onboard/sources tests/tools/release/test_licences.py
 
-faults: $(VENV)/test.installed ### the slow stories of faults, most of a whole daemon, and 20 s of flight from pixels
+faults: $(VENV)/test.installed ### the slow stories of faults, most of a whole daemon, and whole flights: 20 s from pixels, two daemons, PX4's test card
 	$(BIN)/python -m pytest -n 2 -m "slow and (fault or whole_flight) and not browser and not ros" --durations=10
 
 training: $(VENV)/test.installed $(VENV)/train.installed ### the tests of the networks' training, with torch (0.9 GB; with CUDA several)

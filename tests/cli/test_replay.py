@@ -219,7 +219,9 @@ class Flight(NamedTuple):
     log: FlightLog
 
 
-@pytest.fixture(scope="module", params=["dis", "flow"])
+@pytest.fixture(
+    scope="module", params=["dis", pytest.param("flow", marks=[pytest.mark.slow, pytest.mark.whole_flight])]
+)
 def flight(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Flight:
     from flockd.flight.inference.hashes import model_hashes
     from flockd.sim.flock.swarm import fly

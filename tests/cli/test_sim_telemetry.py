@@ -48,6 +48,8 @@ GOAL_NE = (-4.5, -4.0)
 SECONDS_TO_FAIL = 240.0
 
 
+@pytest.mark.slow
+@pytest.mark.whole_flight
 def test_an_order_is_flown_by_sight(tmp_path: Path) -> None:
     """The command as a process: drones that see take an order over telemetry and fly there; Ctrl-C ends it in order."""
     endpoint, out = free_endpoint(), tmp_path / "out"

@@ -60,6 +60,8 @@ def _processes(mark: str) -> dict[int, str]:
     return found
 
 
+@pytest.mark.slow
+@pytest.mark.whole_flight
 def test_two_daemons_fly_from_rendered_frames_and_the_report_is_the_simulators(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

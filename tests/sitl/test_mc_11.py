@@ -274,6 +274,8 @@ STEPS = (
 """What the card asks for, and what a pilot needs beside it, in this order."""
 
 
+@pytest.mark.slow
+@pytest.mark.whole_flight
 @pytest.mark.parametrize(("autopilot", "speed_factor"), [("fake", 2.0), pytest.param("px4", 1.0, marks=PX4)])
 def test_every_step_of_px4s_card_goes_as_it_asks(autopilot: str, speed_factor: float) -> None:
     rows = seen(autopilot, MC_11, speed_factor)
