@@ -234,7 +234,7 @@ def _shares_of(names: NDArray[np.int64]) -> NDArray[np.float64]:
     is_none, is_family = names == -1, (names >= 0) & (names < MAX_FAMILIES)
     shares = np.zeros(len(names))
     for which, of in ((is_family, 1 - worlds.SHAPES_SHARE), (~(is_none | is_family), worlds.SHAPES_SHARE)):
-        shares[which] = of / max(1, np.count_nonzero(which))
+        shares[which] = of / max(1, int(np.count_nonzero(which)))
     shares[is_none] = _NONE_SHARE / (1 - _NONE_SHARE) * shares.sum() if shares.any() else 1.0
     return shares
 
