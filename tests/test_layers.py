@@ -174,7 +174,7 @@ def test_no_drone_reads_telemetry_to_fly() -> None:
 
     assert not shared_memory.PREFIX.startswith(f"{PREFIX.split('/')[0]}/")
     for path in MODULES:
-        if path not in {FRAMES_OVER_ZENOH, *_of("onboard/telemetry", "fleet", "sim/flock/repeater.py")}:
+        if path not in {FRAMES_OVER_ZENOH, *_of("onboard/telemetry", "fleet")}:
             assert "zenoh" not in _libraries(path), path
         text = path.read_text(encoding="utf-8")
         for word, allowed in ZENOH_READERS.items():

@@ -12,9 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from flockd.campaign.campaign_file import Figure as FigureName
-from flockd.campaign.figures import MEASURES
+from flockd.campaign.figures import MEASURES, mean_interval
 from flockd.campaign.flight_plan import CASE
-from flockd.campaign.intervals import mean_interval
 from flockd.campaign.results import Results
 from flockd.campaign.verdicts import Comparison
 from flockd.review.report.style import BAND, DRONE_COLOURS, INK, MUTED, STYLE

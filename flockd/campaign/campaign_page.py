@@ -18,10 +18,9 @@ from flockd.campaign.campaign_figures import (
     parameter_curves,
     shown,
 )
-from flockd.campaign.figures import MEASURES
-from flockd.campaign.intervals import Interval
+from flockd.campaign.conduct import is_known
+from flockd.campaign.figures import MEASURES, Interval
 from flockd.campaign.results import Results, Row
-from flockd.campaign.schedule import is_known
 from flockd.campaign.verdicts import LEVEL, Comparison, Verdict
 from flockd.review.report.figure_files import inline_svg, page_template
 

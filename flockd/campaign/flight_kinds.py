@@ -14,8 +14,7 @@ from functools import lru_cache
 
 from flockd.campaign.campaign_file import Figure, FlightKindName
 from flockd.campaign.figures import Figures, figures_of
-from flockd.campaign.flight_plan import ControlLevel, Run
-from flockd.campaign.recipe import Recipe
+from flockd.campaign.flight_plan import ControlLevel, Recipe, Run
 from flockd.core.choices import SimulatedPerception
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.errors import FlockdError

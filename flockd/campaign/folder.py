@@ -1,7 +1,8 @@
 """The folder of a campaign: every finished flight is in it at once, and it can be gone on with after any end.
 
-`campaign.json` is the plan. A finished task is a file in `parts/`, written beside and renamed; many parts become
-`flights.parquet` and `timings.parquet`, likewise, and are deleted after that. A flight that is in both counts once.
+`campaign.json` is the plan. `flights.jsonl` gets a line for each finished flight; of several of one flight the first
+counts, and a last line that was cut off is none. `flights.parquet` and `timings.parquet` are written from it at the
+end, in order of cells and seeds: the first has what is the same whatever flew it, the second when, where and how long.
 """
 
 from __future__ import annotations
@@ -9,30 +10,35 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
+from pydantic import TypeAdapter, ValidationError
 
-from flockd.campaign.differences import differences
+from flockd import __version__
 from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_plan import Plan, Run
-from flockd.campaign.flight_table import FlightTable, read_table, sync_folder, write_table
-from flockd.core.errors import UsageError
+from flockd.core.errors import UnavailableError, UsageError
 from flockd.core.json_file import read_json
 
 PLAN_NAME = "campaign.json"
+LINES_NAME = "flights.jsonl"
 FLIGHTS_NAME = "flights.parquet"
 TIMINGS_NAME = "timings.parquet"
 REPORT_NAME = "report.html"
 RERUNS = "reruns"
-_PARTS = "parts"
 _LOCK = ".lock"
-_OURS = {PLAN_NAME, FLIGHTS_NAME, TIMINGS_NAME, REPORT_NAME, RERUNS, _PARTS, _LOCK}
-MOST_PARTS = 500
-"""More are merged: a folder of many small files is slow."""
+_OURS = {PLAN_NAME, LINES_NAME, FLIGHTS_NAME, TIMINGS_NAME, REPORT_NAME, RERUNS, _LOCK}
+_FLOWN = TypeAdapter(FlownRun)
+_TIMINGS = "wall_s", "cpu_s", "began", "host", "process"
+"""What differs from one time to the next."""
+_TEXTS = "reason", "networks_sha256"
+"""Columns of text that may be empty in all rows."""
 
 
 class CampaignFolder:
@@ -41,27 +47,23 @@ class CampaignFolder:
     def __init__(self, path: Path, plan: Plan) -> None:
         """Raises UsageError for a folder of another campaign, or with other files."""
         self.path, self._plan = path, plan
-        self._table = FlightTable(plan)
         self._stack = ExitStack()
-        self._parts = 0
         _check(path, plan)
 
     def __enter__(self) -> Self:
         """Makes the folder, and tidies it. Raises UsageError where another process flies it."""
-        (self.path / _PARTS).mkdir(parents=True, exist_ok=True)
-        if (self.path / _LOCK).exists() and not (self.path / _LOCK).is_file():
-            raise UsageError(f"{self.path / _LOCK}: is not an ordinary file; delete it")
+        self.path.mkdir(parents=True, exist_ok=True)
         with ExitStack() as stack:
-            lock = stack.enter_context((self.path / _LOCK).open("w", encoding="utf-8"))
+            lock = stack.enter_context(_ordinary(self.path / _LOCK).open("w", encoding="utf-8"))
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 fault = "another process is flying this campaign; wait, or end that one"
                 raise UsageError(f"{self.path}: {fault}") from None
-            _write_text(self.path / PLAN_NAME, self._plan.to_json())
-            for leftover in [*self.path.glob(".*.part"), *(self.path / _PARTS).glob(".*.part")]:
-                leftover.unlink()
-            self.merge()
+            _write(self.path / PLAN_NAME, self._plan.to_json().encode())
+            lines = stack.enter_context(_ordinary(self.path / LINES_NAME).open("ab"))
+            lines.truncate(sum(map(len, _whole_lines(self.path / LINES_NAME))))
+            self._lines = lines
             self._stack = stack.pop_all()
         return self
 
@@ -70,40 +72,95 @@ class CampaignFolder:
 
     def add(self, flown: Sequence[FlownRun]) -> None:
         """Keeps finished flights: on the disk when this returns."""
-        write_table(self._table.rows(flown), self.path / _PARTS / f"{flown[0].run.name}.parquet")
-        self._parts += 1
-        if self._parts >= MOST_PARTS:
-            self.merge()
+        self._lines.write(b"".join(_FLOWN.dump_json(one) + b"\n" for one in flown))
+        self._lines.flush()
+        os.fsync(self._lines.fileno())
 
-    def merge(self) -> None:
-        """Puts all parts into the two tables, in order of cells and seeds. Raises UnavailableError for other parts."""
-        parts = sorted((self.path / _PARTS).glob("*.parquet"))
-        tables = [self._whole(), *(read_table(part, self._table.schema) for part in parts)]
-        whole = self._table.merged(tables)
-        # Timings first: flights decide what is done, and a kill between the two leaves all parts.
-        write_table(self._table.timings(whole), self.path / TIMINGS_NAME)
-        write_table(self._table.flights(whole), self.path / FLIGHTS_NAME)
-        for part in parts:
-            part.unlink()
-        self._parts = 0
+    def finished(self) -> Iterator[FlownRun]:
+        """The flights that are done. Raises UnavailableError where a line cannot be read."""
+        return iter(flown_in(self.path, self._plan))
 
-    def finished(self, figure: str | None) -> Iterator[tuple[Run, float | None]]:
-        """The flights that are done, each with its value of a figure. Call it before any is added."""
-        columns = ["cell", "number", *([figure] if figure else [])]
-        for row in read_table(self.path / FLIGHTS_NAME, self._table.flights_schema).select(columns).to_pylist():
-            yield Run(row["cell"], row["number"]), row[figure] if figure else None
+    def write_tables(self) -> None:
+        """Writes both tables anew. Raises UnavailableError where a line cannot be read."""
+        flown = flown_in(self.path, self._plan)
+        rows = flight_rows(self._plan, flown)
+        timings = [{**_keys(self._plan, one), **{name: getattr(one, name) for name in _TIMINGS}} for one in flown]
+        for name, table in ((FLIGHTS_NAME, rows), (TIMINGS_NAME, timings)):
+            columns = {column: self._column(column, [row[column] for row in table]) for column in (table or [{}])[0]}
+            sink = pa.BufferOutputStream()
+            pq.write_table(pa.table(columns), sink, compression="zstd")
+            _write(self.path / name, sink.getvalue().to_pybytes())
 
-    def _whole(self) -> pa.Table:
-        """Both files joined. Between writing one and the other: the rows of the shorter one."""
-        flights, timings = self.path / FLIGHTS_NAME, self.path / TIMINGS_NAME
-        if not flights.exists():
-            return self._table.schema.empty_table()
-        done = read_table(flights, self._table.flights_schema)
-        times = read_table(timings, self._table.timings_schema)
-        if len(times) != len(done):
-            known = pa.compute.is_in(times["run"], value_set=done["run"].combine_chunks())
-            times = times.filter(known)
-        return self._table.joined(done, times)
+    def _column(self, name: str, values: Sequence[Any]) -> pa.Array:
+        """Values of one type; those of a parameter that have none in common as JSON."""
+        if name in self._plan.wanted:
+            return pa.array(values, pa.float64())
+        if name in _TEXTS:
+            return pa.array(values, pa.string())
+        kinds = {type(value) for value in values}
+        if kinds <= {int, float} or kinds in ({bool}, {str}):
+            return pa.array(values)
+        return pa.array([value if isinstance(value, str) else json.dumps(value) for value in values])
+
+
+def flown_in(path: Path, plan: Plan) -> list[FlownRun]:
+    """The finished flights of a campaign's folder, in order of cells and seeds.
+
+    Raises UnavailableError where a line cannot be read or is another campaign's.
+    """
+    lines, found = _ordinary(path / LINES_NAME), dict[Run, FlownRun]()
+    for number, line in enumerate(_whole_lines(lines), 1):
+        try:
+            one = _FLOWN.validate_json(line)
+        except ValidationError as error:
+            why = error.errors()[0]["msg"]
+            raise UnavailableError(
+                f"{lines}:{number}: cannot be read ({why}); delete the line, and its flight is flown again"
+            ) from error
+        if not (0 <= one.run.cell < len(plan.cells) and 0 <= one.run.number < plan.config.seeds):
+            raise UnavailableError(f"{lines}:{number}: is a flight of another campaign; delete the line")
+        found.setdefault(one.run, one)
+    return [found[run] for run in sorted(found)]
+
+
+def flight_rows(plan: Plan, flown: Sequence[FlownRun]) -> list[dict[str, Any]]:
+    """One row for each flight, of what is the same whatever flew it."""
+    origin = {
+        "perception": plan.config.perception,
+        "flockd_version": __version__,
+        "numpy_version": np.__version__,
+        "campaign_sha256": plan.sha256,
+    }
+    return [
+        {
+            **_keys(plan, one),
+            **plan.parameters(plan.cells[one.run.cell], one.run.number),
+            "status": "flown" if one.reason is None else "failed",
+            "reason": one.reason,
+            **{figure: one.figures.get(figure) for figure in plan.wanted},
+            **origin,
+            "scenario_sha256": one.scenario_sha256,
+            "networks_sha256": one.networks,
+        }
+        for one in flown
+    ]
+
+
+def _keys(plan: Plan, one: FlownRun) -> dict[str, Any]:
+    run = one.run
+    return {"run": run.name, "cell": run.cell, "number": run.number, "seed": plan.config.seed + run.number}
+
+
+def _whole_lines(path: Path) -> list[bytes]:
+    """The last line is none where a kill has cut it off."""
+    lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
+    return lines[:-1] if lines and not lines[-1].endswith(b"\n") else lines
+
+
+def _ordinary(path: Path) -> Path:
+    if path.exists() and not path.is_file():
+        raise UsageError(f"{path}: is not an ordinary file; delete it")
+    return path
 
 
 def load_plan(path: Path) -> Plan:
@@ -156,14 +213,25 @@ def _check(path: Path, plan: Plan) -> None:
             )
 
 
-def _write_text(path: Path, text: str) -> None:
-    """At once or not at all."""
-    if path.is_file() and path.read_text(encoding="utf-8") == text:
-        return
+def differences(first: Any, second: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
+    """Keys, dotted, whose values differ, each with both values as JSON; of a key that only one has, `null`."""
+    if isinstance(first, Mapping) and isinstance(second, Mapping):
+        for name in dict.fromkeys([*first, *second]):
+            yield from differences(first.get(name), second.get(name), f"{key}.{name}" if key else name)
+    elif json.dumps(first) != json.dumps(second):
+        yield key, json.dumps(first), json.dumps(second)
+
+
+def _write(path: Path, data: bytes) -> None:
+    """At once or not at all, and on the disk."""
     temporary = path.with_name(f".{path.name}.part")
-    with temporary.open("w", encoding="utf-8") as stream:
-        stream.write(text)
+    with temporary.open("wb") as stream:
+        stream.write(data)
         stream.flush()
         os.fsync(stream.fileno())
     temporary.replace(path)
-    sync_folder(path.parent)
+    descriptor = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -13,11 +13,9 @@ from typing import Any
 import numpy as np
 
 from flockd.campaign.campaign_file import Figure
-from flockd.campaign.figures import MEASURES
+from flockd.campaign.figures import MEASURES, Interval, mean_interval
 from flockd.campaign.flight_plan import Plan
-from flockd.campaign.flight_table import FlightTable, read_table
-from flockd.campaign.folder import FLIGHTS_NAME, TIMINGS_NAME, load_plan
-from flockd.campaign.intervals import Interval, mean_interval
+from flockd.campaign.folder import flight_rows, flown_in, load_plan
 from flockd.core.errors import UsageError
 
 Row = Mapping[str, Any]
@@ -32,7 +30,7 @@ class Results:
     path: Path
     plan: Plan
     rows: tuple[Row, ...]
-    """In order of cells and seeds; parameters that are no single value are JSON."""
+    """In order of cells and seeds."""
     core_s: float
     """What all flights took together, of one core."""
 
@@ -40,14 +38,10 @@ class Results:
     def load(cls, path: Path) -> Results:
         """The results in a campaign's folder. Raises UsageError where nothing is in it."""
         plan = load_plan(path)
-        table = FlightTable(plan)
-        if not (path / FLIGHTS_NAME).exists():
+        flown = flown_in(path, plan)
+        if not flown:
             raise UsageError(f"{path}: no flight is finished; run `flockd campaign` first")
-        rows = tuple(read_table(path / FLIGHTS_NAME, table.flights_schema).to_pylist())
-        if not rows:
-            raise UsageError(f"{path}: no flight is finished; run `flockd campaign` first")
-        core_s = sum(read_table(path / TIMINGS_NAME, table.timings_schema)["wall_s"].to_pylist())
-        return cls(path, plan, rows, core_s)
+        return cls(path, plan, tuple(flight_rows(plan, flown)), sum(one.wall_s for one in flown))
 
     @property
     def failures(self) -> tuple[Row, ...]:

@@ -10,10 +10,9 @@ from typing import Any, Literal
 import numpy as np
 
 from flockd.campaign.campaign_file import DRONES, Figure
-from flockd.campaign.differences import differences
-from flockd.campaign.figures import MEASURES
-from flockd.campaign.intervals import Interval, mean_interval
-from flockd.campaign.recipe import merged
+from flockd.campaign.figures import MEASURES, Interval, mean_interval
+from flockd.campaign.flight_plan import merged
+from flockd.campaign.folder import differences
 from flockd.campaign.results import Results
 from flockd.core.errors import UsageError
 from flockd.core.messages import FloatArray

@@ -121,7 +121,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _dry_run(args: argparse.Namespace, plan: Plan, workers: int) -> int:
-    from flockd.campaign.trial import estimate
+    from flockd.campaign.conduct import estimate
 
     with Phases() as phases:
         found = estimate(plan, phases.of("trial flights", "cells"))

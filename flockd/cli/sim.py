@@ -223,8 +223,7 @@ def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespac
         shown = None
         if args.telemetry:
             from flockd.onboard.telemetry.publisher import ZenohTelemetry
-            from flockd.sim.flock.repeater import Repeater
-            from flockd.sim.flock.shown_flock import ShownFlock
+            from flockd.sim.flock.shown_flock import Repeater, ShownFlock
 
             endpoint = args.telemetry_at or ENDPOINT
             zenoh = stack.enter_context(ZenohTelemetry(_plain(scenario.scenario), listen=[endpoint]))
@@ -378,10 +377,8 @@ def _fly_live(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) ->
     from flockd.fleet.simulation import SimulationLink, key_of
     from flockd.fleet.watcher import FleetWatcher
     from flockd.onboard.telemetry.publisher import ZenohTelemetry
-    from flockd.sim.flock.live_controls import LiveControls, answered
-    from flockd.sim.flock.live_flight import fly_live
-    from flockd.sim.flock.repeater import Repeater
-    from flockd.sim.flock.shown_flock import ShownFlock
+    from flockd.sim.flock.live_flight import LiveControls, answered, fly_live
+    from flockd.sim.flock.shown_flock import Repeater, ShownFlock
 
     endpoint = args.telemetry_at or ENDPOINT
     with suppress(KeyboardInterrupt), ExitStack() as stack:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import signal
@@ -21,7 +22,7 @@ from flockd.campaign.conduct import conduct, task_of
 from flockd.campaign.engine import ENGINES, Engine
 from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_plan import Plan, Run
-from flockd.campaign.folder import CampaignFolder
+from flockd.campaign.folder import LINES_NAME, CampaignFolder
 from flockd.core.side_process import with_package
 from tests.campaign.flights import PAPER, Shuffled, campaign_file, flown
 
@@ -160,14 +161,11 @@ def test_20_kills_lose_nothing_and_double_nothing(tmp_path: Path) -> None:
 
 
 def names_in(out: Path) -> set[str]:
-    """Flights that a folder holds, merged or not."""
-    names: set[str] = set()
-    for path in [out / "flights.parquet", *out.glob("parts/*.parquet")]:
-        try:
-            names |= set(pq.read_table(path, columns=["run"], partitioning=None)["run"].to_pylist())
-        except FileNotFoundError:
-            continue  # merged meanwhile, or not there yet
-    return names
+    """Flights that a folder holds."""
+    path = out / LINES_NAME
+    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+    runs = [json.loads(line)["run"] for line in lines if line.endswith("\n")]
+    return {f"c{run['cell']}-s{run['number']}" for run in runs}
 
 
 @pytest.mark.ray

@@ -9,8 +9,7 @@ from random import Random
 
 from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_plan import Plan, Run
-from flockd.campaign.flight_table import FlightTable, write_table
-from flockd.campaign.folder import FLIGHTS_NAME, PLAN_NAME, TIMINGS_NAME, CampaignFolder
+from flockd.campaign.folder import LINES_NAME, PLAN_NAME, CampaignFolder
 from flockd.campaign.results import Results
 from tests.hostile import ROOT, hostile, mutated_bytes, mutated_json, own_errors, put
 
@@ -23,26 +22,20 @@ def test_a_changed_campaign_is_read_or_refused(tmp_path: Path) -> None:
     plan, path = Plan.load(file), tmp_path / "out"
     flown = [FlownRun(Run(cell, number), {"order_tail": 0.9}) for cell in range(2) for number in range(2)]
     with CampaignFolder(path, plan) as campaign:
-        for one in flown[:3]:
-            campaign.add([one])
-        campaign.merge()
+        campaign.add(flown)
     originals = {one.relative_to(path): one.read_bytes() for one in path.rglob("*") if one.is_file()}
     values = json.loads(originals[Path(PLAN_NAME)])
 
     @hostile(5)
     def check(random: Random) -> None:
         shutil.rmtree(path)
-        (path / "parts").mkdir(parents=True)
+        path.mkdir(parents=True)
         for original, data in originals.items():
             (path / original).write_bytes(data)
-        write_table(FlightTable(plan).rows(flown[3:]), path / "parts" / "c1-s1.parquet")
-        name = random.choice((PLAN_NAME, PLAN_NAME, FLIGHTS_NAME, TIMINGS_NAME, "parts/c1-s1.parquet", ".lock"))
+        name = random.choice((PLAN_NAME, PLAN_NAME, LINES_NAME, LINES_NAME, ".lock"))
         if name == PLAN_NAME and random.random() < 0.7:
             changed = json.dumps(mutated_json(random, values)).encode("utf-8", "surrogatepass")
             put(random, path / name, lambda: changed)
-        elif name.endswith("parquet") and random.random() < 0.4:
-            source = random.choice((FLIGHTS_NAME, TIMINGS_NAME))
-            (path / name).write_bytes(originals[Path(source)])
         else:
             content = (path / name).read_bytes() or b"?"
             put(random, path / name, lambda: mutated_bytes(random, content))
@@ -51,6 +44,7 @@ def test_a_changed_campaign_is_read_or_refused(tmp_path: Path) -> None:
             for cell in results.plan.cells[:20]:
                 results.interval("order_tail", [cell.number])
         with own_errors(), CampaignFolder(path, plan) as campaign:
-            list(campaign.finished(None))
+            list(campaign.finished())
+            campaign.write_tables()
 
     check()

@@ -5,9 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 from pathlib import Path
-from typing import Any
 
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -15,8 +13,7 @@ from flockd.campaign.campaign_figures import parameter_curves
 from flockd.campaign.campaign_page import write_campaign_page, write_comparison_page
 from flockd.campaign.flight_kinds import FLIGHT_KINDS, FlightKind
 from flockd.campaign.flight_plan import Plan
-from flockd.campaign.flight_table import FlightTable, write_table
-from flockd.campaign.folder import CampaignFolder
+from flockd.campaign.folder import LINES_NAME, CampaignFolder
 from flockd.campaign.results import Results
 from flockd.campaign.verdicts import compare
 from flockd.cli import main
@@ -39,7 +36,7 @@ def plan(tmp_path: Path) -> Plan:
 
 
 def test_the_same_results_in_any_order_and_after_any_interruption(plan: Plan, tmp_path: Path) -> None:
-    """12 flights; of one folder interrupted twice, and one whose parts are merged all the time."""
+    """12 flights; of one folder interrupted twice."""
     assert flown(plan, tmp_path / "a", Shuffled(1)).flown == 12
     for until in (2, 4):
         with pytest.raises(KeyboardInterrupt):
@@ -52,43 +49,20 @@ def test_the_same_results_in_any_order_and_after_any_interruption(plan: Plan, tm
     assert len(pq.read_table(tmp_path / "b" / "timings.parquet")) == 12
 
 
-def test_a_kill_leaves_what_was_finished(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three flights, killed before they are merged, then in the middle of merging, then before parts are deleted."""
+def test_a_kill_leaves_what_was_finished(plan: Plan, tmp_path: Path) -> None:
+    """Three flights of which the last is cut off as it is written, and before the tables are."""
     path = tmp_path / "out"
-    for files in (0, 1, 2):
-        with monkeypatch.context() as patch:
-            _end_after(patch, files)
-            with pytest.raises((KeyboardInterrupt, InterruptedError)):
-                flown(plan, path, Shuffled(files, until=3))
-    (path / "parts" / ".c0-s0.parquet.part").write_bytes(b"half")
+    with pytest.raises(KeyboardInterrupt):
+        flown(plan, path, Shuffled(1, until=3))
+    lines = (path / LINES_NAME).read_bytes()
+    for name in ("flights.parquet", "timings.parquet"):
+        (path / name).unlink()
+    (path / LINES_NAME).write_bytes(lines[:-9])
+    (path / ".flights.parquet.part").write_bytes(b"half")
     conducted = flown(plan, path, Shuffled(9))
-    assert (conducted.before, conducted.flown) == (3, 9)
+    assert (conducted.before, conducted.flown) == (2, 10)
     rows = pq.read_table(path / "flights.parquet").to_pylist()
     assert [(row["cell"], row["number"]) for row in rows] == [(cell, seed) for cell in (0, 1) for seed in range(6)]
-    assert sorted(entry.name for entry in (path / "parts").iterdir()) == []
-
-
-def _end_after(patch: pytest.MonkeyPatch, files: int) -> None:
-    """Lets merging end after so many of the two files that it writes, once there is something to merge."""
-    merge = CampaignFolder.merge
-
-    def ended(folder: CampaignFolder) -> None:
-        left = files
-
-        def write(table: Any, path: Path) -> None:
-            nonlocal left
-            if left == 0:
-                raise InterruptedError
-            write_table(table, path)
-            left -= 1
-            if left == 0:
-                raise InterruptedError
-
-        if list((folder.path / "parts").iterdir()):
-            patch.setattr("flockd.campaign.folder.write_table", write)
-        merge(folder)
-
-    patch.setattr(CampaignFolder, "merge", ended)
 
 
 def test_a_flight_that_fails_is_a_row_with_its_reason(plan: Plan, tmp_path: Path) -> None:
@@ -177,29 +151,20 @@ def test_a_plan_with_a_number_that_is_none_is_gone_on_with_or_refused_but_never_
         pass
 
 
-@pytest.mark.parametrize("damage", ["other columns", "other types", "no table", "pipe"])
-@pytest.mark.parametrize("name", ["parts/c0-s0.parquet", "flights.parquet", "timings.parquet"])
-def test_a_table_that_is_another_campaigns_is_one_sentence(damage: str, name: str, plan: Plan, tmp_path: Path) -> None:
+@pytest.mark.parametrize("line", [b"word", b"[]", b'{"run": {"cell": 0}}', b'{"run": {"cell": 9, "number": 0}}', None])
+def test_a_line_that_is_no_flight_is_one_sentence(line: bytes | None, plan: Plan, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     flown(plan, folder, Shuffled(1))
-    path = folder / name
-    own = pq.read_table(folder / "timings.parquet")
-    path.unlink(missing_ok=True)
-    match damage:
-        case "other columns":
-            pq.write_table(own.rename_columns([f"x{k}" for k in range(own.num_columns)]), path)
-        case "other types":
-            columns = {"flights": FlightTable(plan).flights_schema, "timings": FlightTable(plan).timings_schema}
-            names = columns.get(path.stem, FlightTable(plan).schema).names
-            pq.write_table(pa.table(dict.fromkeys(names, pa.array(["word"] * len(own)))), path)
-        case "no table":
-            path.write_bytes(b"PAR1 and nothing more")
-        case _:
-            os.mkfifo(path)
-    with pytest.raises(UnavailableError) as refused:
+    path = folder / LINES_NAME
+    if line is None:
+        path.unlink()
+        os.mkfifo(path)
+    else:
+        path.write_bytes(line + b"\n" + path.read_bytes())
+    with pytest.raises((UnavailableError, UsageError)) as refused:
         flown(plan, folder, Shuffled(1))
-    assert str(refused.value).startswith(f"{path}: cannot be read (")
-    assert str(refused.value).endswith("; delete it, and its flights are flown again")
+    assert str(refused.value).startswith(f"{path}:")
+    assert "delete" in str(refused.value)
     assert "\n" not in str(refused.value)
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flockd.campaign.conduct import Schedule
+from flockd.campaign.figures import mean_interval
 from flockd.campaign.flight_plan import Plan, Run
-from flockd.campaign.intervals import mean_interval
-from flockd.campaign.schedule import Schedule
 from flockd.campaign.verdicts import paired_p, unpaired_p
 from tests.campaign.flights import HEAD, campaign_file
 

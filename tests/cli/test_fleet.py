@@ -13,7 +13,7 @@ from flockd.cli import main
 from flockd.cli.fleet import _found
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
-from flockd.sim.sitl.free_ports import free_endpoint
+from flockd.sim.sitl.ports import free_endpoint
 
 ROOT = Path(__file__).parents[2]
 DRONE = """

@@ -23,7 +23,7 @@ from flockd.cli import main
 from flockd.core.config import DroneConfig
 from flockd.core.data import data_path
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from flockd.sim.sitl.free_ports import free_endpoint, free_port
+from flockd.sim.sitl.ports import free_endpoint, free_port
 from tests.onboard.autopilot.conftest import HEARTBEAT_S
 from tests.onboard.daemon.aboard import Cameras, config_for
 from tests.onboard.test_deadline import endless

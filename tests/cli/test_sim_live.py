@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from flockd.cli import main
-from flockd.sim.sitl.free_ports import free_endpoint
+from flockd.sim.sitl.ports import free_endpoint
 
 ROOT = Path(__file__).parents[2]
 RUN = "from flockd.cli import program; program()"

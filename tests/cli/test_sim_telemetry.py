@@ -18,7 +18,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.errors import UnavailableError
 from flockd.fleet.watcher import FleetWatcher
 from flockd.review.flight_log.log import FlightLog
-from flockd.sim.sitl.free_ports import free_endpoint
+from flockd.sim.sitl.ports import free_endpoint
 
 ROOT = Path(__file__).parents[2]
 RUN = "from flockd.cli import program; program()"

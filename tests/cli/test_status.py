@@ -11,7 +11,7 @@ import pytest
 from flockd.fleet.fleet_status import status_rows
 from flockd.fleet.watcher import Heard, Watched
 from flockd.onboard.telemetry.topics import ComputerMessage, FlightMessage
-from flockd.sim.flock.repeater import Repeater
+from flockd.sim.flock.shown_flock import Repeater
 
 NOW_S = 1000.0
 

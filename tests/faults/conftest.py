@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from flockd.sim.sitl.free_ports import free_port
+from flockd.sim.sitl.ports import free_port
 from tests import calm
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.daemon.aboard import Aboard, aboard

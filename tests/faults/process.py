@@ -19,7 +19,7 @@ from flockd.core.messages import UInt8Array
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.sim.sitl.daemons import Daemons
-from flockd.sim.sitl.free_ports import free_endpoint, free_port
+from flockd.sim.sitl.ports import free_endpoint, free_port
 from flockd.sim.sitl.processes import Program
 from tests.make import changed
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M

@@ -17,7 +17,7 @@ import yaml
 from flockd.core.config import DroneConfig
 from flockd.onboard.daemon import DaemonError
 from flockd.onboard.daemon.supervisor_inputs import WallClock
-from flockd.sim.sitl.free_ports import free_endpoint, free_port
+from flockd.sim.sitl.ports import free_endpoint, free_port
 from tests.calm import SPEED_FACTOR, clock
 from tests.faults.conftest import InTheAir
 from tests.faults.process import flying

@@ -19,7 +19,7 @@ from flockd.fleet.fleet_status import status_rows
 from flockd.fleet.page.live_fleet import LiveFleet
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
-from flockd.sim.sitl.free_ports import free_endpoint
+from flockd.sim.sitl.ports import free_endpoint
 from tests.faults.process import Process, flying
 from tests.faults.stories import Reacted
 from tests.fleet.page.test_access import opened, served

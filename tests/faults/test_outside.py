@@ -16,7 +16,7 @@ import zenoh
 
 from flockd.core.config import DroneConfig
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
-from flockd.sim.sitl.free_ports import free_endpoint
+from flockd.sim.sitl.ports import free_endpoint
 from tests.faults.process import Process, flying
 from tests.make import changed
 from tests.onboard.autopilot.flight import until

@@ -27,7 +27,7 @@ from flockd.onboard.daemon.pilot_loop import RigReports
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.reader import Recording
 from flockd.sim.cameras import camera_simulator
-from flockd.sim.cameras.true_rigs import true_rigs
+from flockd.sim.cameras.camera_simulator import true_rigs
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 from tests.faults.stories import Reacted

@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from flockd.core.data import data_path
-from flockd.sim.sitl.free_ports import free_endpoint, free_port
+from flockd.sim.sitl.ports import free_endpoint, free_port
 from tests.faults.process import flying
 from tests.faults.stories import Reacted
 from tests.onboard.autopilot.flight import until

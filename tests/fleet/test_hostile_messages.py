@@ -23,7 +23,7 @@ from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.daemon.operator_orders import OperatorCommands, OperatorRequests
 from flockd.onboard.message_json import from_json
 from flockd.onboard.telemetry.topics import TOPICS
-from flockd.sim.flock.live_controls import LiveControls
+from flockd.sim.flock.live_flight import LiveControls
 from flockd.sim.scenario import load_scenario
 from tests.hostile import ABSURD_TEXTS, absurd, assert_readable, hostile, mutated_bytes, mutated_json, nested
 

@@ -1,15 +1,20 @@
-"""A run of PX4 SITL that leaves nothing behind, and PX4's shell."""
+"""A run of PX4 SITL that leaves nothing behind, PX4's shell, and a ground station that meddles."""
 
 from __future__ import annotations
 
 import os
+import struct
 import subprocess
 from abc import ABC, abstractmethod
 from contextlib import ExitStack
 from typing import Self
 
+from pymavlink.dialects.v20 import development as mavlink
+
 from flockd.core.errors import UnavailableError
+from flockd.core.messages import FloatArray
 from flockd.sim.sitl.autopilots import px4_folder
+from flockd.sim.sitl.ground_station import GroundStation
 
 
 class SitlRun(ABC):
@@ -43,3 +48,34 @@ class SitlRun(ABC):
         )  # fmt: skip
         if done.returncode != 0:
             raise UnavailableError(f"PX4 refused `{' '.join(command)}`: {(done.stdout + done.stderr).strip()}")
+
+
+class Meddler(GroundStation):
+    """A ground station that sets parameters, moves sticks, and sends setpoints of its own."""
+
+    def texts(self, number: int) -> list[str]:
+        """All its STATUSTEXTs so far, whole, in turn: of two at once nobody may read the first while it is the last."""
+        return list(self._vehicles[number].texts)
+
+    def push_sticks(self, number: int, *, forward: int) -> None:
+        """Sends the position of a joystick's sticks once: in the middle but for `forward`, -1000 to 1000."""
+        vehicle = self._vehicles[number]
+        with self._lock:
+            vehicle.mav.manual_control_send(vehicle.number + 1, forward, 0, 500, 0, 0)
+
+    def set_parameter(self, number: int, name: str, value: int | float) -> None:
+        """Sends a parameter: an int for an INT32, a float for a REAL32."""
+        vehicle = self._vehicles[number]
+        kind = mavlink.MAV_PARAM_TYPE_INT32 if isinstance(value, int) else mavlink.MAV_PARAM_TYPE_REAL32
+        # PX4 takes an integer's bytes where MAVLink has a float.
+        wire = struct.unpack("<f", struct.pack("<i", value))[0] if isinstance(value, int) else value
+        with self._lock:
+            vehicle.mav.param_set_send(vehicle.number + 1, 1, name.encode(), wire, kind)
+
+    def send_velocity(self, number: int, velocity: FloatArray) -> None:
+        """Sends a setpoint once, as flockd does: a velocity (2,) m/s north and east, level."""
+        vehicle = self._vehicles[number]
+        with self._lock:
+            vehicle.mav.set_position_target_local_ned_send(
+                0, vehicle.number + 1, 1, 1, 2503, 0, 0, 0, *velocity, 0, 0, 0, 0, 0, 0
+            )

@@ -31,10 +31,10 @@ from flockd.onboard.simulated_time import clock_at
 from flockd.sim.flock.start import with_drones
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.sitl.autopilots import BY_HAND, Autopilots, Px4s, SimulatedAutopilots
-from flockd.sim.sitl.free_ports import free_port
-from flockd.sim.sitl.ground_station import GroundStation
+from flockd.sim.sitl.ports import free_port
 from flockd.sim.sitl.processes import Program
 from tests.onboard.autopilot.pilots_link import PilotsLink
+from tests.sitl.sitl_run import Meddler
 
 HEIGHT_M = 4.0
 NORTH_M_S = 1.0
@@ -119,7 +119,7 @@ class World:
 
     link: PilotsLink
     streamer: SetpointStreamer
-    station: GroundStation
+    station: Meddler
     relay: Relay
     restart: Callable[[], None]
     stack: ExitStack
@@ -317,7 +317,7 @@ async def others_interfere(world: World) -> None:
     await world.saw("NAV_DLL_ACT 0", link.announces, "it does again")
 
 
-async def _stream(station: GroundStation) -> None:
+async def _stream(station: Meddler) -> None:
     while True:
         station.send_velocity(0, np.array([0.0, 3.0]))
         await asyncio.sleep(0.05)
@@ -371,7 +371,7 @@ async def _linked(
     clock = clock_at(speed_factor)
     ports, flockd_port = autopilots.ports[0], free_port()
     relay = stack.enter_context(Relay(ports.offboard, flockd_port))
-    station = stack.enter_context(GroundStation([ports.truth], clock))
+    station = stack.enter_context(Meddler([ports.truth], clock))
     autopilots.start()
     begun = time.monotonic()
     while not station.is_connected(0):

@@ -19,7 +19,7 @@ from flockd.core import services
 from flockd.core.messages import SECTORS, ObstacleRanges
 from flockd.flight.obstacles import free_ahead, nearest_points
 from flockd.onboard.autopilot.mavsdk_link import Severity
-from flockd.sim.sitl.ground_station import GroundStation
+from tests.sitl.sitl_run import Meddler
 from tests.sitl.stories import Row, Stories, World, landing, seen, take_off
 
 GROUND_STATION_PORT = 14550
@@ -39,7 +39,7 @@ async def ready(world: World) -> None:
 
 async def text(world: World) -> None:
     """PX4 forwards it to a ground station's link; the fake has one link for all."""
-    with GroundStation([GROUND_STATION_PORT], world.clock) as ground:
+    with Meddler([GROUND_STATION_PORT], world.clock) as ground:
         await world.until(lambda: bool(ground.mode(0)) or world.station.is_connected(0), "a heartbeat")
         await asyncio.sleep(1.5)  # the autopilot has heard the ground station's heartbeat
         world.link.send_text(TEXT, Severity.WARNING)

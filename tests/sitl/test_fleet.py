@@ -18,8 +18,8 @@ from flockd.cli import main
 from flockd.core.data import data_path
 from flockd.review.flight_log.log import FlightLog
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from flockd.sim.sitl.free_ports import free_port
 from flockd.sim.sitl.ground_station import FULL_STICK_M_S, GroundStation, home_deg
+from flockd.sim.sitl.ports import free_port
 
 SECONDS_TO_START = 120.0
 PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")

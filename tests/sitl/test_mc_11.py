@@ -18,8 +18,8 @@ import pytest
 
 from flockd.core.errors import UnavailableError
 from flockd.core.messages import FloatArray
-from flockd.sim.sitl.free_ports import free_port
 from flockd.sim.sitl.ground_station import Mode
+from flockd.sim.sitl.ports import free_port
 from flockd.sim.sitl.processes import Programs
 from tests.sitl.stories import (
     HEIGHT_M,

@@ -26,7 +26,7 @@ from flockd.review.report.flight_folder import save_flight, write_report_files
 from flockd.sim.flock.start import with_drones
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.sitl.fleet import fly_fleet
-from flockd.sim.sitl.free_ports import free_endpoint
+from flockd.sim.sitl.ports import free_endpoint
 from tools.checks.px4_rows import Order
 from tools.checks.px4_rows import main as px4_rows
 

@@ -28,11 +28,10 @@ from flockd.sim.scenario import ScenarioConfig, load, load_scenario
 from flockd.sim.sitl.autopilots import Autopilots, Ports, Px4s, SimulatedAutopilots
 from flockd.sim.sitl.daemons import Daemons, fleet_configs
 from flockd.sim.sitl.frame_server import FrameServer
-from flockd.sim.sitl.free_ports import free_endpoint
-from flockd.sim.sitl.ground_station import GroundStation
+from flockd.sim.sitl.ports import free_endpoint
 from flockd.sim.sitl.processes import Program, Programs
 from tests.sitl.companion import HEIGHT_M
-from tests.sitl.sitl_run import SitlRun
+from tests.sitl.sitl_run import Meddler, SitlRun
 from tools.checks.soak import small
 
 FRAMES_HZ = 2.0
@@ -153,7 +152,7 @@ class Px4Flight(SitlRun):
         self._px4 = self._stack.enter_context(px4s)
         self._px4.start()
         port = self._px4.ports[0]
-        self.station = self._stack.enter_context(GroundStation([port.truth], self._clock))
+        self.station = self._stack.enter_context(Meddler([port.truth], self._clock))
         self._until(lambda: self.station.is_connected(0), START_S * self._speed_factor, "PX4 sends nothing")
         self.station.request_messages()
         start = self._start_daemon if self._fault.by_daemon else self._start_sender

@@ -29,7 +29,7 @@ from flockd.sim.flock.start import with_drones
 from flockd.sim.scenario import load, load_scenario
 from flockd.sim.sitl.autopilots import Px4s
 from flockd.sim.sitl.daemons import Daemons
-from flockd.sim.sitl.free_ports import free_endpoint
+from flockd.sim.sitl.ports import free_endpoint
 from tests.sitl.sitl_run import SitlRun
 
 FLEET = "reasons"

@@ -41,8 +41,8 @@ from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.sitl.daemons import Daemons
 from flockd.sim.sitl.frame_server import FrameServer
-from flockd.sim.sitl.free_ports import free_endpoint, free_port
 from flockd.sim.sitl.ground_station import Poses
+from flockd.sim.sitl.ports import free_endpoint, free_port
 from tools.measure.bench_daemon import at, of_the_unit
 
 SHRINK = 4

@@ -30,7 +30,7 @@ from flockd.onboard.sources import FramePublisher
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.scenario import load
 from flockd.sim.sitl.daemons import Daemons
-from flockd.sim.sitl.free_ports import free_endpoint, free_port
+from flockd.sim.sitl.ports import free_endpoint, free_port
 
 READY_BAR_S = 3.0
 MEMORY_BAR_MB = 350.0

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flockd.sim.cameras.compression import jpeg
+from flockd.sim.cameras.real_camera import jpeg
 
 Image = NDArray[np.uint8]
 _LEAST_SIDE_PX = 8

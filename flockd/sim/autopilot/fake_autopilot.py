@@ -18,7 +18,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -26,7 +25,6 @@ from pymavlink.dialects.v20 import development as mavlink
 
 from flockd.core.messages import FloatArray
 from flockd.onboard.autopilot.refusal_reasons import CHECKS_FAIL, NO_SETPOINTS
-from flockd.sim.autopilot.collision_prevention import HOLD_S, CollisionPrevention
 from flockd.sim.autopilot.fake_checks import FakeChecks
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.sim.autopilot.fake_telemetry import (
@@ -34,12 +32,11 @@ from flockd.sim.autopilot.fake_telemetry import (
     Mode,
     Outlet,
     TelemetryStreams,
-    VehicleSnapshot,
     custom_mode,
     mode_by_number,
 )
 from flockd.sim.autopilot.fake_vehicle import Asked, Demand, Drift, Motion, MotionState, PointMass
-from flockd.sim.autopilot.sticks import StickOverride, stick_curve
+from flockd.sim.autopilot.sticks import HOLD_S, CollisionPrevention, StickOverride, stick_curve
 
 TICK_S = 0.02
 MAX_STEP_S = 0.2
@@ -159,7 +156,7 @@ class FakeAutopilot:
         """Its own clock, of its stamps and of TIMESYNC, less ``clock`` times the speed factor."""
 
         def streams() -> TelemetryStreams:
-            return TelemetryStreams(self._mav, truth, heartbeat_s, home_deg, -self.clock_offset_s, range_finder)
+            return TelemetryStreams(self, self._mav, truth, -self.clock_offset_s, heartbeat_s, home_deg, range_finder)
 
         self._new_streams = streams
         self._streams = streams()
@@ -183,9 +180,7 @@ class FakeAutopilot:
     def __enter__(self) -> Self:
         return self.start()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @property
@@ -197,6 +192,11 @@ class FakeAutopilot:
     def armed(self) -> bool:
         """Motors on."""
         return self._armed
+
+    @property
+    def intended_mode(self) -> Mode:
+        """The one that it was asked for."""
+        return self._intended
 
     @property
     def failsafe(self) -> bool:
@@ -254,20 +254,20 @@ class FakeAutopilot:
         if self._ground is not None:
             self._socket.sendto(data, self._ground)
 
-    def _snapshot(self) -> VehicleSnapshot:
-        return VehicleSnapshot(
-            self._state,
-            self._mode,
-            self._intended,
-            self._armed,
-            self.estimate_ok,
-            self.sends_motion,
-            self.battery_share,
-            self._followed().velocity if self._mode == "OFFBOARD" and self.setpoints else None,
-            self.frame_off + np.append(self._drift.position, 0.0),
-            self._drift.velocity,
-            self.heading_off_rad,
-        )
+    @property
+    def position_off(self) -> FloatArray:
+        """(3,) m by which its local positions are off the truth, in NED."""
+        return np.asarray(self.frame_off + np.append(self._drift.position, 0.0))
+
+    @property
+    def velocity_off(self) -> FloatArray:
+        """(2,) m/s likewise of its velocity, north and east."""
+        return self._drift.velocity
+
+    @property
+    def followed_velocity(self) -> FloatArray | None:
+        """(2,) m/s, north and east, that it follows in offboard; None in other modes."""
+        return self._followed().velocity if self._mode == "OFFBOARD" and self.setpoints else None
 
     def _clock(self) -> float:
         return self._speed_factor * self._real()
@@ -279,7 +279,7 @@ class FakeAutopilot:
             with self._lock:
                 now = self._clock()
                 self._fly(min(now - flown_s, MAX_STEP_S))
-                self._streams.send_due(now, self._snapshot())
+                self._streams.send_due(now)
                 if not self.wordless:
                     self.checks.tell_changes(self._failing())
                 self.checks.announce(now)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import socket
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from pymavlink import mavutil
@@ -16,26 +15,16 @@ from flockd.core.earth import metres_a_degree
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry import quaternion_from_rotation, rotation_from_vector, vector_from_rotation
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
-from flockd.sim.autopilot.fake_vehicle import MotionState
+
+if TYPE_CHECKING:
+    from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 
 Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "ACRO", "OFFBOARD"]
 """PX4's modes by the names pymavlink gives them; LOITER is Hold."""
 
-DEFAULT_STREAMS_S = {
-    31: 0.1,
-    32: 0.1,
-    245: 1.0,
-    1: 1.0,
-    24: 1.0,
-    230: 1.0,
-    242: 1.0,
-    436: 2.0,
-    132: 0.1,
-    141: 0.1,
-    85: 0.1,
-}
-"""Message number and seconds between two, until another rate is requested."""
 TRUTH_S = 0.04
+_NEVER_ASKED = 0, 115
+"""The heartbeat and the truth, whose rates nobody changes."""
 ON_GROUND_M = 0.05
 UNKNOWN_COVARIANCE = 255
 FULL_SIGNAL, NO_SIGNAL = 100, 1
@@ -55,85 +44,52 @@ class Outlet:
             self._socket.sendto(data, self._address)
 
 
-@dataclass(frozen=True, eq=False)
-class VehicleSnapshot:
-    """All that the messages are made of, as of one tick."""
-
-    motion: MotionState
-    mode: Mode
-    intended_mode: Mode
-    """The mode it was asked for; not `mode` while its failsafe is active."""
-    armed: bool
-    estimate_ok: bool
-    sends_motion: bool
-    battery_share: float
-    setpoint: FloatArray | None = None
-    """(2,) m/s, north and east, that it follows in offboard."""
-    frame_off: FloatArray = field(default_factory=lambda: np.zeros(3))
-    """(3,) m by which its local positions are off the truth, in NED."""
-    velocity_off: FloatArray = field(default_factory=lambda: np.zeros(2))
-    """(2,) m/s likewise of its velocity, north and east."""
-    heading_off_rad: float = 0.0
-    """Likewise of its heading, clockwise."""
-
-    @property
-    def failsafe(self) -> bool:
-        """It flies another mode than it was asked for."""
-        return self.mode != self.intended_mode
-
-
 class TelemetryStreams:
     """Sends each message at its interval, to the link and, of the true pose, to a simulator."""
 
     def __init__(
-        self,
-        link: mavlink.MAVLink,
-        truth: mavlink.MAVLink,
-        heartbeat_s: float,
-        home_deg: tuple[float, float],
-        started_s: float,
-        range_finder: FakeRangeFinder | None = None,
-    ) -> None:
-        self._range_finder = range_finder
+        self, vehicle: FakeAutopilot, link: mavlink.MAVLink, truth: mavlink.MAVLink, started_s: float,
+        heartbeat_s: float, home_deg: tuple[float, float], range_finder: FakeRangeFinder | None,
+    ) -> None:  # fmt: skip
+        self._vehicle, self._mav, self._truth, self._range_finder = vehicle, link, truth, range_finder
+        self._home_deg, self._started_s, self._now_s = home_deg, started_s, started_s
         self._clearance_m = math.nan
-        self._mav, self._truth = link, truth
-        self._heartbeat_s, self._home_deg, self._started_s = heartbeat_s, home_deg, started_s
-        self.intervals_s = dict(DEFAULT_STREAMS_S)
-        """Seconds between two messages, by message number."""
         self.heartbeats_to_lose = 0
         """So many of the next are lost on their way."""
+        self._heartbeat_s = heartbeat_s
         self._due_s: dict[int, float] = {}
         self._sent_modes: tuple[Mode, Mode] | None = None
-        self._now_s = started_s
         self._attitude_before = started_s, np.eye(3)
-        self._vehicle: VehicleSnapshot
+        self.intervals_s = {n: interval_s for n, (interval_s, _) in self._streams().items() if n not in _NEVER_ASKED}
+        """Seconds between two messages, by message number, of those that may be asked for at another rate."""
 
-    def send_due(self, now: float, vehicle: VehicleSnapshot) -> None:
-        """Sends every stream that is due, about ``vehicle``."""
-        self._vehicle, self._now_s = vehicle, now
-        self._send_if_due(now, 0, self._heartbeat_s, self._send_heartbeat)
-        senders: dict[int, Callable[[], None]] = {
-            31: self._send_attitude,
-            32: self._send_position,
-            245: self._send_landed,
-            1: self._send_system,
-            24: self._send_gps,
-            230: self._send_estimator,
-            242: self._send_home,
-            132: self._send_range,
-            141: self._send_altitude,
-            85: self._send_setpoint,
+    def _streams(self) -> dict[int, tuple[float, Callable[[], None]]]:
+        """By message number: seconds between two until another rate is asked for, and what sends one."""
+        return {
+            0: (self._heartbeat_s, self._send_heartbeat),
+            31: (0.1, self._send_attitude),
+            32: (0.1, self._send_position),
+            245: (1.0, self._send_landed),
+            1: (1.0, self._send_system),
+            24: (1.0, self._send_gps),
+            230: (1.0, self._send_estimator),
+            242: (1.0, self._send_home),
+            132: (0.1, self._send_range),
+            141: (0.1, self._send_altitude),
+            85: (0.1, self._send_setpoint),
+            115: (TRUTH_S, self._send_truth),
+            436: (2.0, self._send_mode),
         }
-        for number, sender in senders.items():
-            self._send_if_due(now, number, self.intervals_s[number], sender)
-        self._send_if_due(now, 115, TRUTH_S, self._send_truth)
-        if (vehicle.mode, vehicle.intended_mode) != self._sent_modes:
-            self._send_if_due(now, 436, self.intervals_s[436], self._send_mode)
 
-    def _send_if_due(self, now: float, number: int, interval_s: float, sender: Callable[[], None]) -> None:
-        if now >= self._due_s.get(number, 0.0):
-            self._due_s[number] = max(self._due_s.get(number, now) + interval_s, now)
-            sender()
+    def send_due(self, now: float) -> None:
+        """Sends every stream that is due."""
+        self._now_s = now
+        for number, (interval_s, sender) in self._streams().items():
+            if number == 436 and (self._vehicle.mode, self._vehicle.intended_mode) == self._sent_modes:
+                continue
+            if now >= self._due_s.get(number, 0.0):
+                self._due_s[number] = max(self._due_s.get(number, now) + self.intervals_s.get(number, interval_s), now)
+                sender()
 
     def _boot_ms(self) -> int:
         return int((self._now_s - self._started_s) * 1000)
@@ -146,13 +102,8 @@ class TelemetryStreams:
         if self._vehicle.armed:
             state = mavlink.MAV_STATE_CRITICAL if self._vehicle.failsafe else mavlink.MAV_STATE_ACTIVE
         armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self._vehicle.armed else 0
-        self._mav.heartbeat_send(
-            mavlink.MAV_TYPE_QUADROTOR,
-            mavlink.MAV_AUTOPILOT_PX4,
-            mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | armed,
-            custom_mode(self._vehicle.mode),
-            state,
-        )
+        flags, mode = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | armed, custom_mode(self._vehicle.mode)
+        self._mav.heartbeat_send(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, flags, mode, state)
 
     def _send_mode(self) -> None:
         self._sent_modes = self._vehicle.mode, self._vehicle.intended_mode
@@ -160,31 +111,31 @@ class TelemetryStreams:
 
     def _send_setpoint(self) -> None:
         """Only in offboard: of its other modes' setpoints nothing is simulated."""
-        if self._vehicle.setpoint is not None:
-            nothing = [math.nan] * 3
-            speeds = [*self._vehicle.setpoint, math.nan]
+        velocity = self._vehicle.followed_velocity
+        if velocity is not None:
+            nothing, speeds = [math.nan] * 3, [*velocity, math.nan]
             self._mav.position_target_local_ned_send(self._boot_ms(), 1, 0, *nothing, *speeds, *nothing, math.nan, 0.0)
 
     def _send_attitude(self) -> None:
-        R_ned_body, (before_s, before) = self._vehicle.motion.R_ned_body, self._attitude_before
+        R_ned_body, (before_s, before) = self._vehicle.state.R_ned_body, self._attitude_before
         self._attitude_before = self._now_s, R_ned_body
         rate = vector_from_rotation(before.T @ R_ned_body) / max(self._now_s - before_s, 1e-3)
         shown = rotation_from_vector(np.array([0.0, 0.0, self._vehicle.heading_off_rad])) @ R_ned_body
         self._mav.attitude_quaternion_send(self._boot_ms(), *_wxyz(shown), *rate)
 
     def _send_position(self) -> None:
-        motion = self._vehicle.motion
+        motion = self._vehicle.state
         if self._vehicle.estimate_ok and self._vehicle.sends_motion:
             self._mav.local_position_ned_send(
                 self._boot_ms(),
-                *(motion.position + self._vehicle.frame_off),
+                *(motion.position + self._vehicle.position_off),
                 *(motion.velocity[:2] + self._vehicle.velocity_off),
                 motion.velocity[2],
             )
 
     def _send_landed(self) -> None:
         landed = mavlink.MAV_LANDED_STATE_IN_AIR
-        if self._vehicle.motion.position[2] > -ON_GROUND_M:
+        if self._vehicle.state.position[2] > -ON_GROUND_M:
             landed = mavlink.MAV_LANDED_STATE_ON_GROUND
         elif self._vehicle.mode == "TAKEOFF":
             landed = mavlink.MAV_LANDED_STATE_TAKEOFF
@@ -214,7 +165,7 @@ class TelemetryStreams:
         self._clearance_m = math.nan
         if self._range_finder is None:
             return
-        motion = self._vehicle.motion
+        motion = self._vehicle.state
         reading = self._range_finder.read(self._now_s, motion.position, motion.velocity, motion.R_ned_body)
         if reading is None or reading.min_m is None or reading.max_m is None:
             return
@@ -232,17 +183,14 @@ class TelemetryStreams:
 
     def _send_altitude(self) -> None:
         """With the distance to bottom, which PX4 has as long as it has ranges."""
-        height_m = -float(self._vehicle.motion.position[2])
+        height_m = -float(self._vehicle.state.position[2])
         heights_m = [height_m] * 4
         self._mav.altitude_send(self._boot_ms() * 1000, *heights_m, math.nan, self._clearance_m)
 
     def _send_truth(self) -> None:
-        attitude, place = (
-            _wxyz(self._vehicle.motion.R_ned_body),
-            self._place(self._vehicle.motion.position),
-        )
-        speeds = [round(100.0 * speed) for speed in self._vehicle.motion.velocity]
-        self._truth.hil_state_quaternion_send(0, attitude, 0, 0, 0, *place, *speeds, 0, 0, 0, 0, 0)
+        motion = self._vehicle.state
+        speeds, place = [round(100.0 * speed) for speed in motion.velocity], self._place(motion.position)
+        self._truth.hil_state_quaternion_send(0, _wxyz(motion.R_ned_body), 0, 0, 0, *place, *speeds, 0, 0, 0, 0, 0)
 
     def _place(self, position: FloatArray) -> tuple[int, int, int]:
         """Latitude and longitude in 1e-7 degrees, and millimetres above the ground, of metres from home."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Protocol
 
@@ -11,21 +13,84 @@ import numpy as np
 
 from flockd.core.config.mission import MissionParameters
 from flockd.core.messages import FloatArray, Frame, FrameSet, UInt8Array
-from flockd.flight.geometry import build_rig, rotation_from_vector
+from flockd.flight.geometry import Rig, RigCamera, RigidTransform, build_rig, rotation_from_vector
+from flockd.flight.geometry.camera_motion import scaled_focal
 from flockd.flight.mission import Moment, Navigator
-from flockd.sim.cameras import CameraMotion, Shot, real_cameras
-from flockd.sim.cameras.camera_faults import CameraFaults
 from flockd.sim.cameras.lens_views import lens_view
-from flockd.sim.cameras.pose_trail import FlockPose, PoseTrail
-from flockd.sim.cameras.true_rigs import true_rigs
+from flockd.sim.cameras.real_camera import Shot, real_cameras
+from flockd.sim.cameras.shutter import CameraMotion
 from flockd.sim.flock.truth_perception import RenderTruth
 from flockd.sim.renderer.drone_models import FAMILIES, drone_model
 from flockd.sim.renderer.renderer import Renderer, View
-from flockd.sim.scenario import ScenarioConfig
-from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
-from flockd.sim.vehicles.vehicles import REFERENCE_DEG
+from flockd.sim.scenario import CameraFaultConfig, ScenarioConfig
+from flockd.sim.scenario.imperfect_cameras import RigErrorsConfig
+from flockd.sim.vehicles.pose_trail import FlockPose, PoseTrail
+from flockd.sim.vehicles.vehicles import REFERENCE_DEG, UNDISTURBED, Disturbances
 from flockd.sim.world.obstacle_worlds import obstacles_of
 from flockd.sim.world.world import World
+
+_BANDS, _BAND_SHARE = 4, 8
+"""Bands of interference in an image, each an eighth of it high; they may overlap."""
+
+
+class CameraFaults:
+    """The faults of one scenario. The same seed gives the same images."""
+
+    def __init__(self, faults: Sequence[CameraFaultConfig], seed: int) -> None:
+        self._faults = faults
+        self._rng = np.random.default_rng([seed, 3])
+        self._began_s: float | None = None
+
+    def applied(self, drone: int, camera: str, time_s: float, image: UInt8Array) -> UInt8Array:
+        """The RGB image (h, w, 3) as the camera of the drone, counted from 0, sends it at a time."""
+        self._began_s = time_s if self._began_s is None else self._began_s
+        passed_s = time_s - self._began_s
+        for fault in self._faults:
+            if (fault.drone, fault.camera) == (drone + 1, camera) and fault.begin_s <= passed_s < fault.end_s:
+                image = noisy_image(image, fault, self._rng)
+        return image
+
+
+def noisy_image(image: UInt8Array, fault: CameraFaultConfig, rng: np.random.Generator) -> UInt8Array:
+    """A noisy copy of an RGB image (h, w, 3)."""
+    if fault.kind == "gaussian":
+        added = image + fault.sigma * rng.standard_normal(image.shape)
+        return np.clip(np.rint(added), 0, 255).astype(np.uint8)
+    noise = rng.integers(0, 256, image.shape, dtype=np.uint8)
+    if fault.kind == "uniform":
+        return noise
+    copy, height = image.copy(), len(image) // _BAND_SHARE
+    for top in rng.integers(0, len(image) - height + 1, _BANDS):
+        copy[top : top + height] = noise[top : top + height]
+    return copy
+
+
+def true_rigs(scenario: ScenarioConfig) -> list[Rig]:
+    """Of each drone."""
+    configured = build_rig(scenario.drone.rig)
+    errors = None if scenario.cameras is None else scenario.cameras.rig
+    if errors is None:
+        return [configured] * len(scenario.vehicles)
+    return [_with_errors(configured, errors, (scenario.seed, drone, 6)) for drone in range(len(scenario.vehicles))]
+
+
+def _with_errors(rig: Rig, errors: RigErrorsConfig, seed: tuple[int, ...]) -> Rig:
+    rng = np.random.default_rng(seed)
+    cameras = {}
+    for name, one in rig.cameras.items():
+        turn, way, longer = _direction(rng), _direction(rng), float(rng.choice([-1.0, 1.0]))
+        mounted = RigidTransform(
+            rotation_from_vector(math.radians(errors.mounting_deg) * turn) @ one.T_body_camera.rotation,
+            one.T_body_camera.translation + errors.mounting_m * way,
+        )
+        cameras[name] = RigCamera(name, scaled_focal(one.camera, math.log1p(errors.focal * longer)), mounted)
+    return Rig(cameras)
+
+
+def _direction(rng: np.random.Generator) -> FloatArray:
+    """(3,) unit vector, body axes."""
+    vector = rng.normal(size=3)
+    return np.asarray(vector / np.linalg.norm(vector))
 
 
 class FlockPoses(Protocol):

@@ -3,21 +3,79 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
 
-from flockd.core.messages import FloatArray, UInt8Array
+from flockd.core.messages import Float32Array, FloatArray, UInt8Array
 from flockd.flight.geometry import Camera
-from flockd.sim.cameras.compression import jpeg
 from flockd.sim.cameras.glass import Glass
-from flockd.sim.cameras.light import grey_levels, linear_light
 from flockd.sim.cameras.sensor import Automatic, NoiseTile, noisy
-from flockd.sim.cameras.shake import Shaking
-from flockd.sim.cameras.shutter import CameraMotion, LensField, exposed
-from flockd.sim.cameras.timing import CameraClock
+from flockd.sim.cameras.shutter import CameraMotion, LensField, Shaking, exposed
 from flockd.sim.renderer.renderer import View
-from flockd.sim.scenario.imperfect_cameras import CamerasConfig
+from flockd.sim.scenario.imperfect_cameras import CamerasConfig, CameraTimingConfig
+
+_STEPS = 1 << 14
+"""Of linear light in the table back: each grey level has five at least, so that all 256 come back as they were."""
+_GREY = np.arange(256) / 255.0
+_LINEAR = np.where(_GREY <= 0.04045, _GREY / 12.92, ((_GREY + 0.055) / 1.055) ** 2.4).astype(np.float32)
+_LIGHT = np.arange(_STEPS) / (_STEPS - 1)
+_BACK = np.rint(
+    255.0 * np.where(_LIGHT <= 0.0031308, 12.92 * _LIGHT, 1.055 * np.maximum(_LIGHT, 1e-9) ** (1 / 2.4) - 0.055)
+).astype(np.uint8)
+
+
+def linear_light(image: UInt8Array) -> Float32Array:
+    """Linear light (h, w, 3), 1 for white, of grey levels."""
+    return np.asarray(cv2.LUT(image, _LINEAR), np.float32)
+
+
+def grey_levels(light: Float32Array) -> UInt8Array:
+    """(h, w, 3) of linear light; what is beyond white or below black is cut."""
+    steps = np.rint(np.clip(light, 0.0, 1.0) * np.float32(_STEPS - 1)).astype(np.uint16)
+    return np.asarray(_BACK[steps], np.uint8)
+
+
+_UNPACKING = {1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4}
+
+
+def jpeg(image: UInt8Array, quality: int, reduce: Literal[1, 2, 4] = 1) -> UInt8Array:
+    """The RGB image (h, w, 3) after a JPEG of a quality from 1 to 100, with half the resolution of colours (4:2:0).
+
+    Unpacked as (h / reduce, w / reduce, 3), as a camera's is (`flockd.onboard.sources.image_formats`).
+    """
+    _, packed = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    unpacked = cv2.imdecode(packed, _UNPACKING[reduce])
+    assert unpacked is not None, "what was just packed can be unpacked"
+    return np.asarray(cv2.cvtColor(unpacked, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One image's times."""
+
+    stamp_s: float
+    """As it says itself."""
+    shown_s: float
+    """When its middle row was exposed."""
+    comes: bool
+
+
+class CameraClock:
+    """One camera's: where in its period it runs is drawn once, jitter and drops for each image."""
+
+    def __init__(self, config: CameraTimingConfig, rng: np.random.Generator) -> None:
+        self._config, self._rng = config, rng
+        self._before_s = float(config.apart_s * rng.random())
+
+    def shot(self, time_s: float) -> Shot:
+        """Of the frame set of a time."""
+        jitter, dropped = self._rng.random(2)
+        stamp_s = time_s - self._before_s
+        shown_s = stamp_s - self._config.delay_s - self._config.jitter_s * float(jitter)
+        return Shot(stamp_s, shown_s, bool(dropped >= self._config.dropped))
 
 
 class RealCamera:

@@ -10,15 +10,13 @@ import numpy as np
 from flockd.core.messages import FloatArray
 from flockd.flight.flocking import FlockingLaw, level_offsets, lookahead_s
 from flockd.sim.control_level.flight_code import FlightCode, Known
-from flockd.sim.control_level.flock_figures import FlightFigures, nearest_distances, unions
+from flockd.sim.control_level.flock_figures import FIGURES, FlightFigures, ManyObstacles, nearest_distances, unions
 from flockd.sim.control_level.many_missions import ManyMissions
-from flockd.sim.control_level.many_obstacles import FIGURES, ManyObstacles
-from flockd.sim.control_level.motion import Motion
 from flockd.sim.control_level.near import Near
 from flockd.sim.control_level.perceived_flock import Perception, Seen
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.scenario.perceived import PerceivedErrors
-from flockd.sim.vehicles.vehicles import limit_norms
+from flockd.sim.vehicles.vehicles import Motion, limit_norms
 
 Figures = dict[str, float | int | bool | None]
 _PAIRS = 1_000_000

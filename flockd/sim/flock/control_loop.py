@@ -3,24 +3,177 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Self
 
 import numpy as np
 
-from flockd.core.config.safety import GateParameters
-from flockd.core.messages import FloatArray, Setpoint, Wanted
+from flockd.core.config.safety import GateParameters, SafetyParameters
+from flockd.core.messages import NO_STATUS, FloatArray, MissionStatus, Neighbour, ObstacleRanges, Setpoint, Wanted
 from flockd.flight.obstacles import nearest_points
-from flockd.flight.safety import Decision, Gate, Permission, Request, State, Surroundings, Verdict
+from flockd.flight.safety import (
+    OFFBOARD,
+    CameraHealth,
+    Decision,
+    Event,
+    Gate,
+    Inputs,
+    Permission,
+    Request,
+    State,
+    Supervisor,
+    Surroundings,
+    Verdict,
+    outside_fence,
+    outside_heights,
+)
 from flockd.flight.safety.surroundings import surroundings
 from flockd.review.flight_log.metadata import HandedOver
-from flockd.sim.flock.commands import Commands
 from flockd.sim.flock.made_up_detections import lost_cameras
 from flockd.sim.flock.slowing import Cause, SlowedTime, causes_of, is_slowed, which_are_drones
-from flockd.sim.flock.supervision import WindSupervisor
 from flockd.sim.scenario import ScenarioConfig
-from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
-from flockd.sim.vehicles.handover import Handover
-from flockd.sim.vehicles.vehicles import Vehicles
+from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances, Vehicles
+
+
+@dataclass(frozen=True, eq=False)
+class Commands:
+    """What n drones are asked for in one step."""
+
+    velocity: FloatArray
+    """(n, 2) m/s, north and east."""
+    acceleration: FloatArray
+    """(n, 2) m/s^2; 0 of a drone that is flown by hand."""
+    yaw_rad: FloatArray
+    """(n,)"""
+    height_m: FloatArray
+    """(n,), up positive; NaN: as high as now."""
+    missions: tuple[MissionStatus, ...]
+    """See `PilotOutput.mission`."""
+    desired: FloatArray
+    """(n, 2) m/s: what each mission wants, times its pull."""
+    obstacles: tuple[ObstacleRanges | None, ...]
+    """What each drone saw of them; None where it does not look for any."""
+    neighbours: tuple[tuple[Neighbour, ...], ...]
+    """What each drone knows of the others."""
+
+    @classmethod
+    def of(cls, n: int) -> Self:
+        """Standstill of n drones, to be filled."""
+        still = (np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.full(n, np.nan))
+        return cls(
+            *still, missions=(NO_STATUS,) * n, desired=np.zeros((n, 2)), obstacles=(None,) * n, neighbours=((),) * n
+        )
+
+    @property
+    def takeovers(self) -> list[str | None]:
+        """Which autopilots take over, and how."""
+        return [mission.takeover for mission in self.missions]
+
+
+RETURN_M_S = 2.0
+_THERE_M = 0.5
+_HOLD_PER_S = 0.95
+"""Velocity for each metre from where an autopilot holds: PX4's default of MPC_XY_P."""
+_HOLD_BRAKING_M_S2 = 3.0
+"""It holds where it would stop, braking so hard: PX4's default of MPC_ACC_HOR."""
+
+
+class Handover:
+    """Remembers whose autopilot has taken over: the pilot's commands count no more then."""
+
+    def __init__(self, scenario: ScenarioConfig) -> None:
+        self._starts = np.array([vehicle.position_m[:2] for vehicle in scenario.vehicles])
+        self._taken: dict[int, str] = {}
+        self._held: dict[int, FloatArray] = {}
+        """Where, (3,) m NED."""
+
+    @property
+    def taken(self) -> frozenset[int]:
+        """Whose autopilot has taken over, by its number."""
+        return frozenset(self._taken)
+
+    def hold(self, drone: int, position: FloatArray, velocity: FloatArray) -> None:
+        """The autopilot of a drone at `position` (3,) m NED, with (3,) m/s, goes into Hold and stays there."""
+        self._taken[drone] = "hold"
+        self._held[drone] = position + velocity * (math.hypot(*velocity[:2]) / (2 * _HOLD_BRAKING_M_S2))
+
+    def resume(self, drone: int) -> None:
+        """Its pilot flies it again."""
+        self._taken.pop(drone, None)
+        self._held.pop(drone, None)
+
+    def holding(self, positions: FloatArray) -> dict[int, tuple[FloatArray, float]]:
+        """Of each drone in Hold the velocity (2,) m/s back to its place, from (n, 3) m NED, and its height, m."""
+        return {i: (_HOLD_PER_S * (held - positions[i])[:2], -float(held[2])) for i, held in self._held.items()}
+
+    def applied(
+        self, takeovers: Sequence[str | None], positions: FloatArray, velocity: FloatArray, height_m: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Velocities (n, 2) and heights (n,) of the pilots, with those of the autopilots that land or return.
+
+        `takeovers` are `land`, `return` or None, as of this step; `positions` (n, 3) m NED.
+        """
+        velocity, height_m = velocity.copy(), height_m.copy()
+        for i, takeover in enumerate(takeovers):
+            if takeover is not None:
+                self._taken.setdefault(i, takeover)
+        for i, takeover in self._taken.items():
+            if takeover == "hold":
+                continue
+            way = self._starts[i] - positions[i, :2]
+            away_m = math.hypot(*way)
+            if takeover == "return" and away_m > _THERE_M:
+                velocity[i] = way * (min(RETURN_M_S, away_m) / away_m)
+            else:
+                self._taken[i] = "land"
+                velocity[i], height_m[i] = 0.0, 0.0
+        return velocity, height_m
+
+
+_SEES = CameraHealth(age_s=0.0, period_s=1.0, unplugged=False, frozen=False, noisy=False)
+_LOST = replace(_SEES, unplugged=True)
+_WELL = Inputs(
+    cameras={"one": _SEES}, dropped_share=0.0, estimate_age_s=0.0, ego_motion_age_s=0.0, network_faults=0,
+    inference_stuck=False, load=0.0, temperature_c=None, loop_lag_s=0.0, velocity_error_m_s=0.0, dead_tasks=(),
+    neighbours_age_s=0.0, nearest_neighbour_m=math.inf, refused_commands=0, obstacle_near=False,
+    outside_fence=False, outside_heights=False, motion_age_s=0.0,
+    heartbeat_age_s=0.0, message_age_s=0.0, stream_fault=None, autopilot_failsafe=False, foreign_setpoints=None,
+    parameter_fault=None, frame_jumped=False, flight_mode=OFFBOARD, armed=True, in_air=True, battery_low=False,
+    position_lost=False, shutdown_asked=False, hold_asked=False, land_asked=False, resume_asked=False,
+)  # fmt: skip
+
+
+class WindSupervisor:
+    """The supervisor of a drone that flies from the start on."""
+
+    def __init__(self, parameters: SafetyParameters, cameras: Sequence[str]) -> None:
+        """``cameras``: their names."""
+        self._parameters, self._cameras = parameters, dict.fromkeys(cameras, _SEES)
+        self.degraded_by: frozenset[Event] = frozenset()
+        """Why the drone was last degraded: it flies slower for a while after that is over."""
+        self._supervisor = Supervisor(parameters)
+        for changes in ({"armed": False, "in_air": False, "flight_mode": "hold"}, {"flight_mode": "hold"}, {}):
+            self._supervisor.step(-math.inf, replace(_WELL, **changes))
+
+    def step(
+        self, now_s: float, velocity_error_m_s: float, around: Surroundings, *, lost: Collection[str] = ()
+    ) -> Decision:
+        """As of `now_s`, so far off its setpoints; `lost`: the names of its lost cameras."""
+        gate = self._parameters.gate
+        inputs = replace(
+            _WELL,
+            cameras={**self._cameras, **dict.fromkeys(lost, _LOST)},
+            velocity_error_m_s=velocity_error_m_s,
+            obstacle_near=around.nearest_obstacle_m < self._parameters.hold_room_m,
+            outside_fence=outside_fence(gate, around.position),
+            outside_heights=outside_heights(gate, around.height_m),
+        )
+        decision = self._supervisor.step(now_s, inputs)
+        if decision.state is State.DEGRADED and decision.reasons:
+            self.degraded_by = frozenset(reason.event for reason in decision.reasons)
+        return decision
+
 
 PERIOD_S = 0.05
 """Between two setpoints, as `autopilot.setpoint_rate_hz` is by default."""

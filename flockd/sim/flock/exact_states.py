@@ -16,12 +16,10 @@ from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
 from flockd.flight.obstacles import Avoidance
 from flockd.flight.safety.surroundings import limits_towards
-from flockd.sim.flock.commands import Commands
-from flockd.sim.flock.control_loop import ControlLoop
+from flockd.sim.flock.control_loop import Commands, ControlLoop
 from flockd.sim.flock.made_up_detections import TrackedNeighbours
 from flockd.sim.scenario import ScenarioConfig
-from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
-from flockd.sim.vehicles.vehicles import REFERENCE_DEG, Vehicles
+from flockd.sim.vehicles.vehicles import REFERENCE_DEG, UNDISTURBED, Disturbances, Vehicles
 from flockd.sim.world.obstacle_worlds import obstacles_of
 from flockd.sim.world.obstacles import true_ranges
 

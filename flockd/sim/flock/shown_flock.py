@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -22,11 +22,51 @@ from flockd.onboard.telemetry.preview import Previews
 from flockd.onboard.telemetry.publisher import Ask, NewestImage
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage, FlightMessage, ReasonMessage
 from flockd.sim.cameras.camera_simulator import CameraSimulator
-from flockd.sim.flock.commands import Commands
-from flockd.sim.flock.control_loop import ControlLoop
+from flockd.sim.flock.control_loop import Commands, ControlLoop
 from flockd.sim.scenario import ScenarioConfig
-from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
-from flockd.sim.vehicles.vehicles import REFERENCE_DEG, Vehicles
+from flockd.sim.vehicles.vehicles import REFERENCE_DEG, UNDISTURBED, Disturbances, Vehicles
+
+EVERY_S = 1.0
+"""Below the age at which a watcher takes a message for stale."""
+
+
+class Repeater:
+    """A telemetry sink that hands on each message at once, and the newest of each topic again every second.
+
+    Its thread runs between ``__enter__`` and ``__exit__``.
+    """
+
+    def __init__(self, sink: TelemetrySink, every_s: float = EVERY_S) -> None:
+        self._sink, self._every_s = sink, every_s
+        self._newest: dict[tuple[str, str], Mapping[str, object]] = {}
+        self._lock = threading.Lock()
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._repeat, name="telemetry repeater", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def forget(self, drone: str) -> None:
+        """Of a drone that is gone, nothing is sent again."""
+        with self._lock:
+            self._newest = {key: message for key, message in self._newest.items() if key[0] != drone}
+
+    def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
+        """See `TelemetrySink`."""
+        with self._lock:
+            self._newest[drone, topic] = message
+            self._sink.publish(drone, topic, message)
+
+    def _repeat(self) -> None:
+        while not self._over.wait(self._every_s):
+            with self._lock:
+                for (drone, topic), message in self._newest.items():
+                    self._sink.publish(drone, topic, message)
 
 
 class Announcer(Protocol):
@@ -43,13 +83,6 @@ class Announcer(Protocol):
         """A drone is there no more."""
 
 
-class RepeatingSink(TelemetrySink, Protocol):
-    """Where messages go, and are sent again: `flockd.sim.flock.repeater.Repeater`."""
-
-    def forget(self, drone: str) -> None:
-        """Nothing of a drone is sent again."""
-
-
 REQUESTS = frozenset({"hold", "resume"})
 """Of an operator, beside orders: to the drone's autopilot, and back."""
 
@@ -60,7 +93,7 @@ class ShownFlock:
     Of what an autopilot does it has Hold alone. Queries come on threads of zenoh's.
     """
 
-    def __init__(self, scenario: ScenarioConfig, announcer: Announcer, sink: RepeatingSink) -> None:
+    def __init__(self, scenario: ScenarioConfig, announcer: Announcer, sink: Repeater) -> None:
         self._scenario, self._announcer, self._sink = scenario, announcer, sink
         self._drones = [i for i, vehicle in enumerate(scenario.vehicles) if not vehicle.by_hand]
         self._lock = threading.Lock()

@@ -22,18 +22,15 @@ from flockd.review.flight_log.capture import key_frame_steps
 from flockd.review.flight_log.key_frames import KeyFrame
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FlightMetadata, MissionMetadata
-from flockd.sim.cameras import LateAttitude
 from flockd.sim.cameras.camera_simulator import CameraSimulator
-from flockd.sim.flock.commands import Commands
-from flockd.sim.flock.control_loop import ControlLoop
+from flockd.sim.flock.control_loop import Commands, ControlLoop
 from flockd.sim.flock.exact_states import ExactFlock, HandPilot, fly_exact_states, start_yaw, step_times
-from flockd.sim.flock.pilot_pool import PilotPool
-from flockd.sim.flock.pilots import Stepped
+from flockd.sim.flock.pilot_pool import PilotPool, Stepped
 from flockd.sim.flock.shown_flock import RealTime, ShownFlock, orders_of
 from flockd.sim.scenario import ScenarioConfig
-from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
-from flockd.sim.vehicles.vehicles import SimulatedAutopilot, Vehicles
-from flockd.sim.world.clearances import with_obstacles
+from flockd.sim.vehicles.pose_trail import LateAttitude
+from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances, SimulatedAutopilot, Vehicles
+from flockd.sim.world.obstacle_worlds import with_obstacles
 
 _KEY_FRAME_DRONES = 8
 """Key frames are kept of the first drones only, this many."""

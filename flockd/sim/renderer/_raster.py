@@ -10,13 +10,64 @@ three times as long to compile, and half as much processor time again to run.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 
+from flockd.sim.world.baking import sun_reaches
+from flockd.sim.world.textures import TEXTURE_BITS
+
 SUBSAMPLES = 3
 """Drone colours are sampled 3x3 per pixel; the middle sample is the pixel's centre."""
+
+
+class Eye(NamedTuple):
+    """A pinhole camera in the world: `Renderer.render` says of what shapes."""
+
+    K: Any
+    inverse_K: Any  # noqa: N815 - as in formulas
+    R: Any
+    """From optical axes to NED."""
+    origin: Any
+    focal: float
+
+
+class Scene(NamedTuple):
+    """What colours of a `World` are made of, by the names and with the shapes that it has there."""
+
+    normals: Any
+    texture: Any
+    uv: Any
+    level: Any
+    tint: Any
+    texels: Any
+    ground_map: Any
+    ground_kind: Any
+    ground_detail: Any
+    extent_m: float
+    shadow_map: Any
+    shadow_frame: Any
+    light: Any
+    fog_per_m: float
+    sky: Any
+    tone: Any
+
+
+class Thing(NamedTuple):
+    """What is laid over an image: a drone or a distractor of a pose, and its number there.
+
+    `normals` are NED, `uv` is in body axes, `texels` are its machine textures.
+    """
+
+    identity: int
+    rotation: Any
+    position: Any
+    normals: Any
+    texture: Any
+    uv: Any
+    colours: Any
+    texels: Any
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -93,22 +144,6 @@ def set_up_triangles(q: Any, triangles: Any, width: int, height: int, rows: Any,
         p[9] = (e0x + e1x + e2x) / determinant
         p[10] = (e0y + e1y + e2y) / determinant
         p[11] = (e0z + e1z + e2z) / determinant
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def list_visible(rows: Any) -> Any:
-    """Indices of the triangles with a row range, in order."""
-    count = 0
-    for t in range(rows.shape[0]):
-        if rows[t, 1] >= rows[t, 0]:
-            count += 1
-    visible = np.empty(count, dtype=np.int32)
-    k = 0
-    for t in range(rows.shape[0]):
-        if rows[t, 1] >= rows[t, 0]:
-            visible[k] = t
-            k += 1
-    return visible
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -205,35 +240,6 @@ def _byte(spread: Any, shift: int) -> float:
     """One channel of a spread colour, linear light: textures are stored as square roots."""
     value = float((spread >> np.uint64(shift)) & np.uint64(255)) * (1.0 / 255.0)
     return value * value
-
-
-@njit(cache=True, error_model="numpy")
-def sun_reaches(shadow: Any, frame: Any, n: float, e: float, d: float) -> float:
-    """Share of sunlight at a point, 0 to 1: four neighbours of the shadow map, weighted.
-
-    ``frame`` (3, 4) takes a point to map column, map row and height towards the sun; the map holds the highest
-    thing's height.
-    """
-    size = shadow.shape[0]
-    s = frame[0, 0] * n + frame[0, 1] * e + frame[0, 2] * d + frame[0, 3] - 0.5
-    t = frame[1, 0] * n + frame[1, 1] * e + frame[1, 2] * d + frame[1, 3] - 0.5
-    if s < 0.0 or t < 0.0 or s >= size - 1.0 or t >= size - 1.0:
-        return 1.0
-    here = frame[2, 0] * n + frame[2, 1] * e + frame[2, 2] * d + frame[2, 3]
-    i = int(s)
-    j = int(t)
-    ws = s - i
-    wt = t - j
-    lit = 0.0
-    if here >= shadow[j, i]:
-        lit += (1.0 - ws) * (1.0 - wt)
-    if here >= shadow[j, i + 1]:
-        lit += ws * (1.0 - wt)
-    if here >= shadow[j + 1, i]:
-        lit += (1.0 - ws) * wt
-    if here >= shadow[j + 1, i + 1]:
-        lit += ws * wt
-    return lit
 
 
 @njit(cache=True, error_model="numpy")
@@ -343,40 +349,28 @@ def smooth_edges(hit: Any, texture: Any, planes: Any, linear: Any, tone: Any, sh
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def shade_drone(
+def lay_over(
     hit: Any,
     inverse_depth: Any,
     planes: Any,
     left: int,
     top: int,
-    inverse_K: Any,
-    R: Any,
-    origin: Any,
-    focal: float,
-    R_ned_body: Any,
-    position: Any,
-    normals: Any,
-    texture: Any,
-    uv: Any,
-    colours: Any,
-    texels: Any,
-    texture_bits: int,
-    shadow: Any,
-    shadow_frame: Any,
-    light: Any,
-    fog: float,
-    tone: Any,
+    eye: Any,
+    thing: Any,
+    scene: Any,
     linear: Any,
-    identity: int,
     rgb: Any,
     depth: Any,
     ids: Any,
 ) -> None:
     """Lay one drone over the image by coverage, from its 3x3 supersampled triangle indices within a rectangle.
 
-    Depth and identity come from the middle sample, the pixel's centre. ``normals`` are NED, ``uv`` is in body axes.
+    Depth and identity come from the middle sample, the pixel's centre.
     """
     s = SUBSAMPLES
+    inverse_K, R, origin, texture_bits = eye.inverse_K, eye.R, eye.origin, TEXTURE_BITS
+    R_ned_body, position, normals, uv, colours = thing.rotation, thing.position, thing.normals, thing.uv, thing.colours
+    light, tone = scene.light, scene.tone
     count = hit.shape[0] // s
     sun = light[0]
     texture_area = ((4 << (2 * texture_bits)) - 1) // 3
@@ -427,15 +421,15 @@ def shade_drone(
                         facing = max(0.05, -(rn * nn + re * ne + rd * nd) / away)
                         # Tiles per metre are the same both ways on a drone.
                         tile = abs(uv[t, 0, 0]) + abs(uv[t, 0, 1]) + abs(uv[t, 0, 2])
-                        fineness = math.log2(z / focal / math.sqrt(facing) * texture_size * tile)
-                        fine = sample(texels, texture[t] * texture_area, texture_bits, tu, tv, fineness)
+                        fineness = math.log2(z / eye.focal / math.sqrt(facing) * texture_size * tile)
+                        fine = sample(thing.texels, thing.texture[t] * texture_area, texture_bits, tu, tv, fineness)
                         cosine = nn * sun[0] + ne * sun[1] + nd * sun[2]
                         if cosine > 0.0:
                             cosine *= sun_reaches(
-                                shadow, shadow_frame, n + position[0], e + position[1], d + position[2]
+                                scene.shadow_map, scene.shadow_frame, n + position[0], e + position[1], d + position[2]
                             )
                         red, green, blue = _light(light, nd, max(0.0, cosine))
-                        clear = math.exp(-fog * away)
+                        clear = math.exp(-scene.fog_per_m * away)
                         red = red * 2.0 * colours[t, 0] * _byte(fine, 0) * clear + light[4, 0] * (1.0 - clear)
                         green = green * 2.0 * colours[t, 1] * _byte(fine, 32) * clear + light[4, 1] * (1.0 - clear)
                         blue = blue * 2.0 * colours[t, 2] * _byte(fine, 16) * clear + light[4, 2] * (1.0 - clear)
@@ -455,180 +449,7 @@ def shade_drone(
             t = hit[middle_y, middle_x]
             if t >= 0 and inverse_depth[middle_y, middle_x] > limit:
                 depth[y, x] = 1.0 / (planes[t, 9] * (middle_x + 0.5) + planes[t, 10] * (middle_y + 0.5) + planes[t, 11])
-                ids[y, x] = identity
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def fill_shadow(vertices: Any, triangles: Any, frame: Any, shadow: Any) -> None:
-    """Greatest height towards the sun in each cell of the shadow map (parallel projection)."""
-    size = shadow.shape[0]
-    for t in range(triangles.shape[0]):
-        s = np.empty(3)
-        r = np.empty(3)
-        h = np.empty(3)
-        for k in range(3):
-            p = vertices[triangles[t, k]]
-            s[k] = frame[0, 0] * p[0] + frame[0, 1] * p[1] + frame[0, 2] * p[2] + frame[0, 3]
-            r[k] = frame[1, 0] * p[0] + frame[1, 1] * p[1] + frame[1, 2] * p[2] + frame[1, 3]
-            h[k] = frame[2, 0] * p[0] + frame[2, 1] * p[1] + frame[2, 2] * p[2] + frame[2, 3]
-        area = (s[1] - s[0]) * (r[2] - r[0]) - (s[2] - s[0]) * (r[1] - r[0])
-        if abs(area) < 1e-9:
-            continue
-        x0 = max(0, math.ceil(s.min() - 0.5))
-        x1 = min(size - 1, math.floor(s.max() - 0.5))
-        y0 = max(0, math.ceil(r.min() - 0.5))
-        y1 = min(size - 1, math.floor(r.max() - 0.5))
-        for y in range(y0, y1 + 1):
-            for x in range(x0, x1 + 1):
-                ds = x + 0.5 - s[0]
-                dr = y + 0.5 - r[0]
-                b1 = (ds * (r[2] - r[0]) - (s[2] - s[0]) * dr) / area
-                b2 = ((s[1] - s[0]) * dr - ds * (r[1] - r[0])) / area
-                if b1 >= 0.0 and b2 >= 0.0 and b1 + b2 <= 1.0:
-                    here = h[0] + b1 * (h[1] - h[0]) + b2 * (h[2] - h[0])
-                    shadow[y, x] = max(shadow[y, x], here)
-
-
-@njit(cache=True, error_model="numpy")
-def _noise(maps: Any, k: int, u: float, v: float) -> float:
-    """Bilinear value of the k-th tileable noise map at (u, v) in tiles."""
-    size = maps.shape[1]
-    mask = size - 1
-    fu = u * size
-    fv = v * size
-    x = math.floor(fu)
-    y = math.floor(fv)
-    wx = fu - x
-    wy = fv - y
-    x0 = x & mask
-    x1 = (x + 1) & mask
-    y0 = y & mask
-    y1 = (y + 1) & mask
-    above = maps[k, y0, x0] * (1.0 - wx) + maps[k, y0, x1] * wx
-    below = maps[k, y1, x0] * (1.0 - wx) + maps[k, y1, x1] * wx
-    return float(above * (1.0 - wy) + below * wy)
-
-
-@njit(cache=True, error_model="numpy")
-def _between(grid: Any, i: int, j: int, a: float, b: float) -> float:
-    """Bilinear value of a grid, shares ``a`` and ``b`` of a cell beyond node (i, j)."""
-    low = grid[i, j] * (1.0 - a) + grid[i + 1, j] * a
-    high = grid[i, j + 1] * (1.0 - a) + grid[i + 1, j + 1] * a
-    return float(low * (1.0 - b) + high * b)
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def compose_ground(
-    noise: Any,
-    extent: float,
-    zone_scale: float,
-    zone_limits: Any,
-    zone_colours: Any,
-    zone_kinds: Any,
-    variation: Any,
-    roads: Any,
-    road_colours: Any,
-    patches: Any,
-    patch_colours: Any,
-    openness: Any,
-    slopes: Any,
-    sun: Any,
-    shadow: Any,
-    shadow_frame: Any,
-    heights: Any,
-    colour: Any,
-    kinds: Any,
-) -> None:
-    """The ground's map: colour and baked sunlight per texel (rows run north, columns east), and which detail covers it.
-
-    Zones from noise, then roads (straight with a sway), then rectangles: their rows are ``Scenery``'s.
-    """
-    size = kinds.shape[0]
-    cells = heights.shape[0] - 1
-    coarse = openness.shape[0]
-    for row in range(size):
-        n = ((row + 0.5) / size * 2.0 - 1.0) * extent
-        for column in range(size):
-            e = ((column + 0.5) / size * 2.0 - 1.0) * extent
-            gu = (n / extent + 1.0) * 0.5
-            gv = (e / extent + 1.0) * 0.5
-            broad = _noise(noise, 0, gv * zone_scale, gu * zone_scale)
-            tone = _noise(noise, 1, gv, gu)
-            fine = _noise(noise, 2, e / 19.0, n / 19.0)
-            value = broad + 0.03 * fine
-            zone = 0
-            while zone < zone_limits.shape[0] and value > zone_limits[zone]:
-                zone += 1
-            kind = zone_kinds[zone]
-            red = zone_colours[zone, 0]
-            green = zone_colours[zone, 1]
-            blue = zone_colours[zone, 2]
-            worn = 1.0
-            for k in range(roads.shape[0]):
-                dn = n - roads[k, 0]
-                de = e - roads[k, 1]
-                along = dn * roads[k, 2] + de * roads[k, 3]
-                across = -dn * roads[k, 3] + de * roads[k, 2]
-                across += roads[k, 5] * math.sin(along * roads[k, 6] + roads[k, 7])
-                off = abs(across) - roads[k, 4]
-                ragged = 0.12 * fine if roads[k, 9] < 0.5 else 0.02 * fine
-                if off + ragged < 0.0:
-                    kind = int(roads[k, 8])
-                    red = road_colours[k, 0]
-                    green = road_colours[k, 1]
-                    blue = road_colours[k, 2]
-                    worn = 1.0
-                    if roads[k, 9] > 1.5:
-                        stripe = abs(across) < 0.07 and (along * 0.2 - math.floor(along * 0.2)) < 0.5
-                        if stripe or abs(off + 0.25) < 0.06:
-                            red = green = blue = 0.55
-                            worn = 0.9
-                    elif roads[k, 9] < 0.5:  # two wheel tracks
-                        worn = 1.0 - 0.25 * math.exp(-(((abs(across) - 0.5 * roads[k, 4]) / 0.25) ** 2))
-                elif off + ragged < 0.22 and roads[k, 9] > 0.5:
-                    red = green = blue = 0.3
-                    worn = 1.0
-            for k in range(patches.shape[0]):
-                dn = n - patches[k, 0]
-                de = e - patches[k, 1]
-                a = abs(dn * patches[k, 2] + de * patches[k, 3])
-                b = abs(-dn * patches[k, 3] + de * patches[k, 2])
-                if a + 0.03 * fine < patches[k, 4] and b + 0.03 * fine < patches[k, 5]:
-                    kind = int(patches[k, 6])
-                    red = patch_colours[k, 0]
-                    green = patch_colours[k, 1]
-                    blue = patch_colours[k, 2]
-                    worn = 1.0
-                    if patches[k, 4] - a < 0.15 or patches[k, 5] - b < 0.15:
-                        worn = 0.7
-            shade = worn * math.exp(variation[0] * tone + variation[1] * fine)
-            hue = variation[2] * _noise(noise, 3, gv, gu)
-            i = min(coarse - 1, row * coarse // size)
-            j = min(coarse - 1, column * coarse // size)
-            shade *= openness[i, j]
-            # Sunlight: the grid's slopes, smoothed, with what stands in the way.
-            fn = gu * cells
-            fe = gv * cells
-            ci = min(cells - 1, int(fn))
-            cj = min(cells - 1, int(fe))
-            a = fn - ci
-            b = fe - cj
-            height = _between(heights, ci, cj, a, b)
-            slope_n = _between(slopes[0], ci, cj, a, b)
-            slope_e = _between(slopes[1], ci, cj, a, b)
-            lit = 0.0
-            for k in range(5):
-                dx = 0.06 * ((k & 1) * 2 - 1) if k < 4 else 0.0
-                dy = 0.06 * ((k & 2) - 1) if k < 4 else 0.0
-                lit += 0.2 * sun_reaches(shadow, shadow_frame, n + dx, e + dy, -height)
-            cosine = max(
-                0.0, (-slope_n * sun[0] - slope_e * sun[1] - sun[2]) / math.sqrt(1.0 + slope_n**2 + slope_e**2)
-            )
-            colour[row, column, 0] = red * shade * (1.0 + hue)
-            colour[row, column, 1] = green * shade
-            colour[row, column, 2] = blue * shade * (1.0 - hue)
-            colour[row, column, 3] = lit * cosine
-            kinds[row, column] = kind
+                ids[y, x] = thing.identity
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

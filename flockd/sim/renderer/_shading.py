@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from flockd.sim.renderer._raster import sun_reaches
+from flockd.sim.world.baking import GROUND_MAP_BITS, sun_reaches
+from flockd.sim.world.sky import SKY_BITS
+from flockd.sim.world.textures import TEXTURE_BITS
 
 _ROWS, _COLUMNS = 16, 32
 """Of a tile, a power of two each. Its texels lie together too, and what is known of it stays in the fastest cache."""
@@ -34,42 +36,13 @@ _EXP2 = tuple(np.float32(c) for c in (0.99990029, 0.69632477, 0.22469316, 0.0789
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def shade_scene(
-    hit: Any,
-    planes: Any,
-    K: Any,
-    inverse_K: Any,
-    R: Any,
-    origin: Any,
-    focal: float,
-    normals: Any,
-    texture: Any,
-    uv: Any,
-    level: Any,
-    tint: Any,
-    texels: Any,
-    texture_bits: int,
-    ground: Any,
-    ground_bits: int,
-    ground_kind: Any,
-    ground_detail: Any,
-    extent: float,
-    shadow: Any,
-    shadow_frame: Any,
-    light: Any,
-    fog: float,
-    sky: Any,
-    sky_bits: int,
-    tone: Any,
-    blobs: Any,
-    rgb: Any,
-    depth: Any,
-) -> None:
+def shade_scene(hit: Any, planes: Any, eye: Any, scene: Any, blobs: Any, rgb: Any, depth: Any) -> None:
     """Colour and metric depth of every pixel from its triangle index: the world without drones.
 
     A tile at a time, and each stage for the whole tile: most of it then compiles to vectors.
     """
     height, width = hit.shape
+    tone = scene.tone
     work = np.zeros(12 * _PLANE, dtype=np.float32)
     on_map = np.zeros(7 * _PLANE, dtype=np.float32)
     on_texture = np.zeros(7 * _PLANE, dtype=np.float32)
@@ -84,22 +57,19 @@ def shade_scene(
         count = (bottom - top) * _COLUMNS
         for left in range(0, width, _COLUMNS):
             right = min(width, left + _COLUMNS)
-            _find_depth(hit, planes, K, top, bottom, left, right, depth, work)
-            _find_places(inverse_K, R, origin, focal, fog, top, bottom, left, work)
-            _find_cells(extent, ground_bits, count, work, on_map, cells)
-            _cast_shadows(blobs, light[0], top, bottom, left, right, work)
-            skies, grounds = _find_surfaces(
-                hit, normals, texture, uv, level, tint, texture_bits, ground_kind, ground_detail, shadow, shadow_frame,
-                light[0], top, bottom, left, right, cells, work, on_texture, base,
-            )  # fmt: skip
+            _find_depth(hit, planes, eye.K, top, bottom, left, right, depth, work)
+            _find_places(eye, scene.fog_per_m, top, bottom, left, work)
+            _find_cells(scene.extent_m, GROUND_MAP_BITS, count, work, on_map, cells)
+            _cast_shadows(blobs, scene.light[0], top, bottom, left, right, work)
+            skies, grounds = _find_surfaces(hit, scene, top, bottom, left, right, cells, work, on_texture, base)
             if grounds > 0:
-                _sample_tile(ground, ground_bits, nowhere, count, on_map, taps, seen)
+                _sample_tile(scene.ground_map, GROUND_MAP_BITS, nowhere, count, on_map, taps, seen)
             if skies < (bottom - top) * (right - left):
-                _sample_tile(texels, texture_bits, base, count, on_texture, taps, seen)
+                _sample_tile(scene.texels, TEXTURE_BITS, base, count, on_texture, taps, seen)
             if skies > 0:
-                _find_directions(inverse_K, R, sky_bits, top, bottom, left, on_sky)
-                _sample_tile(sky, sky_bits, nowhere, count, on_sky, taps, seen)
-            _find_tones(light, extent, tone.shape[0] - 1, count, on_map, on_texture, on_sky, work)
+                _find_directions(eye, SKY_BITS, top, bottom, left, on_sky)
+                _sample_tile(scene.sky, SKY_BITS, nowhere, count, on_sky, taps, seen)
+            _find_tones(scene.light, scene.extent_m, tone.shape[0] - 1, count, on_map, on_texture, on_sky, work)
             for y in range(top, bottom):
                 first = (y - top) * _COLUMNS - left
                 for x in range(left, right):
@@ -137,14 +107,12 @@ def _find_depth(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _find_places(
-    inverse_K: Any, R: Any, origin: Any, focal: float, fog: float, top: int, bottom: int, left: int, work: Any
-) -> None:
+def _find_places(eye: Any, fog: float, top: int, bottom: int, left: int, work: Any) -> None:
     """Where each pixel of a tile is, log2 of its footprint's metres, and the share of light that haze leaves."""
-    on, oe, od = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])
+    on, oe, od = np.float32(eye.origin[0]), np.float32(eye.origin[1]), np.float32(eye.origin[2])
     fog_2 = np.float32(-fog / math.log(2.0))
-    sharper = np.float32(math.log2(focal) + 0.4)
-    ray = _rays_of_tile(inverse_K, R, top, left)
+    sharper = np.float32(math.log2(eye.focal) + 0.4)
+    ray = _rays_of_tile(eye.inverse_K, eye.R, top, left)
     one, least = np.float32(1.0), np.float32(0.02)
     for i in range((bottom - top) * _COLUMNS):
         column, row = np.float32(i & (_COLUMNS - 1)), np.float32(i // _COLUMNS)
@@ -235,17 +203,7 @@ def _cast_shadows(blobs: Any, sun: Any, top: int, bottom: int, left: int, right:
 @njit(nogil=True, cache=True, error_model="numpy")
 def _find_surfaces(
     hit: Any,
-    normals: Any,
-    texture: Any,
-    uv: Any,
-    level: Any,
-    tint: Any,
-    texture_bits: int,
-    ground_kind: Any,
-    ground_detail: Any,
-    shadow: Any,
-    shadow_frame: Any,
-    sun: Any,
+    scene: Any,
     top: int,
     bottom: int,
     left: int,
@@ -259,8 +217,9 @@ def _find_surfaces(
 
     Returns how many pixels are sky, and how many are ground.
     """
-    texture_area = ((4 << (2 * texture_bits)) - 1) // 3
-    kinds = ground_kind.ravel()
+    texture_area = ((4 << (2 * TEXTURE_BITS)) - 1) // 3
+    kinds, ground_detail, sun = scene.ground_kind.ravel(), scene.ground_detail, scene.light[0]
+    normals, texture, uv, tint = scene.normals, scene.texture, scene.uv, scene.tint
     skies = 0
     grounds = 0
     for y in range(top, bottom):
@@ -290,10 +249,10 @@ def _find_surfaces(
             work[_TILES + i] = 0.0
             on_texture[_U + i] = uv[t, 0, 0] * n + uv[t, 0, 1] * e + uv[t, 0, 2] * d + uv[t, 0, 3]
             on_texture[_V + i] = uv[t, 1, 0] * n + uv[t, 1, 1] * e + uv[t, 1, 2] * d + uv[t, 1, 3]
-            on_texture[_FINENESS + i] = work[_LEVEL + i] + level[t]
+            on_texture[_FINENESS + i] = work[_LEVEL + i] + scene.level[t]
             cosine = max(0.0, nn * sun[0] + ne * sun[1] + nd * sun[2])
             if cosine > 0.0:
-                cosine *= sun_reaches(shadow, shadow_frame, n + 0.08 * nn, e + 0.08 * ne, d + 0.08 * nd)
+                cosine *= sun_reaches(scene.shadow_map, scene.shadow_frame, n + 0.08 * nn, e + 0.08 * ne, d + 0.08 * nd)
             work[_SUN + i] *= cosine
             work[_UP + i] = 0.5 - 0.5 * nd
             work[_RED + i] = tint[t, 0]
@@ -309,11 +268,11 @@ def _find_surfaces(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _find_directions(inverse_K: Any, R: Any, bits: int, top: int, bottom: int, left: int, on_sky: Any) -> None:
+def _find_directions(eye: Any, bits: int, top: int, bottom: int, left: int, on_sky: Any) -> None:
     """Where each pixel of a tile is on the sky's map: an octahedral one of the upper half."""
     half, none, least = np.float32(0.5), np.float32(0.0), np.float32(1e-9)
     limit = np.float32(0.5 - 0.51 / (1 << bits))  # keep the filter off the opposite border
-    ray = _rays_of_tile(inverse_K, R, top, left)
+    ray = _rays_of_tile(eye.inverse_K, eye.R, top, left)
     for i in range((bottom - top) * _COLUMNS):
         column, row = np.float32(i & (_COLUMNS - 1)), np.float32(i // _COLUMNS)
         n = ray[0][2] + ray[1][2] * column + ray[2][2] * row

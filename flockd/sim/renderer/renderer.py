@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
 from flockd.sim.renderer import _raster, _shading
+from flockd.sim.renderer._raster import Eye, Scene, Thing
 from flockd.sim.renderer.airframe import DroneModel, machine_texels
 from flockd.sim.renderer.distractors import Distractor, Placed
-from flockd.sim.renderer.sky import SKY_BITS
-from flockd.sim.world import textures
 from flockd.sim.world.mesh import face_normals
-from flockd.sim.world.world import GROUND_MAP_BITS, World
+from flockd.sim.world.world import World
 
 Indices = NDArray[np.int32]
+Solid = DroneModel | Distractor
 _DISTRACTOR = 255
 """Id of distractors while an image is drawn; afterwards they count as background."""
 
@@ -49,7 +49,8 @@ class Renderer:
         self._world = world
         self._drones = tuple(drones)
         self._machine = machine_texels()
-        self._normals = [face_normals(d.vertices.astype(np.float64), d.triangles) for d in self._drones]
+        self._normals = [_normals(drone) for drone in self._drones]
+        self._scene = scene_of(world)
         codes = world.tone.astype(np.float64)
         # The middle of the linear values that show as each byte.
         self._linear = np.interp(
@@ -85,25 +86,15 @@ class Renderer:
             raise ValueError(
                 f"{count} drones need {count} poses, not {len(rotations)} rotations and {len(positions)} positions"
             )
-        K: FloatArray = np.ascontiguousarray(matrix, dtype=np.float64)
-        R = np.ascontiguousarray(R_ned_camera, dtype=np.float64)
-        origin: FloatArray = np.ascontiguousarray(position_ned, dtype=np.float64)
-        inverse_K: FloatArray = np.asarray(np.linalg.inv(K), dtype=np.float64)
-        focal = float(np.sqrt(K[0, 0] * K[1, 1]))
+        K, R, origin = (np.ascontiguousarray(one, dtype=np.float64) for one in (matrix, R_ned_camera, position_ned))
+        eye = Eye(K, np.asarray(np.linalg.inv(K)), R, origin, float(np.sqrt(K[0, 0] * K[1, 1])))
         P = np.ascontiguousarray(K @ R.T)
 
         blobs = self._shadows(positions, P, origin, width, height)
         depth = np.empty((height, width), dtype=np.float32)
         sharp = np.empty((height, width, 3), dtype=np.uint8)
-        q = _raster.project_vertices(world.vertices, P, origin)
-        rows, planes = _set_up(q, world.triangles, width, height)
-        hit, _ = _fill(rows, planes, width, height)
-        _shading.shade_scene(
-            hit, planes, K, inverse_K, R, origin, focal, world.normals, world.texture, world.uv, world.level,
-            world.tint, world.texels, textures.TEXTURE_BITS, world.ground_map, GROUND_MAP_BITS, world.ground_kind,
-            world.ground_detail, world.extent_m, world.shadow_map, world.shadow_frame, world.light,
-            world.fog_per_m, world.sky, SKY_BITS, world.tone, blobs, sharp, depth,
-        )  # fmt: skip
+        planes, hit, _ = rasterized(world.vertices, world.triangles, P, origin, width, height)
+        _shading.shade_scene(hit, planes, eye, self._scene, blobs, sharp, depth)
         view = View(
             rgb=sharp.copy(),
             depth=depth,
@@ -112,55 +103,45 @@ class Renderer:
         )
         _raster.smooth_edges(hit, world.texture, planes, self._linear, world.tone, sharp, view.rgb)
         chosen = np.arange(count)[np.asarray(shown)] if len(np.asarray(shown)) else np.arange(0)
-        things: list[tuple[int, DroneModel | Distractor, FloatArray, FloatArray, FloatArray]] = [
-            (int(k) + 1, self._drones[k], self._normals[k], rotations[k], positions[k]) for k in chosen
+        drones, normals = self._drones, self._normals
+        things: list[tuple[Solid, Thing]] = [
+            (drones[k], self._thing(int(k) + 1, drones[k], normals[k], rotations[k], positions[k])) for k in chosen
         ]
         for placed in distractors:
-            normals = face_normals(placed.thing.vertices.astype(np.float64), placed.thing.triangles)
-            things.append((_DISTRACTOR, placed.thing, normals, placed.rotation, placed.position))
-        distance = np.array([np.linalg.norm(position - origin) for *_, position in things])
+            thing = self._thing(_DISTRACTOR, placed.thing, _normals(placed.thing), placed.rotation, placed.position)
+            things.append((placed.thing, thing))
+        distance = np.array([np.linalg.norm(thing.position - origin) for _, thing in things])
         for i in np.argsort(-distance, kind="stable"):
-            identity, model, normals, rotation, position = things[i]
-            self._draw(identity, model, normals, rotation, position, K, inverse_K, R, origin, focal, view)
+            model, thing = things[i]
+            self._draw(model, thing, eye, view)
         if distractors:
             np.equal(view.ids, _DISTRACTOR, out=view.distractors)
             view.ids[view.distractors] = 0
         return view
 
-    def _draw(
-        self,
-        identity: int,
-        model: DroneModel | Distractor,
-        normals: FloatArray,
-        rotation: FloatArray,
-        position: FloatArray,
-        K: FloatArray,
-        inverse_K: FloatArray,
-        R: FloatArray,
-        origin: FloatArray,
-        focal: float,
-        view: View,
-    ) -> None:
+    def _thing(
+        self, identity: int, model: Solid, normals: FloatArray, rotation: FloatArray, position: FloatArray
+    ) -> Thing:
+        turned, look = np.ascontiguousarray(rotation), (model.texture, model.uv, model.colours)
+        return Thing(identity, turned, position, normals @ rotation.T, *look, self._machine)
+
+    def _draw(self, model: Solid, thing: Thing, eye: Eye, view: View) -> None:
         """Lay one thing over the view, supersampled within its bounding rectangle."""
-        world = self._world
         height, width = view.ids.shape
-        vertices = np.ascontiguousarray(model.vertices.astype(np.float64) @ rotation.T + (position - origin))
-        P = K @ R.T
+        seen_from = thing.position - eye.origin
+        vertices = np.ascontiguousarray(model.vertices.astype(np.float64) @ thing.rotation.T + seen_from)
+        P = eye.K @ eye.R.T
         left, top, right, bottom = _bounds(vertices @ P.T, width, height)
         if left >= right or top >= bottom:
             return
         s = _raster.SUBSAMPLES
         zoom = np.array([[s, 0.0, -s * left], [0.0, s, -s * top], [0.0, 0.0, 1.0]])
         wide, high = s * (right - left), s * (bottom - top)
-        q = _raster.project_vertices(vertices, np.ascontiguousarray(zoom @ P), np.zeros(3))
-        rows, planes = _set_up(q, model.triangles, wide, high)
-        hit, inverse_depth = _fill(rows, planes, wide, high)
-        _raster.shade_drone(
-            hit, inverse_depth, planes, left, top, inverse_K, R, origin, focal, np.ascontiguousarray(rotation),
-            position, normals @ rotation.T, model.texture, model.uv, model.colours, self._machine,
-            textures.TEXTURE_BITS, world.shadow_map, world.shadow_frame, world.light, world.fog_per_m, world.tone,
-            self._linear, identity, view.rgb, view.depth, view.ids,
-        )  # fmt: skip
+        zoomed = np.ascontiguousarray(zoom @ P)
+        planes, hit, inverse_depth = rasterized(vertices, model.triangles, zoomed, np.zeros(3), wide, high)
+        _raster.lay_over(
+            hit, inverse_depth, planes, left, top, eye, thing, self._scene, self._linear, view.rgb, view.depth, view.ids
+        )
 
     def _shadows(self, positions: FloatArray, P: FloatArray, origin: FloatArray, width: int, height: int) -> FloatArray:
         """(k, 9) discs that stand for the drones in the sun, and where in the image their shadows may be."""
@@ -180,18 +161,25 @@ class Renderer:
         return np.array(blobs, dtype=np.float64).reshape(-1, 9)
 
 
-def _set_up(q: FloatArray, triangles: Indices, width: int, height: int) -> tuple[Indices, FloatArray]:
-    rows = np.empty((len(triangles), 2), dtype=np.int32)
-    planes = np.empty((len(triangles), 12))
-    _raster.set_up_triangles(q, triangles, width, height, rows, planes)
-    return rows, planes
+def _normals(model: Solid) -> FloatArray:
+    return face_normals(model.vertices.astype(np.float64), model.triangles)
 
 
-def _fill(rows: Indices, planes: FloatArray, width: int, height: int) -> tuple[Indices, Float32Array]:
-    inverse_depth = np.empty((height, width), dtype=np.float32)
-    hit = np.empty((height, width), dtype=np.int32)
-    _raster.fill(_raster.list_visible(rows), rows, planes, inverse_depth, hit)
-    return hit, inverse_depth
+def scene_of(world: World) -> Scene:
+    """What the compiled loops need of a world."""
+    return Scene(**{name: getattr(world, name) for name in Scene._fields})
+
+
+def rasterized(
+    vertices: FloatArray, triangles: Indices, P: FloatArray, origin: FloatArray, width: int, height: int
+) -> tuple[FloatArray, Indices, Float32Array]:
+    """Planes (m, 12) of triangles, and of each pixel the nearest one, -1 for none, and 1/z of it, (h, w)."""
+    rows, planes = np.empty((len(triangles), 2), dtype=np.int32), np.empty((len(triangles), 12))
+    _raster.set_up_triangles(_raster.project_vertices(vertices, P, origin), triangles, width, height, rows, planes)
+    hit, inverse_depth = np.empty((height, width), dtype=np.int32), np.empty((height, width), dtype=np.float32)
+    visible = np.flatnonzero(rows[:, 1] >= rows[:, 0]).astype(np.int32)
+    _raster.fill(visible, rows, planes, inverse_depth, hit)
+    return planes, hit, inverse_depth
 
 
 def _bounds(q: FloatArray, width: int, height: int) -> tuple[int, int, int, int]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Self
 
 import numpy as np
 
@@ -18,9 +18,8 @@ from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, Ground
 from flockd.sim.autopilot.fake_vehicle import DeadTime, Demand, MotionState, PointMass
 from flockd.sim.scenario import ScenarioConfig, StartConfig, VehicleConfig
-from flockd.sim.sitl.free_ports import free_port
 from flockd.sim.sitl.ground_station import FULL_STICK_M_S, home_deg
-from flockd.sim.sitl.leftovers import described, px4_instance, user_of_port
+from flockd.sim.sitl.ports import described, free_port, px4_instance, user_of_port
 from flockd.sim.sitl.processes import Program, Programs
 from flockd.sim.vehicles.vehicles import Vehicles
 
@@ -66,45 +65,47 @@ class Ports:
     """Where the simulator does."""
 
 
-class Autopilots(Protocol):
-    """One autopilot a vehicle, on the ground below its start until it is commanded to take off."""
+class Autopilots(ABC):
+    """One autopilot a vehicle, on the ground below its start until it is commanded to take off.
+
+    Between ``__enter__`` and ``__exit__``.
+    """
 
     name: str
     """For the report."""
     ports: tuple[Ports, ...]
 
-    def __enter__(self) -> Self: ...
+    def __init__(self, scenario: ScenarioConfig, speed_factor: float) -> None:
+        self._scenario, self._speed_factor = scenario, speed_factor
+        self._stack = ExitStack()
+        self._programs = self._stack.enter_context(Programs())
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
+    def __enter__(self) -> Self:
+        return self
 
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    @abstractmethod
     def start(self) -> None:
         """Starts all."""
 
     def programs(self) -> Sequence[Program]:
         """Those that are programs of their own."""
+        return tuple(self._programs)
 
 
-class SimulatedAutopilots:
+class SimulatedAutopilots(Autopilots):
     """The autopilots that `flockd.onboard.autopilot` simulates, on the simulator's own vehicle model."""
 
     name = "fake autopilot"
 
     def __init__(self, scenario: ScenarioConfig, speed_factor: float, ground: Ground) -> None:
         """``ground``: of the world, which range finders measure to."""
-        self._scenario, self._speed_factor, self._ground = scenario, speed_factor, ground
+        super().__init__(scenario, speed_factor)
+        self._ground = ground
         self.ports = tuple(Ports(free_port(), free_port()) for _ in scenario.vehicles)
         self.fakes: list[FakeAutopilot] = []
-        self._stack = ExitStack()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stack.close()
 
     def start(self) -> None:
         """See `Autopilots`."""
@@ -124,10 +125,6 @@ class SimulatedAutopilots:
             fake.parameters["MAN_DEADZONE"] = 0.0
             self.fakes.append(self._stack.enter_context(fake))
 
-    def programs(self) -> Sequence[Program]:
-        """See `Autopilots`."""
-        return ()
-
     def _range_finder(self, number: int, home: FloatArray) -> FakeRangeFinder | None:
         """A vehicle's, which counts its position from home."""
         config = self._scenario.sensors.range_finder
@@ -140,7 +137,7 @@ class SimulatedAutopilots:
         return FakeRangeFinder(config, ground, (self._scenario.seed, number, 2))
 
 
-class Px4s:
+class Px4s(Autopilots):
     """Instances of PX4 SITL that fly its own simulated quadrotor (SIH)."""
 
     name = "PX4 SITL"
@@ -160,22 +157,13 @@ class Px4s:
         """
         if first + len(scenario.vehicles) > MAX_INSTANCES:
             raise UsageError(f"PX4 gives ports to {MAX_INSTANCES} vehicles, not {len(scenario.vehicles)}; fly fewer")
-        self._build = px4_folder(environment)
+        super().__init__(scenario, speed_factor)
+        self._build, self._folder = px4_folder(environment), folder
         self._instances = range(first, first + len(scenario.vehicles))
         _refuse_leftovers(self._instances)
-        self._scenario, self._speed_factor, self._folder = scenario, speed_factor, folder
         self._environment = dict(environment)
         self._parameters = {**PARAMETERS, **(parameters or {})}
         self.ports = tuple(Ports(OFFBOARD_PORT + i, TRUTH_PORT + i) for i in self._instances)
-        self._programs = Programs()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._programs.__exit__(kind, error, trace)
 
     def start(self) -> None:
         """See `Autopilots`."""
@@ -197,10 +185,6 @@ class Px4s:
             command = [str(self._build / "bin/px4"), "-i", f"{i}", "-d", str(self._build / "etc"), "-w", str(working)]
             log = self._folder / f"px4_{i}.log"
             self._programs.start(f"PX4 instance {i}", command, {**self._environment, **settings}, working, log)
-
-    def programs(self) -> Sequence[Program]:
-        """See `Autopilots`."""
-        return tuple(self._programs)
 
 
 def _refuse_leftovers(instances: Iterable[int]) -> None:

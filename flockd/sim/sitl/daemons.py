@@ -7,7 +7,6 @@ import socket
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import yaml
@@ -96,10 +95,8 @@ class Daemons:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._programs.__exit__(kind, error, trace)
+    def __exit__(self, *_: object) -> None:
+        self._programs.__exit__()
         for listener in self._listeners:
             listener.close()
 

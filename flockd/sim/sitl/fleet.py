@@ -25,10 +25,10 @@ from flockd.sim.sitl.autopilots import Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.sitl.daemons import Daemons, fleet_configs
 from flockd.sim.sitl.fleet_log import FleetFrame, FleetRun, fleet_key_frames, fleet_log, recorded_orders
 from flockd.sim.sitl.frame_server import FrameServer
-from flockd.sim.sitl.free_ports import free_endpoint
 from flockd.sim.sitl.ground_station import GroundStation, Mode
+from flockd.sim.sitl.ports import free_endpoint
 from flockd.sim.sitl.processes import Program
-from flockd.sim.world.clearances import with_obstacles
+from flockd.sim.world.obstacle_worlds import with_obstacles
 
 Progress = Callable[[int, int], None]
 

@@ -9,12 +9,10 @@ from __future__ import annotations
 import math
 import select
 import socket
-import struct
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -27,7 +25,7 @@ from flockd.core.messages import FloatArray
 from flockd.flight.geometry import rotation_from_euler, rotation_from_quaternion
 from flockd.onboard.autopilot.mavlink_messages import StatusText
 from flockd.sim.autopilot.sticks import stick_curve
-from flockd.sim.sitl.leftovers import described, user_of_port
+from flockd.sim.sitl.ports import described, user_of_port
 from flockd.sim.vehicles.vehicles import REFERENCE_DEG
 
 Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "ACRO", "OFFBOARD"]
@@ -123,9 +121,7 @@ class GroundStation:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._closing.set()
         self._thread.join()
         for vehicle in self._vehicles:
@@ -171,10 +167,6 @@ class GroundStation:
         """Its last STATUSTEXT, whole; empty if there was none."""
         return next(reversed(self._vehicles[number].texts), "")
 
-    def texts(self, number: int) -> list[str]:
-        """All its STATUSTEXTs so far, whole, in turn: of two at once nobody may read the first while it is the last."""
-        return list(self._vehicles[number].texts)
-
     def version(self, number: int) -> str | None:
         """Version of its firmware, such as `1.18.0`; None while it is not known."""
         return self._vehicles[number].version
@@ -206,29 +198,6 @@ class GroundStation:
         x, y = (int(stick) for stick in np.round(sticks * _STICK))
         with self._lock:
             vehicle.mav.manual_control_send(number + 1, x, y, _NEUTRAL_THROTTLE, 0, 0)
-
-    def push_sticks(self, number: int, *, forward: int) -> None:
-        """Sends the position of a joystick's sticks once: in the middle but for `forward`, -1000 to 1000."""
-        vehicle = self._vehicles[number]
-        with self._lock:
-            vehicle.mav.manual_control_send(vehicle.number + 1, forward, 0, 500, 0, 0)
-
-    def set_parameter(self, number: int, name: str, value: int | float) -> None:
-        """Sends a parameter: an int for an INT32, a float for a REAL32."""
-        vehicle = self._vehicles[number]
-        kind = mavlink.MAV_PARAM_TYPE_INT32 if isinstance(value, int) else mavlink.MAV_PARAM_TYPE_REAL32
-        # PX4 takes an integer's bytes where MAVLink has a float.
-        wire = struct.unpack("<f", struct.pack("<i", value))[0] if isinstance(value, int) else value
-        with self._lock:
-            vehicle.mav.param_set_send(vehicle.number + 1, 1, name.encode(), wire, kind)
-
-    def send_velocity(self, number: int, velocity: FloatArray) -> None:
-        """Sends a setpoint once, as flockd does: a velocity (2,) m/s north and east, level."""
-        vehicle = self._vehicles[number]
-        with self._lock:
-            vehicle.mav.set_position_target_local_ned_send(
-                0, vehicle.number + 1, 1, 1, 2503, 0, 0, 0, *velocity, 0, 0, 0, 0, 0, 0
-            )
 
     def _command(self, vehicle: _Vehicle, command: int, *numbers: float) -> None:
         values = (*numbers, *[0.0] * (7 - len(numbers)))

@@ -4,16 +4,36 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from flockd.core.messages import FloatArray, VehicleState
 from flockd.flight.geometry import rotation_from_euler
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, Ground, level_ground
-from flockd.sim.cameras.pose_trail import KEPT_S, FlockPose, PoseTrail
 from flockd.sim.scenario import SensorConfig, StartConfig, VehicleConfig
-from flockd.sim.vehicles.disturbances import Disturbances
+from flockd.sim.vehicles.pose_trail import KEPT_S, FlockPose, PoseTrail
 from flockd.sim.vehicles.wind import GustField
+
+
+@dataclass(frozen=True)
+class Disturbances:
+    """As of one step. Drones are counted from 0."""
+
+    gust_m_s: float | None = None
+    """As `vehicle.gust_m_s` of the scenario; None: that one."""
+    cameras_off: frozenset[tuple[int, str]] = frozenset()
+    """Of drones, by name: they deliver no images."""
+    removed: frozenset[int] = frozenset()
+    """Drones that are in the world no more."""
+
+    def cameras_off_of(self, drone: int) -> frozenset[str]:
+        """The names of those of one drone."""
+        return frozenset(name for i, name in self.cameras_off if i == drone)
+
+
+UNDISTURBED = Disturbances()
+
 
 GRAVITY_M_S2 = 9.81
 MAX_LEAN_M_S2 = GRAVITY_M_S2 * math.tan(math.radians(45.0))
@@ -34,25 +54,89 @@ REFERENCE_DEG = (1.0, 1.0)
 0.4 m in Europe."""
 
 
-class Vehicles:
-    """All vehicles of a flight.
+class Motion:
+    """How the vehicles of a batch of flights move; remembers what gusts added to their velocities.
 
     Horizontal velocity follows a setpoint as a first-order lag of limited acceleration. With the same time constant it
     comes back from what gusts add, as hard as the vehicle can lean: an autopilot limits what it does for a setpoint,
     and leans against wind as far as need be. Height is held, or changed as by a critically damped controller of limited
-    climb, down to the ground at z = 0. The attitude is the one whose thrust gives the horizontal acceleration. The
-    arrays are replaced by `step`, never changed in place: `position` (n, 3) m and `velocity` (n, 3) m/s in NED,
-    `R_ned_body` (n, 3, 3). `trail` has them of the last second, as if the flight had begun a second before.
+    climb, down to the ground at z = 0.
+    """
+
+    def __init__(self, config: VehicleConfig, seeds: Sequence[int], drones: int) -> None:
+        """`seeds` rule the gusts of the flights, of so many `drones` each."""
+        self._config, self._seeds, self._shape = config, seeds, (len(seeds), drones, 3)
+        self._blown = np.zeros((len(seeds) * drones, 2))
+        """What of the velocity gusts added, m/s."""
+        self.blow(config.gust_m_s)
+
+    def blow(self, gust_m_s: float) -> None:
+        """From now on gusts are as strong as that."""
+        config = self._config.model_copy(update={"gust_m_s": gust_m_s})
+        self._gusts = GustField(np.stack([GustField.of(config, seed).waves for seed in self._seeds]))
+
+    def step(
+        self, now_s: float, dt_s: float, place: FloatArray, velocity: FloatArray, setpoints: FloatArray
+    ) -> FloatArray:
+        """Moves all `place` (n, 3) m and `velocity` (n, 3) m/s in place, towards `setpoints` (n, 2) m/s, for a moment.
+
+        Returns the acceleration (n, 2) m/s^2 that the vehicles lean for.
+        """
+        # The exact mean acceleration of a first-order lag over dt, then its limit.
+        answer_per_s = -math.expm1(-dt_s / self._config.velocity_time_constant_s) / dt_s
+        most_m_s2 = self._config.max_acceleration_m_s2
+        followed = limit_norms((setpoints - (velocity[:, :2] - self._blown)) * answer_per_s, most_m_s2)
+        steered = limit_norms(followed - self._blown * answer_per_s, MAX_LEAN_M_S2)
+        push = self._gusts.push(now_s, place.reshape(self._shape)).reshape(-1, 2)
+        self._blown = self._blown + (steered - followed + push) * dt_s
+        acceleration = steered + push
+        place[:, :2] += velocity[:, :2] * dt_s + acceleration * (dt_s**2 / 2)
+        velocity[:, :2] += acceleration * dt_s
+        return steered
+
+    def fly(
+        self, begin_s: float, interval_s: float, states: FloatArray, setpoints: FloatArray, heights: FloatArray
+    ) -> None:
+        """Moves `states` (6, flights, n) in place for `interval_s`, towards `setpoints` (2, flights, n) m/s.
+
+        `heights` (flights, n) m, up positive; NaN: as high as now.
+        """
+        count = substeps(interval_s)
+        wanted, place, velocity = (part.reshape(len(part), -1).T for part in (setpoints, states[:3], states[3:]))
+        climbs, dt_s = bool(np.isfinite(heights).any()), interval_s / count
+        for substep in range(count):
+            self.step(begin_s + substep * dt_s, dt_s, place, velocity, wanted)
+            if climbs:
+                climb(dt_s, place[:, 2], velocity[:, 2], heights.reshape(-1))
+
+
+def substeps(interval_s: float) -> int:
+    """Into how many short steps an interval is cut."""
+    return math.ceil(interval_s / _MAX_SUBSTEP_S - 1e-9)
+
+
+def climb(dt_s: float, down: FloatArray, sink: FloatArray, heights: FloatArray) -> None:
+    """Moves (n,) m and m/s in place towards heights (n,) m, up positive; NaN: as high as now."""
+    wanted = np.clip(np.nan_to_num((-heights - down) / CLIMB_TIME_S), -MAX_CLIMB_M_S, MAX_CLIMB_M_S)
+    sink += (wanted - sink) * min(1.0, 4.0 * dt_s / CLIMB_TIME_S)
+    down += sink * dt_s
+    landed = down >= 0.0
+    sink[landed], down[landed] = np.minimum(sink[landed], 0.0), 0.0
+
+
+class Vehicles:
+    """All vehicles of a flight, which move as `Motion` says.
+
+    The attitude is the one whose thrust gives the horizontal acceleration. The arrays are replaced by `step`, never
+    changed in place: `position` (n, 3) m and `velocity` (n, 3) m/s in NED, `R_ned_body` (n, 3, 3). `trail` has them of
+    the last second, as if the flight had begun a second before.
     """
 
     def __init__(self, starts: Sequence[StartConfig], config: VehicleConfig, *, yaw_rad: float = 0.0, seed: int = 0):
         """Start in level flight at the configured velocities, all heading `yaw_rad`; `seed` rules the gusts."""
         n = len(starts)
-        self._config = config
-        self._seed, self._gust_m_s = seed, config.gust_m_s
-        self._gusts, self._time_s = GustField.of(config, seed), 0.0
-        self._blown = np.zeros((n, 2))
-        """What of the velocity gusts added, m/s."""
+        self._config, self._gust_m_s, self._time_s = config, config.gust_m_s, 0.0
+        self._motion = Motion(config, [seed], n)
         self._wind = np.array(config.wind_m_s)
         self._yaw = np.full(n, yaw_rad)
         self.position = np.array([start.position_m for start in starts])
@@ -68,7 +152,7 @@ class Vehicles:
         gust_m_s = self._config.gust_m_s if disturbed.gust_m_s is None else disturbed.gust_m_s
         if gust_m_s != self._gust_m_s:
             self._gust_m_s = gust_m_s
-            self._gusts = GustField.of(self._config.model_copy(update={"gust_m_s": gust_m_s}), self._seed)
+            self._motion.blow(gust_m_s)
         if disturbed.removed:
             gone = list(disturbed.removed)
             self.position, self.velocity = self.position.copy(), self.velocity.copy()
@@ -82,44 +166,25 @@ class Vehicles:
 
         `heights` (n,) m, up positive, are flown to; NaN, or None for all: as high as now.
         """
-        substeps = math.ceil(interval_s / _MAX_SUBSTEP_S - 1e-9)
+        count = substeps(interval_s)
         climbs = heights is not None and not (np.isnan(heights).all() and self._is_level)
-        for _ in range(substeps):
-            self._substep(setpoints, yaw_setpoints, interval_s / substeps)
-            if climbs and heights is not None:
-                self._climb(heights, interval_s / substeps)
-            self.R_ned_body = attitude(self._thrust, self._yaw)
-            self.trail.add(FlockPose(self._time_s, self.position, self.R_ned_body))
+        for _ in range(count):
+            self._substep(setpoints, yaw_setpoints, interval_s / count, heights if climbs else None)
 
-    def _substep(self, setpoints: FloatArray, yaw_setpoints: FloatArray, dt: float) -> None:
+    def _substep(self, setpoints: FloatArray, yaw_setpoints: FloatArray, dt: float, heights: FloatArray | None) -> None:
         config = self._config
-        velocity = self.velocity[:, :2]
-        # The exact mean acceleration of a first-order lag over dt, then its limit.
-        answer_per_s = -math.expm1(-dt / config.velocity_time_constant_s) / dt
-        followed = limit_norms((setpoints - (velocity - self._blown)) * answer_per_s, config.max_acceleration_m_s2)
-        steered = limit_norms(followed - self._blown * answer_per_s, MAX_LEAN_M_S2)
-        push = self._gusts.push(self._time_s, self.position)
-        self._blown = self._blown + (steered - followed + push) * dt
-        acceleration = steered + push
+        self.position, self.velocity = self.position.copy(), self.velocity.copy()
+        steered = self._motion.step(self._time_s, dt, self.position, self.velocity, setpoints)
         self._time_s += dt
-        self.position = self.position.copy()
-        self.position[:, :2] += velocity * dt + acceleration * (dt**2 / 2)
-        self.velocity = np.column_stack([velocity + acceleration * dt, self.velocity[:, 2]])
-
         lean = 1.0 if config.tilt_time_constant_s == 0 else -math.expm1(-dt / config.tilt_time_constant_s)
         self._thrust = self._thrust + lean * (steered + self._drag(self.velocity[:, :2]) - self._thrust)
         error = (yaw_setpoints - self._yaw + math.pi) % (2 * math.pi) - math.pi
         limit = math.radians(config.max_yaw_rate_deg_s) * dt
         self._yaw = self._yaw + np.clip(-math.expm1(-dt / config.yaw_time_constant_s) * error, -limit, limit)
-
-    def _climb(self, heights: FloatArray, dt: float) -> None:
-        down, sink = self.position[:, 2], self.velocity[:, 2]
-        wanted = np.clip(np.nan_to_num((-heights - down) / CLIMB_TIME_S), -MAX_CLIMB_M_S, MAX_CLIMB_M_S)
-        sink = sink + (wanted - sink) * min(1.0, 4.0 * dt / CLIMB_TIME_S)
-        down = down + sink * dt
-        sink = np.where(down >= 0.0, np.minimum(sink, 0.0), sink)
-        self.position = np.column_stack([self.position[:, :2], np.minimum(down, 0.0)])
-        self.velocity = np.column_stack([self.velocity[:, :2], sink])
+        if heights is not None:
+            climb(dt, self.position[:, 2], self.velocity[:, 2], heights)
+        self.R_ned_body = attitude(self._thrust, self._yaw)
+        self.trail.add(FlockPose(self._time_s, self.position, self.R_ned_body))
 
     @property
     def _is_level(self) -> bool:

@@ -8,12 +8,195 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from numba import njit
 
 from flockd.core.messages import SECTORS, FloatArray, ObstacleRanges
-from flockd.sim.world.solid_distances import BOX, CAPSULE, FRUSTUM, OWN, level_ranges, point_clearances
+
+FRUSTUM, BOX, CAPSULE = 0.0, 1.0, 2.0
+KIND, NORTH, EAST, REACH_M, LOW_M, HIGH_M, OWN = range(7)
+"""Columns of a solid's row (13,): the upright cylinder around it, and from `OWN` on its own seven figures."""
+_LEAST_SLOPE = 1e-9
+_LEAST_DIRECTION = 1e-12
+_LEAST_SQUARE = 1e-18
+_ROUNDING_RAD = 1e-6
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def level_ranges(
+    x: float, y: float, low: float, high: float, solids: Any, azimuths: Any, half_width: float, limit_m: float, out: Any
+) -> None:
+    """Level metres, (n,), from a place to the nearest of what lies between two heights at each of the azimuths.
+
+    inf without one, or beyond `limit_m`; 0 inside. `azimuths` (n,) and `half_width` are as of `Obstacles.ranges`,
+    `solids` (k, 13) rows.
+    """
+    out[:] = math.inf
+    looks = np.empty((azimuths.size, 3))
+    for k in range(azimuths.size):
+        looks[k, 0], looks[k, 1], looks[k, 2] = azimuths[k], math.cos(azimuths[k]), math.sin(azimuths[k])
+    for k in range(solids.shape[0]):
+        if solids[k, LOW_M] > high or solids[k, HIGH_M] < low:
+            continue
+        reach = solids[k, REACH_M] + limit_m
+        if (solids[k, NORTH] - x) ** 2 + (solids[k, EAST] - y) ** 2 > reach * reach:
+            continue
+        own = solids[k, OWN:]
+        if solids[k, KIND] == FRUSTUM:
+            wide = max(_radius_at(own, max(own[4], low)), _radius_at(own, min(own[5], high)))
+            _disc_ranges(own[0] - x, own[1] - y, wide, looks, half_width, out)
+        elif solids[k, KIND] == BOX:
+            _rectangle_ranges(own[0] - x, own[1] - y, own[2], own[3], own[4], looks, half_width, out)
+        else:
+            _capsule_ranges(own, x, y, low, high, looks, half_width, out)
+    for k in range(out.size):
+        if out[k] > limit_m:
+            out[k] = math.inf
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _radius_at(own: Any, height: float) -> float:
+    """Radius of a frustum at a height."""
+    return float(own[2] + (height - own[4]) / (own[5] - own[4]) * (own[3] - own[2]))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _capsule_ranges(
+    own: Any, x: float, y: float, low: float, high: float, looks: Any, half_width: float, out: Any
+) -> None:
+    """Ranges to the part of a capsule between two heights: discs at its ends, and the rectangle between them.
+
+    Exact for upright and level ones; of a sloping one the axis is cut where it leaves the heights by the radius.
+    """
+    rise = own[5] - own[2]
+    begin, end = 0.0, 1.0
+    if abs(rise) > _LEAST_SLOPE:
+        one, other = (low - own[6] - own[2]) / rise, (high + own[6] - own[2]) / rise
+        begin, end = min(max(min(one, other), 0.0), 1.0), min(max(one, other, 0.0), 1.0)
+    beyond = max(low - max(own[2], own[5]), min(own[2], own[5]) - high, 0.0)
+    if beyond > own[6]:
+        return
+    wide = math.sqrt(max(own[6] ** 2 - beyond**2, 0.0))
+    an, ae = own[0] + begin * (own[3] - own[0]), own[1] + begin * (own[4] - own[1])
+    bn, be = own[0] + end * (own[3] - own[0]), own[1] + end * (own[4] - own[1])
+    _disc_ranges(an - x, ae - y, wide, looks, half_width, out)
+    length = math.sqrt((bn - an) ** 2 + (be - ae) ** 2)
+    if length > 0.0:
+        _disc_ranges(bn - x, be - y, wide, looks, half_width, out)
+        heading = math.atan2(be - ae, bn - an)
+        _rectangle_ranges((an + bn) / 2 - x, (ae + be) / 2 - y, length / 2, wide, heading, looks, half_width, out)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _disc_ranges(dn: float, de: float, radius: float, looks: Any, half_width: float, out: Any) -> None:
+    """A sector's nearest point of something convex is the one whose azimuth is nearest to that of the nearest point."""
+    away = math.sqrt(dn * dn + de * de)
+    if away <= radius:
+        out[:] = 0.0
+        return
+    towards = math.atan2(de, dn)
+    meets = away * math.cos(min(math.asin(radius / away) + half_width + _ROUNDING_RAD, math.pi))
+    for k in range(out.size):
+        if dn * looks[k, 1] + de * looks[k, 2] < meets:
+            continue
+        aside = max(abs(_wrapped(towards - looks[k, 0])) - half_width, 0.0)
+        inside = radius * radius - (away * math.sin(aside)) ** 2
+        if inside >= 0.0 and math.cos(aside) > 0.0:
+            out[k] = min(out[k], away * math.cos(aside) - math.sqrt(inside))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _rectangle_ranges(
+    dn: float, de: float, half_n: float, half_e: float, heading: float, looks: Any, half_width: float, out: Any
+) -> None:
+    """In the rectangle's own axes, along its length and its width."""
+    cosine, sine = math.cos(heading), math.sin(heading)
+    x, y = -(dn * cosine + de * sine), -(de * cosine - dn * sine)
+    to_x, to_y = min(max(x, -half_n), half_n) - x, min(max(y, -half_e), half_e) - y
+    nearest = math.sqrt(to_x * to_x + to_y * to_y)
+    towards = math.atan2(to_y, to_x) + heading
+    for k in range(out.size):
+        aside = _wrapped(towards - looks[k, 0])
+        if abs(aside) <= half_width or nearest == 0.0:
+            out[k] = min(out[k], nearest)
+            continue
+        looked_at = looks[k, 0] + min(max(aside, -half_width), half_width) - heading
+        near_x, far_x = _slab(x, math.cos(looked_at), half_n)
+        near_y, far_y = _slab(y, math.sin(looked_at), half_e)
+        enter, leave = max(near_x, near_y), min(far_x, far_y)
+        if enter <= leave and leave >= 0.0:
+            out[k] = min(out[k], max(enter, 0.0))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _slab(place: float, direction: float, half: float) -> Any:
+    """How far along a line it enters and leaves what is within `half` of 0."""
+    along = _LEAST_DIRECTION if abs(direction) < _LEAST_DIRECTION else direction
+    reach = math.copysign(half, along)
+    return (-reach - place) / along, (reach - place) / along
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _wrapped(angle: float) -> float:
+    """Between -pi and pi."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def point_clearances(points: Any, solids: Any, out: Any) -> None:
+    """Metres, (m,), from points (m, 3) NED to the nearest surface of `solids` (k, 13); negative inside, inf without."""
+    for i in range(points.shape[0]):
+        x, y, height = points[i, 0], points[i, 1], -points[i, 2]
+        least = math.inf
+        for k in range(solids.shape[0]):
+            reach = least + solids[k, REACH_M]
+            if solids[k, LOW_M] - height > least or height - solids[k, HIGH_M] > least or reach < 0.0:
+                continue
+            if (solids[k, NORTH] - x) ** 2 + (solids[k, EAST] - y) ** 2 <= reach * reach:
+                least = min(least, _clearance(solids[k, KIND], solids[k, OWN:], x, y, height))
+        out[i] = least
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _clearance(kind: float, own: Any, x: float, y: float, height: float) -> float:
+    """From a point to a solid's surface, m; negative inside."""
+    if kind == FRUSTUM:
+        return _to_frustum(own, math.sqrt((x - own[0]) ** 2 + (y - own[1]) ** 2), height)
+    if kind == BOX:
+        cosine, sine = math.cos(own[4]), math.sin(own[4])
+        north, east = x - own[0], y - own[1]
+        a = abs(north * cosine + east * sine) - own[2]
+        b = abs(-north * sine + east * cosine) - own[3]
+        c = abs(height - (own[5] + own[6]) / 2) - (own[6] - own[5]) / 2
+        outside = math.sqrt(max(a, 0.0) ** 2 + max(b, 0.0) ** 2 + max(c, 0.0) ** 2)
+        return float(outside + min(max(a, b, c), 0.0))
+    ln, le, lu = own[3] - own[0], own[4] - own[1], own[5] - own[2]
+    along = (x - own[0]) * ln + (y - own[1]) * le + (height - own[2]) * lu
+    share = min(max(along / max(ln * ln + le * le + lu * lu, _LEAST_SQUARE), 0.0), 1.0)
+    a, b, c = x - own[0] - share * ln, y - own[1] - share * le, height - own[2] - share * lu
+    return math.sqrt(a * a + b * b + c * c) - float(own[6])
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _to_frustum(own: Any, away: float, height: float) -> float:
+    """A polygon in distance from the axis and height."""
+    wide, narrow, foot, top = own[2], own[3], own[4], own[5]
+    surface = min(
+        _to_segment(away, height, 0.0, foot, wide, foot),
+        _to_segment(away, height, wide, foot, narrow, top),
+        _to_segment(away, height, 0.0, top, narrow, top),
+    )
+    return -surface if foot <= height <= top and away <= _radius_at(own, height) else surface
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _to_segment(x: float, y: float, x0: float, y0: float, x1: float, y1: float) -> float:
+    along, up = x1 - x0, y1 - y0
+    share = min(max(((x - x0) * along + (y - y0) * up) / max(along**2 + up**2, _LEAST_SQUARE), 0.0), 1.0)
+    return math.sqrt((x - x0 - share * along) ** 2 + (y - y0 - share * up) ** 2)
+
 
 RANGE_LIMIT_M = 20.0
 """How far `true_ranges` reaches."""
@@ -143,7 +326,7 @@ def _rows(solids: Sequence[Solid], kind: type[Solid]) -> FloatArray:
 
 
 def _row(solid: Solid) -> list[float]:
-    """See `flockd.sim.world.solid_distances`."""
+    """See `flockd.sim.world.obstacles`."""
     if isinstance(solid, Frustum):
         reach_m = max(solid.foot_radius, solid.top_radius)
         own = solid.north, solid.east, solid.foot_radius, solid.top_radius, solid.foot, solid.top, 0.0

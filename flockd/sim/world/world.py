@@ -5,7 +5,6 @@ NED metres. Outer faces wind counter-clockwise seen from outside; every solid is
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,16 +12,13 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from flockd.core.messages import Float32Array, FloatArray, UInt8Array
-from flockd.sim.renderer import _raster, sky
-from flockd.sim.world import obstacle_mesh, terrain, textures
-from flockd.sim.world.hills import hills
-from flockd.sim.world.mesh import face_normals, unit
+from flockd.sim.world import baking, obstacle_mesh, sky, terrain, textures
+from flockd.sim.world.mesh import face_normals
 from flockd.sim.world.obstacles import Obstacles
 from flockd.sim.world.scenery import Scenery, footprint_distance
+from flockd.sim.world.terrain import hills
 from flockd.sim.world.textures import PackedArray
 
-GROUND_MAP_BITS = 11
-SHADOW_MAP_SIZE = 2048
 GROUND = -1
 """Texture number of the ground's triangles, which take their colour from the ground map."""
 
@@ -83,7 +79,7 @@ class World:
 
         ``ground_relief_m``: standard deviation of the ground's height (0: exactly flat). Nothing taller than 0.3 m
         comes closer than ``clearance_m`` to any of the ``keep_out`` points (n, 2) north, east, but ``obstacles``, which
-        stand where they stand, on level ground. ``hills_m`` and ``hills_slope``: see `flockd.sim.world.hills`; their
+        stand where they stand, on level ground. ``hills_m`` and ``hills_slope``: see `flockd.sim.world.terrain`; their
         ground is added to the relief.
         """
         if extent_m < 20.0:
@@ -103,11 +99,8 @@ class World:
         vertices = np.vstack([ground_vertices, *mesh.vertices])
         triangles = np.vstack([ground_triangles, *mesh.triangles]).astype(np.int32)
         uv = np.concatenate([np.zeros((ground_count, 2, 4)), *mesh.uv])
-        frame = _shadow_frame(light[0], extent_m)
-        shadow = np.full((SHADOW_MAP_SIZE, SHADOW_MAP_SIZE), -1e9, dtype=np.float32)
-        _raster.fill_shadow(vertices, triangles[ground_count:], frame, shadow)
-        frame[2, 3] += 0.06  # a surface does not shade itself
-        ground_map, kinds = _ground_map(rng, scenery, light[0], shadow, frame)
+        shadow, frame = baking.shadow_map(vertices, triangles[ground_count:], light[0], extent_m)
+        ground_map, kinds = baking.ground_map(rng, scenery, light[0], shadow, frame)
         kind_count = len(scenery.ground_names)
         tiles_per_m = 1.0 / rng.uniform(2.2, 4.5, kind_count)
         return World(
@@ -159,64 +152,3 @@ class World:
             if len(found) >= count:
                 return found[:count]
         raise ValueError(f"no {count} points {min_distance_m} m away from every obstacle")
-
-
-def _ground_map(
-    rng: Generator, scenery: Scenery, sun: FloatArray, shadow: Float32Array, frame: FloatArray
-) -> tuple[Float32Array, UInt8Array]:
-    """Colour with baked sunlight (size, size, 4), and the kind of ground, per texel."""
-    size = 1 << GROUND_MAP_BITS
-    colour = np.empty((size, size, 4), dtype=np.float32)
-    kinds = np.empty((size, size), dtype=np.uint8)
-    noise = np.stack([
-        textures.fractal_noise(rng, slope=rng.uniform(2.0, 2.6), coarsest=0.5),
-        textures.fractal_noise(rng, slope=rng.uniform(0.8, 1.3), coarsest=0.4),
-        textures.fractal_noise(rng, slope=rng.uniform(0.4, 1.0), coarsest=0.4),
-        textures.fractal_noise(rng, slope=1.5, coarsest=0.4),
-    ])  # fmt: skip
-    cell = 2 * scenery.extent / (scenery.heights.shape[0] - 1)
-    slopes = np.stack([np.gradient(scenery.heights, cell, axis=k) for k in (0, 1)])
-    _raster.compose_ground(
-        noise, scenery.extent, rng.uniform(0.7, 2.5), scenery.zone_limits, scenery.zone_colours, scenery.zone_kinds,
-        np.array([rng.uniform(0.12, 0.38), rng.uniform(0.1, 0.35), rng.uniform(0.0, 0.1)]),
-        scenery.roads, scenery.road_colours, scenery.patches, scenery.patch_colours, _openness(scenery), slopes, sun,
-        shadow, frame, scenery.heights, colour, kinds,
-    )  # fmt: skip
-    return colour, kinds
-
-
-def _openness(scenery: Scenery) -> Float32Array:
-    """How much of the sky the ground sees beside its obstacles, (512, 512), roughly."""
-    size = 512
-    cell = 2 * scenery.extent / size
-    covered = np.zeros((size, size), dtype=np.float32)
-    axis = -scenery.extent + (np.arange(size) + 0.5) * cell
-    for north, east, half_length, half_width, heading, top in scenery.obstacles:
-        reach = math.hypot(half_length, half_width)
-        rows = slice(*np.searchsorted(axis, (north - reach, north + reach)))
-        columns = slice(*np.searchsorted(axis, (east - reach, east + reach)))
-        dn = axis[rows, None] - north
-        de = axis[None, columns] - east
-        inside = (np.abs(dn * math.cos(heading) + de * math.sin(heading)) <= half_length) & (
-            np.abs(-dn * math.sin(heading) + de * math.cos(heading)) <= half_width
-        )
-        covered[rows, columns] = np.maximum(covered[rows, columns], inside * min(1.0, 0.3 * top))
-    for axis_number in (0, 1, 0, 1, 0, 1):
-        covered = np.mean([np.roll(covered, k, axis_number) for k in range(-2, 3)], axis=0, dtype=np.float32)
-    return np.asarray(1.0 - 0.45 * covered, dtype=np.float32)
-
-
-def _shadow_frame(sun: FloatArray, extent: float) -> FloatArray:
-    """From NED to the shadow map's columns, rows and height towards the sun."""
-    across = unit(np.array([-sun[1], sun[0], 0.0]))
-    other = np.cross(sun, across)
-    reach = extent * math.sqrt(2.0)
-    tall = 25.0
-    frame = np.zeros((3, 4))
-    frame[0, :3] = across * SHADOW_MAP_SIZE / (2 * reach)
-    frame[0, 3] = SHADOW_MAP_SIZE / 2
-    half = reach * abs(sun[2]) + tall
-    frame[1, :3] = other * SHADOW_MAP_SIZE / (2 * half)
-    frame[1, 3] = SHADOW_MAP_SIZE / 2
-    frame[2, :3] = sun
-    return frame

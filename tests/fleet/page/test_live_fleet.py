@@ -15,7 +15,7 @@ from flockd.fleet.page.live_fleet import LiveFleet
 from flockd.fleet.watcher import FleetWatcher, _heard
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
-from flockd.sim.sitl.free_ports import free_endpoint
+from flockd.sim.sitl.ports import free_endpoint
 
 PICTURE = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1].tobytes()
 WIDE = cv2.imencode(".jpg", np.zeros((2, MAX_PICTURE_PX + 1, 3), np.uint8))[1].tobytes()

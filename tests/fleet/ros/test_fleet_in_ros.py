@@ -15,7 +15,7 @@ from typing import NamedTuple
 import pytest
 
 from flockd.fleet.watcher import FleetWatcher
-from flockd.sim.sitl.free_ports import free_endpoint
+from flockd.sim.sitl.ports import free_endpoint
 from tests.fleet.ros.peers import Peer, bridge, ended, own_domain, peer, until
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]

@@ -15,7 +15,7 @@ from flockd.flight.inference.manifest_file import models_folder
 from flockd.flight.perception import OnnxNetworks
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.recording.reader import Recording
-from flockd.sim.cameras.camera_faults import noisy_image
+from flockd.sim.cameras.camera_simulator import noisy_image
 from flockd.sim.scenario import CameraFaultConfig
 
 pytestmark = pytest.mark.fault("noisy-camera")

@@ -25,7 +25,7 @@ from flockd.onboard.autopilot.clock_sync import ClockEstimate
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.sim.scenario import RangeFinderConfig
-from flockd.sim.sitl.free_ports import free_port
+from flockd.sim.sitl.ports import free_port
 from tests.onboard.autopilot.conftest import HEARTBEAT_S
 
 GOOD: dict[str, float | int] = {

@@ -16,7 +16,7 @@ from flockd.core.errors import UnavailableError
 from flockd.ground.doctor.bench import Sample, bench, judged
 from flockd.ground.doctor.finding import Level
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from flockd.sim.sitl.free_ports import free_endpoint, free_port
+from flockd.sim.sitl.ports import free_endpoint, free_port
 from tests.onboard.daemon.aboard import CAMERAS, Cameras, TinyPerceiver, config_for
 
 CONFIG = config_for(14540, "tcp/127.0.0.1:1", "tcp/127.0.0.1:2")

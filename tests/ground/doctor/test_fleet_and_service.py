@@ -16,7 +16,7 @@ from flockd.ground.doctor.service_checks import check_instance, check_unit, judg
 from flockd.ground.doctor.telemetry_checks import check_fleet
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
-from flockd.sim.sitl.free_ports import free_endpoint
+from flockd.sim.sitl.ports import free_endpoint
 
 QUADROTOR = load_drone(data_path("config") / "quadrotor.yaml")
 needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not here")

@@ -35,7 +35,7 @@ from flockd.onboard.autopilot.refusal_reasons import REASONS
 from flockd.onboard.daemon import Daemon, ServiceManager
 from flockd.onboard.sources import FramePublisher
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from flockd.sim.sitl.free_ports import free_endpoint
+from flockd.sim.sitl.ports import free_endpoint
 from tests.calm import clock
 from tests.flight.perception.shipped import SECOND_STAGE
 from tests.onboard.autopilot.flight import until

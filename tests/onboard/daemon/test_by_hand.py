@@ -12,8 +12,8 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.avoidance import ObstacleParameters
 from flockd.core.messages import FloatArray
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from flockd.sim.sitl.free_ports import free_port
 from flockd.sim.sitl.ground_station import GroundStation
+from flockd.sim.sitl.ports import free_port
 from tests.calm import clock
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import until

@@ -20,7 +20,7 @@ from flockd.core.messages import Frame, FrameSet
 from flockd.onboard.sources import FramePublisher
 from flockd.onboard.sources.shared_memory import SharedMemorySource
 from flockd.onboard.telemetry import zenoh_session
-from flockd.sim.sitl.free_ports import free_endpoint
+from flockd.sim.sitl.ports import free_endpoint
 from tests.onboard.sources.camera_images import SIZE, scene
 
 CAMERAS = ("front", "back")

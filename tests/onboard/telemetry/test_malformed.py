@@ -32,7 +32,7 @@ from flockd.onboard.telemetry.topics import (
     StateMessage,
 )
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
-from flockd.sim.sitl.free_ports import free_endpoint
+from flockd.sim.sitl.ports import free_endpoint
 
 pytestmark = [pytest.mark.fault("wrong-types-of-a-peer"), pytest.mark.fault("hostile-peers")]
 

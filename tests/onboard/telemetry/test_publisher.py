@@ -27,7 +27,7 @@ from flockd.core.messages import (
 )
 from flockd.onboard.telemetry import TOPICS, publish_step
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
-from flockd.sim.sitl.free_ports import free_endpoint
+from flockd.sim.sitl.ports import free_endpoint
 
 Received = queue.Queue[tuple[str, dict[str, object]]]
 

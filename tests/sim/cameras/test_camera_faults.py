@@ -8,7 +8,7 @@ import pytest
 from flockd.core.config.perception import NoiseParameters
 from flockd.core.messages import UInt8Array
 from flockd.flight.perception.image_noise import noise_shares
-from flockd.sim.cameras.camera_faults import CameraFaults
+from flockd.sim.cameras.camera_simulator import CameraFaults
 from flockd.sim.scenario import CameraFaultConfig
 
 GREY = np.full((128, 160, 3), 120, np.uint8)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from flockd.flight.geometry import rotation_from_euler
-from flockd.sim.cameras.pose_trail import FlockPose, PoseTrail
 from flockd.sim.scenario import StartConfig, VehicleConfig
+from flockd.sim.vehicles.pose_trail import FlockPose, PoseTrail
 from flockd.sim.vehicles.vehicles import Vehicles
 
 

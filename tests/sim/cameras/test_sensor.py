@@ -9,16 +9,10 @@ import pytest
 
 from flockd.core.messages import Float32Array, VehicleState
 from flockd.flight.geometry import PinholeCamera, rotation_from_euler
-from flockd.sim.cameras.attitude import LateAttitude
-from flockd.sim.cameras.compression import jpeg
 from flockd.sim.cameras.glass import Glass
-from flockd.sim.cameras.light import grey_levels, linear_light
-from flockd.sim.cameras.pose_trail import FlockPose, PoseTrail
-from flockd.sim.cameras.real_camera import RealCamera
+from flockd.sim.cameras.real_camera import CameraClock, RealCamera, grey_levels, jpeg, linear_light
 from flockd.sim.cameras.sensor import Automatic, NoiseTile, noisy
-from flockd.sim.cameras.shake import Shaking
-from flockd.sim.cameras.shutter import CameraMotion, LensField
-from flockd.sim.cameras.timing import CameraClock
+from flockd.sim.cameras.shutter import CameraMotion, LensField, Shaking
 from flockd.sim.renderer.renderer import View
 from flockd.sim.scenario.imperfect_cameras import (
     AutomaticConfig,
@@ -29,6 +23,7 @@ from flockd.sim.scenario.imperfect_cameras import (
     SensorNoiseConfig,
     ShakeConfig,
 )
+from flockd.sim.vehicles.pose_trail import FlockPose, LateAttitude, PoseTrail
 
 SIZE = (320, 240)
 CAMERA = PinholeCamera(np.array([[160.0, 0.0, 160.0], [0.0, 160.0, 120.0], [0.0, 0.0, 1.0]]), SIZE)

@@ -7,7 +7,7 @@ import pytest
 
 from flockd.core.data import data_path
 from flockd.flight.geometry import build_rig, rotation_angle_deg
-from flockd.sim.cameras.true_rigs import true_rigs
+from flockd.sim.cameras.camera_simulator import true_rigs
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 
 NONE = {"cameras.rig.mounting_deg": 0.0}

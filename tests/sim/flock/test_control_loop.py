@@ -10,8 +10,7 @@ import pytest
 from flockd.core.data import data_path
 from flockd.core.messages import FloatArray
 from flockd.flight.flocking.metrics import min_distance
-from flockd.sim.flock.commands import Commands
-from flockd.sim.flock.control_loop import ControlLoop
+from flockd.sim.flock.control_loop import Commands, ControlLoop
 from flockd.sim.flock.exact_states import ExactFlock, step_times
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import CameraFaultConfig, ScenarioConfig, load_scenario

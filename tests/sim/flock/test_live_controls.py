@@ -10,11 +10,10 @@ import time
 import pytest
 
 from flockd.core.data import data_path
-from flockd.sim.flock.live_controls import LiveControls
+from flockd.sim.flock.live_flight import LiveControls
 from flockd.sim.flock.start import with_drones
 from flockd.sim.scenario import ScenarioConfig, load_scenario
-from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
-from flockd.sim.vehicles.vehicles import Vehicles
+from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances, Vehicles
 
 IDENTITY = "51m"
 

@@ -10,12 +10,11 @@ from flockd.core.config import Overrides
 from flockd.core.data import data_path
 from flockd.onboard.telemetry.publisher import Ask, NewestImage
 from flockd.onboard.telemetry.topics import AboutMessage
-from flockd.sim.flock.live_controls import LiveControls
-from flockd.sim.flock.live_flight import fly_live
-from flockd.sim.flock.shown_flock import ShownFlock
+from flockd.sim.flock.live_flight import LiveControls, fly_live
+from flockd.sim.flock.shown_flock import Repeater, ShownFlock
 from flockd.sim.flock.start import with_drones
 from flockd.sim.scenario import load_scenario
-from flockd.sim.vehicles.disturbances import UNDISTURBED, Disturbances
+from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances
 
 STEPS = 3
 FRONT_OFF = Disturbances(cameras_off=frozenset({(0, "front")}), removed=frozenset({1}))
@@ -36,9 +35,6 @@ class Watching:
 
     def withdraw(self, drone: str) -> None:
         del self.images[drone]
-
-    def forget(self, drone: str) -> None:
-        """Nothing is sent again here."""
 
     def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
         if topic == "command":
@@ -75,7 +71,7 @@ def test_a_flight_begun_again_is_the_same_and_a_camera_that_is_off_shows_nothing
     watching, controls = Watching(), ThreeFlights(flown, "f10c", by_sight=True)
     controls.seen = watching
     with pytest.raises(KeyboardInterrupt):
-        fly_live(flown, ShownFlock(flown, watching, watching), controls)
+        fly_live(flown, ShownFlock(flown, watching, Repeater(watching)), controls)
     of_one = 2 * STEPS
     first, again, disturbed = (watching.commands[begin : begin + of_one] for begin in (0, of_one, 2 * of_one))
     assert first == again, "the same world, the same noise, and pilots that know nothing of the first flight"

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from flockd.core.errors import ConfigError
-from flockd.sim.flock.commands import Commands
-from flockd.sim.flock.control_loop import ControlLoop
+from flockd.sim.flock.control_loop import Commands, ControlLoop
 from flockd.sim.flock.exact_states import fly_exact_states
 from flockd.sim.flock.made_up_detections import TrackedNeighbours
 from flockd.sim.scenario import CameraFaultConfig, DetectionsConfig, ScenarioConfig, load_scenario

@@ -14,7 +14,7 @@ from flockd.core.config import Overrides
 from flockd.core.data import data_path
 from flockd.core.errors import ModelError, UnavailableError
 from flockd.core.side_process import SideProcess
-from flockd.sim.flock.pilots import Pilots
+from flockd.sim.flock.pilot_pool import Pilots
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 from tests.sim.sitl.test_orphans import _until_gone
@@ -23,7 +23,7 @@ FLIGHT = """\
 import os, sys
 from flockd.sim.scenario import load_scenario
 from flockd.core.side_process import SideProcess
-from flockd.sim.flock.pilots import Pilots
+from flockd.sim.flock.pilot_pool import Pilots
 process = SideProcess("flew", Pilots, load_scenario(sys.argv[1]), [0], None)
 print(process.pid, flush=True)
 process.wait_until_ready()

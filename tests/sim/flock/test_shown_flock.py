@@ -13,7 +13,7 @@ import pytest
 from flockd.core.data import data_path
 from flockd.onboard.telemetry.publisher import Ask, NewestImage
 from flockd.onboard.telemetry.topics import AboutMessage
-from flockd.sim.flock.shown_flock import RealTime, ShownFlock
+from flockd.sim.flock.shown_flock import RealTime, Repeater, ShownFlock
 from flockd.sim.flock.start import with_drones
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import ScenarioConfig, load_scenario
@@ -38,10 +38,7 @@ class Watching:
         self.about[drone], self.ask[drone], self.image[drone] = about, ask, newest_image
 
     def withdraw(self, drone: str) -> None:
-        del self.ask[drone]
-
-    def forget(self, drone: str) -> None:
-        del self.states[drone]
+        del self.ask[drone], self.states[drone]
 
     def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
         if topic == "state":
@@ -71,7 +68,7 @@ def test_a_flock_on_exact_states_is_seen_and_goes_where_it_is_sent(monkeypatch: 
     monkeypatch.setattr(RealTime, "wait", lambda self, time_s: None)
     watching = Watching()
     flown = scenario(60.0)
-    shown = ShownFlock(flown, watching, watching)
+    shown = ShownFlock(flown, watching, Repeater(watching))
     assert not watching.goto("drone1", 1.0, 2.0)[0], "not before it knows where it is"
 
     def order_when_due(done: int, total: int) -> None:
@@ -116,7 +113,9 @@ def test_a_drone_is_held_where_it_would_stop_and_flies_on_when_it_is_resumed(mon
         if done in {20, 40}:
             assert watching.command("drone1", "hold" if done == 20 else "resume")[0]
 
-    log = fly(flown, perception="truth", shown=ShownFlock(flown, watching, watching), progress=ask_when_due).log
+    log = fly(
+        flown, perception="truth", shown=ShownFlock(flown, watching, Repeater(watching)), progress=ask_when_due
+    ).log
     told = [(one["state"], one["flight_mode"]) for one in watching.flights["drone1"]]
     assert told == [("normal", "simulated")] * 20 + [("asking", "hold")] * 20 + [("normal", "simulated")] * 20
     (why,) = watching.flights["drone1"][30]["reasons"]

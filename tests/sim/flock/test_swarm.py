@@ -17,8 +17,7 @@ from flockd.onboard.telemetry.publisher import Ask, NewestImage, ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage
 from flockd.review.flight_log.log import FlightLog
 from flockd.sim.flock.pilot_pool import PilotPool
-from flockd.sim.flock.repeater import Repeater
-from flockd.sim.flock.shown_flock import ShownFlock
+from flockd.sim.flock.shown_flock import Repeater, ShownFlock
 from flockd.sim.flock.start import with_drones
 from flockd.sim.flock.swarm import Flight, fly
 from flockd.sim.scenario import ScenarioConfig, load_scenario

@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from flockd.core.messages import Float32Array, FloatArray, UInt8Array
 from flockd.sim.renderer import _raster, _shading
-from flockd.sim.renderer.sky import SKY_BITS
+from flockd.sim.renderer.renderer import rasterized, scene_of
 from flockd.sim.world import textures
-from flockd.sim.world.world import GROUND, GROUND_MAP_BITS, World
+from flockd.sim.world.baking import GROUND_MAP_BITS, sun_reaches
+from flockd.sim.world.sky import SKY_BITS
+from flockd.sim.world.world import GROUND, World
 
 SIZE = (250, 331)
 """No multiple of a tile's."""
@@ -38,22 +40,14 @@ class Shot:
         width, height = SIZE
         self.world, self.R, self.origin, self.drones = world, np.ascontiguousarray(R), origin, drones
         self.inverse_K: FloatArray = np.linalg.inv(K)
-        rows = np.empty((len(world.triangles), 2), np.int32)
-        self.planes = np.empty((len(world.triangles), 12))
-        q = _raster.project_vertices(world.vertices, np.ascontiguousarray(K @ self.R.T), origin)
-        _raster.set_up_triangles(q, world.triangles, width, height, rows, self.planes)
-        self.hit: NDArray[np.int32] = np.empty((height, width), np.int32)
-        _raster.fill(_raster.list_visible(rows), rows, self.planes, np.empty((height, width), np.float32), self.hit)
+        P = np.ascontiguousarray(K @ self.R.T)
+        self.planes, self.hit, _ = rasterized(world.vertices, world.triangles, P, origin, width, height)
         self.rgb: UInt8Array = np.empty((height, width, 3), np.uint8)
         self.depth: Float32Array = np.empty((height, width), np.float32)
         everywhere = np.tile([0.0, 0.0, width, height], (len(drones), 1))
-        _shading.shade_scene(
-            self.hit, self.planes, K, self.inverse_K, self.R, origin, math.sqrt(K[0, 0] * K[1, 1]), world.normals,
-            world.texture, world.uv, world.level, world.tint, world.texels, textures.TEXTURE_BITS, world.ground_map,
-            GROUND_MAP_BITS, world.ground_kind, world.ground_detail, world.extent_m, world.shadow_map,
-            world.shadow_frame, world.light, world.fog_per_m, world.sky, SKY_BITS, world.tone,
-            np.hstack([drones, everywhere]), self.rgb, self.depth,
-        )  # fmt: skip
+        eye = _raster.Eye(K, self.inverse_K, self.R, origin, math.sqrt(K[0, 0] * K[1, 1]))
+        blobs = np.hstack([drones, everywhere])
+        _shading.shade_scene(self.hit, self.planes, eye, scene_of(world), blobs, self.rgb, self.depth)
 
     def expected(self, y: int, x: int) -> tuple[float, list[int]]:
         """Depth and colour of one pixel, in float64, with the library's logarithms."""
@@ -89,7 +83,7 @@ class Shot:
             tu, tv = world.uv[t] @ (n, e, d, 1.0)
             at, fineness = (tu, tv), footprint + world.level[t]
             lit = max(0.0, float(normal @ sun))
-            lit *= _raster.sun_reaches(world.shadow_map, world.shadow_frame, *(place + 0.08 * normal))
+            lit *= sun_reaches(world.shadow_map, world.shadow_frame, *(place + 0.08 * normal))
         area = ((4 << 2 * textures.TEXTURE_BITS) - 1) // 3
         fine = self.sampled(world.texels, int(kind) * area, textures.TEXTURE_BITS, *at, fineness)
         clear = math.exp(-world.fog_per_m * z * length)

@@ -14,7 +14,7 @@ import pytest
 
 from flockd.core.errors import UnavailableError
 from flockd.sim.sitl.ground_station import GroundStation
-from flockd.sim.sitl.leftovers import described, px4_instance, user_of_port
+from flockd.sim.sitl.ports import described, px4_instance, user_of_port
 
 pytestmark = pytest.mark.fault("simulator-killed")
 

@@ -13,7 +13,7 @@ from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.sim.renderer.renderer import Renderer
 from flockd.sim.scenario import RangeFinderConfig, SensorConfig
 from flockd.sim.vehicles.vehicles import SimulatedAutopilot
-from flockd.sim.world.hills import hills
+from flockd.sim.world.terrain import hills
 from flockd.sim.world.world import World
 
 STILL, LEVEL = np.zeros(3), np.eye(3)

@@ -10,8 +10,7 @@ import pytest
 from flockd.core.errors import UsageError
 from flockd.core.messages import SECTORS
 from flockd.sim.scenario import ClearingConfig, ObstaclesConfig
-from flockd.sim.world.clearances import clearances
-from flockd.sim.world.obstacle_worlds import generate_obstacles
+from flockd.sim.world.obstacle_worlds import clearances, generate_obstacles
 from flockd.sim.world.obstacles import Box, Capsule, Frustum, Obstacles, true_ranges
 
 HERE = np.array([0.0, 0.0, -4.0])

@@ -16,7 +16,7 @@ from flockd.flight.geometry import rotation_from_euler
 from flockd.flight.pilot.ground import GroundFilter
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.sim.scenario import RangeFinderConfig
-from flockd.sim.world.hills import hills
+from flockd.sim.world.terrain import hills
 
 pytestmark = pytest.mark.fault("range-finder-lies")
 
