@@ -26,10 +26,10 @@ LINES = {
     "flockd/fleet": 2_690,
     "flockd/ground": 5_980,
     "flockd/review": 4_090,
-    "flockd/sim": 12_540,
-    "flockd/campaign": 2_420,
+    "flockd/sim": 12_190,
+    "flockd/campaign": 2_270,
     "flockd/cli": 4_700,
-    "tests": 48_360,
+    "tests": 48_330,
     "tools/checks": 3_780,
     "tools/docs": 970,
     "tools/measure": 1_220,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_610,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 467}
+FILES = {"flockd": 441}
 NUMBERS_OF_FLIGHT = 529
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
