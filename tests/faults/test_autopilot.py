@@ -339,9 +339,22 @@ async def test_a_parameter_of_the_failsafe_that_is_changed_in_flight_is_told_and
         await ship.until_event("the autopilot's COM_OBL_RC_ACT was changed in flight from 5 to -1")
         reacted("others-interfere", clock() - changed_s)
         await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        await ship.until_event(
-            "asking: COM_OBL_RC_ACT was changed in flight from 5 to -1: the autopilot would not stop"
-        )
+        await ship.until_event("asking: the autopilot's COM_OBL_RC_ACT is -1: it would not stop")
+
+
+@pytest.mark.fault("parameters-unsuitable")
+@pytest.mark.parametrize(("name", "value"), [("COM_OF_LOSS_T", 20.0), ("COM_OBL_RC_ACT", -1)])
+async def test_a_drone_whose_failsafe_would_not_stop_it_waits_and_says_why(
+    name: str, value: float, tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
+) -> None:
+    fake_autopilot.parameters[name] = value
+    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
+        await until(lambda: "parameters_unsuitable" in ship.matters(), SECONDS_TO_FAIL)
+        assert any(f"the autopilot's {name} is {value:g}: " in str(heard.message) for heard in ship.heard().values())
+        await asyncio.sleep(1.0)
+        assert (ship.state(), len(fake_autopilot.setpoints)) == ("idle", 0)
+        fake_autopilot.parameters[name] = {"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": 5}[name]
+        await until(lambda: "parameters_unsuitable" not in ship.matters(), SECONDS_TO_FAIL)
 
 
 class _RefusesToLeave(FakeAutopilot):

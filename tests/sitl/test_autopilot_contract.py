@@ -13,7 +13,7 @@ NO_SETPOINTS = (
     "it receives no setpoints, as flockd sends none yet; fly in Hold or Position until flockd's state is ready, then "
     "switch to offboard"
 )
-CHANGED = "COM_OF_LOSS_T was changed in flight from 1 to 20: the autopilot's failsafe would act that long after"
+CHANGED = "the autopilot's COM_OF_LOSS_T is 20: its failsafe would act that long after"
 FOREIGN = "another program sends setpoints: the autopilot follows 0.0 m/s north and 3.0 m/s east, which flockd did not"
 SEEN = (
     ("start: checks told", "nothing against arming"),

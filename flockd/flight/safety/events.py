@@ -88,7 +88,7 @@ class Inputs:
     foreign_setpoints: str | None
     """What was seen of setpoints of another sender; None: nothing."""
     parameter_fault: str | None
-    """What is wrong with a parameter of the autopilot that was changed in flight; None: nothing."""
+    """What is wrong with a parameter of the autopilot, before the flight or since; None: nothing."""
     frame_jumped: bool
     """The autopilot's local frame or heading has jumped far in this flight."""
     flight_mode: str | None
@@ -140,7 +140,7 @@ class Event(StrEnum):
     STREAM_ENDED = "stream_ended"
     AUTOPILOT_FAILSAFE = "autopilot_failsafe"
     FOREIGN_SETPOINTS = "foreign_setpoints"
-    PARAMETER_CHANGED = "parameter_changed"
+    PARAMETERS_UNSUITABLE = "parameters_unsuitable"
     FRAME_JUMPED = "frame_jumped"
     NOT_OFFBOARD = "not_offboard"
     NOT_ARMED = "not_armed"
@@ -224,7 +224,7 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
             f"the event loop is {inputs.loop_lag_s:.2f} s late",
         ),
         (Event.FOREIGN_SETPOINTS, inputs.foreign_setpoints is not None, f"{inputs.foreign_setpoints}"),
-        (Event.PARAMETER_CHANGED, inputs.parameter_fault is not None, f"{inputs.parameter_fault}"),
+        (Event.PARAMETERS_UNSUITABLE, inputs.parameter_fault is not None, f"{inputs.parameter_fault}"),
         (Event.FRAME_JUMPED, inputs.frame_jumped, "the autopilot's estimate of position or heading has jumped"),
         (
             Event.VELOCITY_OFF,

@@ -117,7 +117,7 @@ def rules(p: SafetyParameters) -> dict[Event, Rule]:
         Event.STREAM_ENDED: Rule(Barrier.LATCH, Reaction.SILENCE),
         Event.AUTOPILOT_FAILSAFE: Rule(Barrier.WAIT, Reaction.NOTE),
         Event.FOREIGN_SETPOINTS: Rule(Barrier.NONE, Reaction.DEGRADE, FOREIGN_S, Reaction.HOLD),
-        Event.PARAMETER_CHANGED: Rule(Barrier.WAIT, Reaction.DEGRADE, FOREIGN_S, Reaction.HOLD),
+        Event.PARAMETERS_UNSUITABLE: Rule(Barrier.WAIT, Reaction.DEGRADE, FOREIGN_S, Reaction.HOLD),
         Event.FRAME_JUMPED: Rule(Barrier.NONE, Reaction.HOLD),
         Event.NOT_OFFBOARD: Rule(Barrier.NONE, Reaction.SILENCE),
         Event.NOT_ARMED: Rule(Barrier.WAIT, Reaction.SILENCE),

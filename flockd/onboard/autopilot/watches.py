@@ -26,34 +26,34 @@ SAFE_ACTIONS: Mapping[int, str] = {0: "Position", 3: "Return", 4: "Land", 5: "Ho
 
 
 class WatchedParameters:
-    """The newest values, and what is wrong with those that were changed while the autopilot was armed."""
+    """The newest values, and what is wrong with them."""
 
     def __init__(self, report: Callable[[str], None]) -> None:
         """``report`` is called with one sentence on each change in flight."""
         self._report = report
         self.values: dict[str, float] = {}
-        self._before: dict[str, float] = {}
-        """As they were while it was disarmed, or when they were read first."""
 
     def take(self, name: str, value: float, *, armed: bool) -> None:
         """Takes a value that was read."""
         known = self.values.get(name, value)
         self.values[name] = value
-        if not armed or name not in self._before:
-            self._before[name] = value
         if armed and value != known:
             self._report(f"the autopilot's {name} was changed in flight from {known:g} to {value:g}")
 
     def fault(self, max_gap_s: float) -> str | None:
-        """What is wrong with a change in flight; None: nothing. ``max_gap_s``: of setpoints, that flockd bridges."""
-        for name, value in list(self.values.items()):
-            if value == self._before.get(name, value):
-                continue
-            changed = f"{name} was changed in flight from {self._before[name]:g} to {value:g}"
-            if name == LOSS_TIME and not max_gap_s < value <= LONGEST_LOSS_S:
-                return f"{changed}: the autopilot's failsafe would act that long after the last setpoint"
-            if name == LOSS_ACTION and value not in SAFE_ACTIONS:
-                return f"{changed}: the autopilot would not stop the drone when setpoints stop"
+        """Why none may fly with them; None: nothing. ``max_gap_s``: of setpoints, that flockd bridges."""
+        loss_s = self.values.get(LOSS_TIME, LONGEST_LOSS_S)
+        if not max_gap_s < loss_s <= LONGEST_LOSS_S:
+            return (
+                f"the autopilot's {LOSS_TIME} is {loss_s:g}: its failsafe would act that long after the last setpoint; "
+                f"set it above {max_gap_s:g} s, and to {LONGEST_LOSS_S:g} s at most"
+            )
+        action = self.values.get(LOSS_ACTION)
+        if action is not None and action not in SAFE_ACTIONS:
+            return (
+                f"the autopilot's {LOSS_ACTION} is {action:g}: it would not stop the drone when setpoints stop; "
+                f"set it to one of {', '.join(f'{safe} ({mode})' for safe, mode in SAFE_ACTIONS.items())}"
+            )
         return None
 
 

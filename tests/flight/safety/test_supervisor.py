@@ -64,7 +64,7 @@ FAULTS = {
     Event.STREAM_ENDED: Fault({"stream_fault": "the thread was stopped"}, "latch", Action.SILENCE),
     Event.AUTOPILOT_FAILSAFE: Fault({"autopilot_failsafe": True}, "wait", Action.FLY),
     Event.FOREIGN_SETPOINTS: Fault({"foreign_setpoints": "3 m/s north"}, "ready", Action.FLY_DEGRADED),
-    Event.PARAMETER_CHANGED: Fault({"parameter_fault": "COM_OF_LOSS_T is 20"}, "wait", Action.FLY_DEGRADED),
+    Event.PARAMETERS_UNSUITABLE: Fault({"parameter_fault": "COM_OF_LOSS_T is 20"}, "wait", Action.FLY_DEGRADED),
     Event.NOT_OFFBOARD: Fault({"flight_mode": "position"}, "ready", Action.SILENCE),
     Event.NOT_ARMED: Fault({"armed": False}, "wait", Action.SILENCE),
     Event.NOT_IN_AIR: Fault({"in_air": False}, "wait", Action.FLY),

@@ -251,7 +251,7 @@ async def test_a_parameter_that_is_changed_in_flight_is_noticed_within_two_secon
         await until(lambda: link.status().parameter_fault is not None)
         fault = link.status().parameter_fault
         assert fault is not None
-        assert fault.startswith("COM_OF_LOSS_T was changed in flight from 1 to 20: ")
+        assert fault.startswith("the autopilot's COM_OF_LOSS_T is 20: ")
         assert link.take_reports() == ["the autopilot's COM_OF_LOSS_T was changed in flight from 1 to 20"]
         fake_autopilot.parameters["COM_OF_LOSS_T"] = 1.0
         await until(lambda: link.status().parameter_fault is None)
