@@ -115,13 +115,17 @@ def _read(kind: Any, value: Json, key: str, *, bounded: bool) -> Any:
 
 @functools.cache
 def _fields(kind: Any) -> dict[str, tuple[Any, bool, bool]]:
-    """Of a type by its fields' names: the type of each, whether it may be None, and whether it has a default."""
+    """Of a type by its fields' names: the type of each, whether it may be None, and whether it may be missing."""
     missing = dataclasses.MISSING
-    given = {
-        field.name
-        for field in (() if is_typeddict(kind) else dataclasses.fields(kind))
-        if field.default is not missing or field.default_factory is not missing
-    }
+    given = (
+        kind.__optional_keys__
+        if is_typeddict(kind)
+        else {
+            field.name
+            for field in dataclasses.fields(kind)
+            if field.default is not missing or field.default_factory is not missing
+        }
+    )
     hints = get_type_hints(kind, include_extras=True)
     return {name: (hint, type(None) in get_args(hint), name in given) for name, hint in hints.items()}
 

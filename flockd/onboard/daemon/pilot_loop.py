@@ -94,7 +94,8 @@ class PilotLoop:
         self._failure: str | None = None
         self._unexpected = 0
         """Errors in a row that nobody expects."""
-        self._height_reports, self._lens_reports = HeightReports(), LensReports()
+        self._height_reports = FaultReports(ReasonKind.HEIGHT, "the range finder works again", each=False)
+        self._lens_reports = FaultReports(ReasonKind.LENS, "its lens is clear again", each=True)
         self._rig_reports, self._size_reports = RigReports(), SizeReports()
         self._took_s: deque[float] = deque(maxlen=STEPS_REMEMBERED)
         self.frames: FrameSet | None = None
@@ -194,14 +195,13 @@ class PilotLoop:
         self.stepped = frames, output
         self._count(self.newest)
         reports = (
-            self._height_reports.update(output.reasons),
+            *self._height_reports.update(output.reasons),
             *self._lens_reports.update(output.reasons),
             *self._rig_reports.update(output),
             *self._size_reports.update(output),
         )
         for report in reports:
-            if report is not None:
-                self._log_event(report)
+            self._log_event(report)
         self._on_step(frames, vehicle, output, order)
 
     def _new_pilot(self) -> FlockPilot:
@@ -243,33 +243,20 @@ def last_seen_s(time_s: float, neighbours: Sequence[Neighbour]) -> float:
     )
 
 
-class HeightReports:
-    """Reports when the range finder begins to fail, fails for another reason, or works again."""
+class FaultReports:
+    """Reports when faults of one kind begin, and when they are over."""
 
-    def __init__(self) -> None:
-        self._fault: str | None = None
-
-    def update(self, reasons: Sequence[Reason]) -> str | None:
-        """The sentence that a step's reasons are worth; None: nothing new."""
-        before, self._fault = self._fault, next((one.text for one in reasons if one.kind is ReasonKind.HEIGHT), None)
-        if self._fault == before:
-            return None
-        return self._fault or "height: the range finder works again"
-
-
-class LensReports:
-    """Reports when a camera's lens begins to show too little, and when it is clear again."""
-
-    def __init__(self) -> None:
+    def __init__(self, kind: ReasonKind, over: str, *, each: bool) -> None:
+        """``over``: said, after its subject, when a fault is over; ``each``: of each fault, else when none is left."""
+        self._kind, self._over, self._each = kind, over, each
         self._faults: dict[str, None] = {}
 
     def update(self, reasons: Sequence[Reason]) -> list[str]:
         """The sentences that a step's reasons are worth."""
-        before, self._faults = self._faults, dict.fromkeys(one.text for one in reasons if one.kind is ReasonKind.LENS)
+        before, self._faults = self._faults, dict.fromkeys(one.text for one in reasons if one.kind is self._kind)
         begun = [fault for fault in self._faults if fault not in before]
-        return begun + [
-            f"{fault.partition(':')[0]}: its lens is clear again" for fault in before if fault not in self._faults
-        ]
+        over = [fault for fault in before if fault not in self._faults] if self._each or not self._faults else []
+        return begun + [f"{fault.partition(':')[0]}: {self._over}" for fault in over]
 
 
 class RigReports:

@@ -37,6 +37,33 @@ OPEN_S = 10.0
 CLOSE_S = 3.0
 
 
+@dataclass(frozen=True, eq=False)
+class Components:
+    """Of a running daemon, created and connected by `open_components`."""
+
+    link: AutopilotLink
+    gate: Gate
+    streamer: SetpointStreamer
+    source: FrameSource
+    pilot_loop: PilotLoop
+    networks: WatchedNetworks
+    control: Control
+    requests: AutopilotRequests
+    refusals: RefusalWatch
+    distances: ObstacleDistances
+    texts: StateTexts
+    sinks: MessageSinks
+    telemetry: ZenohTelemetry
+    commands: OperatorCommands
+    lag: LoopLag
+    thermometer: Thermometer
+    wall_clock: WallClock
+    dead_tasks: dict[str, str]
+    """Why each task that has ended did, by name."""
+    over: asyncio.Event = field(default_factory=asyncio.Event)
+    """Set when the flight is over and the tasks may end."""
+
+
 class Connect(Protocol):
     """Connects to an autopilot, as `AutopilotLink.connect` does."""
 
@@ -157,30 +184,3 @@ async def _close_async(close: Callable[[], Awaitable[None]]) -> None:
             await close()
     except (TimeoutError, LateError, BusyError):
         return
-
-
-@dataclass(frozen=True, eq=False)
-class Components:
-    """Created and connected by `startup.open_components`."""
-
-    link: AutopilotLink
-    gate: Gate
-    streamer: SetpointStreamer
-    source: FrameSource
-    pilot_loop: PilotLoop
-    networks: WatchedNetworks
-    control: Control
-    requests: AutopilotRequests
-    refusals: RefusalWatch
-    distances: ObstacleDistances
-    texts: StateTexts
-    sinks: MessageSinks
-    telemetry: ZenohTelemetry
-    commands: OperatorCommands
-    lag: LoopLag
-    thermometer: Thermometer
-    wall_clock: WallClock
-    dead_tasks: dict[str, str]
-    """Why each task that has ended did, by name."""
-    over: asyncio.Event = field(default_factory=asyncio.Event)
-    """Set when the flight is over and the tasks may end."""

@@ -1,4 +1,4 @@
-"""Collects the supervisor's inputs from all components."""
+"""Collects the supervisor's inputs: of cameras, pilot, autopilot and operators, and of the computer's own monitors."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flockd.core.messages import FloatArray, MissionOrder
+from flockd.core.messages import MissionOrder
 from flockd.core.printable import printable
 from flockd.onboard.message_json import from_json, parsed
 from flockd.onboard.telemetry.topics import AskMessage, OrderMessage
@@ -46,19 +46,22 @@ def parse_order(command: str, message: Mapping[str, object] | None) -> MissionOr
     unknown = sorted(message.keys() - allowed)
     if unknown:
         raise ValueError(f"{command} has no key {unknown[0]!r}; its keys are {', '.join(sorted(allowed))}")
-    height_m, speed_m_s = (None if key not in message else _number(message, key) for key in ("height_m", "speed_m_s"))
+    order: OrderMessage = from_json(OrderMessage, dict(message))
+    if None in (*order.values(), *order.get("velocity_ne", ())):
+        raise ValueError(f"what {command} says has to be numbers")
+    height_m, speed_m_s = order.get("height_m"), order.get("speed_m_s")
     if command == "velocity":
-        velocity = message.get("velocity_ne")
-        if not isinstance(velocity, list) or len(velocity) != 2:
+        velocity = order.get("velocity_ne", [])
+        if len(velocity) != 2:
             raise ValueError("velocity needs `velocity_ne`, a list of two numbers in m/s")
-        parts = {"north": velocity[0], "east": velocity[1]}
-        return MissionOrder(velocity=_pair(parts, "north", "east"), height_m=height_m)
-    metres, degrees = {"north_m", "east_m"} & message.keys(), {"latitude_deg", "longitude_deg"} & message.keys()
+        return MissionOrder(velocity=np.array(velocity, np.float64), height_m=height_m)
+    metres = [order[key] for key in ("north_m", "east_m") if key in order]
+    degrees = [order[key] for key in ("latitude_deg", "longitude_deg") if key in order]
     if sorted((len(metres), len(degrees))) != [0, 2]:
         raise ValueError("goto needs `north_m` and `east_m`, or `latitude_deg` and `longitude_deg`")
     return MissionOrder(
-        place=_pair(message, "north_m", "east_m") if metres else None,
-        place_deg=_pair(message, "latitude_deg", "longitude_deg") if degrees else None,
+        place=np.array(metres, np.float64) if metres else None,
+        place_deg=np.array(degrees, np.float64) if degrees else None,
         height_m=height_m,
         speed_m_s=speed_m_s,
     )
@@ -90,14 +93,3 @@ def _object(payload: bytes) -> dict[str, Any]:
     if not isinstance(message, dict):
         raise ValueError("an order has to be a JSON object")  # noqa: TRY004 - of the message, not of the caller
     return message
-
-
-def _pair(message: Mapping[str, object], one: str, other: str) -> FloatArray:
-    return np.array([_number(message, one), _number(message, other)])
-
-
-def _number(message: Mapping[str, object], key: str) -> float:
-    value = message[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:  # false for NaN too
-        raise ValueError(f"{key} has to be a number, and is {str(value)[:40]!r}")
-    return float(value)

@@ -225,7 +225,7 @@ async def test_a_page_that_only_watches_commands_nothing() -> None:
         (json.dumps({**HOLD, "drones": [1]}).encode(), "names its drones"),
         (json.dumps({**HOLD, "command": "about"}).encode(), "hold, land, resume, goto"),
         (json.dumps({**HOLD, "command": "goto", "order": {"north_m": 1}}).encode(), "`east_m`"),
-        (b'{"drones":["f/one"],"command":"goto","order":{"north_m":1,"east_m":NaN}}', "east_m has to be a number"),
+        (b'{"drones":["f/one"],"command":"goto","order":{"north_m":1,"east_m":NaN}}', "east_m is no finite number"),
     ],
 )
 async def test_what_is_no_command_is_refused_in_one_sentence(body: bytes, told: str) -> None:

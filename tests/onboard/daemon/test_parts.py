@@ -42,7 +42,14 @@ from flockd.flight.safety import Action, Decision, Gate, Inputs, Permission, Req
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
 from flockd.onboard.daemon.control import Control
 from flockd.onboard.daemon.operator_orders import OperatorRequests
-from flockd.onboard.daemon.pilot_loop import PilotLoop, StepResult
+from flockd.onboard.daemon.pilot_loop import (
+    FaultReports,
+    PilotLoop,
+    SizeReports,
+    StepResult,
+    VehicleHistory,
+    last_seen_s,
+)
 from flockd.onboard.daemon.status import ServiceManager
 from flockd.onboard.daemon.supervisor_inputs import CameraMonitor, InputCollector, LoopLag, WallClock, hottest_zone_c
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
@@ -247,8 +254,6 @@ def test_a_camera_whose_images_are_noise_for_three_of_its_periods_is_lost() -> N
 
 
 def test_frames_get_the_vehicle_state_of_their_time() -> None:
-    from flockd.onboard.daemon.pilot_loop import VehicleHistory
-
     history = VehicleHistory()
     assert history.at(1.0) is None
     for number in range(100):
@@ -267,8 +272,6 @@ def test_frames_get_the_vehicle_state_of_their_time() -> None:
 
 def test_frames_get_the_range_that_was_taken_nearest_to_them() -> None:
     """Between two ranges there is none: over an edge, their mean would be of nothing."""
-    from flockd.onboard.daemon.pilot_loop import VehicleHistory
-
     history, level = VehicleHistory(), np.eye(3)
     for time_s, reading in (
         (1.0, RangeReading(0.98, 4.0)),
@@ -281,9 +284,7 @@ def test_frames_get_the_range_that_was_taken_nearest_to_them() -> None:
 
 
 def test_a_range_finder_that_fails_is_an_event_and_so_is_its_return() -> None:
-    from flockd.onboard.daemon.pilot_loop import HeightReports
-
-    reports = HeightReports()
+    reports = FaultReports(ReasonKind.HEIGHT, "the range finder works again", each=False)
     weak, old = (
         Reason(ReasonKind.HEIGHT, f"height: the range{fault}; the barometer's is used")
         for fault in (" finder's signal is too weak", " is too old")
@@ -291,12 +292,10 @@ def test_a_range_finder_that_fails_is_an_event_and_so_is_its_return() -> None:
     left = Reason(ReasonKind.CAMERA, "camera left: no frame")
     steps: tuple[tuple[Reason, ...], ...] = ((), (left, weak), (weak,), (old,), (left,), ())
     found = [reports.update(reasons) for reasons in steps]
-    assert found == [None, weak.text, None, old.text, "height: the range finder works again", None]
+    assert found == [[], [weak.text], [], [old.text], ["height: the range finder works again"], []]
 
 
 def test_who_has_seen_another_twice_is_not_alone_though_it_is_not_confirmed_yet() -> None:
-    from flockd.onboard.daemon.pilot_loop import last_seen_s
-
     def track(unseen_s: float, probability: float, *, confirmed: bool) -> Neighbour:
         return Neighbour(1, np.ones(3), np.zeros(3), 0.1, 0.1, 2.0, unseen_s, 2, confirmed, probability)
 
@@ -310,8 +309,6 @@ def test_who_has_seen_another_twice_is_not_alone_though_it_is_not_confirmed_yet(
 
 
 def test_what_is_learned_of_the_others_size_is_an_event_each_time_that_it_is_new() -> None:
-    from flockd.onboard.daemon.pilot_loop import SizeReports
-
     reports = SizeReports()
     said = Reason(ReasonKind.SIZE, "size: perception.drone_size_m says 0.56 m, and the flight shows 0.39 +-0.04 m")
     steps = (
