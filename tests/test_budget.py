@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_340,
     "flockd/flight": 14_740,
-    "flockd/onboard": 11_350,
+    "flockd/onboard": 11_330,
     "flockd/fleet": 2_690,
     "flockd/ground": 5_980,
     "flockd/review": 4_090,
