@@ -103,6 +103,11 @@ def test_what_flies_stands_in_one_order(room: str, order: tuple[str, ...]) -> No
         assert used & set(order) <= below, path
 
 
+def test_the_bridge_to_ros_knows_no_page() -> None:
+    for path in set(_of("fleet")) - set(_of("fleet/page")):
+        assert not any(names[:2] == ["fleet", "page"] for names in _taken(path)), path
+
+
 def test_the_pure_line_knows_no_clock_no_thread_and_no_network() -> None:
     for path in _of(*PURE_ROOMS):
         assert not _libraries(path) & IMPURE_MODULES, path

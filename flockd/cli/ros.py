@@ -78,7 +78,7 @@ def _perceive(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace) -> int:
     """Until Ctrl-C."""
-    from flockd.fleet.page.live_fleet import LiveFleet
+    from flockd.fleet.live_fleet import LiveFleet
     from flockd.fleet.ros.fleet_bridge import FleetBridge
     from flockd.fleet.watcher import FleetWatcher
     from flockd.onboard.ros.ros_node import RosNode

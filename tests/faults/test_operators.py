@@ -16,7 +16,7 @@ import zenoh
 
 from flockd.core.config import DroneConfig
 from flockd.fleet.fleet_status import status_rows
-from flockd.fleet.page.live_fleet import LiveFleet
+from flockd.fleet.live_fleet import LiveFleet
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
 from flockd.sim.sitl.ports import free_endpoint

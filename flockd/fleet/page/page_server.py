@@ -16,8 +16,8 @@ from typing import Any, Protocol
 
 from aiohttp import WSMsgType, web
 
-from flockd.fleet.page.drone_rows import HISTORY_COLUMNS, Known, Row
-from flockd.fleet.page.fleet_source import Event, FleetSource, events_after
+from flockd.fleet.drone_rows import HISTORY_COLUMNS, Known, Row
+from flockd.fleet.fleet_source import Event, FleetSource
 from flockd.fleet.page.page_access import HEADERS, PageAccess, is_own_host, is_own_origin
 from flockd.fleet.page.page_pictures import PagePictures
 from flockd.fleet.simulation import SimulationMessage, checked_control
@@ -292,7 +292,7 @@ class _Feed:
         self._sent = rows
         events = self._source.events(time_s)
         replay = self._source.span_s is not None
-        new = events[-100:] if replay else events_after(events, self._event)
+        new = events[-100:] if replay else _events_after(events, self._event)
         self._event = events[-1] if events else self._event
         await self._send(
             {
@@ -309,6 +309,14 @@ class _Feed:
 
     async def _send(self, message: dict[str, Any]) -> None:
         await self._socket.send_str(_json(message))
+
+
+def _events_after(events: list[Event], last: Event | None) -> list[Event]:
+    """Those that came later than one; all where that is no longer remembered."""
+    for index in range(len(events) - 1, -1, -1):
+        if events[index] == last:
+            return events[index + 1 :]
+    return events
 
 
 def _asked(body: Mapping[str, Any]) -> tuple[list[str], str, dict[str, object] | None]:

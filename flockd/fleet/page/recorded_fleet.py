@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from flockd.core.messages import PilotOutput, VehicleState
-from flockd.fleet.page.drone_rows import Known, Row, drone_rows, history_row
-from flockd.fleet.page.fleet_source import Event
+from flockd.fleet.drone_rows import Known, Row, drone_rows, history_row
+from flockd.fleet.fleet_source import Event
 from flockd.fleet.page.recorded_pictures import RecordedPictures
 from flockd.fleet.watcher import Heard, Watched
 from flockd.onboard.message_json import from_json, parsed

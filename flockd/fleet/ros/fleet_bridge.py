@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -10,24 +11,21 @@ from typing import Any, cast
 
 import numpy as np
 
+from flockd.core.config.rig import CameraConfig, RigConfig
 from flockd.core.jpeg_header import jpeg_size
 from flockd.core.ros_frames import MAP, attitude_in_ros, camera_in_ros, flu_of_frd
-from flockd.fleet.camera_rigs import cameras_of
+from flockd.fleet.drone_rows import Known, Row, origin_of
+from flockd.fleet.fleet_source import FleetSource
 from flockd.fleet.fleet_status import GONE, QUIET
-from flockd.fleet.page.drone_rows import Known, Row
-from flockd.fleet.page.fleet_source import FleetSource
-from flockd.fleet.ros.drone_names import DroneNames
 from flockd.fleet.ros.fleet_markers import home_in_map, markers
-from flockd.fleet.ros.newest_order import NewestOrder
-from flockd.fleet.ros.order_requests import Whereabouts, goal_of, velocity_of
+from flockd.fleet.ros.ros_orders import NewestOrder, Whereabouts, goal_of, velocity_of
 from flockd.fleet.watcher import Watched
+from flockd.flight.geometry import RigCamera, build_rig
 from flockd.onboard.ros import message_trees as trees
 from flockd.onboard.ros.message_trees import Names, Tree, ros_name
 from flockd.onboard.ros.ros_node import Answer, Delivery, RosNode, has_type, tree_of
 from flockd.onboard.telemetry.topics import (
     AboutMessage,
-    NeighboursMessage,
-    ObstaclesMessage,
     OrderMessage,
     StateMessage,
 )
@@ -115,28 +113,34 @@ class FleetBridge:
 
     def _publish_step(self, drone: Watched, name: str, row: Row, about: AboutMessage | None, now_s: float) -> None:
         """What each step of the drone's pilot told, once."""
-        makers: Mapping[str, Callable[[int, Names, Any], list[tuple[str, str, Tree | None]]]] = {
-            "state": lambda at, names, one: self._of_state(at, names, one, row, about),
-            "neighbours": _of_neighbours,
-            "obstacles": _of_obstacles,
-        }
-        for topic, make in makers.items():
+        for topic in ("state", "neighbours", "obstacles"):
             heard, message = drone.topics.get(topic), drone.message(topic, now_s)
             if heard is None or message is None or self._sent.get((name, topic)) == heard.time_s:
                 continue
             self._sent[name, topic] = heard.time_s
             time_ns = round(1e9 * self._source.wall_s(heard.time_s))
-            for place, kind, tree in make(time_ns, Names(name), message):
+            for place, kind, tree in self._of_step(topic, time_ns, Names(name), message, row, about):
                 if tree is not None:
                     self._node.publish(place, kind, tree, Delivery.SENSOR if place != "/tf" else Delivery.EVENT)
 
-    def _of_state(
-        self, time_ns: int, names: Names, state: StateMessage, row: Row, about: AboutMessage | None
+    def _of_step(
+        self, topic: str, time_ns: int, names: Names, message: Any, row: Row, about: AboutMessage | None
     ) -> list[tuple[str, str, Tree | None]]:
-        found = [(f"/{names.drone}/odometry", trees.ODOMETRY, trees.state_odometry(time_ns, names, state))]
-        if self._has_transforms:
-            found.append(("/tf", trees.TRANSFORMS, _transforms(time_ns, names, state, row, about)))
-        return found
+        space = f"/{names.drone}"
+        match topic:
+            case "neighbours":
+                seen = message["neighbours"]
+                return [
+                    (f"{space}/neighbours", trees.POSE_ARRAY, trees.neighbour_poses(time_ns, names, seen)),
+                    (f"{space}/neighbours/tracks", trees.POINT_CLOUD, trees.tracks(time_ns, names, seen)),
+                ]
+            case "obstacles":
+                return [(f"{space}/obstacles", trees.LASER_SCAN, trees.scan(time_ns, names, message))]
+        frames = _transforms(time_ns, names, message, row, about) if self._has_transforms else None
+        return [
+            (f"{space}/odometry", trees.ODOMETRY, trees.state_odometry(time_ns, names, message)),
+            ("/tf", trees.TRANSFORMS, frames),
+        ]
 
     def _publish_state(self, name: str, row: Row, now_s: float) -> None:
         status = _status(name, row)
@@ -186,7 +190,7 @@ class FleetBridge:
         self._node.publish(f"{base}/image/compressed", trees.COMPRESSED_IMAGE, image, Delivery.SENSOR)
         mounted = cameras_of(known.about).get(camera)
         if mounted is not None:
-            info = trees.camera_info(time_ns, frame, mounted.config, size_px)
+            info = trees.camera_info(time_ns, frame, mounted[0], size_px)
             self._node.publish(f"{base}/camera_info", trees.CAMERA_INFO, info, Delivery.SENSOR)
 
     def _serve(self, key: str, name: str) -> None:
@@ -220,28 +224,33 @@ class FleetBridge:
 
     def _whereabouts(self, key: str, name: str) -> Whereabouts:
         now_s = self._source.now_s()
-        row, about = self._source.rows(now_s).get(key), self._source.known().get(key, Known()).about
-        state = next((d for d in self._source.drones(now_s) if f"{d.fleet}/{d.drone}" == key), None)
-        told = None if state is None else state.message("state", now_s)
-        home = None if row is None else row["home_ne"]
+        home = self._source.rows(now_s).get(key, {}).get("home_ne")
+        about = self._source.known().get(key, Known()).about
+        origin = None if about is None else origin_of(about["configuration"])
+        told = (one.message("state", now_s) for one in self._source.drones(now_s) if f"{one.fleet}/{one.drone}" == key)
+        state = cast("StateMessage | None", next(told, None))
         return Whereabouts(
             Names(name),
             None if home is None else np.array(home),
-            None if about is None else _origin(about["configuration"]),
-            None if told is None else trees.attitude_of_state(cast("StateMessage", told)),
+            None if origin is None else np.array(origin),
+            None if state is None else trees.attitude_of_state(state),
         )
 
 
-def _of_neighbours(time_ns: int, names: Names, message: NeighboursMessage) -> list[tuple[str, str, Tree | None]]:
-    seen = message["neighbours"]
-    return [
-        (f"/{names.drone}/neighbours", trees.POSE_ARRAY, trees.neighbour_poses(time_ns, names, seen)),
-        (f"/{names.drone}/neighbours/tracks", trees.POINT_CLOUD, trees.tracks(time_ns, names, seen)),
-    ]
+class DroneNames:
+    """A namespace for each drone by its key `fleet/drone`; it keeps it, whoever else comes."""
 
+    def __init__(self) -> None:
+        self._names: dict[str, str] = {}
 
-def _of_obstacles(time_ns: int, names: Names, message: ObstaclesMessage) -> list[tuple[str, str, Tree | None]]:
-    return [(f"/{names.drone}/obstacles", trees.LASER_SCAN, trees.scan(time_ns, names, message))]
+    def of(self, key: str) -> str:
+        """Its own name, with its fleet's or a number where another drone has that already."""
+        if key not in self._names:
+            short, whole = ros_name(key.partition("/")[2]), ros_name(key)
+            taken = set(self._names.values())
+            numbered = (f"{whole}_{number}" for number in range(2, len(taken) + 3))
+            self._names[key] = next(name for name in (short, whole, *numbered) if name not in taken)
+        return self._names[key]
 
 
 def _transforms(time_ns: int, names: Names, state: StateMessage, row: Row, about: AboutMessage | None) -> Tree | None:
@@ -256,10 +265,10 @@ def _transforms(time_ns: int, names: Names, state: StateMessage, row: Row, about
             time_ns,
             names.base_link,
             names.optical(ros_name(name)),
-            flu_of_frd(camera.mounted.T_body_camera.translation),
-            camera_in_ros(camera.mounted.T_body_camera.rotation),
+            flu_of_frd(camera.T_body_camera.translation),
+            camera_in_ros(camera.T_body_camera.rotation),
         )
-        for name, camera in cameras_of(about).items()
+        for name, (_, camera) in cameras_of(about).items()
     ]
     return {
         "transforms": [
@@ -271,6 +280,16 @@ def _transforms(time_ns: int, names: Names, state: StateMessage, row: Row, about
     }
 
 
+def cameras_of(about: AboutMessage | None) -> dict[str, tuple[CameraConfig, RigCamera]]:
+    """A drone's cameras by name; none where its configuration is not known or cannot be."""
+    try:
+        config = RigConfig.model_validate_json(json.dumps((about or {"configuration": {}})["configuration"].get("rig")))
+        mounted = build_rig(config).cameras
+    except (ValueError, ArithmeticError, RecursionError):  # of a peer of another version, or a hostile one
+        return {}
+    return {camera.name: (camera, mounted[camera.name]) for camera in config.cameras}
+
+
 def _status(name: str, row: Row) -> Tree:
     """Level, state and reasons; the camera's faults are among the reasons."""
     sentence = ": ".join([row["state"], *filter(None, ["; ".join(row["why"])])])
@@ -280,12 +299,3 @@ def _status(name: str, row: Row) -> Tree:
         sentence,
         {"state": row["state"], **{one: row[one] for one in _VALUES}},
     )
-
-
-def _origin(configuration: Mapping[str, object]) -> np.ndarray[Any, np.dtype[np.float64]] | None:
-    """(2,) of a peer's configuration; None for what is none."""
-    mission = configuration.get("mission")
-    origin = mission.get("origin_m") if isinstance(mission, dict) else None
-    if not isinstance(origin, list) or len(origin) != 2 or not all(isinstance(one, int | float) for one in origin):
-        return None
-    return np.array(origin, np.float64)

@@ -15,8 +15,8 @@ from aiohttp import WSMsgType, web
 from aiohttp.test_utils import TestClient, TestServer
 
 from flockd.core.errors import UnavailableError
-from flockd.fleet.page.drone_rows import Known, Row
-from flockd.fleet.page.fleet_source import Event, FleetSource
+from flockd.fleet.drone_rows import Known, Row
+from flockd.fleet.fleet_source import Event, FleetSource
 from flockd.fleet.page.page_access import PageAccess, is_own_host, lasting_key
 from flockd.fleet.page.page_server import PageServer
 from flockd.fleet.watcher import Watched

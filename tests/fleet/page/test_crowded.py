@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import pytest
 from aiohttp import web
 
-from flockd.fleet.page.drone_rows import Row
+from flockd.fleet.drone_rows import Row
 from flockd.fleet.page.page_access import PageAccess
 from flockd.fleet.page.page_connections import MAX_STRANGERS, STRANGER_S, PageConnections
 from flockd.fleet.page.page_pictures import EVERY_S, SILENT_S, PagePictures

@@ -9,9 +9,9 @@ import pytest
 
 from flockd.core.messages import FloatArray
 from flockd.core.ros_frames import rotation_of
+from flockd.fleet.drone_rows import Known, drone_rows, origin_of
 from flockd.fleet.fleet_status import WORST_FIRST
-from flockd.fleet.page.drone_rows import Known, drone_rows
-from flockd.fleet.ros.fleet_bridge import _LEVELS, _origin, _status, _transforms
+from flockd.fleet.ros.fleet_bridge import _LEVELS, _status, _transforms
 from flockd.fleet.ros.fleet_markers import markers
 from flockd.fleet.watcher import Heard, Watched
 from flockd.onboard.ros.message_trees import Names
@@ -88,7 +88,5 @@ def test_markers_stand_where_the_drone_is() -> None:
 
 @pytest.mark.parametrize("mission", [None, {}, {"origin_m": [1.0]}, {"origin_m": ["a", "b"]}])
 def test_an_origin_that_a_peer_does_not_tell_is_none(mission: Any) -> None:
-    assert _origin({"mission": mission}) is None
-    found = _origin(ABOUT["configuration"])
-    assert found is not None
-    assert found.tolist() == [3.0, -4.0]
+    assert origin_of({"mission": mission}) is None
+    assert origin_of(ABOUT["configuration"]) == [3.0, -4.0]

@@ -15,7 +15,7 @@ import pytest
 
 from flockd.core.config import load_drone
 from flockd.core.config.source import SourceParameters
-from flockd.fleet.ros.order_requests import Whereabouts, goal_of, velocity_of
+from flockd.fleet.ros.ros_orders import Whereabouts, goal_of, velocity_of
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.mcap_file import RecordingError
 from flockd.onboard.recording.reader import decoded_image

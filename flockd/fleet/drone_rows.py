@@ -1,4 +1,4 @@
-"""What the page shows of each drone: one JSON object, from what a watcher heard of it."""
+"""What is shown of each drone, on the page and in ROS 2: one JSON object, from what a watcher heard of it."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def _row(drone: Watched, status: Mapping[str, Any], known: Known, now_s: float) 
         "version": None if about is None else about["version"],
         "commands": None if about is None else about["commands"],
         "fence": _fence(configuration),
-        "origin_ne": _vector(_section(configuration, "mission").get("origin_m")),
+        "origin_ne": origin_of(configuration),
     }
 
 
@@ -183,6 +183,11 @@ def _offset(origin: list[float] | tuple[float, float] | None, home_deg: list[flo
         round((home_deg[0] - origin[0]) * north_m, 2),
         round(degrees_apart(home_deg[1], origin[1]) * east_m, 2),
     ]
+
+
+def origin_of(configuration: Mapping[str, Any]) -> list[float] | None:
+    """(2,) metres from a drone's home to its mission's origin; None for what is none."""
+    return _vector(_section(configuration, "mission").get("origin_m"))
 
 
 def _section(configuration: Mapping[str, Any], name: str) -> Mapping[str, Any]:

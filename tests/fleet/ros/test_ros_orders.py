@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -9,9 +11,10 @@ import numpy as np
 import pytest
 
 from flockd.core.ros_frames import attitude_of_angles
-from flockd.fleet.ros.drone_names import DroneNames
-from flockd.fleet.ros.order_requests import Whereabouts, goal_of, velocity_of
+from flockd.fleet.ros.fleet_bridge import DroneNames
+from flockd.fleet.ros.ros_orders import NewestOrder, Whereabouts, goal_of, velocity_of
 from flockd.onboard.ros.message_trees import Names
+from tests.fleet.ros.peers import until
 
 HOME, ORIGIN = np.array([100.0, 50.0]), np.array([3.0, -4.0])
 DRONE = Whereabouts(Names("drone1"), HOME, ORIGIN, attitude_of_angles(5.0, -10.0, 90.0))
@@ -77,3 +80,29 @@ def test_every_drone_has_a_name_that_ros_takes_and_keeps_it() -> None:
     assert names.of("b/drone-1-x") == "b_drone_1_x_2", "and its fleet's too"
     assert names.of("a/1st") == "d1st"
     assert names.of("a/drone.1-x") == "drone_1_x"
+
+
+def test_of_orders_that_wait_the_newest_counts() -> None:
+    taken: list[int] = []
+    answered, over = threading.Event(), threading.Event()
+
+    def take(order: int) -> None:
+        taken.append(order)
+        if order == 1:
+            answered.wait(60.0)
+        if order == 50:
+            over.set()
+
+    with ThreadPoolExecutor(2) as threads:
+        slow, other = NewestOrder(threads, take), NewestOrder(threads, lambda order: taken.append(-order))
+        slow.offer(1)
+        until(lambda: taken == [1])
+        for order in range(2, 51):
+            slow.offer(order)  # returns at once, though the drone is silent
+        other.offer(1)
+        until(lambda: -1 in taken)
+        answered.set()
+        assert over.wait(60.0)
+        slow.offer(51)
+        until(lambda: 51 in taken)
+    assert taken == [1, -1, 50, 51]

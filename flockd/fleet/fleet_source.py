@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Protocol
 
-from flockd.fleet.page.drone_rows import Known, Row
+from flockd.fleet.drone_rows import Known, Row
 from flockd.fleet.watcher import Watched
 from flockd.onboard.telemetry.topics import AnswerMessage
 
@@ -49,11 +49,3 @@ class FleetSource(Protocol):
 
     def image(self, drone: str, camera: str, time_s: float) -> bytes | None:
         """A JPEG of what a camera sees. Waits; called on a thread of its own."""
-
-
-def events_after(events: list[Event], last: Event | None) -> list[Event]:
-    """Those that came later than one; all where that is no longer remembered."""
-    for index in range(len(events) - 1, -1, -1):
-        if events[index] == last:
-            return events[index + 1 :]
-    return events

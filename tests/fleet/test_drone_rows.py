@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from flockd.fleet.page.drone_rows import HISTORY_COLUMNS, MAX_CAMERAS, Known, drone_rows, history_row
+from flockd.fleet.drone_rows import HISTORY_COLUMNS, MAX_CAMERAS, Known, drone_rows, history_row
 from flockd.fleet.watcher import Heard, Watched
 from flockd.onboard.telemetry.topics import AboutMessage
 

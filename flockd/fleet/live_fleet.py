@@ -11,8 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Self
 
 from flockd.fleet.drone_queries import ClockReading
-from flockd.fleet.page.drone_rows import Known, Row, drone_rows, history_row
-from flockd.fleet.page.fleet_source import Event
+from flockd.fleet.drone_rows import Known, Row, drone_rows, history_row
+from flockd.fleet.fleet_source import Event
 from flockd.fleet.watcher import FleetWatcher, Watched
 from flockd.onboard.telemetry.topics import AnswerMessage, is_name
 

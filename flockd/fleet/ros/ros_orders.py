@@ -1,9 +1,11 @@
-"""Orders as they come from ROS 2, turned into those of flockd. Pure; whether one may be flown is the drone's to say."""
+"""Orders as they come from ROS 2, turned into those of flockd; whether one may be flown is the drone's to say."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import threading
+from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,7 +63,7 @@ def velocity_of(message: Tree, drone: Whereabouts) -> OrderMessage:
     linear = np.array([motion["linear"][axis] for axis in "xyz"])
     if not np.isfinite(linear).all():
         raise ValueError("a velocity's numbers have to be finite")
-    if linear[2] or any(_turns(motion["angular"])):
+    if linear[2] or any(motion["angular"][axis] for axis in "xyz"):
         raise ValueError("flockd flies level and keeps its heading: leave `linear.z` and `angular` at 0")
     if frame in {MAP, drone.names.odom, drone.names.level}:
         north, east, _ = ned_of_enu(linear).tolist()
@@ -77,5 +79,40 @@ def velocity_of(message: Tree, drone: Whereabouts) -> OrderMessage:
     return OrderMessage(velocity_ne=[north, east])
 
 
-def _turns(angular: Mapping[str, Any]) -> list[float]:
-    return [float(angular[axis]) for axis in "xyz"]
+class NewestOrder:
+    """Orders of one kind to one drone, one at a time: of those that wait the newest counts.
+
+    `offer` returns at once, so that a drone that is gone holds up no other.
+    """
+
+    def __init__(self, threads: Executor, take: Callable[[Any], None]) -> None:
+        """``take`` may wait; it is called on a thread of ``threads``."""
+        self._threads, self._take = threads, take
+        self._lock = threading.Lock()
+        self._waiting: list[Any] = []
+        self._busy = False
+
+    def offer(self, message: Any) -> None:
+        """Takes the place of what waits; from any thread."""
+        with self._lock:
+            self._waiting = [message]
+            if self._busy:
+                return
+            self._busy = True
+        self._threads.submit(self._run)
+
+    def _run(self) -> None:
+        while (message := self._next()) is not None:
+            try:
+                self._take(message[0])
+            except BaseException:
+                with self._lock:
+                    self._busy = False  # the next one is passed on all the same
+                raise
+
+    def _next(self) -> list[Any] | None:
+        """What waits; with nothing, this thread has ended its work."""
+        with self._lock:
+            waiting, self._waiting = self._waiting, []
+            self._busy = bool(waiting)
+            return waiting or None

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from flockd.fleet.drone_queries import MAX_PICTURE_PX, MAX_REPLY_BYTES
-from flockd.fleet.page.live_fleet import LiveFleet
+from flockd.fleet.live_fleet import LiveFleet
 from flockd.fleet.watcher import FleetWatcher, _heard
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
