@@ -22,7 +22,7 @@ from flockd.flight.geometry import (
     rotation_from_vector,
 )
 from flockd.ground.doctor import Level
-from flockd.ground.doctor.rig_checks import check_rig
+from flockd.ground.doctor.camera_checks import check_rig
 from flockd.onboard.daemon.pilot_loop import RigReports
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.reader import Recording

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from flockd.core.config import DroneConfig
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.safety import GateParameters
+from flockd.core.messages import RangeReading
 from flockd.flight.safety import link_lost
-from flockd.ground.doctor.finding import Finding, Level, failed, failed_from_error, passed, warned
-from flockd.ground.doctor.range_checks import WATCHED_S, judge_range_finder
+from flockd.flight.tracking.weave_path import HEIGHT_GAIN_PER_S
+from flockd.ground.doctor.finding import Finding, Level, failed, failed_from_error, graded, passed, warned
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware
 from flockd.onboard.autopilot.clock_sync import ClockEstimate
-from flockd.onboard.autopilot.mavlink_messages import MOST_ERROR_S
+from flockd.onboard.autopilot.mavlink_messages import FACES_DOWN, MOST_ERROR_S
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.refusals import Refusal
 
@@ -27,6 +28,75 @@ CHECKS_S = 2.0
 OLDEST_TRIED = (1, 14)
 """Before PX4 1.14, COM_OBL_RC_ACT held only with a remote control, and COM_OBL_ACT without."""
 LONGEST_LOSS_S = 1.0
+
+RANGE_FINDER = "range finder"
+WATCHED_S = 1.5
+"""How long its messages are watched."""
+LEAST_RATE_HZ = 10.0
+NEAREST_M = 0.5
+"""A sensor that measures nothing nearer is blind at take-off and landing."""
+_FACES = {0: "forward", 2: "to the right", 4: "backward", 6: "to the left", 24: "up"}
+
+PARAMETERS: dict[str, type[int] | type[float]] = {
+    "COM_OF_LOSS_T": float,
+    "COM_OBL_RC_ACT": int,
+    "COM_LOW_BAT_ACT": int,
+    "GF_ACTION": int,
+    "GF_MAX_HOR_DIST": float,
+    "GF_MAX_VER_DIST": float,
+    "CP_DIST": float,
+    "MPC_Z_P": float,
+}
+"""Those of PX4 that are judged, each as PX4 declares it."""
+
+
+class Action(NamedTuple):
+    """A parameter that says what PX4 does in some case."""
+
+    when: str
+    words: Mapping[int, str]
+    """PX4's values."""
+    good: tuple[int, int, int]
+    """Those that a drone may have, the best first."""
+    poor: tuple[int, ...] | None = None
+    """With which it may fly, but not well; None: all others. With what is neither it must not fly."""
+
+
+ACTIONS = {
+    "COM_OBL_RC_ACT": Action(
+        "when setpoints stop",
+        {
+            -1: "disabled: it flies on with the last velocity",
+            0: "Position: the sticks then fly it; with no remote control it returns home",
+            1: "Altitude: it keeps its height, and drifts on",
+            2: "Stabilized: it keeps level, and drifts on and down",
+            3: "Return",
+            4: "Land",
+            5: "Hold",
+            6: "Terminate: the motors stop in the air",
+            7: "Disarm: the motors stop in the air",
+        },
+        (5, 4, 3),
+        (0,),
+    ),
+    "COM_LOW_BAT_ACT": Action(
+        "when the battery is low",
+        {0: "only warns", 1: "Return", 2: "Land", 3: "Return, and Land when nearly empty"},
+        (3, 2, 1),
+    ),
+    "GF_ACTION": Action(
+        "at PX4's fence",
+        {
+            0: "None: PX4 has no fence",
+            1: "Warning: PX4's fence stops nothing",
+            2: "Hold",
+            3: "Return",
+            4: "Terminate: motors stop at the fence",
+            5: "Land",
+        },
+        (2, 3, 5),
+    ),
+}
 
 
 def check_autopilot(config: DroneConfig, heard_s: float = HEARD_S) -> Iterator[Finding]:
@@ -55,7 +125,8 @@ async def _ask(config: DroneConfig, parameters: AutopilotParameters, heard_s: fl
         if not _is_silent(link.status(), config):
             found += judge_refusals(await _refusals(link))
             found.append(judge_clock(await _clock(link)))
-            found += await _range_finder(link, config)
+            await asyncio.sleep(WATCHED_S if config.perception.height != "barometer" else 0.0)
+            found += judge_range_finder(link.ground_range(), link.range_finders(), config)
         found += judge_messages(link.unknown_values())
     finally:
         await link.close()
@@ -82,16 +153,11 @@ async def _clock(link: AutopilotLink) -> ClockEstimate | None:
     return link.clock()
 
 
-async def _range_finder(link: AutopilotLink, config: DroneConfig) -> list[Finding]:
-    await asyncio.sleep(WATCHED_S if config.perception.height != "barometer" else 0.0)
-    return judge_range_finder(link.ground_range(), link.range_finders(), config)
-
-
 async def _parameters(link: AutopilotLink, config: DroneConfig) -> list[Finding]:
     found = []
-    for name, wanted in PARAMETERS.items():
+    for name, kind in PARAMETERS.items():
         try:
-            value = await link.parameter(name, wanted.kind)
+            value = await link.parameter(name, kind)
         except AutopilotError as error:
             fix = f"check whether this firmware has {name}, and whether the link loses messages"
             found.append(failed(name, str(error), fix))
@@ -99,7 +165,7 @@ async def _parameters(link: AutopilotLink, config: DroneConfig) -> list[Finding]
                 found.append(judge_heartbeat(link.system_id, link.status(), config))
                 break
         else:
-            found.append(wanted.judge(value, config))
+            found.append(judge_parameter(name, value, config))
     return found
 
 
@@ -156,9 +222,8 @@ def judge_clock(clock: ClockEstimate | None) -> Finding:
         f"shortest round trip {1e3 * clock.round_trip_s:.1f} ms"
     )
     fix = "raise the link's baud rate, send fewer streams over it, and take load off this computer"
-    if clock.error_s > MOST_ERROR_S:
-        return warned("clock", f"{measured}: so uncertain that attitudes count from when they arrive", fix)
-    return passed("clock", measured)
+    uncertain = ": so uncertain that attitudes count from when they arrive" if clock.error_s > MOST_ERROR_S else ""
+    return graded("clock", f"{measured}{uncertain}", fix, warning=bool(uncertain))
 
 
 def judge_messages(unknown_values: Mapping[str, int]) -> list[Finding]:
@@ -180,89 +245,49 @@ def judge_firmware(firmware: Firmware) -> Finding:
     return passed("firmware", measured)
 
 
-def judge_loss_time(value: float, config: DroneConfig) -> Finding:
-    """COM_OF_LOSS_T, in seconds."""
-    name, measured = "COM_OF_LOSS_T", f"{value:g} s"
+def judge_parameter(name: str, value: float, config: DroneConfig) -> Finding:
+    """One of `PARAMETERS`."""
+    gate = config.safety.gate
+    match name:
+        case "COM_OF_LOSS_T":
+            return _judge_loss_time(name, value, config)
+        case "GF_MAX_HOR_DIST":
+            return _judge_limit(name, value, _reach_m(gate), "fence")
+        case "GF_MAX_VER_DIST":
+            return _judge_limit(name, value, gate.max_height_m, "max_height_m")
+        case "CP_DIST":
+            return _judge_collision_prevention(name, value, config)
+        case "MPC_Z_P":
+            return _judge_height_gain(name, value, config)
+    return _judge_action(name, ACTIONS[name], int(value), config)
+
+
+def _judge_loss_time(name: str, value: float, config: DroneConfig) -> Finding:
+    """In seconds."""
     gap_s = AutopilotParameters().max_gap_s if config.autopilot is None else config.autopilot.max_gap_s
+    too_short, too_long = value <= gap_s, value > LONGEST_LOSS_S
+    told = " without setpoints, then its failsafe"
+    if too_short:
+        told = f", not above autopilot.max_gap_s {gap_s:g}: PX4 would leave offboard in gaps flockd bridges"
+    elif too_long:
+        told = ": so long it flies on with the last velocity when setpoints stop"
     fix = f"set {name} to {LONGEST_LOSS_S:g} s"
-    if value <= gap_s:
-        measured = (
-            f"{measured}, not above autopilot.max_gap_s {gap_s:g}: PX4 would leave offboard in gaps flockd bridges"
-        )
-        return failed(name, measured, fix)
-    if value > LONGEST_LOSS_S:
-        return warned(name, f"{measured}: so long it flies on with the last velocity when setpoints stop", fix)
-    return passed(name, f"{measured} without setpoints, then its failsafe")
+    return graded(name, f"{value:g} s{told}", fix, failure=too_short, warning=too_long)
 
 
-def judge_loss_action(value: int, config: DroneConfig) -> Finding:
-    """COM_OBL_RC_ACT: what it does when setpoints stop."""
-    what = {
-        -1: "disabled: it flies on with the last velocity",
-        0: "Position: the sticks then fly it; with no remote control it returns home",
-        1: "Altitude: it keeps its height, and drifts on",
-        2: "Stabilized: it keeps level, and drifts on and down",
-        3: "Return",
-        4: "Land",
-        5: "Hold",
-        6: "Terminate: the motors stop in the air",
-        7: "Disarm: the motors stop in the air",
-    }
-    blame = warned if value == 0 else failed
-    return _judge_action("COM_OBL_RC_ACT", value, what, "when setpoints stop", (5, 4, 3), blame)
+def _judge_action(name: str, action: Action, value: int, config: DroneConfig) -> Finding:
+    measured, good = f"{value} ({action.words.get(value, 'not known')}) {action.when}", value in action.good
+    if name == "COM_LOW_BAT_ACT" and not good:
+        low = config.safety.on_battery_low
+        measured += f": flockd asks for {low} (safety.on_battery_low), and nothing does while it is down"
+    best, second, third = (f"{one} ({action.words[one]})" for one in action.good)
+    fatal = action.poor is not None and value not in (*action.good, *action.poor)
+    return graded(name, measured, f"set {name} to {best}, {second} or {third}", failure=fatal, warning=not good)
 
 
-def judge_low_battery(value: int, config: DroneConfig) -> Finding:
-    """COM_LOW_BAT_ACT."""
-    what = {0: "only warns", 1: "Return", 2: "Land", 3: "Return, and Land when nearly empty"}
-    low = config.safety.on_battery_low
-    own = f": flockd asks for {low} (safety.on_battery_low), and nothing does while it is down"
-    when = f"when the battery is low{'' if value in {1, 2, 3} else own}"
-    return _judge_action("COM_LOW_BAT_ACT", value, what, when, (3, 2, 1), warned)
-
-
-def judge_fence_action(value: int, config: DroneConfig) -> Finding:
-    """GF_ACTION."""
-    what = {
-        0: "None: PX4 has no fence",
-        1: "Warning: PX4's fence stops nothing",
-        2: "Hold",
-        3: "Return",
-        4: "Terminate: motors stop at the fence",
-        5: "Land",
-    }
-    return _judge_action("GF_ACTION", value, what, "at PX4's fence", (2, 3, 5), warned)
-
-
-def _judge_action(
-    name: str,
-    value: int,
-    what: Mapping[int, str],
-    when: str,
-    good: Sequence[int],
-    blame: Callable[[str, str, str], Finding],
-) -> Finding:
-    """``what``: PX4's values in words; ``good``: those that a drone may have, the best first."""
-    measured = f"{value} ({what.get(value, 'not known')}) {when}"
-    best, second, third = (f"{one} ({what[one]})" for one in good)
-    return (
-        passed(name, measured) if value in good else blame(name, measured, f"set {name} to {best}, {second} or {third}")
-    )
-
-
-def judge_fence_radius(value: float, config: DroneConfig) -> Finding:
-    """GF_MAX_HOR_DIST, in metres."""
-    return _judge_limit("GF_MAX_HOR_DIST", value, _reach_m(config.safety.gate), "fence")
-
-
-def judge_fence_height(value: float, config: DroneConfig) -> Finding:
-    """GF_MAX_VER_DIST, in metres."""
-    return _judge_limit("GF_MAX_VER_DIST", value, config.safety.gate.max_height_m, "max_height_m")
-
-
-def judge_collision_prevention(value: float, config: DroneConfig) -> Finding:
-    """CP_DIST, in metres."""
-    name, sends = "CP_DIST", config.autopilot is not None and config.autopilot.obstacle_distance
+def _judge_collision_prevention(name: str, value: float, config: DroneConfig) -> Finding:
+    """In metres."""
+    sends = config.autopilot is not None and config.autopilot.obstacle_distance
     if value > 0 and sends:
         return passed(
             name, f"{value:g} m: PX4 stops a pilot in Position mode by what flockd sees, and where it does not"
@@ -274,6 +299,17 @@ def judge_collision_prevention(value: float, config: DroneConfig) -> Finding:
         measured = f"{value:g}: PX4 ignores the distances that autopilot.obstacle_distance sends"
         return warned(name, measured, "set CP_DIST to the distance to keep, in metres")
     return passed(name, f"{value:g}: PX4 stops no pilot before obstacles")
+
+
+def _judge_height_gain(name: str, value: float, config: DroneConfig) -> Finding:
+    """In 1/s: by it others know how far a drone moves that weaves (`tracking.weave_path`)."""
+    if config.flocking.size == "off":
+        return passed(name, f"{value:g}: nobody weaves (flocking.size)")
+    if abs(value - HEIGHT_GAIN_PER_S) <= MOST_GAIN_OFF_PER_S:
+        return passed(name, f"{value:g}: a weave moves the drone as far as the others take it to")
+    measured = f"{value:g}: a weave moves the drone otherwise than the others take it to, who then judge ranges wrong"
+    fix = f"set {name} to {HEIGHT_GAIN_PER_S:g} on every drone of the fleet, or flocking.size to off"
+    return warned(name, measured, fix)
 
 
 def _judge_limit(name: str, value: float, own_m: float | None, what: str) -> Finding:
@@ -295,22 +331,54 @@ def _reach_m(gate: GateParameters) -> float | None:
     return min([*limits, *([] if gate.fence_radius_m is None else [gate.fence_radius_m])], default=None)
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """One of PX4's that is judged."""
+def judge_range_finder(
+    reading: RangeReading | None, arrivals_s: Mapping[int, Sequence[float]], config: DroneConfig
+) -> list[Finding]:
+    """Findings of a drone that is on the ground; none where the configuration takes the height from elsewhere.
 
-    kind: type[int] | type[float]
-    """As PX4 declares it."""
-    judge: Callable[..., Finding]
-    """Takes the value and the drone's configuration."""
+    Args:
+        reading: the newest of the sensor that faces down, or the autopilot's own distance to bottom.
+        arrivals_s: when the last DISTANCE_SENSOR messages came, by MAV_SENSOR_ORIENTATION.
+        config: the drone's.
+    """
+    perception = config.perception
+    if perception.scale != "height" or perception.height == "barometer":
+        return []
+    blame = failed if perception.height == "range_finder" else warned
+    if reading is None:
+        if arrivals_s:
+            others = ", ".join(_FACES.get(number, f"by MAV_SENSOR_ORIENTATION {number}") for number in arrivals_s)
+            fix = "mount it facing down, and set its orientation in PX4 (such as SENS_CM8JL65_R_0) to 25, downward"
+            return [blame(RANGE_FINDER, f"no range finder faces down; those that are heard face {others}", fix)]
+        fix = "see to the sensor and its driver in PX4, or write perception.height: barometer"
+        return [blame(RANGE_FINDER, "the autopilot sends no DISTANCE_SENSOR and no distance to bottom", fix)]
+    if reading.vertical:
+        measured = f"no DISTANCE_SENSOR; PX4's own distance to bottom is {reading.range_m:.2f} m"
+        return [
+            warned(RANGE_FINDER, measured, "let PX4 send DISTANCE_SENSOR on this link: it is newer, and has its limits")
+        ]
+    return [_judge_sensor(reading, arrivals_s.get(FACES_DOWN, ()), config)]
 
 
-PARAMETERS = {
-    "COM_OF_LOSS_T": Parameter(float, judge_loss_time),
-    "COM_OBL_RC_ACT": Parameter(int, judge_loss_action),
-    "COM_LOW_BAT_ACT": Parameter(int, judge_low_battery),
-    "GF_ACTION": Parameter(int, judge_fence_action),
-    "GF_MAX_HOR_DIST": Parameter(float, judge_fence_radius),
-    "GF_MAX_VER_DIST": Parameter(float, judge_fence_height),
-    "CP_DIST": Parameter(float, judge_collision_prevention),
-}
+def _judge_sensor(reading: RangeReading, arrivals_s: Sequence[float], config: DroneConfig) -> Finding:
+    least_m, most_m = reading.min_m or 0.0, reading.max_m
+    limits = f"from {least_m:.2f} m" if most_m is None else f"from {least_m:.2f} to {most_m:.1f} m"
+    rate_hz = _rate_hz(arrivals_s)
+    measured = f"faces down, {reading.range_m:.2f} m now, measures {limits}, {rate_hz:.0f} times a second"
+    gate = config.safety.gate
+    if most_m is not None and most_m < gate.max_height_m:
+        fix = f"make safety.gate.max_height_m {most_m:.0f} m or less, or take a sensor that measures farther"
+        return warned(RANGE_FINDER, f"{measured}; the drone may fly at {gate.max_height_m:g} m", fix)
+    if least_m > NEAREST_M:
+        return warned(
+            RANGE_FINDER, measured, "take a sensor that measures nearer, or fly higher than that from the start"
+        )
+    if rate_hz < LEAST_RATE_HZ:
+        return warned(RANGE_FINDER, measured, f"let the sensor and this link give it at {LEAST_RATE_HZ:g} Hz or more")
+    return passed(RANGE_FINDER, measured)
+
+
+def _rate_hz(arrivals_s: Sequence[float]) -> float:
+    if len(arrivals_s) < 2 or arrivals_s[-1] <= arrivals_s[0]:
+        return 0.0
+    return (len(arrivals_s) - 1) / (arrivals_s[-1] - arrivals_s[0])

@@ -17,7 +17,7 @@ from flockd.core.messages import FloatArray, PilotOutput, ReasonKind, Setpoint
 from flockd.flight.inference.hashes import model_hashes
 from flockd.flight.perception import load_networks
 from flockd.flight.safety import Gate
-from flockd.ground.doctor.finding import Finding, failed, passed, warned
+from flockd.ground.doctor.finding import Finding, failed, graded, passed, warned
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.daemon import Components, Daemon, InterruptibleNetworks, ServiceManager, cameras_at_once
@@ -190,121 +190,91 @@ def judged(config: DroneConfig, samples: Sequence[Sample], seconds: float) -> It
     if not samples:
         yield failed("bench", "no frame came, so that nothing could be run", "run `flockd doctor` first")
         return
-    ran_s = samples[-1].time_s
-    if samples[-1].armed:
-        yield failed(
-            "bench", f"the drone was armed after {ran_s:.0f} s, which ended it", "leave it disarmed; begin again"
-        )
-    elif ran_s < seconds - 2 * SAMPLE_S:
-        yield warned(
-            "bench", f"ended after {ran_s:.0f} of {seconds:.0f} s", "let it run to its end: heat takes its time"
-        )
+    last = samples[-1]
+    if last.armed:
+        measured = f"the drone was armed after {last.time_s:.0f} s, which ended it"
+        yield failed("bench", measured, "leave it disarmed; begin again")
+    elif last.time_s < seconds - 2 * SAMPLE_S:
+        measured = f"ended after {last.time_s:.0f} of {seconds:.0f} s"
+        yield warned("bench", measured, "let it run to its end: heat takes its time")
     else:
-        yield passed("bench", f"ran for {ran_s:.0f} s without arming; nothing was sent that moves the drone")
-    yield from _steps(config, samples, ran_s)
-    yield from _cameras(config, samples)
-    yield _lag(config, samples)
-    yield _temperature(config, samples)
-    yield _autopilot(config, samples)
+        yield passed("bench", f"ran for {last.time_s:.0f} s without arming; nothing was sent that moves the drone")
+    yield from _steps(config, samples, last.time_s)
+    for camera in config.rig.cameras:
+        yield _camera(camera.name, samples)
+    safety = config.safety
+    worst_s, limit_s = max(sample.loop_lag_s for sample in samples), safety.max_loop_lag_s
+    measured = f"the control loop was late by {1e3 * worst_s:.0f} ms at worst, of {1e3 * limit_s:.0f} ms allowed"
+    fix = "give the service a higher priority, and stop other programs"
+    yield graded("control loop", measured, fix, failure=worst_s > limit_s)
+    yield _temperature([s.temperature_c for s in samples if s.temperature_c is not None], safety.degraded_temperature_c)
+    oldest_s, limit_s = max(sample.heartbeat_age_s for sample in samples), safety.heartbeat_timeout_s
+    measured = f"heartbeats at most {oldest_s:.1f} s apart, {limit_s:g} s allowed"
+    fix = "check the cable, its baud rate, and what else uses the port"
+    yield graded("autopilot", measured, fix, failure=oldest_s > limit_s)
     yield from _what_it_saw(samples)
-    yield _commands(samples)
+    speeds = [float(np.hypot(*sample.command)) for sample in samples if sample.command is not None]
+    if speeds:
+        measured = f"it would have flown at {np.median(speeds):.2f} m/s at the median, {max(speeds):.2f} m/s at most"
+        yield passed("commands", measured)
+    else:
+        yield warned("commands", "none was computed", "let it run longer than two steps")
 
 
 def _steps(config: DroneConfig, samples: Sequence[Sample], ran_s: float) -> Iterator[Finding]:
-    steps, due = samples[-1].steps, max(ran_s / config.step_s, 1.0)
+    steps, due, lost = samples[-1].steps, max(ran_s / config.step_s, 1.0), samples[-1].failed
     measured = f"{steps} steps, {steps / max(ran_s, config.step_s):.2f} a second of {1 / config.step_s:.2f} configured"
-    lost = samples[-1].failed
     if lost:
         yield failed("steps", f"{measured}; {lost} had no result", "read the events above; run `flockd models verify`")
-    elif steps < STEADY * due:
-        yield warned("steps", measured, "give flockd more of the computer, or a longer step_s")
     else:
-        yield passed("steps", measured)
+        fix = "give flockd more of the computer, or a longer step_s"
+        yield graded("steps", measured, fix, warning=steps < STEADY * due)
     loads = np.array([sample.load for sample in samples if sample.steps])
     if not len(loads):
         return
-    measured = f"a step takes {100 * np.median(loads):.0f} % of its time, at worst {100 * loads.max():.0f} %"
+    gone, slow = loads.max() > config.safety.max_load, loads.max() > config.safety.degraded_load
+    what = ": it would have handed over to the autopilot" if gone else ": it would have slowed down" if slow else ""
+    measured = f"a step takes {100 * np.median(loads):.0f} % of its time, at worst {100 * loads.max():.0f} %{what}"
     fix = "stop other programs, cool the computer, use fewer or smaller images, or a longer step_s"
-    if loads.max() > config.safety.max_load:
-        yield failed("load", f"{measured}: it would have handed over to the autopilot", fix)
-    elif loads.max() > config.safety.degraded_load:
-        yield warned("load", f"{measured}: it would have slowed down", fix)
-    else:
-        yield passed("load", measured)
+    yield graded("load", measured, fix, failure=gone, warning=slow)
     stages = {stage: [s.stages_ms[stage] for s in samples if stage in s.stages_ms] for stage in samples[-1].stages_ms}
     spread = {stage: np.percentile(taken_ms, (50, 95)) for stage, taken_ms in stages.items()}
     longest = sorted(spread, key=lambda stage: -spread[stage][0])
-    shown = ", ".join(f"{stage} {spread[stage][0]:.0f} / {spread[stage][1]:.0f}" for stage in longest)
-    if shown:
+    if longest:
+        shown = ", ".join(f"{stage} {spread[stage][0]:.0f} / {spread[stage][1]:.0f}" for stage in longest)
         yield passed("stages", f"ms, median / 95th percentile: {shown}")
 
 
-def _cameras(config: DroneConfig, samples: Sequence[Sample]) -> Iterator[Finding]:
-    for camera in config.rig.cameras:
-        ages_s = [age for s in samples if math.isfinite(age := s.camera_age_s.get(camera.name, math.inf))]
-        faults = list(dict.fromkeys(s.camera_faults[camera.name] for s in samples if camera.name in s.camera_faults))
-        about = f"camera {camera.name}"
-        measured = (
-            f"newest frame {1e3 * float(np.median(ages_s)):.0f} ms old, at worst {1e3 * max(ages_s):.0f} ms"
-            if ages_s
-            else ""
-        )
-        if faults or not ages_s:
-            fix = "run `flockd doctor --only cameras --seconds 60`; check its cable"
-            yield failed(about, "; ".join(filter(None, (measured, *faults))) or "no frame came", fix)
-        else:
-            yield passed(about, measured)
+def _camera(name: str, samples: Sequence[Sample]) -> Finding:
+    ages_s = [age for s in samples if math.isfinite(age := s.camera_age_s.get(name, math.inf))]
+    faults = list(dict.fromkeys(s.camera_faults[name] for s in samples if name in s.camera_faults))
+    told = faults
+    if ages_s:
+        told = [f"newest frame {1e3 * np.median(ages_s):.0f} ms old, at worst {1e3 * max(ages_s):.0f} ms", *faults]
+    fix = "run `flockd doctor --only cameras --seconds 60`; check its cable"
+    return graded(f"camera {name}", "; ".join(told) or "no frame came", fix, failure=bool(faults) or not ages_s)
 
 
-def _lag(config: DroneConfig, samples: Sequence[Sample]) -> Finding:
-    worst_s, limit_s = max(sample.loop_lag_s for sample in samples), config.safety.max_loop_lag_s
-    measured = f"the control loop was late by {1e3 * worst_s:.0f} ms at worst, of {1e3 * limit_s:.0f} ms allowed"
-    fix = "give the service a higher priority, and stop other programs"
-    return failed("control loop", measured, fix) if worst_s > limit_s else passed("control loop", measured)
-
-
-def _temperature(config: DroneConfig, samples: Sequence[Sample]) -> Finding:
-    known = [sample.temperature_c for sample in samples if sample.temperature_c is not None]
-    if not known:
-        return warned(
-            "temperature", "this computer reports none", "load the driver of its thermal sensor, if it has one"
-        )
-    limit_c = config.safety.degraded_temperature_c
-    measured = (
-        f"{known[0]:.0f} °C at the start, {max(known):.0f} at most, {known[-1]:.0f} at the end; limit {limit_c:g}"
-    )
+def _temperature(known_c: Sequence[float], limit_c: float) -> Finding:
+    if not known_c:
+        fix = "load the driver of its thermal sensor, if it has one"
+        return warned("temperature", "this computer reports none", fix)
+    measured = f"{known_c[0]:.0f} °C at the start, {max(known_c):.0f} at most, {known_c[-1]:.0f} at the end"
     fix = "improve its airflow, or add a heat sink"
-    return warned("temperature", measured, fix) if max(known) >= limit_c else passed("temperature", measured)
-
-
-def _autopilot(config: DroneConfig, samples: Sequence[Sample]) -> Finding:
-    oldest_s, limit_s = max(sample.heartbeat_age_s for sample in samples), config.safety.heartbeat_timeout_s
-    measured = f"heartbeats at most {oldest_s:.1f} s apart, {limit_s:g} s allowed"
-    fix = "check the cable, its baud rate, and what else uses the port"
-    return failed("autopilot", measured, fix) if oldest_s > limit_s else passed("autopilot", measured)
+    return graded("temperature", f"{measured}; limit {limit_c:g}", fix, warning=max(known_c) >= limit_c)
 
 
 def _what_it_saw(samples: Sequence[Sample]) -> Iterator[Finding]:
     most = max(sample.neighbours for sample in samples)
     share = sum(sample.neighbours > 0 for sample in samples) / len(samples)
-    measured = (
-        f"{most} {'neighbour' if most == 1 else 'neighbours'} at most, one or more in {100 * share:.0f} % of the time"
-    )
+    what = "neighbour" if most == 1 else "neighbours"
+    measured = f"{most} {what} at most, one or more in {100 * share:.0f} % of the time" if most else "none were seen"
     fix = "where no drone was to be seen, they are false: look at them with `flockd detect` or `flockd report`"
-    yield warned("neighbours", measured, fix) if most else passed("neighbours", "none were seen")
+    yield graded("neighbours", measured, fix, warning=most > 0)
     known = sum(sample.own_motion for sample in samples) / len(samples)
     measured = f"estimated in {100 * known:.0f} % of the time"
     whys = Counter(sample.why for sample in samples if not sample.own_motion and sample.why is not None)
     if known < STEADY and whys:
         measured += f"; mostly: {whys.most_common(1)[0][0]}"
     fix = "show the cameras something with texture, in light; without a range finder lift the drone after its start"
-    yield passed("own motion", measured) if known >= STEADY else warned("own motion", measured, fix)
-
-
-def _commands(samples: Sequence[Sample]) -> Finding:
-    speeds = [float(np.hypot(*sample.command)) for sample in samples if sample.command is not None]
-    if not speeds:
-        return warned("commands", "none was computed", "let it run longer than two steps")
-    return passed(
-        "commands", f"it would have flown at {np.median(speeds):.2f} m/s at the median, {max(speeds):.2f} m/s at most"
-    )
+    yield graded("own motion", measured, fix, warning=known < STEADY)

@@ -1,16 +1,24 @@
-"""Cameras: all of them run at once, as in flight, and are watched for some seconds."""
+"""Cameras: run all at once and watched for some seconds, their calibrations, the rig, and what the last flight saw."""
 
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
 
 from flockd.core.config import DroneConfig
-from flockd.core.config.rig import CameraConfig
+from flockd.core.config.rig import CameraConfig, RigConfig
 from flockd.core.config.source import CameraDeviceParameters
+from flockd.core.errors import FlockdError
+from flockd.flight.geometry import Rig, build_rig, described, rig_faults
+from flockd.ground.calibration.from_flight import found_rig
 from flockd.ground.cameras.watching import START_S, Watched, watch
+from flockd.ground.doctor.computer_checks import STATE_FOLDER
 from flockd.ground.doctor.finding import Finding, failed, failed_from_error, passed, warned
-from flockd.ground.doctor.lens_checks import coverage, lens_problems, width_deg
+from flockd.onboard.recording.reader import Recording
 from flockd.onboard.sources.device_source import Devices
 
 SLOW, TOO_SLOW = 0.95, 0.8
@@ -21,6 +29,14 @@ FIX_RATE = "try another cable and port, fewer cameras on one USB bus, or a short
 FIX_PIPELINE = "try the pipeline with `gst-launch-1.0`, and ask it for a rate and size that it can keep"
 DARK, BRIGHT = 12.0, 243.0
 """Mean grey, 0 to 255, of an image in which little can be seen."""
+
+# A calibration made at another size of image has its principal point far from the middle: half the width off for twice
+# the size. Real lenses sit within some percent of it.
+ODD_CENTRE, WRONG_CENTRE = 0.08, 0.2
+"""Shares of the width or height, between the principal point and the middle."""
+ODD_PIXELS, WRONG_PIXELS = 0.03, 0.15
+"""How much fx and fy differ: pixels are square, unless images were squeezed from another aspect."""
+NARROW_DEG, MOST_PINHOLE_DEG, MOST_WIDE_DEG = 40.0, 130.0, 220.0
 
 
 def check_cameras(
@@ -106,3 +122,106 @@ def _exposure_problems(device: CameraDeviceParameters) -> Iterator[Finding]:
         measured = "its exposure is not configured: an automatic one blurs, which is taken for motion"
         fix = "set it in source.cameras[].controls, as in config/quadrotor.yaml"
         yield warned(f"camera {device.name}", measured, fix)
+
+
+def width_deg(camera: CameraConfig) -> float:
+    """The horizontal field of view through the image's middle row; NaN where the calibration images nothing there.
+
+    Raises ValueError where the intrinsics make no camera.
+    """
+    lens = build_rig(RigConfig(cameras=(camera,))).cameras[camera.name].camera
+    width, _ = camera.size_px
+    cy = camera.intrinsics.cy
+    left, right = lens.rays(np.array([[0.0, cy], [float(width), cy]]))
+    return math.degrees(sum(math.atan2(abs(ray[0]), ray[2]) for ray in (left, right)))
+
+
+def lens_problems(camera: CameraConfig) -> Iterator[Finding]:
+    """What makes a calibration unlikely or impossible for images of the camera's size."""
+    about, lens = f"camera {camera.name}", camera.intrinsics
+    again = "calibrate this camera at the size of its images"
+    try:
+        angle = width_deg(camera)
+    except ValueError as error:
+        yield failed(about, f"its calibration is unusable ({error})", again)
+        return
+    off = max(abs(lens.cx / camera.size_px[0] - 0.5), abs(lens.cy / camera.size_px[1] - 0.5))
+    if off > ODD_CENTRE:
+        size = "x".join(map(str, camera.size_px))
+        measured = f"principal point {lens.cx:g}, {lens.cy:g} is {off:.0%} of the image off the middle of {size}"
+        yield (failed if off > WRONG_CENTRE else warned)(about, measured, again)
+    odd = abs(lens.fx / lens.fy - 1.0)
+    if odd > ODD_PIXELS:
+        measured = f"fx {lens.fx:g} and fy {lens.fy:g} differ by {odd:.0%}, and pixels are square"
+        yield (failed if odd > WRONG_PIXELS else warned)(about, measured, again)
+    most = MOST_PINHOLE_DEG if lens.model == "pinhole" else MOST_WIDE_DEG
+    if not angle <= most:
+        shown = "no direction at its border" if math.isnan(angle) else f"{angle:.0f} degrees from left to right"
+        yield failed(about, f"the {lens.model} calibration sees {shown}; up to {most:.0f} can be", again)
+    elif angle < NARROW_DEG:
+        yield warned(about, f"{angle:.0f} degrees from left to right see few neighbours", f"{again}, or widen the lens")
+
+
+def coverage(rig: RigConfig) -> Finding:
+    """How much of the horizon the cameras see together."""
+    built = build_rig(rig)
+    seen = _seen_around(built, 0)
+    if not seen.any():
+        return failed("rig", "no camera sees the horizon", "fix the cameras' extrinsics")
+    if not seen.all():
+        measured = f"blind at the horizon {' and '.join(_gaps(~seen))}, clockwise from forward: neighbours there are"
+        return warned("rig", f"{measured} not seen", "turn, widen or add cameras, or fix their extrinsics")
+    blind = (deg for deg in range(1, 90) if not (_seen_around(built, deg).all() and _seen_around(built, -deg).all()))
+    reach_deg = next(blind, 91) - 1
+    measured = f"{len(rig.cameras)} cameras see all of the horizon, and all around to {reach_deg} degrees off it"
+    return passed("rig", measured)
+
+
+def _seen_around(rig: Rig, down_deg: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Which of the 360 whole degrees clockwise from forward are seen, so far below the horizon."""
+    angles, down = np.radians(np.arange(360)), math.radians(down_deg)
+    level = np.stack([np.cos(angles), np.sin(angles), np.zeros(360)], axis=1)
+    return rig.covers(math.cos(down) * level + [0.0, 0.0, math.sin(down)])
+
+
+def _gaps(blind: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> list[str]:
+    """From where to where, in whole degrees, around the circle."""
+    begins = np.flatnonzero(blind & ~np.roll(blind, 1))
+    ends = np.flatnonzero(blind & ~np.roll(blind, -1))
+    if ends[0] < begins[0]:
+        ends = np.roll(ends, -1)
+    return [f"from {begin} to {end} degrees" for begin, end in zip(begins, ends, strict=True)]
+
+
+def check_rig(config: DroneConfig, folder: Path | None, state_folder: Path = STATE_FOLDER) -> Iterator[Finding]:
+    """Of this drone's newest recording in the folder, named as for `check_disk`."""
+    files = [path for path in (folder or state_folder).glob(f"{config.name}-*.mcap") if not path.is_symlink()]
+    first_parts = [path for path in files if path.is_file() and path.name.count(".") == 1]
+    newest = max(first_parts, key=lambda path: path.stat().st_mtime, default=None)
+    if newest is None:
+        yield passed("rig", "no flight of this drone is recorded yet that its cameras could be compared with")
+        return
+    try:
+        recording = Recording(newest)
+        found = found_rig(recording)
+    except (FlockdError, OSError) as error:
+        yield warned("rig", f"its last flight could not be read: {error}", "delete it, or recover it: flockd record")
+        return
+    if recording.config.rig != config.rig:
+        yield passed("rig", f"is another than in the last flight, {newest.name}, which says nothing of it")
+        return
+    if not found:
+        yield passed("rig", f"the last flight, {newest.name}, was too short to say anything of it")
+        return
+    off = [one for one in found if rig_faults(one)]
+    for one in off:
+        texts = "; ".join(fault.partition(": ")[2] for fault in rig_faults(one))
+        about = f"camera {one.camera}"
+        if one.elsewhere:
+            fix = "look at `flockd cameras --picture`: then correct the rig, or how it is mounted or plugged in"
+            yield failed(about, f"in the last flight {texts}", fix)
+        else:
+            fix = f"flockd calibrate rig --from-flight {newest} writes the corrected rig; see that the camera is fixed"
+            yield warned(about, f"in the last flight {texts}: {described(one)}", fix)
+    if not off:
+        yield passed("rig", f"the last flight, {newest.name}, saw {len(found)} cameras as they are configured")

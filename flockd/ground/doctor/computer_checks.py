@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from flockd.core.config import DroneConfig
-from flockd.ground.doctor.finding import Finding, failed, passed, warned
+from flockd.ground.doctor.finding import Finding, failed, graded, passed, warned
 
 STATE_FOLDER = Path("/var/lib/flockd")
 """Where the systemd unit lets flockd record."""
@@ -75,13 +75,9 @@ def check_memory(config: DroneConfig, meminfo: Path = MEMORY) -> Iterator[Findin
     free_mb, total_mb = (int(values[key].split()[0]) * 1024 / MB for key in ("MemAvailable", "MemTotal"))
     needs_mb = NEEDS_MB + config.recording.queue_mb
     measured = f"{free_mb:.0f} of {total_mb:.0f} MB are available, flockd needs about {needs_mb:.0f}"
+    little = ": little is left" if needs_mb <= free_mb < needs_mb + SPARE_MB else ""
     fix = "stop other programs, or make recording.queue_mb smaller"
-    if free_mb < needs_mb:
-        yield failed("memory", measured, fix)
-    elif free_mb < needs_mb + SPARE_MB:
-        yield warned("memory", f"{measured}: little is left", fix)
-    else:
-        yield passed("memory", measured)
+    yield graded("memory", f"{measured}{little}", fix, failure=free_mb < needs_mb, warning=bool(little))
 
 
 def check_temperature(config: DroneConfig, folder: Path = THERMAL) -> Iterator[Finding]:
@@ -98,12 +94,10 @@ def check_temperature(config: DroneConfig, folder: Path = THERMAL) -> Iterator[F
     hottest = max(zones, key=zones.__getitem__)
     limit_c = config.safety.degraded_temperature_c
     measured = f"{zones[hottest]:.0f} °C ({hottest}); from {limit_c:g} on it flies slowly"
-    if zones[hottest] >= limit_c:
-        yield failed("temperature", measured, "let it cool down, and improve its airflow, or add a heat sink")
-    elif zones[hottest] > limit_c - SPARE_K:
-        yield warned("temperature", f"{measured}: little is left", "improve its airflow, or add a heat sink")
-    else:
-        yield passed("temperature", measured)
+    hot, warm = zones[hottest] >= limit_c, zones[hottest] > limit_c - SPARE_K
+    fix = f"{'let it cool down, and ' if hot else ''}improve its airflow, or add a heat sink"
+    little = ": little is left" if warm and not hot else ""
+    yield graded("temperature", f"{measured}{little}", fix, failure=hot, warning=warm)
 
 
 def thermal_zones(folder: Path) -> Iterator[tuple[str, float]]:

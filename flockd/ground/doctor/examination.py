@@ -85,18 +85,6 @@ def _check(name: str, drone: Examined) -> Iterable[Finding]:
         fix = "see `instance`, and examine again once that process has ended"
         return (warned(name, "not examined: another flockd has this drone, and may be flying it", fix),)
     match name:
-        case "limits":
-            from flockd.ground.doctor.limit_checks import check_limits
-
-            return check_limits(config)
-        case "rig":
-            from flockd.ground.doctor.rig_checks import check_rig
-
-            return check_rig(config, drone.recordings)
-        case "instance" | "unit":
-            from flockd.ground.doctor.service_checks import check_instance, check_unit
-
-            return check_unit(drone.unit) if name == "unit" else check_instance(drone.taken)
         case "memory" | "disk" | "temperature" | "clock":
             from flockd.ground.doctor import computer_checks as computer
 
@@ -105,26 +93,29 @@ def _check(name: str, drone: Examined) -> Iterable[Finding]:
             if name == "clock":
                 return computer.check_clock()
             return computer.check_memory(config) if name == "memory" else computer.check_temperature(config)
-        case "secrets":
-            from flockd.ground.doctor.secret_checks import check_secrets
-
-            return check_secrets(config, drone.file)
-        case "zenoh":
-            from flockd.ground.doctor.telemetry_checks import check_fleet
-
-            return check_fleet(config)
         case "autopilot":
             from flockd.ground.doctor.autopilot_checks import check_autopilot
 
             return check_autopilot(config)
-        case "cameras":
-            from flockd.ground.doctor.camera_checks import check_cameras
+        case "rig" | "cameras":
+            from flockd.ground.doctor import camera_checks as cameras
 
-            return check_cameras(config, drone.seconds)
-        case _:
+            if name == "rig":
+                return cameras.check_rig(config, drone.recordings)
+            return cameras.check_cameras(config, drone.seconds)
+        case "models":
             from flockd.ground.doctor.model_checks import check_models
 
             return check_models(config)
+    from flockd.ground.doctor import setup_checks as setup
+
+    if name == "limits":
+        return setup.check_limits(config)
+    if name == "secrets":
+        return setup.check_secrets(config, drone.file)
+    if name == "zenoh":
+        return setup.check_fleet(config)
+    return setup.check_unit(drone.unit) if name == "unit" else setup.check_instance(drone.taken)
 
 
 def run_checks(checks: Sequence[Check], on_done: Callable[[int, int], None]) -> dict[str, tuple[Finding, ...]]:

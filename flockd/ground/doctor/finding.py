@@ -43,6 +43,13 @@ def failed(about: str, measured: str, fix: str) -> Finding:
     return Finding(Level.FAILURE, about, measured, fix)
 
 
+def graded(about: str, measured: str, fix: str, *, failure: bool = False, warning: bool = False) -> Finding:
+    """Failed or warned where one of these holds, the worse first; else passed."""
+    if failure or warning:
+        return Finding(Level.FAILURE if failure else Level.WARNING, about, measured, fix)
+    return passed(about, measured)
+
+
 def failed_from_error(about: str, sentence: str) -> Finding:
     """The failure that an error's sentence describes: our sentences end in what to do, after the last semicolon."""
     measured, _, fix = sentence.rpartition("; ")

@@ -18,7 +18,7 @@ from flockd.flight.inference.providers import engines_folder
 from flockd.flight.perception import Networks
 from flockd.flight.perception.requirements import check_roles
 from flockd.flight.pilot import FlockPilot
-from flockd.ground.doctor.finding import Finding, Level, failed, failed_from_error, passed, warned
+from flockd.ground.doctor.finding import Finding, Level, failed_from_error, graded, passed
 from flockd.onboard.daemon import load_side_by_side
 from flockd.onboard.deadline import GOLDEN_S, within
 
@@ -105,8 +105,9 @@ def judge_steps(config: DroneConfig, timed: list[tuple[float, PilotOutput]], bus
     fix = "give perception.threads more cores, raise step_s, take smaller images, or `perception.flow: dis`"
     if busy > cores:
         fix = f"stop other programs first (a load of {busy:.0f} on {cores} cores), and {fix}"
-    if load > config.safety.degraded_load:
-        return failed("step", f"{measured}: above safety.degraded_load, so it would always fly slowly", fix)
-    if load > FULL * config.safety.degraded_load:
-        return warned("step", f"{measured}: little is left for what else the computer does", fix)
-    return passed("step", measured)
+    too_much, much = load > config.safety.degraded_load, load > FULL * config.safety.degraded_load
+    if too_much:
+        measured += ": above safety.degraded_load, so it would always fly slowly"
+    elif much:
+        measured += ": little is left for what else the computer does"
+    return graded("step", measured, fix, failure=too_much, warning=much)

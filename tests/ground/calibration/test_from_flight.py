@@ -17,7 +17,7 @@ from flockd.flight.geometry import build_rig, rotation_from_vector
 from flockd.ground.calibration.errors import CalibrationError
 from flockd.ground.calibration.from_flight import corrected_rig, found_rig
 from flockd.ground.doctor import Level
-from flockd.ground.doctor.rig_checks import check_rig
+from flockd.ground.doctor.camera_checks import check_rig
 from flockd.onboard.daemon.pilot_loop import RigReports
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.mcap_file import RecordingError

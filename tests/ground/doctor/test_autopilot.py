@@ -12,11 +12,11 @@ from flockd.core.config.safety import GateParameters, SafetyParameters
 from flockd.core.data import data_path
 from flockd.ground.doctor import Check, Finding, Level, run_checks
 from flockd.ground.doctor.autopilot_checks import (
-    PARAMETERS,
     check_autopilot,
     judge_clock,
     judge_firmware,
     judge_messages,
+    judge_parameter,
     judge_signing,
     judge_system_id,
 )
@@ -210,7 +210,7 @@ def test_no_autopilot_is_only_for_the_simulator() -> None:
     ],
 )
 def test_what_is_made_of_each_value(name: str, value: float, level: Level) -> None:
-    finding = PARAMETERS[name].judge(value, _config(14540))
+    finding = judge_parameter(name, value, _config(14540))
     assert (finding.about, finding.level) == (name, level)
     assert (finding.fix == "") == (level is Level.PASS)
 
@@ -220,16 +220,22 @@ def test_collision_prevention_is_on_where_flockd_sends_for_it(value: float, leve
     config = _config(14540)
     assert config.autopilot is not None
     sending = config.autopilot.model_copy(update={"obstacle_distance": True})
-    finding = PARAMETERS["CP_DIST"].judge(value, config.model_copy(update={"autopilot": sending}))
+    finding = judge_parameter("CP_DIST", value, config.model_copy(update={"autopilot": sending}))
     assert (finding.about, finding.level) == ("CP_DIST", level)
+
+
+def test_where_nobody_weaves_any_gain_of_height_is_well() -> None:
+    config = _config(14540)
+    still = config.model_copy(update={"flocking": config.flocking.model_copy(update={"size": "off"})})
+    assert judge_parameter("MPC_Z_P", 0.5, still).level is Level.PASS
 
 
 def test_a_fence_with_corners_reaches_as_far_as_the_farthest_inside_the_circle() -> None:
     gate = GateParameters(fence_radius_m=None, fence_corners_m=((30.0, 40.0), (0.0, 10.0), (-10.0, 0.0)))
     config = _config(14540).model_copy(update={"safety": SafetyParameters(gate=gate)})
-    assert "50 m" in PARAMETERS["GF_MAX_HOR_DIST"].judge(49.0, config).measured
+    assert "50 m" in judge_parameter("GF_MAX_HOR_DIST", 49.0, config).measured
     free = SafetyParameters(gate=GateParameters(fence_radius_m=None))
-    endless = PARAMETERS["GF_MAX_HOR_DIST"].judge(0.0, config.model_copy(update={"safety": free}))
+    endless = judge_parameter("GF_MAX_HOR_DIST", 0.0, config.model_copy(update={"safety": free}))
     assert endless.fix == "set GF_MAX_HOR_DIST to where it must never fly"
 
 

@@ -114,8 +114,8 @@ def test_beside_a_flying_daemon_nothing_of_the_drone_is_touched(
         yield
 
     for check in (
-        "rig_checks.check_rig",
-        "telemetry_checks.check_fleet",
+        "camera_checks.check_rig",
+        "setup_checks.check_fleet",
         "autopilot_checks.check_autopilot",
         "camera_checks.check_cameras",
         "model_checks.check_models",

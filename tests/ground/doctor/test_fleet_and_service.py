@@ -12,8 +12,7 @@ from flockd.core.config.telemetry import TelemetryParameters
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.ground.doctor import Check, Finding, Level, run_checks
-from flockd.ground.doctor.service_checks import check_instance, check_unit, judge_exposure
-from flockd.ground.doctor.telemetry_checks import check_fleet
+from flockd.ground.doctor.setup_checks import check_fleet, check_instance, check_unit, judge_exposure
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.sim.sitl.ports import free_endpoint

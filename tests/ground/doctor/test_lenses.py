@@ -8,7 +8,7 @@ from flockd.core.config import load_drone
 from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.data import data_path
 from flockd.ground.doctor import Level
-from flockd.ground.doctor.lens_checks import coverage, lens_problems, width_deg
+from flockd.ground.doctor.camera_checks import coverage, lens_problems, width_deg
 
 QUADROTOR = load_drone(data_path("config") / "quadrotor.yaml").rig
 SIMULATOR = load_drone(data_path("config") / "simulator.yaml").rig

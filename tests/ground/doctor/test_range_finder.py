@@ -9,7 +9,7 @@ from flockd.core.config import DroneConfig, load_drone
 from flockd.core.data import data_path
 from flockd.core.messages import RangeReading
 from flockd.ground.doctor import Level
-from flockd.ground.doctor.range_checks import judge_range_finder
+from flockd.ground.doctor.autopilot_checks import judge_range_finder
 
 AT_30_HZ = {25: tuple(k / 30.0 for k in range(46))}
 GOOD = RangeReading(1.5, 0.12, min_m=0.15, max_m=20.0, quality=1.0)

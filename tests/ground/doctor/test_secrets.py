@@ -8,7 +8,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
 from flockd.core.data import data_path
 from flockd.ground.doctor.finding import Level
-from flockd.ground.doctor.secret_checks import check_secrets
+from flockd.ground.doctor.setup_checks import check_secrets
 from tests.onboard.daemon.aboard import config_for
 
 OPEN, CLOSED = "rtspsrc location=rtsp://10.0.0.7/s", "rtspsrc location=rtsp://anna:hunter2@10.0.0.7/s"
