@@ -22,7 +22,7 @@ from flockd.campaign.conduct import is_known
 from flockd.campaign.figures import MEASURES, Interval
 from flockd.campaign.results import Results, Row
 from flockd.campaign.verdicts import LEVEL, Comparison, Verdict
-from flockd.review.report.figure_files import inline_svg, page_template
+from flockd.review.report.style import inline_svg, page_template
 
 MOST_ROWS = 200
 """The most rows of a table; the Parquet files have all."""

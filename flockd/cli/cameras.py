@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.config import write_checked
 from flockd.cli.options import refuse_overwriting
 from flockd.cli.output import cell, complain, say, say_json
 from flockd.cli.parser import Commands, flag, option, positive_number, size
@@ -17,7 +16,7 @@ from flockd.core.errors import ExitCode, UnavailableError, UsageError
 if TYPE_CHECKING:
     from flockd.ground.cameras.found import FoundCamera, Mode
     from flockd.ground.cameras.listing import Computer
-    from flockd.ground.cameras.measuring import Measured
+    from flockd.ground.cameras.watching import Measured
 
 SECONDS = 4.0
 NONE_FOUND = (
@@ -73,7 +72,7 @@ def run(args: argparse.Namespace, computer: Computer) -> int:
     usable = [(camera, mode) for camera, mode in zip(found, modes, strict=True) if mode is not None]
     measured: dict[str, Measured] = {}
     if args.measure or args.picture is not None:
-        from flockd.ground.cameras.measuring import measure
+        from flockd.ground.cameras.watching import measure
 
         complain(f"measuring {len(usable)} cameras for {args.seconds:g} s")
         rows = measure(usable, args.seconds, computer.kernel)
@@ -90,6 +89,8 @@ def run(args: argparse.Namespace, computer: Computer) -> int:
 
 
 def _write(file: Path, usable: Sequence[tuple[FoundCamera, Mode]], names: Sequence[str] | None, turn_deg: int) -> None:
+    from flockd.cli.config_new import write_checked
+    from flockd.ground.cameras.found import camera_names, sections_text
     from flockd.ground.cameras.sections import camera_names, sections_text
 
     if not usable:
@@ -102,7 +103,7 @@ def _write(file: Path, usable: Sequence[tuple[FoundCamera, Mode]], names: Sequen
 
 def _save_pictures(folder: Path, found: Sequence[FoundCamera], measured: Mapping[str, Measured]) -> dict[str, Path]:
     """By the camera's place."""
-    from flockd.ground.cameras.measuring import as_png
+    from flockd.ground.cameras.watching import as_png
 
     folder.mkdir(parents=True, exist_ok=True)
     saved = {}

@@ -67,7 +67,7 @@ class _Detected:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.ground.datasets.errors import DatasetError
+    from flockd.ground.datasets.image_files import DatasetError
     from flockd.ground.pictures import PictureDetector, find_pictures, read_labels
     from flockd.ground.pictures.copies import Copies
 
@@ -112,9 +112,9 @@ def _detected(
     left_out: list[str],
 ) -> Iterator[_Detected]:
     """In order; what cannot be read is skipped, and why appended to ``left_out``."""
-    from flockd.ground.datasets.errors import DatasetError
-    from flockd.ground.pictures.coco_labels import check_size
-    from flockd.ground.pictures.drawing import annotated
+    from flockd.ground.datasets.image_files import DatasetError
+    from flockd.ground.pictures.copies import annotated
+    from flockd.ground.pictures.picture_files import check_size
 
     count = sum(picture.count(args.every) for picture in pictures)
     with progress("detecting", "pictures") as tell:

@@ -210,7 +210,7 @@ def _missing(names: list[str], drones: Iterable[str]) -> list[str]:
 
 def _verdict(args: argparse.Namespace, answers: dict[str, dict[str, object]], names: list[str], places: str) -> int:
     """Says at the end who did not do it. Raises UnavailableError where nobody was found."""
-    from flockd.fleet.fleet_status import by_name
+    from flockd.fleet.drone_rows import by_name
 
     missing = _missing(names, answers)
     who = f"{' and '.join(missing)} {'was' if len(missing) == 1 else 'were'} not" if missing else "no drone was"

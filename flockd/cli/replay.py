@@ -117,10 +117,14 @@ def _recording(args: argparse.Namespace) -> Iterator[Recording]:
 
 
 def _replay(args: argparse.Namespace, recording: Recording) -> int:
-    from flockd.ground.doctor.computer import peak_memory_mb
-    from flockd.review.replay.fidelity import damage_warnings, replay_warnings
-    from flockd.review.replay.profile import Watch, profile_result
-    from flockd.review.replay.recorded_flight import compare_replay, replay_flight, replay_result
+    from flockd.review.replay.profile import Watch, peak_memory_mb, profile_result
+    from flockd.review.replay.recorded_flight import (
+        compare_replay,
+        damage_warnings,
+        replay_flight,
+        replay_result,
+        replay_warnings,
+    )
 
     config = _config(args, recording)
     start_s, end_s = stretch(recording, args)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from flockd.onboard.recording.reader import Recording
     from flockd.review.flight_log.key_frames import KeyFrame
     from flockd.review.flight_log.log import FlightLog
-    from flockd.review.flight_log.moments import Moment
+    from flockd.review.report.flight_video import Moment
 
 SUFFIX = ".report"
 """Ending of the folder beside a recording that its report goes to."""
@@ -131,8 +131,8 @@ def _video(args: argparse.Namespace) -> int:
 def _moments(args: argparse.Namespace, log: FlightLog, recordings: Sequence[Recording]) -> tuple[int, Iterator[Moment]]:
     """Number of the drone that --drone names, and what its cameras saw."""
     from flockd.review.flight_log.key_frames import load_key_frames
-    from flockd.review.flight_log.moments import held_moments, recorded_moments
     from flockd.review.report.flight_folder import KEY_FRAMES_NAME
+    from flockd.review.report.flight_video import held_moments, recorded_moments
 
     if not recordings:
         if args.drone is not None:
@@ -189,7 +189,7 @@ def _recordings(path: Path) -> tuple[Path, ...]:
 
 def _flight(paths: Sequence[Path], *, pictured: bool) -> tuple[FlightLog, tuple[KeyFrame, ...]]:
     from flockd.review.flight_log.from_recordings import flight_log, key_frames
-    from flockd.review.replay.fidelity import damage_warnings, replay_warnings
+    from flockd.review.replay.recorded_flight import damage_warnings, replay_warnings
 
     recordings = [opened(path) for path in paths]
     for recording in recordings:

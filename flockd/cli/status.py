@@ -41,7 +41,7 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.fleet.fleet_status import status_rows
+    from flockd.fleet.drone_rows import status_rows
     from flockd.fleet.watcher import FleetWatcher
 
     listen, connect = endpoints(args)
@@ -99,7 +99,7 @@ def _show_live(drones: Callable[[], Iterable[Watched]]) -> int:
     """Until Ctrl-C."""
     from rich.live import Live
 
-    from flockd.fleet.fleet_status import status_rows
+    from flockd.fleet.drone_rows import status_rows
 
     with suppress(KeyboardInterrupt), Live(console=tables_console(), auto_refresh=False) as live:
         while True:

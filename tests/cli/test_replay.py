@@ -168,7 +168,7 @@ def test_speed_1_takes_as_long_as_the_flight_took(path: Path, capsys: Capture) -
 def test_what_keeps_a_replay_from_being_the_flight_is_told(
     path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
-    monkeypatch.setattr("flockd.review.replay.fidelity.model_hashes", lambda perception: {"flow": "cd" * 32})
+    monkeypatch.setattr("flockd.review.replay.recorded_flight.model_hashes", lambda perception: {"flow": "cd" * 32})
     killed = path.with_name("killed.mcap")
     killed.write_bytes(path.read_bytes()[:-200_000])
     assert main(["replay", str(killed), "--diff"]) == 0

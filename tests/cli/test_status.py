@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from flockd.fleet.fleet_status import status_rows
+from flockd.fleet.drone_rows import status_rows
 from flockd.fleet.watcher import Heard, Watched
 from flockd.onboard.telemetry.topics import ComputerMessage, FlightMessage
 from flockd.sim.flock.shown_flock import Repeater

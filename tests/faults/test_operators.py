@@ -15,7 +15,7 @@ import pytest
 import zenoh
 
 from flockd.core.config import DroneConfig
-from flockd.fleet.fleet_status import status_rows
+from flockd.fleet.drone_rows import status_rows
 from flockd.fleet.live_fleet import LiveFleet
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session

@@ -16,8 +16,7 @@ from rich.console import Console
 from flockd.cli.status import _table
 from flockd.core.data import data_path
 from flockd.core.messages import MissionOrder
-from flockd.fleet.drone_rows import drone_rows, history_row
-from flockd.fleet.fleet_status import status_rows
+from flockd.fleet.drone_rows import drone_rows, history_row, status_rows
 from flockd.fleet.simulation import CONTROLS, MAX_GUST_M_S, MAX_SPEED, MIN_SPEED, SimulationMessage
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.daemon.operator_orders import OperatorCommands, OperatorRequests

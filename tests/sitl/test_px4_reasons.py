@@ -22,7 +22,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
-from flockd.fleet.fleet_status import status_rows
+from flockd.fleet.drone_rows import status_rows
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.autopilot.refusal_reasons import NOT_STREAMING, REASONS, SEVERAL_SENDERS
 from flockd.sim.flock.start import with_drones

@@ -30,10 +30,9 @@ from flockd.onboard.recording.reader import Recording
 from flockd.review.flight_log.from_recordings import flight_log
 from flockd.review.flight_log.key_frames import load_key_frames
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.flight_log.moments import recorded_moments
 from flockd.review.report.filmstrip import filmstrip
 from flockd.review.report.flight_folder import KEY_FRAMES_NAME, LOG_NAME
-from flockd.review.report.flight_video import write_video
+from flockd.review.report.flight_video import recorded_moments, write_video
 from flockd.review.report.style import GRID, INK, MUTED, PAPER, colour_of
 from flockd.sim.scenario import load_scenario
 

@@ -27,6 +27,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from flockd.ground.doctor.computer import Computer
 from scipy.stats import binom
 
 from flockd.campaign.campaign_file import Figure
@@ -35,7 +36,6 @@ from flockd.core.choices import SimulatedPerception
 from flockd.core.config.loader import Overrides
 from flockd.core.data import data_path
 from flockd.flight.inference.hashes import model_hashes
-from flockd.ground.doctor.computer import Computer
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import load_scenario
 

@@ -26,7 +26,7 @@ from rich.table import Table
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
 from flockd.ground.pictures import Labelled, PictureDetector, PictureFile, find_pictures, summary
-from flockd.ground.pictures.coco_labels import read_labels
+from flockd.ground.pictures.picture_files import read_labels
 from flockd.ground.pictures.scoring import WIDTH_CLASSES
 from flockd.ground.pictures.single_frame import Box
 

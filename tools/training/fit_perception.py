@@ -19,8 +19,8 @@ import numpy as np
 import yaml
 
 from flockd.core.messages import BoolArray, FloatArray
+from flockd.review.flight_log.builder import match_neighbours
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.flight_log.truth_matching import match_neighbours
 from flockd.review.report.flight_folder import LOG_NAME
 from flockd.sim.scenario.perceived import load_perceived_errors
 

@@ -4,25 +4,27 @@ from __future__ import annotations
 
 import functools
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from flockd.core.messages import PilotOutput, VehicleState
+from flockd.core.config.rig import RigConfig
+from flockd.core.messages import Detection, Frame, PilotOutput, VehicleState
 from flockd.fleet.drone_rows import Known, Row, drone_rows, history_row
 from flockd.fleet.fleet_source import Event
-from flockd.fleet.page.recorded_pictures import RecordedPictures
 from flockd.fleet.watcher import Heard, Watched
+from flockd.flight.geometry import build_rig
 from flockd.onboard.message_json import from_json, parsed
 from flockd.onboard.recording import RecordingError
 from flockd.onboard.recording.foxglove import image_stream
 from flockd.onboard.recording.mcap_file import Entry, read_records
-from flockd.onboard.recording.reader import Recording, head_of
+from flockd.onboard.recording.reader import Recording, decoded_image, head_of
 from flockd.onboard.recording.streams import OUTPUT, TABLE, VEHICLE
 from flockd.onboard.telemetry import TOPICS, publish_step
+from flockd.onboard.telemetry.preview import EVERY_S, preview
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
 
 ONE_CLOCK_S = 5.0
@@ -226,3 +228,48 @@ def _align(stories: list[_Story]) -> None:
     if max(apart_s) - min(apart_s) > ONE_CLOCK_S:
         for story, offset_s in zip(stories, apart_s, strict=True):
             story.offset_s = offset_s
+
+
+SHOWN_S = 3.0
+"""For so long a picture stands for what the camera sees."""
+
+
+class RecordedPictures:
+    """Takes a recording's messages in order, and keeps what the page may ask for: about 10 kB a picture."""
+
+    def __init__(self, rig: RigConfig) -> None:
+        self._rig = build_rig(rig)
+        self._messages: dict[str, bytes] = {}
+        self._times: dict[str, list[float]] = {}
+        self._pictures: dict[str, list[bytes]] = {}
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Those that there are pictures of."""
+        return tuple(self._pictures)
+
+    def take_image(self, camera: str, message: bytes) -> None:
+        """A camera's image of the next step."""
+        self._messages[camera] = message
+
+    def take_step(self, time_s: float, detections: Sequence[Detection]) -> None:
+        """What was detected in the images before; of those that do not decode there is no picture."""
+        for camera, message in self._messages.items():
+            times = self._times.setdefault(camera, [])
+            if times and time_s - times[-1] < EVERY_S:
+                continue
+            try:
+                frame = Frame(camera, decoded_image(message), time_s, 0)
+            except (ValueError, RecordingError):
+                continue
+            times.append(time_s)
+            self._pictures.setdefault(camera, []).append(preview(frame, self._rig.cameras.get(camera), detections))
+        self._messages = {}
+
+    def at(self, camera: str, time_s: float) -> bytes | None:
+        """The newest by then; None where it is too old."""
+        times = self._times.get(camera, [])
+        index = bisect_right(times, time_s) - 1
+        if index < 0 or time_s - times[index] > SHOWN_S:
+            return None
+        return self._pictures[camera][index]

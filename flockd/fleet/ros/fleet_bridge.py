@@ -14,9 +14,8 @@ import numpy as np
 from flockd.core.config.rig import CameraConfig, RigConfig
 from flockd.core.jpeg_header import jpeg_size
 from flockd.core.ros_frames import MAP, attitude_in_ros, camera_in_ros, flu_of_frd
-from flockd.fleet.drone_rows import Known, Row, origin_of
+from flockd.fleet.drone_rows import GONE, QUIET, Known, Row, origin_of
 from flockd.fleet.fleet_source import FleetSource
-from flockd.fleet.fleet_status import GONE, QUIET
 from flockd.fleet.ros.fleet_markers import home_in_map, markers
 from flockd.fleet.ros.ros_orders import NewestOrder, Whereabouts, goal_of, velocity_of
 from flockd.fleet.watcher import Watched

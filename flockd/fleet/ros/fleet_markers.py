@@ -10,8 +10,7 @@ import numpy as np
 
 from flockd.core.messages import FloatArray
 from flockd.core.ros_frames import MAP, attitude_in_ros, attitude_of_angles, enu_of_ned
-from flockd.fleet.drone_rows import Row
-from flockd.fleet.fleet_status import GONE, QUIET
+from flockd.fleet.drone_rows import GONE, QUIET, Row
 from flockd.onboard.ros.message_trees import LEVEL_TURN, Tree, header, turn, vector
 
 COURSE_S = 2.0

@@ -7,8 +7,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from flockd.core.errors import FlockdError
 from flockd.core.messages import FloatArray, IntArray, UInt8Array
-from flockd.ground.calibration.errors import CalibrationError
+
+
+class CalibrationError(FlockdError):
+    """What was shown is not enough, or does not fit together, for numbers anybody should fly with."""
+
 
 DICTIONARIES = tuple(
     sorted(name.removeprefix("DICT_").lower() for name in dir(cv2.aruco) if name.startswith("DICT_") and "X" in name)

@@ -11,17 +11,17 @@ import numpy as np
 
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry import Camera, RigidTransform, rotation_angle_deg
-from flockd.ground.calibration.board import BoardDetection
-from flockd.ground.calibration.errors import CalibrationError
+from flockd.ground.calibration.board import BoardDetection, CalibrationError
 from flockd.ground.calibration.least_squares import (
     OutlierRejection,
     Unknowns,
+    first_pose,
     fitted,
     moved,
+    residuals_px,
     root_mean_square,
     steps_from,
 )
-from flockd.ground.calibration.poses import first_pose, residuals_px
 
 MIN_SHARED = 3
 """Boards that two neighbours have to see together."""

@@ -20,7 +20,7 @@ from flockd.flight.geometry import (
     rolling,
     rotation_from_vector,
 )
-from flockd.ground.calibration.errors import CalibrationError
+from flockd.ground.calibration.board import CalibrationError
 from flockd.ground.calibration.fragment import extrinsics_of, measured_today
 from flockd.ground.calibration.rig_session import write_rig
 from flockd.onboard.message_json import from_json, parsed

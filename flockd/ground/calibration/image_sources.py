@@ -13,9 +13,8 @@ from pydantic import ValidationError
 from flockd.core.config import DroneConfig
 from flockd.core.errors import UnavailableError, UsageError
 from flockd.core.messages import UInt8Array
-from flockd.ground.calibration.errors import CalibrationError
-from flockd.ground.datasets.image_files import SUFFIXES, read_image
-from flockd.ground.datasets.video import images_of_video, opened_video
+from flockd.ground.calibration.board import CalibrationError
+from flockd.ground.datasets.image_files import SUFFIXES, images_of_video, opened_video, read_image
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.sources import FrameSource, open_source
 

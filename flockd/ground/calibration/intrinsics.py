@@ -12,16 +12,17 @@ import numpy as np
 from flockd.core.choices import LensModel
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry import Camera, PinholeCamera, RigidTransform, WideAngleCamera
-from flockd.ground.calibration.errors import CalibrationError
+from flockd.ground.calibration.board import CalibrationError
 from flockd.ground.calibration.least_squares import (
     OutlierRejection,
     Unknowns,
+    first_pose,
     fitted,
     moved,
+    residuals_px,
     root_mean_square,
     steps_from,
 )
-from flockd.ground.calibration.poses import first_pose, residuals_px
 from flockd.ground.calibration.views import View
 
 MIN_VIEWS = 6

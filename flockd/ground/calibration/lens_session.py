@@ -13,8 +13,8 @@ import numpy as np
 
 from flockd.core.choices import LENS_MODELS, LensModel
 from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, MeasurementConfig
+from flockd.ground.calibration.board import CalibrationError
 from flockd.ground.calibration.coverage import Plot, draw
-from flockd.ground.calibration.errors import CalibrationError
 from flockd.ground.calibration.fragment import intrinsics_of, rig_text
 from flockd.ground.calibration.image_sources import ImageStream
 from flockd.ground.calibration.intrinsics import Lens, calibrate, rough_tilts_deg

@@ -8,8 +8,7 @@ import zlib
 import cv2
 
 from flockd.core.messages import UInt8Array
-from flockd.ground.calibration.board import BoardSpec
-from flockd.ground.calibration.errors import CalibrationError
+from flockd.ground.calibration.board import BoardSpec, CalibrationError
 
 _PIXELS_PER_MM = 12
 """About 300 to the inch."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,11 @@ from flockd.core.config.rig import CameraConfig
 from flockd.core.errors import ConfigError
 from flockd.core.messages import UInt8Array
 from flockd.flight.geometry import build_rig
+from flockd.ground.calibration.board import BoardDetection, BoardFinder
 from flockd.ground.calibration.extrinsics import RigFit, SharedBoard, calibrate_rig
 from flockd.ground.calibration.fragment import extrinsics_of, measured_today, rig_text
 from flockd.ground.calibration.image_sources import ImageSet, ImageStream
-from flockd.ground.calibration.shared import SharedCollector
+from flockd.ground.calibration.views import edge_width_px, is_still, sharp_px
 from flockd.onboard.recording.editing import written_whole
 
 OnImage = Callable[[int, int], None]
@@ -123,3 +125,34 @@ def write_rig(out: Path, cameras: Sequence[CameraConfig], time_offset_s: float) 
     )
     with written_whole(out) as draft:
         draft.write_text(rig_text(cameras, comment, time_offset_s), encoding="utf-8")
+
+
+class SharedCollector:
+    """Takes sets of images one after the other."""
+
+    def __init__(self, finder: BoardFinder) -> None:
+        self._finder = finder
+        self._before: Mapping[str, tuple[BoardDetection, int]] = {}
+        self.boards: list[SharedBoard] = []
+
+    def offer(self, name: str, greys: Mapping[str, UInt8Array], *, moving: bool) -> None:
+        """Takes the (h, w) images of one time. ``moving``: sets follow each other so fast that motion shows."""
+        found = {camera: (self._finder.find(grey), grey) for camera, grey in greys.items()}
+        seen = {
+            camera: (board, grey.shape[1])
+            for camera, (board, grey) in found.items()
+            if board is not None and not edge_width_px(grey, board, self._finder.spec) > sharp_px(grey.shape[1])
+        }
+        before, self._before = self._before, seen
+        if moving:
+            seen = {
+                camera: (board, width)
+                for camera, (board, width) in seen.items()
+                if camera in before and is_still(before[camera][0], board, width)
+            }
+        if len(seen) > 1:
+            self.boards.append(SharedBoard(name, {camera: board for camera, (board, _) in seen.items()}))
+
+    def links(self) -> Mapping[tuple[str, ...], int]:
+        """How many boards these cameras saw together, and no other with them."""
+        return Counter(tuple(sorted(board.seen)) for board in self.boards)

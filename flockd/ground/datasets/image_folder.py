@@ -7,19 +7,20 @@ apart, and in `poses.txt` a 4x4 camera-to-world matrix a line.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from pydantic import ValidationError
 from scipy.spatial.transform import Rotation, Slerp
 
-from flockd.core.messages import FloatArray
-from flockd.flight.geometry import RigidTransform
-from flockd.ground.datasets.camera_intrinsics import read_calibration
-from flockd.ground.datasets.dataset import Dataset, Entry
-from flockd.ground.datasets.errors import DatasetError
-from flockd.ground.datasets.image_files import SUFFIXES, read_image
-from flockd.ground.datasets.tables import read_lines, read_rows
+from flockd.core.config import load_drone
+from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.core.errors import ConfigError
+from flockd.core.messages import FloatArray, UInt8Array
+from flockd.flight.geometry import RigidTransform, ZMap, build_rig
+from flockd.ground.datasets.image_files import SUFFIXES, DatasetError, read_depth, read_image
 
 _TUM_UNITS_PER_M, _UNITS_PER_M = 5000.0, 1000.0
 """Of depth maps, 16 bits a pixel."""
@@ -157,3 +158,172 @@ def _pose_of_matrix(matrix: FloatArray, where: str) -> RigidTransform:
     if not np.allclose(matrix[3], (0, 0, 0, 1), atol=_ROUNDING):
         raise DatasetError(f"{where}: its last row is not 0 0 0 1; write a camera-to-world matrix")
     return RigidTransform(rotation, matrix[:3, 3])
+
+
+CAMERA = "camera"
+"""Its name where the file has none."""
+_HALF_PIXEL = 0.5
+"""Other people's matrices count pixel centres from 0; ours lie at +0.5."""
+_CENTRAL = (1 / 3, 2 / 3)
+"""Where between an image's borders a principal point may lie. A matrix of half or twice the size is outside."""
+
+
+def read_calibration(file: Path, size: tuple[int, int]) -> CameraConfig:
+    """A 3x3 matrix as text, or a drone's YAML with one camera; for images of ``size`` (width, height).
+
+    Raises ConfigError, also where it is of another size.
+    """
+    if not file.is_file():
+        raise ConfigError.at(file, "does not exist; put the calibration there, or name one with --calibration")
+    if file.suffix.lower() in {".yaml", ".yml"}:
+        return _camera_of_drone(file, size)
+    matrix = read_rows(file, columns=3, what="a 3x3 matrix, three numbers a line")
+    if len(matrix) != 3:
+        raise ConfigError.at(file, f"is no 3x3 matrix, it has {len(matrix)} rows; give it three, of three numbers each")
+    if np.any(matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] != (0, 0, 0, 0, 1)):
+        raise ConfigError.at(file, "is no camera matrix; write [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    fx, fy, cx, cy = (float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    for centre, length, side in ((cx, size[0], "width"), (cy, size[1], "height")):
+        if not _CENTRAL[0] * length <= centre <= _CENTRAL[1] * length:
+            raise ConfigError.at(
+                file,
+                f"is the calibration of another size: its principal point lies at {centre:.0f} of {length} pixels of "
+                f"the images' {side}; name the one that belongs to {size[0]} x {size[1]} pixels",
+            )
+    try:
+        intrinsics = IntrinsicsConfig(fx=fx, fy=fy, cx=cx + _HALF_PIXEL, cy=cy + _HALF_PIXEL)
+        camera = CameraConfig(name=CAMERA, size_px=size, intrinsics=intrinsics)
+        build_rig(RigConfig(cameras=(camera,)))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ConfigError.at(
+            file, f"{'.'.join(map(str, first['loc']))}: {first['msg']}; correct the calibration"
+        ) from None
+    except ValueError as error:
+        raise ConfigError.at(file, f"{error}; correct the calibration") from None
+    return camera
+
+
+def _camera_of_drone(file: Path, size: tuple[int, int]) -> CameraConfig:
+    cameras = load_drone(file).rig.cameras
+    if len(cameras) != 1:
+        raise ConfigError.at(
+            file, f"has {len(cameras)} cameras; name a file with the one that took the images", "rig.cameras"
+        )
+    wanted = cameras[0].size_px
+    if wanted != size:
+        raise ConfigError.at(
+            file,
+            f"is the calibration of another size, {wanted[0]} x {wanted[1]}; name the one that belongs to "
+            f"{size[0]} x {size[1]} pixels",
+            "rig.cameras[0].size_px",
+        )
+    return cameras[0]
+
+
+MAX_TABLE_BYTES = 1 << 28
+"""Hours of poses at 200 Hz."""
+
+
+def read_lines(file: Path) -> list[tuple[int, str]]:
+    """Line number from 1 and text of each line that is neither empty nor a comment. Raises DatasetError."""
+    if file.exists() and not file.is_file():
+        raise DatasetError(f"{file}: is not an ordinary file; restore it")
+    if file.exists() and file.stat().st_size > MAX_TABLE_BYTES:
+        raise DatasetError(f"{file}: is larger than {MAX_TABLE_BYTES >> 20} MiB, which no table is; restore it")
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not text"
+        raise DatasetError(f"{file}: cannot be read ({reason}); put it there") from None
+    lines = ((number, line.rstrip()) for number, line in enumerate(text.splitlines(), start=1))
+    return [(number, line) for number, line in lines if line and not line.lstrip().startswith("#")]
+
+
+def read_rows(file: Path, *, columns: int, what: str) -> FloatArray:
+    """(n, columns) numbers, between blanks or commas. Raises DatasetError where a line has others, or none is."""
+    rows = [_row(file, number, line, columns, what) for number, line in read_lines(file)]
+    if not rows:
+        raise DatasetError(f"{file}: is empty; it needs {what}")
+    return np.array(rows, np.float64)
+
+
+def _row(file: Path, number: int, line: str, columns: int, what: str) -> list[float]:
+    words = line.replace(",", " ").split()
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = []
+    if len(values) != columns or not np.isfinite(values).all():
+        raise DatasetError(f"{file}:{number}: does not fit; it needs {what}")
+    return values
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """When and where an image was taken."""
+
+    index: int
+    """Counted from 0 at the dataset's first frame."""
+    name: str
+    time_s: float
+    T_world_camera: RigidTransform | None
+    """From optical RDF to the dataset's world; None where it is not known."""
+
+
+@dataclass(frozen=True, eq=False)
+class DatasetFrame:
+    """One image of the dataset's camera, and what is known with it."""
+
+    moment: Moment
+    image: UInt8Array
+    """(h, w, 3) RGB."""
+    depth: ZMap | None
+    """(h, w) metres along the optical axis, NaN where there is none; None where it was not asked for."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Where the parts of one frame are."""
+
+    name: str
+    time_s: float
+    image: Path
+    depth: Path | None = None
+    T_world_camera: RigidTransform | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """A sequence of images of one camera; each image, and each depth map, is a file."""
+
+    path: Path
+    camera: CameraConfig
+    """The one that took it; pixel centres at +0.5."""
+    entries: tuple[Entry, ...]
+    depth_units_per_m: float = 1000.0
+    notes: tuple[str, ...] = ()
+    """What a person should know although nothing is wrong: each is one sentence."""
+
+    def __post_init__(self) -> None:
+        """Raises DatasetError if a file is missing: better now than after an hour."""
+        for entry in self.entries:
+            for file in (entry.image, entry.depth):
+                if file is not None and not file.is_file():
+                    raise DatasetError(f"{file}: is missing; restore it, or leave its frame out")
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether depth was recorded."""
+        return any(entry.depth for entry in self.entries)
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def frames(self, *, with_depth: bool) -> Iterator[DatasetFrame]:
+        """All frames in order, read one by one. Raises DatasetError at one that is missing or damaged."""
+        size = self.camera.size_px
+        for index, entry in enumerate(self.entries):
+            depth = ZMap(read_depth(entry.depth, size, self.depth_units_per_m)) if with_depth and entry.depth else None
+            image = read_image(entry.image, size)
+            yield DatasetFrame(Moment(index, entry.name, entry.time_s, entry.T_world_camera), image, depth)

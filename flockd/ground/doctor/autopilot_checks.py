@@ -13,7 +13,7 @@ from flockd.core.config.safety import GateParameters
 from flockd.core.messages import RangeReading
 from flockd.flight.safety import link_lost
 from flockd.flight.tracking.weave_path import HEIGHT_GAIN_PER_S
-from flockd.ground.doctor.finding import Finding, Level, failed, failed_from_error, graded, passed, warned
+from flockd.ground.doctor.examination import Finding, Level, failed, failed_from_error, graded, passed, warned
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware
 from flockd.onboard.autopilot.clock_sync import ClockEstimate
 from flockd.onboard.autopilot.mavlink_messages import FACES_DOWN, MOST_ERROR_S

@@ -17,7 +17,7 @@ from flockd.core.messages import FloatArray, PilotOutput, ReasonKind, Setpoint
 from flockd.flight.inference.hashes import model_hashes
 from flockd.flight.perception import load_networks
 from flockd.flight.safety import Gate
-from flockd.ground.doctor.finding import Finding, failed, graded, passed, warned
+from flockd.ground.doctor.examination import Finding, failed, graded, passed, warned
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.daemon import Components, Daemon, InterruptibleNetworks, ServiceManager, cameras_at_once

@@ -17,7 +17,7 @@ from flockd.flight.geometry import Rig, build_rig, described, rig_faults
 from flockd.ground.calibration.from_flight import found_rig
 from flockd.ground.cameras.watching import START_S, Watched, watch
 from flockd.ground.doctor.computer_checks import STATE_FOLDER
-from flockd.ground.doctor.finding import Finding, failed, failed_from_error, passed, warned
+from flockd.ground.doctor.examination import Finding, failed, failed_from_error, passed, warned
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.sources.device_source import Devices
 

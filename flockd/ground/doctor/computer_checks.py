@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from flockd.core.config import DroneConfig
-from flockd.ground.doctor.finding import Finding, failed, graded, passed, warned
+from flockd.ground.doctor.examination import Finding, failed, graded, passed, warned
 
 STATE_FOLDER = Path("/var/lib/flockd")
 """Where the systemd unit lets flockd record."""

@@ -10,7 +10,6 @@ import numpy as np
 from flockd.core.messages import SECTORS, BoolArray, FloatArray, MissionStatus, ObstacleRanges, PilotOutput
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FlightMetadata, LearnedSize
-from flockd.review.flight_log.truth_matching import match_neighbours
 
 _BY_STEP = (
     "_times", "_position", "_velocity", "_attitude", "_desired", "_command_velocity", "_command_acceleration",
@@ -161,3 +160,20 @@ class FlightLogBuilder:
             tracked=np.array(self._tracked).reshape(-1, 6), goal=self._goal,
             obstacle_range=self._obstacle_range if looked else np.zeros((0, 0, 0)),
         )  # fmt: skip
+
+
+def match_neighbours(estimated: FloatArray, true: FloatArray) -> list[tuple[int, int]]:
+    """Greedy assignment of estimates to drones: (estimate, drone) index pairs, one to one, the nearest pair first.
+
+    `estimated` (m, 3) and `true` (n, 3) are metres relative to one observer, which is not among them. No pair is
+    farther apart than 1 m or a quarter of the true range, whichever is more.
+    """
+    distances = np.linalg.norm(estimated[:, None] - true[None], axis=2)
+    allowed = np.maximum(1.0, 0.25 * np.linalg.norm(true, axis=1))
+    pairs: list[tuple[int, int]] = []
+    for flat in np.argsort(distances, axis=None, kind="stable"):
+        estimate, drone = divmod(int(flat), len(true))
+        taken = any(estimate == e or drone == d for e, d in pairs)
+        if not taken and distances[estimate, drone] <= allowed[drone]:
+            pairs.append((estimate, drone))
+    return sorted(pairs)

@@ -17,8 +17,7 @@ from flockd.onboard.recording import RecordingError
 from flockd.onboard.recording.reader import Recording, head_of
 from flockd.onboard.recording.truth import Truth
 from flockd.review.flight_log.builder import FlightLogBuilder
-from flockd.review.flight_log.capture import capture, key_frame_steps
-from flockd.review.flight_log.key_frames import KeyFrame
+from flockd.review.flight_log.key_frames import KeyFrame, capture, key_frame_steps
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FlightMetadata
 

@@ -20,9 +20,8 @@ from matplotlib.ticker import MaxNLocator
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.flocking.metrics import closest_distances
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.report.paper_results import TABLE_2
 from flockd.review.report.style import BAND, FEW, INK, MUTED, STYLE, colour_of, drone_name
-from flockd.review.report.summary import estimation_errors, objective_sums
+from flockd.review.report.summary import TABLE_2, estimation_errors, objective_sums
 
 
 def flight_curves(log: FlightLog) -> Figure:

@@ -10,8 +10,18 @@ from numpy.typing import NDArray
 
 from flockd.core.messages import BoolArray, UInt8Array
 from flockd.review.flight_log.key_frames import KeyFrame
-from flockd.review.report.plate_drawing import INK, MUTED, PLATE, line, rgb, rig_place, width_of, write
-from flockd.review.report.style import FEW, colour_of
+from flockd.review.report.style import (
+    FEW,
+    PLATE,
+    PLATE_INK,
+    PLATE_MUTED,
+    colour_of,
+    line,
+    rgb,
+    rig_place,
+    width_of,
+    write,
+)
 
 _DEPTH_NORM = LogNorm(1.0, 50.0)
 _DEPTH_COLOURS = colormaps["magma_r"].with_extremes(bad="#26303d")
@@ -31,11 +41,11 @@ def filmstrip(frame: KeyFrame) -> UInt8Array:
     down = round(across * max(image.shape[0] / image.shape[1] for image in frame.images.values()))
     key = _LEFT + len(cameras) * (across + _GAP)
     plate = np.full((_TOP + _BOTTOM + 3 * (down + _GAP) - _GAP, key + _RIGHT - _GAP, 3), rgb(PLATE), np.uint8)
-    write(plate, _LEFT, 40, f"{frame.title}, t = {frame.time_s:.1f} s", 0.9, INK)
+    write(plate, _LEFT, 40, f"{frame.title}, t = {frame.time_s:.1f} s", 0.9, PLATE_INK)
     tops = [_TOP + row * (down + _GAP) for row in range(3)]
     for top, name in zip(tops, ("image", "depth", "flow"), strict=True):
         aside = np.full((_LEFT - _GAP, down, 3), rgb(PLATE), np.uint8)
-        write(aside, (down - width_of(name, 0.6)) / 2, 26, name, 0.6, MUTED)
+        write(aside, (down - width_of(name, 0.6)) / 2, 26, name, 0.6, PLATE_MUTED)
         plate[top : top + down, : _LEFT - _GAP] = np.rot90(aside)
     p95_px = _typical_flow(frame)
     for column, camera in enumerate(cameras):
@@ -50,7 +60,7 @@ def filmstrip(frame: KeyFrame) -> UInt8Array:
         cells = [_seen(frame, camera, masks, size)]
         cells.append(_depth(frame.depth[camera], size) if camera in frame.depth else cells[0][:0])
         cells.append(_flow(frame, camera, masks, size, p95_px) if camera in frame.flow else cells[0][:0])
-        write(plate, left, tops[0] + (down - size[1]) // 2 - 10, camera, 0.6, MUTED)
+        write(plate, left, tops[0] + (down - size[1]) // 2 - 10, camera, 0.6, PLATE_MUTED)
         for top, cell in zip(tops, cells, strict=True):
             upper = top + (down - len(cell)) // 2
             plate[upper : upper + len(cell), left : left + across] = cell
@@ -148,7 +158,7 @@ def _draw_depth_key(plate: UInt8Array, left: int, top: int, height: int) -> None
     plate[top : top + height, left : left + 19] = _depth(np.geomspace(50.0, 1.0, height)[:, None], (19, height))
     for depth_m in _DEPTH_TICKS_M:
         middle = top + (1.0 - float(_DEPTH_NORM(depth_m))) * height
-        write(plate, left + 27, np.clip(middle + 6, top + 12, top + height), f"{depth_m} m", 0.5, INK)
+        write(plate, left + 27, np.clip(middle + 6, top + 12, top + height), f"{depth_m} m", 0.5, PLATE_INK)
 
 
 def _draw_flow_key(plate: UInt8Array, left: int, top: int, p95_px: float) -> None:
@@ -158,4 +168,4 @@ def _draw_flow_key(plate: UInt8Array, left: int, top: int, p95_px: float) -> Non
     wheel = opacity * 255 * _direction_colours(x, y) + (1 - opacity) * np.array(rgb(PLATE))
     plate[top : top + 80, left + 18 : left + 98] = wheel
     for row, text in enumerate(("95 % under", f"{p95_px:.1f} px")):
-        write(plate, left + 58 - width_of(text, 0.5) / 2, top + 102 + 20 * row, text, 0.5, INK)
+        write(plate, left + 58 - width_of(text, 0.5) / 2, top + 102 + 20 * row, text, 0.5, PLATE_INK)

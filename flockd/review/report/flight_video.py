@@ -5,19 +5,114 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from flockd.core.errors import UnavailableError, UsageError
-from flockd.core.messages import FloatArray, UInt8Array
+from flockd.core.messages import Detection, FloatArray, PilotOutput, UInt8Array
+from flockd.flight.geometry import Rig, build_rig
+from flockd.onboard.recording.codec import from_json
+from flockd.onboard.recording.reader import Recording
+from flockd.review.flight_log.key_frames import KeyFrame
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.flight_log.moments import Moment, Outline
-from flockd.review.report.plate_drawing import INK, MUTED, PLATE, line, rgb, rig_place, ring, write
-from flockd.review.report.style import FEW, colour_of
+from flockd.review.report.style import FEW, PLATE, PLATE_INK, PLATE_MUTED, colour_of, line, rgb, rig_place, ring, write
+
+_RING = 32
+"""Points of a detection's outline."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """A detected drone in one image."""
+
+    pixels: FloatArray
+    """(n, 2) along a line around the drone, as far as it is in the image; it ends where it began if all of it is."""
+    track: int | None
+    """The track it belongs to; None for one that has none yet."""
+    range_m: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """One step of one drone."""
+
+    time_s: float
+    """Since the flight's start, as in its log."""
+    images: Mapping[str, UInt8Array]
+    """(h, w, 3) RGB by camera."""
+    outlines: Mapping[str, Sequence[Outline]]
+    """By camera."""
+    taken_s: float
+    """When the images were taken: earlier than `time_s` where there are none of the step itself."""
+
+
+def recorded_moments(recording: Recording) -> Iterator[Moment]:
+    """Each step of a recording, with the detections that were recorded. Raises RecordingError where it is damaged."""
+    rig, zero_s = build_rig(recording.config.rig), recording.pilot_began_s
+    for step in recording.steps():
+        zero_s = step.frames.time_s if zero_s is None else zero_s
+        output: PilotOutput | None = None if step.output is None else from_json(PilotOutput, step.output)
+        time_s = step.frames.time_s - zero_s
+        images = {name: frame.image for name, frame in step.frames.frames.items()}
+        outlines = {} if output is None else _outlines(rig, output)
+        yield Moment(time_s, images, outlines, time_s)
+
+
+def held_moments(times_s: Sequence[float], frames: Sequence[KeyFrame]) -> Iterator[Moment]:
+    """Each time with the newest key frame of before; the first one until there is one."""
+    for time_s in times_s:
+        known = [frame for frame in frames if frame.time_s <= time_s] or frames[:1]
+        if known:
+            yield Moment(time_s, known[-1].images, _masks(known[-1]), known[-1].time_s)
+        else:
+            yield Moment(time_s, {}, {}, time_s)
+
+
+def _outlines(rig: Rig, output: PilotOutput) -> dict[str, list[Outline]]:
+    found: dict[str, list[Outline]] = {}
+    for detection, track in zip(output.detections, output.detection_tracks, strict=True):
+        for camera, pixels in rig.pixels_of(_ring(detection)).items():
+            line = _within(pixels)
+            if len(line):
+                found.setdefault(camera, []).append(Outline(line, track, detection.range_m))
+    return found
+
+
+def _within(ring: FloatArray) -> FloatArray:
+    """The known points of a ring as one line, whose gap is where the ring has its own."""
+    known = np.isfinite(ring[:, 0])
+    if known.all():
+        return np.concatenate([ring, ring[:1]])
+    begins = np.flatnonzero(known & ~np.roll(known, 1))
+    return np.roll(ring, -int(begins[0]), axis=0)[np.roll(known, -int(begins[0]))] if len(begins) else ring[:0]
+
+
+def _ring(detection: Detection) -> FloatArray:
+    """(n, 3) body points around the drone, across the line of sight."""
+    across = np.linalg.svd(detection.bearing[None])[2][1:]  # two unit vectors at right angles to it
+    angles = np.linspace(0.0, 2.0 * math.pi, _RING, endpoint=False)
+    around = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ across
+    ring: FloatArray = detection.position + 0.5 * detection.size_m * around
+    return ring
+
+
+def _masks(frame: KeyFrame) -> dict[str, list[Outline]]:
+    """The boxes of a key frame's masks."""
+    found: dict[str, list[Outline]] = {}
+    for camera, labels in frame.labels.items():
+        for label in (int(one) for one in np.unique(labels) if one):
+            rows, columns = np.nonzero(labels == label)
+            left, right, top, bottom = columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
+            corners = np.array([(left, top), (right, top), (right, bottom), (left, bottom), (left, top)], np.float64)
+            outline = Outline(corners, frame.track_ids.get(label), frame.ranges.get(label))
+            found.setdefault(camera, []).append(outline)
+    return found
+
 
 CODECS = {".webm": "VP90", ".mp4": "vp09"}
 """VP9 in both: free of royalties, in OpenCV's own build, and shown by every browser."""
@@ -126,7 +221,7 @@ class _Plate:
         names = self._log.metadata.names
         name = names[self._drone] if names else f"drone {self._drone + 1}"
         held = f"   images of {moment.taken_s:.1f} s" if moment.taken_s < moment.time_s - 1e-6 else ""
-        write(image, _GAP_PX + 2, 24, f"{name}   t = {moment.time_s:.1f} s{held}", 0.6, INK)
+        write(image, _GAP_PX + 2, 24, f"{name}   t = {moment.time_s:.1f} s{held}", 0.6, PLATE_INK)
         return image
 
     def _extent(self) -> tuple[FloatArray, float]:
@@ -154,7 +249,7 @@ class _Plate:
                 ring(image, self._pixels(trail[-1:])[0], 5, colour, -1)
         origin = log.position[row, own, :2] if np.isfinite(log.position[row, own, :2]).all() else np.zeros(2)
         here = self._pixels(origin[None])[0]
-        ring(image, here, 10, INK, 1)
+        ring(image, here, 10, PLATE_INK, 1)
         if not self._known:
             ring(image, here, 5, self._colours[own], -1)
         for track in log.tracked[(log.tracked[:, 0] == row) & (log.tracked[:, 1] == own)]:
@@ -162,9 +257,9 @@ class _Plate:
             ring(image, place, 7, colour_of(int(track[2]), FEW), 2)
         command = log.command_velocity[row, own]
         if np.isfinite(command).all():
-            line(image, self._pixels(np.stack([origin, origin + 2.0 * command])), INK, 1)
+            line(image, self._pixels(np.stack([origin, origin + 2.0 * command])), PLATE_INK, 1)
         told = "paths, tracks (rings), command (line, 2 s)" if self._known else "tracks around the drone, command"
-        write(image, 8, _MAP_PX - 10, told, 0.42, MUTED)
+        write(image, 8, _MAP_PX - 10, told, 0.42, PLATE_MUTED)
         return image
 
     def _grid(self, image: UInt8Array) -> None:
@@ -175,7 +270,7 @@ class _Plate:
                 ends = np.stack([self._middle - self._reach_m, self._middle + self._reach_m])
                 ends[:, axis] = at_m
                 line(image, self._pixels(ends), _GRID, 1)
-        write(image, 8, 20, f"north up, grid {step_m} m", 0.42, MUTED)
+        write(image, 8, 20, f"north up, grid {step_m} m", 0.42, PLATE_MUTED)
 
     def _pixels(self, plan: FloatArray) -> FloatArray:
         """(n, 2) across and down of (n, 2) metres north and east."""

@@ -17,12 +17,10 @@ from matplotlib.figure import Figure
 from flockd.review.flight_log.key_frames import KeyFrame, load_key_frames
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.curves import account_curves, error_curves, flight_curves
-from flockd.review.report.figure_files import inline_svg, page_template
 from flockd.review.report.filmstrip import filmstrip
-from flockd.review.report.obstacle_figures import in_the_way, obstacle_figure
 from flockd.review.report.page_texts import page_texts
-from flockd.review.report.style import colour_of
-from flockd.review.report.trajectories import trajectories
+from flockd.review.report.style import colour_of, inline_svg, page_template
+from flockd.review.report.trajectories import in_the_way, obstacle_figure, trajectories
 
 Drawing = tuple[Callable[[FlightLog], Figure | None], str, str]
 DRAWINGS_OF_TRUTH: dict[str, Drawing] = {

@@ -12,9 +12,8 @@ import numpy as np
 from flockd.flight.flocking.metrics import closest_distances
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import EXACT_STATES
-from flockd.review.report.paper_results import TABLE_2, TABLE_3
 from flockd.review.report.style import FEW
-from flockd.review.report.summary import causes_text, sizes_text
+from flockd.review.report.summary import TABLE_2, TABLE_3, causes_text, sizes_text
 
 Summary = Mapping[str, Any]
 Rows = list[dict[str, Any]]

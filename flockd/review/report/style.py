@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import io
+import re
+from pathlib import Path
 from typing import Any, Final
 
-from matplotlib import colormaps
+import cv2
+import jinja2
+import numpy as np
+from matplotlib import colormaps, rc_context
 from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+from flockd.core.messages import FloatArray, UInt8Array
 
 FEW: Final = 8
 """Up to this many drones have a line and a colour each; more are shown as the band they fill."""
@@ -74,3 +83,94 @@ def colour_of(number: int, count: int) -> str:
 def drone_name(number: int) -> str:
     """Drones count from 0 in the log and from 1 in the report, as in the paper."""
     return f"drone {number + 1}"
+
+
+RIG_ORDER = ("left", "front", "right", "back")
+"""Reading order of the cameras: a turn to the right. Cameras of other names follow in their own order."""
+PLATE, PLATE_INK, PLATE_MUTED = "#14181f", "#e8ecf1", "#98a3b0"
+"""As dark as film under either scheme of the page, so that the images appear alike in both."""
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+_SHIFT = 4
+"""Fractional bits of the pixels that OpenCV draws at."""
+Colour = tuple[int, int, int]
+"""RGB."""
+
+
+def rig_place(camera: str) -> int:
+    """Its place in the reading order."""
+    return RIG_ORDER.index(camera) if camera in RIG_ORDER else len(RIG_ORDER)
+
+
+def rgb(colour: str) -> Colour:
+    """Of a colour as in `#0072b2`."""
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+def fixed_point(pixels: FloatArray) -> UInt8Array:
+    """Pixels, whose middles are at halves, as OpenCV wants them with a shift."""
+    return np.round((pixels - 0.5) * (1 << _SHIFT)).astype(np.int32)
+
+
+def ring(image: UInt8Array, middle: FloatArray, radius_px: float, colour: str, thick: int) -> None:
+    """A circle around (2,) pixels; of thickness -1 a disc."""
+    at = tuple(fixed_point(middle).tolist())
+    cv2.circle(image, at, round(radius_px * (1 << _SHIFT)), rgb(colour), thick, cv2.LINE_AA, _SHIFT)
+
+
+def line(image: UInt8Array, pixels: FloatArray, colour: str, thick: int) -> None:
+    """Through (n, 2) pixels."""
+    cv2.polylines(image, [fixed_point(pixels)], False, rgb(colour), thick, cv2.LINE_AA, _SHIFT)
+
+
+def width_of(text: str, size: float) -> int:
+    """Pixels."""
+    return int(cv2.getTextSize(text, FONT, size, 1)[0][0])
+
+
+def write(image: UInt8Array, left: float, base: float, text: str, size: float, colour: str = "#ffffff") -> None:
+    """With a dark rim, to be read on anything. The font has ASCII alone; the place is that of the lower left corner."""
+    shown, (x, y) = text.encode("ascii", "replace").decode(), (round(left), round(base))
+    for across, down in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        cv2.putText(image, shown, (x + across, y + down), FONT, size, (0, 0, 0), 1, cv2.LINE_AA)
+    cv2.putText(image, shown, (x, y), FONT, size, rgb(colour), 1, cv2.LINE_AA)
+
+
+# What the page's style sheet turns with the reader's light or dark scheme.
+_THEMED: Final = {
+    INK: "var(--ink)",
+    MUTED: "var(--muted)",
+    GRID: "var(--grid)",
+    PAPER: "var(--paper)",
+    BAND: "var(--blue)",
+}
+
+
+def page_template(path: Path) -> jinja2.Template:
+    """The page at a path, which may include `page.css`. What is filled in is escaped, and nothing may be missing."""
+    loader = jinja2.FileSystemLoader([path.parent, Path(__file__).parent])
+    environment = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.get_template(path.name)
+
+
+def inline_svg(figure: Figure, name: str, description: str) -> str:
+    """The figure as an `<svg>` element for a page that sets --ink, --muted, --grid, --paper, --blue and --sans.
+
+    `name` keeps its ids apart from those of other figures in the same page; `description` is its accessible name.
+    """
+    buffer = io.StringIO()
+    with rc_context({**STYLE, "svg.hashsalt": name}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    used = set(re.findall(r'(?:href="#|url\(#)([^")]+)', text))
+    text = re.sub(r' id="([^"]*)"', lambda found: found[0] if found[1] in used else "", text)
+    text = re.sub(r' width="[\d.]+pt" height="[\d.]+pt"', "", text, count=1)
+    text = re.sub(r' xmlns(:xlink)?="[^"]*"', "", text)
+    text = text.replace("xlink:href=", "href=").replace("<svg", f'<svg role="img" aria-label="{description}"', 1)
+    text = re.sub(r"font: ((?:bold )?[\d.]+px) [^;\"]*", r"font: \1 var(--sans)", text)
+    for colour, variable in _THEMED.items():
+        text = text.replace(colour, variable)
+    return re.sub(r"\n\s*", "\n", text).strip()

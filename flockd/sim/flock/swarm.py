@@ -18,8 +18,7 @@ from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.truth import TrueDrone, Truth
 from flockd.review.flight_log.builder import FlightLogBuilder
-from flockd.review.flight_log.capture import key_frame_steps
-from flockd.review.flight_log.key_frames import KeyFrame
+from flockd.review.flight_log.key_frames import KeyFrame, key_frame_steps
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FlightMetadata, MissionMetadata
 from flockd.sim.cameras.camera_simulator import CameraSimulator

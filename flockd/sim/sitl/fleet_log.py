@@ -22,8 +22,7 @@ from flockd.onboard.recording.mcap_file import Entry, read_records
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.streams import ORDER, OUTPUT, VEHICLE
 from flockd.review.flight_log.builder import FlightLogBuilder
-from flockd.review.flight_log.capture import capture, key_frame_steps
-from flockd.review.flight_log.key_frames import KeyFrame
+from flockd.review.flight_log.key_frames import KeyFrame, capture, key_frame_steps
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FleetMetadata, FlightMetadata, MissionMetadata, Percentiles
 from flockd.sim.scenario import ScenarioConfig

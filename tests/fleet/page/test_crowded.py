@@ -10,8 +10,7 @@ import pytest
 from aiohttp import web
 
 from flockd.fleet.drone_rows import Row
-from flockd.fleet.page.page_access import PageAccess
-from flockd.fleet.page.page_connections import MAX_STRANGERS, STRANGER_S, PageConnections
+from flockd.fleet.page.page_access import MAX_STRANGERS, STRANGER_S, PageAccess, PageConnections
 from flockd.fleet.page.page_pictures import EVERY_S, SILENT_S, PagePictures
 from flockd.fleet.page.page_server import PageServer
 from flockd.onboard.telemetry.topics import AnswerMessage

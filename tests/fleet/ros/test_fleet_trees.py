@@ -9,8 +9,7 @@ import pytest
 
 from flockd.core.messages import FloatArray
 from flockd.core.ros_frames import rotation_of
-from flockd.fleet.drone_rows import Known, drone_rows, origin_of
-from flockd.fleet.fleet_status import WORST_FIRST
+from flockd.fleet.drone_rows import WORST_FIRST, Known, drone_rows, origin_of
 from flockd.fleet.ros.fleet_bridge import _LEVELS, _status, _transforms
 from flockd.fleet.ros.fleet_markers import markers
 from flockd.fleet.watcher import Heard, Watched

@@ -16,8 +16,8 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.messages import Frame, FrameSet, PilotOutput, VehicleState
+from flockd.ground.calibration.board import CalibrationError
 from flockd.ground.calibration.drone_size import DroneSize, Photograph, SizeCandidate, fit_size
-from flockd.ground.calibration.errors import CalibrationError
 from flockd.ground.datasets.image_files import read_image
 from flockd.onboard.recording import Recorder
 from tests.ground.pictures.photographs import DRONE_SIZE_M, FOCAL_PX, FOV_DEG, RENDERED, SIZE, truth

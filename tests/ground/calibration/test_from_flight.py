@@ -14,7 +14,7 @@ import pytest
 from flockd.core.config import DroneConfig, load_drone
 from flockd.core.messages import CameraDeviation, FloatArray, PilotOutput, Reason, ReasonKind
 from flockd.flight.geometry import build_rig, rotation_from_vector
-from flockd.ground.calibration.errors import CalibrationError
+from flockd.ground.calibration.board import CalibrationError
 from flockd.ground.calibration.from_flight import corrected_rig, found_rig
 from flockd.ground.doctor import Level
 from flockd.ground.doctor.camera_checks import check_rig

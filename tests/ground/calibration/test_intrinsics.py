@@ -12,9 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flockd.core.choices import LENS_MODELS
-from flockd.ground.calibration.board import BoardFinder
+from flockd.ground.calibration.board import BoardFinder, CalibrationError
 from flockd.ground.calibration.coverage import Coverage
-from flockd.ground.calibration.errors import CalibrationError
 from flockd.ground.calibration.intrinsics import Lens as Fitted
 from flockd.ground.calibration.intrinsics import calibrate, simplest_that_fits
 from flockd.ground.calibration.views import Collector

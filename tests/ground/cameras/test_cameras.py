@@ -13,9 +13,8 @@ import pytest
 
 from flockd.cli import main
 from flockd.core.config import load_drone
-from flockd.ground.cameras.gstreamer_listing import cameras_of_monitor
-from flockd.ground.cameras.listing import Computer
-from flockd.ground.cameras.measuring import edge_width_px
+from flockd.ground.cameras.listing import Computer, cameras_of_monitor
+from flockd.ground.cameras.watching import edge_width_px
 from flockd.ground.datasets.image_files import read_image
 from tests.ground.filming import filming
 from tests.onboard.sources.fake_kernel import METADATA_CAPTURE, STREAMING, FakeCamera, FakeKernel

@@ -12,9 +12,8 @@ import pytest
 
 from flockd.cli import main
 from flockd.core.jpeg_header import jpeg_size
-from flockd.ground.datasets.errors import DatasetError
-from flockd.ground.datasets.image_files import read_image
-from flockd.ground.datasets.tables import read_lines
+from flockd.ground.datasets.image_files import DatasetError, read_image
+from flockd.ground.datasets.image_folder import read_lines
 from flockd.ground.pictures import read_labels
 from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat
 

@@ -11,7 +11,6 @@ from flockd.core.config import DroneConfig, load_drone
 from flockd.core.config.recording import RecordingConfig
 from flockd.core.data import data_path
 from flockd.ground.doctor import Finding, Level
-from flockd.ground.doctor.computer import Computer, Condition
 from flockd.ground.doctor.computer_checks import (
     check_clock,
     check_disk,
@@ -21,6 +20,7 @@ from flockd.ground.doctor.computer_checks import (
     judge_room,
     wall_clock_error_us,
 )
+from flockd.review.replay.profile import Computer, Condition
 
 QUADROTOR = load_drone(data_path("config") / "quadrotor.yaml")
 SUMMER = datetime(2026, 7, 1, 12, tzinfo=UTC)

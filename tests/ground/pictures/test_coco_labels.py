@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from flockd.ground.datasets.errors import DatasetError
+from flockd.ground.datasets.image_files import DatasetError
 from flockd.ground.pictures import find_pictures, read_labels
-from flockd.ground.pictures.coco_labels import check_size
+from flockd.ground.pictures.picture_files import check_size
 
 Document = dict[str, Any]
 

@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import development as mavlink
 
 from flockd.core.config.mission import MissionParameters, WaypointParameters
 from flockd.core.messages import LearnedSize
-from flockd.fleet.fleet_status import status_rows
+from flockd.fleet.drone_rows import status_rows
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon import DaemonError
 from flockd.onboard.message_json import to_json

@@ -18,7 +18,7 @@ import pytest
 from flockd.core.config import load_drone
 from flockd.core.errors import ConfigError
 from flockd.core.printable import printable
-from flockd.fleet.fleet_status import status_rows
+from flockd.fleet.drone_rows import status_rows
 from flockd.fleet.watcher import MAX_BYTES, MAX_DRONES, MAX_EVENTS_OF_ONE, FleetWatcher, Heard, Watched
 from flockd.onboard.daemon.operator_orders import OperatorCommands, OperatorRequests
 from flockd.onboard.message_json import from_json

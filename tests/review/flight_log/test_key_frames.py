@@ -9,7 +9,7 @@ import pytest
 
 from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.onboard.recording.reader import Recording
-from flockd.review.flight_log.capture import capture, key_frame_steps
+from flockd.review.flight_log.key_frames import capture, key_frame_steps
 
 RECORDING = Path(__file__).parents[2] / "review" / "replay" / "normal.mcap"
 

@@ -15,8 +15,7 @@ from flockd.core.messages import FloatArray, UInt8Array
 from flockd.onboard.recording.reader import Recording
 from flockd.review.flight_log.key_frames import KeyFrame
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.flight_log.moments import Moment, Outline, held_moments, recorded_moments
-from flockd.review.report.flight_video import write_video
+from flockd.review.report.flight_video import Moment, Outline, held_moments, recorded_moments, write_video
 from flockd.review.report.style import DRONE_COLOURS
 from tests.review.report.test_page import _flight
 

@@ -22,10 +22,9 @@ from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FlightMetadata, MissionMetadata
 from flockd.review.report.curves import error_curves, flight_curves
 from flockd.review.report.filmstrip import filmstrip
-from flockd.review.report.obstacle_figures import obstacle_figure
 from flockd.review.report.page import write_report
 from flockd.review.report.summary import summarise, write_summary
-from flockd.review.report.trajectories import gabriel_edges, trajectories
+from flockd.review.report.trajectories import gabriel_edges, obstacle_figure, trajectories
 
 Array = NDArray[np.float64]
 RADIUS_M = 2.1

@@ -15,13 +15,11 @@ from numpy.typing import NDArray
 
 from flockd.core.data import data_path
 from flockd.core.messages import PilotOutput, SizeStatus, Wanted
-from flockd.review.flight_log.builder import FlightLogBuilder
+from flockd.review.flight_log.builder import FlightLogBuilder, match_neighbours
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FlightMetadata, HandedOver, LearnedSize, MissionMetadata
-from flockd.review.flight_log.truth_matching import match_neighbours
 from flockd.review.report.page_texts import page_texts
-from flockd.review.report.paper_results import TABLE_2, TABLE_3
-from flockd.review.report.summary import causes_text, sizes_text, summarise, write_summary
+from flockd.review.report.summary import TABLE_2, TABLE_3, causes_text, sizes_text, summarise, write_summary
 from flockd.sim.scenario import load_scenario
 
 Array = NDArray[np.float64]
