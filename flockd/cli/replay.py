@@ -117,7 +117,7 @@ def _recording(args: argparse.Namespace) -> Iterator[Recording]:
 
 
 def _replay(args: argparse.Namespace, recording: Recording) -> int:
-    from flockd.review.replay.profile import Watch, peak_memory_mb, profile_result
+    from flockd.review.replay.profile import Watch, profile_result
     from flockd.review.replay.recorded_flight import (
         compare_replay,
         damage_warnings,
@@ -153,7 +153,7 @@ def _replay(args: argparse.Namespace, recording: Recording) -> int:
         comparison = compare_replay(recording.drone, replay, expected, dict(args.tolerance), part_only=part_only)
     result = replay_result(recording, replay, warnings, comparison)
     if watch is not None:
-        result["profile"] = profile_result(replay, config, watch, peak_memory_mb())
+        result["profile"] = profile_result(replay, config, watch)
     if args.json:
         say_json(result)
     else:

@@ -130,16 +130,13 @@ def _video(args: argparse.Namespace) -> int:
 
 def _moments(args: argparse.Namespace, log: FlightLog, recordings: Sequence[Recording]) -> tuple[int, Iterator[Moment]]:
     """Number of the drone that --drone names, and what its cameras saw."""
-    from flockd.review.flight_log.key_frames import load_key_frames
-    from flockd.review.report.flight_folder import KEY_FRAMES_NAME
-    from flockd.review.report.flight_video import held_moments, recorded_moments
+    from flockd.review.report.flight_video import Moment, recorded_moments
 
     if not recordings:
         if args.drone is not None:
             raise UsageError(f"--drone {args.drone}: {args.flight} has no recordings; drop it, or fly with --record")
-        path = args.flight / KEY_FRAMES_NAME
-        frames = load_key_frames(path) if path.is_file() else ()
-        return (frames[0].drone if frames else 0), held_moments(log.time_s.tolist(), frames)
+        complain(f"{args.flight}: has no recordings, so the video shows the map alone; fly with --record")
+        return 0, (Moment(time_s, {}, {}) for time_s in log.time_s.tolist())
     names = log.metadata.names or [recording.drone for recording in recordings]
     wanted = args.drone or recordings[0].drone
     recording = next((one for one in recordings if one.drone == wanted), None)

@@ -28,9 +28,8 @@ from PIL import Image, ImageDraw
 from flockd.core.messages import FloatArray
 from flockd.onboard.recording.reader import Recording
 from flockd.review.flight_log.from_recordings import flight_log
-from flockd.review.flight_log.key_frames import load_key_frames
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.report.filmstrip import filmstrip
+from flockd.review.report.filmstrip import load_plates
 from flockd.review.report.flight_folder import KEY_FRAMES_NAME, LOG_NAME
 from flockd.review.report.flight_video import recorded_moments, write_video
 from flockd.review.report.style import GRID, INK, MUTED, PAPER, colour_of
@@ -199,7 +198,7 @@ def _draw_drone(axes: Axes, position: FloatArray, R_ned_body: FloatArray, colour
 
 def save_seen(key_frames: Path, path: Path) -> None:
     """The last key frame of a flight: images with detections, depth, optical flow."""
-    Image.fromarray(filmstrip(load_key_frames(key_frames)[-1])).save(path, quality=72, method=6)
+    path.write_bytes(load_plates(key_frames)[-1].webp)
 
 
 def _image(figure: Figure) -> Image.Image:

@@ -7,7 +7,8 @@ import os
 import platform
 import resource
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from contextlib import suppress
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -23,223 +24,133 @@ from flockd.review.replay.recorded_flight import Replay
 
 LEAST_STEPS = 5
 """Of fewer the slowest twentieth is a single one, and the first does not count."""
+STEP = "step"
+"""The row of all stages together, and what is between them."""
 _ROUND_TO_S = 0.05
 _LIBRARIES = ("onnxruntime", "onnxruntime-gpu", "openvino", "opencv-python-headless", "numpy")
 """Packages that decide how fast it is; one of the runtimes is installed."""
-STEP = "step"
-"""The row of all stages together, and what is between them."""
+_EIGHT_BIT = {
+    "amx_int8": "AMX", "avx512_vnni": "AVX-512 VNNI", "avx_vnni": "AVX-VNNI", "i8mm": "I8MM", "asimddp": "dotprod",
+}  # fmt: skip
+"""Instructions for 8-bit products, by the kernel's names: with none of these the 8-bit networks save little."""
+_VECTOR = {"avx512f": "AVX-512", "avx2": "AVX2", "sve2": "SVE2", "sve": "SVE", "asimd": "NEON"}
+"""Those for numbers in float, the widest first."""
 
 
 @dataclass(frozen=True)
-class Row:
-    """One stage of a step."""
+class Kernel:
+    """Files in which the kernel says what the computer is, and how it does."""
 
-    stage: str
-    p50_ms: float
-    p95_ms: float
-    share: float
-    """Of the steps' time."""
+    cpuinfo: Path = Path("/proc/cpuinfo")
+    board: Path = Path("/proc/device-tree/model")
+    meminfo: Path = MEMORY
+    thermal: Path = THERMAL
+    clocks: Path = Path("/sys/devices/system/cpu")
 
+    def computer(self) -> dict[str, Any]:
+        """What it is: board or processor, cores for this process, instructions, memory (None: not told)."""
+        facts, total = _facts(self.cpuinfo), _facts(self.meminfo).get("MemTotal")
+        flags = (facts.get("flags") or facts.get("Features") or "").split()
+        board = _text(self.board).strip("\0\n ")
+        return {
+            "name": board or facts.get("Model") or facts.get("model name") or "unknown",
+            "architecture": platform.machine(),
+            "cores": len(os.sched_getaffinity(0)),
+            "eight_bit": [name for flag, name in _EIGHT_BIT.items() if flag in flags],
+            "vector": [name for flag, name in _VECTOR.items() if flag in flags],
+            "memory_mb": None if total is None else int(total.split()[0]) * 1024 / MB,
+        }
 
-@dataclass(frozen=True)
-class Profile:
-    """Where time went in the steps after the first, which has no images before it, and warms up."""
-
-    rows: tuple[Row, ...]
-    """In the order of the step; the last is the whole step."""
-    steps: int
-    processor_ms: float
-    """Processor time of a step, all threads together, median."""
-    cores_busy: float
-    """By this process while it steps, on average."""
-    step_s: float
-    """Configured."""
-    least_step_s: float
-    """The shortest step time that leaves a fifth of it for what else the drone's computer does."""
-
-    @classmethod
-    def of(cls, replay: Replay, config: DroneConfig) -> Profile:
-        """Raises ValueError for a replay of fewer than `LEAST_STEPS`."""
-        if len(replay.steps_ms) < LEAST_STEPS:
-            raise ValueError(f"{len(replay.steps_ms)} steps are too few to say where time goes")
-        steps_ms, processor_ms = replay.steps_ms[1:], replay.processor_ms[1:]
-        whole_ms = sum(steps_ms)
-        stages = {stage: samples[-len(steps_ms) :] for stage, samples in replay.stages_ms.items()}
-        rows = [_row(stage, samples, whole_ms) for stage, samples in stages.items()]
-        step = _row(STEP, steps_ms, whole_ms)
-        needed_s = step.p95_ms / 1e3 / (FULL * config.safety.degraded_load)
-        return cls(
-            rows=(*rows, step),
-            steps=len(steps_ms),
-            processor_ms=float(np.median(processor_ms)),
-            cores_busy=sum(processor_ms) / whole_ms,
-            step_s=config.step_s,
-            least_step_s=round(math.ceil(needed_s / _ROUND_TO_S - 1e-9) * _ROUND_TO_S, 2),
-        )
-
-
-def _row(stage: str, samples_ms: Sequence[float], whole_ms: float) -> Row:
-    p50, p95 = np.percentile(samples_ms, (50, 95))
-    return Row(stage, float(p50), float(p95), sum(samples_ms) / whole_ms)
+    def clock_mhz(self) -> float | None:
+        """Of the fastest core now; None where it is not told."""
+        khz = [text for file in self.clocks.glob("cpu[0-9]*/cpufreq/scaling_cur_freq") if (text := _text(file).strip())]
+        return max((int(text) / 1e3 for text in khz), default=None)
 
 
 class Watch:
     """Notes how the computer does while a replay goes on."""
 
-    def __init__(self) -> None:
-        self.computer = Computer.this()
+    def __init__(self, kernel: Kernel | None = None) -> None:
+        self.kernel = kernel or Kernel()
         self._load = os.getloadavg()[0]
-        self._seen = [Condition.now()]
+        self._zone = ""
+        self._temperatures_c: list[float] = []
+        self._clocks_mhz: list[float] = []
+        self._slowed: set[str] = set()
+        self.look()
 
     def look(self) -> None:
         """Once a step."""
-        self._seen.append(Condition.now())
+        zones, clock_mhz = dict(thermal_zones(self.kernel.thermal)), self.kernel.clock_mhz()
+        self._zone = max(zones, key=zones.__getitem__, default="")
+        self._temperatures_c += [zones[self._zone]] if zones else []
+        self._clocks_mhz += [] if clock_mhz is None else [clock_mhz]
+        self._slowed.update(processors_slowed(self.kernel.thermal))
 
     def summary(self) -> dict[str, Any]:
         """Processes that wanted a core before it began (the average of a minute); temperatures in °C at the start, at
         most and at the end; the clock at least and at most; what slowed the processor. None: not told.
         """
-        temperatures = [one.temperature_c for one in self._seen if one.temperature_c is not None]
-        clocks = [one.clock_mhz for one in self._seen if one.clock_mhz is not None]
+        hot, clocks = self._temperatures_c, self._clocks_mhz
         return {
             "load_before": self._load,
-            "temperature_c": [temperatures[0], max(temperatures), temperatures[-1]] if temperatures else None,
-            "zone": self._seen[-1].zone or None,
-            "slowed_by": sorted({device for one in self._seen for device in one.slowed}),
+            "temperature_c": [hot[0], max(hot), hot[-1]] if hot else None,
+            "zone": self._zone or None,
+            "slowed_by": sorted(self._slowed),
             "clock_mhz": [min(clocks), max(clocks)] if clocks else None,
         }
 
 
-def _settings(config: DroneConfig) -> dict[str, Any]:
-    """What of the configuration decides how long a step takes."""
-    wanted = config.perception
+def profile_result(replay: Replay, config: DroneConfig, watch: Watch) -> dict[str, Any]:
+    """As JSON: the computer, what decides how long a step takes, and where time went in the steps after the first,
+    which has no images before it, and warms up. `least_step_s` leaves a fifth for what else the drone's computer does.
+
+    Raises ValueError for a replay of fewer than `LEAST_STEPS`.
+    """
+    if len(replay.steps_ms) < LEAST_STEPS:
+        raise ValueError(f"{len(replay.steps_ms)} steps are too few to say where time goes")
+    steps_ms, processor_ms = replay.steps_ms[1:], replay.processor_ms[1:]
+    samples = {stage: ms[-len(steps_ms) :] for stage, ms in replay.stages_ms.items()}
+    stages = {stage: _row(ms, sum(steps_ms)) for stage, ms in {**samples, STEP: steps_ms}.items()}
+    needed_s = stages[STEP]["p95_ms"] / 1e3 / (FULL * config.safety.degraded_load)
+    versions = {"flockd": __version__}
+    for library in _LIBRARIES:
+        with suppress(metadata.PackageNotFoundError):
+            versions[library] = metadata.version(library)
     return {
-        "networks": [path.stem for path in manifests_of(wanted)],
-        "provider": wanted.provider,
-        "threads": wanted.threads,
+        "versions": {**versions, "python": platform.python_version()},
+        "computer": watch.kernel.computer(),
+        "networks": [path.stem for path in manifests_of(config.perception)],
+        "provider": config.perception.provider,
+        "threads": config.perception.threads,
         "cameras": {camera.name: list(camera.size_px) for camera in config.rig.cameras},
-    }
-
-
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
-
-
-def profile_result(replay: Replay, config: DroneConfig, watch: Watch, memory_mb: float) -> dict[str, Any]:
-    """All of it as JSON. Raises ValueError for a replay of fewer than `LEAST_STEPS`."""
-    profile = Profile.of(replay, config)
-    return {
-        "versions": {
-            "flockd": __version__,
-            **{name: version for name in _LIBRARIES if (version := _version(name)) is not None},
-            "python": platform.python_version(),
-        },
-        "computer": asdict(watch.computer),
-        **_settings(config),
         **watch.summary(),
-        "memory_mb": memory_mb,
-        **{name: value for name, value in asdict(profile).items() if name != "rows"},
-        "stages": {row.stage: {"p50_ms": row.p50_ms, "p95_ms": row.p95_ms, "share": row.share} for row in profile.rows},
+        "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / MB,
+        "steps": len(steps_ms),
+        "processor_ms": float(np.median(processor_ms)),
+        "cores_busy": sum(processor_ms) / sum(steps_ms),
+        "step_s": config.step_s,
+        "least_step_s": round(math.ceil(needed_s / _ROUND_TO_S - 1e-9) * _ROUND_TO_S, 2),
+        "stages": stages,
     }
 
 
-CPUINFO = Path("/proc/cpuinfo")
-BOARD = Path("/proc/device-tree/model")
-"""A board with a device tree says there what it is."""
-CLOCKS = Path("/sys/devices/system/cpu")
-INSTRUCTIONS = {
-    "amx_int8": "AMX",
-    "avx512_vnni": "AVX-512 VNNI",
-    "avx_vnni": "AVX-VNNI",
-    "i8mm": "I8MM",
-    "asimddp": "dotprod",
-}
-"""Of 8-bit products, by the kernel's names of them: with none of these the 8-bit networks save little."""
-OTHERS = {"avx512f": "AVX-512", "avx2": "AVX2", "sve2": "SVE2", "sve": "SVE", "asimd": "NEON"}
-"""Of numbers in float, the widest first."""
+def _row(samples_ms: Sequence[float], whole_ms: float) -> dict[str, float]:
+    p50, p95 = np.percentile(samples_ms, (50, 95))
+    return {"p50_ms": float(p50), "p95_ms": float(p95), "share": sum(samples_ms) / whole_ms}
 
 
-@dataclass(frozen=True)
-class Computer:
-    """What it is."""
-
-    name: str
-    """Of the board where it has one, else of the processor."""
-    architecture: str
-    cores: int
-    """That this process may use."""
-    eight_bit: tuple[str, ...]
-    """Its instructions for 8-bit products; none: the 8-bit networks save little."""
-    vector: tuple[str, ...]
-    """Its other vector instructions."""
-    memory_mb: float | None
-
-    @classmethod
-    def this(cls, cpuinfo: Path = CPUINFO, board: Path = BOARD, meminfo: Path = MEMORY) -> Computer:
-        """The one that this runs on; files are the kernel's. What cannot be read is "unknown" or None."""
-        facts = _facts(_read_text(cpuinfo))
-        flags = (facts.get("flags") or facts.get("Features") or "").split()
-        return cls(
-            name=_read_text(board).strip("\0\n ") or facts.get("Model") or facts.get("model name") or "unknown",
-            architecture=platform.machine(),
-            cores=len(os.sched_getaffinity(0)),
-            eight_bit=tuple(name for flag, name in INSTRUCTIONS.items() if flag in flags),
-            vector=tuple(name for flag, name in OTHERS.items() if flag in flags),
-            memory_mb=_total_mb(_read_text(meminfo)),
-        )
-
-
-@dataclass(frozen=True)
-class Condition:
-    """How it does at one moment."""
-
-    temperature_c: float | None
-    """Of the hottest zone; None where it reports none."""
-    zone: str
-    """That zone's name."""
-    slowed: tuple[str, ...]
-    """Cooling devices that slow its processor down now."""
-    clock_mhz: float | None
-    """Of its fastest core now; None where it is not told."""
-
-    @classmethod
-    def now(cls, thermal: Path = THERMAL, clocks: Path = CLOCKS) -> Condition:
-        """Of this computer; folders are the kernel's."""
-        zones = dict(thermal_zones(thermal))
-        hottest = max(zones, key=zones.__getitem__, default="")
-        mhz = [text for file in clocks.glob("cpu[0-9]*/cpufreq/scaling_cur_freq") if (text := _read_text(file).strip())]
-        return cls(
-            temperature_c=zones.get(hottest),
-            zone=hottest,
-            slowed=tuple(sorted(processors_slowed(thermal))),
-            clock_mhz=max((int(text) / 1e3 for text in mhz), default=None),
-        )
-
-
-def peak_memory_mb() -> float:
-    """The most that this process has held so far, resident."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / MB
-
-
-def _facts(cpuinfo: str) -> dict[str, str]:
+def _facts(file: Path) -> dict[str, str]:
     """The first value of each key: one processor speaks for all."""
     facts: dict[str, str] = {}
-    for line in cpuinfo.splitlines():
+    for line in _text(file).splitlines():
         key, colon, value = line.partition(":")
         if colon:
             facts.setdefault(key.strip(), value.strip())
     return facts
 
 
-def _total_mb(meminfo: str) -> float | None:
-    total = _facts(meminfo).get("MemTotal")
-    return None if total is None else int(total.split()[0]) * 1024 / MB
-
-
-def _read_text(file: Path) -> str:
+def _text(file: Path) -> str:
     try:
         return file.read_text(encoding="utf-8", errors="replace")
     except OSError:

@@ -11,8 +11,9 @@ from typing import Any
 from zipfile import BadZipFile
 
 from flockd.core.errors import UsageError
-from flockd.review.flight_log.key_frames import KeyFrame, save_key_frames
+from flockd.review.flight_log.key_frames import KeyFrame
 from flockd.review.flight_log.log import FlightLog
+from flockd.review.report.filmstrip import save_plates
 from flockd.review.report.page import write_report
 from flockd.review.report.summary import summarise, write_summary
 
@@ -105,10 +106,10 @@ def _in_the_way(directory: Path) -> UsageError:
 
 
 def save_flight(directory: Path, log: FlightLog, key_frames: Sequence[KeyFrame]) -> None:
-    """Writes the flight's log, and its key frames if there are any."""
+    """Writes the flight's log, and the plates of its key frames if there are any."""
     log.save(directory / LOG_NAME)
     if key_frames:
-        save_key_frames(directory / KEY_FRAMES_NAME, key_frames)
+        save_plates(directory / KEY_FRAMES_NAME, key_frames)
 
 
 def write_report_files(

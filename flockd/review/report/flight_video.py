@@ -18,7 +18,6 @@ from flockd.core.messages import Detection, FloatArray, PilotOutput, UInt8Array
 from flockd.flight.geometry import Rig, build_rig
 from flockd.onboard.recording.codec import from_json
 from flockd.onboard.recording.reader import Recording
-from flockd.review.flight_log.key_frames import KeyFrame
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.style import FEW, PLATE, PLATE_INK, PLATE_MUTED, colour_of, line, rgb, rig_place, ring, write
 
@@ -47,8 +46,6 @@ class Moment:
     """(h, w, 3) RGB by camera."""
     outlines: Mapping[str, Sequence[Outline]]
     """By camera."""
-    taken_s: float
-    """When the images were taken: earlier than `time_s` where there are none of the step itself."""
 
 
 def recorded_moments(recording: Recording) -> Iterator[Moment]:
@@ -60,17 +57,7 @@ def recorded_moments(recording: Recording) -> Iterator[Moment]:
         time_s = step.frames.time_s - zero_s
         images = {name: frame.image for name, frame in step.frames.frames.items()}
         outlines = {} if output is None else _outlines(rig, output)
-        yield Moment(time_s, images, outlines, time_s)
-
-
-def held_moments(times_s: Sequence[float], frames: Sequence[KeyFrame]) -> Iterator[Moment]:
-    """Each time with the newest key frame of before; the first one until there is one."""
-    for time_s in times_s:
-        known = [frame for frame in frames if frame.time_s <= time_s] or frames[:1]
-        if known:
-            yield Moment(time_s, known[-1].images, _masks(known[-1]), known[-1].time_s)
-        else:
-            yield Moment(time_s, {}, {}, time_s)
+        yield Moment(time_s, images, outlines)
 
 
 def _outlines(rig: Rig, output: PilotOutput) -> dict[str, list[Outline]]:
@@ -99,19 +86,6 @@ def _ring(detection: Detection) -> FloatArray:
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ across
     ring: FloatArray = detection.position + 0.5 * detection.size_m * around
     return ring
-
-
-def _masks(frame: KeyFrame) -> dict[str, list[Outline]]:
-    """The boxes of a key frame's masks."""
-    found: dict[str, list[Outline]] = {}
-    for camera, labels in frame.labels.items():
-        for label in (int(one) for one in np.unique(labels) if one):
-            rows, columns = np.nonzero(labels == label)
-            left, right, top, bottom = columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
-            corners = np.array([(left, top), (right, top), (right, bottom), (left, bottom), (left, top)], np.float64)
-            outline = Outline(corners, frame.track_ids.get(label), frame.ranges.get(label))
-            found.setdefault(camera, []).append(outline)
-    return found
 
 
 CODECS = {".webm": "VP90", ".mp4": "vp09"}
@@ -220,8 +194,7 @@ class _Plate:
         image[_HEAD_PX : _HEAD_PX + _MAP_PX, left : left + _MAP_PX] = self._map(row)
         names = self._log.metadata.names
         name = names[self._drone] if names else f"drone {self._drone + 1}"
-        held = f"   images of {moment.taken_s:.1f} s" if moment.taken_s < moment.time_s - 1e-6 else ""
-        write(image, _GAP_PX + 2, 24, f"{name}   t = {moment.time_s:.1f} s{held}", 0.6, PLATE_INK)
+        write(image, _GAP_PX + 2, 24, f"{name}   t = {moment.time_s:.1f} s", 0.6, PLATE_INK)
         return image
 
     def _extent(self) -> tuple[FloatArray, float]:

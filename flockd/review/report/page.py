@@ -7,17 +7,14 @@ import io
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from flockd.review.flight_log.key_frames import KeyFrame, load_key_frames
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.curves import account_curves, error_curves, flight_curves
-from flockd.review.report.filmstrip import filmstrip
+from flockd.review.report.filmstrip import load_plates
 from flockd.review.report.page_texts import page_texts
 from flockd.review.report.style import colour_of, inline_svg, page_template
 from flockd.review.report.trajectories import in_the_way, obstacle_figure, trajectories
@@ -38,39 +35,35 @@ _MAX_SVG_BYTES = 700_000
 
 
 def write_report(directory: Path, progress: Callable[[int, int], None] = lambda done, total: None) -> Path:
-    """Write `report.html` and `figures/*.png` into a flight's folder and return the page's path.
+    """Write `report.html` and the files of `figures/` into a flight's folder and return the page's path.
 
     The folder holds `flight.npz` (FlightLog) and `summary.json` (of `summarise`); if key frames were kept
-    `filmstrip.npz`. Raises FileNotFoundError if one of the first two is missing.
+    `filmstrip.npz` (of `save_plates`). Raises FileNotFoundError if one of the first two is missing.
     """
     for name in ("flight.npz", "summary.json"):
         if not (directory / name).is_file():
             raise FileNotFoundError(f"{directory / name} is missing: a report is written from the folder of a flight")
     log = FlightLog.load(directory / "flight.npz")
     summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
-    strip = directory / "filmstrip.npz"
-    frames = [frame for frame in load_key_frames(strip) if frame.cameras] if strip.is_file() else []
+    plates = load_plates(directory / "filmstrip.npz")
     folder = directory / "figures"
     folder.mkdir(exist_ok=True)
-    for old in folder.glob("*.png"):
+    for old in (*folder.glob("*.png"), *folder.glob("*.webp")):
         old.unlink()
     drawings = DRAWINGS_OF_TRUTH if log.has_truth else DRAWINGS_OF_ACCOUNT
-    total = len(drawings) + len(frames)
-    progress(0, total)
+    progress(0, len(drawings))
     embedded: dict[str, Markup | None] = dict.fromkeys(DRAWINGS_OF_TRUTH)
     for done, (name, (draw, file, what)) in enumerate(drawings.items(), 1):
         embedded[name] = _embed(draw(log), folder / f"{file}.png", what)
-        progress(done, total)
-    plates = []
-    for number, frame in enumerate(frames, 1):
-        # As files only the first drone's: 1.4 MB each.
-        plates.append(_plate(frame, folder / f"filmstrip_{number}.png" if frame.drone == frames[0].drone else None))
-        progress(len(drawings) + number, total)
+        progress(done, len(drawings))
+    for number, plate in enumerate(plates, 1):
+        if plate.drone == plates[0].drone:  # as files only the first drone's
+            (folder / f"filmstrip_{number}.webp").write_bytes(plate.webp)
     page = page_template(Path(__file__).with_name("report.html")).render(
         **page_texts(summary, log),
         figures=embedded,
-        filmstrip=plates,
-        plated=list(dict.fromkeys(plate["drone"] for plate in plates)),
+        filmstrip=[{**vars(plate), "source": _data_url("image/webp", plate.webp)} for plate in plates],
+        plated=list(dict.fromkeys(plate.drone for plate in plates)),
         player=Markup(_flight_data(log)) if log.has_truth else None,
         script=Markup((Path(__file__).parent / "report.js").read_text(encoding="utf-8")),
     )
@@ -107,17 +100,6 @@ def _embed(figure: Figure | None, path: Path, description: str) -> Markup | None
     if len(element) > _MAX_SVG_BYTES:
         element = f'<img src="{_data_url("image/png", image.getvalue())}" alt="{description}">'
     return Markup(f'<div class="drawing">{element}</div>')  # drawn here, from numbers
-
-
-def _plate(frame: KeyFrame, file: Path | None) -> dict[str, Any]:
-    """A key frame's plate as a PNG file and, for the page, as WebP, a sixth of the size."""
-    image = filmstrip(frame)[..., ::-1]
-    if file is not None:
-        file.write_bytes(cv2.imencode(".png", image)[1].tobytes())
-    small = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, 82])[1].tobytes()
-    height, width = image.shape[:2]
-    source = _data_url("image/webp", small)
-    return {"drone": frame.title, "time_s": frame.time_s, "source": source, "width": width, "height": height}
 
 
 def _data_url(kind: str, data: bytes) -> str:

@@ -13,9 +13,8 @@ import pytest
 from flockd.cli import main
 from flockd.core.messages import FloatArray, UInt8Array
 from flockd.onboard.recording.reader import Recording
-from flockd.review.flight_log.key_frames import KeyFrame
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.report.flight_video import Moment, Outline, held_moments, recorded_moments, write_video
+from flockd.review.report.flight_video import Moment, Outline, recorded_moments, write_video
 from flockd.review.report.style import DRONE_COLOURS
 from tests.review.report.test_page import _flight
 
@@ -49,7 +48,7 @@ def _moments(log: FlightLog) -> Iterator[Moment]:
     angles = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
     ring = np.stack([32 + 10 * np.cos(angles), 24 + 10 * np.sin(angles)], axis=1)
     for time_s in log.time_s.tolist():
-        yield Moment(time_s, {"front": GREY}, {"front": [Outline(ring, 0, 4.2)]}, time_s)
+        yield Moment(time_s, {"front": GREY}, {"front": [Outline(ring, 0, 4.2)]})
 
 
 def test_each_step_is_a_frame_with_the_ring_in_the_image_and_the_drones_on_the_map(
@@ -91,7 +90,7 @@ def test_images_of_several_cameras_do_not_touch(tmp_path: Path) -> None:
     log = _flight(drones=2, duration_s=0.5)
     names = ("front", "right", "back", "left")
     white = np.full((48, 64, 3), 250, np.uint8)
-    moment = Moment(0.0, dict.fromkeys(names, white), {}, 0.0)
+    moment = Moment(0.0, dict.fromkeys(names, white), {})
     path = tmp_path / "flight.webm"
     write_video(path, log, 0, [moment], scale=SCALE)
     (image,), _ = _frames(path)
@@ -116,24 +115,6 @@ def test_recorded_moments_have_the_recorded_detections() -> None:
     assert (outline.pixels >= 0.0).all()
     assert (outline.pixels <= image.shape[1::-1]).all()
     assert np.ptp(outline.pixels[:, 0]) == pytest.approx(np.ptp(outline.pixels[:, 1]), rel=0.15), "a circle"
-
-
-def test_key_frames_stand_in_for_a_recording_until_the_next_one() -> None:
-    labels = np.zeros((48, 64), np.uint8)
-    labels[10:20, 30:50] = 1
-    frames = [
-        KeyFrame(
-            time_s=time_s, drone=0, cameras=("front",), images={"front": GREY}, depth={}, labels={"front": labels},
-            flow={}, track_ids={1: 7}, ranges={1: 3.0},
-        )
-        for time_s in (1.0, 2.0)
-    ]  # fmt: skip
-    moments = list(held_moments([0.0, 1.0, 1.5, 2.5], frames))
-    assert [moment.taken_s for moment in moments] == [1.0, 1.0, 1.0, 2.0]
-    (outline,) = moments[0].outlines["front"]
-    assert (outline.track, outline.range_m) == (7, 3.0)
-    assert outline.pixels.tolist() == [[30, 10], [50, 10], [50, 20], [30, 20], [30, 10]]
-    assert [moment.images for moment in held_moments([0.0, 1.0], [])] == [{}, {}]
 
 
 def test_a_flights_folder_without_recordings_gives_its_map(tmp_path: Path, capsys: Capture) -> None:
