@@ -31,7 +31,69 @@ _MAX_GAP_S = 0.1
 _ROUNDING = 1e-2
 """How far from a rotation a matrix of rounded numbers may be."""
 
+CAMERA = "camera"
+"""Its name where the file has none."""
+_HALF_PIXEL = 0.5
+"""Other people's matrices count pixel centres from 0; ours lie at +0.5."""
+_CENTRAL = (1 / 3, 2 / 3)
+"""Where between an image's borders a principal point may lie. A matrix of half or twice the size is outside."""
+MAX_TABLE_BYTES = 1 << 28
+"""Hours of poses at 200 Hz."""
+
 _Poses = Sequence[RigidTransform | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """When and where an image was taken, and the files of it."""
+
+    index: int
+    """Counted from 0 at the dataset's first frame."""
+    name: str
+    time_s: float
+    image: Path
+    depth: Path | None
+    T_world_camera: RigidTransform | None
+    """From optical RDF to the dataset's world; None where it is not known."""
+
+
+@dataclass(frozen=True, eq=False)
+class DatasetFrame:
+    """One image of the dataset's camera, and what is known with it."""
+
+    moment: Moment
+    image: UInt8Array
+    """(h, w, 3) RGB."""
+    depth: ZMap | None
+    """(h, w) metres along the optical axis, NaN where there is none; None where it was not asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """A sequence of images of one camera; each image, and each depth map, is a file."""
+
+    path: Path
+    camera: CameraConfig
+    """The one that took it; pixel centres at +0.5."""
+    moments: tuple[Moment, ...]
+    depth_units_per_m: float
+    notes: tuple[str, ...]
+    """What a person should know although nothing is wrong: each is one sentence."""
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether depth was recorded."""
+        return any(moment.depth for moment in self.moments)
+
+    def __len__(self) -> int:
+        return len(self.moments)
+
+    def frames(self, *, with_depth: bool) -> Iterator[DatasetFrame]:
+        """All frames in order, read one by one. Raises DatasetError at one that is missing or damaged."""
+        size = self.camera.size_px
+        for one in self.moments:
+            depth = ZMap(read_depth(one.depth, size, self.depth_units_per_m)) if with_depth and one.depth else None
+            yield DatasetFrame(one, read_image(one.image, size), depth)
 
 
 def open_dataset(path: Path, calibration: Path | None = None) -> Dataset:
@@ -52,14 +114,17 @@ def open_dataset(path: Path, calibration: Path | None = None) -> Dataset:
     else:
         depth, units_per_m = _depth_by_name(path / "depth", images), _UNITS_PER_M
         poses = _poses_in_order(path / "poses.txt", images)
-    entries = tuple(
-        Entry(image.name, float(time_s), image, depth.get(index), pose)
-        for index, (time_s, image, pose) in enumerate(zip(times_s, images, poses, strict=True))
-        if not depth or index in depth
+    kept = [index for index in range(len(images)) if not depth or index in depth]
+    moments = tuple(
+        Moment(number, images[k].name, float(times_s[k]), images[k], depth.get(k), poses[k])
+        for number, k in enumerate(kept)
     )
-    left_out = len(images) - len(entries)
+    for file in (file for one in moments for file in (one.image, one.depth) if file is not None):
+        if not file.is_file():  # better now than after an hour
+            raise DatasetError(f"{file}: is missing; restore it, or leave its frame out")
+    left_out = len(images) - len(kept)
     note = f"{path}: {left_out} of {len(images)} images have no depth map within {_MAX_OFFSET_S:g} s, and are left out"
-    return Dataset(path, camera, entries, units_per_m, (note,) if left_out else ())
+    return Dataset(path, camera, moments, units_per_m, (note,) if left_out else ())
 
 
 def _listed(file: Path) -> tuple[FloatArray, list[Path]]:
@@ -160,14 +225,6 @@ def _pose_of_matrix(matrix: FloatArray, where: str) -> RigidTransform:
     return RigidTransform(rotation, matrix[:3, 3])
 
 
-CAMERA = "camera"
-"""Its name where the file has none."""
-_HALF_PIXEL = 0.5
-"""Other people's matrices count pixel centres from 0; ours lie at +0.5."""
-_CENTRAL = (1 / 3, 2 / 3)
-"""Where between an image's borders a principal point may lie. A matrix of half or twice the size is outside."""
-
-
 def read_calibration(file: Path, size: tuple[int, int]) -> CameraConfig:
     """A 3x3 matrix as text, or a drone's YAML with one camera; for images of ``size`` (width, height).
 
@@ -196,9 +253,8 @@ def read_calibration(file: Path, size: tuple[int, int]) -> CameraConfig:
         build_rig(RigConfig(cameras=(camera,)))
     except ValidationError as error:
         first = error.errors()[0]
-        raise ConfigError.at(
-            file, f"{'.'.join(map(str, first['loc']))}: {first['msg']}; correct the calibration"
-        ) from None
+        key = ".".join(map(str, first["loc"]))
+        raise ConfigError.at(file, f"{key}: {first['msg']}; correct the calibration") from None
     except ValueError as error:
         raise ConfigError.at(file, f"{error}; correct the calibration") from None
     return camera
@@ -207,22 +263,13 @@ def read_calibration(file: Path, size: tuple[int, int]) -> CameraConfig:
 def _camera_of_drone(file: Path, size: tuple[int, int]) -> CameraConfig:
     cameras = load_drone(file).rig.cameras
     if len(cameras) != 1:
-        raise ConfigError.at(
-            file, f"has {len(cameras)} cameras; name a file with the one that took the images", "rig.cameras"
-        )
+        told = f"has {len(cameras)} cameras; name a file with the one that took the images"
+        raise ConfigError.at(file, told, "rig.cameras")
     wanted = cameras[0].size_px
     if wanted != size:
-        raise ConfigError.at(
-            file,
-            f"is the calibration of another size, {wanted[0]} x {wanted[1]}; name the one that belongs to "
-            f"{size[0]} x {size[1]} pixels",
-            "rig.cameras[0].size_px",
-        )
+        told = f"is the calibration of another size, {wanted[0]} x {wanted[1]}; name the one that belongs to "
+        raise ConfigError.at(file, f"{told}{size[0]} x {size[1]} pixels", "rig.cameras[0].size_px")
     return cameras[0]
-
-
-MAX_TABLE_BYTES = 1 << 28
-"""Hours of poses at 200 Hz."""
 
 
 def read_lines(file: Path) -> list[tuple[int, str]]:
@@ -257,73 +304,3 @@ def _row(file: Path, number: int, line: str, columns: int, what: str) -> list[fl
     if len(values) != columns or not np.isfinite(values).all():
         raise DatasetError(f"{file}:{number}: does not fit; it needs {what}")
     return values
-
-
-@dataclass(frozen=True, eq=False)
-class Moment:
-    """When and where an image was taken."""
-
-    index: int
-    """Counted from 0 at the dataset's first frame."""
-    name: str
-    time_s: float
-    T_world_camera: RigidTransform | None
-    """From optical RDF to the dataset's world; None where it is not known."""
-
-
-@dataclass(frozen=True, eq=False)
-class DatasetFrame:
-    """One image of the dataset's camera, and what is known with it."""
-
-    moment: Moment
-    image: UInt8Array
-    """(h, w, 3) RGB."""
-    depth: ZMap | None
-    """(h, w) metres along the optical axis, NaN where there is none; None where it was not asked for."""
-
-
-@dataclass(frozen=True)
-class Entry:
-    """Where the parts of one frame are."""
-
-    name: str
-    time_s: float
-    image: Path
-    depth: Path | None = None
-    T_world_camera: RigidTransform | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Dataset:
-    """A sequence of images of one camera; each image, and each depth map, is a file."""
-
-    path: Path
-    camera: CameraConfig
-    """The one that took it; pixel centres at +0.5."""
-    entries: tuple[Entry, ...]
-    depth_units_per_m: float = 1000.0
-    notes: tuple[str, ...] = ()
-    """What a person should know although nothing is wrong: each is one sentence."""
-
-    def __post_init__(self) -> None:
-        """Raises DatasetError if a file is missing: better now than after an hour."""
-        for entry in self.entries:
-            for file in (entry.image, entry.depth):
-                if file is not None and not file.is_file():
-                    raise DatasetError(f"{file}: is missing; restore it, or leave its frame out")
-
-    @property
-    def has_depth(self) -> bool:
-        """Whether depth was recorded."""
-        return any(entry.depth for entry in self.entries)
-
-    def __len__(self) -> int:
-        return len(self.entries)
-
-    def frames(self, *, with_depth: bool) -> Iterator[DatasetFrame]:
-        """All frames in order, read one by one. Raises DatasetError at one that is missing or damaged."""
-        size = self.camera.size_px
-        for index, entry in enumerate(self.entries):
-            depth = ZMap(read_depth(entry.depth, size, self.depth_units_per_m)) if with_depth and entry.depth else None
-            image = read_image(entry.image, size)
-            yield DatasetFrame(Moment(index, entry.name, entry.time_s, entry.T_world_camera), image, depth)

@@ -7,40 +7,25 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from flockd.core.messages import SECTORS, BoolArray, FloatArray, MissionStatus, ObstacleRanges, PilotOutput
-from flockd.review.flight_log.log import FlightLog
+from flockd.core.messages import BoolArray, FloatArray, MissionStatus, ObstacleRanges, PilotOutput
+from flockd.review.flight_log.log import SHAPES, FlightLog, shape_of
 from flockd.review.flight_log.metadata import FlightMetadata, LearnedSize
-
-_BY_STEP = (
-    "_times", "_position", "_velocity", "_attitude", "_desired", "_command_velocity", "_command_acceleration",
-    "_ego_rotation", "_ego_translation", "_ego_inlier_ratio", "_own_velocity", "_neighbour_position",
-    "_neighbour_velocity", "_detection_position", "_false_tracks", "_goal", "_obstacle_range",
-)  # fmt: skip
-"""Arrays with a row for each step."""
 
 
 class FlightLogBuilder:
     """Builds the log of ``drones`` drones whose steps begin at ``times`` (S,) s; NaN where nothing is added."""
 
     def __init__(self, times: FloatArray, drones: int) -> None:
-        steps, n, nan = len(times), drones, np.nan
-        self._times = times
-        self._position, self._velocity = np.full((steps, n, 3), nan), np.full((steps, n, 3), nan)
-        self._attitude = np.full((steps, n, 3, 3), nan)
-        self._desired = np.full((steps, 2), nan)
-        self._goal = np.full((steps, 2), nan)
-        self._command_velocity, self._command_acceleration = np.full((steps, n, 2), nan), np.full((steps, n, 2), nan)
-        self._ego_rotation, self._ego_translation = np.full((steps, n, 3, 3), nan), np.full((steps, n, 3), nan)
-        self._ego_inlier_ratio = np.full((steps, n), nan)
-        self._own_velocity = np.full((steps, n, 3), nan)
-        self._neighbour_position, self._neighbour_velocity = (np.full((steps, n, n, 3), nan) for _ in range(2))
-        self._detection_position = np.full((steps, n, n, 3), nan)
-        self._obstacle_range = np.full((steps, n, SECTORS), nan)
-        self._false_tracks = np.zeros((steps, n), np.int64)
-        self._false_so_far: list[set[int]] = [set() for _ in range(n)]
+        self._drones = drones
+        self._rows = {
+            name: np.full(shape_of(name, len(times), drones), np.nan)
+            for name in SHAPES.keys() - {"clearance", "truth_position", "truth_velocity"}
+        }
+        self._rows["time_s"], self._rows["false_tracks"] = times, np.zeros((len(times), drones), np.int64)
+        self._false_so_far: list[set[int]] = [set() for _ in range(drones)]
         self._tracked: list[tuple[float, ...]] = []
         self._stages: dict[str, list[float]] = {}
-        self._mission_over = [False] * n
+        self._mission_over = [False] * drones
         self._sizes: dict[int, LearnedSize] = {}
 
     def add_truth(self, step: int, position: FloatArray, velocity: FloatArray, R_ned_body: FloatArray) -> None:
@@ -48,12 +33,13 @@ class FlightLogBuilder:
 
         Call it before `add_output` of the same step, which matches estimates to it.
         """
-        self._position[step], self._velocity[step], self._attitude[step] = position, velocity, R_ned_body
+        for name, state in (("position", position), ("velocity", velocity), ("attitude", R_ned_body)):
+            self._rows[name][step] = state
 
     @property
     def true_path(self) -> tuple[FloatArray, FloatArray]:
         """Positions (S, N, 3) m and velocities (S, N, 3) m/s NED: of a flight on exact states its own companion."""
-        return self._position, self._velocity
+        return self._rows["position"], self._rows["velocity"]
 
     def add_missions(
         self, step: int, desired: FloatArray, missions: Sequence[MissionStatus], homes: FloatArray | None = None
@@ -64,7 +50,7 @@ class FlightLogBuilder:
         whose mission was over in an earlier step has no goal any more. Call it in order of the steps.
         """
         same = (desired == desired[0]).all()
-        self._desired[step] = desired[0] if same else desired.mean(axis=0)
+        self._rows["desired"][step] = desired[0] if same else desired.mean(axis=0)
         goals = [
             tuple(np.round(mission.goal + (0.0 if homes is None else homes[i]), 3).tolist())
             for i, mission in enumerate(missions)
@@ -73,31 +59,28 @@ class FlightLogBuilder:
         for i, mission in enumerate(missions):
             self._mission_over[i] |= mission.takeover is not None
         if goals:
-            self._goal[step] = Counter(goals).most_common(1)[0][0]
+            self._rows["goal"][step] = Counter(goals).most_common(1)[0][0]
 
     def add_obstacles(self, step: int, i: int, seen: ObstacleRanges) -> None:
         """What drone ``i`` knew of them."""
-        self._obstacle_range[step, i] = np.where(seen.seen_m > 0, seen.range_m, np.nan)
+        self._rows["obstacle_range"][step, i] = np.where(seen.seen_m > 0, seen.range_m, np.nan)
 
     def add_exact_states(
-        self, step: int, i: int, others: BoolArray, relative: FloatArray, velocities: FloatArray,
-        command: FloatArray, acceleration: FloatArray,
-    ) -> None:  # fmt: skip
+        self, step: int, i: int, others: BoolArray, relative: FloatArray, velocities: FloatArray, command: FloatArray
+    ) -> None:
         """What drone ``i`` was given of the others in a flight with exact states, and its command.
 
         ``others`` (N,) is true for those that ``relative`` (N - 1, 3) m NED are of; ``velocities`` (N, 3) m/s NED.
         """
-        self._neighbour_position[step, i, others] = relative
-        self._neighbour_velocity[step, i, others] = velocities[others]
-        self._own_velocity[step, i] = velocities[i]
-        self._command_velocity[step, i], self._command_acceleration[step, i] = command, acceleration
+        self._rows["neighbour_position"][step, i, others] = relative
+        self._rows["neighbour_velocity"][step, i, others] = velocities[others]
+        self._rows["own_velocity_estimate"][step, i] = velocities[i]
+        self._rows["command_velocity"][step, i] = command
 
-    def add_output(
-        self, step: int, i: int, output: PilotOutput, R_ned_body: FloatArray, stages_ms: Mapping[str, float]
-    ) -> None:
-        """What the pilot of drone ``i`` estimated and commanded, with the attitude (3, 3) from its autopilot."""
-        if np.isfinite(self._position[step]).all():
-            self._match(step, i, output, R_ned_body)
+    def add_output(self, step: int, i: int, output: PilotOutput, stages_ms: Mapping[str, float]) -> None:
+        """What the pilot of drone ``i`` estimated and commanded."""
+        if np.isfinite(self._rows["position"][step]).all():
+            self._match(step, i, output)
         for neighbour in output.neighbours:
             if neighbour.confirmed:
                 self._tracked.append((float(step), float(i), float(neighbour.track), *neighbour.position.tolist()))
@@ -105,61 +88,49 @@ class FlightLogBuilder:
             self.add_obstacles(step, i, output.obstacles)
         ego = output.ego_motion
         if ego is not None:
-            self._ego_rotation[step, i], self._ego_translation[step, i] = ego.rotation, ego.translation
-            self._ego_inlier_ratio[step, i] = ego.inliers / ego.pairs
+            self._rows["ego_rotation"][step, i], self._rows["ego_translation"][step, i] = ego.rotation, ego.translation
         if output.velocity is not None:
-            self._own_velocity[step, i] = output.velocity
-        self._command_velocity[step, i] = output.command.velocity
-        self._command_acceleration[step, i] = output.command.acceleration
+            self._rows["own_velocity_estimate"][step, i] = output.velocity
+        self._rows["command_velocity"][step, i] = output.command.velocity
         size = output.size
         if size is not None and size.size_m is not None and size.sigma is not None:
-            since_s = self._sizes[i].since_s if i in self._sizes else float(self._times[step])
+            since_s = self._sizes[i].since_s if i in self._sizes else float(self._rows["time_s"][step])
             self._sizes[i] = LearnedSize(since_s=since_s, size_m=size.size_m, sigma=size.sigma, used=size.used)
         for stage, ms in stages_ms.items():
             self._stages.setdefault(stage, []).append(ms)
 
-    def _match(self, step: int, i: int, output: PilotOutput, R_ned_body: FloatArray) -> None:
-        """Match confirmed tracks and detections to true drones; confirmed tracks without a match are false."""
-        others = [j for j in range(self._position.shape[1]) if j != i]
-        true = self._position[step, others] - self._position[step, i]
+    def _match(self, step: int, i: int, output: PilotOutput) -> None:
+        """Match confirmed tracks to true drones; those without a match are false."""
+        others = [j for j in range(self._drones) if j != i]
+        true = self._rows["position"][step, others] - self._rows["position"][step, i]
         confirmed = [n for n in output.neighbours if n.confirmed]
         tracked = np.array([n.position for n in confirmed]).reshape(-1, 3)
         matches = match_neighbours(tracked, true)
         for estimate, truth in matches:
-            self._neighbour_position[step, i, others[truth]] = confirmed[estimate].position
-            self._neighbour_velocity[step, i, others[truth]] = confirmed[estimate].velocity
+            self._rows["neighbour_position"][step, i, others[truth]] = confirmed[estimate].position
+            self._rows["neighbour_velocity"][step, i, others[truth]] = confirmed[estimate].velocity
         matched = {estimate for estimate, _ in matches}
         false = {n.track for k, n in enumerate(confirmed) if k not in matched} - self._false_so_far[i]
         self._false_so_far[i] |= false
-        self._false_tracks[step, i] = len(false)
-        detected = np.array([R_ned_body @ s.position for s in output.detections]).reshape(-1, 3)
-        for estimate, truth in match_neighbours(detected, true):
-            self._detection_position[step, i, others[truth]] = detected[estimate]
+        self._rows["false_tracks"][step, i] = len(false)
 
     def cut(self, steps: int) -> None:
         """Leaves only the first ``steps`` steps: the flight ended there."""
-        for name in _BY_STEP:
-            setattr(self, name, getattr(self, name)[:steps])
+        self._rows = {name: rows[:steps] for name, rows in self._rows.items()}
         self._tracked = [row for row in self._tracked if row[0] < steps]
 
     def build(self, metadata: FlightMetadata, companion: tuple[FloatArray, FloatArray] | None) -> FlightLog:
         """The log, with positions and velocities (S, N, 3) of the companion with exact states, if there is one."""
-        drones = self._position.shape[1]
-        truth_position, truth_velocity = companion or (np.zeros((0, drones, 3)), np.zeros((0, drones, 3)))
-        metadata = metadata.model_copy(update={"sizes": self._sizes})
-        looked = not np.isnan(self._obstacle_range).all()
+        truth_position, truth_velocity = companion or np.zeros((2, 0, self._drones, 3))
+        rows, looked = self._rows, not np.isnan(self._rows["obstacle_range"]).all()
         return FlightLog(
-            time_s=self._times, position=self._position, velocity=self._velocity, attitude=self._attitude,
-            desired=self._desired, command_velocity=self._command_velocity,
-            command_acceleration=self._command_acceleration, ego_rotation=self._ego_rotation,
-            ego_translation=self._ego_translation, ego_inlier_ratio=self._ego_inlier_ratio,
-            own_velocity_estimate=self._own_velocity, neighbour_position=self._neighbour_position,
-            neighbour_velocity=self._neighbour_velocity, detection_position=self._detection_position,
-            false_tracks=self._false_tracks, truth_position=truth_position, truth_velocity=truth_velocity,
-            stages_ms={stage: np.array(ms) for stage, ms in self._stages.items()}, metadata=metadata,
-            tracked=np.array(self._tracked).reshape(-1, 6), goal=self._goal,
-            obstacle_range=self._obstacle_range if looked else np.zeros((0, 0, 0)),
-        )  # fmt: skip
+            **(rows if looked else {**rows, "obstacle_range": np.zeros((0, 0, 0))}),
+            truth_position=truth_position,
+            truth_velocity=truth_velocity,
+            stages_ms={stage: np.array(ms) for stage, ms in self._stages.items()},
+            metadata=metadata.model_copy(update={"sizes": self._sizes}),
+            tracked=np.array(self._tracked).reshape(-1, 6),
+        )
 
 
 def match_neighbours(estimated: FloatArray, true: FloatArray) -> list[tuple[int, int]]:

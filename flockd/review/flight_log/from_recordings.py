@@ -50,8 +50,8 @@ class _Step:
 
     time_s: float
     truth: Truth | None
-    outputs: list[tuple[int, PilotOutput, FloatArray]]
-    """Number of the drone, the output of its pilot, and its attitude (3, 3)."""
+    outputs: list[tuple[int, PilotOutput]]
+    """Number of the drone, and the output of its pilot."""
 
 
 def flight_log(recordings: Sequence[Recording], progress: Progress = lambda done, total: None) -> FlightLog:
@@ -69,11 +69,11 @@ def flight_log(recordings: Sequence[Recording], progress: Progress = lambda done
         if step.truth is not None:
             _add_truth(builder, row, step.truth, companion)
         if began_s is not None and step.outputs:
-            elapsed_s, statuses = step.time_s - began_s, [output.mission for _, output, _ in step.outputs]
+            elapsed_s, statuses = step.time_s - began_s, [output.mission for _, output in step.outputs]
             mission = recordings[0].config.mission
             builder.add_missions(row, np.array([desired_of(mission, elapsed_s, s) for s in statuses]), statuses)
-        for drone, output, R_ned_body in step.outputs:
-            builder.add_output(row, drone, output, R_ned_body, output.stages_ms)
+        for drone, output in step.outputs:
+            builder.add_output(row, drone, output, output.stages_ms)
     metadata = _metadata(recordings, names, steps[-1].time_s - steps[0].time_s, zero_s)
     return builder.build(metadata, (companion[0], companion[1]) if np.isfinite(companion).all() else None)
 
@@ -118,7 +118,7 @@ def _read(recordings: Sequence[Recording], progress: Progress) -> tuple[list[str
             _check_same(recordings, merged.truth, step.truth)
             if step.output is not None:
                 output: PilotOutput = from_json(PilotOutput, step.output)
-                merged.outputs.append((names.index(recording.drone), output, step.vehicle.R_ned_body))
+                merged.outputs.append((names.index(recording.drone), output))
     if not steps:
         raise RecordingError(f"{recordings[0].path}: holds no whole step; name another recording")
     return names, [steps[number] for number in sorted(steps)]

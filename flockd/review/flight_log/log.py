@@ -9,12 +9,39 @@ from typing import Any
 
 import numpy as np
 
-from flockd.core.messages import BoolArray, FloatArray, IntArray
+from flockd.core.messages import SECTORS, BoolArray, FloatArray, IntArray
 from flockd.review.flight_log.metadata import FlightMetadata
 
+_S, _N = -1, -2
+SHAPES: dict[str, tuple[int, ...]] = {
+    "time_s": (_S,),
+    "position": (_S, _N, 3),
+    "velocity": (_S, _N, 3),
+    "attitude": (_S, _N, 3, 3),
+    "desired": (_S, 2),
+    "command_velocity": (_S, _N, 2),
+    "ego_rotation": (_S, _N, 3, 3),
+    "ego_translation": (_S, _N, 3),
+    "own_velocity_estimate": (_S, _N, 3),
+    "neighbour_position": (_S, _N, _N, 3),
+    "neighbour_velocity": (_S, _N, _N, 3),
+    "false_tracks": (_S, _N),
+    "goal": (_S, 2),
+    "clearance": (_S, _N),
+    "obstacle_range": (_S, _N, SECTORS),
+    "truth_position": (_S, _N, 3),
+    "truth_velocity": (_S, _N, 3),
+}
+"""Of a log's arrays with a row a step; see `shape_of`."""
 _STAGE_PREFIX = "stage "
 _LEFT_AWAY = ("goal", "obstacles", "clearance", "obstacle_range")
 """From the file, where they are empty."""
+_MAY_BE_EMPTY = (*_LEFT_AWAY, "truth_position", "truth_velocity")
+
+
+def shape_of(name: str, steps: int, drones: int) -> tuple[int, ...]:
+    """Of an array of `SHAPES` in the log of so many."""
+    return tuple({_S: steps, _N: drones}.get(side, side) for side in SHAPES[name])
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,22 +63,16 @@ class FlightLog:
     """(S, 2) m/s, the flock's desired velocity: the mean of its drones', each times its pull."""
     command_velocity: FloatArray
     """(S, N, 2) m/s, the setpoint of each step."""
-    command_acceleration: FloatArray
-    """(S, N, 2) m/s^2, as of `Wanted`."""
     ego_rotation: FloatArray
     """(S, N, 3, 3) R_FC as estimated over the interval that ended with the step (Eq. 7)."""
     ego_translation: FloatArray
     """(S, N, 3) m, T_FC likewise, in body axes of the interval's start."""
-    ego_inlier_ratio: FloatArray
-    """(S, N) share of the background pairs that Algorithm 1 kept."""
     own_velocity_estimate: FloatArray
     """(S, N, 3) m/s NED, what the flocking law took for the own velocity."""
     neighbour_position: FloatArray
     """(S, N, N, 3) m NED: [s, i, j] is drone j relative to drone i by i's confirmed track of it."""
     neighbour_velocity: FloatArray
     """(S, N, N, 3) m/s NED over ground, likewise."""
-    detection_position: FloatArray
-    """(S, N, N, 3) m NED: as `neighbour_position`, of the single frame set before tracking."""
     false_tracks: IntArray
     """(S, N) confirmed tracks that match no true drone and did not count before."""
     truth_position: FloatArray
@@ -101,35 +122,9 @@ class FlightLog:
 
     def __post_init__(self) -> None:
         steps, drones = self.position.shape[:2]
-        sectors = self.obstacle_range.shape[-1]
-        companion = steps if len(self.truth_position) else 0
-        state, seen = (steps, drones, 3), (steps, drones, drones, 3)
-        expected: dict[str, tuple[int, ...]] = {
-            "time_s": (steps,),
-            "position": state,
-            "velocity": state,
-            "attitude": (*state, 3),
-            "desired": (steps, 2),
-            "command_velocity": (steps, drones, 2),
-            "command_acceleration": (steps, drones, 2),
-            "ego_rotation": (*state, 3),
-            "ego_translation": state,
-            "ego_inlier_ratio": (steps, drones),
-            "own_velocity_estimate": state,
-            "neighbour_position": seen,
-            "neighbour_velocity": seen,
-            "detection_position": seen,
-            "false_tracks": (steps, drones),
-            "goal": (steps if len(self.goal) else 0, 2),
-            "obstacles": (len(self.obstacles), 7),
-            "clearance": (steps, drones) if len(self.clearance) else (0, 0),
-            "obstacle_range": (steps, drones, sectors) if len(self.obstacle_range) else (0, 0, 0),
-            "truth_position": (companion, drones, 3),
-            "truth_velocity": (companion, drones, 3),
-        }
-        for name, shape in expected.items():
-            have = getattr(self, name).shape
-            if have != shape:
+        for name in SHAPES:
+            have, shape = getattr(self, name).shape, shape_of(name, steps, drones)
+            if have != shape and not (name in _MAY_BE_EMPTY and have[0] == 0):
                 raise ValueError(f"{name} of a flight of {steps} steps and {drones} drones is {have}, not {shape}")
 
     def save(self, path: Path) -> None:

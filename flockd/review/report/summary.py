@@ -328,7 +328,7 @@ def _own_account(log: FlightLog) -> Json:
     estimating = log.recorded & log.metadata.by_sight
     _, counts = np.unique(log.tracked[:, :2], axis=0, return_counts=True)
     return {
-        "own_motion_ratio": _mean(np.isfinite(log.ego_inlier_ratio)[1:][estimating[1:]]),
+        "own_motion_ratio": _mean(np.isfinite(log.ego_translation[1:, :, 0])[estimating[1:]]),
         "most_neighbours_tracked": int(counts.max(initial=0)) if estimating.any() and len(log.tracked) else None,
     }
 

@@ -178,8 +178,7 @@ class ExactStatePilots:
         for i in (i for i, by_hand in enumerate(self._by_hand) if not by_hand):
             others = np.arange(len(positions)) != i
             relative = positions[others] - positions[i]
-            command, acceleration = commands.velocity[i], commands.acceleration[i]
-            builder.add_exact_states(step, i, others, relative, velocities, command, acceleration)
+            builder.add_exact_states(step, i, others, relative, velocities, commands.velocity[i])
             if (seen := commands.obstacles[i]) is not None:
                 builder.add_obstacles(step, i, seen)
         return commands
@@ -276,7 +275,7 @@ class VisionPilots:
                 recorder.drain()  # simulated time stands still, so nothing need ever be dropped
                 recorder.step(frames, state, output, truth, orders.get(i))
             if builder is not None:
-                builder.add_output(step, i, output, state.R_ned_body, {"render": render_ms[i], **output.stages_ms})
+                builder.add_output(step, i, output, {"render": render_ms[i], **output.stages_ms})
         return self._commands(time_s, vehicles)
 
     def _commands(self, time_s: float, vehicles: Vehicles) -> Commands:

@@ -20,7 +20,7 @@ from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.onboard.message_json import from_json
 from flockd.onboard.recording.mcap_file import Entry, read_records
 from flockd.onboard.recording.reader import Recording
-from flockd.onboard.recording.streams import ORDER, OUTPUT, VEHICLE
+from flockd.onboard.recording.streams import ORDER, OUTPUT
 from flockd.review.flight_log.builder import FlightLogBuilder
 from flockd.review.flight_log.key_frames import KeyFrame, capture, key_frame_steps
 from flockd.review.flight_log.log import FlightLog
@@ -97,8 +97,8 @@ def fleet_log(
     over: set[str] = set()
     longest_s, spanning = 0.0, 0
     for i, config in zip(flown, configs, strict=True):
-        steps = [(rows[o.time_s], o, R) for o, R in _outputs(recordings, config.name) if o.time_s in rows]
-        for before, (row, output, R_ned_body) in zip([None, *steps], steps, strict=False):
+        steps = [(rows[one.time_s], one) for one in _outputs(recordings, config.name) if one.time_s in rows]
+        for before, (row, output) in zip([None, *steps], steps, strict=False):
             spans_more = False
             if before is not None:
                 longest_s = max(longest_s, float(times[row] - times[before[0]]))
@@ -106,7 +106,7 @@ def fleet_log(
                 spanning += spans_more
             # The log compares a motion with the truth of one frame set before: it cannot take one that spans more.
             kept = replace(output, ego_motion=None) if spans_more else output
-            builder.add_output(row, i, kept, R_ned_body, output.stages_ms)
+            builder.add_output(row, i, kept, output.stages_ms)
             statuses[row][i] = output.mission
             if output.mission.takeover is not None:
                 over.add(config.name)
@@ -182,26 +182,23 @@ def _metadata(
     )
 
 
-def _outputs(recordings: Path, drone: str) -> Iterator[tuple[PilotOutput, FloatArray]]:
-    """The output of one drone's pilot in each step of its flight, and the attitude (3, 3) from its autopilot."""
+def _outputs(recordings: Path, drone: str) -> Iterator[PilotOutput]:
+    """The output of one drone's pilot in each step of its flight."""
+    for entry in _entries(recordings, drone, OUTPUT.topic):
+        output: PilotOutput = from_json(PilotOutput, json.loads(entry.data))
+        yield output
+
+
+def _entries(recordings: Path, drone: str, topic: str) -> Iterator[Entry]:
     for path in sorted(recordings.glob(f"{drone}-*.mcap")):
-        outputs: dict[int, PilotOutput] = {}
-        attitudes: dict[int, FloatArray] = {}
-        for record in read_records(path):
-            if isinstance(record, Entry) and record.stream.topic == OUTPUT.topic:
-                outputs[record.sequence] = from_json(PilotOutput, json.loads(record.data))
-            elif isinstance(record, Entry) and record.stream.topic == VEHICLE.topic:
-                attitudes[record.sequence] = np.reshape(json.loads(record.data)["R_ned_body"], (3, 3))
-        yield from ((outputs[step], attitudes[step]) for step in sorted(outputs.keys() & attitudes.keys()))
+        yield from (one for one in read_records(path) if isinstance(one, Entry) and one.stream.topic == topic)
 
 
 def recorded_orders(recordings: Path, drone: str, zero_s: float) -> list[tuple[float, MissionOrder]]:
     """What operators ordered of a drone in flight, and when, in seconds from `zero_s` of the recording's clock."""
     return [
-        (record.time_ns / 1e9 - zero_s, from_json(MissionOrder, json.loads(record.data)))
-        for path in sorted(recordings.glob(f"{drone}-*.mcap"))
-        for record in read_records(path)
-        if isinstance(record, Entry) and record.stream.topic == ORDER.topic
+        (entry.time_ns / 1e9 - zero_s, from_json(MissionOrder, json.loads(entry.data)))
+        for entry in _entries(recordings, drone, ORDER.topic)
     ]
 
 

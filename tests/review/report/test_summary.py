@@ -81,14 +81,11 @@ def _hand_made() -> FlightLog:
         attitude=np.broadcast_to(HEADING_EAST, (STEPS, DRONES, 3, 3)).copy(),
         desired=np.tile([1.0, 0.0], (STEPS, 1)),
         command_velocity=velocity[..., :2],
-        command_acceleration=np.zeros((STEPS, DRONES, 2)),
         ego_rotation=ego_rotation,
         ego_translation=ego_translation,
-        ego_inlier_ratio=np.full((STEPS, DRONES), 0.9),
         own_velocity_estimate=velocity,
         neighbour_position=neighbour_position,
         neighbour_velocity=np.full((STEPS, DRONES, DRONES, 3), np.nan),
-        detection_position=neighbour_position,
         false_tracks=false_tracks,
         truth_position=truth_position,
         truth_velocity=truth_velocity,
@@ -295,7 +292,7 @@ def test_a_single_drone_has_no_distances() -> None:
     shared = ("time_s", "desired", "goal", "obstacles", "obstacle_range", "stages_ms", "metadata", *alone)
     for name in log.__dataclass_fields__:
         value = getattr(log, name)
-        if name in ("neighbour_position", "neighbour_velocity", "detection_position"):
+        if name in ("neighbour_position", "neighbour_velocity"):
             alone[name] = value[:, :1, :1]
         elif name not in shared:
             alone[name] = value[:, :1]
@@ -474,6 +471,6 @@ def test_the_log_keeps_what_was_learned_last_and_since_when() -> None:
     for step, size in enumerate(sizes):
         command = Wanted(np.zeros(2), np.zeros(2), 0.0)
         output = PilotOutput(0.5 * step, None, None, (), (), {}, (), command, size=size)
-        builder.add_output(step, 0, output, np.eye(3), {})
+        builder.add_output(step, 0, output, {})
     kept = builder.build(_hand_made().metadata, None).metadata.sizes
     assert kept == {0: LearnedSize(since_s=0.5, size_m=0.43, sigma=0.07, used=True)}

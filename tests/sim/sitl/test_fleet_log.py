@@ -33,7 +33,7 @@ def test_a_motion_over_a_skipped_frame_set_is_not_in_the_log(tmp_path: Path) -> 
     log = fleet_log(scenario, [config], run, tmp_path, 0.5, companion)
     np.testing.assert_allclose(log.time_s, np.array(times) - times[0])
     assert log.recorded[:, 0].tolist() == [True, True, False, True, True]
-    assert np.isfinite(log.ego_inlier_ratio[:, 0]).tolist() == [True, True, False, False, True]
+    assert np.isfinite(log.ego_translation[:, 0, 0]).tolist() == [True, True, False, False, True]
     assert log.position[:, 0, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
     metadata = log.metadata
     assert (metadata.autopilot, metadata.wall_s, metadata.drones) == ("PX4 1.18.0", 9.0, 1)
