@@ -8,8 +8,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from flockd.core.choices import PixelFormat
+from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig
 from flockd.core.config.source import CameraDeviceParameters
 from flockd.core.errors import UsageError
+from flockd.ground.calibration.fragment import rig_text
 
 USUAL_SIZE, USUAL_RATE_HZ = (640, 480), 30.0
 """What is chosen where a camera offers it."""
@@ -120,14 +122,13 @@ def sections_text(cameras: Mapping[str, tuple[FoundCamera, Mode]], turn_deg: int
             "--turn-deg is for USB cameras, and one of these needs a pipeline; add `videoflip` to each there"
         )
     sizes = {name: mode.size if turn_deg % 180 == 0 else mode.size[::-1] for name, (_, mode) in cameras.items()}
+    comment = (
+        "Written by `flockd cameras`: the cameras of this computer, as sections of a drone's configuration.",
+        "Fill in which camera looks where: exchange the names. `flockd cameras --picture FOLDER` shows what each sees.",
+        "Fill in intrinsics and extrinsics, by `flockd calibrate camera` and `flockd calibrate rig`.",
+    )
     lines = [
-        "# Written by `flockd cameras`: the cameras of this computer, as sections of a drone's configuration.",
-        "# Fill in which camera looks where: exchange the names. `flockd cameras --picture FOLDER` shows what each",
-        "# sees.",
-        "rig:",
-        "  # Fill in: intrinsics and extrinsics, by `flockd calibrate camera` and `flockd calibrate rig`.",
-        "  cameras:",
-        _rig_cameras(sizes, FIELD_OF_VIEW_DEG),
+        rig_text([_evenly(number, sizes, name) for number, name in enumerate(sizes)], comment).rstrip(),
         "source:",
         f"  kind: {'gstreamer' if as_pipelines else 'v4l2'}",
         "  cameras:",
@@ -175,26 +176,13 @@ def camera_names(count: int) -> Sequence[str]:
     return named.get(count, tuple(f"camera{number + 1}" for number in range(count)))
 
 
-def _rig_cameras(sizes: Mapping[str, tuple[int, int]], field_of_view_deg: float) -> str:
-    """The list `rig.cameras`: they look evenly around, with perfect wide-angle lenses. ``sizes`` by name, in pixels.
-
-    The field of view is that of the longer side.
-    """
-    lines = []
-    for number, (name, (width, height)) in enumerate(sizes.items()):
-        yaw_deg = 360.0 * number / len(sizes)
-        forward_m, right_m = 0.1 * math.cos(math.radians(yaw_deg)), 0.1 * math.sin(math.radians(yaw_deg))
-        focal_px = max(width, height) / 2 / math.radians(field_of_view_deg / 2)
-        lines += [
-            f"    - name: {name}",
-            f"      size_px: [{width}, {height}]",
-            f"      intrinsics: {{model: wide_angle, fx: {focal_px:.1f}, fy: {focal_px:.1f}, cx: {width / 2}, "
-            f"cy: {height / 2}}}",
-            f"      extrinsics: {{position_m: [{_plain(forward_m)}, {_plain(right_m)}, 0.0], yaw_deg: {yaw_deg:g}}}",
-        ]
-    return "\n".join((*lines, ""))
-
-
-def _plain(metres: float) -> str:
-    """To the centimetre, and never -0.0."""
-    return f"{round(metres, 2) + 0.0:g}"
+def _evenly(number: int, sizes: Mapping[str, tuple[int, int]], name: str) -> CameraConfig:
+    """One of the cameras that look evenly around, with perfect wide-angle lenses; the field of view is that of the
+    longer side."""
+    width, height = sizes[name]
+    yaw_deg = 360.0 * number / len(sizes)
+    forward_m, right_m = (round(0.1 * of(math.radians(yaw_deg)), 2) + 0.0 for of in (math.cos, math.sin))  # no -0.0
+    focal_px = round(max(width, height) / 2 / math.radians(FIELD_OF_VIEW_DEG / 2), 1)
+    lens = IntrinsicsConfig(model="wide_angle", fx=focal_px, fy=focal_px, cx=width / 2, cy=height / 2)
+    mounting = ExtrinsicsConfig(position_m=(forward_m, right_m, 0.0), yaw_deg=yaw_deg)
+    return CameraConfig(name=name, size_px=(width, height), intrinsics=lens, extrinsics=mounting)
