@@ -31,8 +31,11 @@ _READABLE, _WRITABLE = 0o004, 0o022
 def check_limits(config: DroneConfig) -> Iterator[Finding]:
     """``config`` as it is flown."""
     speed, layer = f"{config.flocking.max_speed_m_s:g} m/s at most", config.safety.first_flight_layer
-    height = f"{config.mission.height_m:g} m above the ground at home"
-    yield passed("first flight", f"off: {speed}" if layer is None else f"on: layer {layer}, {height}, {speed}")
+    if layer is None:
+        yield passed("first flight", f"off: {speed}")
+    else:
+        height = f"{config.mission.height_m:g} m above the ground at home"
+        yield passed("first flight", f"on: layer {layer}, {height}, {speed}")
     for key, text in beyond_envelope(config).items():
         measured, _, fix = text.partition("; ")
         yield warned(key_text(key), measured, fix)
