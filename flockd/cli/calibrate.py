@@ -71,8 +71,7 @@ def _add_shared(parser: Parser, help_of_config: str) -> None:
 
 def _board_of(args: argparse.Namespace) -> BoardSpec:
     """The board of the options. Raises UsageError for one that cannot be."""
-    from flockd.ground.calibration.board import BoardSpec
-    from flockd.ground.calibration.errors import CalibrationError
+    from flockd.ground.calibration.board import BoardSpec, CalibrationError
 
     square_m = args.square_mm / 1000.0
     marker_m = args.marker_mm / 1000.0 if args.marker_mm else MARKER_SHARE * square_m
@@ -167,7 +166,7 @@ def _camera(args: argparse.Namespace) -> int:
 
 
 def _print_board(args: argparse.Namespace, board: BoardSpec) -> int:
-    from flockd.ground.calibration.errors import CalibrationError
+    from flockd.ground.calibration.board import CalibrationError
     from flockd.ground.calibration.paper import board_file, page_of
     from flockd.onboard.recording.editing import written_whole
 
@@ -189,7 +188,7 @@ def _print_board(args: argparse.Namespace, board: BoardSpec) -> int:
 def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, ImageStream]:
     """The images of the one camera that is meant, and its name."""
     from flockd.ground.calibration import image_sources
-    from flockd.ground.datasets.video import SUFFIXES
+    from flockd.ground.datasets.image_files import SUFFIXES
 
     config = loaded(args.config)
     path = None if args.source is None else Path(args.source)
@@ -293,7 +292,7 @@ def _rig(args: argparse.Namespace) -> int:
 
 def _by_board(args: argparse.Namespace, out: Path) -> int:
     from flockd.ground.calibration.board import BoardFinder
-    from flockd.ground.calibration.shared import SharedCollector
+    from flockd.ground.calibration.rig_session import SharedCollector
 
     session = _session(args)
     names = [camera.name for camera in session.config.rig.cameras]
@@ -425,7 +424,7 @@ def _drone(args: argparse.Namespace) -> int:
 
 
 def _distances(args: argparse.Namespace) -> list[tuple[float, Path]]:
-    from flockd.ground.calibration.distances import MAX_DISTANCE_M, read_distances
+    from flockd.ground.calibration.drone_size import MAX_DISTANCE_M, read_distances
 
     if (args.source is None) == (not args.distance):
         raise UsageError("name the pictures and their distances, either in a YAML file or with --distance M PICTURE...")

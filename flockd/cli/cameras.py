@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flockd.cli.config import write_checked
 from flockd.cli.options import refuse_overwriting
 from flockd.cli.output import cell, complain, say, say_json
 from flockd.cli.parser import Commands, flag, option, positive_number, size
@@ -89,9 +90,7 @@ def run(args: argparse.Namespace, computer: Computer) -> int:
 
 
 def _write(file: Path, usable: Sequence[tuple[FoundCamera, Mode]], names: Sequence[str] | None, turn_deg: int) -> None:
-    from flockd.cli.config_new import write_checked
     from flockd.ground.cameras.found import camera_names, sections_text
-    from flockd.ground.cameras.sections import camera_names, sections_text
 
     if not usable:
         raise UsageError(f"{file} was not written, as no camera can be used; see what is wrong with each above")

@@ -22,8 +22,8 @@ from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
     from flockd.core.messages import MissionOrder
-    from flockd.fleet.page.fleet_source import FleetSource
-    from flockd.fleet.page.page_connections import PageConnections
+    from flockd.fleet.fleet_source import FleetSource
+    from flockd.fleet.page.page_access import PageConnections
     from flockd.fleet.page.page_server import PageServer
     from flockd.fleet.watcher import FleetWatcher
 
@@ -276,7 +276,7 @@ async def serve_page(page: PageServer, address: str, port: int, served: Callable
     """
     from aiohttp import web
 
-    from flockd.fleet.page.page_connections import PageConnections
+    from flockd.fleet.page.page_access import PageConnections
 
     runner = web.AppRunner(page.application(), access_log=None, shutdown_timeout=1.0)
     await runner.setup()
@@ -301,7 +301,7 @@ async def _listen(connections: PageConnections, address: str, port: int) -> int:
 
 def _open_source(args: argparse.Namespace, stack: ExitStack) -> FleetSource:
     """As the options say; what has to be closed is left to ``stack``."""
-    from flockd.fleet.page.live_fleet import LiveFleet
+    from flockd.fleet.live_fleet import LiveFleet
     from flockd.fleet.page.recorded_fleet import RecordedFleet
     from flockd.fleet.watcher import FleetWatcher
 

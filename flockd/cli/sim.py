@@ -371,7 +371,7 @@ def _fly_live(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) ->
     """Until Ctrl-C."""
     import aiohttp.web  # noqa: F401 - before anything is opened: it is of an extra
 
-    from flockd.fleet.page.live_fleet import LiveFleet
+    from flockd.fleet.live_fleet import LiveFleet
     from flockd.fleet.page.page_access import PageAccess
     from flockd.fleet.page.page_server import PageServer
     from flockd.fleet.simulation import SimulationLink, key_of

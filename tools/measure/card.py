@@ -36,6 +36,7 @@ from flockd.core.choices import SimulatedPerception
 from flockd.core.config.loader import Overrides
 from flockd.core.data import data_path
 from flockd.flight.inference.hashes import model_hashes
+from flockd.review.replay.profile import Kernel
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import load_scenario
 
@@ -219,7 +220,7 @@ def _rounded(value: float) -> float:
 
 def document(commit: str, date: str, lines: Sequence[Line], *, quick: bool) -> dict[str, Any]:
     """What docs/figures.json holds."""
-    computer = Computer.this()
+    computer = Kernel().computer()
     files = {name: one.file for name, one in SCENARIOS.items()}
     networks: dict[str, str] = {}
     for file in sorted(set(files.values())):
@@ -229,7 +230,7 @@ def document(commit: str, date: str, lines: Sequence[Line], *, quick: bool) -> d
         "date": date,
         "quick": quick,
         "command": f"python -m tools.measure.card{' --quick' * quick}",
-        "machine": f"{computer.name}, {computer.cores} cores, Python {platform.python_version()}",
+        "machine": f"{computer['name']}, {computer['cores']} cores, Python {platform.python_version()}",
         "networks": networks,
         "flown_s": round(sum(line["wall_s"] for line in lines)),
         "figures": {figure: {"name": MEASURES[figure].name, "unit": MEASURES[figure].unit} for figure in FIGURES},

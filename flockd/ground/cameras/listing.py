@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from flockd.ground.cameras.found import ControlRange, FoundCamera, Mode
-from flockd.onboard.sources.gstreamer_formats import FORMATS
+from flockd.onboard.sources.gstreamer_device import FORMATS
 from flockd.onboard.sources.v4l2_device import CAN_CAPTURE, CAPTURE, FOURCC, camera_flags, controls_of
 from flockd.onboard.sources.v4l2_kernel import (
     VIDIOC_ENUM_FMT,

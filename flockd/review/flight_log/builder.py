@@ -133,14 +133,14 @@ class FlightLogBuilder:
         )
 
 
-def match_neighbours(estimated: FloatArray, true: FloatArray) -> list[tuple[int, int]]:
+def match_neighbours(estimated: FloatArray, true: FloatArray, within_m: float = 1.0) -> list[tuple[int, int]]:
     """Greedy assignment of estimates to drones: (estimate, drone) index pairs, one to one, the nearest pair first.
 
     `estimated` (m, 3) and `true` (n, 3) are metres relative to one observer, which is not among them. No pair is
-    farther apart than 1 m or a quarter of the true range, whichever is more.
+    farther apart than `within_m` or a quarter of the true range, whichever is more.
     """
     distances = np.linalg.norm(estimated[:, None] - true[None], axis=2)
-    allowed = np.maximum(1.0, 0.25 * np.linalg.norm(true, axis=1))
+    allowed = np.maximum(within_m, 0.25 * np.linalg.norm(true, axis=1))
     pairs: list[tuple[int, int]] = []
     for flat in np.argsort(distances, axis=None, kind="stable"):
         estimate, drone = divmod(int(flat), len(true))

@@ -16,7 +16,7 @@ import numpy as np
 from flockd.core.errors import UnavailableError, UsageError
 from flockd.core.messages import Detection, FloatArray, PilotOutput, UInt8Array
 from flockd.flight.geometry import Rig, build_rig
-from flockd.onboard.recording.codec import from_json
+from flockd.onboard.message_json import from_json
 from flockd.onboard.recording.reader import Recording
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.style import FEW, PLATE, PLATE_INK, PLATE_MUTED, colour_of, line, rgb, rig_place, ring, write

@@ -12,8 +12,8 @@ import numpy as np
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.flocking.metrics import closest_distances, connectivity, obj1, obj2, order, safety, union
+from flockd.review.flight_log.builder import match_neighbours
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.flight_log.truth_matching import match_neighbours
 
 TAIL_S = 10.0
 """The end of a flight, over which the flock counts as converged."""
