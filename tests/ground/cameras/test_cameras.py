@@ -157,7 +157,7 @@ def test_what_is_written_checks_and_names_the_devices(computer: type[_Shelf], ca
     capsys.readouterr()
 
     assert main(["cameras", "--write", str(file)]) == 2
-    assert capsys.readouterr().err == f"{file} exists; name another file, or overwrite it with --force\n"
+    assert capsys.readouterr().err == f"{file}: exists; name another file, or overwrite it with --force\n"
     assert main(["cameras", "--write", str(file), "--force", "--names", "left", "right"]) == 0
     assert [camera.name for camera in load_drone(file).rig.cameras] == ["left", "right"]
     capsys.readouterr()
