@@ -12,7 +12,6 @@ from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import RangeReading
 from flockd.flight.safety import link_lost
-from flockd.flight.tracking.weave_path import HEIGHT_GAIN_PER_S
 from flockd.ground.doctor.examination import Finding, Level, failed, failed_from_error, graded, passed, warned
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware
 from flockd.onboard.autopilot.clock_sync import ClockEstimate
@@ -45,7 +44,6 @@ PARAMETERS: dict[str, type[int] | type[float]] = {
     "GF_MAX_HOR_DIST": float,
     "GF_MAX_VER_DIST": float,
     "CP_DIST": float,
-    "MPC_Z_P": float,
 }
 """Those of PX4 that are judged, each as PX4 declares it."""
 
@@ -257,8 +255,6 @@ def judge_parameter(name: str, value: float, config: DroneConfig) -> Finding:
             return _judge_limit(name, value, gate.max_height_m, "max_height_m")
         case "CP_DIST":
             return _judge_collision_prevention(name, value, config)
-        case "MPC_Z_P":
-            return _judge_height_gain(name, value, config)
     return _judge_action(name, ACTIONS[name], int(value), config)
 
 
@@ -299,17 +295,6 @@ def _judge_collision_prevention(name: str, value: float, config: DroneConfig) ->
         measured = f"{value:g}: PX4 ignores the distances that autopilot.obstacle_distance sends"
         return warned(name, measured, "set CP_DIST to the distance to keep, in metres")
     return passed(name, f"{value:g}: PX4 stops no pilot before obstacles")
-
-
-def _judge_height_gain(name: str, value: float, config: DroneConfig) -> Finding:
-    """In 1/s: by it others know how far a drone moves that weaves (`tracking.weave_path`)."""
-    if config.flocking.size == "off":
-        return passed(name, f"{value:g}: nobody weaves (flocking.size)")
-    if abs(value - HEIGHT_GAIN_PER_S) <= MOST_GAIN_OFF_PER_S:
-        return passed(name, f"{value:g}: a weave moves the drone as far as the others take it to")
-    measured = f"{value:g}: a weave moves the drone otherwise than the others take it to, who then judge ranges wrong"
-    fix = f"set {name} to {HEIGHT_GAIN_PER_S:g} on every drone of the fleet, or flocking.size to off"
-    return warned(name, measured, fix)
 
 
 def _judge_limit(name: str, value: float, own_m: float | None, what: str) -> Finding:

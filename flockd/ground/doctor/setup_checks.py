@@ -11,7 +11,7 @@ from pathlib import Path
 
 from flockd.core.config import DroneConfig
 from flockd.core.config.document import key_text
-from flockd.core.config.envelope import beyond_envelope
+from flockd.core.config.real_drone import beyond_envelope
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.core.secrets import masked

@@ -224,12 +224,6 @@ def test_collision_prevention_is_on_where_flockd_sends_for_it(value: float, leve
     assert (finding.about, finding.level) == ("CP_DIST", level)
 
 
-def test_where_nobody_weaves_any_gain_of_height_is_well() -> None:
-    config = _config(14540)
-    still = config.model_copy(update={"flocking": config.flocking.model_copy(update={"size": "off"})})
-    assert judge_parameter("MPC_Z_P", 0.5, still).level is Level.PASS
-
-
 def test_a_fence_with_corners_reaches_as_far_as_the_farthest_inside_the_circle() -> None:
     gate = GateParameters(fence_radius_m=None, fence_corners_m=((30.0, 40.0), (0.0, 10.0), (-10.0, 0.0)))
     config = _config(14540).model_copy(update={"safety": SafetyParameters(gate=gate)})
