@@ -27,7 +27,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from flockd.ground.doctor.computer import Computer
 from scipy.stats import binom
 
 from flockd.campaign.campaign_file import Figure

@@ -15,8 +15,7 @@ from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, VehicleSta
 from flockd.core.side_process import SideProcess
 from flockd.flight.perception import ImageNetworks, load_networks
 from flockd.flight.pilot import FlockPilot, StepTrace
-from flockd.review.flight_log.capture import capture
-from flockd.review.flight_log.key_frames import KeyFrame
+from flockd.review.flight_log.key_frames import KeyFrame, capture
 from flockd.sim.flock.truth_perception import RenderTruth, TruthPerception
 from flockd.sim.scenario import ScenarioConfig
 
