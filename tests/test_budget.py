@@ -23,13 +23,13 @@ LINES = {
     "flockd/core": 3_340,
     "flockd/flight": 14_740,
     "flockd/onboard": 11_330,
-    "flockd/fleet": 2_690,
-    "flockd/ground": 5_980,
-    "flockd/review": 4_090,
+    "flockd/fleet": 2_630,
+    "flockd/ground": 5_580,
+    "flockd/review": 3_880,
     "flockd/sim": 12_190,
     "flockd/campaign": 2_270,
     "flockd/cli": 4_700,
-    "tests": 48_350,
+    "tests": 48_290,
     "tools/checks": 3_780,
     "tools/docs": 970,
     "tools/measure": 1_220,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_610,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 441}
+FILES = {"flockd": 401}
 NUMBERS_OF_FLIGHT = 529
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
