@@ -188,7 +188,7 @@ def _print_board(args: argparse.Namespace, board: BoardSpec) -> int:
 def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, ImageStream]:
     """The images of the one camera that is meant, and its name."""
     from flockd.ground.calibration import image_sources
-    from flockd.ground.datasets.image_files import SUFFIXES
+    from flockd.ground.datasets.image_files import VIDEO_SUFFIXES
 
     config = loaded(args.config)
     path = None if args.source is None else Path(args.source)
@@ -210,7 +210,7 @@ def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, 
         return name, image_sources.from_cameras(live, str(path), args.seconds, enough)
     if path.is_dir():
         return name, image_sources.from_folder(path, name)
-    if path.suffix.lower() in SUFFIXES and path.is_file():
+    if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file():
         return name, image_sources.from_video(path, name, args.every)
     fault = "is no folder, video or recording; name one of these" if path.exists() else "does not exist; check the path"
     raise UsageError(f"{path}: {fault}")

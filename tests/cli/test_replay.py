@@ -34,8 +34,7 @@ Capture = pytest.CaptureFixture[str]
 def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A recorded flight of the made-up pilot, which will also be the one to fly it again."""
     monkeypatch.setattr("flockd.review.replay.recorded_flight.FlockPilot", MadeUpPilot)
-    for module in ("recorded_flight", "fidelity"):
-        monkeypatch.setattr(f"flockd.review.replay.{module}.model_hashes", lambda perception: MODELS)
+    monkeypatch.setattr("flockd.review.replay.recorded_flight.model_hashes", lambda perception: MODELS)
     path = tmp_path / "drone1.mcap"
     record(path)
     return path

@@ -169,6 +169,7 @@ def test_a_key_given_twice_is_refused(tmp_path: Path) -> None:
     assert "first in line 6" in problem.message
 
 
+@pytest.mark.parametrize(("escape", "shown"), [("\\0", "0x0000"), ("\\ud800", "0xd800")])
 def test_a_text_that_no_program_takes_is_refused(escape: str, shown: str, tmp_path: Path) -> None:
     """In a pipeline it killed the camera's thread, after the check had passed it."""
     source = f"""\
