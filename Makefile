@@ -11,7 +11,7 @@ LOCK := requirements/service.txt
 COMPILE = $(BIN)/uv pip compile --quiet --no-header --no-annotate --only-binary=:all: pyproject.toml -
 
 .DEFAULT_GOAL := help
-.PHONY: help demo live docs lint test test-all browser training ray coverage ros faults breakages mutants references wheel release deb container lock sbom clean
+.PHONY: help demo live docs lint test test-all browser training ray coverage ros faults flights breakages mutants references wheel release deb container lock sbom clean
 
 help:
 	@sed -n 's/^\([a-z-]*\):.* ## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -33,7 +33,7 @@ lint: $(VENV)/test.installed ### ruff and mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: lint ## lint and all tests but the slow ones, on two cores in about 6 minutes
+test: lint ## lint and all tests but the slow ones, on two cores in about 10 minutes
 	$(BIN)/python -m pytest -n 2 -m "not slow and not browser and not ros and not ray and not training" --durations=10 --durations-min=1
 
 test-all: lint ### lint and all tests, those too that take minutes each
@@ -42,8 +42,11 @@ test-all: lint ### lint and all tests, those too that take minutes each
 ros: $(ROS_VENV)/ros.installed ### what needs ROS 2: nodes in processes of their own, cameras by topic; with the times it takes
 	$(ROS_VENV)/bin/python -m pytest -m ros -rP tests/fleet/ros tests/onboard/sources tests/tools/release/test_licences.py
 
-faults: $(VENV)/test.installed ### the slow stories of faults, most of a whole daemon, and whole flights: 20 s from pixels, two daemons, PX4's test card
-	$(BIN)/python -m pytest -n 2 -m "slow and (fault or whole_flight) and not browser and not ros" --durations=10
+faults: $(VENV)/test.installed ### the slow stories of faults of a whole daemon
+	$(BIN)/python -m pytest -n 2 -m "slow and fault and not whole_flight and not browser and not ros" --durations=10
+
+flights: $(VENV)/test.installed ### flights of minutes: encounters, 20 s from pixels, two daemons, PX4's test card; in about half an hour
+	$(BIN)/python -m pytest -n 2 -m "slow and whole_flight and not browser and not ros" --durations=10
 
 training: $(VENV)/test.installed $(VENV)/train.installed ### the tests of the networks' training, with torch (0.9 GB; with CUDA several)
 	$(BIN)/python -m pytest -m training tests/tools/training

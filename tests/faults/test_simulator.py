@@ -14,7 +14,7 @@ import pytest
 from tests.faults.stories import Reacted
 from tests.sitl.test_fleet import _left_behind, _processes, _scenario
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.whole_flight]
 SECONDS_TO_START = 180.0
 
 
