@@ -153,7 +153,7 @@ def _plain(kind: Any, value: Json, key: str, *, bounded: bool) -> Any:
     if kind is float and not isinstance(value, bool):
         if not bounded and isinstance(value, int | float | str):
             return _exact(value, key)
-        if value is None or isinstance(value, int | float):
+        if value is None or isinstance(value, int) or (isinstance(value, float) and math.isfinite(value)):
             return _in_bounds(value, key)
     elif kind is int and isinstance(value, int) and not isinstance(value, bool):
         if abs(value) <= LARGEST_INT:
@@ -176,7 +176,7 @@ def _exact(value: float | str, key: str) -> float:
 def _in_bounds(value: float | None, key: str) -> float | None:
     name = key.partition("[")[0]
     largest = next((most for unit, most in LARGEST_OF_UNIT.items() if name.endswith(unit)), LARGEST_NUMBER)
-    if value is not None and not abs(value) <= largest:  # nor NaN
+    if value is not None and abs(value) > largest:
         raise ValueError(f"{key} is beyond {largest:g}")
     return value
 
