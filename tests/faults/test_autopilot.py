@@ -324,6 +324,8 @@ async def test_a_large_jump_of_the_local_frame_or_the_heading_ends_in_hold(
         await ship.until_event("asking: the autopilot's estimate of position or heading has jumped")
         what = "heading" if heading_off_rad else "local frame"
         assert sum(event.startswith(f"the autopilot's {what} jumped by ") for event in ship.events) == 1
+        asked_m_s = [asked.sink_m_s for at_s, asked in list(fake_autopilot.setpoints) if at_s > jumped_s]
+        assert all(abs(sink_m_s) < 0.3 for sink_m_s in asked_m_s), "not even one setpoint follows the jump"
         assert -float(fake_autopilot.state.position[2]) == pytest.approx(height_m, abs=0.4)
 
 
