@@ -18,26 +18,19 @@ from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from flockd.core.config import DroneConfig
-    from flockd.core.messages import UInt8Array
-    from flockd.flight.geometry import Camera
     from flockd.ground.calibration.board import BoardSpec
     from flockd.ground.calibration.drone_size import DroneSize, Photograph
     from flockd.ground.calibration.image_sources import ImageStream
-    from flockd.ground.calibration.rig_session import RigSession
     from flockd.ground.calibration.views import Collector
-
-    Taken = tuple[str, float, UInt8Array, Camera]
-    """A picture's name, its distance in metres, the image and its camera."""
 
 SECONDS = 120.0
 MARKER_SHARE = 0.75
 MOST_VIEWS = 60
 NAMED = 6
 """How many of the refused images are named one by one."""
-_RECORDING = ".mcap"
 _DRONE_NOTES = """\
 A distance is from the lens to the drone's middle. Photograph the drone alone, from several sides and at two or more
-distances, at least 30 pixels wide. Of a recording, the drone stays at that distance all the time."""
+distances, at least 30 pixels wide."""
 
 
 def add(commands: Commands) -> None:
@@ -100,7 +93,7 @@ def _add_camera(commands: Commands) -> None:
     """Adds the command."""
     examples = (
         "flockd calibrate camera --print-board board.pdf",
-        "flockd calibrate camera pictures/ --camera front --picture coverage.png",
+        "flockd calibrate camera pictures/ --camera front",
         "flockd calibrate camera clip.mp4 --every 5 --model wide_angle",
         "flockd calibrate camera drone1.mcap --camera left",
         "flockd calibrate camera /dev/video0 --size 640x480",
@@ -115,7 +108,6 @@ def _add_camera(commands: Commands) -> None:
     option(parser, "--views N", "use N views at most (60)", positive_count, default=MOST_VIEWS)
     option(parser, "--max-blur PX", "widest edge of a sharp view (4)", positive_number)
     option(parser, "--serial TEXT", "the camera's serial number, where the device does not give it")
-    option(parser, "--picture FILE", "draw the coverage and the residuals (.png)", Path)
     option(parser, "--size WxH", "of a /dev/video (640x480)", size, default=(640, 480))
     option(parser, "--pixel-format", "of a /dev/video (mjpeg)", choices=get_args(PixelFormat), default="mjpeg")
     option(
@@ -126,7 +118,7 @@ def _add_camera(commands: Commands) -> None:
         choices=(0, 90, 180, 270),
         default=0,
     )
-    option(parser, "--print-board FILE", "write the board to print (.pdf, .png)", Path)
+    option(parser, "--print-board FILE", "write the board to print (.pdf)", Path)
     _add_shared(parser, "the drone, for its camera's device and serial")
     parser.set_defaults(run=_camera)
 
@@ -138,13 +130,13 @@ def _camera(args: argparse.Namespace) -> int:
     from flockd.ground.calibration.board import BoardFinder
     from flockd.ground.calibration.fragment import measured_today
     from flockd.ground.calibration.intrinsics import simplest_that_fits
-    from flockd.ground.calibration.lens_session import CalibratedLens, collect_views, fit_lenses, is_enough
+    from flockd.ground.calibration.lens_session import collect_views, fit_lenses, is_enough, lens_result, write_lens
     from flockd.ground.calibration.views import Collector
 
     collector = Collector(BoardFinder(board), args.views, args.max_blur)
     name, images = _images(args, lambda: is_enough(collector))
     out = args.out or Path(f"{name}.yaml")
-    refuse_overwriting(args, out, args.picture)
+    refuse_overwriting(args, out)
     with progress("detecting the board", "images") as on_image, _ended_by_ctrl_c(images.live):
         collect_views(images, name, collector, on_image, complain)
     lenses = fit_lenses(collector, args.model, _source_name(args))
@@ -155,9 +147,9 @@ def _camera(args: argparse.Namespace) -> int:
         views=len(lens.views),
         residual_px=round(lens.rms_px, 4),
     )
-    calibrated = CalibratedLens(name, collector, lens, lenses, measured)
-    calibrated.write(out, args.picture)
-    result = calibrated.as_json(out)
+    intrinsics = write_lens(name, lens, measured, out).model_dump(mode="json")
+    numbers = lens_result(lens, lenses, collector)
+    result = {"camera": name, "intrinsics": intrinsics, **numbers, "out": str(out)}
     if args.json:
         say_json(result)
     else:
@@ -167,13 +159,15 @@ def _camera(args: argparse.Namespace) -> int:
 
 def _print_board(args: argparse.Namespace, board: BoardSpec) -> int:
     from flockd.ground.calibration.board import CalibrationError
-    from flockd.ground.calibration.paper import board_file, page_of
+    from flockd.ground.calibration.paper import board_pdf, page_of
     from flockd.onboard.recording.editing import written_whole
 
     file: Path = args.print_board
     refuse_overwriting(args, file)
+    if file.suffix.lower() != ".pdf":
+        raise UsageError(f"{file}: a board is written as .pdf; give it such a name")
     try:
-        data = board_file(board, file.suffix)
+        data = board_pdf(board)
     except CalibrationError as error:
         raise UsageError(f"{file}: {error}") from None
     with written_whole(file) as draft:
@@ -291,22 +285,27 @@ def _rig(args: argparse.Namespace) -> int:
 
 
 def _by_board(args: argparse.Namespace, out: Path) -> int:
+    from flockd.flight.geometry import build_rig
     from flockd.ground.calibration.board import BoardFinder
-    from flockd.ground.calibration.rig_session import SharedCollector
+    from flockd.ground.calibration.extrinsics import calibrate_rig
+    from flockd.ground.calibration.rig_session import SharedCollector, collect_boards, write_fit
 
-    session = _session(args)
-    names = [camera.name for camera in session.config.rig.cameras]
-    if len(names) < 2:
-        raise UsageError(f"{session.where}: has one camera; a rig that is calibrated by a board has two or more")
-    reference = args.reference or names[0]
-    if reference not in names:
-        raise UsageError(f"{session.where}: has no camera {reference!r}; choose --reference from {', '.join(names)}")
+    config, images = _rig_images(args)
+    where, rig = str(args.config or args.source), build_rig(config.rig).cameras
+    if len(rig) < 2:
+        raise UsageError(f"{where}: has one camera; a rig that is calibrated by a board has two or more")
+    reference = args.reference or next(iter(rig))
+    if reference not in rig:
+        raise UsageError(f"{where}: has no camera {reference!r}; choose --reference from {', '.join(rig)}")
     collector = SharedCollector(BoardFinder(_board_of(args)))
-    with progress("detecting the board", "images") as on_image, _ended_by_ctrl_c(session.images.live):
-        session.collect_boards(
-            collector, on_image, lambda links: complain(f"boards seen together: {links}; Ctrl-C ends it")
-        )
-    return _say_rig(args, session.by_board(collector.boards, reference, out))
+    with progress("detecting the board", "images") as on_image, _ended_by_ctrl_c(images.live):
+        collect_boards(
+            images, config, where, collector, on_image,
+            lambda links: complain(f"boards seen together: {links}; Ctrl-C ends it"),
+        )  # fmt: skip
+    cameras = {name: one.camera for name, one in rig.items()}
+    fit = calibrate_rig(cameras, collector.boards, reference, rig[reference].T_body_camera)
+    return _say_rig(args, write_fit(fit, config, where, _source_name(args), images.identities, out))
 
 
 def _from_flight(args: argparse.Namespace, out: Path) -> int:
@@ -327,13 +326,6 @@ def _from_flight(args: argparse.Namespace, out: Path) -> int:
         taken = " and ".join(one["taken"]) or "nothing"
         say(f"{name}: {one['found']}; taken over: {taken}")
     return _written(result)
-
-
-def _session(args: argparse.Namespace) -> RigSession:
-    from flockd.ground.calibration.rig_session import RigSession
-
-    config, images = _rig_images(args)
-    return RigSession(config, str(args.config or args.source), _source_name(args), images)
 
 
 def _rig_images(args: argparse.Namespace) -> tuple[DroneConfig, ImageStream]:
@@ -385,18 +377,16 @@ def _add_drone(commands: Commands) -> None:
     """Adds the command."""
     examples = (
         "flockd calibrate drone --distance 3.0 a.jpg b.jpg --distance 5.0 c.jpg d.jpg --fov 70",
-        "flockd calibrate drone distances.yaml --config my_drone.yaml --camera front",
-        "flockd calibrate drone --distance 4.0 hover.mcap --every 10",
+        "flockd calibrate drone --distance 2.5 near/ --distance 4.0 far/ --config my_drone.yaml --camera front",
     )
     parser = commands("drone", "Measure the drones' size, as the networks see it.", examples, _DRONE_NOTES)
-    parser.add_argument("source", metavar="DISTANCES", nargs="?", type=Path, help="YAML: `pictures`, file, distance_m")
     parser.add_argument(
         "--distance",
         metavar=("M", "PICTURE"),
         nargs="+",
         action="append",
         default=[],
-        help="metres, and the images, folders, videos or recordings taken there; may be given again",
+        help="metres, and the images, folders or videos taken there; may be given again",
     )
     option(parser, "--every N", "take every Nth frame (1)", positive_count, default=1)
     option(parser, "--out FILE", "where the result goes (drone_size.yaml)", Path)
@@ -413,7 +403,7 @@ def _drone(args: argparse.Namespace) -> int:
     out = args.out or Path("drone_size.yaml")
     refuse_overwriting(args, out)
     size = fit_size(list(_photographs(args, _distances(args))))
-    source = str(args.source) if args.source else ", ".join(f"{one[0]} m: {len(one) - 1}" for one in args.distance)
+    source = ", ".join(f"{one[0]} m: {len(one) - 1}" for one in args.distance)
     with written_whole(out) as draft:
         draft.write_text(size.fragment(source), encoding="utf-8")
     if args.json:
@@ -423,13 +413,12 @@ def _drone(args: argparse.Namespace) -> int:
     return ExitCode.DONE
 
 
-def _distances(args: argparse.Namespace) -> list[tuple[float, Path]]:
-    from flockd.ground.calibration.drone_size import MAX_DISTANCE_M, read_distances
+def _distances(args: argparse.Namespace) -> list[tuple[float, list[Path]]]:
+    """Metres, and the pictures taken there."""
+    from flockd.ground.calibration.drone_size import MAX_DISTANCE_M
 
-    if (args.source is None) == (not args.distance):
-        raise UsageError("name the pictures and their distances, either in a YAML file or with --distance M PICTURE...")
-    if args.source is not None:
-        return read_distances(args.source)
+    if not args.distance:
+        raise UsageError("name the pictures and their distances with --distance M PICTURE...")
     listed = []
     for text, *pictures in args.distance:
         try:
@@ -440,68 +429,33 @@ def _distances(args: argparse.Namespace) -> list[tuple[float, Path]]:
             raise UsageError(f"--distance: {text} is more than {MAX_DISTANCE_M:g} m; write metres")
         if not pictures:
             raise UsageError(f"--distance {text}: names no picture; write the pictures taken there after the metres")
-        listed += [(distance_m, Path(picture)) for picture in pictures]
+        listed.append((distance_m, [Path(picture) for picture in pictures]))
     return listed
 
 
-def _photographs(args: argparse.Namespace, distances: Sequence[tuple[float, Path]]) -> Iterator[Photograph]:
+def _photographs(args: argparse.Namespace, distances: Sequence[tuple[float, list[Path]]]) -> Iterator[Photograph]:
     """With what is detected in each picture, of unknown size."""
     from flockd.ground.calibration.drone_size import Photograph, SizeCandidate
-    from flockd.ground.pictures import PictureDetector
+    from flockd.ground.pictures.picture_files import find_pictures
+    from flockd.ground.pictures.single_frame import PictureDetector
 
-    recordings = [path for _, path in distances if path.suffix == _RECORDING]
-    cameras = None
-    if args.config is not None or args.fov is not None or len(recordings) < len(distances):
-        cameras = PictureCameras(args)
-    detector = PictureDetector(perception_of(args, None if cameras is None else cameras.config, drone_size_m=None))
+    cameras = PictureCameras(args)
+    taken = [(distance_m, picture) for distance_m, paths in distances for picture in find_pictures(paths)]
+    detector = PictureDetector(perception_of(args, cameras.config, drone_size_m=None))
+    done = 0
     with progress("detecting", "pictures") as tell:
-        for number, (name, distance_m, image, camera) in enumerate(_taken(args, distances, cameras), start=1):
-            found = detector.detect(image, camera).detections
-            tell(number, max(number, len(distances)))
-            yield Photograph(
-                name,
-                distance_m,
-                tuple(
+        for distance_m, picture in taken:
+            for name, image in picture.images(args.every):
+                found = detector.detect(image, cameras.of(name, (image.shape[1], image.shape[0]))).detections
+                done += 1
+                tell(done, max(done, len(taken)))
+                candidates = (
                     SizeCandidate(
                         distance_m * one.size_m / one.range_m, one.range_sigma_m / one.range_m, one.probability
                     )
                     for one in found
-                ),
-            )
-
-
-def _taken(
-    args: argparse.Namespace, distances: Sequence[tuple[float, Path]], cameras: PictureCameras | None
-) -> Iterator[Taken]:
-    from flockd.ground.pictures import find_pictures
-
-    for distance_m, path in distances:
-        if path.suffix == _RECORDING:
-            yield from _of_recording(args, distance_m, path, None if cameras is None else cameras.config)
-            continue
-        assert cameras is not None
-        for picture in find_pictures([path]):
-            for name, image in picture.images(args.every):
-                yield name, distance_m, image, cameras.of(name, (image.shape[1], image.shape[0]))
-
-
-def _of_recording(
-    args: argparse.Namespace, distance_m: float, path: Path, config: DroneConfig | None
-) -> Iterator[Taken]:
-    """Frames of every camera, or of --camera."""
-    from flockd.flight.geometry import build_rig
-
-    recording = opened(path)
-    rig = build_rig((config or recording.config).rig)
-    if args.camera is not None and args.camera not in rig.cameras:
-        raise UsageError(f"{path}: has no camera {args.camera!r}; choose --camera from {', '.join(rig.cameras)}")
-    for step in recording.steps():
-        if step.number % args.every:
-            continue
-        for name, frame in step.frames.frames.items():
-            if name in rig.cameras and args.camera in {None, name}:
-                label = f"{path} {step.frames.time_s - recording.start_s:.2f} s, {name}"
-                yield label, distance_m, frame.image, rig.cameras[name].camera
+                )
+                yield Photograph(name, distance_m, tuple(candidates))
 
 
 def _say_drone(size: DroneSize, out: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
@@ -86,45 +85,3 @@ class Coverage:
             for j, (a, b) in enumerate(pairwise((0, 3, 5, COLUMNS)))
         ]
         return max(zones)[2]
-
-
-@dataclass(frozen=True, eq=False)
-class Plot:
-    """What is drawn over the image: every corner, and how far the fit is off there."""
-
-    pixels: FloatArray
-    """(n, 2)"""
-    residuals: FloatArray
-    """(n, 2) seen less predicted, pixels."""
-
-
-_WIDTH_PX = 960
-_BACKGROUND, _COVERED, _OUTSIDE = (24, 24, 30), (46, 66, 52), (0, 0, 0)
-_LINES, _DOT, _ARROW, _TEXT = (70, 70, 78), (120, 220, 255), (255, 120, 80), (235, 235, 235)
-_ARROW_SCALE = 50.0
-"""A residual of one pixel is drawn this long, in the image's own pixels."""
-
-
-def draw(coverage: Coverage, plot: Plot, title: str) -> UInt8Array:
-    """(h, w, 3) RGB image: the cells with corners lighter, each corner a dot, its residual a line, 50 times."""
-    width, height = coverage.size
-    scale = _WIDTH_PX / width
-    image = np.empty((round(height * scale), _WIDTH_PX, 3), np.uint8)
-    for row in range(ROWS):
-        for column in range(COLUMNS):
-            top, bottom = (round(edge * image.shape[0] / ROWS) for edge in (row, row + 1))
-            left, right = (round(edge * _WIDTH_PX / COLUMNS) for edge in (column, column + 1))
-            covered, imaged = coverage.counts[row, column] > 0, coverage.imaged[row, column]
-            image[top:bottom, left:right] = _COVERED if covered else _BACKGROUND if imaged else _OUTSIDE
-            cv2.rectangle(image, (left, top), (right, bottom), _LINES, 1)
-    for seen, residual in zip(plot.pixels, plot.residuals, strict=True):
-        start, end = seen * scale, (seen + residual * _ARROW_SCALE) * scale
-        cv2.line(image, _point(start), _point(end), _ARROW, 1, cv2.LINE_AA)
-        cv2.circle(image, _point(start), 2, _DOT, -1, cv2.LINE_AA)
-    bar = np.full((36, _WIDTH_PX, 3), _OUTSIDE, np.uint8)
-    cv2.putText(bar, title, (10, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.55, _TEXT, 1, cv2.LINE_AA)
-    return np.concatenate([bar, image])
-
-
-def _point(place: FloatArray) -> tuple[int, int]:
-    return round(float(place[0])), round(float(place[1]))

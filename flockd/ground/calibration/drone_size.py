@@ -6,19 +6,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
-from flockd.core.config.base import Section
-from flockd.core.config.document import read_document
-from flockd.core.config.loader import validated
 from flockd.core.config.perception import MAX_DRONE_SIZE_M, MIN_DRONE_SIZE_M
 from flockd.core.messages import FloatArray
 from flockd.ground.calibration.board import CalibrationError
 
+MAX_DISTANCE_M = 200.0
+"""Nobody measures more with a tape, and no network detects a drone there."""
 MIN_PICTURES = 4
 """Fewer cannot show that one of them is wrong."""
 AGREEMENT = 0.2
@@ -184,28 +181,3 @@ def _refuse_contradictions(sized: Sequence[SizedPhotograph]) -> None:
         f"the pictures contradict each other: the drone's size is {np.median(sizes):.2f} m by {used} of them, and "
         f"{others}{more}; check the distances, and that nothing else in the pictures looks like a drone"
     )
-
-
-MAX_DISTANCE_M = 200.0
-"""Nobody measures more with a tape, and no network detects a drone there."""
-
-
-class DistanceConfig(Section):
-    """Pictures at one distance."""
-
-    file: Annotated[str, Field(min_length=1)]
-    """An image, a folder of images, a video or a recording; relative paths count from the YAML file's folder."""
-    distance_m: Annotated[float, Field(gt=0, le=MAX_DISTANCE_M)]
-    """From the camera's lens to the drone's middle."""
-
-
-class DistancesConfig(Section):
-    """The whole file."""
-
-    pictures: Annotated[tuple[DistanceConfig, ...], Field(min_length=1)]
-
-
-def read_distances(path: Path) -> list[tuple[float, Path]]:
-    """Distances in metres, with what was photographed there. Raises ConfigError with all that is wrong."""
-    listed = validated(DistancesConfig, read_document(path, "list of distances"))
-    return [(one.distance_m, path.parent / one.file) for one in listed.pictures]

@@ -7,12 +7,15 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
+import numpy as np
 import yaml
 
-from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, MeasurementConfig, RigConfig
-from flockd.core.messages import FloatArray
-from flockd.flight.geometry import RigidTransform, build_rig, euler_from_rotation
+from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, MeasurementConfig
+from flockd.flight.geometry import RigidTransform, euler_from_rotation
 from flockd.ground.calibration.intrinsics import Lens
+
+_R_FRD_RDF = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""``R_body_camera`` of a camera that is mounted without any turn."""
 
 
 def measured_today(**facts: Any) -> MeasurementConfig:
@@ -30,7 +33,7 @@ def intrinsics_of(lens: Lens, measured: MeasurementConfig) -> IntrinsicsConfig:
 
 def extrinsics_of(T_body_camera: RigidTransform, measured: MeasurementConfig) -> ExtrinsicsConfig:
     """A mounting as configuration: ten thousandths of a degree, hundredths of a millimetre."""
-    roll, pitch, yaw = euler_from_rotation(T_body_camera.rotation @ _looking_forward().T)
+    roll, pitch, yaw = euler_from_rotation(T_body_camera.rotation @ _R_FRD_RDF.T)
     x, y, z = (round(float(value), 5) + 0.0 for value in T_body_camera.translation)
     return ExtrinsicsConfig(
         position_m=(x, y, z),
@@ -43,30 +46,16 @@ def extrinsics_of(T_body_camera: RigidTransform, measured: MeasurementConfig) ->
 
 def rig_text(cameras: Sequence[CameraConfig], comment: Sequence[str], time_offset_s: float = 0.0) -> str:
     """A YAML file with a `rig` section and nothing else; ``comment``: lines to stand above it."""
-    lines = [*(f"# {line}".rstrip() for line in comment), "rig:"]
-    if time_offset_s:
-        lines.append(f"  time_offset_s: {time_offset_s:.4f}")
-    lines.append("  cameras:")
+    rig: dict[str, Any] = {"time_offset_s": round(time_offset_s, 4)} if time_offset_s else {}
+    rig["cameras"] = []
     for camera in cameras:
         values = camera.model_dump(mode="json", exclude_defaults=True)
-        model = {"model": camera.intrinsics.model}  # worth saying, although it may be the default
-        values["intrinsics"] = {**model, **values["intrinsics"]}
-        for number, (key, value) in enumerate(values.items()):
-            lines.append(f"    {'-' if number == 0 else ' '} {key}:{_value(value)}")
-    return "\n".join(lines) + "\n"
-
-
-def _value(value: object) -> str:
-    if not isinstance(value, dict):
-        return " " + yaml.safe_dump(value, default_flow_style=True, width=math.inf).removesuffix("...\n").strip()
-    lines = []
-    for key, inner in value.items():
-        text = yaml.safe_dump(inner, default_flow_style=True, sort_keys=False, width=math.inf, allow_unicode=True)
-        lines.append(f"        {key}: {text.removesuffix('...' + chr(10)).strip()}")
-    return "\n" + "\n".join(lines)
-
-
-def _looking_forward() -> FloatArray:
-    """(3, 3) ``R_body_camera`` of a camera that is mounted without any turn."""
-    plain = CameraConfig(name="any", size_px=(64, 64), intrinsics=IntrinsicsConfig(fx=1.0, fy=1.0, cx=1.0, cy=1.0))
-    return build_rig(RigConfig(cameras=(plain,))).cameras["any"].T_body_camera.rotation
+        values["intrinsics"] = {
+            "model": camera.intrinsics.model,
+            **values["intrinsics"],
+        }  # worth saying, if the default
+        rig["cameras"].append(values)
+    text: str = yaml.safe_dump(
+        {"rig": rig}, default_flow_style=None, sort_keys=False, width=math.inf, allow_unicode=True
+    )
+    return "".join(f"# {line}".rstrip() + "\n" for line in comment) + text

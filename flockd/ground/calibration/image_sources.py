@@ -93,10 +93,11 @@ def from_recording(recording: Recording, every: int) -> tuple[ImageStream, Drone
         for step in recording.steps()
         if step.number % every == 0
     )
-    devices = {} if config.source is None else {camera.name: camera.place for camera in config.source.cameras}
+    places = {} if config.source is None else {camera.name: f", {camera.place}" for camera in config.source.cameras}
     identities = {
-        camera.name: _known(config, camera.name)
-        or f"not known ({camera.name} of {recording.drone}{_at(devices.get(camera.name))})"
+        camera.name: camera.intrinsics.measured.camera
+        if camera.intrinsics.measured
+        else f"not known ({camera.name} of {recording.drone}{places.get(camera.name, '')})"
         for camera in config.rig.cameras
     }
     return ImageStream(sets, -(-len(recording.contents.steps) // every), live=False, identities=identities), config
@@ -176,15 +177,6 @@ def _frames(source: FrameSource, seconds: float, enough: Callable[[], bool]) -> 
 
 def _images(folder: Path) -> list[Path]:
     return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
-
-
-def _known(config: DroneConfig, camera: str) -> str | None:
-    measured = next(one.intrinsics.measured for one in config.rig.cameras if one.name == camera)
-    return measured.camera if measured else None
-
-
-def _at(device: str | None) -> str:
-    return f", {device}" if device else ""
 
 
 def _text(file: Path) -> str:

@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import cv2
-import numpy as np
 
 from flockd.core.choices import LENS_MODELS, LensModel
 from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, MeasurementConfig
 from flockd.ground.calibration.board import CalibrationError
-from flockd.ground.calibration.coverage import Plot, draw
 from flockd.ground.calibration.fragment import intrinsics_of, rig_text
 from flockd.ground.calibration.image_sources import ImageStream
 from flockd.ground.calibration.intrinsics import Lens, calibrate, rough_tilts_deg
-from flockd.ground.calibration.views import Collector, all_pixels
+from flockd.ground.calibration.views import Collector
 from flockd.onboard.recording.editing import written_whole
 
 ENOUGH_VIEWS, ENOUGH_SHARE = 20, 0.9
@@ -80,73 +75,39 @@ def fit_lenses(collector: Collector, model: LensModel | None, source: str) -> li
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class CalibratedLens:
-    """The best lens of a session, with what it was chosen from."""
+def write_lens(camera: str, lens: Lens, measured: MeasurementConfig, out: Path) -> IntrinsicsConfig:
+    """Writes a drone with this one camera as YAML, and gives the lens as configuration."""
+    intrinsics = intrinsics_of(lens, measured)
+    comment = (
+        f"The lens of camera {camera}, written by `flockd calibrate camera`. Copy `intrinsics` to the camera of this",
+        "name in your drone's file, then run `flockd config check` on that; this file too is a drone with one camera.",
+    )
+    config = CameraConfig(name=camera, size_px=lens.camera.size, intrinsics=intrinsics)
+    with written_whole(out) as draft:
+        draft.write_text(rig_text((config,), comment), encoding="utf-8")
+    return intrinsics
 
-    camera: str
-    collector: Collector
-    lens: Lens
-    lenses: Sequence[Lens]
-    """One of each model that was fitted."""
-    measured: MeasurementConfig
 
-    @property
-    def intrinsics(self) -> IntrinsicsConfig:
-        """As configuration."""
-        return intrinsics_of(self.lens, self.measured)
-
-    def write(self, out: Path, plot: Path | None) -> None:
-        """Writes a drone with this one camera as YAML, and, where asked for, coverage and residuals as PNG."""
-        camera = CameraConfig(name=self.camera, size_px=self.lens.camera.size, intrinsics=self.intrinsics)
-        comment = (
-            f"The lens of camera {self.camera}, written by `flockd calibrate camera`. Copy `intrinsics` to the camera "
-            "of this",
-            "name in your drone's file, then run `flockd config check` on that; this file too is a drone with one "
-            "camera.",
-        )
-        with written_whole(out) as draft:
-            draft.write_text(rig_text((camera,), comment), encoding="utf-8")
-        if plot is not None:
-            with written_whole(plot) as draft:
-                draft.write_bytes(self._plot_png())
-
-    def as_json(self, out: Path) -> dict[str, Any]:
-        """Numbers for machines: pixels, degrees, residuals by view, and advice. ``out``: where it was written."""
-        lens, coverage = self.lens, self.collector.coverage
-        assert coverage is not None
-        advice = list(coverage.advice(lens.tilts_deg))
-        if not lens.reaches_corners:
-            advice.append("show the board in the corners of the image: the fitted lens does not reach them")
-        names = [view.name for view in lens.views]
-        return {
-            "camera": self.camera,
-            "size_px": list(lens.camera.size),
-            "intrinsics": self.intrinsics.model_dump(mode="json"),
-            "sigma_px": {key: float(value) for key, value in zip(("fx", "fy", "cx", "cy"), lens.sigma, strict=False)},
-            "field_of_view_deg": [angle if math.isfinite(angle) else None for angle in lens.field_of_view_deg],
-            "residual_px": {
-                "rms": lens.rms_px,
-                "max": lens.max_px,
-                "views": dict(zip(names, lens.rms_of_views_px, strict=True)),
-            },
-            "models": {one.model: {"rms_px": one.rms_px} for one in self.lenses},
-            "coverage": coverage.share,
-            "views": len(lens.views),
-            "refused": self.collector.counts(),
-            "blurred": {one.name: one.edge_px for one in self.collector.refused if one.why == "blurred"},
-            "dropped": {view.name: value for view, value in lens.dropped},
-            "advice": advice,
-            "out": str(out),
-        }
-
-    def _plot_png(self) -> bytes:
-        coverage = self.collector.coverage
-        assert coverage is not None
-        residuals = np.concatenate(self.lens.residuals())
-        title = f"{self.camera}: {100 * coverage.share:.0f} % covered, rms {self.lens.rms_px:.3f} px (lines: x 50)"
-        image = draw(coverage, Plot(all_pixels(self.lens.views), residuals), title)
-        return bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1])
+def lens_result(lens: Lens, lenses: Sequence[Lens], collector: Collector) -> dict[str, Any]:
+    """Numbers for machines: pixels, degrees, residuals by view, and advice. ``lenses``: one of each fitted model."""
+    assert collector.coverage is not None
+    advice = list(collector.coverage.advice(lens.tilts_deg))
+    if not lens.reaches_corners:
+        advice.append("show the board in the corners of the image: the fitted lens does not reach them")
+    of_views = dict(zip((view.name for view in lens.views), lens.rms_of_views_px, strict=True))
+    return {
+        "size_px": list(lens.camera.size),
+        "sigma_px": {key: float(value) for key, value in zip(("fx", "fy", "cx", "cy"), lens.sigma, strict=False)},
+        "field_of_view_deg": [angle if math.isfinite(angle) else None for angle in lens.field_of_view_deg],
+        "residual_px": {"rms": lens.rms_px, "max": lens.max_px, "views": of_views},
+        "models": {one.model: {"rms_px": one.rms_px} for one in lenses},
+        "coverage": collector.coverage.share,
+        "views": len(lens.views),
+        "refused": collector.counts(),
+        "blurred": {one.name: one.edge_px for one in collector.refused if one.why == "blurred"},
+        "dropped": {view.name: value for view, value in lens.dropped},
+        "advice": advice,
+    }
 
 
 def _next_step(collector: Collector) -> str:

@@ -1,13 +1,9 @@
-"""The board on paper, in its true size: a PNG that knows its resolution, or a page of PDF."""
+"""The board on paper, in its true size: a page of PDF."""
 
 from __future__ import annotations
 
-import struct
 import zlib
 
-import cv2
-
-from flockd.core.messages import UInt8Array
 from flockd.ground.calibration.board import BoardSpec, CalibrationError
 
 _PIXELS_PER_MM = 12
@@ -25,44 +21,15 @@ _PAGES_MM = {
 }
 
 
-def board_file(spec: BoardSpec, suffix: str) -> bytes:
-    """The whole file, for `.png` or `.pdf`. Raises CalibrationError for another suffix and for a board too large."""
+def board_pdf(spec: BoardSpec) -> bytes:
+    """One page (ISO 32000-1): the board, what it is, and a line to check the printer with.
+
+    Raises CalibrationError for a board that is too large to print.
+    """
     pixels_per_square = round(spec.square_m * 1000.0 * _PIXELS_PER_MM)
     if not 8 <= pixels_per_square <= _LARGEST_PIXELS // max(spec.columns, spec.rows):
         raise CalibrationError(f"squares of {spec.square_m * 1000:g} mm cannot be printed; choose another size")
     image = spec.image(pixels_per_square)
-    if suffix.lower() == ".png":
-        return _png(image, pixels_per_square / spec.square_m)
-    if suffix.lower() == ".pdf":
-        return _pdf(spec, image)
-    raise CalibrationError(f"a board is written as .png or .pdf, not as {suffix or 'a file without a suffix'}")
-
-
-def page_of(spec: BoardSpec) -> str:
-    """The smallest sheet of paper that the board fits on with its margin, or the size of one made for it."""
-    name, (width, height) = _page(spec)
-    return name or f"{width:.0f} x {height:.0f} mm"
-
-
-def _page(spec: BoardSpec) -> tuple[str, tuple[float, float]]:
-    """Name and millimetres, the longer side across; no name for a size of its own."""
-    width, height = (1000.0 * spec.square_m * squares for squares in (spec.columns, spec.rows))
-    for name, (page_width, page_height) in _PAGES_MM.items():
-        if width + 2 * _MARGIN_MM <= page_width and height + 2 * _MARGIN_MM <= page_height:
-            return name, (page_width, page_height)
-    return "", (width + 2 * _MARGIN_MM, height + 2 * _MARGIN_MM)
-
-
-def _png(image: UInt8Array, pixels_per_m: float) -> bytes:
-    data = bytes(cv2.imencode(".png", image)[1])
-    after_header = 33  # signature 8, IHDR 25: where pHYs has to stand, before the image data
-    body = b"pHYs" + struct.pack(">IIB", round(pixels_per_m), round(pixels_per_m), 1)
-    chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
-    return data[:after_header] + chunk + data[after_header:]
-
-
-def _pdf(spec: BoardSpec, image: UInt8Array) -> bytes:
-    """One page (ISO 32000-1): the image, what it is, and a line to check the printer with."""
     page_width, page_height = (side * _POINTS_PER_MM for side in _page(spec)[1])
     width, height = (1000.0 * spec.square_m * squares * _POINTS_PER_MM for squares in (spec.columns, spec.rows))
     left, bottom = (page_width - width) / 2, (page_height - height) / 2
@@ -97,6 +64,21 @@ def _pdf(spec: BoardSpec, image: UInt8Array) -> bytes:
     head = b"xref\n0 %d\n0000000000 65535 f \n" % (len(objects) + 1)
     tail = b"trailer\n<< /Size %d /Root 1 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (len(objects) + 1, len(data))
     return data + head + table + tail
+
+
+def page_of(spec: BoardSpec) -> str:
+    """The smallest sheet of paper that the board fits on with its margin, or the size of one made for it."""
+    name, (width, height) = _page(spec)
+    return name or f"{width:.0f} x {height:.0f} mm"
+
+
+def _page(spec: BoardSpec) -> tuple[str, tuple[float, float]]:
+    """Name and millimetres, the longer side across; no name for a size of its own."""
+    width, height = (1000.0 * spec.square_m * squares for squares in (spec.columns, spec.rows))
+    for name, (page_width, page_height) in _PAGES_MM.items():
+        if width + 2 * _MARGIN_MM <= page_width and height + 2 * _MARGIN_MM <= page_height:
+            return name, (page_width, page_height)
+    return "", (width + 2 * _MARGIN_MM, height + 2 * _MARGIN_MM)
 
 
 def _stream(entries: str, data: bytes) -> bytes:

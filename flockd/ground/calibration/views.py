@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal
@@ -34,7 +33,7 @@ class View:
     """Name of the file, or the frame's number or time."""
     seen: BoardDetection
     edge_px: float
-    """See `sharpness.edge_width_px`."""
+    """See `edge_width_px`."""
 
 
 @dataclass(frozen=True)
@@ -126,11 +125,6 @@ def sharp_px(width: int) -> float:
 def is_still(before: BoardDetection, now: BoardDetection, width: int) -> bool:
     """Whether a board was held still from one frame to the next, in images of this width."""
     return _apart(before, now, width) < _STILL
-
-
-def all_pixels(views: Sequence[View]) -> FloatArray:
-    """(n, 2) the corners of all views."""
-    return np.concatenate([view.seen.pixels for view in views])
 
 
 def _apart(first: BoardDetection, second: BoardDetection, width: int) -> float:

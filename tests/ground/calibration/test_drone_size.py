@@ -12,16 +12,10 @@ import pytest
 import yaml
 
 from flockd.cli import main
-from flockd.core.config import DroneConfig
 from flockd.core.config.perception import PerceptionConfig
-from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
-from flockd.core.messages import Frame, FrameSet, PilotOutput, VehicleState
 from flockd.ground.calibration.board import CalibrationError
 from flockd.ground.calibration.drone_size import DroneSize, Photograph, SizeCandidate, fit_size
-from flockd.ground.datasets.image_files import read_image
-from flockd.onboard.recording import Recorder
-from tests.ground.pictures.photographs import DRONE_SIZE_M, FOCAL_PX, FOV_DEG, RENDERED, SIZE, truth
-from tests.make import filled
+from tests.ground.pictures.photographs import DRONE_SIZE_M, FOV_DEG, RENDERED, truth
 
 Capture = pytest.CaptureFixture[str]
 FOV = ("--fov", f"{FOV_DEG:g}")
@@ -134,50 +128,22 @@ def test_rendered_photographs_give_the_drones_size(capsys: Capture, tmp_path: Pa
     assert "exists; name another file, or overwrite it with --force" in capsys.readouterr().err
 
 
-def test_a_recording_at_one_distance_gives_it_too(capsys: Capture, tmp_path: Path) -> None:
-    """By the recorded rig's camera; four steps, of which every one shows the drone at 2.5 m or so."""
-    lens = IntrinsicsConfig(fx=FOCAL_PX, fy=FOCAL_PX, cx=SIZE[0] / 2, cy=SIZE[1] / 2)
-    config = DroneConfig(rig=RigConfig(cameras=(CameraConfig(name="front", size_px=SIZE, intrinsics=lens),)))
-    flight = tmp_path / "hover.mcap"
-    with Recorder(flight, drone="drone1", config=config) as recorder:
-        for step in range(5):
-            image = read_image(RENDERED / f"2.5_m_{2 * (step % 2)}.jpg")
-            frames = FrameSet(10.0 + step, {"front": Frame("front", image, 10.0 + step, step)})
-            recorder.step(frames, VehicleState(10.0 + step, np.eye(3), 1.0), filled(PilotOutput, 0.5))
-            recorder.drain()
-    out = tmp_path / "size.yaml"
-    assert main(["calibrate", "drone", "--distance", "2.5", str(flight), "--out", str(out), "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert result["drone_size_m"] == pytest.approx(DRONE_SIZE_M, rel=0.06)
-    assert [one["file"] for one in result["pictures"]] == [f"{flight} {step:.2f} s, front" for step in range(5)]
-
-
-def test_a_list_of_distances_with_mistakes_is_refused(capsys: Capture, tmp_path: Path) -> None:
-    """Two of four pictures at 2.5 m listed as of 5 m, as from a wrong note: twice the size."""
+def test_wrong_distances_are_refused(capsys: Capture, tmp_path: Path) -> None:
+    """Three of six pictures at 2.5 m are said to be of 5 m, as from a wrong note: twice the size."""
     for k in range(3):
-        shutil.copy(RENDERED / f"2.5_m_{k}.jpg", tmp_path)
         shutil.copy(RENDERED / f"2.5_m_{k}.jpg", tmp_path / f"again_{k}.jpg")
-    rows = [f"  - {{file: 2.5_m_{k}.jpg, distance_m: 2.5}}" for k in range(3)]
-    rows += [f"  - {{file: again_{k}.jpg, distance_m: 5}}" for k in range(3)]
-    listed = tmp_path / "distances.yaml"
-    listed.write_text("\n".join(["pictures:", *rows]))
-    out = ("--out", str(tmp_path / "size.yaml"))
-    assert main(["calibrate", "drone", str(listed), *FOV, *out]) == 1
+    given = ("--distance", "2.5", *sorted(map(str, RENDERED.glob("2.5_*"))), "--distance", "5", str(tmp_path))
+    assert main(["calibrate", "drone", *given, *FOV, "--out", str(tmp_path / "size.yaml")]) == 1
     error = capsys.readouterr().err
     assert "the pictures contradict each other" in error
     assert error.count("\n") == 1
     assert not (tmp_path / "size.yaml").exists()
-    listed.write_text("pictures:\n  - {file: a.jpg, distance_m: far}\n  - {file: b.jpg}\n")
-    assert main(["calibrate", "drone", str(listed), *FOV, *out]) == 78
-    error = capsys.readouterr().err
-    assert f"{listed}:2: pictures[0].distance_m: " in error
-    assert f"{listed}:3: pictures[1].distance_m: " in error
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ((), "name the pictures and their distances, either in a YAML file or with --distance"),
+        ((), "name the pictures and their distances with --distance"),
         (("--distance", "3"), "--distance 3: names no picture"),
         (("--distance", "near", "a.jpg"), "'near' is not a positive number; write metres, then the pictures"),
         (("--distance", "300", "a.jpg"), "300 is more than 200 m"),
