@@ -21,7 +21,7 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_340,
-    "flockd/flight": 14_740,
+    "flockd/flight": 14_770,
     "flockd/onboard": 11_330,
     "flockd/fleet": 2_630,
     "flockd/ground": 5_410,
@@ -29,7 +29,7 @@ LINES = {
     "flockd/sim": 12_190,
     "flockd/campaign": 2_270,
     "flockd/cli": 4_650,
-    "tests": 48_260,
+    "tests": 48_300,
     "tools/checks": 3_780,
     "tools/docs": 970,
     "tools/measure": 1_220,
@@ -38,7 +38,7 @@ LINES = {
 }
 """Lines of Python below a folder."""
 FILES = {"flockd": 401}
-NUMBERS_OF_FLIGHT = 529
+NUMBERS_OF_FLIGHT = 528
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
 """A budget that is farther above what there is is to be lowered."""

@@ -166,7 +166,6 @@ def test_two_drones_whose_autopilots_obey_a_little_late_and_weakly_stay_apart(
 
 
 @pytest.mark.fault("autopilot-obeys-late")
-@pytest.mark.xfail(strict=True, reason="0.12 m: the gate reckons with 0.5 s, and the velocity's error tells in 13 s")
 def test_two_drones_whose_autopilots_obey_a_second_late_and_weakly_stay_apart(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -189,5 +188,5 @@ def test_an_autopilot_that_does_not_obey_ends_in_hold_with_the_reason(
 def _held_for_what_carries_them_off(met: Encounter) -> None:
     """Both; said by the daemons themselves."""
     assert met.fleet.handed_over.keys() == {"drone1", "drone2"}
-    assert all("off the setpoints, more than" in why for why in met.fleet.handed_over.values()), met.fleet.handed_over
+    assert all("off the setpoints" in why for why in met.fleet.handed_over.values()), met.fleet.handed_over
     assert all(modes == ["OFFBOARD", "LOITER"] for modes in met.fleet.modes.values())

@@ -19,7 +19,7 @@ from flockd.flight.geometry.transform import RigidTransform
 
 _MAX_PAIRS = 800
 """Drawn of more: each costs two residuals a step."""
-_FLOW_SIGMA_PX = 0.3
+FLOW_SIGMA_PX = 0.3
 _DEPTH_SIGMA = 0.05
 """Relative error of depth. Only its ratio to the flow's error matters: their common size is found from the
 residuals."""
@@ -178,7 +178,7 @@ class _Weighting:
     @classmethod
     def learned(cls, state: _Reprojection, typical: BoolArray) -> _Weighting:
         """From the parallax of all residuals, and the size of the ``typical`` (m,) ones."""
-        white_by = whitening(state.parallaxes, _FLOW_SIGMA_PX, _DEPTH_SIGMA)
+        white_by = whitening(state.parallaxes, FLOW_SIGMA_PX, _DEPTH_SIGMA)
         squared = (times(white_by, state.residuals) ** 2).sum(axis=0)
         # Outliers under a half do not move the median, which for a Rayleigh distribution is sqrt(2 ln 2) sigma.
         sigma = max(math.sqrt(median(squared[typical]) / (2.0 * math.log(2.0))), 1e-3)

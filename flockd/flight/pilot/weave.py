@@ -12,6 +12,7 @@ import numpy as np
 
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import Neighbour
+from flockd.flight.safety.gate import COLUMN
 from flockd.flight.tracking.weave_path import (
     AMPLITUDE_SIGMA,
     ASKED_M,
@@ -43,9 +44,6 @@ _MOST_UNLIKE = 3 * AMPLITUDE_SIGMA
 _ALIKE = AMPLITUDE_SIGMA
 """... and after two in a row whose shares are so near it weaves no more: its autopilot follows heights otherwise. A
 gate that holds it does not hold it twice alike."""
-_COLUMN = 1.5
-"""Level distance, in the gate's degraded separations, within which no other drone may be when it begins: nearer to one
-above or below the gate lets it rise or sink no more, as it also does later."""
 
 
 class Weave:
@@ -165,5 +163,5 @@ class Weave:
         )
 
     def _is_near(self, neighbours: Sequence[Neighbour]) -> bool:
-        column_m = _COLUMN * self._gate.degraded_separation_m
+        column_m = COLUMN * self._gate.degraded_separation_m
         return any(one.confirmed and math.hypot(*one.position[:2]) < column_m for one in neighbours)

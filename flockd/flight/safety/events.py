@@ -61,6 +61,8 @@ class Inputs:
     """How late the event loop runs."""
     velocity_error_m_s: float
     """How strongly the drone was carried off its setpoints in the last seconds."""
+    velocity_late_s: float
+    """By how much later than expected it follows them."""
     dead_tasks: tuple[str, ...]
     """Names of tasks that have ended and should not have."""
     neighbours_age_s: float
@@ -176,7 +178,15 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
     temperature = inputs.temperature_c
     lost_link = link_lost(inputs.heartbeat_age_s, inputs.message_age_s, p)
     # While another's setpoints are followed, the own ones are not.
-    too_far_off = not inputs.velocity_error_m_s <= p.max_velocity_error_m_s and inputs.foreign_setpoints is None
+    far_off = not (
+        inputs.velocity_error_m_s <= p.max_velocity_error_m_s and inputs.velocity_late_s <= p.gate.reaction_s
+    )
+    is_off = inputs.velocity_error_m_s > p.degraded_velocity_error_m_s or inputs.velocity_late_s > 0
+    too_far_off = far_off and inputs.foreign_setpoints is None
+    off = f"the velocity is {inputs.velocity_error_m_s:.1f} m/s off the setpoints"
+    if inputs.velocity_late_s > 0:
+        off = f"{off}, and follows them {inputs.velocity_late_s:.1f} s later than expected"
+    cause = f"{off}: wind of more than {p.max_velocity_error_m_s:g} m/s, or an autopilot that does not follow"
     table = (
         (Event.SIGHT_LOST, sightless, f"too few cameras deliver images: {', '.join(lost) or 'there are none'}"),
         (Event.CAMERA_LOST, len(lost) > 0 and not sightless, f"a camera is lost: {', '.join(lost)}"),
@@ -226,23 +236,12 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (Event.FOREIGN_SETPOINTS, inputs.foreign_setpoints is not None, f"{inputs.foreign_setpoints}"),
         (Event.PARAMETERS_UNSUITABLE, inputs.parameter_fault is not None, f"{inputs.parameter_fault}"),
         (Event.FRAME_JUMPED, inputs.frame_jumped, "the autopilot's estimate of position or heading has jumped"),
-        (
-            Event.VELOCITY_OFF,
-            p.degraded_velocity_error_m_s < inputs.velocity_error_m_s <= p.max_velocity_error_m_s,
-            f"the velocity is {inputs.velocity_error_m_s:.1f} m/s off the setpoints",
-        ),
-        (
-            Event.VELOCITY_FAR_OFF,
-            too_far_off and not inputs.obstacle_near,
-            f"the velocity is {inputs.velocity_error_m_s:.1f} m/s off the setpoints, more than "
-            f"{p.max_velocity_error_m_s:g}: wind, or an autopilot that does not follow",
-        ),
+        (Event.VELOCITY_OFF, is_off and not far_off, off),
+        (Event.VELOCITY_FAR_OFF, too_far_off and not inputs.obstacle_near, cause),
         (
             Event.NO_ROOM_TO_HOLD,
             too_far_off and inputs.obstacle_near,
-            f"the velocity is {inputs.velocity_error_m_s:.1f} m/s off the setpoints, more than "
-            f"{p.max_velocity_error_m_s:g}: wind, or an autopilot that does not follow; the drone flies "
-            f"on to where no obstacle is within {p.hold_room_m:g} m, and asks for Hold there",
+            f"{cause}; the drone flies on to where no obstacle is within {p.hold_room_m:g} m, and asks for Hold there",
         ),
         (Event.TASK_DIED, len(inputs.dead_tasks) > 0, f"ended and should not have: {', '.join(inputs.dead_tasks)}"),
         (

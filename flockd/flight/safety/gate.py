@@ -101,7 +101,7 @@ class Verdict:
     objections: tuple[Objection, ...]
 
 
-_COLUMN = 1.5
+COLUMN = 1.5
 """A neighbour is above or below where its level range is less than this many times the degraded separation: downwash
 widens on its way down, and neither drone stays exactly where it is."""
 _HEIGHT_NOISE_M = 0.3
@@ -119,8 +119,9 @@ class Gate:
     distance. Every change of velocity stays within the acceleration limit, except that this one wins.
 
     Wind is left to the autopilot, whose velocity controller integrates: a second loop around it, here, oscillated with
-    PX4's real response. A drone that is measured to be faster than a limit brakes harder, and one that does not follow
-    its setpoints (`ResponseMonitor`) is for the supervisor.
+    PX4's real response. A drone that is measured to be faster than a limit brakes harder; one that is measured to
+    follow late keeps the distance that it then needs, and one that does not follow (`ResponseMonitor`) is for the
+    supervisor.
     """
 
     def __init__(self, parameters: GateParameters) -> None:
@@ -134,6 +135,11 @@ class Gate:
     def velocity_error_m_s(self) -> float:
         """By how much the drone's velocity was off its setpoints in the last seconds; see `ResponseMonitor`."""
         return self._response.error_m_s
+
+    @property
+    def velocity_late_s(self) -> float:
+        """By how much later than expected it follows them; see `ResponseMonitor`."""
+        return self._response.late_s
 
     def step(self, now_s: float, request: Request) -> Verdict:
         """What may be sent at `now_s`, on the clock of the other times; never raises, whatever the numbers are."""
@@ -227,7 +233,9 @@ class Gate:
 
     def _space(self, action: Action, around: Surroundings) -> dict[Objection, tuple[FloatArray, FloatArray]]:
         """Directions (n, 2), and how fast to fly there, (n,) m/s: to the fence, to neighbours and to obstacles."""
-        p = self._parameters
+        p, late_s = self._parameters, self._response.late_s
+        later = {"reaction_s": p.reaction_s + late_s, "neighbour_reaction_s": p.neighbour_reaction_s + late_s}
+        p = p.model_copy(update=later)
         separation_m = p.min_separation_m if action is Action.FLY else p.degraded_separation_m
         return {
             Objection.FENCE: towards_fence(p, around.position),
@@ -294,7 +302,7 @@ class Gate:
         """
         p, offsets = self._parameters, around.neighbours
         own_m = around.height_m if math.isfinite(around.height_m) else start_m
-        near = np.hypot(offsets[:, 0], offsets[:, 1]) < _COLUMN * p.degraded_separation_m
+        near = np.hypot(offsets[:, 0], offsets[:, 1]) < COLUMN * p.degraded_separation_m
         if not near.any():
             return -math.inf, math.inf
         up = -offsets[near, 2]

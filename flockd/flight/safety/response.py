@@ -1,4 +1,4 @@
-"""How well the drone's velocity follows its setpoints."""
+"""How well the drone's velocity follows its setpoints, and how late."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import numpy as np
 from flockd.core.messages import FloatArray
 
 _MEMORY_S = 10.0
-"""Of the mean square: a few gusts."""
+"""Of the mean squares: a few gusts."""
 _FASTEST_M_S = 100.0
 """What is measured to be faster is no velocity."""
+_UNSURE_M_S = 0.15
+"""By how much PX4's own velocity errs. Responses whose errors differ by less, squared, explain it alike."""
 
 
 class ResponseMonitor:
@@ -19,36 +21,59 @@ class ResponseMonitor:
 
     Expected is a first-order lag of the setpoints. The error is a root mean square, so that wind, an autopilot that
     does not follow and one that oscillates all show in it. It says how far the velocity is off, not why.
+
+    A delay shows where setpoints change: the same response is compared as of up to four time constants before. The
+    shortest delay that explains the measured velocity nearly as well as the best one is kept for the flight, as a drone
+    that flies straight on tells nothing. Wind and an error of the measured velocity make all of them worse alike.
     """
 
     def __init__(self, response_s: float) -> None:
         """`response_s`: time constant of the lag, the vehicle's dead time included."""
         self._response_s = response_s
-        self._expected: FloatArray | None = None
-        self._mean_square = 0.0
+        self._delays_s = response_s * np.arange(5)
+        self._now_s = 0.0
+        self._times_s: FloatArray = np.empty(0)
+        self._expected: FloatArray = np.empty((0, 2))
+        """m/s, at `_times_s`, of the last seconds; empty: nothing is expected."""
+        self._mean_squares = np.zeros(len(self._delays_s))
+        self.late_s = 0.0
+        """By how much later than expected the vehicle was seen to follow its setpoints."""
 
     @property
     def error_m_s(self) -> float:
         """Root mean square of the difference's norm over the last ten seconds or so."""
-        return math.sqrt(self._mean_square)
+        return math.sqrt(self._mean_squares[0])
 
     def restart(self, velocity: FloatArray) -> None:
         """Begins anew, while something else flies the drone, with its measured `velocity` (2,) m/s."""
-        self._expected = velocity if _is_known(velocity) else None
-        self._mean_square = 0.0
+        self._expect(velocity)
+        self._mean_squares = np.zeros_like(self._mean_squares)
+        self.late_s = 0.0
 
     def step(self, velocity: FloatArray, setpoint: FloatArray, elapsed_s: float) -> None:
         """With the measured `velocity` (2,) m/s, and the `setpoint` (2,) m/s that was flown for the last `elapsed_s`.
 
         Where a velocity is not known, or no time, what is expected begins anew.
         """
-        if self._expected is None or not _is_known(velocity) or not elapsed_s >= 0:
-            self._expected = velocity if _is_known(velocity) else None
+        if not len(self._expected) or not _is_known(velocity) or not elapsed_s >= 0:
+            self._expect(velocity)
             return
+        self._now_s += elapsed_s
         share = -math.expm1(-elapsed_s / self._response_s)
-        self._expected = self._expected + share * (setpoint - self._expected)
-        square = float(np.sum((velocity - self._expected) ** 2))
-        self._mean_square += -math.expm1(-elapsed_s / _MEMORY_S) * (square - self._mean_square)
+        expected = self._expected[-1] + share * (setpoint - self._expected[-1])
+        recent = self._times_s >= self._now_s - 2 * self._delays_s[-1]
+        self._times_s = np.append(self._times_s[recent], self._now_s)
+        self._expected = np.vstack([self._expected[recent], expected])
+        then = np.searchsorted(self._times_s, self._now_s - self._delays_s, side="right") - 1
+        squares = ((velocity - self._expected[np.maximum(then, 0)]) ** 2).sum(axis=1)
+        self._mean_squares += -math.expm1(-elapsed_s / _MEMORY_S) * (squares - self._mean_squares)
+        least = self._mean_squares.min()
+        alike = self._mean_squares <= max(2 * least, least + _UNSURE_M_S**2)
+        self.late_s = max(self.late_s, float(self._delays_s[np.argmax(alike)]))
+
+    def _expect(self, velocity: FloatArray) -> None:
+        known = int(_is_known(velocity))
+        self._times_s, self._expected = np.full(known, self._now_s), np.reshape(velocity, (1, 2))[:known]
 
 
 def _is_known(velocity: FloatArray) -> bool:

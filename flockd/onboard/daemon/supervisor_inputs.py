@@ -87,6 +87,7 @@ class InputCollector:
             load=pilot_loop.load(),
             temperature_c=self._thermometer.hottest_c,
             loop_lag_s=self._lag.worst_s(),
+            velocity_late_s=self._gate.velocity_late_s,
             velocity_error_m_s=self._gate.velocity_error_m_s,
             dead_tasks=tuple(self._dead_tasks),
             neighbours_age_s=now - pilot_loop.neighbour_seen_s,

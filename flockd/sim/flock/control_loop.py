@@ -135,7 +135,8 @@ _SEES = CameraHealth(age_s=0.0, period_s=1.0, unplugged=False, frozen=False, noi
 _LOST = replace(_SEES, unplugged=True)
 _WELL = Inputs(
     cameras={"one": _SEES}, dropped_share=0.0, estimate_age_s=0.0, ego_motion_age_s=0.0, network_faults=0,
-    inference_stuck=False, load=0.0, temperature_c=None, loop_lag_s=0.0, velocity_error_m_s=0.0, dead_tasks=(),
+    inference_stuck=False, load=0.0, temperature_c=None, loop_lag_s=0.0, velocity_late_s=0.0, velocity_error_m_s=0.0,
+    dead_tasks=(),
     neighbours_age_s=0.0, nearest_neighbour_m=math.inf, refused_commands=0, obstacle_near=False,
     outside_fence=False, outside_heights=False, motion_age_s=0.0,
     heartbeat_age_s=0.0, message_age_s=0.0, stream_fault=None, autopilot_failsafe=False, foreign_setpoints=None,
@@ -156,18 +157,17 @@ class WindSupervisor:
         for changes in ({"armed": False, "in_air": False, "flight_mode": "hold"}, {"flight_mode": "hold"}, {}):
             self._supervisor.step(-math.inf, replace(_WELL, **changes))
 
-    def step(
-        self, now_s: float, velocity_error_m_s: float, around: Surroundings, *, lost: Collection[str] = ()
-    ) -> Decision:
-        """As of `now_s`, so far off its setpoints; `lost`: the names of its lost cameras."""
-        gate = self._parameters.gate
+    def step(self, now_s: float, gate: Gate, around: Surroundings, *, lost: Collection[str] = ()) -> Decision:
+        """As of `now_s`, with the drone's gate; `lost`: the names of its lost cameras."""
+        limits = self._parameters.gate
         inputs = replace(
             _WELL,
             cameras={**self._cameras, **dict.fromkeys(lost, _LOST)},
-            velocity_error_m_s=velocity_error_m_s,
+            velocity_late_s=gate.velocity_late_s,
+            velocity_error_m_s=gate.velocity_error_m_s,
             obstacle_near=around.nearest_obstacle_m < self._parameters.hold_room_m,
-            outside_fence=outside_fence(gate, around.position),
-            outside_heights=outside_heights(gate, around.height_m),
+            outside_fence=outside_fence(limits, around.position),
+            outside_heights=outside_heights(limits, around.height_m),
         )
         decision = self._supervisor.step(now_s, inputs)
         if decision.state is State.DEGRADED and decision.reasons:
@@ -288,7 +288,7 @@ class ControlLoop:
         drone = self._drones[i]
         around = self._around(i, now_s, vehicles, order)
         lost = self._lost_cameras(i, now_s)
-        decision = drone.supervisor.step(now_s, drone.gate.velocity_error_m_s, around, lost=lost)
+        decision = drone.supervisor.step(now_s, drone.gate, around, lost=lost)
         self._supervised[i] = decision
         if decision.state is State.ASKING:
             self._hand_over(i, now_s, vehicles, decision.reasons[0].sentence)

@@ -37,6 +37,7 @@ QUIET = Inputs(
     temperature_c=60.0,
     loop_lag_s=0.01,
     velocity_error_m_s=0.1,
+    velocity_late_s=0.0,
     dead_tasks=(),
     neighbours_age_s=0.4,
     nearest_neighbour_m=2.5,

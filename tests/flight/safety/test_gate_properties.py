@@ -133,6 +133,7 @@ def _quiet() -> Inputs:
     fine: dict[str, Any] = dict.fromkeys(_NUMBERS, 0.01) | dict.fromkeys(_FLAGS, False) | dict.fromkeys(_COUNTS, 0)
     fine |= dict.fromkeys(_SEEN)
     fine |= {"nearest_neighbour_m": 3.0, "cameras": {"front": sees, "back": sees}, "temperature_c": 50.0}
+    fine["velocity_late_s"] = 0.0
     return Inputs(**fine, dead_tasks=(), flight_mode=OFFBOARD, armed=True, in_air=True)
 
 

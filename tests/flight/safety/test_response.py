@@ -146,3 +146,38 @@ def test_two_readings_at_one_time_change_nothing() -> None:
     before = monitor.error_m_s
     monitor.step(np.array([0.9, 0.0]), np.zeros(2), 0.0)
     assert monitor.error_m_s == before
+
+
+def followed(response_s: float, dead_s: float, gust_m_s: float = 0.0) -> ResponseMonitor:
+    """A monitor of a vehicle whose setpoints rise to 2 m/s in a second; its estimate wanders as PX4's, 0.15 m/s."""
+    monitor, velocity, off, random = ResponseMonitor(0.5), np.zeros(2), np.zeros(2), np.random.default_rng(1)
+    setpoints = [np.zeros(2)] * (late := round(dead_s / TICK_S))
+    monitor.restart(velocity)
+    keep, sigma = math.exp(-TICK_S / 2.0), math.hypot(0.1, gust_m_s)
+    for tick in range(400):
+        setpoints.append(np.array([min(0.1 * tick, 2.0), 0.0]))
+        velocity = velocity - math.expm1(-TICK_S / response_s) * (setpoints[-1 - late] - velocity)
+        off = keep * off + math.sqrt(1 - keep**2) * sigma * random.normal(size=2)
+        monitor.step(velocity + off, setpoints[-1], TICK_S)
+    return monitor
+
+
+@pytest.mark.fault("autopilot-obeys-late")
+@pytest.mark.parametrize(("dead_s", "late_s"), [(1.2, 0.5), (2.5, 2.0), (60.0, 2.0)])
+def test_a_vehicle_that_follows_late_is_told_and_stays_known(dead_s: float, late_s: float) -> None:
+    """Also by a steady flight after it, which tells nothing. 60 s: not at all."""
+    assert followed(0.25, dead_s).late_s >= late_s
+
+
+@pytest.mark.parametrize("gust_m_s", [0.0, 0.4])
+@pytest.mark.parametrize(("response_s", "dead_s"), [(0.25, 0.0), (0.39, 0.2), (0.45, 0.21), (0.25, 0.3)])
+def test_neither_px4_nor_gusts_are_late(response_s: float, dead_s: float, gust_m_s: float) -> None:
+    assert followed(response_s, dead_s, gust_m_s).late_s == 0.0
+
+
+@pytest.mark.fault("autopilot-obeys-late")
+def test_a_late_vehicle_begins_to_brake_before_a_neighbour_by_as_much_earlier() -> None:
+    """3 m from one that may begin to come, (r + 0.25) v + v^2 / 3 = 1 m with a reaction of r = 0.5 s, and later."""
+    around = replace(NOWHERE, neighbours=np.array([[3.0, 0.0, 0.0]]), neighbour_velocities=np.zeros((1, 2)))
+    slow, quick = (flown(Gate(FREE), np.array([2.0, 0.0]), 0.25, dead_s, around)[-1, 0] for dead_s in (2.5, 0.0))
+    assert 0.0 < slow < 0.7 * quick

@@ -647,6 +647,8 @@ LIMITS: list[tuple[str, float, float, Event | None, Event]] = [
     ("loop_lag_s", 0.2, 0.201, None, Event.LOOP_LATE),
     ("velocity_error_m_s", 0.6, 0.61, None, Event.VELOCITY_OFF),
     ("velocity_error_m_s", 0.8, 0.81, Event.VELOCITY_OFF, Event.VELOCITY_FAR_OFF),
+    ("velocity_late_s", 0.0, 0.5, None, Event.VELOCITY_OFF),
+    ("velocity_late_s", 0.5, 1.0, Event.VELOCITY_OFF, Event.VELOCITY_FAR_OFF),
     ("neighbours_age_s", 2.0, 2.001, None, Event.NEIGHBOURS_LOST),
     ("nearest_neighbour_m", 1.0, 0.999, None, Event.NEIGHBOUR_CLOSE),
     ("refused_commands", 0, 1, None, Event.COMMAND_REFUSED),

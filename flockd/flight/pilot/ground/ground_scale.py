@@ -25,12 +25,12 @@ from flockd.flight.geometry import (
     inverse_ranges_of_rays,
     scale_on_track,
 )
+from flockd.flight.geometry.ego_motion_refinement import FLOW_SIGMA_PX
 from flockd.flight.perception import CameraObservation, Observation
 
 MATCHES = 1200
 """Of each image: with four times as many the scale was no better. Of 640x480 pixels they are those at which the flow is
 exact."""
-FLOW_SIGMA_PX = 0.3
 MIN_BASELINE_M = 0.08
 """Across the line of sight; with less, the ground's depth is noise."""
 MAX_CORRECTION = 1.4
