@@ -3,8 +3,7 @@
 sudo python3 -m tools.checks.check_device                              # from nothing; downloads about 300 MB
 sudo python3 -m tools.checks.check_device --cache /var/cache/flockd    # keeps what it built for the next time
 sudo python3 -m tools.checks.check_device --debian 13                  # on Debian 13 (trixie), with systemd 257
-sudo python3 -m tools.checks.check_device --package                    # the Debian package: installed, upgraded,
-removed
+sudo python3 -m tools.checks.check_device --package                    # the Debian package, from install to purge
 
 Needs Linux on x86-64 with qemu-system-x86, mmdebstrap and e2fsprogs, and no KVM: the processor is emulated. The machine
 runs Debian 12 or 13 with its own kernel and systemd; flockd is installed by the lines of docs/real_drone.md, and its
@@ -31,10 +30,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,17 +40,18 @@ from tools.release.wheels import LOCK, ROOT, copy_sources, download, download_lo
 PROGRAMS = {"qemu-system-x86_64": "qemu-system-x86", "mmdebstrap": "mmdebstrap", "mkfs.ext4": "e2fsprogs"}
 """And the Debian package of each."""
 PACKAGES = (
-    *("systemd-sysv", "udev", "dbus", "kmod", "sudo", "iproute2", "python3", "python3-venv", "v4l-utils"),
+    *("systemd-sysv", "udev", "dbus", "kmod", "sudo", "iproute2", "procps", "python3", "python3-venv"),
     *("linux-image-amd64", "linux-headers-amd64", "v4l2loopback-dkms", "initramfs-tools", "zstd"),
     *("gstreamer1.0-plugins-base", "gstreamer1.0-plugins-good", "gstreamer1.0-tools", "gstreamer1.0-plugins-base-apps"),
 )
 SUITES = {"12": "bookworm", "13": "trixie"}
 """By Debian's version: its name at Debian."""
 BOOT_MODULES = ("virtio_pci", "virtio_blk", "ext4")
-PAGE, SECTION = ROOT / "docs" / "real_drone.md", "## Install it as a service"
+CHECKS = Path("tools/checks/device_check")
 DRONE_FILE = "my_drone.yaml"
-"""What the page calls the file that its reader has written."""
+"""What docs/real_drone.md calls the file that its reader has written."""
 FAKE_AUTOPILOT = "pymavlink>=2.4.40"
+PIP = f"pip install --quiet --no-compile --target /opt/fake-autopilot '{FAKE_AUTOPILOT}'"
 COMPILE = "import flockd.sim.autopilot.fake_autopilot"
 """What it needs of a dozen MAVLink dialects, and no more."""
 ARCH = "amd64"
@@ -94,56 +91,57 @@ def main() -> int:
     """Builds, boots, listens, and prints."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, metavar="DIR", help="keep the machine's files here, and use those there")
-    parser.add_argument(
-        "--only",
-        nargs="+",
-        default=[],
-        metavar="GROUP",
-        help="of capture, pipelines, sandbox, bench and service",
-    )
+    only = "of capture, sandbox and service"
+    parser.add_argument("--only", nargs="+", default=[], choices=("capture", "sandbox", "service"), help=only)
     parser.add_argument("--debian", choices=tuple(SUITES), default="12", help="what boots; default: %(default)s")
     parser.add_argument("--package", action="store_true", help="check the Debian package, and that alone")
-    parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     try:
         _need_all()
-        signal.signal(signal.SIGTERM, _end)
-        with _folder(arguments.cache, arguments.debian) as folder:
-            part = _package(arguments.debian) if arguments.package else _by_hand(arguments.only)
-            return _check(folder, arguments.debian, part, as_json=arguments.json)
+        signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))  # takes the machine with it
+        if arguments.cache is not None:
+            kept = (arguments.cache / f"debian{arguments.debian}").resolve()
+            kept.mkdir(parents=True, exist_ok=True)
+            return check(kept, arguments.debian, None if arguments.package else arguments.only)
+        with tempfile.TemporaryDirectory(prefix="flockd-device-", dir="/var/tmp") as folder:
+            return check(Path(folder), arguments.debian, None if arguments.package else arguments.only)
     except (UnavailableError, deb.UnavailableError) as error:
         print(f"check_device: {error}", file=sys.stderr)
         return UNAVAILABLE
 
 
-@dataclass(frozen=True)
-class Part:
-    """What is checked."""
-
-    install: Callable[[Path, Path], None]
-    """Makes the machine's files ready, with a folder of wheels."""
-    share: Callable[[Path, Path], str]
-    """Puts what the checks need into a folder that the machine sees, likewise; their command."""
-
-
-def _check(folder: Path, debian: str, part: Part, *, as_json: bool) -> int:
-    begun_s = time.monotonic()
-    rows: list[dict[str, Any]] = []
-    image, wheels = _build(folder, debian, part)
-    for line in _run(folder, image, wheels, part):
-        if "check" in line:
-            rows.append(line)
-            if not as_json:
-                print(_row(line), flush=True)
-        elif "group" in line:
-            _note(f"{line['group']}: {line['took_s']} s of the machine's time")
-    failed = [row for row in rows if not row["passed"]]
-    wall_s = time.monotonic() - begun_s
-    if as_json:
-        print(json.dumps({"passed": not failed, "wall_s": round(wall_s, 1), "checks": rows}, indent=1))
+def check(folder: Path, debian: str, groups: Sequence[str] | None) -> int:
+    """flockd installed by the documentation's lines, all groups or these; None: the Debian package. The exit code."""
+    begun_s, passed, failed = time.monotonic(), 0, 0
+    install, start = documented_lines()
+    image, wheels = _build(folder, debian, None if groups is None else install)
+    shared = _fresh(folder / "check")
+    shutil.copytree(ROOT / CHECKS, shared / CHECKS)
+    findings = "/mnt/findings/lines"
+    if groups is None:
+        _note("building the package in two versions")
+        files = [deb.build(shared, ARCH, f"debian{debian}", version, shelf=wheels, level=1) for version in VERSIONS]
+        paths = [f"/mnt/check/{file.name}" for file in files]
+        command = ["python3", "-m", "tools.checks.device_check.package", findings, *paths]
     else:
-        print(f"{len(rows) - len(failed)} of {len(rows)} passed, in {wall_s:.0f} s")
+        (shared / "start.sh").write_text(start, encoding="utf-8")
+        command = ["/opt/flockd/bin/python", "-m", "tools.checks.device_check.guest", findings, "start.sh", *groups]
+    (shared / "check.sh").write_text(f"exec {' '.join(command)}\n", encoding="utf-8")
+    for line in _run(folder, image, shared):
+        if "check" in line:
+            passed, failed = passed + line["passed"], failed + (not line["passed"])
+            row = f" (row {line['row']} of the faults)" if line.get("row") else ""
+            verdict = "PASS" if line["passed"] else "FAIL"
+            print(f"{verdict}  {line['check']:32s} {line['measured']}  (wanted: {line['wanted']}){row}", flush=True)
+    print(f"{passed} of {passed + failed} passed, in {time.monotonic() - begun_s:.0f} s")
     return FAILED if failed else DONE
+
+
+def documented_lines() -> tuple[str, str]:
+    """What docs/real_drone.md says to install flockd as a service, and to start it."""
+    page = (ROOT / "docs" / "real_drone.md").read_text(encoding="utf-8")
+    install, start = re.findall(r"```sh\n(.*?)```", page.partition("## Install it as a service")[2], re.DOTALL)[:2]
+    return install, start
 
 
 def _need_all() -> None:
@@ -157,76 +155,39 @@ def _need_all() -> None:
         raise UnavailableError("the files of a Debian belong to root, who must run this; begin the command with sudo")
 
 
-@contextmanager
-def _folder(cache: Path | None, debian: str) -> Iterator[Path]:
-    """Where the machine's files are."""
-    if cache is not None:
-        kept = cache / f"debian{debian}"
-        kept.mkdir(parents=True, exist_ok=True)
-        yield kept.resolve()
-        return
-    with tempfile.TemporaryDirectory(prefix="flockd-device-", dir="/var/tmp") as folder:
-        yield Path(folder)
-
-
-def _documented_lines() -> tuple[str, str]:
-    """What docs/real_drone.md says to install flockd as a service, and to start it."""
-    _, _, section = PAGE.read_text(encoding="utf-8").partition(SECTION)
-    blocks: list[str] = re.findall(r"```sh\n(.*?)```", section, re.DOTALL)
-    return blocks[0], blocks[1]
-
-
-def _by_hand(groups: list[str]) -> Part:
-    """flockd installed by the documentation's lines; all groups of checks, or these."""
-    install, start = _documented_lines()
-
-    def share(shared: Path, _wheels: Path) -> str:
-        (shared / "start.sh").write_text(start, encoding="utf-8")
-        return " ".join(
-            ["/opt/flockd/bin/python -m tools.checks.device_check.guest /mnt/findings/lines start.sh", *groups]
-        )
-
-    return Part(lambda system, wheels: _install(system, wheels, install), share)
-
-
-def _package(debian: str) -> Part:
-    """The Debian package in two versions, on a Debian without flockd."""
-
-    def share(shared: Path, wheels: Path) -> str:
-        _note("building the package in two versions")
-        files = [deb.build(shared, ARCH, f"debian{debian}", version, shelf=wheels, level=1) for version in VERSIONS]
-        paths = (f"/mnt/check/{file.name}" for file in files)
-        return " ".join(["python3 -m tools.checks.device_check.package /mnt/findings/lines", *paths])
-
-    return Part(_install_fake_autopilot, share)
-
-
-def _build(folder: Path, debian: str, part: Part) -> tuple[Path, Path]:
-    """The machine's disk, and the wheels for it. Raises UnavailableError when something cannot be fetched."""
-    system = folder / "system"
-    with ThreadPoolExecutor(1) as aside:
-        wheels = aside.submit(_wheels, folder, debian)
-        if not (folder / "system.done").exists():
-            _note("building a Debian")
-            shutil.rmtree(system, ignore_errors=True)
-            _debian(system, debian)
-            (folder / "system.done").touch()
-        _note("installing")
-        _empty(system)
-        part.install(system, wheels.result())
+def _build(folder: Path, debian: str, install: str | None) -> tuple[Path, Path]:
+    """The machine's disk, with flockd by these lines or without, and the wheels for it. Raises UnavailableError."""
+    system, wheels = folder / "system", _wheels(folder, debian)
+    if not (folder / "system.done").exists():
+        _note("building a Debian")
+        _debian(_fresh(system), debian)
+        (folder / "system.done").touch()
+    _note("installing")
+    _empty(system)
+    shelf = system / "srv/wheels"
+    shutil.copytree(wheels, shelf)
+    if install is None:
+        _inside(system, f"python3 -m venv /srv/pip\n/srv/pip/bin/{PIP}\nrm -r /srv/pip")
+    else:
+        source = system / "srv/flockd"
+        source.mkdir(0o700)  # what is installed must not need it: the service cannot read it
+        copy_sources(source)
+        shutil.copy(ROOT / CHECKS / "drone.yaml", source / DRONE_FILE)
+        _inside(system, f"cd /srv/flockd\n{install}")
+        _inside(system, f"/opt/flockd/bin/{PIP}\nPYTHONPATH=/opt/fake-autopilot /opt/flockd/bin/python -c '{COMPILE}'")
+    shutil.rmtree(shelf)
     _note("writing the disk")
     image = folder / "disk.img"
     image.unlink(missing_ok=True)
     _command("mkfs.ext4", "-q", "-O", "^has_journal", "-d", str(system), str(image), f"{IMAGE_MB}M")
-    return image, wheels.result()
+    return image, wheels
 
 
 def _debian(system: Path, debian: str) -> None:
     """A tree of files, with a kernel that has the virtual cameras."""
-    listed = r"\n".join(BOOT_MODULES)
     few_modules = (
         'mkdir -p "$1/etc/initramfs-tools/conf.d" && echo MODULES=list > "$1/etc/initramfs-tools/conf.d/check" && '
-        f'printf "{listed}\\n" > "$1/etc/initramfs-tools/modules"'
+        f'printf "%s\\n" {" ".join(BOOT_MODULES)} > "$1/etc/initramfs-tools/modules"'
     )
     without = [f"--dpkgopt=path-exclude=/usr/share/{what}/*" for what in ("doc", "man", "locale", "info")]
     _command(
@@ -241,53 +202,31 @@ def _wheels(folder: Path, debian: str) -> Path:
     if wheels.exists():
         return wheels
     machine, python = deb.MACHINES[ARCH], deb.SYSTEMS[f"debian{debian}"].python
-    with tempfile.TemporaryDirectory(dir=folder) as fresh:
-        try:
-            download_locked(Path(fresh), machine=machine, python=python)
-            download(Path(fresh), [FAKE_AUTOPILOT], machine=machine, python=python)
-        except subprocess.CalledProcessError as error:
-            raise UnavailableError("pip could not download the wheels; what it printed stands above") from error
-        Path(fresh).rename(wheels)
-        Path(fresh).mkdir()
-    return wheels
+    fresh = _fresh(folder / "wheels-coming")
+    try:
+        download_locked(fresh, machine=machine, python=python)
+        download(fresh, [FAKE_AUTOPILOT], machine=machine, python=python)
+    except subprocess.CalledProcessError as error:
+        raise UnavailableError("pip could not download the wheels; what it printed stands above") from error
+    return fresh.rename(wheels)
 
 
 def _empty(system: Path) -> None:
     """A Debian without flockd that runs the checks when it starts."""
     for old in ("opt/flockd", "opt/fake-autopilot", "etc/flockd", "srv/flockd", "srv/wheels"):
         shutil.rmtree(system / old, ignore_errors=True)
-    for old in ("usr/lib/sysusers.d/flockd.conf", "etc/systemd/system/flockd.service"):
+    wanted = "etc/systemd/system/multi-user.target.wants/device-check.service"
+    for old in ("usr/lib/sysusers.d/flockd.conf", "etc/systemd/system/flockd.service", wanted):
         (system / old).unlink(missing_ok=True)
-    (system / "etc/fstab").write_text(FSTAB, encoding="utf-8")
-    (system / "etc/hostname").write_text("drone\n", encoding="utf-8")
-    (system / "etc/hosts").write_text("127.0.0.1 localhost drone\n", encoding="utf-8")
-    (system / "etc/pip.conf").write_text("[global]\nno-index = true\nfind-links = /srv/wheels\n", encoding="utf-8")
-    (system / "etc/systemd/system/device-check.service").write_text(UNIT, encoding="utf-8")
-    wanted = system / "etc/systemd/system/multi-user.target.wants/device-check.service"
-    wanted.unlink(missing_ok=True)
-    wanted.symlink_to("../device-check.service")
-
-
-def _install(system: Path, wheels: Path, install: str) -> None:
-    """Runs the documentation's lines in the machine's files, as on a drone, but for where pip finds its packages."""
-    source, shelf = system / "srv/flockd", system / "srv/wheels"
-    source.mkdir(0o700, parents=True)  # what is installed must not need it: the service cannot read it
-    copy_sources(source)
-    shutil.copy(ROOT / "tools/checks/device_check/drone.yaml", source / DRONE_FILE)
-    shutil.copytree(wheels, shelf)
-    _inside(system, f"cd /{source.relative_to(system)}\n{install}")
-    install = f"pip install --quiet --no-compile --target /opt/fake-autopilot '{FAKE_AUTOPILOT}'"
-    _inside(system, f"/opt/flockd/bin/{install}\nPYTHONPATH=/opt/fake-autopilot /opt/flockd/bin/python -c '{COMPILE}'")
-    shutil.rmtree(shelf)
-
-
-def _install_fake_autopilot(system: Path, wheels: Path) -> None:
-    """What it needs beyond flockd."""
-    shelf = system / "srv/wheels"
-    shutil.copytree(wheels, shelf)
-    install = f"pip install --quiet --no-compile --target /opt/fake-autopilot '{FAKE_AUTOPILOT}'"
-    _inside(system, f"python3 -m venv /srv/pip\n/srv/pip/bin/{install}\nrm -r /srv/pip")
-    shutil.rmtree(shelf)
+    for name, text in {
+        "etc/fstab": FSTAB,
+        "etc/hostname": "drone\n",
+        "etc/hosts": "127.0.0.1 localhost drone\n",
+        "etc/pip.conf": "[global]\nno-index = true\nfind-links = /srv/wheels\n",
+        "etc/systemd/system/device-check.service": UNIT,
+    }.items():
+        (system / name).write_text(text, encoding="utf-8")
+    (system / wanted).symlink_to("../device-check.service")
 
 
 def _inside(system: Path, lines: str) -> None:
@@ -295,26 +234,11 @@ def _inside(system: Path, lines: str) -> None:
     _command("chroot", str(system), "env", "-i", f"PATH={SYSTEM_PATH}", "HOME=/root", "bash", "-ec", lines)
 
 
-def _run(folder: Path, image: Path, wheels: Path, part: Part) -> Iterator[dict[str, Any]]:
-    """Boots, and gives what the machine writes down, line by line, until it has switched itself off."""
-    shared, findings = folder / "check", folder / "findings"
-    for fresh in (shared, findings):
-        shutil.rmtree(fresh, ignore_errors=True)
-        fresh.mkdir()
-    shutil.copytree(ROOT / "tools/checks/device_check", shared / "tools/checks/device_check")
-    (shared / "check.sh").write_text(f"exec {part.share(shared, wheels)}\n", encoding="utf-8")
+def _run(folder: Path, image: Path, shared: Path) -> Iterator[dict[str, Any]]:
+    """Boots, and gives what the machine writes, line by line; one that ends without its last word has failed."""
+    boot, findings, console = folder / "system/boot", _fresh(folder / "findings"), folder / "console.log"
     _note("booting")
-    machine = subprocess.Popen(_qemu(folder, image, shared, findings), stdin=subprocess.DEVNULL)
-    try:
-        yield from _lines(findings / "lines", machine)
-    finally:
-        machine.kill()
-        machine.wait()
-
-
-def _qemu(folder: Path, image: Path, shared: Path, findings: Path) -> list[str]:
-    boot = folder / "system/boot"
-    return [
+    command = [
         "qemu-system-x86_64", "-nodefaults", "-no-reboot", "-display", "none", "-m", str(MEMORY_MB),
         "-machine", "pc,accel=tcg", "-cpu", "Nehalem", "-icount", "shift=0,sleep=off", "-rtc", "clock=vm",
         "-kernel", str(next(boot.glob("vmlinuz-*"))), "-initrd", str(next(boot.glob("initrd.img-*"))),
@@ -322,50 +246,44 @@ def _qemu(folder: Path, image: Path, shared: Path, findings: Path) -> list[str]:
         "-drive", f"file={image},format=raw,if=virtio,snapshot=on",
         "-virtfs", f"local,path={shared},mount_tag=check,security_model=none,readonly=on",
         "-virtfs", f"local,path={findings},mount_tag=findings,security_model=none",
-        "-serial", f"file:{folder / 'console.log'}",
+        "-serial", f"file:{console}",
     ]  # fmt: skip
-
-
-def _lines(file: Path, machine: subprocess.Popen[bytes]) -> Iterator[dict[str, Any]]:
-    """As they come; a machine that ends without its last word is a failed check."""
+    machine = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     begun_s, read, line = time.monotonic(), 0, dict[str, Any]()
-    while "done" not in line:
-        over = machine.poll() is not None or time.monotonic() - begun_s > PATIENCE_S
-        whole = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
-        for text in whole[read:]:
-            line = json.loads(text)
-            yield line
-        read = len(whole)
-        if over and "done" not in line:
-            console = (file.parent.parent / "console.log").read_text(encoding="utf-8", errors="replace")
-            print(console[-4000:], file=sys.stderr)
-            what = "ended or hung before all checks were done; the end of its console stands above"
-            yield {"check": "the machine", "passed": False, "measured": what, "wanted": "to run to its end"}
-            return
-        time.sleep(0.5)
+    try:
+        while "done" not in line:
+            over = machine.poll() is not None or time.monotonic() - begun_s > PATIENCE_S
+            file = findings / "lines"
+            whole = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+            for text in whole[read:]:
+                line = json.loads(text)
+                yield line
+            read = len(whole)
+            if over and "done" not in line:
+                print(console.read_text(encoding="utf-8", errors="replace")[-4000:], file=sys.stderr)
+                what = "ended or hung before all checks were done; the end of its console stands above"
+                yield {"check": "the machine", "passed": False, "measured": what, "wanted": "to run to its end"}
+                return
+            time.sleep(0.5)
+    finally:
+        machine.kill()
+        machine.wait()
 
 
-def _row(line: dict[str, Any]) -> str:
-    verdict = "PASS" if line["passed"] else "FAIL"
-    row = f" (row {line['row']} of the faults)" if line.get("row") else ""
-    return f"{verdict}  {line['check']:32s} {line['measured']}  (wanted: {line['wanted']}){row}"
+def _fresh(folder: Path) -> Path:
+    """An empty folder in the place of what is there."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
 
 
 def _command(*command: str) -> None:
     """Raises UnavailableError with the end of what a command that failed has printed."""
-    result = subprocess.run(command, capture_output=True, text=True, check=False, env=_environment())
+    environment = {**os.environ, "PATH": f"{SYSTEM_PATH}:{os.environ.get('PATH', '')}", "LC_ALL": "C"}
+    result = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     if result.returncode:
         output = (result.stdout + result.stderr).strip().splitlines()[-3:]
         raise UnavailableError(f"{Path(command[0]).name} failed ({'; '.join(output)})")
-
-
-def _environment() -> dict[str, str]:
-    return {**os.environ, "PATH": f"{SYSTEM_PATH}:{os.environ.get('PATH', '')}", "LC_ALL": "C"}
-
-
-def _end(number: int, _frame: object) -> None:
-    """On SIGTERM: takes the virtual machine with it."""
-    sys.exit(128 + number)
 
 
 def _note(what: str) -> None:

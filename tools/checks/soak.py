@@ -3,8 +3,6 @@
 python -m tools.checks.soak --steps 100000              # the pilot with the shipped networks on small images
 python -m tools.checks.soak --steps 100000 --minutes 80 # as many of them as this computer does in that time
 python -m tools.checks.soak --daemon --minutes 60       # a real `flockd run`, a fake autopilot, rendered frames
-python -m tools.checks.soak --steps 5000 --json
-python -m tools.checks.soak --daemon --samples soak.csv # each sample too, to draw the curve
 
 Prints for memory, file descriptors, threads, latency and what waits or is lost: how much it grew in the first tenth of
 the run, which is the warm-up. Then the mean of the next and of the last tenth, and the slope over the rest with its 95
@@ -16,16 +14,13 @@ allowance, all of the interval above it.
 from __future__ import annotations
 
 import argparse
-import csv
-import ctypes
-import json
 import os
 import sys
 import tempfile
 import time
 from array import array
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +57,6 @@ SAMPLE_S = 2.0
 DAEMON_MINUTES = 60.0
 PATIENCE_S = 600.0
 """For the daemon to become ready: a busy computer compiles the renderer for minutes."""
-MALLINFO = ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost")
 ALLOWED = {
     "memory, MB": 0.03,
     "own memory, MB": 0.03,
@@ -161,20 +155,6 @@ def follower(place: FloatArray, velocity: FloatArray, rotation: FloatArray, dist
     return Poses(np.stack([place, place + beside]), np.stack([velocity, velocity]), np.stack([rotation, rotation]))
 
 
-class _Malloc(ctypes.Structure):
-    """glibc's ``struct mallinfo2``."""
-
-    _fields_ = tuple((name, ctypes.c_size_t) for name in MALLINFO)
-
-
-def allocated() -> dict[str, float]:
-    """What this process has asked for and not given back: memory that grows without it is kept by the allocator."""
-    mallinfo2 = ctypes.CDLL(None).mallinfo2  # of all arenas; glibc from 2.33 on
-    mallinfo2.restype = _Malloc
-    told = mallinfo2()
-    return {"malloc in use, MB": 1e-6 * (told.uordblks + told.hblkhd), "python blocks": float(sys.getallocatedblocks())}
-
-
 def soak_pilot(steps: int, minutes: float) -> tuple[int, dict[str, array[float]]]:
     """How many steps were made in the time, and samples of each quantity."""
     world = scenario()
@@ -199,7 +179,7 @@ def soak_pilot(steps: int, minutes: float) -> tuple[int, dict[str, array[float]]
         if (number + 1) % every == 0:
             facts = {
                 **process_facts(os.getpid()),
-                **allocated(),
+                "python blocks": float(sys.getallocatedblocks()),
                 "step, ms": 1e3 * took_s / every,
                 "tracks": float(len(output.neighbours)),
                 "detections": float(len(output.detections)),
@@ -321,8 +301,6 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=5000, help="of the pilot (default: 5000)")
     parser.add_argument("--daemon", action="store_true", help="a whole daemon instead")
     parser.add_argument("--minutes", type=float, help="of the daemon (default: 60), or the most that steps may take")
-    parser.add_argument("--samples", type=Path, metavar="FILE", help="write every sample to a CSV file")
-    parser.add_argument("--json", action="store_true", help="print the slopes as JSON")
     args = parser.parse_args()
     if args.daemon:
         minutes = args.minutes or DAEMON_MINUTES
@@ -330,19 +308,13 @@ def main() -> int:
     else:
         done, samples = soak_pilot(args.steps, args.minutes or np.inf)
         what = f"{done} steps of the pilot"
-    if args.samples is not None:
-        with args.samples.open("w", encoding="utf-8", newline="") as file:
-            csv.writer(file).writerows([samples.keys(), *zip(*samples.values(), strict=True)])
     slopes = {name: slope_of(name, _filled(values)) for name, values in samples.items()}
-    if args.json:
-        print(json.dumps({name: asdict(slope) for name, slope in slopes.items()}, indent=1))
-    else:
-        print(f"{what}, {len(next(iter(samples.values())))} samples")
-        print(f"{'':20}{'warm-up':>10}{'first':>10}{'last':>10}{'growth after the warm-up, 95 %':>34}")
-        for name, one in slopes.items():
-            verdict = "  GROWS" if one.grows else ""
-            interval = f"{one.slope:+.3f} ({one.low:+.3f} to {one.high:+.3f})"
-            print(f"{name:20}{one.warm_up:+10.2f}{one.first:10.2f}{one.last:10.2f}{interval:>34}{verdict}")
+    print(f"{what}, {len(next(iter(samples.values())))} samples")
+    print(f"{'':20}{'warm-up':>10}{'first':>10}{'last':>10}{'growth after the warm-up, 95 %':>34}")
+    for name, one in slopes.items():
+        verdict = "  GROWS" if one.grows else ""
+        interval = f"{one.slope:+.3f} ({one.low:+.3f} to {one.high:+.3f})"
+        print(f"{name:20}{one.warm_up:+10.2f}{one.first:10.2f}{one.last:10.2f}{interval:>34}{verdict}")
     return 1 if any(slope.grows for slope in slopes.values()) else 0
 
 

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from flockd.core.config import load_real_drone
-from tools.checks.check_device import DRONE_FILE
+from tools.checks.check_device import DRONE_FILE, documented_lines
 
 ROOT = Path(__file__).parents[3]
 
@@ -23,18 +23,12 @@ def test_without_its_programs_it_says_what_to_install(tmp_path: Path) -> None:
         check=False,
     )
     assert (result.returncode, result.stdout) == (69, "")
-    assert result.stderr == (
-        "check_device: e2fsprogs, mmdebstrap, qemu-system-x86 is not installed; "
-        "`sudo apt install e2fsprogs mmdebstrap qemu-system-x86`\n"
-    )
+    assert "`sudo apt install e2fsprogs mmdebstrap qemu-system-x86`" in result.stderr
 
 
 def test_the_documentation_installs_what_the_unit_starts() -> None:
     """The check runs these lines; a drone's owner does so by hand."""
-    _, _, section = (
-        (ROOT / "docs" / "real_drone.md").read_text(encoding="utf-8").partition("## Install it as a service")
-    )
-    install, start = re.findall(r"```sh\n(.*?)```", section, re.DOTALL)[:2]
+    install, start = documented_lines()
     unit = (ROOT / "systemd" / "flockd.service").read_text(encoding="utf-8")
     command = re.search(r"^ExecStart=(\S+)/bin/flockd run --config (\S+)", unit, re.MULTILINE)
     assert command is not None

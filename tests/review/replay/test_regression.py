@@ -19,11 +19,12 @@ from tools.checks.record_regressions import with_float_networks
 
 HERE = Path(__file__).parent
 FLIGHTS = ("normal", "crossing", "faults", "fisheye")
-# Another processor adds up in another order. `python -m tools.checks.regression_spread` simulates some: ONNX Runtime
-# without graph optimisation, libraries without AVX. The largest differences in `normal` and `crossing` were 3e-6 in
-# velocity, 0.001 in command, 0.0093 in neighbours, 0.0008 in detections and 1.3e-6 in ego_motion; in `faults`, whose
-# torn and black images leave a detection close to a threshold, 0.0003, 0.0054, 0.052, 0.0073 and 0.00016. Tolerances
-# lie above by factors of 1.6 to 77. Units are m, rad and s; a detection's log range is the logarithm of metres.
+# Another processor adds up in another order. `tools.checks.regression_spread` of commit 7b9dec37 simulated some: ONNX
+# Runtime without graph optimisation, libraries without AVX. The largest differences in `normal` and `crossing` were
+# 3e-6 in velocity, 0.001 in command, 0.0093 in neighbours, 0.0008 in detections and 1.3e-6 in ego_motion; in `faults`,
+# whose torn and black images leave a detection close to a threshold, 0.0003, 0.0054, 0.052, 0.0073 and 0.00016.
+# Tolerances lie above by factors of 1.6 to 77. Units are m, rad and s; a detection's log range is the logarithm of
+# metres.
 TOLERANCES = ("velocity=1e-4", "command=0.002", "neighbours=0.015", "detections=0.003", "ego_motion=1e-4")
 TOLERANCES_OF = {
     "fisheye": ("velocity=1e-4", "command=0.002", "neighbours=0.015", "detections=0.012", "ego_motion=1e-4"),

@@ -1,164 +1,144 @@
-"""The virtual cameras: two of `vivid`, and one of `v4l2loopback` whose sensor is a process of ours."""
+"""The virtual cameras: one of `vivid`, and one of `v4l2loopback` whose sensor is this module as a process.
+
+python -m tools.checks.device_check.cameras mjpeg 640 480 25
+"""
 
 from __future__ import annotations
 
 import fcntl
+import functools
+import itertools
 import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 
+import cv2
+import numpy as np
+
+from flockd.core.choices import PixelFormat
 from flockd.onboard.sources.v4l2_device import control_name
-from flockd.onboard.sources.v4l2_kernel import VIDIOC_QUERYCTRL, VIDIOC_S_CTRL, Control, QueryControl
+from flockd.onboard.sources.v4l2_kernel import (
+    VIDIOC_QUERYCTRL,
+    VIDIOC_S_CTRL,
+    VIDIOC_S_FMT,
+    Control,
+    Format,
+    QueryControl,
+)
+from tools.checks.device_check.findings import run
 
 WEBCAM = "/dev/video10"
 """A camera of vivid: shows its own pattern, in sizes and rates as USB cameras have them, and breaks in every way it
 can."""
-CABLE_OUT, CABLE = "/dev/video11", "/dev/video12"
-"""An HDMI output of vivid, and the camera at the other end of its cable."""
 LOOPBACK = "/dev/video20"
-"""A camera of v4l2loopback with Motion-JPEG."""
+COUNT = 16
+"""Images of the loopback's; then they begin again. No two that follow each other are the same."""
+Size = tuple[int, int]
+"""Width, height."""
 _NEXT = 0x80000000  # V4L2_CTRL_FLAG_NEXT_CTRL
-_WHITE = 6
+_OUTPUT, _PROGRESSIVE = 2, 1  # V4L2_BUF_TYPE_VIDEO_OUTPUT, V4L2_FIELD_NONE
+_WHITE, _COUNTERS = 6, 1
 """A test pattern in which the networks see nothing: in the coloured bars they see drones."""
-_COUNTERS, _NOTHING = 1, 2
-_FIRST_OUTPUT = 2
+_SKY, _GRASS = (215, 190, 170), (80, 130)
+"""The colour, blue first; from how bright to how bright."""
+_PASSING_PX = 4
 
 
 def load() -> None:
     """Loads both drivers, unless they are."""
     if Path(WEBCAM).exists():
         return
-    devices = ["n_devs=2", "node_types=0x1,0x101", "vid_cap_nr=10,12", "vid_out_nr=-1,11"]
-    ends = ["num_inputs=1,1", "input_types=0,3", "num_outputs=1,1", "output_types=1,1"]  # a webcam; HDMI to HDMI
-    run("modprobe", "vivid", *devices, *ends)
+    run("modprobe", "vivid", "n_devs=1", "node_types=0x1", "vid_cap_nr=10", "num_inputs=1", "input_types=0")
     run("modprobe", "v4l2loopback", "devices=1", "video_nr=20", "card_label=front")
     run("udevadm", "settle")
-    for device in (WEBCAM, CABLE):
-        control(device, "timestamp_source")  # stamped when the image begins; else the stamps lie in the future
-    for device in (CABLE_OUT, CABLE):
-        run("v4l2-ctl", "-d", device, "--set-dv-bt-timings", f"index={_vga(device)}")
-    control(WEBCAM, "test_pattern", _WHITE)
-    control(WEBCAM, "osd_text_mode", _COUNTERS)  # so that no two images are the same
-    _plug_in()
-    control(CABLE, "osd_text_mode", _NOTHING)  # written over the images
+    control("timestamp_source")  # stamped when the image begins; else the stamps lie in the future
+    control("test_pattern", _WHITE)
+    control("osd_text_mode", _COUNTERS)  # so that no two images are the same
 
 
-def _plug_in() -> None:
-    """Connects the cable: since Linux 6.11 each input says to which output it leads, after itself and none."""
-    with _opened(CABLE) as descriptor:
-        names = _controls(descriptor)
-    to_output = next((name for name in names if name.endswith("_is_connected_to")), None)
-    if to_output is None:
-        control(CABLE, "loop_video")
-    else:
-        control(CABLE, to_output, _FIRST_OUTPUT)
-
-
-def control(device: str, name: str, value: int = 1) -> float:
-    """Sets a control, or presses it if it is a button; just before when, on the monotonic clock."""
-    with _opened(device) as descriptor:
-        wanted = Control(id=_controls(descriptor)[name], value=value)
+def control(name: str, value: int = 1) -> float:
+    """Sets a control of vivid's, or presses it if it is a button; just before when, on the monotonic clock."""
+    descriptor = os.open(WEBCAM, os.O_RDWR)
+    try:
+        query = QueryControl(id=_NEXT)
+        while True:
+            fcntl.ioctl(descriptor, VIDIOC_QUERYCTRL, query)  # after the last: OSError
+            if control_name(query.name) == name:
+                break
+            query = QueryControl(id=query.id | _NEXT)
         now_s = time.monotonic()
-        fcntl.ioctl(descriptor, VIDIOC_S_CTRL, wanted)
+        fcntl.ioctl(descriptor, VIDIOC_S_CTRL, Control(id=query.id, value=value))
+    finally:
+        os.close(descriptor)
     return now_s
 
 
-@contextmanager
-def _opened(device: str) -> Iterator[int]:
-    descriptor = os.open(device, os.O_RDWR)
-    try:
-        yield descriptor
-    finally:
-        os.close(descriptor)
+@functools.cache
+def image(pixel_format: PixelFormat, size: Size, number: int) -> bytes:
+    """What the loopback camera shows: as YUYV every byte by chance within what video allows; else a JPEG.
 
-
-def run(*command: str) -> str:
-    """What a command prints. Raises RuntimeError with what it complained of."""
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    if result.returncode:
-        raise RuntimeError(f"{' '.join(command)}: {result.stderr.strip() or result.stdout.strip()}")
-    return result.stdout
+    The JPEG is sky above grass that passes by. Nothing resembles a drone: to range one takes an emulated processor
+    long.
+    """
+    width, height = size
+    if pixel_format == "yuyv":
+        return np.random.default_rng(number).integers(16, 236, width * height * 2, np.uint8).tobytes()
+    wide, high = width + _PASSING_PX * COUNT, height - height // 2
+    blades = np.random.default_rng(0).integers(*_GRASS, (high // 2, wide // 2, 3), dtype=np.uint8)
+    scene = np.full((height, width, 3), _SKY, np.uint8)
+    scene[height // 2 :] = cv2.resize(blades, (wide, high))[:, _PASSING_PX * number :][:, :width]
+    return cv2.imencode(".jpg", scene, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
 
 
 class Feeder:
-    """The process behind a camera."""
+    """The process behind the loopback camera."""
 
-    def __init__(self, *command: str) -> None:
-        """Begins once the process has said something, which it does with its first image."""
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-        assert self._process.stdout is not None
-        if not self._process.stdout.read(1):
+    def __init__(self, pixel_format: PixelFormat, size: Size, rate_hz: float) -> None:
+        """Begins with its first image."""
+        command = [sys.executable, "-m", __name__, pixel_format, *map(str, size), str(rate_hz)]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE)
+        assert self.process.stdout is not None
+        if not self.process.stdout.read(1):
             raise RuntimeError(f"{' '.join(command)}: ended at once")
 
     def fall_silent(self) -> float:
         """Stops its images; since when, on the monotonic clock."""
-        os.kill(self._process.pid, signal.SIGSTOP)
+        self.process.send_signal(signal.SIGSTOP)
         return time.monotonic()
 
     def go_on(self) -> float:
         """Sends images again; since when."""
-        os.kill(self._process.pid, signal.SIGCONT)
+        self.process.send_signal(signal.SIGCONT)
         return time.monotonic()
 
     def close(self) -> None:
         """Ends it."""
-        self._process.kill()
-        self._process.wait()
+        self.process.kill()
+        self.process.wait()
 
 
-def loopback(size: tuple[int, int], rate_hz: float) -> Feeder:
-    """Feeds the loopback camera with Motion-JPEG."""
-    module = [sys.executable, "-m", "tools.checks.device_check.feeder"]
-    return Feeder(*module, LOOPBACK, *map(str, size), str(rate_hz))
+def feed(pixel_format: PixelFormat, size: Size, rate_hz: float) -> None:
+    """Plays the sensor until it is killed; prints a word when the first image is out."""
+    fourcc = int.from_bytes(b"YUYV" if pixel_format == "yuyv" else b"MJPG", "little")
+    wanted = Format(
+        type=_OUTPUT, width=size[0], height=size[1], pixelformat=fourcc, field=_PROGRESSIVE,
+        sizeimage=2 * size[0] * size[1],
+    )  # fmt: skip
+    frames = [image(pixel_format, size, number) for number in range(COUNT)]
+    descriptor = os.open(LOOPBACK, os.O_RDWR)
+    fcntl.ioctl(descriptor, VIDIOC_S_FMT, wanted)
+    due_s = time.monotonic()
+    for number in itertools.count():
+        os.write(descriptor, frames[number % COUNT])
+        if number == 0:
+            print("feeds", flush=True)
+        due_s = max(due_s + 1.0 / rate_hz, time.monotonic())
+        time.sleep(max(due_s - time.monotonic(), 0.0))
 
 
-def cable(images: Sequence[bytes]) -> Feeder:
-    """Feeds the HDMI output with frames, over and over."""
-    with tempfile.NamedTemporaryFile(delete=False) as file:
-        file.write(b"".join(images))
-    return Feeder("v4l2-ctl", "-d", CABLE_OUT, "--stream-out-mmap", f"--stream-from={file.name}", "--stream-loop")
-
-
-@contextmanager
-def feeding(feeder: Feeder) -> Iterator[Feeder]:
-    """Until the end of the block."""
-    try:
-        yield feeder
-    finally:
-        feeder.close()
-
-
-def _controls(descriptor: int) -> dict[str, int]:
-    """The number of each, by its name."""
-    found: dict[str, int] = {}
-    query = QueryControl(id=_NEXT)
-    while True:
-        try:
-            fcntl.ioctl(descriptor, VIDIOC_QUERYCTRL, query)
-        except OSError:
-            return found  # that was the last
-        found[control_name(query.name)] = query.id
-        query = QueryControl(id=query.id | _NEXT)
-
-
-def _vga(device: str) -> int:
-    """Which of the device's timings is 640x480 at 60 Hz."""
-    index, width, height = -1, "", ""
-    for line in run("v4l2-ctl", "-d", device, "--list-dv-timings").splitlines():
-        key, _, value = (part.strip() for part in line.partition(":"))
-        match key:
-            case "Index":
-                index = int(value)
-            case "Active width":
-                width = value
-            case "Active height":
-                height = value
-            case "Pixelclock" if (width, height) == ("640", "480") and "59.94" in value:
-                return index
-    raise RuntimeError(f"{device} has no timings of 640x480 at 59.94 Hz")
+if __name__ == "__main__":
+    _, kind, wide_px, high_px, hz = sys.argv
+    feed("yuyv" if kind == "yuyv" else "mjpeg", (int(wide_px), int(high_px)), float(hz))

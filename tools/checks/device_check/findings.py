@@ -1,13 +1,18 @@
-"""What a check found, and how it gets out of the virtual machine: a line of JSON each, in the order of the checks."""
+"""What a check found, how it gets out of the virtual machine, and what all checks do; of the standard library alone."""
 
 from __future__ import annotations
 
 import json
+import subprocess
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+
+UNIT = "flockd.service"
+PATIENCE_S = 180.0
+"""As long as an emulated processor may need for anything."""
 
 
 @dataclass(frozen=True)
@@ -25,34 +30,50 @@ class Finding:
 Check = Callable[[], Iterator[Finding]]
 
 
-class Notebook:
-    """Writes findings down as they come: what the machine does not live to write has failed."""
+def run_checks(path: Path, checks: Iterable[Check]) -> None:
+    """Writes a line of JSON for each finding as it comes: what the machine does not live to write has failed.
 
-    def __init__(self, path: Path, only: Sequence[str]) -> None:
-        """``only``: the groups to run; none for all."""
-        self._path, self._only = path, only
+    A check that breaks has failed, and the next one runs.
+    """
 
-    def run(self, group: str, checks: Sequence[Check]) -> None:
-        """Runs one group; a check that breaks has failed, and the next one runs."""
-        if self._only and group not in self._only:
-            return
-        begun_s = time.monotonic()
-        for check in checks:
-            try:
-                for finding in check():
-                    self._write(asdict(finding))
-            except Exception as error:  # noqa: BLE001 - whatever it is, the other checks still have something to say
-                traceback.print_exc()
-                measured = f"{type(error).__name__}: {error}"
-                self._write(
-                    asdict(Finding(check.__name__, passed=False, measured=measured, wanted="to run to its end"))
-                )
-        self._write({"group": group, "took_s": round(time.monotonic() - begun_s, 1)})
-
-    def close(self) -> None:
-        """All checks have run."""
-        self._write({"done": True})
-
-    def _write(self, line: dict[str, object]) -> None:
-        with self._path.open("a", encoding="utf-8") as file:
+    def write(line: dict[str, object]) -> None:
+        with path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
+
+    for check in checks:
+        try:
+            for finding in check():
+                write(asdict(finding))
+        except Exception as error:  # noqa: BLE001 - whatever it is, the other checks still have something to say
+            traceback.print_exc()
+            measured = f"{type(error).__name__}: {error}"
+            write(asdict(Finding(check.__name__, passed=False, measured=measured, wanted="to run to its end")))
+    write({"done": True})
+
+
+def soon(check: str, took_s: float, limit_s: float, row: int | None = None) -> Finding:
+    """Whether something happened in time."""
+    return Finding(check, took_s <= limit_s, f"{took_s:.2f} s", f"within {limit_s:g} s", row)
+
+
+def until(condition: Callable[[], bool], what: str, *, look_s: float = 0.1, within_s: float = PATIENCE_S) -> float:
+    """When it became so, on the monotonic clock. Raises TimeoutError, which names what was waited for."""
+    begun_s = time.monotonic()
+    while not condition():
+        if time.monotonic() - begun_s > within_s:
+            raise TimeoutError(f"waited {within_s:g} s for {what}")
+        time.sleep(look_s)
+    return time.monotonic()
+
+
+def run(*command: str) -> str:
+    """What a command prints on both streams. Raises RuntimeError with the end of it where the command fails."""
+    result = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    if result.returncode:
+        raise RuntimeError(f"{' '.join(command)}: {result.stdout.strip()[-400:]}")
+    return result.stdout
+
+
+def shown(what: str) -> str:
+    """A property of the unit."""
+    return run("systemctl", "show", UNIT, "--value", "-p", what).strip()
