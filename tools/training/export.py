@@ -2,7 +2,8 @@
 
     python -m tools.training.export neighbours --checkpoint RUNS/neighbours/checkpoint.pt --out models_of_mine --half
 
-Crops, thresholds and meanings are those of `--like`, by default of models/NETWORK.yaml.
+Crops, thresholds, meanings and data are those of `--like`, by default of models/NETWORK.yaml. The flow is exported with
+one iteration: it trains with three, and DIS does the rest better.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from tools.training.weights import HALVED
 Arrays = dict[str, NDArray[Any]]
 NETWORKS: dict[str, Callable[[], nn.Module]] = {
     "neighbours": NeighboursNet, "distance": DistanceNet, "verification": VerificationNet, "detector": Boxes,
-    "flow": FlowNet,
+    "flow": lambda: FlowNet(iterations=1),
 }  # fmt: skip
 ALLOWED_DIFFERENCE = 2e-3
 """Between ONNX Runtime and torch, as a share of the output's largest value."""
@@ -53,21 +54,14 @@ def main() -> None:
     parser.add_argument("--like", type=Path, help="manifest that says all that is not measured here")
     parser.add_argument("--half", action="store_true", help="store weights in 16 bits: half the file")
     parser.add_argument(
-        "--iterations", type=int, default=1, help="of the flow: it trains with 3, DIS does the rest better"
-    )
-    parser.add_argument(
         "--begun-with",
         type=Path,
         metavar="CHECKPOINT",
         help="what the run was started with, its start.pt: the mean of both weights is exported",
     )
     parser.add_argument("--share", type=float, default=BEGUN_WITH_SHARE, help="of --begun-with in that mean")
-    parser.add_argument("--learnt-from", metavar="TEXT", help="its data and their licences; default: the shipped one's")
-    parser.add_argument("--accuracy", action="append", default=[], metavar="WHAT=FIGURE", help="measured accuracy")
     arguments = parser.parse_args()
     net = NETWORKS[arguments.network]()
-    if isinstance(net, FlowNet):
-        net.iterations = arguments.iterations
     state = torch.load(arguments.checkpoint, map_location="cpu")
     trained = net.detector if isinstance(net, Boxes) else net
     trained.load_state_dict(state["net"])
@@ -76,8 +70,7 @@ def main() -> None:
     like, _ = load_manifest(arguments.like or data_path("models") / f"{arguments.network}.yaml")
     document = like.model_dump(mode="json", exclude_defaults=True) | {
         "name": arguments.network,
-        "data": arguments.learnt_from or like.data,
-        "accuracy": dict(a.split("=", 1) for a in arguments.accuracy),
+        "accuracy": {},
         "command": f"tools.training.train {arguments.network} ({state['spent'] / 60:.0f} minutes, {state['step']} "
         f"steps), tools.training.export{' --half' * arguments.half}",
     }

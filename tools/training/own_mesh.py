@@ -175,37 +175,28 @@ def _in_cells(vertices: Array, triangles: Array, cell_m: float) -> tuple[Array, 
 def _colours(piece: Any, is_gltf: bool) -> Array:
     """(m, 3) linear albedo of each triangle, NaN where the file says none.
 
-    Of glTF, pictures are sRGB and all other colours linear, and a material without a colour is white (glTF 2.0, 3.7.2.1
-    and 3.9.2); of other files, all are sRGB.
+    Of glTF, pictures are sRGB and all other colours linear (glTF 2.0, 3.7.2.1 and 3.9.2); of other files, all are sRGB.
     """
     visual, of_numbers = piece.visual, (lambda grey: grey) if is_gltf else _linear
     if visual.kind in ("vertex", "face"):
         return np.asarray(of_numbers(np.asarray(visual.face_colors, np.float64)[:, :3] / 255.0))
+    nothing = np.full((len(piece.faces), 3), np.nan)
     if visual.kind != "texture":
-        return np.full((len(piece.faces), 3), np.nan)
-    factor, image = _paint(visual.material)
-    colours = np.full((len(piece.faces), 3), 1.0 if is_gltf or factor is not None else np.nan)
+        return nothing
+    material = visual.material
+    if isinstance(material, PBRMaterial):
+        factor, image = material.baseColorFactor, material.baseColorTexture
+    else:
+        # Where it has a picture, without its Kd: many programs write one that is not meant to darken the picture. What
+        # the reader puts in place of a material that is nowhere described has no "kd".
+        image = material.image if material.image is not None and "file_path" in material.image.info else None
+        factor = material.diffuse if "kd" in material.kwargs else None
     if image is not None and visual.uv is not None:
         middles = np.asarray(visual.uv, np.float64)[piece.faces].mean(axis=1)
-        colours = _linear(uv_to_color(middles, image)[:, :3] / 255.0)
-    if factor is not None:
-        colours = colours * of_numbers(np.asarray(factor, np.float64)[:3] / 255.0)
-    shades = visual.vertex_attributes.get("color")
-    if shades is not None:
-        most = np.iinfo(shades.dtype).max if np.issubdtype(shades.dtype, np.integer) else 1.0
-        colours = colours * (np.asarray(shades, np.float64)[:, :3] / most)[piece.faces].mean(axis=1)
-    return np.asarray(colours)
-
-
-def _paint(material: Any) -> tuple[Any, Any]:
-    """One colour (r, g, b, a), 0 to 255, and a picture, each None where the file says none."""
-    if isinstance(material, PBRMaterial):
-        return material.baseColorFactor, material.baseColorTexture
-    if material.image is not None and "file_path" in material.image.info:
-        # Without its Kd: many programs write one that is not meant to darken the picture.
-        return None, material.image
-    # What the reader puts in place of a material that is nowhere described has no "kd".
-    return material.diffuse if "kd" in material.kwargs else None, None
+        return np.asarray(_linear(uv_to_color(middles, image)[:, :3] / 255.0))
+    if factor is None:
+        return nothing
+    return np.tile(of_numbers(np.asarray(factor, np.float64)[:3] / 255.0), (len(piece.faces), 1))
 
 
 def _linear(grey: Array) -> Array:

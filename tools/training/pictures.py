@@ -205,8 +205,6 @@ class CropFiles:
         for path in sorted(folder.glob("*.npz")):
             with np.load(path) as arrays:
                 files.append(dict(arrays))
-            if "mask" not in files[-1]:
-                raise ValueError(f"{path}: its crops have no masks; make the folder anew")
         if not files:
             raise FileNotFoundError(
                 f"{folder}: no crops here; make them with `python -m tools.training.render_drone_crops`"

@@ -48,15 +48,13 @@ def main() -> None:
         help="folder of tools.training.render_training_data, or tools.training.render_drone_crops",
     )
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--accuracy", action="append", default=[], metavar="WHAT=FIGURE", help="measured accuracy")
     arguments = parser.parse_args()
-    accuracy = dict(measured.split("=", 1) for measured in arguments.accuracy)
-    path, differences = quantise(arguments.manifest, arguments.data, arguments.out, accuracy)
+    path, differences = quantise(arguments.manifest, arguments.data, arguments.out)
     size = path.with_suffix(".onnx").stat().st_size
     print(f"{path}: {size / 1e6:.1f} MB; mean differences in deviations: {differences}")
 
 
-def quantise(float_manifest: Path, data: Path, out: Path, accuracy: dict[str, str]) -> tuple[Path, dict[str, float]]:
+def quantise(float_manifest: Path, data: Path, out: Path) -> tuple[Path, dict[str, float]]:
     """Write the 8-bit twin into ``out``: its manifest, and each output's mean difference in standard deviations.
 
     Raises SystemExit where one differs too much.
@@ -69,7 +67,7 @@ def quantise(float_manifest: Path, data: Path, out: Path, accuracy: dict[str, st
     twin = out / f"{name}.onnx"
     _quantise(file, feeds[:IMAGES], twin)
     differences = _differences(file, twin, feeds[IMAGES:])
-    accuracy = accuracy | {
+    accuracy = {
         f"{output}, mean difference from {manifest.name}": f"{d} deviations" for output, d in differences.items()
     }
     document = manifest.model_dump(mode="json", exclude_defaults=True)

@@ -60,7 +60,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--worlds", type=int, default=300)
-    parser.add_argument("--skip", type=int, default=0, help="worlds, of which there are crops already elsewhere")
     parser.add_argument("--scenes", type=int, default=400, help="drones a world")
     add_mesh(parser)
     parser.add_argument("--held-out", action="store_true", help="to measure on, of drones and worlds never learnt from")
@@ -70,7 +69,7 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     # From the far end of the training worlds: other places than those of whole images.
     split = worlds.TEST if arguments.held_out else worlds.TRAINING
-    files = {seed: arguments.out / f"{seed}.npz" for seed in split[::-1][arguments.skip :][: arguments.worlds]}
+    files = {seed: arguments.out / f"{seed}.npz" for seed in split[::-1][: arguments.worlds]}
     jobs = [
         CropJob(file, seed, arguments.scenes, own, measures=arguments.held_out)
         for seed, file in files.items()

@@ -44,7 +44,6 @@ def main() -> None:
     parser.add_argument("--split", choices=["training", "validation", "test"], default="training")
     parser.add_argument("--families", choices=["training", "unseen"], default="training")
     parser.add_argument("--worlds", type=int, default=120)
-    parser.add_argument("--skip", type=int, default=0, help="worlds of the split, which are rendered already")
     parser.add_argument("--pairs", type=int, default=30, help="pairs a world")
     parser.add_argument("--obstacles", type=float, default=0.0, metavar="SHARE", help="of the worlds; default: none")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
@@ -52,10 +51,9 @@ def main() -> None:
     seeds = {"training": worlds.TRAINING, "validation": worlds.VALIDATION, "test": worlds.TEST}[arguments.split]
     families = {"training": worlds.FAMILIES, "unseen": worlds.UNSEEN_FAMILIES}[arguments.families]
     share = worlds.SHAPES_SHARE if (arguments.split, arguments.families) == ("training", "training") else 0.0
-    wanted = range(arguments.skip, arguments.skip + arguments.worlds)
     jobs = [
         PairJob(arguments.out / f"part-{i:04d}", seeds[i], arguments.pairs, families, share, arguments.obstacles)
-        for i in wanted
+        for i in range(arguments.worlds)
     ]
     missing = [job for job in jobs if not (job.folder / "made.json").is_file()]
     worlds.in_processes(render_world, missing, arguments.processes)

@@ -8,7 +8,7 @@ DATA/cutouts of render_cutouts, DATA/photographs without drones and DATA/labelle
 docs/networks.md), and what tools.training.mine found in them. `sigma` is the last part of `distance`: how far it may
 misjudge a drone's size, also of one that it has not seen.
 
-Writes OUT/checkpoint.pt, OUT/curve.csv and a picture of it every few minutes. Uses a GPU where there is one.
+Writes OUT/checkpoint.pt every few minutes and OUT/curve.csv. Uses a GPU where there is one.
 With --start it goes on from another run's weights, or from a network of models/, and keeps them as OUT/start.pt.
 """
 
@@ -23,7 +23,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
@@ -143,7 +142,6 @@ def train(task: Task, out: Path, budget_s: float, seed: int, workers: int) -> No
             }  # fmt: skip
             torch.save(state, checkpoint.with_suffix(".new"))
             checkpoint.with_suffix(".new").replace(checkpoint)
-            _draw_curve(out)
             last_save = spent
 
 
@@ -189,19 +187,6 @@ def _note(out: Path, step: int, spent: float, recent: list[dict[str, float]]) ->
         curve.write_text("step,seconds," + ",".join(means) + "\n")
     with curve.open("a") as file:
         file.write(f"{step},{spent:.0f}," + ",".join(f"{v:.6f}" for v in means.values()) + "\n")
-
-
-def _draw_curve(out: Path) -> None:
-    """One small plot a figure, over minutes of training."""
-    with (out / "curve.csv").open() as file:
-        names = file.readline().strip().split(",")[2:]
-        rows = np.array([[float(value) for value in line.split(",")] for line in file])
-    figure = Figure(figsize=(4.0 * len(names), 3.0), layout="constrained")
-    for name, axes, values in zip(names, figure.subplots(1, len(names)), rows[:, 2:].T, strict=True):
-        axes.plot(rows[:, 1] / 60.0, values, linewidth=0.8)
-        axes.set(title=name, xlabel="minutes", yscale="log" if (values > 0).all() else "linear")
-        axes.grid(alpha=0.3, which="both")
-    figure.savefig(out / "curve.png", dpi=80)
 
 
 if __name__ == "__main__":

@@ -11,10 +11,7 @@ from flockd.core.config.loader import load_drone
 from flockd.core.data import data_path
 from flockd.core.messages import Detection, Float32Array, FloatArray
 from flockd.flight.geometry import (
-    PinholeCamera,
     RangeMap,
-    RigCamera,
-    RigidTransform,
     ZMap,
     build_rig,
     estimate_ego_motion,
@@ -92,14 +89,3 @@ def test_the_own_motion_before_an_exact_wall_is_as_exact_as_with_a_pinhole() -> 
     ego = estimate_ego_motion(pairs, RIG, 0.5, CONFIG.geometry)
     np.testing.assert_allclose(ego.translation, FRONT.T_body_camera.rotation @ step, atol=0.005)
     assert ego.inliers == pytest.approx(len(pairs), rel=0.05)
-
-
-def test_a_pinhole_and_a_fisheye_lift_the_same_wall_to_the_same_points() -> None:
-    matrix = np.array([[320.0, 0.0, 240.0], [0.0, 320.0, 320.0], [0.0, 0.0, 1.0]])
-    pinhole = RigCamera("pinhole", PinholeCamera(matrix, (480, 640)), RigidTransform(np.eye(3), np.zeros(3)))
-    point = np.array([[2.0, 1.0, WALL_M]])
-    for lens in (pinhole.camera, FRONT.camera):
-        pixel = lens.project(point)
-        column, row = pixel[0].astype(int)
-        ranges = range_map(wall_z(WALL_M), lens)
-        np.testing.assert_allclose(lens.unproject(pixel, ranges[row, [column]].astype(np.float64)), point, atol=0.02)

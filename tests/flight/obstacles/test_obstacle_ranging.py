@@ -9,11 +9,12 @@ import pytest
 
 from flockd.core.config.avoidance import ObstacleParameters
 from flockd.core.data import data_path
-from flockd.core.messages import SECTORS, UNCLASSED, EgoMotion, FloatArray, ObstacleRanges, VehicleState
-from flockd.flight.geometry import RangeMap, Rig, build_rig, grid_pixels
+from flockd.core.messages import SECTORS, UNCLASSED, EgoMotion, FloatArray, GroundEstimate, ObstacleRanges, VehicleState
+from flockd.flight.geometry import RangeMap, Rig, ZMap, build_rig, grid_pixels, ground_inverse_depth, range_map
 from flockd.flight.obstacles import ObstacleRanging
 from flockd.flight.perception import CameraObservation, Observation
 from flockd.sim.scenario import load_scenario
+from tests.flight.geometry.synthetic_world import four_camera_rig
 
 RIG = build_rig(load_scenario(data_path("config") / "square.yaml").drone.rig)
 PARAMETERS = ObstacleParameters(range_m=12.0, range_sigma=0.1, min_pixels=4)
@@ -228,3 +229,18 @@ def test_a_depth_map_counts_where_the_flow_could_not_show_what_it_says(way_m: fl
     assert all(k in found(ranges) for k in np.flatnonzero(off <= sectors - 2))
     np.testing.assert_allclose(ranges.range_m[0], 4.0, rtol=0.06)
     np.testing.assert_allclose(ranges.seen_m[SECTORS // 8], 4.0, rtol=0.06)
+
+
+def test_a_hillside_ahead_is_ground_and_no_obstacle() -> None:
+    """It rises to the drone's height, and ranges to the ground have told its slope."""
+    rig, height_m, slope, cameras = four_camera_rig(), 2.5, (0.15, 0.0), {}
+    for name, camera in rig.cameras.items():
+        inverse = ground_inverse_depth(camera, LEVEL, height_m, slope=slope)
+        depth = range_map(ZMap((1.0 / np.maximum(inverse, 1e-3)).astype(np.float32)), camera.camera)
+        nothing = np.zeros(inverse.shape, np.uint8)
+        cameras[name] = CameraObservation(np.zeros((*inverse.shape, 3), np.uint8), depth, nothing, None)
+    seen_hill = Observation(0.0, VehicleState(0.0, LEVEL, height_m), cameras, (), None)
+    ranging = ObstacleRanging(rig, ObstacleParameters())
+    assert np.isfinite(ranging.ranges(seen_hill).range_m[0]), "of level ground below, the hill would stand on it"
+    told = GroundEstimate(height_m, np.array(slope), "range_finder")
+    assert not np.isfinite(ranging.ranges(seen_hill, ground=told).range_m).any()

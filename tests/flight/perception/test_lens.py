@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import cv2
@@ -27,9 +28,14 @@ LEVEL = np.eye(3)
 Spoil = Callable[[UInt8Array], UInt8Array]
 
 
-def ground(number: int, contrast: float = 25.0) -> UInt8Array:
-    """Sky above, ground of photographs' spectrum below, other ground in each image."""
-    image = scene(1.0, contrast, seed=number, size=(SIZE[1], SIZE[0]))
+@functools.cache
+def texture(number: int) -> UInt8Array:
+    return scene(1.0, 25.0, seed=number, size=(SIZE[1], SIZE[0]))
+
+
+def ground(number: int) -> UInt8Array:
+    """Sky above, ground of photographs' spectrum below, other ground in each image of a camera in turn."""
+    image = np.roll(texture(number % 9), 37 * number, axis=1)
     image[: SIZE[1] // 2] = 190
     return image
 

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from flockd.cli import main
 from flockd.core.choices import ROLES
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
@@ -61,24 +60,6 @@ def test_another_models_weights_do_not_give_the_golden_output(copies: Path) -> N
     manifest.write_text(text.replace(golden, golden.split(":")[0] + ": 123.0"))
     with pytest.raises(ModelError, match=r"distance\.yaml:\d+: outputs\.range: the golden input gives mean"):
         OnnxModel(manifest, threads=1)
-
-
-def test_the_simulator_refuses_a_flipped_bit_in_one_sentence(
-    copies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    content = bytearray((copies / "neighbours_int8.onnx").read_bytes())
-    content[-100] ^= 8
-    (copies / "neighbours_int8.onnx").write_bytes(content)
-    drone = (ROOT / "config" / "simulator.yaml").read_text()
-    drone = drone.replace("perception:\n", f"perception:\n  models_dir: {copies}\n")
-    (tmp_path / "simulator.yaml").write_text(drone)
-    flight = tmp_path / "flight.yaml"
-    flight.write_text((ROOT / "config" / "paper_flight.yaml").read_text())
-    assert main(["sim", str(flight), "--duration", "1", "--quiet", "--out", str(tmp_path / "out")]) == 78
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert f"{copies / 'neighbours_int8.yaml'}:6: sha256: {copies / 'neighbours_int8.onnx'}" in error
-    assert "restore it" in error
 
 
 def test_a_model_in_the_wrong_role_is_refused() -> None:
@@ -213,7 +194,7 @@ def test_many_images_go_in_batches_no_larger_than_what_is_prepared(monkeypatch: 
 
 
 def test_the_network_of_flow_is_made_exact_as_configured() -> None:
-    first, second = shifted_pictures((9, -5), (480, 640))
+    first, second = shifted_pictures((9, -5), (320, 240))
     network = OnnxFlow(OnnxModel(MODELS / "flow_int8.yaml", threads=1))
     no_drones = np.zeros(first.shape[:2], np.uint8)
     rough = network.flow(first, second)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -19,11 +19,10 @@ from flockd.core.messages import (
     FrameSet,
     Reason,
     ReasonKind,
-    UInt8Array,
     VehicleState,
 )
 from flockd.flight.geometry import RigCalibration, RigCamera, rotation_angle_deg
-from flockd.flight.perception import Crop, Observation, RangeEstimate, SceneMaps
+from flockd.flight.perception import Observation, SceneMaps
 from flockd.flight.pilot import FlockPilot
 from tests.flight.pilot.flyer import STEP_S, Flyer, scenario_with
 
@@ -112,11 +111,11 @@ def test_a_neighbour_pulls_by_how_long_it_has_been_seen() -> None:
     drone = flyer.scenario.drone
     as_in_paper = drone.flocking.model_copy(update={"cohesion_time_s": None})
     other = FlockPilot(drone.model_copy(update={"flocking": as_in_paper}), flyer.truth)
-    for step in range(10):
+    for step in range(5):
         frames, state = flyer.take_frames()
         ours, papers = flyer.pilot.step(frames, state), other.step(frames, state)
         flyer.move()
-        if step in (2, 3, 9):
+        if step > 1:
             (neighbour,) = ours.neighbours
             whole = 0.1 * (d := float(np.hypot(*neighbour.position[:2]))) * math.log(d / 3.5)
             lacking = papers.command.acceleration[0] - ours.command.acceleration[0]
@@ -125,60 +124,39 @@ def test_a_neighbour_pulls_by_how_long_it_has_been_seen() -> None:
 
 
 @pytest.mark.fault("network-not-finite")
-def test_an_output_that_is_not_finite_costs_its_frame_only() -> None:
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
-    sound = flyer.truth.sound("scene")
-
-    def spoilt(frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
-        if frame.camera == "back":
-            raise FloatingPointError("model x: output depth is not finite")
-        result: SceneMaps = sound(frame, camera, ground)
-        return result
-
-    flyer.truth.instead["scene"] = spoilt
-    flyer.step()
-    flyer.move()
-    output = flyer.step()
-    assert output.counts["camera back: model x: output depth is not finite"] == 1
-    assert output.ego_motion is not None
-
-
-@pytest.mark.fault("network-not-finite")
-def test_a_flow_that_is_not_finite_costs_its_camera_only() -> None:
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
-    sound = flyer.truth.sound("flow")
-
-    def spoilt(first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
-        if second.camera == "back":
-            raise FloatingPointError("model x: output flow is not finite")
-        result: Float32Array = sound(first, second, labels)
-        return result
-
-    flyer.truth.instead["flow"] = spoilt
-    flyer.step()
-    flyer.move()
-    output = flyer.step()
-    assert output.reasons == (Reason(ReasonKind.CAMERA, "camera back: model x: output flow is not finite"),)
-    assert output.ego_motion is not None
-    assert len(output.detections) == 1
-
-
-@pytest.mark.fault("network-not-finite")
-def test_a_range_that_is_not_finite_costs_its_proposal_only() -> None:
-    """Two neighbours, ahead and behind; the network fails on any batch that holds a crop of what is behind."""
+@pytest.mark.parametrize(
+    ("role", "of_behind", "kind", "text"),
+    [
+        ("scene", lambda frame, *_: frame.camera == "back", ReasonKind.CAMERA, "camera back: model x: not finite"),
+        ("flow", lambda _, second, __: second.camera == "back", ReasonKind.CAMERA, "camera back: model x: not finite"),
+        (
+            "ranges", lambda crops: any(crop.T_body_camera.rotation[0, 2] < 0.0 for crop in crops),
+            ReasonKind.PROPOSAL, "proposal: model x: not finite",
+        ),
+    ],
+    ids=["an output costs its frame", "a flow its camera", "a range its proposal"],
+)  # fmt: skip
+def test_what_is_not_finite_costs_no_more_than_what_it_is_of(
+    role: str, of_behind: Callable[..., bool], kind: ReasonKind, text: str
+) -> None:
+    """Two neighbours, ahead and behind; the network fails on what is behind, and on any batch of crops with it."""
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6), (-3.0, 0.0, -3.6)))
-    sound = flyer.truth.sound("ranges")
+    sound = flyer.truth.sound(role)
 
-    def spoilt(crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        if any(crop.T_body_camera.rotation[0, 2] < 0.0 for crop in crops):
-            raise FloatingPointError("model x: output range is not finite")
-        result: tuple[RangeEstimate, ...] = sound(crops)
-        return result
+    def spoilt(*given: Any) -> Any:
+        if of_behind(*given):
+            raise FloatingPointError("model x: not finite")
+        return sound(*given)
 
-    flyer.truth.instead["ranges"] = spoilt
+    flyer.truth.instead[role] = spoilt
+    flyer.step()
+    flyer.move()
     output = flyer.step()
-    assert output.reasons == (Reason(ReasonKind.PROPOSAL, "proposal: model x: output range is not finite"),)
-    assert [detection.position[0] > 0.0 for detection in output.detections] == [True]
+    assert Reason(kind, text) in output.reasons
+    assert {reason.kind for reason in output.reasons} == {kind}
+    assert output.ego_motion is not None
+    ahead = [detection.position[0] > 0.0 for detection in output.detections]
+    assert sorted(ahead) == ([False, True] if role == "flow" else [True])
 
 
 @pytest.mark.parametrize("still_there", [True, False])
@@ -261,18 +239,19 @@ def test_a_mission_is_unknown_before_the_first_good_step_and_stays_known_in_refu
 
 
 @pytest.mark.parametrize("yaw", ["hold", "course"])
-def test_a_heading_to_hold_is_the_first_one_whatever_the_wind_makes_of_it(yaw: str) -> None:
+@pytest.mark.parametrize(
+    ("headings_rad", "height_m", "asked_rad"),
+    [
+        ((1.0, 1.2, 0.7, -3.0), 4.0, (1.0, 1.0, 1.0, 1.0)),  # whatever the wind makes of it
+        ((2.0, 2.1), math.nan, (2.0, 2.0)),  # refused before its first good step
+        ((math.nan, 2.0, 2.5), 4.0, (None, 2.0, 2.0)),  # before any good attitude
+    ],
+)
+def test_a_heading_to_hold_is_the_first_good_one(
+    yaw: str, headings_rad: tuple[float, ...], height_m: float, asked_rad: tuple[float | None, ...]
+) -> None:
     """With `course`, where the mission has none."""
-    assert blown_about(yaw, 1.0, 1.2, 0.7, -3.0) == pytest.approx([1.0] * 4)
-
-
-@pytest.mark.parametrize("yaw", ["hold", "course"])
-def test_refused_before_its_first_good_step_it_holds_the_heading_that_it_has_then(yaw: str) -> None:
-    assert blown_about(yaw, 2.0, 2.1, height_m=math.nan) == pytest.approx([2.0] * 2)
-
-
-def test_before_any_good_attitude_no_heading_is_asked_for() -> None:
-    assert blown_about("course", math.nan, 2.0, 2.5) == [None, pytest.approx(2.0), pytest.approx(2.0)]
+    assert blown_about(yaw, *headings_rad, height_m=height_m) == [one and pytest.approx(one) for one in asked_rad]
 
 
 @pytest.mark.parametrize(

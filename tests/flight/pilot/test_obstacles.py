@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -11,10 +10,9 @@ import pytest
 
 from flockd.core.config import DroneConfig
 from flockd.core.data import data_path
-from flockd.core.messages import SECTORS, FrameSet, ObstacleRanges, PilotOutput, VehicleState
+from flockd.core.messages import SECTORS, FrameSet, PilotOutput, VehicleState
 from flockd.flight.perception import Observation
 from flockd.flight.pilot import FlockPilot
-from flockd.onboard.message_json import from_json, parsed, to_json
 from flockd.sim.scenario import load_scenario
 from flockd.sim.world.obstacles import Box, Obstacles, true_ranges
 from tests.make import frames, vehicle
@@ -82,13 +80,3 @@ def test_where_it_sees_nothing_more_the_wall_stays_for_a_while_and_then_it_stand
     kept = [bool(np.isfinite(output.obstacles.range_m[0])) for output in outputs if output.obstacles is not None]
     assert kept == [True] * 7 + [False] * 2  # 3 s
     np.testing.assert_allclose(outputs[-1].command.velocity, 0.0, atol=1e-9)
-
-
-def test_a_recorded_map_is_the_map() -> None:
-    output = flown(drone(enabled=True), [True])[-1]
-    assert output.obstacles is not None
-    written = parsed(json.dumps(to_json(output)).encode())
-    read = from_json(PilotOutput, written)
-    for name in ("range_m", "sigma_m", "seen_m"):
-        np.testing.assert_array_equal(getattr(read.obstacles, name), getattr(output.obstacles, name))
-    assert isinstance(read.obstacles, ObstacleRanges)

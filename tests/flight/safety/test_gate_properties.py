@@ -10,24 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.core.config import load_drone
 from flockd.core.config.safety import GateParameters, SafetyParameters
-from flockd.core.messages import Wanted
 from flockd.flight.safety import (
     OFFBOARD,
     Action,
     CameraHealth,
-    Gate,
     Inputs,
-    Permission,
-    Request,
     State,
     Supervisor,
     Surroundings,
     Verdict,
     link_lost,
 )
-from tests.hostile import CORPUS, any_float, hostile
+from tests.hostile import any_float, hostile
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numbers near the largest overflow
 ROUNDING = 1e-6
@@ -53,44 +48,6 @@ def assert_safe(verdict: Verdict, p: GateParameters, action: Action, around: Sur
         level = math.hypot(*offset[:2])
         if np.isfinite(offset).all() and level > 0.1 and math.hypot(*offset) < separation_m - ROUNDING:
             assert offset[:2] / level @ setpoint.velocity <= ROUNDING, "towards a neighbour that is too near"
-
-
-def test_whatever_is_asked_for_nothing_unsafe_is_sent() -> None:
-    parameters = (
-        GateParameters(),
-        GateParameters(fence_radius_m=None, fence_corners_m=((0, 0), (20, 0), (20, 20), (0, 20))),
-        load_drone(CORPUS / "drone.yaml").safety.gate,
-    )
-
-    @hostile(40)
-    def check(random: Random) -> None:
-        p = random.choice(parameters)
-        gate, now_s = Gate(p), random.choice((0.0, 1e3, 1e9))
-        for _ in range(random.randrange(1, 8)):
-            now_s += random.choice((0.0, 0.05, 0.05, 0.05, 0.5, -0.1))
-            two = [np.array([any_float(random), any_float(random)]) for _ in range(2)]
-            yaw_rad, height_m = (None if random.random() < 0.2 else any_float(random) for _ in range(2))
-            wanted = Wanted(two[0], two[1], yaw_rad, height_m=height_m)
-            around = _surroundings(random)
-            action = random.choice(list(Action))
-            wanted_s = now_s - random.choice((0.0, 0.1, 1.0, 1.2, any_float(random)))
-            permission = Permission(action, now_s - random.choice((0.0, 0.0, 0.0, any_float(random))))
-            request = Request(permission, wanted, wanted_s, any_float(random), around)
-            assert_safe(gate.step(now_s, request), p, action, around)
-
-    check()
-
-
-def _surroundings(random: Random) -> Surroundings:
-    count = random.choice((0, 1, 1, 2, 5, 12))
-    return Surroundings(
-        np.array([any_float(random), any_float(random)]),
-        np.array([any_float(random), any_float(random)]),
-        any_float(random),
-        np.array([any_float(random) for _ in range(3 * count)]).reshape(count, 3),
-        np.array([any_float(random) for _ in range(2 * count)]).reshape(count, 2),
-        any_float(random),
-    )
 
 
 _NUMBERS = tuple(field.name for field in dataclasses.fields(Inputs) if field.type == "float")

@@ -131,11 +131,6 @@ def test_a_velocity_that_is_not_finite_does_not_raise() -> None:
     np.testing.assert_array_equal(nearest_within(np.array([np.nan, 0.0]), np.array([[1.0, 0.0]]), np.zeros(1)), [0, 0])
 
 
-def test_who_is_told_of_no_obstacles_has_no_points() -> None:
-    still, nobody = np.zeros(2), np.empty((0, 3))
-    assert Surroundings(still, still, 0.0, nobody, nobody[:, :2], 5.0).obstacles.shape == (0, 2)
-
-
 def test_a_velocity_within_its_limits_is_itself() -> None:
     directions, limits = np.array([[1.0, 0.0], [0.0, -1.0], [-1.0, 0.0]]), np.array([0.5, 0.0, 0.0])
     np.testing.assert_array_equal(nearest_within(np.array([0.3, 0.7]), directions, limits), [0.3, 0.7])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import fields, replace
-from enum import StrEnum
 from typing import Any, Literal, NamedTuple
 
 import pytest
@@ -711,9 +710,3 @@ def test_in_waiting_what_keeps_it_from_flying_is_reported_first() -> None:
     assert flight.events[0] is Event.HOLD_ASKED
     assert flight.events[1] is Event.FENCE_LEFT
     assert sorted(flight.events[2:]) == [Event.CAMERA_LOST, Event.NOT_OFFBOARD]
-
-
-def test_states_events_and_actions_go_by_their_names_in_telemetry() -> None:
-    names: tuple[type[StrEnum], ...] = (State, Event, Action)
-    for names_of in names:
-        assert all(str(name) == name.name.lower() for name in names_of)

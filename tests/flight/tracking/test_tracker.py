@@ -122,19 +122,6 @@ def test_existence_depends_on_time_and_not_on_the_rate_of_frame_sets() -> None:
     assert found[0] < 0.95
 
 
-def test_what_is_seen_ten_times_a_second_is_confirmed_after_the_same_time() -> None:
-    """Three detections half a second apart: by 1 s. At ten steps a second 0.2 s were enough before."""
-    for step_s in (0.5, 0.1):
-        tracker, confirmed_s = Tracker(TrackingParameters(confirm_hits=3)), math.nan
-        for k in range(round(3.0 / step_s)):
-            tracker.predict(step_s, np.zeros(3))
-            tracker.update(k * step_s, [_seen(AHEAD)])
-            if _confirmed(tracker):
-                confirmed_s = k * step_s
-                break
-        assert confirmed_s == pytest.approx(1.0, abs=1e-9)
-
-
 def test_dense_clutter_makes_a_detection_say_less() -> None:
     """The innovation's own density is at most 1 / (2 pi)^2 / 0.09^3 / (0.0125 sqrt(2)) = 1,965."""
     probability = {}
@@ -252,15 +239,6 @@ def test_who_was_followed_for_long_is_still_there_after_a_longer_dropout(steps: 
     numbers = _step(tracker, time_s + STEP_S, 1.4 * AHEAD, sigma_m=0.3 * float(np.linalg.norm(AHEAD)))
     followed = [one.track for one in tracker.neighbours()]
     assert (numbers == (1,)) == (followed == [1]) == (steps == 80)
-
-
-def test_confirmation_takes_the_number_of_hits_asked_for() -> None:
-    tracker = Tracker(TrackingParameters(confirm_hits=3))
-    found = []
-    for k in range(4):
-        _step(tracker, k * STEP_S, AHEAD)
-        found.append(len(_confirmed(tracker)))
-    assert found == [0, 0, 1, 1]
 
 
 def test_a_detection_that_contradicts_a_track_does_not_confirm_it() -> None:

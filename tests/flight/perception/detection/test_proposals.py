@@ -9,7 +9,7 @@ from flockd.core.messages import UNCLASSED
 from flockd.flight.geometry import Rig, ZMap
 from flockd.flight.perception import Instance, SceneMaps, group_instances
 from flockd.flight.perception.detection.proposals import propose_instances, propose_residuals
-from tests.flight.perception.shipped import SECOND_STAGE
+from tests.flight.perception.cameras import SECOND_STAGE
 from tests.make import rig_camera
 
 RULES = SECOND_STAGE.rules
