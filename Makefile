@@ -69,7 +69,7 @@ mutants: $(VENV)/test.installed ### the same with every small change of the safe
 	$(BIN)/python -m tools.checks.breakages --mutants $(MUTANTS)
 
 references: $(VENV)/test.installed ### write what the recorded flights of tests/review/replay are expected to give again
-	$(BIN)/python -m tools.checks.record_regressions --only references
+	$(BIN)/python -m tools.checks.references
 
 wheel: $(VENV)/test.installed ### build sdist and wheel in dist, check them, install the wheel alone, and fly it
 	$(BIN)/python -m tools.release.check_wheel --out dist

@@ -19,7 +19,6 @@ from flockd.campaign.verdicts import compare
 from flockd.cli import main
 from flockd.core.errors import UnavailableError, UsageError
 from tests.campaign.flights import HEAD, Shuffled, campaign_file, flown, made_up
-from tools.docs.docs_campaign import table
 
 pytestmark = pytest.mark.usefixtures("made_up_flights")
 GRID = "vary: {drone.flocking.cohesion: {values: [0.1, 0.2]}}\nmeasure: [min_distance_m, order_tail]\n"
@@ -203,13 +202,17 @@ def test_figures_stand_under_the_case_and_the_value_that_were_flown(tmp_path: Pa
     )
     flown(Plan.load(campaign_file(tmp_path, text)), tmp_path / "out", Shuffled(1))
     results = Results.load(tmp_path / "out")
-    _, _, head, _, *rows = table(results, ["order_tail"]).splitlines()
-    assert head == "| drone.flocking.separation | weak | strong |"
-    found = [[float(cell.split(" ± ")[0]) for cell in row.strip("| ").split(" | ")] for row in rows]
-    assert [row[0] for row in found] == [50, 1]
+    separation = "drone.flocking.separation"
+    assert (results.values_of(separation), results.values_of("case")) == ((50, 1), ("weak", "strong"))
+
+    def mean(value: int, case: str) -> float:
+        seeds = results.by_seed("order_tail", results.cells_with({separation: value, "case": case}))
+        return sum(seeds.values()) / len(seeds)
+
     # `made_up`: cohesion + 0.1 separation + what cells have in common
-    assert [row[2] - row[1] for row in found] == [pytest.approx(8.0), pytest.approx(8.0)]
-    assert found[0][1] - found[1][1] == pytest.approx(4.9)
+    for value in (50, 1):
+        assert mean(value, "strong") - mean(value, "weak") == pytest.approx(8.0)
+    assert mean(50, "weak") - mean(1, "weak") == pytest.approx(4.9)
     assert [axes.get_xscale() for axes in parameter_curves(results, "order_tail").axes] == ["log"]
 
 

@@ -1,6 +1,6 @@
 """Four short flights, replayed: what came out when they were made comes out today.
 
-After a change that is meant to change it: `python -m tools.checks.record_regressions --only references`. Recordings
+After a change that is meant to change it: `python -m tools.checks.references`. Recordings
 stay as they are. They are replayed with the networks in 32-bit floats, whose outputs differ little between processors.
 """
 
@@ -15,10 +15,9 @@ import yaml
 
 from flockd.cli import main
 from flockd.onboard.recording.reader import Recording
-from tools.checks.record_regressions import with_float_networks
+from tools.checks.references import FLIGHTS, with_float_networks
 
 HERE = Path(__file__).parent
-FLIGHTS = ("normal", "crossing", "faults", "fisheye")
 # Another processor adds up in another order. `tools.checks.regression_spread` of commit 7b9dec37 simulated some: ONNX
 # Runtime without graph optimisation, libraries without AVX. The largest differences in `normal` and `crossing` were
 # 3e-6 in velocity, 0.001 in command, 0.0093 in neighbours, 0.0008 in detections and 1.3e-6 in ego_motion; in `faults`,
