@@ -3,14 +3,12 @@
 sudo python3 -m tools.checks.check_device                              # from nothing; downloads about 300 MB
 sudo python3 -m tools.checks.check_device --cache /var/cache/flockd    # keeps what it built for the next time
 sudo python3 -m tools.checks.check_device --debian 13                  # on Debian 13 (trixie), with systemd 257
-sudo python3 -m tools.checks.check_device --package                    # the Debian package, from install to purge
 
 Needs Linux on x86-64 with qemu-system-x86, mmdebstrap and e2fsprogs, and no KVM: the processor is emulated. The machine
 runs Debian 12 or 13 with its own kernel and systemd; flockd is installed by the lines of docs/real_drone.md, and its
 unit runs `flockd run` with the shipped networks. The autopilot is flockd's fake; as an emulated processor is slow, the
 images are small and the steps far apart. The machine's clock counts instructions, a nanosecond each: how busy this
-computer is changes how long the check takes, and nothing of what it measures. --package installs half a gigabyte three
-times.
+computer is changes how long the check takes, and nothing of what it measures.
 
 Exit code 0, 1 a check failed, 69 something needed is not there. A check that is a row of the list of faults
 (`docs/reference/faults.md`) says which.
@@ -55,8 +53,6 @@ PIP = f"pip install --quiet --no-compile --target /opt/fake-autopilot '{FAKE_AUT
 COMPILE = "import flockd.sim.autopilot.fake_autopilot"
 """What it needs of a dozen MAVLink dialects, and no more."""
 ARCH = "amd64"
-VERSIONS = ("1", "2")
-"""Versions of the package, before and after it is upgraded."""
 SYSTEM_PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 IMAGE_MB, MEMORY_MB = 4096, 2048
 PATIENCE_S = 3600.0
@@ -94,7 +90,6 @@ def main() -> int:
     only = "of capture, sandbox and service"
     parser.add_argument("--only", nargs="+", default=[], choices=("capture", "sandbox", "service"), help=only)
     parser.add_argument("--debian", choices=tuple(SUITES), default="12", help="what boots; default: %(default)s")
-    parser.add_argument("--package", action="store_true", help="check the Debian package, and that alone")
     arguments = parser.parse_args()
     try:
         _need_all()
@@ -102,31 +97,24 @@ def main() -> int:
         if arguments.cache is not None:
             kept = (arguments.cache / f"debian{arguments.debian}").resolve()
             kept.mkdir(parents=True, exist_ok=True)
-            return check(kept, arguments.debian, None if arguments.package else arguments.only)
+            return check(kept, arguments.debian, arguments.only)
         with tempfile.TemporaryDirectory(prefix="flockd-device-", dir="/var/tmp") as folder:
-            return check(Path(folder), arguments.debian, None if arguments.package else arguments.only)
-    except (UnavailableError, deb.UnavailableError) as error:
+            return check(Path(folder), arguments.debian, arguments.only)
+    except UnavailableError as error:
         print(f"check_device: {error}", file=sys.stderr)
         return UNAVAILABLE
 
 
-def check(folder: Path, debian: str, groups: Sequence[str] | None) -> int:
-    """flockd installed by the documentation's lines, all groups or these; None: the Debian package. The exit code."""
+def check(folder: Path, debian: str, groups: Sequence[str]) -> int:
+    """All groups, or these; the exit code."""
     begun_s, passed, failed = time.monotonic(), 0, 0
     install, start = documented_lines()
-    image, wheels = _build(folder, debian, None if groups is None else install)
+    image = _build(folder, debian, install)
     shared = _fresh(folder / "check")
     shutil.copytree(ROOT / CHECKS, shared / CHECKS)
-    findings = "/mnt/findings/lines"
-    if groups is None:
-        _note("building the package in two versions")
-        files = [deb.build(shared, ARCH, f"debian{debian}", version, shelf=wheels, level=1) for version in VERSIONS]
-        paths = [f"/mnt/check/{file.name}" for file in files]
-        command = ["python3", "-m", "tools.checks.device_check.package", findings, *paths]
-    else:
-        (shared / "start.sh").write_text(start, encoding="utf-8")
-        command = ["/opt/flockd/bin/python", "-m", "tools.checks.device_check.guest", findings, "start.sh", *groups]
-    (shared / "check.sh").write_text(f"exec {' '.join(command)}\n", encoding="utf-8")
+    (shared / "start.sh").write_text(start, encoding="utf-8")
+    command = ["-m", "tools.checks.device_check.guest", "/mnt/findings/lines", "start.sh", *groups]
+    (shared / "check.sh").write_text(f"exec /opt/flockd/bin/python {' '.join(command)}\n", encoding="utf-8")
     for line in _run(folder, image, shared):
         if "check" in line:
             passed, failed = passed + line["passed"], failed + (not line["passed"])
@@ -155,8 +143,8 @@ def _need_all() -> None:
         raise UnavailableError("the files of a Debian belong to root, who must run this; begin the command with sudo")
 
 
-def _build(folder: Path, debian: str, install: str | None) -> tuple[Path, Path]:
-    """The machine's disk, with flockd by these lines or without, and the wheels for it. Raises UnavailableError."""
+def _build(folder: Path, debian: str, install: str) -> Path:
+    """The machine's disk, with flockd installed by these lines. Raises UnavailableError."""
     system, wheels = folder / "system", _wheels(folder, debian)
     if not (folder / "system.done").exists():
         _note("building a Debian")
@@ -166,21 +154,18 @@ def _build(folder: Path, debian: str, install: str | None) -> tuple[Path, Path]:
     _empty(system)
     shelf = system / "srv/wheels"
     shutil.copytree(wheels, shelf)
-    if install is None:
-        _inside(system, f"python3 -m venv /srv/pip\n/srv/pip/bin/{PIP}\nrm -r /srv/pip")
-    else:
-        source = system / "srv/flockd"
-        source.mkdir(0o700)  # what is installed must not need it: the service cannot read it
-        copy_sources(source)
-        shutil.copy(ROOT / CHECKS / "drone.yaml", source / DRONE_FILE)
-        _inside(system, f"cd /srv/flockd\n{install}")
-        _inside(system, f"/opt/flockd/bin/{PIP}\nPYTHONPATH=/opt/fake-autopilot /opt/flockd/bin/python -c '{COMPILE}'")
+    source = system / "srv/flockd"
+    source.mkdir(0o700)  # what is installed must not need it: the service cannot read it
+    copy_sources(source)
+    shutil.copy(ROOT / CHECKS / "drone.yaml", source / DRONE_FILE)
+    _inside(system, f"cd /srv/flockd\n{install}")
+    _inside(system, f"/opt/flockd/bin/{PIP}\nPYTHONPATH=/opt/fake-autopilot /opt/flockd/bin/python -c '{COMPILE}'")
     shutil.rmtree(shelf)
     _note("writing the disk")
     image = folder / "disk.img"
     image.unlink(missing_ok=True)
     _command("mkfs.ext4", "-q", "-O", "^has_journal", "-d", str(system), str(image), f"{IMAGE_MB}M")
-    return image, wheels
+    return image
 
 
 def _debian(system: Path, debian: str) -> None:
