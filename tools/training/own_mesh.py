@@ -31,8 +31,7 @@ WIDTHS = (0.6, 1.05)
 missing."""
 FLAT = 0.7
 """A mesh stands upright where no level side is less than this share of its height."""
-MOST_BYTES = 500 << 20
-MOST_TRIANGLES_READ, MOST_TRIANGLES = 4_000_000, 40_000
+MOST_TRIANGLES = 40_000
 CELLS = (320, 160, 80)
 """A mesh of too many triangles is simplified to so many cells from tip to tip, in turn: at first a fifth of a
 crop's pixel each."""
@@ -96,8 +95,6 @@ def _loaded(path: Path) -> list[tuple[Any, Array]]:
         raise ValueError(f"{path}: a mesh is read from {', '.join(ENDINGS)}; export it as one of these")
     if not path.is_file():
         raise ValueError(f"{path}: there is no such file")
-    if path.stat().st_size > MOST_BYTES:
-        raise ValueError(f"{path}: is larger than {MOST_BYTES >> 20} MB; simplify it where it was modelled")
     try:
         scene: Any = trimesh.load_scene(path, process=False)
         # Scene.dump would lose the colours of corners that have a material as well.
@@ -111,12 +108,6 @@ def _loaded(path: Path) -> list[tuple[Any, Array]]:
         raise ValueError(f"{path}: is no mesh that can be read ({str(error) or type(error).__name__})") from None
     if not pieces:
         raise ValueError(f"{path}: holds no triangles; export the drone's surface as a mesh")
-    count = sum(len(piece.faces) for piece, _ in pieces)
-    if count > MOST_TRIANGLES_READ:
-        raise ValueError(
-            f"{path}: has {count} triangles, and at most {MOST_TRIANGLES_READ} are read; "
-            "simplify it where it was modelled"
-        )
     if not all(np.isfinite(places).all() for _, places in pieces):
         raise ValueError(f"{path}: has places that are no numbers; export it again")
     return pieces
