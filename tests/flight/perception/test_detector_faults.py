@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -14,8 +16,13 @@ from tests.flight.perception.cameras import rendered
 SIZE = (480, 352)
 
 
+@functools.cache
+def detector() -> PictureDetector:
+    return PictureDetector(PerceptionConfig(threads=1))
+
+
 def seen(image: UInt8Array) -> PictureResult:
-    return PictureDetector(PerceptionConfig(threads=1)).detect(image, fov_deg=90.0)
+    return detector().detect(image, fov_deg=90.0)
 
 
 def answering(monkeypatch: pytest.MonkeyPatch, probability: float, width_px: float) -> None:

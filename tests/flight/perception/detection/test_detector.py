@@ -15,7 +15,7 @@ from flockd.flight.perception import Crop, Instance, RangeEstimate, SceneMaps
 from flockd.flight.perception.detection.detector import DetectionTrace, Detector
 from flockd.flight.perception.detection.masks import DroneLogits, DroneMasks, first_stage_labels, without_borders
 from flockd.flight.perception.detection.proposals import largest_blobs, propose_residuals
-from tests.flight.perception.cameras import SECOND_STAGE
+from tests.flight.perception.shipped import SECOND_STAGE
 from tests.flight.pilot.flyer import Flyer, SpoilableTruth, scenario_with
 
 PARAMETERS = DetectionParameters()

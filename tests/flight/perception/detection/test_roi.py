@@ -10,7 +10,7 @@ import pytest
 from flockd.flight.geometry import Rig, RigCamera, WideAngleCamera
 from flockd.flight.perception import Instance
 from flockd.flight.perception.detection.roi import Roi, angle_between, roi_of_instance, take_crop
-from tests.flight.perception.cameras import SECOND_STAGE
+from tests.flight.perception.shipped import SECOND_STAGE
 from tests.make import rig_camera
 
 RULES = SECOND_STAGE.rules
