@@ -77,7 +77,7 @@ def _place(node: ast.AST, line: int) -> str:
 def _edited(source: str, edits: Sequence[Edit]) -> str:
     """The source with some nodes, from the last to the first, written anew."""
     lines = source.encode().splitlines(keepends=True)
-    starts = [sum(map(len, lines[:number])) for number in range(len(lines))]
+    starts = list(itertools.accumulate(map(len, lines), initial=0))
     raw = source.encode()
     for node, text in sorted(edits, key=lambda edit: (edit[0].lineno, edit[0].col_offset), reverse=True):
         assert node.end_lineno is not None
