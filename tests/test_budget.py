@@ -29,12 +29,12 @@ LINES = {
     "flockd/sim": 12_190,
     "flockd/campaign": 2_270,
     "flockd/cli": 4_650,
-    "tests": 48_300,
-    "tools/checks": 3_780,
-    "tools/docs": 970,
+    "tests": 47_800,
+    "tools/checks": 2_550,
+    "tools/docs": 900,
     "tools/measure": 1_220,
     "tools/release": 620,
-    "tools/training": 4_610,
+    "tools/training": 4_550,
 }
 """Lines of Python below a folder."""
 FILES = {"flockd": 401}
