@@ -304,8 +304,8 @@ def _by_board(args: argparse.Namespace, out: Path) -> int:
             lambda links: complain(f"boards seen together: {links}; Ctrl-C ends it"),
         )  # fmt: skip
     cameras = {name: one.camera for name, one in rig.items()}
-    fit = calibrate_rig(cameras, collector.boards, reference, rig[reference].T_body_camera)
-    return _say_rig(args, write_fit(fit, config, where, _source_name(args), images.identities, out))
+    mountings = calibrate_rig(cameras, collector.boards, reference, rig[reference].T_body_camera)
+    return _say_rig(args, write_fit(mountings, config, where, _source_name(args), images.identities, out))
 
 
 def _from_flight(args: argparse.Namespace, out: Path) -> int:

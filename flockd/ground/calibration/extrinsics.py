@@ -2,30 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import compress
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from flockd.core.messages import FloatArray
 from flockd.flight.geometry import Camera, RigidTransform, rotation_angle_deg
 from flockd.ground.calibration.board import BoardDetection, CalibrationError
-from flockd.ground.calibration.least_squares import (
-    OutlierRejection,
-    Unknowns,
-    first_pose,
-    fitted,
-    moved,
-    residuals_px,
-    root_mean_square,
-    steps_from,
-)
+from flockd.ground.calibration.poses import MAX_DROPPED, first_pose, inliers, residuals_px, root_mean_square
 
 MIN_SHARED = 3
 """Boards that two neighbours have to see together."""
-_REJECTION = OutlierRejection(margin_px=0.2)
+_MARGIN_PX = 0.5
 _SIGMA_DEG, _SIGMA_M = 0.5, 0.02
 """A camera whose place the boards leave more uncertain than this is not known."""
 _METRES_A_DEGREE = 0.01
@@ -45,154 +34,92 @@ class Mounting:
     """Where one camera sits, and how sure that is."""
 
     T_body_camera: RigidTransform
-    sigma_deg: float
-    """Standard deviation of its turn about the worst of the body's axes: what noise alone leaves open."""
-    sigma_m: float
-    """Standard deviation of its place along the worst of the body's axes."""
-    rms_px: float
-    boards: int
-    """Boards that it saw together with another camera."""
-
-
-@dataclass(frozen=True, eq=False)
-class RigFit:
-    """The cameras in the body, with the reference camera where it was said to be."""
-
-    reference: str
-    mountings: Mapping[str, Mounting]
-    rms_px: float
-    dropped: tuple[tuple[str, float], ...]
+    sigma_deg: float = 0.0
+    """Standard deviation of its turn about the worst axis, by how much the boards differ; 0 of the reference."""
+    sigma_m: float = 0.0
+    """Standard deviation of its place along the worst axis, likewise."""
+    rms_px: float = 0.0
+    """Of the board's corners, where the neighbour's view of it says that they are."""
+    boards: int = 0
+    """Those that it shares with that neighbour."""
+    dropped: tuple[tuple[str, float], ...] = ()
     """Names of boards that did not fit the others, with their residuals in pixels."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Placed:
-    """Cameras and boards in the body."""
-
-    boards: tuple[SharedBoard, ...]
-    mounts: Mapping[str, RigidTransform]
-    """``T_body_camera``"""
-    places: tuple[RigidTransform, ...]
-    """``T_body_board``"""
-
-    def residuals(self, cameras: Mapping[str, Camera]) -> list[dict[str, FloatArray]]:
-        """For each board and each camera that saw it (n, 2) pixels, seen less predicted."""
-        return [
-            {
-                name: residuals_px(cameras[name], seen, self.mounts[name].inverse() @ place)
-                for name, seen in board.seen.items()
-            }
-            for board, place in zip(self.boards, self.places, strict=True)
-        ]
 
 
 def calibrate_rig(
     cameras: Mapping[str, Camera], boards: Sequence[SharedBoard], reference: str, T_body_reference: RigidTransform
-) -> RigFit:
-    """Places every camera in the body from boards that it shares with its neighbours.
+) -> dict[str, Mounting]:
+    """Places every camera in the body, by way of the neighbour with which it shares most boards.
 
     Raises CalibrationError where a camera shares too few boards with those that are linked to the reference, or where
     the boards contradict each other.
     """
-    placed = _begin(cameras, boards, reference, T_body_reference)
-    given, dropped = len(placed.boards), list[tuple[str, float]]()
-    for _ in range(_REJECTION.max_rounds):
-        placed, sigma = _fitted(cameras, placed, reference)
-        residuals = placed.residuals(cameras)
-        rms = np.array([root_mean_square(np.concatenate(list(one.values()))) for one in residuals])
-        fits = _REJECTION.inliers(rms)
-        if fits.all():
-            break
-        dropped += [(placed.boards[index].name, float(rms[index])) for index in np.flatnonzero(~fits)]
-        placed = replace(
-            placed, boards=tuple(compress(placed.boards, fits)), places=tuple(compress(placed.places, fits))
-        )
-        if len(dropped) > _REJECTION.max_dropped * given:
-            raise CalibrationError(
-                f"{len(dropped)} of {given} boards contradict the others; hold the board still, let every camera take "
-                "its image at the same time, and check the cameras' intrinsics"
-            )
-    mountings = {name: _mounting(name, placed.mounts[name], sigma.get(name), residuals) for name in cameras}
-    rms_px = root_mean_square(np.concatenate([r for one in residuals for r in one.values()]))
-    return RigFit(reference, mountings, rms_px, tuple(dropped))
-
-
-def _begin(
-    cameras: Mapping[str, Camera], boards: Sequence[SharedBoard], reference: str, T_body_reference: RigidTransform
-) -> _Placed:
-    """Each camera by way of the neighbour with which it shares most boards."""
-    all_poses = [
+    poses = [
         {name: pose for name, seen in board.seen.items() if (pose := first_pose(cameras[name], seen)[1]) is not None}
         for board in boards
     ]
-    shared = [(board, found) for board, found in zip(boards, all_poses, strict=True) if len(found) > 1]
-    poses = [found for _, found in shared]
-    mounts = {reference: T_body_reference}
-    while len(mounts) < len(cameras):
-        links = [
+    mountings = {reference: Mounting(T_body_reference)}
+    while len(mountings) < len(cameras):
+        count, known, new = max(
             (sum(known in found and new in found for found in poses), known, new)
-            for known in mounts
-            for new in cameras
-            if new not in mounts
-        ]
-        count, known, new = max(links)
+            for known in mountings
+            for new in cameras.keys() - mountings.keys()
+        )
         if count < MIN_SHARED:
-            others = ", ".join(mounts)
+            others = ", ".join(mountings)
             raise CalibrationError(
                 f"camera {new!r} shares {count} boards with {others}, and needs {MIN_SHARED}; show the board where "
                 "both see it, and hold it still"
             )
-        steps = [found[known] @ found[new].inverse() for found in poses if known in found and new in found]
-        mounts[new] = mounts[known] @ _middle(steps)
-    kept = tuple(SharedBoard(board.name, {name: board.seen[name] for name in found}) for board, found in shared)
-    places = []
-    for board, found in zip(kept, poses, strict=True):
-        best = max(found, key=lambda name: len(board.seen[name].ids))
-        places.append(mounts[best] @ found[best])
-    return _Placed(kept, mounts, tuple(places))
+        shared = [
+            (board, found[known], found[new])
+            for board, found in zip(boards, poses, strict=True)
+            if known in found and new in found
+        ]
+        mountings[new] = _beside(mountings[known].T_body_camera, new, cameras[new], shared)
+    return mountings
 
 
-def _middle(transforms: Sequence[RigidTransform]) -> RigidTransform:
-    """The one that is nearest to all the others: no outlier moves it."""
-
-    def distance(a: RigidTransform, b: RigidTransform) -> float:
-        turn = rotation_angle_deg(a.rotation.T @ b.rotation)
-        return turn * _METRES_A_DEGREE + float(np.linalg.norm(a.translation - b.translation))
-
-    return min(transforms, key=lambda one: sum(distance(one, other) for other in transforms))
-
-
-def _fitted(cameras: Mapping[str, Camera], start: _Placed, reference: str) -> tuple[_Placed, Mapping[str, FloatArray]]:
-    """With the least squares; and by camera but the reference the deviations (6,) of its turn and place."""
-    free = [name for name in cameras if name != reference]
-    mounts = [start.mounts[name] for name in free]
-    seen = [(number, name, 2 * len(s.ids)) for number, one in enumerate(start.boards) for name, s in one.seen.items()]
-    counts = [count for _, _, count in seen]
-    of_mount = np.repeat([free.index(name) if name in free else -1 for _, name, _ in seen], counts)
-    of_board = np.repeat([number for number, _, _ in seen], counts)
-
-    def placed(numbers: Sequence[FloatArray]) -> _Placed:
-        moved_mounts = dict(zip(free, moved(mounts, numbers[0]), strict=True))
-        return replace(start, mounts={**start.mounts, **moved_mounts}, places=tuple(moved(start.places, numbers[1])))
-
-    def residuals(numbers: Sequence[FloatArray]) -> FloatArray:
-        return np.concatenate([r.ravel() for one in placed(numbers).residuals(cameras) for r in one.values()])
-
-    unknowns = Unknowns(steps_from(mounts), of_mount), Unknowns(steps_from(start.places), of_board)
-    found = fitted(residuals, unknowns)
-    return placed(found.numbers), dict(zip(free, found.sigma[0], strict=True))
-
-
-def _mounting(
-    name: str, T_body_camera: RigidTransform, sigma: FloatArray | None, residuals: Sequence[Mapping[str, FloatArray]]
+def _beside(
+    T_body_known: RigidTransform,
+    name: str,
+    camera: Camera,
+    shared: Sequence[tuple[SharedBoard, RigidTransform, RigidTransform]],
 ) -> Mounting:
-    """``sigma``: of its turn and place; None of the reference."""
-    sigma = np.zeros(6) if sigma is None else sigma
-    own = [one[name] for one in residuals if name in one]
-    sigma_deg, sigma_m = math.degrees(float(sigma[:3].max())), float(sigma[3:].max())
+    """``shared``: each board with its pose in the known camera and in the new one."""
+
+    def residual_px(T_known_new: RigidTransform, board: SharedBoard, T_known_board: RigidTransform) -> float:
+        return root_mean_square(residuals_px(camera, board.seen[name], T_known_new.inverse() @ T_known_board))
+
+    steps = [T_known_board @ T_new_board.inverse() for _, T_known_board, T_new_board in shared]
+    middle = min(steps, key=lambda one: sum(_distance(one, other) for other in steps))  # no outlier moves it
+    rms_px = np.array([residual_px(middle, board, T_known_board) for board, T_known_board, _ in shared])
+    fits = inliers(rms_px, _MARGIN_PX)
+    dropped = tuple((shared[k][0].name, float(rms_px[k])) for k in np.flatnonzero(~fits))
+    kept = np.flatnonzero(fits)
+    if len(dropped) > MAX_DROPPED * len(shared) or len(kept) < MIN_SHARED:
+        raise CalibrationError(
+            f"{len(dropped)} of {len(shared)} boards contradict the others; hold the board still, let every camera "
+            "take its image at the same time, and check the cameras' intrinsics"
+        )
+    turns = Rotation.from_matrix([steps[k].rotation for k in kept])
+    places = np.array([steps[k].translation for k in kept])
+    mean = RigidTransform(turns.mean().as_matrix(), places.mean(axis=0))
+    apart_deg = np.degrees((turns.mean().inv() * turns).as_rotvec())
+    spread = np.sqrt(len(kept) * (len(kept) - 1))  # of a mean
+    sigma_deg = float(np.linalg.norm(apart_deg, axis=0).max() / spread)
+    sigma_m = float(np.linalg.norm(places - places.mean(axis=0), axis=0).max() / spread)
     if not (sigma_deg < _SIGMA_DEG and sigma_m < _SIGMA_M):
         raise CalibrationError(
             f"the boards leave the place of camera {name!r} uncertain by {sigma_deg:.2g} degrees and "
             f"{100 * sigma_m:.2g} cm; show the board nearer, tilted, and in more places that both see"
         )
-    return Mounting(T_body_camera, sigma_deg, sigma_m, root_mean_square(np.concatenate(own)) if own else 0.0, len(own))
+    left_px = [residual_px(mean, shared[k][0], shared[k][1]) for k in kept]
+    return Mounting(
+        T_body_known @ mean, sigma_deg, sigma_m, float(np.sqrt(np.mean(np.square(left_px)))), len(kept), dropped
+    )
+
+
+def _distance(a: RigidTransform, b: RigidTransform) -> float:
+    turn = rotation_angle_deg(a.rotation.T @ b.rotation)
+    return turn * _METRES_A_DEGREE + float(np.linalg.norm(a.translation - b.translation))

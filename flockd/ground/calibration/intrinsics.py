@@ -8,21 +8,13 @@ from dataclasses import dataclass
 from itertools import compress
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from flockd.core.choices import LensModel
 from flockd.core.messages import FloatArray
-from flockd.flight.geometry import Camera, PinholeCamera, RigidTransform, WideAngleCamera
+from flockd.flight.geometry import Camera, PinholeCamera, RigidTransform, WideAngleCamera, rotation_from_vector
 from flockd.ground.calibration.board import CalibrationError
-from flockd.ground.calibration.least_squares import (
-    OutlierRejection,
-    Unknowns,
-    first_pose,
-    fitted,
-    moved,
-    residuals_px,
-    root_mean_square,
-    steps_from,
-)
+from flockd.ground.calibration.poses import MAX_DROPPED, first_pose, inliers, residuals_px, root_mean_square
 from flockd.ground.calibration.views import View
 
 MIN_VIEWS = 6
@@ -32,7 +24,14 @@ _FIRST_FOCALS = {
     "wide_angle": 1.0 / np.radians(np.linspace(60.0, 240.0, 9)),
 }
 """Focal lengths to begin with, in widths of the image."""
-_REJECTION = OutlierRejection(margin_px=0.1)
+_MARGIN_PX, _ROUNDS = 0.1, 5
+"""Of the rejection of outliers."""
+_STEP = 1.5e-8
+"""Of a numeric derivative: the root of double precision."""
+_MAX_STEPS, _GAIN = 60, 1e-10
+"""A fit ends after so many, or where a step gains no larger share: of the squares, or of the numbers."""
+_UNKNOWN = 1e-13
+"""Least eigenvalue of a scaled normal matrix: what is less is rounding."""
 _FOCAL_SIGMA = 0.01
 """A focal length that the views leave more uncertain than this is not known."""
 _CENTRE_SIGMA = 0.01
@@ -110,17 +109,17 @@ def calibrate(views: Sequence[View], size: tuple[int, int], model: LensModel) ->
     camera, poses = _begin(views, size, model)
     dropped: list[tuple[View, float]] = []
     kept = list(views)
-    for _ in range(_REJECTION.max_rounds):
+    for _ in range(_ROUNDS):
         camera, poses, sigma = _fitted(camera, kept, poses)
         rms = np.array(
             [root_mean_square(residuals_px(camera, view.seen, pose)) for view, pose in zip(kept, poses, strict=True)]
         )
-        fits = _REJECTION.inliers(rms)
+        fits = inliers(rms, _MARGIN_PX)
         if fits.all():
             break
         dropped += [(kept[index], float(rms[index])) for index in np.flatnonzero(~fits)]
         kept, poses = list(compress(kept, fits)), list(compress(poses, fits))
-        if len(dropped) > _REJECTION.max_dropped * len(views) or len(kept) < MIN_VIEWS:
+        if len(dropped) > MAX_DROPPED * len(views) or len(kept) < MIN_VIEWS:
             raise CalibrationError(
                 f"{len(dropped)} of {len(views)} views contradict the others; use a flat, rigid board, focus that "
                 "stays as it is, and the board's own numbers of squares"
@@ -190,22 +189,51 @@ def _begin(views: Sequence[View], size: tuple[int, int], model: LensModel) -> tu
 def _fitted(
     camera: Camera, views: Sequence[View], poses: Sequence[RigidTransform]
 ) -> tuple[Camera, list[RigidTransform], FloatArray]:
-    """Camera and poses with the least squared residual, from a start; and the deviations of the camera's numbers."""
+    """Camera and poses with the least squared residual, from a start; and the deviations of the camera's numbers.
+
+    OpenCV's `fisheye.calibrate` does not begin with a board that a wide lens sees beside itself, nor gives deviations.
+    """
     model: LensModel = "pinhole" if isinstance(camera, PinholeCamera) else "wide_angle"
     of = np.repeat(np.arange(len(views)), [2 * len(view.seen.ids) for view in views])
     pixels = np.concatenate([view.seen.pixels for view in views])
     lens = np.array([*camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *camera.distortion])
+    first = len(lens)
 
-    def residuals(numbers: Sequence[FloatArray]) -> FloatArray:
-        (lens,), steps = numbers
-        if min(lens[:2]) <= 0.0:  # no camera: the step is refused
+    def moved(x: FloatArray) -> list[RigidTransform]:
+        """Each pose turned about the board's origin by three numbers, radians; three more are where that comes to."""
+        steps = x[first:].reshape(-1, 6)
+        turns = rotation_from_vector(steps[:, :3])
+        return [RigidTransform(R @ pose.rotation, step[3:]) for R, pose, step in zip(turns, poses, steps, strict=True)]
+
+    def residuals(x: FloatArray) -> FloatArray:
+        if min(x[:2]) <= 0.0:  # no camera: the step is refused
             return np.full(pixels.size, np.nan)
-        points = [pose.apply(view.seen.points) for view, pose in zip(views, moved(poses, steps), strict=True)]
-        off: FloatArray = _camera(model, camera.size, lens).project(np.concatenate(points)) - pixels
+        points = [pose.apply(view.seen.points) for view, pose in zip(views, moved(x), strict=True)]
+        off: FloatArray = _camera(model, camera.size, x[:first]).project(np.concatenate(points)) - pixels
         return off.ravel()
 
-    found = fitted(residuals, (Unknowns(lens[None], np.zeros_like(of)), Unknowns(steps_from(poses), of)))
-    return _camera(model, camera.size, found.numbers[0][0]), moved(poses, found.numbers[1]), found.sigma[0][0]
+    def derivative(x: FloatArray) -> FloatArray:
+        """(m, n): the same number of all poses is moved at once, as no residual hangs on two of them."""
+        here, rows = residuals(x), np.arange(pixels.size)
+        found = np.zeros((len(here), len(x)))
+        for number in range(first + 6):
+            own = number + (6 * of if number >= first else 0 * of)
+            there = x.copy()
+            there[number : None if number >= first else number + 1 : 6] += _STEP * max(1.0, abs(x[number]))
+            found[rows, own] = (residuals(there) - here) / (there - x)[own]
+        return np.nan_to_num(found)
+
+    start = np.concatenate([lens, *([0.0, 0.0, 0.0, *pose.translation] for pose in poses)])
+    if not np.isfinite(residuals(start)).all():
+        raise CalibrationError("what is seen contradicts itself; check the board's squares")
+    found = least_squares(residuals, start, derivative, x_scale="jac", xtol=_GAIN, ftol=_GAIN, max_nfev=_MAX_STEPS)
+    hessian = found.jac.T @ found.jac
+    scale = np.sqrt(np.diag(hessian))
+    scale[scale == 0.0] = 1.0
+    values, vectors = np.linalg.eigh(hessian / np.outer(scale, scale))
+    variance = 2.0 * found.cost / max(len(found.fun) - len(start), 1)
+    sigma = np.sqrt(variance * (vectors**2 @ (1.0 / np.maximum(values, _UNKNOWN)))) / scale
+    return _camera(model, camera.size, found.x[:first]), moved(found.x), sigma[:first]
 
 
 def _first_numbers(focal: float, size: tuple[int, int]) -> list[float]:

@@ -15,7 +15,7 @@ from flockd.core.config.rig import CameraConfig
 from flockd.core.errors import ConfigError
 from flockd.core.messages import UInt8Array
 from flockd.ground.calibration.board import BoardDetection, BoardFinder
-from flockd.ground.calibration.extrinsics import RigFit, SharedBoard
+from flockd.ground.calibration.extrinsics import Mounting, SharedBoard
 from flockd.ground.calibration.fragment import extrinsics_of, measured_today, rig_text
 from flockd.ground.calibration.image_sources import ImageSet, ImageStream
 from flockd.ground.calibration.views import edge_width_px, is_still, sharp_px
@@ -92,17 +92,23 @@ def _greys(one: ImageSet, config: DroneConfig, where: str) -> dict[str, UInt8Arr
 
 
 def write_fit(
-    fit: RigFit, config: DroneConfig, where: str, source: str, identities: Mapping[str, str], out: Path
+    mountings: Mapping[str, Mounting],
+    config: DroneConfig,
+    where: str,
+    source: str,
+    identities: Mapping[str, str],
+    out: Path,
 ) -> dict[str, Any]:
-    """Writes the mountings to ``out`` and gives the result; ``source``: where the images came from."""
+    """Writes the mountings, the reference's first, to ``out`` and gives the result; ``source``: of the images."""
+    reference = next(iter(mountings))
     cameras, results = [], {}
     for camera in config.rig.cameras:
-        mounting, extrinsics = fit.mountings[camera.name], camera.extrinsics
-        if camera.name != fit.reference:
+        mounting, extrinsics = mountings[camera.name], camera.extrinsics
+        if camera.name != reference:
             known = camera.intrinsics.measured
             measured = measured_today(
                 camera=known.camera if known else identities.get(camera.name, camera.name),
-                source=f"{source}, against {fit.reference}",
+                source=f"{source}, against {reference}",
                 views=mounting.boards,
                 residual_px=round(mounting.rms_px, 4),
             )
@@ -116,15 +122,14 @@ def write_fit(
             "boards": mounting.boards,
         }
     note = (
-        f"{fit.reference} sits where {where} says, and the others beside it: a board cannot determine where in the "
+        f"{reference} sits where {where} says, and the others beside it: a board cannot determine where in the "
         "body that is, but `--from-flight` tells how it is turned"
     )
     write_rig(out, cameras, config.rig.time_offset_s)
     return {
         "by": "board",
-        "reference": fit.reference,
-        "residual_px": fit.rms_px,
-        "dropped": dict(fit.dropped),
+        "reference": reference,
+        "dropped": dict(one for mounting in mountings.values() for one in mounting.dropped),
         "cameras": results,
         "time_offset_s": None,
         "notes": [note],
