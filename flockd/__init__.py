@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from flockd.flight.pilot.ground import level_ground
     from flockd.flight.safety import Gate
     from flockd.flight.tracking import Measurement, Tracker, TrackingParameters
-    from flockd.ground.pictures import PictureDetector
+    from flockd.ground.pictures.single_frame import PictureDetector
     from flockd.onboard.recording import Recording
 
 __version__ = "0.2.0"
@@ -59,7 +59,7 @@ _HOMES = {
     "flockd.flight.pilot.ground": ("level_ground",),
     "flockd.flight.safety": ("Gate",),
     "flockd.flight.tracking": ("Measurement", "Tracker", "TrackingParameters"),
-    "flockd.ground.pictures": ("PictureDetector",),
+    "flockd.ground.pictures.single_frame": ("PictureDetector",),
     "flockd.onboard.recording": ("Recording",),
 }
 """Where each name is defined: the imports above, for when the program runs."""

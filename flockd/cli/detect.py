@@ -17,8 +17,9 @@ from flockd.cli.picture_options import PictureCameras, add_picture_options, perc
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.ground.pictures import DetectedDrone, PictureDetector, PictureFile, PictureLabels
     from flockd.ground.pictures.copies import Copies
+    from flockd.ground.pictures.picture_files import PictureFile, PictureLabels
+    from flockd.ground.pictures.single_frame import DetectedDrone, PictureDetector
 
 NOTES = """\
 Larger pictures are resized to 1280 pixels for the networks; boxes are in pixels of the picture.
@@ -68,8 +69,9 @@ class _Detected:
 
 def _run(args: argparse.Namespace) -> int:
     from flockd.ground.datasets.image_files import DatasetError
-    from flockd.ground.pictures import PictureDetector, find_pictures, read_labels
     from flockd.ground.pictures.copies import Copies
+    from flockd.ground.pictures.picture_files import find_pictures, read_labels
+    from flockd.ground.pictures.single_frame import PictureDetector
 
     if args.force and args.out is None:
         raise UsageError("--force has no meaning without --out; add it")
@@ -145,7 +147,7 @@ def _detected(
 
 
 def _result(detected: Sequence[_Detected], *, measure: bool) -> dict[str, Any]:
-    from flockd.ground.pictures import Labelled, summary
+    from flockd.ground.pictures.scoring import Labelled, summary
 
     count = max(len(detected), 1)
     result: dict[str, Any] = {

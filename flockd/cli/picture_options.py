@@ -76,7 +76,7 @@ class PictureCameras:
                     "of that camera, or --fov instead of --config"
                 )
             return self._mine
-        from flockd.ground.pictures import camera_with_fov
+        from flockd.ground.pictures.single_frame import camera_with_fov
 
         return camera_with_fov(size, self._fov)
 

@@ -17,7 +17,7 @@ from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from flockd.core.config import DroneConfig
-    from flockd.ground.datasets import Dataset
+    from flockd.ground.datasets.image_folder import Dataset
     from flockd.onboard.recording.difference import Comparison
     from flockd.onboard.recording.reader import Recording
     from flockd.review.replay.dataset_flight import Depth
@@ -264,7 +264,7 @@ def _run_dataset(args: argparse.Namespace) -> int:
     refuse(args, _OF_RECORDINGS, "is for recordings of flockd, and this is none; leave it out")
     if args.trajectory is not None:
         refuse_existing(args.trajectory, "--trajectory")
-    from flockd.ground.datasets import open_dataset
+    from flockd.ground.datasets.image_folder import open_dataset
     from flockd.review.replay.dataset_flight import dataset_config, dataset_result, replay_dataset, write_trajectory
 
     stride = args.stride or 1

@@ -13,8 +13,8 @@ from pymavlink import mavutil
 
 from flockd.core.config import DroneConfig
 from flockd.core.data import data_path
+from flockd.ground.doctor import Level
 from flockd.ground.doctor.autopilot_checks import check_autopilot
-from flockd.ground.doctor.examination import Level
 from flockd.sim.flock.start import with_drones
 from flockd.sim.scenario import load, load_scenario
 from flockd.sim.sitl.autopilots import Px4s

@@ -25,10 +25,9 @@ from rich.table import Table
 
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
-from flockd.ground.pictures import Labelled, PictureDetector, PictureFile, find_pictures, summary
-from flockd.ground.pictures.picture_files import read_labels
-from flockd.ground.pictures.scoring import WIDTH_CLASSES
-from flockd.ground.pictures.single_frame import Box
+from flockd.ground.pictures.picture_files import PictureFile, find_pictures, read_labels
+from flockd.ground.pictures.scoring import WIDTH_CLASSES, Labelled, summary
+from flockd.ground.pictures.single_frame import Box, PictureDetector
 
 Image = NDArray[np.uint8]
 Picture = tuple[str, Callable[[], Image], tuple[Box, ...]]

@@ -95,8 +95,8 @@ def _beside(
     middle = min(steps, key=lambda one: sum(_distance(one, other) for other in steps))  # no outlier moves it
     rms_px = np.array([residual_px(middle, board, T_known_board) for board, T_known_board, _ in shared])
     fits = inliers(rms_px, _MARGIN_PX)
-    dropped = tuple((shared[k][0].name, float(rms_px[k])) for k in np.flatnonzero(~fits))
-    kept = np.flatnonzero(fits)
+    dropped = tuple((shared[k][0].name, float(rms_px[k])) for k in np.flatnonzero(~fits).tolist())
+    kept = np.flatnonzero(fits).tolist()
     if len(dropped) > MAX_DROPPED * len(shared) or len(kept) < MIN_SHARED:
         raise CalibrationError(
             f"{len(dropped)} of {len(shared)} boards contradict the others; hold the board still, let every camera "

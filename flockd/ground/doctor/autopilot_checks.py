@@ -12,7 +12,7 @@ from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import RangeReading
 from flockd.flight.safety import link_lost
-from flockd.ground.doctor.examination import Finding, Level, failed, failed_from_error, graded, passed, warned
+from flockd.ground.doctor import Finding, Level, failed, failed_from_error, graded, passed, warned
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware
 from flockd.onboard.autopilot.clock_sync import ClockEstimate
 from flockd.onboard.autopilot.mavlink_messages import FACES_DOWN, MOST_ERROR_S
@@ -283,18 +283,20 @@ def _judge_action(name: str, action: Action, value: int, config: DroneConfig) ->
 
 def _judge_collision_prevention(name: str, value: float, config: DroneConfig) -> Finding:
     """In metres."""
-    sends = config.autopilot is not None and config.autopilot.obstacle_distance
-    if value > 0 and sends:
-        return passed(
-            name, f"{value:g} m: PX4 stops a pilot in Position mode by what flockd sees, and where it does not"
-        )
-    if value > 0:
-        measured = f"{value:g} m: PX4 lets nobody fly in Position mode where nothing sends it distances of obstacles"
-        return warned(name, measured, "set CP_DIST to -1, or autopilot.obstacle_distance to true")
-    if sends:
-        measured = f"{value:g}: PX4 ignores the distances that autopilot.obstacle_distance sends"
-        return warned(name, measured, "set CP_DIST to the distance to keep, in metres")
-    return passed(name, f"{value:g}: PX4 stops no pilot before obstacles")
+    sends, on = config.autopilot is not None and config.autopilot.obstacle_distance, value > 0
+    measured, fix = {
+        (True, True): ("m: PX4 stops a pilot in Position mode by what flockd sees, and where it does not", ""),
+        (True, False): (
+            "m: PX4 lets nobody fly in Position mode where nothing sends it distances of obstacles",
+            "set CP_DIST to -1, or autopilot.obstacle_distance to true",
+        ),
+        (False, True): (
+            "PX4 ignores the distances that autopilot.obstacle_distance sends",
+            "set CP_DIST to the distance to keep, in metres",
+        ),
+        (False, False): ("PX4 stops no pilot before obstacles", ""),
+    }[on, sends]
+    return graded(name, f"{value:g}{' ' if on else ': '}{measured}", fix, warning=on != sends)
 
 
 def _judge_limit(name: str, value: float, own_m: float | None, what: str) -> Finding:
@@ -348,22 +350,15 @@ def judge_range_finder(
 def _judge_sensor(reading: RangeReading, arrivals_s: Sequence[float], config: DroneConfig) -> Finding:
     least_m, most_m = reading.min_m or 0.0, reading.max_m
     limits = f"from {least_m:.2f} m" if most_m is None else f"from {least_m:.2f} to {most_m:.1f} m"
-    rate_hz = _rate_hz(arrivals_s)
+    span_s = arrivals_s[-1] - arrivals_s[0] if arrivals_s else 0.0
+    rate_hz = (len(arrivals_s) - 1) / span_s if span_s > 0.0 else 0.0
     measured = f"faces down, {reading.range_m:.2f} m now, measures {limits}, {rate_hz:.0f} times a second"
     gate = config.safety.gate
     if most_m is not None and most_m < gate.max_height_m:
         fix = f"make safety.gate.max_height_m {most_m:.0f} m or less, or take a sensor that measures farther"
         return warned(RANGE_FINDER, f"{measured}; the drone may fly at {gate.max_height_m:g} m", fix)
     if least_m > NEAREST_M:
-        return warned(
-            RANGE_FINDER, measured, "take a sensor that measures nearer, or fly higher than that from the start"
-        )
-    if rate_hz < LEAST_RATE_HZ:
-        return warned(RANGE_FINDER, measured, f"let the sensor and this link give it at {LEAST_RATE_HZ:g} Hz or more")
-    return passed(RANGE_FINDER, measured)
-
-
-def _rate_hz(arrivals_s: Sequence[float]) -> float:
-    if len(arrivals_s) < 2 or arrivals_s[-1] <= arrivals_s[0]:
-        return 0.0
-    return (len(arrivals_s) - 1) / (arrivals_s[-1] - arrivals_s[0])
+        fix = "take a sensor that measures nearer, or fly higher than that from the start"
+        return warned(RANGE_FINDER, measured, fix)
+    fix = f"let the sensor and this link give it at {LEAST_RATE_HZ:g} Hz or more"
+    return graded(RANGE_FINDER, measured, fix, warning=rate_hz < LEAST_RATE_HZ)

@@ -13,11 +13,11 @@ import numpy as np
 
 from flockd.core.config import DroneConfig
 from flockd.core.errors import UnavailableError
-from flockd.core.messages import FloatArray, PilotOutput, ReasonKind, Setpoint
+from flockd.core.messages import FloatArray, ReasonKind, Setpoint
 from flockd.flight.inference.hashes import model_hashes
 from flockd.flight.perception import load_networks
 from flockd.flight.safety import Gate
-from flockd.ground.doctor.examination import Finding, failed, graded, passed, warned
+from flockd.ground.doctor import Finding, failed, graded, passed, warned
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.daemon import Components, Daemon, InterruptibleNetworks, ServiceManager, cameras_at_once
@@ -77,7 +77,6 @@ async def bench(
     stop: asyncio.Event,
     on_second: Callable[[int], None] = lambda seconds: None,
     load: Callable[[], InterruptibleNetworks] | None = None,
-    clock: Callable[[], float] = time.monotonic,
     patience_s: float = FIRST_FRAME_S,
 ) -> list[Sample]:
     """Runs the daemon with a link that sends nothing, until the time is over, `stop` is set, or the drone is armed.
@@ -89,7 +88,6 @@ async def bench(
         stop: ends it early.
         on_second: called with how many seconds are over.
         load: loads the networks; None: the configured ones.
-        clock: monotonic seconds.
         patience_s: for the first frame, from when all else runs.
 
     Raises FlockdError for what cannot be opened, and where no frame comes.
@@ -103,12 +101,38 @@ async def bench(
         models=model_hashes(config.perception),
         recordings=None,
         service=ServiceManager({}),
-        clock=clock,
+        clock=time.monotonic,
         connect=SilentLink.connect,
     )
     running = asyncio.create_task(daemon.run())
+    gate, samples = Gate(config.safety.gate), list[Sample]()
+    began_s = sampled_s = late_s = math.inf
     try:
-        return await _sampled(daemon, running, Gate(config.safety.gate), seconds, stop, on_second, clock, patience_s)
+        while not running.done() and not stop.is_set():
+            await asyncio.sleep(GATE_PERIOD_S)
+            components, now = daemon.components, time.monotonic()
+            if components is None:
+                continue
+            if components.pilot_loop.frames is None:
+                late_s = min(late_s, now + patience_s)
+                if now > late_s:
+                    cameras = components.source.status().items()
+                    faults = "; ".join(f"camera {name} {one.fault or 'delivers nothing'}" for name, one in cameras)
+                    told = f"no images of all cameras came within {patience_s:g} s: {faults}"
+                    raise UnavailableError(f"{told}; `flockd doctor` says what to do")
+                continue
+            if math.isinf(began_s):
+                began_s, sampled_s = now, now - SAMPLE_S
+            setpoint = components.control.rehearsed(gate)
+            if now - sampled_s >= SAMPLE_S:
+                sampled_s = now
+                samples.append(_sample(components, now - began_s, None if setpoint is None else setpoint.velocity))
+                on_second(int(now - began_s))
+                if samples[-1].armed:
+                    break
+            if now - began_s >= seconds:
+                break
+        return samples
     finally:
         daemon.ask_to_stop()
         await asyncio.wait({running})
@@ -116,50 +140,12 @@ async def bench(
             raise error
 
 
-async def _sampled(
-    daemon: Daemon, running: asyncio.Task[object], gate: Gate, seconds: float, stop: asyncio.Event,
-    on_second: Callable[[int], None], clock: Callable[[], float], patience_s: float,
-) -> list[Sample]:  # fmt: skip
-    samples: list[Sample] = []
-    began_s = sampled_s = late_s = math.inf
-    command: FloatArray | None = None
-    while not running.done() and not stop.is_set():
-        await asyncio.sleep(GATE_PERIOD_S)
-        components, now = daemon.components, clock()
-        if components is None:
-            continue
-        if components.pilot_loop.frames is None:
-            late_s = min(late_s, now + patience_s)
-            if now > late_s:
-                raise UnavailableError(_why_no_frame(components, patience_s))
-            continue
-        if math.isinf(began_s):
-            began_s, sampled_s = now, now - SAMPLE_S
-        setpoint = components.control.rehearsed(gate)
-        command = None if setpoint is None else setpoint.velocity
-        if now - sampled_s >= SAMPLE_S:
-            sampled_s = now
-            samples.append(_sample(components, now - began_s, command))
-            on_second(int(now - began_s))
-            if samples[-1].armed:
-                break
-        if now - began_s >= seconds:
-            break
-    return samples
-
-
-def _why_no_frame(components: Components, patience_s: float) -> str:
-    cameras = components.source.status()
-    faults = [f"camera {name} {camera.fault or 'delivers nothing'}" for name, camera in cameras.items()]
-    return (
-        f"no images of all cameras came within {patience_s:g} s: {'; '.join(faults)}; `flockd doctor` says what to do"
-    )
-
-
 def _sample(components: Components, time_s: float, command: FloatArray | None) -> Sample:
-    loop, status = components.pilot_loop, components.link.status()
-    cameras = components.source.status()
+    loop, status, cameras = components.pilot_loop, components.link.status(), components.source.status()
     output = None if loop.newest is None else loop.newest.output
+    # What an own motion lacks, in the line from the input on; a height by another source than wanted is no cause.
+    causes = (ReasonKind.INPUT, ReasonKind.CAMERA, ReasonKind.LENS, ReasonKind.PAIR, ReasonKind.EGO_MOTION)
+    reasons = () if output is None else output.reasons
     return Sample(
         time_s=time_s,
         armed=status.armed,
@@ -173,16 +159,10 @@ def _sample(components: Components, time_s: float, command: FloatArray | None) -
         camera_faults={name: camera.fault for name, camera in cameras.items() if camera.fault is not None},
         neighbours=0 if output is None else sum(one.confirmed for one in output.neighbours),
         own_motion=output is not None and output.ego_motion is not None,
-        why=None if output is None else _why_no_motion(output),
+        why=next((reason.text for kind in causes for reason in reasons if reason.kind is kind), None),
         command=command,
         stages_ms={} if output is None else output.stages_ms,
     )
-
-
-def _why_no_motion(output: PilotOutput) -> str | None:
-    """The first cause in the line from the input on; a height by another source than wanted is none."""
-    causes = (ReasonKind.INPUT, ReasonKind.CAMERA, ReasonKind.LENS, ReasonKind.PAIR, ReasonKind.EGO_MOTION)
-    return next((reason.text for kind in causes for reason in output.reasons if reason.kind is kind), None)
 
 
 def judged(config: DroneConfig, samples: Sequence[Sample], seconds: float) -> Iterator[Finding]:

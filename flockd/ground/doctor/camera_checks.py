@@ -11,13 +11,12 @@ import numpy as np
 
 from flockd.core.config import DroneConfig
 from flockd.core.config.rig import CameraConfig, RigConfig
-from flockd.core.config.source import CameraDeviceParameters
 from flockd.core.errors import FlockdError
 from flockd.flight.geometry import Rig, build_rig, described, rig_faults
 from flockd.ground.calibration.from_flight import found_rig
 from flockd.ground.cameras.watching import START_S, Watched, watch
+from flockd.ground.doctor import Finding, Level, failed, failed_from_error, graded, passed, warned
 from flockd.ground.doctor.computer_checks import STATE_FOLDER
-from flockd.ground.doctor.examination import Finding, failed, failed_from_error, passed, warned
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.sources.device_source import Devices
 
@@ -58,70 +57,52 @@ def check_cameras(
 
 
 def _judged(camera: CameraConfig, config: DroneConfig, watched: Watched | None) -> Iterator[Finding]:
-    problems = list(lens_problems(camera))
-    measured = []
+    problems, measured = list(lens_problems(camera)), []
     if watched is not None and config.source is not None:
         device = next((entry for entry in config.source.cameras if entry.name == camera.name), None)
-        rate_hz = device.rate_hz if device else config.source.shared_memory.rate_hz
-        fix_rate = _fix_rate(device)
-        problems += stream_problems(camera.name, watched, rate_hz, config.safety.max_dropped_share, fix_rate)
-        problems += [] if device is None or device.pipeline else _exposure_problems(device)
-        measured = [
-            f"{watched.rate_hz:.1f} of {rate_hz:g} images a second, jitter {1e3 * watched.jitter_s():.1f} ms, no gaps",
-            f"{len(device.controls)} controls accepted" if device and device.device else "",
-        ]
-    size = "x".join(map(str, camera.size_px))
+        rate_hz, fix_rate = config.source.shared_memory.rate_hz, "check why the program that publishes them is late"
+        if device is not None:
+            rate_hz, fix_rate = device.rate_hz, FIX_PIPELINE if device.pipeline else FIX_RATE
+        found = _stream(camera.name, watched, rate_hz, config.safety.max_dropped_share, fix_rate)
+        problems += [finding for finding in found if finding.level is not Level.PASS]
+        # The driver refuses controls that it does not accept; here is what was not even asked.
+        if device and not device.pipeline and not any("exposure" in control.name for control in device.controls):
+            told = "its exposure is not configured: an automatic one blurs, which is taken for motion"
+            fix = "set it in source.cameras[].controls, as in config/quadrotor.yaml"
+            problems.append(warned(f"camera {camera.name}", told, fix))
+        jitter_ms = 1e3 * watched.jitter_s()
+        measured.append(f"{watched.rate_hz:.1f} of {rate_hz:g} images a second, jitter {jitter_ms:.1f} ms, no gaps")
+        measured += [f"{len(device.controls)} controls accepted"] if device and device.device else []
     if problems:
         yield from problems
     else:
-        calibration = f"calibration fits {size}, {width_deg(camera):.0f} degrees wide"
-        yield passed(f"camera {camera.name}", ", ".join(part for part in [*measured, calibration] if part))
+        size = "x".join(map(str, camera.size_px))
+        measured.append(f"calibration fits {size}, {width_deg(camera):.0f} degrees wide")
+        yield passed(f"camera {camera.name}", ", ".join(measured))
 
 
-def _fix_rate(device: CameraDeviceParameters | None) -> str:
-    """What to do about frames that are too few, uneven or damaged."""
-    if device is None:
-        return "check why the program that publishes them is late"
-    return FIX_PIPELINE if device.pipeline else FIX_RATE
-
-
-def stream_problems(
-    name: str, watched: Watched, rate_hz: float, max_dropped_share: float, fix_rate: str
-) -> Iterator[Finding]:
-    """What is wrong with the images that came; ``fix_rate``: what to do about too few, uneven or damaged ones."""
+def _stream(name: str, watched: Watched, rate_hz: float, max_dropped_share: float, fix_rate: str) -> Iterator[Finding]:
+    """Of the images that came; ``fix_rate``: what to do about too few, uneven or damaged ones."""
     about = f"camera {name}"
     if watched.fault is not None:
         yield failed_from_error(about, watched.fault.removeprefix(f"{name}: "))
         return
     came, bad = len(watched.stamps_s), sum(watched.refused.values())
     share = (watched.lost + bad) / max(came + watched.lost + bad, 1)
-    if watched.lost or bad:
-        what = [f"{count} {reason}" for reason, count in (("lost", watched.lost), *watched.refused.items()) if count]
-        measured = f"of {came + watched.lost + bad} images {', '.join(what)} ({share:.0%})"
-        yield (failed if share > max_dropped_share else warned)(about, measured, fix_rate)
+    what = [f"{count} {reason}" for reason, count in (("lost", watched.lost), *watched.refused.items()) if count]
+    measured = f"of {came + watched.lost + bad} images {', '.join(what)} ({share:.0%})"
+    yield graded(about, measured, fix_rate, failure=share > max_dropped_share, warning=bool(what))
     pace = watched.rate_hz / rate_hz
-    if pace < SLOW or pace > 2.0 - SLOW:
-        measured = f"{watched.rate_hz:.1f} images a second instead of {rate_hz:g}"
-        fix = f"{fix_rate}, or write rate_hz: {max(watched.rate_hz, 0.1):.2g}"
-        yield (failed if pace < TOO_SLOW else warned)(about, measured, fix)
-    jitter_s = watched.jitter_s()
-    if jitter_s * rate_hz > UNEVEN:
-        measured = f"images come unevenly: {1e3 * jitter_s:.1f} ms off their period of {1e3 / rate_hz:.1f} ms"
-        yield (failed if jitter_s * rate_hz > TOO_UNEVEN else warned)(about, measured, fix_rate)
-    if watched.image is not None:
-        grey = float(watched.image.mean())
-        if not DARK <= grey <= BRIGHT:
-            how = "dark" if grey < DARK else "bright"
-            fix = "remove the lens cap, or set exposure and gain for the light where it flies"
-            yield warned(about, f"the image is too {how} (mean {grey:.0f} of 255)", fix)
-
-
-def _exposure_problems(device: CameraDeviceParameters) -> Iterator[Finding]:
-    """The driver refuses controls that it does not accept; here is what was not even asked."""
-    if not any("exposure" in control.name for control in device.controls):
-        measured = "its exposure is not configured: an automatic one blurs, which is taken for motion"
-        fix = "set it in source.cameras[].controls, as in config/quadrotor.yaml"
-        yield warned(f"camera {device.name}", measured, fix)
+    measured = f"{watched.rate_hz:.1f} images a second instead of {rate_hz:g}"
+    fix = f"{fix_rate}, or write rate_hz: {max(watched.rate_hz, 0.1):.2g}"
+    yield graded(about, measured, fix, failure=pace < TOO_SLOW, warning=pace < SLOW or pace > 2.0 - SLOW)
+    uneven = watched.jitter_s() * rate_hz
+    measured = f"images come unevenly: {1e3 * watched.jitter_s():.1f} ms off their period of {1e3 / rate_hz:.1f} ms"
+    yield graded(about, measured, fix_rate, failure=uneven > TOO_UNEVEN, warning=uneven > UNEVEN)
+    if watched.image is not None and not DARK <= (grey := float(watched.image.mean())) <= BRIGHT:
+        how = "dark" if grey < DARK else "bright"
+        fix = "remove the lens cap, or set exposure and gain for the light where it flies"
+        yield warned(about, f"the image is too {how} (mean {grey:.0f} of 255)", fix)
 
 
 def width_deg(camera: CameraConfig) -> float:

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from flockd.core.config import DroneConfig
-from flockd.ground.doctor.examination import Finding, failed, graded, passed, warned
+from flockd.ground.doctor import Finding, failed, graded, passed, warned
 
 STATE_FOLDER = Path("/var/lib/flockd")
 """Where the systemd unit lets flockd record."""
@@ -57,16 +57,15 @@ def check_disk(config: DroneConfig, folder: Path | None, state_folder: Path = ST
 
 def judge_room(config: DroneConfig, folder: Path, free_mb: float, own_mb: float) -> Finding:
     """The quota counts what this drone has recorded there before, and deletes the oldest of it."""
-    wanted = config.recording
-    room_mb = free_mb + own_mb
+    file_mb, quota_mb, room_mb = config.recording.file_mb, config.recording.quota_mb, free_mb + own_mb
     measured = f"{free_mb / 1e3:.1f} GB free in {folder}, {own_mb / 1e3:.1f} GB are this drone's recordings"
-    if room_mb < wanted.file_mb:
+    if room_mb < file_mb:
         fix = f"make room, or write recording.file_mb and quota_mb: {0.8 * room_mb:.0f}"
-        return failed("disk", f"{measured}: not enough for a file of {wanted.file_mb / 1e3:g} GB (file_mb)", fix)
-    if room_mb < wanted.quota_mb:
+        return failed("disk", f"{measured}: not enough for a file of {file_mb / 1e3:g} GB (file_mb)", fix)
+    if room_mb < quota_mb:
         fix = f"make room, or write recording.quota_mb: {0.9 * room_mb:.0f}"
-        return warned("disk", f"{measured}: not enough for the quota of {wanted.quota_mb / 1e3:g} GB", fix)
-    return passed("disk", f"{measured}; the quota of {wanted.quota_mb / 1e3:g} GB fits")
+        return warned("disk", f"{measured}: not enough for the quota of {quota_mb / 1e3:g} GB", fix)
+    return passed("disk", f"{measured}; the quota of {quota_mb / 1e3:g} GB fits")
 
 
 def check_memory(config: DroneConfig, meminfo: Path = MEMORY) -> Iterator[Finding]:
@@ -155,25 +154,20 @@ def check_clock(
         yield warned("wall clock", measured, "start a time service, as with `timedatectl set-ntp true`")
     else:
         yield passed("wall clock", f"{date:%Y-%m-%d %H:%M} UTC, synchronised to {1e-3 * error_us():.0f} ms")
-    yield judge_monotonic(_ticks())
-
-
-def _ticks() -> list[float]:
     ticks = [time.monotonic()]
     for _ in range(SAMPLES):
         time.sleep(SAMPLE_S)
         ticks.append(time.monotonic())
-    return ticks
+    yield judge_monotonic(ticks)
 
 
 def judge_monotonic(ticks: list[float]) -> Finding:
     """Readings with pauses of `SAMPLE_S` between them; a pause takes as long or longer."""
     fix = "check /sys/devices/system/clocksource/clocksource0/current_clocksource, and boot with another"
-    steps = [after - before for before, after in itertools.pairwise(ticks)]
-    if min(steps) <= 0.0:
-        return failed("monotonic clock", f"it stood or went back by {-1e3 * min(steps):.1f} ms", fix)
-    shortest = min(steps)
-    if shortest < (1.0 - DRIFT) * SAMPLE_S:
-        measured = f"{1e3 * shortest:.1f} ms went by in a pause of {1e3 * SAMPLE_S:.0f} ms: it is slow or coarse"
+    shortest_ms, pause_ms = 1e3 * min(after - before for before, after in itertools.pairwise(ticks)), 1e3 * SAMPLE_S
+    if shortest_ms <= 0.0:
+        return failed("monotonic clock", f"it stood or went back by {-shortest_ms:.1f} ms", fix)
+    if shortest_ms < (1.0 - DRIFT) * pause_ms:
+        measured = f"{shortest_ms:.1f} ms went by in a pause of {pause_ms:.0f} ms: it is slow or coarse"
         return failed("monotonic clock", measured, fix)
-    return passed("monotonic clock", f"runs on; {1e3 * SAMPLE_S:.0f} ms pauses took {1e3 * shortest:.1f} ms and more")
+    return passed("monotonic clock", f"runs on; {pause_ms:.0f} ms pauses took {shortest_ms:.1f} ms and more")

@@ -18,7 +18,7 @@ from flockd.flight.inference.providers import engines_folder
 from flockd.flight.perception import Networks
 from flockd.flight.perception.requirements import check_roles
 from flockd.flight.pilot import FlockPilot
-from flockd.ground.doctor.examination import Finding, Level, failed_from_error, graded, passed
+from flockd.ground.doctor import Finding, Level, failed_from_error, graded, passed
 from flockd.onboard.daemon import load_side_by_side
 from flockd.onboard.deadline import GOLDEN_S, within
 

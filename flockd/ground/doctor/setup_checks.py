@@ -16,7 +16,7 @@ from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.core.secrets import masked
 from flockd.fleet.watcher import FleetWatcher
-from flockd.ground.doctor.examination import Finding, failed, graded, passed, warned
+from flockd.ground.doctor import Finding, failed, graded, passed, warned
 from flockd.onboard.telemetry.zenoh_session import SessionError, private_keys
 
 UNIT_FOLDERS = (Path("/etc/systemd/system"), Path("/usr/lib/systemd/system"), Path("/lib/systemd/system"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -133,7 +132,8 @@ class _Annotation(_Part):
     category_id: int
     bbox: tuple[float, float, Positive, Positive]
     """Left, top, width, height."""
-    iscrowd: Literal[0, 1] = 0
+    iscrowd: Literal[0] = 0
+    """One box a drone."""
 
 
 class _Coco(_Part):
@@ -157,9 +157,7 @@ def read_labels(path: Path, pictures: Sequence[PictureFile]) -> dict[PictureFile
     A file name in the labels counts from the label file's folder, or from a folder that was given.
     """
     coco = _parsed(path)
-    by_place: dict[Path, PictureFile] = {}
-    for picture in pictures:
-        by_place[picture.path.resolve()] = picture
+    by_place = {picture.path.resolve(): picture for picture in pictures}
     folders = dict.fromkeys([path.parent.resolve(), *(one.root.resolve() for one in pictures)])
     labels: dict[PictureFile, PictureLabels] = {}
     drones = {category.id for category in coco.categories if category.name == CATEGORY}
@@ -192,20 +190,16 @@ def _parsed(path: Path) -> _Coco:
         raise DatasetError(f"{path}: cannot be read ({error.strerror}); name a COCO file with --labels") from None
     except ValidationError as error:
         raise DatasetError(f"{path}: {_sentence(error)}") from None
-    images = {image.id for image in coco.images}
-    categories = {category.id for category in coco.categories}
-    for name, ids in (("images", coco.images), ("categories", coco.categories)):
-        doubled = [number for number, count in Counter(one.id for one in ids).items() if count > 1]
+    known = {"image": [image.id for image in coco.images], "category": [one.id for one in coco.categories]}
+    for name, ids in known.items():
+        doubled = [number for number, count in Counter(ids).items() if count > 1]
         if doubled:
-            raise DatasetError(f"{path}: {name}: two have the id {doubled[0]}; give each its own")
-    for k, one in enumerate(coco.annotations):
-        if one.image_id not in images:
-            raise DatasetError(f"{path}: annotations[{k}].image_id: there is no image {one.image_id}; correct it")
-        if one.category_id not in categories:
-            message = f"there is no category {one.category_id}; correct it, or add it to categories"
-            raise DatasetError(f"{path}: annotations[{k}].category_id: {message}")
-        if one.iscrowd:
-            raise DatasetError(f"{path}: annotations[{k}].iscrowd: is 1; give each drone a box of its own")
+            key = {"image": "images", "category": "categories"}[name]
+            raise DatasetError(f"{path}: {key}: two have the id {doubled[0]}; give each its own")
+        for k, one in enumerate(coco.annotations):
+            value = getattr(one, f"{name}_id")
+            if value not in ids:
+                raise DatasetError(f"{path}: annotations[{k}].{name}_id: there is no {name} {value}; correct it")
     names = [category.name for category in coco.categories]
     if CATEGORY not in names:
         has = f"has {', '.join(names)}" if names else "is empty"
@@ -223,6 +217,4 @@ def _sentence(error: ValidationError) -> str:
     key = key_text(first["loc"])
     if first["type"] == "missing":
         return f"{key}: is missing; add it"
-    message = first["msg"][0].lower() + first["msg"][1:]
-    shown = json.dumps(first["input"], default=str)
-    return f"{key}: {message}, and not {shown if len(shown) < 60 else f'{shown[:60]}...'}; correct it"
+    return f"{key}: {first['msg'][0].lower() + first['msg'][1:]}, and not {first['input']!r:.60}; correct it"

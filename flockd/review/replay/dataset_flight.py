@@ -34,8 +34,7 @@ from flockd.flight.geometry import (
 )
 from flockd.flight.perception import Crop, ImageNetworks, OneByOne, RangeEstimate, SceneMaps, load_networks
 from flockd.flight.pilot import FlockPilot
-from flockd.ground.datasets import Dataset, DatasetFrame
-from flockd.ground.datasets.image_folder import Moment
+from flockd.ground.datasets.image_folder import Dataset, DatasetFrame, Moment
 from flockd.onboard.recording.editing import written_whole
 
 Depth = Literal["recorded", "network"]

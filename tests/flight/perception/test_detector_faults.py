@@ -10,7 +10,7 @@ import pytest
 from flockd.core.config.perception import DetectionParameters, PerceptionConfig
 from flockd.core.messages import Float32Array, UInt8Array
 from flockd.flight.inference import OnnxModel
-from flockd.ground.pictures import PictureDetector, PictureResult
+from flockd.ground.pictures.single_frame import PictureDetector, PictureResult
 from tests.flight.perception.cameras import rendered
 
 SIZE = (480, 352)

@@ -9,8 +9,8 @@ from random import Random
 import cv2
 import numpy as np
 
-from flockd.ground.datasets import open_dataset
 from flockd.ground.datasets.image_files import read_image
+from flockd.ground.datasets.image_folder import open_dataset
 from tests.hostile import hostile, mutated_bytes, odd_file, own_errors, put, removed, text_of
 
 MOST_FRAMES = 50

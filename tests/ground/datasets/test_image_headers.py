@@ -14,7 +14,7 @@ from flockd.cli import main
 from flockd.core.jpeg_header import jpeg_size
 from flockd.ground.datasets.image_files import DatasetError, read_image
 from flockd.ground.datasets.image_folder import read_lines
-from flockd.ground.pictures import read_labels
+from flockd.ground.pictures.picture_files import read_labels
 from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat
 
 HUGE = 60_000

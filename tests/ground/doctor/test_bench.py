@@ -13,8 +13,8 @@ import pytest
 
 from flockd.cli import main
 from flockd.core.errors import UnavailableError
+from flockd.ground.doctor import Level
 from flockd.ground.doctor.bench import Sample, bench, judged
-from flockd.ground.doctor.examination import Level
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.sitl.ports import free_endpoint, free_port
 from tests.onboard.daemon.aboard import CAMERAS, Cameras, TinyPerceiver, config_for

@@ -7,7 +7,7 @@ from pathlib import Path
 from flockd.core.config import DroneConfig
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
 from flockd.core.data import data_path
-from flockd.ground.doctor.examination import Level
+from flockd.ground.doctor import Level
 from flockd.ground.doctor.setup_checks import check_secrets
 from tests.onboard.daemon.aboard import config_for
 

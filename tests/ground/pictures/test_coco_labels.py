@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from flockd.ground.datasets.image_files import DatasetError
-from flockd.ground.pictures import find_pictures, read_labels
-from flockd.ground.pictures.picture_files import check_size
+from flockd.ground.pictures.picture_files import check_size, find_pictures, read_labels
 
 Document = dict[str, Any]
 
@@ -57,32 +56,35 @@ def test_boxes_of_drones_are_read(folder: Path, place: str) -> None:
         check_size(path, "a.png", by_name["a.png"], (48, 64))
 
 
+def _set(*path: object, **values: object) -> Callable[[Document], object]:
+    """A change of one part of the document."""
+
+    def change(document: Document) -> object:
+        part: Any = document
+        for key in path:
+            part = part[key]
+        return part.update(values)
+
+    return change
+
+
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (lambda d: d["annotations"][0].update(category_id=9), r"annotations\[0\]\.category_id: there is no category 9"),
-        (lambda d: d["annotations"][1].update(image_id=9), r"annotations\[1\]\.image_id: there is no image 9; correct"),
-        (lambda d: d["annotations"][0].update(bbox=[1, 2, 3]), r"annotations\[0\]\.bbox\[3\]: is missing; add it"),
-        (
-            lambda d: d["annotations"][0].update(bbox="1 2 3 4"),
-            r"annotations\[0\]\.bbox: input should be .*\"1 2 3 4\"",
-        ),
-        (
-            lambda d: d["annotations"][0].update(bbox=[1, 2, 0, 4]),
-            r"annotations\[0\]\.bbox\[2\]: input should be great",
-        ),
-        (lambda d: d["annotations"][0].update(iscrowd=1), r"annotations\[0\]\.iscrowd: is 1; give each drone a box"),
-        (lambda d: d["images"][0].update(id="7"), r"images\[0\]\.id: input should be a valid integer, and not \"7\""),
-        (lambda d: d["images"][1].update(id=7), r"images: two have the id 7; give each its own"),
-        (lambda d: d["images"][1].update(file_name="a.png"), r"a\.png is in the images twice; delete one"),
-        (lambda d: d["images"][1].update(file_name="d.png"), r"d\.png is labelled and is not among the pictures; add"),
+        (_set("annotations", 0, category_id=9), r"annotations\[0\]\.category_id: there is no category 9"),
+        (_set("annotations", 1, image_id=9), r"annotations\[1\]\.image_id: there is no image 9; correct"),
+        (_set("annotations", 0, bbox=[1, 2, 3]), r"annotations\[0\]\.bbox\[3\]: is missing; add it"),
+        (_set("annotations", 0, bbox="1 2 3 4"), r"annotations\[0\]\.bbox: input should be .*'1 2 3 4'"),
+        (_set("annotations", 0, bbox=[1, 2, 0, 4]), r"annotations\[0\]\.bbox\[2\]: input should be great"),
+        (_set("annotations", 0, iscrowd=1), r"annotations\[0\]\.iscrowd: input should be 0, and not 1; correct"),
+        (_set("images", 0, id="7"), r"images\[0\]\.id: input should be a valid integer, and not '7'"),
+        (_set("images", 1, id=7), r"images: two have the id 7; give each its own"),
+        (_set("images", 1, file_name="a.png"), r"a\.png is in the images twice; delete one"),
+        (_set("images", 1, file_name="d.png"), r"d\.png is labelled and is not among the pictures; add"),
         (lambda d: d["images"][0].pop("file_name"), r"images\[0\]\.file_name: is missing; add it"),
         (lambda d: d.pop("annotations"), r"labels\.json: annotations: is missing; add it"),
-        (lambda d: d.update(images={}), r"labels\.json: images: input should be a valid"),
-        (
-            lambda d: d["categories"][0].update(name="Drone"),
-            r"categories: has Drone, bird, and the drones' must be named `drone`; rename or add it",
-        ),
+        (_set(images={}), r"labels\.json: images: input should be a valid"),
+        (_set("categories", 0, name="Drone"), r"categories: has Drone, bird, and the drones' must be named `drone`"),
     ],
 )
 def test_wrong_labels_are_refused(folder: Path, change: Callable[[Document], object], sentence: str) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from flockd.cli import main
-from flockd.ground.pictures import PictureDetector, camera_with_fov
+from flockd.ground.pictures.single_frame import PictureDetector, camera_with_fov
 from tests.ground.pictures.photographs import DRONE_SIZE_M, FOCAL_PX, FOV_DEG, LABELS, RENDERED, SIZE, truth
 
 Capture = pytest.CaptureFixture[str]

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import pytest
 
-from flockd.ground.pictures import DetectedDrone, Labelled, summary
 from flockd.ground.pictures.scoring import (
+    Labelled,
     average_precision,
     centre_in_box,
     count_interval,
     intersection_over_union,
     match,
     overlap,
+    summary,
     width_class,
 )
-from flockd.ground.pictures.single_frame import Box
+from flockd.ground.pictures.single_frame import Box, DetectedDrone
 
 BOX = (10.0, 10.0, 30.0, 20.0)
 
