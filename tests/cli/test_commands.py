@@ -365,7 +365,7 @@ def test_a_flight_leaves_its_log_summary_and_report(
     assert capsys.readouterr().err.startswith(f"{folder}: holds a flight; ")
     (folder / "recordings").mkdir()
     (folder / "recordings" / "drone1.mcap").touch()
-    monkeypatch.setattr("flockd.review.report.flight_folder.write_report", lambda folder, progress: folder)
+    monkeypatch.setattr("flockd.review.report.flight_folder.write_report", lambda folder, *_: folder)
     assert main([*short, "--quiet", "--force"]) == 0
     captured = capsys.readouterr()
     assert (captured.out, captured.err) == (f"{folder / 'report.html'}\n", "")
@@ -376,7 +376,7 @@ def test_each_flight_has_its_own_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("flockd.review.report.flight_folder.write_report", lambda folder, progress: folder)
+    monkeypatch.setattr("flockd.review.report.flight_folder.write_report", lambda folder, *_: folder)
     short = ["sim", "--perception", "truth", "--duration", "2", "--quiet"]
     for expected in ("", "-2", "-3"):
         assert main(short) == 0
@@ -407,7 +407,7 @@ def test_an_interrupted_flight_leaves_its_report_and_can_be_flown_again(
         step(vehicles, *arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Vehicles, "step", interrupted)
-    monkeypatch.setattr("flockd.review.report.flight_folder.write_report", lambda folder, progress: folder)
+    monkeypatch.setattr("flockd.review.report.flight_folder.write_report", lambda folder, *_: folder)
     folder = tmp_path / "flight"
     command = ["sim", "--perception", "truth", "--duration", "20", "--quiet", "--out", str(folder)]
     assert main(command) == 130

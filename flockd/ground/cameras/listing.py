@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import errno
-import functools
 import os
 import re
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -66,21 +66,16 @@ def list_cameras(computer: Computer) -> list[FoundCamera]:
 
 
 def _of_kernel(computer: Computer) -> Iterator[FoundCamera]:
-    links = _stable_paths(computer.links)
+    """Each by the shortest of its links, as udev has more than one for a USB 2 socket."""
+    links: dict[str, str] = {}
+    for link in sorted(computer.links.glob("*"), key=lambda link: (len(link.name), link.name)):
+        if link.is_symlink():
+            links.setdefault(link.readlink().name, str(BY_PATH / link.name))
     names = sorted((file.name for file in computer.nodes.glob("video*")), key=lambda name: (len(name), name))
     for name in names:
         camera = read_camera(computer.kernel, f"/dev/{name}", links.get(name, f"/dev/{name}"))
         if camera is not None:
             yield camera
-
-
-def _stable_paths(folder: Path) -> dict[str, str]:
-    """By the name of the node; of several the shortest, as udev has more than one for a USB 2 socket."""
-    links: dict[str, str] = {}
-    for link in sorted(folder.glob("*"), key=lambda link: (len(link.name), link.name)):
-        if link.is_symlink():
-            links.setdefault(link.readlink().name, str(BY_PATH / link.name))
-    return links
 
 
 def _by_argus(found: Sequence[FoundCamera]) -> Iterator[FoundCamera]:
@@ -164,7 +159,7 @@ def read_camera(kernel: Kernel, node: str, device: str) -> FoundCamera | None:
         if not camera_flags(capability) & CAN_CAPTURE:
             return None
         name = capability.card.decode("utf-8", "replace")
-        described = _entries(kernel, descriptor, VIDIOC_ENUM_FMT, lambda i: FormatDescription(index=i, type=CAPTURE))
+        described = _entries(kernel, descriptor, VIDIOC_ENUM_FMT, partial(FormatDescription, type=CAPTURE))
         formats = [entry.pixelformat for entry in described]
         modes = tuple(
             mode for number in formats if number in _NAMES for mode in _kernel_modes(kernel, descriptor, number)
@@ -190,26 +185,19 @@ def _useless(formats: list[int]) -> str:
 
 
 def _kernel_modes(kernel: Kernel, descriptor: int, number: int) -> Iterator[Mode]:
-    def size_at(index: int) -> FrameSize:
-        return FrameSize(index=index, pixel_format=number)
-
-    sized = list(_entries(kernel, descriptor, VIDIOC_ENUM_FRAMESIZES, size_at))
+    sized = list(_entries(kernel, descriptor, VIDIOC_ENUM_FRAMESIZES, partial(FrameSize, pixel_format=number)))
     sizes = [(one.width, one.height) for one in sized if one.type == _DISCRETE]
     for width, height in sizes if sizes or not sized else _SIZES_OF_RANGE:
-        interval = functools.partial(_interval, number, width, height)
-        intervals = _entries(kernel, descriptor, VIDIOC_ENUM_FRAMEINTERVALS, interval)
+        entry = partial(FrameInterval, pixel_format=number, width=width, height=height)
+        intervals = _entries(kernel, descriptor, VIDIOC_ENUM_FRAMEINTERVALS, entry)
         rates = {round(one.denominator / one.numerator, 3) for one in intervals if one.numerator}
         yield Mode(_NAMES[number], (width, height), tuple(sorted(rates, reverse=True)))
 
 
-def _interval(number: int, width: int, height: int, index: int) -> FrameInterval:
-    return FrameInterval(index=index, pixel_format=number, width=width, height=height)
-
-
-def _entries(kernel: Kernel, descriptor: int, request: int, entry: Callable[[int], _Entry]) -> Iterator[_Entry]:
+def _entries(kernel: Kernel, descriptor: int, request: int, entry: Callable[..., _Entry]) -> Iterator[_Entry]:
     """A list of the driver's, by index, until it has no more or does not keep one."""
     for index in range(_MOST):
-        asked = entry(index)
+        asked = entry(index=index)
         try:
             kernel.ioctl(descriptor, request, asked)
         except OSError as error:

@@ -151,26 +151,34 @@ _BLACK, _WHITE = 4, 251
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """One camera in one mode."""
+    """One camera in one mode; numbers are NaN without an image."""
 
     mode: Mode
     watched: Watched
-    edge_px: float
-    """See ``edge_width_px``; NaN without an image."""
-    mean_grey: float
-    """Mean grey, 0 to 255; NaN without an image."""
-    black_share: float
-    white_share: float
+    edge_px: float = math.nan
+    """See ``edge_width_px``."""
+    mean_grey: float = math.nan
+    """Mean grey, 0 to 255."""
+    black_share: float = math.nan
+    white_share: float = math.nan
 
 
 def measure(cameras: Sequence[tuple[FoundCamera, Mode]], seconds: float, kernel: Kernel) -> list[Measured]:
     """Runs all cameras side by side, for ``seconds`` from their first image on."""
-    names = [f"camera{number}" for number in range(len(cameras))]
-    entries = [camera.parameters(name, mode) for name, (camera, mode) in zip(names, cameras, strict=True)]
+    modes = {f"camera{number}": mode for number, (_, mode) in enumerate(cameras)}
+    entries = [camera.parameters(name, mode) for name, (camera, mode) in zip(modes, cameras, strict=True)]
     source = SourceParameters(kind="v4l2").model_copy(update={"cameras": entries, "silence_s": _SILENCE_S})
-    sizes = {name: mode.size for name, (_, mode) in zip(names, cameras, strict=True)}
-    watched = watch(sizes, source, seconds, Devices(kernel))
-    return [_measured(mode, watched[name]) for name, (_, mode) in zip(names, cameras, strict=True)]
+    watched = watch({name: mode.size for name, mode in modes.items()}, source, seconds, Devices(kernel))
+    measured = []
+    for name, mode in modes.items():
+        image = watched[name].image
+        if image is None:
+            measured.append(Measured(mode, watched[name]))
+            continue
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        black, white = (float(np.mean(beyond)) for beyond in (grey <= _BLACK, grey >= _WHITE))
+        measured.append(Measured(mode, watched[name], edge_width_px(image), float(grey.mean()), black, white))
+    return measured
 
 
 def edge_width_px(image: UInt8Array) -> float:
@@ -190,17 +198,3 @@ def edge_width_px(image: UInt8Array) -> float:
 def as_png(image: UInt8Array) -> bytes:
     """An RGB image as a file."""
     return bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1])
-
-
-def _measured(mode: Mode, watched: Watched) -> Measured:
-    if watched.image is None:
-        return Measured(mode, watched, math.nan, math.nan, math.nan, math.nan)
-    grey = cv2.cvtColor(watched.image, cv2.COLOR_RGB2GRAY)
-    return Measured(
-        mode,
-        watched,
-        edge_width_px(watched.image),
-        float(grey.mean()),
-        float(np.mean(grey <= _BLACK)),
-        float(np.mean(grey >= _WHITE)),
-    )

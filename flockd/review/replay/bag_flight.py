@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import uuid
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -72,7 +71,8 @@ def recording_of_bag(bag: Bag, config: DroneConfig, vehicle_topic: str | None, t
     states = _states(bag, _vehicle_topic(bag, vehicle_topic), config, began_ns)
     steps = 0
     with McapFile(target) as file:
-        file.write(Note(FLIGHT_NOTE, _facts(bag, config)))
+        facts = {"format": FORMAT, "drone": config.name, "images": "png", "recording": uuid.uuid4().hex, "part": "0"}
+        file.write(Note(FLIGHT_NOTE, {**facts, "from_bag": bag.path.name}))
         file.write(Note(MODELS_NOTE, model_hashes(config.perception)))
         file.write(Inclosure(CONFIGURATION, "application/json", config.model_dump_json(indent=1).encode()))
         last_s = -np.inf
@@ -93,14 +93,6 @@ def recording_of_bag(bag: Bag, config: DroneConfig, vehicle_topic: str | None, t
     return steps
 
 
-@dataclass(frozen=True, eq=False)
-class _Packed:
-    """An image as a recording has it."""
-
-    data: bytes
-    form: ImageFormat
-
-
 def _sets(bag: Bag, topics: Mapping[str, str], config: DroneConfig, began_ns: int) -> Iterator[RawFrameSet]:
     """Frames by their stamps, as a drone puts them together; the clock begins with the first one's."""
     assert config.source is not None
@@ -111,20 +103,16 @@ def _sets(bag: Bag, topics: Mapping[str, str], config: DroneConfig, began_ns: in
     for message in bag.messages(topics):
         camera = topics[message.topic]
         image = _image(bag, message)
-        time_s = _time_s(image.stamp_ns, began_ns)
-        before = last.get(camera)
-        missing = 0 if before is None else max(round((time_s - before.time_s) * rates[camera]), 1)
-        frame = RawFrame(camera, image.data, _decoder(image, sizes[camera], message), time_s, missing + _number(before))
+        time_s, number = _time_s(image.stamp_ns, began_ns), 0
+        if (before := last.get(camera)) is not None:
+            number = before.sequence + max(round((time_s - before.time_s) * rates[camera]), 1)
+        frame = RawFrame(camera, image.data, _decoder(image, sizes[camera], message), time_s, number)
         if assembler.offer(frame, time_s) is None:
             last[camera] = frame
             if (found := assembler.take(time_s)) is not None:
                 yield found
     if (found := assembler.take(np.inf)) is not None:
         yield found
-
-
-def _number(frame: RawFrame | None) -> int:
-    return 0 if frame is None else frame.sequence
 
 
 def _time_s(stamp_ns: int, began_ns: int) -> float:
@@ -193,34 +181,20 @@ def _vehicle_topic(bag: Bag, wanted: str | None) -> str:
     raise UsageError(f"{bag.path}: has no odometry, pose or IMU, from which the drone's attitude is known")
 
 
-def _facts(bag: Bag, config: DroneConfig) -> dict[str, str]:
-    facts = {"format": FORMAT, "drone": config.name, "images": "png", "recording": uuid.uuid4().hex, "part": "0"}
-    return {**facts, "from_bag": bag.path.name}
-
-
 def _entries(step: int, frames: RawFrameSet, vehicle: VehicleState) -> Iterator[Entry]:
-    """Images that do not decode are left out, as a drone does."""
+    """Images that do not decode are left out, as a drone does; those that came as JPEG stay so, others become PNG."""
     kept = []
     for camera, frame in frames.frames.items():
         try:
-            packed = _packed(frame)
+            image = frame.decode(frame.data)
         except CorruptImageError:
             continue
+        data, stamp = frame.data, nanoseconds(frame.time_s)
+        form: ImageFormat = "jpeg"
+        if not data.startswith(b"\xff\xd8"):
+            data, form = bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]), "png"
         kept.append(FrameEntry(camera, frame.time_s, frame.sequence))
-        stamp = nanoseconds(frame.time_s)
-        yield Entry(foxglove.image_stream(camera), stamp, step, foxglove.image(stamp, camera, packed.data, packed.form))
+        yield Entry(foxglove.image_stream(camera), stamp, step, foxglove.image(stamp, camera, data, form))
     stamp = nanoseconds(frames.time_s)
-    yield Entry(FRAMES, stamp, step, _json(StepFrames(step, frames.time_s, tuple(kept))))
-    yield Entry(VEHICLE, stamp, step, _json(vehicle))
-
-
-def _json(message: object) -> bytes:
-    return json.dumps(to_json(message), allow_nan=False).encode()
-
-
-def _packed(frame: RawFrame) -> _Packed:
-    """Compressed as it came where it came so; else PNG. Raises CorruptImageError."""
-    image = frame.decode(frame.data)
-    if frame.data[:2] == b"\xff\xd8":
-        return _Packed(frame.data, "jpeg")
-    return _Packed(bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]), "png")
+    for stream, message in ((FRAMES, StepFrames(step, frames.time_s, tuple(kept))), (VEHICLE, vehicle)):
+        yield Entry(stream, stamp, step, json.dumps(to_json(message), allow_nan=False).encode())

@@ -15,7 +15,6 @@ from flockd.core.config.geometry import GeometryParameters
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.config.rig import RigConfig
 from flockd.core.messages import (
-    EgoMotion,
     Float32Array,
     Frame,
     FrameSet,
@@ -34,7 +33,7 @@ from flockd.flight.geometry import (
 )
 from flockd.flight.perception import Crop, ImageNetworks, OneByOne, RangeEstimate, SceneMaps, load_networks
 from flockd.flight.pilot import FlockPilot
-from flockd.ground.datasets.image_folder import Dataset, DatasetFrame, Moment
+from flockd.ground.datasets.image_folder import Dataset, Moment
 from flockd.onboard.recording.editing import written_whole
 
 Depth = Literal["recorded", "network"]
@@ -97,13 +96,12 @@ def write_trajectory(path: Path, pairs: Sequence[Pair], stride: int) -> Pair | N
 
 
 def _pair_result(pair: Pair) -> dict[str, Any]:
-    true_rotation, true_translation = size_of(pair.true) if pair.true else (None, None)
-    rotation_error, translation_error = pair.error or (None, None)
+    true, (rotation_error, translation_error) = pair.true, pair.error or (None, None)
     return {
         "from": pair.before.index,
         "to": pair.after.index,
-        "true_rotation_deg": true_rotation,
-        "true_translation_m": true_translation,
+        "true_rotation_deg": rotation_angle_deg(true.rotation) if true else None,
+        "true_translation_m": float(np.linalg.norm(true.translation)) if true else None,
         "rotation_error_deg": rotation_error,
         "translation_error_m": translation_error,
         "inlier_ratio": pair.inlier_ratio,
@@ -151,11 +149,6 @@ class Pair:
         return rotation, float(np.linalg.norm(self.found.translation - self.true.translation))
 
 
-def size_of(motion: RigidTransform) -> tuple[float, float]:
-    """How far a motion turns, degrees, and goes, metres."""
-    return rotation_angle_deg(motion.rotation), float(np.linalg.norm(motion.translation))
-
-
 class RecordedDepth(OneByOne):
     """The learned perception, with the recorded depth in place of the network's."""
 
@@ -189,58 +182,37 @@ def fly_pairs(
     """Each frame i with frame i + ``stride``, in order, as a pilot with this configuration sees them.
 
     ``config`` has the dataset's camera as its only one. As many pilots as the stride take the frames in turns, so that
-    each flies with every frame once. Nobody knows the autopilot's attitude and height. Raises DatasetError at a frame
-    that is missing or damaged.
+    each flies with every frame once. Nobody knows the autopilot's attitude and height: with `perception.scale: network`
+    the own motion needs none. Raises DatasetError at a frame that is missing or damaged.
     """
-    mounted = build_rig(config.rig).cameras[dataset.camera.name]
+    camera = build_rig(config.rig).cameras[dataset.camera.name]
+    mount = camera.T_body_camera
     perceiver = RecordedDepth(learned)
     pilots = [FlockPilot(config, perceiver) for _ in range(stride)]
     past: deque[tuple[Moment, PilotOutput]] = deque(maxlen=stride)
     for frame in dataset.frames(with_depth=recorded_depth):
         moment = frame.moment
         perceiver.show(frame.depth)
-        frames = _frame_set(frame, mounted.name)
-        output = pilots[moment.index % stride].step(frames, _unknown_vehicle(moment.time_s))
+        frames = {camera.name: Frame(camera.name, frame.image, moment.time_s, moment.index)}
+        if float(frame.image.std(axis=(0, 1)).max()) < _FLAT_DEVIATION:
+            frames = {}  # as cameras' images of one colour are left out in flight
+        vehicle = VehicleState(moment.time_s, np.eye(3), 0.0)
+        output = pilots[moment.index % stride].step(FrameSet(moment.time_s, frames), vehicle)
         if len(past) == stride:
             before, output_before = past[0]
-            yield _pair(mounted, before, moment, output_before, output)
+            ego = output.ego_motion
+            if ego is None:
+                reasons = [*_blind(before, output_before), *_blind(moment, output)]
+                reasons += [reason.text for reason in output.reasons if reason.kind is not ReasonKind.CAMERA]
+                yield Pair(before, moment, None, None, "; ".join(reasons))
+            else:
+                found = mount.inverse() @ RigidTransform(ego.rotation, ego.translation) @ mount
+                yield Pair(before, moment, found, ego.inliers / ego.pairs, None)
         past.append((moment, output))
-
-
-def _frame_set(frame: DatasetFrame, camera: str) -> FrameSet:
-    """Without a frame where its image is all of one colour, as cameras' images are in flight."""
-    moment = frame.moment
-    if float(frame.image.std(axis=(0, 1)).max()) < _FLAT_DEVIATION:
-        return FrameSet(moment.time_s, {})
-    return FrameSet(moment.time_s, {camera: Frame(camera, frame.image, moment.time_s, moment.index)})
-
-
-def _unknown_vehicle(time_s: float) -> VehicleState:
-    """There is no autopilot: with `perception.scale: network` the own motion needs none."""
-    return VehicleState(time_s, np.eye(3), 0.0)
-
-
-def _pair(camera: RigCamera, before: Moment, after: Moment, first: PilotOutput, second: PilotOutput) -> Pair:
-    ego = second.ego_motion
-    if ego is None:
-        return Pair(
-            before, after, None, None, "; ".join([*_blind(before, first), *_blind(after, second), *_why(second)])
-        )
-    return Pair(before, after, _of_camera(ego, camera), ego.inliers / ego.pairs, None)
 
 
 def _blind(moment: Moment, output: PilotOutput) -> list[str]:
     return [f"frame {moment.index}: {reason}" for reason in output.reasons if reason.kind is ReasonKind.CAMERA]
-
-
-def _why(output: PilotOutput) -> list[str]:
-    return [reason.text for reason in output.reasons if reason.kind is not ReasonKind.CAMERA]
-
-
-def _of_camera(ego: EgoMotion, camera: RigCamera) -> RigidTransform:
-    """The body's motion as the camera's."""
-    mount = camera.T_body_camera
-    return mount.inverse() @ RigidTransform(ego.rotation, ego.translation) @ mount
 
 
 def integrate(pairs: Iterable[Pair], stride: int) -> tuple[list[tuple[float, RigidTransform]], Pair | None]:

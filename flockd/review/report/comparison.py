@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
+from operator import getitem
 from typing import Any
 
 Summary = Mapping[str, Any]
@@ -35,40 +37,34 @@ class Row:
     """Decimal digits of a number; None for a word."""
     first: Any
     second: Any
-    difference: float | None
+    difference: float | None = None
     """Second less first."""
 
     @property
     def cells(self) -> tuple[str, str, str]:
         """Both values and their difference, for people."""
         if self.digits is None:
-            return self._text(self.first), self._text(self.second), "differs" if self.first != self.second else ""
-        return self._text(self.first), self._text(self.second), self._text(self.difference, sign="+")
-
-    def _text(self, value: Any, sign: str = "") -> str:
-        if value is None:
-            return ""
-        if self.digits is None:
-            return str(value)
-        return f"{value:{sign}.{self.digits}f} {self.unit}".rstrip()
+            first, second = ("" if value is None else str(value) for value in (self.first, self.second))
+            return first, second, "differs" if first != second else ""
+        first, second, difference = (
+            "" if value is None else f"{value:{sign}.{self.digits}f} {self.unit}".rstrip()
+            for value, sign in ((self.first, ""), (self.second, ""), (self.difference, "+"))
+        )
+        return first, second, difference
 
 
 def compare(first: Summary, second: Summary) -> tuple[Row, ...]:
     """Rows for two flights by their summaries, without those that neither has a value for."""
-    rows = [Row(name, "", None, first[name], second[name], None) for name in _SETTINGS]
+    rows = [Row(name, "", None, first[name], second[name]) for name in _SETTINGS]
     options = dict.fromkeys((*first["settings"], *second["settings"]))
-    rows += [
-        Row(f"--{one}", "", None, first["settings"].get(one), second["settings"].get(one), None) for one in options
-    ]
+    rows += [Row(f"--{one}", "", None, first["settings"].get(one), second["settings"].get(one)) for one in options]
     for name, keys, unit, digits in _FIGURES:
-        one, other = _value(first, keys), _value(second, keys)
+        one, other = (_value(summary, keys) for summary in (first, second))
         difference = None if one is None or other is None else other - one
         rows.append(Row(name, unit, digits, one, other, difference))
     return tuple(row for row in rows if row.first is not None or row.second is not None)
 
 
 def _value(summary: Summary, keys: tuple[str, ...]) -> float | None:
-    value: Any = summary
-    for key in keys:
-        value = value[key]
+    value: Any = reduce(getitem, keys, summary)
     return None if value is None else float(value)

@@ -20,7 +20,7 @@ from matplotlib.ticker import MaxNLocator
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.flocking.metrics import closest_distances
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.report.style import BAND, FEW, INK, MUTED, STYLE, colour_of, drone_name
+from flockd.review.report.style import BAND, FEW, INK, MUTED, STYLE, colour_of, drone_handles
 from flockd.review.report.summary import TABLE_2, estimation_errors, objective_sums
 
 
@@ -29,7 +29,8 @@ def flight_curves(log: FlightLog) -> Figure:
 
     One drone has no distances and no shape.
     """
-    flights = [(_flight_title(log), log.position, log.velocity)]
+    title = "By sight" if log.metadata.by_sight else "With exact states"
+    flights = [(title, log.position, log.velocity)]
     exact = log.companion
     if exact:
         flights.append(("With exact states", *exact))
@@ -51,11 +52,6 @@ def flight_curves(log: FlightLog) -> Figure:
 
 _CURVES: Final = ("airspeed, m/s", "course, °", "height, m", "distance, m", "Σ obj1", "Σ obj2")
 _CURVES_OF_PAIRS: Final = ("distance, m", "Σ obj2")
-
-
-def _flight_title(log: FlightLog) -> str:
-    """Which states the drones flew by."""
-    return "By sight" if log.metadata.by_sight else "With exact states"
 
 
 _DESIRED: Final[dict[str, Any]] = {"color": INK, "linestyle": (0, (4, 3)), "linewidth": 1.0}
@@ -129,27 +125,17 @@ def _flock_lines(axes: Axes, time_s: FloatArray, values: FloatArray) -> None:
     axes.plot(time_s[some], middle, color=BAND)
 
 
-def _flock_handles(drones: int) -> list[Line2D | Patch]:
-    if drones <= FEW:
-        return [Line2D([], [], color=colour_of(i, drones), label=drone_name(i)) for i in range(drones)]
-    return [
+def _legend(figure: Figure, log: FlightLog, *more: Line2D) -> None:
+    drones = log.position.shape[1]
+    of_flock: list[Line2D | Patch] = [
         Line2D([], [], color=BAND, label="median drone"),
         Patch(color=BAND, alpha=0.5, linewidth=0, label="10th to 90th percentile"),
         Patch(color=BAND, alpha=0.18, linewidth=0, label="all drones"),
     ]
-
-
-def _legend(figure: Figure, log: FlightLog, *more: Line2D) -> None:
-    handles = [*_flock_handles(log.position.shape[1]), *more]
+    handles = [*(drone_handles(drones) if drones <= FEW else of_flock), *more]
     if _circle_ends(log):
         handles.append(Line2D([], [], color=MUTED, linewidth=0.8, label="circle ends"))
-    figure.legend(
-        handles=handles,
-        loc="outside upper left",
-        ncols=len(handles),
-        handlelength=1.8,
-        columnspacing=1.4,
-    )
+    figure.legend(handles=handles, loc="outside upper left", ncols=len(handles), handlelength=1.8, columnspacing=1.4)
 
 
 # ---------------------------------------------------------------------------------------------------- without truth

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -13,9 +14,9 @@ from zipfile import BadZipFile
 from flockd.core.errors import UsageError
 from flockd.review.flight_log.key_frames import KeyFrame
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.report.filmstrip import save_plates
+from flockd.review.report.filmstrip import load_plates, save_plates
 from flockd.review.report.page import write_report
-from flockd.review.report.summary import summarise, write_summary
+from flockd.review.report.summary import summarise
 
 LOG_NAME = "flight.npz"
 KEY_FRAMES_NAME = "filmstrip.npz"
@@ -42,10 +43,7 @@ Progress = Callable[[int, int], None]
 
 def new_folder(base: Path) -> Path:
     """Makes ``base``, or ``base-2``, ``base-3``, ... where there is something already; returns which."""
-    number, folder = 1, base
-    while folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-        number += 1
-        folder = base.with_name(f"{base.name}-{number}")
+    folder = base if base.is_dir() and not any(base.iterdir()) else _free_name(base)
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 
@@ -115,10 +113,11 @@ def save_flight(directory: Path, log: FlightLog, key_frames: Sequence[KeyFrame])
 def write_report_files(
     directory: Path, log: FlightLog, progress: Progress = lambda done, total: None
 ) -> dict[str, Any]:
-    """Writes the summary and the report beside the flight's log, and returns the summary."""
+    """Writes the summary and the report beside the flight's log, and returns the summary. A NaN raises ValueError."""
     summary = summarise(log)
-    write_summary(summary, directory / SUMMARY_NAME)
-    write_report(directory, progress)
+    text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+    (directory / SUMMARY_NAME).write_text(text, encoding="utf-8")
+    write_report(directory, log, summary, load_plates(directory / KEY_FRAMES_NAME), progress)
     return summary
 
 

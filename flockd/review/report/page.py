@@ -5,8 +5,9 @@ from __future__ import annotations
 import base64
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -14,7 +15,7 @@ from matplotlib.figure import Figure
 
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.curves import account_curves, error_curves, flight_curves
-from flockd.review.report.filmstrip import load_plates
+from flockd.review.report.filmstrip import Plate
 from flockd.review.report.page_texts import page_texts
 from flockd.review.report.style import colour_of, inline_svg, page_template
 from flockd.review.report.trajectories import in_the_way, obstacle_figure, trajectories
@@ -34,18 +35,17 @@ _MAX_SVG_BYTES = 700_000
 """Long flights of many drones make SVG elements larger than the PNG file."""
 
 
-def write_report(directory: Path, progress: Callable[[int, int], None] = lambda done, total: None) -> Path:
-    """Write `report.html` and the files of `figures/` into a flight's folder and return the page's path.
+def write_report(
+    directory: Path,
+    log: FlightLog,
+    summary: Mapping[str, Any],
+    plates: Sequence[Plate],
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Path:
+    """Writes `report.html` and the files of `figures/` into a flight's folder and returns the page's path.
 
-    The folder holds `flight.npz` (FlightLog) and `summary.json` (of `summarise`); if key frames were kept
-    `filmstrip.npz` (of `save_plates`). Raises FileNotFoundError if one of the first two is missing.
+    ``summary`` is `summarise`'s of the log.
     """
-    for name in ("flight.npz", "summary.json"):
-        if not (directory / name).is_file():
-            raise FileNotFoundError(f"{directory / name} is missing: a report is written from the folder of a flight")
-    log = FlightLog.load(directory / "flight.npz")
-    summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
-    plates = load_plates(directory / "filmstrip.npz")
     folder = directory / "figures"
     folder.mkdir(exist_ok=True)
     for old in (*folder.glob("*.png"), *folder.glob("*.webp")):

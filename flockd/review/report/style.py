@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib import colormaps, rc_context
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from flockd.core.messages import FloatArray, UInt8Array
 
@@ -83,6 +84,11 @@ def colour_of(number: int, count: int) -> str:
 def drone_name(number: int) -> str:
     """Drones count from 0 in the log and from 1 in the report, as in the paper."""
     return f"drone {number + 1}"
+
+
+def drone_handles(drones: int) -> list[Line2D]:
+    """Of a legend: each drone's line."""
+    return [Line2D([], [], color=colour_of(i, drones), label=drone_name(i)) for i in range(drones)]
 
 
 RIG_ORDER = ("left", "front", "right", "back")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -101,11 +99,6 @@ def sizes_text(summary: Mapping[str, Any]) -> str:
         return ""
     used = sum(one["used"] for one in summary["sizes"].values())
     return f"{min(sizes):.2f} to {max(sizes):.2f} m, by {len(sizes)} of {summary['drones']} drones; {used} go by it"
-
-
-def write_summary(summary: Json, path: Path) -> None:
-    """Write strict JSON; a NaN in it raises ValueError."""
-    path.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def estimation_errors(log: FlightLog) -> dict[str, FloatArray]:

@@ -29,6 +29,7 @@ from flockd.review.report.style import (
     PAPER,
     STYLE,
     colour_of,
+    drone_handles,
     drone_name,
 )
 from flockd.review.report.summary import SAME_GOAL_M
@@ -102,22 +103,13 @@ def _plan(axes: Axes, track: FloatArray, **style: object) -> None:
 
 
 def _path_handles(drones: int, *, exact: bool, goals: bool) -> list[Line2D]:
-    handles = []
-    if drones <= FEW:
-        handles += [Line2D([], [], color=colour_of(i, drones), label=drone_name(i)) for i in range(drones)]
-    else:
-        handles += [
-            Line2D([], [], color=colour_of(0, drones), label="drone 1"),
-            Line2D([], [], color=colour_of(drones // 2, drones), label="…"),
-            Line2D([], [], color=colour_of(drones - 1, drones), label=f"drone {drones}"),
-        ]
+    handles = drone_handles(drones)
+    if drones > FEW:
+        handles = [handles[0], Line2D([], [], color=colour_of(drones // 2, drones), label="…"), handles[-1]]
     handles.append(Line2D([], [], color=MUTED, marker="o", markerfacecolor=PAPER, linestyle="", label="start"))
     handles.append(Line2D([], [], color=MUTED, marker="o", linestyle="", label="end"))
-    if exact:
-        handles.append(Line2D([], [], label="with exact states", **_COMPANION))
-    if goals:
-        handles.append(Line2D([], [], label="goal", **_GOAL))
-    return handles
+    handles += [Line2D([], [], label="with exact states", **_COMPANION)] * exact
+    return handles + [Line2D([], [], label="goal", **_GOAL)] * goals
 
 
 def _centred(position: FloatArray) -> FloatArray:
@@ -233,16 +225,17 @@ def _clearance_curves(axes: Axes, log: FlightLog, radius_m: float) -> None:
 def _local_map(axes: Axes, log: FlightLog, step: int, drone: int, radius_m: float) -> None:
     drones = log.clearance.shape[1]
     north, east = log.position[step, drone, :2]
-    knew = bool(len(log.obstacle_range)) and bool(np.isfinite(log.obstacle_range[step, drone]).any())
-    if knew:
-        _add_free_sectors(axes, log, step, drone)
+    sectors = _sectors(log, step, drone) if len(log.obstacle_range) else []
+    for begin_deg, end_deg, range_m in sectors:
+        reach_m, angles = min(range_m, 2 * _MAP_M), np.radians([begin_deg, end_deg])
+        axes.add_patch(Wedge((east, north), reach_m, begin_deg, end_deg, color=_FREE, linewidth=0.6, zorder=0.5))
+        if math.isfinite(range_m):
+            edge = east + range_m * np.cos(angles), north + range_m * np.sin(angles)
+            axes.plot(*edge, color=INK, linewidth=1.6, zorder=3)
     add_obstacles(axes, log)
     for other in range(drones):
         place = log.position[step, other]
-        style: dict[str, Any] = {"color": colour_of(other, drones), "zorder": 4}
-        axes.add_patch(Circle((place[1], place[0]), radius_m, **style))
-    if knew:
-        _add_ranges(axes, log, step, drone)
+        axes.add_patch(Circle((place[1], place[0]), radius_m, color=colour_of(other, drones), zorder=4))
     axes.set(
         xlim=(east - _MAP_M, east + _MAP_M), ylim=(north - _MAP_M, north + _MAP_M),
         xlabel="east, m", ylabel="north, m",
@@ -250,25 +243,9 @@ def _local_map(axes: Axes, log: FlightLog, step: int, drone: int, radius_m: floa
     )  # fmt: skip
     axes.set_aspect("equal")
     handles = [Patch(color=IN_THE_WAY, label="obstacle"), Patch(color=GRID, label="above or below")]
-    if knew:
+    if sectors:
         handles += [Patch(color=_FREE, label="known free"), Patch(color=INK, label="range it knew")]
     axes.legend(handles=handles, **LEGEND)
-
-
-def _add_free_sectors(axes: Axes, log: FlightLog, step: int, drone: int) -> None:
-    for begin_deg, end_deg, range_m in _sectors(log, step, drone):
-        reach = min(range_m, 2 * _MAP_M)
-        east, north = log.position[step, drone, 1], log.position[step, drone, 0]
-        axes.add_patch(Wedge((east, north), reach, begin_deg, end_deg, color=_FREE, linewidth=0.6, zorder=0.5))
-
-
-def _add_ranges(axes: Axes, log: FlightLog, step: int, drone: int) -> None:
-    for begin_deg, end_deg, range_m in _sectors(log, step, drone):
-        if math.isfinite(range_m):
-            angles = np.radians([begin_deg, end_deg])
-            east = log.position[step, drone, 1] + range_m * np.cos(angles)
-            north = log.position[step, drone, 0] + range_m * np.sin(angles)
-            axes.plot(east, north, color=INK, linewidth=1.6, zorder=3)
 
 
 def _sectors(log: FlightLog, step: int, drone: int) -> list[tuple[float, float, float]]:

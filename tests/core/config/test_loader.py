@@ -10,12 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from flockd.campaign.campaign_file import load_campaign
-from flockd.core.config import DroneConfig, Overrides, load_drone
+from flockd.core.config import load_drone
 from flockd.core.config.document import core_scalar
 from flockd.core.errors import ConfigError, ConfigProblem, ModelError
 from flockd.flight.perception import load_networks
-from flockd.sim.scenario import load_scenario, scenario_schema
 
 CONFIG = Path(__file__).parents[3] / "config"
 
@@ -26,22 +24,12 @@ rig:
       size_px: [640, 480]
       intrinsics: {fx: 320, fy: 320.0, cx: 320, cy: 240}
 """
-SCENARIO = """\
-scenario: two
-drone: drone.yaml
-vehicles:
-  - {position_m: [0, 0, -4]}
-  - {position_m: [0, 5, -4]}
-"""
-
-
 REMEDY = r"\b(write|add|delete|put|did you mean|check|correct|close|save|flatten|give|move|name|copy|separate|keep)\b"
 """Every sentence says what to do."""
 
 
-def _problems(path: Path) -> list[ConfigProblem]:
+def problems_in(path: Path, load: Callable[[Path], object] = load_drone) -> list[ConfigProblem]:
     """What is told of a file, each with its line, its key and what to do; files without their folder."""
-    load = load_scenario if path.name == "scenario.yaml" else load_drone
     with pytest.raises(ConfigError) as caught:
         load(path)
     assert len(str(caught.value).splitlines()) == min(len(caught.value.problems), 21), "one line a problem"
@@ -53,35 +41,23 @@ def _problems(path: Path) -> list[ConfigProblem]:
 def _drone_problems(folder: Path, text: str) -> list[ConfigProblem]:
     path = folder / "drone.yaml"
     path.write_text(text, encoding="utf-8")
-    return _problems(path)
+    return problems_in(path)
 
 
-def _places(problems: list[ConfigProblem]) -> list[str]:
+def places_of(problems: list[ConfigProblem]) -> list[str]:
     """Where they are, as in `drone.yaml:6: step_s`."""
     return [f"{problem.file}:{problem.line}: {problem.key}" for problem in problems]
 
 
-def _with(line: str) -> str:
+def with_line(line: str) -> str:
     return DRONE + line + "\n"
 
 
-def test_the_papers_flight_is_table_1() -> None:
-    scenario = load_scenario(CONFIG / "paper_flight.yaml")
-    table_1 = [(-0.5, 0.9, -4.5), (0.5, -2.8, -4.0), (1.2, 4.5, -5.0), (3.9, 0.5, -3.5), (4.5, 1.4, -3.0)]
-    assert [vehicle.position_m for vehicle in scenario.vehicles] == table_1
-    assert {vehicle.velocity_m_s for vehicle in scenario.vehicles} == {(1.0, 0.0)}
-    assert scenario.duration_s == 110.0
-    assert scenario.drone.step_s == 0.5
-    assert scenario.drone.flocking.desired_distance_m == 3.5
-
-
 def test_whole_numbers_stand_for_floats_and_lists_for_tuples(tmp_path: Path) -> None:
-    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
-    (tmp_path / "scenario.yaml").write_text(SCENARIO, encoding="utf-8")
-    scenario = load_scenario(tmp_path / "scenario.yaml")
-    assert scenario.drone.rig.cameras[0].intrinsics.fx == 320.0
-    assert isinstance(scenario.drone.rig.cameras[0].intrinsics.fx, float)
-    assert scenario.vehicles[1].position_m == (0.0, 5.0, -4.0)
+    path = tmp_path / "drone.yaml"
+    path.write_text(DRONE, encoding="utf-8")
+    (camera,) = load_drone(path).rig.cameras
+    assert (camera.intrinsics.fx, type(camera.intrinsics.fx), camera.size_px) == (320.0, float, (640, 480))
 
 
 @pytest.mark.parametrize(
@@ -159,12 +135,12 @@ SLIPS = (
 @pytest.mark.parametrize(("line", "told"), SLIPS, ids=[line for line, _ in SLIPS])
 def test_a_slip_in_line_six_is_reported_with_what_to_do(tmp_path: Path, line: str, told: str) -> None:
     """What is cut off says in the same words what is wanted."""
-    (problem,) = _drone_problems(tmp_path, _with(line))
+    (problem,) = _drone_problems(tmp_path, with_line(line))
     assert str(problem).startswith(f"drone.yaml:6: {told}")
 
 
 def test_a_key_given_twice_is_refused(tmp_path: Path) -> None:
-    (problem,) = _drone_problems(tmp_path, _with("step_s: 0.5\nyaw: hold\nstep_s: 0.1"))
+    (problem,) = _drone_problems(tmp_path, with_line("step_s: 0.5\nyaw: hold\nstep_s: 0.1"))
     assert (problem.line, problem.key) == (8, "step_s")
     assert "first in line 6" in problem.message
 
@@ -177,20 +153,20 @@ source:
   kind: gstreamer
   cameras:
     - {{name: front, pipeline: "videotestsrc{escape} ! videoconvert"}}"""
-    (problem,) = _drone_problems(tmp_path, _with(source))
+    (problem,) = _drone_problems(tmp_path, with_line(source))
     assert str(problem).startswith(f"drone.yaml:9: source.cameras[0].pipeline: holds the character {shown}, ")
 
 
 def test_a_rig_without_cameras_is_refused(tmp_path: Path) -> None:
-    assert _places(_drone_problems(tmp_path, "rig:\n  cameras: []\n")) == ["drone.yaml:2: rig.cameras"]
-    assert _places(_drone_problems(tmp_path, "step_s: 1\n")) == ["drone.yaml:1: rig"]
+    assert places_of(_drone_problems(tmp_path, "rig:\n  cameras: []\n")) == ["drone.yaml:2: rig.cameras"]
+    assert places_of(_drone_problems(tmp_path, "step_s: 1\n")) == ["drone.yaml:1: rig"]
 
 
 def test_faults_inside_a_camera_name_the_camera(tmp_path: Path) -> None:
     text = DRONE.replace("[640, 480]", "[640]").replace("fx: 320,", "fx:320,").replace("cy: 240", "cy: 0")
     problems = _drone_problems(tmp_path, text)
     camera = "rig.cameras[0]"
-    assert _places(problems) == [
+    assert places_of(problems) == [
         f"drone.yaml:4: {camera}.size_px",
         *(f"drone.yaml:5: {camera}.intrinsics.{key}" for key in ("cy", "fx", "fx:320")),
     ]
@@ -199,29 +175,7 @@ def test_faults_inside_a_camera_name_the_camera(tmp_path: Path) -> None:
 
 def test_two_cameras_of_one_name_are_refused(tmp_path: Path) -> None:
     twice = DRONE + DRONE.split("cameras:\n")[1]
-    assert _places(_drone_problems(tmp_path, twice)) == ["drone.yaml:6: rig.cameras[1].name"]
-
-
-@pytest.mark.fault("wrong-configuration")
-def test_all_problems_of_both_files_come_at_once(tmp_path: Path) -> None:
-    (tmp_path / "drone.yaml").write_text(_with("stepp_s: 0.5\nyaw: corse"), encoding="utf-8")
-    scenario = tmp_path / "scenario.yaml"
-    scenario.write_text(SCENARIO.replace("[0, 5, -4]", "[0, 5]") + "duration_s: 0\n", encoding="utf-8")
-    assert _places(_problems(scenario)) == [
-        *("drone.yaml:6: stepp_s", "drone.yaml:7: yaw"),
-        *("scenario.yaml:5: vehicles[1].position_m", "scenario.yaml:6: duration_s"),
-    ]
-
-
-def test_a_scenario_without_its_drones_file_has_one_fault_and_no_false_ones(tmp_path: Path) -> None:
-    scenario = tmp_path / "scenario.yaml"
-    for text in (SCENARIO, (CONFIG / "square.yaml").read_text(encoding="utf-8").replace("simulator.", "drone.")):
-        scenario.write_text(text, encoding="utf-8")
-        missing, named = _problems(scenario)
-        assert (missing.file, missing.key) == ("drone.yaml", "")
-        assert (named.file, named.key) == ("scenario.yaml", "drone")
-    scenario.write_text(SCENARIO.replace("drone: drone.yaml\n", ""), encoding="utf-8")
-    assert _places(_problems(scenario)) == ["scenario.yaml:1: drone"]
+    assert places_of(_drone_problems(tmp_path, twice)) == ["drone.yaml:6: rig.cameras[1].name"]
 
 
 @pytest.mark.parametrize(
@@ -246,7 +200,7 @@ def test_a_scenario_without_its_drones_file_has_one_fault_and_no_false_ones(tmp_
 def test_a_file_that_cannot_be_read_gets_one_sentence(tmp_path: Path, content: bytes, told: str) -> None:
     path = tmp_path / "drone.yaml"
     path.write_bytes(content)
-    (problem,) = _problems(path)
+    (problem,) = problems_in(path)
     assert str(problem).startswith(f"drone.yaml{told}")
 
 
@@ -257,7 +211,7 @@ def test_paths_that_are_no_files_get_one_sentence(tmp_path: Path) -> None:
         (tmp_path / "folder", "is a folder"),
         (Path("/dev/zero"), "is not an ordinary file"),
     ):
-        (problem,) = _problems(path)
+        (problem,) = problems_in(path)
         assert problem.message.startswith(told)
 
 
@@ -289,15 +243,6 @@ def test_a_windows_file_is_read_as_any_other(tmp_path: Path) -> None:
     assert load_drone(path).rig.cameras[0].size_px == (640, 480)
 
 
-def test_overrides_win_over_both_files() -> None:
-    overrides: Overrides = {"seed": 7, "drone.perception.flow": "dis", "drone.flocking.weight.kind": "nearest"}
-    scenario = load_scenario(CONFIG / "paper_flight.yaml", overrides)
-    assert scenario.seed == 7
-    assert scenario.drone.perception.flow == "dis"
-    assert scenario.drone.perception.depth == "neighbours_int8", "the rest of the section stays"
-    assert scenario.drone.flocking.weight.kind == "nearest"
-
-
 def test_a_relative_path_counts_from_the_folder_of_the_file_it_stands_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -307,138 +252,36 @@ def test_a_relative_path_counts_from_the_folder_of_the_file_it_stands_in(
     folders = "models_dir: ../models, engines_dir: e"
     perception = f"perception: {{{folders}, flow: mine/flow.yaml, depth: /opt/depth.yaml, distance: none}}\n"
     (drones / "drone.yaml").write_text(f"{DRONE}{perception}telemetry: {{zenoh_config: tls.json5}}\n", encoding="utf-8")
-    (tmp_path / "scenario.yaml").write_text(SCENARIO.replace("drone.yaml", "drones/drone.yaml"), encoding="utf-8")
     monkeypatch.chdir(elsewhere)
-    alone, flown = load_drone("../drones/drone.yaml"), load_scenario("../scenario.yaml").drone
-    for drone in (alone, flown):
-        assert drone.perception.models_dir == str(tmp_path / "models")
-        assert drone.perception.engines_dir == str(drones / "e")
-        assert drone.perception.flow == str(drones / "mine" / "flow.yaml")
-        assert drone.telemetry.zenoh_config == str(drones / "tls.json5")
-        assert (drone.perception.depth, drone.perception.distance) == ("/opt/depth.yaml", "none")
-        assert drone.perception.segmentation == "neighbours_int8", "a name is not a path"
+    drone = load_drone("../drones/drone.yaml")
+    assert drone.perception.models_dir == str(tmp_path / "models")
+    assert drone.perception.engines_dir == str(drones / "e")
+    assert drone.perception.flow == str(drones / "mine" / "flow.yaml")
+    assert drone.telemetry.zenoh_config == str(drones / "tls.json5")
+    assert (drone.perception.depth, drone.perception.distance) == ("/opt/depth.yaml", "none")
+    assert drone.perception.segmentation == "neighbours_int8", "a name is not a path"
     overridden = load_drone("../drones/drone.yaml", {"perception.models_dir": "here"})
     assert overridden.perception.models_dir == "here", "who overrides it stands elsewhere"
 
 
 def test_models_that_are_not_there_are_reported_with_where_they_were_searched_for(tmp_path: Path) -> None:
     (tmp_path / "models").mkdir()
-    (tmp_path / "drone.yaml").write_text(_with("perception: {models_dir: modles}"), encoding="utf-8")
+    (tmp_path / "drone.yaml").write_text(with_line("perception: {models_dir: modles}"), encoding="utf-8")
     with pytest.raises(ModelError, match=rf"^perception\.models_dir: {tmp_path}/modles is no folder; name the one "):
         load_networks(load_drone(tmp_path / "drone.yaml").perception)
-    (tmp_path / "drone.yaml").write_text(_with("perception: {models_dir: models}"), encoding="utf-8")
+    (tmp_path / "drone.yaml").write_text(with_line("perception: {models_dir: models}"), encoding="utf-8")
     with pytest.raises(
         ModelError, match=rf"^perception\.flow: there is no model 'flow_int8' \({tmp_path}/models/flow_int8\.yaml "
     ):
         load_networks(load_drone(tmp_path / "drone.yaml").perception)
-    (tmp_path / "drone.yaml").write_text(_with("perception: {flow: my/flow.yaml}"), encoding="utf-8")
+    (tmp_path / "drone.yaml").write_text(with_line("perception: {flow: my/flow.yaml}"), encoding="utf-8")
     with pytest.raises(ModelError, match=rf"\({tmp_path}/my/flow\.yaml is missing\)"):
         load_networks(load_drone(tmp_path / "drone.yaml").perception)
 
 
-def test_a_wrong_override_is_reported_as_such() -> None:
-    with pytest.raises(ConfigError) as caught:
-        load_scenario(CONFIG / "paper_flight.yaml", {"duration_s": -3.0, "drone.perception.sclae": "height"})
-    assert [(one.file, one.line, one.key) for one in caught.value.problems] == [
-        ("override", 0, "drone.perception.sclae"),
-        ("override", 0, "duration_s"),
-    ]
-
-
-def test_the_schema_describes_the_file_and_not_the_merged_model() -> None:
-    drone = scenario_schema()["properties"]["drone"]
-    assert drone["anyOf"] == [{"type": "string"}, {"$ref": "#/$defs/DroneConfig"}], "a path, or the drone itself"
-    assert DroneConfig.model_json_schema()["required"] == ["rig"]
-
-
-FLIGHTS = (
-    ("[0, 0, -4]", "[0, 0, 4.5]", "4: vehicles[0].position_m: the third number points down"),
-    ("[0, 0, -4]", "[0, 0, -0.2]", "4: vehicles[0].position_m: begins 0.2 m above the ground"),
-    ("[0, 5, -4]", "[0, 0, -4]", "5: vehicles[1].position_m: is 0 m from vehicles[0]"),
-    ("", "faults: [{drone: 3, camera: front, kind: uniform}]", "2: faults[0].drone: is 3, but there are 2"),
-    ("", "faults: [{drone: 1, camera: top, kind: uniform}]", "2: faults[0].camera: is not in the rig"),
-    (
-        *("", "faults: [{drone: 1, camera: front, kind: gaussian, begin_s: 5.0, end_s: 4.0}]"),
-        "2: faults[0].end_s: is not after begin_s 5",
-    ),
-    (
-        "",
-        "world: {drone_family: 99}",
-        "2: world.drone_family: 99 is not at most 13; write a whole number from 0 to 13 or",
-    ),
-    ("", "world:\n  obstacles:\n    kind: jungle", "4: world.obstacles.kind: jungle is not known; write `forest` or"),
-    (
-        *("", "world:\n  obstacles:\n    kind: forest\n    trees_per_hectare: 900"),
-        "5: world.obstacles.trees_per_hectare: 900 is not at most 400",
-    ),
-    (
-        *("", "world:\n  obstacles:\n    kind: village\n    trees_per_hectare: 100"),
-        "5: world.obstacles.trees_per_hectare: has no meaning with kind `village`",
-    ),
-    ("", "duration_s: 0.1", "2: duration_s: 0.1 s is shorter than a step of 0.5 s"),
-    ("", "duration_s: 1e6", "2: duration_s: 1e6 is not at most 86400"),
-    (
-        "  - {position_m: [0, 0, -4]}\n",
-        "".join(f"  - {{position_m: [{north}, 0, -4]}}\n" for north in range(5000)),
-        "3: vehicles: has 5001 entries",
-    ),
-)
-
-
-@pytest.mark.parametrize(("old", "new", "told"), FLIGHTS, ids=[told for *_, told in FLIGHTS])
-def test_a_flight_that_cannot_be_flown_is_refused_at_its_line(tmp_path: Path, old: str, new: str, told: str) -> None:
-    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
-    scenario = tmp_path / "scenario.yaml"
-    text = SCENARIO.replace(old, new) if old else SCENARIO.replace("scenario: two", f"scenario: two\n{new}")
-    scenario.write_text(text, encoding="utf-8")
-    (problem,) = _problems(scenario)
-    assert str(problem).startswith(f"scenario.yaml:{told}")
-
-
 def test_a_principal_point_outside_the_image_is_refused_at_its_line(tmp_path: Path) -> None:
     outside = _drone_problems(tmp_path, DRONE.replace("cx: 320", "cx: 3200").replace("cy: 240", "cy: 480"))
-    assert _places(outside) == [f"drone.yaml:5: rig.cameras[0].intrinsics.{key}" for key in ("cx", "cy")]
-
-
-def test_files_of_another_kind_are_refused_with_what_to_name(tmp_path: Path) -> None:
-    campaign, scenario, drone = CONFIG / "campaigns" / "nightly.yaml", CONFIG / "square.yaml", CONFIG / "quadrotor.yaml"
-    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
-    (flight := tmp_path / "flight.yaml").write_text(SCENARIO, encoding="utf-8")
-    (nested := tmp_path / "scenario.yaml").write_text(SCENARIO.replace("drone.yaml", "flight.yaml"), encoding="utf-8")
-    refusals: tuple[tuple[Callable[[Path], object], Path, str, str], ...] = (
-        (load_drone, campaign, "is a campaign", "`flockd campaign`"),
-        (load_scenario, campaign, "is a campaign", "`flockd campaign`"),
-        (load_campaign, scenario, "is a scenario", "the keys `campaign` and `scenario`"),
-        (load_campaign, drone, "is a drone's own file", "the keys `campaign` and `scenario`"),
-        (load_drone, flight, "is a scenario", "name that: drone.yaml"),
-        (load_scenario, drone, "is a drone's own file", "the keys `vehicles` and `drone`"),
-        (load_scenario, nested, "is a scenario", "name that: drone.yaml"),
-    )
-    for load_file, file, kind, instead in refusals:
-        with pytest.raises(ConfigError) as refused:
-            load_file(file)
-        told = str(refused.value).splitlines()[0].replace(f"{tmp_path}/", "")
-        assert kind in told
-        assert instead in told
-
-
-def test_a_scenario_may_hold_its_drone(tmp_path: Path) -> None:
-    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
-    (tmp_path / "named.yaml").write_text(SCENARIO, encoding="utf-8")
-    inline = "drone:\n" + "".join(f"  {line}\n" for line in DRONE.splitlines())
-    (tmp_path / "held.yaml").write_text(SCENARIO.replace("drone: drone.yaml\n", inline), encoding="utf-8")
-    assert load_scenario(tmp_path / "held.yaml") == load_scenario(tmp_path / "named.yaml")
-    (tmp_path / "scenario.yaml").write_text(
-        SCENARIO.replace("drone: drone.yaml\n", inline.replace("cx: 320", "cx: -1")), encoding="utf-8"
-    )
-    assert _places(_problems(tmp_path / "scenario.yaml")) == ["scenario.yaml:7: drone.rig.cameras[0].intrinsics.cx"]
-
-
-def test_the_configuration_knows_how_many_families_the_simulator_has() -> None:
-    from flockd.sim.renderer.drone_models import FAMILIES
-    from flockd.sim.scenario import DRONE_FAMILIES
-
-    assert DRONE_FAMILIES == FAMILIES
+    assert places_of(outside) == [f"drone.yaml:5: rig.cameras[0].intrinsics.{key}" for key in ("cx", "cy")]
 
 
 def test_the_trim_that_an_error_recommends_is_taken_though_rounding_adds_up(tmp_path: Path) -> None:
@@ -462,4 +305,4 @@ def test_what_is_wrong_with_a_camera_is_told_at_its_own_line(tmp_path: Path) -> 
         (rig.replace("- name: right", "- name: front") + source + rest, "rig.cameras[1].name"),
         (quadrotor.replace("usb-0:2:1.0", "usb-0:1:1.0"), "source.cameras[1].device"),
     ):
-        assert any(told in place for place in _places(_drone_problems(tmp_path, text)))
+        assert any(told in place for place in places_of(_drone_problems(tmp_path, text)))

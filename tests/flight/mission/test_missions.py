@@ -24,7 +24,8 @@ from flockd.onboard.telemetry.order_messages import order_message, parse_order
 from flockd.sim.autopilot.fake_vehicle import Demand, PointMass
 from flockd.sim.flock.exact_states import fly_exact_states
 from flockd.sim.scenario import load_scenario
-from tests.core.config.test_loader import CONFIG, DRONE, SCENARIO
+from tests.core.config.test_loader import CONFIG, DRONE
+from tests.sim.scenario.test_scenario_file import SCENARIO
 
 GATE = GateParameters()
 ORIGIN = np.zeros(2)

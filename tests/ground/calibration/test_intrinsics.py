@@ -56,31 +56,6 @@ def test_a_lens_is_found_again(lens: Lens) -> None:
     assert np.all(np.abs(centre - [lens.cx, lens.cy]) < 4 * found.sigma[2:4])
 
 
-@pytest.mark.parametrize("lens", [PINHOLE, WIDE], ids=lambda lens: lens.model)
-def test_opencv_finds_the_same_lens_from_the_same_corners(lens: Lens) -> None:
-    """Its pixels' centres lie at whole numbers."""
-    found = calibrate(collected(lens).views, lens.size, lens.model)
-    points = [view.seen.points.astype(np.float32) for view in found.views]
-    pixels = [(view.seen.pixels - 0.5).astype(np.float32) for view in found.views]
-    none = np.zeros(0)
-    if lens.model == "pinhole":
-        rms, matrix, distortion, *_ = cv2.calibrateCamera(points, pixels, lens.size, none, none)
-    else:
-        rms, matrix, distortion, *_ = cv2.fisheye.calibrate(
-            [one.reshape(1, -1, 3).astype(np.float64) for one in points],
-            [one.reshape(1, -1, 2).astype(np.float64) for one in pixels],
-            lens.size,
-            np.array([[170.0, 0.0, 240.0], [0.0, 170.0, 180.0], [0.0, 0.0, 1.0]]),  # by itself it does not begin well
-            np.zeros((4, 1)),
-            flags=cv2.CALIB_FIX_SKEW | cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_USE_INTRINSIC_GUESS,
-        )
-    ours = found.camera.matrix
-    assert found.rms_px == pytest.approx(rms, abs=1e-4)
-    assert [ours[0, 0], ours[1, 1]] == pytest.approx([matrix[0, 0], matrix[1, 1]], abs=0.01)
-    assert ours[:2, 2] - 0.5 == pytest.approx(matrix[:2, 2], abs=0.01)
-    assert found.camera.distortion == pytest.approx(np.ravel(distortion), abs=2e-3)
-
-
 def test_a_plain_pinhole_is_not_taken_for_a_wide_angle_with_absurd_distortion() -> None:
     """Both models fit a lens without distortion, and noise decides which leaves less residual."""
     plain = Lens("pinhole", (480, 360), 402.3, 405.1, 246.7, 175.2, (0.0, 0.0, 0.0, 0.0, 0.0))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import shutil
 import struct
 from pathlib import Path
@@ -244,12 +243,6 @@ def test_one_truncated_picture_among_others_is_left_out_and_said(capsys: Capture
     assert result["left_out"] == [fault]
     assert captured.err.splitlines()[-2:] == [f"written: 2 copies in {tmp_path / 'drawn'}", f"left out: {fault}"]
     assert sorted(path.name for path in (tmp_path / "drawn").iterdir()) == ["a.jpg", "c.jpg"]
-
-
-def test_a_pipe_is_refused_without_waiting_for_its_writer(capsys: Capture, tmp_path: Path) -> None:
-    for name in ("a.jpg", "a.mp4"):
-        os.mkfifo(tmp_path / name)
-        assert f"{name}: is not an ordinary file" in told(capsys, 2, "detect", tmp_path / name, *FOV)
 
 
 def test_a_video_that_cannot_be_decoded_ends_it(capsys: Capture, tmp_path: Path) -> None:
