@@ -30,6 +30,8 @@ _SCALES = {
 
 def page_texts(summary: Summary, log: FlightLog) -> dict[str, Any]:
     """What the page's template fills in, by name: the summary's own values, and the texts and cells made of them."""
+    by_sight, flock = summary["perception"] != EXACT_STATES, summary["drones"] > 1 and summary["has_truth"]
+    longest = max((stage["p95"] for stage in summary["stages_ms"].values()), default=0.0) or 1.0
     return {
         **summary,
         "setting": _setting(summary),
@@ -37,14 +39,17 @@ def page_texts(summary: Summary, log: FlightLog) -> dict[str, Any]:
         "colophon": _colophon(summary),
         "lead": _lead(summary),
         "facts": list(_facts(summary, log)),
-        "by_sight": summary["perception"] != EXACT_STATES,
+        "by_sight": by_sight,
         "companion": log.companion is not None,
         "few": FEW,
         "table2": _table2(summary),
         "table3": _table3(summary["table3"]),
-        "flock": _rows(summary["flock"], _FLOCK) if summary["drones"] > 1 and summary["has_truth"] else [],
-        "neighbours": _rows(summary["neighbours"], _NEIGHBOURS) if _knows_neighbours(summary) else [],
-        "stages": _stages(summary["stages_ms"]),
+        "flock": _rows(summary["flock"], _FLOCK) if flock else [],
+        "neighbours": _rows(summary["neighbours"], _NEIGHBOURS) if flock and by_sight else [],
+        "stages": [
+            {"name": name.replace("_", " "), **stage, "share": stage["p95"] / longest}
+            for name, stage in summary["stages_ms"].items()
+        ],
     }
 
 
@@ -191,11 +196,10 @@ def _table3(table: Mapping[str, Any]) -> Rows:
     for flight, name in (("truth", "With exact states"), ("vision", "By sight")):
         ours, paper = table[flight], TABLE_3[flight]
         if ours["obj1"]["error"] is not None:
-            cells = [_cell(ours[total][kind], paper[total].get(kind), kind) for total, kind in kinds]
-            rows.append(_row(name, cells, "main"))
-            rows.append(
-                _row("the paper’s", [_cell(paper[total].get(kind), None, kind) for total, kind in kinds], "paper")
-            )
+            of_paper = [paper[total].get(kind) for total, kind in kinds]
+            cells = [_cell(ours[of][kind], most, kind) for (of, kind), most in zip(kinds, of_paper, strict=True)]
+            theirs = [_cell(most, None, kind) for (_, kind), most in zip(kinds, of_paper, strict=True)]
+            rows += [_row(name, cells, "main"), _row("the paper’s", theirs, "paper")]
     return rows
 
 
@@ -209,10 +213,6 @@ def _cell(value: float | None, paper: float | None = None, kind: str = "error") 
     if kind == "time_s":
         return {"text": "never" if value is None else f"{value:.1f}", "met": met}
     return {"text": _number(value, 4), "met": met}
-
-
-def _knows_neighbours(summary: Summary) -> bool:
-    return summary["perception"] != EXACT_STATES and summary["drones"] > 1 and bool(summary["has_truth"])
 
 
 _FLOCK = {
@@ -232,11 +232,3 @@ _NEIGHBOURS = {
 
 def _rows(values: Mapping[str, Any], names: Mapping[str, tuple[str, int]]) -> Rows:
     return [{"name": name, "value": _number(values[key], digits)} for key, (name, digits) in names.items()]
-
-
-def _stages(stages: Mapping[str, Mapping[str, float]]) -> Rows:
-    longest = max((stage["p95"] for stage in stages.values()), default=0.0) or 1.0
-    return [
-        {"name": name.replace("_", " "), "p50": stage["p50"], "p95": stage["p95"], "share": stage["p95"] / longest}
-        for name, stage in stages.items()
-    ]

@@ -48,11 +48,15 @@ def summarise(log: FlightLog) -> Json:
     daemons flew, and `fleet` holds their figures; null where the simulator ran the pilots.
     """
     metadata, value = log.metadata, log.metadata.model_dump()
+    errors, circling = estimation_errors(log), np.asarray(log.time_s < metadata.circle_until_s)
     return {
         **{key: value[key] for key in _FROM_METADATA},
         "has_truth": log.has_truth,
         "realtime_factor": metadata.duration_s / metadata.wall_s if metadata.wall_s else None,
-        "table2": _table_2(log),
+        "table2": {
+            window: {column: _spread(np.abs(values[steps & metadata.by_sight])) for column, values in errors.items()}
+            for window, steps in (("before", circling), ("after", ~circling))
+        },
         "table3": _table_3(log),
         "flock": _flock(log),
         "mission": mission_figures(log),
@@ -126,7 +130,8 @@ def estimation_errors(log: FlightLog) -> dict[str, FloatArray]:
 
 def objective_sums(log: FlightLog, position: FloatArray, velocity: FloatArray) -> dict[str, FloatArray]:
     """The sums of obj1 and obj2 over the flock at each step, (S,), of true states (S, N, 3) on the log's time base."""
-    parameters = _flocking(log)
+    distances = {key: getattr(log.metadata, key) for key in ("observation_distance_m", "desired_distance_m")}
+    parameters = FlockingParameters(**distances)
     circling = log.time_s < log.metadata.circle_until_s
     plan, speed = position[..., :2], velocity[..., :2]
     steps = range(len(plan))
@@ -206,16 +211,6 @@ def _handed_over(log: FlightLog) -> Json:
     }
 
 
-def _table_2(log: FlightLog) -> Json:
-    by_sight = np.full(len(log.time_s), log.metadata.by_sight)
-    circling = np.asarray(log.time_s < log.metadata.circle_until_s)
-    errors = estimation_errors(log)
-    return {
-        window: {column: _spread(np.abs(values[steps & by_sight])) for column, values in errors.items()}
-        for window, steps in (("before", circling), ("after", ~circling))
-    }
-
-
 def _spread(values: FloatArray) -> Json:
     known = values[np.isfinite(values)]
     if not len(known):
@@ -230,7 +225,8 @@ def _spread(values: FloatArray) -> Json:
 
 def _table_3(log: FlightLog) -> Json:
     totals: dict[str, dict[str, FloatArray]] = {}
-    if _is_settled(log):
+    tail = _tail(log)  # all of it has to follow the circle's end, where Eq. 44 changes its branch
+    if log.has_truth and not tail.all() and np.all(log.time_s[tail] >= log.metadata.circle_until_s):
         totals["vision" if log.metadata.by_sight else "truth"] = objective_sums(log, log.position, log.velocity)
         if log.metadata.by_sight and len(log.truth_position):
             totals["truth"] = objective_sums(log, log.truth_position, log.truth_velocity)
@@ -331,23 +327,10 @@ def _relative_positions(log: FlightLog) -> FloatArray:
     return np.asarray(log.position[:, None] - log.position[:, :, None], dtype=float)
 
 
-def _is_settled(log: FlightLog) -> bool:
-    """Whether the whole tail follows the circle's end, where Eq. 44 changes its branch."""
-    tail = _tail(log)
-    return log.has_truth and not tail.all() and bool(np.all(log.time_s[tail] >= log.metadata.circle_until_s))
-
-
 def _tail(log: FlightLog) -> BoolArray:
     """The steps of the last 10 s; all of a shorter flight."""
     begin_s = log.time_s[-1] + log.metadata.step_s - TAIL_S
     return np.asarray(log.time_s > begin_s - 1e-6, dtype=bool)  # the step that begins just then belongs to it
-
-
-def _flocking(log: FlightLog) -> FlockingParameters:
-    """With the distances that Eq. 45 takes."""
-    return FlockingParameters(
-        observation_distance_m=log.metadata.observation_distance_m, desired_distance_m=log.metadata.desired_distance_m
-    )
 
 
 def _mean(values: FloatArray | BoolArray | list[float]) -> float | None:

@@ -1,4 +1,4 @@
-"""What is asked of the autopilot over real MAVLink, and what is made of its replies. It is a fake, not PX4."""
+"""What is asked of the autopilot over real MAVLink, a fake, not PX4, and what is made of its replies."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from typing import Any
 
 import pytest
 
+from flockd.core.choices import HeightSource
 from flockd.core.config import DroneConfig, load_drone
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.safety import GateParameters, SafetyParameters
 from flockd.core.data import data_path
+from flockd.core.messages import RangeReading
 from flockd.ground.doctor import Check, Finding, Level, run_checks
 from flockd.ground.doctor.autopilot_checks import (
     check_autopilot,
@@ -17,6 +19,7 @@ from flockd.ground.doctor.autopilot_checks import (
     judge_firmware,
     judge_messages,
     judge_parameter,
+    judge_range_finder,
     judge_signing,
     judge_system_id,
 )
@@ -253,3 +256,45 @@ def test_unknown_values_in_messages_are_a_warning() -> None:
     (finding,) = judge_messages({"EXTENDED_SYS_STATE.landed_state = 5": 3})
     assert (finding.level, finding.about) == (Level.WARNING, "messages")
     assert "EXTENDED_SYS_STATE.landed_state = 5 (3 times)" in finding.measured
+
+
+AT_30_HZ = {25: tuple(k / 30.0 for k in range(46))}
+GOOD_RANGE = RangeReading(1.5, 0.12, min_m=0.15, max_m=20.0, quality=1.0)
+
+
+def _by_height(height: HeightSource) -> DroneConfig:
+    drone = load_drone(data_path("config") / "quadrotor.yaml")
+    return drone.model_copy(update={"perception": drone.perception.model_copy(update={"height": height})})
+
+
+def test_one_that_faces_down_passes_and_its_limits_and_rate_are_told() -> None:
+    (found,) = judge_range_finder(GOOD_RANGE, AT_30_HZ, _by_height("best"))
+    assert found.level is Level.PASS
+    assert found.measured == "faces down, 0.12 m now, measures from 0.15 to 20.0 m, 30 times a second"
+
+
+@pytest.mark.parametrize(("height", "level"), [("range_finder", Level.FAILURE), ("best", Level.WARNING)])
+def test_none_is_a_failure_where_nothing_else_gives_the_scale(height: HeightSource, level: Level) -> None:
+    (absent,) = judge_range_finder(None, {}, _by_height(height))
+    (forward,) = judge_range_finder(None, {0: (1.0,)}, _by_height(height))
+    assert absent.level is forward.level is level
+    assert "those that are heard face forward" in forward.measured
+
+
+def test_a_drone_that_flies_by_its_barometer_is_not_asked() -> None:
+    assert judge_range_finder(None, {}, _by_height("barometer")) == []
+
+
+@pytest.mark.parametrize(
+    ("reading", "arrivals", "why"),
+    [
+        (RangeReading(1.5, 1.0, min_m=0.15, max_m=8.0), AT_30_HZ, "the drone may fly at 10 m"),
+        (RangeReading(1.5, 1.0, min_m=0.8, max_m=20.0), AT_30_HZ, "measures from 0.80"),
+        (GOOD_RANGE, {25: (0.0, 0.2, 0.4)}, "5 times a second"),
+        (RangeReading(1.5, 1.0, vertical=True), {}, "PX4's own distance to bottom"),
+    ],
+)
+def test_what_limits_it_is_a_warning(reading: RangeReading, arrivals: dict[int, tuple[float, ...]], why: str) -> None:
+    (found,) = judge_range_finder(reading, arrivals, _by_height("best"))
+    assert found.level is Level.WARNING
+    assert why in found.measured

@@ -1,4 +1,4 @@
-"""Who else is there: on the fleet, on this computer; and how much its unit leaves open."""
+"""Who else is there: on the fleet, on this computer; how open its unit is, and which secrets others may read."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ from pathlib import Path
 import pytest
 
 from flockd.core.config import DroneConfig, load_drone
+from flockd.core.config.source import CameraDeviceParameters, SourceParameters
 from flockd.core.config.telemetry import TelemetryParameters
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.ground.doctor import Check, Finding, Level, run_checks
-from flockd.ground.doctor.setup_checks import check_fleet, check_instance, check_unit, judge_exposure
+from flockd.ground.doctor.setup_checks import check_fleet, check_instance, check_secrets, check_unit, judge_exposure
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.sim.sitl.ports import free_endpoint
+from tests.onboard.daemon.aboard import config_for
 
 QUADROTOR = load_drone(data_path("config") / "quadrotor.yaml")
 needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not here")
@@ -104,3 +106,50 @@ def test_without_systemd_the_unit_is_not_checked(monkeypatch: pytest.MonkeyPatch
 def test_how_open_is_too_open() -> None:
     levels = [judge_exposure(score, Path("u"), "").level for score in (1.5, 1.6, 4.9, 5.0)]
     assert levels == [Level.PASS, Level.WARNING, Level.WARNING, Level.FAILURE]
+
+
+OPEN, CLOSED = "rtspsrc location=rtsp://10.0.0.7/s", "rtspsrc location=rtsp://anna:hunter2@10.0.0.7/s"
+
+
+def _with_pipeline(pipeline: str, settings: Path | None = None) -> DroneConfig:
+    config = config_for(1, "tcp/127.0.0.1:1", "tcp/127.0.0.1:2")
+    camera = CameraDeviceParameters(name="front", pipeline=pipeline)
+    telemetry = config.telemetry.model_copy(update={"zenoh_config": None if settings is None else str(settings)})
+    source = SourceParameters(kind="gstreamer", cameras=(camera,))
+    return config.model_copy(update={"source": source, "telemetry": telemetry})
+
+
+def _levels(config: DroneConfig, file: Path) -> list[tuple[Level, str]]:
+    return [(finding.level, finding.measured) for finding in check_secrets(config, file)]
+
+
+def test_a_configuration_with_a_password_is_for_the_service_alone(tmp_path: Path) -> None:
+    file = tmp_path / "drone.yaml"
+    file.touch()
+    file.chmod(0o644)
+    assert _levels(_with_pipeline(OPEN), file) == [(Level.PASS, f"{file} holds no password, mode 644")]
+    readable = f"{file} holds a password, and every user of this computer may read it"
+    assert _levels(_with_pipeline(CLOSED), file) == [(Level.FAILURE, readable)]
+    file.chmod(0o640)
+    assert _levels(_with_pipeline(CLOSED), file) == [(Level.PASS, f"{file} holds a password, mode 640")]
+    file.chmod(0o666)
+    assert _levels(_with_pipeline(OPEN), file) == [(Level.FAILURE, f"{file} may be changed by others than its owner")]
+    assert _levels(_with_pipeline(OPEN), tmp_path / "none")[0][0] is Level.WARNING
+
+
+def test_the_private_keys_of_tls_are_for_the_service_alone(tmp_path: Path) -> None:
+    file, settings, key = (tmp_path / name for name in ("drone.yaml", "tls.json5", "own.key"))
+    for one in (file, key):
+        one.touch()
+        one.chmod(0o600)
+    text = (data_path("config") / "zenoh_tls.json5").read_text(encoding="utf-8")
+    settings.write_text(text.replace("/etc/flockd/tls", str(tmp_path)), encoding="utf-8")
+    settings.chmod(0o644)
+    assert [level for level, _ in _levels(_with_pipeline(OPEN, settings), file)] == [Level.PASS] * 3, (
+        "listens and connects"
+    )
+    key.chmod(0o644)
+    (level, told) = _levels(_with_pipeline(OPEN, settings), file)[-1]
+    assert (level, told) == (Level.FAILURE, f"{key} is a private key, and every user of this computer may read it")
+    settings.write_text("{", encoding="utf-8")
+    assert _levels(_with_pipeline(OPEN, settings), file)[-1][0] is Level.FAILURE
