@@ -1,10 +1,10 @@
-"""`flockd calibrate`: measures the lenses of cameras and their places in the rig, by a board, and the drones' size."""
+"""`flockd calibrate`: measures the lenses of cameras and their places in the rig, by a board or by a flight."""
 
 from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -12,14 +12,12 @@ from typing import TYPE_CHECKING, Any, get_args
 from flockd.cli.options import loaded, opened, refuse_overwriting
 from flockd.cli.output import complain, progress, say, say_json, say_result
 from flockd.cli.parser import Commands, Parser, add_commands, flag, option, positive_count, positive_number, size
-from flockd.cli.picture_options import PictureCameras, add_picture_options, perception_of
 from flockd.core.choices import LENS_MODELS, PixelFormat
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from flockd.core.config import DroneConfig
     from flockd.ground.calibration.board import BoardSpec
-    from flockd.ground.calibration.drone_size import DroneSize, Photograph
     from flockd.ground.calibration.image_sources import ImageStream
     from flockd.ground.calibration.views import Collector
 
@@ -28,9 +26,6 @@ MARKER_SHARE = 0.75
 MOST_VIEWS = 60
 NAMED = 6
 """How many of the refused images are named one by one."""
-_DRONE_NOTES = """\
-A distance is from the lens to the drone's middle. Photograph the drone alone, from several sides and at two or more
-distances, at least 30 pixels wide."""
 
 
 def add(commands: Commands) -> None:
@@ -39,12 +34,9 @@ def add(commands: Commands) -> None:
         "flockd calibrate camera --print-board board.pdf",
         "flockd calibrate camera pictures/ --camera front",
         "flockd calibrate rig --config my_drone.yaml",
-        "flockd calibrate drone --distance 3.0 a.jpg b.jpg --distance 5.0 c.jpg d.jpg --fov 70",
     )
-    parser = commands(
-        "calibrate", "Measure the cameras (lenses, mountings, time offsets) and the drones' size.", examples
-    )
-    add_commands(parser, (_add_camera, _add_rig, _add_drone))
+    parser = commands("calibrate", "Measure the cameras: lenses, mountings, time offsets.", examples)
+    add_commands(parser, (_add_camera, _add_rig))
 
 
 def _add_shared(parser: Parser, help_of_config: str) -> None:
@@ -371,103 +363,3 @@ def _written(result: Mapping[str, Any]) -> int:
         say(f"note: {note}")
     say(f"written: {result['out']}; put it in place of rig in your drone's file, then run flockd config check on that")
     return ExitCode.DONE
-
-
-def _add_drone(commands: Commands) -> None:
-    """Adds the command."""
-    examples = (
-        "flockd calibrate drone --distance 3.0 a.jpg b.jpg --distance 5.0 c.jpg d.jpg --fov 70",
-        "flockd calibrate drone --distance 2.5 near/ --distance 4.0 far/ --config my_drone.yaml --camera front",
-    )
-    parser = commands("drone", "Measure the drones' size, as the networks see it.", examples, _DRONE_NOTES)
-    parser.add_argument(
-        "--distance",
-        metavar=("M", "PICTURE"),
-        nargs="+",
-        action="append",
-        default=[],
-        help="metres, and the images, folders or videos taken there; may be given again",
-    )
-    option(parser, "--every N", "take every Nth frame (1)", positive_count, default=1)
-    option(parser, "--out FILE", "where the result goes (drone_size.yaml)", Path)
-    flag(parser, "--force", "overwrite what is there")
-    flag(parser, "--json", "print the result as JSON")
-    add_picture_options(parser)
-    parser.set_defaults(run=_drone)
-
-
-def _drone(args: argparse.Namespace) -> int:
-    from flockd.ground.calibration.drone_size import fit_size
-    from flockd.onboard.recording.editing import written_whole
-
-    out = args.out or Path("drone_size.yaml")
-    refuse_overwriting(args, out)
-    size = fit_size(list(_photographs(args, _distances(args))))
-    source = ", ".join(f"{one[0]} m: {len(one) - 1}" for one in args.distance)
-    with written_whole(out) as draft:
-        draft.write_text(size.fragment(source), encoding="utf-8")
-    if args.json:
-        say_json({**size.as_json(), "out": str(out)})
-    else:
-        _say_drone(size, out)
-    return ExitCode.DONE
-
-
-def _distances(args: argparse.Namespace) -> list[tuple[float, list[Path]]]:
-    """Metres, and the pictures taken there."""
-    from flockd.ground.calibration.drone_size import MAX_DISTANCE_M
-
-    if not args.distance:
-        raise UsageError("name the pictures and their distances with --distance M PICTURE...")
-    listed = []
-    for text, *pictures in args.distance:
-        try:
-            distance_m = positive_number(text)
-        except argparse.ArgumentTypeError as error:
-            raise UsageError(f"--distance: {error}; write metres, then the pictures taken there") from None
-        if distance_m > MAX_DISTANCE_M:
-            raise UsageError(f"--distance: {text} is more than {MAX_DISTANCE_M:g} m; write metres")
-        if not pictures:
-            raise UsageError(f"--distance {text}: names no picture; write the pictures taken there after the metres")
-        listed.append((distance_m, [Path(picture) for picture in pictures]))
-    return listed
-
-
-def _photographs(args: argparse.Namespace, distances: Sequence[tuple[float, list[Path]]]) -> Iterator[Photograph]:
-    """With what is detected in each picture, of unknown size."""
-    from flockd.ground.calibration.drone_size import Photograph, SizeCandidate
-    from flockd.ground.pictures.picture_files import find_pictures
-    from flockd.ground.pictures.single_frame import PictureDetector
-
-    cameras = PictureCameras(args)
-    taken = [(distance_m, picture) for distance_m, paths in distances for picture in find_pictures(paths)]
-    detector = PictureDetector(perception_of(args, cameras.config, drone_size_m=None))
-    done = 0
-    with progress("detecting", "pictures") as tell:
-        for distance_m, picture in taken:
-            for name, image in picture.images(args.every):
-                found = detector.detect(image, cameras.of(name, (image.shape[1], image.shape[0]))).detections
-                done += 1
-                tell(done, max(done, len(taken)))
-                candidates = (
-                    SizeCandidate(
-                        distance_m * one.size_m / one.range_m, one.range_sigma_m / one.range_m, one.probability
-                    )
-                    for one in found
-                )
-                yield Photograph(name, distance_m, tuple(candidates))
-
-
-def _say_drone(size: DroneSize, out: Path) -> None:
-    for one in size.pictures:
-        residual = one.residual(size.size_m)
-        note = "" if one.used else "; dropped: it does not fit the others"
-        say(
-            f"{one.name}: {one.distance_m:g} m, size {one.size_m:.3f} m, "
-            f"range {100 * residual:+.1f} % ({residual * one.distance_m:+.2f} m){note}"
-        )
-    if size.missed:
-        say(f"nothing detected: {', '.join(size.missed)}")
-    used = sum(one.used for one in size.pictures)
-    say(f"drone_size_m: {size.size_m:.4f} +- {size.sigma_m:.4f} m, from {used} pictures")
-    say(f"written: {out}; copy its keys to perception in your drone's file, then run flockd config check on that")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from flockd.core.config.rig import CameraConfig, RigConfig
+from flockd.core.config.rig import RigConfig
 from flockd.core.messages import CameraDeviation, PilotOutput
 from flockd.flight.geometry import (
     RigidTransform,
@@ -68,10 +68,30 @@ def corrected_rig(recording: Recording, source: str, out: Path) -> dict[str, Any
     notes += rolling(next(iter(found.values())))
     for camera in config.cameras:
         one = found[camera.name]
-        turned, scaled = _takes_turn(one), _takes_focal(one)
-        cameras.append(_corrected(camera, one, turned=turned, scaled=scaled, source=source))
-        results[camera.name] = _result(one, cameras[-1], turned=turned, scaled=scaled)
-        sigma_rad = _worst_turn(one)
+        off, sigmas = differs(one), np.sqrt(np.diag(one.covariance))
+        sigma_rad = math.sqrt(float(np.linalg.eigvalsh(one.covariance[:3, :3])[-1]))  # about the axis known worst
+        changes: dict[str, Any] = {}
+        measured = measured_today(camera=camera.name, source=f"{source}, in flight", views=1)
+        if off.turn and sigma_rad < MAX_TURN_RAD and not one.elsewhere:
+            before = build_rig(RigConfig(cameras=(camera,))).cameras[camera.name].T_body_camera
+            after = RigidTransform(rotation_from_vector(one.turn) @ before.rotation, before.translation)
+            changes["extrinsics"] = extrinsics_of(after, measured)
+        if off.focal and sigmas[4] < MAX_FOCAL and not one.elsewhere:
+            focal = {key: round(getattr(camera.intrinsics, key) * one.focal_scale, 4) for key in ("fx", "fy")}
+            changes["intrinsics"] = camera.intrinsics.model_copy(update={**focal, "measured": measured})
+        cameras.append(camera.model_copy(update=changes))
+        results[camera.name] = {
+            **cameras[-1].extrinsics.model_dump(mode="json", exclude={"measured"}),
+            "fx": cameras[-1].intrinsics.fx,
+            "fy": cameras[-1].intrinsics.fy,
+            "taken": [{"extrinsics": "mounting", "intrinsics": "focal length"}[key] for key in changes],
+            "found": described(one),
+            "sigma_deg": math.degrees(sigma_rad),
+            "time_offset_s": one.time_offset_s,
+            "sigma_s": float(sigmas[3]),
+            "focal_scale": one.focal_scale,
+            "sigma_focal": float(sigmas[4]),
+        }
         if one.elsewhere:
             notes.append(*rig_faults(one))
         elif sigma_rad > MAX_TURN_RAD:
@@ -94,38 +114,6 @@ def corrected_rig(recording: Recording, source: str, out: Path) -> dict[str, Any
     }
 
 
-def _corrected(
-    camera: CameraConfig, found: CameraDeviation, *, turned: bool, scaled: bool, source: str
-) -> CameraConfig:
-    measured = measured_today(camera=camera.name, source=f"{source}, in flight", views=1)
-    changes: dict[str, Any] = {}
-    if turned:
-        before = build_rig(RigConfig(cameras=(camera,))).cameras[camera.name].T_body_camera
-        after = RigidTransform(rotation_from_vector(found.turn) @ before.rotation, before.translation)
-        changes["extrinsics"] = extrinsics_of(after, measured)
-    if scaled:
-        lens = camera.intrinsics
-        focal = {key: round(getattr(lens, key) * found.focal_scale, 4) for key in ("fx", "fy")}
-        changes["intrinsics"] = lens.model_copy(update={**focal, "measured": measured})
-    return camera.model_copy(update=changes)
-
-
-def _result(found: CameraDeviation, camera: CameraConfig, *, turned: bool, scaled: bool) -> dict[str, Any]:
-    taken = [name for name, is_taken in (("mounting", turned), ("focal length", scaled)) if is_taken]
-    return {
-        **camera.extrinsics.model_dump(mode="json", exclude={"measured"}),
-        "fx": camera.intrinsics.fx,
-        "fy": camera.intrinsics.fy,
-        "taken": taken,
-        "found": described(found),
-        "sigma_deg": math.degrees(_worst_turn(found)),
-        "time_offset_s": found.time_offset_s,
-        "sigma_s": math.sqrt(found.covariance[3, 3]),
-        "focal_scale": found.focal_scale,
-        "sigma_focal": math.sqrt(found.covariance[4, 4]),
-    }
-
-
 def _offset_s(found: Sequence[CameraDeviation]) -> tuple[float | None, str | None]:
     """What is to be added to the rig's offset, or None; and a note where the cameras do not agree."""
     known = [one for one in found if not one.elsewhere and math.sqrt(one.covariance[3, 3]) < MAX_OFFSET_S]
@@ -140,19 +128,6 @@ def _offset_s(found: Sequence[CameraDeviation]) -> tuple[float | None, str | Non
         worst = known[int(apart_s.argmax())].camera
         note = f"the time of camera {worst!r} is {1e3 * apart_s.max():.0f} ms off the others'; the offset is their mean"
     return (mean_s, note) if abs(mean_s) > 3.0 * sigma_s else (None, note)
-
-
-def _takes_turn(found: CameraDeviation) -> bool:
-    return not found.elsewhere and _worst_turn(found) < MAX_TURN_RAD and differs(found).turn
-
-
-def _takes_focal(found: CameraDeviation) -> bool:
-    return not found.elsewhere and math.sqrt(found.covariance[4, 4]) < MAX_FOCAL and differs(found).focal
-
-
-def _worst_turn(found: CameraDeviation) -> float:
-    """Standard deviation about the axis that is known worst, rad."""
-    return math.sqrt(float(np.linalg.eigvalsh(found.covariance[:3, :3])[-1]))
 
 
 def _is_possible(one: CameraDeviation) -> bool:

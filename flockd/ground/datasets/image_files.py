@@ -54,29 +54,26 @@ def read_depth(path: Path, size: tuple[int, int], units_per_m: float) -> Float32
 def _decoded(path: Path, flags: int) -> cv2.typing.MatLike:
     logging = cv2.utils.logging
     before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # the sentence below says it
+    image = None
     try:
-        data = _read(path)
-        fault = _fault(data)
-        image = None if fault else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        if path.exists() and not path.is_file():  # a pipe or a device may never end
+            fault = "is not an ordinary file"
+        elif path.exists() and path.stat().st_size > MAX_FILE_BYTES:
+            fault = f"is larger than {MAX_FILE_BYTES >> 20} MiB"
+        else:
+            data = path.read_bytes()
+            known = _fault(data)
+            fault = known or "is no image"
+            image = None if known else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except (OSError, ValueError) as error:  # ValueError: what a list names cannot be a path
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise DatasetError(f"{path}: cannot be read ({reason}); restore it, or leave its frame out") from None
+        fault = f"cannot be read ({error.strerror if isinstance(error, OSError) else error})"
     except cv2.error:  # of a header that claims more pixels than OpenCV is to take, or of no bytes at all
-        image, fault = None, "has more pixels than any camera, or none"
+        fault = "has more pixels than any camera, or none"
     finally:
         logging.setLogLevel(before)
     if image is None:
-        raise DatasetError(f"{path}: {fault or 'is no image'}; restore it, or leave its frame out")
+        raise DatasetError(f"{path}: {fault}; restore it, or leave its frame out")
     return image
-
-
-def _read(path: Path) -> bytes:
-    """The bytes of an ordinary file: a pipe or a device may never end."""
-    if path.exists() and not path.is_file():
-        raise DatasetError(f"{path}: is not an ordinary file; restore it, or leave its frame out")
-    if path.exists() and path.stat().st_size > MAX_FILE_BYTES:
-        raise DatasetError(f"{path}: is larger than {MAX_FILE_BYTES >> 20} MiB; give it the dataset's size")
-    return path.read_bytes()
 
 
 def _fault(data: bytes) -> str | None:

@@ -289,18 +289,15 @@ def read_lines(file: Path) -> list[tuple[int, str]]:
 
 def read_rows(file: Path, *, columns: int, what: str) -> FloatArray:
     """(n, columns) numbers, between blanks or commas. Raises DatasetError where a line has others, or none is."""
-    rows = [_row(file, number, line, columns, what) for number, line in read_lines(file)]
+    rows = []
+    for number, line in read_lines(file):
+        try:
+            row = [float(word) for word in line.replace(",", " ").split()]
+        except ValueError:
+            row = []
+        if len(row) != columns or not np.isfinite(row).all():
+            raise DatasetError(f"{file}:{number}: does not fit; it needs {what}")
+        rows.append(row)
     if not rows:
         raise DatasetError(f"{file}: is empty; it needs {what}")
     return np.array(rows, np.float64)
-
-
-def _row(file: Path, number: int, line: str, columns: int, what: str) -> list[float]:
-    words = line.replace(",", " ").split()
-    try:
-        values = [float(word) for word in words]
-    except ValueError:
-        values = []
-    if len(values) != columns or not np.isfinite(values).all():
-        raise DatasetError(f"{file}:{number}: does not fit; it needs {what}")
-    return values
