@@ -7,12 +7,12 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 from flockd.cli.options import loaded, opened, refuse_overwriting
 from flockd.cli.output import complain, progress, say, say_json, say_result
 from flockd.cli.parser import Commands, Parser, add_commands, flag, option, positive_count, positive_number, size
-from flockd.core.choices import LENS_MODELS, PixelFormat
+from flockd.core.choices import LENS_MODELS
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -88,28 +88,17 @@ def _add_camera(commands: Commands) -> None:
         "flockd calibrate camera pictures/ --camera front",
         "flockd calibrate camera clip.mp4 --every 5 --model wide_angle",
         "flockd calibrate camera drone1.mcap --camera left",
-        "flockd calibrate camera /dev/video0 --size 640x480",
         "flockd calibrate camera --config my_drone.yaml --camera front",
     )
     description = "Measure a camera's lens from views of a ChArUco board."
     parser = commands("camera", description, examples)
-    help_of_source = "a folder of images, a video, a recording or a /dev/video; by default --config's own camera, live"
+    help_of_source = "a folder of images, a video or a recording; by default --config's own camera, live"
     option(parser, "SOURCE", help_of_source, nargs="?")
     option(parser, "--camera NAME", "the camera's name in the rig")
     option(parser, "--model", "default: pinhole, unless the other fits clearly better", choices=LENS_MODELS)
     option(parser, "--views N", "use N views at most (60)", positive_count, default=MOST_VIEWS)
     option(parser, "--max-blur PX", "widest edge of a sharp view (4)", positive_number)
     option(parser, "--serial TEXT", "the camera's serial number, where the device does not give it")
-    option(parser, "--size WxH", "of a /dev/video (640x480)", size, default=(640, 480))
-    option(parser, "--pixel-format", "of a /dev/video (mjpeg)", choices=get_args(PixelFormat), default="mjpeg")
-    option(
-        parser,
-        "--turn-deg",
-        "of a /dev/video: clockwise, what makes up up in its images, as in the drone's file; --size is as turned",
-        int,
-        choices=(0, 90, 180, 270),
-        default=0,
-    )
     option(parser, "--print-board FILE", "write the board to print (.pdf)", Path)
     _add_shared(parser, "the drone, for its camera's device and serial")
     parser.set_defaults(run=_camera)
@@ -191,14 +180,13 @@ def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, 
     name = args.camera or "camera" if config is None else _name_in(config, args, str(args.config))
     if not re.fullmatch("[a-z0-9_-]+", name):
         raise UsageError(f"--camera {name}: a camera's name has small letters, digits, _ and - only")
-    if path.is_relative_to("/dev"):
-        live = image_sources.device_config(str(path), name, args.size, args.pixel_format, args.turn_deg)
-        return name, image_sources.from_cameras(live, str(path), args.seconds, enough)
     if path.is_dir():
         return name, image_sources.from_folder(path, name)
     if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file():
         return name, image_sources.from_video(path, name, args.every)
-    fault = "is no folder, video or recording; name one of these" if path.exists() else "does not exist; check the path"
+    fault = "does not exist; check the path"
+    if path.exists():
+        fault = "is no folder, video or recording; name one, or for a live camera the drone with --config"
     raise UsageError(f"{path}: {fault}")
 
 

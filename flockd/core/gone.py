@@ -37,6 +37,10 @@ COMMANDS: Mapping[str, str] = {
     "flockd calibrate rig --by": "fly, and take over what the flight found with `--from-flight RECORDING`",
     "flockd calibrate rig --max-offset": "a flight finds the time offset: `--from-flight RECORDING`",
     "flockd sim --verbose": "the report says what was flown, and `flockd config show SCENARIO` what a file stands for",
+    **dict.fromkeys(
+        (f"flockd calibrate camera --{option}" for option in ("size", "pixel-format", "turn-deg")),
+        "`flockd cameras --write FILE` writes the cameras that are plugged in; name that with --config",
+    ),
     "flockd calibrate drone": "measure from tip to tip, with propellers, and write `perception.drone_size_m`",
     "flockd calibrate camera --picture": "the command prints the coverage and each view's residual",
     "flockd view": "open the recording in Foxglove, or in Rerun after `rerun mcap convert RECORDING.mcap -o X.rrd`",

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
-from pydantic import ValidationError
 
 from flockd.core.config import DroneConfig
-from flockd.core.errors import UnavailableError, UsageError
+from flockd.core.errors import UnavailableError
 from flockd.core.messages import UInt8Array
 from flockd.ground.calibration.board import CalibrationError
 from flockd.ground.datasets.image_files import SUFFIXES, images_of_video, opened_video, read_image
@@ -126,26 +125,6 @@ def identity(device: Path, sysfs: Path = SYSFS) -> str:
     if vendor and product:
         return f"USB {vendor}:{product} {f'serial {serial}' if serial else f'without a serial number, {device}'}"
     return f"{_text(entry / 'name') or 'not known'}, {device}"
-
-
-def device_config(device: str, camera: str, size: tuple[int, int], pixel_format: str, turn_deg: int = 0) -> DroneConfig:
-    """A drone with this camera alone, placeholder intrinsics, an upright image of this ``size``. Raises UsageError."""
-    lens = {"fx": size[0] * 1.0, "fy": size[0] * 1.0, "cx": size[0] / 2, "cy": size[1] / 2}
-    try:
-        return DroneConfig.model_validate(
-            {
-                "rig": {"cameras": ({"name": camera, "size_px": size, "intrinsics": lens},)},
-                "source": {
-                    "kind": "v4l2",
-                    "cameras": (
-                        {"name": camera, "device": device, "pixel_format": pixel_format, "turn_deg": turn_deg},
-                    ),
-                },
-            }
-        )
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise UsageError(f"{device}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
 def with_one_camera(config: DroneConfig, name: str) -> DroneConfig:
