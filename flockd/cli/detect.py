@@ -11,16 +11,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from flockd.cli.options import loaded
 from flockd.cli.output import complain, progress, say, say_json, say_table
 from flockd.cli.parser import Commands, flag, number, option, positive_count, positive_number
-from flockd.cli.picture_options import PictureCameras, add_picture_options, perception_of
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
+    from flockd.core.config import DroneConfig
+    from flockd.core.config.perception import PerceptionConfig
+    from flockd.flight.geometry import Camera
     from flockd.ground.pictures.copies import Copies
     from flockd.ground.pictures.picture_files import PictureFile, PictureLabels
     from flockd.ground.pictures.single_frame import DetectedDrone, PictureDetector
 
+MAX_FOV_DEG = 170.0
 NOTES = """\
 Larger pictures are resized to 1280 pixels for the networks; boxes are in pixels of the picture.
 --labels: a drone is found when the centre of a detection lies in its box, each box once; any other detection is false.
@@ -52,7 +56,15 @@ def add(commands: Commands) -> None:
     option(parser, "--drone-size M", "of every drone, tip to tip, if known", positive_number)
     option(parser, "--every N", "every Nth frame of a video (1)", positive_count, default=1)
     flag(parser, "--json", "print the result as JSON")
-    add_picture_options(parser)
+    camera = parser.add_argument_group("the camera of the pictures")
+    option(
+        camera,
+        "--fov DEG",
+        "field of view across the longer side, of a lens without distortion; above 100, of a fisheye",
+        number(f"an angle above 0 and up to {MAX_FOV_DEG:g} degrees", high=MAX_FOV_DEG, above=0.0),
+    )
+    option(camera, "--config FILE", "a drone, for its networks and settings and, without --fov, its camera", Path)
+    option(camera, "--camera NAME", "which of --config's cameras, where it has several")
     parser.set_defaults(run=_run)
 
 
@@ -75,11 +87,11 @@ def _run(args: argparse.Namespace) -> int:
 
     if args.force and args.out is None:
         raise UsageError("--force has no meaning without --out; add it")
-    cameras = PictureCameras(args)
+    drone = loaded(args.config)
+    cameras = _Cameras(args, drone)
     pictures = find_pictures(args.pictures, but_not=args.out)
     labels = None if args.labels is None else read_labels(args.labels, pictures)
-    more = {} if args.drone_size is None else {"drone_size_m": args.drone_size}
-    config = perception_of(args, cameras.config, **more)
+    config = _perception(drone, args.drone_size)
     with ExitStack() as stack:
         copies = None
         if args.out is not None:
@@ -104,12 +116,70 @@ def _run(args: argparse.Namespace) -> int:
     return ExitCode.CHECK_FAILED if left_out else ExitCode.DONE
 
 
+class _Cameras:
+    """The camera of each picture, by its size."""
+
+    def __init__(self, args: argparse.Namespace, drone: DroneConfig | None) -> None:
+        """Raises UsageError where the options do not give one."""
+        if drone is None and args.fov is None:
+            raise UsageError(
+                "the pictures' camera is not known; give its field of view with --fov (a phone's main camera has 65 to "
+                "75 degrees, its data sheet says), or a drone with --config"
+            )
+        if args.camera is not None and (drone is None or args.fov is not None):
+            raise UsageError("--camera is one of --config's, in place of --fov; name the drone's file alone")
+        self._file, self._fov = args.config, args.fov
+        self._mine = None if drone is None or args.fov is not None else self._of_rig(args, drone)
+
+    @staticmethod
+    def _of_rig(args: argparse.Namespace, drone: DroneConfig) -> Camera:
+        from flockd.flight.geometry import build_rig
+
+        cameras = build_rig(drone.rig).cameras
+        if args.camera is None and len(cameras) > 1:
+            raise UsageError(f"{args.config}: has cameras {', '.join(cameras)}; choose one with --camera")
+        name = args.camera or next(iter(cameras))
+        if name not in cameras:
+            raise UsageError(f"{args.config}: has no camera {name!r}; choose --camera from {', '.join(cameras)}")
+        return cameras[name].camera
+
+    def of(self, name: str, size: tuple[int, int]) -> Camera:
+        """The camera of a picture of this width and height. Raises UsageError where --config's has another size."""
+        if self._mine is not None:
+            if self._mine.size != size:
+                wanted = " x ".join(map(str, self._mine.size))
+                raise UsageError(
+                    f"{name}: is {size[0]} x {size[1]} pixels, and the camera of {self._file} {wanted}; give pictures "
+                    "of that camera, or --fov too"
+                )
+            return self._mine
+        from flockd.ground.pictures.single_frame import camera_with_fov
+
+        return camera_with_fov(size, self._fov)
+
+
+def _perception(drone: DroneConfig | None, drone_size_m: float | None) -> PerceptionConfig:
+    """A drone's settings, or the defaults. Raises UsageError for a size that cannot be."""
+    from pydantic import ValidationError
+
+    from flockd.core.config.perception import PerceptionConfig
+
+    values = {} if drone is None else drone.perception.model_dump()
+    if drone_size_m is not None:
+        values["drone_size_m"] = drone_size_m
+    try:
+        return PerceptionConfig.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise UsageError(f"perception.{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+
+
 def _detected(
     args: argparse.Namespace,
     pictures: Sequence[PictureFile],
     labels: Mapping[PictureFile, PictureLabels] | None,
     detector: PictureDetector,
-    cameras: PictureCameras,
+    cameras: _Cameras,
     copies: Copies | None,
     left_out: list[str],
 ) -> Iterator[_Detected]:

@@ -41,6 +41,13 @@ COMMANDS: Mapping[str, str] = {
         (f"flockd calibrate camera --{option}" for option in ("size", "pixel-format", "turn-deg")),
         "`flockd cameras --write FILE` writes the cameras that are plugged in; name that with --config",
     ),
+    **dict.fromkeys(
+        (
+            f"flockd detect --{option}"
+            for option in ("models", "first-stage", "detector", "second-stage", "verification", "threads")
+        ),
+        "write it in the section `perception` of a drone's file, and name that with --config",
+    ),
     "flockd calibrate drone": "measure from tip to tip, with propellers, and write `perception.drone_size_m`",
     "flockd calibrate camera --picture": "the command prints the coverage and each view's residual",
     "flockd view": "open the recording in Foxglove, or in Rerun after `rerun mcap convert RECORDING.mcap -o X.rrd`",

@@ -178,6 +178,10 @@ def test_a_drones_own_camera_is_taken(capsys: Capture, tmp_path: Path) -> None:
     assert "has cameras front, left; choose one with --camera" in told(capsys, 2, "detect", NEAR, "--config", config)
     other = ("--config", config, "--camera", "right")
     assert "has no camera 'right'; choose --camera from front, left" in told(capsys, 2, "detect", NEAR, *other)
+    with config.open("a", encoding="utf-8") as file:
+        file.write("perception: {distance: none}\n")
+    no_second_stage = ("--config", config, *FOV, "--drone-size", "0.7")
+    assert "needs the apparent size, which a second stage" in told(capsys, 2, "detect", NEAR, *no_second_stage)
     assert cv2.imwrite(str(tmp_path / "small.png"), np.zeros((60, 80, 3), np.uint8))
     small = (tmp_path / "small.png", "--config", config, "--camera", "left")
     assert "is 80 x 60 pixels, and the camera of" in told(capsys, 2, "detect", *small)
@@ -187,15 +191,11 @@ def test_a_drones_own_camera_is_taken(capsys: Capture, tmp_path: Path) -> None:
     ("arguments", "code", "sentence"),
     [
         ((NEAR,), 2, "the pictures' camera is not known; give its field of view with --fov"),
-        ((NEAR, *FOV, "--config", "d.yaml"), 2, "--fov and --config exclude each other"),
-        ((NEAR, *FOV, "--camera", "front"), 2, "--camera is one of --config's"),
+        ((NEAR, *FOV, "--camera", "front"), 2, "--camera is one of --config's, in place of --fov"),
         ((NEAR, *FOV, "--force"), 2, "--force has no meaning without --out"),
         (("nowhere.jpg", *FOV), 2, "nowhere.jpg: does not exist; name an image, a video or a folder"),
         ((LABELS, *FOV), 2, "drones.json: is no image or video by its name"),
-        ((NEAR, *FOV, "--models", "nowhere"), 78, "nowhere is no folder; name the one that holds the models"),
-        ((NEAR, *FOV, "--second-stage", "range9"), 78, "there is no model 'range9'"),
         ((NEAR, *FOV, "--drone-size", "0.01"), 2, "perception.drone_size_m: "),
-        ((NEAR, *FOV, "--drone-size", "0.7", "--second-stage", "none"), 2, "needs the apparent size, which a second"),
         ((NEAR, *FOV, "--labels", LABELS), 1, "2.5_m_1.jpg is labelled and is not among the pictures; add it"),
         ((NEAR, *FOV, "--labels", "no.json"), 1, "no.json: cannot be read (No such file or directory)"),
     ],
