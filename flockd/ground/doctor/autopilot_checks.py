@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
 from flockd.core.config import DroneConfig
 from flockd.core.config.autopilot import AutopilotParameters
-from flockd.core.config.safety import GateParameters
 from flockd.core.messages import RangeReading
 from flockd.flight.safety import link_lost
 from flockd.ground.doctor import Finding, Level, failed, failed_from_error, graded, passed, warned
@@ -121,34 +121,22 @@ async def _ask(config: DroneConfig, parameters: AutopilotParameters, heard_s: fl
         found += [signing] if responds or signing.level is Level.FAILURE else []
         found += [] if signing.level is Level.FAILURE else await _parameters(link, config)
         if not _is_silent(link.status(), config):
-            found += judge_refusals(await _refusals(link))
-            found.append(judge_clock(await _clock(link)))
+            with suppress(AutopilotError, TimeoutError):  # without the checks of now, what its messages say counts
+                async with asyncio.timeout(CHECKS_S):
+                    await link.ask_for_checks()
+                    while not link.knows_checks():
+                        await asyncio.sleep(0.02)
+            found += judge_refusals(link.refusals())
+            with suppress(TimeoutError):
+                async with asyncio.timeout(CLOCK_S):
+                    await link.synchronise()
+            found.append(judge_clock(link.clock()))
             await asyncio.sleep(WATCHED_S if config.perception.height != "barometer" else 0.0)
             found += judge_range_finder(link.ground_range(), link.range_finders(), config)
         found += judge_messages(link.unknown_values())
     finally:
         await link.close()
     return found
-
-
-async def _refusals(link: AutopilotLink) -> tuple[Refusal, ...]:
-    """What the autopilot's checks say when they are run now; without such a list, what its messages say."""
-    try:
-        async with asyncio.timeout(CHECKS_S):
-            await link.ask_for_checks()
-            while not link.knows_checks():
-                await asyncio.sleep(0.02)
-    except (AutopilotError, TimeoutError):
-        pass
-    return link.refusals()
-
-
-async def _clock(link: AutopilotLink) -> ClockEstimate | None:
-    """The autopilot's clock after some exchanges; None where it does not answer them."""
-    with suppress(TimeoutError):
-        async with asyncio.timeout(CLOCK_S):
-            await link.synchronise()
-    return link.clock()
 
 
 async def _parameters(link: AutopilotLink, config: DroneConfig) -> list[Finding]:
@@ -250,7 +238,10 @@ def judge_parameter(name: str, value: float, config: DroneConfig) -> Finding:
         case "COM_OF_LOSS_T":
             return _judge_loss_time(name, value, config)
         case "GF_MAX_HOR_DIST":
-            return _judge_limit(name, value, _reach_m(gate), "fence")
+            corners_m = [math.hypot(*corner) for corner in gate.fence_corners_m]
+            limits_m = [] if gate.fence_radius_m is None else [gate.fence_radius_m]
+            limits_m += [max(corners_m)] if corners_m else []
+            return _judge_limit(name, value, min(limits_m, default=None), "fence")
         case "GF_MAX_VER_DIST":
             return _judge_limit(name, value, gate.max_height_m, "max_height_m")
         case "CP_DIST":
@@ -309,13 +300,6 @@ def _judge_limit(name: str, value: float, own_m: float | None, what: str) -> Fin
         return warned(name, measured, f"set {name} to {outside}, or make safety.gate.{what} smaller")
     own = "flockd has none itself" if own_m is None else f"outside flockd's own {own_m:g} m"
     return passed(name, f"{value:g} m, {own}")
-
-
-def _reach_m(gate: GateParameters) -> float | None:
-    """How far from home flockd's own fence lets it fly; None: for ever."""
-    corners = [(north**2 + east**2) ** 0.5 for north, east in gate.fence_corners_m]
-    limits = [max(corners)] if corners else []
-    return min([*limits, *([] if gate.fence_radius_m is None else [gate.fence_radius_m])], default=None)
 
 
 def judge_range_finder(

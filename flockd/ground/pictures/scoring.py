@@ -100,38 +100,35 @@ def average_precision(judged: Sequence[tuple[float, bool]], boxes: int) -> float
     return float(np.sum(best * np.diff(recall, prepend=0.0)))
 
 
-def summary(pictures: Sequence[Labelled], min_probability: float = 0.0) -> dict[str, Any]:
-    """The summary of one set of labelled pictures, counting detections that are at least so probable.
+def summary(pictures: Sequence[Labelled]) -> dict[str, Any]:
+    """The summary of one set of labelled pictures.
 
     ``boxes``; ``by_width``: by the box's width in pixels the boxes, those ``found`` (a detection's centre lies in the
     box) and those ``found_iou30``; ``ap50``; ``measured``: how many pictures; ``false``: detections that found no box;
     ``false_per_picture`` and its 95 % confidence interval ``false_per_picture_95``.
     """
     counts = {name: {"boxes": 0, "found": 0, "found_iou30": 0} for name in WIDTH_CLASSES}
-    false = 0
-    judged: list[tuple[float, bool]] = []
-    for picture in pictures:
-        kept = tuple(one for one in picture.detections if one.probability >= min_probability)
-        one = Labelled(kept, picture.boxes)
+    false, judged = 0, list[tuple[float, bool]]()
+    for one in pictures:
         by_centre, by_each = match(one, centre_in_box)
         by_overlap, _ = match(one, overlap(FOUND_IOU))
         false += sum(not is_true for _, is_true in by_each)
         judged += match(one, overlap(AP_IOU))[1]
-        for box, is_found, is_overlapped in zip(picture.boxes, by_centre, by_overlap, strict=True):
+        for box, is_found, is_overlapped in zip(one.boxes, by_centre, by_overlap, strict=True):
             of_width = counts[width_class(box)]
             of_width["boxes"] += 1
             of_width["found"] += is_found
             of_width["found_iou30"] += is_overlapped
-    boxes = sum(len(picture.boxes) for picture in pictures)
+    boxes, measured = sum(len(picture.boxes) for picture in pictures), len(pictures)
     ap50 = average_precision(judged, boxes)
     return {
         "boxes": boxes,
         "by_width": counts,
         "ap50": None if ap50 is None else round(ap50, 4),
-        "measured": len(pictures),
+        "measured": measured,
         "false": false,
-        "false_per_picture": false / len(pictures) if pictures else None,
-        "false_per_picture_95": [count / len(pictures) for count in count_interval(false)] if pictures else None,
+        "false_per_picture": false / measured if measured else None,
+        "false_per_picture_95": [count / measured for count in count_interval(false)] if measured else None,
     }
 
 

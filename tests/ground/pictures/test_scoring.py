@@ -89,8 +89,6 @@ def test_a_summary_of_pictures_with_and_without_drones() -> None:
         "false_per_picture": 0.5,
     }  # fmt: skip
     assert (low, high) == pytest.approx((0.242 / 4, 7.225 / 4), abs=2e-3)
-    assert summary(pictures, 0.97)["by_width"]["12-30"] == {"boxes": 3, "found": 1, "found_iou30": 1}
-    assert summary(pictures, 0.97)["false_per_picture"] == 0.0
     assert (summary([])["ap50"], summary([])["false_per_picture"], summary([])["false_per_picture_95"]) == (None,) * 3
 
 
