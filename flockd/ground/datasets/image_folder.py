@@ -58,17 +58,6 @@ class Moment:
 
 
 @dataclass(frozen=True, eq=False)
-class DatasetFrame:
-    """One image of the dataset's camera, and what is known with it."""
-
-    moment: Moment
-    image: UInt8Array
-    """(h, w, 3) RGB."""
-    depth: ZMap | None
-    """(h, w) metres along the optical axis, NaN where there is none; None where it was not asked for."""
-
-
-@dataclass(frozen=True, eq=False)
 class Dataset:
     """A sequence of images of one camera; each image, and each depth map, is a file."""
 
@@ -88,12 +77,13 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.moments)
 
-    def frames(self, *, with_depth: bool) -> Iterator[DatasetFrame]:
-        """All frames in order, read one by one. Raises DatasetError at one that is missing or damaged."""
+    def frames(self, *, with_depth: bool) -> Iterator[tuple[Moment, UInt8Array, ZMap | None]]:
+        """All in order, read one by one: (h, w, 3) RGB, and (h, w) metres along the optical axis, NaN where there are
+        none; None where they were not asked for. Raises DatasetError at a file that is missing or damaged."""
         size = self.camera.size_px
         for one in self.moments:
             depth = ZMap(read_depth(one.depth, size, self.depth_units_per_m)) if with_depth and one.depth else None
-            yield DatasetFrame(one, read_image(one.image, size), depth)
+            yield one, read_image(one.image, size), depth
 
 
 def open_dataset(path: Path, calibration: Path | None = None) -> Dataset:

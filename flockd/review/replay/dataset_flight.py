@@ -190,11 +190,10 @@ def fly_pairs(
     perceiver = RecordedDepth(learned)
     pilots = [FlockPilot(config, perceiver) for _ in range(stride)]
     past: deque[tuple[Moment, PilotOutput]] = deque(maxlen=stride)
-    for frame in dataset.frames(with_depth=recorded_depth):
-        moment = frame.moment
-        perceiver.show(frame.depth)
-        frames = {camera.name: Frame(camera.name, frame.image, moment.time_s, moment.index)}
-        if float(frame.image.std(axis=(0, 1)).max()) < _FLAT_DEVIATION:
+    for moment, image, depth in dataset.frames(with_depth=recorded_depth):
+        perceiver.show(depth)
+        frames = {camera.name: Frame(camera.name, image, moment.time_s, moment.index)}
+        if float(image.std(axis=(0, 1)).max()) < _FLAT_DEVIATION:
             frames = {}  # as cameras' images of one colour are left out in flight
         vehicle = VehicleState(moment.time_s, np.eye(3), 0.0)
         output = pilots[moment.index % stride].step(FrameSet(moment.time_s, frames), vehicle)
