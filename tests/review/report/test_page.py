@@ -8,6 +8,7 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -127,48 +128,49 @@ def _report(folder: Path, log: FlightLog, *moments: KeyFrame) -> str:
     return (folder / "report.html").read_text(encoding="utf-8")
 
 
-class _Page(HTMLParser):
-    """Reads a page: its text, the links it follows, its table cells, and whether every tag is closed in turn."""
+class Page(HTMLParser):
+    """A page read: its elements as a tree, its text, the links it follows, and whether every tag is closed in turn."""
 
     _VOID = frozenset({"meta", "img", "br", "link", "input", "hr"})
 
     def __init__(self, html: str) -> None:
         super().__init__()
+        self.root: dict[str, Any] = {"tag": "page", "attributes": {}, "children": [], "text": ""}
         self.text = ""
         self.links: list[tuple[str, str]] = []
-        self.tags: set[str] = set()
-        self.rows: list[list[tuple[str, bool]]] = []
-        self._open: list[str] = []
+        self.elements: list[dict[str, Any]] = []
+        self._open = [self.root]
         self.feed(html)
         self.close()
-        assert self._open == []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.add(tag)
-        self.links += [
-            (tag, value or "") for name, value in attrs if name in ("src", "href", "srcset", "data", "action")
-        ]
-        if tag == "tr":
-            self.rows.append([])
-        if tag in ("td", "th"):
-            self.rows[-1].append(("", ("class", "met") in attrs))
-        if tag not in self._VOID:
-            self._open.append(tag)
+        assert self._open == [self.root]
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.add(tag)
-        self.links += [(tag, value or "") for name, value in attrs if name in ("src", "href")]
+        named = {name: value or "" for name, value in attrs}
+        self.links += [(tag, named[name]) for name in ("src", "href", "srcset", "data", "action") if name in named]
+        self.elements.append({"tag": tag, "attributes": named, "children": [], "text": ""})
+        self._open[-1]["children"].append(self.elements[-1])
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_startendtag(tag, attrs)
+        if tag not in self._VOID:
+            self._open.append(self.elements[-1])
 
     def handle_endtag(self, tag: str) -> None:
-        assert self._open.pop() == tag
+        assert self._open.pop()["tag"] == tag
 
     def handle_data(self, data: str) -> None:
-        if {"style", "script"} & set(self._open):
-            return
-        self.text += data
-        if self._open and self._open[-1] in ("td", "th"):
-            text, met = self.rows[-1][-1]
-            self.rows[-1][-1] = (text + data, met)
+        self._open[-1]["text"] += data
+        if not {"style", "script"} & {element["tag"] for element in self._open}:
+            self.text += data
+
+    @property
+    def rows(self) -> list[list[tuple[str, bool]]]:
+        """Of all tables, each cell's text and mark."""
+        return [
+            [(cell["text"], cell["attributes"].get("class") == "met") for cell in row["children"]]
+            for row in self.elements
+            if row["tag"] == "tr"
+        ]
 
     def row(self, name: str, number: int = 0) -> list[tuple[str, bool]]:
         """Text and mark of the cells right of the heading `name`, where it comes for the `number`-th time."""
@@ -183,15 +185,15 @@ def five(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def five_page(five: Path) -> _Page:
-    return _Page((five / "report.html").read_text(encoding="utf-8"))
+def five_page(five: Path) -> Page:
+    return Page((five / "report.html").read_text(encoding="utf-8"))
 
 
-def test_the_page_needs_nothing_but_itself(five: Path, five_page: _Page) -> None:
+def test_the_page_needs_nothing_but_itself(five: Path, five_page: Page) -> None:
     html = (five / "report.html").read_text(encoding="utf-8")
     assert "http" not in html
     assert "@import" not in html
-    assert not five_page.tags & {"link", "iframe", "object", "embed"}
+    assert not {element["tag"] for element in five_page.elements} & {"link", "iframe", "object", "embed"}
     assert "script" not in {tag for tag, _ in five_page.links}, "scripts stand in the page"
     assert [link for tag, link in five_page.links if tag == "img" and not link.startswith("data:image/")] == []
     assert [link for _, link in five_page.links if not link.startswith(("data:", "#"))] == []
@@ -227,7 +229,7 @@ def test_the_page_speaks_of_the_flight_it_shows(tmp_path: Path) -> None:
     log = _flight(drones=3, duration_s=20.0)
     log.position[:, 0, 2] = -6.25
     metadata = log.metadata.model_copy(update={"began": "2026-11-21T09:05:00+00:00", "version": "0.1.0"})
-    text = " ".join(_Page(_report(tmp_path, FlightLog(**{**vars(log), "metadata": metadata}))).text.split())
+    text = " ".join(Page(_report(tmp_path, FlightLog(**{**vars(log), "metadata": metadata}))).text.split())
     assert "begun 2026-11-21 09:05 UTC, flockd 0.1.0" in text
     assert "–6.2 m" in text
     assert "in 3D, drones" in text
@@ -235,7 +237,7 @@ def test_the_page_speaks_of_the_flight_it_shows(tmp_path: Path) -> None:
     assert "The paper’s are of 5 drones, this flight is of 3." in text
 
 
-def test_the_headline_tells_what_happened(five_page: _Page) -> None:
+def test_the_headline_tells_what_happened(five_page: Page) -> None:
     text = five_page.text
     assert "Five drones flew 110 s by sight and stayed one flock" in text
     assert "seed 7" in text
@@ -245,7 +247,7 @@ def test_the_headline_tells_what_happened(five_page: _Page) -> None:
     assert "100.0" in text  # per cent of the neighbours
 
 
-def test_table_2_has_our_errors_and_marks_those_that_meet_the_paper(five_page: _Page) -> None:
+def test_table_2_has_our_errors_and_marks_those_that_meet_the_paper(five_page: Page) -> None:
     # x 0.02 m, y 0.01 m, yaw 0.5 degrees, no pitch and roll; 1 % of the diagonal is the largest error of distance.
     diagonal_m = 2 * RADIUS_M * math.sin(2 * math.pi / 5)
     expected = ["0.0200", "0.0100", "0.5000", "0.0000", "0.0000", f"{0.01 * diagonal_m:.4f}"]
@@ -258,7 +260,7 @@ def test_table_2_has_our_errors_and_marks_those_that_meet_the_paper(five_page: _
     assert [cell for cell, _ in five_page.row("the paper’s maximum", 1)][:2] == ["0.0099", "0.0155"]
 
 
-def test_table_3_and_the_flock(five_page: _Page) -> None:
+def test_table_3_and_the_flock(five_page: Page) -> None:
     # Nothing ever moves within the polygon: converged from the start in shape, from the end of the circle in velocity.
     cells = [cell.lstrip("-") for cell, _ in five_page.row("By sight")]
     assert cells == ["66.0", "0.0000", "0.0000", "0.0", "0.0000", "0.0000"]
@@ -280,7 +282,7 @@ def test_figures_are_also_files(five: Path) -> None:
 
 
 def test_a_flight_with_exact_states_says_what_it_lacks(tmp_path: Path) -> None:
-    page = _Page(_report(tmp_path, _flight(perception="truth")))
+    page = Page(_report(tmp_path, _flight(perception="truth")))
     assert "Five drones flew 110 s with exact states and stayed one flock" in page.text
     assert "there is no estimate to compare with the truth" in page.text
     assert "No camera images were kept of this flight." in page.text
@@ -292,7 +294,7 @@ def test_a_flight_with_exact_states_says_what_it_lacks(tmp_path: Path) -> None:
 
 def test_a_flight_shorter_than_the_circle_has_no_convergence(tmp_path: Path) -> None:
     html = _report(tmp_path, _flight(duration_s=20.0))
-    page = _Page(html)
+    page = Page(html)
     assert "this flight was too short" in " ".join(page.text.split())
     assert "On the circle, t < 66 s" in page.text
     assert "Straight on" not in page.text
@@ -301,7 +303,7 @@ def test_a_flight_shorter_than_the_circle_has_no_convergence(tmp_path: Path) -> 
 
 def test_one_drone_is_no_flock(tmp_path: Path) -> None:
     log = _flight(drones=1, duration_s=10.0)
-    page = _Page(_report(tmp_path, log))
+    page = Page(_report(tmp_path, log))
     assert "One drone flew 10 s by sight" in page.text
     assert "Closest" not in page.text
     assert not {"distance, m", "Σ obj2"} & {axes.get_ylabel() for axes in flight_curves(log).axes}
@@ -310,7 +312,7 @@ def test_one_drone_is_no_flock(tmp_path: Path) -> None:
 
 def test_fifty_drones_fit_on_a_page(tmp_path: Path) -> None:
     html = _report(tmp_path, _flight(drones=50, duration_s=20.0))
-    text = _Page(html).text
+    text = Page(html).text
     assert "50 drones flew 20 s by sight, but came within 0.26 m of each other" in text  # 2 * 2.1 * sin(pi / 50)
     assert "drone 50" in text
     assert "drone 25" not in text

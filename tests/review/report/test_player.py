@@ -7,7 +7,6 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -16,42 +15,10 @@ import pytest
 from markupsafe import Markup
 from py_mini_racer import MiniRacer
 
-from tests.review.report.test_page import _flight, _moment, _report
+from tests.review.report.test_page import Page, _flight, _moment, _report
 
-VOID = frozenset({"meta", "img", "br", "link", "input", "hr"})
 SIDE_M = 2.1 * 3**0.5
 """Side of a triangle whose corners are 2.1 m from its middle."""
-
-
-class _Tree(HTMLParser):
-    """The elements of a page, as the stand-in for a browser wants them, and its script."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.root = self._node("page", [])
-        self._open = [self.root]
-        self.feed(html)
-        self.close()
-
-    @staticmethod
-    def _node(tag: str, attributes: list[tuple[str, str | None]]) -> dict[str, Any]:
-        named = {name: value or "" for name, value in attributes}
-        return {"tag": tag, "attributes": named, "children": [], "text": ""}
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        node = self._node(tag, attrs)
-        self._open[-1]["children"].append(node)
-        if tag not in VOID:
-            self._open.append(node)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self._open[-1]["children"].append(self._node(tag, attrs))
-
-    def handle_endtag(self, tag: str) -> None:
-        self._open.pop()
-
-    def handle_data(self, data: str) -> None:
-        self._open[-1]["text"] += data
 
 
 class _Browser:
@@ -60,7 +27,7 @@ class _Browser:
     def __init__(self, html: str) -> None:
         self._engine = MiniRacer()
         script = html.rpartition("<script>")[2].partition("</script>")[0]
-        self._engine.eval(f"const page = {json.dumps(_Tree(html).root)};")
+        self._engine.eval(f"const page = {json.dumps(Page(html).root)};")
         self._engine.eval((Path(__file__).parent / "browser.js").read_text(encoding="utf-8"))
         self._engine.eval(f"{{{script}}}")
 
