@@ -23,10 +23,6 @@ MIN_CORNERS = 8
 """Fewer say too little of where the board is."""
 _CENTRE_PX = 0.5
 """OpenCV has pixel centres at whole numbers."""
-_MAX_STEPS, _PRECISION_PX = 50, 0.002
-"""Limits of the search for a corner's exact place."""
-_WINDOW, _WINDOWS_PX = 0.13, (2, 12)
-"""Half the side of the window around a corner: in squares, so that no marker is in it, and its limits."""
 
 
 @dataclass(frozen=True)
@@ -100,25 +96,8 @@ class BoardFinder:
         points = np.asarray(points, np.float64).reshape(-1, 3)
         if min(len(np.unique(points[:, 0].round(9))), len(np.unique(points[:, 1].round(9)))) < 2:
             return None
-        pixels = _refined(grey, np.asarray(pixels, np.float64).reshape(-1, 2)) + _CENTRE_PX
+        pixels = np.asarray(pixels, np.float64).reshape(-1, 2) + _CENTRE_PX
         return BoardDetection(np.asarray(ids, np.int64).reshape(-1), pixels, points)
-
-
-def _refined(grey: UInt8Array, corners: FloatArray) -> FloatArray:
-    """Corners (n, 2), each where the edges around it meet.
-
-    The detector has done this, but where it missed a marker nearby with a window in which that marker is too.
-    """
-    apart = np.linalg.norm(corners[:, None] - corners[None], axis=2)
-    np.fill_diagonal(apart, np.inf)
-    window = np.clip(np.round(_WINDOW * apart.min(axis=1)), *_WINDOWS_PX).astype(int)
-    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _MAX_STEPS, _PRECISION_PX)
-    refined = corners.copy()
-    for size in np.unique(window):
-        chosen = window == size
-        start = corners[chosen].astype(np.float32).reshape(-1, 1, 2)
-        refined[chosen] = cv2.cornerSubPix(grey, start, (int(size), int(size)), (-1, -1), stop).reshape(-1, 2)
-    return refined
 
 
 def _opencv_board(spec: BoardSpec) -> cv2.aruco.CharucoBoard:
