@@ -24,12 +24,12 @@ LINES = {
     "flockd/flight": 14_770,
     "flockd/onboard": 11_330,
     "flockd/fleet": 2_630,
-    "flockd/ground": 5_410,
-    "flockd/review": 3_880,
+    "flockd/ground": 4_860,
+    "flockd/review": 3_760,
     "flockd/sim": 12_190,
     "flockd/campaign": 2_270,
-    "flockd/cli": 4_650,
-    "tests": 47_800,
+    "flockd/cli": 4_480,
+    "tests": 47_360,
     "tools/checks": 2_550,
     "tools/docs": 900,
     "tools/measure": 1_220,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_550,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 401}
+FILES = {"flockd": 398}
 NUMBERS_OF_FLIGHT = 528
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
