@@ -77,11 +77,10 @@ def beyond_envelope(config: DroneConfig) -> dict[KeyPath, str]:
 
 def outside_envelope(config: DroneConfig, places: Mapping[KeyPath, Place]) -> list[ConfigProblem]:
     """The same of `config` as it is flown, as problems; `places` has every value that is no default."""
-    return [_problem(key, text, places) for key, text in beyond_envelope(as_flown(config)).items()]
-
-
-def _problem(key: KeyPath, text: str, places: Mapping[KeyPath, Place]) -> ConfigProblem:
-    if key in places:
-        return places[key].problem(text)
     file = next(iter(places.values())).file
-    return ConfigProblem(file, 0, ".".join(map(str, key)), f"is not given, and its default of {text}")
+    return [
+        places[key].problem(text)
+        if key in places
+        else ConfigProblem(file, 0, ".".join(map(str, key)), f"is not given, and its default of {text}")
+        for key, text in beyond_envelope(as_flown(config)).items()
+    ]

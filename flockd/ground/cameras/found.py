@@ -74,14 +74,16 @@ class FoundCamera:
         if not self.modes:
             return None
         best = min(self.modes, key=cost)
-        return replace(best, rates_hz=(_usual_rate(best.rates_hz),))
+        usual = [rate for rate in best.rates_hz if rate <= USUAL_RATE_HZ + 0.5]
+        return replace(best, rates_hz=(max(usual, default=min(best.rates_hz, default=USUAL_RATE_HZ)),))
 
     def parameters(self, name: str, mode: Mode, *, as_pipeline: bool = False) -> CameraDeviceParameters:
         """How flockd runs it in a mode, under a name of the rig; ``as_pipeline``: through GStreamer in any case."""
         rate_hz = mode.rates_hz[0]
         if self.element or as_pipeline:
             kind = _CAPS.get(mode.pixel_format, f"video/x-raw,format={mode.pixel_format}")
-            limits = f"width={mode.size[0]},height={mode.size[1]},framerate={_fraction(rate_hz)}"
+            fraction = f"{rate_hz:.0f}/1" if rate_hz == round(rate_hz) else f"{round(rate_hz * 1000)}/1000"
+            limits = f"width={mode.size[0]},height={mode.size[1]},framerate={fraction}"
             element = self.element or f"v4l2src device={self.device}"
             if element.startswith("nvarguscamerasrc"):
                 pipeline = f"{element} ! video/x-raw(memory:NVMM),{limits} ! nvvidconv ! video/x-raw,format=NV12"
@@ -93,16 +95,6 @@ class FoundCamera:
 
 
 _CAPS = {"mjpeg": "image/jpeg", "yuyv": "video/x-raw,format=YUY2"}
-
-
-def _usual_rate(rates_hz: Sequence[float]) -> float:
-    """The highest that is not above the usual one; else the lowest there is, and the usual one of an unknown camera."""
-    usual = [rate for rate in rates_hz if rate <= USUAL_RATE_HZ + 0.5]
-    return max(usual) if usual else min(rates_hz, default=USUAL_RATE_HZ)
-
-
-def _fraction(rate_hz: float) -> str:
-    return f"{rate_hz:.0f}/1" if rate_hz == round(rate_hz) else f"{round(rate_hz * 1000)}/1000"
 
 
 FIELD_OF_VIEW_DEG = 130.0

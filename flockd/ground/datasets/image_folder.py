@@ -202,17 +202,17 @@ def _poses_in_order(file: Path, images: Sequence[Path]) -> _Poses:
         raise DatasetError(
             f"{file}: has {len(rows)} poses, and {images[0].parent} {len(images)} images; give each image its line"
         )
-    return [_pose_of_matrix(row.reshape(4, 4), f"{file}: pose {number}") for number, row in enumerate(rows, start=1)]
-
-
-def _pose_of_matrix(matrix: FloatArray, where: str) -> RigidTransform:
-    u, _, vt = np.linalg.svd(matrix[:3, :3])
-    rotation = u @ vt  # the nearest: the numbers were rounded when they were written
-    if np.abs(rotation - matrix[:3, :3]).max() > _ROUNDING or np.linalg.det(rotation) < 0:
-        raise DatasetError(f"{where}: its first three columns are no rotation; write a camera-to-world matrix")
-    if not np.allclose(matrix[3], (0, 0, 0, 1), atol=_ROUNDING):
-        raise DatasetError(f"{where}: its last row is not 0 0 0 1; write a camera-to-world matrix")
-    return RigidTransform(rotation, matrix[:3, 3])
+    poses = []
+    for number, row in enumerate(rows, start=1):
+        matrix, where = row.reshape(4, 4), f"{file}: pose {number}"
+        u, _, vt = np.linalg.svd(matrix[:3, :3])
+        rotation = u @ vt  # the nearest: the numbers were rounded when they were written
+        if np.abs(rotation - matrix[:3, :3]).max() > _ROUNDING or np.linalg.det(rotation) < 0:
+            raise DatasetError(f"{where}: its first three columns are no rotation; write a camera-to-world matrix")
+        if not np.allclose(matrix[3], (0, 0, 0, 1), atol=_ROUNDING):
+            raise DatasetError(f"{where}: its last row is not 0 0 0 1; write a camera-to-world matrix")
+        poses.append(RigidTransform(rotation, matrix[:3, 3]))
+    return poses
 
 
 def read_calibration(file: Path, size: tuple[int, int]) -> CameraConfig:

@@ -32,7 +32,9 @@ class Copies:
             raise UsageError(f"{folder}: is no folder; name one with --out")
         taken: dict[Path, Path] = {}
         for picture in pictures:
-            target = folder / _named(picture)
+            as_it_is = not picture.is_video and picture.path.suffix.lower() in _JPEG
+            suffix = picture.path.suffix if as_it_is else ".mp4" if picture.is_video else ".png"
+            target = folder / picture.relative.with_suffix(suffix)
             if target.resolve() in sources:
                 raise UsageError(f"{target}: is one of the pictures themselves; name another folder with --out")
             if target in taken:
@@ -84,12 +86,6 @@ class _VideoCopy:
             self._draft.replace(self.target)
         else:
             self._draft.unlink(missing_ok=True)
-
-
-def _named(picture: PictureFile) -> Path:
-    if picture.is_video:
-        return picture.relative.with_suffix(".mp4")
-    return picture.relative if picture.path.suffix.lower() in _JPEG else picture.relative.with_suffix(".png")
 
 
 _COLOURS = ((255, 109, 0), (0, 176, 255), (213, 0, 249), (0, 200, 83), (255, 214, 0), (255, 23, 68))

@@ -115,7 +115,8 @@ def _read(recordings: Sequence[Recording], progress: Progress) -> tuple[list[str
             if step.truth is None and recording.has_truth:
                 continue  # killed within this step
             merged = steps.setdefault(step.number, _Step(step.frames.time_s, step.truth, []))
-            _check_same(recordings, merged.truth, step.truth)
+            if json.dumps(to_json(merged.truth)) != json.dumps(to_json(step.truth)):  # to the last bit
+                raise _not_of_one_flight(recordings)
             if step.output is not None:
                 output: PilotOutput = from_json(PilotOutput, step.output)
                 merged.outputs.append((names.index(recording.drone), output))
@@ -137,12 +138,6 @@ def _names(recordings: Sequence[Recording], truth: Truth | None) -> list[str]:
     if len({recording.drone for recording in recordings}) < len(recordings):
         raise RecordingError(f"{first.path.parent}: holds several recordings of one drone; name one recording")
     return names
-
-
-def _check_same(recordings: Sequence[Recording], one: Truth | None, other: Truth | None) -> None:
-    """Two drones of one flight were recorded beside the same truth, to the last bit."""
-    if json.dumps(to_json(one)) != json.dumps(to_json(other)):
-        raise _not_of_one_flight(recordings)
 
 
 def _not_of_one_flight(recordings: Sequence[Recording]) -> RecordingError:

@@ -6,7 +6,6 @@ import math
 import os
 import platform
 import resource
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
@@ -111,7 +110,14 @@ def profile_result(replay: Replay, config: DroneConfig, watch: Watch) -> dict[st
         raise ValueError(f"{len(replay.steps_ms)} steps are too few to say where time goes")
     steps_ms, processor_ms = replay.steps_ms[1:], replay.processor_ms[1:]
     samples = {stage: ms[-len(steps_ms) :] for stage, ms in replay.stages_ms.items()}
-    stages = {stage: _row(ms, sum(steps_ms)) for stage, ms in {**samples, STEP: steps_ms}.items()}
+    stages = {
+        stage: {
+            "p50_ms": float(np.median(ms)),
+            "p95_ms": float(np.percentile(ms, 95)),
+            "share": sum(ms) / sum(steps_ms),
+        }
+        for stage, ms in {**samples, STEP: steps_ms}.items()
+    }
     needed_s = stages[STEP]["p95_ms"] / 1e3 / (FULL * config.safety.degraded_load)
     versions = {"flockd": __version__}
     for library in _LIBRARIES:
@@ -133,11 +139,6 @@ def profile_result(replay: Replay, config: DroneConfig, watch: Watch) -> dict[st
         "least_step_s": round(math.ceil(needed_s / _ROUND_TO_S - 1e-9) * _ROUND_TO_S, 2),
         "stages": stages,
     }
-
-
-def _row(samples_ms: Sequence[float], whole_ms: float) -> dict[str, float]:
-    p50, p95 = np.percentile(samples_ms, (50, 95))
-    return {"p50_ms": float(p50), "p95_ms": float(p95), "share": sum(samples_ms) / whole_ms}
 
 
 def _facts(file: Path) -> dict[str, str]:

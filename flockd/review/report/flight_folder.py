@@ -94,7 +94,8 @@ def _check_no_other_files(directory: Path) -> None:
     if not directory.is_dir():
         return
     recordings = directory / RECORDINGS
-    kept = [path for path in recordings.iterdir() if not _is_recording(path)] if recordings.is_dir() else []
+    found = recordings.iterdir() if recordings.is_dir() else ()
+    kept = [path for path in found if re.fullmatch(r"drone\d+([.-].*)?\.mcap", path.name) is None]
     if {path.name for path in directory.iterdir()} - set(OF_A_FLIGHT) or kept:
         raise UsageError(f"{directory}: holds other files than a flight's; name a new or empty folder with --out")
 
@@ -119,10 +120,6 @@ def write_report_files(
     (directory / SUMMARY_NAME).write_text(text, encoding="utf-8")
     write_report(directory, log, summary, load_plates(directory / KEY_FRAMES_NAME), progress)
     return summary
-
-
-def _is_recording(path: Path) -> bool:
-    return re.fullmatch(r"drone\d+([.-].*)?\.mcap", path.name) is not None
 
 
 def _was_interrupted(directory: Path) -> bool:
