@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from flockd.onboard.recording.reader import Recording
     from flockd.review.flight_log.key_frames import KeyFrame
     from flockd.review.flight_log.log import FlightLog
-    from flockd.review.report.flight_video import Moment
+    from flockd.review.report.flight_video import VideoStep
 
 SUFFIX = ".report"
 """Ending of the folder beside a recording that its report goes to."""
@@ -128,15 +128,17 @@ def _video(args: argparse.Namespace) -> int:
     return say_result(args, facts, f"{args.video}: {count} frames, {seconds:g} s")
 
 
-def _moments(args: argparse.Namespace, log: FlightLog, recordings: Sequence[Recording]) -> tuple[int, Iterator[Moment]]:
+def _moments(
+    args: argparse.Namespace, log: FlightLog, recordings: Sequence[Recording]
+) -> tuple[int, Iterator[VideoStep]]:
     """Number of the drone that --drone names, and what its cameras saw."""
-    from flockd.review.report.flight_video import Moment, recorded_moments
+    from flockd.review.report.flight_video import VideoStep, recorded_moments
 
     if not recordings:
         if args.drone is not None:
             raise UsageError(f"--drone {args.drone}: {args.flight} has no recordings; drop it, or fly with --record")
         complain(f"{args.flight}: has no recordings, so the video shows the map alone; fly with --record")
-        return 0, (Moment(time_s, {}, {}) for time_s in log.time_s.tolist())
+        return 0, (VideoStep(time_s, {}, {}) for time_s in log.time_s.tolist())
     names = log.metadata.names or [recording.drone for recording in recordings]
     wanted = args.drone or recordings[0].drone
     recording = next((one for one in recordings if one.drone == wanted), None)

@@ -35,7 +35,7 @@ from flockd.core.choices import SimulatedPerception
 from flockd.core.config.loader import Overrides
 from flockd.core.data import data_path
 from flockd.flight.inference.hashes import model_hashes
-from flockd.review.replay.profile import Kernel
+from flockd.review.replay.profile import ComputerFiles
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import load_scenario
 
@@ -219,7 +219,7 @@ def _rounded(value: float) -> float:
 
 def document(commit: str, date: str, lines: Sequence[Line], *, quick: bool) -> dict[str, Any]:
     """What docs/figures.json holds."""
-    computer = Kernel().computer()
+    computer = ComputerFiles().computer()
     files = {name: one.file for name, one in SCENARIOS.items()}
     networks: dict[str, str] = {}
     for file in sorted(set(files.values())):

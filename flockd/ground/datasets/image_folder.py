@@ -44,7 +44,7 @@ _Poses = Sequence[RigidTransform | None]
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class DatasetFrame:
     """When and where an image was taken, and the files of it."""
 
     index: int
@@ -64,7 +64,7 @@ class Dataset:
     path: Path
     camera: CameraConfig
     """The one that took it; pixel centres at +0.5."""
-    moments: tuple[Moment, ...]
+    moments: tuple[DatasetFrame, ...]
     depth_units_per_m: float
     notes: tuple[str, ...]
     """What a person should know although nothing is wrong: each is one sentence."""
@@ -77,7 +77,7 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.moments)
 
-    def frames(self, *, with_depth: bool) -> Iterator[tuple[Moment, UInt8Array, ZMap | None]]:
+    def frames(self, *, with_depth: bool) -> Iterator[tuple[DatasetFrame, UInt8Array, ZMap | None]]:
         """All in order, read one by one: (h, w, 3) RGB, and (h, w) metres along the optical axis, NaN where there are
         none; None where they were not asked for. Raises DatasetError at a file that is missing or damaged."""
         size = self.camera.size_px
@@ -106,7 +106,7 @@ def open_dataset(path: Path, calibration: Path | None = None) -> Dataset:
         poses = _poses_in_order(path / "poses.txt", images)
     kept = [index for index in range(len(images)) if not depth or index in depth]
     moments = tuple(
-        Moment(number, images[k].name, float(times_s[k]), images[k], depth.get(k), poses[k])
+        DatasetFrame(number, images[k].name, float(times_s[k]), images[k], depth.get(k), poses[k])
         for number, k in enumerate(kept)
     )
     for file in (file for one in moments for file in (one.image, one.depth) if file is not None):

@@ -48,7 +48,7 @@ PARAMETERS: dict[str, type[int] | type[float]] = {
 """Those of PX4 that are judged, each as PX4 declares it."""
 
 
-class Action(NamedTuple):
+class ParameterChoice(NamedTuple):
     """A parameter that says what PX4 does in some case."""
 
     when: str
@@ -61,7 +61,7 @@ class Action(NamedTuple):
 
 
 ACTIONS = {
-    "COM_OBL_RC_ACT": Action(
+    "COM_OBL_RC_ACT": ParameterChoice(
         "when setpoints stop",
         {
             -1: "disabled: it flies on with the last velocity",
@@ -77,12 +77,12 @@ ACTIONS = {
         (5, 4, 3),
         (0,),
     ),
-    "COM_LOW_BAT_ACT": Action(
+    "COM_LOW_BAT_ACT": ParameterChoice(
         "when the battery is low",
         {0: "only warns", 1: "Return", 2: "Land", 3: "Return, and Land when nearly empty"},
         (3, 2, 1),
     ),
-    "GF_ACTION": Action(
+    "GF_ACTION": ParameterChoice(
         "at PX4's fence",
         {
             0: "None: PX4 has no fence",
@@ -262,7 +262,7 @@ def _judge_loss_time(name: str, value: float, config: DroneConfig) -> Finding:
     return graded(name, f"{value:g} s{told}", fix, failure=too_short, warning=too_long)
 
 
-def _judge_action(name: str, action: Action, value: int, config: DroneConfig) -> Finding:
+def _judge_action(name: str, action: ParameterChoice, value: int, config: DroneConfig) -> Finding:
     measured, good = f"{value} ({action.words.get(value, 'not known')}) {action.when}", value in action.good
     if name == "COM_LOW_BAT_ACT" and not good:
         low = config.safety.on_battery_low

@@ -33,7 +33,7 @@ from flockd.flight.geometry import (
 )
 from flockd.flight.perception import Crop, ImageNetworks, OneByOne, RangeEstimate, SceneMaps, load_networks
 from flockd.flight.pilot import FlockPilot
-from flockd.ground.datasets.image_folder import Dataset, Moment
+from flockd.ground.datasets.image_folder import Dataset, DatasetFrame
 from flockd.onboard.recording.editing import written_whole
 
 Depth = Literal["recorded", "network"]
@@ -126,8 +126,8 @@ _FLAT_DEVIATION = 1.0
 class Pair:
     """Two frames, and the camera's motion between them."""
 
-    before: Moment
-    after: Moment
+    before: DatasetFrame
+    after: DatasetFrame
     found: RigidTransform | None
     """``T_before_after`` of the camera, as the pilot found it; None if it did not."""
     inlier_ratio: float | None
@@ -189,7 +189,7 @@ def fly_pairs(
     mount = camera.T_body_camera
     perceiver = RecordedDepth(learned)
     pilots = [FlockPilot(config, perceiver) for _ in range(stride)]
-    past: deque[tuple[Moment, PilotOutput]] = deque(maxlen=stride)
+    past: deque[tuple[DatasetFrame, PilotOutput]] = deque(maxlen=stride)
     for moment, image, depth in dataset.frames(with_depth=recorded_depth):
         perceiver.show(depth)
         frames = {camera.name: Frame(camera.name, image, moment.time_s, moment.index)}
@@ -210,7 +210,7 @@ def fly_pairs(
         past.append((moment, output))
 
 
-def _blind(moment: Moment, output: PilotOutput) -> list[str]:
+def _blind(moment: DatasetFrame, output: PilotOutput) -> list[str]:
     return [f"frame {moment.index}: {reason}" for reason in output.reasons if reason.kind is ReasonKind.CAMERA]
 
 

@@ -37,7 +37,7 @@ _VECTOR = {"avx512f": "AVX-512", "avx2": "AVX2", "sve2": "SVE2", "sve": "SVE", "
 
 
 @dataclass(frozen=True)
-class Kernel:
+class ComputerFiles:
     """Files in which the kernel says what the computer is, and how it does."""
 
     cpuinfo: Path = Path("/proc/cpuinfo")
@@ -69,8 +69,8 @@ class Kernel:
 class Watch:
     """Notes how the computer does while a replay goes on."""
 
-    def __init__(self, kernel: Kernel | None = None) -> None:
-        self.kernel = kernel or Kernel()
+    def __init__(self, kernel: ComputerFiles | None = None) -> None:
+        self.kernel = kernel or ComputerFiles()
         self._load = os.getloadavg()[0]
         self._zone = ""
         self._temperatures_c: list[float] = []

@@ -37,7 +37,7 @@ class Outline:
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class VideoStep:
     """One step of one drone."""
 
     time_s: float
@@ -48,7 +48,7 @@ class Moment:
     """By camera."""
 
 
-def recorded_moments(recording: Recording) -> Iterator[Moment]:
+def recorded_moments(recording: Recording) -> Iterator[VideoStep]:
     """Each step of a recording, with the detections that were recorded. Raises RecordingError where it is damaged."""
     rig, zero_s = build_rig(recording.config.rig), recording.pilot_began_s
     for step in recording.steps():
@@ -57,7 +57,7 @@ def recorded_moments(recording: Recording) -> Iterator[Moment]:
         time_s = step.frames.time_s - zero_s
         images = {name: frame.image for name, frame in step.frames.frames.items()}
         outlines = {} if output is None else _outlines(rig, output)
-        yield Moment(time_s, images, outlines)
+        yield VideoStep(time_s, images, outlines)
 
 
 def _outlines(rig: Rig, output: PilotOutput) -> dict[str, list[Outline]]:
@@ -112,7 +112,7 @@ def write_video(
     path: Path,
     log: FlightLog,
     drone: int,
-    moments: Iterable[Moment],
+    moments: Iterable[VideoStep],
     progress: Progress = lambda done, total: None,
     *,
     scale: float = 1.0,
@@ -182,7 +182,7 @@ class _Plate:
         self._colours = [colour_of(number, log.position.shape[1]) for number in range(log.position.shape[1])]
         self._middle, self._reach_m = self._extent()
 
-    def draw(self, moment: Moment) -> UInt8Array:
+    def draw(self, moment: VideoStep) -> UInt8Array:
         """(h, w, 3) RGB; both sides are even."""
         row = int(np.clip(np.searchsorted(self._log.time_s, moment.time_s - 1e-6), 0, len(self._log.time_s) - 1))
         seen = _tiles(moment)
@@ -252,7 +252,7 @@ class _Plate:
         return np.stack([_MAP_PX / 2 + off[:, 1], _MAP_PX / 2 - off[:, 0]], axis=1)
 
 
-def _tiles(moment: Moment) -> UInt8Array:
+def _tiles(moment: VideoStep) -> UInt8Array:
     """All images, in reading order of a turn to the right, with gaps; as high together as the map."""
     cameras = sorted(moment.images, key=rig_place)
     if not cameras:

@@ -20,7 +20,7 @@ from flockd.ground.doctor.computer_checks import (
     judge_room,
     wall_clock_error_us,
 )
-from flockd.review.replay.profile import Kernel, Watch
+from flockd.review.replay.profile import ComputerFiles, Watch
 
 QUADROTOR = load_drone(data_path("config") / "quadrotor.yaml")
 SUMMER = datetime(2026, 7, 1, 12, tzinfo=UTC)
@@ -184,12 +184,12 @@ def test_a_computer_says_which_instructions_it_has(
 ) -> None:
     (tmp_path / "cpuinfo").write_text(cpuinfo, encoding="utf-8")
     (tmp_path / "meminfo").write_text("MemTotal:  8000000 kB\n", encoding="ascii")
-    computer = Kernel(tmp_path / "cpuinfo", tmp_path / "none", tmp_path / "meminfo").computer()
+    computer = ComputerFiles(tmp_path / "cpuinfo", tmp_path / "none", tmp_path / "meminfo").computer()
     assert (computer["name"], computer["eight_bit"], computer["vector"]) == (name, list(eight_bit), list(vector))
     assert computer["memory_mb"] == pytest.approx(8192.0)
     assert computer["cores"] >= 1
     (tmp_path / "model").write_bytes(b"NVIDIA Jetson Orin Nano Developer Kit\0")
-    board = Kernel(tmp_path / "cpuinfo", tmp_path / "model", tmp_path / "none").computer()
+    board = ComputerFiles(tmp_path / "cpuinfo", tmp_path / "model", tmp_path / "none").computer()
     assert (board["name"], board["memory_mb"]) == ("NVIDIA Jetson Orin Nano Developer Kit", None)
 
 
@@ -205,7 +205,7 @@ def test_how_a_computer_does_now(tmp_path: Path) -> None:
     for core, khz in (("cpu0", "1500000"), ("cpu1", "2400000")):
         (clocks / core / "cpufreq").mkdir(parents=True)
         (clocks / core / "cpufreq" / "scaling_cur_freq").write_text(f"{khz}\n", encoding="ascii")
-    told = Watch(Kernel(thermal=thermal, clocks=clocks)).summary()
+    told = Watch(ComputerFiles(thermal=thermal, clocks=clocks)).summary()
     del told["load_before"]
     assert told == {
         "temperature_c": [61.5] * 3,
@@ -213,5 +213,5 @@ def test_how_a_computer_does_now(tmp_path: Path) -> None:
         "slowed_by": ["cpufreq-cpu0"],
         "clock_mhz": [2400.0] * 2,
     }
-    told = Watch(Kernel(thermal=tmp_path / "none", clocks=tmp_path / "none")).summary()
+    told = Watch(ComputerFiles(thermal=tmp_path / "none", clocks=tmp_path / "none")).summary()
     assert (told["temperature_c"], told["zone"], told["slowed_by"], told["clock_mhz"]) == (None, None, [], None)

@@ -14,7 +14,7 @@ from flockd.cli import main
 from flockd.core.messages import FloatArray, UInt8Array
 from flockd.onboard.recording.reader import Recording
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.report.flight_video import Moment, Outline, recorded_moments, write_video
+from flockd.review.report.flight_video import Outline, VideoStep, recorded_moments, write_video
 from flockd.review.report.style import DRONE_COLOURS
 from tests.review.report.test_page import _flight
 
@@ -43,12 +43,12 @@ def _near(image: UInt8Array, colour: str, within: float = 60.0) -> FloatArray:
     return np.stack([columns, rows], axis=1).astype(float)
 
 
-def _moments(log: FlightLog) -> Iterator[Moment]:
+def _moments(log: FlightLog) -> Iterator[VideoStep]:
     """One camera with a ring of track 0 in the middle of its image."""
     angles = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
     ring = np.stack([32 + 10 * np.cos(angles), 24 + 10 * np.sin(angles)], axis=1)
     for time_s in log.time_s.tolist():
-        yield Moment(time_s, {"front": GREY}, {"front": [Outline(ring, 0, 4.2)]})
+        yield VideoStep(time_s, {"front": GREY}, {"front": [Outline(ring, 0, 4.2)]})
 
 
 def test_each_step_is_a_frame_with_the_ring_in_the_image_and_the_drones_on_the_map(
@@ -90,7 +90,7 @@ def test_images_of_several_cameras_do_not_touch(tmp_path: Path) -> None:
     log = _flight(drones=2, duration_s=0.5)
     names = ("front", "right", "back", "left")
     white = np.full((48, 64, 3), 250, np.uint8)
-    moment = Moment(0.0, dict.fromkeys(names, white), {})
+    moment = VideoStep(0.0, dict.fromkeys(names, white), {})
     path = tmp_path / "flight.webm"
     write_video(path, log, 0, [moment], scale=SCALE)
     (image,), _ = _frames(path)
