@@ -120,7 +120,7 @@ def _video(args: argparse.Namespace) -> int:
     check_video_path(args.video, force=args.force)
     paths = recordings_in(args.flight / RECORDINGS) if _is_flight(args.flight) else _recordings(args.flight)
     log = _log_of(args.flight)
-    drone, moments = _moments(args, log, [opened(path) for path in paths])
+    drone, moments = _steps_shown(args, log, [opened(path) for path in paths])
     with progress("writing the video", "steps") as tell_progress:
         count = write_video(args.video, log, drone, moments, tell_progress)
     seconds = count * log.metadata.step_s
@@ -128,11 +128,11 @@ def _video(args: argparse.Namespace) -> int:
     return say_result(args, facts, f"{args.video}: {count} frames, {seconds:g} s")
 
 
-def _moments(
+def _steps_shown(
     args: argparse.Namespace, log: FlightLog, recordings: Sequence[Recording]
 ) -> tuple[int, Iterator[VideoStep]]:
     """Number of the drone that --drone names, and what its cameras saw."""
-    from flockd.review.report.flight_video import VideoStep, recorded_moments
+    from flockd.review.report.flight_video import VideoStep, recorded_steps
 
     if not recordings:
         if args.drone is not None:
@@ -144,7 +144,7 @@ def _moments(
     recording = next((one for one in recordings if one.drone == wanted), None)
     if recording is None or wanted not in names:
         raise UsageError(f"--drone {wanted}: has no recording; name one of {', '.join(r.drone for r in recordings)}")
-    return names.index(wanted), recorded_moments(recording)
+    return names.index(wanted), recorded_steps(recording)
 
 
 def _is_flight(folder: Path) -> bool:

@@ -48,7 +48,7 @@ class VideoStep:
     """By camera."""
 
 
-def recorded_moments(recording: Recording) -> Iterator[VideoStep]:
+def recorded_steps(recording: Recording) -> Iterator[VideoStep]:
     """Each step of a recording, with the detections that were recorded. Raises RecordingError where it is damaged."""
     rig, zero_s = build_rig(recording.config.rig), recording.pilot_began_s
     for step in recording.steps():

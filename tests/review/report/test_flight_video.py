@@ -14,7 +14,7 @@ from flockd.cli import main
 from flockd.core.messages import FloatArray, UInt8Array
 from flockd.onboard.recording.reader import Recording
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.report.flight_video import Outline, VideoStep, recorded_moments, write_video
+from flockd.review.report.flight_video import Outline, VideoStep, recorded_steps, write_video
 from flockd.review.report.style import DRONE_COLOURS
 from tests.review.report.test_page import _flight
 
@@ -43,7 +43,7 @@ def _near(image: UInt8Array, colour: str, within: float = 60.0) -> FloatArray:
     return np.stack([columns, rows], axis=1).astype(float)
 
 
-def _moments(log: FlightLog) -> Iterator[VideoStep]:
+def _steps_shown(log: FlightLog) -> Iterator[VideoStep]:
     """One camera with a ring of track 0 in the middle of its image."""
     angles = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
     ring = np.stack([32 + 10 * np.cos(angles), 24 + 10 * np.sin(angles)], axis=1)
@@ -57,7 +57,9 @@ def test_each_step_is_a_frame_with_the_ring_in_the_image_and_the_drones_on_the_m
     log = _flight(drones=2, duration_s=1.0)
     path = tmp_path / "flight.webm"
     told: list[tuple[int, int]] = []
-    assert write_video(path, log, 0, _moments(log), lambda *counts: told.append(counts), scale=SCALE) == len(log.time_s)
+    assert write_video(path, log, 0, _steps_shown(log), lambda *counts: told.append(counts), scale=SCALE) == len(
+        log.time_s
+    )
     images, rate_hz = _frames(path)
     assert len(images) == len(log.time_s)
     assert rate_hz == pytest.approx(1.0 / log.metadata.step_s, rel=0.01)
@@ -102,7 +104,7 @@ def test_images_of_several_cameras_do_not_touch(tmp_path: Path) -> None:
 def test_recorded_moments_have_the_recorded_detections() -> None:
     """In the recording a neighbour is 2 to 4 m before the drone, in the front camera."""
     recording = Recording(NORMAL)
-    moments = list(recorded_moments(recording))
+    moments = list(recorded_steps(recording))
     assert len(moments) == len(recording.contents.steps)
     assert moments[0].time_s == pytest.approx(0.0, abs=0.5)
     seen = [outline for moment in moments for outline in moment.outlines.get("front", ())]
