@@ -120,9 +120,9 @@ def _video(args: argparse.Namespace) -> int:
     check_video_path(args.video, force=args.force)
     paths = recordings_in(args.flight / RECORDINGS) if _is_flight(args.flight) else _recordings(args.flight)
     log = _log_of(args.flight)
-    drone, moments = _steps_shown(args, log, [opened(path) for path in paths])
+    drone, steps = _steps_shown(args, log, [opened(path) for path in paths])
     with progress("writing the video", "steps") as tell_progress:
-        count = write_video(args.video, log, drone, moments, tell_progress)
+        count = write_video(args.video, log, drone, steps, tell_progress)
     seconds = count * log.metadata.step_s
     facts = {"video": str(args.video), "frames": count, "seconds": seconds}
     return say_result(args, facts, f"{args.video}: {count} frames, {seconds:g} s")

@@ -112,21 +112,21 @@ def write_video(
     path: Path,
     log: FlightLog,
     drone: int,
-    moments: Iterable[VideoStep],
+    steps: Iterable[VideoStep],
     progress: Progress = lambda done, total: None,
     *,
     scale: float = 1.0,
 ) -> int:
     """Writes the video, a frame a step in real time, and gives the number of frames.
 
-    ``drone`` (from 0) is whose ``moments`` these are; ``scale`` makes the frames smaller. The file appears when it is
+    ``drone`` (from 0) is whose ``steps`` these are; ``scale`` makes the frames smaller. The file appears when it is
     whole. Raises UnavailableError where OpenCV has no encoder.
     """
     draft = path.with_name(f".{path.stem}.part{path.suffix}")
     plate, count, video = _Plate(log, drone), 0, None
     try:
-        for moment in moments:
-            frame = _scaled(plate.draw(moment), scale)
+        for step in steps:
+            frame = _scaled(plate.draw(step), scale)
             video = video or _opened(draft, 1.0 / log.metadata.step_s, (frame.shape[1], frame.shape[0]))
             video.write(np.ascontiguousarray(frame[..., ::-1]))
             count += 1

@@ -43,7 +43,7 @@ def _near(image: UInt8Array, colour: str, within: float = 60.0) -> FloatArray:
     return np.stack([columns, rows], axis=1).astype(float)
 
 
-def _steps_shown(log: FlightLog) -> Iterator[VideoStep]:
+def _shown(log: FlightLog) -> Iterator[VideoStep]:
     """One camera with a ring of track 0 in the middle of its image."""
     angles = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
     ring = np.stack([32 + 10 * np.cos(angles), 24 + 10 * np.sin(angles)], axis=1)
@@ -57,9 +57,7 @@ def test_each_step_is_a_frame_with_the_ring_in_the_image_and_the_drones_on_the_m
     log = _flight(drones=2, duration_s=1.0)
     path = tmp_path / "flight.webm"
     told: list[tuple[int, int]] = []
-    assert write_video(path, log, 0, _steps_shown(log), lambda *counts: told.append(counts), scale=SCALE) == len(
-        log.time_s
-    )
+    assert write_video(path, log, 0, _shown(log), lambda *counts: told.append(counts), scale=SCALE) == len(log.time_s)
     images, rate_hz = _frames(path)
     assert len(images) == len(log.time_s)
     assert rate_hz == pytest.approx(1.0 / log.metadata.step_s, rel=0.01)
