@@ -11,8 +11,8 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from flockd.campaign.campaign_file import Figure as FigureName
 from flockd.campaign.figures import MEASURES, mean_interval
+from flockd.campaign.figures import Figure as FigureName
 from flockd.campaign.flight_plan import CASE
 from flockd.campaign.results import Results
 from flockd.campaign.verdicts import Comparison

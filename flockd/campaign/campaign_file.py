@@ -8,52 +8,13 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from flockd.campaign.figures import Figure
 from flockd.core.config.base import Name, NonNegative, Positive, Section, refuse
 from flockd.core.config.document import KeyPath, Place, read_document
 from flockd.core.config.loader import require, validated
 
 FlightKindName = Literal["truth", "sight", "control"]
 """How the flights of a campaign are flown."""
-
-Figure = Literal[
-    "min_distance_m",
-    "min_distance_after_10s_m",
-    "order_tail",
-    "union_tail",
-    "connectivity_tail",
-    "safety",
-    "velocity_deviation_tail",
-    "shape_deviation_tail",
-    "arrived",
-    "arrival_time_s",
-    "final_error_m",
-    "collisions",
-    "min_clearance_m",
-    "time_within_1m_s",
-    "recall_within_10m",
-    "false_per_drone_minute",
-    "distance_error_median_m",
-    "distance_error_p95_m",
-    "false_share",
-    "associated_error_median_m",
-    "associated_error_p95_m",
-    "associated_error_max_m",
-    "convergence_time_s",
-    "own_motion_ratio",
-    "drones_held",
-    "first_hold_s",
-    "min_distance_flown_m",
-    "collisions_flown",
-    "slowed_share",
-    "slowed_by_false_share",
-    "min_distance_tail_m",
-    "min_level_distance_m",
-    "drone_collisions",
-    "first_collision_s",
-    "mean_nearest_tail_m",
-    "rms_radius_tail_m",
-]
-"""What a campaign can measure; `flockd.campaign.figures` says what each is."""
 
 DRONES = "drones"
 """Instead of a key: the size of the flock."""

@@ -7,9 +7,9 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
-from flockd.campaign.campaign_file import Figure, StopRule
+from flockd.campaign.campaign_file import StopRule
 from flockd.campaign.engine import Engine
-from flockd.campaign.figures import MEASURES, mean_interval
+from flockd.campaign.figures import MEASURES, Figure, mean_interval
 from flockd.campaign.flight_kinds import FLIGHT_KINDS, FlownRun, Task
 from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.folder import CampaignFolder

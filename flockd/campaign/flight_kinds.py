@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import lru_cache
 
-from flockd.campaign.campaign_file import Figure, FlightKindName
-from flockd.campaign.figures import Figures, figures_of
+from flockd.campaign.campaign_file import FlightKindName
+from flockd.campaign.figures import Figure, Figures, figures_of
 from flockd.campaign.flight_plan import ControlLevel, Recipe, Run
 from flockd.core.choices import SimulatedPerception
 from flockd.core.config.perception import PerceptionConfig

@@ -11,13 +11,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self, get_args
+from typing import Any, Self
 
 import numpy as np
 from pydantic import ValidationError
 
 from flockd import __version__
-from flockd.campaign.campaign_file import DRONES, MAX_CONTROL_DRONES, CampaignConfig, Figure, Variation, load_campaign
+from flockd.campaign.campaign_file import DRONES, MAX_CONTROL_DRONES, CampaignConfig, Variation, load_campaign
+from flockd.campaign.figures import MEASURES, Figure
 from flockd.core.choices import ROLES
 from flockd.core.config.document import KeyPath, Place, key_text
 from flockd.core.config.loader import PATHS
@@ -192,7 +193,7 @@ class Plan:
     @property
     def wanted(self) -> tuple[Figure, ...]:
         """What is measured."""
-        return self.config.measure or get_args(Figure)
+        return self.config.measure or tuple(MEASURES)
 
     @property
     def control(self) -> ControlLevel:

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from flockd.campaign.campaign_file import Figure
-from flockd.campaign.figures import MEASURES, Interval, mean_interval
+from flockd.campaign.figures import MEASURES, Figure, Interval, mean_interval
 from flockd.campaign.flight_plan import Plan
 from flockd.campaign.folder import flight_rows, flown_in, load_plan
 from flockd.core.errors import UsageError

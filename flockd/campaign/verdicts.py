@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from flockd.campaign.campaign_file import DRONES, Figure
-from flockd.campaign.figures import MEASURES, Interval, mean_interval
+from flockd.campaign.campaign_file import DRONES
+from flockd.campaign.figures import MEASURES, Figure, Interval, mean_interval
 from flockd.campaign.flight_plan import merged
 from flockd.campaign.folder import differences
 from flockd.campaign.results import Results

@@ -6,10 +6,9 @@ import random
 from collections.abc import Sequence
 from pathlib import Path
 
-from flockd.campaign.campaign_file import Figure
 from flockd.campaign.conduct import Conducted, conduct
 from flockd.campaign.engine import Flown
-from flockd.campaign.figures import Figures
+from flockd.campaign.figures import Figure, Figures
 from flockd.campaign.flight_kinds import Task, fly_task
 from flockd.campaign.flight_plan import Plan
 from flockd.campaign.folder import CampaignFolder

@@ -29,8 +29,7 @@ from typing import Any
 
 from scipy.stats import binom
 
-from flockd.campaign.campaign_file import Figure
-from flockd.campaign.figures import MEASURES, figures_of
+from flockd.campaign.figures import MEASURES, Figure, figures_of
 from flockd.core.choices import SimulatedPerception
 from flockd.core.config.loader import Overrides
 from flockd.core.data import data_path

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockd.sim.renderer.airframe import DroneModel
+from flockd.sim.renderer.airframe import DroneModel, Solid
 from flockd.sim.renderer.drone_models import drone_model
 from tools.training import worlds
 from tools.training.dataset import FOCAL_PX, HEIGHT, R_BODY_CAMERA, WIDTH
@@ -156,25 +156,27 @@ def _scene(
     if seen.centre[2] < 0.3:
         return []
     alone, beside = rng.random() < DISTRACTOR_ALONE, rng.random() < WITH_DISTRACTORS
-    others = []
+    others: list[tuple[Solid, Array, Array]] = []
     if alone or beside:
         ray = positions[0] - position + (0.0 if alone else 0.25) * rng.normal(0, 0.5, 3)
         others = [worlds.drawn_distraction(position, ray / np.linalg.norm(ray), ground, rng).at(0.0)]
     if alone:
         positions[:] = np.nan  # nobody, and nobody's shadow
-        centre = R_ned_camera.T @ (others[0].position - position)
+        centre = R_ned_camera.T @ (others[0][2] - position)
         if centre[2] < 0.3:
             return []
-        crops = [crop_at(centre, others[0].thing.size_m, focal, rng) for _ in range(PICTURES_A_SCENE)]
+        crops = [crop_at(centre, others[0][0].size_m, focal, rng) for _ in range(PICTURES_A_SCENE)]
     else:
         crops = [crop_around(seen, rng) for _ in range(PICTURES_A_SCENE)]
     left, top, right, bottom = _window(crops)
     matrix = np.array([[focal, 0.0, WIDTH / 2 - left], [0.0, focal, HEIGHT / 2 - top], [0.0, 0.0, 1.0]])
-    view = Renderer(world, drones).render(
+    view = Renderer(world, [*drones, *(thing for thing, _, _ in others)]).render(
         matrix, (right - left, bottom - top), R_ned_camera, position,
-        drone_rotations=rotations, drone_positions=positions, shown=np.full(count, not alone), distractors=others,
+        drone_rotations=np.array([*rotations, *(turned for _, turned, _ in others)]),
+        drone_positions=np.array([*positions, *(at for _, _, at in others)]),
+        shown=np.append(np.full(count, not alone), np.ones(len(others), dtype=bool)),
     )  # fmt: skip
-    if np.count_nonzero(view.distractors if alone else view.ids == 1) < MIN_PIXELS:
+    if np.count_nonzero(view.ids > count if alone else view.ids == 1) < MIN_PIXELS:
         return []
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     image[top:bottom, left:right] = view.rgb
@@ -200,7 +202,7 @@ def _is_whole(drone: DroneInView, view: Any, matrix: Array, corner: tuple[int, i
     if (pixels < 1).any() or (pixels > (WIDTH - 1, HEIGHT - 1)).any():
         return False
     outline = worlds.outline_of(places, matrix, view.ids.shape)
-    before = (view.depth < drone.centre[2] - drone.model.size_m / 2) | view.distractors | (view.ids > 1)
+    before = (view.depth < drone.centre[2] - drone.model.size_m / 2) | (view.ids > 1)
     return bool((before & outline).sum() < HIDDEN_SHARE * outline.sum())
 
 

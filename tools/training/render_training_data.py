@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +77,6 @@ class PairJob:
 def render_world(job: PairJob) -> None:
     """One part."""
     from flockd.sim.cameras.camera_simulator import FIELD_GRID_M, field_grid  # noqa: PLC0415 - numba starts in the worker
-    from flockd.sim.renderer.renderer import Renderer  # noqa: PLC0415
     from flockd.sim.world.world import World  # noqa: PLC0415
 
     folder, seed, count = job.folder, job.seed, job.pairs
@@ -98,8 +97,7 @@ def render_world(job: PairJob) -> None:
     for index in range(count):
         drones = [_drawn_drone(job, shapes, rng) for _ in range(MAX_DRONES)]
         families = np.array([drone.family for drone in drones])
-        renderer = Renderer(world, drones)
-        _render_pair(renderer, world, places[index], highest_m, families, part, index, rng)
+        _render_pair(drones, world, places[index], highest_m, families, part, index, rng)
     for array in part.values():
         array.flush()  # type: ignore[attr-defined]
     note(
@@ -134,7 +132,7 @@ def _drawn_drone(job: PairJob, shapes: list[DroneModel], rng: np.random.Generato
 
 
 def _render_pair(
-    renderer: Any,
+    drones: list[DroneModel],
     world: Any,
     place: Array,
     highest_m: float,
@@ -143,7 +141,7 @@ def _render_pair(
     index: int,
     rng: np.random.Generator,
 ) -> None:
-    from flockd.sim.renderer.renderer import true_flow  # noqa: PLC0415
+    from flockd.sim.renderer.renderer import Renderer, true_flow  # noqa: PLC0415
 
     focal = FOCAL_PX * float(np.exp(rng.normal(0, 0.08)))
     matrix = np.array([[focal, 0.0, WIDTH / 2], [0.0, focal, HEIGHT / 2], [0.0, 0.0, 1.0]])
@@ -167,14 +165,18 @@ def _render_pair(
     drone_rotations = [np.array(turns), np.array([r @ w for r, w in zip(turns, wobble, strict=True)])]
     count = int(rng.integers(1, 5)) if rng.random() < WITH_DISTRACTORS else 0
     others = worlds.drawn_distractions(count, position, start @ R_BODY_CAMERA, focal, ground, rng)
-    views = []
+    views, nobody = [], np.zeros((2, HEIGHT, WIDTH), dtype=bool)
     for k in range(2):
         R_ned_camera = attitudes[k] @ R_BODY_CAMERA
-        view = renderer.render(
+        besides = [other.at(k * interval) for other in others]
+        view = Renderer(world, [*drones, *(thing for thing, _, _ in besides)]).render(
             matrix, (WIDTH, HEIGHT), R_ned_camera, positions[k],
-            drone_rotations=drone_rotations[k], drone_positions=drone_positions[k], shown=shown,
-            distractors=[other.at(k * interval) for other in others],
+            drone_rotations=np.array([*drone_rotations[k], *(turned for _, turned, _ in besides)]),
+            drone_positions=np.array([*drone_positions[k], *(place for _, _, place in besides)]),
+            shown=np.append(shown, np.ones(count, dtype=bool)),
         )  # fmt: skip
+        nobody[k] = view.ids > MAX_DRONES
+        view = replace(view, ids=np.where(nobody[k], 0, view.ids).astype(np.uint8))
         views.append(view)
         part["image"][index, k] = view.rgb
         part["depth"][index, k] = np.minimum(view.depth[1::2, 1::2], 1000.0)
@@ -191,7 +193,7 @@ def _render_pair(
         drone_positions=(drone_positions[0], drone_positions[1]),
     )  # fmt: skip
     part["flow"][index] = np.moveaxis(flow[1::2, 1::2], 2, 0)
-    part["flow_valid"][index] = valid[1::2, 1::2]
+    part["flow_valid"][index] = (valid & ~nobody[0])[1::2, 1::2]  # wings beat
     part["focal"][index] = focal
     part["drone_family"][index] = families
 

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.flight.geometry import rotation_from_euler
-from flockd.sim.renderer.distractors import Distractor, Placed, bag, balloon, bird, kite, mast
 from flockd.sim.scenario import ObstaclesConfig
 from tools.training.dataset import HEIGHT, WIDTH
+from tools.training.distractors import Distractor, bag, balloon, bird, kite, mast
 
 Array = NDArray[Any]
 Job = TypeVar("Job")
@@ -94,11 +94,11 @@ class Distraction:
     beat: tuple[float, float, float]
     """Beat of the wings: amplitude and phase, rad, and rad/s."""
 
-    def at(self, time_s: float) -> Placed:
-        """As it is after some time."""
+    def at(self, time_s: float) -> tuple[Distractor, Array, Array]:
+        """As it is after some time, its turn (3, 3) R_ned_body and its place (3,) NED m."""
         amplitude, phase, rate = self.beat
         roll, pitch, yaw = self.turn * time_s
-        return Placed(
+        return (
             self.thing.flapped(amplitude * np.sin(phase + rate * time_s)),
             self.R_ned_body @ attitude(yaw, np.array([roll, pitch])),
             self.place + self.velocity * time_s,

@@ -38,7 +38,6 @@ def lens_view(camera: Camera, draw: Draw) -> View:
         rgb=np.zeros((height, width, 3), np.uint8),
         depth=np.full((height, width), np.inf, np.float32),
         ids=np.zeros((height, width), np.uint8),
-        distractors=np.zeros((height, width), np.bool_),
     )
     for part in _parts(camera):
         view = draw(part.matrix, part.size, part.R_lens_part)
@@ -47,7 +46,6 @@ def lens_view(camera: Camera, draw: Draw) -> View:
         seen.rgb[part.mine] = drawn[part.mine]
         seen.depth[part.mine] = view.depth[row, column] * part.z_share[part.mine]
         seen.ids[part.mine] = view.ids[row, column]
-        seen.distractors[part.mine] = view.distractors[row, column]
     return seen
 
 

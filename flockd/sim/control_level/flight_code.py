@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,24 +13,14 @@ from flockd.flight.flocking.passing import Passing
 from flockd.flight.obstacles import Avoidance, nearest_points
 from flockd.flight.safety import Action, Gate, Permission, Request, Surroundings
 from flockd.flight.safety.approach import towards_neighbours
+from flockd.sim.control_level.perceived_flock import Seen
 
 _SETPOINT_RATE_HZ = 20.0
 """Rate for a drone without an autopilot's section, as by default in one."""
 
 
-class Known(NamedTuple):
-    """What one drone knows as a step begins."""
-
-    offsets: FloatArray
-    """(k, 3) m, NED, from the drone, of its neighbours."""
-    velocities: FloatArray
-    """(k, 3) m/s, NED, over ground."""
-    ages_s: FloatArray
-    """(k,) for how long it has known them."""
-    numbers: Sequence[int]
-    """The k neighbours' numbers; empty: not known from step to step."""
-    ranges: ObstacleRanges | None
-    """None: of no obstacles."""
+Known = tuple[Seen, ObstacleRanges | None]
+"""What one drone knows as a step begins: of its neighbours, and of obstacles, None without any."""
 
 
 class FlightCode:
@@ -46,22 +35,24 @@ class FlightCode:
         rate_hz = _SETPOINT_RATE_HZ if drone.autopilot is None else drone.autopilot.setpoint_rate_hz
         self._ticks = max(round(step_s * rate_hz), 1)
 
-    def ask(self, i: int, velocity: FloatArray, command: FloatArray, desired: FloatArray, known: Known) -> FloatArray:
+    def ask(
+        self, i: int, velocity: FloatArray, command: FloatArray, desired: FloatArray, seen: Seen,
+        ranges: ObstacleRanges | None,
+    ) -> FloatArray:  # fmt: skip
         """The velocity (2,) m/s that drone `i` at `velocity` (2,) asks for instead of its `command` (2,).
 
         Among obstacles it is the avoidance's, for the `desired` (2,) m/s of the mission; in open air it passes its
         neighbours. Where these have no numbers no side is remembered.
         """
-        level = known.velocities[:, :2]
-        if known.ranges is not None:
-            return self._avoidances[i].command(
-                self._law, velocity, known.offsets, level, desired, known.ranges, known.ages_s
-            )[0]
+        offsets, level = seen.offsets, seen.velocities[:, :2]
+        if ranges is not None:
+            return self._avoidances[i].command(self._law, velocity, offsets, level, desired, ranges, seen.ages_s)[0]
         gate = self._drone.safety.gate
-        near = np.hypot(known.offsets[:, 0], known.offsets[:, 1]) <= self._drone.flocking.observation_distance_m
-        offsets, level = known.offsets[near], level[near]
-        numbers = np.array(known.numbers)[near].tolist() if known.numbers else [-1 - one for one in range(len(offsets))]
-        passing = self._passings[i] if known.numbers else Passing(self._law, gate.vertical_separation_m)
+        passing = self._passings[i]
+        if not (seen.numbers >= 0).any():
+            passing = Passing(self._law, gate.vertical_separation_m)
+        near = np.hypot(offsets[:, 0], offsets[:, 1]) <= self._drone.flocking.observation_distance_m
+        offsets, level, numbers = offsets[near], level[near], seen.numbers[near].tolist()
         limits = towards_neighbours(gate, offsets, level, gate.min_separation_m, unseen_s=np.zeros(len(offsets)))
         return passing.clear(command, velocity, offsets, level, numbers, limits)
 
@@ -82,7 +73,7 @@ class FlightCode:
         """
         tick_s = self._drone.step_s / self._ticks
         sigmas = self._drone.obstacles.sigmas
-        points = [np.empty((0, 2)) if one.ranges is None else nearest_points(one.ranges, sigmas) for one in known]
+        points = [np.empty((0, 2)) if ranges is None else nearest_points(ranges, sigmas) for _, ranges in known]
         wanted = [Wanted(command.copy(), np.zeros(2), 0.0) for command in commands.T]
         holds, began = np.isnan(heights), states[:3].copy()
         asked_m = np.where(holds, -states[2], heights)
@@ -90,7 +81,7 @@ class FlightCode:
         for tick in range(self._ticks):
             now_s, age_s = begin_s + tick * tick_s, tick * tick_s
             moved = states[:3] - began
-            for i, one in enumerate(known):
+            for i, (one, _) in enumerate(known):
                 around = Surroundings(
                     position=states[:2, i].copy(),
                     velocity=states[3:5, i].copy(),
@@ -109,7 +100,7 @@ class FlightCode:
             fly(now_s, tick_s, sent, sent_m)
 
 
-def _by_now(known: Known, age_s: float, moved: FloatArray) -> FloatArray:
+def _by_now(known: Seen, age_s: float, moved: FloatArray) -> FloatArray:
     """(k, 3) m from the drone, which `moved` (3,) m, to its neighbours, as `surroundings` has it."""
     braked = known.offsets - moved
     flown = braked + age_s * known.velocities

@@ -10,15 +10,16 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from flockd.core.messages import FloatArray, ObstacleRanges
+from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.geometry import closest_approach
+from flockd.review.report.summary import NEAR_M, TAIL_S
 from flockd.sim.control_level.near import Near
+from flockd.sim.flock.exact_states import step_times
 from flockd.sim.scenario import ScenarioConfig
-from flockd.sim.world.obstacle_worlds import clearances, obstacles_of
-from flockd.sim.world.obstacles import true_ranges
+from flockd.sim.world.obstacle_worlds import clearances
+from flockd.sim.world.obstacles import Obstacles
 
-TAIL_S = 10.0
-"""The end of a flight, over which order and union are means, as in a report."""
+Figures = dict[str, float | int | bool | None]
 SAFE_M = 1.0
 """Nearer than this a pair counts against `safety`, as in `flockd.flight.flocking.metrics`."""
 
@@ -91,119 +92,112 @@ def orders(velocity: FloatArray) -> FloatArray:
 class FlightFigures:
     """Collects the figures of a batch of flights, one step after the other."""
 
-    def __init__(self, flights: int, drones: int, times: FloatArray, step_s: float, radius_m: float) -> None:
-        self._n, self._radius_m = drones, radius_m
-        self._tail = times > times[-1] + step_s - TAIL_S - 1e-6
-        self._late = times >= TAIL_S
-        self._times = times
-        self._least = np.full(flights, np.inf)
-        self._least_level = np.full(flights, np.inf)
-        self._least_late = np.full(flights, np.inf)
-        self._least_tail = np.full(flights, np.inf)
-        self._unsafe = np.zeros(flights)
-        self._touching = np.zeros((flights, drones), dtype=bool)
-        self._contacts = np.zeros(flights, dtype=np.int64)
-        self._first_s = np.full(flights, np.inf)
-        self._order, self._union, self._mean_nearest, self._extent = (np.zeros(flights) for _ in range(4))
+    def __init__(
+        self, scenario: ScenarioConfig, worlds: Sequence[Obstacles], goal: FloatArray | None, reached_m: float
+    ) -> None:
+        """`worlds` of the flights; `goal` (2,) m, where their drones have one, is reached within `reached_m`."""
+        self._scenario, self._worlds, self._goal, self._reached_m = scenario, worlds, goal, reached_m
+        self._times = step_times(scenario)
+        self._tail = self._times > self._times[-1] + scenario.drone.step_s - TAIL_S - 1e-6
+        self._before: FloatArray | None = None
+        self._touching = np.zeros((len(worlds), len(scenario.vehicles)), dtype=bool)
+        self._steps: list[dict[str, FloatArray]] = []
+        """Of each step (flights,) values by name."""
+        self._flown: list[FloatArray] = []
+        """States, where there are obstacles."""
 
-    def needs_union(self, step: int) -> bool:
-        """Whether `add_tail` has to be called in this step."""
-        return bool(self._tail[step])
+    def add(self, states: FloatArray, near: Near, to_the_last: BoolArray) -> None:
+        """The next step begins at `states` (6, flights, n); `to_the_last`: whose flock is on the way to its goal."""
+        found = nearest_distances(near, states if self._before is None else self._before, states)
+        touching = found.since < 2 * self._scenario.vehicle.radius_m
+        middles = states[:2].mean(axis=2, keepdims=True)
+        of_step = {
+            "level_since": found.level_since.min(axis=1), "since": found.since.min(axis=1),
+            "now": found.now.min(axis=1), "level_now": found.level_now.mean(axis=1), "unsafe": found.unsafe.sum(axis=1),
+            "contacts": (touching & ~self._touching).sum(axis=1),
+            "to_the_last": to_the_last, "order": orders(states[3:5]),
+            "extent": np.sqrt(((states[:2] - middles) ** 2).sum(axis=0).mean(axis=1)),
+        }  # fmt: skip
+        if self._tail[len(self._steps)]:
+            reach_m = self._scenario.drone.flocking.observation_distance_m
+            of_step["union"] = unions(near, touching.shape, reach_m)
+        if self._goal is not None:
+            of_step["away"] = np.hypot(*(middles[:, :, 0] - self._goal[:, None]))
+        if any(world.solids for world in self._worlds):
+            self._flown.append(states.copy())
+        self._steps.append(of_step)
+        self._before, self._touching = states.copy(), touching
 
-    def add(self, step: int, found: Nearest) -> None:
-        """Distances of one step and since the one before."""
-        last = max(step - 1, 0)
-        least = found.since.min(axis=1)
-        touching = found.since < 2 * self._radius_m
-        self._contacts += (touching & ~self._touching).sum(axis=1)
-        self._first_s = np.where(touching.any(axis=1), np.minimum(self._first_s, self._times[last]), self._first_s)
-        self._touching = touching
-        np.minimum(self._least, least, out=self._least)
-        np.minimum(self._least_level, found.level_since.min(axis=1), out=self._least_level)
-        for of_window, begins in (self._least_late, self._late), (self._least_tail, self._tail):
-            if begins[step]:
-                np.minimum(of_window, least if begins[last] else found.now.min(axis=1), out=of_window)
-        if self._tail[step]:
-            self._mean_nearest += found.level_now.mean(axis=1)
-        self._unsafe += found.unsafe.sum(axis=1) / 2
+    def of_flights(self) -> list[Figures]:
+        """The figures of each flight; None where there is nothing to say."""
+        return [
+            {**self._of_flock(k), **self._of_goal(k), **self._of_obstacles(k, world)}
+            for k, world in enumerate(self._worlds)
+        ]
 
-    def add_tail(self, states: FloatArray, union: FloatArray) -> None:
-        """`states` (6, flights, n) and the unions of a step of the tail."""
-        self._order += orders(states[3:5])
-        self._union += union
-        places = states[:2] - states[:2].mean(axis=2, keepdims=True)
-        self._extent += np.sqrt((places**2).sum(axis=0).mean(axis=1))
+    def _values(self, name: str, flight: int) -> FloatArray:
+        """One flight's, of each step that has them."""
+        return np.array([of_step[name][flight] for of_step in self._steps if name in of_step])
 
-    def of_flight(self, flight: int) -> dict[str, float | int | None]:
-        """The figures of one flight; None where there is nothing to say."""
-        steps, tail, pairs = len(self._times), int(self._tail.sum()), self._n * (self._n - 1) / 2
+    def _of_flock(self, flight: int) -> Figures:
+        def values(name: str) -> FloatArray:
+            return self._values(name, flight)
+
+        def tail_mean(name: str) -> float:
+            of_tail: list[float] = values(name)[-int(self._tail.sum()) :].tolist()
+            return sum(of_tail) / len(of_tail)
+
+        def least_in(window: BoolArray) -> float | None:
+            """From the first step of a window on, whose distances since the one before are outside of it."""
+            begins = np.flatnonzero(window)[:1]
+            within = window.copy()
+            within[begins] = False
+            return _least([*values("since")[within], *values("now")[begins]])
+
+        n = self._touching.shape[1]
+        pairs = n * (n - 1) / 2
         return {
-            "min_distance_m": _finite(self._least[flight]),
-            "min_distance_after_10s_m": _finite(self._least_late[flight]),
-            "min_distance_tail_m": _finite(self._least_tail[flight]),
-            "min_level_distance_m": _finite(self._least_level[flight]),
-            "order_tail": float(self._order[flight] / tail),
-            "union_tail": float(self._union[flight] / tail),
-            "safety": 1.0 - float(self._unsafe[flight] / pairs / steps) if pairs else 1.0,
-            "drone_collisions": int(self._contacts[flight]),
-            "first_collision_s": _finite(self._first_s[flight]),
-            "mean_nearest_tail_m": _finite(self._mean_nearest[flight] / tail),
-            "rms_radius_tail_m": float(self._extent[flight] / tail),
+            "min_distance_m": _least(values("since")),
+            "min_distance_after_10s_m": least_in(self._times >= TAIL_S),
+            "min_distance_tail_m": least_in(self._tail),
+            "min_level_distance_m": _least(values("level_since")),
+            "order_tail": tail_mean("order"),
+            "union_tail": tail_mean("union"),
+            "safety": 1.0 - sum(values("unsafe")) / 2 / pairs / len(self._steps) if pairs else 1.0,
+            "drone_collisions": int(values("contacts").sum()),
+            "mean_nearest_tail_m": tail_mean("level_now") if pairs else None,
+            "rms_radius_tail_m": tail_mean("extent"),
+        }
+
+    def _of_goal(self, flight: int) -> Figures:
+        """Whether and when the flock's true middle was at the last goal, once that was the one to fly to."""
+        if self._goal is None:
+            return dict.fromkeys(("arrived", "arrival_time_s", "final_error_m"))
+        away_m, elsewhere = self._values("away", flight), np.flatnonzero(self._values("to_the_last", flight) == 0)
+        there = np.flatnonzero(away_m <= self._reached_m)
+        there = there[there > (elsewhere[-1] if len(elsewhere) else -1)]
+        return {
+            "arrived": bool(away_m[-1] <= self._reached_m),
+            "arrival_time_s": float(self._times[there[0]]) if len(there) else None,
+            "final_error_m": float(away_m[-1]),
+        }
+
+    def _of_obstacles(self, flight: int, world: Obstacles) -> Figures:
+        """As `flockd.review.report.summary.obstacle_figures`."""
+        if not world.solids:
+            return dict.fromkeys(("collisions", "min_clearance_m", "time_within_1m_s"))
+        flown = np.array(self._flown)[:, :, flight].transpose(1, 0, 2)
+        places, velocities = np.moveaxis(flown[:3], 0, -1), np.moveaxis(flown[3:], 0, -1)
+        free_m = clearances(world, self._times, places, velocities) - self._scenario.vehicle.radius_m
+        touching = np.vstack([np.zeros(free_m.shape[1], dtype=bool), free_m < 0])
+        return {
+            "collisions": int((touching[1:] & ~touching[:-1]).sum()),
+            "min_clearance_m": float(free_m.min()),
+            "time_within_1m_s": float((free_m < NEAR_M).sum() * self._scenario.drone.step_s),
         }
 
 
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-FIGURES = "collisions", "min_clearance_m", "time_within_1m_s"
-NEAR_M = 1.0
-"""Nearer than this counts for `time_within_1m_s`, as in a report."""
-
-
-class ManyObstacles:
-    """Those of all flights of a batch, and what came of them so far: `flockd.review.report.summary.obstacle_figures`.
-
-    Raises UsageError where obstacles do not fit into their world.
-    """
-
-    def __init__(self, scenarios: Sequence[ScenarioConfig]) -> None:
-        scenario, f, n = scenarios[0], len(scenarios), len(scenarios[0].vehicles)
-        self._worlds = [obstacles_of(one) for one in scenarios]
-        self._step_s, self._radius_m = scenario.drone.step_s, scenario.vehicle.radius_m
-        self._before: FloatArray | None = None
-        self._touching = np.zeros((f, n), dtype=bool)
-        self._contacts, self._near = np.zeros(f, np.int64), np.zeros(f, np.int64)
-        self._least_m = np.full(f, np.inf)
-
-    def look(self, flight: int, time_s: float, place: FloatArray) -> ObstacleRanges | None:
-        """Exact ranges from a `place` (3,) NED; None where the flight has no obstacles."""
-        world = self._worlds[flight]
-        return true_ranges(world, time_s, place) if world.solids else None
-
-    def measure(self, states: FloatArray, *, ends: bool) -> None:
-        """Takes how near the drones came since the last step's `states` (6, flights, n); `ends`: this is the last."""
-        if self._before is not None:
-            self._take(self._before, states)
-        if ends:
-            self._take(states, states)
-        self._before = states.copy()
-
-    def _take(self, before: FloatArray, now: FloatArray) -> None:
-        times = np.array([0.0, self._step_s if now is not before else 0.0])
-        both = np.stack([before, now]).transpose(2, 0, 3, 1)
-        ways = zip(self._worlds, both[..., :3], both[..., 3:], strict=True)
-        free_m = np.array([clearances(world, times, places, flown)[0] for world, places, flown in ways])
-        free_m -= self._radius_m
-        touching = free_m < 0
-        self._contacts += (touching & ~self._touching).sum(axis=1)
-        self._touching = touching
-        self._near += (free_m < NEAR_M).sum(axis=1)
-        np.minimum(self._least_m, free_m.min(axis=1), out=self._least_m)
-
-    def of_flight(self, flight: int) -> dict[str, float | int | None]:
-        """The figures of one flight; None where it has no obstacles."""
-        if not self._worlds[flight].solids:
-            return dict.fromkeys(FIGURES)
-        found = int(self._contacts[flight]), float(self._least_m[flight]), float(self._near[flight] * self._step_s)
-        return dict(zip(FIGURES, found, strict=True))
+def _least(values: Sequence[float] | FloatArray) -> float | None:
+    """None without any, or where all are infinite: of one drone alone."""
+    least = min(values, default=math.inf)
+    return float(least) if math.isfinite(least) else None

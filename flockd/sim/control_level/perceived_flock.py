@@ -39,16 +39,12 @@ class Seen(NamedTuple):
     """(p, 3) m/s, NED, over ground."""
     ages_s: FloatArray
     """(p,) for how long it has known them."""
+    numbers: IntArray
+    """(p,) of the neighbours; below 0: not known from step to step."""
 
-    def of(self, chosen: BoolArray | IntArray | slice) -> Self:
+    def of(self, chosen: IntArray | slice) -> Self:
         """Some of the pairs."""
-        return type(self)(self.owners[chosen], self.offsets[chosen], self.velocities[chosen], self.ages_s[chosen])
-
-    @classmethod
-    def joined(cls, several: Sequence[Self]) -> Self:
-        """The pairs of all, of each drone in this order."""
-        together = cls(*(np.concatenate(parts) for parts in zip(*several, strict=True)))
-        return together.of(np.argsort(together.owners, kind="stable"))
+        return type(self)._make(part[chosen] for part in self)
 
 
 class Perception:
@@ -99,8 +95,11 @@ class Perception:
         z = self._normals(owners, pairs, 3, step, errors.error_time_s)
         velocities[:, :2] += _error(table, ranges[:, None], VELOCITY, z)
         offsets = np.column_stack([north * cos - east * sin, north * sin + east * cos, down])
-        true = Seen(owners, offsets, velocities, np.full(len(owners), math.inf))
-        return Seen.joined([true, self._false(who, reach_m, states, step)])
+        true = Seen(owners, offsets, velocities, np.full(len(owners), math.inf), owners)
+        false = self._false(who, reach_m, states, step)
+        seen = Seen._make(np.concatenate(parts) for parts in zip(true, false, strict=True))
+        seen = seen.of(np.argsort(seen.owners, kind="stable"))
+        return seen._replace(numbers=-1 - np.arange(len(seen.owners)))
 
     def _false(self, who: IntArray, reach_m: FloatArray, states: FloatArray, step: int) -> Seen:
         """Neighbours that are none, which fly as the drone itself does."""
@@ -115,7 +114,8 @@ class Perception:
         which, number = np.nonzero(there & (range_m <= reach_m[:, None]))
         range_m, bearing, at = range_m[which, number], bearing[which, number], at[which, number]
         offsets = np.column_stack([range_m * np.cos(bearing), range_m * np.sin(bearing), np.zeros(len(which))])
-        return Seen(who[which], offsets, states[who[which], 3:], (at - np.floor(at)) * false.lifetime_s)
+        ages_s = (at - np.floor(at)) * false.lifetime_s
+        return Seen(who[which], offsets, states[who[which], 3:], ages_s, who[which])
 
     def _visible(self, owners: IntArray, rays: FloatArray, widths: FloatArray) -> BoolArray:
         """Who is not hidden, (p,), of pairs from near to far.

@@ -55,7 +55,7 @@ class Scene(NamedTuple):
 
 
 class Thing(NamedTuple):
-    """What is laid over an image: a drone or a distractor of a pose, and its number there.
+    """What is laid over an image: a drone of a pose, and its number there.
 
     `normals` are NED, `uv` is in body axes, `texels` are its machine textures.
     """

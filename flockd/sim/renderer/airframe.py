@@ -17,11 +17,9 @@ from flockd.sim.world.textures import PackedArray
 
 
 @dataclass(frozen=True, eq=False)
-class DroneModel:
-    """One drone's mesh, body FRD, metres, origin at the centre of its bounding box."""
+class Solid:
+    """The mesh of what flies, body FRD, metres."""
 
-    family: int
-    seed: int
     vertices: Float32Array
     """(n, 3)"""
     triangles: NDArray[np.int32]
@@ -32,13 +30,21 @@ class DroneModel:
     """(m,) number of the machine texture."""
     uv: FloatArray
     """(m, 2, 4) texture coordinates in tiles from body (x, y, z, 1)."""
+    size_m: float
+    """Widest horizontal distance, of a drone from propeller tip to tip."""
+
+
+@dataclass(frozen=True, eq=False)
+class DroneModel(Solid):
+    """One drone's, its origin at the centre of its bounding box."""
+
+    family: int
+    seed: int
     hubs: FloatArray
     """(n, 3) tops of the motors; of the families: front right, rear right, rear left, front left (plus frame: front,
     right, rear, left)."""
     extent: FloatArray
     """(2, 3) least and greatest corner, propellers at any angle; a family's own."""
-    size_m: float
-    """Widest horizontal distance, propeller tip to tip."""
 
 
 @functools.cache

@@ -15,15 +15,13 @@ from numpy.typing import NDArray
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
 from flockd.sim.renderer import _raster, _shading
 from flockd.sim.renderer._raster import Eye, Scene, Thing
-from flockd.sim.renderer.airframe import DroneModel, machine_texels
-from flockd.sim.renderer.distractors import Distractor, Placed
+from flockd.sim.renderer.airframe import Solid, machine_texels
 from flockd.sim.world.mesh import face_normals
 from flockd.sim.world.world import World
 
 Indices = NDArray[np.int32]
-Solid = DroneModel | Distractor
-_DISTRACTOR = 255
-"""Id of distractors while an image is drawn; afterwards they count as background."""
+_MOST_DRONES = 254
+"""Their ids are bytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,21 +33,19 @@ class View:
     depth: Float32Array
     """(h, w) metres along the optical axis at the pixel's centre; inf for sky."""
     ids: UInt8Array
-    """(h, w) 0 for the world, sky and distractors, k for drone k - 1."""
-    distractors: BoolArray
-    """(h, w) where something in the air is seen that is no drone."""
+    """(h, w) 0 for the world and sky, k for drone k - 1."""
 
 
 class Renderer:
     """Draws one world and one flock from any camera. Holds no state that changes between images."""
 
-    def __init__(self, world: World, drones: Sequence[DroneModel]) -> None:
-        if len(drones) >= _DISTRACTOR:
-            raise ValueError(f"ids are bytes: at most {_DISTRACTOR - 1} drones, not {len(drones)}")
+    def __init__(self, world: World, drones: Sequence[Solid]) -> None:
+        if len(drones) > _MOST_DRONES:
+            raise ValueError(f"ids are bytes: at most {_MOST_DRONES} drones, not {len(drones)}")
         self._world = world
         self._drones = tuple(drones)
         self._machine = machine_texels()
-        self._normals = [_normals(drone) for drone in self._drones]
+        self._normals = [face_normals(one.vertices.astype(np.float64), one.triangles) for one in self._drones]
         self._scene = scene_of(world)
         codes = world.tone.astype(np.float64)
         # The middle of the linear values that show as each byte.
@@ -67,7 +63,6 @@ class Renderer:
         drone_rotations: FloatArray,
         drone_positions: FloatArray,
         shown: BoolArray | Sequence[int] | IntArray,
-        distractors: Sequence[Placed] = (),
     ) -> View:
         """One image.
 
@@ -75,7 +70,7 @@ class Renderer:
         takes optical RDF axes to NED, ``position_ned`` (3,) m. ``drone_rotations`` (n, 3, 3) are R_ned_body and
         ``drone_positions`` (n, 3) NED m, one of each drone of the constructor. ``shown``: a mask (n,) or indices; the
         others are not seen, but every drone with a finite position casts its shadow. Poses of another number than the
-        drones raise ``ValueError``. ``distractors`` are seen like drones, but have no id and no shadow.
+        drones raise ``ValueError``.
         """
         world = self._world
         width, height = size
@@ -95,41 +90,19 @@ class Renderer:
         sharp = np.empty((height, width, 3), dtype=np.uint8)
         planes, hit, _ = rasterized(world.vertices, world.triangles, P, origin, width, height)
         _shading.shade_scene(hit, planes, eye, self._scene, blobs, sharp, depth)
-        view = View(
-            rgb=sharp.copy(),
-            depth=depth,
-            ids=np.zeros((height, width), dtype=np.uint8),
-            distractors=np.zeros((height, width), dtype=np.bool_),
-        )
+        view = View(rgb=sharp.copy(), depth=depth, ids=np.zeros((height, width), dtype=np.uint8))
         _raster.smooth_edges(hit, world.texture, planes, self._linear, world.tone, sharp, view.rgb)
         chosen = np.arange(count)[np.asarray(shown)] if len(np.asarray(shown)) else np.arange(0)
-        drones, normals = self._drones, self._normals
-        things: list[tuple[Solid, Thing]] = [
-            (drones[k], self._thing(int(k) + 1, drones[k], normals[k], rotations[k], positions[k])) for k in chosen
-        ]
-        for placed in distractors:
-            thing = self._thing(_DISTRACTOR, placed.thing, _normals(placed.thing), placed.rotation, placed.position)
-            things.append((placed.thing, thing))
-        distance = np.array([np.linalg.norm(thing.position - origin) for _, thing in things])
-        for i in np.argsort(-distance, kind="stable"):
-            model, thing = things[i]
-            self._draw(model, thing, eye, view)
-        if distractors:
-            np.equal(view.ids, _DISTRACTOR, out=view.distractors)
-            view.ids[view.distractors] = 0
+        away_m = np.array([np.linalg.norm(positions[k] - origin) for k in chosen])
+        for k in chosen[np.argsort(-away_m, kind="stable")]:
+            self._draw(int(k), np.ascontiguousarray(rotations[k]), positions[k], eye, view)
         return view
 
-    def _thing(
-        self, identity: int, model: Solid, normals: FloatArray, rotation: FloatArray, position: FloatArray
-    ) -> Thing:
-        turned, look = np.ascontiguousarray(rotation), (model.texture, model.uv, model.colours)
-        return Thing(identity, turned, position, normals @ rotation.T, *look, self._machine)
-
-    def _draw(self, model: Solid, thing: Thing, eye: Eye, view: View) -> None:
-        """Lay one thing over the view, supersampled within its bounding rectangle."""
+    def _draw(self, k: int, rotation: FloatArray, position: FloatArray, eye: Eye, view: View) -> None:
+        """Lay one drone over the view, supersampled within its bounding rectangle."""
         height, width = view.ids.shape
-        seen_from = thing.position - eye.origin
-        vertices = np.ascontiguousarray(model.vertices.astype(np.float64) @ thing.rotation.T + seen_from)
+        model, normals = self._drones[k], self._normals[k] @ rotation.T
+        vertices = np.ascontiguousarray(model.vertices.astype(np.float64) @ rotation.T + (position - eye.origin))
         P = eye.K @ eye.R.T
         left, top, right, bottom = _bounds(vertices @ P.T, width, height)
         if left >= right or top >= bottom:
@@ -139,6 +112,7 @@ class Renderer:
         wide, high = s * (right - left), s * (bottom - top)
         zoomed = np.ascontiguousarray(zoom @ P)
         planes, hit, inverse_depth = rasterized(vertices, model.triangles, zoomed, np.zeros(3), wide, high)
+        thing = Thing(k + 1, rotation, position, normals, model.texture, model.uv, model.colours, self._machine)
         _raster.lay_over(
             hit, inverse_depth, planes, left, top, eye, thing, self._scene, self._linear, view.rgb, view.depth, view.ids
         )
@@ -159,10 +133,6 @@ class Renderer:
             spread = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-0.4, 0.4)]) * reach / -sun[2]
             blobs.append((*position, radius, 0.6, *_bounds((foot + spread - origin) @ P.T, width, height)))
         return np.array(blobs, dtype=np.float64).reshape(-1, 9)
-
-
-def _normals(model: Solid) -> FloatArray:
-    return face_normals(model.vertices.astype(np.float64), model.triangles)
 
 
 def scene_of(world: World) -> Scene:
@@ -207,8 +177,7 @@ def true_flow(
     """Where every pixel of the first image went in the second: flow (h, w, 2) in pixels, valid (h, w).
 
     Poses come in pairs (first, second), shaped as for ``Renderer.render``. Sky moves as a point at infinity. Valid: in
-    front of the second camera, within its image, and seen there (same id, and a depth that agrees); never on a
-    distractor, which moves as it likes.
+    front of the second camera, within its image, and seen there (same id, and a depth that agrees).
     """
     h, w = first.ids.shape
     K = np.asarray(matrix, dtype=np.float64)
@@ -226,4 +195,4 @@ def true_flow(
         b[k + 1] = R2.T @ (turn @ (p1 - drone_positions[0][k]) + drone_positions[1][k] - p2)
     inverse_K = np.linalg.inv(K)
     _raster.flow(first.depth, first.ids, second.depth, second.ids, K @ A @ inverse_K, b @ K.T, flow, valid)
-    return flow, valid & ~first.distractors
+    return flow, valid

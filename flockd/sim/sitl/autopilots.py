@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, Ground
 from flockd.sim.autopilot.fake_vehicle import DeadTime, Demand, MotionState, PointMass
 from flockd.sim.scenario import ScenarioConfig, StartConfig, VehicleConfig
 from flockd.sim.sitl.ground_station import FULL_STICK_M_S, home_deg
-from flockd.sim.sitl.ports import described, free_port, px4_instance, user_of_port
+from flockd.sim.sitl.ports import free_port
 from flockd.sim.sitl.processes import Program, Programs
 from flockd.sim.vehicles.vehicles import Vehicles
 
@@ -153,14 +153,13 @@ class Px4s(Autopilots):
     ) -> None:
         """Each works in a folder under ``folder``, from number ``first`` on; ``parameters`` win over `PARAMETERS`.
 
-        Raises UnavailableError where there is no PX4, or where an instance or a daemon of another flight still runs.
+        Raises UnavailableError where there is no PX4.
         """
         if first + len(scenario.vehicles) > MAX_INSTANCES:
             raise UsageError(f"PX4 gives ports to {MAX_INSTANCES} vehicles, not {len(scenario.vehicles)}; fly fewer")
         super().__init__(scenario, speed_factor)
         self._build, self._folder = px4_folder(environment), folder
         self._instances = range(first, first + len(scenario.vehicles))
-        _refuse_leftovers(self._instances)
         self._environment = dict(environment)
         self._parameters = {**PARAMETERS, **(parameters or {})}
         self.ports = tuple(Ports(OFFBOARD_PORT + i, TRUTH_PORT + i) for i in self._instances)
@@ -185,16 +184,6 @@ class Px4s(Autopilots):
             command = [str(self._build / "bin/px4"), "-i", f"{i}", "-d", str(self._build / "etc"), "-w", str(working)]
             log = self._folder / f"px4_{i}.log"
             self._programs.start(f"PX4 instance {i}", command, {**self._environment, **settings}, working, log)
-
-
-def _refuse_leftovers(instances: Iterable[int]) -> None:
-    for i in instances:
-        instance = px4_instance(i)
-        if instance is not None:
-            raise UnavailableError(f"PX4 instance {i} runs already: {described(instance)}")
-        user = user_of_port(OFFBOARD_PORT + i)
-        if user is not None:
-            raise UnavailableError(f"UDP port {OFFBOARD_PORT + i} of PX4 instance {i} is used by {described(user)}")
 
 
 def px4_folder(environment: Mapping[str, str]) -> Path:

@@ -25,7 +25,6 @@ from flockd.core.messages import FloatArray
 from flockd.flight.geometry import rotation_from_euler, rotation_from_quaternion
 from flockd.onboard.autopilot.mavlink_messages import StatusText
 from flockd.sim.autopilot.sticks import stick_curve
-from flockd.sim.sitl.ports import described, user_of_port
 from flockd.sim.vehicles.vehicles import REFERENCE_DEG
 
 Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "ACRO", "OFFBOARD"]
@@ -297,7 +296,8 @@ def _bound(port: int) -> socket.socket:
         bound.bind(("127.0.0.1", port))
     except OSError as error:
         bound.close()
-        user = user_of_port(port)
-        advice = "end the other simulation that uses it" if user is None else f"it is used by {described(user)}"
-        raise UnavailableError(f"UDP port {port} cannot be used ({error.strerror}); {advice}") from error
+        found = f"`ss -lunp sport = :{port}` names it"
+        raise UnavailableError(
+            f"UDP port {port} cannot be used ({error.strerror}); end the other program that uses it: {found}"
+        ) from error
     return bound

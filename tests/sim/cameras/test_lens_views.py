@@ -15,8 +15,7 @@ from flockd.sim.renderer.renderer import View
 
 def grey(matrix: FloatArray, size: tuple[int, int], R_lens_part: FloatArray) -> View:
     shape = size[::-1]
-    none = np.zeros(shape, np.uint8)
-    return View(np.full((*shape, 3), 90, np.uint8), np.ones(shape, np.float32), none, none > 0)
+    return View(np.full((*shape, 3), 90, np.uint8), np.ones(shape, np.float32), np.zeros(shape, np.uint8))
 
 
 def small_fisheye() -> WideAngleCamera:

@@ -50,8 +50,7 @@ def test_light_and_grey_levels_are_those_of_srgb() -> None:
 def test_twice_as_many_pixels_that_are_reduced_have_half_the_noise(quality: int | None) -> None:
     """Four independent pixels make one. A JPEG takes some of the noise out by itself, so that less is won."""
     grey = View(
-        np.full((*SIZE[::-1], 3), 128, np.uint8), np.full(SIZE[::-1], 9.0, np.float32), np.zeros(SIZE[::-1], np.uint8),
-        np.zeros(SIZE[::-1], np.bool_),
+        np.full((*SIZE[::-1], 3), 128, np.uint8), np.full(SIZE[::-1], 9.0, np.float32), np.zeros(SIZE[::-1], np.uint8)
     )  # fmt: skip
     still = CameraMotion(np.zeros(3), np.zeros(3), lambda times_s: np.zeros((len(times_s), 3)), {})
     off = []

@@ -36,10 +36,8 @@ def motion(
 
 def view(depth_m: float, ids: np.ndarray | None = None) -> View:
     shape = SIZE[::-1]
-    none = np.zeros(shape, np.uint8)
-    return View(
-        np.zeros((*shape, 3), np.uint8), np.full(shape, depth_m, np.float32), none if ids is None else ids, none > 0
-    )
+    ids = np.zeros(shape, np.uint8) if ids is None else ids
+    return View(np.zeros((*shape, 3), np.uint8), np.full(shape, depth_m, np.float32), ids)
 
 
 def edge(column: float) -> Float32Array:
@@ -108,7 +106,7 @@ def test_shaking_skews_a_camera_on_its_side_as_one_upright_that_is_turned() -> N
     light = np.random.default_rng(3).random((24, 24, 3), dtype=np.float32).repeat(10, axis=0).repeat(10, axis=1)
     shaking = Shaking(ShakeConfig(rms_deg=1.0, frequency_hz=50.0), np.random.default_rng(4))
     none = np.zeros((240, 240), np.uint8)
-    seen = View(np.zeros((240, 240, 3), np.uint8), np.full((240, 240), np.inf, np.float32), none, none > 0)
+    seen = View(np.zeros((240, 240, 3), np.uint8), np.full((240, 240), np.inf, np.float32), none)
 
     def turned(times_s: FloatArray) -> FloatArray:
         right, down, ahead = shaking.at(times_s).T  # the upright image's right is the sensor's up

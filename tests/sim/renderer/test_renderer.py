@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -17,7 +17,6 @@ from flockd.core.messages import FloatArray
 from flockd.flight.geometry import PinholeCamera, WideAngleCamera
 from flockd.sim.cameras.lens_views import lens_view
 from flockd.sim.renderer.airframe import DroneModel
-from flockd.sim.renderer.distractors import Placed, bag, balloon, bird, kite, mast
 from flockd.sim.renderer.drone_models import FAMILIES, drone_model
 from flockd.sim.renderer.renderer import Renderer, View, true_flow
 from flockd.sim.world.world import GROUND, World
@@ -407,68 +406,3 @@ def test_a_drone_shades_the_ground_away_from_the_sun(flat: World) -> None:
     ys, xs = np.nonzero(darker > 0.5 * darker.max())
     assert darker.max() > 20
     assert np.hypot(xs.mean() - u, ys.mean() - v) < 3.0
-
-
-def test_a_bird_is_seen_and_is_nobody(scenes: list[Scene]) -> None:
-    """It flies past the nearest drone: in the picture and in depth, without an id, and no flow is told for it."""
-    scene = scenes[0]
-    gull = next(thing for seed in range(99) if (thing := bird(np.random.default_rng(seed))).size_m > 0.9)
-    ahead, right = scene.positions[0] - scene.position, scene.R[:, 0]
-    start = scene.position + 0.7 * ahead
-    shots = {"drone_rotations": scene.rotations, "drone_positions": scene.positions, "shown": range(5)}
-    views = [
-        scene.renderer.render(
-            MATRIX, SIZE, scene.R, scene.position, **shots, distractors=[Placed(gull.flapped(a), np.eye(3), place)]
-        )
-        for a, place in ((0.4, start), (-0.3, start + 0.05 * right))
-    ]
-    without = scene.render()
-    assert not without.distractors.any()
-    u, v = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
-    rays = np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3) @ np.linalg.inv(MATRIX).T @ scene.R.T
-    solid = replace(scene.drones[0], vertices=gull.flapped(0.4).vertices, triangles=gull.triangles)
-    rotations, positions = np.array([*scene.rotations, np.eye(3)]), np.array([*scene.positions, start])
-    depth, ids = _cast(scene.world, [*scene.drones, solid], rotations, positions, scene.position, rays)
-    seen = views[0].distractors
-    assert seen.sum() > 500
-    assert (seen == (ids == 6).reshape(seen.shape)).mean() > 0.999
-    assert np.isclose(views[0].depth[seen], depth.reshape(seen.shape)[seen], rtol=1e-3).mean() > 0.98
-    # It hides a part of the drone behind it, and what it does not touch stays as it is.
-    assert (seen & (without.ids == 1)).any()
-    assert (views[0].ids[seen] == 0).all()
-    assert np.array_equal(views[0].ids[~seen], without.ids[~seen])
-    assert np.array_equal(views[0].depth[~seen], without.depth[~seen])
-    assert (views[0].rgb[seen] != without.rgb[seen]).any(-1).mean() > 0.9
-    pose = {
-        "R_ned_camera": (scene.R, scene.R),
-        "position_ned": (scene.position, scene.position),
-        "drone_rotations": (scene.rotations, scene.rotations),
-        "drone_positions": (scene.positions, scene.positions),
-    }
-    _, valid = true_flow(views[0], views[1], MATRIX, **pose)
-    assert not valid[seen | views[1].distractors].any()
-    assert valid[~seen & ~views[1].distractors].mean() > 0.99
-    # The same for a bird that stands still, which depth alone would take for a part of the world.
-    _, valid = true_flow(views[0], views[0], MATRIX, **pose)
-    assert not valid[seen].any()
-
-
-def test_distractors_have_their_sizes_and_closed_parts() -> None:
-    rng = np.random.default_rng(0)
-    for make in (bird, balloon, kite, bag, lambda rng: mast(rng, 5.0)):
-        for _ in range(8):
-            thing = make(rng)
-            mesh = trimesh.Trimesh(thing.vertices, thing.triangles)
-            mesh.merge_vertices(digits_vertex=5)
-            assert mesh.is_watertight
-            assert all(part.volume > 0 for part in mesh.split())
-            assert len(thing.triangles) <= 500
-            widest = np.ptp(thing.vertices[:, :2], axis=0).max()
-            assert 0.2 <= thing.size_m <= 1.2
-            if thing.wing.any():
-                np.testing.assert_allclose(np.ptp(thing.vertices[:, 1]), thing.size_m, rtol=1e-5)
-                up, down = thing.flapped(0.6), thing.flapped(-0.6)
-                tip = thing.vertices[:, 1].argmax()
-                assert up.vertices[tip, 2] < thing.vertices[tip, 2] < down.vertices[tip, 2]  # z is down
-            else:
-                assert widest < 2.5 * thing.size_m

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from flockd.core.messages import Float32Array, FloatArray
+from flockd.core.messages import FloatArray
+from flockd.sim.renderer.airframe import Solid
 from flockd.sim.world.mesh import Mesh
 
 _SKIN = 0
@@ -20,25 +21,13 @@ _DOWN = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
-class Distractor:
-    """One thing's mesh, FRD, metres, origin in its body."""
+class Distractor(Solid):
+    """One thing's, its origin in its body; `size_m` is its longest side, a mast's without the pole."""
 
-    vertices: Float32Array
-    """(n, 3)"""
-    triangles: NDArray[np.int32]
-    """(m, 3)"""
-    colours: Float32Array
-    """(m, 3) linear albedo."""
-    texture: NDArray[np.int32]
-    """(m,) number of the machine texture."""
-    uv: FloatArray
-    """(m, 2, 4) texture coordinates in tiles from body (x, y, z, 1)."""
     wing: NDArray[np.int8]
     """(n,) 1 for vertices of a right wing, -1 of a left one, else 0."""
     shoulder_m: float
     """Half the distance between the wings' hinges."""
-    size_m: float
-    """Its longest side, a mast's without the pole."""
 
     def flapped(self, angle: float) -> Distractor:
         """The same with its wings raised by an angle, rad; a thing without wings stays as it is."""
@@ -49,17 +38,6 @@ class Distractor:
         )
         vertices = np.where(self.wing[:, None] == 0, self.vertices, turned).astype(np.float32)
         return dataclasses.replace(self, vertices=vertices)
-
-
-@dataclass(frozen=True, eq=False)
-class Placed:
-    """A distractor at one moment."""
-
-    thing: Distractor
-    rotation: FloatArray
-    """(3, 3) R_ned_body."""
-    position: FloatArray
-    """(3,) NED m."""
 
 
 def bird(rng: Generator) -> Distractor:
