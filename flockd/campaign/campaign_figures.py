@@ -15,8 +15,7 @@ from flockd.campaign.figures import MEASURES, mean_interval
 from flockd.campaign.figures import Figure as FigureName
 from flockd.campaign.flight_plan import CASE
 from flockd.campaign.results import Results
-from flockd.campaign.verdicts import Comparison
-from flockd.review.report.style import BAND, DRONE_COLOURS, INK, MUTED, STYLE
+from flockd.review.report.style import BAND, DRONE_COLOURS, MUTED, STYLE
 
 BINS: Final = 8
 """How many bins a drawn parameter's flights are put into: flights with neighbouring values are taken together."""
@@ -33,10 +32,9 @@ Points = list[tuple[Any, Sequence[float]]]
 def parameter_curves(results: Results, figure: FigureName) -> Figure:
     """One panel a parameter: the figure's mean over its values, with the 95 % confidence interval of the mean.
 
-    With cases, one line a case. A parameter that each flight draws as a list has no panel.
+    With cases, one line a case.
     """
-    lists = {name for name, variation in results.plan.drawn.items() if isinstance(variation.low, tuple)}
-    parameters = [name for name in results.parameters if name != CASE and name not in lists] or [CASE]
+    parameters = [name for name in results.parameters if name != CASE] or [CASE]
     cases: Sequence[str | None] = (None,)
     if CASE in results.parameters and parameters != [CASE]:
         cases = results.values_of(CASE)
@@ -77,53 +75,6 @@ def heat_maps(results: Results, figure: FigureName) -> Figure | None:
             _heat_map(drawing, axes, results, figure, across, up)
         for axes in panels.flat[len(pairs) :]:
             axes.set_axis_off()
-    return drawing
-
-
-def distance_distribution(results: Results) -> Figure | None:
-    """How many flights came how near: of each flight its nearest distance of two drones; None if not measured."""
-    groups: dict[str, list[float]] = {}
-    for row in results.rows:
-        if row.get("min_distance_m") is not None:
-            groups.setdefault(str(row.get(CASE, "all flights")), []).append(row["min_distance_m"])
-    if not groups:
-        return None
-    low, high = min(map(min, groups.values())), max(map(max, groups.values()))
-    edges = np.linspace(low, high, 31) if high > low else np.array([low - 0.05, low + 0.05])
-    with rc_context(STYLE):
-        drawing = Figure(figsize=(11.0, 3.2), layout="constrained")
-        counts, shares = drawing.subplots(1, 2)
-        for number, (name, values) in enumerate(groups.items()):
-            colour = DRONE_COLOURS[number % len(DRONE_COLOURS)]
-            counts.hist(values, edges, color=colour, alpha=0.35 if len(groups) > 1 else 0.8, label=name)
-            inside = np.sort(values)
-            shares.step(
-                [low, *inside, high], [0.0, *np.arange(1, len(inside) + 1) / len(inside), 1.0], where="post",
-                color=colour, label=name,
-            )  # fmt: skip
-        counts.set(xlabel="nearest distance of a flight, m", ylabel="flights")
-        shares.set(xlabel="distance, m", ylabel="share of flights that came as near", ylim=(0, 1))
-        if len(groups) > 1:
-            shares.legend()
-    return drawing
-
-
-def difference_figure(comparison: Comparison) -> Figure:
-    """The difference in each figure with its confidence interval, as a share of the first campaign's mean."""
-    verdicts = comparison.verdicts
-    with rc_context(STYLE):
-        drawing = Figure(figsize=(8.0, 0.9 + 0.42 * len(verdicts)), layout="constrained")
-        axes = drawing.subplots()
-        for place, verdict in enumerate(reversed(verdicts)):
-            scale = 100 / (abs(verdict.first) or 1.0)
-            difference = verdict.difference
-            colour = {"better": DRONE_COLOURS[2], "worse": DRONE_COLOURS[3]}.get(verdict.says, MUTED)
-            axes.plot([difference.low * scale, difference.high * scale], [place, place], color=colour, linewidth=3)
-            axes.plot(difference.mean * scale, place, "o", color=colour)
-        axes.axvline(0.0, color=INK, linewidth=0.8)
-        names = [f"{MEASURES[v.figure].name} ({MEASURES[v.figure].better} is better)" for v in reversed(verdicts)]
-        axes.set_yticks(range(len(verdicts)), names)
-        axes.set_xlabel("difference, % of the first campaign’s mean")
     return drawing
 
 

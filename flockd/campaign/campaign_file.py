@@ -24,7 +24,6 @@ MAX_VALUES = 1000
 MAX_SEEDS = 1_000_000
 _Name = Annotated[Name, Field(max_length=60)]
 _Number = Annotated[float, Field(allow_inf_nan=False)]
-_Bound = _Number | Annotated[tuple[_Number, ...], Field(min_length=1, max_length=16)]
 
 
 class Variation(Section):
@@ -32,9 +31,9 @@ class Variation(Section):
 
     values: Annotated[tuple[Any, ...], Field(min_length=1, max_length=MAX_VALUES)] | None = None
     """Each is a part of the grid."""
-    low: _Bound | None = None
-    """The smallest value; a list where the key's value is one, as of `vehicle.wind_m_s`."""
-    high: _Bound | None = None
+    low: _Number | None = None
+    """The smallest value."""
+    high: _Number | None = None
     """The largest value."""
     steps: Annotated[int, Field(ge=2, le=MAX_VALUES)] | None = None
     """So many values from `low` to `high`, evenly spaced, each a part of the grid. none: each flight draws its own
@@ -53,13 +52,6 @@ class Variation(Section):
             faults |= {(key,): "has no meaning beside `values`; delete one of them" for key in others}
         elif self.low is None or self.high is None:
             raise ValueError("needs `values`, or `low` and `high`; add them")
-        elif isinstance(self.low, tuple) or isinstance(self.high, tuple):
-            if not (isinstance(self.low, tuple) and isinstance(self.high, tuple) and len(self.low) == len(self.high)):
-                faults["high",] = "must be a list as long as `low`; write both with as many numbers"
-            elif any(high < low for low, high in zip(self.low, self.high, strict=True)):
-                faults["high",] = "is below `low`; exchange them"
-            elif self.steps is not None:
-                faults["steps",] = "is for numbers, and `low` is a list; write out the `values`"
         elif self.high <= self.low:
             faults["high",] = f"{self.high:g} is not above `low`, {self.low:g}; write a larger number"
         refuse(self, faults)

@@ -10,14 +10,7 @@ from typing import Any
 from markupsafe import Markup
 from matplotlib.figure import Figure as Drawing
 
-from flockd.campaign.campaign_figures import (
-    difference_figure,
-    distance_distribution,
-    heat_maps,
-    label_of,
-    parameter_curves,
-    shown,
-)
+from flockd.campaign.campaign_figures import heat_maps, label_of, parameter_curves, shown
 from flockd.campaign.conduct import is_known
 from flockd.campaign.figures import MEASURES, Interval
 from flockd.campaign.results import Results, Row
@@ -133,22 +126,13 @@ _CURVES = (
     "confidence interval of that mean. All cells fly the same seeds."
 )
 _MAPS = "How to read this: the mean over the seeds and over all other parameters."
-_DISTANCES = (
-    "How to read this: of each flight the smallest distance of two drones in 3D; on the left how many flights came how "
-    "near, on the right the share of flights that came as near or nearer."
-)
 _CELLS = "How to read this: mean over the seeds, and half the width of its 95 % confidence interval."
 _NEAREST = "The flights in which two drones came nearest; the command flies one again, with its full report."
-_DIFFERENCES = (
-    "How to read this: the line is the 95 % confidence interval of the difference; green is better, orange is worse, "
-    "grey may be chance."
-)
 _TEST = (
     "Flights with the same seed have the same starts, gusts and worlds, so they are pairs. The permutation test gives "
     "each pair’s difference either sign: p is the share of all ways in which the mean difference would be as large, if "
-    "it did not matter which campaign a flight is of. Without common seeds, flights are exchanged between the "
-    f"campaigns instead. p is adjusted for the number of figures (Holm); below {LEVEL:g} a difference is "
-    "called one."
+    f"it did not matter which campaign a flight is of. p is adjusted for the number of figures (Holm); below {LEVEL:g} "
+    "a difference is called one."
 )
 
 
@@ -160,12 +144,9 @@ def _parts(results: Results) -> list[Part]:
             curves.append(_svg(drawing, f"{figure}-curves", f"{label_of(figure)} over the parameters"))
         if (two := heat_maps(results, figure)) is not None:
             maps.append(_svg(two, f"{figure}-map", f"{label_of(figure)} over two parameters"))
-    distances = distance_distribution(results)
-    of_distances = [] if distances is None else [_svg(distances, "distances", "Distribution of the nearest distances")]
     drawn = [
         Part("Figures over the parameters", _CURVES, curves),
         Part("Two parameters at once", _MAPS, maps),
-        Part("Nearest distances", _DISTANCES, of_distances),
     ]
     tables = [_nearest(results), _cells(results), _failures(results)]
     return [*(part for part in drawn if part.drawings), *(part for part in tables if part.rows)]
@@ -212,13 +193,7 @@ def _comparison_parts(comparison: Comparison) -> list[Part]:
     names = [str(one.path) for one in (comparison.first, comparison.second)]
     columns = ["figure", *names, "difference", "95 % confidence", "pairs", "p", names[1]]
     parts = [
-        Part(
-            "Differences",
-            _DIFFERENCES,
-            [_svg(difference_figure(comparison), "differences", "Difference in each figure")],
-            columns,
-            [_verdict_row(verdict) for verdict in comparison.verdicts],
-        ),
+        Part("Differences", "", (), columns, [_verdict_row(verdict) for verdict in comparison.verdicts]),
         Part("The test", _TEST),
     ]
     if comparison.changes:
@@ -237,7 +212,7 @@ def _verdict_row(verdict: Verdict) -> list[str | TableCell]:
         TableCell(f"{verdict.second:.4g}"),
         TableCell(f"{difference.mean:+.3g}"),
         TableCell(f"{difference.low:+.3g} to {difference.high:+.3g}"),
-        TableCell(f"{verdict.pairs}" if verdict.pairs else "none"),
+        TableCell(f"{verdict.pairs}"),
         TableCell(f"{verdict.p:.2g}"),
         TableCell(verdict.says, kind="met" if verdict.says == "better" else ""),
     ]

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
 from scipy.special import ndtri, stdtrit
 
 from flockd.core.messages import FloatArray
@@ -151,7 +152,7 @@ MEASURES: dict[str, Measure] = {
 
 def _known(figure: str) -> str:
     if figure not in MEASURES:
-        raise ValueError(f"is no figure; write one of {', '.join(MEASURES)}")
+        raise PydanticCustomError("unknown_figure", "is no figure")
     return figure
 
 

@@ -230,7 +230,7 @@ def values_of(variation: Variation) -> tuple[Any, ...]:
     if variation.values is not None:
         return variation.values
     low, high, steps = variation.low, variation.high, variation.steps
-    assert isinstance(low, float | int) and isinstance(high, float | int) and steps is not None
+    assert low is not None and high is not None and steps is not None
     # To 12 digits: 0.3 and not 0.30000000000000004.
     return tuple(float(f"{value:.12g}") for value in np.linspace(low, high, steps))
 
@@ -240,12 +240,11 @@ def _count_of_cells(config: CampaignConfig) -> int:
     return max(len(config.cases), 1) * math.prod(sizes)
 
 
-def _draw(variation: Variation, key: str, seed: int) -> float | tuple[float, ...]:
+def _draw(variation: Variation, key: str, seed: int) -> float:
     """One flight's own value: by its seed and the key alone."""
     assert variation.low is not None and variation.high is not None
     rng = np.random.default_rng([seed, zlib.crc32(key.encode())])
-    drawn = rng.uniform(variation.low, variation.high)
-    return float(drawn) if np.ndim(drawn) == 0 else tuple(drawn.tolist())
+    return float(rng.uniform(variation.low, variation.high))
 
 
 def _idle_seeds(plan: Plan) -> str | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -36,7 +36,7 @@ class Verdict:
     difference: Interval
     """Second less first, with its 95 % confidence interval."""
     pairs: int
-    """Seeds that both flew; 0: they have none in common, and were compared as they are."""
+    """Seeds that both flew."""
     p: float
     """How often a difference so large would come up if there were none, adjusted for all figures (Holm, 1979)."""
 
@@ -82,7 +82,7 @@ def compare(first: Results, second: Results) -> Comparison:
     if not verdicts:
         raise UsageError(
             f"{first.path} and {second.path} cannot be compared, without a cell and a figure that both have of two "
-            "seeds; vary and measure the same in both"
+            "seeds alike; vary and measure the same in both, from the same `seed` on"
         )
     return Comparison(
         first, second, len(cells), _adjusted(verdicts), tuple(differences(_values(first), _values(second)))
@@ -95,46 +95,26 @@ def _verdict(first: Results, second: Results, figure: Figure, cells: list[tuple[
     # Flight n of both is a pair only where the seeds are the same.
     offset = first.plan.config.seed - second.plan.config.seed
     common = [number for number in mine if number + offset in theirs]
-    if len(common) >= 2:
-        a = np.array([mine[number] for number in common])
-        b = np.array([theirs[number + offset] for number in common])
-        difference = mean_interval((b - a).tolist())
-        assert difference is not None
-        return Verdict(figure, float(a.mean()), float(b.mean()), difference, len(common), paired_p(b - a))
-    a, b = np.array(list(mine.values())), np.array(list(theirs.values()))
-    if min(len(a), len(b)) < 2:
+    a = np.array([mine[number] for number in common])
+    b = np.array([theirs[number + offset] for number in common])
+    difference = mean_interval((b - a).tolist())
+    if difference is None:
         return None
-    return Verdict(figure, float(a.mean()), float(b.mean()), _of_two(a, b), 0, unpaired_p(a, b))
+    return Verdict(figure, float(a.mean()), float(b.mean()), difference, len(common), paired_p(b - a))
 
 
 def paired_p(differences: FloatArray) -> float:
-    """By flipping signs: of (n,) differences, how often their mean is as far from zero if each could be either way."""
-    return _p((differences,), "samples", lambda change, axis: change.mean(axis=axis))
+    """By flipping signs: of (n,) differences, how often their mean is as far from zero if each could be either way.
 
-
-def unpaired_p(first: FloatArray, second: FloatArray) -> float:
-    """By exchanging values: how often two sets drawn from all of them have means as far apart."""
-    return _p((first, second), "independent", lambda a, b, axis: b.mean(axis=axis) - a.mean(axis=axis))
-
-
-def _p(
-    samples: tuple[FloatArray, ...], kind: Literal["samples", "independent"], statistic: Callable[..., FloatArray]
-) -> float:
-    """The p value of all permutations, or of `_DRAWS` of them where there are more."""
+    Of all ways, or of `_DRAWS` of them where there are more.
+    """
     from scipy.stats import permutation_test  # noqa: PLC0415 - heavy
 
-    at_once = max(_NUMBERS_AT_ONCE // sum(map(len, samples)), 1)
+    at_once = max(_NUMBERS_AT_ONCE // len(differences), 1)
     found = permutation_test(
-        samples, statistic, permutation_type=kind, n_resamples=_DRAWS, batch=at_once, rng=0, vectorized=True
+        (differences,), np.mean, permutation_type="samples", n_resamples=_DRAWS, batch=at_once, rng=0, vectorized=True
     )
     return float(found.pvalue)
-
-
-def _of_two(first: FloatArray, second: FloatArray) -> Interval:
-    """The difference of two means, taken as normal."""
-    mean = float(second.mean() - first.mean())
-    reach = 1.96 * float(np.sqrt(first.var(ddof=1) / len(first) + second.var(ddof=1) / len(second)))
-    return Interval(mean, mean - reach, mean + reach)
 
 
 def _adjusted(verdicts: list[Verdict]) -> tuple[Verdict, ...]:

@@ -175,7 +175,7 @@ def test_the_report_says_what_was_flown(plan: Plan, tmp_path: Path) -> None:
     assert "12 flights of paper_flight in 2 cells" in page
     assert f"flockd campaign rerun {tmp_path / 'out' / 'c1-s3'}" in page
     assert "no flight today" in page
-    assert page.count("<svg") == 3, "two figures over a parameter, and the distribution of distances"
+    assert page.count("<svg") == 2, "two figures over a parameter"
     assert "http://" not in page.replace("http://www.w3.org", "")
     mean = results.interval("min_distance_m", [1])
     assert mean is not None

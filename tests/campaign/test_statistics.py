@@ -11,7 +11,7 @@ import pytest
 from flockd.campaign.conduct import Schedule
 from flockd.campaign.figures import mean_interval
 from flockd.campaign.flight_plan import Plan, Run
-from flockd.campaign.verdicts import paired_p, unpaired_p
+from flockd.campaign.verdicts import paired_p
 from tests.campaign.flights import HEAD, campaign_file
 
 
@@ -82,8 +82,3 @@ def test_paired_differences_that_all_go_one_way() -> None:
     assert paired_p(np.array([1.0, -1.0, 1.0, -1.0])) == 1.0
     assert paired_p(np.full(30, 0.2)) < 1e-3
     assert paired_p(np.tile([1.0, -1.1], 15)) > 0.5
-
-
-def test_two_sets_without_pairs() -> None:
-    """Two of 20 ways to draw 3 of 6 have means as far apart: p = 0.1."""
-    assert unpaired_p(np.array([1.0, 2.0, 3.0]), np.array([11.0, 12.0, 13.0])) == 0.1
