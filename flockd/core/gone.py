@@ -59,6 +59,8 @@ KEYS: Mapping[str, str] = {
     "autopilot.max_heartbeat_age_s": "write `heartbeat_timeout_s` in the section `safety`",
     "cameras.compression.h264_mbit_s": "write `jpeg_quality`; streams are no longer simulated",
     "desired": "write the section `mission`, with `kind: circle_then_tangent` for the same flight",
+    "faults.kind": "delete it: a camera that fails sends nothing but noise",
+    "faults.sigma": "delete it: a camera that fails sends nothing but noise",
     "safety.degraded_gusts_m_s": "write `degraded_velocity_error_m_s`",
     "safety.gate.max_drift_m_s": "delete it: wind is left to the autopilot",
     "safety.gate.response_s": "delete it, and write `reaction_s`, which contains it",

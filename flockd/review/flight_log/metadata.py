@@ -46,8 +46,6 @@ class FleetMetadata(BaseModel):
     """Ego-motions that are not in the log, as the pilot had skipped a frame set."""
     frames_late_s: Percentiles
     """Simulated seconds until the last drone had its frames."""
-    autopilot_clock_rates: list[float]
-    """Seconds of each autopilot's clock in one of the simulation's."""
     order_last_20s: float
     union_last_20s: float
     handed_over: dict[str, str]

@@ -29,9 +29,6 @@ from flockd.sim.vehicles.vehicles import REFERENCE_DEG, UNDISTURBED, Disturbance
 from flockd.sim.world.obstacle_worlds import obstacles_of
 from flockd.sim.world.world import World
 
-_BANDS, _BAND_SHARE = 4, 8
-"""Bands of interference in an image, each an eighth of it high; they may overlap."""
-
 
 class CameraFaults:
     """The faults of one scenario. The same seed gives the same images."""
@@ -47,22 +44,8 @@ class CameraFaults:
         passed_s = time_s - self._began_s
         for fault in self._faults:
             if (fault.drone, fault.camera) == (drone + 1, camera) and fault.begin_s <= passed_s < fault.end_s:
-                image = noisy_image(image, fault, self._rng)
+                image = self._rng.integers(0, 256, image.shape, dtype=np.uint8)
         return image
-
-
-def noisy_image(image: UInt8Array, fault: CameraFaultConfig, rng: np.random.Generator) -> UInt8Array:
-    """A noisy copy of an RGB image (h, w, 3)."""
-    if fault.kind == "gaussian":
-        added = image + fault.sigma * rng.standard_normal(image.shape)
-        return np.clip(np.rint(added), 0, 255).astype(np.uint8)
-    noise = rng.integers(0, 256, image.shape, dtype=np.uint8)
-    if fault.kind == "uniform":
-        return noise
-    copy, height = image.copy(), len(image) // _BAND_SHARE
-    for top in rng.integers(0, len(image) - height + 1, _BANDS):
-        copy[top : top + height] = noise[top : top + height]
-    return copy
 
 
 def true_rigs(scenario: ScenarioConfig) -> list[Rig]:

@@ -184,17 +184,12 @@ class DetectionsConfig(Section):
 
 
 class CameraFaultConfig(Section):
-    """What goes wrong with one simulated camera."""
+    """That one simulated camera sends nothing but noise."""
 
     drone: Annotated[int, Field(ge=1)]
     """Whose: the number of its entry in `vehicles`, from 1."""
     camera: str
     """Its name in the rig."""
-    kind: Literal["uniform", "gaussian", "interference"]
-    """`uniform`: nothing but noise; `gaussian`: noise of `sigma` on the image; `interference`: bands of noise, at other
-    places in each image."""
-    sigma: Annotated[float, Field(gt=0, le=255)] = 50.0
-    """Standard deviation in grey levels of 0-255, for `gaussian`."""
     begin_s: NonNegative = 0.0
     """Counted from the first image of the flight; with PX4, that is before the take-off."""
     end_s: Positive = MAX_DURATION_S

@@ -139,47 +139,38 @@ class _Fleet:
         """Starts all programs and waits until they are connected."""
         self._autopilots.start()
         self._needed = self._autopilots.programs()
-        self._wait_for(
-            self._station.is_connected,
-            AUTOPILOT_START_S * self._speed_factor,
-            lambda i: f"{self._autopilots.name} {i + 1} sent nothing for {AUTOPILOT_START_S:g} s",
-        )
+        start_s = AUTOPILOT_START_S * self._speed_factor
+        self._until(self._station.is_connected, start_s, f"heard nothing of its {self._autopilots.name}")
         self._station.request_messages()
         self._server.start()
         self._daemons.start()
         self._needed = (*self._autopilots.programs(), *self._daemons.programs())
-        self._wait_for(
-            lambda i: self._daemons.is_ready(self.drones.index(i)),
-            DAEMON_START_S * self._speed_factor,
-            lambda i: f"the daemon of drone{i + 1} was not ready after {DAEMON_START_S:g} s ({self._last_messages(i)})",
-            of=self.drones,
-        )
+        self._until(
+            lambda i: self._daemons.is_ready(self.drones.index(i)), DAEMON_START_S * self._speed_factor,
+            "had no daemon that was ready", of=self.drones,
+        )  # fmt: skip
 
     def take_off(self) -> None:
         """Arms, climbs to the drone's own height, and selects offboard when flockd is ready."""
         station = self._station
         self._began_s, apart_s = self._clock(), self._scenario.take_off_apart_s * (len(self._all) - 1)
-        up_s = ARM_S + CLIMB_S + apart_s
-        self._request(self._is_up, self._request_climb, up_s, "could not be armed or did not reach its height")
-        self._wait_for(
-            lambda i: self._status(i).startswith("ready") and station.mode_is(i, "LOITER"),
-            READY_S,
-            lambda i: f"flockd was not ready to fly drone{i + 1} after {READY_S:g} s ({self._last_messages(i)})",
-            of=self.drones,
-        )
+        up_s, late = ARM_S + CLIMB_S + apart_s, "could not be armed or did not reach its height"
+        self._until(self._is_up, up_s, late, request=self._request_climb)
+        self._until(
+            lambda i: self._status(i).startswith("ready") and station.mode_is(i, "LOITER"), READY_S,
+            "had no flockd that was ready to fly it", of=self.drones,
+        )  # fmt: skip
         modes: dict[int, Mode] = {i: "POSCTL" if i in self._hands else "OFFBOARD" for i in self._all}
-        self._request(
-            lambda i: station.mode_is(i, modes[i]),
-            lambda i: station.select(i, modes[i]),
-            OFFBOARD_S,
+        self._until(
+            lambda i: station.mode_is(i, modes[i]), OFFBOARD_S,
             "did not go into offboard, or one that is flown by hand into Position mode",
-        )
+            request=lambda i: station.select(i, modes[i]),
+        )  # fmt: skip
 
     def fly(self, progress: Progress) -> FleetRun:
         """Monitors the flight until its time is over, or until KeyboardInterrupt once there is something to report."""
         run = FleetRun(self._clock(), began=datetime.now(UTC).isoformat(timespec="seconds"))
-        wall_s, cpu_s, booted = time.monotonic(), self._cpu_s(), [self._station.uptime_s(i) for i in self._all]
-        total_s = self._scenario.duration_s
+        wall_s, cpu_s, total_s = time.monotonic(), self._cpu_s(), self._scenario.duration_s
         try:
             while (flying_s := self._clock() - run.began_s) < total_s:
                 progress(int(flying_s), int(total_s))
@@ -196,7 +187,6 @@ class _Fleet:
         self._note_handovers(run, np.inf)
         run.ended_s, run.wall_s = self._clock(), time.monotonic() - wall_s
         run.cores = {kind: (after - cpu_s[kind]) / run.wall_s for kind, after in self._cpu_s().items()}
-        run.clock_rates = [rate for i in self._all if (rate := _rate(booted[i], self._station.uptime_s(i))) is not None]
         version = self._station.version(0)
         is_fake = self._autopilots.name == SimulatedAutopilots.name
         run.autopilot = self._autopilots.name if is_fake or version is None else f"{self._autopilots.name} {version}"
@@ -214,9 +204,9 @@ class _Fleet:
         run.notes += [f"{name} had ended, so that its drone was not landed" for name in ended]
         self._needed = ()
         try:
-            self._request(
-                lambda i: self._autopilot_ended(i) or not self._station.is_armed(i),
-                lambda i: self._station.select(i, "LAND"), LAND_S, "did not land",
+            self._until(
+                lambda i: self._autopilot_ended(i) or not self._station.is_armed(i), LAND_S, "did not land",
+                request=lambda i: self._station.select(i, "LAND"),
             )  # fmt: skip
         except UnavailableError as error:  # the flight is over, and worth its report
             run.notes.append(str(error))
@@ -297,34 +287,21 @@ class _Fleet:
             messages.append(f"autopilot: {self._station.last_text(i)}")
         return "; ".join(messages)
 
-    def _request(
-        self, done: Callable[[int], bool], request: Callable[[int], None], timeout_s: float, otherwise: str
-    ) -> None:
-        """Sends a request to all drones, and again to those that have not complied; raises after the timeout."""
-        until_s, sent_s = self._clock() + timeout_s, -np.inf
-        while (pending := [i for i in self._all if not done(i)]) and self._clock() < until_s:
-            if self._clock() - sent_s >= REQUEST_AGAIN_S:
-                sent_s = self._clock()
+    def _until(
+        self, done: Callable[[int], bool], timeout_s: float, otherwise: str, *,
+        request: Callable[[int], None] | None = None, of: Sequence[int] | None = None,
+    ) -> None:  # fmt: skip
+        """Waits for all drones, with requests to those that are not done; raises after the timeout."""
+        until_s, asked_s = self._clock() + timeout_s, -np.inf
+        while pending := [i for i in (self._all if of is None else of) if not done(i)]:
+            now_s, first = self._clock(), pending[0]
+            if now_s >= until_s:
+                why = self._last_messages(first) or "see its log"
+                raise UnavailableError(f"drone{first + 1} {otherwise} within {timeout_s:g} s ({why})")
+            if request is not None and now_s - asked_s >= REQUEST_AGAIN_S:
+                asked_s = now_s
                 for i in pending:
                     request(i)
-            self._poll()
-        if pending:
-            first = pending[0]
-            raise UnavailableError(
-                f"drone{first + 1} {otherwise} within {timeout_s:g} s ({self._last_messages(first)})"
-            )
-
-    def _wait_for(
-        self,
-        done: Callable[[int], bool],
-        timeout_s: float,
-        otherwise: Callable[[int], str],
-        of: Sequence[int] | None = None,
-    ) -> None:
-        until_s = self._clock() + timeout_s
-        while pending := [i for i in (self._all if of is None else of) if not done(i)]:
-            if self._clock() >= until_s:
-                raise UnavailableError(f"{otherwise(pending[0])}; see its log")
             self._poll()
 
     def _poll(self) -> None:
@@ -371,9 +348,3 @@ def _kept(folder: Path, logs: Path) -> Iterator[None]:
 
 def _logs_in(folder: Path) -> list[Path]:
     return [*folder.glob("*.log"), *folder.glob("drone*.yaml")]
-
-
-def _rate(before: tuple[float, float] | None, after: tuple[float, float] | None) -> float | None:
-    if before is None or after is None or after[1] <= before[1]:
-        return None
-    return (after[0] - before[0]) / (after[1] - before[1])

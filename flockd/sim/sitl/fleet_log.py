@@ -66,8 +66,6 @@ class FleetRun:
     modes: dict[str, list[str]] = field(default_factory=dict)
     """The flight modes of each autopilot, in order, by its drone's name."""
     autopilot: str = ""
-    clock_rates: list[float] = field(default_factory=list)
-    """Seconds of each autopilot's clock in one of the simulation's."""
     exit_codes: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -171,7 +169,6 @@ def _metadata(
         longest_step_s=longest_step_s,
         motions_over_more_than_one_frame_set=spanning,
         frames_late_s=Percentiles(p50=float(np.percentile(delays_s, 50)), p95=float(np.percentile(delays_s, 95))),
-        autopilot_clock_rates=[round(rate, 4) for rate in run.clock_rates],
         order_last_20s=float(np.mean([order(velocity[s]) for s in end])),
         union_last_20s=float(np.mean([union(position[s], flocking.observation_distance_m) for s in end])),
         handed_over={name: why for name, why in run.handed_over.items() if name not in over},

@@ -45,14 +45,7 @@ FURTHER_MODES = {10 << 16: "TERMINATION"}
 """Those of PX4's modes, by number, that pymavlink has no name for."""
 _RECEIVED = {
     name: int(getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
-    for name in (
-        "HEARTBEAT",
-        "HIL_STATE_QUATERNION",
-        "CURRENT_MODE",
-        "SYSTEM_TIME",
-        "STATUSTEXT",
-        "AUTOPILOT_VERSION",
-    )
+    for name in ("HEARTBEAT", "HIL_STATE_QUATERNION", "CURRENT_MODE", "STATUSTEXT", "AUTOPILOT_VERSION")
 }
 
 
@@ -88,8 +81,6 @@ class _Vehicle:
     pose: _Pose | None = None
     mode: int | None = None
     armed: bool = False
-    booted_s: tuple[float, float] | None = None
-    """On its clock, and then on ours."""
     version: str | None = None
     texts: list[str] = field(default_factory=list)
     chunks: StatusText = field(default_factory=StatusText)
@@ -132,10 +123,9 @@ class GroundStation:
         return vehicle.pose is not None and vehicle.mode is not None
 
     def request_messages(self) -> None:
-        """Requests mode, system time and version from all autopilots."""
+        """Requests mode and version from all autopilots."""
         for vehicle in self._vehicles:
             self._command(vehicle, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, _RECEIVED["CURRENT_MODE"], 1e6 / MODE_HZ)
-            self._command(vehicle, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, _RECEIVED["SYSTEM_TIME"], 1e6)
             self._command(vehicle, mavlink.MAV_CMD_REQUEST_MESSAGE, _RECEIVED["AUTOPILOT_VERSION"])
 
     def poses(self) -> Poses:
@@ -169,10 +159,6 @@ class GroundStation:
     def version(self, number: int) -> str | None:
         """Version of its firmware, such as `1.18.0`; None while it is not known."""
         return self._vehicles[number].version
-
-    def uptime_s(self, number: int) -> tuple[float, float] | None:
-        """Seconds since it started by its own clock, and when it said so on ours; None where it does not say."""
-        return self._vehicles[number].booted_s
 
     def arm(self, number: int) -> None:
         """Sends the request to arm; see `is_armed`."""
@@ -243,8 +229,6 @@ def _update(vehicle: _Vehicle, message: Any, now: float) -> None:
             vehicle.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         case "CURRENT_MODE":
             vehicle.mode = int(message.custom_mode)
-        case "SYSTEM_TIME":
-            vehicle.booted_s = message.time_boot_ms * 1e-3, now
         case "STATUSTEXT":
             text = vehicle.chunks.joined(message.to_dict())
             if text is not None:

@@ -125,48 +125,40 @@ class Mesh:
         bands = np.atleast_2d(tint)
         share = np.linspace(0.0, 1.0, len(bands) + 1)[:, None, None]
         rings = base + share * (tip - base) + (radius[0] + share * (radius[1] - radius[0])) * ring
-        vertices = np.vstack([rings.reshape(-1, 3), base[None], tip[None]])
-        k = np.arange(sides)
-        following = (k + 1) % sides
-        faces, shades = [], []
-        for band, colour in enumerate(bands):
-            low, high = band * sides, (band + 1) * sides
-            faces.append(np.stack([k + low, following + low, k + high], 1))
-            faces.append(np.stack([following + low, following + high, k + high], 1))
-            shades.append(np.tile(colour, (2 * sides, 1)))
-        end = len(bands) * sides
-        faces += [
-            np.stack([following, k, np.full(sides, end + sides)], 1),
-            np.stack([k + end, following + end, np.full(sides, end + sides + 1)], 1),
-        ]
-        shades += [np.tile(bands[0], (sides, 1)), np.tile(bands[-1], (sides, 1))]
-        triangles, colours = np.vstack(faces), np.vstack(shades)
-        if radius[1] == 0:  # a point has no cap
-            keep = np.linalg.norm(face_normals(vertices, triangles), axis=1) > 0.5
-            triangles, colours = triangles[keep], colours[keep]
-        self.add(vertices, triangles, texture, colours, tile)
+        self.loft(list(rings), texture, bands, tile, ends=np.stack([base, tip]))
 
     def loft(
-        self, rings: list[FloatArray], texture: int, tint: FloatArray, tile: tuple[float, float] = (1.0, 1.0)
+        self,
+        rings: list[FloatArray],
+        texture: int,
+        tint: FloatArray,
+        tile: tuple[float, float] = (1.0, 1.0),
+        *,
+        ends: FloatArray | None = None,
     ) -> None:
         """A closed skin over rings (n, 3) of equally many points, right-handed about the way from first to last.
 
-        ``tint`` (len(rings) - 1, 3): of the bands between the rings.
+        ``tint`` (len(rings) - 1, 3): of the bands between the rings. ``ends`` (2, 3): middles of the first and the last
+        ring, where these are not the means of their points.
         """
         sides = len(rings[0])
         k = np.arange(sides)
         following = (k + 1) % sides
         faces = []
-        for band in range(len(rings) - 1):
-            low, high = band * sides, (band + 1) * sides
+        for low in range(0, (len(rings) - 1) * sides, sides):
+            high = low + sides
             faces.append(np.stack([k + low, following + low, k + high], 1))
             faces.append(np.stack([following + low, following + high, k + high], 1))
         last, middle = (len(rings) - 1) * sides, len(rings) * sides
         faces.append(np.stack([following, k, np.full(sides, middle)], 1))
         faces.append(np.stack([k + last, following + last, np.full(sides, middle + 1)], 1))
         colours = np.vstack([np.repeat(tint, 2 * sides, axis=0), np.repeat(tint[[0, -1]], sides, axis=0)])
-        vertices = np.vstack([*rings, rings[0].mean(0)[None], rings[-1].mean(0)[None]])
-        self.add(vertices, np.vstack(faces), texture, colours, tile)
+        middles = np.stack([rings[0].mean(0), rings[-1].mean(0)]) if ends is None else ends
+        vertices, triangles = np.vstack([*rings, middles]), np.vstack(faces)
+        if (rings[-1] == middles[1]).all():  # a point has no cap
+            keep = np.linalg.norm(face_normals(vertices, triangles), axis=1) > 0.5
+            triangles, colours = triangles[keep], colours[keep]
+        self.add(vertices, triangles, texture, colours, tile)
 
     def blob(
         self,

@@ -17,18 +17,24 @@ def relief(rng: Generator, extent: float, deviation_m: float) -> FloatArray:
     """Heights (cells + 1, cells + 1), up positive, rows north: waves of 8-40 m, mean 0, zero along the border."""
     cells = max(2, round(2 * extent / CELL_M))
     axis = np.linspace(-extent, extent, cells + 1)
-    heights = np.zeros((cells + 1, cells + 1))
-    for _ in range(24):
-        wavelength = math.exp(rng.uniform(math.log(8.0), math.log(40.0)))
-        heading, phase = rng.uniform(0, 2 * math.pi, 2)
-        k = 2 * math.pi / wavelength
-        wave = np.cos(k * (math.cos(heading) * axis[:, None] + math.sin(heading) * axis[None, :]) + phase)
-        heights += wavelength * wave
+    heights, _ = _waves(rng, axis, 24, (8.0, 40.0))
     border = np.clip((extent - np.abs(axis)) / 12.0, 0.0, 1.0)
     fade = border[:, None] * border[None, :]
     heights -= (heights * fade).sum() / fade.sum()
     heights *= fade
     return np.asarray(heights * (deviation_m / heights.std()))
+
+
+def _waves(rng: Generator, axis: FloatArray, count: int, lengths_m: tuple[float, float]) -> tuple[FloatArray, float]:
+    """The sum of so many waves on the grid of an axis, as high as they are long, and its height at the origin."""
+    heights, at_origin = np.zeros((len(axis), len(axis))), 0.0
+    for _ in range(count):
+        wavelength = math.exp(rng.uniform(math.log(lengths_m[0]), math.log(lengths_m[1])))
+        heading, phase = rng.uniform(0.0, 2.0 * math.pi, 2)
+        k = 2.0 * math.pi / wavelength
+        heights += wavelength * np.cos(k * (math.cos(heading) * axis[:, None] + math.sin(heading) * axis) + phase)
+        at_origin += wavelength * math.cos(phase)
+    return heights, at_origin
 
 
 def grid_height(heights: FloatArray, extent: float, north: FloatArray, east: FloatArray) -> FloatArray:
@@ -103,14 +109,7 @@ def steepest(heights: FloatArray, cell_m: float) -> float:
 
 def _drawn(rng: Generator, axis: FloatArray, extent: float) -> FloatArray:
     north, east = axis[:, None], axis[None, :]
-    heights = np.zeros((len(axis), len(axis)))
-    at_origin = 0.0
-    for _ in range(WAVES):
-        wavelength = math.exp(rng.uniform(*np.log(WAVELENGTHS_M)))
-        heading, phase = rng.uniform(0.0, 2.0 * math.pi, 2)
-        k = 2.0 * math.pi / wavelength
-        heights += wavelength * np.cos(k * (math.cos(heading) * north + math.sin(heading) * east) + phase)
-        at_origin += wavelength * math.cos(phase)
+    heights, at_origin = _waves(rng, axis, WAVES, WAVELENGTHS_M)
     border = _smooth((extent - np.abs(axis)) / BORDER_M)
     inner = _smooth((np.hypot(north, east) - LEVEL_M) / (FULL_M - LEVEL_M))
     return np.asarray((heights - at_origin) * border[:, None] * border[None, :] * inner)

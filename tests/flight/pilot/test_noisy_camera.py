@@ -16,8 +16,6 @@ from flockd.flight.inference.manifest_file import models_folder
 from flockd.flight.perception import OnnxNetworks
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.recording.reader import Recording
-from flockd.sim.cameras.camera_simulator import noisy_image
-from flockd.sim.scenario import CameraFaultConfig
 
 pytestmark = pytest.mark.fault("noisy-camera")
 
@@ -44,7 +42,7 @@ Spoil = Callable[[UInt8Array, int, np.random.Generator], UInt8Array]
 
 def noise(image: UInt8Array, number: int, rng: np.random.Generator) -> UInt8Array:
     """In every pixel, until its camera is good again after four images."""
-    return noisy_image(image, CameraFaultConfig(drone=1, camera=CAMERA, kind="uniform"), rng) if number < 4 else image
+    return rng.integers(0, 256, image.shape, dtype=np.uint8) if number < 4 else image
 
 
 def blocks(image: UInt8Array, number: int, rng: np.random.Generator) -> UInt8Array:

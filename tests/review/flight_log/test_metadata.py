@@ -18,7 +18,7 @@ def test_metadata_of_a_fleet_comes_back(tmp_path: Path) -> None:
         speed_factor=0.5, cores={"daemons": 1.5}, frame_sets=4, frame_sets_looked_at={"drone1": 3},
         longest_step_s=1.0, motions_over_more_than_one_frame_set=1,
         frames_late_s=Percentiles(p50=0.1, p95=float("nan")),
-        autopilot_clock_rates=[0.5], order_last_20s=1.0, union_last_20s=1.0, handed_over={"drone1": "it landed"},
+        order_last_20s=1.0, union_last_20s=1.0, handed_over={"drone1": "it landed"},
         exit_codes={"drone1": 0}, notes=["a note"],
     )  # fmt: skip
     drone = load_scenario(data_path("config") / "paper_flight.yaml").drone

@@ -82,7 +82,7 @@ def test_gates_leave_a_flock_the_shape_that_the_law_gives_it() -> None:
 
 def test_a_lost_camera_is_no_wind() -> None:
     """Drone 1, which wants 2 m/s, flies at the 1 m/s of a degraded one, until 2 s after its camera is back."""
-    fault = CameraFaultConfig(drone=1, camera="left", kind="uniform", begin_s=2.0, end_s=6.0)
+    fault = CameraFaultConfig(drone=1, camera="left", begin_s=2.0, end_s=6.0)
     scenario = load_scenario(data_path("config") / "encounter.yaml", {"duration_s": 10.0})
     far = scenario.vehicles[1].model_copy(update={"position_m": (30.0, 30.0, -5.0)})
     scenario = scenario.model_copy(update={"faults": (fault,), "vehicles": (scenario.vehicles[0], far)})

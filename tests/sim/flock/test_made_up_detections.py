@@ -52,7 +52,7 @@ def test_nobody_is_known_beyond_the_range_nor_when_all_are_missed() -> None:
 def test_nobody_is_detected_in_the_view_of_a_camera_that_has_a_fault() -> None:
     """8 m north and 6 m east of a drone that faces north: 37 degrees right of ahead, which the front camera shows."""
     for camera, yaw_deg, seen in (("front", 0.0, False), ("back", 0.0, True), ("left", 90.0, False)):
-        fault = CameraFaultConfig(drone=1, camera=camera, kind="uniform", begin_s=2.0, end_s=4.0)
+        fault = CameraFaultConfig(drone=1, camera=camera, begin_s=2.0, end_s=4.0)
         scenario = ENCOUNTER.model_copy(update={"faults": (fault,)})
         tracked = TrackedNeighbours(scenario, DetectionsConfig(missed=0.0), 0)
         others = TrackedNeighbours(scenario, DetectionsConfig(missed=0.0), 1)
@@ -66,7 +66,7 @@ def test_nobody_is_detected_in_the_view_of_a_camera_that_has_a_fault() -> None:
 
 
 def test_a_drone_that_lost_a_camera_flies_degraded() -> None:
-    fault = CameraFaultConfig(drone=1, camera="back", kind="uniform", begin_s=0.5, end_s=9.0)
+    fault = CameraFaultConfig(drone=1, camera="back", begin_s=0.5, end_s=9.0)
     scenario = ENCOUNTER.model_copy(update={"faults": (fault,), "detections": DetectionsConfig(latency_s=0.0)})
     loop, vehicles = ControlLoop(scenario), Vehicles(scenario.vehicles, scenario.vehicle)
     speeds_m_s = []

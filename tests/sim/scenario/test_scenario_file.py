@@ -83,10 +83,10 @@ FLIGHTS = (
     ("[0, 0, -4]", "[0, 0, 4.5]", "4: vehicles[0].position_m: the third number points down"),
     ("[0, 0, -4]", "[0, 0, -0.2]", "4: vehicles[0].position_m: begins 0.2 m above the ground"),
     ("[0, 5, -4]", "[0, 0, -4]", "5: vehicles[1].position_m: is 0 m from vehicles[0]"),
-    ("", "faults: [{drone: 3, camera: front, kind: uniform}]", "2: faults[0].drone: is 3, but there are 2"),
-    ("", "faults: [{drone: 1, camera: top, kind: uniform}]", "2: faults[0].camera: is not in the rig"),
+    ("", "faults: [{drone: 3, camera: front}]", "2: faults[0].drone: is 3, but there are 2"),
+    ("", "faults: [{drone: 1, camera: top}]", "2: faults[0].camera: is not in the rig"),
     (
-        *("", "faults: [{drone: 1, camera: front, kind: gaussian, begin_s: 5.0, end_s: 4.0}]"),
+        *("", "faults: [{drone: 1, camera: front, begin_s: 5.0, end_s: 4.0}]"),
         "2: faults[0].end_s: is not after begin_s 5",
     ),
     (
