@@ -71,20 +71,6 @@ class Thing(NamedTuple):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def project_vertices(vertices: Any, P: Any, origin: Any) -> Any:
-    """Homogeneous pixel coordinates (n, 3): ``P @ (vertex - origin)``."""
-    count = vertices.shape[0]
-    q = np.empty((count, 3))
-    for i in range(count):
-        x = vertices[i, 0] - origin[0]
-        y = vertices[i, 1] - origin[1]
-        z = vertices[i, 2] - origin[2]
-        for k in range(3):
-            q[i, k] = P[k, 0] * x + P[k, 1] * y + P[k, 2] * z
-    return q
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
 def set_up_triangles(q: Any, triangles: Any, width: int, height: int, rows: Any, planes: Any) -> None:
     """Row range and plane coefficients of each triangle that can be seen; rows (0, -1) for the others.
 
@@ -450,57 +436,3 @@ def lay_over(
             if t >= 0 and inverse_depth[middle_y, middle_x] > limit:
                 depth[y, x] = 1.0 / (planes[t, 9] * (middle_x + 0.5) + planes[t, 10] * (middle_y + 0.5) + planes[t, 11])
                 ids[y, x] = thing.identity
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def flow(depth: Any, ids: Any, depth_2: Any, ids_2: Any, H: Any, t: Any, out: Any, valid: Any) -> None:
-    """Pixel motion: ``z2 (u2, v2, 1) = z H[id] (u, v, 1) + t[id]``, and whether the second image shows that point."""
-    height, width = ids.shape
-    for y in range(height):
-        for x in range(width):
-            u = x + 0.5
-            v = y + 0.5
-            k = ids[y, x]
-            m = H[k]
-            z = depth[y, x]
-            sky = not z < np.inf
-            a = m[0, 0] * u + m[0, 1] * v + m[0, 2]
-            b = m[1, 0] * u + m[1, 1] * v + m[1, 2]
-            c = m[2, 0] * u + m[2, 1] * v + m[2, 2]
-            if not sky:
-                a = z * a + t[k, 0]
-                b = z * b + t[k, 1]
-                c = z * c + t[k, 2]
-            if c <= 1e-6:
-                out[y, x, 0] = 0.0
-                out[y, x, 1] = 0.0
-                valid[y, x] = False
-                continue
-            u2 = a / c
-            v2 = b / c
-            out[y, x, 0] = u2 - u
-            out[y, x, 1] = v2 - v
-            valid[y, x] = False
-            if u2 < 0.0 or v2 < 0.0 or u2 >= width or v2 >= height:
-                continue
-            i = int(u2)
-            j = int(v2)
-            if ids_2[j, i] != k:
-                continue
-            if sky:
-                valid[y, x] = not depth_2[j, i] < np.inf
-                continue
-            if abs(depth_2[j, i] - c) < 0.01 * c:
-                valid[y, x] = True
-                continue
-            # Steep planes change by more than that within a pixel; 1/z is linear in the image.
-            fx = u2 - 0.5
-            fy = v2 - 0.5
-            i = max(0, min(width - 2, math.floor(fx)))
-            j = max(0, min(height - 2, math.floor(fy)))
-            fx -= i
-            fy -= j
-            inverse = (1.0 - fy) * ((1.0 - fx) / depth_2[j, i] + fx / depth_2[j, i + 1]) + fy * (
-                (1.0 - fx) / depth_2[j + 1, i] + fx / depth_2[j + 1, i + 1]
-            )
-            valid[y, x] = abs(inverse * c - 1.0) < 0.01

@@ -145,7 +145,11 @@ def rasterized(
 ) -> tuple[FloatArray, Indices, Float32Array]:
     """Planes (m, 12) of triangles, and of each pixel the nearest one, -1 for none, and 1/z of it, (h, w)."""
     rows, planes = np.empty((len(triangles), 2), dtype=np.int32), np.empty((len(triangles), 12))
-    _raster.set_up_triangles(_raster.project_vertices(vertices, P, origin), triangles, width, height, rows, planes)
+    x, y, z = (vertices - origin).T[..., None]
+    pixels = np.ascontiguousarray(
+        P[:, 0] * x + P[:, 1] * y + P[:, 2] * z
+    )
+    _raster.set_up_triangles(pixels, triangles, width, height, rows, planes)
     hit, inverse_depth = np.empty((height, width), dtype=np.int32), np.empty((height, width), dtype=np.float32)
     visible = np.flatnonzero(rows[:, 1] >= rows[:, 0]).astype(np.int32)
     _raster.fill(visible, rows, planes, inverse_depth, hit)
@@ -181,8 +185,6 @@ def true_flow(
     """
     h, w = first.ids.shape
     K = np.asarray(matrix, dtype=np.float64)
-    flow = np.empty((h, w, 2), dtype=np.float32)
-    valid = np.empty((h, w), dtype=np.bool_)
     # From the first camera's axes to the second's, for the world (0) and for each drone (k + 1): p2 = A p1 + b.
     count = len(drone_positions[0])
     A = np.empty((count + 1, 3, 3))
@@ -193,6 +195,24 @@ def true_flow(
         turn = drone_rotations[1][k] @ drone_rotations[0][k].T
         A[k + 1] = R2.T @ turn @ R1
         b[k + 1] = R2.T @ (turn @ (p1 - drone_positions[0][k]) + drone_positions[1][k] - p2)
-    inverse_K = np.linalg.inv(K)
-    _raster.flow(first.depth, first.ids, second.depth, second.ids, K @ A @ inverse_K, b @ K.T, flow, valid)
-    return flow, valid
+    H, t = (K @ A @ np.linalg.inv(K))[first.ids], (b @ K.T)[first.ids]
+    v, u = np.mgrid[:h, :w] + 0.5
+    sky = ~np.isfinite(first.depth)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        point = H[..., 0] * u[..., None] + H[..., 1] * v[..., None] + H[..., 2]
+        point = np.where(sky[..., None], point, first.depth[..., None] * point + t)
+        z = point[..., 2]
+        u2, v2 = np.where(z > 1e-6, point[..., 0] / z, np.nan), np.where(z > 1e-6, point[..., 1] / z, np.nan)
+        flow = np.nan_to_num(np.stack([u2 - u, v2 - v], axis=-1)).astype(np.float32)
+        inside = (u2 >= 0.0) & (v2 >= 0.0) & (u2 < w) & (v2 < h)
+        u2, v2 = np.where(inside, u2, 0.5), np.where(inside, v2, 0.5)
+        i, j = u2.astype(int), v2.astype(int)
+        there = second.depth[j, i]
+        agrees = np.abs(there - z) < 0.01 * z
+        # Steep planes change by more than that within a pixel; 1/z is linear in the image.
+        i, j = np.clip(np.floor(u2 - 0.5), 0, w - 2).astype(int), np.clip(np.floor(v2 - 0.5), 0, h - 2).astype(int)
+        a, b = u2 - 0.5 - i, v2 - 0.5 - j
+        upper, lower = ((1.0 - a) / second.depth[row, i] + a / second.depth[row, i + 1] for row in (j, j + 1))
+        agrees |= np.abs(((1.0 - b) * upper + b * lower) * z - 1.0) < 0.01
+    same = inside & (second.ids[v2.astype(int), u2.astype(int)] == first.ids)
+    return flow, same & np.where(sky, ~np.isfinite(there), agrees)
