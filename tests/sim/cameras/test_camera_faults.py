@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from flockd.core.config.perception import NoiseParameters
 from flockd.core.messages import UInt8Array
 from flockd.flight.perception.image_noise import noise_shares
-from flockd.sim.cameras.camera_simulator import CameraFaults
+from flockd.sim.cameras.camera_simulator import CameraFaults, ImageNoise
 from flockd.sim.scenario import CameraFaultConfig
 
 GREY = np.full((128, 160, 3), 120, np.uint8)
@@ -37,3 +38,12 @@ def test_the_same_seed_is_the_same_noise_and_enough_to_be_told() -> None:
     assert np.array_equal(image, shown(same, 10.0))
     assert not np.array_equal(image, shown(other, 10.0))
     assert noise_shares(image, NoiseParameters()).white > 0.08
+
+
+@pytest.mark.parametrize("size", [(240, 320), (1280, 960), (1500, 1100)])
+def test_images_of_any_size_get_the_noise_that_is_asked_for(size: tuple[int, int]) -> None:
+    """Larger ones than the tile of noise, too: before, they ended the flight."""
+    grey = np.full((*size, 3), 128, np.uint8)
+    noisy = ImageNoise(4.0, seed=1).add(grey)
+    assert noisy.shape == grey.shape
+    assert (noisy.astype(float) - 128.0).std() == pytest.approx(4.0, rel=0.05)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import pytest
 
-from flockd.core.data import data_path
 from flockd.core.errors import UsageError
 from flockd.core.messages import FloatArray
 from flockd.flight.flocking import FlockingLaw, FlockingParameters, WeightParameters
@@ -19,16 +17,10 @@ from flockd.sim.control_level.flock_figures import orders
 from flockd.sim.control_level.flock_flights import FlockFlights
 from flockd.sim.flock.exact_states import fly_exact_states
 from flockd.sim.flock.start import scattered, with_drones
-from flockd.sim.scenario import ScenarioConfig, load_scenario
-from flockd.sim.scenario.perceived import load_perceived_errors
+from flockd.sim.scenario import ScenarioConfig
+from tests.sim.control_level.flocks import SHIPPED, flock
 
 UNIFORM = WeightParameters(kind="uniform")
-
-
-@lru_cache
-def _scenario(name: str = "paper_flight", **overrides: Any) -> ScenarioConfig:
-    keys = {key.replace("__", "."): value for key, value in overrides.items()}
-    return load_scenario(data_path("config") / f"{name}.yaml", keys)
 
 
 def _seeded(scenario: ScenarioConfig, seed: int) -> ScenarioConfig:
@@ -61,7 +53,7 @@ def _flown(flights: FlockFlights) -> tuple[FloatArray, FloatArray]:
 )
 @pytest.mark.parametrize(("drones", "spread_m"), [(2, 1.0), (7, 3.0), (60, 1.5), (60, 12.0), (40, 200.0)])
 def test_each_drone_accelerates_as_the_law_says(parameters: FlockingParameters, drones: int, spread_m: float) -> None:
-    scenario = with_drones(_scenario(), drones)
+    scenario = flock(drones=drones)
     drone = scenario.drone.model_copy(update={"flocking": parameters})
     flights = FlockFlights([scenario.model_copy(update={"drone": drone})] * 2)
     random = np.random.default_rng(drones)
@@ -81,7 +73,7 @@ def test_each_drone_accelerates_as_the_law_says(parameters: FlockingParameters, 
 
 def test_two_drones_at_one_spot_are_pushed_as_the_law_pushes_them() -> None:
     for parameters in (FlockingParameters(weight=UNIFORM), FlockingParameters()):
-        scenario = with_drones(_scenario(), 2)
+        scenario = flock(drones=2)
         drone = scenario.drone.model_copy(update={"flocking": parameters})
         flights = FlockFlights([scenario.model_copy(update={"drone": drone})])
         flights.states[:] = 0.0
@@ -93,12 +85,12 @@ def test_two_drones_at_one_spot_are_pushed_as_the_law_pushes_them() -> None:
 @pytest.mark.parametrize(
     ("scenario", "drones"),
     [
-        (_scenario(duration_s=20.0, drone__flocking__weight__kind="uniform"), 5),
-        (_scenario(duration_s=15.0, vehicle__gust_m_s=0.2, seed=3), 3),
-        (_scenario(duration_s=10.0, drone__flocking__weight__nearest=3), 12),
-        (_scenario("square", duration_s=50.0), 2),
-        (_scenario("one_knows", duration_s=15.0), 3),
-        (_scenario(duration_s=15.0, drone__mission__height_m=9.0), 2),
+        (flock(duration_s=20.0, drone__flocking__weight__kind="uniform"), 5),
+        (flock(duration_s=15.0, vehicle__gust_m_s=0.2, seed=3), 3),
+        (flock(duration_s=10.0, drone__flocking__weight__nearest=3), 12),
+        (flock("square", duration_s=50.0), 2),
+        (flock("one_knows", duration_s=15.0), 3),
+        (flock(duration_s=15.0, drone__mission__height_m=9.0), 2),
     ],
 )
 def test_a_flight_is_the_simulators_flight_with_exact_states(scenario: ScenarioConfig, drones: int) -> None:
@@ -110,7 +102,7 @@ def test_a_flight_is_the_simulators_flight_with_exact_states(scenario: ScenarioC
 
 
 def test_the_figures_are_those_of_the_metrics() -> None:
-    scenario = with_drones(_scenario(duration_s=15.0), 9)
+    scenario = flock(drones=9, duration_s=15.0)
     flights = FlockFlights([_seeded(scenario, seed) for seed in (4, 5)])
     positions, velocities = _flown(flights)
     for flight, figures in enumerate(flights.figures()):
@@ -129,7 +121,7 @@ def test_the_figures_are_those_of_the_metrics() -> None:
 
 
 def test_a_flock_that_has_fallen_apart_is_told_by_its_union() -> None:
-    scenario = with_drones(_scenario(duration_s=1.0), 4)
+    scenario = flock(drones=4, duration_s=1.0)
     flights = FlockFlights([scenario])
     flights.states[0, 0] = [0.0, 15.0, 300.0, 310.0]
     flights.states[1, 0] = 0.0
@@ -138,7 +130,7 @@ def test_a_flock_that_has_fallen_apart_is_told_by_its_union() -> None:
 
 
 def test_contacts_are_counted_from_touch_to_free() -> None:
-    scenario = with_drones(_scenario(duration_s=4.0, drone__flocking__max_acceleration_m_s2=0.001), 2)
+    scenario = flock(drones=2, duration_s=4.0, drone__flocking__max_acceleration_m_s2=0.001)
     flights = FlockFlights([scenario])
     flights.states[:, 0] = np.array([[0.0, 0.0, -4.0, 1.0, 0.0, 0.0], [3.0, 0.0, -4.0, -1.0, 0.0, 0.0]]).T
     figures = _and_fly(flights)  # 3 m apart, at 2 m/s towards each other: within 0.7 m from 1.15 to 1.85 s
@@ -151,7 +143,7 @@ def test_drones_that_pass_between_two_steps_are_as_near_as_they_were() -> None:
     then at the steps they are 0.996 m and farther apart."""
     ahead_m = math.sqrt(0.996**2 - 0.34**2) + 2 * 2.0  # two steps of 2 m before that
     free = {"drone__flocking__max_acceleration_m_s2": 1e-6, "drone__flocking__max_speed_m_s": 2.0}
-    flights = FlockFlights([with_drones(_scenario(duration_s=4.0, **free), 2)])
+    flights = FlockFlights([flock(drones=2, duration_s=4.0, **free)])
     flights.states[:, 0] = np.array([[0.0, 0.0, -4.0, 2.0, 0.0, 0.0], [ahead_m, 0.34, -4.0, -2.0, 0.0, 0.0]]).T
     positions, _ = _flown(flights)
     at_steps = np.linalg.norm(positions[:, 0, 0] - positions[:, 0, 1], axis=1).min()
@@ -170,7 +162,7 @@ def test_of_many_that_cross_the_nearest_are_found(fast: int, speed_m_s: float) -
 
     Two that are fast have passed drones that are many cells away by the next step.
     """
-    flights = FlockFlights([with_drones(_scenario(duration_s=1.0), 64)] * 8)
+    flights = FlockFlights([flock(drones=64, duration_s=1.0)] * 8)
     random = np.random.default_rng(1)
     lattice = 2.5 * np.stack(np.divmod(np.arange(64.0), 8.0))
     flights.states[:2] = lattice[:, None] + random.uniform(-0.3, 0.3, (2, 8, 64))
@@ -201,7 +193,7 @@ def test_order_of_one_that_stands_still_counts_as_in_the_metrics() -> None:
 
 @pytest.mark.parametrize("weight", ["uniform", "nearest"])
 def test_a_flight_is_the_same_in_any_batch(weight: str) -> None:
-    scenario = with_drones(_scenario(duration_s=5.0, drone__flocking__weight__kind=weight), 300)
+    scenario = flock(drones=300, duration_s=5.0, drone__flocking__weight__kind=weight)
     flown = [_seeded(scenario, seed) for seed in (7, 8, 3)]
     alone = [fly_flocks([one])[0] for one in flown[:2]]
     shorter = scenario.model_copy(update={"duration_s": 1.0})
@@ -210,25 +202,24 @@ def test_a_flight_is_the_same_in_any_batch(weight: str) -> None:
 
 
 def test_a_flight_that_arrives_says_when() -> None:
-    figures = fly_flocks([_scenario("square", duration_s=190.0)])[0]
+    figures = fly_flocks([flock("square", duration_s=190.0)])[0]
     assert figures["arrived"] is True
     assert figures["arrival_time_s"] == 160.0  # as `flockd sim config/square.yaml --perception truth` says
 
 
 def test_drones_flown_by_hand_are_refused() -> None:
     with pytest.raises(UsageError, match=r"vehicles\[0\] is flown by hand"):
-        fly_flocks([_scenario("led_by_hand")])
+        fly_flocks([flock("led_by_hand")])
 
 
 def test_at_10_hz_a_flock_with_measured_errors_keeps_the_order_that_it_has_at_2_hz() -> None:
     """What the own velocity is wrong by for seconds is not to be added to it ten times a second."""
-    errors = load_perceived_errors(data_path("config") / "perceived" / "shipped_networks.yaml")
     flown = {
         step_s: fly_flocks(
-            [_scenario().model_copy(update={"seed": seed, "drone": drone}) for seed in range(4)], errors=errors
+            [flock().model_copy(update={"seed": seed, "drone": drone}) for seed in range(4)], errors=SHIPPED
         )
         for step_s in (0.5, 0.1)
-        for drone in [_scenario().drone.model_copy(update={"step_s": step_s})]
+        for drone in [flock().drone.model_copy(update={"step_s": step_s})]
     }
     disorder = {step_s: 1 - np.mean([figures["order_tail"] for figures in each]) for step_s, each in flown.items()}
     assert disorder[0.5] < 0.001, "as flown in the paper"

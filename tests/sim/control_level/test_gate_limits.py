@@ -7,24 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.core.data import data_path
 from flockd.sim.control_level import fly_flocks
 from flockd.sim.control_level.flock_flights import FlockFlights
 from flockd.sim.flock.exact_states import fly_exact_states
-from flockd.sim.flock.start import scattered, with_drones
-from flockd.sim.scenario import ScenarioConfig, load_scenario
-from flockd.sim.scenario.perceived import load_perceived_errors
-
-TICKS, TICK_S = 10, 0.05
+from flockd.sim.flock.start import scattered
+from flockd.sim.scenario import ScenarioConfig
+from tests.sim.control_level.flocks import SHIPPED, flock, level
 
 
-def _scenario(drones: int, **overrides: Any) -> ScenarioConfig:
+def _scenario(drones: int, **keys: Any) -> ScenarioConfig:
     """A flock that is too dense: its gates have to limit it."""
-    keys = {key.replace("__", "."): value for key, value in overrides.items()}
-    keys |= {"duration_s": 6.0, "drone.safety.gate.fence_radius_m": None, "drone.flocking.weight.kind": "uniform"}
-    scenario = with_drones(load_scenario(data_path("config") / "paper_flight.yaml", keys), drones)
-    level = [v.model_copy(update={"position_m": (*v.position_m[:2], -4.0)}) for v in scenario.vehicles]
-    return scattered(scenario.model_copy(update={"vehicles": tuple(level)}), 0.8)
+    dense = {"drone__safety__gate__fence_radius_m": None, "drone__flocking__weight__kind": "uniform"}
+    return scattered(level(flock(drones=drones, duration_s=6.0, **dense, **keys)), 0.8)
 
 
 @pytest.mark.parametrize(
@@ -62,9 +56,8 @@ def test_drones_that_fly_at_each_other_stop_in_time() -> None:
 
 
 def test_a_gated_flight_is_the_same_in_any_batch() -> None:
-    errors = load_perceived_errors(data_path("config") / "perceived" / "shipped_networks.yaml")
-    flock = _scenario(130).model_copy(update={"duration_s": 1.0})
-    flown = [scattered(flock.model_copy(update={"seed": seed}), 0.1) for seed in range(4)]
-    alone = fly_flocks(flown[2:3], errors=errors, gated=True)
-    assert fly_flocks(flown, errors=errors, gated=True)[2:3] == alone
-    assert fly_flocks(flown[2:3], errors=errors) != alone
+    dense = _scenario(130).model_copy(update={"duration_s": 1.0})
+    flown = [scattered(dense.model_copy(update={"seed": seed}), 0.1) for seed in range(4)]
+    alone = fly_flocks(flown[2:3], errors=SHIPPED, gated=True)
+    assert fly_flocks(flown, errors=SHIPPED, gated=True)[2:3] == alone
+    assert fly_flocks(flown[2:3], errors=SHIPPED) != alone

@@ -7,46 +7,27 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.core.data import data_path
 from flockd.review.report.summary import obstacle_figures
 from flockd.sim.control_level import fly_flocks
 from flockd.sim.control_level.flock_flights import FlockFlights
 from flockd.sim.flock.exact_states import ExactFlock
-from flockd.sim.flock.start import scattered, with_drones
+from flockd.sim.flock.start import scattered
 from flockd.sim.flock.swarm import fly
-from flockd.sim.scenario import ScenarioConfig, load_scenario
-from flockd.sim.scenario.perceived import PerceivedErrors, load_perceived_errors
+from flockd.sim.scenario import ScenarioConfig
+from tests.sim.control_level.flocks import errors, flock
 
 STEP_S = 0.5
 
 
-def _scenario(kind: str, drones: int, **overrides: Any) -> ScenarioConfig:
+def _scenario(kind: str, drones: int, **keys: Any) -> ScenarioConfig:
     """A small, dense world around the drones."""
-    keys: dict[str, Any] = {"world.obstacles.extent_m": 20.0, "world.obstacles.free_start_m": 1.0}
-    keys |= {key.replace("__", "."): value for key, value in overrides.items()}
-    keys["drone.safety.gate.fence_radius_m"] = None
-    scenario = load_scenario(data_path("config") / f"{kind}.yaml", keys)
-    flock = with_drones(scenario, drones).vehicles
-    away = np.mean([vehicle.position_m[:2] for vehicle in flock], axis=0)
-    places = [(v.position_m[0] - away[0], v.position_m[1] - away[1], v.position_m[2]) for v in flock]
-    moved = tuple(v.model_copy(update={"position_m": place}) for v, place in zip(flock, places, strict=True))
+    small = {"world__obstacles__extent_m": 20.0, "world__obstacles__free_start_m": 1.0, **keys}
+    scenario = flock(kind, drones, **small, drone__safety__gate__fence_radius_m=None)
+    starts = scenario.vehicles
+    away = np.mean([vehicle.position_m[:2] for vehicle in starts], axis=0)
+    places = [(v.position_m[0] - away[0], v.position_m[1] - away[1], v.position_m[2]) for v in starts]
+    moved = tuple(v.model_copy(update={"position_m": place}) for v, place in zip(starts, places, strict=True))
     return scattered(scenario.model_copy(update={"vehicles": moved}), 0.5)
-
-
-def _faultless() -> PerceivedErrors:
-    """Errors of perception that measures and misses nothing wrongly."""
-    errors = load_perceived_errors(data_path("config") / "perceived" / "shipped_networks.yaml")
-    exact = {"median": 0.0, "p95": 0.0}
-    entry = dict.fromkeys(("range_error", "bearing_error_deg", "velocity_error_m_s"), exact)
-    values = errors.model_dump() | {
-        "by_distance": ({"distance_m": 1.0, "missed": 0.0, "range_bias": 0.0, "samples": 0, **entry},),
-        "range_limit_m": 100.0,
-        "elevation_limit_deg": 90.0,
-        "hidden_limit": 1.0,
-        "own_velocity_error_m_s": exact,
-        "false_neighbours": {"at_once": 0.0, "lifetime_s": 1.0, "distances_m": (1.0, 2.0, 3.0)},
-    }
-    return PerceivedErrors.model_validate(values)
 
 
 @pytest.mark.parametrize(
@@ -59,7 +40,7 @@ def _faultless() -> PerceivedErrors:
 def test_each_drone_is_asked_to_fly_as_its_own_avoidance_says(kind: str, faultless: bool, keys: dict[str, Any]) -> None:
     scenarios = [_scenario(kind, 6, seed=seed, **keys) for seed in (0, 1)]
     blind = [_scenario(kind, 6, seed=seed, **keys, drone__obstacles__enabled=False) for seed in (0, 1)]
-    flights = FlockFlights(scenarios, _faultless() if faultless else None)
+    flights = FlockFlights(scenarios, errors() if faultless else None)
     flocks = [(ExactFlock(scenario), ExactFlock(unseen)) for scenario, unseen in zip(scenarios, blind, strict=True)]
     flights.states[:3, :, 1] = flights.states[:3, :, 0] + [[0.02], [0.05], [-0.6]]  # above the first: in no direction
     turned = 0
@@ -89,7 +70,7 @@ def test_the_figures_are_those_of_a_flight_on_exact_states(enabled: bool) -> Non
 @pytest.mark.slow  # the simulator's flights take 2.5 s each
 @pytest.mark.parametrize("seed", range(4))
 def test_the_shipped_forest_is_flown_as_the_simulator_flies_it(seed: int) -> None:
-    scenario = load_scenario(data_path("config") / "forest.yaml", {"seed": seed})
+    scenario = flock("forest", seed=seed)
     flights, log = FlockFlights([scenario]), fly(scenario, perception="truth", gated=False, pictured=False).log
     for step in range(flights.steps):
         np.testing.assert_allclose(flights.states[:3, 0].T, log.position[step], atol=1e-9)
@@ -107,5 +88,5 @@ def test_a_flight_among_obstacles_is_the_same_in_any_batch() -> None:
 
 
 def test_a_flight_without_obstacles_has_no_figures_of_them() -> None:
-    scenario = load_scenario(data_path("config") / "paper_flight.yaml", {"duration_s": 1.0})
+    scenario = flock(duration_s=1.0)
     assert fly_flocks([scenario])[0]["collisions"] is None

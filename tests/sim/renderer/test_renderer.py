@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from flockd.core.messages import FloatArray
-from flockd.flight.geometry import PinholeCamera, WideAngleCamera
+from flockd.flight.geometry import Camera, PinholeCamera, WideAngleCamera
 from flockd.sim.cameras.lens_views import lens_view
 from flockd.sim.renderer.airframe import DroneModel
 from flockd.sim.renderer.drone_models import FAMILIES, drone_model
@@ -47,20 +47,24 @@ class Scene:
         self.renderer = Renderer(self.world, self.drones)
 
     def render(self, **changes: FloatArray) -> View:
-        pose = {
-            "R": self.R,
-            "position": self.position,
-            "rotations": self.rotations,
-            "positions": self.positions,
-        } | changes
+        pose = {"R": self.R, "position": self.position, "rotations": self.rotations, "positions": self.positions}
+        return self._rendered(MATRIX, SIZE, **(pose | changes))
+
+    def through(self, camera: Camera) -> View:
+        """What a lens sees from there."""
+
+        def draw(matrix: FloatArray, size: tuple[int, int], turn: FloatArray) -> View:
+            return self._rendered(matrix, size, self.R @ turn, self.position, self.rotations, self.positions)
+
+        return lens_view(camera, draw)
+
+    def _rendered(
+        self, matrix: FloatArray, size: tuple[int, int], R: FloatArray, position: FloatArray, rotations: FloatArray,
+        positions: FloatArray,
+    ) -> View:  # fmt: skip
+        everyone = np.ones(len(self.drones), dtype=bool)
         return self.renderer.render(
-            MATRIX,
-            SIZE,
-            pose["R"],
-            pose["position"],
-            drone_rotations=pose["rotations"],
-            drone_positions=pose["positions"],
-            shown=np.ones(len(self.drones), dtype=bool),
+            matrix, size, R, position, drone_rotations=rotations, drone_positions=positions, shown=everyone
         )
 
 
@@ -135,14 +139,7 @@ LENSES = {
 def test_what_any_lens_sees_agrees_with_a_ray_caster(scenes: list[Scene], lens: str) -> None:
     camera = LENSES[lens]
     for scene in scenes:
-
-        def draw(matrix: FloatArray, size: tuple[int, int], turn: FloatArray, scene: Scene = scene) -> View:
-            return scene.renderer.render(
-                matrix, size, scene.R @ turn, scene.position, drone_rotations=scene.rotations,
-                drone_positions=scene.positions, shown=np.ones(len(scene.drones), dtype=bool),
-            )  # fmt: skip
-
-        view = lens_view(camera, draw)
+        view = scene.through(camera)
         v, u = np.divmod(np.arange(view.ids.size), camera.size[0])
         rays = camera.rays(np.column_stack([u, v]) + 0.5)
         imaged = np.isfinite(rays[:, 0])
@@ -161,15 +158,7 @@ def test_what_any_lens_sees_agrees_with_a_ray_caster(scenes: list[Scene], lens: 
 
 def test_a_lens_that_is_nearly_a_pinhole_sees_what_the_pinhole_sees(scenes: list[Scene]) -> None:
     scene = scenes[0]
-    nearly = PinholeCamera(MATRIX, SIZE, (1e-9, 0.0, 0.0, 0.0))
-
-    def draw(matrix: FloatArray, size: tuple[int, int], turn: FloatArray) -> View:
-        return scene.renderer.render(
-            matrix, size, scene.R @ turn, scene.position, drone_rotations=scene.rotations,
-            drone_positions=scene.positions, shown=np.ones(len(scene.drones), dtype=bool),
-        )  # fmt: skip
-
-    sampled, drawn = lens_view(nearly, draw), scene.render()
+    sampled, drawn = scene.through(PinholeCamera(MATRIX, SIZE, (1e-9, 0.0, 0.0, 0.0))), scene.render()
     assert (sampled.ids == drawn.ids).mean() > 0.99
     off = np.abs(sampled.rgb.astype(int) - drawn.rgb.astype(int))
     assert np.median(off) <= 2

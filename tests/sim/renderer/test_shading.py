@@ -136,20 +136,3 @@ def test_colours_are_those_of_the_plain_formulas(seed: int, down: float, height_
     assert max(off) <= 2
     assert np.mean(np.array(off) > 1) < 1e-3
     assert np.mean(np.array(off) > 0) < 0.05
-
-
-def test_a_drone_casts_its_shadow_on_the_ground_below() -> None:
-    world = World.generate(12)
-    ground = world.height_at(np.zeros(1), np.zeros(1))[0]
-    sun = world.light[0]
-    foot = np.array([0.0, 0.0, -ground])
-    centre = foot + sun / -sun[2] * 2.0
-    drones = np.array([[*centre, 0.4, 0.6]])
-    down = tilted(math.pi / 2, 0.0)
-    origin = np.array([0.0, 0.0, -ground - 6.0])
-    lit = Shot(world, down, origin, np.zeros((0, 5))).rgb.astype(int)
-    shaded = Shot(world, down, origin, drones).rgb.astype(int)
-    u, v = (int(k) for k in (K[0, 2], K[1, 2]))
-    assert (shaded <= lit).all()
-    assert shaded[v, u].sum() < lit[v, u].sum()
-    assert np.array_equal(shaded[0], lit[0]), "far from it nothing changes"
