@@ -155,7 +155,7 @@ class Mesh:
         colours = np.vstack([np.repeat(tint, 2 * sides, axis=0), np.repeat(tint[[0, -1]], sides, axis=0)])
         middles = np.stack([rings[0].mean(0), rings[-1].mean(0)]) if ends is None else ends
         vertices, triangles = np.vstack([*rings, middles]), np.vstack(faces)
-        if (rings[-1] == middles[1]).all():  # a point has no cap
+        if not np.ptp(rings[-1], axis=0).any():  # a point has no cap
             keep = np.linalg.norm(face_normals(vertices, triangles), axis=1) > 0.5
             triangles, colours = triangles[keep], colours[keep]
         self.add(vertices, triangles, texture, colours, tile)
