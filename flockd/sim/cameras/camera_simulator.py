@@ -17,7 +17,7 @@ from flockd.flight.geometry import Rig, RigCamera, RigidTransform, build_rig, ro
 from flockd.flight.geometry.camera_motion import scaled_focal
 from flockd.flight.mission import Moment, Navigator
 from flockd.sim.cameras.lens_views import lens_view
-from flockd.sim.cameras.real_camera import Shot, real_cameras
+from flockd.sim.cameras.real_camera import NOISE_TILE, NoiseTile, Shot, real_cameras
 from flockd.sim.cameras.shutter import CameraMotion
 from flockd.sim.flock.truth_perception import RenderTruth
 from flockd.sim.renderer.drone_models import FAMILIES, drone_model
@@ -237,23 +237,18 @@ def field_grid(extent_m: float) -> FloatArray:
 
 
 class ImageNoise:
-    """Noise that differs from image to image: a seeded crop of one large tile of normal noise."""
+    """Noise that differs from image to image."""
 
     def __init__(self, sigma: float, seed: int) -> None:
-        self._rng = np.random.default_rng([seed, 2])
-        self._tile = sigma * self._rng.standard_normal((1031, 1033, 3), dtype=np.float32) if sigma > 0 else None
+        self._sigma, self._rng = sigma, np.random.default_rng([seed, 2])
+        self._tile = NoiseTile(self._rng) if sigma > 0 else None
 
     def add(self, image: UInt8Array) -> UInt8Array:
         """The image (h, w, 3) with it."""
         if self._tile is None:
             return image
-        (height, width), (tall, wide) = image.shape[:2], self._tile.shape[:2]
-        top = int(self._rng.integers(max(tall - height, 1)))
-        left = int(self._rng.integers(max(wide - width, 1)))
-        noise = self._tile[top : top + height, left : left + width]
-        if noise.shape != image.shape:
-            rows, columns = np.arange(top, top + height) % tall, np.arange(left, left + width) % wide
-            noise = self._tile[rows[:, None], columns]
+        within = max(NOISE_TILE[0] - image.shape[0], 1), max(NOISE_TILE[1] - image.shape[1], 1)
+        noise = self._sigma * self._tile.crop(image.shape[:2], self._rng, within)
         return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), dtype=np.uint8)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -9,13 +10,12 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from flockd.core.messages import Float32Array, FloatArray, UInt8Array
+from flockd.core.messages import BoolArray, Float32Array, FloatArray, UInt8Array
 from flockd.flight.geometry import Camera
 from flockd.sim.cameras.glass import Glass
-from flockd.sim.cameras.sensor import Automatic, NoiseTile, noisy
 from flockd.sim.cameras.shutter import CameraMotion, LensField, Shaking, exposed
 from flockd.sim.renderer.renderer import View
-from flockd.sim.scenario.imperfect_cameras import CamerasConfig, CameraTimingConfig
+from flockd.sim.scenario.imperfect_cameras import AutomaticConfig, CamerasConfig, CameraTimingConfig, SensorNoiseConfig
 
 _STEPS = 1 << 14
 """Of linear light in the table back: each grey level has five at least, so that all 256 come back as they were."""
@@ -78,6 +78,63 @@ class CameraClock:
         return Shot(stamp_s, shown_s, bool(dropped >= self._config.dropped))
 
 
+_TARGET = 0.18
+"""Mean of the linear light that exposure meters aim at."""
+_MOST_GAIN, _MOST_BALANCE = 4.0, 1.6
+_STRIDE = 8
+"""Of the pixels that are metered."""
+NOISE_TILE = (1031, 1033)
+
+
+class Automatic:
+    """One camera's automatic gains. They begin where they settle in the first image."""
+
+    def __init__(self, config: AutomaticConfig) -> None:
+        self._config = config
+        self._log_gains: FloatArray | None = None
+        self._time_s = 0.0
+
+    def gains(self, light: Float32Array, imaged: BoolArray, time_s: float) -> FloatArray:
+        """(3,) for red, green and blue of the image (h, w, 3) of a time."""
+        mean = light[::_STRIDE, ::_STRIDE][imaged[::_STRIDE, ::_STRIDE]].mean(axis=0, dtype=np.float64) + 1e-6
+        exposure = np.clip(np.log(_TARGET / mean.mean()), -math.log(_MOST_GAIN), math.log(_MOST_GAIN))
+        balance = np.clip(np.log(mean[1] / mean), -math.log(_MOST_BALANCE), math.log(_MOST_BALANCE))
+        wanted = self._config.exposure * exposure + self._config.white_balance * balance
+        if self._log_gains is None:
+            self._log_gains = wanted
+        else:
+            share = -math.expm1(-max(time_s - self._time_s, 0.0) / self._config.time_s)
+            self._log_gains = self._log_gains + share * (wanted - self._log_gains)
+        self._time_s = time_s
+        return np.asarray(np.exp(self._log_gains), np.float64)
+
+
+class NoiseTile:
+    """Standard normal noise that images take crops of."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._tile = rng.standard_normal((*NOISE_TILE, 3), dtype=np.float32)
+
+    def crop(
+        self, size: tuple[int, ...], rng: np.random.Generator, within: tuple[int, int] = NOISE_TILE
+    ) -> Float32Array:
+        """(height, width, 3) of `size` from a place drawn `within` the first rows and columns, on past its borders."""
+        rows, columns = (rng.integers(begins) + np.arange(side) for begins, side in zip(within, size, strict=True))
+        return self._tile.take(rows, axis=0, mode="wrap").take(columns, axis=1, mode="wrap")
+
+
+def noisy(light: Float32Array, normal: Float32Array, config: SensorNoiseConfig, brightened: float) -> Float32Array:
+    """Linear light (h, w, 3) with a sensor's noise, of standard normal noise of its shape.
+
+    EMVA 1288, equation of the photon transfer: the variance of a grey value is that of reading, times the square of the
+    gain, and the gain times the mean. The gain is white over the electrons that give it; ``brightened`` is what the
+    automatic exposure amplified beside it.
+    """
+    per_electron = np.float32(config.gain * max(brightened, 1.0) / config.full_well_e)
+    variance = np.maximum(light, 0.0) * per_electron + np.float32((per_electron * config.read_noise_e) ** 2)
+    return np.asarray(light + np.sqrt(variance) * normal, np.float32)
+
+
 class RealCamera:
     """One camera of one drone, with its own dirt, phases and noise. Its images depend on no other camera's."""
 
@@ -109,7 +166,7 @@ class RealCamera:
         if config.reduce > 1:
             light = np.asarray(cv2.resize(light, (width, height), interpolation=cv2.INTER_CUBIC), np.float32)
         if config.noise.gain > 0:
-            light = noisy(light, self._tile.crop(height, width, self._rng), config.noise, brightened)
+            light = noisy(light, self._tile.crop((height, width), self._rng), config.noise, brightened)
         return grey_levels(light)
 
     def compressed(self, image: UInt8Array) -> UInt8Array:
@@ -125,7 +182,7 @@ def real_cameras(
     config: CamerasConfig, cameras: Mapping[str, Camera], drones: int, seed: int
 ) -> dict[tuple[int, str], RealCamera]:
     """The same lenses on each of so many drones, by drone (from 0) and name."""
-    tile = NoiseTile(seed)
+    tile = NoiseTile(np.random.default_rng([seed, 6]))
     lenses = {name: LensField.of(camera) for name, camera in cameras.items()}
     return {
         (drone, name): RealCamera(config, lens, tile, (seed, 4, drone, number))

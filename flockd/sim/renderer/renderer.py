@@ -146,9 +146,7 @@ def rasterized(
     """Planes (m, 12) of triangles, and of each pixel the nearest one, -1 for none, and 1/z of it, (h, w)."""
     rows, planes = np.empty((len(triangles), 2), dtype=np.int32), np.empty((len(triangles), 12))
     x, y, z = (vertices - origin).T[..., None]
-    pixels = np.ascontiguousarray(
-        P[:, 0] * x + P[:, 1] * y + P[:, 2] * z
-    )
+    pixels = np.ascontiguousarray(P[:, 0] * x + P[:, 1] * y + P[:, 2] * z)
     _raster.set_up_triangles(pixels, triangles, width, height, rows, planes)
     hit, inverse_depth = np.empty((height, width), dtype=np.int32), np.empty((height, width), dtype=np.float32)
     visible = np.flatnonzero(rows[:, 1] >= rows[:, 0]).astype(np.int32)
