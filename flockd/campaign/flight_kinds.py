@@ -14,7 +14,7 @@ from functools import lru_cache
 
 from flockd.campaign.campaign_file import FlightKindName
 from flockd.campaign.figures import Figure, Figures, figures_of
-from flockd.campaign.flight_plan import ControlLevel, Recipe, Run
+from flockd.campaign.flight_plan import Recipe, Run
 from flockd.core.choices import SimulatedPerception
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.errors import FlockdError
@@ -22,9 +22,26 @@ from flockd.flight.inference.hashes import model_hashes
 from flockd.sim.control_level import fly_flocks
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import ScenarioConfig
+from flockd.sim.scenario.perceived import PerceivedErrors
 
-Fly = Callable[[Sequence[ScenarioConfig], Sequence[Figure], ControlLevel], Sequence[Figures]]
-"""Flies scenarios of one cell that differ in what follows from their seeds, and gives the wanted figures of each."""
+
+@dataclass(frozen=True)
+class Task:
+    """What is sent to where it is flown: flights of one cell."""
+
+    kind: FlightKindName
+    wanted: tuple[Figure, ...]
+    runs: tuple[Run, ...]
+    recipes: tuple[Recipe, ...]
+    """As many."""
+    gated: bool = True
+    """See `CampaignConfig.gated`."""
+    errors: PerceivedErrors | None = None
+    """Perception's, at control level; None: exact states."""
+
+
+Fly = Callable[[Sequence[ScenarioConfig], Task], Sequence[Figures]]
+"""Flies a task's scenarios, and gives the wanted figures of each."""
 
 
 @dataclass(frozen=True)
@@ -41,24 +58,18 @@ class FlightKind:
 def _alone(perception: SimulatedPerception) -> Fly:
     """Flies one after the other, each on this thread alone, without key frames."""
 
-    def flown(scenarios: Sequence[ScenarioConfig], wanted: Sequence[Figure], control: ControlLevel) -> list[Figures]:
-        logs = (
-            fly(one, perception=perception, gated=control.gated, processes=0, pictured=False).log for one in scenarios
-        )
-        return [figures_of(log, wanted) for log in logs]
+    def flown(scenarios: Sequence[ScenarioConfig], task: Task) -> list[Figures]:
+        logs = (fly(one, perception=perception, gated=task.gated, processes=0, pictured=False).log for one in scenarios)
+        return [figures_of(log, task.wanted) for log in logs]
 
     return flown
 
 
-def _at_control_level(
-    scenarios: Sequence[ScenarioConfig], wanted: Sequence[Figure], control: ControlLevel
-) -> list[Figures]:
+def _at_control_level(scenarios: Sequence[ScenarioConfig], task: Task) -> list[Figures]:
     """All at once, on this thread."""
-    flown = fly_flocks(scenarios, errors=control.errors, gated=control.gated)
-    return [
-        {figure: None if one.get(figure) is None else float(one[figure]) for figure in wanted}  # type: ignore[arg-type]
-        for one in flown
-    ]
+    flown = fly_flocks(scenarios, errors=task.errors, gated=task.gated)
+    found = ({figure: one.get(figure) for figure in task.wanted} for one in flown)
+    return [{figure: None if value is None else float(value) for figure, value in one.items()} for one in found]
 
 
 FLIGHT_KINDS: dict[FlightKindName, FlightKind] = {
@@ -66,18 +77,6 @@ FLIGHT_KINDS: dict[FlightKindName, FlightKind] = {
     "sight": FlightKind(_alone("learned"), "learned"),
     "control": FlightKind(_at_control_level, "truth", at_once=16),
 }
-
-
-@dataclass(frozen=True)
-class Task:
-    """What is sent to where it is flown: flights of one cell."""
-
-    kind: FlightKindName
-    wanted: tuple[Figure, ...]
-    runs: tuple[Run, ...]
-    recipes: tuple[Recipe, ...]
-    """As many."""
-    control: ControlLevel
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ def fly_task(task: Task) -> list[FlownRun]:
     wall_s, cpu_s, began = time.perf_counter(), time.process_time(), datetime.now(UTC).isoformat(timespec="seconds")
     try:
         scenarios = [_single_threaded(recipe.scenario()) for recipe in task.recipes]
-        figures = FLIGHT_KINDS[task.kind].fly(scenarios, task.wanted, task.control)
+        figures = FLIGHT_KINDS[task.kind].fly(scenarios, task)
         networks = _networks(scenarios[0].drone.perception) if task.kind == "sight" else ""
     except Exception as error:  # noqa: BLE001 - whatever it is, it is one flight's result
         if len(task.runs) > 1:

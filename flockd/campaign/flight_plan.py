@@ -101,16 +101,6 @@ class Run:
 
 
 @dataclass(frozen=True)
-class ControlLevel:
-    """What only flights at control level have."""
-
-    errors: PerceivedErrors | None = None
-    """Perception's errors; None: exact states."""
-    gated: bool = True
-    """See `CampaignConfig.gated`."""
-
-
-@dataclass(frozen=True)
 class Plan:
     """All flights of a campaign, as values only: what it takes is no longer read from files."""
 
@@ -194,11 +184,6 @@ class Plan:
     def wanted(self) -> tuple[Figure, ...]:
         """What is measured."""
         return self.config.measure or tuple(MEASURES)
-
-    @property
-    def control(self) -> ControlLevel:
-        """How flights at control level are flown."""
-        return ControlLevel(self.errors, self.config.gated)
 
     @property
     def most_flights(self) -> int:

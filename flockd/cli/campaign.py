@@ -124,13 +124,13 @@ def _dry_run(args: argparse.Namespace, plan: Plan, workers: int) -> int:
     from flockd.campaign.conduct import estimate
 
     with Phases() as phases:
-        found = estimate(plan, phases.of("trial flights", "cells"))
-    hours = found.core_hours / workers
+        flight_s = estimate(plan, phases.of("trial flights", "cells"))
+    cells, flights, hours = len(plan.cells), plan.most_flights, plan.most_flights * flight_s / 3600 / workers
     most = "at most " if plan.config.stop is not None else ""
     return say_result(
         args,
-        {"cells": found.cells, "most_flights": found.flights, "flight_s": found.flight_s, "most_hours": hours},
-        f"{found.cells} cells, {most}{found.flights} flights of {found.flight_s:.2g} s on one core",
+        {"cells": cells, "most_flights": flights, "flight_s": flight_s, "most_hours": hours},
+        f"{cells} cells, {most}{flights} flights of {flight_s:.2g} s on one core",
         f"{most}{hours:.2g} h with {workers} at once, if each has a core of its own",
     )
 

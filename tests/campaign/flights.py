@@ -8,7 +8,7 @@ from pathlib import Path
 
 from flockd.campaign.conduct import Conducted, conduct
 from flockd.campaign.engine import Flown
-from flockd.campaign.figures import Figure, Figures
+from flockd.campaign.figures import Figures
 from flockd.campaign.flight_kinds import Task, fly_task
 from flockd.campaign.flight_plan import Plan
 from flockd.campaign.folder import CampaignFolder
@@ -60,7 +60,7 @@ def flown(plan: Plan, folder: Path, engine: Shuffled) -> Conducted:
         return conduct(plan, campaign, engine, lambda done, total: None)
 
 
-def made_up(scenarios: Sequence[ScenarioConfig], wanted: Sequence[Figure], _: object) -> list[Figures]:
+def made_up(scenarios: Sequence[ScenarioConfig], task: Task) -> list[Figures]:
     """Figures that follow from a flight's scenario alone, in no time; seed 3 cannot be flown."""
     if any(scenario.seed == 3 for scenario in scenarios):
         raise ArithmeticError("no flight today")
@@ -71,4 +71,4 @@ def made_up(scenarios: Sequence[ScenarioConfig], wanted: Sequence[Figure], _: ob
         + 0.1 * one.drone.flocking.separation
         for one in scenarios
     ]
-    return [dict.fromkeys(wanted, value) for value in values]
+    return [dict.fromkeys(task.wanted, value) for value in values]

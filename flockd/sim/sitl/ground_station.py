@@ -132,10 +132,15 @@ class GroundStation:
         """Poses of all as of now, extrapolated from the last messages."""
         now = self._clock()
         with self._lock:
-            received = [vehicle.pose for vehicle in self._vehicles]
-        assert all(pose is not None for pose in received), "wait until all are connected"
-        extrapolated = [_extrapolated(pose, now) for pose in received if pose is not None]
-        return Poses(*(np.array([getattr(pose, name) for pose in extrapolated]) for name in Poses.__annotations__))
+            poses = [vehicle.pose for vehicle in self._vehicles if vehicle.pose is not None]
+        assert len(poses) == len(self._vehicles), "wait until all are connected"
+        ages_s = [min(max(now - pose.time_s, 0.0), MAX_FORWARD_S) for pose in poses]
+        since = list(zip(poses, ages_s, strict=True))
+        return Poses(  # as if neither velocity nor turn had changed
+            np.array([pose.position + age_s * pose.velocity for pose, age_s in since]),
+            np.array([pose.velocity for pose in poses]),
+            np.array([pose.R_ned_body @ rotation_from_euler(*(age_s * pose.turn_rad_s)) for pose, age_s in since]),
+        )
 
     def mode_is(self, number: int, mode: Mode) -> bool:
         """It flies in this mode."""
@@ -249,18 +254,6 @@ def _pose(message: Any, now: float) -> _Pose:
         velocity=np.array([message.vx, message.vy, message.vz]) * 1e-2,
         R_ned_body=rotation_from_quaternion(np.roll(message.attitude_quaternion, -1)),
         turn_rad_s=np.array([message.rollspeed, message.pitchspeed, message.yawspeed]),
-    )
-
-
-def _extrapolated(pose: _Pose, now: float) -> _Pose:
-    """Where it is now if neither velocity nor turn has changed."""
-    elapsed_s = min(max(now - pose.time_s, 0.0), MAX_FORWARD_S)
-    return _Pose(
-        now,
-        pose.position + elapsed_s * pose.velocity,
-        pose.velocity,
-        pose.R_ned_body @ rotation_from_euler(*(elapsed_s * pose.turn_rad_s)),
-        pose.turn_rad_s,
     )
 
 
