@@ -248,11 +248,7 @@ def _wire(one: FloatArray, other: FloatArray, *, sag: float) -> list[Solid]:
     share = np.linspace(0.0, 1.0, _SPAN_PARTS + 1)[:, None]
     points = one + share * (other - one)
     points[:, 2] -= sag * 4 * (share * (1 - share))[:, 0]
-    return [Capsule(*a, *b, _WIRE_RADIUS_M, "metal") for a, b in itertools.pairwise(map(_three, points))]
-
-
-def _three(point: FloatArray) -> tuple[float, float, float]:
-    return float(point[0]), float(point[1]), float(point[2])
+    return [Capsule(*a, *b, radius=_WIRE_RADIUS_M, material="metal") for a, b in itertools.pairwise(points.tolist())]
 
 
 def with_obstacles(log: FlightLog, scenario: ScenarioConfig) -> FlightLog:

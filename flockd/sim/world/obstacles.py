@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -289,21 +289,15 @@ class Obstacles:
 
     def outlines(self) -> FloatArray:
         """(k, 7) of `FlightLog.obstacles`, a sloping line without its round ends."""
-        upright, boxes, lines = (_rows(self.solids, kind) for kind in (Frustum, Box, Capsule))
-        way = lines[:, 3:5] - lines[:, :2]
+        upright, boxes, lines = (self._solids[self._solids[:, KIND] == kind] for kind in (FRUSTUM, BOX, CAPSULE))
+        way, radius = lines[:, OWN + 3 : OWN + 5] - lines[:, OWN : OWN + 2], lines[:, OWN + 6]
         length = np.hypot(way[:, 0], way[:, 1])
-        low = np.minimum(lines[:, 2], lines[:, 5]) - lines[:, 6]
-        high = np.maximum(lines[:, 2], lines[:, 5]) + lines[:, 6]
-        of_frusta = [upright[:, :2], upright[:, 2:4].max(axis=1), np.zeros((len(upright), 2)), upright[:, 4:6]]
-        of_lines = [
-            (lines[:, :2] + lines[:, 3:5]) / 2,
-            np.where(length > 0, length / 2, lines[:, 6]),
-            np.where(length > 0, lines[:, 6], 0.0),
-            np.arctan2(way[:, 1], way[:, 0]),
-            low,
-            high,
-        ]
-        return np.vstack([np.column_stack(of_frusta), boxes, np.column_stack(of_lines)])
+        along = np.where(length > 0, length / 2, radius)
+        across = np.where(length > 0, radius, 0.0)
+        heights = slice(LOW_M, HIGH_M + 1)
+        of_frusta = [upright[:, NORTH : REACH_M + 1], np.zeros((len(upright), 2)), upright[:, heights]]
+        of_lines = [lines[:, NORTH : EAST + 1], along, across, np.arctan2(way[:, 1], way[:, 0]), lines[:, heights]]
+        return np.vstack([np.column_stack(of_frusta), boxes[:, OWN:], np.column_stack(of_lines)])
 
 
 def true_ranges(
@@ -320,25 +314,17 @@ def true_ranges(
     )
 
 
-def _rows(solids: Sequence[Solid], kind: type[Solid]) -> FloatArray:
-    rows = np.array([_row(solid) for solid in solids if isinstance(solid, kind)]).reshape(-1, 13)
-    return rows[:, OWN:]
-
-
 def _row(solid: Solid) -> list[float]:
-    """See `flockd.sim.world.obstacles`."""
-    if isinstance(solid, Frustum):
-        reach_m = max(solid.foot_radius, solid.top_radius)
-        own = solid.north, solid.east, solid.foot_radius, solid.top_radius, solid.foot, solid.top, 0.0
-        return [FRUSTUM, solid.north, solid.east, reach_m, solid.foot, solid.top, *own]
-    if isinstance(solid, Box):
-        sides = solid.half_length, solid.half_width
-        own = solid.north, solid.east, *sides, solid.heading, solid.foot, solid.top
-        return [BOX, solid.north, solid.east, math.hypot(*sides), solid.foot, solid.top, *own]
-    own = (
-        solid.north, solid.east, solid.height, solid.other_north, solid.other_east, solid.other_height, solid.radius,
-    )  # fmt: skip
-    half_m = math.hypot(solid.other_north - solid.north, solid.other_east - solid.east) / 2
-    low, high = sorted((solid.height, solid.other_height))
-    middle = (solid.north + solid.other_north) / 2, (solid.east + solid.other_east) / 2
-    return [CAPSULE, *middle, half_m + solid.radius, low - solid.radius, high + solid.radius, *own]
+    own = [*astuple(solid)[:-1], 0.0][:7]
+    north, east = solid.north, solid.east
+    match solid:
+        case Frustum():
+            kind, reach_m, low, high = FRUSTUM, max(solid.foot_radius, solid.top_radius), solid.foot, solid.top
+        case Box():
+            kind, reach_m, low, high = BOX, math.hypot(solid.half_length, solid.half_width), solid.foot, solid.top
+        case Capsule():
+            half_m = math.hypot(solid.other_north - solid.north, solid.other_east - solid.east) / 2
+            north, east = (solid.north + solid.other_north) / 2, (solid.east + solid.other_east) / 2
+            low, high = sorted((solid.height, solid.other_height))
+            kind, reach_m, low, high = CAPSULE, half_m + solid.radius, low - solid.radius, high + solid.radius
+    return [kind, north, east, reach_m, low, high, *own]
