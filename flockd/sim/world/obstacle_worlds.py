@@ -248,7 +248,8 @@ def _wire(one: FloatArray, other: FloatArray, *, sag: float) -> list[Solid]:
     share = np.linspace(0.0, 1.0, _SPAN_PARTS + 1)[:, None]
     points = one + share * (other - one)
     points[:, 2] -= sag * 4 * (share * (1 - share))[:, 0]
-    return [Capsule(*a, *b, radius=_WIRE_RADIUS_M, material="metal") for a, b in itertools.pairwise(points.tolist())]
+    ends = itertools.pairwise(points.tolist())
+    return [Capsule(a[0], a[1], a[2], b[0], b[1], b[2], _WIRE_RADIUS_M, "metal") for a, b in ends]
 
 
 def with_obstacles(log: FlightLog, scenario: ScenarioConfig) -> FlightLog:
