@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -11,7 +11,6 @@ import numpy as np
 
 from flockd import __version__
 from flockd.core.config import DroneConfig
-from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import NO_STATUS, FloatArray, MissionOrder, MissionStatus, PilotOutput
 from flockd.flight.flocking.metrics import order, union
 from flockd.flight.mission.circle_then_tangent import desired_of
@@ -95,7 +94,8 @@ def fleet_log(
     over: set[str] = set()
     longest_s, spanning = 0.0, 0
     for i, config in zip(flown, configs, strict=True):
-        steps = [(rows[one.time_s], one) for one in _outputs(recordings, config.name) if one.time_s in rows]
+        found = (from_json(PilotOutput, json.loads(e.data)) for e in _entries(recordings, config.name, OUTPUT.topic))
+        steps: list[tuple[int, PilotOutput]] = [(rows[one.time_s], one) for one in found if one.time_s in rows]
         for before, (row, output) in zip([None, *steps], steps, strict=False):
             spans_more = False
             if before is not None:
@@ -110,6 +110,25 @@ def fleet_log(
                 over.add(config.name)
         processed[config.name] = len(steps)
     _add_missions(builder, scenario, frames, times, statuses)
+    delays_s = [frame.delay_s for frame in frames]
+    end = [frame for frame, time_s in zip(frames, times, strict=True) if time_s >= times[-1] - END_OF_FLIGHT_S]
+    reach_m = drone.flocking.observation_distance_m
+    fleet = FleetMetadata(
+        speed_factor=speed_factor,
+        cores={name: round(cores, 3) for name, cores in run.cores.items()},
+        frame_sets=len(frames),
+        frame_sets_looked_at=processed,
+        longest_step_s=longest_s,
+        motions_over_more_than_one_frame_set=spanning,
+        frames_late_s=Percentiles(p50=float(np.percentile(delays_s, 50)), p95=float(np.percentile(delays_s, 95))),
+        order_last_20s=float(np.mean([order(frame.velocity[:, :2]) for frame in end])),
+        union_last_20s=float(np.mean([union(frame.position[:, :2], reach_m) for frame in end])),
+        handed_over={name: why for name, why in run.handed_over.items() if name not in over},
+        mission_over={name: why for name, why in run.handed_over.items() if name in over},
+        modes=run.modes,
+        exit_codes=run.exit_codes,
+        notes=run.notes,
+    )
     metadata = FlightMetadata.of_configuration(
         drone,
         scenario=scenario.scenario,
@@ -123,7 +142,7 @@ def fleet_log(
         perception="learned",
         wall_s=run.wall_s,
         autopilot=run.autopilot,
-        fleet=_metadata(run, times, drone.flocking, speed_factor, processed, longest_s, spanning, over),
+        fleet=fleet,
     )
     return builder.build(metadata, companion)
 
@@ -151,39 +170,6 @@ def _add_missions(
             for i in vehicles
         ]
         builder.add_missions(row, np.array(desired), [newest.get(i, NO_STATUS) for i in vehicles], homes)
-
-
-def _metadata(
-    run: FleetRun, times: FloatArray, flocking: FlockingParameters, speed_factor: float,
-    processed: dict[str, int], longest_step_s: float, spanning: int, over: Set[str],
-) -> FleetMetadata:  # fmt: skip
-    delays_s = [frame.delay_s for frame in run.frames]
-    position = np.array([frame.position[:, :2] for frame in run.frames])
-    velocity = np.array([frame.velocity[:, :2] for frame in run.frames])
-    end = np.flatnonzero(times >= times[-1] - END_OF_FLIGHT_S)
-    return FleetMetadata(
-        speed_factor=speed_factor,
-        cores={name: round(cores, 3) for name, cores in run.cores.items()},
-        frame_sets=len(run.frames),
-        frame_sets_looked_at=processed,
-        longest_step_s=longest_step_s,
-        motions_over_more_than_one_frame_set=spanning,
-        frames_late_s=Percentiles(p50=float(np.percentile(delays_s, 50)), p95=float(np.percentile(delays_s, 95))),
-        order_last_20s=float(np.mean([order(velocity[s]) for s in end])),
-        union_last_20s=float(np.mean([union(position[s], flocking.observation_distance_m) for s in end])),
-        handed_over={name: why for name, why in run.handed_over.items() if name not in over},
-        mission_over={name: why for name, why in run.handed_over.items() if name in over},
-        modes=run.modes,
-        exit_codes=run.exit_codes,
-        notes=run.notes,
-    )
-
-
-def _outputs(recordings: Path, drone: str) -> Iterator[PilotOutput]:
-    """The output of one drone's pilot in each step of its flight."""
-    for entry in _entries(recordings, drone, OUTPUT.topic):
-        output: PilotOutput = from_json(PilotOutput, json.loads(entry.data))
-        yield output
 
 
 def _entries(recordings: Path, drone: str, topic: str) -> Iterator[Entry]:
