@@ -10,7 +10,8 @@ three times as long to compile, and half as much processor time again to run.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from collections import namedtuple
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -20,54 +21,19 @@ from flockd.sim.world.textures import TEXTURE_BITS
 
 SUBSAMPLES = 3
 """Drone colours are sampled 3x3 per pixel; the middle sample is the pixel's centre."""
+Eye = namedtuple("Eye", ["K", "inverse_K", "R", "origin", "focal"])
+"""A pinhole camera in the world: `Renderer.render` says of what shapes; `R` is from optical axes to NED."""
+Scene = namedtuple(
+    "Scene",
+    "normals texture uv level tint texels ground_map ground_kind ground_detail extent_m shadow_map shadow_frame light "
+    "fog_per_m sky tone",
+)
+"""What colours of a `World` are made of, by the names and with the shapes that it has there."""
+Thing = namedtuple("Thing", ["identity", "rotation", "position", "normals", "texture", "uv", "colours", "texels"])
+"""What is laid over an image: a drone of a pose, and its number there.
 
-
-class Eye(NamedTuple):
-    """A pinhole camera in the world: `Renderer.render` says of what shapes."""
-
-    K: Any
-    inverse_K: Any  # noqa: N815 - as in formulas
-    R: Any
-    """From optical axes to NED."""
-    origin: Any
-    focal: float
-
-
-class Scene(NamedTuple):
-    """What colours of a `World` are made of, by the names and with the shapes that it has there."""
-
-    normals: Any
-    texture: Any
-    uv: Any
-    level: Any
-    tint: Any
-    texels: Any
-    ground_map: Any
-    ground_kind: Any
-    ground_detail: Any
-    extent_m: float
-    shadow_map: Any
-    shadow_frame: Any
-    light: Any
-    fog_per_m: float
-    sky: Any
-    tone: Any
-
-
-class Thing(NamedTuple):
-    """What is laid over an image: a drone of a pose, and its number there.
-
-    `normals` are NED, `uv` is in body axes, `texels` are its machine textures.
-    """
-
-    identity: int
-    rotation: Any
-    position: Any
-    normals: Any
-    texture: Any
-    uv: Any
-    colours: Any
-    texels: Any
+`normals` are NED, `uv` is in body axes, `texels` are its machine textures.
+"""
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
