@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -23,14 +24,14 @@ class Schedule:
         self._batch = self._seeds if self._stop is None else self._stop.batch
         self._values: dict[int, dict[int, float | None]] = {cell.number: {} for cell in plan.cells}
         """What the stop rule is about, for each cell by number of the seed."""
-        self._until = dict.fromkeys(self._values, min(self._batch, self._seeds))
+        self._until = dict.fromkeys(self._values, 0)
         """How many seeds of each cell are to be flown."""
         self._open = set(self._values)
         """Cells that may need more."""
-        self._waiting: deque[tuple[int, int, int]] = deque()
-        """Cells, each with its first and the end of the seeds that are to be flown."""
+        self._waiting: deque[tuple[int, Iterator[int]]] = deque()
+        """Cells, each with seeds that are to be flown."""
         for cell in self._values:
-            self._add(cell, 0)
+            self._decide(cell)
 
     def finished(self, runs: Iterable[tuple[Run, float | None]]) -> None:
         """Takes note of flights, each with its value of the stop rule's figure; None where it has none."""
@@ -42,14 +43,11 @@ class Schedule:
         """Up to ``count`` flights of one cell that are to be flown; empty where there are none now."""
         found: list[Run] = []
         while self._waiting and not found:
-            cell, begin, end = self._waiting.popleft()
-            number = begin
-            while number < end and len(found) < count:
-                if number not in self._values[cell]:
-                    found.append(Run(cell, number))
-                number += 1
-            if number < end:
-                self._waiting.appendleft((cell, number, end))
+            cell, numbers = self._waiting[0]
+            missing = (Run(cell, number) for number in numbers if number not in self._values[cell])
+            found = list(itertools.islice(missing, count))
+            if len(found) < count:
+                self._waiting.popleft()
         return tuple(found)
 
     @property
@@ -65,19 +63,12 @@ class Schedule:
             begin = self._until[cell]
             if len(values) < begin or not all(number in values for number in range(begin)):
                 return
-            if begin == self._seeds or self._is_known(cell):
+            known = self._stop is not None and is_known([values[number] for number in range(begin)], self._stop)
+            if begin == self._seeds or known:
                 self._open.remove(cell)
             else:
                 self._until[cell] = min(begin + self._batch, self._seeds)
-                self._add(cell, begin)
-
-    def _add(self, cell: int, begin: int) -> None:
-        self._waiting.append((cell, begin, self._until[cell]))
-
-    def _is_known(self, cell: int) -> bool:
-        return self._stop is not None and is_known(
-            [self._values[cell][number] for number in range(self._until[cell])], self._stop
-        )
+                self._waiting.append((cell, iter(range(begin, self._until[cell]))))
 
 
 def is_known(values: Iterable[float | None], stop: StopRule) -> bool:
