@@ -7,9 +7,11 @@ import pytest
 
 from flockd.core.config.perception import NoiseParameters
 from flockd.core.messages import UInt8Array
+from flockd.flight.geometry import build_rig, rotation_angle_deg
 from flockd.flight.perception.image_noise import noise_shares
-from flockd.sim.cameras.camera_simulator import CameraFaults, ImageNoise
+from flockd.sim.cameras.camera_simulator import CameraFaults, ImageNoise, true_rigs
 from flockd.sim.scenario import CameraFaultConfig
+from tests import make
 
 GREY = np.full((128, 160, 3), 120, np.uint8)
 
@@ -47,3 +49,43 @@ def test_images_of_any_size_get_the_noise_that_is_asked_for(size: tuple[int, int
     noisy = ImageNoise(4.0, seed=1).add(grey)
     assert noisy.shape == grey.shape
     assert (noisy.astype(float) - 128.0).std() == pytest.approx(4.0, rel=0.05)
+
+
+NONE = {"cameras.rig.mounting_deg": 0.0}
+OFF = {"cameras.rig.mounting_deg": 2.0, "cameras.rig.mounting_m": 0.02, "cameras.rig.focal": 0.03}
+
+
+def test_each_camera_of_each_drone_is_off_by_as_much_and_in_a_direction_of_its_own() -> None:
+    flight = make.scenario(OFF)
+    configured = build_rig(flight.drone.rig)
+    rigs, directions = true_rigs(flight), []
+    assert len(rigs) == len(flight.vehicles)
+    for rig in rigs:
+        assert list(rig.cameras) == list(configured.cameras)
+        for name, one in rig.cameras.items():
+            before = configured.cameras[name]
+            turn = one.T_body_camera.rotation @ before.T_body_camera.rotation.T
+            way = one.T_body_camera.translation - before.T_body_camera.translation
+            assert rotation_angle_deg(turn) == pytest.approx(2.0)
+            assert np.linalg.norm(way) == pytest.approx(0.02)
+            assert abs(one.camera.focal_px / before.camera.focal_px - 1.0) == pytest.approx(0.03)
+            assert (one.camera.matrix[:2, 2] == before.camera.matrix[:2, 2]).all()
+            directions.append(tuple(np.round(way, 6)))
+    assert len(set(directions)) == len(directions)
+
+
+def test_a_seed_gives_the_same_rigs_and_another_seed_others() -> None:
+    one, same, other = (
+        true_rigs(make.scenario({"seed": seed, **OFF}))[1].cameras["left"].T_body_camera.rotation for seed in (0, 0, 1)
+    )
+    assert (one == same).all()
+    assert not np.allclose(one, other)
+
+
+@pytest.mark.parametrize("overrides", [{}, NONE], ids=["no cameras", "no errors"])
+def test_without_errors_rigs_are_as_configured(overrides: dict[str, float]) -> None:
+    flight = make.scenario(overrides)
+    for rig in true_rigs(flight):
+        for name, one in build_rig(flight.drone.rig).cameras.items():
+            assert (rig.cameras[name].T_body_camera.rotation == one.T_body_camera.rotation).all()
+            assert (rig.cameras[name].camera.matrix == one.camera.matrix).all()
