@@ -31,13 +31,14 @@ def test_a_key_that_is_gone_is_refused_with_its_line_and_what_to_use(
     key: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     *sections, name = key.split(".")
-    file = _CONFIG / ("simulator.yaml" if sections[:1] != ["cameras"] else "square.yaml")
+    file = _CONFIG / ("square.yaml" if sections[:1] in (["cameras"], ["faults"]) else "simulator.yaml")
     values: Any = yaml.safe_load(file.read_text(encoding="utf-8"))
     if "drone" in values:
         values["drone"] = str(_CONFIG / values["drone"])
     inner = values
     for section in sections:
-        inner = inner.setdefault(section, {})
+        inner = inner.setdefault(section, [{"drone": 1, "camera": "front"}] if section == "faults" else {})
+        inner = inner[0] if isinstance(inner, list) else inner
     assert name not in inner
     inner[name] = 1
     path = tmp_path / "file.yaml"
@@ -45,4 +46,4 @@ def test_a_key_that_is_gone_is_refused_with_its_line_and_what_to_use(
     path.write_text(text, encoding="utf-8")
     (line,) = (number for number, one in enumerate(text.splitlines(), 1) if one.strip() == f"{name}: 1")
     assert main(["config", "check", str(path)]) == 78
-    assert f"{path}:{line}: {key}: is gone; {KEYS[key]}\n" in capsys.readouterr().err
+    assert f"{path}:{line}: {key.replace('faults.', 'faults[0].')}: is gone; {KEYS[key]}\n" in capsys.readouterr().err
