@@ -26,18 +26,18 @@ LINES = {
     "flockd/fleet": 2_630,
     "flockd/ground": 4_850,
     "flockd/review": 3_750,
-    "flockd/sim": 12_190,
-    "flockd/campaign": 2_270,
+    "flockd/sim": 11_480,
+    "flockd/campaign": 2_070,
     "flockd/cli": 4_480,
-    "tests": 47_360,
+    "tests": 47_160,
     "tools/checks": 2_550,
     "tools/docs": 900,
     "tools/measure": 1_220,
     "tools/release": 620,
-    "tools/training": 4_550,
+    "tools/training": 4_730,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 398}
+FILES = {"flockd": 395}
 NUMBERS_OF_FLIGHT = 528
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
