@@ -11,18 +11,18 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.options import ENDPOINT, add_endpoint_options, add_operator_option, endpoints
-from flockd.cli.output import complain, progress, say, say_json
+from flockd.cli.output import complain, say, say_json
 from flockd.cli.parser import ALONE, Commands, Parser, add_commands, flag, number, option, port_number, positive_number
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
     from flockd.core.messages import MissionOrder
-    from flockd.fleet.fleet_source import FleetSource
+    from flockd.fleet.live_fleet import LiveFleet
     from flockd.fleet.page.page_access import PageConnections
     from flockd.fleet.page.page_server import PageServer
     from flockd.fleet.watcher import FleetWatcher
@@ -53,7 +53,6 @@ def add(commands: Commands) -> None:
     examples = (
         "flockd fleet",
         "flockd fleet --connect tcp/10.0.0.11:7447 --connect tcp/10.0.0.12:7447",
-        "flockd fleet --recordings out/paper_flight-learned-seed1/recordings",
         "flockd fleet goto all 20 -5 --height 4",
         "flockd fleet velocity drone1 0.5 0 --seconds 10",
         "flockd fleet hold all",
@@ -225,7 +224,6 @@ def _verdict(args: argparse.Namespace, answers: dict[str, dict[str, object]], na
 
 
 def _add_page(parser: Parser) -> None:
-    """Adds the page's options, and those that say where its data come from."""
     option(parser, "--port N", f"(default: {PORT}; 0: any)", port_number, default=PORT)
     option(
         parser,
@@ -235,7 +233,6 @@ def _add_page(parser: Parser) -> None:
         default=HERE,
         dest="server_address",
     )
-    option(parser, "--recordings FOLDER", "show the recordings in it on one time line, not telemetry", Path)
     add_endpoint_options(parser, "--drones-at")
     flag(parser, "--watch-only", "the page passes no command on")
     option(
@@ -252,14 +249,20 @@ def _add_page(parser: Parser) -> None:
 def _show_page(args: argparse.Namespace) -> int:
     import aiohttp.web  # noqa: F401 - before anything is opened: it is of an extra
 
-    with ExitStack() as stack:
-        source = _open_source(args, stack)
-        with suppress(KeyboardInterrupt):
-            asyncio.run(_serve(args, source))
+    from flockd.fleet.live_fleet import LiveFleet
+    from flockd.fleet.watcher import FleetWatcher
+
+    listen, connect = endpoints(args)
+    with (
+        FleetWatcher(args.fleet, listen=listen, connect=connect, settings=args.zenoh_config) as watcher,
+        LiveFleet(watcher) as source,
+        suppress(KeyboardInterrupt),
+    ):
+        asyncio.run(_serve(args, source))
     return ExitCode.DONE
 
 
-async def _serve(args: argparse.Namespace, source: FleetSource) -> None:
+async def _serve(args: argparse.Namespace, source: LiveFleet) -> None:
     from flockd.fleet.page.page_access import PageAccess, lasting_key
     from flockd.fleet.page.page_server import PageServer
 
@@ -299,24 +302,6 @@ async def _listen(connections: PageConnections, address: str, port: int) -> int:
     return bound
 
 
-def _open_source(args: argparse.Namespace, stack: ExitStack) -> FleetSource:
-    """As the options say; what has to be closed is left to ``stack``."""
-    from flockd.fleet.live_fleet import LiveFleet
-    from flockd.fleet.page.recorded_fleet import RecordedFleet
-    from flockd.fleet.watcher import FleetWatcher
-
-    if args.recordings is not None:
-        if args.connect or args.drones_at or args.fleet or args.zenoh_config:
-            raise UsageError(
-                "--recordings goes without telemetry; drop --connect, --drones-at, --fleet, --zenoh-config"
-            )
-        with progress("reading", "MB") as tell_progress:
-            return RecordedFleet(args.recordings, lambda done, total: tell_progress(done >> 20, total >> 20))
-    listen, connect = endpoints(args)
-    watcher = FleetWatcher(args.fleet, listen=listen, connect=connect, settings=args.zenoh_config)
-    return stack.enter_context(LiveFleet(stack.enter_context(watcher)))
-
-
 def announce(args: argparse.Namespace, port: int, key: str) -> None:
     """Says where it is served, once it is, and where other computers reach it, what they may do."""
     where = ipaddress.ip_address(args.server_address)
@@ -329,7 +314,7 @@ def announce(args: argparse.Namespace, port: int, key: str) -> None:
             "network that you trust"
         )
         say(f"on other computers: the same with this computer's address in the place of {host}")
-    if args.recordings is None and not args.connect and not args.drones_at:
+    if not args.connect and not args.drones_at:
         say(
             f"it looks for drones at {ENDPOINT}; for those that connect to this computer, as those of "
             f"`flockd sim --autopilot` do, start it with --drones-at {ENDPOINT}"

@@ -31,6 +31,7 @@ COMMANDS: Mapping[str, str] = {
         }.items()
         for option, instead in options.items()
     },
+    "flockd fleet --recordings": "`flockd report FOLDER` writes a report of the recordings that plays them",
     "flockd foxglove": "watch live with `flockd fleet`, or in ROS 2 with `flockd ros`; Foxglove opens recordings",
     "flockd record export --ros2": "Foxglove opens the recording itself; record a flight's topics of `flockd ros`",
     "flockd report --ulog": "open PX4's log in Flight Review or PlotJuggler",

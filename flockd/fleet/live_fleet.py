@@ -12,9 +12,11 @@ from typing import Self
 
 from flockd.fleet.drone_queries import ClockReading
 from flockd.fleet.drone_rows import Known, Row, drone_rows, history_row
-from flockd.fleet.fleet_source import Event
 from flockd.fleet.watcher import FleetWatcher, Watched
 from flockd.onboard.telemetry.topics import AnswerMessage, is_name
+
+Event = tuple[float, str, str]
+"""When it was heard, of which drone by its key, and what it says."""
 
 ASK_EVERY_S = 5.0
 """Each drone for its clocks, and for what it flies with until it has told."""
@@ -33,9 +35,10 @@ _ASKING_THREADS = 16
 
 
 class LiveFleet:
-    """A `FleetSource`. Asks drones for their clocks on threads of its own between ``__enter__`` and ``__exit__``."""
+    """What the page and the bridge to ROS 2 show, on the event loop except for what waits.
 
-    span_s = None
+    It asks drones for their clocks on threads of its own between ``__enter__`` and ``__exit__``.
+    """
 
     def __init__(self, watcher: FleetWatcher) -> None:
         """``watcher``: stays its owner's."""
@@ -64,27 +67,27 @@ class LiveFleet:
         self._pool.shutdown(cancel_futures=True)
 
     def now_s(self) -> float:
-        """See `FleetSource`; so all that follow."""
+        """The watcher's clock."""
         return time.monotonic()
 
     def wall_s(self, time_s: float) -> float:
-        """By this computer's clock."""
+        """Seconds since 1970, by this computer's clock, at a time of the watcher's."""
         return time.time() - time.monotonic() + time_s
 
-    def drones(self, time_s: float) -> tuple[Watched, ...]:
+    def drones(self) -> tuple[Watched, ...]:
         """All that were ever heard."""
         return self._watcher.drones()
 
     def known(self) -> Mapping[str, Known]:
-        """As far as queries have found it."""
+        """What each drone flies with, by its key, as far as queries have found it."""
         with self._lock:
             return dict(self._known)
 
     def rows(self, time_s: float) -> dict[str, Row]:
-        """Rows of all drones that were ever heard."""
+        """What is known of each drone that was ever heard, by its key, the worst first."""
         made_s, rows = self._rows
         if not 0.0 <= time_s - made_s < ROWS_S:
-            rows = drone_rows(self.drones(time_s), self.known(), time_s)
+            rows = drone_rows(self.drones(), self.known(), time_s)
             self._rows = time_s, rows
         return rows
 
@@ -98,22 +101,22 @@ class LiveFleet:
             notes.append(f"more names are heard than a fleet has drones: {_rounded(forgotten)} were forgotten")
         return [f"{note}; see who else reaches these endpoints" for note in notes]
 
-    def events(self, time_s: float) -> list[Event]:
-        """All that are remembered."""
+    def events(self) -> list[Event]:
+        """All that are remembered, the newest last."""
         return [(event.time_s, f"{event.fleet}/{event.drone}", event.sentence) for event in self._watcher.events()]
 
     def history(self) -> Mapping[str, list[list[float | None]]]:
-        """The history of the last five minutes."""
+        """Of the last five minutes, by key: rows of `HISTORY_COLUMNS` in order of time."""
         with self._lock:
             return {key: list(rows) for key, rows in self._history.items()}
 
     def ask(self, drone: str, command: str, order: Mapping[str, object] | None, operator: str) -> AnswerMessage:
-        """Asks the drone itself, which decides."""
+        """Asks the drone itself, which decides. Waits; called on a thread of its own, as `image` is."""
         answer = self._watcher.ask(drone, command, operator, order)
         return answer or AnswerMessage(accepted=False, sentence="did not answer, or this computer may not command it")
 
-    def image(self, drone: str, camera: str, time_s: float) -> bytes | None:
-        """Asks the drone itself."""
+    def image(self, drone: str, camera: str) -> bytes | None:
+        """A JPEG of what a camera sees: asks the drone itself."""
         return self._watcher.queries.image(drone, camera) if self._is_there(drone) and is_name(camera) else None
 
     def _is_there(self, drone: str) -> bool:

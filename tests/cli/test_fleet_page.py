@@ -2,31 +2,21 @@
 
 from __future__ import annotations
 
-import shutil
 import socket
 from argparse import Namespace
-from pathlib import Path
 
 import pytest
 
 from flockd.cli import main
 from flockd.cli.fleet import announce
 
-RECORDING = Path(__file__).parents[1] / "review" / "replay" / "crossing.mcap"
 
-
-def test_recordings_go_without_telemetry(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fleet", "--recordings", "x", "--connect", "tcp/127.0.0.1:1"]) == 2
-    assert "--recordings goes without telemetry" in capsys.readouterr().err
-
-
-def test_a_taken_port_is_reported_in_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copy(RECORDING, tmp_path)
+def test_a_taken_port_is_reported_in_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        assert main(["fleet", "--recordings", str(tmp_path), "--port", str(port)]) == 69
+        assert main(["fleet", "--connect", "tcp/127.0.0.1:1", "--port", str(port)]) == 69
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert error.startswith(f"the page cannot use 127.0.0.1 port {port} (")
     assert error.endswith("); name others")
@@ -44,7 +34,7 @@ def test_a_taken_port_is_reported_in_one_sentence(tmp_path: Path, capsys: pytest
 def test_an_address_that_others_reach_comes_with_a_warning(
     address: str, shown: str, warns: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    args = Namespace(server_address=address, recordings=None, connect=["tcp/127.0.0.1:1"], drones_at=None)
+    args = Namespace(server_address=address, connect=["tcp/127.0.0.1:1"], drones_at=None)
     announce(args, 80, "k")
     out, err = capsys.readouterr()
     assert out.splitlines()[0] == f"the fleet page is at http://{shown}:80/?key=k"

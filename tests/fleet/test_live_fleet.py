@@ -52,11 +52,11 @@ def test_a_drone_is_shown_with_what_queries_tell_and_answers_for_itself() -> Non
         assert fleet.ask("f/d", "goto", {"north_m": 1}, "anna")["sentence"] == "goto {'north_m': 1}"
         unheard = {"accepted": False, "sentence": "no drone of this name was heard"}
         assert fleet.ask("f/other", "hold", None, "anna") == unheard
-        assert (fleet.image("f/d", "front", 0.0), fleet.image("f/d", "back", 0.0)) == (PICTURE, None)
+        assert (fleet.image("f/d", "front"), fleet.image("f/d", "back")) == (PICTURE, None)
         for number in range(3):
             drone.publish("d", "events", {"time_s": float(number), "event": f"event {number}"})
-        until(lambda: len(fleet.events(fleet.now_s())) == 3)
-        assert [event[1:] for event in fleet.events(0.0)] == [("f/d", f"event {number}") for number in range(3)]
+        until(lambda: len(fleet.events()) == 3)
+        assert [event[1:] for event in fleet.events()] == [("f/d", f"event {number}") for number in range(3)]
         until(lambda: len(fleet.history()["f/d"]) >= 2)
 
 

@@ -33,7 +33,7 @@ export class FleetCommands {
   // Why a drone has no command; empty where it has some.
   refusal(key) {
     const { commands, state: now } = state.rows.get(key);
-    if (!state.live || !state.mayCommand || now === "gone" || (commands || []).length) return "";
+    if (!state.mayCommand || now === "gone" || (commands || []).length) return "";
     return commands ? "takes no commands: its telemetry.commands allows none" : "takes no commands: it has not told which";
   }
 

@@ -3,7 +3,6 @@ import { FleetCards } from "./fleet_cards.js";
 import { FleetCommands } from "./fleet_commands.js";
 import { FleetCurves } from "./fleet_curves.js";
 import { FleetMap } from "./fleet_map.js";
-import { ReplayControls } from "./fleet_replay.js";
 import { SimulationControls } from "./fleet_simulation.js";
 import { STATES, nameOf, put, state, take } from "./fleet_state.js";
 
@@ -22,10 +21,7 @@ const curves = new FleetCurves(document.getElementById("curves"));
 const summary = document.getElementById("summary");
 const trouble = document.getElementById("trouble");
 const notes = document.getElementById("notes");
-let [socket, heard, lastEvent, told] = [null, 0, "", ""];
-const replay = new ReplayControls(document.getElementById("replay"), (at) => {
-  if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ at }));
-});
+let [socket, heard, told] = [null, 0, ""];
 
 function choose(key) {
   state.chosen = key === state.chosen ? null : key;
@@ -66,14 +62,12 @@ async function whyLost() {
 async function greeted(hello) {
   complain("");
   document.querySelector("#events ol").replaceChildren();
-  state.live = hello.span_s === null;
-  state.mayCommand = hello.may_command && state.live;
+  state.mayCommand = hello.may_command;
   const reply = await fetch("history");
   if (!reply.ok) return complain(await reply.text());
   const { columns, drones } = await reply.json();
   state.columns = Object.fromEntries(columns.map((name, i) => [name, i]));
   state.history = new Map(Object.entries(drones));
-  if (!state.live) replay.begin(hello.span_s);
   return undefined;
 }
 
@@ -86,7 +80,6 @@ function show(message) {
   cards.changed(changed ? state.order : Object.keys(message.rows));
   commands.changed();
   map.changed();
-  replay.shown(state.now);
   showSummary();
   showEvents(message);
   put(notes, message.notes.join(" "));
@@ -112,13 +105,8 @@ function showSummary() {
   summary.replaceChildren(parts.length ? `${drones}: ` : "No drone was heard yet.", ...parts.flatMap((part, i) => (i ? [", ", part] : [part])));
 }
 
-// Live only what is new; of recordings all up to the time that is shown.
-function showEvents({ events, all_events: all }) {
-  const mark = all ? JSON.stringify(events) : "";
-  if (all ? mark === lastEvent : !events.length) return;
-  lastEvent = mark;
+function showEvents({ events }) {
   const list = document.querySelector("#events ol");
-  if (all) list.replaceChildren();
   for (const event of events.slice(-EVENTS_SHOWN)) showEvent(list, event);
   while (list.children.length > EVENTS_SHOWN) list.lastChild.remove();
 }
@@ -141,7 +129,7 @@ function eventLine([time, key, sentence]) {
   line.append(document.createElement("time"), document.createElement("b"), document.createElement("span"));
   const clock = new Date(Date.now() - 1000 * (state.now - time));
   const parts = [clock.getHours(), clock.getMinutes(), clock.getSeconds()];
-  put(line.children[0], state.live ? parts.map((part) => String(part).padStart(2, "0")).join(":") : replay.label(time));
+  put(line.children[0], parts.map((part) => String(part).padStart(2, "0")).join(":"));
   put(line.children[1], nameOf(key));
   put(line.children[2], sentence);
   return line;
@@ -154,7 +142,7 @@ function complain(sentence) {
 
 setInterval(() => {
   if (socket.readyState !== WebSocket.OPEN) return;
-  if (state.live && heard && performance.now() - heard > SILENT_MS) complain("Nothing came from the server for seconds: what is shown is old.");
+  if (heard && performance.now() - heard > SILENT_MS) complain("Nothing came from the server for seconds: what is shown is old.");
   else if (heard) complain("");
 }, AGAIN_MS);
 connect();

@@ -1,7 +1,6 @@
 // What the page knows of the fleet, and how values are written.
 
 export const state = {
-  live: true,
   mayCommand: false,
   now: 0,
   rows: new Map(),
@@ -63,7 +62,7 @@ export function take(message) {
   for (const key of [...message.order].sort(byName)) if (!numbers.has(key)) numbers.set(key, numbers.size);
   for (const [key, row] of Object.entries(message.rows)) {
     state.rows.set(key, row);
-    if (state.live) remember(key, row);
+    remember(key, row);
   }
   for (const key of state.rows.keys()) if (!message.order.includes(key)) state.rows.delete(key);
 }

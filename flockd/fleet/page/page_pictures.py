@@ -24,18 +24,12 @@ Key = tuple[str, str]
 class PagePictures:
     """On the event loop; what waits for drones has threads of its own, of which one drone has a few."""
 
-    def __init__(
-        self, fetch: Callable[[str, str, float], bytes | None], clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        """``fetch``: of a drone, a camera and a time; waits."""
+    def __init__(self, fetch: Callable[[str, str], bytes | None], clock: Callable[[], float] = time.monotonic) -> None:
+        """``fetch``: of a drone and a camera; waits."""
         self._fetch, self._clock = fetch, clock
         self._threads = ThreadPoolExecutor(_THREADS, "pictures for the fleet page")
         self._asking: dict[Key, asyncio.Task[None]] = {}
         self._made: dict[Key, tuple[float, bytes | None]] = {}
-
-    async def recorded(self, drone: str, camera: str, time_s: float) -> bytes | None:
-        """Of recordings, at a time of theirs."""
-        return await asyncio.get_running_loop().run_in_executor(self._threads, self._fetch, drone, camera, time_s)
 
     async def newest(self, drone: str, camera: str) -> bytes | None:
         """A live one; None where there is none yet, or none any more."""
@@ -53,7 +47,7 @@ class PagePictures:
 
     async def _ask(self, key: Key) -> None:
         try:
-            picture = await self.recorded(*key, 0.0)
+            picture = await asyncio.get_running_loop().run_in_executor(self._threads, self._fetch, *key)
             self._made.pop(key, None)
             self._made[key] = self._clock(), picture
             while len(self._made) > _MOST_KEPT:

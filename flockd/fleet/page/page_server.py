@@ -17,7 +17,7 @@ from typing import Any, Protocol
 from aiohttp import WSMsgType, web
 
 from flockd.fleet.drone_rows import HISTORY_COLUMNS, Known, Row
-from flockd.fleet.fleet_source import Event, FleetSource
+from flockd.fleet.live_fleet import Event, LiveFleet
 from flockd.fleet.page.page_access import HEADERS, PageAccess, is_own_host, is_own_origin
 from flockd.fleet.page.page_pictures import PagePictures
 from flockd.fleet.simulation import SimulationMessage, checked_control
@@ -55,7 +55,7 @@ class PageServer:
 
     def __init__(
         self,
-        source: FleetSource,
+        source: LiveFleet,
         access: PageAccess,
         *,
         may_command: bool,
@@ -154,10 +154,7 @@ class PageServer:
 
     async def _image(self, request: web.Request) -> web.Response:
         drone, camera = f"{request.match_info['fleet']}/{request.match_info['drone']}", request.match_info["camera"]
-        if self._source.span_s is None:
-            image = await self._pictures.newest(drone, camera)
-        else:
-            image = await self._pictures.recorded(drone, camera, _number(request.query.get("at")))
+        image = await self._pictures.newest(drone, camera)
         if image is None:
             return web.Response(status=204)
         return web.Response(body=image, content_type="image/jpeg")
@@ -240,7 +237,7 @@ class PageServer:
             return
         feed = _Feed(self._source, socket, self._simulation)
         await feed.greet(may_command=self._may_command)
-        await (feed.push() if self._source.span_s is None else feed.follow())
+        await feed.push()
 
     def _operator_of(self, request: web.Request) -> str:
         """Whose page it is that commands: of one computer, each has a number."""
@@ -252,7 +249,7 @@ class PageServer:
 class _Feed:
     """What one page is sent: each time only what has changed for it."""
 
-    def __init__(self, source: FleetSource, socket: web.WebSocketResponse, simulation: Simulation | None) -> None:
+    def __init__(self, source: LiveFleet, socket: web.WebSocketResponse, simulation: Simulation | None) -> None:
         self._source, self._socket, self._simulation = source, socket, simulation
         self._sent: dict[str, Row] = {}
         self._event: Event | None = None
@@ -260,7 +257,7 @@ class _Feed:
 
     async def greet(self, *, may_command: bool) -> None:
         """What the page has to know of the server."""
-        await self._send({"kind": "hello", "span_s": self._source.span_s, "may_command": may_command})
+        await self._send({"kind": "hello", "may_command": may_command})
 
     async def push(self) -> None:
         """Sends what is new until the page is closed."""
@@ -268,31 +265,23 @@ class _Feed:
         try:
             while not reading.done():
                 began_s = time.monotonic()
-                await self._snapshot(self._source.now_s())
+                await self._snapshot()
                 rest_s = max(0.05, PUSH_EVERY_S - (time.monotonic() - began_s))
                 await asyncio.wait({reading}, timeout=rest_s)
         finally:
             reading.cancel()
 
-    async def follow(self) -> None:
-        """Sends what the recordings hold at each time that the page asks for."""
-        async for message in self._socket:
-            asked = _object(message.data) if message.type == WSMsgType.TEXT else {}
-            at = asked.get("at")
-            if isinstance(at, int | float) and abs(at) < 1e12:  # false for NaN too
-                await self._snapshot(float(at))
-
     async def _wait_for_end(self) -> None:
         async for _ in self._socket:
             pass
 
-    async def _snapshot(self, time_s: float) -> None:
+    async def _snapshot(self) -> None:
+        time_s = self._source.now_s()
         rows = self._source.rows(time_s)
         changed = {key: row for key, row in rows.items() if self._sent.get(key) != row}
         self._sent = rows
-        events = self._source.events(time_s)
-        replay = self._source.span_s is not None
-        new = events[-100:] if replay else _events_after(events, self._event)
+        events = self._source.events()
+        new = _events_after(events, self._event)
         self._event = events[-1] if events else self._event
         await self._send(
             {
@@ -301,7 +290,6 @@ class _Feed:
                 "order": list(rows),
                 "rows": changed,
                 "events": new,
-                "all_events": replay,
                 "notes": self._source.notes(),
                 "simulation": None if self._simulation is None else self._simulation.state(),
             }
@@ -343,13 +331,6 @@ def _object(text: str | bytes) -> dict[str, Any]:
     except (ValueError, RecursionError):
         return {}
     return value if isinstance(value, dict) else {}
-
-
-def _number(text: str | None) -> float:
-    try:
-        return float(text or 0.0)
-    except ValueError:
-        return 0.0
 
 
 def _text(status: int, sentence: str) -> web.Response:

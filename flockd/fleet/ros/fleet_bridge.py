@@ -15,7 +15,7 @@ from flockd.core.config.rig import CameraConfig, RigConfig
 from flockd.core.jpeg_header import jpeg_size
 from flockd.core.ros_frames import MAP, attitude_in_ros, camera_in_ros, flu_of_frd
 from flockd.fleet.drone_rows import GONE, QUIET, Known, Row, origin_of
-from flockd.fleet.fleet_source import FleetSource
+from flockd.fleet.live_fleet import LiveFleet
 from flockd.fleet.ros.fleet_markers import home_in_map, markers
 from flockd.fleet.ros.ros_orders import NewestOrder, Whereabouts, goal_of, velocity_of
 from flockd.fleet.watcher import Watched
@@ -54,7 +54,7 @@ _VALUES = (
 class FleetBridge:
     """Publishes between ``__enter__`` and ``__exit__`` on a thread of its own."""
 
-    def __init__(self, source: FleetSource, node: RosNode, *, may_command: bool, operator: str) -> None:
+    def __init__(self, source: LiveFleet, node: RosNode, *, may_command: bool, operator: str) -> None:
         """``source`` and ``node`` stay their owner's. ``may_command``: whether orders are passed on at all, and in the
         name of which ``operator``."""
         self._source, self._node, self._may_command, self._operator = source, node, may_command, operator
@@ -97,7 +97,7 @@ class FleetBridge:
         """Publishes what is new."""
         now_s = self._source.now_s()
         rows, known = self._source.rows(now_s), self._source.known()
-        for drone in self._source.drones(now_s):
+        for drone in self._source.drones():
             key = f"{drone.fleet}/{drone.drone}"
             name, row = self._names.of(key), rows.get(key)
             if row is None:
@@ -180,7 +180,7 @@ class FleetBridge:
 
     def _publish_picture(self, key: str, name: str, camera: str, base: str, known: Known) -> None:
         now_s = self._source.now_s()
-        picture = self._source.image(key, camera, now_s)
+        picture = self._source.image(key, camera)
         size_px = None if picture is None else jpeg_size(picture)
         if picture is None or size_px is None:
             return
@@ -226,7 +226,7 @@ class FleetBridge:
         home = self._source.rows(now_s).get(key, {}).get("home_ne")
         about = self._source.known().get(key, Known()).about
         origin = None if about is None else origin_of(about["configuration"])
-        told = (one.message("state", now_s) for one in self._source.drones(now_s) if f"{one.fleet}/{one.drone}" == key)
+        told = (one.message("state", now_s) for one in self._source.drones() if f"{one.fleet}/{one.drone}" == key)
         state = cast("StateMessage | None", next(told, None))
         return Whereabouts(
             Names(name),

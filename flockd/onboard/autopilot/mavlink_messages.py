@@ -195,7 +195,6 @@ class ReceivedMessages:
             self.status(now_s),
             self.check_events,
             {name: self._fields(name) for name in ("HEARTBEAT", "SYS_STATUS")},
-            self.recent_texts(now_s, TEXT_MEMORY_S),
             now_s - self._other_computer_s < services.OTHER_HEARTBEAT.timeout,
             streams=streams,
             settled=now_s - self._first_s >= SETTLED_S,

@@ -1,7 +1,7 @@
 """Why the autopilot would refuse to arm or to fly offboard now, from its messages; without I/O.
 
 PX4 sends the checks that fail as MAVLink events: a summary with the modes that can be armed and flown, one event for
-each check, and a second summary at the end. A firmware without events tells less, by texts and by single flags.
+each check, and a second summary at the end.
 """
 
 from __future__ import annotations
@@ -23,11 +23,7 @@ from flockd.onboard.autopilot.refusal_reasons import (
     OF_STATE,
     RANK,
     REASONS,
-    SAID,
     SEVERAL_SENDERS,
-    SYSTEMS,
-    TEXTS,
-    UNHEALTHY,
     UNKNOWN_CHECK,
     event_number,
 )
@@ -167,7 +163,6 @@ def refusals(
     status: AutopilotStatus,
     events: CheckEvents,
     messages: Mapping[str, Mapping[str, Any]],
-    texts: Sequence[str],
     other_computers: bool,
     *,
     streams: bool,
@@ -179,7 +174,6 @@ def refusals(
         status: the newest.
         events: what the events say.
         messages: the newest fields of SYS_STATUS and HEARTBEAT, by name.
-        texts: STATUSTEXT of warning or worse of the last seconds.
         other_computers: one more onboard computer is heard.
         streams: flockd sends setpoints.
         settled: an autopilot that tells its checks by events would have done so by now.
@@ -190,8 +184,8 @@ def refusals(
         report = events.report
         if report is not None:
             found += _of_report(report, status, streams=streams, asked=_asked(events, status.time_s))
-        elif not status.armed and settled:
-            found += _of_flags(status, messages, texts)
+        elif not status.armed and settled and _checks_fail(messages["SYS_STATUS"]):
+            found.append(_refusal(CHECKS_FAIL, "to arm"))
         found += _of_denial(events, status, found)
         found += _of_mode(events, status.time_s)
     return _few({refusal.reason: refusal for refusal in reversed(found)})
@@ -245,31 +239,10 @@ def _blocking(report: CheckReport, state: int, status: AutopilotStatus) -> list[
     return certain or warned or [FailedCheck(event_number(CHECKS_FAIL), ALL_MODES, ERROR)]
 
 
-def _of_flags(
-    status: AutopilotStatus, messages: Mapping[str, Mapping[str, Any]], texts: Sequence[str]
-) -> Iterator[Refusal]:
-    """For a firmware without events: what its texts, its health bits and single messages say."""
-    system = messages["SYS_STATUS"]
+def _checks_fail(system: Mapping[str, Any]) -> bool:
+    """By SYS_STATUS, of a firmware that does not tell which."""
     enabled, healthy = (int(system.get(f"onboard_control_sensors_{what}") or 0) for what in ("enabled", "health"))
-    if healthy & PREARM_CHECK:
-        return
-    for text in texts:
-        words = text.lower()
-        name = next((name for parts, name in TEXTS if all(part in words for part in parts)), SAID)
-        if name != SAID or "fail" in words or "denied" in words:
-            refusal = _refusal(name, "to arm")
-            yield refusal._replace(what=f'{refusal.what} ("{text}")')
-    unhealthy = [name for bit, name in SYSTEMS.items() if enabled & bit and not healthy & bit]
-    if unhealthy:
-        yield _refusal(UNHEALTHY, "to arm")._replace(what=f"not healthy: {', '.join(unhealthy)}")
-    if status.estimate_ok is False:
-        yield _refusal("estimate_missing", "to arm")
-    if status.gps_ok is False:
-        yield _refusal("fix_missing", "to arm")
-    if status.home_ned is None:
-        yield _refusal("home_missing", "to arm")
-    if not (unhealthy or texts) and enabled & PREARM_CHECK and not healthy & PREARM_CHECK:
-        yield _refusal(CHECKS_FAIL, "to arm")
+    return bool(enabled & ~healthy & PREARM_CHECK)
 
 
 def _of_denial(events: CheckEvents, status: AutopilotStatus, found: Sequence[Refusal]) -> Iterator[Refusal]:

@@ -16,20 +16,17 @@ from aiohttp.test_utils import TestClient, TestServer
 
 from flockd.core.errors import UnavailableError
 from flockd.fleet.drone_rows import Known, Row
-from flockd.fleet.fleet_source import Event, FleetSource
+from flockd.fleet.live_fleet import Event, LiveFleet
 from flockd.fleet.page.page_access import PageAccess, is_own_host, lasting_key
 from flockd.fleet.page.page_server import PageServer
-from flockd.fleet.watcher import Watched
 from flockd.onboard.telemetry.topics import AnswerMessage
 
 HOLD = {"drones": ["f/one"], "command": "hold"}
 Client = TestClient[web.Request, web.Application]
 
 
-class Asked:
+class Asked(LiveFleet):
     """A fleet of one drone that accepts everything, and notes it."""
-
-    span_s = None
 
     def __init__(self) -> None:
         self.commands: list[tuple[str, str, object]] = []
@@ -38,19 +35,13 @@ class Asked:
     def now_s(self) -> float:
         return 1.0
 
-    def wall_s(self, time_s: float) -> float:
-        return time_s
-
-    def drones(self, time_s: float) -> tuple[Watched, ...]:
-        return ()
-
     def known(self) -> Mapping[str, Known]:
         return {}
 
     def rows(self, time_s: float) -> dict[str, Row]:
         return {"f/one": {"state": "normal"}}
 
-    def events(self, time_s: float) -> list[Event]:
+    def events(self) -> list[Event]:
         return [(0.5, "f/one", "took off")]
 
     def history(self) -> Mapping[str, list[list[float | None]]]:
@@ -64,13 +55,13 @@ class Asked:
         self.commands.append((drone, command, order))
         return AnswerMessage(accepted=True, sentence="tried")
 
-    def image(self, drone: str, camera: str, time_s: float) -> bytes | None:
+    def image(self, drone: str, camera: str) -> bytes | None:
         return b"jpeg" if (drone, camera) == ("f/one", "front") else None
 
 
 @asynccontextmanager
 async def served(
-    *, may_command: bool = True, fleet: FleetSource | None = None
+    *, may_command: bool = True, fleet: LiveFleet | None = None
 ) -> AsyncIterator[tuple[Client, PageAccess, Asked]]:
     """A server, of ``fleet`` or of one that notes what is asked, and a browser without a page."""
     access, noted = PageAccess(), Asked()
@@ -197,7 +188,7 @@ async def test_live_data_go_to_the_sessions_own_page_only() -> None:
             assert wrong.close_code == 4403
         async with client.ws_connect("/live", headers={"Origin": own["Origin"]}) as page:
             await page.send_json({"token": own["X-Flockd-Token"]})
-            assert await page.receive_json() == {"kind": "hello", "span_s": None, "may_command": True}
+            assert await page.receive_json() == {"kind": "hello", "may_command": True}
             shown = await page.receive_json()
             assert shown["rows"] == {"f/one": {"state": "normal"}}
             assert shown["events"] == [[0.5, "f/one", "took off"]]

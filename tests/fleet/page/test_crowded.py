@@ -27,7 +27,7 @@ class Stuck(Asked):
         self.happened: list[str] = []
         self.answers = threading.Event()
 
-    def image(self, drone: str, camera: str, time_s: float) -> bytes | None:
+    def image(self, drone: str, camera: str) -> bytes | None:
         self.happened.append("asked for a picture")
         self.answers.wait(60.0)
         self.happened.append("a picture came")
@@ -70,7 +70,7 @@ async def test_each_camera_is_asked_once_a_second_and_a_silent_one_seldom() -> N
     asked: list[str] = []
     now_s = 100.0
 
-    def fetch(drone: str, camera: str, time_s: float) -> bytes | None:
+    def fetch(drone: str, camera: str) -> bytes | None:
         asked.append(camera)
         return None if camera == "silent" else b"picture %d" % len(asked)
 

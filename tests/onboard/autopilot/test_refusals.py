@@ -1,4 +1,4 @@
-"""Why an autopilot refuses to arm or to fly offboard, from its messages: PX4's own events, flags and texts."""
+"""Why an autopilot refuses to arm or to fly offboard, from its messages: PX4's own events."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavlink_messages import ReceivedMessages
-from flockd.onboard.autopilot.refusal_reasons import NAMES, REASONS, event_number
+from flockd.onboard.autopilot.refusal_reasons import CHECKS_FAIL, NAMES, REASONS, event_number
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from tests.calm import clock
 from tests.onboard.autopilot.flight import attended, flying, until
@@ -212,33 +212,14 @@ def test_arming_that_was_refused_is_told_for_a_while(event: str, words: str) -> 
     assert story.sentences() == []
 
 
-def test_a_firmware_without_events_is_understood_by_its_texts_and_flags() -> None:
+def test_of_a_firmware_without_events_its_state_and_that_its_checks_fail_are_told() -> None:
     story = Story()
-    story.send("HOME_POSITION", x=0.0, y=0.0, z=0.0)
     story.send("SYS_STATUS", onboard_control_sensors_enabled=0x10200007, onboard_control_sensors_health=0x00200003)
     assert story.sentences() == [], "an autopilot that has a list of checks would be wronged in its first second"
     story.now_s += 2.0
-    assert story.sentences() == [
-        "the autopilot refuses to arm: not healthy: the compass; check the sensor and its cable, "
-        "or correct how many the autopilot's parameters SYS_HAS_... name"
-    ]
+    assert [refusal.reason for refusal in story.received.refusals(story.now_s, streams=False)] == [CHECKS_FAIL]
     story.send("SYS_STATUS", onboard_control_sensors_enabled=0x10200007, onboard_control_sensors_health=0x10200003)
     assert story.sentences() == [], "all checks pass: what is not healthy is not needed"
-    story.send("SYS_STATUS", onboard_control_sensors_enabled=0x10200007, onboard_control_sensors_health=0x00200003)
-    story.send("STATUSTEXT", severity=2, text="Preflight Fail: Gyro 0 uncalibrated", id=0, chunk_seq=0)
-    story.send("ESTIMATOR_STATUS", flags=1)
-    sentences = " ".join(story.sentences())
-    assert 'a gyroscope is not calibrated ("Preflight Fail: Gyro 0 uncalibrated"); calibrate it' in sentences
-    assert "its estimator gives no attitude, height, velocity or position" in sentences
-    assert story.log == ["the autopilot says: Preflight Fail: Gyro 0 uncalibrated"]
-
-
-def test_state_and_failed_checks_alone_are_reasons_too() -> None:
-    story = Story()
-    story.send("HOME_POSITION", x=0.0, y=0.0, z=0.0)
-    story.send("SYS_STATUS", onboard_control_sensors_enabled=0x10000000, onboard_control_sensors_health=0)
-    story.now_s += 2.0
-    assert "its checks before the flight fail; read its checks" in story.sentences()[0]
     story.send("HEARTBEAT", custom_mode=HOLD, base_mode=0, system_status=2)
     assert "a calibration is under way" in story.sentences()[0]
 
