@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flockd.cli.options import loaded
-from flockd.cli.output import noted_table, progress, say, say_json, say_table, tables_console
+from flockd.cli.output import noted_table, progress, say, say_facts, say_json, say_table, tables_console
 from flockd.cli.parser import Commands, Parser, add_commands, flag, option, positive_count, size
 from flockd.core.choices import PROVIDERS, Provider
 from flockd.core.errors import ExitCode, ModelError, UnavailableError, UsageError
@@ -208,16 +208,7 @@ def _prepare(args: argparse.Namespace) -> int:
         for path in paths:
             prepared.append(_prepare_one(path, config))
             tell(len(prepared), len(paths))
-    if args.json:
-        say_json(prepared)
-        return ExitCode.DONE
-    for one in prepared:
-        start = f"starts in {one['start_s']:.2f} s"
-        if one["engines"] is None:
-            say(f"{one['model']}: nothing to prepare for {config.perception.provider}; {start}")
-        else:
-            say(f"{one['model']}: prepared in {one['prepare_s']:.1f} s, {start}: {one['engines']}")
-    return ExitCode.DONE
+    return say_facts(args, {"prepared": prepared})
 
 
 def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import argparse
 import functools
 import json
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from time import monotonic
 from typing import Self
@@ -92,6 +92,24 @@ def say_result(args: argparse.Namespace, facts: object, *lines: str) -> int:
         for line in lines:
             say(line)
     return ExitCode.DONE
+
+
+def say_facts(args: argparse.Namespace, facts: Mapping[str, object], *lines: str) -> int:
+    """The same, of a command whose facts speak for themselves: people get them as YAML, to four digits."""
+    if not args.json:
+        import yaml
+
+        text = yaml.safe_dump(_shown(facts), sort_keys=False, default_flow_style=None, width=110, allow_unicode=True)
+        say(text.rstrip())
+    return say_result(args, facts, *lines)
+
+
+def _shown(value: object) -> object:
+    if isinstance(value, Mapping):
+        return {str(key): _shown(inner) for key, inner in value.items() if inner is not None}
+    if isinstance(value, list | tuple):
+        return [_shown(inner) for inner in value]
+    return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
 @contextmanager

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.options import add_stretch, opened, refuse_existing, stretch
-from flockd.cli.output import cell, say, say_json, say_result, say_table
+from flockd.cli.output import say_facts, say_result
 from flockd.cli.parser import Commands, Parser, add_commands, flag, option
-from flockd.core.errors import ExitCode, UsageError
+from flockd.core.errors import UsageError
 
 if TYPE_CHECKING:
     from flockd.onboard.recording.reader import Recording
@@ -45,15 +45,9 @@ def _add_cut(commands: Commands) -> None:
 
 
 def _add_export(commands: Commands) -> None:
-    examples = (
-        "flockd record export drone1.mcap --out tables",
-        "flockd record export drone1.mcap --out tables --format parquet --images",
-    )
-    parser = _with_recording(
-        commands("export", "Write a recording's messages as tables, its images as files.", examples)
-    )
+    examples = ("flockd record export drone1.mcap --out tables --images",)
+    parser = _with_recording(commands("export", "Write a recording's messages as CSV, its images as files.", examples))
     option(parser, "--out DIR", "a new or empty folder", Path, required=True)
-    option(parser, "--format", "of the tables (default: csv)", choices=("csv", "parquet"), default="csv")
     flag(parser, "--images", "the images too, in DIR/images/CAMERA")
     parser.set_defaults(run=_export)
 
@@ -67,29 +61,7 @@ def _with_recording(parser: Parser) -> Parser:
 def _info(args: argparse.Namespace) -> int:
     from flockd.onboard.recording.reader import recording_info
 
-    recording = opened(args.recording)
-    facts = recording_info(recording)
-    if args.json:
-        say_json(facts)
-        return ExitCode.DONE
-    for name in ("drone", "began", "version", "steps", "duration_s", "bytes", "images", "finished", "lost"):
-        say(f"{name:12}{facts[name]}")
-    for name, sha256 in facts["models"].items():
-        say(f"{'model':12}{name} {sha256[:12]}")
-    for gap in facts["gaps"]:
-        say(f"{'gap':12}steps {gap['first_step']} to {gap['last_step']} are missing")
-    for damage in facts["damages"]:
-        say(f"{'damage':12}{damage['file']} at byte {damage['byte']}: {damage['reason']}")
-    rows = [
-        (cell(one["topic"]), cell(one["schema"]), f"{one['messages']}", _rate(one["rate_hz"]))
-        for one in facts["streams"]
-    ]
-    say_table(("stream", "schema", "messages", "rate"), rows)
-    return ExitCode.DONE
-
-
-def _rate(rate_hz: float | None) -> str:
-    return "" if rate_hz is None else f"{rate_hz:.2f} Hz"
+    return say_facts(args, recording_info(opened(args.recording)))
 
 
 def _recover(args: argparse.Namespace) -> int:
@@ -120,11 +92,9 @@ def _export(args: argparse.Namespace) -> int:
 
     if args.out.exists() and (not args.out.is_dir() or any(args.out.iterdir())):
         raise UsageError(f"{args.out}: is not an empty folder; name a new one with --out")
-    if args.format == "parquet":
-        import pyarrow  # noqa: F401 - so that nothing is half-written when the extra is missing
     recording = opened(args.recording)
     args.out.mkdir(parents=True, exist_ok=True)
-    tables = export_tables(recording, args.out, args.format)
+    tables = export_tables(recording, args.out)
     images = export_images(recording, args.out / "images") if args.images else 0
     facts = {"out": str(args.out), "tables": [path.name for path in tables], "images": images}
     return say_result(args, facts, f"{args.out}: {len(tables)} tables, {images} images")

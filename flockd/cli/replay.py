@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from flockd.cli.options import add_stretch, loaded, opened, refuse, refuse_existing, stretch
-from flockd.cli.output import complain, progress, say, say_json
+from flockd.cli.output import complain, progress, say, say_facts, say_json
 from flockd.cli.parser import Commands, Parser, flag, number, option, positive_count
 from flockd.core.errors import ExitCode, UsageError
 
@@ -159,7 +159,7 @@ def _replay(args: argparse.Namespace, recording: Recording) -> int:
     else:
         _say_result(args, comparison, result)
         if watch is not None:
-            _say_profile(result["profile"])
+            _say_profile(args, result["profile"])
     return ExitCode.CHECK_FAILED if comparison is not None and comparison.first else ExitCode.DONE
 
 
@@ -285,10 +285,8 @@ def _run_dataset(args: argparse.Namespace) -> int:
                 f"{args.trajectory}: ends at frame {broken.before.index}, as the motion to frame {broken.after.index} "
                 f"could not be estimated: {broken.reason}"
             )
-    if args.json:
-        say_json(result)
-    else:
-        _say_dataset(args, result)
+    lines = [f"not estimated: {p['from']} to {p['to']}: {p['reason']}" for p in result["pairs"] if not p["estimated"]]
+    say_facts(args, result if args.json else {**result, "pairs": len(pairs)}, *lines)
     if not any(pair.found for pair in pairs):
         complain(f"{dataset.path}: no motion could be estimated: {pairs[0].reason}")
         return ExitCode.CHECK_FAILED
@@ -309,67 +307,12 @@ def _check_dataset(dataset: Dataset, stride: int, depth: str) -> None:
         raise UsageError(f"{dataset.path}: has {len(dataset)} frames, and none {stride} after another; lower --stride")
 
 
-def _say_dataset(args: argparse.Namespace, result: Mapping[str, Any]) -> None:
-    pairs = result["pairs"]
-    estimated = [pair for pair in pairs if pair["estimated"]]
-    say(
-        f"{args.recording}: {len(pairs)} pairs of frames, {result['stride']} apart; flow {result['flow']}, depth "
-        f"{result['depth']}"
-    )
-    say(f"estimated: {len(estimated)} ({100 * result['estimated_ratio']:.1f} %)")
-    for name, unit, factor in (("rotation_error_deg", "deg", 1), ("translation_error_m", "cm", 100)):
-        spread = {key: value for key, value in result[name].items() if value is not None}
-        if spread:
-            shown = ", ".join(f"{key} {factor * value:.2f} {unit}" for key, value in spread.items())
-            say(f"{name.partition('_')[0]} error: {shown}")
-    for pair in pairs:
-        if not pair["estimated"]:
-            say(f"not estimated: {pair['from']} to {pair['to']}: {pair['reason']}")
-    if args.trajectory is not None:
-        say(f"trajectory: {args.trajectory}")
-
-
-def _say_profile(profile: Mapping[str, Any]) -> None:
+def _say_profile(args: argparse.Namespace, profile: Mapping[str, Any]) -> None:
     """A table of stages, the computer, and the step time that it can keep; ``profile`` as `profile_result` gives it."""
     say(f"\n{'stage':<20}{'p50 ms':>8}{'p95 ms':>8}{'share':>8}")
     for stage, row in profile["stages"].items():
         say(f"{stage:<20}{row['p50_ms']:>8.1f}{row['p95_ms']:>8.1f}{100 * row['share']:>7.0f}%")
-    say(f"\n{_computer(profile['computer'])}")
-    say(_instructions(profile["computer"]))
-    cameras = ", ".join(f"{name} {width}x{height}" for name, (width, height) in profile["cameras"].items())
-    say(f"cameras: {cameras}")
-    say(f"networks: {', '.join(profile['networks'])} on {profile['provider']}, perception.threads {profile['threads']}")
-    say(f"a step takes {profile['processor_ms']:.0f} ms of processor time: {profile['cores_busy']:.1f} cores busy")
-    say(f"memory: {profile['memory_mb']:.0f} MB at most; load before: {profile['load_before']:.1f}")
-    say(f"temperature: {_temperature(profile)}")
-    say("; ".join(f"{name} {version}" for name, version in profile["versions"].items()))
-    say(f"\n{_advice(profile)}")
-
-
-def _computer(computer: Mapping[str, Any]) -> str:
-    memory = "" if computer["memory_mb"] is None else f", {computer['memory_mb'] / 1e3:.1f} GB of memory"
-    cores = computer["cores"]
-    return (
-        f"computer: {computer['name']}, {computer['architecture']}, {cores} {'core' if cores == 1 else 'cores'}{memory}"
-    )
-
-
-def _instructions(computer: Mapping[str, Any]) -> str:
-    eight_bit = ", ".join(computer["eight_bit"]) or "none known, so the 8-bit networks save little"
-    return f"instructions for 8-bit numbers: {eight_bit}; others: {', '.join(computer['vector']) or 'none known'}"
-
-
-def _temperature(profile: Mapping[str, Any]) -> str:
-    if profile["temperature_c"] is None:
-        text = "this computer reports none"
-    else:
-        start, most, end = profile["temperature_c"]
-        text = f"{start:.0f} °C at the start, {most:.0f} at most, {end:.0f} at the end ({profile['zone']})"
-    if profile["clock_mhz"] is not None:
-        text += "; clock {:.0f} to {:.0f} MHz".format(*profile["clock_mhz"])
-    if profile["slowed_by"]:
-        text += f"; THE PROCESSOR WAS SLOWED DOWN ({', '.join(profile['slowed_by'])}): cool it, and measure again"
-    return text
+    say_facts(args, {name: fact for name, fact in profile.items() if name != "stages"}, _advice(profile))
 
 
 def _advice(profile: Mapping[str, Any]) -> str:

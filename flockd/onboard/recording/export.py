@@ -6,7 +6,7 @@ import csv
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from flockd.onboard.message_json import Json, parsed
 from flockd.onboard.recording import foxglove
@@ -16,17 +16,16 @@ from flockd.onboard.recording.streams import is_image
 
 Row = dict[str, Any]
 Tables = dict[str, list[Row]]
-Format = Literal["csv", "parquet"]
 _FILE_NAME = re.compile(r"\w[\w.-]{,100}")
 WORDS = ("NaN", "Infinity", "-Infinity")
 """Numbers that JSON has only as text."""
 
 
-def export_tables(recording: Recording, folder: Path, form: Format) -> tuple[Path, ...]:
+def export_tables(recording: Recording, folder: Path) -> tuple[Path, ...]:
     """Writes a table for each stream of JSON messages, and one for each list within them: a row each message or entry.
 
-    Nested names are joined by dots. Raises RecordingError for messages and names that cannot stand in a table, OSError,
-    and ModuleNotFoundError for Parquet without pyarrow.
+    Nested names are joined by dots. Raises RecordingError for messages and names that cannot stand in a table, and
+    OSError.
     """
     tables: Tables = {}
     for entry in _entries(recording):
@@ -37,10 +36,9 @@ def export_tables(recording: Recording, folder: Path, form: Format) -> tuple[Pat
             except ValueError as error:
                 reason = f"a message of {entry.stream.topic[:60]} cannot be read ({error})"
                 raise RecordingError(f"{recording.path}: {reason}; use another copy") from error
-    write = _write_csv if form == "csv" else _write_parquet
     try:
-        return tuple(write(folder / f"{_file_name(name)}.{form}", rows) for name, rows in tables.items())
-    except (ValueError, OverflowError, TypeError) as error:  # TypeError: Parquet has one type a column
+        return tuple(_write_csv(folder / f"{_file_name(name)}.csv", rows) for name, rows in tables.items())
+    except ValueError as error:
         raise RecordingError(f"{recording.path}: cannot be written as tables ({error}); use another copy") from error
 
 
@@ -106,21 +104,9 @@ def _number(value: Json) -> Json:
     return float(value) if isinstance(value, str) and value in WORDS else value
 
 
-def _columns(rows: list[Row]) -> list[str]:
-    return list(dict.fromkeys(name for row in rows for name in row))
-
-
 def _write_csv(path: Path, rows: list[Row]) -> Path:
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, _columns(rows))
+        writer = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)))
         writer.writeheader()
         writer.writerows(rows)
-    return path
-
-
-def _write_parquet(path: Path, rows: list[Row]) -> Path:
-    import pyarrow as pa  # noqa: PLC0415 - an optional extra
-    import pyarrow.parquet as pq  # noqa: PLC0415
-
-    pq.write_table(pa.table({name: [row.get(name) for row in rows] for name in _columns(rows)}), path)
     return path

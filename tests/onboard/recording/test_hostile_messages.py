@@ -68,7 +68,7 @@ def test_a_step_whose_image_does_not_decode_is_recovered_without(tmp_path: Path,
 def test_a_message_that_is_none_ends_an_export_in_one_sentence(tmp_path: Path, whole: Path, data: bytes) -> None:
     path = changed(whole, tmp_path / "x.mcap", "/output", lambda entry: replace(entry, data=data))
     with pytest.raises(RecordingError, match="a message of /output cannot be read") as caught:
-        export_tables(Recording(path), tmp_path, "csv")
+        export_tables(Recording(path), tmp_path)
     assert "\n" not in str(caught.value)
 
 
@@ -77,7 +77,7 @@ def test_lists_of_words_and_numbers_become_a_table_all_the_same(tmp_path: Path, 
         return replace(entry, data=json.dumps({**json.loads(entry.data), "reasons": ["a", 1, None]}).encode())
 
     path = changed(whole, tmp_path / "x.mcap", "/output", mixed)
-    export_tables(Recording(path), tmp_path, "csv")
+    export_tables(Recording(path), tmp_path)
     assert "a; 1; None" in (tmp_path / "output.csv").read_text(encoding="utf-8")
 
 
@@ -90,7 +90,7 @@ def test_no_name_in_a_recording_leads_out_of_the_folder_of_an_export(tmp_path: P
     folder.mkdir(parents=True)
     path = changed(whole, tmp_path / "x.mcap", "/output", renamed)
     with pytest.raises(RecordingError, match="which is none for a file"):
-        export_tables(Recording(path), folder, "csv")
+        export_tables(Recording(path), folder)
     assert {found.name for found in tmp_path.rglob("*.csv")} <= {found.name for found in folder.rglob("*.csv")}
 
 

@@ -39,7 +39,7 @@ def test_a_changed_recording_is_read_or_refused_and_writes_nowhere_else(tmp_path
                 pass
         with own_errors():
             recover(Recording(file), copied)
-            export_tables(Recording(copied), tables / "csv", "csv")
+            export_tables(Recording(copied), tables / "csv")
             export_images(Recording(copied), tables / "images")
         assert {path.name for path in tables.iterdir()} <= {"csv", "images"}, "written outside of its tmp_path"
         assert {path.name for path in tmp_path.iterdir()} <= {file.name, copied.name, tables.name}, "written outside"

@@ -329,7 +329,7 @@ def test_tables_and_images_hold_what_was_flown(tmp_path: Path) -> None:
     recording = Recording(tmp_path / "drone1.mcap")
     folder = tmp_path / "tables"
     folder.mkdir()
-    export_tables(recording, folder, "csv")
+    export_tables(recording, folder)
     with (folder / "output.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [float(row["command.yaw_rad"]) for row in rows] == [output.command.yaw_rad for output in outputs]
@@ -349,12 +349,3 @@ def test_tables_and_images_hold_what_was_flown(tmp_path: Path) -> None:
     written = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
     assert np.array_equal(written, step.frames.frames["left"].image)
     assert json.dumps(step.output) == json.dumps(to_json(outputs[0]))
-
-
-def test_tables_as_parquet(tmp_path: Path) -> None:
-    from pyarrow import parquet
-
-    outputs = record(tmp_path / "drone1.mcap", steps=3)
-    export_tables(Recording(tmp_path / "drone1.mcap"), tmp_path, "parquet")
-    table = parquet.read_table(tmp_path / "output.parquet").to_pydict()
-    assert table["command.yaw_rad"] == [output.command.yaw_rad for output in outputs]
