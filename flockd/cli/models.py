@@ -104,7 +104,7 @@ def _list(args: argparse.Namespace) -> int:
 def _verify(args: argparse.Namespace) -> int:
     from flockd.flight.inference import OnnxModel
     from flockd.flight.perception.requirements import check_roles
-    from flockd.onboard.deadline import GOLDEN_S, within
+    from flockd.onboard.worker import GOLDEN_S, within
 
     faults: dict[str, str | None] = {}
     for path in _manifests(args.dir):

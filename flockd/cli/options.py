@@ -96,14 +96,6 @@ def opened(path: Path) -> Recording:
         return Recording(path, tell)
 
 
-def refuse_existing(path: Path, option: str = "--out") -> None:
-    """Raises UsageError when there is something at `path`, or no folder for it."""
-    if path.exists():
-        raise UsageError(f"{path}: exists; name a new file with {option}")
-    if not path.parent.is_dir():
-        raise UsageError(f"{path.parent}: is no folder; make it first, or name another file with {option}")
-
-
 def add_force(parser: Parser) -> None:
     """Adds the option."""
     flag(parser, "--force", "take speeds beyond those that were shown to be safe")
@@ -145,8 +137,10 @@ def refuse(args: argparse.Namespace, options: Sequence[str], why: str) -> None:
 
 def refuse_overwriting(args: argparse.Namespace, *files: Path | None) -> None:
     """Raises UsageError where a result would take a file's place without --force: before the work, not after it."""
+    force: bool | None = getattr(args, "force", None)
     for file in files:
-        if file is not None and file.exists() and not args.force:
-            raise UsageError(f"{file}: exists; name another file, or overwrite it with --force")
+        if file is not None and file.exists() and not force:
+            instead = "" if force is None else ", or overwrite it with --force"
+            raise UsageError(f"{file}: exists; name another file{instead}")
         if file is not None and not file.parent.is_dir():
             raise UsageError(f"{file.parent}: is no folder; make it first, or name another file")

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.options import add_stretch, opened, refuse_existing, stretch
+from flockd.cli.options import add_stretch, opened, refuse_overwriting, stretch
 from flockd.cli.output import say_facts, say_result
 from flockd.cli.parser import Commands, Parser, add_commands, flag, option
 from flockd.core.errors import UsageError
@@ -68,7 +68,7 @@ def _recover(args: argparse.Namespace) -> int:
     from flockd.onboard.recording.editing import recover
 
     out = args.out or args.recording.with_name(f"{args.recording.stem}.recovered.mcap")
-    refuse_existing(out)
+    refuse_overwriting(args, out)
     recording = opened(args.recording)
     return _report_copy(args, recording, out, recover(recording, out))
 
@@ -76,7 +76,7 @@ def _recover(args: argparse.Namespace) -> int:
 def _cut(args: argparse.Namespace) -> int:
     from flockd.onboard.recording.editing import cut
 
-    refuse_existing(args.out)
+    refuse_overwriting(args, args.out)
     recording = opened(args.recording)
     return _report_copy(args, recording, args.out, cut(recording, args.out, *stretch(recording, args)))
 

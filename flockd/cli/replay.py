@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.options import add_stretch, loaded, opened, refuse, refuse_existing, stretch
+from flockd.cli.options import add_stretch, loaded, opened, refuse, refuse_overwriting, stretch
 from flockd.cli.output import complain, progress, say, say_facts, say_json
 from flockd.cli.parser import Commands, Parser, flag, number, option, positive_count
 from flockd.core.errors import ExitCode, UsageError
@@ -174,8 +174,7 @@ def _check_options(args: argparse.Namespace) -> None:
         raise UsageError("--profile measures how fast it goes, and --speed holds it back; drop one of them")
     if args.tolerance and not args.diff:
         raise UsageError("--tolerance has no meaning without --diff; add it")
-    if args.out is not None:
-        refuse_existing(args.out)
+    refuse_overwriting(args, args.out)
 
 
 def _refuse_short(recording: Recording, start_s: float, end_s: float) -> None:
@@ -262,8 +261,7 @@ def _refuse_dataset(args: argparse.Namespace) -> None:
 def _run_dataset(args: argparse.Namespace) -> int:
     """Runs the command for a dataset."""
     refuse(args, _OF_RECORDINGS, "is for recordings of flockd, and this is none; leave it out")
-    if args.trajectory is not None:
-        refuse_existing(args.trajectory, "--trajectory")
+    refuse_overwriting(args, args.trajectory)
     from flockd.ground.datasets.image_folder import open_dataset
     from flockd.review.replay.dataset_flight import dataset_config, dataset_result, replay_dataset, write_trajectory
 

@@ -103,8 +103,8 @@ async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceMa
     from flockd.flight.inference.hashes import model_hashes
     from flockd.flight.perception import load_networks
     from flockd.onboard.daemon import Daemon, cameras_at_once
-    from flockd.onboard.deadline import GOLDEN_S, within
     from flockd.onboard.simulated_time import clock_at
+    from flockd.onboard.worker import GOLDEN_S, within
 
     daemon = Daemon(
         config,

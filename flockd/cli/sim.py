@@ -14,6 +14,7 @@ import tempfile
 import threading
 import webbrowser
 from collections.abc import Iterator
+from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -432,38 +433,22 @@ def _opened(address: str) -> Iterator[None]:
 @contextmanager
 def _served(page: PageServer, port: int) -> Iterator[int]:
     """Serves the page on a thread of its own. Gives its port; raises what its start did."""
-    loop = asyncio.new_event_loop()
-    begun: list[int] = []
-    failed: list[BaseException] = []
-    known = threading.Event()
-
-    def served(at: int) -> None:
-        begun.append(at)
-        known.set()
-
-    async def serve() -> None:
-        try:
-            await serve_page(page, HERE, port, served)
-        except Exception as error:  # noqa: BLE001 - raised again where it was started
-            failed.append(error)
-        finally:
-            known.set()
-
-    task = loop.create_task(serve())
+    loop, begun = asyncio.new_event_loop(), Future[int]()
+    task = loop.create_task(serve_page(page, HERE, port, begun.set_result))
 
     def run() -> None:
-        asyncio.set_event_loop(loop)
         with suppress(asyncio.CancelledError):
-            loop.run_until_complete(task)
+            try:
+                loop.run_until_complete(task)
+            except Exception as error:  # noqa: BLE001 - raised again where it was started
+                begun.set_exception(error)
         loop.close()
 
     thread = threading.Thread(target=run, name="fleet page server", daemon=True)
     thread.start()
-    known.wait()
-    if failed:
-        raise failed[0]
+    bound = begun.result()
     try:
-        yield begun[0]
+        yield bound
     finally:
         loop.call_soon_threadsafe(task.cancel)
         thread.join()

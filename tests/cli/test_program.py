@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.onboard.test_deadline import endless
+from tests.onboard.test_worker import endless
 
 ROOT = Path(__file__).parents[2]
 GIVEN_UP = """

@@ -26,7 +26,7 @@ from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.sitl.ports import free_endpoint, free_port
 from tests.onboard.autopilot.conftest import HEARTBEAT_S
 from tests.onboard.daemon.aboard import Cameras, config_for
-from tests.onboard.test_deadline import endless
+from tests.onboard.test_worker import endless
 
 RUN = "from flockd.cli import program; program()"
 WITHOUT_NETWORKS = (

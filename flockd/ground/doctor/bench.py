@@ -21,7 +21,7 @@ from flockd.ground.doctor import Finding, failed, graded, passed, warned
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.daemon import Components, Daemon, InterruptibleNetworks, ServiceManager, cameras_at_once
-from flockd.onboard.deadline import GOLDEN_S, within
+from flockd.onboard.worker import GOLDEN_S, within
 
 SAMPLE_S = 0.5
 STEADY = 0.95

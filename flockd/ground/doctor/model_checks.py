@@ -20,7 +20,7 @@ from flockd.flight.perception.requirements import check_roles
 from flockd.flight.pilot import FlockPilot
 from flockd.ground.doctor import Finding, Level, failed_from_error, graded, passed
 from flockd.onboard.daemon import load_side_by_side
-from flockd.onboard.deadline import GOLDEN_S, within
+from flockd.onboard.worker import GOLDEN_S, within
 
 STEPS = 4
 """How many are timed. The first has no images before it, and warms up."""

@@ -11,13 +11,13 @@ import json
 import logging
 import math
 import socket
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from enum import IntEnum
+from functools import lru_cache
 from itertools import cycle
 from typing import Any, Self, TypeVar
 
@@ -97,6 +97,8 @@ ANNOUNCEMENT = {
 }  # fmt: skip
 """A HEARTBEAT of MAV_TYPE_GCS: PX4 sends its texts on no link on which it hears no ground station."""
 MOST_REPORTS = 100
+MAX_TEXTS = 100
+"""Of MAVSDK's that are remembered, to be logged once each."""
 GONE_S = 10.0
 """A serial port that is gone for longer is not waited for on the ground; an autopilot that starts anew takes 5."""
 
@@ -656,37 +658,11 @@ def _settle(answer: asyncio.Future[T], value: T) -> None:
 def _to_logging(level: LogLevel, message: str, *_: object) -> bool:
     """MAVSDK would print; this says that it is taken care of."""
     expected = message.startswith("No raw connection available. Subscription")  # `_open` subscribes before it connects
-    _throttled(logging.DEBUG if expected else _LOG_LEVELS[level], message)
+    _tell_once(logging.DEBUG if expected else _LOG_LEVELS[level], message)
     return True
 
 
-AGAIN_S = 60.0
-MAX_TEXTS = 100
-"""Texts remembered; a library that puts numbers into its texts never repeats one."""
-
-
-class ThrottledLog:
-    """May be called on any thread."""
-
-    def __init__(self, log: logging.Logger, clock: Callable[[], float] = time.monotonic) -> None:
-        self._log, self._clock = log, clock
-        self._lock = threading.Lock()
-        self._told: dict[str, tuple[float, int]] = {}
-        """When each text was written last, and how often it has come since."""
-
-    def __call__(self, level: int, text: str) -> None:
-        """Writes the text, or counts it."""
-        with self._lock:
-            now = self._clock()
-            told_s, count = self._told.get(text, (-AGAIN_S, 0))
-            if now - told_s < AGAIN_S:
-                self._told[text] = told_s, count + 1
-                return
-            if len(self._told) >= MAX_TEXTS:
-                self._told.clear()
-            self._told[text] = now, 0
-        self._log.log(level, "%s", f"{text} ({count} times more in {now - told_s:.0f} s)" if count else text)
-
-
-_throttled = ThrottledLog(_log)
-"""MAVSDK sends a heartbeat a second, and complains of each that an autopilot which is gone does not take."""
+@lru_cache(MAX_TEXTS)
+def _tell_once(level: int, message: str) -> None:
+    """MAVSDK sends a heartbeat a second, and complains of each that an autopilot which is gone does not take."""
+    _log.log(level, "%s", message)

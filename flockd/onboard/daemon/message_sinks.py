@@ -11,10 +11,10 @@ from pathlib import Path
 from flockd.core.config import DroneConfig
 from flockd.core.messages import FrameSet, LearnedSize, MissionOrder, PilotOutput, VehicleState
 from flockd.core.printable import printable
-from flockd.onboard.daemon.worker import BusyError, Worker
 from flockd.onboard.recording import Recorder
 from flockd.onboard.telemetry import TelemetrySink, publish_step
 from flockd.onboard.telemetry.topics import EventMessage
+from flockd.onboard.worker import BusyError, Worker
 
 BACKLOG = 100
 CLOSE_S = 5.0

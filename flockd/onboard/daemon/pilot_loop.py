@@ -31,8 +31,8 @@ from flockd.core.messages import (
 from flockd.flight.geometry import described, rig_faults, rotation_from_vector, vector_from_rotation
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
-from flockd.onboard.daemon.worker import BusyError, LateError, Worker
 from flockd.onboard.sources import FrameSource
+from flockd.onboard.worker import BusyError, LateError, Worker
 
 FRAME_WAIT_S = 0.1
 FRAME_DEADLINE_S = 5.0

@@ -25,11 +25,11 @@ from flockd.onboard.daemon.operator_orders import MissionOrders, OperatorCommand
 from flockd.onboard.daemon.pilot_loop import PilotLoop, VehicleHistory
 from flockd.onboard.daemon.supervisor_inputs import InputCollector, LoopLag, Thermometer, WallClock
 from flockd.onboard.daemon.watched_networks import InterruptibleNetworks, WatchedNetworks, cameras_at_once
-from flockd.onboard.daemon.worker import BusyError, LateError, Worker
 from flockd.onboard.sources import FrameSource
 from flockd.onboard.telemetry.preview import Previews
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage
+from flockd.onboard.worker import BusyError, LateError, Worker
 
 LOAD_S = 60.0
 """To load the networks from a slow card."""

@@ -31,12 +31,8 @@ async def notify_service_manager(components: Components, service: ServiceManager
     sent = components.control.decision
     service.ready(state_sentence(sent))
     components.sinks.event("ready: models loaded, autopilot heard, first frames seen")
-    reported: set[str] = set()
     loop = asyncio.get_running_loop()
     while True:
-        for note in set(components.source.notes()) - reported:
-            components.sinks.event(note)
-            reported.add(note)
         until = loop.time() + STATUS_EVERY_S
         while _matters(components.control.decision) == _matters(sent) and loop.time() < until:
             await asyncio.sleep(STATUS_POLL_S)

@@ -20,8 +20,8 @@ from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
 from flockd.onboard.daemon.operator_orders import OperatorRequests
 from flockd.onboard.daemon.pilot_loop import PilotLoop
 from flockd.onboard.daemon.watched_networks import WatchedNetworks
-from flockd.onboard.daemon.worker import LateError, Worker
 from flockd.onboard.sources import CameraStatus, Count, FrameSource
+from flockd.onboard.worker import LateError, Worker
 
 DROPS_WINDOW_S = 5.0
 _BAD: tuple[Count, ...] = ("time_stamp", "flagged", "corrupt", "malformed")

@@ -21,7 +21,7 @@ from flockd.flight.perception import (
     load_networks,
     outcome,
 )
-from flockd.onboard.daemon.worker import Worker
+from flockd.onboard.worker import Worker
 
 T = TypeVar("T")
 TERMINATE_S = 0.5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
 import queue
 import threading
@@ -22,7 +23,7 @@ from flockd import __version__
 from flockd.core.config import DroneConfig
 from flockd.core.config.recording import RecordingConfig
 from flockd.core.config.rig import RigConfig
-from flockd.core.messages import FloatArray, Frame, FrameSet, LearnedSize, MissionOrder, PilotOutput, VehicleState
+from flockd.core.messages import Frame, FrameSet, LearnedSize, MissionOrder, PilotOutput, VehicleState
 from flockd.core.secrets import masked
 from flockd.onboard.message_json import to_json
 from flockd.onboard.recording import foxglove
@@ -276,17 +277,19 @@ class Recorder:
 
 
 class _Track:
-    """The frames' places and the own path, for viewers."""
+    """The frames' places and the own path, for viewers: north and east from the first step, up by the autopilot."""
 
     def __init__(self, rig: RigConfig) -> None:
         self._rig = rig
-        self._path = OwnPath()
+        self._north_east, self._time_s = np.zeros(2), math.nan
 
     def entries(self, step: _Step) -> Iterator[Entry]:
         """Where everything is at this step."""
-        time_s, velocity = step.frames.time_s, step.output.velocity
-        position, R_ned_body = self._path.go_on(time_s, velocity, step.vehicle.height_m), step.vehicle.R_ned_body
-        stamp = nanoseconds(time_s)
+        time_s, velocity, R_ned_body = step.frames.time_s, step.output.velocity, step.vehicle.R_ned_body
+        if velocity is not None and not math.isnan(self._time_s):
+            self._north_east = self._north_east + velocity[:2] * (time_s - self._time_s)
+        self._time_s = time_s
+        position, stamp = np.array([*self._north_east, -step.vehicle.height_m]), nanoseconds(time_s)
         places = foxglove.transforms(stamp, position, R_ned_body, self._rig)
         yield Entry(foxglove.TRANSFORMS, stamp, step.number, places)
         if velocity is not None:
@@ -447,18 +450,3 @@ def _json_entry(stream: Any, time_s: float, sequence: int, message: object) -> E
 def _log_entry(time_s: float, level: Literal["INFO", "WARNING"], text: str) -> Entry:
     stamp = nanoseconds(time_s)
     return Entry(foxglove.LOG, stamp, 0, foxglove.log(stamp, level, text))
-
-
-class OwnPath:
-    """Begins at the first step, north and east of which it counts; the height is the autopilot's."""
-
-    def __init__(self) -> None:
-        self._north_east = np.zeros(2)
-        self._time_s: float | None = None
-
-    def go_on(self, time_s: float, velocity: FloatArray | None, height_m: float) -> FloatArray:
-        """(3,) m NED at this step; ``velocity`` (3,) m/s NED since the last one, None: stand still."""
-        if velocity is not None and self._time_s is not None:
-            self._north_east = self._north_east + velocity[:2] * (time_s - self._time_s)
-        self._time_s = time_s
-        return np.array([*self._north_east, -height_m])

@@ -184,10 +184,6 @@ class ReceivedFrames:
         """See ``FrameSource``."""
         return self._receiver.status()
 
-    def notes(self) -> tuple[str, ...]:
-        """See ``FrameSource``."""
-        return ()
-
 
 class FrameReceiver:
     """The assembler behind a lock, and the decoding in front of it: what all sources have in common."""

@@ -68,9 +68,6 @@ class FrameSource(Protocol):
     def status(self) -> Mapping[str, CameraStatus]:
         """How each camera is doing, by its name."""
 
-    def notes(self) -> tuple[str, ...]:
-        """What a person should know although nothing is wrong: each is one sentence."""
-
     def stop(self) -> None:
         """Closes everything; returns within a fraction of a second."""
 

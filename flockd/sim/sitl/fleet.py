@@ -198,7 +198,6 @@ class _Fleet:
 
     def land(self, run: FleetRun) -> None:
         """Ends the daemons, which leaves the drones in Hold, and lands all whose autopilot still runs."""
-        run.notes += self._server.notes()
         run.exit_codes = self._daemons.end()
         ended = [program.name for program in self._autopilots.programs() if program.ended is not None]
         run.notes += [f"{name} had ended, so that its drone was not landed" for name in ended]

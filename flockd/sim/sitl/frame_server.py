@@ -58,10 +58,6 @@ class FrameServer:
             raise self._failure
         return tuple(self._frames)
 
-    def notes(self) -> tuple[str, ...]:
-        """Remarks of the publisher, for people."""
-        return self._publisher.notes()
-
     def _run(self) -> None:
         due_s = self._clock()
         try:

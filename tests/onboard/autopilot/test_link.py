@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mavsdk.connection_result import ConnectionResult
+from mavsdk.logging import LogLevel
 from mavsdk.mavsdk import Mavsdk
 from mavsdk.system import System
 from pymavlink.dialects.v20 import common as mavlink
@@ -20,7 +22,14 @@ from pymavlink.dialects.v20 import common as mavlink
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.messages import Setpoint, Wanted
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, Firmware
-from flockd.onboard.autopilot.mavsdk_link import RECEIVED, SETPOINT_TYPE_MASK, TIME_SYNC, AutopilotLink, Severity
+from flockd.onboard.autopilot.mavsdk_link import (
+    RECEIVED,
+    SETPOINT_TYPE_MASK,
+    TIME_SYNC,
+    AutopilotLink,
+    Severity,
+    _to_logging,
+)
 from flockd.sim.autopilot.fake_autopilot import TICK_S, FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.sim.autopilot.fake_telemetry import TelemetryStreams
@@ -533,3 +542,13 @@ async def test_a_close_that_nobody_waits_for_still_destroys_mavsdk(address: str,
     answer.set()
     await asking
     await asyncio.wait_for(destroyed.wait(), 10.0)
+
+
+def test_what_mavsdk_says_once_a_second_of_a_dead_autopilot_is_in_the_log_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        for number in range(180):
+            _to_logging(LogLevel.ERROR, "Sending message failed")
+            _to_logging(LogLevel.DEBUG, f"number {number}")
+    assert caplog.messages == ["Sending message failed"]

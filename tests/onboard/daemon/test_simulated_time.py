@@ -110,9 +110,6 @@ class SlowCamera:
 
     def stop(self) -> None: ...
 
-    def notes(self) -> tuple[str, ...]:
-        return ()
-
     def status(self) -> Mapping[str, CameraStatus]:
         return {}
 

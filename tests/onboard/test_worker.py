@@ -1,7 +1,8 @@
-"""A network that would run for ever on its golden input is ended, and the model refused."""
+"""A worker and its deadlines; a network that would run for ever on its golden input is ended, and refused."""
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ from onnx import TensorProto, helper
 
 from flockd.core.errors import ModelError
 from flockd.flight.inference import OnnxModel
-from flockd.onboard.deadline import within
+from flockd.onboard.worker import BusyError, LateError, Worker, within
 from tests.flight.inference.foreign import SIZE, image_input, map_output, write_model
 
 
@@ -84,3 +85,28 @@ def test_work_that_takes_too_long_is_stopped_and_left_if_it_does_not_obey(obeys:
     assert asked.is_set()
     assert not free.is_set(), "nobody waits for it"
     free.set()
+
+
+def test_a_worker_answers_passes_errors_on_and_is_not_kept_by_a_job_that_hangs() -> None:
+    hang = threading.Event()
+
+    async def story() -> None:
+        worker = Worker("test")
+        assert await worker.do(5.0, divmod, 7, 2) == (3, 1)
+        with pytest.raises(ZeroDivisionError):
+            await worker.do(5.0, divmod, 7, 0)
+        with pytest.raises(TimeoutError, match="the job's own"):
+            await worker.do(5.0, _raises_timeout)
+        with pytest.raises(LateError, match=r"test: not done within 0\.05 s"):
+            await worker.do(0.05, hang.wait)
+        worker.submit(hang.wait)
+        with pytest.raises(BusyError, match="test: too many jobs wait"):
+            worker.submit(hang.wait)
+        hang.set()
+        worker.leave()
+
+    asyncio.run(story())
+
+
+def _raises_timeout() -> None:
+    raise TimeoutError("the job's own")

@@ -6,11 +6,17 @@ import asyncio
 import queue
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from contextlib import suppress
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+
+GOLDEN_S = 8.0
+"""For a network's run on its golden input, which takes less than a second on any computer that flies: a network that
+never ends is refused within ten."""
+_END_S = 1.0
+"""How long work may take to end when it is stopped; ONNX Runtime takes a few milliseconds."""
 
 
 class LateError(Exception):
@@ -70,3 +76,23 @@ class Worker:
             else:
                 future.set_result(result)
             del entry, future, job  # or the last frames would stay in memory until the next
+
+
+def within(seconds: float) -> Callable[[Callable[[], None], Callable[[], None]], None]:
+    """Something that runs its first argument, and where that takes longer stops it by the second.
+
+    It then raises TimeoutError, whether or not the work has ended; what the work itself raises passes through.
+    """
+
+    def run(work: Callable[[], None], stop: Callable[[], None]) -> None:
+        worker = Worker("deadline")
+        done = worker.submit(work)
+        if not wait([done], seconds).done:
+            stop()
+            wait([done], _END_S)
+            worker.leave()
+            raise TimeoutError(f"more than {seconds:g} s")
+        worker.leave()
+        done.result()
+
+    return run
