@@ -3,9 +3,9 @@
 ros_child.py TOPIC CAMERA_INFO_TOPIC system|simulator
 
 It needs rclpy, and nothing of flockd. What it writes are messages as those of `gstreamer_child.py`: `imag` and `jpeg`
-are an Image and a CompressedImage as they travelled, with their time in nanoseconds of CLOCK_MONOTONIC; `info` is a
-CameraInfo; `fail` says why there will be no more. It waits for the topic to appear, and takes it as its publishers
-offer it: reliably where all do, else by best effort.
+are an Image and a CompressedImage, an `IMAGE_HEAD` and the data, with their time in nanoseconds of CLOCK_MONOTONIC;
+`info` is the `INFO_BODY` of a CameraInfo; `fail` says why there will be no more. It waits for the topic to appear, and
+takes it as its publishers offer it: reliably where all do, else by best effort.
 """
 
 from __future__ import annotations
@@ -24,8 +24,10 @@ IMAGE, COMPRESSED, INFO, ERROR = b"imag", b"jpeg", b"info", b"fail"
 NO_TIME = -1
 NO_ROS = "there is no rclpy"
 IMAGES = {"sensor_msgs/msg/Image": (IMAGE, "Image"), "sensor_msgs/msg/CompressedImage": (COMPRESSED, "CompressedImage")}
-_STAMP = {1: struct.Struct("<iI"), 0: struct.Struct(">iI")}
-"""By the second byte, which says in which order the others stand."""
+IMAGE_HEAD = struct.Struct("<64sIII")
+"""The encoding or format; width, height and bytes a line of an Image."""
+INFO_BODY = struct.Struct("<II4d")
+"""Width, height; fx, fy, cx, cy."""
 _LOOK_S = 0.1
 _CLOCK_S = 0.5
 """So long one reading of a simulator's clock counts: it may have come late, and then a later one is better."""
@@ -68,16 +70,30 @@ def listen(topic: str, info_topic: str, stamps: str, output: int) -> None:
     clock = _Clock()
     if stamps == "simulator":
         kept = importlib.import_module("rosgraph_msgs.msg").Clock
-        node.create_subscription(kept, "/clock", clock.take, best, raw=True)
-    node.create_subscription(
-        getattr(messages, name),
-        topic,
-        lambda data: send(output, kind, data, clock.monotonic_ns(data, simulated=stamps == "simulator")),
-        offered,
-        raw=True,
-    )
-    node.create_subscription(messages.CameraInfo, info_topic, lambda data: send(output, INFO, data), best, raw=True)
+        node.create_subscription(kept, "/clock", lambda now: clock.take(_ns(now.clock)), best)
+
+    def take(message: Any) -> None:
+        time_ns = clock.monotonic_ns(_ns(message.header.stamp), simulated=stamps == "simulator")
+        send(output, kind, packed(message), time_ns)
+
+    node.create_subscription(getattr(messages, name), topic, take, offered)
+    node.create_subscription(messages.CameraInfo, info_topic, lambda info: send(output, INFO, body_of(info)), best)
     rclpy.spin(node)
+
+
+def packed(message: Any) -> bytes:
+    """An Image or CompressedImage as it is written."""
+    if hasattr(message, "encoding"):
+        head = IMAGE_HEAD.pack(message.encoding.encode(), message.width, message.height, message.step)
+    else:
+        head = IMAGE_HEAD.pack(message.format.encode(), 0, 0, 0)
+    return head + bytes(message.data)
+
+
+def body_of(info: Any) -> bytes:
+    """A CameraInfo as it is written."""
+    fx, _, cx, _, fy, cy, *_ = info.k
+    return INFO_BODY.pack(info.width, info.height, fx, fy, cx, cy)
 
 
 def _wait_for(node: Any, topic: str) -> tuple[bytes, str, bool]:
@@ -102,25 +118,23 @@ class _Clock:
         self._readings: deque[tuple[int, int]] = deque()
         """When a simulator's clock came, and by how much that is more than it said."""
 
-    def take(self, data: bytes) -> None:
+    def take(self, stamp_ns: int) -> None:
         now_ns = time.monotonic_ns()
-        self._readings.append((now_ns, now_ns - _stamp_ns(data)))
+        self._readings.append((now_ns, now_ns - stamp_ns))
         while now_ns - self._readings[0][0] > _CLOCK_S * 1e9:
             self._readings.popleft()
 
-    def monotonic_ns(self, data: bytes, *, simulated: bool) -> int:
+    def monotonic_ns(self, stamp_ns: int, *, simulated: bool) -> int:
         """Of an image's stamp; `NO_TIME` before a simulator's clock came."""
         if not simulated:
-            return _stamp_ns(data) + time.monotonic_ns() - time.time_ns()
+            return stamp_ns + time.monotonic_ns() - time.time_ns()
         if not self._readings:
             return NO_TIME
-        return _stamp_ns(data) + min(behind for _, behind in self._readings)
+        return stamp_ns + min(behind for _, behind in self._readings)
 
 
-def _stamp_ns(data: bytes) -> int:
-    """Of a message that begins with a time, behind the four bytes that say how it is written."""
-    seconds, nanoseconds = _STAMP[data[1]].unpack_from(data, 4)
-    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+def _ns(stamp: Any) -> int:
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def send(output: int, kind: bytes, data: bytes, time_ns: int = 0) -> None:

@@ -9,12 +9,11 @@ from pathlib import Path
 from flockd.core.config.rig import IntrinsicsConfig
 from flockd.core.config.source import CameraDeviceParameters
 from flockd.core.ros_frames import CENTRE_PX
-from flockd.onboard.ros.ros_input import RosCameraInfo, read_camera_info, read_compressed_image, read_image
 from flockd.onboard.sources import ros_child
 from flockd.onboard.sources.child_device import ChildDevice, ChildMessage
 from flockd.onboard.sources.frames import CameraError, CapturedBuffer
 from flockd.onboard.sources.image_formats import ImageFormat, MjpegFormat, PackedFormat
-from flockd.onboard.sources.ros_child import COMPRESSED, IMAGE, INFO
+from flockd.onboard.sources.ros_child import COMPRESSED, IMAGE, IMAGE_HEAD, INFO, INFO_BODY
 
 CHILD = (sys.executable, "-P", str(Path(ros_child.__file__)))
 """Without its folder on Python's path, where its neighbours' names would hide those of other packages."""
@@ -66,23 +65,21 @@ class RosDevice(ChildDevice):
         return self._format
 
     def _taken(self, message: ChildMessage) -> CapturedBuffer | None:
-        try:
-            if message.kind == INFO:
-                self._compare(read_camera_info(message.data))
-                return None
-            image = read_image(message.data) if message.kind == IMAGE else read_compressed_image(message.data)
-        except ValueError as error:
-            raise CameraError(f"{self._name}: {self._topic} sent what is no image ({error})") from error
+        if message.kind == INFO:
+            self._compare(*INFO_BODY.unpack(message.data))
+            return None
+        text, width, height, bytes_per_line = IMAGE_HEAD.unpack_from(message.data)
+        encoding = text.rstrip(b"\0").decode("utf-8", "replace")
         if message.kind == IMAGE:
-            self._format = self._packed(image.encoding, image.size, image.bytes_per_line)
-        elif "jpeg" in image.encoding or "jpg" in image.encoding:
+            self._format = self._packed(encoding, (width, height), bytes_per_line)
+        elif "jpeg" in encoding or "jpg" in encoding:
             self._format = MjpegFormat(self._size)
         else:
-            raise CameraError(f"{self._name}: {self._topic} sends {image.encoding[:40]!r}; let its transport send JPEG")
-        return self._captured(image.data, message)
+            raise CameraError(f"{self._name}: {self._topic} sends {encoding[:40]!r}; let its transport send JPEG")
+        return self._captured(message.data[IMAGE_HEAD.size :], message)
 
-    def _packed(self, encoding: str, size: tuple[int, int] | None, bytes_per_line: int | None) -> ImageFormat:
-        if size != self._size and size is not None:
+    def _packed(self, encoding: str, size: tuple[int, int], bytes_per_line: int) -> ImageFormat:
+        if size != self._size:
             gives, asked = (f"{width}x{height}" for width, height in (size, self._size))
             raise CameraError(
                 f"{self._name}: {self._topic} gives {gives}, but the rig has {asked}; correct size_px, or the driver"
@@ -95,14 +92,17 @@ class RosDevice(ChildDevice):
             )
         return PackedFormat(ENCODINGS[encoding], self._size, bytes_per_line)
 
-    def _compare(self, info: RosCameraInfo) -> None:
-        """Raises CameraError where a CameraInfo says something else than the rig. One without a calibration may."""
-        if self._lens is None or info.fx == 0:
+    def _compare(self, width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> None:
+        """Raises CameraError where a CameraInfo says something else than the rig. One without a calibration may.
+
+        Pixel centres are at whole numbers in ROS.
+        """
+        if self._lens is None or fx == 0:
             return
-        if info.size != self._size:
-            gives, asked = (f"{width}x{height}" for width, height in (info.size, self._size))
+        if (width, height) != self._size:
+            gives, asked = (f"{w}x{h}" for w, h in ((width, height), self._size))
             raise CameraError(f"{self._name}: {self._info_topic} is of {gives}, but the rig has {asked}; correct one")
-        found = {"fx": info.fx, "fy": info.fy, "cx": info.cx + CENTRE_PX, "cy": info.cy + CENTRE_PX}
+        found = {"fx": fx, "fy": fy, "cx": cx + CENTRE_PX, "cy": cy + CENTRE_PX}
         for key, value in found.items():
             expected = getattr(self._lens, key)
             if not abs(value - expected) <= LENS_TOLERANCE * self._lens.fx:

@@ -37,8 +37,7 @@ from flockd.onboard.ros.ros_input import (
     STATES,
     NearestState,
     RosImage,
-    read_compressed_image,
-    read_image,
+    image_of,
     stamp_ns,
     vehicle_state,
 )
@@ -67,7 +66,7 @@ def recording_of_bag(bag: Bag, config: DroneConfig, vehicle_topic: str | None, t
         if kinds.get(topic) not in {IMAGE, COMPRESSED_IMAGE}:
             there = ", ".join(name for name, kind in kinds.items() if kind in {IMAGE, COMPRESSED_IMAGE}) or "none"
             raise UsageError(f"{bag.path}: has no images of camera {camera} in {topic}; topics with images: {there}")
-    began_ns = next((_image(bag, one).stamp_ns for one in bag.messages(topics)), 0)
+    began_ns = next((stamp_ns(bag.read(one)) for one in bag.messages(topics)), 0)
     states = _states(bag, _vehicle_topic(bag, vehicle_topic), config, began_ns)
     steps = 0
     with McapFile(target) as file:
@@ -102,7 +101,7 @@ def _sets(bag: Bag, topics: Mapping[str, str], config: DroneConfig, began_ns: in
     last: dict[str, RawFrame] = {}
     for message in bag.messages(topics):
         camera = topics[message.topic]
-        image = _image(bag, message)
+        image = image_of(bag.read(message))
         time_s, number = _time_s(image.stamp_ns, began_ns), 0
         if (before := last.get(camera)) is not None:
             number = before.sequence + max(round((time_s - before.time_s) * rates[camera]), 1)
@@ -118,13 +117,6 @@ def _sets(bag: Bag, topics: Mapping[str, str], config: DroneConfig, began_ns: in
 def _time_s(stamp_ns: int, began_ns: int) -> float:
     """Since the first image: since 1970, a float would hold no microseconds."""
     return (stamp_ns - began_ns) * 1e-9
-
-
-def _image(bag: Bag, message: BagMessage) -> RosImage:
-    try:
-        return read_image(message.data) if message.kind == IMAGE else read_compressed_image(message.data)
-    except ValueError as error:
-        raise RecordingError(f"{bag.path}: an image of {message.topic} cannot be read ({error})") from error
 
 
 def _decoder(image: RosImage, size: tuple[int, int], message: BagMessage) -> Callable[[bytes], UInt8Array]:
