@@ -29,7 +29,7 @@ from flockd.cli import (
     status,
 )  # fmt: skip
 from flockd.cli.output import complain
-from flockd.cli.parser import Parser, add_commands
+from flockd.cli.parser import Parser, commands_of
 from flockd.core.errors import ExitCode, FlockdError, UnavailableError, shortage_of
 from flockd.core.jpeg_header import MAX_IMAGE_PIXELS
 
@@ -125,22 +125,10 @@ def _parser() -> Parser:
         notes=EXIT_CODES,
     )
     parser.add_argument("--version", action="version", version=f"flockd {__version__}")
-    commands = (
-        run,
-        status,
-        fleet,
-        ros,
-        doctor,
-        sim,
-        campaign,
-        report,
-        record,
-        replay,
-        detect,
-        cameras,
-        calibrate,
-        config,
+    commands = commands_of(parser)
+    for command in (
+        run, status, fleet, ros, doctor, sim, campaign, report, record, replay, detect, cameras, calibrate, config,
         models,
-    )
-    add_commands(parser, [command.add for command in commands])
+    ):  # fmt: skip
+        command.add(commands)
     return parser

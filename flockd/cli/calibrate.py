@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from flockd.cli.options import loaded, opened, refuse_overwriting
 from flockd.cli.output import complain, progress, say, say_json, say_result
-from flockd.cli.parser import Commands, Parser, add_commands, flag, option, positive_count, positive_number, size
+from flockd.cli.parser import Commands, Parser, commands_of, flag, option, positive_count, positive_number, size
 from flockd.core.choices import LENS_MODELS
 from flockd.core.errors import ExitCode, UsageError
 
@@ -35,8 +35,9 @@ def add(commands: Commands) -> None:
         "flockd calibrate camera pictures/ --camera front",
         "flockd calibrate rig --config my_drone.yaml",
     )
-    parser = commands("calibrate", "Measure the cameras: lenses, mountings, time offsets.", examples)
-    add_commands(parser, (_add_camera, _add_rig))
+    commands = commands_of(commands("calibrate", "Measure the cameras: lenses, mountings, time offsets.", examples))
+    _add_camera(commands)
+    _add_rig(commands)
 
 
 def _add_shared(parser: Parser, help_of_config: str) -> None:
@@ -91,7 +92,7 @@ def _add_camera(commands: Commands) -> None:
         "flockd calibrate camera --config my_drone.yaml --camera front",
     )
     description = "Measure a camera's lens from views of a ChArUco board."
-    parser = commands("camera", description, examples)
+    parser = commands("camera", description, examples, _camera)
     help_of_source = "a folder of images, a video or a recording; by default --config's own camera, live"
     option(parser, "SOURCE", help_of_source, nargs="?")
     option(parser, "--camera NAME", "the camera's name in the rig")
@@ -101,7 +102,6 @@ def _add_camera(commands: Commands) -> None:
     option(parser, "--serial TEXT", "the camera's serial number, where the device does not give it")
     option(parser, "--print-board FILE", "write the board to print (.pdf)", Path)
     _add_shared(parser, "the drone, for its camera's device and serial")
-    parser.set_defaults(run=_camera)
 
 
 def _camera(args: argparse.Namespace) -> int:
@@ -247,7 +247,7 @@ def _add_rig(commands: Commands) -> None:
         "Measure the cameras' mountings: relative poses, from a board that two of them see at once; or what a "
         "flight found of orientation in the body, time offset and focal length."
     )
-    parser = commands("rig", description, examples)
+    parser = commands("rig", description, examples, _rig)
     help_of_source = (
         "a folder with a folder of images for each camera, or a recording; by default --config's cameras, live"
     )
@@ -255,7 +255,6 @@ def _add_rig(commands: Commands) -> None:
     option(parser, "--reference NAME", "the camera whose mounting --config gives (default: the first)")
     option(parser, "--from-flight RECORDING", "take over what this flight found of its own rig", Path)
     _add_shared(parser, "the drone, with its cameras' intrinsics; a recording has its own")
-    parser.set_defaults(run=_rig)
 
 
 def _rig(args: argparse.Namespace) -> int:

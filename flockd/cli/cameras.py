@@ -35,7 +35,7 @@ def add(commands: Commands) -> None:
         "flockd cameras --turn-deg 90 --write cameras.yaml",
     )
     description = "List the cameras of this computer, measure what they give, and write the configuration of them."
-    parser = commands("cameras", description, examples)
+    parser = commands("cameras", description, examples, _run)
     flag(parser, "--measure", "run all cameras and measure what comes")
     option(parser, "--seconds S", f"measure this long ({SECONDS:g})", positive_number, default=SECONDS)
     option(parser, "--picture FOLDER", "save an image of each camera; measures too", Path)
@@ -52,7 +52,6 @@ def add(commands: Commands) -> None:
     option(parser, "--names NAME", "of the cameras in the rig, in the listed order", nargs="+")
     flag(parser, "--force", "overwrite the file if it exists")
     flag(parser, "--json", "print JSON")
-    parser.set_defaults(run=_run)
 
 
 def _run(args: argparse.Namespace) -> int:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.options import require
 from flockd.cli.output import Phases, complain, say_result
-from flockd.cli.parser import Commands, add_commands, flag, option, positive_count
+from flockd.cli.parser import Commands, commands_of, flag, option, positive_count
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ Ctrl-C and every other end lose only flights that are in the air: the same comma
 
 def add(commands: Commands) -> None:
     """Adds the command."""
-    examples = (
+    examples: tuple[str, ...] = (
         "flockd campaign config/campaigns/separation.yaml --dry-run",
         "flockd campaign config/campaigns/separation.yaml",
         "flockd campaign report out/separation",
@@ -38,17 +38,13 @@ def add(commands: Commands) -> None:
         "Fly many flights of a scenario, rerun one of them, report on all; `campaign FILE` is `campaign run FILE`."
     )
     parser = commands("campaign", description, examples)
-    parser.default_command = RUN
-    add_commands(parser, (_add_run, _add_rerun, _add_report))
-
-
-def _add_run(commands: Commands) -> None:
+    parser.default_command, commands = RUN, commands_of(parser)
     examples = (
         "flockd campaign config/campaigns/separation.yaml --dry-run",
         "flockd campaign config/campaigns/separation.yaml --workers 4 --out out/tonight",
         "flockd campaign config/campaigns/separation.yaml --engine ray --address 10.0.0.5:6379",
     )
-    parser = commands(RUN, "Fly what is missing of a campaign, and write its report.", examples, COSTS)
+    parser = commands(RUN, "Fly what is missing of a campaign, and write its report.", examples, _run, notes=COSTS)
     option(parser, "FILE", "of the campaign", Path)
     option(parser, "--out FOLDER", "default: out/NAME, by the campaign's name", Path)
     option(parser, "--workers N", "flights at once (default: processors)", positive_count)
@@ -62,30 +58,22 @@ def _add_run(commands: Commands) -> None:
     option(parser, "--address HOST:PORT", "with --engine ray: a running cluster (default: a new one)")
     flag(parser, "--dry-run", "print how many flights and hours it is; keep nothing")
     flag(parser, "--json", "print what was flown as JSON")
-    parser.set_defaults(run=_run)
-
-
-def _add_rerun(commands: Commands) -> None:
     examples = (
         "flockd campaign rerun out/separation/c3-s12",
         "flockd campaign rerun out/night/c0-s7 --out out/why --json",
     )
-    parser = commands("rerun", "Fly one flight of a campaign again, with its full report.", examples)
+    parser = commands("rerun", "Fly one flight of a campaign again, with its full report.", examples, _rerun)
     parser.add_argument("flight", metavar="RUN", type=Path, help="the campaign's folder and the flight's name")
     option(parser, "--out DIR", "default: FOLDER/reruns/NAME", Path)
     flag(parser, "--force", "overwrite an earlier flight in that folder")
     flag(parser, "--json", "print the summary as JSON")
-    parser.set_defaults(run=_rerun, quiet=False, settings={})
-
-
-def _add_report(commands: Commands) -> None:
+    parser.set_defaults(quiet=False, settings={})
     examples = ("flockd campaign report out/separation", "flockd campaign report out/old_networks out/new_networks")
-    parser = commands("report", "Write the report of a campaign, or compare a second one with it.", examples)
+    parser = commands("report", "Write the report of a campaign, or compare a second one with it.", examples, _report)
     option(parser, "FOLDER", "of a campaign", Path)
     option(parser, "OTHER", "is compared with it: is this one better?", Path, nargs="?")
     option(parser, "--out FILE", "default: report.html, or OTHER/versus_NAME.html of two", Path)
     flag(parser, "--json", "print the figures as JSON")
-    parser.set_defaults(run=_report)
 
 
 def _run(args: argparse.Namespace) -> int:

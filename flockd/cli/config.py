@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.options import add_force, permit, refuse_overwriting
 from flockd.cli.output import say, say_json, say_result
-from flockd.cli.parser import Commands, Parser, add_commands, flag, option
+from flockd.cli.parser import Commands, Parser, commands_of, flag, option
 from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, ModelError, UsageError
 
 if TYPE_CHECKING:
@@ -26,45 +26,43 @@ CHANGE_ME = "CHANGE-ME"
 
 def add(commands: Commands) -> None:
     """Adds the command."""
-    examples = (
+    examples: tuple[str, ...] = (
         "flockd config check config/paper_flight.yaml",
         "flockd config show config/simulator.yaml",
         "flockd config new scenario my_flight.yaml --set duration_s=30",
     )
-    parser = commands("config", "Check, show, describe and begin configuration files.", examples)
-    add_commands(parser, (_add_check, _add_show, _add_schema, _add_card, _add_new))
-
-
-def _add_check(commands: Commands) -> None:
+    commands = commands_of(commands("config", "Check, show, describe and begin configuration files.", examples))
     examples = ("flockd config check my_flight.yaml", "flockd config check --json config/*.yaml")
-    parser = commands("check", "Report all errors in files of drones, scenarios and campaigns.", examples)
+    parser = commands("check", "Report all errors in files of drones, scenarios and campaigns.", examples, _check)
     parser.add_argument("files", nargs="+", metavar="FILE", type=Path, help="of drones, scenarios or campaigns")
     flag(parser, "--json", "print the problems as JSON")
     add_force(parser)
-    parser.set_defaults(run=_check)
-
-
-def _add_show(commands: Commands) -> None:
     examples = ("flockd config show config/paper_flight.yaml", "flockd config show --json config/simulator.yaml")
-    parser = commands("show", "Show a file with every default filled in, a scenario with its drone.", examples)
+    parser = commands("show", "Show a file with every default filled in, a scenario with its drone.", examples, _show)
     option(parser, "FILE", "of a drone or a scenario", Path)
     flag(parser, "--json", "print JSON instead of YAML")
-    parser.set_defaults(run=_show)
-
-
-def _add_schema(commands: Commands) -> None:
     examples = ("flockd config schema drone", "flockd config schema scenario > scenario.schema.json")
-    parser = commands("schema", "Print the JSON schema of a kind of file, for editors and other tools.", examples)
+    description = "Print the JSON schema of a kind of file, for editors and other tools."
+    parser = commands("schema", description, examples, _schema)
     parser.add_argument("kind", choices=("drone", "scenario", "campaign"), help="of the file")
-    parser.set_defaults(run=_schema)
-
-
-def _add_card(commands: Commands) -> None:
     examples = ("flockd config card my_drone.yaml", "flockd config card /etc/flockd/drone.yaml > card.md")
     description = "Print the card of a flight day, as Markdown: limits, heights, what each fault does, who does what."
-    parser = commands("card", description, examples)
-    option(parser, "FILE", "of a drone", Path)
-    parser.set_defaults(run=_card)
+    option(commands("card", description, examples, _card), "FILE", "of a drone", Path)
+    examples = ("flockd config new drone my_drone.yaml", "flockd config new scenario my_flight.yaml")
+    commands = commands_of(
+        commands("new", "Write a commented file of a drone or a scenario, to be filled in.", examples)
+    )
+    examples = (
+        "flockd config new drone my_drone.yaml",
+        "flockd config new drone my_drone.yaml --set name=kite2 --set safety.first_flight_layer=2",
+    )
+    _add_new_options(commands("drone", "Write the configuration of a real drone.", examples, _new), "drone")
+    examples = (
+        "flockd config new scenario my_flight.yaml",
+        "flockd config new scenario woods.yaml --set world.obstacles.kind=forest --set obstacles.enabled=true",
+    )
+    description = "Write the configuration of a simulated flight."
+    _add_new_options(commands("scenario", description, examples, _new), "scenario")
 
 
 def _card(args: argparse.Namespace) -> int:
@@ -178,29 +176,6 @@ def _schema(args: argparse.Namespace) -> int:
     return ExitCode.DONE
 
 
-def _add_new(commands: Commands) -> None:
-    """Adds the command."""
-    examples = ("flockd config new drone my_drone.yaml", "flockd config new scenario my_flight.yaml")
-    parser = commands("new", "Write a commented file of a drone or a scenario, to be filled in.", examples)
-    add_commands(parser, (_add_new_drone, _add_new_scenario))
-
-
-def _add_new_drone(commands: Commands) -> None:
-    examples = (
-        "flockd config new drone my_drone.yaml",
-        "flockd config new drone my_drone.yaml --set name=kite2 --set safety.first_flight_layer=2",
-    )
-    _add_new_options(commands("drone", "Write the configuration of a real drone.", examples), "drone")
-
-
-def _add_new_scenario(commands: Commands) -> None:
-    examples = (
-        "flockd config new scenario my_flight.yaml",
-        "flockd config new scenario woods.yaml --set world.obstacles.kind=forest --set obstacles.enabled=true",
-    )
-    _add_new_options(commands("scenario", "Write the configuration of a simulated flight.", examples), "scenario")
-
-
 def _add_new_options(parser: Parser, kind: str) -> None:
     option(parser, "FILE", "to write", Path)
     flag(parser, "--force", "overwrite the file if it exists")
@@ -213,7 +188,7 @@ def _add_new_options(parser: Parser, kind: str) -> None:
         default=[],
         dest="settings",
     )
-    parser.set_defaults(run=_new, kind=kind)
+    parser.set_defaults(kind=kind)
 
 
 def _setting(text: str) -> tuple[str, str]:

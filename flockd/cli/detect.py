@@ -41,7 +41,7 @@ def add(commands: Commands) -> None:
         "flockd detect pictures/ --fov 70 --labels drones.json",
         "flockd detect photograph.jpg --fov 70 --drone-size 0.35",
     )
-    parser = commands("detect", "Detect drones in pictures, with the code that flies.", examples, NOTES)
+    parser = commands("detect", "Detect drones in pictures, with the code that flies.", examples, _run, notes=NOTES)
     option(parser, "PICTURES", "images, folders of them, videos", Path, nargs="+")
     option(parser, "--out FOLDER", "write copies of the pictures with the detections drawn in", Path)
     flag(parser, "--force", "overwrite what is there")
@@ -65,7 +65,6 @@ def add(commands: Commands) -> None:
     )
     option(camera, "--config FILE", "a drone, for its networks and settings and, without --fov, its camera", Path)
     option(camera, "--camera NAME", "which of --config's cameras, where it has several")
-    parser.set_defaults(run=_run)
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ def add(commands: Commands) -> None:
         "Examine a drone on the ground: cameras, models, autopilot, computer, telemetry. Changes nothing: "
         "never arms, switches modes or sends setpoints."
     )
-    parser = commands("doctor", description, examples)
+    parser = commands("doctor", description, examples, _run)
     option(parser, "--config FILE", "the drone's configuration", Path, required=True)
     option(parser, "--record DIR", "where `flockd run` is to record flights", Path)
     option(parser, "--unit FILE", "the systemd unit; by default the installed one", Path)
@@ -57,7 +57,6 @@ def add(commands: Commands) -> None:
     option(parser, "--minutes M", f"how long --bench runs ({BENCH_MINUTES:g})", positive_number)
     flag(parser, "--json", "print JSON")
     add_force(parser)
-    parser.set_defaults(run=_run)
 
 
 def _run(args: argparse.Namespace) -> int:

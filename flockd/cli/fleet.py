@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import functools
 import ipaddress
 import math
 import sys
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.options import ENDPOINT, add_endpoint_options, add_operator_option, endpoints
 from flockd.cli.output import complain, say, say_json
-from flockd.cli.parser import ALONE, Commands, Parser, add_commands, flag, number, option, port_number, positive_number
+from flockd.cli.parser import ALONE, Commands, Parser, commands_of, flag, number, option, port_number, positive_number
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
@@ -58,14 +59,14 @@ def add(commands: Commands) -> None:
         "flockd fleet hold all",
     )
     what = "Show the fleet on a page in the browser; with a command: ask drones to fly elsewhere, hold, land, or go on."
-    parser = commands("fleet", what, examples, _NOTES)
-    add_commands(parser, (_add_goto, _add_velocity, *(_plain(command) for command in PLAIN)))
+    parser = commands("fleet", what, examples, notes=_NOTES)
+    _add_orders(commands_of(parser))
     _add_page(parser)
     parser.usage = ALONE
 
 
-def _add_goto(commands: Commands) -> None:
-    examples = (
+def _add_orders(commands: Commands) -> None:
+    examples: tuple[str, ...] = (
         "flockd fleet goto all 20 -5",
         "flockd fleet goto drone1,drone2 20 -5 --height 4 --speed 0.5",
         "flockd fleet goto drone1 47.3977 8.5456 --degrees",
@@ -75,48 +76,32 @@ def _add_goto(commands: Commands) -> None:
         "The goal takes the place of the mission until the flight ends. A drone whose mission is `operator` hovers\n"
         "two seconds after the last one: send it with --repeat, and Ctrl-C stops it."
     )
-    parser = commands("goto", "Send drones to a place: they lead the centre of their flock there.", examples, notes)
-    _add_drones(parser)
+    what = "Send drones to a place: they lead the centre of their flock there."
+    parser = _ordering(commands("goto", what, examples, _goto, notes=notes))
     option(parser, "NORTH", "metres north of the mission's origin", _number)
     option(parser, "EAST", "metres east of it", _number)
     flag(parser, "--degrees", "NORTH and EAST are latitude and longitude")
     option(parser, "--height M", "height above the ground at home (default: the present one)", _number)
     option(parser, "--speed V", "in m/s (default: the mission's)", positive_number)
     flag(parser, "--repeat", "send it every second until Ctrl-C")
-    _add_connection(parser)
-    parser.set_defaults(run=_goto)
-
-
-def _add_velocity(commands: Commands) -> None:
     examples = ("flockd fleet velocity drone1 0.5 0 --seconds 10", "flockd fleet velocity all 0 -1 --height 6")
-    parser = commands("velocity", "Make drones fly at a velocity for as long as it is sent.", examples)
-    _add_drones(parser)
+    what = "Make drones fly at a velocity for as long as it is sent."
+    parser = _ordering(commands("velocity", what, examples, _velocity))
     option(parser, "NORTH", "m/s to the north", _number)
     option(parser, "EAST", "m/s to the east", _number)
     option(parser, "--height M", "height above the ground at home (default: the present one)", _number)
     option(parser, "--seconds S", "repeat it every second for S seconds (default: once)", positive_number)
-    _add_connection(parser)
-    parser.set_defaults(run=_velocity)
+    for command, what in PLAIN.items():
+        examples = (f"flockd fleet {command} all", f"flockd fleet {command} drone1")
+        _ordering(commands(command, what, examples, functools.partial(_ask, command=command)))
 
 
-def _plain(command: str) -> Callable[[Commands], None]:
-    def add(commands: Commands) -> None:
-        parser = commands(command, PLAIN[command], (f"flockd fleet {command} all", f"flockd fleet {command} drone1"))
-        _add_drones(parser)
-        _add_connection(parser)
-        parser.set_defaults(run=lambda args: _ask(args, command, None))
-
-    return add
-
-
-def _add_drones(parser: Parser) -> None:
+def _ordering(parser: Parser) -> Parser:
     option(parser, "DRONES", f"names with commas between them, or `{ALL}`")
-
-
-def _add_connection(parser: Parser) -> None:
     add_endpoint_options(parser)
     add_operator_option(parser)
     flag(parser, "--json", "print the last replies as JSON, by drone")
+    return parser
 
 
 def _goto(args: argparse.Namespace) -> int:
@@ -141,7 +126,7 @@ def _velocity(args: argparse.Namespace) -> int:
     return _ask(args, "velocity", order, repeat_s=args.seconds or 0.0)
 
 
-def _ask(args: argparse.Namespace, command: str, order: MissionOrder | None, repeat_s: float = 0.0) -> int:
+def _ask(args: argparse.Namespace, command: str, order: MissionOrder | None = None, repeat_s: float = 0.0) -> int:
     """Asks each drone as soon as it is found, whatever others do, again and again for ``repeat_s``.
 
     Says what each answers, later only what has changed.

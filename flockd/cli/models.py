@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from flockd.cli.options import loaded
 from flockd.cli.output import noted_table, progress, say, say_facts, say_json, say_table, tables_console
-from flockd.cli.parser import Commands, Parser, add_commands, flag, option, positive_count, size
+from flockd.cli.parser import Commands, Parser, commands_of, flag, option, positive_count, size
 from flockd.core.choices import PROVIDERS, Provider
 from flockd.core.errors import ExitCode, ModelError, UnavailableError, UsageError
 
@@ -28,53 +28,39 @@ RUNS = 9
 
 def add(commands: Commands) -> None:
     """Adds the command."""
-    description = "List, verify, time and prepare the networks."
-    examples = ("flockd models list", "flockd models verify", "flockd models bench --threads 1,2")
-    parser = commands("models", description, examples)
-    add_commands(parser, (_add_list, _add_verify, _add_bench, _add_prepare))
-
-
-def _add_list(commands: Commands) -> None:
+    examples: tuple[str, ...] = (
+        "flockd models list", "flockd models verify", "flockd models bench --threads 1,2"
+    )  # fmt: skip
+    commands = commands_of(commands("models", "List, verify, time and prepare the networks.", examples))
     examples = ("flockd models list", "flockd models list --json", "flockd models list --dir my_models")
-    _add_options(commands("list", "List each model with its roles; a damaged one is refused.", examples), _list)
-
-
-def _add_verify(commands: Commands) -> None:
+    _add_options(commands("list", "List each model with its roles; a damaged one is refused.", examples, _list))
     examples = ("flockd models verify", "flockd models verify --json")
     description = "Check each model file against its manifest: hash, weights, inputs, outputs, and golden output."
-    _add_options(commands("verify", description, examples), _verify)
-
-
-def _add_bench(commands: Commands) -> None:
+    _add_options(commands("verify", description, examples, _verify))
     examples = (
         "flockd models bench",
         "flockd models bench --threads 1,2,4 --size 640x480 --json",
         "flockd models bench --dir models_of_others --provider cuda",
     )
     description = "Time each model, for each provider and number of threads: milliseconds a run, the median."
-    parser = _add_options(commands("bench", description, examples), _bench)
+    parser = _add_options(commands("bench", description, examples, _bench))
     option(parser, "--provider NAME,...", f"{', '.join(PROVIDERS)} (default: all that are installed)")
     option(parser, "--threads N,...", "on the CPU (default: 1,2)", _counts, default=(1, 2))
     option(parser, "--size WxH", "of the image (default: 640x480)", size, default=(640, 480))
     option(parser, "--runs N", f"to time (default: {RUNS})", positive_count, default=RUNS)
-
-
-def _add_prepare(commands: Commands) -> None:
     examples = ("flockd models prepare --config my_drone.yaml", "flockd models prepare --config my_drone.yaml --json")
     description = (
         "Build what a drone's provider needs for its models and cameras, ahead of flight. TensorRT takes minutes, and "
         "a flight with it is refused before; OpenVINO starts sooner; CPU and CUDA have nothing to build."
     )
-    parser = commands("prepare", description, examples)
+    parser = commands("prepare", description, examples, _prepare)
     option(parser, "--config FILE", "the drone's configuration", Path, required=True)
     flag(parser, "--json", "print JSON")
-    parser.set_defaults(run=_prepare)
 
 
-def _add_options(parser: Parser, run: Any) -> Parser:
+def _add_options(parser: Parser) -> Parser:
     option(parser, "--dir", "folder of the manifests; by default the one that comes with flockd", Path)
     flag(parser, "--json", "print JSON")
-    parser.set_defaults(run=run)
     return parser
 
 

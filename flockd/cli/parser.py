@@ -73,25 +73,37 @@ ALONE = "%(prog)s [OPTION ...]\n       %(prog)s COMMAND ..."
 """Usage of a parser that has commands, and does something without one."""
 
 
+Run = Callable[[argparse.Namespace], int]
+"""A command's function: from its options to its exit code."""
+
+
 class Commands(Protocol):
     """Adds a command."""
 
-    def __call__(self, name: str, description: str, examples: Sequence[str], notes: str = "") -> Parser:
-        """By name, one-line description, examples, and what stands below them in its help."""
+    def __call__(
+        self, name: str, description: str, examples: Sequence[str], run: Run | None = None, *, notes: str = ""
+    ) -> Parser:
+        """By name, one-line description, examples, its function (None: it has commands of its own), and what stands
+        below the examples in its help."""
         ...
 
 
-def add_commands(parser: Parser, additions: Sequence[Callable[[Commands], None]]) -> None:
-    """Gives a parser its commands; without one it prints its help and exits with a usage error.
+def commands_of(parser: Parser) -> Commands:
+    """What gives a parser its commands; without one it prints its help and exits with a usage error.
 
     A parser that does something without a command too gets its own `run` and options afterwards, and `ALONE` as usage.
 
     What is parsed has `run`, the command's function, and `parser`, the command's own.
     """
     subparsers = parser.add_subparsers(metavar="COMMAND", parser_class=Parser)
-    parser.set_defaults(run=lambda _: _print_help(parser), parser=parser)
 
-    def add(name: str, description: str, examples: Sequence[str], notes: str = "") -> Parser:
+    def print_help(_: argparse.Namespace) -> int:
+        parser.print_help(sys.stderr)
+        return ExitCode.USAGE
+
+    parser.set_defaults(run=print_help, parser=parser)
+
+    def add(name: str, description: str, examples: Sequence[str], run: Run | None = None, *, notes: str = "") -> Parser:
         parser.commands.append(name)
         command: Parser = subparsers.add_parser(
             name,
@@ -101,16 +113,10 @@ def add_commands(parser: Parser, additions: Sequence[Callable[[Commands], None]]
             examples=examples,
             notes=notes,
         )
-        command.set_defaults(parser=command)
+        command.set_defaults(parser=command, **({} if run is None else {"run": run}))
         return command
 
-    for addition in additions:
-        addition(add)
-
-
-def _print_help(parser: Parser) -> int:
-    parser.print_help(sys.stderr)
-    return ExitCode.USAGE
+    return add
 
 
 def option(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.options import add_stretch, opened, refuse_overwriting, stretch
 from flockd.cli.output import say_facts, say_result
-from flockd.cli.parser import Commands, Parser, add_commands, flag, option
+from flockd.cli.parser import Commands, Parser, commands_of, flag, option
 from flockd.core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -17,39 +17,23 @@ if TYPE_CHECKING:
 
 def add(commands: Commands) -> None:
     """Adds the command."""
-    examples = ("flockd record info drone1.mcap", "flockd record recover drone1.mcap")
-    parser = commands("record", "Inspect, recover, cut and export recordings.", examples)
-    add_commands(parser, (_add_info, _add_recover, _add_cut, _add_export))
-
-
-def _add_info(commands: Commands) -> None:
+    examples: tuple[str, ...] = ("flockd record info drone1.mcap", "flockd record recover drone1.mcap")
+    commands = commands_of(commands("record", "Inspect, recover, cut and export recordings.", examples))
     examples = ("flockd record info drone1.mcap", "flockd record info --json drone1.mcap")
-    parser = _with_recording(commands("info", "Show what a recording contains: duration, gaps, rates.", examples))
-    parser.set_defaults(run=_info)
-
-
-def _add_recover(commands: Commands) -> None:
+    _with_recording(commands("info", "Show what a recording contains: duration, gaps, rates.", examples, _info))
     examples = ("flockd record recover drone1.mcap", "flockd record recover drone1.mcap --out whole.mcap")
     description = "Recover a recording that is damaged, or was cut off by a kill or a power loss."
-    parser = _with_recording(commands("recover", description, examples))
+    parser = _with_recording(commands("recover", description, examples, _recover))
     option(parser, "--out FILE", "default: NAME.recovered.mcap", Path)
-    parser.set_defaults(run=_recover)
-
-
-def _add_cut(commands: Commands) -> None:
     examples = ("flockd record cut drone1.mcap --start 20 --end 30 --out turn.mcap",)
-    parser = _with_recording(commands("cut", "Copy a part of a recording to a new one.", examples))
+    parser = _with_recording(commands("cut", "Copy a part of a recording to a new one.", examples, _cut))
     add_stretch(parser)
     option(parser, "--out FILE", "the new recording", Path, required=True)
-    parser.set_defaults(run=_cut)
-
-
-def _add_export(commands: Commands) -> None:
     examples = ("flockd record export drone1.mcap --out tables --images",)
-    parser = _with_recording(commands("export", "Write a recording's messages as CSV, its images as files.", examples))
+    description = "Write a recording's messages as CSV, its images as files."
+    parser = _with_recording(commands("export", description, examples, _export))
     option(parser, "--out DIR", "a new or empty folder", Path, required=True)
     flag(parser, "--images", "the images too, in DIR/images/CAMERA")
-    parser.set_defaults(run=_export)
 
 
 def _with_recording(parser: Parser) -> Parser:

@@ -39,7 +39,7 @@ def add(commands: Commands) -> None:
         "flockd replay flight_bag --config my_drone.yaml --vehicle /mavros/local_position/odom",
     )
     description = "Run the pilot on a recorded flight again: the same frames and vehicle states, the same code."
-    parser = commands("replay", description, examples)
+    parser = commands("replay", description, examples, _run)
     option(parser, "RECORDING", "a recording, or a dataset (see below)", Path)
     option(
         parser,
@@ -67,7 +67,6 @@ def add(commands: Commands) -> None:
     group = parser.add_argument_group("bags of ROS 2", "a bag folder as RECORDING, with --config")
     option(group, "--vehicle TOPIC", "odometry, pose or IMU of the drone (default: the only one there is)")
     _add_dataset(parser)
-    parser.set_defaults(run=_run)
 
 
 def _tolerance(text: str) -> tuple[str, float]:

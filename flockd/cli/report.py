@@ -37,7 +37,7 @@ def add(commands: Commands) -> None:
         "flockd report out/short --video short.webm --drone drone2",
     )
     description = "Write the summary and the report of a flight, from its folder or from recordings; or compare two."
-    parser = commands("report", description, examples)
+    parser = commands("report", description, examples, _run)
     parser.add_argument(
         "flight",
         metavar="RECORDING",
@@ -58,7 +58,6 @@ def add(commands: Commands) -> None:
     )
     option(parser, "--drone NAME", "whose images the video shows; default: the first recorded")
     flag(parser, "--json", "print the summary as JSON")
-    parser.set_defaults(run=_run)
 
 
 def _run(args: argparse.Namespace) -> int:

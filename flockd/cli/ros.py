@@ -9,7 +9,7 @@ from pathlib import Path
 
 from flockd.cli.options import add_endpoint_options, add_operator_option, endpoints
 from flockd.cli.output import complain, say
-from flockd.cli.parser import ALONE, Commands, Parser, add_commands, flag, option
+from flockd.cli.parser import ALONE, Commands, Parser, commands_of, flag, option
 from flockd.core.errors import ExitCode
 
 _NOTES = """\
@@ -25,8 +25,8 @@ def add(commands: Commands) -> None:
         "flockd ros perceive --config my_drone.yaml",
     )
     what = "Show the fleet to ROS 2, and take orders from there; with `perceive`: only see drones, for another stack."
-    parser = commands("ros", what, examples, _NOTES)
-    add_commands(parser, (_add_perceive,))
+    parser = commands("ros", what, examples, notes=_NOTES)
+    _add_perceive(commands_of(parser))
     add_endpoint_options(parser, "--drones-at")
     flag(parser, "--orders", "offer services and topics that order drones (default: watch only)")
     add_operator_option(parser)
@@ -49,12 +49,12 @@ def _add_perceive(commands: Commands) -> None:
         "NAME and all cameras from the configuration. Without --vehicle it needs `perception.scale: network`."
     )
     parser = commands(
-        "perceive", "See drones in the images of topics, and publish them; command nothing.", examples, notes
-    )
+        "perceive", "See drones in the images of topics, and publish them; command nothing.", examples, _perceive,
+        notes=notes,
+    )  # fmt: skip
     option(parser, "--config FILE", "a drone's, with its source", Path, required=True)
     option(parser, "--vehicle TOPIC", "odometry, pose or IMU of the vehicle, in REP 103's axes")
     _add_network(parser)
-    parser.set_defaults(run=_perceive)
 
 
 def _perceive(args: argparse.Namespace) -> int:

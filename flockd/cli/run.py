@@ -37,7 +37,7 @@ def add(commands: Commands) -> None:
         "flockd run --config /etc/flockd/drone1.yaml --record /var/lib/flockd",
     )
     description = "Fly this drone: from camera frames to setpoints for its autopilot, until SIGTERM or Ctrl-C."
-    parser = commands("run", description, examples)
+    parser = commands("run", description, examples, _run)
     option(parser, "--config FILE", "the drone's configuration", Path, required=True)
     option(
         parser,
@@ -46,7 +46,6 @@ def add(commands: Commands) -> None:
         Path,
     )
     add_force(parser)
-    parser.set_defaults(run=_run)
 
 
 def _run(args: argparse.Namespace) -> int:

@@ -90,7 +90,7 @@ def add(commands: Commands) -> None:
         "flockd sim --autopilot standin --drones 2 --duration 20",
         "flockd sim config/px4_flight.yaml --autopilot px4",
     )
-    parser = commands("sim", "Fly a simulated flock, and write a report of the flight.", examples, COSTS)
+    parser = commands("sim", "Fly a simulated flock, and write a report of the flight.", examples, _run, notes=COSTS)
     option(parser, "SCENARIO", "by default the paper's flight", Path, nargs="?")
     option(
         parser,
@@ -168,7 +168,6 @@ def add(commands: Commands) -> None:
     flag(parser, "--record", "write a recording of each drone to DIR/recordings, 4.5 MB a drone and simulated second")
     flag(parser, "--quiet", "print only the path of the report, and no progress")
     flag(parser, "--json", "print the summary as JSON")
-    parser.set_defaults(run=_run)
 
 
 def _wind(text: str) -> tuple[float, float]:

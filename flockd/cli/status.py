@@ -33,11 +33,10 @@ def add(commands: Commands) -> None:
         "flockd status --listen tcp/0.0.0.0:7447 --fleet meadow",
         "flockd status --json --seconds 2",
     )
-    parser = commands("status", "Show how each drone of a fleet is doing, the worst first.", examples)
+    parser = commands("status", "Show how each drone of a fleet is doing, the worst first.", examples, _run)
     add_endpoint_options(parser)
     option(parser, "--seconds S", "listen this long and print once, also on a terminal", positive_number)
     flag(parser, "--json", "print JSON, once")
-    parser.set_defaults(run=_run)
 
 
 def _run(args: argparse.Namespace) -> int:
