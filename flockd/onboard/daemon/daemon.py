@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from flockd.core.config import DroneConfig
-from flockd.core.errors import ConfigError, ConfigProblem, FlockdError
+from flockd.core.errors import ConfigError, FlockdError
 from flockd.flight.safety import Decision, Event, State
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
@@ -60,7 +60,8 @@ class Daemon:
 
         Raises ConfigError for a configuration that cannot be flown.
         """
-        _check_flyable(config, file)
+        if config.autopilot is None:
+            raise ConfigError.at(file, "is missing; add it with the `address` of the autopilot", "autopilot")
         self._source = open_source(config, file, clock=clock)
         self._config = config
         self._load_networks, self._models, self._recordings = load_networks, models, recordings
@@ -212,9 +213,3 @@ def _raise_failure(components: Components) -> None:
         raise DaemonError(
             "the autopilot did not confirm Hold; flockd stopped sending setpoints, so that its failsafe acts; check it"
         )
-
-
-def _check_flyable(config: DroneConfig, file: str) -> None:
-    if config.autopilot is None:
-        problem = ConfigProblem(file, 0, "autopilot", "is missing; add it with the `address` of the autopilot")
-        raise ConfigError([problem])

@@ -64,14 +64,11 @@ def _matters(decision: Decision) -> tuple[State, tuple[Event, ...]]:
     return decision.state, tuple(reason.event for reason in decision.reasons)
 
 
-def _noisy(images: int) -> dict[str, int]:
-    """Their count, absent where there are none, as all counts."""
-    return {"noisy": images} if images else {}
-
-
 def _flight_message(components: Components, now: float) -> FlightMessage:
     decision, status, stream = components.control.decision, components.link.status(), components.streamer.report()
     vehicle, refusals = components.link.vehicle_state(), components.refusals.current
+    newest = components.pilot_loop.newest
+    trim = None if newest is None else newest.output.command.trim
     return FlightMessage(
         time_s=now,
         state=decision.state.value,
@@ -86,7 +83,7 @@ def _flight_message(components: Components, now: float) -> FlightMessage:
         heartbeats_lost=components.link.heartbeats_lost(),
         battery_share=status.battery_share,
         height_m=None if vehicle is None else vehicle.height_m,
-        velocity_trim=_velocity_trim(components),
+        velocity_trim=[0.0, 0.0] if trim is None else trim.tolist(),
         velocity_error_m_s=components.gate.velocity_error_m_s,
         silence=stream.silence,
         setpoints_sent=stream.sent,
@@ -110,20 +107,14 @@ def _clock_message(components: Components, now: float) -> ClockMessage:
     )
 
 
-def _velocity_trim(components: Components) -> list[float]:
-    """(2,) m/s, north and east, of the newest command."""
-    newest = components.pilot_loop.newest
-    trim = None if newest is None else newest.output.command.trim
-    return [0.0, 0.0] if trim is None else [float(v) for v in trim]
-
-
 def _computer_message(components: Components, now: float) -> ComputerMessage:
-    noisy_images = components.pilot_loop.noisy_images
+    noisy = components.pilot_loop.noisy_images
     cameras = {
         name: CameraMessage(
             age_s=camera.age_s,
             fault=camera.fault,
-            counts={str(what): n for what, n in camera.counts.items()} | _noisy(noisy_images[name]),
+            counts={str(what): n for what, n in camera.counts.items()}
+            | ({"noisy": noisy[name]} if noisy[name] else {}),
         )
         for name, camera in components.source.status().items()
     }

@@ -46,7 +46,8 @@ class InputCollector:
         """``dead_tasks``: why each task that has ended did, by name; grows elsewhere."""
         self._config, self._source, self._pilot_loop, self._networks = config, source, pilot_loop, networks
         self._gate, self._lag, self._thermometer, self._dead_tasks = gate, lag, thermometer, dead_tasks
-        self._clock = clock
+        assert config.autopilot is not None
+        self._clock, self._low_battery_share = clock, config.autopilot.low_battery_share
         self._camera_monitor = CameraMonitor(config)
         self._faults_before = 0
         self._refused_before = 0
@@ -92,7 +93,7 @@ class InputCollector:
             dead_tasks=tuple(self._dead_tasks),
             neighbours_age_s=now - pilot_loop.neighbour_seen_s,
             nearest_neighbour_m=min(ranges, default=math.inf),
-            refused_commands=self._refused() - self._refused_before,
+            refused_commands=sum(self._gate.counts[objection] for objection in _REFUSED) - self._refused_before,
             obstacle_near=obstacle_m < self._config.safety.hold_room_m,
             outside_fence=outside_fence(self._config.safety.gate, position),
             outside_heights=vehicle is None or outside_heights(self._config.safety.gate, vehicle.height_m),
@@ -107,7 +108,7 @@ class InputCollector:
             flight_mode=None if status.flight_mode == "unknown" else status.flight_mode,
             armed=None if math.isinf(status.heartbeat_age_s) else status.armed,
             in_air=None if status.landed_state == "unknown" else status.in_air,
-            battery_low=self._battery_low(status),
+            battery_low=status.battery_share is not None and status.battery_share <= self._low_battery_share,
             position_lost=status.estimate_ok is False or (self._had_satellites and status.gps_ok is False),
             shutdown_asked=operator.shutdown,
             hold_asked=operator.hold,
@@ -119,13 +120,6 @@ class InputCollector:
         self._refused_before += inputs.refused_commands
         operator.resume = False
         return inputs
-
-    def _refused(self) -> int:
-        return sum(self._gate.counts[objection] for objection in _REFUSED)
-
-    def _battery_low(self, status: AutopilotStatus) -> bool:
-        assert self._config.autopilot is not None
-        return status.battery_share is not None and status.battery_share <= self._config.autopilot.low_battery_share
 
 
 def position_from_home(status: AutopilotStatus) -> FloatArray:
