@@ -10,22 +10,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flockd.cli.options import loaded, opened, refuse_overwriting
-from flockd.cli.output import complain, progress, say, say_json, say_result
+from flockd.cli.output import complain, progress, say_facts, say_result
 from flockd.cli.parser import Commands, Parser, commands_of, flag, option, positive_count, positive_number, size
 from flockd.core.choices import LENS_MODELS
-from flockd.core.errors import ExitCode, UsageError
+from flockd.core.errors import UsageError
 
 if TYPE_CHECKING:
     from flockd.core.config import DroneConfig
     from flockd.ground.calibration.board import BoardSpec
     from flockd.ground.calibration.image_sources import ImageStream
-    from flockd.ground.calibration.views import Collector
 
 SECONDS = 120.0
 MARKER_SHARE = 0.75
 MOST_VIEWS = 60
-NAMED = 6
-"""How many of the refused images are named one by one."""
 
 
 def add(commands: Commands) -> None:
@@ -131,11 +128,11 @@ def _camera(args: argparse.Namespace) -> int:
     intrinsics = write_lens(name, lens, measured, out).model_dump(mode="json")
     numbers = lens_result(lens, lenses, collector)
     result = {"camera": name, "intrinsics": intrinsics, **numbers, "out": str(out)}
-    if args.json:
-        say_json(result)
-    else:
-        _say_lens(result, collector)
-    return ExitCode.DONE
+    assert collector.coverage is not None
+    return say_facts(
+        args, result, "## where corners of the board were seen:", *collector.coverage.text,
+        f"written: {out}; copy its intrinsics into your drone's file, then run flockd config check on that",
+    )  # fmt: skip
 
 
 def _print_board(args: argparse.Namespace, board: BoardSpec) -> int:
@@ -197,43 +194,6 @@ def _name_in(config: DroneConfig, args: argparse.Namespace, where: str) -> str:
         said = "has several cameras" if name is None else f"has no camera {name!r}"
         raise UsageError(f"{where}: {said}; choose with --camera from {', '.join(names)}")
     return name
-
-
-def _say_lens(result: Mapping[str, Any], collector: Collector) -> None:
-    lens, rms = result["intrinsics"], result["residual_px"]
-    views = rms["views"].values()
-    say(f"{result['camera']}: {result['views']} views of the board, {' x '.join(map(str, result['size_px']))} pixels")
-    _say_refused(collector)
-    for view, value in result["dropped"].items():
-        say(f"dropped: {view}: its residual is {value:.2f} px, it does not fit the others")
-    others = [f"{name} {one['rms_px']:.3f} px" for name, one in result["models"].items() if name != lens["model"]]
-    beside = f" (residual with {', '.join(others)})" if others else ""
-    say(f"model: {lens['model']}{beside}")
-    for key, value in result["sigma_px"].items():
-        say(f"  {key} {lens[key]:.2f} +- {value:.2f} px")
-    say(f"  distortion {' '.join(f'{k:.5f}' for k in lens['distortion'])}")
-    across, down = (f"{angle:.1f}" if angle is not None else "?" for angle in result["field_of_view_deg"])
-    say(f"  field of view {across} x {down} degrees")
-    say(f"residual: rms {rms['rms']:.3f} px; of a view {min(views):.3f} to {max(views):.3f}; max {rms['max']:.2f}")
-    assert collector.coverage is not None
-    say(f"coverage: {100 * result['coverage']:.0f} % of the image; ## where corners of the board were seen")
-    for line in collector.coverage.text:
-        say(f"  {line}")
-    for sentence in result["advice"]:
-        say(f"better: {sentence}")
-    say(f"written: {result['out']}; copy its intrinsics into your drone's file, then run flockd config check on that")
-
-
-def _say_refused(collector: Collector) -> None:
-    for reason, count in collector.counts().items():
-        names = [
-            one.name if one.edge_px is None else f"{one.name} (edges {one.edge_px:.1f} px wide)"
-            for one in collector.refused
-            if one.why == reason
-        ]
-        more = f" and {count - NAMED} more" if count > NAMED else ""
-        limit = f", as edges wider than {collector.max_edge_px:.1f} px are" if reason == "blurred" else ""
-        say(f"refused: {count} {reason}{limit}: {', '.join(names[:NAMED])}{more}")
 
 
 def _add_rig(commands: Commands) -> None:
@@ -298,13 +258,7 @@ def _from_flight(args: argparse.Namespace, out: Path) -> int:
         message = f"is not the rig that {args.from_flight} was flown with, which is what it found the errors of"
         raise ConfigError.at(str(args.config), f"{message}; drop --config", "rig")
     result = corrected_rig(recording, str(args.from_flight), out)
-    if args.json:
-        say_json(result)
-        return ExitCode.DONE
-    for name, one in result["cameras"].items():
-        taken = " and ".join(one["taken"]) or "nothing"
-        say(f"{name}: {one['found']}; taken over: {taken}")
-    return _written(result)
+    return _say_rig(args, result)
 
 
 def _rig_images(args: argparse.Namespace) -> tuple[DroneConfig, ImageStream]:
@@ -324,29 +278,5 @@ def _rig_images(args: argparse.Namespace) -> tuple[DroneConfig, ImageStream]:
 
 
 def _say_rig(args: argparse.Namespace, result: Mapping[str, Any]) -> int:
-    if args.json:
-        say_json(result)
-        return ExitCode.DONE
-    for name, one in result["cameras"].items():
-        x, y, z = one["position_m"]
-        if name == result["reference"]:
-            say(f"{name}: is the reference and keeps its mounting")
-            continue
-        say(
-            f"{name}: yaw {one['yaw_deg']:.2f} pitch {one['pitch_deg']:.2f} roll {one['roll_deg']:.2f} +- "
-            f"{one['sigma_deg']:.2f} deg"
-        )
-        say(f"  position {x:.4f} {y:.4f} {z:.4f} +- {one['sigma_m']:.4f} m")
-        say(f"  residual {one['residual_px']:.3f} px rms over {one['boards']} shared boards")
-    for board, value in result["dropped"].items():
-        say(f"dropped: {board}: its residual is {value:.2f} px, it does not fit the others")
-    return _written(result)
-
-
-def _written(result: Mapping[str, Any]) -> int:
-    if result["time_offset_s"] is not None:
-        say(f"time offset of the rig: {1000 * result['time_offset_s']:.1f} ms")
-    for note in result["notes"]:
-        say(f"note: {note}")
-    say(f"written: {result['out']}; put it in place of rig in your drone's file, then run flockd config check on that")
-    return ExitCode.DONE
+    advice = "put it in place of rig in your drone's file, then run flockd config check on that"
+    return say_facts(args, result, f"written: {result['out']}; {advice}")

@@ -69,10 +69,9 @@ def test_a_folder_of_images_becomes_a_camera_that_checks(folder: Path, capsys: C
     out = folder.with_name("front.yaml")
     command = ("calibrate", "camera", folder, "--camera", "front", "--out", out)
     text = told(capsys, 0, *command, "--serial", "A1B2", "--model", "pinhole")
-    assert "refused: 1 no board: wall.png" in text
-    assert re.search(r"refused: 1 blurred, as edges wider than 4\.0 px are: soft\.png \(edges \d\.\d px wide\)", text)
-    assert re.search(r"residual: rms 0\.\d+ px; of a view 0\.\d+ to 0\.\d+; max \d\.\d+", text)
-    assert re.search(r"coverage: \d\d % of the image; ## where corners of the board were seen\n  (## |\.\. ){7}", text)
+    assert "refused: {no board: 1, blurred: 1}" in text
+    assert re.search(r"blurred: \{soft\.png: \d\.\d+\}", text)
+    assert re.search(r"## where corners of the board were seen:\n(## |\.\. ){7}", text)
     told(capsys, 0, "config", "check", out)
     camera = load_drone(out).rig.cameras[0]
     assert (camera.name, camera.size_px) == ("front", (480, 360))
@@ -287,8 +286,8 @@ def test_a_rig_is_calibrated_from_folders(tmp_path: Path, capsys: Capture) -> No
             )
     command = ("calibrate", "rig", shots, "--config", config, "--out", out)
     text = told(capsys, 0, *command)
-    assert "front: is the reference and keeps its mounting" in text
-    assert re.search(r"right: yaw 8[78]\.\d+ pitch \d\.\d+ roll -\d\.\d+ \+- 0\.\d+ deg", text)
+    assert "reference: front" in text
+    assert re.search(r"yaw_deg: 8[78]\.\d+", text)
     told(capsys, 0, "config", "check", out)
     front, right = load_drone(out).rig.cameras
     assert front.extrinsics == drone("front").rig.cameras[0].extrinsics
