@@ -100,3 +100,12 @@ def run_coroutine_test(test: pytest.Function, run_it: Callable[[Story], None]) -
     given = {name: test.funcargs[name] for name in inspect.signature(test.obj).parameters}
     run_it(lambda: test.obj(**given))
     return True
+
+
+def until(true: Callable[[], Any], patience_s: float = 60.0) -> Any:
+    """Waits for it in real time, and gives it; fails where it does not come."""
+    end_s = time.monotonic() + patience_s
+    while not (found := true()):
+        assert time.monotonic() < end_s, "it did not come"
+        time.sleep(0.01)
+    return found

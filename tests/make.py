@@ -31,6 +31,8 @@ from flockd.core.messages import (
     Wanted,
 )
 from flockd.flight.geometry import PinholeCamera, RigCamera, RigidTransform, log_polar_covariance
+from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
+from flockd.onboard.telemetry.topics import FlightMessage
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 
 Section = TypeVar("Section", bound=BaseModel)
@@ -76,6 +78,26 @@ def output(time_s: float = 0.0, **fields: Any) -> PilotOutput:
     """Of a step in which nothing was seen and nothing is wanted."""
     nothing = PilotOutput(time_s, None, None, (), (), {}, (), wanted())
     return replace(nothing, **fields)
+
+
+def autopilot_status(**fields: Any) -> AutopilotStatus:
+    """Armed in the air in Hold, heard a moment ago, all well, at home."""
+    known = AutopilotStatus(
+        time_s=0.0, heartbeat_age_s=0.1, message_age_s=0.1, flight_mode="hold", armed=True, failsafe=False,
+        landed_state="air", battery_share=1.0, battery_v=16.0, estimate_ok=True, gps_ok=True,
+        position_ned=np.zeros(3), home_ned=np.zeros(3),
+    )  # fmt: skip
+    return replace(known, **fields)
+
+
+def flight_message(**fields: Any) -> dict[str, Any]:
+    """Telemetry's `flight` of a drone that flies with the flock."""
+    known = FlightMessage(
+        time_s=5.0, state="normal", reasons=[], flight_mode="offboard", armed=True, in_air=True, heartbeat_age_s=0.1,
+        heartbeats_lost=0, battery_share=0.5, height_m=4.0, velocity_trim=[0.0, 0.0], velocity_error_m_s=0.1,
+        silence=None, setpoints_sent=1, setpoints_missed=0, orders=[], orders_refused=0,
+    )  # fmt: skip
+    return {**known, **fields}
 
 
 def frames(time_s: float, images: Mapping[str, UInt8Array] | None = None, sequence: int = 0) -> FrameSet:

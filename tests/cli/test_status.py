@@ -10,19 +10,16 @@ import pytest
 
 from flockd.fleet.drone_rows import status_rows
 from flockd.fleet.watcher import Heard, Watched
-from flockd.onboard.telemetry.topics import ComputerMessage, FlightMessage
+from flockd.onboard.telemetry.topics import ComputerMessage
 from flockd.sim.flock.shown_flock import Repeater
+from tests.make import flight_message
 
 NOW_S = 1000.0
 
 
 def _drone(name: str, state: str, *, alive: bool = True, age_s: float = 0.3, **more: Any) -> Watched:
-    flight = FlightMessage(
-        time_s=5.0, state=state, reasons=[], flight_mode="offboard", armed=True, in_air=True, heartbeat_age_s=0.1,
-        heartbeats_lost=0, battery_share=0.5, height_m=4.0, velocity_trim=[0.0, 0.0], velocity_error_m_s=0.1,
-        silence=None, setpoints_sent=1, setpoints_missed=0, orders=[], orders_refused=0,
-    )  # fmt: skip
-    return Watched("meadow", name, alive, {"flight": Heard(NOW_S - age_s, {**flight, **more})}, announced=True)
+    flight = flight_message(state=state, **more)
+    return Watched("meadow", name, alive, {"flight": Heard(NOW_S - age_s, flight)}, announced=True)
 
 
 def test_the_worst_stands_first() -> None:

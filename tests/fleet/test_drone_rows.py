@@ -10,18 +10,15 @@ import pytest
 from flockd.fleet.drone_rows import HISTORY_COLUMNS, MAX_CAMERAS, Known, drone_rows, history_row
 from flockd.fleet.watcher import Heard, Watched
 from flockd.onboard.telemetry.topics import AboutMessage
+from tests.make import flight_message
 
 STATE: dict[str, Any] = {
     "time_s": 4.0, "height_m": 5.0, "roll_deg": 0.0, "pitch_deg": 0.0, "yaw_deg": 90.0,
     "velocity_ned": [3.0, -4.0, 0.0], "position_ne": [10.0, 20.0], "home_deg": [47.0, 8.0],
 }  # fmt: skip
-FLIGHT: dict[str, Any] = {
-    "time_s": 4.0, "state": "degraded", "reasons": [{"event": "x", "sentence": "the battery is low"}],
-    "flight_mode": "offboard", "armed": True, "in_air": True, "heartbeat_age_s": 0.1, "heartbeats_lost": 0,
-    "battery_share": 0.4,
-    "height_m": 5.1, "velocity_trim": [0.0, 0.0], "velocity_error_m_s": 0.1, "silence": None, "setpoints_sent": 9,
-    "setpoints_missed": 2, "orders": [], "orders_refused": 0,
-}  # fmt: skip
+FLIGHT = flight_message(
+    state="degraded", reasons=[{"event": "x", "sentence": "the battery is low"}], battery_share=0.4, height_m=5.1
+)
 
 
 def watched(name: str, *, alive: bool = True, **topics: dict[str, Any]) -> Watched:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -16,18 +14,11 @@ from flockd.fleet.watcher import FleetWatcher, _heard
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.sim.sitl.ports import free_endpoint
+from tests.calm import until
 
 PICTURE = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1].tobytes()
 WIDE = cv2.imencode(".jpg", np.zeros((2, MAX_PICTURE_PX + 1, 3), np.uint8))[1].tobytes()
 ABOUT = AboutMessage(version="1.2.3", configuration={"safety": {"gate": {"fence_radius_m": 40.0}}}, commands=["hold"])
-
-
-def until(true: Callable[[], bool]) -> None:
-    """Waits for it, and fails where it does not come."""
-    end_s = time.monotonic() + 60.0
-    while not true():
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
 
 
 def test_a_drone_is_shown_with_what_queries_tell_and_answers_for_itself() -> None:

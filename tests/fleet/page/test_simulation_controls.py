@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from aiohttp import WSMsgType, web
 from aiohttp.test_utils import TestClient, TestServer
@@ -15,9 +14,9 @@ from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import PREFIX, AboutMessage, AnswerMessage
 from flockd.sim.sitl.ports import free_endpoint
+from tests.calm import until
 from tests.fleet.page.test_access import Asked, opened
 
-SECONDS_TO_FAIL = 60.0
 PAUSE = {"control": "pause", "value": None}
 
 
@@ -94,13 +93,6 @@ async def test_controls_need_what_commands_need() -> None:
         headers = await opened(client, access)
         assert (await client.post("/simulate", json=PAUSE, headers=headers)).status == 403, "--watch-only"
         assert len(simulated.asked) == 1
-
-
-def until(true: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + SECONDS_TO_FAIL
-    while not true():
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
 
 
 def test_as_soon_as_a_drone_is_heard_that_is_not_of_the_simulation_there_is_nothing_to_control() -> None:

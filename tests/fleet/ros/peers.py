@@ -8,23 +8,14 @@ import random
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from tests.calm import until
+
 FLOCKD = "from flockd.cli import program; program()"
-PATIENCE_S = 60.0
-
-
-def until(true: Callable[[], Any], patience_s: float = PATIENCE_S) -> Any:
-    """Waits for it, and gives it; fails where it does not come."""
-    end_s = time.monotonic() + patience_s
-    while not (found := true()):
-        assert time.monotonic() < end_s, "it did not come"
-        time.sleep(0.005)
-    return found
 
 
 def own_domain() -> dict[str, str]:

@@ -16,7 +16,8 @@ import pytest
 
 from flockd.fleet.watcher import FleetWatcher
 from flockd.sim.sitl.ports import free_endpoint
-from tests.fleet.ros.peers import Peer, bridge, ended, own_domain, peer, until
+from tests.calm import until
+from tests.fleet.ros.peers import Peer, bridge, ended, own_domain, peer
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 

@@ -15,6 +15,7 @@ from flockd.fleet.ros.fleet_markers import markers
 from flockd.fleet.watcher import Heard, Watched
 from flockd.onboard.ros.message_trees import Names
 from flockd.onboard.telemetry.topics import AboutMessage, StateMessage
+from tests.make import flight_message
 
 CAMERA = {
     "name": "right", "size_px": [640, 480], "intrinsics": {"fx": 300.0, "fy": 300.0, "cx": 320.0, "cy": 240.0},
@@ -27,10 +28,9 @@ STATE = StateMessage(
     time_s=1.0, height_m=5.0, roll_deg=0.0, pitch_deg=0.0, yaw_deg=90.0, velocity_ned=[1.0, 0.0, 0.0],
     position_ne=[10.0, 20.0], home_deg=[47.0, 8.0],
 )  # fmt: skip
-FLIGHT: dict[str, Any] = {
-    "state": "degraded", "reasons": [{"event": "x", "sentence": "the battery is low; land"}],
-    "flight_mode": "offboard", "armed": True, "in_air": True, "battery_share": 0.4, "height_m": 5.0, "silence": None,
-}  # fmt: skip
+FLIGHT = flight_message(
+    state="degraded", reasons=[{"event": "x", "sentence": "the battery is low; land"}], battery_share=0.4
+)
 
 
 def row() -> dict[str, Any]:

@@ -14,7 +14,8 @@ import yaml
 
 from flockd.cli import main
 from flockd.onboard.recording.reader import Recording
-from tests.fleet.ros.peers import FLOCKD, ended, own_domain, peer, until
+from tests.calm import until
+from tests.fleet.ros.peers import FLOCKD, ended, own_domain, peer
 
 FLIGHT = Path(__file__).parents[2] / "review" / "replay" / "crossing.mcap"
 DRIVER = Path(__file__).parents[2] / "onboard" / "sources" / "ros_cameras.py"

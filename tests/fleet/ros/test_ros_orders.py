@@ -14,7 +14,7 @@ from flockd.core.ros_frames import attitude_of_angles
 from flockd.fleet.ros.fleet_bridge import DroneNames
 from flockd.fleet.ros.ros_orders import NewestOrder, Whereabouts, goal_of, velocity_of
 from flockd.onboard.ros.message_trees import Names
-from tests.fleet.ros.peers import until
+from tests.calm import until
 
 HOME, ORIGIN = np.array([100.0, 50.0]), np.array([3.0, -4.0])
 DRONE = Whereabouts(Names("drone1"), HOME, ORIGIN, attitude_of_angles(5.0, -10.0, 90.0))

@@ -13,27 +13,14 @@ from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.safety import SafetyParameters
 from flockd.core.messages import Setpoint
 from flockd.flight.safety import Request, Verdict
-from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus
+from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.streamer import SetpointStreamer
+from tests.make import autopilot_status
 from tests.onboard.autopilot.flight import NORTH, let_pass, request_of
 
 PERIOD_S = 0.05
 
-HOVERING = AutopilotStatus(
-    time_s=0.0,
-    heartbeat_age_s=0.1,
-    message_age_s=0.1,
-    flight_mode="hold",
-    armed=True,
-    failsafe=False,
-    landed_state="air",
-    battery_share=1.0,
-    battery_v=16.0,
-    estimate_ok=True,
-    gps_ok=True,
-    position_ned=np.zeros(3),
-    home_ned=np.zeros(3),
-)
+HOVERING = autopilot_status()
 
 
 class Story:

@@ -33,6 +33,8 @@ from flockd.onboard.telemetry.topics import (
 )
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
 from flockd.sim.sitl.ports import free_endpoint
+from tests.calm import until
+from tests.make import flight_message
 
 pytestmark = [pytest.mark.fault("wrong-types-of-a-peer"), pytest.mark.fault("hostile-peers")]
 
@@ -48,21 +50,7 @@ def fault(message: object, kind: type) -> str | None:
     return None
 
 
-FLIGHT = {
-    "time_s": 5.0, "state": "normal", "reasons": [], "flight_mode": "offboard", "armed": True, "in_air": True,
-    "heartbeat_age_s": 0.1, "heartbeats_lost": 0,
-    "battery_share": 0.5, "height_m": 4.0, "velocity_trim": [0.0, 0.0], "velocity_error_m_s": 0.1,
-    "silence": None,
-    "setpoints_sent": 1, "setpoints_missed": 0, "orders": [], "orders_refused": 0,
-}  # fmt: skip
-
-
-def until(true: Callable[[], bool]) -> None:
-    """Waits for it, and fails where it does not come."""
-    end_s = time.monotonic() + 60.0
-    while not true():
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
+FLIGHT = flight_message()
 
 
 @pytest.mark.parametrize(
