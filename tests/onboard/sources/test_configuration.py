@@ -62,48 +62,27 @@ TOPICS = """\
 """
 
 
-def test_frames_may_come_from_topics_of_ros(tmp_path: Path) -> None:
-    path = tmp_path / "drone.yaml"
-    path.write_text(RIG + "source:\n  kind: ros\n" + TOPICS, encoding="utf-8")
-    config = load_drone(path)
-    assert config.source is not None
-    assert [camera.place for camera in config.source.cameras] == ["/front/image_raw", "/back/image_raw/compressed"]
-    assert isinstance(open_source(config, str(path)), DeviceSource)
-
-
 @pytest.mark.parametrize(
-    "source",
+    ("source", "places"),
     [
-        "source:\n  kind: v4l2\n" + TWO,
-        "source:\n  kind: gstreamer\n" + PIPELINES,
-        "source:\n  kind: ros\n" + TOPICS,
-        "source: {kind: shared_memory}\n",
+        ("{kind: shared_memory, shared_memory: {drone: '3'}}\n", []),
+        ("\n  kind: v4l2\n" + TWO, ["/dev/video0", "/dev/video2"]),
+        ("\n  kind: gstreamer\n" + PIPELINES, ["nvarguscamerasrc sensor-id=0", "libcamerasrc"]),
+        ("\n  kind: ros\n" + TOPICS, ["/front/image_raw", "/back/image_raw/compressed"]),
     ],
 )
-def test_a_recorded_configuration_can_be_read_again(tmp_path: Path, source: str) -> None:
+def test_frames_come_from_where_the_file_says_and_so_does_its_recording(
+    tmp_path: Path, source: str, places: list[str]
+) -> None:
     """A recording holds every key, those too that are of another kind of source and empty."""
     path = tmp_path / "drone.yaml"
-    path.write_text(RIG + source, encoding="utf-8")
-    config = load_drone(path)
-    assert DroneConfig.model_validate_json(config.model_dump_json()) == config
-
-
-def test_frames_may_come_from_another_program(tmp_path: Path) -> None:
-    path = tmp_path / "drone.yaml"
-    path.write_text(RIG + "source: {kind: shared_memory, shared_memory: {drone: '3'}}\n", encoding="utf-8")
+    path.write_text(RIG + "source: " + source, encoding="utf-8")
     config = load_drone(path)
     assert config.source is not None
+    assert [camera.place for camera in config.source.cameras] == places
+    assert isinstance(open_source(config, str(path)), DeviceSource if places else SharedMemorySource)
     assert config.source.shared_memory.connect == ("tcp/127.0.0.1:7448",)
-    assert isinstance(open_source(config, str(path)), SharedMemorySource)
-
-
-def test_frames_may_come_from_a_pipeline_a_camera(tmp_path: Path) -> None:
-    path = tmp_path / "drone.yaml"
-    path.write_text(RIG + "source:\n  kind: gstreamer\n" + PIPELINES, encoding="utf-8")
-    config = load_drone(path)
-    assert config.source is not None
-    assert [camera.place for camera in config.source.cameras] == ["nvarguscamerasrc sensor-id=0", "libcamerasrc"]
-    assert isinstance(open_source(config, str(path)), DeviceSource)
+    assert DroneConfig.model_validate_json(config.model_dump_json()) == config
 
 
 def test_the_examples_of_the_documentation_check(tmp_path: Path) -> None:

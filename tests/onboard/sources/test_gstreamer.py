@@ -5,70 +5,43 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from flockd.core.config.source import CameraDeviceParameters, SourceParameters
-from flockd.core.messages import FrameSet, UInt8Array
-from flockd.onboard.sources import CameraStatus
-from flockd.onboard.sources.device_source import Devices, DeviceSource
+from flockd.core.config.source import CameraDeviceParameters
+from flockd.core.messages import UInt8Array
+from flockd.onboard.sources.device_source import Devices
 from flockd.onboard.sources.frames import CameraDevice, CameraError
 from flockd.onboard.sources.gstreamer_child import HEADER, Buffer
 from flockd.onboard.sources.gstreamer_device import CHILD, FORMATS, GstreamerDevice, caps, format_of
 from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat
+from tests.onboard.sources.watched import Watch
 
 FAKE = (sys.executable, "-IS", str(Path(__file__).with_name("fake_pipeline.py")))
 SIZE = (64, 48)
 RATE_HZ = 50.0
 CAMERA = CameraDeviceParameters(name="front", pipeline="any", rate_hz=RATE_HZ)
-Start = Callable[..., DeviceSource]
 
 
 @pytest.fixture
-def start() -> Iterator[Start]:
+def start(watch: Watch) -> Watch:
     """Starts a source of the given pipelines, called camera0 and so on."""
-    started: list[DeviceSource] = []
 
-    def begin(*pipelines: str, silence_s: float = 30.0, devices: type[Devices] = Devices) -> DeviceSource:
-        names = [f"camera{number}" for number in range(len(pipelines))]
+    def begin(*pipelines: str, devices: type[Devices] = Devices, **more: Any) -> Any:
         cameras = tuple(
-            CameraDeviceParameters(name=name, pipeline=pipeline, rate_hz=RATE_HZ)
-            for name, pipeline in zip(names, pipelines, strict=True)
+            CameraDeviceParameters(name=f"camera{number}", pipeline=pipeline, rate_hz=RATE_HZ)
+            for number, pipeline in enumerate(pipelines)
         )
-        parameters = SourceParameters(kind="gstreamer", cameras=cameras, silence_s=silence_s, set_tolerance_s=5.0)
-        source = DeviceSource(dict.fromkeys(names, SIZE), parameters, devices(command=FAKE))
-        started.append(source)
-        source.start()
-        return source
+        return watch({camera.name: SIZE for camera in cameras}, cameras, devices(command=FAKE), **more)
 
-    yield begin
-    for source in started:
-        source.stop()
+    return begin
 
 
-def _until(source: DeviceSource, holds: Callable[[CameraStatus], bool], camera: str = "camera0") -> CameraStatus:
-    until_s = time.monotonic() + 30.0
-    while not holds(status := source.status()[camera]):
-        assert time.monotonic() < until_s, status
-        time.sleep(0.005)
-    return status
-
-
-def _next(source: DeviceSource) -> FrameSet:
-    frames = source.newest(30.0)
-    assert frames is not None
-    return frames
-
-
-def _fault(source: DeviceSource) -> str:
-    return str(_until(source, lambda status: status.fault is not None).fault)
-
-
-def test_a_camera_whose_opening_fails_for_a_reason_nobody_expects_is_seen_to_fail(start: Start) -> None:
+def test_a_camera_whose_opening_fails_for_a_reason_nobody_expects_is_seen_to_fail(start: Watch) -> None:
     """Its thread ended with a traceback, and its status said nothing."""
 
     class Breaking(Devices):
@@ -78,15 +51,15 @@ def test_a_camera_whose_opening_fails_for_a_reason_nobody_expects_is_seen_to_fai
             return super().open(camera, size)
 
     source = start("words", "caps:64x48 1000", devices=Breaking)
-    failed = _until(source, lambda status: status.fault is not None, "camera0")
+    failed = source.until(lambda status: status.fault is not None, "camera0")
     assert failed.fault == "camera0: cannot be run (ValueError: embedded null byte)"
-    _until(source, lambda status: status.counts.get("received", 0) > 2, "camera1")
+    source.until(lambda status: status.counts.get("received", 0) > 2, "camera1")
 
 
-def test_images_come_with_the_times_of_their_buffers(start: Start) -> None:
+def test_images_come_with_the_times_of_their_buffers(start: Watch) -> None:
     begun_s = time.monotonic()
     source = start("caps:64x48 500 stall")
-    first, second = _next(source), _next(source)
+    first, second = source.next(), source.next()
     for frames in (first, second):
         assert begun_s < frames.time_s <= time.monotonic()
         image = frames.frames["camera0"].image
@@ -119,28 +92,28 @@ def test_numbers_count_periods_so_that_what_is_missing_shows() -> None:
     [("short", "corrupt"), ("flagged", "flagged"), ("old", "time_stamp"), ("untimed", "time_stamp")],
 )
 def test_what_is_worth_nothing_is_dropped_and_counted_and_the_next_is_fine(
-    start: Start, pipeline: str, count: str
+    start: Watch, pipeline: str, count: str
 ) -> None:
     source = start(f"caps:64x48 {pipeline} 500 stall")
-    _next(source)
+    source.next()
     assert source.status()["camera0"].counts.get(count) == 1  # type: ignore[call-overload]
     assert source.status()["camera0"].fault is None
 
 
-def test_a_silent_pipeline_is_started_again_and_comes_back(start: Start, tmp_path: Path) -> None:
+def test_a_silent_pipeline_is_started_again_and_comes_back(start: Watch, tmp_path: Path) -> None:
     source = start(f"caps:64x48 3 once:{tmp_path / 'was_silent'} stall 500 stall", silence_s=0.2)
     # The first process stalls after three images; those that follow find the file and go on.
-    assert "gave no usable image for 0.2 s" in _fault(source)
-    status = _until(source, lambda status: status.fault is None)
+    assert "gave no usable image for 0.2 s" in source.fault()
+    status = source.until(lambda status: status.fault is None)
     assert status.counts["opened"] >= 2
-    assert _next(source).frames
+    assert source.next().frames
 
 
 @pytest.mark.fault("frozen-frames")
-def test_a_frozen_pipeline_counts_as_silent(start: Start) -> None:
+def test_a_frozen_pipeline_counts_as_silent(start: Watch) -> None:
     source = start("caps:64x48 3 same:500 stall", silence_s=1.0)
-    assert _fault(source) == "camera0: the image is frozen; restart its camera or program"
-    _until(source, lambda status: "gave no usable image for 1 s (the last was refused: frozen)" in str(status.fault))
+    assert source.fault() == "camera0: the image is frozen; restart its camera or program"
+    source.until(lambda status: "gave no usable image for 1 s (the last was refused: frozen)" in str(status.fault))
 
 
 @pytest.mark.parametrize(
@@ -173,16 +146,16 @@ def test_a_frozen_pipeline_counts_as_silent(start: Start) -> None:
         ("2", "camera0: the process of its pipeline sent what is no image; something in it prints"),
     ],
 )
-def test_each_way_to_fail_is_one_sentence_and_is_tried_again(start: Start, pipeline: str, sentence: str) -> None:
+def test_each_way_to_fail_is_one_sentence_and_is_tried_again(start: Watch, pipeline: str, sentence: str) -> None:
     source = start(pipeline)
-    assert _fault(source) == sentence
-    _until(source, lambda status: status.counts.get("opened", 0) >= 2)
+    assert source.fault() == sentence
+    source.until(lambda status: status.counts.get("opened", 0) >= 2)
 
 
 @pytest.mark.fault("camera-unplugged")
-def test_a_crash_is_followed_by_images_when_the_driver_is_back(start: Start, tmp_path: Path) -> None:
+def test_a_crash_is_followed_by_images_when_the_driver_is_back(start: Watch, tmp_path: Path) -> None:
     source = start(f"caps:64x48 once:{tmp_path / 'has_crashed'} crash 500 stall")
-    assert _next(source).frames
+    assert source.next().frames
     assert source.status()["camera0"].counts["opened"] == 2
 
 

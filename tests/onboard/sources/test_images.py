@@ -63,20 +63,6 @@ def test_a_white_sky_and_a_black_ground_are_no_damage() -> None:
     assert MjpegFormat(SIZE).decode(jpeg(image)).shape == (480, 640, 3)
 
 
-def test_random_damage_is_refused_or_gives_an_image_of_the_right_shape() -> None:
-    whole = jpeg(scene())
-    rng = np.random.default_rng(1)
-    for _ in range(60):
-        data = bytearray(whole)
-        for at in rng.integers(2, len(data) - 2, 5):
-            data[at] = rng.integers(256)
-        try:
-            image = MjpegFormat(SIZE).decode(bytes(data))
-        except CorruptImageError:
-            continue
-        assert image.shape == (480, 640, 3)
-
-
 def test_yuyv_is_bt_601() -> None:
     """The colour bars of BT.601 at 100 %: white, red, green, blue, and mid grey."""
     bars = [(235, 128, 128), (81, 90, 240), (145, 54, 34), (41, 240, 110), (126, 128, 128)]

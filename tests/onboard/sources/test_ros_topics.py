@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,13 +14,13 @@ import numpy as np
 import pytest
 
 from flockd.core.config.rig import IntrinsicsConfig
-from flockd.core.config.source import CameraDeviceParameters, SourceParameters
-from flockd.core.messages import FrameSet
-from flockd.onboard.sources import CameraStatus, ros_child
-from flockd.onboard.sources.device_source import Devices, DeviceSource
+from flockd.core.config.source import CameraDeviceParameters
+from flockd.onboard.sources import ros_child
+from flockd.onboard.sources.device_source import Devices
 from flockd.onboard.sources.ros_child import body_of, packed
 from flockd.onboard.sources.ros_device import info_topic_of
 from tests.onboard.sources.fake_topics import __file__ as fake
+from tests.onboard.sources.watched import Watch
 
 SIZE = (64, 48)
 LENS = IntrinsicsConfig(fx=50.0, fy=50.0, cx=32.0, cy=24.0)
@@ -54,43 +53,19 @@ def test_camera_info_stands_beside_the_images(topic: str, expected: str) -> None
     assert info_topic_of(topic) == expected
 
 
-Start = Callable[..., DeviceSource]
-
-
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Start]:
+def start(watch: Watch, tmp_path: Path) -> Watch:
     """A source of one camera whose topics bring these messages: kind, data, and how many ms ago it was taken."""
-    started: list[DeviceSource] = []
 
-    def begin(*messages: tuple[str, bytes] | tuple[str, bytes, int], silence_s: float = 30.0) -> DeviceSource:
+    def begin(*messages: tuple[str, bytes] | tuple[str, bytes, int], **more: Any) -> Any:
         file = tmp_path / "messages"
         named = [dict(zip(("kind", "data", "ms"), (one[0], one[1].hex(), *one[2:]), strict=False)) for one in messages]
         file.write_text("\n".join(json.dumps(one) for one in named), encoding="ascii")
         camera = CameraDeviceParameters(name="front", topic="/front/image_raw", rate_hz=50.0)
-        parameters = SourceParameters(kind="ros", cameras=(camera,), silence_s=silence_s, set_tolerance_s=5.0)
         devices = Devices(ros_command=(sys.executable, "-IS", fake, str(file)), lenses={"front": LENS})
-        source = DeviceSource({"front": SIZE}, parameters, devices)
-        started.append(source)
-        source.start()
-        return source
+        return watch({"front": SIZE}, (camera,), devices, **more)
 
-    yield begin
-    for source in started:
-        source.stop()
-
-
-def until(source: DeviceSource, holds: Callable[[CameraStatus], object]) -> CameraStatus:
-    end_s = time.monotonic() + 30.0
-    while not holds(status := source.status()["front"]):
-        assert time.monotonic() < end_s, status
-        time.sleep(0.005)
-    return status
-
-
-def next_of(source: DeviceSource) -> FrameSet:
-    frames = source.newest(30.0)
-    assert frames is not None
-    return frames
+    return begin
 
 
 PADDED = np.pad(RGB.reshape(48, 192), ((0, 0), (0, 8)))
@@ -106,30 +81,22 @@ PADDED = np.pad(RGB.reshape(48, 192), ((0, 0), (0, 8)))
         ("rgb8", PADDED, RGB),
     ],
 )
-def test_an_image_becomes_rgb_bit_by_bit(start: Start, encoding: str, pixels: Any, expected: Any) -> None:
+def test_an_image_becomes_rgb_bit_by_bit(start: Watch, encoding: str, pixels: Any, expected: Any) -> None:
     source = start(("info", info()), ("imag", image(encoding, pixels)))
     begun_s = time.monotonic()
-    frames = next_of(source)
+    frames = source.next()
     assert np.array_equal(frames.frames["front"].image, expected)
     assert begun_s - 5.0 < frames.time_s <= time.monotonic()
     assert source.status()["front"].fault is None
 
 
-def test_a_jpeg_is_decoded_as_that_of_any_camera(start: Start) -> None:
+def test_a_jpeg_is_decoded_as_that_of_any_camera(start: Watch) -> None:
     smooth = cv2.GaussianBlur(RGB, (0, 0), 4)
     data = bytes(cv2.imencode(".jpg", smooth)[1])
     source = start(("jpeg", compressed("bgr8; jpeg compressed bgr8", data)))
     expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
     assert expected is not None
-    assert np.array_equal(next_of(source).frames["front"].image, expected)
-
-
-def test_numbers_count_periods_so_that_what_is_missing_shows(start: Start) -> None:
-    """At 50 Hz, taken 200, 180 and 100 ms ago: 1 and 4 periods on."""
-    images = [image("rgb8", np.roll(RGB, shift)) for shift in range(3)]
-    source = start(("imag", images[0], 200), ("imag", images[1], 180), ("imag", images[2], 100))
-    status = until(source, lambda status: status.counts.get("received", 0) >= 3)
-    assert status.counts["lost"] == 3
+    assert np.array_equal(source.next().frames["front"].image, expected)
 
 
 @pytest.mark.fault("damaged-images")
@@ -142,9 +109,9 @@ def test_numbers_count_periods_so_that_what_is_missing_shows(start: Start) -> No
         (("jpeg", compressed("jpeg", b"\xff\xd8 nothing")), "corrupt"),
     ],
 )
-def test_what_is_worth_nothing_is_counted_and_the_next_is_fine(start: Start, message: Any, count: str) -> None:
+def test_what_is_worth_nothing_is_counted_and_the_next_is_fine(start: Watch, message: Any, count: str) -> None:
     source = start(message, ("imag", image("rgb8", np.roll(RGB, 5))))
-    next_of(source)
+    source.next()
     assert source.status()["front"].counts.get(count) == 1  # type: ignore[call-overload]
 
 
@@ -164,22 +131,22 @@ def test_what_is_worth_nothing_is_counted_and_the_next_is_fine(start: Start, mes
         (("fail", b"there is no rclpy"), "front: there is no rclpy; source a ROS 2, or, with Python 3.11 on x86-64"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_sentence(start: Start, message: Any, sentence: str) -> None:
+def test_what_cannot_be_is_said_in_one_sentence(start: Watch, message: Any, sentence: str) -> None:
     source = start(message)
-    assert sentence in str(until(source, lambda status: status.fault).fault)
+    assert sentence in source.fault()
 
 
-def test_a_lens_that_nobody_calibrated_contradicts_nothing(start: Start) -> None:
+def test_a_lens_that_nobody_calibrated_contradicts_nothing(start: Watch) -> None:
     source = start(("info", info(fx=0.0, cx=0.0)), ("imag", image()))
-    next_of(source)
+    source.next()
     assert source.status()["front"].fault is None
 
 
 @pytest.mark.fault("camera-unplugged")
-def test_a_silent_topic_is_opened_again(start: Start) -> None:
+def test_a_silent_topic_is_opened_again(start: Watch) -> None:
     source = start(("imag", image()), silence_s=0.2)
-    assert "/front/image_raw gave no usable image for 0.2 s" in str(until(source, lambda status: status.fault).fault)
-    assert until(source, lambda status: status.counts.get("opened", 0) >= 2)
+    assert "/front/image_raw gave no usable image for 0.2 s" in source.fault()
+    assert source.until(lambda status: status.counts.get("opened", 0) >= 2)
 
 
 def test_a_simulators_clock_is_carried_over() -> None:

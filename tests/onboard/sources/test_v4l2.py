@@ -8,18 +8,17 @@ import mmap
 import os
 import termios
 import time
-from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
-from flockd.core.config.source import CameraDeviceParameters, ControlParameters, SourceParameters
-from flockd.core.messages import FrameSet
-from flockd.onboard.sources import CameraStatus, v4l2_kernel
-from flockd.onboard.sources.device_source import Devices, DeviceSource
+from flockd.core.config.source import CameraDeviceParameters, ControlParameters
+from flockd.onboard.sources import v4l2_kernel
+from flockd.onboard.sources.device_source import Devices
 from flockd.onboard.sources.v4l2_device import control_name
 from flockd.onboard.sources.v4l2_kernel import Kernel
+from tests.calm import until
 from tests.onboard.sources.camera_images import SIZE, jpeg, scene, yuyv
 from tests.onboard.sources.fake_kernel import (
     FLAG_CLOCK_UNKNOWN,
@@ -33,6 +32,7 @@ from tests.onboard.sources.fake_kernel import (
     FakeKernel,
     Request,
 )
+from tests.onboard.sources.watched import WAIT_S, Watch
 
 JPEGS = [jpeg(scene(number)) for number in range(8)]
 BY_HAND = (
@@ -40,57 +40,20 @@ BY_HAND = (
     ControlParameters(name="exposure_time_absolute", value=50),
     ControlParameters(name="gain", value=32),
 )
-Start = Callable[..., DeviceSource]
-SECONDS_TO_FAIL = 60.0
 
 
 @pytest.fixture
-def start() -> Iterator[Start]:
+def start(watch: Watch) -> Watch:
     """Starts a source of the given cameras; each camera's device is /dev/ and its name."""
-    started: list[DeviceSource] = []
 
-    def begin(
-        kernel: Kernel,
-        *cameras: CameraDeviceParameters,
-        silence_s: float = SECONDS_TO_FAIL,
-        size: tuple[int, int] = SIZE,
-    ) -> DeviceSource:
-        parameters = SourceParameters(kind="v4l2", cameras=cameras, silence_s=silence_s, set_tolerance_s=5.0)
-        source = DeviceSource({c.name: size for c in cameras}, parameters, Devices(kernel))
-        started.append(source)
-        source.start()
-        return source
+    def begin(kernel: Kernel, *cameras: CameraDeviceParameters, size: tuple[int, int] = SIZE, **more: Any) -> Any:
+        return watch({camera.name: size for camera in cameras}, cameras, Devices(kernel), **more)
 
-    yield begin
-    for source in started:
-        source.stop()
+    return begin
 
 
 def _camera(name: str = "front", **changes: object) -> CameraDeviceParameters:
     return CameraDeviceParameters.model_validate({"name": name, "device": f"/dev/{name}", **changes})
-
-
-def _until(source: DeviceSource, holds: Callable[[CameraStatus], bool], camera: str = "front") -> CameraStatus:
-    until_s = time.monotonic() + SECONDS_TO_FAIL
-    while not holds(status := source.status()[camera]):
-        assert time.monotonic() < until_s, status
-        time.sleep(0.005)
-    return status
-
-
-def _received(source: DeviceSource, **counts: int) -> None:
-    """Waits until so many frames of each camera have come."""
-    until_s = time.monotonic() + SECONDS_TO_FAIL
-    for camera, count in counts.items():
-        while (status := source.status()[camera]).counts.get("received", 0) < count:
-            assert time.monotonic() < until_s, status
-            time.sleep(0.005)
-
-
-def _next(source: DeviceSource) -> FrameSet:
-    frames = source.newest(SECONDS_TO_FAIL)
-    assert frames is not None
-    return frames
 
 
 def test_the_structures_are_those_of_the_header() -> None:
@@ -117,12 +80,12 @@ def test_the_structures_are_those_of_the_header() -> None:
         assert getattr(v4l2_kernel.Buffer, names.get(name, name)).offset == offset
 
 
-def test_two_cameras_become_one_set_with_the_kernels_times_and_numbers(start: Start) -> None:
+def test_two_cameras_become_one_set_with_the_kernels_times_and_numbers(start: Watch) -> None:
     kernel = FakeKernel(front=FakeCamera(), back=FakeCamera())
     source = start(kernel, _camera("front"), _camera("back"))
     stamps = {"front": kernel.send("front", JPEGS[0]), "back": kernel.send("back", JPEGS[1])}
-    _received(source, front=1, back=1)
-    frames = _next(source)
+    source.received(front=1, back=1)
+    frames = source.next()
 
     assert frames.frames.keys() == {"front", "back"}
     assert frames.time_s == pytest.approx(stamps["back"], abs=2e-6)
@@ -133,16 +96,16 @@ def test_two_cameras_become_one_set_with_the_kernels_times_and_numbers(start: St
         assert np.abs(frame.image.astype(int) - scene(number)).mean() < 3.0
         status = source.status()[name]
         assert status.fault is None
-        assert 0.0 < status.age_s < SECONDS_TO_FAIL
+        assert 0.0 < status.age_s < WAIT_S
         assert status.counts == {"received": 1, "used": 1, "opened": 1}
     assert source.newest() is None, "no frame is handed out twice"
 
 
-def test_the_driver_is_asked_for_what_the_configuration_says_in_its_order(start: Start) -> None:
+def test_the_driver_is_asked_for_what_the_configuration_says_in_its_order(start: Watch) -> None:
     kernel = FakeKernel(front=FakeCamera())
     source = start(kernel, _camera(pixel_format="mjpeg", rate_hz=15.0, controls=BY_HAND))
     kernel.send("front", JPEGS[0])
-    _next(source)
+    source.next()
     assert kernel.cameras["/dev/front"].settings == [
         ("format", (640, 480, b"MJPG")),
         ("rate", 15.0),
@@ -154,13 +117,13 @@ def test_the_driver_is_asked_for_what_the_configuration_says_in_its_order(start:
 
 @pytest.mark.parametrize(("turn_deg", "red"), [(90, np.s_[:320]), (270, np.s_[320:]), (180, np.s_[:, 320:])])
 def test_a_camera_on_its_side_gives_images_in_which_up_is_up(
-    start: Start, turn_deg: int, red: tuple[slice, ...]
+    start: Watch, turn_deg: int, red: tuple[slice, ...]
 ) -> None:
     """A clockwise quarter of a turn brings the left, which is red, to the top."""
     kernel = FakeKernel(front=FakeCamera())
     source = start(kernel, _camera(turn_deg=turn_deg), size=SIZE if turn_deg == 180 else SIZE[::-1])
     kernel.send("front", JPEGS[0])
-    image = _next(source).frames["front"].image
+    image = source.next().frames["front"].image
     assert kernel.cameras["/dev/front"].settings[0] == ("format", (*SIZE, b"MJPG")), "as the sensor has it"
     assert image.shape == ((480, 640, 3) if turn_deg == 180 else (640, 480, 3))
     is_red = image[..., 0].astype(int) > image[..., 2]
@@ -169,7 +132,7 @@ def test_a_camera_on_its_side_gives_images_in_which_up_is_up(
 
 
 @pytest.mark.parametrize("pixel_format", ["mjpeg", "yuyv"])
-def test_a_larger_image_is_reduced_to_the_rigs_size(start: Start, pixel_format: str) -> None:
+def test_a_larger_image_is_reduced_to_the_rigs_size(start: Watch, pixel_format: str) -> None:
     """The camera is asked for 640 x 480, the rig has a quarter of the pixels: the mean of four, with half the noise."""
     kernel = FakeKernel(front=FakeCamera())
     source = start(kernel, _camera(reduce=2, pixel_format=pixel_format), size=(320, 240))
@@ -177,7 +140,7 @@ def test_a_larger_image_is_reduced_to_the_rigs_size(start: Start, pixel_format: 
     grey = np.repeat(np.clip(128.0 + noise, 0, 255), 3, axis=2).astype(np.uint8)
     sent = jpeg(grey) if pixel_format == "mjpeg" else _yuyv_of(grey)
     kernel.send("front", sent)
-    image = _next(source).frames["front"].image
+    image = source.next().frames["front"].image
     code = b"MJPG" if pixel_format == "mjpeg" else b"YUYV"
     assert kernel.cameras["/dev/front"].settings[0] == ("format", (*SIZE, code))
     assert image.shape == (240, 320, 3)
@@ -202,11 +165,11 @@ def test_names_of_controls_are_those_that_v4l2_ctl_prints() -> None:
     ]
 
 
-def test_uncompressed_images_may_have_padded_rows(start: Start) -> None:
+def test_uncompressed_images_may_have_padded_rows(start: Watch) -> None:
     kernel = FakeKernel(front=FakeCamera(padding=64))
     source = start(kernel, _camera(pixel_format="yuyv"))
     kernel.send("front", yuyv([(81, 90, 240), (41, 240, 110)], SIZE, padding=64))
-    image = _next(source).frames["front"].image
+    image = source.next().frames["front"].image
     np.testing.assert_allclose(image[:, 10:300].mean((0, 1)), (255, 0, 0), atol=2)
     np.testing.assert_allclose(image[:, 340:630].mean((0, 1)), (0, 0, 255), atol=2)
 
@@ -227,89 +190,67 @@ def test_uncompressed_images_may_have_padded_rows(start: Start) -> None:
     ids=["error flag", "truncated", "empty", "other size", "unknown clock", "ahead", "wall clock", "long ago"],
 )
 def test_what_is_worth_nothing_is_dropped_and_counted_and_the_next_is_fine(
-    start: Start, data: bytes, flags: int, offset_s: float, count: str
+    start: Watch, data: bytes, flags: int, offset_s: float, count: str
 ) -> None:
     kernel = FakeKernel(front=FakeCamera())
     source = start(kernel, _camera())
     kernel.send("front", JPEGS[0])
-    assert _next(source).frames["front"].sequence == 0
+    assert source.next().frames["front"].sequence == 0
     kernel.send("front", data, flags=flags, time_s=time.monotonic() + offset_s)
-    _received(source, front=2)
+    source.received(front=2)
     assert source.newest(0.05) is None
     kernel.send("front", JPEGS[2])
-    assert _next(source).frames["front"].sequence == 2
+    assert source.next().frames["front"].sequence == 2
     counts = dict(source.status()["front"].counts)
     assert counts.pop("lost", 0) in {0, 1}
     assert counts == {"received": 3, "used": 2, "opened": 1, count: 1}
 
 
-def test_a_driver_may_leave_the_name_of_its_clock_out_if_its_stamps_are_of_now(start: Start) -> None:
+def test_a_driver_may_leave_the_name_of_its_clock_out_if_its_stamps_are_of_now(start: Watch) -> None:
     kernel = FakeKernel(front=FakeCamera())
     source = start(kernel, _camera())
     kernel.send("front", JPEGS[0], flags=FLAG_CLOCK_UNKNOWN, time_s=time.monotonic())
-    assert _next(source).frames["front"].sequence == 0
+    assert source.next().frames["front"].sequence == 0
 
 
-def test_what_only_the_decoder_notices_leaves_its_camera_out_of_the_set(start: Start) -> None:
-    kernel = FakeKernel(front=FakeCamera(), back=FakeCamera())
-    source = start(kernel, _camera("front"), _camera("back"))
-    kernel.send("front", JPEGS[0][: len(JPEGS[0]) // 2] + b"\xff\xd9")
-    kernel.send("back", JPEGS[1])
-    _received(source, front=1, back=1)
-    assert _next(source).frames.keys() == {"back"}
-    counts = source.status()["front"].counts
-    assert counts == {"received": 1, "corrupt": 1, "undecodable": 1, "missing": 1, "opened": 1}
-
-
-def test_a_camera_whose_images_show_nothing_has_a_fault_until_one_shows_something(start: Start) -> None:
+def test_a_camera_whose_images_show_nothing_has_a_fault_until_one_shows_something(start: Watch) -> None:
     kernel = FakeKernel(front=FakeCamera(), back=FakeCamera())
     source = start(kernel, _camera("front"), _camera("back"))
     plain = [jpeg(np.full_like(scene(), level)) for level in (60, 61, 62)]
     for number, data in enumerate([*plain, JPEGS[0]]):
         kernel.send("front", data)
         kernel.send("back", JPEGS[number + 1])
-        _received(source, front=number + 1, back=number + 1)
+        source.received(front=number + 1, back=number + 1)
         fault = source.status()["front"].fault
         assert fault == (None if number < 3 else "front: its images show nothing; check its lens and cable")
-        assert _next(source).frames.keys() == ({"back"} if number < 3 else {"front", "back"})
+        assert source.next().frames.keys() == ({"back"} if number < 3 else {"front", "back"})
     assert source.status()["front"].fault is None
     assert source.status()["front"].counts["undecodable"] == 3
 
 
-def test_a_stamp_that_does_not_increase_is_dropped(start: Start) -> None:
-    kernel = FakeKernel(front=FakeCamera())
-    source = start(kernel, _camera())
-    stamp = kernel.send("front", JPEGS[0])
-    kernel.send("front", JPEGS[1], time_s=stamp)
-    kernel.send("front", JPEGS[2], time_s=stamp - 0.01)
-    _received(source, front=3)
-    assert source.status()["front"].counts["time_stamp"] == 2
-    assert _next(source).frames["front"].sequence == 0
-
-
 @pytest.mark.fault("camera-unplugged")
-def test_an_unplugged_camera_is_reported_at_once_and_comes_back_when_plugged_in(start: Start) -> None:
+def test_an_unplugged_camera_is_reported_at_once_and_comes_back_when_plugged_in(start: Watch) -> None:
     kernel = FakeKernel(front=FakeCamera(), back=FakeCamera())
     source = start(kernel, _camera("front", controls=BY_HAND), _camera("back"))
     kernel.send("front", JPEGS[0])
     kernel.send("back", JPEGS[1])
-    _received(source, front=1, back=1)
-    assert _next(source).frames.keys() == {"front", "back"}
+    source.received(front=1, back=1)
+    assert source.next().frames.keys() == {"front", "back"}
 
     kernel.unplug("front")
-    fault = _until(source, lambda status: status.fault is not None).fault
+    fault = source.fault()
     assert fault == "front: /dev/front is not there; plug the camera in, or correct the path"
 
     kernel.send("back", JPEGS[2])
-    assert _next(source).frames.keys() == {"back"}, "the others go on"
+    assert source.next().frames.keys() == {"back"}, "the others go on"
     assert source.status()["front"].counts["missing"] == 1
 
     kernel.plug("front")
     kernel.send("front", JPEGS[0])
     kernel.send("front", JPEGS[3])
     kernel.send("back", JPEGS[4])
-    _received(source, front=3, back=3)
-    assert _next(source).frames.keys() == {"front", "back"}
+    source.received(front=3, back=3)
+    assert source.next().frames.keys() == {"front", "back"}
     status = source.status()["front"]
     assert status.fault is None
     assert status.counts["opened"] == 2
@@ -317,24 +258,24 @@ def test_an_unplugged_camera_is_reported_at_once_and_comes_back_when_plugged_in(
     assert kernel.cameras["/dev/front"].settings.count(("Gain", 32)) == 2, "it is set up again"
 
 
-def test_a_silent_camera_is_noticed_and_opened_again(start: Start) -> None:
+def test_a_silent_camera_is_noticed_and_opened_again(start: Watch) -> None:
     kernel = FakeKernel(front=FakeCamera())
     source = start(kernel, _camera(), silence_s=0.2)
     kernel.send("front", JPEGS[0])
-    _next(source)
-    status = _until(source, lambda status: status.fault is not None)
+    source.next()
+    status = source.until(lambda status: status.fault is not None)
     assert status.fault == "front: /dev/front gave no usable image for 0.2 s"
     kernel.send("front", JPEGS[0])  # as v4l2loopback does: the last picture of before, stamped as of now
-    _received(source, front=2)
+    source.received(front=2)
     assert source.newest(0.05) is None
     assert source.status()["front"].fault is not None
     kernel.send("front", JPEGS[1])
-    assert _next(source).frames["front"].sequence == 1
+    assert source.next().frames["front"].sequence == 1
     assert source.status()["front"].counts["opened"] == 2
 
 
 @pytest.mark.fault("frozen-frames")
-def test_a_frozen_camera_counts_as_silent(start: Start) -> None:
+def test_a_frozen_camera_counts_as_silent(start: Watch) -> None:
     kernel = FakeKernel(front=FakeCamera())
     source = start(kernel, _camera(), silence_s=0.2)
     used = 0
@@ -344,38 +285,38 @@ def test_a_frozen_camera_counts_as_silent(start: Start) -> None:
     assert used == 5, "the picture and four repetitions; the fifth is one too many"
     counts = source.status()["front"].counts
     assert counts["frozen"] == 4
-    _until(source, lambda status: status.fault == "front: /dev/front gave no usable image for 0.2 s "
+    source.until(lambda status: status.fault == "front: /dev/front gave no usable image for 0.2 s "
            "(the last was refused: frozen)")  # fmt: skip
     kernel.send("front", JPEGS[0])
     kernel.send("front", JPEGS[1])
-    _next(source)
+    source.next()
     assert source.status()["front"].fault is None
 
 
-def test_a_camera_that_another_program_uses_is_reported_and_taken_when_it_is_free(start: Start) -> None:
+def test_a_camera_that_another_program_uses_is_reported_and_taken_when_it_is_free(start: Watch) -> None:
     kernel = FakeKernel(front=FakeCamera(owner=1))
     source = start(kernel, _camera())
-    status = _until(source, lambda status: status.fault is not None)
+    status = source.until(lambda status: status.fault is not None)
     assert status.fault == "front: /dev/front is in use by another program; stop that one"
     assert status.age_s == float("inf")
     kernel.cameras["/dev/front"].owner = None
     kernel.send("front", JPEGS[0])
-    _next(source)
+    source.next()
     assert source.status()["front"].fault is None
 
 
-def test_an_error_of_the_stream_closes_the_camera_and_opens_it_again(start: Start) -> None:
+def test_an_error_of_the_stream_closes_the_camera_and_opens_it_again(start: Watch) -> None:
     kernel = FakeKernel(front=FakeCamera())
     source = start(kernel, _camera())
     kernel.send("front", JPEGS[0])
-    _next(source)
+    source.next()
     kernel.fail("front", errno.EIO)
-    status = _until(source, lambda status: status.fault is not None)
+    status = source.until(lambda status: status.fault is not None)
     assert status.fault == "front: /dev/front has failed (Input/output error)"
     kernel.fail("front", 0)
     kernel.send("front", JPEGS[0])
     kernel.send("front", JPEGS[1])
-    _next(source)
+    source.next()
 
 
 @pytest.mark.parametrize(
@@ -428,13 +369,13 @@ def test_an_error_of_the_stream_closes_the_camera_and_opens_it_again(start: Star
     ids=["size", "size to reduce", "rate", "metadata", "no such control", "range", "automatic on", "step"],
 )
 def test_what_the_camera_cannot_do_is_said_in_one_sentence(
-    start: Start, camera: FakeCamera, asked: dict[str, Any], sentence: str
+    start: Watch, camera: FakeCamera, asked: dict[str, Any], sentence: str
 ) -> None:
     source = start(FakeKernel(front=camera), _camera("front", **asked))
-    assert _until(source, lambda status: status.fault is not None).fault == sentence
+    assert source.fault() == sentence
 
 
-def test_openings_become_rarer_while_nothing_is_there(start: Start) -> None:
+def test_openings_become_rarer_while_nothing_is_there(start: Watch) -> None:
     kernel = FakeKernel()
     attempts: list[float] = []
     missing = kernel.open
@@ -445,15 +386,12 @@ def test_openings_become_rarer_while_nothing_is_there(start: Start) -> None:
 
     kernel.open = counted  # type: ignore[method-assign]
     start(kernel, _camera())
-    until_s = time.monotonic() + SECONDS_TO_FAIL
-    while len(attempts) < 4:
-        assert time.monotonic() < until_s
-        time.sleep(0.01)
+    until(lambda: len(attempts) >= 4, WAIT_S)
     pauses_s = np.diff(attempts[:4])
     assert (pauses_s >= [0.1, 0.2, 0.4]).all(), "at 0, 0.1, 0.3 and 0.7 s, or later"
 
 
-def test_stopping_gives_the_devices_back_and_waits_for_nothing(start: Start) -> None:
+def test_stopping_gives_the_devices_back_and_waits_for_nothing(start: Watch) -> None:
     kernel = FakeKernel(front=FakeCamera(), back=FakeCamera(), left=FakeCamera(plugged=False))
     source = start(kernel, _camera("front"), _camera("back"), _camera("left"))
     kernel.send("front", JPEGS[0])
@@ -487,8 +425,8 @@ def test_the_real_system_calls_write_into_the_structures_they_are_given() -> Non
     memory.close()
 
 
-def test_what_is_no_camera_is_reported_by_the_real_kernel(start: Start) -> None:
+def test_what_is_no_camera_is_reported_by_the_real_kernel(start: Watch) -> None:
     camera = CameraDeviceParameters(name="front", device="/dev/null")
     source = start(Kernel(), camera)
     sentence = "front: /dev/null is not a V4L2 camera (Inappropriate ioctl for device)"
-    assert _until(source, lambda status: status.fault is not None).fault == sentence
+    assert source.fault() == sentence
