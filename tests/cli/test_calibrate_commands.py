@@ -154,9 +154,6 @@ class Film:
     def status(self) -> Mapping[str, CameraStatus]:
         return {}
 
-    def notes(self) -> tuple[str, ...]:
-        return ()
-
     def stop(self) -> None:
         self.ended = True
 
