@@ -23,7 +23,6 @@ from flockd.core.config.flocking import FlockingParameters
 from flockd.core.config.geometry import GeometryParameters
 from flockd.core.config.mission import MissionParameters
 from flockd.core.config.perception import PerceptionConfig
-from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
 from flockd.core.config.safety import SafetyParameters
 from flockd.core.config.source import SharedMemoryParameters, SourceParameters
 from flockd.core.config.telemetry import OperatorCommand, TelemetryParameters
@@ -36,6 +35,7 @@ from flockd.onboard.daemon import Daemon, ServiceManager
 from flockd.onboard.sources import FramePublisher
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.sitl.ports import free_endpoint
+from tests import make
 from tests.calm import clock
 from tests.flight.perception.shipped import SECOND_STAGE
 from tests.onboard.autopilot.flight import until
@@ -152,15 +152,10 @@ def config_for(
     own_velocity: Literal["vision", "autopilot"] = "autopilot",
     **autopilot: Any,
 ) -> DroneConfig:
-    lens = IntrinsicsConfig(fx=32.0, fy=32.0, cx=32.0, cy=24.0)
-    cameras = tuple(
-        CameraConfig(name=name, size_px=(WIDTH, HEIGHT), intrinsics=lens, extrinsics=ExtrinsicsConfig(yaw_deg=yaw))
-        for name, yaw in zip(CAMERAS, (0.0, 180.0), strict=True)
-    )
-    return DroneConfig(
+    return make.drone(
+        *(make.camera(name, yaw_deg=yaw) for name, yaw in zip(CAMERAS, (0.0, 180.0), strict=True)),
         name="tiny",
         step_s=STEP_S,
-        rig=RigConfig(cameras=cameras),
         perception=PerceptionConfig(deadline_s=0.5),
         geometry=GeometryParameters(hypotheses=20),
         safety=PATIENT,

@@ -18,7 +18,6 @@ import pytest
 
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.drone import DroneConfig
-from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.config.source import SourceParameters
 from flockd.core.data import data_path
 from flockd.core.messages import (
@@ -32,13 +31,10 @@ from flockd.core.messages import (
     Reason,
     ReasonKind,
     SizeStatus,
-    VehicleState,
-    Wanted,
 )
 from flockd.flight.inference import OnnxModel
 from flockd.flight.perception import ImagePair
 from flockd.flight.safety import Action, Decision, Gate, Inputs, Permission, Request, State, Surroundings
-from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
 from flockd.onboard.daemon.control import Control
 from flockd.onboard.daemon.operator_orders import OperatorRequests
 from flockd.onboard.daemon.pilot_loop import (
@@ -54,6 +50,7 @@ from flockd.onboard.daemon.supervisor_inputs import CameraMonitor, InputCollecto
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
 from flockd.onboard.sources import CameraStatus, Count
 from flockd.onboard.worker import Worker
+from tests.make import autopilot_status, camera, changed, drone, neighbour, output, vehicle, wanted
 from tests.onboard.daemon.aboard import TinyPerceiver
 
 IMAGE = np.zeros((48, 64, 3), np.uint8)
@@ -200,9 +197,8 @@ def test_monitor_tell_frozen_from_unplugged_and_count_bad_frames_of_late() -> No
 
 
 def _flyable(*cameras: str) -> DroneConfig:
-    lens = IntrinsicsConfig(fx=32.0, fy=32.0, cx=32.0, cy=24.0)
-    rig = RigConfig(cameras=tuple(CameraConfig(name=name, size_px=(64, 48), intrinsics=lens) for name in cameras))
-    return DroneConfig(rig=rig, source=SourceParameters(kind="shared_memory"))
+    shared, link = SourceParameters(kind="shared_memory"), AutopilotParameters()
+    return drone(*(camera(name) for name in cameras), source=shared, autopilot=link)
 
 
 def test_images_found_useless_when_decoded_count_against_the_few_that_are_decoded() -> None:
@@ -234,7 +230,7 @@ def test_frames_get_the_vehicle_state_of_their_time() -> None:
         yaw = math.radians(number)
         turned = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
         velocity = np.array([0.1 * number, 0.0, 0.0])
-        history.add(VehicleState(100.0 + 0.05 * number, turned, height_m=float(number), velocity_ned=velocity))
+        history.add(vehicle(100.0 + 0.05 * number, float(number), R_ned_body=turned, velocity_ned=velocity))
     found = [history.at(time_s) for time_s in (104.62, 104.95, 103.0, math.inf, 7.0)]
     assert [state and state.height_m for state in found] == pytest.approx([92.4, 99.0, 60.0, 99.0, 99.0])
     between = found[0]
@@ -246,13 +242,9 @@ def test_frames_get_the_vehicle_state_of_their_time() -> None:
 
 def test_frames_get_the_range_that_was_taken_nearest_to_them() -> None:
     """Between two ranges there is none: over an edge, their mean would be of nothing."""
-    history, level = VehicleHistory(), np.eye(3)
-    for time_s, reading in (
-        (1.0, RangeReading(0.98, 4.0)),
-        (1.1, RangeReading(1.09, 2.5)),
-        (1.2, None),
-    ):
-        history.add(VehicleState(time_s, level, 4.0, ground_range=reading))
+    history = VehicleHistory()
+    for time_s, reading in ((1.0, RangeReading(0.98, 4.0)), (1.1, RangeReading(1.09, 2.5)), (1.2, None)):
+        history.add(vehicle(time_s, ground_range=reading))
     found = [history.at(time_s) for time_s in (1.02, 1.06, 1.18)]
     assert [state and state.ground_range and state.ground_range.range_m for state in found] == [4.0, 2.5, 2.5]
 
@@ -271,7 +263,9 @@ def test_a_range_finder_that_fails_is_an_event_and_so_is_its_return() -> None:
 
 def test_who_has_seen_another_twice_is_not_alone_though_it_is_not_confirmed_yet() -> None:
     def track(unseen_s: float, probability: float, *, confirmed: bool) -> Neighbour:
-        return Neighbour(1, np.ones(3), np.zeros(3), 0.1, 0.1, 2.0, unseen_s, 2, confirmed, probability)
+        return neighbour(
+            [1.0, 1.0, 1.0], unseen_s=unseen_s, confirmed=confirmed, existence_probability=probability, hits=2
+        )
 
     confirmed, twice, once = (
         track(2.0, 0.7, confirmed=True),
@@ -293,11 +287,7 @@ def test_what_is_learned_of_the_others_size_is_an_event_each_time_that_it_is_new
         (SizeStatus(False, 0.43, 0.07, used=True), (said,)),
         (SizeStatus(False, 0.43, 0.07, used=True), (said,)),
     )
-    command = Wanted(np.zeros(2), np.zeros(2), 0.0)
-    told = [
-        reports.update(PilotOutput(0.0, None, None, (), (), {}, (), command, reasons, size=size))
-        for size, reasons in steps
-    ]
+    told = [reports.update(output(reasons=reasons, size=size)) for size, reasons in steps]
     weaves, found = (
         "size: moves up and down to learn how large the others are",
         "size: the others are 0.43 m large, +-8%; ranges follow from it",
@@ -309,11 +299,10 @@ def test_the_own_motion_is_missed_from_the_last_step_that_found_it() -> None:
     """In seconds of the steps, also where a flight begins, whose first step has nothing to compare with."""
     anything: Any = None
     loop = PilotLoop(_flyable("front"), anything, anything, anything, anything, anything, lambda: 0.0)
-    found, command = EgoMotion(np.eye(3), np.zeros(3), 0.1, 9, 9, 0.1), Wanted(np.zeros(2), np.zeros(2), 0.0)
-    ages = []
+    found, ages = EgoMotion(np.eye(3), np.zeros(3), 0.1, 9, 9, 0.1), []
     steps = [(5.0, 1, None), (5.1, 2, found), (5.2, 3, None), (5.9, 4, None), (6.0, 5, found), (80.0, 1, None)]
     for time_s, number, ego in steps:
-        loop.newest = StepResult(time_s, PilotOutput(time_s, ego, None, (), (), {}, (), command), 1, number)
+        loop.newest = StepResult(time_s, output(time_s, ego_motion=ego), 1, number)
         loop._count(loop.newest)
         ages.append(loop.ego_motion_age_s)
     assert ages == pytest.approx([0.0, 0.0, 0.1, 0.8, 0.0, 0.0])
@@ -330,13 +319,13 @@ def test_what_was_learned_since_the_drone_was_armed_goes_into_the_flight(monkeyp
         def step(self, frames: FrameSet, *_: object) -> PilotOutput:
             for begin in during:
                 begin()
-            return PilotOutput(frames.time_s, None, None, (), (), {}, (), Wanted(np.zeros(2), np.zeros(2), 0.0))
+            return output(frames.time_s)
 
     monkeypatch.setattr("flockd.onboard.daemon.pilot_loop.FlockPilot", Pilot)
     anything: Any = lambda *_: None  # noqa: E731
     networks: Any = SimpleNamespace(leave=lambda: None)
     loop = PilotLoop(_flyable("front"), anything, networks, anything, anything, anything, lambda: 0.0)
-    state = VehicleState(0.0, np.eye(3), 0.0, None)
+    state = vehicle(height_m=0.0, velocity_ned=None)
     during: list[Callable[[], None]] = []  # what happens while a step is under way
     begun: list[Callable[[], None]] = [
         lambda: None, loop.watch, lambda: loop.begin_flight(1), lambda: loop.begin_flight(2), loop.watch,
@@ -360,24 +349,22 @@ def test_what_was_learned_since_the_drone_was_armed_goes_into_the_flight(monkeyp
 @pytest.mark.parametrize(("step_s", "first"), [(0.5, 2), (0.1, 6)])
 def test_standstill_is_wanted_until_neighbours_can_be_confirmed(step_s: float, first: int) -> None:
     """Two detections, half a second apart."""
-    config = _flyable("front").model_copy(update={"autopilot": AutopilotParameters(), "step_s": step_s})
+    config = changed(_flyable("front"), step_s=step_s)
     anything: Any = None
     loop: Any = SimpleNamespace(newest=None)
     control = Control(
         config, anything, anything, loop, anything, anything, anything, OperatorRequests(), anything, lambda: 0.0
     )
-    command, flown = Wanted(np.ones(2), np.zeros(2), 0.0), []
+    flown = []
     for number in range(1, 9):
-        output = PilotOutput(0.0, None, None, (), (), {}, (), command)
-        loop.newest = StepResult(0.0, output, control._flight, number)
+        loop.newest = StepResult(0.0, output(command=wanted([1.0, 1.0])), control._flight, number)
         flown.append(bool(control._wanted(0.0)[0].velocity.any()))
     assert flown.index(True) + 1 == first
 
 
 def test_the_supervisor_is_told_of_an_obstacle_where_hold_needs_room() -> None:
     """As of the last tick's surroundings: `safety.hold_room_m` is 2 m."""
-    config, watched = _flyable("front").model_copy(update={"autopilot": AutopilotParameters()}), list[int]()
-    status = AutopilotStatus(0.0, 0.1, 0.1, "offboard", True, False, "air", None, None, True, True, None, None)
+    config, watched, status = _flyable("front"), list[int](), autopilot_status(flight_mode="offboard")
     parts: Any = SimpleNamespace(  # all that the control loop asks, of whichever part
         newest=None, noisy_images=Counter(), ego_motion_age_s=0.0, neighbour_seen_s=0.0, load=lambda: 0.5, faults=0,
         stuck=False, worst_s=lambda: 0.0, hottest_c=None, report=lambda: SimpleNamespace(fault=None), end=str,
@@ -399,8 +386,7 @@ def test_the_supervisor_is_told_of_an_obstacle_where_hold_needs_room() -> None:
         around = Surroundings(
             np.zeros(2), np.zeros(2), 0.0, np.empty((0, 3)), np.empty((0, 2)), 5.0, np.array([[away_m, 0.0]])
         )
-        wanted = Wanted(np.zeros(2), np.zeros(2), None)
-        control._request = Request(Permission(Action.FLY, 0.0), wanted, 0.0, 5.0, around)
+        control._request = Request(Permission(Action.FLY, 0.0), wanted(), 0.0, 5.0, around)
         control.tick()
     control.tick()  # in silence nothing is known to be near
     assert [inputs.obstacle_near for inputs in told] == [True, False, False]
