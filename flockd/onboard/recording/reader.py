@@ -16,7 +16,6 @@ from pydantic import ValidationError
 
 from flockd.core import gone
 from flockd.core.config import DroneConfig
-from flockd.core.config.perception import NO_MODEL
 from flockd.core.jpeg_header import cost_fault
 from flockd.core.messages import Frame, FrameSet, LearnedSize, MissionOrder, UInt8Array, VehicleState
 from flockd.onboard.message_json import from_json, parsed
@@ -292,7 +291,7 @@ def _time_of(path: Path, data: bytes) -> float:
 
 def _config(path: Path, contents: Contents) -> DroneConfig:
     try:
-        config = DroneConfig.model_validate_json(json.dumps(_without_gone(json.loads(contents.configuration))))
+        return DroneConfig.model_validate_json(json.dumps(_without_gone(json.loads(contents.configuration))))
     except json.JSONDecodeError as error:
         raise RecordingError(f"{path}: the configuration in it is no JSON ({error}); use another copy") from error
     except ValidationError as error:
@@ -303,10 +302,6 @@ def _config(path: Path, contents: Contents) -> DroneConfig:
             f"{path}: the configuration in it is not one of this flockd ({key}: {first['msg']}); "
             f"use the flockd that wrote it, {version}"
         ) from error
-    if "detector" in config.perception.model_fields_set:
-        return config
-    flown_without = config.perception.model_copy(update={"detector": NO_MODEL})  # by a flockd that had none
-    return config.model_copy(update={"perception": flown_without})
 
 
 def _without_gone(values: Any, at: str = "") -> Any:

@@ -107,18 +107,6 @@ def test_a_configuration_of_another_version_is_refused_with_the_version_that_rea
     )
 
 
-def test_a_recording_from_before_there_were_detectors_replays_without_one(tmp_path: Path, whole: Path) -> None:
-    def earlier(entry: Record) -> Record:
-        if not isinstance(entry, Inclosure):
-            return entry
-        written = json.loads(entry.data)
-        del written["perception"]["detector"]
-        return replace(entry, data=json.dumps(written).encode())
-
-    assert Recording(rewritten(whole, tmp_path / "earlier.mcap", earlier)).config.perception.detector == "none"
-    assert Recording(whole).config.perception.detector == "detector"
-
-
 def test_a_file_cut_off_anywhere_is_refused_or_played_as_far_as_it_goes(tmp_path: Path, whole: Path) -> None:
     content = whole.read_bytes()
     path = tmp_path / "drone1.mcap"

@@ -8,28 +8,23 @@ import cv2
 import numpy as np
 import pytest
 
-from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
-from flockd.core.messages import Detection, Frame, FrameSet, PilotOutput, UInt8Array, Wanted
+from flockd.core.config.rig import RigConfig
+from flockd.core.messages import FrameSet, PilotOutput, UInt8Array
 from flockd.flight.geometry import build_rig
 from flockd.onboard.telemetry.preview import EVERY_S, FRESH_S, Previews
+from tests import make
 
 WIDTH, HEIGHT, FOCAL_PX = 640, 480, 400.0
-LENS = IntrinsicsConfig(fx=FOCAL_PX, fy=FOCAL_PX, cx=WIDTH / 2, cy=HEIGHT / 2)
-RIG = build_rig(RigConfig(cameras=(CameraConfig(name="front", size_px=(WIDTH, HEIGHT), intrinsics=LENS),)))
+RIG = build_rig(RigConfig(cameras=(make.camera("front", (WIDTH, HEIGHT), FOCAL_PX),)))
 
 
 def frames(time_s: float, grey: int = 0) -> FrameSet:
-    return FrameSet(time_s, {"front": Frame("front", np.full((HEIGHT, WIDTH, 3), grey, np.uint8), time_s, 0)})
+    return make.frames(time_s, {"front": np.full((HEIGHT, WIDTH, 3), grey, np.uint8)})
 
 
 def output(*bearings: tuple[float, float, float]) -> PilotOutput:
     """One detection of half a metre, 4 m away, in each direction (body FRD)."""
-    found = tuple(
-        Detection(np.array(bearing), math.log(4.0), np.eye(3), 0.9, 0.5, ("front",), label)
-        for label, bearing in enumerate(bearings, 1)
-    )
-    command = Wanted(np.zeros(2), np.zeros(2), 0.0)
-    return PilotOutput(0.0, None, None, found, (), {}, (), command)
+    return make.output(detections=tuple(make.detection(4.0 * np.array(bearing)) for bearing in bearings))
 
 
 def decoded(data: bytes | None) -> UInt8Array:

@@ -17,17 +17,16 @@ from flockd.core.errors import UnavailableError
 from flockd.core.messages import (
     SECTORS,
     MissionStatus,
-    Neighbour,
     ObstacleRanges,
     PilotOutput,
     Reason,
     ReasonKind,
     VehicleState,
-    Wanted,
 )
 from flockd.onboard.telemetry import TOPICS, publish_step
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.sim.sitl.ports import free_endpoint
+from tests.make import neighbour, output, vehicle, wanted
 
 Received = queue.Queue[tuple[str, dict[str, object]]]
 
@@ -72,18 +71,13 @@ def _wait_until_heard(telemetry: ZenohTelemetry, received: Received) -> None:
 def _yawed(yaw_deg: float) -> VehicleState:
     cosine, sine = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
     attitude = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    return VehicleState(time_s=12.5, R_ned_body=attitude, height_m=4.5, position=np.array([3.0, -4.0]))
+    return vehicle(12.5, 4.5, R_ned_body=attitude, position=[3.0, -4.0])
 
 
 def _output(velocity: np.ndarray | None) -> PilotOutput:
-    neighbour = Neighbour(
-        track=3, position=np.array([1.0, -2.5, 0.5]), velocity=np.array([1.0, 0.0, 0.0]), position_sigma_m=0.1,
-        velocity_sigma_m_s=math.inf, age_s=2.0, unseen_s=0.5, hits=4, confirmed=True,
-    )  # fmt: skip
-    command = Wanted(velocity=np.array([0.9, 0.1]), acceleration=np.array([0.2, -0.2]), yaw_rad=math.pi / 2)
-    return PilotOutput(
-        time_s=12.5, ego_motion=None, velocity=velocity, detections=(), detection_tracks=(), neighbour_motions={},
-        neighbours=(neighbour,), command=command,
+    seen = neighbour([1.0, -2.5, 0.5], velocity_sigma_m_s=math.inf)
+    return output(
+        12.5, velocity=velocity, neighbours=(seen,), command=wanted([0.9, 0.1], math.pi / 2),
         reasons=(Reason(ReasonKind.EGO_MOTION, "no ego-motion: 12 pairs are too few"),),
         counts={"ego": 1}, stages_ms={"flow": 14.0},
         mission=MissionStatus("waypoints", np.array([1.0, 0.0]), "9 m to the goal", goal=np.array([9.0, 2.0])),
@@ -133,7 +127,7 @@ def test_attitude_angles_are_those_of_scipy() -> None:
         def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
             seen[topic] = message
 
-    publish_step(Sink(), "1", VehicleState(time_s=0.0, R_ned_body=attitude, height_m=3.0), _output(None))
+    publish_step(Sink(), "1", vehicle(R_ned_body=attitude), _output(None))
     state = seen["state"]
     assert [state[f"{name}_deg"] for name in ("roll", "pitch", "yaw")] == pytest.approx(angles)
     assert state["velocity_ned"] is None
