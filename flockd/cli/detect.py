@@ -252,7 +252,10 @@ def _say(detected: Sequence[_Detected], result: Mapping[str, Any]) -> None:
     for one in detected:
         for found in one.detections:
             box = " ".join(f"{value:.0f}" for value in found.box)
-            range_m, size_m = (f"{v:.2f} +- {s:.2f}" for v, s in _values(found))
+            range_m, size_m = (
+                f"{found.range_m:.2f} +- {found.range_sigma_m:.2f}",
+                f"{found.size_m:.2f} +- {found.size_sigma_m:.2f}",
+            )
             rows.append((names[one.name], box, f"{found.probability:.2f}", range_m, size_m))
     if rows:
         say_table(("picture", "box, px", "probability", "range, m", "size, m"), rows)
@@ -288,10 +291,6 @@ def _false(result: Mapping[str, Any]) -> str:
 
 def _pictures(count: int) -> str:
     return f"{count} {'picture' if count == 1 else 'pictures'}"
-
-
-def _values(found: DetectedDrone) -> tuple[tuple[float, float], tuple[float, float]]:
-    return (found.range_m, found.range_sigma_m), (found.size_m, found.size_sigma_m)
 
 
 def _share(counts: Mapping[str, int], key: str) -> str:

@@ -45,7 +45,13 @@ def add(commands: Commands) -> None:
     description = "Time each model, for each provider and number of threads: milliseconds a run, the median."
     parser = _add_options(commands("bench", description, examples, _bench))
     option(parser, "--provider NAME,...", f"{', '.join(PROVIDERS)} (default: all that are installed)")
-    option(parser, "--threads N,...", "on the CPU (default: 1,2)", _counts, default=(1, 2))
+    option(
+        parser,
+        "--threads N,...",
+        "on the CPU (default: 1,2)",
+        lambda text: tuple(map(positive_count, text.split(","))),
+        default=(1, 2),
+    )
     option(parser, "--size WxH", "of the image (default: 640x480)", size, default=(640, 480))
     option(parser, "--runs N", f"to time (default: {RUNS})", positive_count, default=RUNS)
     examples = ("flockd models prepare --config my_drone.yaml", "flockd models prepare --config my_drone.yaml --json")
@@ -62,10 +68,6 @@ def _add_options(parser: Parser) -> Parser:
     option(parser, "--dir", "folder of the manifests; by default the one that comes with flockd", Path)
     flag(parser, "--json", "print JSON")
     return parser
-
-
-def _counts(text: str) -> tuple[int, ...]:
-    return tuple(positive_count(part) for part in text.split(","))
 
 
 def _list(args: argparse.Namespace) -> int:

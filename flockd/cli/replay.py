@@ -17,7 +17,6 @@ from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from flockd.core.config import DroneConfig
-    from flockd.ground.datasets.image_folder import Dataset
     from flockd.onboard.recording.difference import Comparison
     from flockd.onboard.recording.reader import Recording
     from flockd.review.replay.dataset_flight import Depth
@@ -85,7 +84,7 @@ def _run(args: argparse.Namespace) -> int:
 
     if args.recording.is_dir() and not is_bag(args.recording):
         return _run_dataset(args)
-    _refuse_dataset(args)
+    refuse(args, _OF_DATASETS, "is for datasets; a recording of flockd holds it, or --config gives it")
     _check_options(args)
     with _recording(args) as recording:
         return _replay(args, recording)
@@ -252,11 +251,6 @@ def _add_dataset(parser: Parser) -> None:
     option(group, "--trajectory FILE", "write the integrated path in TUM format", Path)
 
 
-def _refuse_dataset(args: argparse.Namespace) -> None:
-    """Raises UsageError where a recording is to be replayed like a dataset."""
-    refuse(args, _OF_DATASETS, "is for datasets; a recording of flockd holds it, or --config gives it")
-
-
 def _run_dataset(args: argparse.Namespace) -> int:
     """Runs the command for a dataset."""
     refuse(args, _OF_RECORDINGS, "is for recordings of flockd, and this is none; leave it out")
@@ -267,11 +261,16 @@ def _run_dataset(args: argparse.Namespace) -> int:
     stride = args.stride or 1
     depth: Depth = args.depth or "network"
     dataset = open_dataset(args.recording, args.calibration)
-    _check_dataset(dataset, stride, depth)
+    if depth == "recorded" and not dataset.has_depth:
+        raise UsageError(f"{dataset.path}: has no recorded depth; replay it with --depth network")
+    if stride >= len(dataset):
+        raise UsageError(f"{dataset.path}: has {len(dataset)} frames, and none {stride} after another; lower --stride")
     given = loaded(args.config)
     config = dataset_config(dataset, given, depth, args.flow)
-    for note in (*dataset.notes, *_notes(args.config, given)):
+    for note in dataset.notes:
         complain(note)
+    if given is not None and (scale := given.perception.scale) != "network":
+        complain(f"{args.config}: perception.scale: {scale} needs an autopilot; of a dataset it is the network's")
     with progress("replaying", "pairs") as show_progress:
         pairs = replay_dataset(dataset, config, stride, depth, show_progress)
     result = {**dataset_result(pairs), "stride": stride, "depth": depth, "flow": config.perception.flow}
@@ -288,20 +287,6 @@ def _run_dataset(args: argparse.Namespace) -> int:
         complain(f"{dataset.path}: no motion could be estimated: {pairs[0].reason}")
         return ExitCode.CHECK_FAILED
     return ExitCode.DONE
-
-
-def _notes(file: Path | None, config: DroneConfig | None) -> list[str]:
-    if config is None or config.perception.scale == "network":
-        return []
-    scale = config.perception.scale
-    return [f"{file}: perception.scale: {scale} needs an autopilot, which a dataset lacks; scale is the network's"]
-
-
-def _check_dataset(dataset: Dataset, stride: int, depth: str) -> None:
-    if depth == "recorded" and not dataset.has_depth:
-        raise UsageError(f"{dataset.path}: has no recorded depth; replay it with --depth network")
-    if stride >= len(dataset):
-        raise UsageError(f"{dataset.path}: has {len(dataset)} frames, and none {stride} after another; lower --stride")
 
 
 def _say_profile(args: argparse.Namespace, profile: Mapping[str, Any]) -> None:

@@ -53,7 +53,10 @@ def _run(args: argparse.Namespace) -> int:
     from flockd.onboard.daemon import StderrLog
 
     log = StderrLog()
-    _log_to_stderr(log)
+    dated = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "  # the journal dates its lines itself
+    log.setFormatter(logging.Formatter(f"{dated}%(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[log])
+    logging.getLogger("flockd.onboard.autopilot").setLevel(logging.WARNING)  # MAVSDK tells a lot of itself
     try:
         return _run_daemon(args)
     finally:
@@ -130,11 +133,3 @@ async def _say_what_it_waits_for(daemon: Daemon, every_s: float) -> None:
     while (what := daemon.waits_for()) is not None:
         logging.getLogger("flockd").info("waits for %s", what)
         await asyncio.sleep(every_s)
-
-
-def _log_to_stderr(handler: logging.Handler) -> None:
-    """The journal dates its lines itself."""
-    dated = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
-    handler.setFormatter(logging.Formatter(f"{dated}%(message)s"))
-    logging.basicConfig(level=logging.INFO, handlers=[handler])
-    logging.getLogger("flockd.onboard.autopilot").setLevel(logging.WARNING)  # MAVSDK tells a lot of itself

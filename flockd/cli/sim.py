@@ -396,7 +396,9 @@ def _fly_live(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) ->
         if not args.quiet:
             complain(f"other programs find it at {endpoint}; Ctrl-C ends it")
         sys.stdout.flush()  # whoever reads a pipe needs the address now
-        if args.browser and _has_screen():
+        # Somewhere to open it: not a text browser in this terminal.
+        screen = sys.platform in {"darwin", "win32"} or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        if args.browser and screen:
             stack.enter_context(_opened(address))
         with Phases(quiet=args.quiet) as phases:
             fly_live(
@@ -409,11 +411,6 @@ def _fly_live(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) ->
                 preparing=phases.of("loading networks and building the world", "parts"),
             )
     return ExitCode.DONE
-
-
-def _has_screen() -> bool:
-    """Whether a browser has somewhere to open: not a text browser in this terminal."""
-    return sys.platform in {"darwin", "win32"} or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 @contextmanager

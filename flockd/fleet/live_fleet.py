@@ -117,10 +117,8 @@ class LiveFleet:
 
     def image(self, drone: str, camera: str) -> bytes | None:
         """A JPEG of what a camera sees: asks the drone itself."""
-        return self._watcher.queries.image(drone, camera) if self._is_there(drone) and is_name(camera) else None
-
-    def _is_there(self, drone: str) -> bool:
-        return any(one.alive and f"{one.fleet}/{one.drone}" == drone for one in self._watcher.drones())
+        there = any(one.alive and f"{one.fleet}/{one.drone}" == drone for one in self._watcher.drones())
+        return self._watcher.queries.image(drone, camera) if there and is_name(camera) else None
 
     def _run(self) -> None:
         """Keeps the history, and asks each drone that is alive as soon as it appears, then now and again."""

@@ -231,15 +231,11 @@ class FleetWatcher(SessionOwner):
             self.malformed += 1
             return None
         if len(self._drones) >= MAX_DRONES:
-            self._forget()
+            # Those of which least is known: who invents names says little under each.
+            for key in sorted(self._drones, key=lambda key: _standing(self._drones[key]))[:FORGOTTEN_AT_ONCE]:
+                del self._drones[key]
+            self.forgotten += FORGOTTEN_AT_ONCE
         return Watched(fleet, drone)
-
-    def _forget(self) -> None:
-        """Those of which least is known: who invents names says little under each."""
-        ranked = sorted(self._drones, key=lambda key: _standing(self._drones[key]))
-        for key in ranked[:FORGOTTEN_AT_ONCE]:
-            del self._drones[key]
-        self.forgotten += FORGOTTEN_AT_ONCE
 
     def _remember(self, event: HeardEvent) -> None:
         """However much one drone says, what the others said stays."""

@@ -12,7 +12,7 @@ import secrets
 import socket
 import stat
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -166,11 +166,6 @@ class PageConnections:
         self._since_s = {one: self._since_s.get(one, now_s) for one in connections}
         strangers = [one for one in connections if one not in self._trusted]
         late = sum(now_s - self._since_s[one] > STRANGER_S for one in strangers)
-        _close(strangers[: max(late, len(strangers) - most, 0)])
-
-
-def _close(connections: Collection[web.RequestHandler]) -> None:
-    """The oldest come first: aiohttp keeps them in order."""
-    for connection in connections:
-        if connection.transport is not None:
-            connection.transport.abort()
+        for one in strangers[: max(late, len(strangers) - most, 0)]:  # aiohttp keeps them in order, the oldest first
+            if one.transport is not None:
+                one.transport.abort()

@@ -281,7 +281,9 @@ class _Feed:
         changed = {key: row for key, row in rows.items() if self._sent.get(key) != row}
         self._sent = rows
         events = self._source.events()
-        new = _events_after(events, self._event)
+        # Those that came later than the last; all where that is no longer remembered.
+        seen = len(events) - events[::-1].index(self._event) if self._event in events else 0
+        new = events[seen:]
         self._event = events[-1] if events else self._event
         await self._send(
             {
@@ -297,14 +299,6 @@ class _Feed:
 
     async def _send(self, message: dict[str, Any]) -> None:
         await self._socket.send_str(_json(message))
-
-
-def _events_after(events: list[Event], last: Event | None) -> list[Event]:
-    """Those that came later than one; all where that is no longer remembered."""
-    for index in range(len(events) - 1, -1, -1):
-        if events[index] == last:
-            return events[index + 1 :]
-    return events
 
 
 def _asked(body: Mapping[str, Any]) -> tuple[list[str], str, dict[str, object] | None]:

@@ -57,12 +57,14 @@ class PerceptionNode:
 
     def run(self, source: FrameSource) -> None:
         """Between the source's start and its end."""
+        # Frames that come a little before a step is due are those of the step.
+        slack_s = 0.0 if self._config.source is None else self._config.source.set_tolerance_s
         source.start()
         try:
             while not self._over.is_set():
                 self._listen()
                 frames = source.newest(_LOOK_S)
-                if frames is not None and frames.time_s >= self._last_s + self._config.step_s - self._slack_s():
+                if frames is not None and frames.time_s >= self._last_s + self._config.step_s - slack_s:
                     vehicle = self._vehicle(frames.time_s)
                     if vehicle is None:
                         self._tell(source, ["no state of the vehicle is near the images' time; check --vehicle"])
@@ -75,10 +77,6 @@ class PerceptionNode:
                     self._tell(source, [] if frames else None)
         finally:
             source.stop()
-
-    def _slack_s(self) -> float:
-        """Frames that come a little before a step is due are those of the step."""
-        return 0.0 if self._config.source is None else self._config.source.set_tolerance_s
 
     def _listen(self) -> None:
         """As soon as the topic of the vehicle's state is there, whose kind is known only then."""

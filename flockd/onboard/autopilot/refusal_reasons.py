@@ -174,12 +174,11 @@ def _reasons() -> dict[str, Reason]:
         elif told:
             found[name] = Reason(what, remedy)
         else:
-            found |= {one: Reason(f"its check `{_own_words(one)}` fails", remedy) for one in line.split()}
+            found |= {
+                one: Reason(f"its check `{one.partition('_')[2].replace('_', ' ')}` fails", remedy)
+                for one in line.split()
+            }
     return found
-
-
-def _own_words(name: str) -> str:
-    return name.partition("_")[2].replace("_", " ")
 
 
 REASONS: Mapping[str, Reason] = _reasons()

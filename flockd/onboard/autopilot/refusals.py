@@ -180,7 +180,8 @@ def refusals(
     """
     found = [_refusal(SEVERAL_SENDERS, "")] if other_computers else []
     if not (status.armed and status.flight_mode == "offboard"):
-        found += _of_state(messages)
+        state = OF_STATE.get(int(messages["HEARTBEAT"].get("system_status") or 0))
+        found += [] if state is None else [_refusal(state, "to arm")]
         report = events.report
         if report is not None:
             found += _of_report(report, status, streams=streams, asked=_asked(events, status.time_s))
@@ -205,11 +206,6 @@ def _few(found: Mapping[str, Refusal]) -> tuple[Refusal, ...]:
 def _asked(events: CheckEvents, now_s: float) -> bool:
     """Somebody has just tried to switch to offboard."""
     return events.denied is not None and events.denied[1] == NO_SETPOINTS and now_s - events.denied[0] < REMEMBERED_S
-
-
-def _of_state(messages: Mapping[str, Mapping[str, Any]]) -> list[Refusal]:
-    state = OF_STATE.get(int(messages["HEARTBEAT"].get("system_status") or 0))
-    return [] if state is None else [_refusal(state, "to arm")]
 
 
 def _of_report(report: CheckReport, status: AutopilotStatus, *, streams: bool, asked: bool) -> Iterator[Refusal]:

@@ -76,7 +76,9 @@ def compare(drone: str, expected: Outputs, found: Outputs, tolerances: Mapping[s
             result.first = result.first or Difference(step, time_s, drone, name, a, b)
             differing = result.fields.setdefault(plain(name), FieldDifference())
             differing.steps.add(step)
-            differing.largest = _larger(differing.largest, a, b)
+            if differing.largest is not None:
+                numbers = _is_number(a) and _is_number(b)
+                differing.largest = max(differing.largest, abs(float(a) - float(b))) if numbers else None
     return result
 
 
@@ -135,12 +137,6 @@ def _same(a: Json, b: Json, tolerance: float) -> bool:
     if _is_number(a) and _is_number(b):
         return bool(a == b or abs(a - b) <= tolerance)
     return type(a) is type(b) and bool(a == b)
-
-
-def _larger(largest: float | None, a: Json, b: Json) -> float | None:
-    if largest is None or not (_is_number(a) and _is_number(b)):
-        return None
-    return max(largest, abs(float(a) - float(b)))
 
 
 def _is_number(value: Json) -> bool:

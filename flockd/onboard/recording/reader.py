@@ -353,7 +353,7 @@ def recording_info(recording: Recording) -> dict[str, Any]:
     return {
         **contents.flight,
         "files": [str(path) for path in contents.paths],
-        "bytes": sum(_bytes(path) for path in contents.paths),
+        "bytes": sum(path.stat().st_size for path in contents.paths),
         "finished": contents.finished,
         "steps": len(contents.steps),
         "start_s": recording.start_s,
@@ -375,8 +375,3 @@ def recording_info(recording: Recording) -> dict[str, Any]:
             for stream in contents.streams.values()
         ],
     }
-
-
-def _bytes(path: Path) -> int:
-    """Of a file, or of all in a bag's folder."""
-    return sum(one.stat().st_size for one in path.iterdir()) if path.is_dir() else path.stat().st_size

@@ -111,9 +111,10 @@ class Recorder:
         flight = {"drone": drone, "began": began, "images": self._settings.images, **_VERSIONS, **(facts or {})}
         if learned is not None:
             flight[LEARNED_SIZE] = json.dumps(to_json(learned))
+        shown = masked(config.model_dump(mode="json"))  # it is passed on; nobody needs passwords to fly it
         head = (
             Note(MODELS_NOTE, models or {}),
-            Inclosure(CONFIGURATION, "application/json", _without_passwords(config)),
+            Inclosure(CONFIGURATION, "application/json", json.dumps(shown, indent=1, ensure_ascii=False).encode()),
         )
         self._parts = _Parts(path, flight, head, config.rig, self._settings, self._tell)
         self._track = _Track(config.rig)
@@ -436,11 +437,6 @@ def _compressed(frame: Frame, settings: RecordingConfig) -> bytes | None:
     if settings.images == "jpeg":
         options = [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality]
     return bytes(cv2.imencode(f".{settings.images}", bgr, options)[1])
-
-
-def _without_passwords(config: DroneConfig) -> bytes:
-    """A recording is passed on; what opens a camera is not needed to fly it again."""
-    return json.dumps(masked(config.model_dump(mode="json")), indent=1, ensure_ascii=False).encode()
 
 
 def _json_entry(stream: Any, time_s: float, sequence: int, message: object) -> Entry:
