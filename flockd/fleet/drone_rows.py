@@ -147,7 +147,7 @@ def _row(drone: Watched, status: Mapping[str, Any], known: Known, now_s: float) 
     state, flight, computer = of("state"), of("flight"), of("computer")
     about = known.about
     configuration = {} if about is None else about["configuration"]
-    height_m = status["height_m"]
+    height_m, level = status["height_m"], _vector(state.get("velocity_ned"), 3)
     return {
         **status,
         "height_m": _rounded(state.get("height_m") if height_m is None else height_m, 2),
@@ -157,7 +157,7 @@ def _row(drone: Watched, status: Mapping[str, Any], known: Known, now_s: float) 
         "silence": flight.get("silence"),
         **{f"{angle}_deg": _rounded(state.get(f"{angle}_deg"), 1) for angle in ("roll", "pitch", "yaw")},
         "velocity_ned": _vector(state.get("velocity_ned"), size=3),
-        "speed_m_s": _speed(state.get("velocity_ned")),
+        "speed_m_s": None if level is None else round(math.hypot(*level), 2),
         "command_ne": _vector(of("command").get("velocity_ne")),
         "position_ne": _vector(state.get("position_ne")),
         "home_deg": _vector(state.get("home_deg"), 7),
@@ -237,11 +237,6 @@ def _vector(values: object, digits: int = 2, *, size: int = 2) -> list[float] | 
     if not all(isinstance(value, int | float) and abs(value) <= _FARTHEST_M for value in first):  # false for NaN too
         return None
     return [round(float(value), digits) for value in first]
-
-
-def _speed(velocity: object) -> float | None:
-    level = _vector(velocity, 3)
-    return None if level is None else round(math.hypot(*level), 2)
 
 
 def _rounded(value: float | None, digits: int) -> float | None:

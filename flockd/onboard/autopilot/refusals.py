@@ -182,9 +182,12 @@ def refusals(
     if not (status.armed and status.flight_mode == "offboard"):
         state = OF_STATE.get(int(messages["HEARTBEAT"].get("system_status") or 0))
         found += [] if state is None else [_refusal(state, "to arm")]
+        # Somebody has just tried to switch to offboard.
+        denied = events.denied
+        asked = denied is not None and denied[1] == NO_SETPOINTS and status.time_s - denied[0] < REMEMBERED_S
         report = events.report
         if report is not None:
-            found += _of_report(report, status, streams=streams, asked=_asked(events, status.time_s))
+            found += _of_report(report, status, streams=streams, asked=asked)
         elif not status.armed and settled and _checks_fail(messages["SYS_STATUS"]):
             found.append(_refusal(CHECKS_FAIL, "to arm"))
         found += _of_denial(events, status, found)
@@ -201,11 +204,6 @@ def _few(found: Mapping[str, Refusal]) -> tuple[Refusal, ...]:
     last = ordered[MOST_TOLD - 1]
     more = f"{rest} further reason" + ("s" if rest > 1 else "")
     return (*ordered[: MOST_TOLD - 1], last._replace(remedy=f"{last.remedy} ({more})"))
-
-
-def _asked(events: CheckEvents, now_s: float) -> bool:
-    """Somebody has just tried to switch to offboard."""
-    return events.denied is not None and events.denied[1] == NO_SETPOINTS and now_s - events.denied[0] < REMEMBERED_S
 
 
 def _of_report(report: CheckReport, status: AutopilotStatus, *, streams: bool, asked: bool) -> Iterator[Refusal]:

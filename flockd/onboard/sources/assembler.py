@@ -83,7 +83,8 @@ class Assembler:
         """The newest set that is ready; None if there is none newer than the last."""
         awaited = {name for name, line in self._lines.items() if line.awaited}
         best: RawFrameSet | None = None
-        for time_s in self._times():
+        stamps = {held.frame.time_s for line in self._lines.values() for held in line.held}
+        for time_s in sorted((stamp for stamp in stamps if stamp > self._last_set_s), reverse=True):
             candidate = RawFrameSet(time_s, self._near(time_s))
             if awaited <= candidate.frames.keys():
                 return self._handed_out(candidate)
@@ -126,11 +127,6 @@ class Assembler:
         """Whether a camera's oldest frame is older than any set can wait for."""
         span_s = line.held[-1].frame.time_s - line.held[0].frame.time_s
         return span_s > self._wait_s + self._tolerance_s or len(line.held) > _MOST_HELD
-
-    def _times(self) -> list[float]:
-        """Where a set could be, newest first."""
-        stamps = {held.frame.time_s for line in self._lines.values() for held in line.held}
-        return sorted((stamp for stamp in stamps if stamp > self._last_set_s), reverse=True)
 
     def _near(self, time_s: float) -> dict[str, RawFrame]:
         nearest = {}
