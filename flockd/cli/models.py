@@ -196,7 +196,7 @@ def _prepare(args: argparse.Namespace) -> int:
         for path in paths:
             prepared.append(_prepare_one(path, config))
             tell(len(prepared), len(paths))
-    return say_facts(args, {"prepared": prepared})
+    return say_facts(args, prepared)
 
 
 def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:

@@ -94,7 +94,7 @@ def say_result(args: argparse.Namespace, facts: object, *lines: str) -> int:
     return ExitCode.DONE
 
 
-def say_facts(args: argparse.Namespace, facts: Mapping[str, object], *lines: str) -> int:
+def say_facts(args: argparse.Namespace, facts: object, *lines: str) -> int:
     """The same, of a command whose facts speak for themselves: people get them as YAML, to four digits."""
     if not args.json:
         import yaml

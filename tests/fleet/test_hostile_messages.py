@@ -56,7 +56,6 @@ def _sample(key: str, payload: bytes, attachment: bytes | None = None) -> Any:
 def test_whatever_is_published_is_shown_or_left() -> None:
     examples = {name: _example(topic.type) for name, topic in TOPICS.items()}
     now_s = [1000.0]
-    watcher = FleetWatcher(None, listen=(), connect=(), clock=lambda: now_s[0])  # connected to nobody
 
     @hostile(50)
     def check(random: Random) -> None:
@@ -79,7 +78,8 @@ def test_whatever_is_published_is_shown_or_left() -> None:
         Console(file=screen, markup=False, highlight=False, width=1000).print(_table(rows))
         assert not {char for char in screen.getvalue() if char != "\n" and not char.isprintable()}
 
-    check()
+    with FleetWatcher(None, listen=(), connect=(), clock=lambda: now_s[0]) as watcher:  # connected to nobody
+        check()
 
 
 class _Missions:

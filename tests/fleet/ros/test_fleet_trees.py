@@ -29,7 +29,7 @@ STATE = StateMessage(
     position_ne=[10.0, 20.0], home_deg=[47.0, 8.0],
 )  # fmt: skip
 FLIGHT = flight_message(
-    state="degraded", reasons=[{"event": "x", "sentence": "the battery is low; land"}], battery_share=0.4
+    state="degraded", reasons=[{"event": "x", "sentence": "the battery is low; land"}], battery_share=0.4, height_m=5.0
 )
 
 
