@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from flockd.cli.options import add_stretch, loaded, opened, refuse, refuse_overwriting, stretch
 from flockd.cli.output import complain, progress, say, say_facts, say_json
-from flockd.cli.parser import Commands, Parser, flag, number, option, positive_count
+from flockd.cli.parser import Commands, Parser, flag, option, positive_count
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from flockd.onboard.recording.reader import Recording
     from flockd.review.replay.dataset_flight import Depth
 
-_OF_RECORDINGS = ("speed", "start", "end", "out", "diff", "reference", "update_reference", "tolerance")
+_OF_RECORDINGS = ("start", "end", "out", "diff", "reference", "update_reference", "tolerance")
 _OF_DATASETS = ("depth", "stride", "flow", "calibration", "trajectory")
 
 
@@ -29,7 +29,7 @@ def add(commands: Commands) -> None:
     """Adds the command."""
     examples = (
         "flockd replay drone1.mcap --diff",
-        "flockd replay drone1.mcap --start 60 --end 70 --speed 1",
+        "flockd replay drone1.mcap --start 60 --end 70",
         "flockd replay drone1.mcap --profile",
         "flockd replay drone1.mcap --config my_drone.yaml --out again.mcap",
         "flockd replay drone1.mcap --diff --reference drone1.expected --tolerance command=1e-6",
@@ -40,13 +40,6 @@ def add(commands: Commands) -> None:
     description = "Run the pilot on a recorded flight again: the same frames and vehicle states, the same code."
     parser = commands("replay", description, examples, _run)
     option(parser, "RECORDING", "a recording, or a dataset (see below)", Path)
-    option(
-        parser,
-        "--speed X",
-        "times real time; 0: as fast as it goes (default)",
-        number("a number, 0 or more", 0),
-        default=0.0,
-    )
     add_stretch(parser)
     option(parser, "--config FILE", "fly with this drone's or scenario's settings", Path)
     option(parser, "--out FILE", "write a new recording", Path)
@@ -140,7 +133,7 @@ def _replay(args: argparse.Namespace, recording: Recording) -> int:
             if watch is not None:
                 watch.look()
 
-        replay = replay_flight(recording, config, start_s, end_s, speed=args.speed, out=args.out, progress=after_step)
+        replay = replay_flight(recording, config, start_s, end_s, out=args.out, progress=after_step)
     if args.update_reference:
         from flockd.onboard.recording.difference import save_reference
 
@@ -168,8 +161,6 @@ def _check_options(args: argparse.Namespace) -> None:
         raise UsageError("--diff and --update-reference exclude each other; compare first, then update")
     if args.reference is not None and not (args.diff or args.update_reference):
         raise UsageError("--reference alone does nothing; add --diff or --update-reference")
-    if args.profile and args.speed > 0:
-        raise UsageError("--profile measures how fast it goes, and --speed holds it back; drop one of them")
     if args.tolerance and not args.diff:
         raise UsageError("--tolerance has no meaning without --diff; add it")
     refuse_overwriting(args, args.out)

@@ -89,7 +89,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["record", "xyz"], "flockd record: 'xyz' is not a command, of info, recover, cut, export; see "),
         (["fleet", "--port", "99999"], "flockd fleet: argument --port: '99999' is not a port"),
         (["fleet", "--listen", "tcp/0.0.0.0:7447"], "flockd fleet: argument --listen: 'tcp/0.0.0.0:7447' is not an IP"),
-        (["replay", "x.mcap", "--speed", "-1"], "flockd replay: argument --speed: '-1' is not a number, 0 or more"),
+        (["replay", "x.mcap", "--start", "-1"], "flockd replay: argument --start: '-1' is not a number, 0 or more"),
         (["replay", "x.mcap", "--tolerance", "command"], "flockd replay: argument --tolerance: 'command' is not"),
         (["replay", "x.mcap", "--tolerance", "command=-1"], "flockd replay: argument --tolerance: 'command=-1' is not"),
         (["sim", "--wind", "3"], "flockd sim: argument --wind: '3' is not two numbers"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from contextlib import ExitStack
 from dataclasses import fields, replace
 from pathlib import Path
@@ -157,13 +156,6 @@ def test_other_settings_can_be_tried(path: Path, capsys: Capture) -> None:
     assert capsys.readouterr().err.startswith(f"{file}: rig.cameras: camera 'left' has 320 x 240 pixels, but {path} ")
 
 
-def test_speed_1_takes_as_long_as_the_flight_took(path: Path, capsys: Capture) -> None:
-    begin = time.monotonic()
-    assert main(["replay", str(path), "--speed", "1", "--start", "0.3", "--end", "0.8"]) == 0
-    assert time.monotonic() - begin >= 0.5
-    assert capsys.readouterr().out.startswith("drone1: 6 steps, 0.5 s")
-
-
 def test_what_keeps_a_replay_from_being_the_flight_is_told(
     path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
@@ -183,7 +175,6 @@ def test_what_keeps_a_replay_from_being_the_flight_is_told(
         (["--reference", "x"], "--reference alone"),
         (["--tolerance", "command=1"], "--tolerance has no meaning without --diff"),
         (["--reference", "x", "--diff", "--update-reference"], "--diff and --update-reference exclude each other"),
-        (["--profile", "--speed", "1"], "--profile measures"),
         (["--vehicle", "/odom"], "--vehicle is for bags"),
         (["--depth", "recorded"], "--depth is for datasets"),
     ],

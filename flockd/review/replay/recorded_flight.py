@@ -47,7 +47,6 @@ def replay_flight(
     start_s: float,
     end_s: float,
     *,
-    speed: float = 0.0,
     out: Path | None = None,
     progress: Callable[[int, int], None],
 ) -> Replay:
@@ -58,7 +57,6 @@ def replay_flight(
         config: the settings to fly with, for the recording's cameras.
         start_s: first time, on the recording's clock.
         end_s: last time.
-        speed: times real time; 0: as fast as possible.
         out: a new recording of the replay; None: none.
         progress: called with the steps done and their total.
 
@@ -69,7 +67,7 @@ def replay_flight(
     replay = Replay()
     with ExitStack() as stack:
         recorder = None if out is None else stack.enter_context(_recording_to(out, recording, config))
-        for step, read_s in _paced(recording.steps(start_s, end_s), speed):
+        for step, read_s in _timed(recording.steps(start_s, end_s)):
             begin_s, processor_begin_s = time.perf_counter(), time.process_time()
             output = pilot.step(step.frames, step.vehicle, order=step.order)
             replay.steps_ms.append(1e3 * (time.perf_counter() - begin_s))
@@ -161,20 +159,12 @@ def _recording_to(out: Path, recording: Recording, config: DroneConfig) -> Itera
             raise RecordingError(f"{out}: could not be written ({recorder.failure}); choose another place with --out")
 
 
-def _paced(steps: Iterator[RecordedStep], speed: float) -> Iterator[tuple[RecordedStep, float]]:
-    """Each step not before its time, with how long it took to read."""
-    began_s, first_s = time.monotonic(), None
-    while True:
+def _timed(steps: Iterator[RecordedStep]) -> Iterator[tuple[RecordedStep, float]]:
+    """Each step, with how long it took to read."""
+    begin_s = time.perf_counter()
+    for step in steps:
+        yield step, time.perf_counter() - begin_s
         begin_s = time.perf_counter()
-        step = next(steps, None)
-        read_s = time.perf_counter() - begin_s
-        if step is None:
-            return
-        first_s = step.frames.time_s if first_s is None else first_s
-        if speed > 0:
-            due_s = began_s + (step.frames.time_s - first_s) / speed
-            time.sleep(max(0.0, due_s - time.monotonic()))
-        yield step, read_s
 
 
 def damage_warnings(recording: Recording) -> Iterator[str]:
