@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.config import write_checked
 from flockd.cli.options import refuse_overwriting
-from flockd.cli.output import cell, complain, say, say_json
+from flockd.cli.output import complain, say_facts
 from flockd.cli.parser import Commands, flag, option, positive_number, size
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
@@ -78,10 +78,10 @@ def run(args: argparse.Namespace, computer: Computer) -> int:
         rows = measure(usable, args.seconds, computer.kernel)
         measured = {camera.place: row for (camera, _), row in zip(usable, rows, strict=True)}
     pictures = _save_pictures(args.picture, found, measured) if args.picture is not None else {}
-    if args.json:
-        say_json([_as_json(camera, mode, measured, pictures) for camera, mode in zip(found, modes, strict=True)])
-    else:
-        _print(found, modes, measured, pictures)
+    facts = [_facts(camera, mode, measured, pictures) for camera, mode in zip(found, modes, strict=True)]
+    if not args.json:
+        facts = [{**fact, **_offers(camera, mode)} for fact, camera, mode in zip(facts, found, modes, strict=True)]
+    say_facts(args, facts)
     if args.write is not None:
         _write(args.write, usable, args.names, args.turn_deg)
     faulty = any(camera.fault for camera in found) or any(row.watched.fault for row in measured.values())
@@ -113,56 +113,23 @@ def _save_pictures(folder: Path, found: Sequence[FoundCamera], measured: Mapping
     return saved
 
 
-def _print(
-    found: Sequence[FoundCamera],
-    modes: Sequence[Mode | None],
-    measured: Mapping[str, Measured],
-    pictures: Mapping[str, Path],
-) -> None:
-    for number, (camera, mode) in enumerate(zip(found, modes, strict=True)):
-        say(f"camera {number}: {cell(camera.name or 'unknown')}{f' ({camera.node})' if camera.node else ''}")
-        say(f"  {cell(camera.place)}")
-        if camera.fault:
-            say(f"  fault: {cell(camera.fault)}")
-        for line in _offers(camera, mode):
-            say(f"  {line}")
-        if camera.place in measured:
-            for line in _told(measured[camera.place]):
-                say(f"  {line}")
-        if camera.place in pictures:
-            say(f"  picture: {pictures[camera.place]}")
-
-
-def _offers(camera: FoundCamera, chosen: Mode | None) -> list[str]:
+def _offers(camera: FoundCamera, chosen: Mode | None) -> dict[str, object]:
+    """Its modes for people, a line a format, and the one that is used."""
     by_format: dict[str, list[str]] = {}
     for mode in camera.modes:
-        rates = ", ".join(f"{rate:g}" for rate in mode.rates_hz)
-        by_format.setdefault(mode.pixel_format, []).append(f"{_size(mode)}{f' at {rates}' if rates else ''}")
-    lines = [f"{name}: {'; '.join(sizes)}" for name, sizes in by_format.items()]
-    return [*lines, f"used: {chosen.pixel_format} {_size(chosen)} at {chosen.rates_hz[0]:g}"] if chosen else lines
+        by_format.setdefault(mode.pixel_format, []).append(_told(mode))
+    return {
+        "modes": {name: "; ".join(told) for name, told in by_format.items()},
+        "used": chosen and f"{chosen.pixel_format} {_told(chosen)}",
+    }
 
 
-def _told(row: Measured) -> list[str]:
-    watched = row.watched
-    if watched.fault is not None:
-        return [f"fault: {cell(watched.fault)}"]
-    lost = f", {watched.lost} lost" if watched.lost else ""
-    refused = "".join(f", {count} {cell(reason)}" for reason, count in watched.refused.items())
-    lines = [f"rate: {watched.rate_hz:.2f} Hz, jitter {1e3 * watched.jitter_s():.1f} ms (p95){lost}{refused}"]
-    if not math.isnan(row.mean_grey):
-        edges = "no edge with contrast in view" if math.isnan(row.edge_px) else f"edges {row.edge_px:.1f} px wide"
-        lines.append(f"sharpness: {edges} (sharp: under 3)")
-        lines.append(
-            f"exposure: mean {row.mean_grey:.0f} of 255, {row.black_share:.1%} black, {row.white_share:.1%} white"
-        )
-    return lines
+def _told(mode: Mode) -> str:
+    size, rates = "x".join(map(str, mode.size)), ", ".join(f"{rate:g}" for rate in mode.rates_hz)
+    return f"{size} at {rates}" if rates else size
 
 
-def _size(mode: Mode) -> str:
-    return "x".join(map(str, mode.size))
-
-
-def _as_json(
+def _facts(
     camera: FoundCamera, chosen: Mode | None, measured: Mapping[str, Measured], pictures: Mapping[str, Path]
 ) -> dict[str, object]:
     def mode_json(mode: Mode) -> dict[str, object]:
