@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flockd.cli.options import loaded
-from flockd.cli.output import complain, progress, say, say_json, say_table
+from flockd.cli.output import complain, progress, say_facts, say_table
 from flockd.cli.parser import Commands, flag, number, option, positive_count, positive_number
 from flockd.core.errors import ExitCode, UsageError
 
@@ -101,10 +101,11 @@ def _run(args: argparse.Namespace) -> int:
     if left_out and not detected:
         raise DatasetError("\n".join(left_out))
     result = {**_result(detected, measure=labels is not None), "left_out": left_out}
-    if args.json:
-        say_json(result)
-    else:
-        _say(detected, result)
+    if not args.json:
+        _say_detections(detected)
+        found = {"detections": sum(len(one.detections) for one in detected)}
+        result = found | {name: fact for name, fact in result.items() if name not in {"pictures", "left_out"}}
+    say_facts(args, result)
     unlabelled = 0 if labels is None else sum(one.labels is None for one in detected)
     if unlabelled:
         complain(f"{args.labels}: does not list {unlabelled} of the {len(detected)} pictures; they are not measured")
@@ -246,52 +247,16 @@ def _result(detected: Sequence[_Detected], *, measure: bool) -> dict[str, Any]:
     return result
 
 
-def _say(detected: Sequence[_Detected], result: Mapping[str, Any]) -> None:
-    names = _short_names([one.name for one in detected])
+def _say_detections(detected: Sequence[_Detected]) -> None:
+    """A row each, its picture named from the folder on that all are in."""
+    common = os.path.commonpath([Path(one.name).parent for one in detected]) if detected else ""
     rows = []
     for one in detected:
         for found in one.detections:
             box = " ".join(f"{value:.0f}" for value in found.box)
-            range_m, size_m = (
-                f"{found.range_m:.2f} +- {found.range_sigma_m:.2f}",
-                f"{found.size_m:.2f} +- {found.size_sigma_m:.2f}",
-            )
-            rows.append((names[one.name], box, f"{found.probability:.2f}", range_m, size_m))
+            range_m = f"{found.range_m:.2f} +- {found.range_sigma_m:.2f}"
+            size_m = f"{found.size_m:.2f} +- {found.size_sigma_m:.2f}"
+            name = os.path.relpath(one.name, common or ".")
+            rows.append((name, box, f"{found.probability:.2f}", range_m, size_m))
     if rows:
         say_table(("picture", "box, px", "probability", "range, m", "size, m"), rows)
-    drones = sum(len(one.detections) for one in detected)
-    cost = f"{result['proposals_per_image']:g} proposals and {result['ms_per_image']:g} ms a picture"
-    say(f"{drones} {'detection' if drones == 1 else 'detections'} in {_pictures(result['images'])}; {cost}")
-    if "boxes" not in result:
-        return
-    widths = [
-        (width, str(counts["boxes"]), _share(counts, "found"), _share(counts, "found_iou30"))
-        for width, counts in result["by_width"].items()
-    ]
-    say_table(("box width, px", "boxes", "found", "found, IoU 0.3"), widths)
-    ap50 = "unknown" if result["ap50"] is None else f"{100 * result['ap50']:.1f} %"
-    say(f"{result['boxes']} boxes; AP50 {ap50}; {_false(result)}")
-
-
-def _short_names(names: Sequence[str]) -> dict[str, str]:
-    """Each picture's name from the folder on that all are in."""
-    common = os.path.commonpath([Path(name).parent for name in names]) if names else ""
-    return {name: os.path.relpath(name, common or ".") for name in names}
-
-
-def _false(result: Mapping[str, Any]) -> str:
-    """The rate with what it rests on: few pictures without a false detection prove little."""
-    count, pictures = result["false"], result["measured"]
-    told = f"{count} false {'detection' if count == 1 else 'detections'} in {_pictures(pictures)}"
-    if not pictures:
-        return told
-    low, high = result["false_per_picture_95"]
-    return f"{told}: {result['false_per_picture']:.2g} a picture (95 % interval: {low:.2g} to {high:.2g})"
-
-
-def _pictures(count: int) -> str:
-    return f"{count} {'picture' if count == 1 else 'pictures'}"
-
-
-def _share(counts: Mapping[str, int], key: str) -> str:
-    return f"{counts[key]} ({100 * counts[key] / counts['boxes']:.0f} %)" if counts["boxes"] else "-"

@@ -119,7 +119,7 @@ def test_copies_show_what_was_found_and_nothing_is_lost(capsys: Capture, tmp_pat
     out = tmp_path / "drawn"
     for force in ((), ("--force",)):  # the second time, copies of before lie in the folder
         text = told(capsys, 0, "detect", tmp_path, *FOV, "--out", out, *force)
-        assert "1 detection in 1 picture;" in text
+        assert "{detections: 1, images: 1, " in text
     assert [path.name for path in out.rglob("*")] == ["a.jpg"]
     before, after = (cv2.imread(str(path)) for path in (tmp_path / "a.jpg", out / "a.jpg"))
     assert before is not None
