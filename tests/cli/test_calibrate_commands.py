@@ -69,7 +69,7 @@ def test_a_folder_of_images_becomes_a_camera_that_checks(folder: Path, capsys: C
     out = folder.with_name("front.yaml")
     command = ("calibrate", "camera", folder, "--camera", "front", "--out", out)
     text = told(capsys, 0, *command, "--serial", "A1B2", "--model", "pinhole")
-    assert "refused: {no board: 1, blurred: 1}" in text
+    assert "refused: {blurred: 1, no board: 1}" in text
     assert re.search(r"blurred: \{soft\.png: \d\.\d+\}", text)
     assert re.search(r"## where corners of the board were seen:\n(## |\.\. ){7}", text)
     told(capsys, 0, "config", "check", out)
