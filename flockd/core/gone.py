@@ -61,6 +61,7 @@ KEYS: Mapping[str, str] = {
     "autopilot.arm_and_take_off": "leave it out: a pilot or a ground station arms, takes off and selects offboard",
     "autopilot.max_heartbeat_age_s": "write `heartbeat_timeout_s` in the section `safety`",
     "cameras.compression.h264_mbit_s": "write `jpeg_quality`; streams are no longer simulated",
+    "detections.latency_s": "write `latency_s` beside `detections`",
     "desired": "write the section `mission`, with `kind: circle_then_tangent` for the same flight",
     "faults.kind": "delete it: a camera that fails sends nothing but noise",
     "faults.sigma": "delete it: a camera that fails sends nothing but noise",

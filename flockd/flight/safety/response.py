@@ -12,8 +12,9 @@ _MEMORY_S = 10.0
 """Of the mean squares: a few gusts."""
 _FASTEST_M_S = 100.0
 """What is measured to be faster is no velocity."""
-_UNSURE_M_S = 0.15
-"""By how much PX4's own velocity errs. Responses whose errors differ by less, squared, explain it alike."""
+_UNSURE_M_S = 0.2
+"""More than PX4's own velocity errs by. Responses whose errors differ by less, squared, explain it alike; so do those
+whose errors are at most twice as large."""
 
 
 class ResponseMonitor:
@@ -68,7 +69,7 @@ class ResponseMonitor:
         squares = ((velocity - self._expected[np.maximum(then, 0)]) ** 2).sum(axis=1)
         self._mean_squares += -math.expm1(-elapsed_s / _MEMORY_S) * (squares - self._mean_squares)
         least = self._mean_squares.min()
-        alike = self._mean_squares <= max(2 * least, least + _UNSURE_M_S**2)
+        alike = self._mean_squares <= max(4 * least, least + _UNSURE_M_S**2)
         self.late_s = max(self.late_s, float(self._delays_s[np.argmax(alike)]))
 
     def _expect(self, velocity: FloatArray) -> None:

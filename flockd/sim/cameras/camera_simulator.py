@@ -51,7 +51,7 @@ class CameraFaults:
 def true_rigs(scenario: ScenarioConfig) -> list[Rig]:
     """Of each drone."""
     configured = build_rig(scenario.drone.rig)
-    errors = None if scenario.cameras is None else scenario.cameras.rig
+    errors = None if scenario.camera_faults is None else scenario.camera_faults.rig
     if errors is None:
         return [configured] * len(scenario.vehicles)
     return [_with_errors(configured, errors, (scenario.seed, drone, 6)) for drone in range(len(scenario.vehicles))]
@@ -113,7 +113,7 @@ class CameraSimulator:
         models = [drone_model(family, int(rng.integers(1 << 31))) for _ in range(self._count)]
         self._world = world
         self._renderer = Renderer(world, models)
-        by_gain = scenario.cameras is not None and scenario.cameras.noise.gain > 0
+        by_gain = scenario.camera_faults is not None and scenario.camera_faults.noise.gain > 0
         self._scenario, self._image_noise = scenario, 0.0 if by_gain else scenario.sensors.image_noise
         self.begin_again()
         count = os.cpu_count() if threads is None else threads
@@ -125,9 +125,9 @@ class CameraSimulator:
         self._noise = ImageNoise(self._image_noise, scenario.seed)
         self._faults = CameraFaults(scenario.faults, scenario.seed)
         self._captured = PoseTrail()
-        if scenario.cameras is not None:
+        if scenario.camera_faults is not None:
             lenses = {name: mounted.camera for name, mounted in self.rig.cameras.items()}
-            self._real = real_cameras(scenario.cameras, lenses, self._count, scenario.seed)
+            self._real = real_cameras(scenario.camera_faults, lenses, self._count, scenario.seed)
 
     def ground_height(self, north: FloatArray, east: FloatArray) -> FloatArray:
         """(n,) metres above z = 0 of the ground that is drawn, at points (n,) north and east."""

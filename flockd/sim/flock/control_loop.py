@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
@@ -76,7 +77,7 @@ _THERE_M = 0.5
 _HOLD_PER_S = 0.95
 """Velocity for each metre from where an autopilot holds: PX4's default of MPC_XY_P."""
 _HOLD_BRAKING_M_S2 = 3.0
-"""It holds where it would stop, braking so hard: PX4's default of MPC_ACC_HOR."""
+"""It holds where it would stop, braking so hard once it answers: PX4's default of MPC_ACC_HOR."""
 
 
 class Handover:
@@ -84,6 +85,7 @@ class Handover:
 
     def __init__(self, scenario: ScenarioConfig) -> None:
         self._starts = np.array([vehicle.position_m[:2] for vehicle in scenario.vehicles])
+        self._response_s = scenario.vehicle.dead_time_s + scenario.vehicle.velocity_time_constant_s
         self._taken: dict[int, str] = {}
         self._held: dict[int, FloatArray] = {}
         """Where, (3,) m NED."""
@@ -96,7 +98,8 @@ class Handover:
     def hold(self, drone: int, position: FloatArray, velocity: FloatArray) -> None:
         """The autopilot of a drone at `position` (3,) m NED, with (3,) m/s, goes into Hold and stays there."""
         self._taken[drone] = "hold"
-        self._held[drone] = position + velocity * (math.hypot(*velocity[:2]) / (2 * _HOLD_BRAKING_M_S2))
+        stops_s = self._response_s + math.hypot(*velocity[:2]) / (2 * _HOLD_BRAKING_M_S2)
+        self._held[drone] = position + velocity * [stops_s, stops_s, 0.0]
 
     def resume(self, drone: int) -> None:
         """Its pilot flies it again."""
@@ -222,8 +225,9 @@ class ControlLoop:
         }
         self._start_m = [-vehicle.position_m[2] for vehicle in scenario.vehicles]
         self._scenario = scenario
-        self._latency_s = scenario.detections.latency_s if scenario.detections is not None else 0.0
-        self._in_force: _Order | None = None
+        self._latency_s = scenario.step_latency_s
+        self._orders: deque[_Order] = deque()
+        """The one in force, and those that are still being computed."""
         self._disturbed = UNDISTURBED
         self._supervised: dict[int, Decision] = {}
         self.slowed = SlowedTime()
@@ -262,26 +266,25 @@ class ControlLoop:
         """From `time_s` one step on."""
         self._disturbed = disturbed
         velocity, height_m = self._handover.applied(
-            commands.takeovers, vehicles.position, commands.velocity, commands.height_m
+            commands.takeovers, vehicles.known_position, commands.velocity, commands.height_m
         )
-        coming = _Order(time_s, vehicles.position, commands, velocity, height_m)
-        order = self._in_force or coming
+        self._orders.append(_Order(time_s, vehicles.known_position, commands, velocity, height_m))
         periods = max(round(self._step_s / PERIOD_S), 1) if self._drones or self._latency_s else 1
         period_s = self._step_s / periods
         for period in range(periods):
             now_s = time_s + period * period_s
-            if now_s - time_s >= self._latency_s - _SAME_TIME_S:
-                order = coming
+            while len(self._orders) > 1 and now_s - self._orders[1].time_s >= self._latency_s - _SAME_TIME_S:
+                self._orders.popleft()
+            order = self._orders[0]
             setpoints, heights = order.velocity.copy(), order.height_m.copy()
             for i in self._drones.keys() - self._handover.taken - disturbed.removed:
                 setpoint = self._setpoint(i, now_s, period_s, vehicles, order)
                 setpoints[i] = setpoint.velocity
                 if math.isfinite(order.height_m[i]):
                     heights[i] = setpoint.height_m
-            for i, (back, held_m) in self._handover.holding(vehicles.position).items():
+            for i, (back, held_m) in self._handover.holding(vehicles.known_position).items():
                 setpoints[i], heights[i] = back, held_m
             vehicles.step(setpoints, order.commands.yaw_rad, period_s, heights)
-        self._in_force = coming
 
     def _setpoint(self, i: int, now_s: float, period_s: float, vehicles: Vehicles, order: _Order) -> Setpoint:
         """What the gate of a drone makes of its order now; its supervisor may hand it over instead."""
@@ -301,7 +304,7 @@ class ControlLoop:
         return verdict.setpoint
 
     def _hand_over(self, i: int, now_s: float, vehicles: Vehicles, why: str) -> None:
-        self._handover.hold(i, vehicles.position[i], vehicles.velocity[i])
+        self._handover.hold(i, vehicles.known_position[i], vehicles.known_velocity[i])
         self.handed_over[i] = HandedOver(time_s=now_s, reason=why)
 
     def _lost_cameras(self, i: int, now_s: float) -> frozenset[str]:
@@ -316,14 +319,14 @@ class ControlLoop:
         return causes_of(drone.parameters, request, verdict, truth, is_drone, drone.supervisor.degraded_by)
 
     def _around(self, i: int, now_s: float, vehicles: Vehicles, order: _Order) -> Surroundings:
-        here, commands = vehicles.position[i], order.commands
+        here, commands = vehicles.known_position[i], order.commands
         ranges = commands.obstacles[i]
         return surroundings(
             commands.neighbours[i],
             now_s - order.time_s,
             moved=here - order.places[i],
             position=here[:2],
-            velocity=vehicles.velocity[i],
+            velocity=vehicles.known_velocity[i],
             yaw_rad=float(commands.yaw_rad[i]),
             height_m=float(-here[2]),
             obstacles=np.empty((0, 2)) if ranges is None else nearest_points(ranges, self._sigmas),

@@ -60,8 +60,11 @@ class ExactFlock:
         velocities: FloatArray,
         orders: Mapping[int, MissionOrder] | None = None,
         disturbed: Disturbances = UNDISTURBED,
+        own: FloatArray | None = None,
     ) -> Commands:
         """The commands for drones at (n, 3) m and (n, 3) m/s in NED; called in order of time.
+
+        `own` (n, 3) m/s: what each takes for its own velocity; None: the exact one.
 
         `orders` are operators' of now, by drone, beside those that were given at the beginning. In the view of a camera
         that is off, as `disturbed` says, a drone knows of nobody.
@@ -72,7 +75,8 @@ class ExactFlock:
             self._neighbours(i, time_s, positions, velocities, disturbed.cameras_off_of(i))
             for i in range(len(positions))
         ]
-        found = [self._of(i, time_s, positions, velocities, known[i], ranges) for i, ranges in enumerate(seen)]
+        own = velocities if own is None else own
+        found = [self._of(i, time_s, positions, own, known[i], ranges) for i, ranges in enumerate(seen)]
         velocity, acceleration, yaw_rad, height_m, missions, desired = zip(*found, strict=True)
         self._yaw_rad = np.array(yaw_rad)
         return Commands(
@@ -173,6 +177,17 @@ def start_yaw(scenario: ScenarioConfig) -> float:
     return Navigator(mission, scenario.drone.safety.gate).step(moment).course_rad or 0.0
 
 
+def vehicles_of(scenario: ScenarioConfig) -> Vehicles:
+    """The vehicles of a flight as it begins."""
+    return Vehicles(
+        scenario.vehicles,
+        scenario.vehicle,
+        yaw_rad=start_yaw(scenario),
+        seed=scenario.seed,
+        sensors=None if scenario.ideal else scenario.sensors,
+    )
+
+
 def fly_exact_states(
     scenario: ScenarioConfig, *, gated: bool = True, orders: Orders | None = None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -185,7 +200,7 @@ def fly_exact_states(
     """
     times = step_times(scenario)
     flock, loop = ExactFlock(scenario, orders, passes=gated), ControlLoop(scenario, gated=gated)
-    vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=start_yaw(scenario), seed=scenario.seed)
+    vehicles = vehicles_of(scenario)
     positions, velocities = [], []
     for time_s in times:
         positions.append(vehicles.position)

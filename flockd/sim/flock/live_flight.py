@@ -16,12 +16,12 @@ from flockd.onboard.daemon.operator_orders import OrderChecks
 from flockd.onboard.telemetry.order_messages import parse_ask
 from flockd.onboard.telemetry.topics import AnswerMessage
 from flockd.sim.flock.control_loop import ControlLoop
-from flockd.sim.flock.exact_states import start_yaw
+from flockd.sim.flock.exact_states import vehicles_of
 from flockd.sim.flock.pilot_pool import PilotPool
 from flockd.sim.flock.shown_flock import ShownFlock
 from flockd.sim.flock.swarm import ExactStatePilots, VisionPilots
 from flockd.sim.scenario import ScenarioConfig
-from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances, Vehicles
+from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances
 
 _REACHED_OVER_S = 4.0
 _LONGEST_WAIT_S = 0.2
@@ -256,7 +256,7 @@ def _fly_once(
 ) -> None:
     """Until another flight is to begin."""
     loop = ControlLoop(scenario, gated=gated)
-    vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=start_yaw(scenario), seed=scenario.seed)
+    vehicles = vehicles_of(scenario)
     for step in itertools.count():
         time_s = step * scenario.drone.step_s
         if not controls.wait(time_s):

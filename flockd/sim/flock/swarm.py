@@ -23,7 +23,14 @@ from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FlightMetadata, MissionMetadata
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.control_loop import Commands, ControlLoop
-from flockd.sim.flock.exact_states import ExactFlock, HandPilot, fly_exact_states, start_yaw, step_times
+from flockd.sim.flock.exact_states import (
+    ExactFlock,
+    HandPilot,
+    fly_exact_states,
+    start_yaw,
+    step_times,
+    vehicles_of,
+)
 from flockd.sim.flock.pilot_pool import PilotPool, Stepped
 from flockd.sim.flock.shown_flock import RealTime, ShownFlock, orders_of
 from flockd.sim.scenario import ScenarioConfig
@@ -87,7 +94,7 @@ def fly(
     builder = FlightLogBuilder(times, len(scenario.vehicles))
     preparing(0, _PREPARATIONS)
     loop = ControlLoop(scenario, gated=gated)
-    vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=start_yaw(scenario), seed=scenario.seed)
+    vehicles = vehicles_of(scenario)
     chosen = key_frame_steps(len(times)) if pictured else set()
     key_frames: list[KeyFrame] = []
     flown, pace = 0, RealTime()
@@ -170,7 +177,8 @@ class ExactStatePilots:
         """Commands for all drones; there are no images. ``builder``: None where nothing is kept."""
         positions, velocities = vehicles.position, vehicles.velocity
         orders = orders_of(self._shown, range(len(positions)))
-        commands = self._flock.step(time_s, positions, velocities, orders, disturbed)
+        own = None if self._scenario.detections is None else vehicles.known_velocity
+        commands = self._flock.step(time_s, positions, velocities, orders, disturbed, own)
         if self._shown is not None:
             self._shown.show_exact(step, time_s, vehicles, commands)
         if builder is None:
@@ -224,7 +232,7 @@ class VisionPilots:
         self._autopilots = {
             i: SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=i, ground=ground) for i in self._drones
         }
-        late = None if scenario.cameras is None else scenario.cameras.attitude
+        late = None if scenario.camera_faults is None else scenario.camera_faults.attitude
         self._attitudes = {} if late is None else {i: LateAttitude(late, scenario.seed, i) for i in self._drones}
         self._stepped: dict[int, Stepped] = {}
         self._begins = set(self._drones)
@@ -250,8 +258,9 @@ class VisionPilots:
             frames, seen = self._cameras.capture(i, step, time_s, vehicles, vehicles.trail, disturbed)
             render_ms[i] = 1e3 * (time.perf_counter() - begin)
             state = self._autopilots[i].read(
-                time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i], turn_rates[i]
-            )
+                time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i], turn_rates[i],
+                vehicles.errors[i] if vehicles.errors else None,
+            )  # fmt: skip
             if self._attitudes:
                 state = self._attitudes[i].heard(state, vehicles.trail)
             with_pictures = pictured and i in self._drones[:_KEY_FRAME_DRONES]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -39,6 +40,7 @@ GRAVITY_M_S2 = 9.81
 MAX_LEAN_M_S2 = GRAVITY_M_S2 * math.tan(math.radians(45.0))
 """The largest acceleration, at PX4's default of MPC_TILTMAX_AIR."""
 _MAX_SUBSTEP_S = 0.02
+_SAME_TIME_S = 1e-9
 _AWAY_M = 1e5
 """To the north of the origin: nobody sees one that is so far away."""
 _DRAG_PER_S = 0.3
@@ -47,8 +49,6 @@ MAX_CLIMB_M_S = 1.5
 CLIMB_TIME_S = 1.0
 """From a height error to the climb that is asked for; that one is answered in a quarter of it: no overshoot."""
 _ATTITUDE_ERROR_TIME_S = 30.0
-_VELOCITY_ERROR_TIME_S = 10.0
-_POSITION_ERROR_TIME_S = 60.0
 REFERENCE_DEG = (1.0, 1.0)
 """Latitude and longitude of the world's origin. PX4 keeps its home as float32, whose steps are a centimetre here, and
 0.4 m in Europe."""
@@ -57,10 +57,10 @@ REFERENCE_DEG = (1.0, 1.0)
 class Motion:
     """How the vehicles of a batch of flights move; remembers what gusts added to their velocities.
 
-    Horizontal velocity follows a setpoint as a first-order lag of limited acceleration. With the same time constant it
-    comes back from what gusts add, as hard as the vehicle can lean: an autopilot limits what it does for a setpoint,
-    and leans against wind as far as need be. Height is held, or changed as by a critically damped controller of limited
-    climb, down to the ground at z = 0.
+    Horizontal velocity follows a setpoint, after a dead time, as a first-order lag of limited acceleration and jerk.
+    With the same time constant it comes back from what gusts add, as hard as the vehicle can lean: an autopilot limits
+    what it does for a setpoint, and leans against wind as far as need be. Height is held, or changed as by a critically
+    damped controller of limited climb, down to the ground at z = 0.
     """
 
     def __init__(self, config: VehicleConfig, seeds: Sequence[int], drones: int) -> None:
@@ -68,6 +68,11 @@ class Motion:
         self._config, self._seeds, self._shape = config, seeds, (len(seeds), drones, 3)
         self._blown = np.zeros((len(seeds) * drones, 2))
         """What of the velocity gusts added, m/s."""
+        self._waiting: deque[tuple[float, FloatArray]] = deque()
+        """Setpoints (n, 2) m/s that are not answered yet, and when they are."""
+        self._answered: FloatArray | None = None
+        self._followed = np.zeros((len(seeds) * drones, 2))
+        """Acceleration towards the setpoints, m/s^2."""
         self.blow(config.gust_m_s)
 
     def blow(self, gust_m_s: float) -> None:
@@ -82,10 +87,11 @@ class Motion:
 
         Returns the acceleration (n, 2) m/s^2 that the vehicles lean for.
         """
-        # The exact mean acceleration of a first-order lag over dt, then its limit.
-        answer_per_s = -math.expm1(-dt_s / self._config.velocity_time_constant_s) / dt_s
-        most_m_s2 = self._config.max_acceleration_m_s2
-        followed = limit_norms((setpoints - (velocity[:, :2] - self._blown)) * answer_per_s, most_m_s2)
+        config, setpoints = self._config, self._after_dead_time(now_s, dt_s, velocity, setpoints)
+        # The exact mean acceleration of a first-order lag over dt, then its limits.
+        answer_per_s = -math.expm1(-dt_s / config.velocity_time_constant_s) / dt_s
+        wanted = limit_norms((setpoints - (velocity[:, :2] - self._blown)) * answer_per_s, config.max_acceleration_m_s2)
+        followed = self._followed = self._followed + limit_norms(wanted - self._followed, config.max_jerk_m_s3 * dt_s)
         steered = limit_norms(followed - self._blown * answer_per_s, MAX_LEAN_M_S2)
         push = self._gusts.push(now_s, place.reshape(self._shape)).reshape(-1, 2)
         self._blown = self._blown + (steered - followed + push) * dt_s
@@ -93,6 +99,15 @@ class Motion:
         place[:, :2] += velocity[:, :2] * dt_s + acceleration * (dt_s**2 / 2)
         velocity[:, :2] += acceleration * dt_s
         return steered
+
+    def _after_dead_time(self, now_s: float, dt_s: float, velocity: FloatArray, setpoints: FloatArray) -> FloatArray:
+        """The setpoints (n, 2) m/s that the vehicles answer as the substep ends; before, they keep their velocity."""
+        if self._answered is None:
+            self._answered = velocity[:, :2].copy()
+        self._waiting.append((now_s + self._config.dead_time_s, setpoints.copy()))
+        while self._waiting and self._waiting[0][0] <= now_s + min(dt_s, self._config.dead_time_s) + _SAME_TIME_S:
+            self._answered = self._waiting.popleft()[1]
+        return self._answered
 
     def fly(
         self, begin_s: float, interval_s: float, states: FloatArray, setpoints: FloatArray, heights: FloatArray
@@ -132,9 +147,25 @@ class Vehicles:
     the last second, as if the flight had begun a second before.
     """
 
-    def __init__(self, starts: Sequence[StartConfig], config: VehicleConfig, *, yaw_rad: float = 0.0, seed: int = 0):
-        """Start in level flight at the configured velocities, all heading `yaw_rad`; `seed` rules the gusts."""
+    def __init__(
+        self,
+        starts: Sequence[StartConfig],
+        config: VehicleConfig,
+        *,
+        yaw_rad: float = 0.0,
+        seed: int = 0,
+        sensors: SensorConfig | None = None,
+    ):
+        """Start in level flight at the configured velocities, all heading `yaw_rad`; `seed` rules gusts and errors.
+
+        Autopilots fly by their estimates, whose errors `sensors` has; None: by the truth. A person flies by eye.
+        """
         n = len(starts)
+        self.errors: tuple[EstimateErrors, ...] = ()
+        """Of each drone's autopilot about its own state; empty: it knows the truth."""
+        if sensors is not None:
+            self.errors = tuple(EstimateErrors(sensors, seed=seed, drone=i) for i in range(n))
+        self._by_estimate = [i for i, start in enumerate(starts) if not start.by_hand and self.errors]
         self._config, self._gust_m_s, self._time_s = config, config.gust_m_s, 0.0
         self._motion = Motion(config, [seed], n)
         self._wind = np.array(config.wind_m_s)
@@ -166,6 +197,16 @@ class Vehicles:
 
         `heights` (n,) m, up positive, are flown to; NaN, or None for all: as high as now.
         """
+        for errors in self.errors:
+            errors.advance(self._time_s)
+        if self._by_estimate:
+            some, wrong = self._by_estimate, [self.errors[i] for i in self._by_estimate]
+            setpoints, yaw_setpoints = setpoints.copy(), yaw_setpoints.copy()
+            setpoints[some] -= [of.velocity[:2] for of in wrong]
+            yaw_setpoints[some] -= [of.attitude[2] for of in wrong]
+            if heights is not None:
+                heights = heights.copy()
+                heights[some] -= [of.height_m for of in wrong]
         count = substeps(interval_s)
         climbs = heights is not None and not (np.isnan(heights).all() and self._is_level)
         for _ in range(count):
@@ -187,6 +228,22 @@ class Vehicles:
         self.trail.add(FlockPose(self._time_s, self.position, self.R_ned_body))
 
     @property
+    def known_position(self) -> FloatArray:
+        """(n, 3) m NED, as the autopilots estimate."""
+        if not self.errors:
+            return self.position
+        off: FloatArray = np.array([[*of.position, -of.height_m] for of in self.errors])
+        return self.position + off
+
+    @property
+    def known_velocity(self) -> FloatArray:
+        """(n, 3) m/s NED, as the autopilots estimate."""
+        if not self.errors:
+            return self.velocity
+        off: FloatArray = np.array([of.velocity for of in self.errors])
+        return self.velocity + off
+
+    @property
     def _is_level(self) -> bool:
         """Whether all fly level, off the ground."""
         return bool((self.velocity[:, 2] == 0.0).all() and (self.position[:, 2] < 0.0).all())
@@ -196,20 +253,61 @@ class Vehicles:
         return np.asarray(_DRAG_PER_S * (velocity - self._wind), dtype=float)
 
 
+class EstimateErrors:
+    """How one drone's autopilot is wrong about its own state: errors that wander, seeded.
+
+    The autopilot flies by its estimate, so that the vehicle's true velocity, height and heading err the other way.
+    """
+
+    def __init__(self, config: SensorConfig, *, seed: int, drone: int) -> None:
+        self._config = config
+        self._random = np.random.default_rng([seed, drone])
+        self._time_s: float | None = None
+        self.height_m = 0.0
+        """The barometer is set to zero at take-off."""
+        self._tilt = math.radians(config.attitude_error_deg) * self._random.normal(size=2)
+        self._heading = math.radians(config.heading_error_deg) * self._random.normal(size=1)
+        self.velocity = config.velocity_error_m_s * self._random.normal(size=3)
+        """(3,) m/s NED."""
+        self.position = config.position_error_m * self._random.normal(size=2)
+        """(2,) m north and east."""
+
+    @property
+    def attitude(self) -> FloatArray:
+        """(3,) rad: roll, pitch, yaw."""
+        return np.concatenate([self._tilt, self._heading])
+
+    def advance(self, time_s: float) -> None:
+        """To `time_s`; never back."""
+        config, before_s = self._config, time_s if self._time_s is None else self._time_s
+        elapsed_s, self._time_s = time_s - before_s, max(time_s, before_s)
+        if elapsed_s <= 0.0:
+            return
+        height = self._drift(
+            np.array([self.height_m]), config.barometer_drift_m, config.barometer_drift_time_s, elapsed_s
+        )
+        self.height_m = float(height[0])
+        self._tilt = self._drift(self._tilt, math.radians(config.attitude_error_deg), _ATTITUDE_ERROR_TIME_S, elapsed_s)
+        self._heading = self._drift(
+            self._heading, math.radians(config.heading_error_deg), _ATTITUDE_ERROR_TIME_S, elapsed_s
+        )
+        self.velocity = self._drift(self.velocity, config.velocity_error_m_s, config.velocity_error_time_s, elapsed_s)
+        self.position = self._drift(self.position, config.position_error_m, config.position_error_time_s, elapsed_s)
+
+    def _drift(self, error: FloatArray, sigma: float, time_constant_s: float, elapsed_s: float) -> FloatArray:
+        """A Gauss-Markov process after `elapsed_s`."""
+        keep = math.exp(-elapsed_s / time_constant_s)
+        return keep * error + math.sqrt(1 - keep**2) * sigma * self._random.normal(size=error.shape)
+
+
 class SimulatedAutopilot:
-    """One drone's autopilot: the truth with seeded errors that change slowly, and noise on the barometer."""
+    """What one drone's autopilot says of its state: the truth with its errors, and noise on barometer and gyroscope."""
 
     def __init__(self, config: SensorConfig, *, seed: int, drone: int, ground: Ground = level_ground) -> None:
         """``ground`` is what its range finder measures to, if it has one."""
         self._config = config
-        self._random = np.random.default_rng([seed, drone])
-        self._time_s: float | None = None
-        self._height_error = np.zeros(1)  # the barometer is set to zero at take-off
-        self._tilt_error = math.radians(config.attitude_error_deg) * self._random.normal(size=3)
-        self._velocity_error = config.velocity_error_m_s * self._random.normal(size=3)
-        # A generator of its own: the position came later, and the other errors are as they were without it.
-        self._of_position = np.random.default_rng([seed, drone, 1])
-        self._position_error = config.position_error_m * self._of_position.normal(size=2)
+        self._errors = EstimateErrors(config, seed=seed, drone=drone)
+        self._random = np.random.default_rng([seed, drone, 1])
         ranger = config.range_finder
         self._range_finder = None if ranger is None else FakeRangeFinder(ranger, ground, (seed, drone, 2))
 
@@ -220,44 +318,27 @@ class SimulatedAutopilot:
         velocity: FloatArray,
         R_ned_body: FloatArray,
         turn_rate: FloatArray | None = None,
+        errors: EstimateErrors | None = None,
     ) -> VehicleState:
         """What it says at `time_s`, not before the last, of a drone at `position` (3,) m NED, ground at z = 0.
 
-        Home is the world's origin. Yaw errs as roll and pitch do.
+        Home is the world's origin. `errors`: those that the vehicle is flown with; None: of its own.
         """
-        config = self._config
-        elapsed_s = 0.0 if self._time_s is None else time_s - self._time_s
-        self._time_s = time_s
-        self._height_error = self._drift(
-            self._height_error, config.barometer_drift_m, config.barometer_drift_time_s, elapsed_s
-        )
-        self._tilt_error = self._drift(
-            self._tilt_error, math.radians(config.attitude_error_deg), _ATTITUDE_ERROR_TIME_S, elapsed_s
-        )
-        self._velocity_error = self._drift(
-            self._velocity_error, config.velocity_error_m_s, _VELOCITY_ERROR_TIME_S, elapsed_s
-        )
-        keep = math.exp(-elapsed_s / _POSITION_ERROR_TIME_S)
-        kick = math.sqrt(1 - keep**2) * config.position_error_m * self._of_position.normal(size=2)
-        self._position_error = keep * self._position_error + kick
+        config, errors = self._config, errors or self._errors
+        errors.advance(time_s)
         noise = config.barometer_noise_m * self._random.normal()
+        rate_noise = math.radians(config.turn_rate_noise_deg_s) * self._random.normal(size=3)
         ranger = self._range_finder
-        ground_range = None if ranger is None else ranger.read(time_s, position, velocity, R_ned_body)
         return VehicleState(
             time_s=time_s,
-            R_ned_body=rotation_from_euler(*self._tilt_error) @ R_ned_body,
-            height_m=float(-position[2] + self._height_error[0] + noise),
-            velocity_ned=velocity + self._velocity_error,
-            position=position[:2] + self._position_error,
+            R_ned_body=rotation_from_euler(*errors.attitude) @ R_ned_body,
+            height_m=float(-position[2] + errors.height_m + noise),
+            velocity_ned=velocity + errors.velocity,
+            position=position[:2] + errors.position,
             home_deg=np.array(REFERENCE_DEG),
-            ground_range=ground_range,
-            turn_rate=turn_rate,
+            ground_range=None if ranger is None else ranger.read(time_s, position, velocity, R_ned_body),
+            turn_rate=None if turn_rate is None else turn_rate + rate_noise,
         )
-
-    def _drift(self, error: FloatArray, sigma: float, time_constant_s: float, elapsed_s: float) -> FloatArray:
-        """A Gauss-Markov process after `elapsed_s`."""
-        keep = math.exp(-elapsed_s / time_constant_s)
-        return keep * error + math.sqrt(1 - keep**2) * sigma * self._random.normal(size=error.shape)
 
 
 def limit_norms(vectors: FloatArray, most: float) -> FloatArray:

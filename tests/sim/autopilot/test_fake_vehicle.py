@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,24 @@ import pytest
 
 from flockd.core.messages import FloatArray
 from flockd.sim.autopilot.fake_vehicle import Demand, Drift, PointMass
+from flockd.sim.scenario import StartConfig, VehicleConfig
+from flockd.sim.vehicles.vehicles import Vehicles
 
 PX4_STEPS = np.loadtxt(Path(__file__).with_name("px4_steps.csv"), delimiter=",", skiprows=1)
 """Time (s), setpoint and estimated velocity (m/s, north and east each), at 20 Hz: PX4 1.18.0 in software, SIH
 quadrotor, SIH_KDV 0.1, at real time, recorded once over MAVLink with setpoints of velocity, height and heading."""
 WANDERS_M_S = 0.15
 """By so much PX4's estimate wanders."""
+
+
+def _flown_by_simulator(setpoints: FloatArray, times: FloatArray) -> FloatArray:
+    """The same of the simulator's vehicles."""
+    start = StartConfig(position_m=(0.0, 0.0, -4.0))
+    vehicles, velocities = Vehicles([start], VehicleConfig()), []
+    for setpoint, interval_s in zip(setpoints, np.diff(times, prepend=times[0] - 1e-6), strict=True):
+        vehicles.step(setpoint[None], np.zeros(1), float(interval_s))
+        velocities.append(vehicles.velocity[0, :2])
+    return np.array(velocities)
 
 
 def _flown(setpoints: FloatArray, times: FloatArray) -> FloatArray:
@@ -26,9 +39,10 @@ def _flown(setpoints: FloatArray, times: FloatArray) -> FloatArray:
     return np.array(velocities)
 
 
-def test_it_answers_as_px4_did_to_the_same_setpoints() -> None:
+@pytest.mark.parametrize("fly", [_flown, _flown_by_simulator])
+def test_it_answers_as_px4_did_to_the_same_setpoints(fly: Callable[[FloatArray, FloatArray], FloatArray]) -> None:
     times, setpoints, px4 = PX4_STEPS[:, 0], PX4_STEPS[:, 1:3], PX4_STEPS[:, 3:5]
-    error = _flown(np.roll(setpoints, 1, axis=0), times) - px4  # what comes now is flown from now on
+    error = fly(np.roll(setpoints, 1, axis=0), times) - px4  # what comes now is flown from now on
     assert np.sqrt((error**2).mean()) < WANDERS_M_S
     for step in np.flatnonzero(np.linalg.norm(np.diff(setpoints, axis=0), axis=1) > 0.9):
         late = error[step : step + 60]  # three seconds, in which all of the answer lies

@@ -42,8 +42,8 @@ def errors(entry: dict[str, Any] | None = None, **keys: Any) -> PerceivedErrors:
 
 @lru_cache
 def flock(name: str = "paper_flight", drones: int | None = None, **keys: Any) -> ScenarioConfig:
-    """A shipped scenario with so many drones, and values by dotted key with `__`."""
-    scenario = make.scenario({key.replace("__", "."): value for key, value in keys.items()}, name)
+    """A shipped scenario with so many drones, and values by dotted key with `__`; ideal, as the control level is."""
+    scenario = make.scenario({"ideal": True} | {key.replace("__", "."): value for key, value in keys.items()}, name)
     return scenario if drones is None else with_drones(scenario, drones)
 
 

@@ -60,7 +60,7 @@ class Watching:
 
 
 def scenario(duration_s: float) -> ScenarioConfig:
-    overrides = {"duration_s": duration_s, "drone.safety.gate.fence_radius_m": 30.0}
+    overrides = {"duration_s": duration_s, "ideal": True, "drone.safety.gate.fence_radius_m": 30.0}
     return with_drones(load_scenario(data_path("config") / "paper_flight.yaml", overrides), 2)
 
 

@@ -33,7 +33,10 @@ TABLE_1 = tuple(
     )
 )
 CAMERA = CameraConfig(name="front", size_px=(64, 64), intrinsics=IntrinsicsConfig(fx=50.0, fy=50.0, cx=32.0, cy=32.0))
-FIVE = ScenarioConfig(scenario="five", vehicles=TABLE_1, drone=DroneConfig(rig=RigConfig(cameras=(CAMERA,))))
+AT_ONCE = VehicleConfig(dead_time_s=0.0, velocity_time_constant_s=0.25, max_acceleration_m_s2=4.0, max_jerk_m_s3=1e9)
+FIVE = ScenarioConfig(
+    scenario="five", ideal=True, vehicles=TABLE_1, drone=DroneConfig(rig=RigConfig(cameras=(CAMERA,)))
+)
 
 
 def _yaw_pitch_roll_deg(R_ned_body: Array) -> Array:
@@ -41,8 +44,8 @@ def _yaw_pitch_roll_deg(R_ned_body: Array) -> Array:
 
 
 def test_velocity_responds_to_a_setpoint_as_a_first_order_lag() -> None:
-    tau = 0.25
-    vehicles = Vehicles([START], VehicleConfig(velocity_time_constant_s=tau))
+    tau = AT_ONCE.velocity_time_constant_s
+    vehicles = Vehicles([START], AT_ONCE)
     setpoint = np.array([[0.6, -0.3]])
     for k in range(1, 9):
         vehicles.step(setpoint, NO_YAW, 0.1)
@@ -54,10 +57,28 @@ def test_velocity_responds_to_a_setpoint_as_a_first_order_lag() -> None:
 
 
 def test_a_large_change_is_limited_by_acceleration() -> None:
-    vehicles = Vehicles([START], VehicleConfig(max_acceleration_m_s2=4.0))
+    vehicles = Vehicles([START], AT_ONCE)
     vehicles.step(np.array([[6.0, 8.0]]), NO_YAW, 1.0)
     np.testing.assert_allclose(vehicles.velocity[0], [2.4, 3.2, 0.0])
     np.testing.assert_allclose(vehicles.position[0], [1 + 1.2, 2 + 1.6, -4.0])
+
+
+def test_it_is_flown_by_its_estimate_and_so_truly_flies_otherwise() -> None:
+    """An autopilot that believes to fly what it is asked for, at the height and heading, does not; a person does."""
+    sensors = SensorConfig(velocity_error_time_s=1e6, barometer_drift_m=1.0, barometer_drift_time_s=30.0)
+    starts = [START, START.model_copy(update={"by_hand": True})]
+    vehicles = Vehicles(starts, AT_ONCE, seed=3, sensors=sensors)
+    for _ in range(200):
+        vehicles.step(np.tile([1.0, 0.0], (2, 1)), np.zeros(2), 0.05, np.full(2, 4.0))
+    errors = vehicles.errors[0]
+    np.testing.assert_allclose(vehicles.velocity[0, :2], [1.0, 0.0] - errors.velocity[:2], atol=0.01)
+    np.testing.assert_allclose(vehicles.known_velocity[0, :2], [1.0, 0.0], atol=0.01)
+    yaw_deg = _yaw_pitch_roll_deg(vehicles.R_ned_body[0])[0]
+    assert yaw_deg == pytest.approx(-math.degrees(errors.attitude[2]), abs=0.2)
+    np.testing.assert_allclose(vehicles.velocity[1, :2], [1.0, 0.0], atol=1e-6)
+    assert -vehicles.position[1, 2] == pytest.approx(4.0, abs=0.01)
+    assert abs(errors.height_m) > 0.02
+    np.testing.assert_allclose(vehicles.known_position[0] - vehicles.position[0], [*errors.position, -errors.height_m])
 
 
 def test_one_long_step_is_many_short_ones() -> None:
@@ -96,7 +117,7 @@ def test_a_small_turn_is_a_first_order_lag() -> None:
 
 
 def test_nose_down_to_the_north_and_right_side_down_to_the_east() -> None:
-    config = VehicleConfig(tilt_time_constant_s=0.0)
+    config = AT_ONCE.model_copy(update={"tilt_time_constant_s": 0.0})
     north, east = (Vehicles([START], config) for _ in range(2))
     north.step(np.array([[1.0, 0.0]]), NO_YAW, 0.02)
     east.step(np.array([[0.0, 1.0]]), NO_YAW, 0.02)
@@ -155,7 +176,10 @@ def test_gusts_depend_on_the_seed_alone() -> None:
 
 
 def test_an_autopilot_without_errors_gives_true_values() -> None:
-    perfect = SensorConfig(barometer_drift_m=0.0, barometer_noise_m=0.0, attitude_error_deg=0.0, velocity_error_m_s=0.0)
+    perfect = SensorConfig(
+        barometer_drift_m=0.0, barometer_noise_m=0.0, attitude_error_deg=0.0, velocity_error_m_s=0.0,
+        heading_error_deg=0.0, position_error_m=0.0, turn_rate_noise_deg_s=0.0,
+    )  # fmt: skip
     autopilot = SimulatedAutopilot(perfect, seed=0, drone=0)
     turn = rotation_from_euler(0.1, -0.2, 1.0)
     state = autopilot.read(3.5, np.array([1.0, 2.0, -4.0]), np.array([1.0, 0.5, 0.0]), turn)
@@ -167,7 +191,11 @@ def test_an_autopilot_without_errors_gives_true_values() -> None:
 
 def test_an_autopilots_errors_are_as_large_as_configured() -> None:
     config = SensorConfig(
-        barometer_drift_m=0.1, barometer_drift_time_s=100.0, barometer_noise_m=0.02, position_error_m=0.3
+        barometer_drift_m=0.1,
+        barometer_drift_time_s=100.0,
+        barometer_noise_m=0.02,
+        position_error_m=0.3,
+        heading_error_deg=1.5,
     )
     position, velocity, level = np.array([0.0, 0.0, -4.0]), np.zeros(3), np.eye(3)
     heights, angles_deg, velocities, places = [], [], [], []
@@ -182,11 +210,11 @@ def test_an_autopilots_errors_are_as_large_as_configured() -> None:
     assert at_start == pytest.approx(0.02, rel=0.15)  # noise alone
     assert soon == pytest.approx(math.sqrt(0.02**2 + 0.1**2 * (1 - math.exp(-0.01))), rel=0.15)
     assert late == pytest.approx(math.hypot(0.1, 0.02), rel=0.15)
-    np.testing.assert_allclose(np.std(angles_deg, axis=0), 0.2, rtol=0.15)
+    np.testing.assert_allclose(np.std(angles_deg, axis=0), [1.5, 0.2, 0.2], rtol=0.15)
     assert np.std(velocities) == pytest.approx(0.1, rel=0.1)
     np.testing.assert_allclose(np.std(places, axis=0), 0.3, rtol=0.15)
     changes = np.diff(np.array(velocities), axis=1)
-    assert np.std(changes) == pytest.approx(0.1 * math.sqrt(2 * (1 - math.exp(-0.05))), rel=0.1)  # slow
+    assert np.std(changes) == pytest.approx(0.1 * math.sqrt(2 * (1 - math.exp(-0.5 / 2.0))), rel=0.1)  # slow
 
 
 def test_an_autopilots_errors_depend_on_seed_and_drone_alone() -> None:

@@ -50,7 +50,7 @@ def test_without_gusts_nothing_pushes() -> None:
 
 def test_a_vehicle_leans_against_gusts_harder_than_it_follows_setpoints() -> None:
     """Pushes of 2.1 m/s^2 an axis: with no more than 4 m/s^2 against them drones were carried away at 10 m/s."""
-    config = VehicleConfig(gust_m_s=0.5)
+    config = VehicleConfig(gust_m_s=0.5, velocity_time_constant_s=0.25, max_acceleration_m_s2=4.0)
     assert push_sigma_m_s2(config) == pytest.approx(2.1, abs=0.1)
     assert config.max_acceleration_m_s2 < MAX_LEAN_M_S2 == pytest.approx(9.81)
     fastest = []
@@ -64,7 +64,9 @@ def test_a_vehicle_leans_against_gusts_harder_than_it_follows_setpoints() -> Non
 
 def test_a_setpoint_is_followed_no_harder_in_gusts() -> None:
     """Two vehicles side by side are pushed alike, so that their difference is what the setpoint makes."""
-    vehicles = Vehicles([StartConfig(position_m=(0.0, 0.0, -5.0))] * 2, VehicleConfig(gust_m_s=0.3), seed=1)
+    vehicles = Vehicles(
+        [StartConfig(position_m=(0.0, 0.0, -5.0))] * 2, VehicleConfig(gust_m_s=0.3, max_acceleration_m_s2=4.0), seed=1
+    )
     for _ in range(10):
         before = vehicles.velocity[1, 0] - vehicles.velocity[0, 0]
         vehicles.step(np.array([[0.0, 0.0], [9.0, 0.0]]), np.zeros(2), 0.1)
