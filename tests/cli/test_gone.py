@@ -31,7 +31,7 @@ def test_a_key_that_is_gone_is_refused_with_its_line_and_what_to_use(
     key: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     *sections, name = key.split(".")
-    file = _CONFIG / ("square.yaml" if sections[:1] in (["cameras"], ["faults"]) else "simulator.yaml")
+    file = _CONFIG / ("square.yaml" if sections[:1] in (["cameras"], ["detections"], ["faults"]) else "simulator.yaml")
     values: Any = yaml.safe_load(file.read_text(encoding="utf-8"))
     if "drone" in values:
         values["drone"] = str(_CONFIG / values["drone"])

@@ -207,7 +207,7 @@ class CameraFaultConfig(Section):
 
 
 _CLOCKS_APART_S = 0.2
-_UNEVEN = CamerasConfig(timing=CameraTimingConfig(apart_s=0.004, jitter_s=0.002))
+_UNEVEN = CamerasConfig(timing=CameraTimingConfig(jitter_s=0.002))
 _REFERENCE_LATENCY_S = 0.25
 """A step of four cameras on one core of the reference computer takes 0.19 s at the median, capture and decoding the
 rest."""
@@ -244,8 +244,8 @@ class ScenarioConfig(Section):
     vehicle: VehicleConfig = VehicleConfig()
     sensors: SensorConfig = SensorConfig()
     cameras: CamerasConfig | None = None
-    """How the cameras differ from ideal ones. null: their images come within 4 ms before the set's time and are as old
-    as their time stamps say to 2 ms; where `ideal`, in nothing but `sensors.image_noise`."""
+    """How the cameras differ from ideal ones. null: their images are as old as their time stamps say to 2 ms; where
+    `ideal`, in nothing but `sensors.image_noise`."""
     world: WorldConfig = WorldConfig()
     detections: DetectionsConfig | None = None
     """For `--perception truth`: drones know each other by tracking such detections; null: exactly and at once."""

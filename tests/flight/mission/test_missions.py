@@ -385,7 +385,7 @@ def test_one_of_five_knows_the_goal_and_all_arrive_within_ten_metres() -> None:
 
 def test_the_flight_with_exact_states_flies_orders_when_they_were_given() -> None:
     """The paper's circle until 5 s; then all go to a goal that is not on it."""
-    scenario = load_scenario(CONFIG / "paper_flight.yaml", {"duration_s": 30.0})
+    scenario = load_scenario(CONFIG / "paper_flight.yaml", {"duration_s": 30.0, "ideal": True})
     goal = np.array([-5.0, -8.0])
     ordered = {i: [(5.0, MissionOrder(place=goal))] for i in range(len(scenario.vehicles))}
     times, position, _ = fly_exact_states(scenario, orders=ordered)

@@ -173,7 +173,7 @@ def test_without_obstacles_the_command_is_the_laws() -> None:
 
 def flight(solids: list[Solid], duration_s: float) -> tuple[float, FloatArray]:
     """The smallest clearance of five drones that fly north at 1.5 m/s, and where they end, (5, 3) m."""
-    scenario = load_scenario(data_path("config") / "square.yaml")
+    scenario = load_scenario(data_path("config") / "square.yaml", {"ideal": True})
     drone = scenario.drone.model_copy(
         update={
             "mission": MissionParameters(kind="velocity", velocity_m_s=(1.5, 0.0)),

@@ -43,7 +43,7 @@ class NoNetworks:
 
 
 def scenario_with(*places: tuple[float, float, float]) -> ScenarioConfig:
-    scenario = load_scenario(data_path("config") / "paper_flight.yaml", {"seed": 4, **BAROMETER})
+    scenario = load_scenario(data_path("config") / "paper_flight.yaml", {"seed": 4, "ideal": True, **BAROMETER})
     start = scenario.vehicles[0]
     drones = tuple(start.model_copy(update={"position_m": place, "velocity_m_s": (1.0, 0.0)}) for place in places)
     return scenario.model_copy(update={"vehicles": drones})

@@ -121,7 +121,7 @@ def test_too_little_depth_is_no_motion(folder: Path, capsys: Capture) -> None:
         cv2.imwrite(str(file), depth)
     assert main(["replay", str(folder), "--depth", "recorded"]) == 1
     captured = capsys.readouterr()
-    assert "estimated: 0 (0.0 %)" in captured.out
+    assert "estimated_ratio: 0.0" in captured.out
     assert "no motion could be estimated: ego-motion: fewer than three pairs" in captured.err
 
 
@@ -257,7 +257,7 @@ def test_poses_of_another_time_are_named(scene: Scene, tmp_path: Path, onlooker:
     [
         (["--diff"], "--diff is for recordings of flockd"),
         (["--stride", "6"], "has 6 frames, and none 6 after another"),
-        (["--trajectory", "K.txt"], "K.txt: exists; name a new file with --trajectory"),
+        (["--trajectory", "K.txt"], "K.txt: exists; name another file"),
     ],
 )
 def test_what_cannot_be_asked_of_a_dataset(arguments: list[str], words: str, folder: Path, capsys: Capture) -> None:

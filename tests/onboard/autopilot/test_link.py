@@ -28,6 +28,7 @@ from flockd.onboard.autopilot.mavsdk_link import (
     TIME_SYNC,
     AutopilotLink,
     Severity,
+    _tell_once,
     _to_logging,
 )
 from flockd.sim.autopilot.fake_autopilot import TICK_S, FakeAutopilot
@@ -547,6 +548,7 @@ async def test_a_close_that_nobody_waits_for_still_destroys_mavsdk(address: str,
 def test_what_mavsdk_says_once_a_second_of_a_dead_autopilot_is_in_the_log_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
+    _tell_once.cache_clear()
     with caplog.at_level(logging.WARNING):
         for number in range(180):
             _to_logging(LogLevel.ERROR, "Sending this once failed")

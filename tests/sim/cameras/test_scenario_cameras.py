@@ -27,7 +27,7 @@ AS_MOUNTED = {"shutter": {"readout_from": "right"}, "reduce": 2}
 
 def scenario_with(cameras: CamerasConfig | None, image_noise: float = 2.0) -> ScenarioConfig:
     """Two drones, one ahead of the other, with two of the lenses of `quadrotor.yaml` at a quarter of their size."""
-    paper = load_scenario(CONFIG / "paper_flight.yaml", {"sensors.image_noise": image_noise})
+    paper = load_scenario(CONFIG / "paper_flight.yaml", {"sensors.image_noise": image_noise, "ideal": True})
     rig = []
     for camera in RIG.cameras[:2]:
         quarter = {name: getattr(camera.intrinsics, name) / 4 for name in ("fx", "fy", "cx", "cy")}
