@@ -34,7 +34,7 @@ START_M, HEIGHT_M = 12.0, 3.0
 NEAR_M = 5.0
 """Drones that have been so near have met."""
 CALM = VehicleConfig()
-WEAK = VehicleConfig(max_acceleration_m_s2=CALM.max_acceleration_m_s2 / 2)
+WEAK = VehicleConfig(max_acceleration_m_s2=2.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -186,7 +186,8 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
     off = f"the velocity is {inputs.velocity_error_m_s:.1f} m/s off the setpoints"
     if inputs.velocity_late_s > 0:
         off = f"{off}, and follows them {inputs.velocity_late_s:.1f} s later than expected"
-    cause = f"{off}: wind of more than {p.max_velocity_error_m_s:g} m/s, or an autopilot that does not follow"
+    most = f"at most {p.max_velocity_error_m_s:g} m/s and {p.gate.reaction_s:g} s are flown"
+    cause = f"{off} ({most}): wind, or an autopilot that does not follow"
     table = (
         (Event.SIGHT_LOST, sightless, f"too few cameras deliver images: {', '.join(lost) or 'there are none'}"),
         (Event.CAMERA_LOST, len(lost) > 0 and not sightless, f"a camera is lost: {', '.join(lost)}"),

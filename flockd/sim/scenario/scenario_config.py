@@ -259,8 +259,8 @@ class ScenarioConfig(Section):
         """The configuration that one vehicle's pilot flies with."""
         mission = self.vehicles[vehicle].mission or self.drone.mission
         if mission.kind == "circle_then_tangent":
-            late_s = self._clocks_apart_s * abs(random.Random(f"clock {self.seed} {vehicle}").gauss(0.0, 1.0))
-            mission = mission.model_copy(update={"circle_until_s": mission.circle_until_s + late_s})
+            late_s = self._clocks_apart_s * random.Random(f"clock {self.seed} {vehicle}").gauss(0.0, 1.0)
+            mission = mission.model_copy(update={"circle_until_s": max(mission.circle_until_s + late_s, 0.0)})
         return self.drone if mission is self.drone.mission else self.drone.model_copy(update={"mission": mission})
 
     @property

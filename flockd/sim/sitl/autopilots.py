@@ -16,7 +16,7 @@ from flockd.core.errors import UnavailableError, UsageError
 from flockd.core.messages import FloatArray
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, Ground
-from flockd.sim.autopilot.fake_vehicle import DeadTime, Demand, MotionState, PointMass
+from flockd.sim.autopilot.fake_vehicle import Demand, MotionState
 from flockd.sim.scenario import ScenarioConfig, StartConfig, VehicleConfig
 from flockd.sim.sitl.ground_station import FULL_STICK_M_S, home_deg
 from flockd.sim.sitl.ports import free_port
@@ -199,19 +199,15 @@ def px4_folder(environment: Mapping[str, str]) -> Path:
 
 
 class _Flown:
-    """One of the simulator's vehicles, from its home on the ground; it answers as late as PX4's does."""
+    """One of the simulator's vehicles, from its home on the ground."""
 
     def __init__(self, config: VehicleConfig, seed: int) -> None:
-        if "velocity_time_constant_s" not in config.model_fields_set:
-            config = config.model_copy(update={"velocity_time_constant_s": PointMass.RESPONSE_S})
         self._vehicles = Vehicles([StartConfig(position_m=(0.0, 0.0, 0.0))], config, seed=seed)
-        self._dead_time = DeadTime()
 
     def __call__(self, demand: Demand, interval_s: float) -> MotionState:
         """Flies on."""
         vehicles = self._vehicles
         if interval_s > 0.0:
             heading = np.array([demand.yaw_rad])
-            obeyed = self._dead_time(demand.velocity, interval_s)
-            vehicles.step(obeyed[None], heading, interval_s, heights=np.array([-demand.down_m]))
+            vehicles.step(demand.velocity[None], heading, interval_s, heights=np.array([-demand.down_m]))
         return MotionState(vehicles.position[0], vehicles.velocity[0], vehicles.R_ned_body[0])
