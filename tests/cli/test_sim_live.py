@@ -156,7 +156,7 @@ async def test_a_flock_flies_where_the_page_sends_it_and_stands_still_when_it_is
         await page.ask("goto", order, ("drone1", "drone2", "drone3"))
         await page.until(lambda: all("at" in (row["mission"] or "") for row in page.rows.values()))
         middle = np.mean([page.place(drone) for drone in page.rows], axis=0)
-        assert np.linalg.norm(middle - GOAL_NE) < 1.5
+        assert np.linalg.norm(middle - GOAL_NE) < 1.5 + 0.6, "`reached_m`, and what their estimates are off"
 
         await page.control("speed", factor=2.0)
         await page.ask("velocity", {"velocity_ne": [1.0, 0.0]})
