@@ -474,6 +474,8 @@ def _fly_fleet(args: argparse.Namespace, scenario: ScenarioConfig, directory: Pa
     from flockd.review.report.flight_folder import FLEET_LOGS, RECORDINGS
     from flockd.sim.sitl.fleet import fly_fleet
 
+    if scenario.takeovers:
+        raise UsageError("the scenario's `takeovers` are not flown with daemons; delete them, or drop --autopilot")
     with ExitStack() as stack:
         stack.enter_context(_ended_in_order())
         phases = stack.enter_context(Phases(quiet=args.quiet))

@@ -265,8 +265,15 @@ class ControlLoop:
     def fly(self, time_s: float, vehicles: Vehicles, commands: Commands, disturbed: Disturbances = UNDISTURBED) -> None:
         """From `time_s` one step on."""
         self._disturbed = disturbed
+        takeovers = commands.takeovers
+        for takeover in self._scenario.takeovers:
+            if time_s - self._step_s < takeover.time_s <= time_s:
+                if takeover.to == "hold":
+                    self.hold(takeover.drone - 1, time_s, vehicles)
+                else:
+                    takeovers[takeover.drone - 1] = takeover.to
         velocity, height_m = self._handover.applied(
-            commands.takeovers, vehicles.known_position, commands.velocity, commands.height_m
+            takeovers, vehicles.known_position, commands.velocity, commands.height_m
         )
         self._orders.append(_Order(time_s, vehicles.known_position, commands, velocity, height_m))
         periods = max(round(self._step_s / PERIOD_S), 1) if self._drones or self._latency_s else 1

@@ -12,6 +12,7 @@ from flockd.sim.scenario.scenario_config import (
     ScenarioConfig,
     SensorConfig,
     StartConfig,
+    TakeoverConfig,
     VehicleConfig,
 )
 from flockd.sim.scenario.scenario_file import load, load_scenario, load_with_places, scenario_schema
@@ -28,6 +29,7 @@ __all__ = [
     "ScenarioConfig",
     "SensorConfig",
     "StartConfig",
+    "TakeoverConfig",
     "VehicleConfig",
     "load",
     "load_scenario",

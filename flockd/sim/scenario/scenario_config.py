@@ -206,6 +206,15 @@ class CameraFaultConfig(Section):
     end_s: Positive = MAX_DURATION_S
 
 
+class TakeoverConfig(Section):
+    """That one drone's autopilot takes over in flight, as when a person flips a switch: flockd flies it no more."""
+
+    drone: Annotated[int, Field(ge=1)]
+    """Whose: the number of its entry in `vehicles`, from 1."""
+    time_s: NonNegative
+    to: Literal["hold", "land"]
+
+
 _CLOCKS_APART_S = 0.2
 _UNEVEN = CamerasConfig(timing=CameraTimingConfig(jitter_s=0.002))
 _REFERENCE_LATENCY_S = 0.25
@@ -251,6 +260,8 @@ class ScenarioConfig(Section):
     """For `--perception truth`: drones know each other by tracking such detections; null: exactly and at once."""
     faults: tuple[CameraFaultConfig, ...] = ()
     """None, unless a flight is to show what flockd does about them."""
+    takeovers: tuple[TakeoverConfig, ...] = ()
+    """Not with real daemons."""
     drone: DroneConfig
     """In the file: the path of the drone's own configuration, relative to the scenario's; or that configuration. Keys
     `mission` and `obstacles` beside it are flown instead of its own."""
@@ -321,13 +332,17 @@ class ScenarioConfig(Section):
         return self
 
     @model_validator(mode="after")
-    def _faults_have_their_cameras(self) -> Self:
+    def _faults_have_their_drones_and_cameras(self) -> Self:
         cameras = [camera.name for camera in self.drone.rig.cameras]
         faults: dict[tuple[str | int, ...], str] = {}
+        named = {
+            **{("faults", number, "drone"): fault.drone for number, fault in enumerate(self.faults)},
+            **{("takeovers", number, "drone"): takeover.drone for number, takeover in enumerate(self.takeovers)},
+        }
+        for key, drone in named.items():
+            if drone > len(self.vehicles):
+                faults[key] = f"is {drone}, but there are {len(self.vehicles)} vehicles; write one of theirs"
         for number, fault in enumerate(self.faults):
-            if fault.drone > len(self.vehicles):
-                text = f"is {fault.drone}, but there are {len(self.vehicles)} vehicles; write one of theirs"
-                faults["faults", number, "drone"] = text
             if fault.camera not in cameras:
                 faults["faults", number, "camera"] = f"is not in the rig; write one of {', '.join(cameras)}"
             if fault.end_s <= fault.begin_s:

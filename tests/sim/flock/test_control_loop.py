@@ -115,6 +115,16 @@ def test_a_held_drone_takes_no_command_any_more() -> None:
     assert vehicles.position[0, 0] - scenario.vehicles[0].position_m[0] == pytest.approx(10.0, abs=0.3)
 
 
+def test_a_drone_that_is_taken_over_holds_or_lands_and_its_mates_keep_apart() -> None:
+    takeovers = {"drone": 1, "time_s": 10.0, "to": "hold"}, {"drone": 4, "time_s": 12.0, "to": "land"}
+    log = fly(_scenario(duration_s=25.0, takeovers=takeovers), perception="truth", pictured=False).log
+    still = np.linalg.norm(log.velocity[-10:], axis=2).max(axis=0) < 0.4  # what the estimates wander by
+    assert still.tolist() == [True, False, False, True, False]
+    assert log.position[-1, 3, 2] > -0.1 > log.position[-1, 0, 2]
+    assert log.metadata.handed_over[0].time_s == 10.0
+    assert min(map(min_distance, log.position)) > 0.7
+
+
 def test_a_log_says_who_was_held_when_and_why() -> None:
     scenario = _scenario(duration_s=40.0, vehicle__gust_m_s=0.8, seed=2)
     metadata = fly(scenario, perception="truth", pictured=False).log.metadata
