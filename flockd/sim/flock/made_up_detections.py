@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from scipy.special import ndtri
 
 from flockd.core.messages import BoolArray, FloatArray, Neighbour
 from flockd.flight.geometry import build_rig, rotation_from_euler
@@ -10,7 +13,8 @@ from flockd.flight.tracking import Measurement, Tracker
 from flockd.sim.scenario import DetectionsConfig, ScenarioConfig
 
 _OWN_MOTION_ERROR_M = 0.02
-"""Standard deviation, each axis and step, that the tracker is told of its own motion, which is exact."""
+"""Standard deviation of a drone's motion in a step, each axis, and what the tracker is told of it; where the scenario is
+`ideal` the motion is exact."""
 
 
 class TrackedNeighbours:
@@ -21,6 +25,9 @@ class TrackedNeighbours:
         self._scenario, self._rig = scenario, build_rig(scenario.drone.rig)
         self._tracker = Tracker(scenario.drone.tracking)
         self._random = np.random.default_rng([scenario.seed, drone])
+        self._errors = self._random.normal(size=(len(scenario.vehicles) - 1, 5))
+        """Of each other drone, in standard deviations: of the range's logarithm and the bearing (3), and the normal
+        number that decides whether it is missed."""
         self._position: FloatArray | None = None
 
     def step(
@@ -33,10 +40,16 @@ class TrackedNeighbours:
         """
         here = positions[self._drone]
         if self._position is not None:
-            self._tracker.predict(self._step_s, here - self._position, _OWN_MOTION_ERROR_M)
+            wrong_m = 0.0 if self._scenario.ideal else self._random.normal(0.0, _OWN_MOTION_ERROR_M, 3)
+            self._tracker.predict(self._step_s, here - self._position + wrong_m, _OWN_MOTION_ERROR_M)
         self._position = here
         offsets = np.delete(positions, self._drone, axis=0) - here
-        found = [detection for offset in offsets if (detection := self._detection(offset)) is not None]
+        times_s = (self._config.error_time_s,) * 4 + (self._config.missed_time_s,)
+        keep = np.array([math.exp(-self._step_s / time_s) if time_s else 0.0 for time_s in times_s])
+        fresh = self._random.normal(size=self._errors.shape)
+        self._errors = keep * self._errors + np.sqrt(1.0 - keep**2) * fresh
+        made_up = (self._detection(*pair) for pair in zip(offsets, self._errors, strict=True))
+        found = [detection for detection in made_up if detection is not None]
         gone = lost_cameras(self._scenario, self._drone, time_s) | cameras_off
         R_ned_body = rotation_from_euler(0.0, 0.0, yaw_rad)
 
@@ -47,16 +60,16 @@ class TrackedNeighbours:
         self._tracker.update(time_s, found, velocities[self._drone], shown)
         return self._tracker.neighbours()
 
-    def _detection(self, offset: FloatArray) -> Measurement | None:
+    def _detection(self, offset: FloatArray, errors: FloatArray) -> Measurement | None:
         config = self._config
         range_m = float(np.linalg.norm(offset))
-        if range_m > config.range_m or self._random.random() < config.missed:
+        if range_m > config.range_m or errors[4] < ndtri(config.missed):
             return None
-        bearing = offset / range_m + self._random.normal(0.0, config.bearing_error_rad, 3)
+        bearing = offset / range_m + config.bearing_error_rad * errors[1:4]
         bearing /= np.linalg.norm(bearing)
         across, along = config.bearing_error_rad**2, config.range_error**2
         covariance = across * np.eye(3) + (along - across) * np.outer(bearing, bearing)
-        log_range = float(np.log(range_m) + config.range_error * self._random.normal())
+        log_range = float(np.log(range_m) + config.range_error * errors[0])
         return Measurement(bearing, log_range, covariance, 0.6, 0.95)
 
 

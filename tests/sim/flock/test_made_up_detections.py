@@ -30,7 +30,9 @@ def known(seed: int = 0, steps: int = 20, positions: np.ndarray = AHEAD, **chang
 
 
 def test_who_is_near_is_tracked_to_within_the_errors() -> None:
-    finals = np.array([known(seed, range_error=0.1, bearing_error_rad=0.01)[-1] for seed in range(20)])
+    finals = np.array(
+        [known(seed, range_error=0.1, bearing_error_rad=0.01, error_time_s=0.0)[-1] for seed in range(20)]
+    )
     errors = finals - [8.0, 6.0, 0.0]
     assert 0.02 < np.sqrt(np.mean(errors**2)) < 0.5  # one detection: 1 m along, 0.1 m across
     assert np.abs(errors.mean(axis=0)).max() < 0.3
@@ -108,12 +110,26 @@ def limited(scenario: ScenarioConfig, time_s: float) -> ScenarioConfig:
 
 def test_who_pulls_away_at_the_start_is_followed() -> None:
     """Three drones of which one knows the goal, seen up to 11 m: new neighbours pull little, but soon enough."""
-    scenario = load_scenario(CONFIG / "one_knows.yaml", {"duration_s": 30.0})
+    scenario = load_scenario(CONFIG / "one_knows.yaml", {"duration_s": 30.0, "ideal": True})
     three = scenario.model_copy(
-        update={"vehicles": scenario.vehicles[:3], "detections": DetectionsConfig(missed=0.05, range_m=11.0)}
+        update={
+            "vehicles": scenario.vehicles[:3],
+            "detections": DetectionsConfig(missed=0.05, range_m=11.0, error_time_s=0.0, missed_time_s=0.0),
+        }
     )
     positions = fly_exact_states(limited(three, 5.0))[1]
     apart = np.linalg.norm(positions[:, None] - positions[:, :, None], axis=-1)
     assert apart[-1].max() < 11.0
     positions = fly_exact_states(limited(three, 20.0))[1]
     assert np.linalg.norm(positions[-1, 0] - positions[-1, 1:], axis=-1).min() > 11.0
+
+
+def test_errors_last_as_long_as_they_are_said_to() -> None:
+    """The range's error of one neighbour, step by step: a Gauss-Markov process, its correlation exp(-t / 3.06 s)."""
+    tracked = TrackedNeighbours(ENCOUNTER, DetectionsConfig(), 0)
+    errors = []
+    for i in range(4000):
+        tracked.step(0.5 * i, AHEAD, np.zeros((2, 3)))
+        errors.append(tracked._errors[0, 0])
+    for lag in (1, 6):
+        assert np.corrcoef(errors[:-lag], errors[lag:])[0, 1] == pytest.approx(np.exp(-0.5 * lag / 3.06), abs=0.08)
