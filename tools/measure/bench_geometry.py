@@ -11,6 +11,7 @@ cm), or none.
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -190,22 +191,30 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=30)
     parser.add_argument("--only", nargs="+", metavar="CASE", choices=[case.name for case in CASES])
     parser.add_argument("--methods", nargs="+", choices=METHODS)
+    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     cv2.setNumThreads(1)
     chosen = {name: METHODS[name] for name in options.methods or METHODS}
-    print(
-        f"{'case':36} {'method':27} {'ms':>8} {'deg':>7} {'99 %':>7} {'cm':>7} {'99 %':>7} failures of {options.draws}"
-    )
+    rows = []
+    if not options.json:
+        print(
+            f"{'case':36} {'method':27} {'ms':>8} {'deg':>7} {'99 %':>7} {'cm':>7} {'99 %':>7} "
+            f"failures of {options.draws}"
+        )
     for case in CASES:
         if options.only and case.name not in options.only:
             continue
         for name, solve in chosen.items():
             row = measured(case, solve, options.draws)
-            print(
-                f"{case.name:36} {name:27} {row.ms:8.2f} {row.degrees[0]:7.3f} {row.degrees[1]:7.3f} "
-                f"{row.cm[0]:7.2f} {row.cm[1]:7.2f} {row.failures}",
-                flush=True,
-            )
+            rows.append({"case": case.name, "method": name, **vars(row)})
+            if not options.json:
+                print(
+                    f"{case.name:36} {name:27} {row.ms:8.2f} {row.degrees[0]:7.3f} {row.degrees[1]:7.3f} "
+                    f"{row.cm[0]:7.2f} {row.cm[1]:7.2f} {row.failures}",
+                    flush=True,
+                )
+    if options.json:
+        print(json.dumps(rows, indent=1))
 
 
 if __name__ == "__main__":

@@ -1,35 +1,44 @@
-"""Fly the published scenarios on seeds of this commit, by sight, blind and on exact states; write docs/figures.json.
+"""Measure every published figure and write docs/figures.json, from which `tools.docs.figures` writes the pages.
 
-python -m tools.measure.card --quick     # for who changes something: 20 minutes on two cores
-python -m tools.measure.card             # for a release: some 30 hours on two cores
+python -m tools.measure.card --quick            # for who changes something: flights of 20 minutes on two cores
+python -m tools.measure.card                    # for a release: some 30 hours on two cores
+python -m tools.measure.card --parts px4 step   # these again; the others stay as they were measured, with their commit
 
-Seeds follow from the commit's hash, so that nobody can have tuned to them. Beside each flight by sight stand, on the
-same seed, a blind one, whose drones detect nobody, and an exact one, on the true states of all: what the blind flock
-matches is no achievement. A run that was stopped goes on: RESULTS/COMMIT-quick.jsonl or -whole.jsonl has a line for
-each flight.
+`flights`: the published scenarios on seeds that follow from the commit's hash, so that nobody can have tuned to them.
+Beside each flight by sight stand, on the same seed, a blind one, whose drones detect nobody, and an exact one, on the
+true states of all: what the blind flock matches is no achievement. A run that was stopped goes on: RESULTS/COMMIT-*
+has a line for each flight, and the logs of those by sight. `errors`: what drones perceive wrongly in these flights,
+for config/perceived. `encounters`: two drones that meet on made-up detections with such errors. `pictures`: real ones,
+with --labelled and --without-drones. `px4`: where FLOCKD_PX4 names a build. `geometry`, `step`: on this computer.
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
+import itertools
 import json
 import math
 import multiprocessing
 import os
 import platform
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import yaml
 from scipy.stats import binom
 
 from flockd.campaign.figures import MEASURES, Figure, figures_of
+from flockd.campaign.flight_plan import CASE
+from flockd.campaign.results import Results
 from flockd.core.choices import SimulatedPerception
 from flockd.core.config.document import Value
 from flockd.core.config.loader import Overrides
@@ -37,9 +46,11 @@ from flockd.core.data import data_path
 from flockd.flight.inference.hashes import model_hashes
 from flockd.review.replay.profile import ComputerFiles
 from flockd.sim.flock.swarm import fly
-from flockd.sim.scenario import load_scenario
+from flockd.sim.scenario import MIN_START_DISTANCE_M, load_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
+FIGURES_FILE = ROOT / "docs" / "figures.json"
+PERCEIVED = ROOT / "config" / "perceived" / "shipped_networks.yaml"
 SEEDS = 1_000_000
 """Worlds of flights have seeds below this: `tools.training.worlds` keeps those of training apart."""
 CONFIDENCE = 0.95
@@ -138,8 +149,8 @@ def seeds_of(commit: str, scenario: str, count: int) -> list[int]:
     return [int.from_bytes(one[:8]) % SEEDS for one in hashes]
 
 
-def flown(flight: Flight) -> Line:
-    """Fly it on this process alone; a flight that cannot be flown has its reason."""
+def flown(flight: Flight, logs: Path | None = None) -> Line:
+    """Fly it on this process alone; a flight that cannot be flown has its reason. One by sight leaves its log."""
     begin, reason, figures = time.monotonic(), None, dict[Figure, float | None]()
     overrides: Overrides = {**flight.overrides, "seed": flight.seed, "drone.perception.threads": 1}
     if flight.duration_s is not None:
@@ -148,6 +159,8 @@ def flown(flight: Flight) -> Line:
         scenario = load_scenario(data_path("config") / flight.file, overrides)
         log = fly(scenario, perception=EYES[flight.eyes].perception, processes=0, pictured=False).log
         figures = figures_of(log, FIGURES)
+        if logs is not None and flight.eyes == "sight":
+            log.save(logs / f"{flight.scenario.replace(' ', '_')}-{flight.seed}.npz")
     except Exception as error:  # noqa: BLE001 - whatever it is, it is one flight's result
         reason = f"{type(error).__name__}: {error}"
     who = dict(zip(("scenario", "eyes", "seed"), flight.key, strict=True))
@@ -155,11 +168,12 @@ def flown(flight: Flight) -> Line:
 
 
 def run(
-    flights: Sequence[Flight], results: Path, workers: int, fly_one: Callable[[Flight], Line] = flown
+    flights: Sequence[Flight], results: Path, workers: int, fly_one: Callable[[Flight], Line] | None = None
 ) -> list[Line]:
     """Fly what ``results`` does not have yet, add it there, and give all lines; flights that failed are tried again."""
     lines = {_key(line): line for line in read_lines(results) if line["failed"] is None}
     missing = [flight for flight in flights if flight.key not in lines]
+    fly_one = fly_one or partial(flown, logs=results.parent)
     results.parent.mkdir(parents=True, exist_ok=True)
     draft = results.with_suffix(".new")
     draft.write_text("".join(json.dumps(line) + "\n" for line in lines.values()), encoding="utf-8")
@@ -231,19 +245,14 @@ def _rounded(value: float) -> float:
     return value if value == 0.0 else round(value, 3 - math.floor(math.log10(abs(value))))
 
 
-def document(commit: str, date: str, lines: Sequence[Line], *, quick: bool) -> dict[str, Any]:
-    """What docs/figures.json holds."""
-    computer = ComputerFiles().computer()
+def document(commit: str, lines: Sequence[Line], *, quick: bool) -> dict[str, Any]:
+    """What docs/figures.json holds of the flights."""
     files = {name: one.file for name, one in SCENARIOS.items()}
     networks: dict[str, str] = {}
     for file in sorted(set(files.values())):
         networks |= model_hashes(load_scenario(data_path("config") / file).drone.perception)
     return {
-        "commit": commit,
-        "date": date,
-        "quick": quick,
-        "command": f"python -m tools.measure.card{' --quick' * quick}",
-        "machine": f"{computer['name']}, {computer['cores']} cores, Python {platform.python_version()}",
+        **_measured_by(commit, f"python -m tools.measure.card{' --quick' * quick} --parts flights"),
         "networks": networks,
         "flown_s": round(sum(line["wall_s"] for line in lines)),
         "figures": {figure: {"name": MEASURES[figure].name, "unit": MEASURES[figure].unit} for figure in FIGURES},
@@ -252,40 +261,121 @@ def document(commit: str, date: str, lines: Sequence[Line], *, quick: bool) -> d
     }
 
 
+def _measured_by(commit: str, command: str) -> dict[str, Any]:
+    computer = ComputerFiles().computer()
+    machine = f"{computer['name']}, {computer['cores']} cores, Python {platform.python_version()}"
+    return {"commit": commit, "date": datetime.now(UTC).date().isoformat(), "command": command, "machine": machine}
+
+
+def encounters(results: Results) -> list[dict[str, Any]]:
+    """Of each speed, range error and share that is missed: how many flights, the nearest, and how many touched."""
+    found = []
+    errors = "detections.range_error", "detections.missed"
+    for speed in sorted({str(case).rpartition("_")[2] for case in results.values_of(CASE)}):
+        cases = [case for case in results.values_of(CASE) if str(case).endswith(f"_{speed}")]
+        for wrong, missed in itertools.product(*(results.values_of(key) for key in errors)):
+            cells = {
+                cell for case in cases for cell in results.cells_with({CASE: case, errors[0]: wrong, errors[1]: missed})
+            }
+            near_m = [row["min_distance_m"] for row in results.rows if row["cell"] in cells]
+            known = sorted(metres for metres in near_m if metres is not None)
+            found.append({
+                "speed_m_s": float(speed), "range_error": wrong, "missed": missed, "flights": len(known),
+                "nearest_m": round(known[0], 2), "touched": sum(metres < MIN_START_DISTANCE_M for metres in known),
+            })  # fmt: skip
+    return found
+
+
+def _campaign(name: str, seeds: int | None, folder: Path, workers: int) -> Results:
+    """Fly a campaign of config/campaigns with so many seeds, None: the file's; what is there already is kept."""
+    path = data_path("config") / "campaigns" / f"{name}.yaml"
+    document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    document["scenario"] = str((path.parent / document["scenario"]).resolve())
+    document |= {} if seeds is None else {"seeds": seeds}
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    copy = folder.with_suffix(".yaml")
+    copy.write_text(yaml.safe_dump(document), encoding="utf-8")
+    _flockd("campaign", "run", str(copy), "--out", str(folder), "--workers", str(workers))
+    return Results.load(folder)
+
+
+def _flockd(*words: str) -> str:
+    """What a command of flockd prints."""
+    return _output("-c", "from flockd.cli import program; program()", *words)
+
+
+def _output(*words: str) -> str:
+    """What a Python program prints, which may say with exit code 1 that a bar is missed."""
+    ended = subprocess.run([sys.executable, *words], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False)
+    if ended.returncode not in (0, 1):
+        raise SystemExit(f"{' '.join(words)} ended with exit code {ended.returncode}")
+    return ended.stdout
+
+
 def commit_of(root: Path) -> str:
     """The commit that is checked out. Raises SystemExit where what flies differs from it."""
-    changed = _git(root, "status", "--porcelain", "--", "flockd", "models", "config")
+    changed = git(root, "status", "--porcelain", "--", "flockd", "models", "config")
     if changed:
         raise SystemExit(f"flockd, models or config differ from the commit; commit first:\n{changed}")
-    return _git(root, "rev-parse", "HEAD")
+    return git(root, "rev-parse", "HEAD")
 
 
-def _git(root: Path, *words: str) -> str:
+def git(root: Path, *words: str) -> str:
+    """What git prints in the folder `root`."""
     return subprocess.run(["git", *words], cwd=root, check=True, capture_output=True, text=True).stdout.strip()
 
 
+def _part(part: str, commit: str, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Measure one part."""
+    quick, workers, results = arguments.quick, arguments.workers, arguments.results / commit[:12]
+    size = "quick" if quick else "whole"
+    found: Any = None
+    if part == "flights":
+        lines = run(flights_of(commit, quick=quick), results / f"{size}.jsonl", workers)
+        return document(commit, lines, quick=quick)
+    if part == "errors":
+        logs = sorted(str(path) for path in results.glob("*.npz"))
+        _output("-m", "tools.training.fit_perception", *logs, "--out", str(PERCEIVED))
+        found = {"logs": [Path(log).name for log in logs]}
+    elif part == "encounters":
+        found = encounters(_campaign("encounters", 1 if quick else None, results / f"encounters-{size}", workers))
+    elif part == "pictures":
+        sets = [("--labelled", one) for one in arguments.labelled] + [
+            ("--without-drones", one) for one in arguments.without_drones
+        ]
+        found = json.loads(_output("-m", "tools.measure.evaluate_real", "--json", *itertools.chain(*sets)))
+    elif part == "px4":
+        found = json.loads(_output("-m", "tools.checks.px4_rows", "--json"))["flights"]
+    elif part == "geometry":
+        found = json.loads(_output("-m", "tools.measure.bench_geometry", "--json", "--draws", "30" if quick else "300"))
+    elif part == "step":
+        recording = "tests/review/replay/crossing.mcap"
+        found = json.loads(_flockd("replay", recording, "--profile", "--json"))
+    return {**_measured_by(commit, f"python -m tools.measure.card{' --quick' * quick} --parts {part}"), "found": found}
+
+
+PARTS = ("flights", "errors", "encounters", "pictures", "px4", "geometry", "step")
+
+
 def main() -> None:
-    """Fly what is missing and write the file."""
+    """Measure what is asked for and write the file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="few and short flights")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, metavar="PART", help="default: all that can be measured")
     parser.add_argument("--results", type=Path, default=ROOT / "out" / "card", help="default: out/card")
-    parser.add_argument("--out", type=Path, help="default: docs/figures.json; with --quick RESULTS/figures.json")
-    parser.add_argument("--only", nargs="+", choices=SCENARIOS, metavar="SCENARIO", help="fly these, and write nothing")
+    parser.add_argument("--out", type=Path, default=FIGURES_FILE, help="default: docs/figures.json")
+    parser.add_argument("--labelled", action="append", default=[], metavar="NAME=FOLDER")
+    parser.add_argument("--without-drones", action="append", default=[], metavar="NAME=FOLDER")
     parser.add_argument("--workers", type=int, default=os.cpu_count(), help="flights at once")
     arguments = parser.parse_args()
     commit = commit_of(ROOT)
-    flights = flights_of(commit, quick=arguments.quick)
-    if arguments.only:
-        flights = [one for one in flights if one.scenario in arguments.only]
-    name = f"{commit[:12]}-{'quick' if arguments.quick else 'whole'}.jsonl"
-    lines = run(flights, arguments.results / name, arguments.workers)
-    if arguments.only:
-        print(json.dumps(table_of(lines), indent=1))
-        return
-    out = arguments.out or (arguments.results if arguments.quick else ROOT / "docs") / "figures.json"
-    date = datetime.now(UTC).date().isoformat()
-    out.write_text(json.dumps(document(commit, date, lines, quick=arguments.quick), indent=1) + "\n", encoding="utf-8")
-    print(out)
+    missing = set() if arguments.labelled or arguments.without_drones else {"pictures"}
+    missing |= set() if "FLOCKD_PX4" in os.environ else {"px4"}
+    for part in arguments.parts or [part for part in PARTS if part not in missing]:
+        measured = _part(part, commit, arguments)
+        known = json.loads(arguments.out.read_text(encoding="utf-8")) if arguments.out.is_file() else {}
+        arguments.out.write_text(json.dumps(known | {part: measured}, indent=1) + "\n", encoding="utf-8")
+        print(f"{arguments.out}: {part}", flush=True)
 
 
 if __name__ == "__main__":

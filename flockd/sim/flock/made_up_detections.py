@@ -13,7 +13,7 @@ from flockd.flight.tracking import Measurement, Tracker
 from flockd.sim.scenario import DetectionsConfig, ScenarioConfig
 
 _OWN_MOTION_ERROR_M = 0.02
-"""Standard deviation of a drone's motion in a step, each axis, and what the tracker is told of it; where the scenario is
+"""Standard deviation of a drone's motion in a step, each axis, of which the tracker is told. Where the scenario is
 `ideal` the motion is exact."""
 
 

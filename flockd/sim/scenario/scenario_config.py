@@ -182,7 +182,8 @@ class WorldConfig(Section):
 
 class DetectionsConfig(Section):
     """Detections made up from the truth with errors that last, for flights without images through the drone's own
-    tracker, which is wrong about the drone's own way by 2 cm a step. In the view of a camera that has one of `faults` nobody is detected, and the drone flies degraded."""
+    tracker, which is wrong about the drone's own way by 2 cm a step. In the view of a camera that has one of `faults`
+    nobody is detected, and the drone flies degraded."""
 
     range_m: Positive = 20.0
     """Farther away nobody is detected."""

@@ -1,0 +1,171 @@
+"""Writes the tables of figures in README and docs from docs/figures.json, which `tools.measure.card` measures.
+
+python -m tools.docs.figures            # writes the pages
+python -m tools.docs.figures --check    # exit code 1 when a page is not up to date
+
+A page has a table between `<!-- figures: NAME -->` and `<!-- end of figures -->`, NAME being one of `TABLES`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from flockd.ground.pictures.scoring import WIDTH_CLASSES
+from tools.measure.card import EYES, FIGURES_FILE, ROOT, git
+
+BLOCK = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
+AGE = re.compile(r" \d+ commits? of `flockd/flight` since\.")
+"""Which changes with every commit, so that it is as of when the page was written."""
+Part = Mapping[str, Any]
+PAPERS = "the paper's five drones"
+SHORT = ("order_tail", "recall_within_10m", "false_share", "associated_error_median_m", "min_distance_after_10s_m",
+         "slowed_share")  # fmt: skip
+"""Of README."""
+
+
+def pages() -> list[Path]:
+    """Those that may have tables."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def written(text: str, parts: Mapping[str, Part]) -> str:
+    """A page's text with its tables."""
+    return BLOCK.sub(lambda found: f"{found[1]}{TABLES[found[2]](parts)}\n{found[3]}", text)
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
+
+
+def _origin(part: Part) -> str:
+    """By which command, of which commit, and how old that is."""
+    commit = part["commit"]
+    try:
+        count = int(git(ROOT, "rev-list", "--count", f"{commit}..HEAD", "--", "flockd/flight"))
+    except (OSError, subprocess.CalledProcessError):
+        count = 0
+    since = f"{count} commit{'s' * (count != 1)} of `flockd/flight` since."
+    return f"\n`{part['command']}`, commit {commit[:8]}, {part['date']}, {part['machine']}; {since}"
+
+
+def _cell(figures: Part, figure: str) -> str:
+    one = figures.get(figure)
+    return "-" if one is None else f"{one['median']:g}" + (f" ({one['worst']:g})" if one["count"] > 1 else "")
+
+
+def _flights(parts: Mapping[str, Part], scenarios: Iterable[str] | None = None, only: Sequence[str] = ()) -> str:
+    """Median and, in brackets, worst of a figure: by sight, exact and blind."""
+    part = parts["flights"]
+    tables = []
+    for scenario in scenarios or part["scenarios"]:
+        eyes = part["scenarios"][scenario]
+        names = {figure: f"{of['name']}{', ' * bool(of['unit'])}{of['unit']}" for figure, of in part["figures"].items()}
+        rows = [
+            [names[figure], *(_cell(eyes[kind]["figures"], figure) for kind in EYES)]
+            for figure in (only or names)
+            if any(figure in eyes[kind]["figures"] for kind in EYES)
+        ]
+        count = eyes["sight"]["flights"] - eyes["sight"]["failed"]
+        head = f"{scenario}: {count} flight{'s' * (count != 1)}, median (worst)"
+        tables.append(_table((head, *(f"by {kind}" if kind == "sight" else kind for kind in EYES)), rows))
+    return "\n\n".join(tables) + "\n" + _origin(part)
+
+
+def _paper(parts: Mapping[str, Part]) -> str:
+    """What the paper says of the same flight: its largest errors, and its Table 3."""
+    figures = parts["flights"]["scenarios"][PAPERS]["sight"]["figures"]
+    rows = [
+        ("distance to a neighbour, largest error, m", "0.168", _cell(figures, "associated_error_max_m")),
+        ("time from which the shape stays, s", "67", _cell(figures, "convergence_time_s")),
+    ]
+    return _table(("", "paper, one flight", "flockd, median (worst)"), rows) + "\n" + _origin(parts["flights"])
+
+
+def _encounters(parts: Mapping[str, Part]) -> str:
+    rows = [
+        (f"{one['speed_m_s']:g} m/s", f"{one['range_error']:.0%}", f"{one['missed']:.0%}", str(one["flights"]),
+         f"{one['nearest_m']:g} m", str(one["touched"]))
+        for one in parts["encounters"]["found"]
+    ]  # fmt: skip
+    head = "each flies", "ranges err by", "missed", "flights", "nearest", "touched"
+    return _table(head, rows) + "\n" + _origin(parts["encounters"])
+
+
+def _pictures(parts: Mapping[str, Part]) -> str:
+    rows = []
+    for name, one in parts["pictures"]["found"].items():
+        widths = (one["by_width"][width] for width in WIDTH_CLASSES)
+        shares = [f"{of['found'] / of['boxes']:.0%} of {of['boxes']}" if of["boxes"] else "" for of in widths]
+        precision = "" if one["ap50"] is None else f"{one['ap50']:.2f}"
+        rows.append([name, str(one["images"]), *shares, precision, f"{one['false']} in {one['measured']}"])
+    head = ("set", "pictures", *(f"{width} px found" for width in WIDTH_CLASSES), "average precision", "false")
+    return _table(head, rows) + "\n" + _origin(parts["pictures"])
+
+
+def _px4(parts: Mapping[str, Part]) -> str:
+    rows = [
+        (one["flight"], f"{one['speed_factor']:g}", f"{one['off_m_s']:.3f}", f"{one['truly_off_m_s']:.3f}",
+         f"{one['order']:.3f}", "-" if one["closest_m"] is None else f"{one['closest_m']:.2f}",
+         f"{one['longest_step_s']:.2f}", "kept" if one["kept"] else "not kept", one["modes"])
+        for one in parts["px4"]["found"]
+    ]  # fmt: skip
+    head = ("flight", "speed", "off, m/s", "truly", "order", "nearest, m", "longest step, s", "limit", "modes")
+    return _table(head, rows) + "\n" + _origin(parts["px4"])
+
+
+def _geometry(parts: Mapping[str, Part]) -> str:
+    off = "degrees", "cm"
+    rows = [
+        (one["case"], one["method"], f"{one['ms']:.2f}", *(f"{one[kind][0]:.3f} ({one[kind][1]:.3f})" for kind in off),
+         str(one["failures"]))
+        for one in parts["geometry"]["found"]
+    ]  # fmt: skip
+    head = ("pairs", "method", "ms", "degrees off, median (99 %)", "cm off", "failures")
+    return _table(head, rows) + "\n" + _origin(parts["geometry"])
+
+
+def _step(parts: Mapping[str, Part]) -> str:
+    stages = parts["step"]["found"]["stages"]
+    rows = [(name, f"{one['p50_ms']:.1f}", f"{one['p95_ms']:.1f}") for name, one in stages.items()]
+    return _table(("stage", "p50, ms", "p95, ms"), rows) + "\n" + _origin(parts["step"])
+
+
+TABLES: dict[str, Callable[[Mapping[str, Part]], str]] = {
+    "flights": _flights,
+    "readme": lambda parts: _flights(parts, (PAPERS,), SHORT),
+    "paper": _paper,
+    "encounters": _encounters,
+    "pictures": _pictures,
+    "px4": _px4,
+    "geometry": _geometry,
+    "step": _step,
+}
+
+
+def main() -> int:
+    """Reads the command line; writes or checks the pages."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing; exit code 1 when a page is out of date")
+    check = parser.parse_args().check
+    parts, old = json.loads(FIGURES_FILE.read_text(encoding="utf-8")), []
+    for page in pages():
+        text = page.read_text(encoding="utf-8")
+        fresh = written(text, parts)
+        if AGE.sub("", fresh) != AGE.sub("", text):
+            old.append(page)
+        if fresh != text and not check:
+            page.write_text(fresh, encoding="utf-8")
+    for page in old if check else ():
+        print(f"{page.relative_to(ROOT)}: out of date; run python -m tools.docs.figures", file=sys.stderr)
+    return 1 if check and old else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
