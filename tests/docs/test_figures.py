@@ -1,0 +1,54 @@
+"""Figures of performance on the pages are those of docs/figures.json, measured with the networks that are shipped."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flockd.core.data import data_path
+from flockd.flight.inference.hashes import model_hashes
+from flockd.sim.scenario import load_scenario
+from tools.docs.figures import AGE, BLOCK, TABLES, pages, written
+from tools.measure.card import FIGURES_FILE, ROOT
+
+BY_HAND = re.compile(r"\b\d{1,2} (?:October|November|December) 20\d\d\b|\bcommit [0-9a-f]{7,40}\b")
+"""What a figure that somebody measured and typed says with it."""
+PARTS = json.loads(FIGURES_FILE.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda page: str(page.relative_to(ROOT)))
+def test_tables_are_generated_and_no_figure_is_typed(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert AGE.sub("", text) == AGE.sub("", written(text, PARTS)), "run python -m tools.docs.figures"
+    assert BY_HAND.findall(BLOCK.sub("", text)) == []
+
+
+def test_every_table_is_on_a_page() -> None:
+    found = {name for page in pages() for _, name, _ in BLOCK.findall(page.read_text(encoding="utf-8"))}
+    assert found == set(TABLES)
+
+
+def test_flights_were_flown_with_the_networks_that_are_shipped() -> None:
+    shipped: dict[str, str] = {}
+    for file in set(PARTS["flights"]["files"].values()):
+        shipped |= model_hashes(load_scenario(data_path("config") / file).drone.perception)
+    assert PARTS["flights"]["networks"] == shipped
+
+
+def test_a_table_says_median_and_worst_beside_the_exact_and_the_blind() -> None:
+    def eyes(median: float) -> dict[str, Any]:
+        order = {"median": median, "worst": median - 0.1, "interval": [0, 1], "count": 3}
+        return {"flights": 3, "failed": 0, "figures": {"order_tail": order}}
+
+    part = {
+        "commit": "0" * 40, "date": "2026-11-28", "command": "python -m nothing", "machine": "none",
+        "figures": {"order_tail": {"name": "order at the end", "unit": ""}},
+        "scenarios": {"square": {"sight": eyes(0.9), "blind": eyes(0.5), "exact": eyes(0.99)}},
+    }  # fmt: skip
+    page = written("<!-- figures: flights -->\nold\n<!-- end of figures -->", {"flights": part})
+    assert "old" not in page
+    assert "| order at the end | 0.9 (0.8) | 0.5 (0.4) | 0.99 (0.89) |" in page
