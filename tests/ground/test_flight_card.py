@@ -40,7 +40,7 @@ def test_limits_heights_and_people_are_those_of_the_file(capsys: Capture, tmp_pa
 
 
 def test_every_fault_stands_there_with_what_it_does(capsys: Capture) -> None:
-    """The words of `docs/concepts/safety.md`; the file holds on a low battery."""
+    """The words of `docs/safety.md`; the file holds on a low battery."""
     card = rows(capsys, QUADROTOR)
     named = " ".join(card.values())
     assert all(f"`{event.value}`" in named for event in Event if event.value not in {"started", "no_answer"})

@@ -74,7 +74,7 @@ _SIZE, _SHARED = 5, 5
 _TURN, _OFFSET, _FOCAL = slice(0, 3), 3, 4
 _LASTING = np.diag(np.array([math.radians(0.1)] * 3 + [1.5e-3, 3e-3]) ** 2)
 """Beside the filter's own covariance: a network's flow and a rate of turn err in one direction for whole flights. By
-sight in the simulator with gusts of 0.3 m/s (`docs/calibration.md`): 0.05 degrees an axis, 1.7 ms and 0.06 %, root mean
+sight in the simulator with gusts of 0.3 m/s 0.05 degrees an axis, 1.7 ms and 0.06 %, root mean
 squares of 16 cameras in two worlds; with real cameras more is to be expected."""
 
 

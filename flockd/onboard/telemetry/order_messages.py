@@ -25,7 +25,7 @@ def parse_ask(payload: bytes) -> AskMessage:
     try:
         ask: AskMessage = from_json(AskMessage, message)
     except ValueError as error:
-        told = f"an order has to say who gives it, its number and its time ({error}); see docs/telemetry.md"
+        told = f"an order has to say who gives it, its number and its time ({error}); see docs/fleet_page.md"
         raise ValueError(told) from error
     names = ask["operator"], ask["session"]
     if not all(name and len(name) <= LONGEST_NAME and printable(name, lines=False) == name for name in names):

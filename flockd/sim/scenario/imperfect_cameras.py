@@ -122,7 +122,7 @@ _PRESETS: Mapping[CameraPreset, Mapping[str, Mapping[str, Any]]] = {
         # As `config/quadrotor.yaml` sets it; a sensor of at most 60 images a second: rows take 1 / (60 rows), the rule
         # of https://docs.luxonis.com/hardware/platform/sensors/shutter-type.
         "shutter": {"exposure_s": 0.005, "readout_s": 0.0167},
-        # 0.3 rad/s at 100 Hz, an assumption: docs/real_drone.md says how to measure one's own. Propellers turn at
+        # 0.3 rad/s at 100 Hz, an assumption: docs/cameras.md says how to measure one's own. Propellers turn at
         # 40-300 Hz: https://diydrones.com/forum/topics/vibration-analysis-1.
         "shake": {"rms_deg": 0.03, "frequency_hz": 100.0},
         # OV5647, 1.4 um: 4.3 ke, 36 dB, 68 dB, so 4300 / 10^(68 / 20) = 1.7 e (user guide of the OptArc AF51, page 21).
