@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 SCENARIO = "paper_flight.yaml"
 COSTS = """\
-costs, measured with five drones on a processor without 8-bit instructions, November 2026:
+costs, with five drones on a processor without 8-bit instructions:
   time       12 s of processor time a simulated second, so 11 minutes on two free cores for the whole flight, and 10 s
              to begin; a flight of 10 s with three drones 66 s of processor time; with --perception truth a few
              seconds
