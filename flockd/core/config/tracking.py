@@ -58,13 +58,13 @@ class TrackingParameters(Section):
     track."""
 
     detection_probability: Probability = 0.7
-    """P_D: of a neighbour that the cameras can show being detected in one frame set. The shipped networks detect 93 %
-    of drones at least 12 px wide and 34 % at 6 to 12 px (docs/networks.md), and misses come in runs. At 0.7 a track
-    stays confirmed through three frame sets in a row without a detection."""
+    """P_D: of a neighbour that the cameras can show being detected in one frame set. Less than what the shipped networks
+    detect of drones at least 12 px wide, because misses come in runs: at 0.7 a track stays confirmed through three
+    frame sets in a row without a detection."""
     clutter_density: Positive = 0.01
-    """False detections in one frame set, per steradian, unit of log range and unit of log size. The shipped networks
-    give 9 in 500 images (docs/networks.md), each of about 1.5 sr, at 0.5 to 20 m and 0.15 to 1.2 m large, thus 0.0016
-    on average; taken larger, as they crowd where trees are."""
+    """False detections in one frame set, per steradian, unit of log range and unit of log size. More than the shipped
+    networks give on average (9 in 500 images of 1.5 sr, at 0.5 to 20 m and 0.15 to 1.2 m large, are 0.0016), because
+    false detections crowd where trees are."""
     survival_time_s: Duration = 60.0
     """Mean time that a neighbour stays within sight: existence probability decays with this time constant."""
     birth_probability: Probability = 0.5

@@ -33,7 +33,7 @@ _LEAST_SIGMA = 0.04
 """What the model does not know of adds this to every estimate's relative standard deviation."""
 _TEMPER = 0.9
 """Power of all likelihoods: errors of cameras and networks last longer than a step, and are no independent evidence. So
-chosen that errors are as large as is said (`docs/concepts/size.md`)."""
+chosen that errors are as large as is said."""
 _LEVEL, _VERTICAL, _WEAVING = 0.2, (1e-4, 0.02), 3e-4
 """Spectral densities, assumed m^2/s^3, of the acceleration of a neighbour relative to the own drone. Each vertical one
 is a motion model: it flies level, rises and sinks in any way, or weaves. They are not of metres, so that they say
