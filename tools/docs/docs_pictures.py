@@ -10,8 +10,7 @@
 
     python -m tools.docs.docs_pictures above FLIGHT docs/pictures/circle.webp     # a short clip for the gallery
 
-detected.webp is what `flockd detect` draws, law_curve.svg what this program drew at commit 7b9dec37; the other pictures
-are drawn by hand.
+detected.webp is what `flockd detect` draws; the other pictures are drawn by hand.
 """
 
 from __future__ import annotations
