@@ -132,7 +132,7 @@ def _geometry(parts: Mapping[str, Part]) -> str:
 
 
 def _step(parts: Mapping[str, Part]) -> str:
-    stages = parts["step"]["found"]["stages"]
+    stages = parts["step"]["found"]["profile"]["stages"]
     rows = [(name, f"{one['p50_ms']:.1f}", f"{one['p95_ms']:.1f}") for name, one in stages.items()]
     return _table(("stage", "p50, ms", "p95, ms"), rows) + "\n" + _origin(parts["step"])
 

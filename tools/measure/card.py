@@ -104,7 +104,7 @@ SCENARIOS = {
     "varied": Scenario("paper_flight.yaml", (3, 20.0), varied=True),
     "forest": Scenario("forest.yaml", (1, 20.0)),
     "fisheye": Scenario("fisheye_flight.yaml", (1, 15.0)),
-    "head-on": Scenario("head_on.yaml", (2, None)),
+    "head-on": Scenario("head_on.yaml", (6, None)),
 }
 
 

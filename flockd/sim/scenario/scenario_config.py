@@ -193,10 +193,10 @@ class DetectionsConfig(Section):
     """Standard deviation of the logarithm of a range."""
     bearing_error_rad: Annotated[float, Field(gt=0, le=1)] = 0.005
     """Standard deviation of a bearing, each axis."""
-    error_time_s: NonNegative = 3.06
+    error_time_s: NonNegative = 1.85
     """How long errors stay about the same; 0: each step has its own. By default as of the shipped networks
     (config/perceived/shipped_networks.yaml) ..."""
-    missed_time_s: NonNegative = 2.17
+    missed_time_s: NonNegative = 4.24
     """... and the same of what is missed."""
 
 

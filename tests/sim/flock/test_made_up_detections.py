@@ -125,11 +125,11 @@ def test_who_pulls_away_at_the_start_is_followed() -> None:
 
 
 def test_errors_last_as_long_as_they_are_said_to() -> None:
-    """The range's error of one neighbour, step by step: a Gauss-Markov process, its correlation exp(-t / 3.06 s)."""
+    """The range's error of one neighbour, step by step: a Gauss-Markov process, its correlation exp(-t / 1.85 s)."""
     tracked = TrackedNeighbours(ENCOUNTER, DetectionsConfig(), 0)
     errors = []
     for i in range(4000):
         tracked.step(0.5 * i, AHEAD, np.zeros((2, 3)))
         errors.append(tracked._errors[0, 0])
     for lag in (1, 6):
-        assert np.corrcoef(errors[:-lag], errors[lag:])[0, 1] == pytest.approx(np.exp(-0.5 * lag / 3.06), abs=0.08)
+        assert np.corrcoef(errors[:-lag], errors[lag:])[0, 1] == pytest.approx(np.exp(-0.5 * lag / 1.85), abs=0.08)
