@@ -30,11 +30,6 @@ PERMITTED = (
         "name in FLOCKD_DATA a folder that holds hololens/",
     ),
     PermittedSkip(
-        "tests/onboard/sources/*",
-        "no virtual camera",
-        "`modprobe vivid`, on a kernel that was built with CONFIG_VIDEO_VIVID",
-    ),
-    PermittedSkip(
         "tests/flight/inference/*",
         "this computer can compute with CUDA",
         "install onnxruntime in place of onnxruntime-gpu",

@@ -163,7 +163,7 @@ ZENOH_READERS = {
         ("joblib", {"campaign/engine.py"}),
         ("ray", {"campaign/engine.py"}),
         ("rosbags", {"onboard/recording/ros_bag.py"}),
-        ("rclpy", {"onboard/ros/ros_node.py", "onboard/sources/ros_child.py"}),
+        ("rclpy", {"onboard/ros/ros_node.py", "onboard/sources/camera_child.py"}),
     ],
 )
 def test_an_outside_library_sits_behind_its_adapters(library: str, adapters: set[str]) -> None:

@@ -24,7 +24,7 @@ from flockd import __version__
 from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_plan import Plan, Run
 from flockd.core.errors import UnavailableError, UsageError
-from flockd.core.json_file import read_json
+from flockd.onboard.message_json import parsed
 
 PLAN_NAME = "campaign.json"
 LINES_NAME = "flights.jsonl"
@@ -37,6 +37,7 @@ _OURS = {PLAN_NAME, LINES_NAME, FLIGHTS_NAME, TIMINGS_NAME, REPORT_NAME, RERUNS,
 _FLOWN = TypeAdapter(FlownRun)
 _TIMINGS = "wall_s", "cpu_s", "began", "host", "process"
 """What differs from one time to the next."""
+MAX_PLAN_BYTES = 1 << 26
 _TEXTS = "reason", "networks_sha256"
 """Columns of text that may be empty in all rows."""
 
@@ -173,11 +174,15 @@ def load_plan(path: Path) -> Plan:
 
 def _plan_values(path: Path) -> Any:
     """What the plan's file holds. Raises UsageError."""
+    file = path / PLAN_NAME
+    if not file.exists():
+        raise UsageError(f"{path}: holds no campaign, as it has no {PLAN_NAME}; name another folder")
     try:
-        return read_json(path / PLAN_NAME)
-    except FileNotFoundError as error:
-        raise UsageError(f"{path}: holds no campaign, as it has no {PLAN_NAME}; name another folder") from error
-    except ValueError as error:
+        if not file.is_file():
+            raise ValueError("it is not an ordinary file")  # noqa: TRY301 - wrapped below
+        with file.open("rb") as stream:
+            return parsed(stream.read(MAX_PLAN_BYTES))
+    except (OSError, ValueError) as error:
         raise _no_plan(path, error) from error
 
 

@@ -102,9 +102,9 @@ def test_another_campaign_is_refused(plan: Plan, tmp_path: Path) -> None:
     ("content", "why"),
     [
         (b"{garbled", "Expecting property name"),
-        (b"[" * 100_000, "it is nested more than 50 levels deep"),
-        (b'{"campaign": ' + b"[" * 200 + b"]" * 200 + b"}", "it is nested more than 50 levels deep"),
-        (b"\xff{}", "it is not UTF-8 text"),
+        (b"[" * 100_000, "it is nested too deep"),
+        (b'{"campaign": ' + b"[" * 200 + b"]" * 200 + b"}", "it has no 'errors'"),
+        (b"\xff{}", "can't decode byte"),
         (b"[]", "it holds something else"),
         (b"{}", "it has no 'errors'"),
         (b'{"errors": null, "campaign": {"campaign": "x"}, "scenario": {}}', "scenario: Field required"),

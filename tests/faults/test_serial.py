@@ -81,18 +81,3 @@ async def test_in_flight_it_is_opened_again_however_long_that_takes_and_nothing_
             await asyncio.sleep(QUIET_S)
             assert len(fake_autopilot.setpoints) == sent
             assert ship.state() == "silent"
-
-
-@pytest.mark.fault("serial-port")
-async def test_with_two_autopilots_and_no_system_id_it_does_not_start(port: int, tmp_path: Path) -> None:
-    with (
-        FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as own,
-        FakeAutopilot(port, system_id=2, height_m=2.5, clock=clock) as neighbour,
-    ):
-        async with aboard(own, port, tmp_path) as ship:
-            await asyncio.wait({ship.ending}, timeout=SECONDS_TO_FAIL)
-            error = ship.ending.exception()
-            assert isinstance(error, AutopilotError)
-            assert error.exit_code is ExitCode.BAD_CONFIGURATION
-            assert "autopilot.system_id: is missing, and the autopilots of systems 1, 2 are heard" in str(error)
-            assert not neighbour.setpoints

@@ -203,7 +203,7 @@ async def on_the_ground(world: World) -> None:
     losing = iter([True, True])
     world.relay.losing = lambda number: number == EVENT and next(losing, False)
     world.streamer.begin()
-    checks = link._received.check_events
+    checks = link.received.check_events
     await world.saw("two events lost", lambda: offboard_possible(link), "requested, and the list is whole")
     world.rows.append(Row("two events lost", f"given up: {checks._order.gaps}"))
     world.relay.losing = lambda number: False
@@ -212,7 +212,7 @@ async def on_the_ground(world: World) -> None:
 
 def offboard_possible(link: AutopilotLink) -> bool:
     """The list of checks lets offboard be selected."""
-    report = link._received.check_events.report
+    report = link.received.check_events.report
     return report is not None and bool(report.can_run >> 14 & 1)
 
 
@@ -274,13 +274,13 @@ async def _lose_heartbeats(world: World) -> None:
         count[0] += number == HEARTBEAT
         return number == HEARTBEAT and count[0] % 3 == 0
 
-    lost = world.link.heartbeats_lost()
+    lost = world.link.received.heartbeats_lost
     world.relay.losing = every_third
     await asyncio.sleep(12.0)
     world.relay.losing = lambda number: False
     flown = world.mode("offboard")() and world.streamer.report().silence is None
     world.rows.append(Row("every third heartbeat lost", "flown on" if flown else f"{world.streamer.report().silence}"))
-    counted = world.link.heartbeats_lost() - lost
+    counted = world.link.received.heartbeats_lost - lost
     world.rows.append(Row("every third heartbeat lost", "counted" if counted >= 3 else f"{counted} counted"))
 
 
@@ -345,7 +345,7 @@ async def starting_anew(world: World) -> None:
 
 def _rate(world: World) -> bool:
     """The attitude comes at more than the 10 Hz or 50 Hz of its own accord: CURRENT_MODE was requested."""
-    return world.link._received.restarts > 0 and not world.link._received.check_events.incomplete
+    return world.link.received.restarts > 0 and not world.link.received.check_events.incomplete
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -26,29 +26,12 @@ Model = TypeVar("Model", bound=BaseModel)
 Overrides = Mapping[str, Value]
 
 
-class _Kind(NamedTuple):
-    """A kind of file."""
-
-    words: str
-    needed: tuple[str, ...]
-    """Its keys without a default, the one first that no other kind has."""
-    keys: frozenset[str]
-    """By which it is known."""
-
-
-_KINDS: Mapping[FileKind, _Kind] = {
-    "scenario": _Kind(
-        "a scenario",
-        ("vehicles", "drone"),
-        frozenset(("scenario", "duration_s", "seed", "vehicles", "vehicle", "sensors", "cameras", "world", "drone")),
-    ),
-    "drone": _Kind("a drone's own file", ("rig",), frozenset(DroneConfig.model_fields)),
-    "campaign": _Kind(
-        "a campaign",
-        ("campaign", "scenario"),
-        frozenset(("campaign", "scenario", "perception", "seed", "seeds", "fixed", "vary", "cases", "measure", "stop")),
-    ),
+_KINDS: Mapping[FileKind, tuple[str, tuple[str, ...]]] = {
+    "campaign": ("a campaign", ("campaign", "scenario")),
+    "scenario": ("a scenario", ("vehicles", "drone")),
+    "drone": ("a drone's own file", ("rig",)),
 }
+"""Each kind's name, and its keys without a default, the one first that no other kind has."""
 
 
 def load_drone(path: Path | str, overrides: Overrides | None = None) -> DroneConfig:
@@ -72,24 +55,26 @@ def load_real_drone(path: Path | str) -> tuple[DroneConfig, list[ConfigProblem]]
 
 def kind_of(document: Document) -> FileKind:
     """Whose file it is, by its keys; a scenario's, where that is not clear."""
-    return max(_KINDS, key=lambda kind: len(document.values.keys() & _KINDS[kind].keys))
+    keys = document.values.keys()
+    if not keys & {"scenario", "drone"} and keys <= DroneConfig.model_fields.keys():
+        return "drone"
+    return next((kind for kind, (_, needed) in _KINDS.items() if needed[0] in keys), "scenario")
 
 
 def require(document: Document, wanted: FileKind) -> None:
     """Raises ConfigError for the file of another kind, with what to name instead."""
     kind = kind_of(document)
-    found = _KINDS[kind]
-    if kind == wanted or not document.values.keys() & {found.needed[0]}:
+    words, (own, *_) = _KINDS[kind]
+    if kind == wanted or own not in document.values:
         return
-    drone = document.values.get("drone")
+    drone, (wanted_words, needed) = document.values.get("drone"), _KINDS[wanted]
     if kind == "campaign":
         hint = "`flockd campaign` flies it"
     elif wanted == "drone" and isinstance(drone, str):
         hint = f"name that: {Path(document.file).parent / drone}"
     else:
-        needed = _KINDS[wanted].needed
         hint = f"name one with the key{'s' * (len(needed) > 1)} `{'` and `'.join(needed)}`"
-    raise ConfigError.at(document.file, f"is {found.words}, and {_KINDS[wanted].words} is needed here; {hint}")
+    raise ConfigError.at(document.file, f"is {words}, and {wanted_words} is needed here; {hint}")
 
 
 def drone_document(path: Path, overrides: Overrides) -> Document:

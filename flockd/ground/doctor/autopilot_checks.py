@@ -130,10 +130,10 @@ async def _ask(config: DroneConfig, parameters: AutopilotParameters, heard_s: fl
             with suppress(TimeoutError):
                 async with asyncio.timeout(CLOCK_S):
                     await link.synchronise()
-            found.append(judge_clock(link.clock()))
+            found.append(judge_clock(link.received.trusted_clock()))
             await asyncio.sleep(WATCHED_S if config.perception.height != "barometer" else 0.0)
-            found += judge_range_finder(link.ground_range(), link.range_finders(), config)
-        found += judge_messages(link.unknown_values())
+            found += judge_range_finder(link.received.ground_range(), link.received.range_finders(), config)
+        found += judge_messages(link.received.unknown_values())
     finally:
         await link.close()
     return found

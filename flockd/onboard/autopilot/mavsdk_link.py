@@ -13,7 +13,7 @@ import math
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from enum import IntEnum
@@ -32,7 +32,7 @@ from mavsdk.system import System
 
 from flockd.core import services
 from flockd.core.config.autopilot import AutopilotParameters
-from flockd.core.messages import FloatArray, RangeReading, Setpoint, VehicleState
+from flockd.core.messages import FloatArray, Setpoint, VehicleState
 from flockd.flight.tracking.weave_path import HEIGHT_GAIN_PER_S
 from flockd.onboard.autopilot.autopilot_status import (
     MODES,
@@ -42,7 +42,6 @@ from flockd.onboard.autopilot.autopilot_status import (
     Firmware,
     FlightMode,
 )
-from flockd.onboard.autopilot.clock_sync import ClockEstimate
 from flockd.onboard.autopilot.mavlink_messages import Fields, ReceivedMessages, result_text, text_chunks
 from flockd.onboard.autopilot.refusal_reasons import REMEDIES_OF_RESULTS
 from flockd.onboard.autopilot.refusals import Refusal
@@ -143,7 +142,8 @@ class AutopilotLink:
         self._system_id = int(system.get_system_id())
         self._heard = {self._system_id}
         """System ids of the autopilots on the link."""
-        self._received = ReceivedMessages(self._reports.append, parameters.max_gap_s)
+        self.received = ReceivedMessages(self._reports.append, parameters.max_gap_s)
+        """What the autopilot has sent; its clock is measured by `synchronise`, its parameters are read by `attend`."""
         self._sent_s = -math.inf
         """When the last setpoint was sent."""
         self._param = Param(system)
@@ -241,48 +241,24 @@ class AutopilotLink:
 
     def status(self) -> AutopilotStatus:
         """The newest of everything that the autopilot has sent."""
-        return self._received.status(self._clock())
+        return self.received.status(self._clock())
 
     def vehicle_state(self) -> VehicleState | None:
         """See `ReceivedMessages.vehicle_state`."""
-        return self._received.vehicle_state()
-
-    def ground_range(self) -> RangeReading | None:
-        """See `ReceivedMessages.ground_range`."""
-        return self._received.ground_range()
-
-    def range_finders(self) -> Mapping[int, tuple[float, ...]]:
-        """See `ReceivedMessages.range_finders`."""
-        return self._received.range_finders()
-
-    def unknown_values(self) -> Mapping[str, int]:
-        """See `ReceivedMessages.unknown_values`."""
-        return self._received.unknown_values()
-
-    def parameters(self) -> Mapping[str, float]:
-        """The newest values of those that flockd relies on; see `attend`."""
-        return dict(self._received.parameters.values)
-
-    def heartbeats_lost(self) -> int:
-        """How many did not come while other messages did."""
-        return self._received.heartbeats_lost
+        return self.received.vehicle_state()
 
     def refusals(self) -> tuple[Refusal, ...]:
         """Why it would refuse to arm or to fly offboard now, the cause first."""
         now = self._clock()
-        return self._received.refusals(now, streams=now - self._sent_s < services.SETPOINT_STREAM.timeout)
+        return self.received.refusals(now, streams=now - self._sent_s < services.SETPOINT_STREAM.timeout)
 
     def knows_checks(self) -> bool:
         """Whether the autopilot's list of failed checks is here, and whole."""
-        return not self._received.check_events.incomplete
+        return not self.received.check_events.incomplete
 
     async def ask_for_checks(self) -> None:
         """Asks it to send its list of failed checks. Raises AutopilotError where it cannot."""
         await self._command("for its checks", COMMAND_RUN_CHECKS)
-
-    def clock(self) -> ClockEstimate | None:
-        """See `ReceivedMessages.trusted_clock`. It is measured by `synchronise`."""
-        return self._received.trusted_clock()
 
     async def synchronise(self) -> None:
         """Exchanges times with the autopilot until cancelled."""
@@ -325,8 +301,8 @@ class AutopilotLink:
 
         That is with NAV_DLL_ACT other than 0, or at the end of a mission.
         """
-        acts = self._received.parameters.values.get(GROUND_STATION_LOSS)
-        return acts == 0 and self._received.flight_mode() != "mission"
+        acts = self.received.parameters.values.get(GROUND_STATION_LOSS)
+        return acts == 0 and self.received.flight_mode() != "mission"
 
     async def _request_what_is_missing(self) -> None:
         beginnings = self._beginnings()
@@ -343,14 +319,14 @@ class AutopilotLink:
 
     def _beginnings(self) -> int:
         """How often it may have forgotten what it was asked to send."""
-        return self._received.restarts + (0 if self._port is None else self._port.reopened)
+        return self.received.restarts + (0 if self._port is None else self._port.reopened)
 
     async def _read_parameters(self) -> None:
         while True:
             for name, kind in KINDS.items():
                 with suppress(AutopilotError):  # an older firmware may lack one, and one that is lost says so elsewhere
                     value = await self.parameter(name, kind)
-                    self._received.parameters.take(name, float(value), armed=self.status().armed)
+                    self.received.parameters.take(name, float(value), armed=self.status().armed)
                 await asyncio.sleep(PARAMETER_S)
 
     def take_reports(self) -> list[str]:
@@ -364,7 +340,7 @@ class AutopilotLink:
         once too often, makes PX4 climb or sink by as much.
         """
         north, east = (float(v) for v in setpoint.velocity)
-        down = HEIGHT_GAIN_PER_S * (self._received.height_m - setpoint.height_m)
+        down = HEIGHT_GAIN_PER_S * (self.received.height_m - setpoint.height_m)
         if not all(math.isfinite(number) for number in (north, east, down, setpoint.yaw_rad)):
             raise AutopilotError("a setpoint that is not finite was not sent")
         fields = {
@@ -382,7 +358,7 @@ class AutopilotLink:
         except MavlinkDirectError as error:
             raise AutopilotError(f"MAVSDK could not send a setpoint ({error.result.name.lower()})") from error
         self._sent_s = self._clock()
-        self._received.setpoints.sent(self._sent_s, north, east)
+        self.received.setpoints.sent(self._sent_s, north, east)
 
     def send_obstacle_distances(self, free_m: FloatArray, range_m: float) -> None:
         """Sends how far the drone sees that it is free, once: `free_m` (n,) as of `free_ahead`, up to `range_m`."""
@@ -449,12 +425,12 @@ class AutopilotLink:
         now = self._clock()
         if message.system_id != self._system_id or message.component_id != AUTOPILOT_COMPONENT:
             if message.message_name == "HEARTBEAT":
-                self._received.add_other_heartbeat(json.loads(message.fields_json), now)
+                self.received.add_other_heartbeat(json.loads(message.fields_json), now)
         elif message.message_name == TIME_SYNC:
             self._take_time(json.loads(message.fields_json), now)
         else:
-            self._received.add(message.message_name, json.loads(message.fields_json), now)
-            missing = self._received.check_events.missing(now)
+            self.received.add(message.message_name, json.loads(message.fields_json), now)
+            missing = self.received.check_events.missing(now)
             if missing is not None:
                 self._missing.append(missing)
 
@@ -463,7 +439,7 @@ class AutopilotLink:
         sent_ns = int(fields["ts1"])
         if fields["tc1"] and sent_ns in self._time_syncs:
             self._time_syncs.remove(sent_ns)
-            self._received.clock.add(1e-9 * sent_ns, 1e-9 * int(fields["tc1"]), now)
+            self.received.clock.add(1e-9 * sent_ns, 1e-9 * int(fields["tc1"]), now)
 
     async def _set_mode(self, mode: FlightMode) -> None:
         main, sub = next(numbers for numbers, name in MODES.items() if name == mode)
@@ -471,7 +447,7 @@ class AutopilotLink:
 
     async def _leave_offboard(self) -> None:
         """PX4 goes back to the last mode it was asked for after landing, and cannot be armed if that was offboard."""
-        if self._received.flight_mode() == "offboard":
+        if self.received.flight_mode() == "offboard":
             await self.hold()
 
     async def _request_streams(self) -> None:
@@ -511,7 +487,7 @@ class AutopilotLink:
 
         def said() -> list[str]:
             now = self._clock()
-            return self._received.recent_texts(now, now - asked_s)
+            return self.received.recent_texts(now, now - asked_s)
 
         deadline = self._clock() + REASON_S
         while not said() and self._clock() < deadline:
@@ -529,7 +505,7 @@ class AutopilotLink:
         return MavlinkMessage(name, 0, 0, self._system_id, AUTOPILOT_COMPONENT, text)
 
     async def _wait_for(self, name: str, deadline: float) -> Fields:
-        while (message := self._received.newest(name)) is None:
+        while (message := self.received.newest(name)) is None:
             if self._clock() > deadline:
                 raise AutopilotError(f"the autopilot sends no {name}; check the link")
             await asyncio.sleep(0.02)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -195,9 +195,9 @@ class RefusalWatch:
     """Asks for the list of failed checks where it is missing, and logs each new reason."""
 
     def __init__(self, link: AutopilotLink, log_event: Callable[[str], None], clock: Callable[[], float]) -> None:
-        self._link, self._clock = link, clock
-        self._log = RefusalLog(log_event)
+        self._link, self._log_event, self._clock = link, log_event, clock
         self._asked_s = -math.inf
+        self._seen_s: dict[str, float] = {}
         self.current: tuple[Refusal, ...] = ()
         """As of the last half second, the cause first."""
 
@@ -206,7 +206,10 @@ class RefusalWatch:
         while True:
             now = self._clock()
             self.current = self._link.refusals()
-            self._log.update(self.current, now)
+            for refusal in self.current:
+                if now - self._seen_s.get(refusal.reason, -math.inf) >= LOG_AGAIN_S:
+                    self._log_event(refusal.sentence)
+                self._seen_s[refusal.reason] = now
             if self._must_ask(now):
                 self._asked_s = now
                 await self._ask()
@@ -222,18 +225,3 @@ class RefusalWatch:
                 await self._link.ask_for_checks()
         except (AutopilotError, TimeoutError):
             return  # a firmware without such a list; single messages tell the reasons then
-
-
-class RefusalLog:
-    """Logs each reason when it comes, and not again while it comes and goes."""
-
-    def __init__(self, log_event: Callable[[str], None]) -> None:
-        self._log_event = log_event
-        self._seen_s: dict[str, float] = {}
-
-    def update(self, refusals: Iterable[Refusal], now_s: float) -> None:
-        """Takes all that hold now."""
-        for refusal in refusals:
-            if now_s - self._seen_s.get(refusal.reason, -math.inf) >= LOG_AGAIN_S:
-                self._log_event(refusal.sentence)
-            self._seen_s[refusal.reason] = now_s

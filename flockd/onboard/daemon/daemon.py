@@ -136,7 +136,6 @@ class Daemon:
             "pilot": components.pilot_loop.run,
             "loop lag": components.lag.run,
             "thermometer": components.thermometer.run,
-            "wall clock": components.wall_clock.run,
             "telemetry": lambda: publish_status(components, self._clock),
             "service": lambda: notify_service_manager(components, self._service),
         }

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from flockd import __version__
 from flockd.core.config import DroneConfig
-from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.secrets import masked
 from flockd.flight.geometry import build_rig
 from flockd.flight.safety import Decision, Gate
@@ -23,7 +21,7 @@ from flockd.onboard.daemon.control import Control
 from flockd.onboard.daemon.message_sinks import MessageSinks
 from flockd.onboard.daemon.operator_orders import MissionOrders, OperatorCommands, OperatorRequests
 from flockd.onboard.daemon.pilot_loop import PilotLoop, VehicleHistory
-from flockd.onboard.daemon.supervisor_inputs import InputCollector, LoopLag, Thermometer, WallClock
+from flockd.onboard.daemon.supervisor_inputs import InputCollector, LoopLag, Thermometer
 from flockd.onboard.daemon.watched_networks import InterruptibleNetworks, WatchedNetworks, cameras_at_once
 from flockd.onboard.sources import FrameSource
 from flockd.onboard.telemetry.preview import Previews
@@ -57,20 +55,14 @@ class Components:
     commands: OperatorCommands
     lag: LoopLag
     thermometer: Thermometer
-    wall_clock: WallClock
     dead_tasks: dict[str, str]
     """Why each task that has ended did, by name."""
     over: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when the flight is over and the tasks may end."""
 
 
-class Connect(Protocol):
-    """Connects to an autopilot, as `AutopilotLink.connect` does."""
-
-    def __call__(
-        self, parameters: AutopilotParameters, *, clock: Callable[[], float]
-    ) -> Coroutine[Any, Any, AutopilotLink]:
-        """The link."""
+Connect = Callable[..., Coroutine[Any, Any, AutopilotLink]]
+"""Connects to an autopilot, as `AutopilotLink.connect` does."""
 
 
 async def open_components(
@@ -132,7 +124,7 @@ async def open_components(
         requests=requests, refusals=RefusalWatch(link, sinks.event, clock), sinks=sinks,
         distances=ObstacleDistances(config, link, pilot_loop, history, clock),
         texts=StateTexts(link.send_text, clock), telemetry=telemetry, commands=commands, lag=lag,
-        thermometer=thermometer, wall_clock=WallClock(sinks.event, time.monotonic), dead_tasks=dead_tasks,
+        thermometer=thermometer, dead_tasks=dead_tasks,
     )  # fmt: skip
 
 

@@ -80,7 +80,7 @@ def _flight_message(components: Components, now: float) -> FlightMessage:
         armed=None if math.isinf(status.heartbeat_age_s) else status.armed,
         in_air=None if status.landed_state == "unknown" else status.in_air,
         heartbeat_age_s=status.heartbeat_age_s,
-        heartbeats_lost=components.link.heartbeats_lost(),
+        heartbeats_lost=components.link.received.heartbeats_lost,
         battery_share=status.battery_share,
         height_m=None if vehicle is None else vehicle.height_m,
         velocity_trim=[0.0, 0.0] if trim is None else trim.tolist(),
@@ -94,7 +94,7 @@ def _flight_message(components: Components, now: float) -> FlightMessage:
 
 
 def _clock_message(components: Components, now: float) -> ClockMessage:
-    clock = components.link.clock()
+    clock = components.link.received.trusted_clock()
     if clock is None:
         return ClockMessage(time_s=now, offset_s=None, error_s=None, jitter_s=None, round_trip_s=None, age_s=None)
     return ClockMessage(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -217,7 +216,6 @@ SAMPLE_S = 0.05
 MEMORY_S = 1.0
 THERMAL_ZONES = Path("/sys/class/thermal")
 READ_DEADLINE_S = 1.0
-JUMP_S = 0.5
 
 
 class LoopLag:
@@ -263,29 +261,6 @@ class Thermometer:
                 self._worker.leave()
                 self._worker = Worker("thermometer")
             await asyncio.sleep(1.0)
-
-
-class WallClock:
-    """Reports when the wall clock is set: the flight does not use it, but readers of the log need to know."""
-
-    def __init__(
-        self, log_event: Callable[[str], None], clock: Callable[[], float], wall: Callable[[], float] = time.time
-    ) -> None:
-        self._log_event, self._clock, self._wall = log_event, clock, wall
-        self._ahead_s = wall() - clock()
-
-    async def run(self) -> None:
-        """Checks once a second until cancelled."""
-        while True:
-            self.check()
-            await asyncio.sleep(1.0)
-
-    def check(self) -> None:
-        """Checks once."""
-        ahead_s = self._wall() - self._clock()
-        if abs(ahead_s - self._ahead_s) > JUMP_S:
-            self._log_event(f"the wall clock was set by {ahead_s - self._ahead_s:+.1f} s; the flight does not use it")
-        self._ahead_s = ahead_s
 
 
 def hottest_zone_c(folder: Path) -> float | None:

@@ -25,6 +25,7 @@ from flockd.core.config.recording import RecordingConfig
 from flockd.core.config.rig import RigConfig
 from flockd.core.messages import Frame, FrameSet, LearnedSize, MissionOrder, PilotOutput, VehicleState
 from flockd.core.secrets import masked
+from flockd.flight.geometry import build_rig
 from flockd.onboard.message_json import to_json
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.mcap_file import Entry, Inclosure, McapFile, Note, RecordingError
@@ -281,7 +282,7 @@ class _Track:
     """The frames' places and the own path, for viewers: north and east from the first step, up by the autopilot."""
 
     def __init__(self, rig: RigConfig) -> None:
-        self._rig = rig
+        self._rig = build_rig(rig)
         self._north_east, self._time_s = np.zeros(2), math.nan
 
     def entries(self, step: _Step) -> Iterator[Entry]:

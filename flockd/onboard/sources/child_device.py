@@ -12,14 +12,22 @@ import os
 import select
 import signal
 import subprocess
+import sys
 import time
 from abc import abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+from flockd.core.config.source import CameraDeviceParameters
+from flockd.onboard.sources import camera_child
+from flockd.onboard.sources.camera_child import DAMAGED, END, ERROR, HEADER
 from flockd.onboard.sources.frames import CameraDevice, CameraError, CapturedBuffer
-from flockd.onboard.sources.gstreamer_child import DAMAGED, END, ERROR, HEADER
+from flockd.onboard.sources.image_formats import ImageFormat
 
+CHILD = (sys.executable, "-I", str(Path(camera_child.__file__)))
+ROS_CHILD = (sys.executable, "-P", CHILD[-1])
+"""rclpy may be on the environment's path; the folder of the file is not, whose names would hide other packages."""
 _PIPE_BYTES = 1 << 20
 """What an ordinary user may have; fewer system calls an image than with the usual 64 kB."""
 _MOST_BYTES = 1 << 28
@@ -51,30 +59,31 @@ class ChildDevice(CameraDevice):
 
     def __init__(
         self,
-        name: str,
-        rate_hz: float,
+        camera: CameraDeviceParameters,
+        size: tuple[int, int],
         command: Sequence[str],
-        environment: Mapping[str, str] | None = None,
         told: bytes = b"",
     ) -> None:
         """Starts the process, and writes ``told`` to its standard input. Raises CameraError.
 
         Every user of the computer can read arguments, and what is told may hold a password.
         """
-        self._name, self._rate_hz = name, rate_hz
+        self._name, self._rate_hz, self._size = camera.name, camera.rate_hz, size
+        self._format: ImageFormat | None = None
         self._last_s: float | None = None
         self._sequence = 0
         try:
             self._process = subprocess.Popen(
                 command,
-                env=environment,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 bufsize=0,
                 start_new_session=True,  # Ctrl-C is not for it
             )
         except OSError as error:
-            raise CameraError(f"{name}: the process of {self._what} cannot be started ({error.strerror})") from error
+            raise CameraError(
+                f"{self._name}: the process of {self._what} cannot be started ({error.strerror})"
+            ) from error
         assert self._process.stdin is not None and self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):  # it has ended, which `read` says
             self._process.stdin.write(told)
@@ -112,6 +121,17 @@ class ChildDevice(CameraDevice):
     @abstractmethod
     def _failed(self, reason: str) -> CameraError:
         """What to say of an error that the process tells."""
+
+    def image_format(self) -> ImageFormat:
+        """See ``CameraDevice``."""
+        assert self._format is not None
+        return self._format
+
+    def _check_size(self, size: tuple[int, int], who: str, remedy: str) -> None:
+        """Raises CameraError for another width and height than the rig's."""
+        if size != self._size:
+            gives, asked = (f"{width}x{height}" for width, height in (size, self._size))
+            raise CameraError(f"{self._name}: {who} {gives}, but the rig has {asked}; {remedy}")
 
     def _captured(self, data: bytes, message: ChildMessage) -> CapturedBuffer:
         """An image with its number."""

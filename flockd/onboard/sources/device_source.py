@@ -11,10 +11,10 @@ from flockd.core.config.rig import IntrinsicsConfig
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
 from flockd.core.secrets import masked
 from flockd.onboard.sources.assembler import FrameReceiver, ReceivedFrames
+from flockd.onboard.sources.child_device import CHILD, ROS_CHILD
 from flockd.onboard.sources.frames import CameraDevice, CameraError, CapturedBuffer, Count, RawFrame
-from flockd.onboard.sources.gstreamer_device import CHILD, GstreamerDevice
+from flockd.onboard.sources.gstreamer_device import GstreamerDevice
 from flockd.onboard.sources.image_formats import CorruptImageError, ImageFormat
-from flockd.onboard.sources.ros_device import CHILD as ROS_CHILD
 from flockd.onboard.sources.ros_device import RosDevice
 from flockd.onboard.sources.v4l2_device import V4l2Device
 from flockd.onboard.sources.v4l2_kernel import Kernel

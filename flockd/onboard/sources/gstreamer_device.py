@@ -6,10 +6,8 @@ Such are those on the CSI ports of a Jetson or a Raspberry Pi, network cameras, 
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,10 +15,9 @@ import numpy as np
 from flockd.core.config.source import CameraDeviceParameters
 from flockd.core.messages import UInt8Array
 from flockd.core.secrets import masked
-from flockd.onboard.sources import gstreamer_child
-from flockd.onboard.sources.child_device import ChildDevice, ChildMessage
+from flockd.onboard.sources.camera_child import CAPS, IMAGE, NOT_INSTALLED, packed_text
+from flockd.onboard.sources.child_device import CHILD, ChildDevice, ChildMessage
 from flockd.onboard.sources.frames import CameraError, CapturedBuffer
-from flockd.onboard.sources.gstreamer_child import CAPS, IMAGE, packed_text
 from flockd.onboard.sources.image_formats import (
     PACKED,
     ImageFormat,
@@ -31,7 +28,6 @@ from flockd.onboard.sources.image_formats import (
     up_to,
 )
 
-CHILD = (sys.executable, "-I", str(Path(gstreamer_child.__file__)))
 PACKAGES = "libgstreamer1.0-0, gstreamer1.0-plugins-base and the plugins that its pipeline needs"
 
 
@@ -42,15 +38,8 @@ class GstreamerDevice(ChildDevice):
 
     def __init__(self, camera: CameraDeviceParameters, size: tuple[int, int], command: Sequence[str] = CHILD) -> None:
         """Starts the process: ``command``, with what is asked of the pipeline. Raises CameraError."""
-        self._size = size
-        self._format: ImageFormat | None = None
-        wanted = [*command, caps(size, camera.rate_hz)]
-        super().__init__(camera.name, camera.rate_hz, wanted, told=packed_text(camera.place))
-
-    def image_format(self) -> ImageFormat:
-        """See ``CameraDevice``."""
-        assert self._format is not None
-        return self._format
+        wanted = [*command, "gstreamer", caps(size, camera.rate_hz)]
+        super().__init__(camera, size, wanted, told=packed_text(camera.place))
 
     def _taken(self, message: ChildMessage) -> CapturedBuffer | None:
         if message.kind == CAPS:
@@ -65,15 +54,11 @@ class GstreamerDevice(ChildDevice):
         if found is None:
             raise CameraError(f"{self._name}: its pipeline gives {masked(text)[:80]}; end it with `videoconvert`")
         self._format, size = found
-        if size != self._size:
-            gives, asked = (f"{width}x{height}" for width, height in (size, self._size))
-            raise CameraError(
-                f"{self._name}: its pipeline gives {gives}, but the rig has {asked}; end it with "
-                f"`videoscale ! video/x-raw,width={self._size[0]},height={self._size[1]}`, or correct size_px"
-            )
+        scale = f"`videoscale ! video/x-raw,width={self._size[0]},height={self._size[1]}`"
+        self._check_size(size, "its pipeline gives", f"end it with {scale}, or correct size_px")
 
     def _failed(self, reason: str) -> CameraError:
-        if reason == gstreamer_child.NOT_INSTALLED:
+        if reason == NOT_INSTALLED:
             return CameraError(f"{self._name}: {reason}; install {PACKAGES}")
         return CameraError(
             f"{self._name}: its pipeline {masked(reason)}; try it with `gst-launch-1.0 PIPELINE ! fakesink`"

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 from flockd.core.config.rig import IntrinsicsConfig
 from flockd.core.config.source import CameraDeviceParameters
 from flockd.core.ros_frames import CENTRE_PX
-from flockd.onboard.sources import ros_child
-from flockd.onboard.sources.child_device import ChildDevice, ChildMessage
+from flockd.onboard.sources.camera_child import COMPRESSED, IMAGE, IMAGE_HEAD, INFO, INFO_BODY, NO_ROS
+from flockd.onboard.sources.child_device import ROS_CHILD, ChildDevice, ChildMessage
 from flockd.onboard.sources.frames import CameraError, CapturedBuffer
 from flockd.onboard.sources.image_formats import ImageFormat, MjpegFormat, PackedFormat
-from flockd.onboard.sources.ros_child import COMPRESSED, IMAGE, IMAGE_HEAD, INFO, INFO_BODY
 
-CHILD = (sys.executable, "-P", str(Path(ros_child.__file__)))
-"""Without its folder on Python's path, where its neighbours' names would hide those of other packages."""
 ENCODINGS: Mapping[str, str] = {
     "rgb8": "RGB",
     "bgr8": "BGR",
@@ -51,18 +46,12 @@ class RosDevice(ChildDevice):
         camera: CameraDeviceParameters,
         size: tuple[int, int],
         lens: IntrinsicsConfig | None = None,
-        command: Sequence[str] = CHILD,
+        command: Sequence[str] = ROS_CHILD,
     ) -> None:
         """Starts the process; ``lens``: of the rig, which a CameraInfo must not contradict. Raises CameraError."""
-        self._topic, self._size, self._lens = camera.place, size, lens
-        self._format: ImageFormat | None = None
+        self._topic, self._lens = camera.place, lens
         self._info_topic = camera.camera_info or info_topic_of(camera.place)
-        super().__init__(camera.name, camera.rate_hz, [*command, camera.place, self._info_topic, camera.stamps])
-
-    def image_format(self) -> ImageFormat:
-        """See ``CameraDevice``."""
-        assert self._format is not None
-        return self._format
+        super().__init__(camera, size, [*command, "ros", camera.place, self._info_topic, camera.stamps])
 
     def _taken(self, message: ChildMessage) -> CapturedBuffer | None:
         if message.kind == INFO:
@@ -79,11 +68,7 @@ class RosDevice(ChildDevice):
         return self._captured(message.data[IMAGE_HEAD.size :], message)
 
     def _packed(self, encoding: str, size: tuple[int, int], bytes_per_line: int) -> ImageFormat:
-        if size != self._size:
-            gives, asked = (f"{width}x{height}" for width, height in (size, self._size))
-            raise CameraError(
-                f"{self._name}: {self._topic} gives {gives}, but the rig has {asked}; correct size_px, or the driver"
-            )
+        self._check_size(size, f"{self._topic} gives", "correct size_px, or the driver")
         if encoding not in ENCODINGS:
             known = ", ".join(ENCODINGS)
             raise CameraError(
@@ -99,9 +84,7 @@ class RosDevice(ChildDevice):
         """
         if self._lens is None or fx == 0:
             return
-        if (width, height) != self._size:
-            gives, asked = (f"{w}x{h}" for w, h in ((width, height), self._size))
-            raise CameraError(f"{self._name}: {self._info_topic} is of {gives}, but the rig has {asked}; correct one")
+        self._check_size((width, height), f"{self._info_topic} is of", "correct one")
         found = {"fx": fx, "fy": fy, "cx": cx + CENTRE_PX, "cy": cy + CENTRE_PX}
         for key, value in found.items():
             expected = getattr(self._lens, key)
@@ -111,7 +94,7 @@ class RosDevice(ChildDevice):
                 )
 
     def _failed(self, reason: str) -> CameraError:
-        if reason == ros_child.NO_ROS:
+        if reason == NO_ROS:
             return CameraError(
                 f"{self._name}: {reason}; source a ROS 2, or, with Python 3.11 on x86-64, pip install -e '.[ros]'"
             )

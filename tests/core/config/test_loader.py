@@ -102,6 +102,7 @@ def test_words_that_old_yaml_takes_for_truth_values_stay_words(tmp_path: Path) -
     assert load_drone(path).rig.cameras[0].name == "on"
 
 
+CAMERA, SLOW = "{name: front, device: /dev/video0}", "shared_memory: {speed_factor: 0.5}"
 SLIPS = (
     ("step_s: -0.5", "step_s: -0.5 is not greater than 0; write a number of seconds above 0 and up to 60"),
     ("step_s: '0.5'", "step_s: '0.5' is not a number of seconds above 0 and up to 60; write 0.5"),
@@ -128,6 +129,15 @@ SLIPS = (
     ("---", "a second document begins here"),
     ("autopilot: {address: /dev/ttyAMA0}", "autopilot.address: /dev/ttyAMA0 is not an address; write an address, as"),
     ("telemetry: {listen: ['0.0.0.0:7447']}", "telemetry.listen[0]: '0.0.0.0:7447' is not a zenoh endpoint; write a"),
+    (f"source: {{kind: v4l2, cameras: [{CAMERA}], {SLOW}}}", "source: real cameras know real time only; delete"),
+    (
+        f"source: {{kind: shared_memory, {SLOW.replace('0.5', '0.01')}}}",
+        "source.shared_memory.speed_factor: 0.01 is not",
+    ),
+    (
+        f"source: {{kind: shared_memory, {SLOW}}}\nautopilot: {{address: 'serial:///dev/ttyS1:921600'}}",
+        "source.shared_memory.speed_factor: is for simulations, and an autopilot on a cable is none; delete it",
+    ),
     ("autopilot: {obstacle_distance: true}", "autopilot.obstacle_distance: needs the map of obstacles"),
 )
 

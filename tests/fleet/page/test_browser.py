@@ -22,16 +22,12 @@ from playwright.sync_api import Page, expect
 
 from flockd.sim.sitl.ports import free_endpoint, free_port
 from tests.fleet.page.chromium import (
-    BROWSERS,
-    CAMERAS,
     NARROW,
     PATIENCE_MS,
     WIDE,
     chromium,
     hold_s,
-    look_at_silent,
     made_up_drones,
-    open_page,
     served_page,
 )
 
@@ -150,25 +146,6 @@ def opened_beside(flock: Flock) -> Page:
     browser = flock.page.context.browser
     assert browser is not None
     return browser.new_context().new_page()
-
-
-def test_a_hold_passes_twenty_four_pictures_that_nobody_answers_on_four_pages(flock: Flock) -> None:
-    """The drone has answered while none of the others has; how long it took is printed."""
-    endpoint = free_endpoint()
-    with (
-        served_page(endpoint) as (address, _),
-        made_up_drones(endpoint, "--drones", "1", "--flock", "3", "--commands", "hold"),
-        made_up_drones(endpoint, "--drones", "2", "--first", "2", "--flock", "3", "--mute", f"{CAMERAS}"),
-    ):
-        pages = [opened_beside(flock) for _ in range(BROWSERS)]
-        for page in pages:
-            open_page(page, address, 3)
-            look_at_silent(page, 2)
-        for page in pages:
-            told("a hold beside 24 stuck pictures", time.monotonic() - hold_s(page))
-            pictures = page.locator(".pictures img")
-            assert pictures.evaluate_all("all => all.filter(image => image.naturalWidth > 0).length") == 0
-        expect(pages[0].locator("article[data-key='made-up/drone1'] .why")).to_contain_text("4 operators commanded it")
 
 
 def test_an_open_page_goes_on_when_the_server_is_started_again(flock: Flock, tmp_path: Path) -> None:
@@ -290,18 +267,6 @@ def fly_by_hand(page: Page) -> None:
     expect(page.locator(f"{of} .state")).to_have_text("normal")
     expect(page.locator("#summary")).to_have_text("3 drones: 3 normal")
     expect(page.locator("article .meaning").first).to_contain_text("on the circle")
-
-
-def test_a_page_of_drones_that_no_simulation_flies_has_no_controls_of_one(flock: Flock) -> None:
-    expect(flock.page.locator("#simulation")).to_be_hidden()
-    for button in flock.page.locator("article .remove").all():
-        expect(button).to_be_hidden()
-    page = opened_beside(flock)
-    page.goto(flock.address)
-    refused = page.evaluate("""async () => (await fetch("simulate", {method: "POST",
-        headers: {"X-Flockd-Token": document.querySelector("meta[name=token]").content},
-        body: JSON.stringify({control: "pause"})})).status""")
-    assert refused == 403
 
 
 def test_nothing_was_loaded_from_elsewhere_and_nothing_failed(flock: Flock) -> None:

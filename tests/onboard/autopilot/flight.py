@@ -1,14 +1,8 @@
-"""A small flight as the daemon will make it: a link, a streamer, and a control task that offers setpoints and beats.
-
-`python -m tests.onboard.autopilot.flight PORT SPEED_FACTOR` flies north at 1 m/s until it is killed, and says
-`offboard` once it does.
-"""
+"""A small flight as the daemon will make it: a link, a streamer, and a control task that offers setpoints and beats."""
 
 from __future__ import annotations
 
 import asyncio
-import functools
-import sys
 import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -23,7 +17,6 @@ from flockd.core.config.safety import SafetyParameters
 from flockd.core.messages import Setpoint, Wanted
 from flockd.flight.safety import Action, Permission, Request, Surroundings, Verdict
 from flockd.onboard.autopilot.streamer import SetpointStreamer
-from flockd.onboard.simulated_time import clock_at, event_loop_at
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from tests import calm
 from tests.onboard.autopilot.pilots_link import PilotsLink
@@ -59,7 +52,6 @@ async def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> float
 class Flight:
     link: PilotsLink
     streamer: SetpointStreamer
-    control: asyncio.Task[None]
 
     async def enter_offboard(self) -> None:
         self.streamer.begin()
@@ -130,21 +122,7 @@ async def flying(
 
         task = asyncio.create_task(control())
         try:
-            yield Flight(link, streamer, task)
+            yield Flight(link, streamer)
         finally:
             task.cancel()
             streamer.close()
-
-
-async def main(port: int, speed_factor: float) -> None:
-    clock = clock_at(speed_factor)
-    async with flying(f"udpin://127.0.0.1:{port}", clock=clock) as flight:
-        await flight.enter_offboard()
-        print("offboard", flush=True)  # noqa: T201
-        await asyncio.sleep(3600)
-
-
-if __name__ == "__main__":
-    factor = float(sys.argv[2])
-    with asyncio.Runner(loop_factory=functools.partial(event_loop_at, factor)) as runner:
-        runner.run(main(int(sys.argv[1]), factor))

@@ -231,8 +231,8 @@ async def test_the_fake_autopilots_known_clock_is_found_through_mavsdk(port: int
     with FakeAutopilot(port, clock_ahead_s=1234.5, clock=clock) as fake_autopilot:
         link = await AutopilotLink.connect(AutopilotParameters(address=f"udpin://127.0.0.1:{port}"), clock=clock)
         synchronising = asyncio.create_task(link.synchronise())
-        await until(lambda: link.clock() is not None)
-        estimate = link.clock()
+        await until(lambda: link.received.trusted_clock() is not None)
+        estimate = link.received.trusted_clock()
         assert estimate is not None
         error_s = estimate.offset_s - fake_autopilot.clock_offset_s
         assert abs(error_s) <= estimate.error_s + 1e-6

@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-import subprocess
-import sys
 import threading
 import time
 from typing import Any
@@ -33,14 +31,13 @@ from flockd.onboard.autopilot.mavsdk_link import (
 )
 from flockd.sim.autopilot.fake_autopilot import TICK_S, FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
-from flockd.sim.autopilot.fake_telemetry import TelemetryStreams
 from flockd.sim.autopilot.fake_vehicle import Demand, MotionState
 from flockd.sim.scenario import RangeFinderConfig
 from flockd.sim.sitl.ground_station import GroundStation
 from flockd.sim.sitl.ports import free_port
 from tests.calm import clock
-from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
-from tests.onboard.autopilot.flight import Foreigner, attended, flying, until
+from tests.onboard.autopilot.conftest import HEARTBEAT_S
+from tests.onboard.autopilot.flight import attended, flying, until
 
 
 def _parameters(address: str, system_id: int | None = 1) -> AutopilotParameters:
@@ -96,25 +93,6 @@ async def test_telemetry_is_what_the_vehicle_does(port: int, address: str) -> No
         await link.close()
 
 
-@pytest.mark.fault("absurd-mavlink")
-async def test_a_landed_state_that_mavlink_does_not_have_is_unknown_and_counted(
-    address: str, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A vehicle in the air reports 2, then 5: MAV_LANDED_STATE ends at 4."""
-
-    def sends_5(self: TelemetryStreams) -> None:
-        self._mav.extended_sys_state_send(0, 5)
-
-    link = await AutopilotLink.connect(_parameters(address), clock=clock)
-    await until(lambda: link.status().landed_state == "air")
-    monkeypatch.setattr(TelemetryStreams, "_send_landed", sends_5)
-    await until(lambda: link.status().landed_state == "unknown")
-    assert not link.status().in_air
-    assert link.unknown_values().keys() == {"EXTENDED_SYS_STATE.landed_state = 5"}
-    assert link.status().heartbeat_age_s < 2 * HEARTBEAT_S, "the link still receives"
-    await link.close()
-
-
 async def test_firmware_and_failsafe_parameters_can_be_read(address: str, fake_autopilot: FakeAutopilot) -> None:
     fake_autopilot.parameters |= {"COM_OF_LOSS_T": 0.75, "COM_OBL_RC_ACT": 4, "COM_LOW_BAT_ACT": -3}
     link = await AutopilotLink.connect(_parameters(address), clock=clock)
@@ -146,21 +124,12 @@ async def test_an_autopilot_that_acts_on_the_loss_of_its_ground_station_hears_no
     """Flockd's announcement would hide that loss. Its events tell the reason all the same."""
     fake_autopilot.parameters["NAV_DLL_ACT"] = 2
     async with attended(address) as link:
-        await until(lambda: bool(link.parameters()))
+        await until(lambda: bool(link.received.parameters.values))
         assert not link.announces()
         fake_autopilot.parameters["NAV_DLL_ACT"] = 0
         await until(lambda: fake_autopilot.has_ground_station)
         fake_autopilot.parameters["NAV_DLL_ACT"] = 3
         await until(lambda: not fake_autopilot.has_ground_station)
-
-
-@pytest.mark.fault("silent-autopilot")
-async def test_a_refusal_without_a_word_is_told_as_such(address: str, fake_autopilot: FakeAutopilot) -> None:
-    async with attended(address) as link:
-        fake_autopilot.wordless = True
-        fake_autopilot.failing = {"check_gyro_not_calibrated"}
-        with pytest.raises(AutopilotError, match=r"which was refused for now without a reason; wait a few seconds"):
-            await link.arm()
 
 
 @pytest.mark.fault("silent-autopilot")
@@ -217,56 +186,6 @@ async def test_what_still_sends_over_a_closed_link_is_refused(port: int, address
         attending.cancel()
 
 
-@pytest.mark.fault("heartbeats-lost")
-async def test_one_lost_heartbeat_loses_no_link_and_is_counted(port: int, address: str) -> None:
-    """PX4's: one a second."""
-    with FakeAutopilot(port, height_m=HOVER_M, clock=clock) as fake_autopilot:
-        async with flying(address) as flight:
-            await flight.enter_offboard()
-            for lost in range(1, 4):
-                fake_autopilot.lose_heartbeats(1)
-                await until(lambda lost=lost: flight.link.heartbeats_lost() >= lost)  # type: ignore[misc]
-                assert flight.streamer.report().silence is None
-            fake_autopilot.lose_heartbeats(2)
-            await until(lambda: flight.link.heartbeats_lost() >= 5)
-            assert fake_autopilot.mode == "OFFBOARD"
-            (told,) = flight.link.take_reports()
-            assert told.startswith("the autopilot's heartbeat did not come for ")
-
-
-async def test_setpoints_of_another_program_are_noticed_within_two_seconds(
-    address: str, fake_autopilot: FakeAutopilot
-) -> None:
-    async with flying(address) as flight:
-        await flight.enter_offboard()
-        await asyncio.sleep(2.0)
-        assert flight.link.status().foreign_setpoints is None
-        with Foreigner(fake_autopilot, north_m_s=0.0, east_m_s=3.0) as other:
-            await until(lambda: flight.link.status().foreign_setpoints is not None)
-            assert other.sent <= 40, "two seconds of its setpoints"
-        seen = flight.link.status().foreign_setpoints
-        assert seen == (
-            "another program sends setpoints: the autopilot follows 0.0 m/s north and 3.0 m/s east, "
-            "which flockd did not send"
-        )
-        await until(lambda: flight.link.status().foreign_setpoints is None)
-
-
-async def test_a_parameter_that_is_changed_in_flight_is_noticed_within_two_seconds(
-    address: str, fake_autopilot: FakeAutopilot
-) -> None:
-    async with attended(address) as link:
-        await until(lambda: "COM_OF_LOSS_T" in link.parameters())
-        fake_autopilot.parameters["COM_OF_LOSS_T"] = 20.0
-        await until(lambda: link.status().parameter_fault is not None)
-        fault = link.status().parameter_fault
-        assert fault is not None
-        assert fault.startswith("the autopilot's COM_OF_LOSS_T is 20: ")
-        assert link.take_reports() == ["the autopilot's COM_OF_LOSS_T was changed in flight from 1 to 20"]
-        fake_autopilot.parameters["COM_OF_LOSS_T"] = 1.0
-        await until(lambda: link.status().parameter_fault is None)
-
-
 async def test_the_vehicle_follows_the_velocity_and_holds_its_own_height(
     address: str, fake_autopilot: FakeAutopilot
 ) -> None:
@@ -313,42 +232,6 @@ async def test_arming_taking_off_and_landing_from_offboard(port: int, address: s
             await until(lambda: not flight.streamer.report().streaming)
 
 
-async def test_return_flies_home(address: str, fake_autopilot: FakeAutopilot) -> None:
-    async with flying(address) as flight:
-        await flight.enter_offboard()
-        await until(lambda: fake_autopilot.state.position[0] > 1.0)
-        await flight.link.return_home()
-        await until(lambda: flight.link.status().flight_mode == "return")
-        await until(lambda: flight.link.status().flight_mode == "land")
-        assert abs(fake_autopilot.state.position[0]) < 0.5
-
-
-async def test_two_links_on_two_ports_mind_their_own_vehicle(address: str, fake_autopilot: FakeAutopilot) -> None:
-    second_port = free_port()
-    with FakeAutopilot(second_port, system_id=9, height_m=4.0, heartbeat_s=HEARTBEAT_S, clock=clock) as second:
-        south = Wanted(np.array([-0.5, 0.0]), np.zeros(2), 0.0, height_m=4.0)
-        async with flying(address) as one, flying(f"udpin://127.0.0.1:{second_port}", south, system_id=9) as two:
-            await asyncio.gather(one.enter_offboard(), two.enter_offboard())
-            await asyncio.sleep(1.5)
-            assert fake_autopilot.state.velocity[0] == pytest.approx(1.0, abs=0.15)
-            assert second.state.velocity[0] == pytest.approx(-0.5, abs=0.15)
-            assert (one.link.system_id, two.link.system_id) == (1, 9)
-
-
-async def test_the_stand_in_runs_as_a_program_too(port: int, address: str) -> None:
-    options = ["--port", str(port), "--system-id", "4", "--height", "6"]
-    with subprocess.Popen([sys.executable, "-m", "flockd.sim.autopilot.fake_autopilot", *options]) as program:
-        try:
-            link = await AutopilotLink.connect(_parameters(address, system_id=4))
-            await until(lambda: link.vehicle_state() is not None)
-            state = link.vehicle_state()
-            assert state is not None
-            assert state.height_m == pytest.approx(6.0)
-            await link.close()
-        finally:
-            program.kill()
-
-
 async def test_a_stand_in_that_is_late_for_every_tick_still_hears(port: int, address: str) -> None:
     """As on a busy computer: to fly on takes it longer than a tick."""
 
@@ -368,11 +251,6 @@ async def test_a_stand_in_that_is_late_for_every_tick_still_hears(port: int, add
 def test_nobody_there_is_told_with_what_to_check(address: str) -> None:
     with pytest.raises(AutopilotError, match=f"no autopilot was heard at {address} within 0.3 s"):
         asyncio.run(AutopilotLink.connect(_parameters(address, None), timeout_s=0.3))
-
-
-async def test_somebody_elses_autopilot_is_not_taken_for_the_own(address: str, fake_autopilot: FakeAutopilot) -> None:
-    with pytest.raises(AutopilotError, match=r"no autopilot with system id 5 .* heard instead: 1"):
-        await AutopilotLink.connect(_parameters(address, system_id=5), timeout_s=0.7, clock=clock)
 
 
 async def test_no_system_outlives_a_search_that_fails(address: str, fake_autopilot: FakeAutopilot) -> None:
@@ -483,13 +361,13 @@ async def test_the_range_finder_is_heard_along_the_bodys_down_axis_and_falls_sil
     with FakeAutopilot(port, height_m=6.0, motion=still, heartbeat_s=HEARTBEAT_S, range_finder=finder, clock=clock):
         link = await AutopilotLink.connect(_parameters(address), clock=clock)
         await until(lambda: (state := link.vehicle_state()) is not None and state.ground_range is not None)
-        reading = link.ground_range()
+        reading = link.received.ground_range()
         assert reading is not None
         assert reading.range_m == pytest.approx(6.0 / cos, abs=0.05)  # 0.01 m of noise, and centimetres
         assert (reading.min_m, reading.max_m, reading.quality) == pytest.approx((0.15, 12.0, 1.0))
         place[2] = -15.0
-        await until(lambda: (reading := link.ground_range()) is not None and reading.quality == 0.0)
-        assert set(link.range_finders()) == {25}
+        await until(lambda: (reading := link.received.ground_range()) is not None and reading.quality == 0.0)
+        assert set(link.received.range_finders()) == {25}
         await link.close()
 
 

@@ -13,9 +13,7 @@ import numpy as np
 import pytest
 
 from flockd.core.config.autopilot import AutopilotParameters
-from flockd.core.errors import ExitCode
 from flockd.core.messages import Setpoint
-from flockd.onboard.autopilot import mavsdk_link
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
@@ -69,21 +67,6 @@ async def test_it_comes_back_with_the_device_which_has_forgotten_its_streams(
         gone, back = link.take_reports()[:2]
         assert gone.startswith(f"the autopilot's serial port {cable.device} is gone (")
         assert back.startswith(f"the autopilot's serial port {cable.device} is back after ")
-
-
-async def test_without_its_device_for_long_it_is_not_usable(
-    fake_autopilot: FakeAutopilot, cable: SerialCable, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(mavsdk_link, "GONE_S", 0.3)
-    async with attended(cable.address) as link:
-        cable.unplug()
-        await until(lambda: link.unusable() is not None)
-        error = link.unusable()
-        assert error is not None
-        assert error.exit_code is ExitCode.UNAVAILABLE
-        assert f"{cable.address} has been gone for more than 0.3 s; check the cable" in str(error)
-        cable.plug_in()
-        await until(lambda: link.unusable() is None)
 
 
 @pytest.mark.fault("serial-port")

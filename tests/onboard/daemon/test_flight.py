@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import socket
-import time
 from pathlib import Path
 from typing import Literal
 
@@ -130,52 +129,6 @@ async def test_a_position_and_velocity_that_come_no_more_are_not_flown_by(
         assert not fake_autopilot.failsafe
 
 
-async def test_one_camera_gone_is_a_slower_flight_and_all_gone_a_hover_and_then_hold(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
-) -> None:
-    async with aboard(fake_autopilot, port, tmp_path) as ship:
-        await ship.is_ready_in_the_air()
-        await ship.flies()
-        ship.cameras.silent.add("back")
-        await ship.until_event("degraded: a camera is lost: back silent")
-        assert fake_autopilot.mode == "OFFBOARD"
-        ship.cameras.silent.add("front")
-        silent_s = clock()
-        await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        # Three frame periods of 0.2 s until it is noticed, 1 s of hovering, and some for Hold on a busy computer.
-        assert 1.0 < clock() - silent_s < 3.0
-        assert not fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
-        hover = [sent for at_s, sent in fake_autopilot.setpoints if at_s > silent_s + 1.2]
-        assert hover, "the hover is sent"
-        assert np.linalg.norm(hover[-1].velocity) < 0.1, "standstill at last, however late it was noticed"
-        await ship.until_state("silent")
-        ship.cameras.silent.clear()
-        await asyncio.sleep(1.0)
-        assert ship.state() == "silent", "no re-entry by itself"
-
-
-@pytest.mark.fault("noisy-camera")
-async def test_a_noisy_camera_is_lost_and_said_so_until_it_is_good_again(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
-) -> None:
-    async with aboard(fake_autopilot, port, tmp_path) as ship:
-        await ship.is_ready_in_the_air()
-        await ship.flies()
-        ship.cameras.noisy.add("back")
-        await ship.until_event("degraded: a camera is lost: back noisy")
-        assert fake_autopilot.mode == "OFFBOARD"
-        await until(lambda: "frames_dropped" in ship.matters(), SECONDS_TO_FAIL)  # of two cameras' images a half
-        assert ship.heard()["computer"].message["cameras"]["back"]["counts"]["noisy"] > 0
-        assert "camera back: its image is noise" in ship.heard()["health"].message["reasons"]
-        ship.cameras.noisy.clear()
-        await until(lambda: "camera_lost" not in ship.matters(), SECONDS_TO_FAIL)
-        assert fake_autopilot.mode == "OFFBOARD"
-        ship.cameras.noisy |= set(CAMERAS)
-        await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        await ship.until_event("hover: too few cameras deliver images: front noisy, back noisy")
-        assert not fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
-
-
 @pytest.mark.fault("home-moved")
 async def test_a_second_sender_with_the_autopilots_ids_moves_neither_height_band_nor_fence(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
@@ -206,34 +159,6 @@ class _Sender:
 
     def write(self, data: bytes) -> None:
         self._wire.sendto(data, ("127.0.0.1", self._port))
-
-
-@pytest.mark.fault("network-not-finite")
-async def test_networks_not_finite_or_stuck_degrade_and_sigterm_ends_in_hold(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
-) -> None:
-    async with aboard(fake_autopilot, port, tmp_path, recordings=tmp_path) as ship:
-        await ship.is_ready_in_the_air()
-        await ship.flies()
-        await ship.until_state("normal")
-        ship.perceiver.not_finite = 1
-        await ship.until_event("degraded: a network's output is not finite or not plausible")
-        ship.perceiver.hangs.set()
-        await ship.until_event("a step failed: a network call took longer than 0.5 s")
-        assert ship.perceiver.told_to_end == 1
-        await ship.until_state("normal")
-        assert fake_autopilot.mode == "OFFBOARD"
-        assert ship.heard()["computer"].message["recording"].startswith(str(tmp_path))
-
-        asked_s = clock()
-        ship.daemon.ask_to_stop()
-        await until(lambda: fake_autopilot.mode == "LOITER", 2.0)
-        assert not fake_autopilot.failsafe
-        await ship.ending
-        assert "STOPPING=1" in ship.service
-        assert fake_autopilot.setpoints[-1][0] - asked_s < 2.0
-    (path,) = tmp_path.glob("tiny-*.mcap")
-    _replays_to_the_last_bit(Recording(path))
 
 
 def _replays_to_the_last_bit(recording: Recording) -> None:
@@ -334,35 +259,6 @@ async def test_a_dead_task_is_held_by_the_last_resort(
         assert not fake_autopilot.failsafe
         with pytest.raises(DaemonError, match=rf"a task died \({task}: ArithmeticError\('for the test'\)\)"):
             await ship.ending
-
-
-@pytest.mark.fault("event-loop-stuck")
-async def test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
-) -> None:
-    async with aboard(fake_autopilot, port, tmp_path) as ship:
-        await ship.is_ready_in_the_air()
-        await ship.flies()
-        ship.service.clear()
-        blocked_s = clock()
-        time.sleep(2.0)
-        assert fake_autopilot.setpoints[-1][0] - blocked_s < 0.5
-        assert fake_autopilot.mode == "LOITER"
-        assert fake_autopilot.failsafe
-        before = len(fake_autopilot.setpoints)
-        await ship.until_state("silent")
-        assert len(fake_autopilot.setpoints) == before, "one more, and PX4 would be in offboard again"
-        await until(lambda: any(event.startswith("silent: ") for event in ship.events), SECONDS_TO_FAIL)
-        silent = next(event for event in ship.events if event.startswith("silent: "))
-        assert silent.startswith("silent: setpoints ended: the control loop is late, for more than 0.5 s in offboard")
-        assert "; the flight mode is hold" in silent, "the consequence beside the cause, and after it"
-        assert (await ship.ask("ask/resume"))["accepted"] is True
-        await until(lambda: "autopilot_failsafe" in ship.matters(), SECONDS_TO_FAIL)
-        await asyncio.sleep(1.0)
-        assert (ship.state(), len(fake_autopilot.setpoints)) == ("idle", before), "not ready, as nothing is offered"
-        fake_autopilot.pilot_selects("LOITER")
-        await ship.until_state("ready")
-        await ship.flies()
 
 
 async def test_the_pilot_brings_it_up_and_it_flies_at_the_height_that_is_configured(tmp_path: Path, port: int) -> None:

@@ -46,7 +46,7 @@ from flockd.onboard.daemon.pilot_loop import (
     last_seen_s,
 )
 from flockd.onboard.daemon.status import ServiceManager
-from flockd.onboard.daemon.supervisor_inputs import CameraMonitor, InputCollector, LoopLag, WallClock, hottest_zone_c
+from flockd.onboard.daemon.supervisor_inputs import CameraMonitor, InputCollector, LoopLag, hottest_zone_c
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
 from flockd.onboard.sources import CameraStatus, Count
 from flockd.onboard.worker import Worker
@@ -96,16 +96,6 @@ def test_the_shipped_networks_end_when_told() -> None:
     with pytest.raises(Exception, match="terminate"):
         call.result()
     worker.leave(5.0)
-
-
-def test_a_network_with_an_output_that_is_not_finite_is_counted() -> None:
-    tiny = TinyPerceiver()
-    tiny.not_finite = 1
-    networks = WatchedNetworks(tiny, deadline_s=5.0)
-    fault, flow = networks.flows([PAIR, PAIR])
-    assert isinstance(fault, FloatingPointError)
-    assert isinstance(flow, np.ndarray)
-    assert (networks.faults, networks.stuck) == (1, False)
 
 
 @pytest.mark.parametrize("abstract", [False, True])
@@ -163,18 +153,6 @@ def test_a_blocked_event_loop_is_seen_while_it_is_and_after() -> None:
         task.cancel()
 
     asyncio.run(story())
-
-
-def test_a_clock_that_was_set_is_told_once() -> None:
-    told: list[str] = []
-    ahead_s = 1.7e9
-    watch = WallClock(told.append, lambda: 5.0, lambda: 5.0 + ahead_s)
-    watch.check()
-    assert told == []
-    ahead_s -= 3600.0
-    watch.check()
-    watch.check()
-    assert told == ["the wall clock was set by -3600.0 s; the flight does not use it"]
 
 
 def _status(fault: str | None, **counts: int) -> dict[str, CameraStatus]:

@@ -6,13 +6,10 @@ import asyncio
 import time
 from collections.abc import Mapping
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from flockd.core.config import load_drone
-from flockd.core.errors import ConfigError
 from flockd.core.messages import Frame, FrameSet, VehicleState
 from flockd.onboard.daemon.pilot_loop import PilotLoop
 from flockd.onboard.daemon.watched_networks import WatchedNetworks
@@ -54,35 +51,6 @@ def test_sleeps_and_timeouts_count_in_simulated_seconds() -> None:
 
 def test_the_clock_of_a_real_drone_is_the_computers() -> None:
     assert clock_at(1.0) is time.monotonic
-
-
-@pytest.mark.parametrize(
-    ("source", "autopilot", "told"),
-    [
-        (
-            "{kind: v4l2, cameras: [{name: front, device: /dev/video0}], shared_memory: {speed_factor: 0.5}}",
-            "udpin://127.0.0.1:14540",
-            "real cameras know real time only; delete `shared_memory.speed_factor`",
-        ),
-        (
-            "{kind: shared_memory, shared_memory: {speed_factor: 0.5}}",
-            "serial:///dev/ttyS1:921600",
-            "an autopilot on a cable is none; delete it",
-        ),
-        ("{kind: shared_memory, shared_memory: {speed_factor: 0.01}}", "udpin://127.0.0.1:14540", "0.02"),
-    ],
-)
-def test_what_is_real_cannot_be_slow(source: str, autopilot: str, told: str, tmp_path: Path) -> None:
-    lens = "{fx: 32.0, fy: 32.0, cx: 32.0, cy: 24.0}"
-    file = tmp_path / "drone.yaml"
-    file.write_text(
-        f"rig: {{cameras: [{{name: front, size_px: [64, 48], intrinsics: {lens}}}]}}\n"
-        f"source: {source}\nautopilot: {{address: '{autopilot}'}}\n",
-        encoding="utf-8",
-    )
-    with pytest.raises(ConfigError, match="speed_factor") as caught:
-        load_drone(file)
-    assert told in str(caught.value)
 
 
 class SlowCamera:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -90,33 +89,3 @@ def same_detections(one: PilotOutput, other: PilotOutput) -> None:
         assert mine.log_range == pytest.approx(yours.log_range, abs=1e-6)
         assert mine.cameras == yours.cameras
     assert [n.track for n in one.neighbours] == [n.track for n in other.neighbours]
-
-
-def test_a_publisher_that_goes_and_comes_back_is_seen_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Killed in the midst; another one starts."""
-    for key, value in own_domain().items():
-        monkeypatch.setenv(key, value)
-    images = np.random.default_rng(3).integers(0, 256, (400, 48, 64, 3), dtype=np.uint8)
-    file = tmp_path / "noise.npz"
-    np.savez(file, names=["front"], stamps=0.05 * np.arange(400), images_front=images, k_front=np.zeros(9))
-    recording = Recording(FLIGHT)
-    (camera, *_) = recording.config.rig.cameras
-    small = camera.model_copy(update={"name": "front", "size_px": (64, 48)})
-    rig = recording.config.rig.model_copy(update={"cameras": (small,)})
-    topic = CameraDeviceParameters(name="front", topic="/front/image_raw", rate_hz=20.0)
-    parameters = SourceParameters(kind="ros", cameras=(topic,), set_tolerance_s=0.03, silence_s=1.0)
-    source = open_source(recording.config.model_copy(update={"rig": rig, "source": parameters}), "drone.yaml")
-    source.start()
-    command = [sys.executable, str(Path(__file__).with_name("ros_cameras.py")), str(file)]
-    try:
-        for _ in range(2):
-            with ended(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)):
-                for _ in range(5):
-                    assert source.newest(60.0) is not None, source.status()
-            began_s = time.monotonic()
-            while source.status()["front"].fault is None:
-                assert time.monotonic() < began_s + 30.0
-                source.newest(0.01)
-            assert "gave no usable image for 1 s" in str(source.status()["front"].fault)
-    finally:
-        source.stop()

@@ -15,9 +15,9 @@ import pytest
 
 from flockd.core.config.rig import IntrinsicsConfig
 from flockd.core.config.source import CameraDeviceParameters
-from flockd.onboard.sources import ros_child
+from flockd.onboard.sources import camera_child
+from flockd.onboard.sources.camera_child import body_of, packed
 from flockd.onboard.sources.device_source import Devices
-from flockd.onboard.sources.ros_child import body_of, packed
 from flockd.onboard.sources.ros_device import info_topic_of
 from tests.onboard.sources.fake_topics import __file__ as fake
 from tests.onboard.sources.watched import Watch
@@ -151,8 +151,8 @@ def test_a_silent_topic_is_opened_again(start: Watch) -> None:
 
 def test_a_simulators_clock_is_carried_over() -> None:
     """The least delay of the last half second counts; before the first reading there is no time."""
-    clock = ros_child._Clock()
-    assert clock.monotonic_ns(0, simulated=True) == ros_child.NO_TIME
+    clock = camera_child._Clock()
+    assert clock.monotonic_ns(0, simulated=True) == camera_child.NO_TIME
     now_ns = time.monotonic_ns()
     clock.take(50_000_000_000)
     time.sleep(0.02)

@@ -196,7 +196,7 @@ def _fails_and_returns(source: DeviceSource, what: str, fail: Callable[[], float
 
 def _crash() -> float:
     """Of the only pipeline there is; when."""
-    (pid,) = run("pgrep", "-f", "gstreamer_child").split()
+    (pid,) = run("pgrep", "-f", "camera_child").split()
     now_s = time.monotonic()
     os.kill(int(pid), signal.SIGSEGV)
     return now_s

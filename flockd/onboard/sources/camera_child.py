@@ -1,44 +1,54 @@
-"""Runs one GStreamer pipeline and writes its images to standard output; a process of its own, started by this file.
+"""The process of a camera that is no device of the kernel: runs a GStreamer pipeline, or listens to topics of ROS 2.
 
-gstreamer_child.py CAPS
+camera_child.py gstreamer CAPS        # the pipeline comes over standard input, as its length and UTF-8
+camera_child.py ros TOPIC CAMERA_INFO_TOPIC system|simulator
 
-The pipeline comes over standard input, as its length and UTF-8. It calls the libraries of GStreamer by their C
-interface, needs nothing of Python but what Python brings, and ends when its standard input is closed. What it
-writes is a row of messages, each a header and its data:
+It needs nothing of flockd. GStreamer is called by its C interface; topics need rclpy. It ends when its standard input
+is closed. What it writes to standard output is a row of messages, each a header and its data:
 
-- `caps`: what the images are from now on, as GStreamer writes it; a text.
-- `image`: one image, its time in nanoseconds of CLOCK_MONOTONIC (-1: the buffer has none), and whether it is damaged.
-- `error`: why there will be no more images; a text.
-- `end`: the pipeline has ended by itself.
+- `caps`: what a pipeline's images are from now on, as GStreamer writes it; a text.
+- `imag`: one image, its time in nanoseconds of CLOCK_MONOTONIC (-1: it has none), and whether it is damaged; of a topic
+  an Image: an `IMAGE_HEAD` and the data. `jpeg`: likewise a CompressedImage.
+- `info`: the `INFO_BODY` of a CameraInfo.
+- `fail`: why there will be no more images; a text. `end`: the pipeline has ended by itself.
+
+A topic is waited for, and taken as its publishers offer it: reliably where all do, else by best effort.
 """
 
 from __future__ import annotations
 
 import ctypes
+import importlib
 import os
 import struct
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Mapping
 from ctypes import POINTER, byref, c_char_p, c_int, c_size_t, c_uint32, c_uint64, c_void_p
 from typing import Any, ClassVar
 
 HEADER = struct.Struct("<4sIqI4x")
 """Kind, flags, time in ns, length of the data."""
-CAPS, IMAGE, ERROR, END = b"caps", b"imag", b"fail", b"end\0"
+CAPS, IMAGE, COMPRESSED, INFO, ERROR, END = b"caps", b"imag", b"jpeg", b"info", b"fail", b"end\0"
 LENGTH = struct.Struct("<I")
 DAMAGED = 1
 """A flag of an image."""
 NO_TIME = -1
-NOT_INSTALLED = "GStreamer is not installed"
+NOT_INSTALLED, NO_ROS = "GStreamer is not installed", "there is no rclpy"
+IMAGES = {"sensor_msgs/msg/Image": (IMAGE, "Image"), "sensor_msgs/msg/CompressedImage": (COMPRESSED, "CompressedImage")}
+IMAGE_HEAD = struct.Struct("<64sIII")
+"""The encoding or format; width, height and bytes a line of an Image."""
+INFO_BODY = struct.Struct("<II4d")
+"""Width, height; fx, fy, cx, cy."""
 
+_END_S = 1.0
+"""Given to a pipeline to close its camera."""
 _SINK = b"flockd_sink"
 _LOOK_NS = 50_000_000
 _PREROLL_NS = 3_000_000_000
 """A pipeline that has not said by then whether it is live is a file."""
-_END_S = 1.0
-"""Given to the pipeline to close its camera."""
 _PAUSED, _PLAYING, _NULL = 3, 4, 1  # GstState
 _FAILED, _LIVE = 0, 3  # GST_STATE_CHANGE_FAILURE, _NO_PREROLL
 _TIME = 3  # GST_FORMAT_TIME
@@ -46,6 +56,9 @@ _NONE = 2**64 - 1  # GST_CLOCK_TIME_NONE
 _EOS, _ERROR = 1, 2  # GstMessageType
 _CORRUPTED = 1 << 8  # GST_BUFFER_FLAG_CORRUPTED
 _READ = 1  # GST_MAP_READ
+_TOPIC_LOOK_S = 0.1
+_CLOCK_S = 0.5
+"""So long one reading of a simulator's clock counts: it may have come late, and then a later one is better."""
 
 
 class Buffer(ctypes.Structure):
@@ -72,22 +85,28 @@ class _Error(ctypes.Structure):
     _fields_: ClassVar = [("domain", c_uint32), ("code", c_int), ("message", c_char_p)]
 
 
-class _PipelineError(Exception):
+class _NoImagesError(Exception):
     """Why there are no images."""
 
 
 def main() -> None:
-    """Runs the pipeline until it ends or the other side goes."""
+    """Runs until there are no more images or the other side goes."""
     output = os.dup(1)
-    os.dup2(2, 1)  # some drivers print, and this is no place for it
+    os.dup2(2, 1)  # drivers and ROS print, and this is no place for it
     stopping = threading.Event()
-    pipeline = read_text()
-    threading.Thread(target=_await_end, args=(stopping,), daemon=True).start()
+    kind, *arguments = sys.argv[1:]
+    pipeline = read_text() if kind == "gstreamer" else ""
+    patience_s = _END_S if kind == "gstreamer" else 0.0
+    threading.Thread(target=_await_end, args=(stopping, patience_s), daemon=True).start()
     try:
         try:
-            run(pipeline, sys.argv[1], output, stopping)
-        except _PipelineError as error:
-            send(output, ERROR, data=str(error).encode())
+            if kind == "gstreamer":
+                run(pipeline, arguments[0], output, stopping)
+            else:
+                listen(*arguments, output)
+        except (ImportError, _NoImagesError) as error:
+            reason = NO_ROS if getattr(error, "name", None) == "rclpy" else str(error).splitlines()[0]
+            send(output, ERROR, data=reason.encode())
     except BrokenPipeError:
         pass  # the other side has gone
     os._exit(0)  # threads of drivers may hang
@@ -100,7 +119,7 @@ def packed_text(text: str) -> bytes:
 
 
 def read_text() -> str:
-    """The pipeline; empty where the other side has gone."""
+    """What `packed_text` packed; empty where the other side has gone."""
     with open(0, "rb", buffering=0, closefd=False) as source:
         header = _exactly(source, LENGTH.size)
         return _exactly(source, LENGTH.unpack(header)[0] if len(header) == LENGTH.size else 0).decode()
@@ -113,23 +132,23 @@ def _exactly(source: Any, size: int) -> bytes:
     return data
 
 
-def _await_end(stopping: threading.Event) -> None:
+def _await_end(stopping: threading.Event, patience_s: float) -> None:
     while os.read(0, 1):
         pass
     stopping.set()
-    time.sleep(_END_S)
+    time.sleep(patience_s)
     os._exit(1)
 
 
 def run(pipeline_text: str, caps: str, output: int, stopping: threading.Event) -> None:
-    """All images to the file descriptor ``output``. Raises _PipelineError."""
+    """All images to the file descriptor ``output``. Raises _NoImagesError."""
     gst = _library("libgstreamer-1.0.so.0", _GST)
     app = _library("libgstapp-1.0.so.0", _APP)
     gst.gst_init(None, None)
     error = POINTER(_Error)()
     pipeline = gst.gst_parse_launch(b"%s ! appsink name=%s" % (pipeline_text.encode(), _SINK), byref(error))
     if error:
-        raise _PipelineError(f"cannot be built ({_text(error)})")
+        raise _NoImagesError(f"cannot be built ({_text(error)})")
     sink = gst.gst_bin_get_by_name(pipeline, _SINK)
     for key, value in (("caps", caps), ("max-buffers", "2"), ("drop", "true"), ("qos", "false")):
         gst.gst_util_set_object_arg(sink, key.encode(), value.encode())
@@ -147,10 +166,10 @@ def _start(gst: ctypes.CDLL, pipeline: int, sink: int) -> None:
     if changed not in (_FAILED, _LIVE):
         changed = gst.gst_element_get_state(pipeline, None, None, _PREROLL_NS)
     if changed == _FAILED:
-        raise _PipelineError(_failure(gst, pipeline) or "cannot be started")
+        raise _NoImagesError(_failure(gst, pipeline) or "cannot be started")
     gst.gst_util_set_object_arg(sink, b"sync", b"false" if changed == _LIVE else b"true")
     if gst.gst_element_set_state(pipeline, _PLAYING) == _FAILED:
-        raise _PipelineError(_failure(gst, pipeline) or "cannot be started")
+        raise _NoImagesError(_failure(gst, pipeline) or "cannot be started")
 
 
 def _forward(
@@ -160,7 +179,7 @@ def _forward(
     while not stopping.is_set():
         failure = _failure(gst, pipeline)
         if failure is not None:
-            raise _PipelineError(failure)
+            raise _NoImagesError(failure)
         sample = app.gst_app_sink_try_pull_sample(sink, _LOOK_NS)
         if not sample:
             if app.gst_app_sink_is_eos(sink):
@@ -183,7 +202,7 @@ def _send_image(gst: ctypes.CDLL, pipeline: int, sample: int, output: int) -> No
     flags = DAMAGED if gst.gst_buffer_has_flags(buffer, _CORRUPTED) else 0
     mapped = _Map()
     if not gst.gst_buffer_map(buffer, byref(mapped), _READ):
-        raise _PipelineError("gives images that cannot be read; end it with an element that copies them to main memory")
+        raise _NoImagesError("gives images that cannot be read; end it with an element that copies them to main memory")
     try:
         send(output, IMAGE, flags, time_ns, (ctypes.c_char * mapped.size).from_address(mapped.data))
     finally:
@@ -264,11 +283,92 @@ def _library(name: str, signatures: Mapping[str, tuple[Any, ...]]) -> ctypes.CDL
     try:
         library = ctypes.CDLL(name)
     except OSError as error:
-        raise _PipelineError(NOT_INSTALLED) from error
+        raise _NoImagesError(NOT_INSTALLED) from error
     for function, (result, *arguments) in signatures.items():
         pointer = getattr(library, function)
         pointer.restype, pointer.argtypes = result, arguments
     return library
+
+
+def listen(topic: str, info_topic: str, stamps: str, output: int) -> None:
+    """For ever. Raises ImportError and _NoImagesError."""
+    import rclpy  # noqa: PLC0415 - of ROS 2
+    from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: PLC0415
+
+    rclpy.init()
+    node = rclpy.create_node(f"flockd_camera_{os.getpid()}")
+    kind, name, reliable = _wait_for(node, topic)
+    messages = importlib.import_module("sensor_msgs.msg")
+    best = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
+    offered = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE) if reliable else best
+    clock = _Clock()
+    if stamps == "simulator":
+        kept = importlib.import_module("rosgraph_msgs.msg").Clock
+        node.create_subscription(kept, "/clock", lambda now: clock.take(_ns(now.clock)), best)
+
+    def take(message: Any) -> None:
+        time_ns = clock.monotonic_ns(_ns(message.header.stamp), simulated=stamps == "simulator")
+        send(output, kind, 0, time_ns, packed(message))
+
+    node.create_subscription(getattr(messages, name), topic, take, offered)
+    node.create_subscription(messages.CameraInfo, info_topic, lambda info: send(output, INFO, data=body_of(info)), best)
+    rclpy.spin(node)
+
+
+def packed(message: Any) -> bytes:
+    """An Image or CompressedImage as it is written."""
+    if hasattr(message, "encoding"):
+        head = IMAGE_HEAD.pack(message.encoding.encode(), message.width, message.height, message.step)
+    else:
+        head = IMAGE_HEAD.pack(message.format.encode(), 0, 0, 0)
+    return head + bytes(message.data)
+
+
+def body_of(info: Any) -> bytes:
+    """A CameraInfo as it is written."""
+    fx, _, cx, _, fy, cy, *_ = info.k
+    return INFO_BODY.pack(info.width, info.height, fx, fy, cx, cy)
+
+
+def _wait_for(node: Any, topic: str) -> tuple[bytes, str, bool]:
+    """What comes there, and whether all who publish it do so reliably."""
+    from rclpy.qos import ReliabilityPolicy  # noqa: PLC0415
+
+    while True:
+        known = [one for one in node.get_publishers_info_by_topic(topic) if one.topic_type]
+        kinds = {one.topic_type for one in known}
+        if kinds - IMAGES.keys():
+            raise _NoImagesError(f"is of {sorted(kinds - IMAGES.keys())[0]}")
+        if kinds:
+            reliable = all(one.qos_profile.reliability == ReliabilityPolicy.RELIABLE for one in known)
+            return *IMAGES[sorted(kinds)[0]], reliable
+        time.sleep(_TOPIC_LOOK_S)
+
+
+class _Clock:
+    """From stamps to CLOCK_MONOTONIC."""
+
+    def __init__(self) -> None:
+        self._readings: deque[tuple[int, int]] = deque()
+        """When a simulator's clock came, and by how much that is more than it said."""
+
+    def take(self, stamp_ns: int) -> None:
+        now_ns = time.monotonic_ns()
+        self._readings.append((now_ns, now_ns - stamp_ns))
+        while now_ns - self._readings[0][0] > _CLOCK_S * 1e9:
+            self._readings.popleft()
+
+    def monotonic_ns(self, stamp_ns: int, *, simulated: bool) -> int:
+        """Of an image's stamp; `NO_TIME` before a simulator's clock came."""
+        if not simulated:
+            return stamp_ns + time.monotonic_ns() - time.time_ns()
+        if not self._readings:
+            return NO_TIME
+        return stamp_ns + min(behind for _, behind in self._readings)
+
+
+def _ns(stamp: Any) -> int:
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 if __name__ == "__main__":
