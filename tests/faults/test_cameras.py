@@ -22,58 +22,63 @@ NOTICED_S = 0.8
 """Three frame periods at 5 Hz, and some."""
 
 
-async def _is_held_and_stays_so(process: Process, fault_s: float, *, repair: Callable[[], None]) -> None:
-    """Hold is asked for, standstill comes before it, and the drone does not come back by itself; an operator may."""
-    assert not process.fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
-    assert process.standing_still(fault_s + NOTICED_S + 0.3)
-    await process.until_event("silent: ")
-    assert any(event.startswith("hover: too few cameras deliver images") for event in process.events)
-    before = len(process.fake_autopilot.setpoints)
-    repair()
-    await until(lambda: _all_see(process), SECONDS_TO_FAIL)
-    await process.until_state("silent")
-    assert len(process.fake_autopilot.setpoints) == before
-    assert (await process.ask("ask/resume"))["accepted"] is True
-    await process.until_state("ready")
-
-
 @pytest.mark.fault("camera-unplugged", within_s=3.0)
-async def test_no_camera_delivers_any_more(tmp_path: Path, reacted: Reacted) -> None:
-    async with flying(tmp_path) as process:
-        process.cameras.silent |= set(CAMERAS)
-        fault_s = time.monotonic()
-        await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted("camera-unplugged", time.monotonic() - fault_s)
-        await _is_held_and_stays_so(process, fault_s, repair=process.cameras.silent.clear)
-
-
 @pytest.mark.fault("frozen-frames", within_s=3.0)
-async def test_all_cameras_freeze(tmp_path: Path, reacted: Reacted) -> None:
+@pytest.mark.parametrize("fault", ["camera-unplugged", "frozen-frames"])
+async def test_no_camera_delivers_anything_new(fault: str, tmp_path: Path, reacted: Reacted) -> None:
     async with flying(tmp_path) as process:
-        process.cameras.spoil = lambda frame: replace(frame, sequence=17)
+        if fault == "camera-unplugged":
+            process.cameras.silent |= set(CAMERAS)
+        else:
+            process.cameras.spoil = lambda frame: replace(frame, sequence=17)
         fault_s = time.monotonic()
         await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted("frozen-frames", time.monotonic() - fault_s)
-        await process.until_event("hover: too few cameras deliver images: front frozen, back frozen")
-        await _is_held_and_stays_so(process, fault_s, repair=lambda: _good_again(process))
+        reacted(fault, time.monotonic() - fault_s)
+        assert not process.fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
+        assert process.standing_still(fault_s + NOTICED_S + 0.3)
+        why = "front silent, back silent" if fault == "camera-unplugged" else "front frozen, back frozen"
+        await process.until_event(f"hover: too few cameras deliver images: {why}")
+        await process.until_event("silent: ")
+        before = len(process.fake_autopilot.setpoints)
+        process.cameras.silent.clear()
+        _good_again(process)
+        await until(lambda: _all_see(process), SECONDS_TO_FAIL)
+        await process.until_state("silent")
+        assert len(process.fake_autopilot.setpoints) == before, "it does not come back by itself"
+        assert (await process.ask("ask/resume"))["accepted"] is True
+        await process.until_state("ready")
+
+
+def _stamped_back(frame: Frame) -> Frame:
+    return frame if frame.sequence % 2 else replace(frame, time_s=frame.time_s - 3.0)
+
+
+def _cut_off(frame: Frame) -> Frame:
+    return frame if frame.sequence % 2 else replace(frame, image=frame.image[:7])
 
 
 @pytest.mark.fault("time-stamps-backwards", within_s=5.0)
-async def test_time_stamps_are_repeated_and_run_backwards(tmp_path: Path, reacted: Reacted) -> None:
-    """Half of the frames: they are dropped and counted, and the drone flies on, slower, by the others."""
-
-    def stamped_badly(frame: Frame) -> Frame:
-        return frame if frame.sequence % 2 else replace(frame, time_s=frame.time_s - 3.0)
-
+@pytest.mark.fault("damaged-images", within_s=6.0)
+@pytest.mark.parametrize(
+    ("fault", "spoil", "counts"),
+    [
+        ("time-stamps-backwards", _stamped_back, ("time_stamp",)),
+        ("damaged-images", _cut_off, ("malformed", "corrupt")),
+    ],
+)
+async def test_every_second_frame_is_worth_nothing(
+    fault: str, spoil: Callable[[Frame], Frame], counts: tuple[str, ...], tmp_path: Path, reacted: Reacted
+) -> None:
+    """They are dropped and counted, and the drone flies on, slower, by the others."""
     async with flying(tmp_path) as process:
-        process.cameras.spoil = stamped_badly
+        process.cameras.spoil = spoil
         fault_s = time.monotonic()
         await until(lambda: "frames_dropped" in process.matters(), SECONDS_TO_FAIL)
-        reacted("time-stamps-backwards", time.monotonic() - fault_s)
-        assert process.fake_autopilot.mode == "OFFBOARD"
+        reacted(fault, time.monotonic() - fault_s)
         steps = process.heard()["computer"].message["steps"]
         await until(lambda: process.heard()["computer"].message["steps"] > steps + 3, SECONDS_TO_FAIL)
-        assert process.heard()["computer"].message["cameras"]["front"]["counts"]["time_stamp"] > 1
+        assert process.fake_autopilot.mode == "OFFBOARD"
+        assert sum(_counted(process, "front", what) for what in counts) > 1
         _good_again(process)
         await until(lambda: "frames_dropped" not in process.matters(), SECONDS_TO_FAIL)
         await process.until_state("normal")
@@ -116,25 +121,6 @@ async def test_a_frame_of_another_time_silences_nobody(ahead_s: float, tmp_path:
         await until(lambda: _all_see(process), SECONDS_TO_FAIL)
         reacted("time-stamps-jump", time.monotonic() - spoiled[-1])
         assert process.fake_autopilot.mode == "OFFBOARD"
-        await process.until_state("normal")
-
-
-@pytest.mark.fault("damaged-images", within_s=6.0)
-async def test_images_are_damaged(tmp_path: Path, reacted: Reacted) -> None:
-    """Every second image is cut off: dropped and counted; the drone flies on by the others."""
-
-    def cut_off(frame: Frame) -> Frame:
-        return frame if frame.sequence % 2 else replace(frame, image=frame.image[:7])
-
-    async with flying(tmp_path) as process:
-        process.cameras.spoil = cut_off
-        fault_s = time.monotonic()
-        await until(lambda: "frames_dropped" in process.matters(), SECONDS_TO_FAIL)
-        reacted("damaged-images", time.monotonic() - fault_s)
-        assert sum(_counted(process, "front", what) for what in ("malformed", "corrupt")) > 0
-        assert process.fake_autopilot.mode == "OFFBOARD"
-        _good_again(process)
-        await until(lambda: "frames_dropped" not in process.matters(), SECONDS_TO_FAIL)
         await process.until_state("normal")
 
 

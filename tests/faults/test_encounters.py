@@ -101,42 +101,6 @@ def _head_on(speed_m_s: float) -> tuple[StartConfig, StartConfig]:
     return _drone(-START_M, speed_m_s), _drone(START_M, -speed_m_s)
 
 
-@pytest.mark.fault("neighbour-too-near")
-@pytest.mark.fault("head-on")
-@pytest.mark.parametrize("speed_m_s", [1.5, 2.0])
-def test_two_drones_that_meet_head_on_stay_apart(speed_m_s: float, fly: Fly) -> None:
-    met = fly(_head_on(speed_m_s), START_M / speed_m_s + 7.0)
-    assert met.fastest_m_s > 0.75 * speed_m_s
-    assert met.apart_m.min() < NEAR_M
-    assert met.apart_m.min() >= APART_M
-    assert met.fleet.handed_over == {}
-
-
-@pytest.mark.fault("one-that-does-not-avoid")
-def test_a_drone_that_hovers_in_the_way_and_does_not_avoid_is_stopped_before(fly: Fly) -> None:
-    met = fly((_drone(-START_M, 2.0), _drone(0.0, 0.0, by_hand=True)), 14.0)
-    assert met.fastest_m_s > 1.6
-    assert met.apart_m.min() < NEAR_M
-    assert met.apart_m.min() >= APART_M
-    assert met.fleet.handed_over == {}
-
-
-@pytest.mark.fault("gusts")
-def test_gusts_up_to_the_limit_do_not_bring_two_drones_together(fly: Fly) -> None:
-    """Each axis deviates by 0.4 m/s, so that drift is 0.57 m/s: below `safety.degraded_velocity_error_m_s`."""
-    met = fly(_head_on(1.5), 15.0, VehicleConfig(gust_m_s=0.4))
-    assert met.apart_m.min() < NEAR_M
-    assert met.apart_m.min() >= APART_M
-
-
-@pytest.mark.fault("gusts")
-def test_gusts_beyond_the_limit_end_in_hold_with_the_reason(fly: Fly) -> None:
-    """2.8 m/s of drift, and `safety.max_velocity_error_m_s` is 0.8, as a root mean square over ten seconds."""
-    met = fly(_head_on(1.0), 10.0, VehicleConfig(gust_m_s=2.0))
-    assert met.apart_m.min() >= APART_M
-    _held_for_what_carries_them_off(met)
-
-
 class _Late(Vehicles):
     """Obeys setpoints some time after they came."""
 
@@ -155,38 +119,56 @@ class _Late(Vehicles):
         super().step(self._obeyed, yaw_setpoints, interval_s, heights)
 
 
+ASIDE = (_drone(-START_M, 2.0), _drone(0.0, 0.0, by_hand=True))
+"""One flies to another that hovers in its way and does not avoid."""
+
+
+@pytest.mark.fault("neighbour-too-near")
+@pytest.mark.fault("head-on")
+@pytest.mark.fault("one-that-does-not-avoid")
+@pytest.mark.fault("gusts")
 @pytest.mark.fault("autopilot-obeys-late")
-def test_two_drones_whose_autopilots_obey_a_little_late_and_weakly_stay_apart(
-    fly: Fly, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(autopilots, "Vehicles", partial(_Late, 0.3))
-    met = fly(_head_on(1.5), 20.0, WEAK)
-    assert met.apart_m.min() < NEAR_M
+@pytest.mark.parametrize(
+    ("drones", "seconds", "vehicle", "late_s", "fastest_m_s"),
+    [
+        (_head_on(1.5), 15.0, CALM, 0.0, 1.1),
+        (_head_on(2.0), 13.0, CALM, 0.0, 1.5),
+        (ASIDE, 14.0, CALM, 0.0, 1.6),
+        # Each axis deviates by 0.4 m/s, so that drift is 0.57 m/s: below `safety.degraded_velocity_error_m_s`.
+        (_head_on(1.5), 15.0, VehicleConfig(gust_m_s=0.4), 0.0, 0.0),
+        (_head_on(1.5), 20.0, WEAK, 0.3, 0.0),
+        (_head_on(2.0), 20.0, WEAK, 1.0, 0.0),
+    ],
+    ids=["1.5 m/s", "2 m/s", "one that hovers", "gusts", "a little late and weak", "a second late and weak"],
+)
+def test_two_drones_that_meet_stay_apart(
+    drones: tuple[StartConfig, StartConfig], seconds: float, vehicle: VehicleConfig, late_s: float, fastest_m_s: float,
+    fly: Fly, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    if late_s:
+        monkeypatch.setattr(autopilots, "Vehicles", partial(_Late, late_s))
+    met = fly(drones, seconds, vehicle)
     assert met.apart_m.min() >= APART_M
+    assert met.fastest_m_s > fastest_m_s
+    assert met.apart_m.min() < NEAR_M or late_s == 1.0, "they have met"
+    assert met.fleet.handed_over == {} or not fastest_m_s
 
 
+@pytest.mark.fault("gusts")
 @pytest.mark.fault("autopilot-obeys-late")
-def test_two_drones_whose_autopilots_obey_a_second_late_and_weakly_stay_apart(
-    fly: Fly, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("speed_m_s", "seconds", "vehicle", "late_s"),
+    [(1.0, 10.0, VehicleConfig(gust_m_s=2.0), 0.0), (2.0, 20.0, WEAK, 60.0)],
+    ids=["gusts", "does not obey"],
+)
+def test_drones_that_are_carried_off_their_setpoints_end_in_hold_with_the_reason(
+    speed_m_s: float, seconds: float, vehicle: VehicleConfig, late_s: float, fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(autopilots, "Vehicles", partial(_Late, 1.0))
-    met = fly(_head_on(2.0), 20.0, WEAK)
-    assert met.apart_m.min() >= APART_M
-
-
-@pytest.mark.fault("autopilot-obeys-late")
-def test_an_autopilot_that_does_not_obey_ends_in_hold_with_the_reason(
-    fly: Fly, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(autopilots, "Vehicles", partial(_Late, 60.0))
-    met = fly(_head_on(2.0), 20.0, WEAK)
-    assert met.fleet.handed_over.keys() == {"drone1", "drone2"}
-    assert all("off the setpoints" in why for why in met.fleet.handed_over.values()), met.fleet.handed_over
-    assert all(modes == ["OFFBOARD", "LOITER"] for modes in met.fleet.modes.values())
-
-
-def _held_for_what_carries_them_off(met: Encounter) -> None:
-    """Both; said by the daemons themselves."""
+    """In gusts by 2.8 m/s, and `safety.max_velocity_error_m_s` is 0.8, as a root mean square over ten seconds."""
+    if late_s:
+        monkeypatch.setattr(autopilots, "Vehicles", partial(_Late, late_s))
+    met = fly(_head_on(speed_m_s), seconds, vehicle)
+    assert met.apart_m.min() >= APART_M or late_s
     assert met.fleet.handed_over.keys() == {"drone1", "drone2"}
     assert all("off the setpoints" in why for why in met.fleet.handed_over.values()), met.fleet.handed_over
     assert all(modes == ["OFFBOARD", "LOITER"] for modes in met.fleet.modes.values())

@@ -28,7 +28,7 @@ def test_what_has_to_happen_in_time_is_measured() -> None:
         file, _, name = story.test.partition("::")
         if story.within_s is not None:
             body = (ROOT / file).read_text(encoding="utf-8").partition(f"def {name}(")[2].partition("\n@pytest")[0]
-            assert f'reacted("{story.fault}", ' in body, story
+            assert f'reacted("{story.fault}", ' in body or "reacted(fault, " in body, story
 
 
 TWO = """

@@ -118,10 +118,7 @@ def test_what_is_worth_nothing_is_counted_and_the_next_is_fine(start: Watch, mes
 @pytest.mark.parametrize(
     ("message", "sentence"),
     [
-        (
-            ("imag", image(width=32)),
-            "/front/image_raw gives 32x48, but the rig has 64x48; correct size_px, or the driver",
-        ),
+        (("imag", image(width=32)), "/front/image_raw gives 32x48, but the rig has 64x48; correct size_px, or the"),
         (("imag", image("bayer_rggb8")), "/front/image_raw has the encoding 'bayer_rggb8', and not one of rgb8, "),
         (("jpeg", compressed("png", b"x")), "/front/image_raw sends 'png'; let its transport send JPEG"),
         (("info", info(fx=80.0)), "/front/camera_info has fx 80.0, but the rig 50.0; correct one"),
@@ -132,8 +129,7 @@ def test_what_is_worth_nothing_is_counted_and_the_next_is_fine(start: Watch, mes
     ],
 )
 def test_what_cannot_be_is_said_in_one_sentence(start: Watch, message: Any, sentence: str) -> None:
-    source = start(message)
-    assert sentence in source.fault()
+    assert sentence in start(message).fault()
 
 
 def test_a_lens_that_nobody_calibrated_contradicts_nothing(start: Watch) -> None:

@@ -35,11 +35,13 @@ from tests.onboard.sources.fake_kernel import (
 from tests.onboard.sources.watched import WAIT_S, Watch
 
 JPEGS = [jpeg(scene(number)) for number in range(8)]
-BY_HAND = (
-    ControlParameters(name="auto_exposure", value=1),
-    ControlParameters(name="exposure_time_absolute", value=50),
-    ControlParameters(name="gain", value=32),
-)
+
+
+def _controls(**values: int) -> tuple[ControlParameters, ...]:
+    return tuple(ControlParameters(name=name, value=value) for name, value in values.items())
+
+
+BY_HAND = _controls(auto_exposure=1, exposure_time_absolute=50, gain=32)
 
 
 @pytest.fixture
@@ -319,60 +321,29 @@ def test_an_error_of_the_stream_closes_the_camera_and_opens_it_again(start: Watc
     source.next()
 
 
+ONE_GAIN = {GAIN: FakeControl(b"Gain", 0, 255, 64, step=16)}
+
+
 @pytest.mark.parametrize(
-    ("camera", "asked", "sentence"),
+    ("camera", "asked", "told"),
     [
-        (
-            FakeCamera(formats=((1280, 720, b"MJPG"),)),
-            {},
-            "front: /dev/front offers 1280x720 MJPG instead of 640x480 mjpeg; "
-            "choose from what `v4l2-ctl --list-formats-ext` lists",
-        ),
-        (
-            FakeCamera(formats=((640, 480, b"MJPG"),)),
-            {"reduce": 2},
-            "front: /dev/front offers 640x480 MJPG instead of 1280x960 mjpeg; "
-            "choose from what `v4l2-ctl --list-formats-ext` lists, or write a smaller reduce than 2",
-        ),
-        (
-            FakeCamera(),
-            {"rate_hz": 60.0},
-            "front: /dev/front runs at 30 instead of 60 images a second; write rate_hz: 30",
-        ),
-        (
-            FakeCamera(capabilities=METADATA_CAPTURE | STREAMING),
-            {},
-            "front: /dev/front does not capture images; many cameras have a second device for their metadata: "
-            "name the other one",
-        ),
-        (
-            FakeCamera(),
-            {"controls": (ControlParameters(name="iris", value=1),)},
-            "front: /dev/front has no control 'iris'; it has auto_exposure, exposure_time_absolute, gain",
-        ),
-        (
-            FakeCamera(),
-            {"controls": (ControlParameters(name="gain", value=300),)},
-            "front: /dev/front takes gain from 0 to 255, not 300",
-        ),
-        (
-            FakeCamera(),
-            {"controls": BY_HAND[1:]},
-            "front: /dev/front cannot set exposure_time_absolute to 50 (Permission denied)",
-        ),
-        (
-            FakeCamera(controls={GAIN: FakeControl(b"Gain", 0, 255, 64, step=16)}),
-            {"controls": (ControlParameters(name="gain", value=40),)},
-            "front: /dev/front makes 32 of gain 40; write a value it can keep",
-        ),
+        (FakeCamera(formats=((1280, 720, b"MJPG"),)), {}, "offers 1280x720 MJPG instead of 640x480 mjpeg; choose from"),
+        (FakeCamera(formats=((640, 480, b"MJPG"),)), {"reduce": 2}, "or write a smaller reduce than 2"),
+        (FakeCamera(), {"rate_hz": 60.0}, "runs at 30 instead of 60 images a second; write rate_hz: 30"),
+        (FakeCamera(capabilities=METADATA_CAPTURE | STREAMING), {}, "does not capture images; many cameras have a"),
+        (FakeCamera(), {"controls": _controls(iris=1)}, "has no control 'iris'; it has auto_exposure, exposure_time_"),
+        (FakeCamera(), {"controls": _controls(gain=300)}, "takes gain from 0 to 255, not 300"),
+        (FakeCamera(), {"controls": BY_HAND[1:]}, "cannot set exposure_time_absolute to 50 (Permission denied)"),
+        (FakeCamera(controls=ONE_GAIN), {"controls": _controls(gain=40)}, "makes 32 of gain 40; write a value it can"),
     ],
     ids=["size", "size to reduce", "rate", "metadata", "no such control", "range", "automatic on", "step"],
 )
 def test_what_the_camera_cannot_do_is_said_in_one_sentence(
-    start: Watch, camera: FakeCamera, asked: dict[str, Any], sentence: str
+    start: Watch, camera: FakeCamera, asked: dict[str, Any], told: str
 ) -> None:
-    source = start(FakeKernel(front=camera), _camera("front", **asked))
-    assert source.fault() == sentence
+    fault = start(FakeKernel(front=camera), _camera("front", **asked)).fault()
+    assert fault.startswith("front: /dev/front ")
+    assert told in fault
 
 
 def test_openings_become_rarer_while_nothing_is_there(start: Watch) -> None:
