@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
-from flockd.core.config import DroneConfig
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_telemetry import Mode
 from flockd.sim.autopilot.fake_vehicle import Demand
 from tests.calm import clock
+from tests.faults.conftest import InTheAir, never_alone
 from tests.faults.process import flying
 from tests.faults.stories import Reacted
 from tests.make import changed
@@ -79,7 +79,7 @@ class _Refuses(FakeAutopilot):
 @pytest.mark.fault("text-in-chunks")
 async def test_offboard_is_refused_and_the_whole_reason_reported(tmp_path: Path, port: int, reacted: Reacted) -> None:
     with _Refuses(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
-        async with aboard(autopilot, port, tmp_path, change=_never_alone) as ship:
+        async with aboard(autopilot, port, tmp_path, change=never_alone) as ship:
             await ship.is_ready_in_the_air()
             await until(lambda: autopilot.has_ground_station, SECONDS_TO_FAIL)
             asked_s = clock()
@@ -171,7 +171,7 @@ async def test_forty_heartbeats_are_lost_one_at_a_time_and_no_flight_ends(
 ) -> None:
     """Of PX4's, one a second; each of the forty could end a flight."""
     with FakeAutopilot(port, height_m=HOVER_M, clock=clock) as autopilot:
-        async with aboard(autopilot, port, tmp_path, change=_never_alone) as ship:
+        async with aboard(autopilot, port, tmp_path, change=never_alone) as ship:
             await ship.is_ready_in_the_air()
             await ship.flies()
             slowest_s = 0.0
@@ -191,18 +191,12 @@ def _heartbeats_lost(ship: Watched) -> int:
     return int(ship.heard()["flight"].message["heartbeats_lost"])
 
 
-def _never_alone(config: DroneConfig) -> DroneConfig:
-    return changed(config, safety__alone_s=None)
-
-
 @pytest.mark.fault("failsafe-then-resume", within_s=2.0)
 @pytest.mark.fault("own-stall", within_s=2.0)
 async def test_after_the_autopilots_failsafe_it_says_what_to_select_and_is_not_ready_before(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, reacted: Reacted
+    in_flight: InTheAir, fake_autopilot: FakeAutopilot, reacted: Reacted
 ) -> None:
-    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
-        await ship.is_ready_in_the_air()
-        await ship.flies()
+    async with in_flight() as ship:
         time.sleep(2.0)  # the loop is stuck, and the autopilot's failsafe acts
         awake_s = clock()
         await ship.until_event("silent: setpoints ended: the control loop is late, for more than 0.5 s")
@@ -224,11 +218,9 @@ async def test_after_the_autopilots_failsafe_it_says_what_to_select_and_is_not_r
 
 @pytest.mark.fault("others-interfere", within_s=2.0)
 async def test_setpoints_of_another_program_are_told_and_end_in_hold(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, reacted: Reacted
+    in_flight: InTheAir, fake_autopilot: FakeAutopilot, reacted: Reacted
 ) -> None:
-    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
-        await ship.is_ready_in_the_air()
-        await ship.flies()
+    async with in_flight() as ship:
         began_s = clock()
         with Foreigner(fake_autopilot, north_m_s=0.0, east_m_s=3.0):
             await until(lambda: "foreign_setpoints" in ship.matters(), SECONDS_TO_FAIL)
@@ -243,7 +235,7 @@ async def test_where_the_autopilot_limits_setpoints_flockd_asks_for_no_more_and_
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, reacted: Reacted
 ) -> None:
     fake_autopilot.parameters["MPC_XY_VEL_MAX"] = 0.5
-    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
+    async with aboard(fake_autopilot, port, tmp_path, change=never_alone) as ship:
         await ship.is_ready_in_the_air()
         await until(lambda: len(fake_autopilot.setpoints) > 50, SECONDS_TO_FAIL)
         fake_autopilot.pilot_selects("OFFBOARD")
@@ -260,11 +252,9 @@ async def test_where_the_autopilot_limits_setpoints_flockd_asks_for_no_more_and_
 
 @pytest.mark.fault("frame-jumps", within_s=2.0)
 async def test_a_small_jump_of_the_local_frame_is_said_and_flown_through(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, reacted: Reacted
+    in_flight: InTheAir, fake_autopilot: FakeAutopilot, reacted: Reacted
 ) -> None:
-    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
-        await ship.is_ready_in_the_air()
-        await ship.flies()
+    async with in_flight() as ship:
         height_m, jumped_s = -float(fake_autopilot.state.position[2]), clock()
         fake_autopilot.frame_off = np.array([0.0, 0.6, -0.9])
         await ship.until_event("the autopilot's local frame jumped by ")
@@ -285,12 +275,13 @@ async def test_a_small_jump_of_the_local_frame_is_said_and_flown_through(
     ids=["4 m up", "30 m down", "20 m north", "heading"],
 )
 async def test_a_large_jump_of_the_local_frame_or_the_heading_ends_in_hold(
-    frame_off: tuple[float, float, float], heading_off_rad: float, tmp_path: Path, port: int,
-    fake_autopilot: FakeAutopilot, reacted: Reacted,
-) -> None:  # fmt: skip
-    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
-        await ship.is_ready_in_the_air()
-        await ship.flies()
+    frame_off: tuple[float, float, float],
+    heading_off_rad: float,
+    in_flight: InTheAir,
+    fake_autopilot: FakeAutopilot,
+    reacted: Reacted,
+) -> None:
+    async with in_flight() as ship:
         height_m, jumped_s = -float(fake_autopilot.state.position[2]), clock()
         fake_autopilot.frame_off, fake_autopilot.heading_off_rad = np.array(frame_off), heading_off_rad
         await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
@@ -306,11 +297,9 @@ async def test_a_large_jump_of_the_local_frame_or_the_heading_ends_in_hold(
 
 @pytest.mark.fault("others-interfere", within_s=2.0)
 async def test_a_parameter_of_the_failsafe_that_is_changed_in_flight_is_told_and_ends_in_hold(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, reacted: Reacted
+    in_flight: InTheAir, fake_autopilot: FakeAutopilot, reacted: Reacted
 ) -> None:
-    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
-        await ship.is_ready_in_the_air()
-        await ship.flies()
+    async with in_flight() as ship:
         await asyncio.sleep(2.0)  # all have been read
         changed_s, fake_autopilot.parameters["COM_OBL_RC_ACT"] = clock(), -1
         await ship.until_event("the autopilot's COM_OBL_RC_ACT was changed in flight from 5 to -1")
@@ -325,7 +314,7 @@ async def test_a_drone_whose_failsafe_would_not_stop_it_waits_and_says_why(
     name: str, value: float, tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
     fake_autopilot.parameters[name] = value
-    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
+    async with aboard(fake_autopilot, port, tmp_path, change=never_alone) as ship:
         await until(lambda: "parameters_unsuitable" in ship.matters(), SECONDS_TO_FAIL)
         assert any(f"the autopilot's {name} is {value:g}: " in str(heard.message) for heard in ship.heard().values())
         await asyncio.sleep(1.0)
@@ -346,7 +335,7 @@ async def test_an_autopilot_that_refuses_without_a_word_is_told_as_such(
     tmp_path: Path, port: int, reacted: Reacted
 ) -> None:
     with _RefusesToLeave(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
-        async with aboard(autopilot, port, tmp_path, change=_never_alone) as ship:
+        async with aboard(autopilot, port, tmp_path, change=never_alone) as ship:
             await ship.is_ready_in_the_air()
             await ship.flies()
             assert (await ship.ask("ask/land"))["accepted"] is True
@@ -359,11 +348,9 @@ async def test_an_autopilot_that_refuses_without_a_word_is_told_as_such(
 
 @pytest.mark.fault("landed-after-an-order", within_s=2.0)
 async def test_landed_and_disarmed_after_an_operators_order_the_next_flight_may_begin(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, reacted: Reacted
+    in_flight: InTheAir, fake_autopilot: FakeAutopilot, reacted: Reacted
 ) -> None:
-    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
-        await ship.is_ready_in_the_air()
-        await ship.flies()
+    async with in_flight() as ship:
         assert (await ship.ask("ask/land"))["accepted"] is True
         await until(lambda: not fake_autopilot.armed, SECONDS_TO_FAIL)
         disarmed_s = clock()
@@ -393,8 +380,7 @@ async def test_messages_with_absurd_values(tmp_path: Path) -> None:
                 mav.statustext_send(2, b"\x1b[2J\x07")
                 mav.command_ack_send(65535, 200)
             await asyncio.sleep(0.1)
-        steps = process.heard()["computer"].message["steps"]
-        await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+        await process.steps_on()
         assert process.fake_autopilot.mode == "OFFBOARD"
         await process.until_state("normal", "degraded")
         assert process.program.ended is None
@@ -413,8 +399,7 @@ async def test_timesync_lies(ahead_s: float, tmp_path: Path, reacted: Reacted) -
         await process.until_event("the autopilot's clock, by TIMESYNC, is 0.9")
         reacted("timesync-lies", time.monotonic() - fault_s)
         await until(lambda: process.heard()["clock"].message["offset_s"] is None, SECONDS_TO_FAIL)
-        steps = process.heard()["computer"].message["steps"]
-        await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+        await process.steps_on()
         assert process.fake_autopilot.mode == "OFFBOARD"
         await process.until_state("normal", "degraded")
 
@@ -431,7 +416,6 @@ async def test_the_ground_is_reached_in_flight(tmp_path: Path, reacted: Reacted)
         reacted("ground-reached", time.monotonic() - fault_s)
         await until(lambda: process.heard()["flight"].message["in_air"] is False, SECONDS_TO_FAIL)
         assert any("land" in event or "ground" in event for event in process.events), process.events
-        steps = process.heard()["computer"].message["steps"]
-        await until(lambda: process.heard()["computer"].message["steps"] > steps + 3, SECONDS_TO_FAIL)
+        await process.steps_on(3)
         assert process.program.ended is None
         assert "Traceback" not in process.log()

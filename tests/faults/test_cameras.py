@@ -75,8 +75,7 @@ async def test_every_second_frame_is_worth_nothing(
         fault_s = time.monotonic()
         await until(lambda: "frames_dropped" in process.matters(), SECONDS_TO_FAIL)
         reacted(fault, time.monotonic() - fault_s)
-        steps = process.heard()["computer"].message["steps"]
-        await until(lambda: process.heard()["computer"].message["steps"] > steps + 3, SECONDS_TO_FAIL)
+        await process.steps_on(3)
         assert process.fake_autopilot.mode == "OFFBOARD"
         assert sum(_counted(process, "front", what) for what in counts) > 1
         _good_again(process)
@@ -91,8 +90,7 @@ async def test_one_of_two_cameras_is_gone_and_comes_back(tmp_path: Path, reacted
         fault_s = time.monotonic()
         await process.until_event("degraded: a camera is lost: back silent")
         reacted("one-camera-gone", time.monotonic() - fault_s)
-        steps = process.heard()["computer"].message["steps"]
-        await until(lambda: process.heard()["computer"].message["steps"] > steps + 3, SECONDS_TO_FAIL)
+        await process.steps_on(3)
         assert process.fake_autopilot.mode == "OFFBOARD"
         await until(lambda: "camera_lost" in process.matters(), SECONDS_TO_FAIL)  # as often as it is published
         process.cameras.silent.clear()
@@ -156,8 +154,7 @@ async def test_a_lens_is_covered(tmp_path: Path, reacted: Reacted) -> None:
         return replace(frame, image=np.asarray(np.clip(noise, 0, 255), np.uint8))
 
     async with flying(tmp_path) as process:
-        steps = process.heard()["computer"].message["steps"]
-        await until(lambda: process.heard()["computer"].message["steps"] > steps + 8, SECONDS_TO_FAIL)
+        await process.steps_on(8)
         process.cameras.spoil = covered
         fault_s = time.monotonic()
         await process.until_event("camera back: its lens is covered, dirty, fogged or in the sun")

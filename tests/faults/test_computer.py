@@ -14,11 +14,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from flockd.core.config import DroneConfig
 from flockd.onboard.daemon import DaemonError
 from flockd.sim.sitl.ports import free_endpoint, free_port
 from tests.calm import SPEED_FACTOR, clock
-from tests.faults.conftest import InTheAir
+from tests.faults.conftest import InTheAir, never_alone
 from tests.faults.process import flying
 from tests.faults.stories import Reacted
 from tests.onboard.autopilot.flight import until
@@ -28,20 +27,9 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 
 
-async def _flies(ship: Aboard) -> None:
-    await ship.is_ready_in_the_air()
-    await ship.flies()
-
-
-def _alone(config: DroneConfig, **safety: object) -> DroneConfig:
-    changed = config.safety.model_copy(update={"alone_s": None, **safety})
-    return config.model_copy(update={"safety": changed})
-
-
 @pytest.mark.fault("network-not-finite", within_s=2.0)
-async def test_a_networks_output_is_not_finite(in_the_air: InTheAir, reacted: Reacted) -> None:
-    async with in_the_air(change=_alone) as ship:
-        await _flies(ship)
+async def test_a_networks_output_is_not_finite(in_flight: InTheAir, reacted: Reacted) -> None:
+    async with in_flight() as ship:
         await ship.until_state("normal")
         ship.perceiver.not_finite = 2
         fault_s = clock()
@@ -53,10 +41,9 @@ async def test_a_networks_output_is_not_finite(in_the_air: InTheAir, reacted: Re
 
 
 @pytest.mark.fault("step-exception", within_s=5.0)
-async def test_a_step_ends_in_an_error_that_nobody_expects(in_the_air: InTheAir, reacted: Reacted) -> None:
+async def test_a_step_ends_in_an_error_that_nobody_expects(in_flight: InTheAir, reacted: Reacted) -> None:
     """One such step is lost, and the flight goes on; three in a row end in Hold."""
-    async with in_the_air(change=_alone) as ship:
-        await _flies(ship)
+    async with in_flight() as ship:
         await ship.until_state("normal")
         ship.perceiver.unexpected = 1
         await ship.until_event("a step failed: KeyError: 'for the test'")
@@ -77,10 +64,9 @@ async def test_a_step_ends_in_an_error_that_nobody_expects(in_the_air: InTheAir,
 
 
 @pytest.mark.fault("network-stuck", within_s=2.0)
-async def test_a_network_never_returns(in_the_air: InTheAir, reacted: Reacted) -> None:
+async def test_a_network_never_returns(in_flight: InTheAir, reacted: Reacted) -> None:
     """Not even when it is told to: hover and Hold first, then the watchdog of the service manager is not fed."""
-    async with in_the_air(change=_alone) as ship:
-        await _flies(ship)
+    async with in_flight() as ship:
         ship.perceiver.ends_when_told = False
         ship.perceiver.hangs.set()
         fault_s = clock()
@@ -103,12 +89,11 @@ def _is_not_fed(ship: Aboard) -> bool:
 
 
 @pytest.mark.fault("overrun", within_s=8.0)
-async def test_steps_take_longer_than_they_may(in_the_air: InTheAir, reacted: Reacted) -> None:
+async def test_steps_take_longer_than_they_may(in_flight: InTheAir, reacted: Reacted) -> None:
     """Frames are not queued: each step takes the newest; the drone hovers and asks for Hold."""
-    change = functools.partial(_alone, degraded_load=1.05, max_load=1.1)
+    change = functools.partial(never_alone, degraded_load=1.05, max_load=1.1)
 
-    async with in_the_air(change=change) as ship:
-        await _flies(ship)
+    async with in_flight(change) as ship:
         ship.perceiver.slow_s = 0.15
         fault_s = clock()
         await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
@@ -121,12 +106,11 @@ async def test_steps_take_longer_than_they_may(in_the_air: InTheAir, reacted: Re
 
 
 @pytest.mark.fault("overrun", within_s=8.0)
-async def test_it_gets_too_hot(in_the_air: InTheAir, reacted: Reacted, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_it_gets_too_hot(in_flight: InTheAir, reacted: Reacted, monkeypatch: pytest.MonkeyPatch) -> None:
     temperature_c = [50.0]
     monkeypatch.setattr("flockd.onboard.daemon.supervisor_inputs.hottest_zone_c", lambda _: temperature_c[0])
 
-    async with in_the_air(change=_alone) as ship:
-        await _flies(ship)
+    async with in_flight() as ship:
         temperature_c[0] = 88.0
         await ship.until_event("degraded: the computer is at 88.0 °C")
         assert ship.fake_autopilot.mode == "OFFBOARD"
@@ -138,9 +122,8 @@ async def test_it_gets_too_hot(in_the_air: InTheAir, reacted: Reacted, monkeypat
 
 
 @pytest.mark.fault("event-loop-stuck", within_s=0.5)
-async def test_the_event_loop_is_stuck(in_the_air: InTheAir, reacted: Reacted) -> None:
-    async with in_the_air(change=_alone) as ship:
-        await _flies(ship)
+async def test_the_event_loop_is_stuck(in_flight: InTheAir, reacted: Reacted) -> None:
+    async with in_flight() as ship:
         ship.service.clear()
         stuck_s = clock()
         time.sleep(2.0)
@@ -154,9 +137,8 @@ async def test_the_event_loop_is_stuck(in_the_air: InTheAir, reacted: Reacted) -
 
 
 @pytest.mark.fault("task-dies", within_s=2.0)
-async def test_a_task_dies(in_the_air: InTheAir, reacted: Reacted, monkeypatch: pytest.MonkeyPatch) -> None:
-    async with in_the_air(change=_alone) as ship:
-        await _flies(ship)
+async def test_a_task_dies(in_flight: InTheAir, reacted: Reacted, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with in_flight() as ship:
 
         def dies(*_: object) -> None:
             raise ArithmeticError("for the test")
@@ -172,16 +154,14 @@ async def test_a_task_dies(in_the_air: InTheAir, reacted: Reacted, monkeypatch: 
 
 
 @pytest.mark.fault("clock-jump")
-async def test_the_wall_clock_is_set(in_the_air: InTheAir, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_wall_clock_is_set(in_flight: InTheAir, monkeypatch: pytest.MonkeyPatch) -> None:
     wall, ahead_s = time.time, [0.0]
     monkeypatch.setattr(time, "time", lambda: wall() + ahead_s[0])
 
-    async with in_the_air(change=_alone) as ship:
-        await _flies(ship)
+    async with in_flight() as ship:
         await ship.until_state("normal")
         ahead_s[0] = -86_400.0
-        steps = ship.heard()["computer"].message["steps"]
-        await until(lambda: ship.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+        await ship.steps_on()
         assert ship.fake_autopilot.mode == "OFFBOARD"
         assert ship.state() == "normal"
 

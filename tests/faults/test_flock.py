@@ -17,7 +17,7 @@ from flockd.flight.pilot import FlockPilot
 from flockd.flight.tracking.tracker import Tracker
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from tests.calm import clock
-from tests.faults.conftest import InTheAir
+from tests.faults.conftest import InTheAir, never_alone
 from tests.faults.process import flying
 from tests.faults.stories import Reacted
 from tests.make import changed, neighbour
@@ -27,22 +27,15 @@ from tests.onboard.daemon.aboard import SECONDS_TO_FAIL
 pytestmark = pytest.mark.slow
 
 
-def _company(config: DroneConfig) -> DroneConfig:
-    """Flying alone is no fault."""
-    return changed(config, safety__alone_s=None)
-
-
 @pytest.mark.fault("neighbour-too-near", within_s=1.5)
 async def test_a_neighbour_comes_too_near(
-    in_the_air: InTheAir, reacted: Reacted, monkeypatch: pytest.MonkeyPatch
+    in_flight: InTheAir, reacted: Reacted, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In the way that it wants to fly: whatever the law says, no velocity towards it is sent."""
     seen: list[Neighbour] = []
     monkeypatch.setattr(Tracker, "neighbours", lambda _: tuple(seen))
 
-    async with in_the_air(change=_company) as ship:
-        await ship.is_ready_in_the_air()
-        await ship.flies()
+    async with in_flight() as ship:
         seen.append(neighbour([0.6, 0.0, 0.0]))
         fault_s = clock()
         await until(lambda: ship.fake_autopilot.setpoints[-1][1].velocity[0] <= 0.01, SECONDS_TO_FAIL)
@@ -89,7 +82,7 @@ async def test_all_neighbours_are_lost(in_the_air: InTheAir, reacted: Reacted, m
 @pytest.mark.parametrize("velocity", [(np.nan, 0.0), (np.inf, 0.0), (1e6, 0.0)], ids=["NaN", "infinite", "too large"])
 async def test_a_command_that_cannot_be_flown(
     velocity: tuple[float, float],
-    in_the_air: InTheAir,
+    in_flight: InTheAir,
     reacted: Reacted,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -104,9 +97,7 @@ async def test_a_command_that_cannot_be_flown(
 
     monkeypatch.setattr(FlockPilot, "step", spoiled)
 
-    async with in_the_air(change=_company) as ship:
-        await ship.is_ready_in_the_air()
-        await ship.flies()
+    async with in_flight() as ship:
         wrong.append(True)
         fault_s = clock()
         await until(
@@ -125,7 +116,7 @@ async def test_the_fence_is_left(tmp_path: Path, reacted: Reacted) -> None:
     """It wants to go on to the north, stops before the fence 4 m from home, and is carried over it."""
 
     def fenced(config: DroneConfig) -> DroneConfig:
-        return changed(_company(config), safety__gate__fence_radius_m=4.0)
+        return changed(never_alone(config), safety__gate__fence_radius_m=4.0)
 
     async with flying(tmp_path, change=fenced) as process:
         autopilot = process.fake_autopilot
@@ -163,7 +154,7 @@ async def test_two_drones_at_one_spot_part(
     monkeypatch.setattr(Tracker, "neighbours", other)
 
     def still(config: DroneConfig) -> DroneConfig:
-        return changed(_company(config), mission__speed_m_s=0.0)
+        return changed(never_alone(config), mission__speed_m_s=0.0)
 
     async with in_the_air(change=still) as ship:
         await ship.until_state("idle")

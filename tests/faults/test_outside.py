@@ -24,8 +24,7 @@ ROOT = Path(__file__).parents[2]
 
 
 async def _flies_on(process: Process) -> None:
-    steps = process.heard()["computer"].message["steps"]
-    await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+    await process.steps_on()
     assert process.fake_autopilot.mode == "OFFBOARD"
     assert process.program.ended is None
 

@@ -214,6 +214,11 @@ class Watched:
     async def until_event(self, beginning: str) -> None:
         await until(lambda: any(event.startswith(beginning) for event in self.events), SECONDS_TO_FAIL)
 
+    async def steps_on(self, more: int = 4) -> None:
+        """Until so many steps more were made, and one."""
+        steps = self.heard()["computer"].message["steps"]
+        await until(lambda: self.heard()["computer"].message["steps"] > steps + more, SECONDS_TO_FAIL)
+
     async def ask(self, what: str) -> dict[str, Any]:
         """The answer to a query, with zenoh alone as any other program would put it."""
         payload = b""
