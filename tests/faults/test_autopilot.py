@@ -388,22 +388,6 @@ async def test_messages_with_absurd_values(tmp_path: Path) -> None:
         assert "\x1b" not in process.log()
 
 
-@pytest.mark.fault("timesync-lies", within_s=5.0)
-@pytest.mark.parametrize("ahead_s", [0.9, -0.9])
-async def test_timesync_lies(ahead_s: float, tmp_path: Path, reacted: Reacted) -> None:
-    """Its replies jump, as somebody else's would; the stamps of attitudes stay. It is not used, and the drone flies."""
-    async with flying(tmp_path) as process:
-        await until(lambda: process.heard()["clock"].message["offset_s"] is not None, SECONDS_TO_FAIL)
-        process.fake_autopilot.clock_offset_s += ahead_s
-        fault_s = time.monotonic()
-        await process.until_event("the autopilot's clock, by TIMESYNC, is 0.9")
-        reacted("timesync-lies", time.monotonic() - fault_s)
-        await until(lambda: process.heard()["clock"].message["offset_s"] is None, SECONDS_TO_FAIL)
-        await process.steps_on()
-        assert process.fake_autopilot.mode == "OFFBOARD"
-        await process.until_state("normal", "degraded")
-
-
 @pytest.mark.fault("ground-reached", within_s=6.0)
 async def test_the_ground_is_reached_in_flight(tmp_path: Path, reacted: Reacted) -> None:
     """The vehicle sinks whatever it is told; its barometer says zero and less. Landing is reported and recorded."""

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from flockd.core.messages import Frame
@@ -140,29 +139,6 @@ async def test_a_camera_shows_noise(tmp_path: Path, reacted: Reacted) -> None:
             await asyncio.sleep(0.05)
         assert process.fake_autopilot.mode == "OFFBOARD"
         process.cameras.noisy.clear()
-        await until(lambda: "camera_lost" not in process.matters(), SECONDS_TO_FAIL)
-
-
-@pytest.mark.fault("lens-covered", within_s=8.0)
-async def test_a_lens_is_covered(tmp_path: Path, reacted: Reacted) -> None:
-    """It counts as blind, which is said, while the drone flies on by the other camera; once clear, it sees again."""
-
-    def covered(frame: Frame) -> Frame:
-        if frame.camera != "back":
-            return frame
-        noise = np.random.default_rng(frame.sequence).normal(50.0, 2.0, frame.image.shape)
-        return replace(frame, image=np.asarray(np.clip(noise, 0, 255), np.uint8))
-
-    async with flying(tmp_path) as process:
-        await process.steps_on(8)
-        process.cameras.spoil = covered
-        fault_s = time.monotonic()
-        await process.until_event("camera back: its lens is covered, dirty, fogged or in the sun")
-        reacted("lens-covered", time.monotonic() - fault_s)
-        await process.until_event("degraded: a camera is lost: back")
-        assert process.fake_autopilot.mode == "OFFBOARD"
-        _good_again(process)
-        await process.until_event("camera back: its lens is clear again")
         await until(lambda: "camera_lost" not in process.matters(), SECONDS_TO_FAIL)
 
 

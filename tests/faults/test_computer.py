@@ -121,21 +121,6 @@ async def test_it_gets_too_hot(in_flight: InTheAir, reacted: Reacted, monkeypatc
         assert not ship.fake_autopilot.failsafe
 
 
-@pytest.mark.fault("event-loop-stuck", within_s=0.5)
-async def test_the_event_loop_is_stuck(in_flight: InTheAir, reacted: Reacted) -> None:
-    async with in_flight() as ship:
-        ship.service.clear()
-        stuck_s = clock()
-        time.sleep(2.0)
-        reacted("event-loop-stuck", max(0.0, ship.fake_autopilot.setpoints[-1][0] - stuck_s))
-        assert ship.fake_autopilot.failsafe
-        assert ship.service == [], "the watchdog of systemd acts after two seconds"
-        sent = len(ship.fake_autopilot.setpoints)
-        await ship.until_state("silent")
-        await asyncio.sleep(1.0)
-        assert len(ship.fake_autopilot.setpoints) == sent
-
-
 @pytest.mark.fault("task-dies", within_s=2.0)
 async def test_a_task_dies(in_flight: InTheAir, reacted: Reacted, monkeypatch: pytest.MonkeyPatch) -> None:
     async with in_flight() as ship:

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from flockd.core.config import DroneConfig
-from flockd.core.messages import FloatArray, FrameSet, Neighbour, PilotOutput, VehicleState
+from flockd.core.messages import FrameSet, Neighbour, PilotOutput, VehicleState
 from flockd.flight.pilot import FlockPilot
 from flockd.flight.tracking.tracker import Tracker
-from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from tests.calm import clock
 from tests.faults.conftest import InTheAir, never_alone
 from tests.faults.process import flying
@@ -133,36 +132,3 @@ async def test_the_fence_is_left(tmp_path: Path, reacted: Reacted) -> None:
         assert late
         assert max(late) < 0.05, "nothing outward"
         assert any("outside the fence" in event for event in process.events)
-
-
-@pytest.mark.fault("one-spot")
-async def test_two_drones_at_one_spot_part(
-    in_the_air: InTheAir, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One hovers above this one: this one leaves to its own right, and the other's right is another.
-
-    It faces north and looks up, so that its right is the west; its estimate is the truth, so that nothing else decides.
-    """
-    fake_autopilot.drifts = False
-    spot: list[FloatArray] = []
-
-    def other(_: Tracker) -> tuple[Neighbour, ...]:
-        here = fake_autopilot.state.position
-        away = spot[0] - here if spot else 0.0 * here
-        return (neighbour([away[0], away[1] + 0.0005, -0.8]),)
-
-    monkeypatch.setattr(Tracker, "neighbours", other)
-
-    def still(config: DroneConfig) -> DroneConfig:
-        return changed(never_alone(config), mission__speed_m_s=0.0)
-
-    async with in_the_air(change=still) as ship:
-        await ship.until_state("idle")
-        await until(lambda: ship.matters() <= {"started", "not_offboard", "neighbour_close"}, SECONDS_TO_FAIL)
-        assert (await ship.ask("ask/resume"))["accepted"] is True
-        await ship.until_state("ready")
-        await until(lambda: len(fake_autopilot.setpoints) > 5, SECONDS_TO_FAIL)
-        spot.append(fake_autopilot.state.position.copy())
-        fake_autopilot.pilot_selects("OFFBOARD")
-        await until(lambda: float(fake_autopilot.state.position[1] - spot[0][1]) < -0.5, SECONDS_TO_FAIL)
-        assert abs(float(fake_autopilot.state.position[0] - spot[0][0])) < 0.5

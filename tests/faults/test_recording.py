@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import resource
 import signal
 import time
@@ -80,21 +79,3 @@ async def test_the_disk_is_full(tmp_path: Path, reacted: Reacted) -> None:
         await process.steps_on()
         assert process.fake_autopilot.mode == "OFFBOARD"
         assert "file too large" in process.heard()["computer"].message["recording"]
-
-
-@pytest.mark.fault("foreign-recordings")
-async def test_foreign_things_lie_among_the_recordings(tmp_path: Path) -> None:
-    (tmp_path / "tiny-folder.mcap").mkdir()
-    (tmp_path / "tiny-link.mcap").symlink_to(tmp_path / "nowhere")
-    os.mkfifo(tmp_path / "tiny-fifo.mcap")
-    (tmp_path / "tiny-damaged.mcap").write_bytes(b"\x89MCAP0\r\nnot a recording")
-    async with flying(tmp_path) as process:
-        path = await _has_recorded(process, 50_000)
-        assert process.heard()["computer"].message["recording"] == str(path)
-        process.signal(signal.SIGTERM)
-        assert await process.ended() == 0
-        assert Recording(path).contents.finished
-        log = process.log()
-        assert "tiny-fifo.mcap" in log
-        assert "tiny-folder.mcap" in log
-    assert (tmp_path / "tiny-damaged.mcap").exists(), "what is not a recording of its own is left alone"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import time
@@ -14,7 +13,6 @@ from typing import Any
 import pytest
 import yaml
 
-from flockd.core.data import data_path
 from flockd.sim.sitl.ports import free_endpoint, free_port
 from tests.faults.process import flying
 from tests.faults.stories import Reacted
@@ -69,68 +67,6 @@ def test_the_configuration_is_wrong(
     assert told in ended.last
     assert ended.last.startswith(f"{tmp_path / 'drone.yaml'}:")
     reacted("wrong-configuration", ended.took_s)
-
-
-def _models(folder: Path) -> Path:
-    """Copies of the shipped ones; links for the large files."""
-    models = folder / "models"
-    models.mkdir()
-    for file in data_path("models").iterdir():
-        if file.suffix == ".yaml":
-            (models / file.name).write_bytes(file.read_bytes())
-        else:
-            (models / file.name).symlink_to(file)
-    return models
-
-
-@pytest.mark.fault("model-changed", within_s=15.0)
-def test_a_model_was_changed(tmp_path: Path, reacted: Reacted) -> None:
-    models = _models(tmp_path)
-    flow = bytearray((models / "flow_int8.onnx").read_bytes())
-    flow[len(flow) // 2] ^= 1
-    (models / "flow_int8.onnx").unlink()
-    (models / "flow_int8.onnx").write_bytes(flow)
-    ended = _run(tmp_path, lambda values: values["perception"].update(models_dir=str(models)))
-    assert ended.code == 78
-    assert "flow_int8.yaml:5: sha256: " in ended.last
-    reacted("model-changed", ended.took_s)
-
-
-def _aliases(path: Path) -> None:
-    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
-    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12)]
-    path.write_text("\n".join(lines), encoding="utf-8")
-
-
-def _zero(path: Path) -> None:
-    path.unlink()
-    path.symlink_to("/dev/zero")
-
-
-def _fifo(path: Path) -> None:
-    path.unlink()
-    os.mkfifo(path)
-
-
-@pytest.mark.fault("hostile-manifest", within_s=15.0)
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        _aliases,
-        _zero,
-        _fifo,
-        lambda path: path.write_text("a: " + "[" * 5000, encoding="utf-8"),
-        lambda path: path.write_bytes(b"name: \xff\xfe"),
-    ],
-    ids=["aliases", "zero", "fifo", "depth", "not UTF-8"],
-)
-def test_a_manifest_is_hostile(spoil: Callable[[Path], object], tmp_path: Path, reacted: Reacted) -> None:
-    models = _models(tmp_path)
-    spoil(models / "flow_int8.yaml")
-    ended = _run(tmp_path, lambda values: values["perception"].update(models_dir=str(models)))
-    assert ended.code == 78
-    assert ended.last.startswith(f"{models / 'flow_int8.yaml'}:")
-    reacted("hostile-manifest", ended.took_s)
 
 
 @pytest.mark.fault("second-instance", within_s=15.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +9,7 @@ from pathlib import Path
 import pytest
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
-from flockd.onboard.message_json import from_json, parsed
-from flockd.onboard.recording import RecordingError, foxglove
+from flockd.onboard.recording import RecordingError
 from flockd.onboard.recording.editing import recover
 from flockd.onboard.recording.export import export_images, export_tables
 from flockd.onboard.recording.mcap_file import Entry, Record
@@ -56,31 +54,6 @@ def test_a_step_with_a_damaged_message_is_named_and_recovered_without(
         assert [step.number for step in Recording(tmp_path / "y.mcap").steps()] == [0, 2]
 
 
-def test_a_step_whose_image_does_not_decode_is_recovered_without(tmp_path: Path, whole: Path) -> None:
-    broken = foxglove.image(0, "front", b"no image", "png")
-    path = changed(whole, tmp_path / "x.mcap", "/camera/front/image", lambda entry: replace(entry, data=broken))
-    with pytest.raises(RecordingError, match="does not decode"):
-        list(Recording(path).steps())
-    assert recover(Recording(path), tmp_path / "y.mcap") == STEPS - 1
-
-
-@pytest.mark.parametrize("data", [b"{", b"\xff", b"[1]", b"1", DEEP], ids=["open", "utf8", "list", "number", "deep"])
-def test_a_message_that_is_none_ends_an_export_in_one_sentence(tmp_path: Path, whole: Path, data: bytes) -> None:
-    path = changed(whole, tmp_path / "x.mcap", "/output", lambda entry: replace(entry, data=data))
-    with pytest.raises(RecordingError, match="a message of /output cannot be read") as caught:
-        export_tables(Recording(path), tmp_path)
-    assert "\n" not in str(caught.value)
-
-
-def test_lists_of_words_and_numbers_become_a_table_all_the_same(tmp_path: Path, whole: Path) -> None:
-    def mixed(entry: Entry) -> Entry:
-        return replace(entry, data=json.dumps({**json.loads(entry.data), "reasons": ["a", 1, None]}).encode())
-
-    path = changed(whole, tmp_path / "x.mcap", "/output", mixed)
-    export_tables(Recording(path), tmp_path)
-    assert "a; 1; None" in (tmp_path / "output.csv").read_text(encoding="utf-8")
-
-
 @pytest.mark.parametrize("topic", ["/../../out", "/..", "/a/b", "/.hidden", "/a\x1b[2J", "/" + "a" * 300])
 def test_no_name_in_a_recording_leads_out_of_the_folder_of_an_export(tmp_path: Path, whole: Path, topic: str) -> None:
     def renamed(entry: Entry) -> Entry:
@@ -105,12 +78,3 @@ def test_no_image_is_written_outside_either(tmp_path: Path, whole: Path, camera:
     with pytest.raises(RecordingError, match="which is none for a file"):
         export_images(Recording(path), folder)
     assert all(folder in found.parents for found in tmp_path.rglob("*.png"))
-
-
-def test_json_from_outside_is_parsed_or_refused() -> None:
-    assert parsed(b'{"a": 1}') == {"a": 1}
-    for data in (DEEP, b"{", b"\xff"):
-        with pytest.raises(ValueError, match=r"."):
-            parsed(data)
-    with pytest.raises(ValueError, match="it is no number"):
-        from_json(float, 10**400)

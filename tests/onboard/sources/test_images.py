@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat, PackedFormat, RgbFormat
-from tests.onboard.sources.camera_images import SIZE, jpeg, scene, yuyv
+from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat, RgbFormat
+from tests.onboard.sources.camera_images import SIZE, jpeg, scene
 
 
 def _without_huffman_tables(data: bytes) -> bytes:
@@ -61,26 +61,6 @@ def test_a_white_sky_and_a_black_ground_are_no_damage() -> None:
     image[:200] = 255
     image[400:] = 0
     assert MjpegFormat(SIZE).decode(jpeg(image)).shape == (480, 640, 3)
-
-
-def test_yuyv_is_bt_601() -> None:
-    """The colour bars of BT.601 at 100 %: white, red, green, blue, and mid grey."""
-    bars = [(235, 128, 128), (81, 90, 240), (145, 54, 34), (41, 240, 110), (126, 128, 128)]
-    image = PackedFormat("YUY2", (640, 480), 1280).decode(yuyv(bars, (640, 480)))
-    expected = [(255, 255, 255), (255, 0, 0), (0, 255, 0), (0, 0, 255), (128, 128, 128)]
-    for bar, colour in enumerate(expected):
-        np.testing.assert_allclose(image[:, 128 * bar + 10 : 128 * bar + 118].mean((0, 1)), colour, atol=2)
-
-
-def test_yuyv_rows_may_be_padded_and_must_be_all_there() -> None:
-    bars = [(235, 128, 128), (81, 90, 240)]
-    padded = yuyv(bars, (64, 32), padding=16)
-    np.testing.assert_array_equal(
-        PackedFormat("YUY2", (64, 32), 144).decode(padded),
-        PackedFormat("YUY2", (64, 32), 128).decode(yuyv(bars, (64, 32))),
-    )
-    with pytest.raises(CorruptImageError, match="4464 bytes instead of 4608"):
-        PackedFormat("YUY2", (64, 32), 144).decode(padded[:-144])
 
 
 def test_plain_rgb_is_handed_on_as_it_is_even_if_it_shows_nothing() -> None:

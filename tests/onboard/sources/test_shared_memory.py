@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import socket
 import struct
 import time
 from collections.abc import Iterator
@@ -13,7 +12,6 @@ import pytest
 import zenoh
 
 from flockd.core.config.source import SharedMemoryParameters, SourceParameters
-from flockd.core.errors import UnavailableError
 from flockd.core.messages import Frame, FrameSet
 from flockd.onboard.sources import FramePublisher
 from flockd.onboard.sources.shared_memory import SharedMemorySource
@@ -157,15 +155,6 @@ def test_stamps_of_another_clock_are_dropped_and_good_frames_go_on_at_once(
         assert received is not None
         _assert_same(received, number + 1)
         assert source.status()["front"].fault is None
-
-
-def test_an_endpoint_that_is_none_is_reported_in_one_sentence() -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        with pytest.raises(UnavailableError, match=rf"^frames cannot use {endpoint} \(.*\); name another endpoint$"):
-            FramePublisher(listen=[endpoint])
 
 
 def test_a_source_without_simulator_starts_and_stops(source: SharedMemorySource) -> None:
