@@ -7,9 +7,16 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from flockd.core.messages import RangeReading
 from flockd.onboard.autopilot.mavlink_messages import ENUMERATIONS, RESULTS, ReceivedMessages, result_text
 
 pytestmark = pytest.mark.fault("absurd-mavlink")
+
+
+POSE = (
+    ("ATTITUDE_QUATERNION", {"q1": 1.0, "q2": 0.0, "q3": 0.0, "q4": 0.0}),
+    ("LOCAL_POSITION_NED", {"x": 0.0, "y": 0.0, "z": -4.0, "vx": 0.0, "vy": 0.0, "vz": 0.0}),
+)
 
 
 def _received(*messages: tuple[str, dict[str, Any]]) -> tuple[ReceivedMessages, list[str]]:
@@ -18,6 +25,18 @@ def _received(*messages: tuple[str, dict[str, Any]]) -> tuple[ReceivedMessages, 
     for number, (name, fields) in enumerate(messages):
         received.add(name, fields, float(number))
     return received, log
+
+
+def _text_of(received: ReceivedMessages) -> str:
+    newest = received.newest("STATUSTEXT")
+    assert newest is not None
+    return str(newest.fields["text"])
+
+
+def _ground_range(received: ReceivedMessages) -> RangeReading:
+    reading = received.ground_range()
+    assert reading is not None
+    return reading
 
 
 def _values(enumeration: str) -> set[int]:
@@ -61,11 +80,10 @@ def test_a_battery_that_cannot_be_is_unknown_and_not_empty(percent: int) -> None
 
 @pytest.mark.parametrize("quaternion", [(0.0, 0.0, 0.0, 0.0), (1e30, 0.0, 0.0, 0.0), (0.5, 0.5, 0.5, 0.0)])
 def test_a_quaternion_without_direction_is_no_attitude(quaternion: tuple[float, ...]) -> None:
-    place = dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 0.0)
     fields = dict(zip(("q1", "q2", "q3", "q4"), quaternion, strict=True))
-    received, _ = _received(("LOCAL_POSITION_NED", place), ("ATTITUDE_QUATERNION", fields))
+    received, _ = _received(POSE[1], ("ATTITUDE_QUATERNION", fields))
     assert received.vehicle_state() is None
-    received.add("ATTITUDE_QUATERNION", {"q1": 1.0, "q2": 0.0, "q3": 0.0, "q4": 0.0}, 3.0)
+    received.add(*POSE[0], 3.0)
     assert received.vehicle_state() is not None
 
 
@@ -106,9 +124,7 @@ def _home(north_m: float, down_m: float) -> tuple[str, dict[str, Any]]:
 
 @pytest.mark.fault("home-moved")
 def test_home_stays_while_armed_whatever_landed_state_and_home_say_and_moves_after() -> None:
-    position = ("LOCAL_POSITION_NED", {"x": 0.0, "y": 0.0, "z": -5.0, "vx": 0.0, "vy": 0.0, "vz": 0.0})
-    attitude = ("ATTITUDE_QUATERNION", {"q1": 1.0, "q2": 0.0, "q3": 0.0, "q4": 0.0})
-    received, log = _received(_home(0.0, 0.0), ("HEARTBEAT", ARMED), ("EXTENDED_SYS_STATE", GROUND), position, attitude)
+    received, log = _received(_home(0.0, 0.0), ("HEARTBEAT", ARMED), ("EXTENDED_SYS_STATE", GROUND), *POSE)
     received.add(*_home(1.0, -0.2), 6.0)
     assert received.home_down_m == -0.2, "PX4 sets home when it is armed, still on the ground"
     received.add("EXTENDED_SYS_STATE", AIR, 7.0)
@@ -118,7 +134,7 @@ def test_home_stays_while_armed_whatever_landed_state_and_home_say_and_moves_aft
     status, vehicle = received.status(11.0), received.vehicle_state()
     assert status.home_ned is not None and vehicle is not None
     assert list(status.home_ned) == [1.0, 0.0, -0.2]
-    assert vehicle.height_m == pytest.approx(4.8)  # -0.2 + 5.0
+    assert vehicle.height_m == pytest.approx(3.8)  # -0.2 + 4.0
     assert log == [
         "the autopilot reports that the drone is on the ground, still armed",
         "the autopilot's home moved by 53.0 m in flight; "  # sqrt(49^2 + 20.2^2)
@@ -143,13 +159,9 @@ def _text(chunk: str, number: int = 0, sequence: int = 0) -> tuple[str, dict[str
 def test_a_text_in_chunks_is_seen_whole_and_not_before() -> None:
     sentence = "Preflight Fail: the battery is far below what a take-off needs, and the compass disagrees with the yaw"
     received, _ = _received(_text("short"), _text(sentence[:50], 7, 0), _text(sentence[50:100], 7, 1))
-    newest = received.newest("STATUSTEXT")
-    assert newest is not None
-    assert newest.fields["text"] == "short"
+    assert _text_of(received) == "short"
     received.add(*_text(sentence[100:], 7, 2), 3.0)
-    newest = received.newest("STATUSTEXT")
-    assert newest is not None
-    assert (newest.fields["text"], newest.time_s) == (sentence, 3.0)
+    assert _text_of(received) == sentence
 
 
 def test_the_first_text_of_px4_has_the_id_of_texts_without_chunks_and_is_seen_whole() -> None:
@@ -180,19 +192,9 @@ def test_a_text_of_just_one_chunk_is_seen_when_it_does_not_go_on() -> None:
 
 def test_a_chunk_that_is_lost_is_marked_and_does_not_mix_texts() -> None:
     received, _ = _received(_text("a" * 50, 7, 0), _text("end", 7, 2), _text("b" * 50, 8, 0), _text("tail", 8, 1))
-    newest = received.newest("STATUSTEXT")
-    assert newest is not None
-    assert newest.fields["text"] == "b" * 50 + "tail"
+    assert _text_of(received) == "b" * 50 + "tail"
     lost, _ = _received(_text("a" * 50, 7, 0), _text("end", 7, 2))
-    newest = lost.newest("STATUSTEXT")
-    assert newest is not None
-    assert newest.fields["text"] == "a" * 50 + "...end"
-
-
-POSE = (
-    ("ATTITUDE_QUATERNION", {"q1": 1.0, "q2": 0.0, "q3": 0.0, "q4": 0.0}),
-    ("LOCAL_POSITION_NED", {"x": 0.0, "y": 0.0, "z": -4.0, "vx": 0.0, "vy": 0.0, "vz": 0.0}),
-)
+    assert _text_of(lost) == "a" * 50 + "...end"
 
 
 def _distance(orientation: int, current: int, signal: int = 0) -> tuple[str, dict[str, Any]]:
@@ -205,32 +207,22 @@ def _distance(orientation: int, current: int, signal: int = 0) -> tuple[str, dic
 def test_the_range_is_that_of_the_sensor_which_faces_down() -> None:
     down = int(mavlink.MAV_SENSOR_ROTATION_PITCH_270)
     received, _ = _received(*POSE, _distance(down, 412, 100), _distance(0, 90))
-    state = received.vehicle_state()
-    assert state is not None
-    reading = state.ground_range
-    assert reading is not None
+    reading = _ground_range(received)
     assert (reading.time_s, reading.range_m, reading.min_m, reading.max_m) == pytest.approx((2.0, 4.12, 0.15, 20.0))
     assert (reading.quality, reading.vertical) == (1.0, False)
     assert received.range_finders() == {down: (2.0,), 0: (3.0,)}
     for signal, quality in ((0, None), (1, 0.0), (51, pytest.approx(0.505, abs=0.001))):
         received.add(*_distance(down, 412, signal), 4.0)
-        newest = received.ground_range()
-        assert newest is not None
-        assert newest.quality == quality
+        assert _ground_range(received).quality == quality
 
 
 def test_px4s_distance_to_bottom_serves_where_no_sensor_is_heard() -> None:
     nothing, _ = _received(*POSE, _distance(0, 90), ("ALTITUDE", {"bottom_clearance": None}))
     assert nothing.ground_range() is None
     received, _ = _received(*POSE, ("ALTITUDE", {"bottom_clearance": 3.9}))
-    reading = received.ground_range()
-    assert reading is not None
+    reading = _ground_range(received)
     assert (reading.time_s, reading.range_m, reading.vertical, reading.max_m) == (2.0, 3.9, True, None)
     received.add(*_distance(25, 412), 2.1)
-    newest = received.ground_range()
-    assert newest is not None
-    assert not newest.vertical, "the sensor's own reading is preferred"
+    assert not _ground_range(received).vertical, "the sensor's own reading is preferred"
     received.add("ALTITUDE", {"bottom_clearance": 3.8}, 2.7)
-    newest = received.ground_range()
-    assert newest is not None
-    assert newest.vertical, "until it is silent"
+    assert _ground_range(received).vertical, "until it is silent"
