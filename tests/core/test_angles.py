@@ -31,21 +31,11 @@ def test_every_message_holds_the_same_direction_within_half_a_turn(angle_deg: fl
         assert abs(math.sin((held_rad - math.radians(same_deg)) / 2)) < 1e-12
 
 
-def test_one_that_is_within_stays_to_the_last_bit() -> None:
+def test_a_direction_stays_to_the_last_bit_and_what_is_none_is_none() -> None:
     for angle_rad in np.random.default_rng(0).uniform(-math.pi, math.pi, 1000):
         assert wrapped(angle_rad) == angle_rad
-
-
-@pytest.mark.parametrize("angle_rad", [1e300, -1e300])
-def test_a_number_without_a_direction_left_in_it_is_still_a_direction(angle_rad: float) -> None:
-    assert -math.pi < wrapped(angle_rad) <= math.pi
-
-
-@pytest.mark.parametrize("angle_rad", [math.nan, math.inf, -math.inf])
-def test_what_is_not_finite_is_no_direction(angle_rad: float) -> None:
-    assert math.isnan(wrapped(angle_rad))
-
-
-def test_no_heading_stays_none() -> None:
+    for angle_rad in (1e300, -1e300):
+        assert -math.pi < wrapped(angle_rad) <= math.pi, "a number without a direction left in it is still one"
+    assert all(math.isnan(wrapped(angle_rad)) for angle_rad in (math.nan, math.inf, -math.inf))
     assert Wanted(np.zeros(2), np.zeros(2), None).yaw_rad is None
     assert Guidance(np.zeros(2), "stands").course_rad is None

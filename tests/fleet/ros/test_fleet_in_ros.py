@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import pytest
 
-from flockd.fleet.watcher import FleetWatcher
 from flockd.sim.sitl.ports import free_endpoint
 from tests.calm import until
 from tests.fleet.ros.peers import Peer, bridge, ended, own_domain, peer
@@ -169,28 +168,6 @@ def test_a_peer_that_stops_holds_up_nobody(fleet: Fleet) -> None:
             assert fleet.node.call("/drone1/resume")["ok"]
         finally:
             stopped.process.send_signal(signal.SIGCONT)
-
-
-def test_a_bridge_that_hangs_holds_up_no_drone() -> None:
-    """It stops as by SIGSTOP, with its connections open; another watcher hears the drone as before."""
-    environment, endpoint = own_domain(), free_endpoint()
-    with ExitStack() as stack:
-        stack.enter_context(made_up_drones(endpoint, "--drones", "1", connect=False))
-        watcher = stack.enter_context(FleetWatcher(None, listen=[], connect=[endpoint]))
-        running = stack.enter_context(bridge(environment, "--connect", endpoint))
-        node = stack.enter_context(peer(environment, "someone"))
-        node.listen("/drone1/odometry", ODOMETRY)
-        node.newest("/drone1/odometry")
-        running.send_signal(signal.SIGSTOP)
-        try:
-            times, began_s = set[float](), time.monotonic()
-            while len(times) < 20:
-                assert time.monotonic() < began_s + 60.0
-                times |= {one.topics["state"].message["time_s"] for one in watcher.drones() if "state" in one.topics}
-                time.sleep(0.02)
-            told("steps of a drone whose bridge hangs", (len(times) - 1) / (max(times) - min(times)), "Hz, of 2")
-        finally:
-            running.send_signal(signal.SIGCONT)
 
 
 def test_a_bridge_that_starts_again_is_found_again() -> None:

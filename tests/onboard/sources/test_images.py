@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat, RgbFormat
+from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat, PackedFormat, RgbFormat
 from tests.onboard.sources.camera_images import SIZE, jpeg, scene
 
 
@@ -61,6 +61,12 @@ def test_a_white_sky_and_a_black_ground_are_no_damage() -> None:
     image[:200] = 255
     image[400:] = 0
     assert MjpegFormat(SIZE).decode(jpeg(image)).shape == (480, 640, 3)
+
+
+def test_whole_pixels_are_reduced_to_their_mean() -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
+    reduced = PackedFormat("RGB", (64, 48), reduce=2).decode(pixels.tobytes())
+    np.testing.assert_allclose(reduced, pixels.reshape(24, 2, 32, 2, 3).mean(axis=(1, 3)), atol=1.0)
 
 
 def test_plain_rgb_is_handed_on_as_it_is_even_if_it_shows_nothing() -> None:
