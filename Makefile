@@ -40,7 +40,7 @@ test-all: lint ### lint and all tests, those too that take minutes each
 	$(BIN)/python -m pytest -n 2
 
 ros: $(ROS_VENV)/ros.installed ### what needs ROS 2: nodes in processes of their own, cameras by topic; with the times it takes
-	$(ROS_VENV)/bin/python -m pytest -m ros -rP tests/fleet/ros tests/onboard/sources tests/tools/release/test_licences.py
+	$(ROS_VENV)/bin/python -m pytest -m ros -rP tests/fleet/ros tests/tools/release/test_licences.py
 
 faults: $(VENV)/test.installed ### the slow stories of faults of a whole daemon
 	$(BIN)/python -m pytest -n 2 -m "slow and fault and not whole_flight and not browser and not ros" --durations=10

@@ -18,7 +18,7 @@ from tests.calm import until
 from tests.fleet.ros.peers import FLOCKD, ended, own_domain, peer
 
 FLIGHT = Path(__file__).parents[2] / "review" / "replay" / "crossing.mcap"
-DRIVER = Path(__file__).parents[2] / "onboard" / "sources" / "ros_cameras.py"
+DRIVER = Path(__file__).with_name("ros_cameras.py")
 STEPS = 6
 
 

@@ -14,7 +14,6 @@ import pytest
 import zenoh
 
 from flockd.onboard.telemetry.publisher import MAX_PEERS, ZenohTelemetry
-from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
 from flockd.sim.sitl.ports import free_endpoint
 
@@ -102,21 +101,6 @@ def test_a_peer_costs_little_memory_and_others_are_answered(attack: Callable[[ze
         assert peak_mb(process) - before_mb < MAX_COST_MB
         close_session(hostile)
         close_session(other)
-
-
-def test_what_a_drone_sends_may_be_longer_than_what_it_receives() -> None:
-    endpoint, image = free_endpoint(), bytes(300_000)
-    with ZenohTelemetry("meadow", listen=[endpoint]) as telemetry:
-        telemetry.announce(
-            "tiny",
-            AboutMessage(version="1", configuration={}, commands=[]),
-            lambda command, payload: AnswerMessage(accepted=True, sentence=""),
-            lambda camera: image,
-        )
-        session = open_session("other", [], [endpoint])
-        connected(session)
-        assert ask(session, "image/front", b"") == [image]
-        close_session(session)
 
 
 def test_more_peers_than_it_takes_are_refused() -> None:

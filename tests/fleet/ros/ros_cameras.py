@@ -2,8 +2,7 @@
 
 ros_cameras.py FILE. The file is an npz: `stamps` (seconds, when each set was taken), and for each camera of `names`
 `images_NAME` (n, h, w, 3) RGB and `k_NAME` (9,). It waits until each camera has a reader, then publishes each set as
-long after the first as it was taken after that, stamped by this computer's clock. With a second argument it waits for a
-line before each set, so that none comes before somebody has taken the last.
+long after the first as it was taken after that, stamped by this computer's clock.
 """
 
 from __future__ import annotations
@@ -37,8 +36,6 @@ def main() -> None:
     first_ns = time.time_ns()
     for number, stamp_s in enumerate(flight["stamps"]):
         stamp_ns = first_ns + round(1e9 * float(stamp_s - flight["stamps"][0]))
-        if sys.argv[2:]:
-            sys.stdin.readline()
         time.sleep(max(0.0, (stamp_ns - time.time_ns()) / 1e9))
         for name in names:
             publish(images[name], lenses[name], flight[f"images_{name}"][number], flight[f"k_{name}"], stamp_ns)
