@@ -167,22 +167,8 @@ MAX_AHEAD_S = 0.02
 """Drivers that work out time stamps from the camera's own clock may be this much ahead."""
 
 
-class ReceivedFrames:
-    """What all sources have in common for the pilot: sets are fetched from a receiver."""
-
-    _receiver: FrameReceiver
-
-    def newest(self, timeout_s: float = 0.0) -> FrameSet | None:
-        """See ``FrameSource``."""
-        return self._receiver.newest(timeout_s)
-
-    def status(self) -> Mapping[str, CameraStatus]:
-        """See ``FrameSource``."""
-        return self._receiver.status()
-
-
 class FrameReceiver:
-    """The assembler behind a lock, and the decoding in front of it: what all sources have in common."""
+    """What all sources have in common: the assembler behind a lock, and the decoding in front of it."""
 
     def __init__(
         self,
@@ -242,7 +228,7 @@ class FrameReceiver:
         with self._changed:
             self._faults[camera] = sentence
 
-    def newest(self, timeout_s: float) -> FrameSet | None:
+    def newest(self, timeout_s: float = 0.0) -> FrameSet | None:
         """See ``FrameSource``."""
         until_s = self._clock() + timeout_s
         while (raw := self._next(until_s)) is not None:
@@ -264,7 +250,7 @@ class FrameReceiver:
             }
 
     def stop(self) -> None:
-        """Lets a waiting reader go."""
+        """See ``FrameSource``; lets a waiting reader go."""
         with self._changed:
             self._stopped = True
             self._changed.notify_all()

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from flockd.core.config.rig import IntrinsicsConfig
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
 from flockd.core.secrets import masked
-from flockd.onboard.sources.assembler import FrameReceiver, ReceivedFrames
+from flockd.onboard.sources.assembler import FrameReceiver
 from flockd.onboard.sources.child_device import CHILD, ROS_CHILD
 from flockd.onboard.sources.frames import CameraDevice, CameraError, CapturedBuffer, Count, RawFrame
 from flockd.onboard.sources.gstreamer_device import GstreamerDevice
@@ -45,7 +45,7 @@ class Devices:
         return V4l2Device(camera, size, self.kernel)
 
 
-class DeviceSource(ReceivedFrames):
+class DeviceSource(FrameReceiver):
     """A ``FrameSource`` of the kernel's cameras, pipelines and topics, with their own time stamps and numbers."""
 
     def __init__(
@@ -59,9 +59,9 @@ class DeviceSource(ReceivedFrames):
 
         ``on_frame`` is called with each usable frame, on its camera's thread.
         """
-        self._receiver = FrameReceiver(tuple(sizes), parameters, on_frame=on_frame)
+        super().__init__(tuple(sizes), parameters, on_frame=on_frame)
         self._cameras = [
-            _Camera(camera, sizes[camera.name], parameters.silence_s, self._receiver, devices or Devices())
+            _Camera(camera, sizes[camera.name], parameters.silence_s, self, devices or Devices())
             for camera in parameters.cameras
         ]
 
@@ -72,16 +72,16 @@ class DeviceSource(ReceivedFrames):
 
     def stop(self) -> None:
         """See ``FrameSource``."""
-        self._receiver.stop()
+        super().stop()
         for camera in self._cameras:
-            camera.ask_to_stop()
+            camera.stopping.set()
         until_s = time.monotonic() + _STOP_S
-        for camera in self._cameras:
+        for camera in filter(threading.Thread.is_alive, self._cameras):
             camera.join(max(until_s - time.monotonic(), 0.0))
 
 
-class _Camera:
-    """One camera and the thread that keeps it running."""
+class _Camera(threading.Thread):
+    """The thread that keeps one camera running."""
 
     def __init__(
         self,
@@ -91,53 +91,41 @@ class _Camera:
         receiver: FrameReceiver,
         devices: Devices,
     ) -> None:
-        self._name = parameters.name
-        self._parameters = parameters
-        self._size = size
-        self._silence_s = silence_s
-        self._receiver = receiver
-        self._devices = devices
+        super().__init__(name=f"camera-{parameters.name}", daemon=True)
+        self._parameters, self._size, self._silence_s = parameters, size, silence_s
+        self._receiver, self._devices = receiver, devices
+        self._who = parameters.name
         self._delivered = False
         """Whether this opening of the device has brought a usable frame."""
         self._has_delivered = False
         """Whether any has."""
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=f"camera-{self._name}", daemon=True)
+        self.stopping = threading.Event()
 
-    def start(self) -> None:
-        self._thread.start()
-
-    def ask_to_stop(self) -> None:
-        self._stopping.set()
-
-    def join(self, timeout_s: float) -> None:
-        if self._thread.is_alive():
-            self._thread.join(timeout_s)
-
-    def _run(self) -> None:
+    def run(self) -> None:
+        """Until ``stopping`` is set."""
         pause_s = _FIRST_PAUSE_S
-        while not self._stopping.is_set():
+        while not self.stopping.is_set():
             self._delivered = False
             try:
                 with self._devices.open(self._parameters, self._size) as device:
-                    self._receiver.count(self._name, "opened")
+                    self._receiver.count(self._who, "opened")
                     self._capture(device)
             except CameraError as error:
-                self._receiver.fault(self._name, str(error))
+                self._receiver.fault(self._who, str(error))
             except Exception as error:  # noqa: BLE001 - the thread's border: a camera that fails so is seen, too
-                self._receiver.fault(self._name, f"{self._name}: cannot be run ({type(error).__name__}: {error})")
+                self._receiver.fault(self._who, f"{self._who}: cannot be run ({type(error).__name__}: {error})")
             pause_s = _FIRST_PAUSE_S if self._delivered else pause_s
-            self._stopping.wait(pause_s)
+            self.stopping.wait(pause_s)
             pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S)
 
     def _capture(self, device: CameraDevice) -> None:
         """Until it is asked to stop; raises CameraError when the camera fails or falls silent."""
         usable_s, refused = time.monotonic(), None
         left_over = self._has_delivered  # drivers may begin again with the last image of before, stamped as of now
-        while not self._stopping.is_set():
+        while not self.stopping.is_set():
             captured = device.read(_LOOK_S)
             if captured is not None and left_over:
-                self._receiver.count(self._name, "received", "late")
+                self._receiver.count(self._who, "received", "late")
                 left_over = False
             elif captured is not None:
                 refused = self._take(captured, device.image_format())
@@ -147,15 +135,15 @@ class _Camera:
             if time.monotonic() - usable_s > limit_s:
                 last = f" (the last was refused: {refused.replace('_', ' ')})" if refused else ""
                 raise CameraError(
-                    f"{self._name}: {masked(self._parameters.place)} gave no usable image for {limit_s:g} s{last}"
+                    f"{self._who}: {masked(self._parameters.place)} gave no usable image for {limit_s:g} s{last}"
                 )
 
     def _take(self, captured: CapturedBuffer, image_format: ImageFormat) -> Count | None:
         refused = self._refusal(captured, image_format)
         if refused is not None:
-            self._receiver.count(self._name, "received", refused)
+            self._receiver.count(self._who, "received", refused)
             return refused
-        frame = RawFrame(self._name, captured.data, image_format.decode, captured.time_s, captured.sequence)
+        frame = RawFrame(self._who, captured.data, image_format.decode, captured.time_s, captured.sequence)
         return self._receiver.offer(frame)
 
     def _refusal(self, captured: CapturedBuffer, image_format: ImageFormat) -> Count | None:

@@ -18,7 +18,7 @@ import zenoh
 from flockd.core import services
 from flockd.core.config.source import SourceParameters
 from flockd.core.messages import Frame
-from flockd.onboard.sources.assembler import FrameReceiver, ReceivedFrames
+from flockd.onboard.sources.assembler import FrameReceiver
 from flockd.onboard.sources.frames import RawFrame
 from flockd.onboard.sources.image_formats import RgbFormat
 from flockd.onboard.telemetry.zenoh_session import SessionError, SessionOwner, close_session, open_session
@@ -56,7 +56,7 @@ class FramePublisher(SessionOwner):
         return publisher
 
 
-class SharedMemorySource(ReceivedFrames):
+class SharedMemorySource(FrameReceiver):
     """A ``FrameSource`` of what a ``FramePublisher`` publishes for one drone."""
 
     def __init__(
@@ -69,7 +69,7 @@ class SharedMemorySource(ReceivedFrames):
         """``sizes``: width, height by camera; ``on_frame``: called with each usable frame, on a thread of zenoh's."""
         self._formats = {camera: RgbFormat(size) for camera, size in sizes.items()}
         self._where = parameters.shared_memory
-        self._receiver = FrameReceiver(tuple(self._formats), parameters, clock, on_frame)
+        super().__init__(tuple(self._formats), parameters, clock, on_frame)
         self._session: zenoh.Session | None = None
         self._subscribers: list[zenoh.Subscriber[None]] = []
 
@@ -85,7 +85,7 @@ class SharedMemorySource(ReceivedFrames):
 
     def stop(self) -> None:
         """See ``FrameSource``."""
-        self._receiver.stop()
+        super().stop()
         if self._session is not None:
             close_session(self._session)
 
@@ -98,18 +98,18 @@ class SharedMemorySource(ReceivedFrames):
         except struct.error:
             magic = b""
         if magic != _MAGIC:
-            self._receiver.count(camera, "received", "malformed")
+            self.count(camera, "received", "malformed")
             return
         if (width, height) != image_format.size:
             asked = "x".join(map(str, image_format.size))
             why = f"{camera}: frames are {width}x{height}, but the rig has {asked}; correct one"
-            self._receiver.refuse(camera, "corrupt", why)
+            self.refuse(camera, "corrupt", why)
             return
-        if not self._receiver.is_of_now(time_s, services.FRAME_STAMP.timeout):
+        if not self.is_of_now(time_s, services.FRAME_STAMP.timeout):
             why = f"{camera}: a time stamp is not of this computer's clock; correct the program"
-            self._receiver.refuse(camera, "time_stamp", why)
+            self.refuse(camera, "time_stamp", why)
             return
-        self._receiver.offer(RawFrame(camera, sample.payload.to_bytes(), image_format.decode, time_s, sequence))
+        self.offer(RawFrame(camera, sample.payload.to_bytes(), image_format.decode, time_s, sequence))
 
 
 def _open(*, listen: Sequence[str], connect: Sequence[str]) -> zenoh.Session:
