@@ -2,8 +2,7 @@
 
 from flockd.onboard.daemon.daemon import Daemon, DaemonError
 from flockd.onboard.daemon.message_sinks import StderrLog
-from flockd.onboard.daemon.startup import Components
-from flockd.onboard.daemon.status import ServiceManager
+from flockd.onboard.daemon.status import Components, ServiceManager
 from flockd.onboard.daemon.watched_networks import InterruptibleNetworks, cameras_at_once, load_side_by_side
 
 __all__ = [

@@ -9,22 +9,46 @@ from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
+from flockd import __version__
 from flockd.core.config import DroneConfig
 from flockd.core.errors import ConfigError, FlockdError
-from flockd.flight.safety import Decision, Event, State
+from flockd.core.secrets import masked
+from flockd.flight.geometry import build_rig
+from flockd.flight.safety import Decision, Event, Gate, State
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
+from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.onboard.autopilot.watches import MOST_SPEED
-from flockd.onboard.daemon.autopilot_tasks import state_sentence
-from flockd.onboard.daemon.control import FLYING
-from flockd.onboard.daemon.operator_orders import OperatorRequests
-from flockd.onboard.daemon.startup import Components, Connect, open_components
-from flockd.onboard.daemon.status import ServiceManager, notify_service_manager, publish_status
-from flockd.onboard.daemon.watched_networks import InterruptibleNetworks
+from flockd.onboard.daemon.autopilot_tasks import (
+    AutopilotRequests,
+    ObstacleDistances,
+    RefusalWatch,
+    StateTexts,
+    state_sentence,
+)
+from flockd.onboard.daemon.control import FLYING, Control
+from flockd.onboard.daemon.message_sinks import MessageSinks
+from flockd.onboard.daemon.operator_orders import MissionOrders, OperatorCommands, OperatorRequests
+from flockd.onboard.daemon.pilot_loop import PilotLoop, VehicleHistory
+from flockd.onboard.daemon.status import Components, ServiceManager, notify_service_manager, publish_status
+from flockd.onboard.daemon.supervisor_inputs import InputCollector, LoopLag, Thermometer
+from flockd.onboard.daemon.watched_networks import InterruptibleNetworks, WatchedNetworks, cameras_at_once
 from flockd.onboard.sources import open_source
+from flockd.onboard.telemetry.preview import Previews
+from flockd.onboard.telemetry.publisher import ZenohTelemetry
+from flockd.onboard.telemetry.topics import AboutMessage
+from flockd.onboard.worker import BusyError, LateError, Worker
 
+LOAD_S = 60.0
+"""To load the networks from a slow card."""
+OPEN_S = 10.0
+CLOSE_S = 3.0
 HOLD_S = 2.0
 """For the autopilot to confirm Hold after the control loop has failed."""
+
+
+Connect = Callable[..., Coroutine[Any, Any, AutopilotLink]]
+"""Connects to an autopilot, as `AutopilotLink.connect` does."""
 
 
 class DaemonError(FlockdError):
@@ -95,22 +119,79 @@ class Daemon:
         when the link is not usable any more on the ground.
         """
         async with AsyncExitStack() as stack:
-            start = open_components(
-                stack,
-                self._config,
-                source=self._source,
-                load_networks=self._load_networks,
-                models=self._models,
-                recordings=self._recordings,
-                operator=self._operator,
-                on_tick=self._on_tick,
-                clock=self._clock,
-                connect=self._connect,
-            )
-            components = await self._unless_stopped(start)
+            components = await self._unless_stopped(self._open(stack))
             if components is not None:
                 self.components = components
                 await self._fly(components)
+
+    async def _open(self, stack: AsyncExitStack) -> Components:
+        """Opens and connects all components; ``stack`` closes what was opened, in reverse order.
+
+        Raises FlockdError for what cannot be opened.
+        """
+        config, clock = self._config, self._clock
+        assert config.autopilot is not None
+        loading = Worker("loading")
+        # A process that ends while a thread is inside ONNX Runtime is aborted; nothing else runs by then.
+        stack.callback(loading.leave, LOAD_S)
+        closing = Worker("closing", backlog=8)
+        stack.callback(closing.leave)
+        telemetry = await closing.do(OPEN_S, self._open_telemetry)
+        stack.push_async_callback(_close, closing, telemetry.close)
+        sinks = MessageSinks(config, telemetry, self._models, self._recordings, clock)
+        stack.push_async_callback(_close_async, sinks.close)
+        await closing.do(OPEN_S, self._source.start)
+        stack.push_async_callback(_close, closing, self._source.stop)
+        networks, link = await _both(self._networks(loading), self._connect(config.autopilot, clock=clock))
+        stack.push_async_callback(_close_async, link.close)
+        gate = Gate(config.safety.gate)
+        streamer = SetpointStreamer(
+            link.send_setpoint, link.status, gate.step, config.autopilot, config.safety, clock=clock
+        )
+        streamer.start()
+        stack.callback(streamer.close)
+        history, lag, thermometer = VehicleHistory(), LoopLag(clock), Thermometer()
+        pilot_loop = PilotLoop(config, self._source, networks, history.at, sinks.step, sinks.event, clock)
+        stack.push_async_callback(_close, closing, pilot_loop.leave)
+        dead_tasks: dict[str, str] = {}
+        collector = InputCollector(
+            config, self._source, pilot_loop, networks, gate, lag, thermometer, dead_tasks, clock
+        )
+        requests = AutopilotRequests(link, sinks.event)
+        control = Control(
+            config, link, streamer, pilot_loop, collector, requests, history, self._operator, self._on_tick, clock
+        )  # fmt: skip
+        missions = MissionOrders(config, pilot_loop, link.vehicle_state, lambda: control.decision.state)
+        loop = asyncio.get_running_loop()
+        commands = OperatorCommands(
+            config.telemetry.commands, self._operator, missions, loop, sinks.event, identity=telemetry.identity
+        )
+        previews = Previews(build_rig(config.rig), lambda: (pilot_loop.frames, pilot_loop.stepped))
+        about = AboutMessage(
+            version=__version__,
+            configuration=masked(config.model_dump(mode="json")),
+            commands=list(config.telemetry.commands),
+        )
+        telemetry.announce(config.name, about, commands.handle, previews.picture)
+        return Components(
+            link=link, gate=gate, streamer=streamer, source=self._source, pilot_loop=pilot_loop, networks=networks,
+            control=control,
+            requests=requests, refusals=RefusalWatch(link, sinks.event, clock), sinks=sinks,
+            distances=ObstacleDistances(config, link, pilot_loop, history, clock),
+            texts=StateTexts(link.send_text, clock), telemetry=telemetry, commands=commands, lag=lag,
+            thermometer=thermometer, dead_tasks=dead_tasks,
+        )  # fmt: skip
+
+    async def _networks(self, loading: Worker) -> WatchedNetworks:
+        networks = await loading.do(LOAD_S, self._load_networks)
+        loading.leave()
+        deadline_s = self._config.perception.deadline_s / self._config.speed_factor
+        return WatchedNetworks(networks, deadline_s, cameras_at_once(self._config))
+
+    def _open_telemetry(self) -> ZenohTelemetry:
+        parameters = self._config.telemetry
+        settings = None if parameters.zenoh_config is None else Path(parameters.zenoh_config)
+        return ZenohTelemetry(parameters.fleet, listen=parameters.listen, connect=parameters.connect, settings=settings)
 
     async def _unless_stopped(self, start: Coroutine[Any, Any, Components]) -> Components | None:
         """Starts; None when asked to stop before that is done."""
@@ -212,3 +293,33 @@ def _raise_failure(components: Components) -> None:
         raise DaemonError(
             "the autopilot did not confirm Hold; flockd stopped sending setpoints, so that its failsafe acts; check it"
         )
+
+
+async def _both(
+    networks: Coroutine[Any, Any, WatchedNetworks], link: Coroutine[Any, Any, AutopilotLink]
+) -> tuple[WatchedNetworks, AutopilotLink]:
+    """Runs both concurrently; when one fails the other is cancelled."""
+    tasks = asyncio.create_task(networks), asyncio.create_task(link)
+    try:
+        return await asyncio.gather(*tasks)
+    except BaseException:
+        for task in tasks:
+            task.cancel()
+        raise
+
+
+async def _close(worker: Worker, close: Callable[[], None]) -> None:
+    """Closes on a worker, within a deadline: what hangs ends with the process."""
+    try:
+        await worker.do(CLOSE_S, close)
+    except (LateError, BusyError):
+        return
+
+
+async def _close_async(close: Callable[[], Awaitable[None]]) -> None:
+    """The same for a coroutine."""
+    try:
+        async with asyncio.timeout(2 * CLOSE_S):
+            await close()
+    except (TimeoutError, LateError, BusyError):
+        return

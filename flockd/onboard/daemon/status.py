@@ -8,18 +8,66 @@ import os
 import socket
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
-from flockd.flight.safety import Decision, Event, State
-from flockd.onboard.daemon.autopilot_tasks import state_sentence
-from flockd.onboard.daemon.startup import Components
+from flockd.flight.safety import Decision, Event, Gate, State
+from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
+from flockd.onboard.autopilot.streamer import SetpointStreamer
+from flockd.onboard.daemon.autopilot_tasks import (
+    AutopilotRequests,
+    ObstacleDistances,
+    RefusalWatch,
+    StateTexts,
+    state_sentence,
+)
+from flockd.onboard.daemon.control import Control
+from flockd.onboard.daemon.message_sinks import MessageSinks
+from flockd.onboard.daemon.operator_orders import OperatorCommands
+from flockd.onboard.daemon.pilot_loop import PilotLoop
+from flockd.onboard.daemon.supervisor_inputs import LoopLag, Thermometer
+from flockd.onboard.daemon.watched_networks import WatchedNetworks
+from flockd.onboard.sources import FrameSource
 from flockd.onboard.telemetry import TOPICS
-from flockd.onboard.telemetry.topics import CameraMessage, ClockMessage, ComputerMessage, FlightMessage, ReasonMessage
+from flockd.onboard.telemetry.publisher import ZenohTelemetry
+from flockd.onboard.telemetry.topics import (
+    CameraMessage,
+    ClockMessage,
+    ComputerMessage,
+    FlightMessage,
+    ReasonMessage,
+)
 
 START_POLL_S = 0.1
 START_MORE_S = 10.0
 STATUS_EVERY_S = 2.0
 STATUS_POLL_S = 0.05
 """A new status is sent after this long at most, so that whoever reads the lines has them in the order of events."""
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """Of a running daemon, created and connected by `Daemon`."""
+
+    link: AutopilotLink
+    gate: Gate
+    streamer: SetpointStreamer
+    source: FrameSource
+    pilot_loop: PilotLoop
+    networks: WatchedNetworks
+    control: Control
+    requests: AutopilotRequests
+    refusals: RefusalWatch
+    distances: ObstacleDistances
+    texts: StateTexts
+    sinks: MessageSinks
+    telemetry: ZenohTelemetry
+    commands: OperatorCommands
+    lag: LoopLag
+    thermometer: Thermometer
+    dead_tasks: dict[str, str]
+    """Why each task that has ended did, by name."""
+    over: asyncio.Event = field(default_factory=asyncio.Event)
+    """Set when the flight is over and the tasks may end."""
 
 
 async def notify_service_manager(components: Components, service: ServiceManager) -> None:
