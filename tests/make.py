@@ -84,7 +84,7 @@ def autopilot_status(**fields: Any) -> AutopilotStatus:
     """Armed in the air in Hold, heard a moment ago, all well, at home."""
     known = AutopilotStatus(
         time_s=0.0, heartbeat_age_s=0.1, message_age_s=0.1, flight_mode="hold", armed=True, failsafe=False,
-        landed_state="air", battery_share=1.0, battery_v=16.0, estimate_ok=True, gps_ok=True,
+        landed_state="air", battery_share=1.0, estimate_ok=True, gps_ok=True,
         position_ned=np.zeros(3), home_ned=np.zeros(3),
     )  # fmt: skip
     return replace(known, **fields)

@@ -64,7 +64,6 @@ class AutopilotStatus:
     landed_state: LandedState
     battery_share: float | None
     """0 to 1."""
-    battery_v: float | None
     estimate_ok: bool | None
     """Attitude, height and horizontal velocity and position are estimated."""
     gps_ok: bool | None

@@ -50,7 +50,6 @@ class ClockEstimate:
     """The shortest of the last seconds."""
     recent_round_trip_s: float
     """The shortest of the last `RECENT_S`."""
-    samples: int
 
     def local_s(self, autopilot_s: float) -> float:
         """When on this computer's clock the autopilot's showed that."""
@@ -145,5 +144,4 @@ def _overlap(samples: FloatArray) -> ClockEstimate:
         jitter_s=1.4826 * float(np.median(np.abs(offset_s - np.median(offset_s)))),
         round_trip_s=float(duration_s.min()),
         recent_round_trip_s=float(duration_s[time_s >= time_s[-1] - RECENT_S].min()),
-        samples=len(samples),
     )

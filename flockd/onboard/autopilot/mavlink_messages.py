@@ -56,6 +56,8 @@ RANGES: Mapping[tuple[str, str], range] = {("SYS_STATUS", "battery_remaining"): 
 """What other fields may be, likewise; -1 is MAVLink's own word for unknown."""
 FACES_DOWN = 25
 """MAV_SENSOR_ROTATION_PITCH_270 of MAV_SENSOR_ORIENTATION."""
+RANGES_KEPT = 200
+"""Arrivals of each range finder, to tell its rate."""
 FULL_SIGNAL, NO_SIGNAL = 100, 1
 """Values of DISTANCE_SENSOR's `signal_quality`, in percent; 0 is for sensors that do not say."""
 QUATERNION_TOLERANCE = 0.1
@@ -116,7 +118,9 @@ class ReceivedMessages:
         self._begun_fields: Fields = {}
         self._texts: deque[tuple[float, str]] = deque(maxlen=TEXTS_KEPT)
         """Warnings and worse, with their times."""
-        self._ranges = RangeMessages()
+        self._ground_range: RangeReading | None = None
+        self._ranges_s: dict[int, deque[float]] = {}
+        """When the newest readings of range finders came, by their orientation."""
         self._other_computer_s = -math.inf
         self._first_s, self._heard_s = math.inf, -math.inf
         """When its first heartbeat came, and its newest message."""
@@ -161,7 +165,10 @@ class ReceivedMessages:
         if name in STAMPED:
             arrived_s, time_s = time_s, self._stamped_s(name, fields, time_s)
             if name == DISTANCE_SENSOR:
-                self._ranges.add(fields, time_s, arrived_s)
+                orientation = int(fields.get("orientation") or 0)
+                self._ranges_s.setdefault(orientation, deque(maxlen=RANGES_KEPT)).append(arrived_s)
+                if orientation == FACES_DOWN:
+                    self._ground_range = _range_reading(fields, time_s)
         self._newest[name] = ReceivedMessage(time_s, self._checked(name, fields))
         self._follow(name, time_s)
 
@@ -332,7 +339,7 @@ class ReceivedMessages:
     def status(self, now_s: float) -> AutopilotStatus:
         """What they say of the autopilot."""
         heartbeat = self._newest.get("HEARTBEAT", ReceivedMessage(-math.inf, {}))
-        system = self._fields("SYS_STATUS")
+        percent = self._fields("SYS_STATUS").get("battery_remaining")
         landed_state = self._fields("EXTENDED_SYS_STATE").get("landed_state")
         fix_type = self._fields("GPS_RAW_INT").get("fix_type")
         return AutopilotStatus(
@@ -343,8 +350,7 @@ class ReceivedMessages:
             armed=bool(heartbeat.fields.get("base_mode", 0) & MAV_MODE_FLAG_SAFETY_ARMED),
             failsafe=heartbeat.fields.get("system_status") == MAV_STATE_CRITICAL or self._would_return(),
             landed_state="unknown" if landed_state is None else LANDED_STATES[landed_state],
-            battery_share=_known(system.get("battery_remaining", -1), scale=0.01),
-            battery_v=_known(system.get("voltage_battery", 0), scale=0.001, unknown=(0, 65535)),
+            battery_share=None if percent in {None, -1} else 0.01 * percent,
             estimate_ok=_estimate_ok(self._newest.get("ESTIMATOR_STATUS")),
             gps_ok=None if fix_type is None else fix_type >= GPS_FIX_3D,
             position_ned=_vector(self._fields("LOCAL_POSITION_NED"), "x", "y", "z"),
@@ -380,7 +386,7 @@ class ReceivedMessages:
 
     def ground_range(self) -> RangeReading | None:
         """The newest of the range finder that faces down, or PX4's distance to bottom where that is silent."""
-        sensor, altitude = self._ranges.newest, self._newest.get("ALTITUDE")
+        sensor, altitude = self._ground_range, self._newest.get("ALTITUDE")
         bottom = None if altitude is None else _vector(altitude.fields, "bottom_clearance")
         if altitude is None or bottom is None or bottom[0] <= 0.0:
             return sensor
@@ -390,7 +396,7 @@ class ReceivedMessages:
 
     def range_finders(self) -> Mapping[int, tuple[float, ...]]:
         """When the last readings came, by the MAV_SENSOR_ORIENTATION of the sensor."""
-        return self._ranges.arrivals_s()
+        return {orientation: tuple(times) for orientation, times in list(self._ranges_s.items())}
 
     def flight_mode(self) -> FlightMode:
         """By the newer of heartbeat and CURRENT_MODE; a mode that is not in `MODES` is `other`."""
@@ -422,28 +428,6 @@ class ReceivedMessages:
                 self._report(f"the autopilot sends {value}, which flockd does not know; it counts as unknown")
             self._unknown_values[value] += 1
         return {**fields, **dict.fromkeys(unknown)} if unknown else fields
-
-
-class RangeMessages:
-    """DISTANCE_SENSOR messages: of several sensors, with the newest reading of the one that faces down."""
-
-    KEPT = 200
-    """Arrivals of each orientation, to tell its rate."""
-
-    def __init__(self) -> None:
-        self.newest: RangeReading | None = None
-        self._arrivals_s: dict[int, deque[float]] = {}
-
-    def add(self, fields: Fields, time_s: float, arrived_s: float) -> None:
-        """Takes a message by its fields."""
-        orientation = int(fields.get("orientation") or 0)
-        self._arrivals_s.setdefault(orientation, deque(maxlen=self.KEPT)).append(arrived_s)
-        if orientation == FACES_DOWN:
-            self.newest = _range_reading(fields, time_s)
-
-    def arrivals_s(self) -> Mapping[int, tuple[float, ...]]:
-        """By orientation."""
-        return {orientation: tuple(times) for orientation, times in list(self._arrivals_s.items())}
 
 
 class StatusText:
@@ -518,10 +502,6 @@ def _attitude(fields: Fields) -> FloatArray | None:
     if quaternion is None or abs(float(np.linalg.norm(quaternion)) - 1.0) > QUATERNION_TOLERANCE:
         return None
     return rotation_from_quaternion(quaternion)
-
-
-def _known(value: float | None, *, scale: float, unknown: tuple[float, ...] = (-1,)) -> float | None:
-    return None if value is None or value in unknown else value * scale
 
 
 def _estimate_ok(message: ReceivedMessage | None) -> bool | None:

@@ -81,10 +81,6 @@ class RosNode:
         self._context.try_shutdown()
         self._thread.join(5.0)
 
-    def now_ns(self) -> int:
-        """Since 1970, or of a simulator's clock where `use_sim_time` is set."""
-        return int(self._node.get_clock().now().nanoseconds)
-
     def advertise(self, topic: str, kind: str, delivery: Delivery) -> None:
         """Makes a topic's publisher, if there is none yet."""
         with self._lock:

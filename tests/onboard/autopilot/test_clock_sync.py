@@ -82,7 +82,6 @@ def test_one_round_trip_that_lies_changes_nothing_and_a_new_start_is_a_new_clock
     _exchanged(sync, _times(2.0) + 10.2, np.full((10, 2), 0.001), offset_s=-9.0)
     assert sync.estimate is not None
     assert sync.estimate.offset_s == pytest.approx(-9.0, abs=1e-4)
-    assert sync.estimate.samples == 10
 
 
 def test_impossible_round_trips_and_few_say_nothing() -> None:
