@@ -146,7 +146,9 @@ class PilotLoop:
         Raises LateError when decoding or a step hangs, and StepsFailedError when some steps in a row had no result for
         an error that nobody expects; one such step is counted, and the next comes as if it had not been.
         """
-        due_s, frame_period_s = self._clock(), _frame_period_s(self._config)
+        assert self._config.source is not None
+        source, due_s = self._config.source, self._clock()
+        frame_period_s = 1.0 / min([camera.rate_hz for camera in source.cameras] or [source.shared_memory.rate_hz])
         while True:
             frames = await self._decoding.do(FRAME_DEADLINE_S, self._source.newest, FRAME_WAIT_S)
             if frames is None:
@@ -287,31 +289,22 @@ class SizeReports:
     """Reports when the drone begins to weave, when it has found how large the others are, and what contradicts it."""
 
     def __init__(self) -> None:
-        self._weaves = self._used = self._contradicted = False
+        self._told: set[str] = set()
 
     def update(self, output: PilotOutput) -> list[str]:
         """The sentences that a step's output is worth."""
-        size, sentences = output.size, []
+        size, told = output.size, dict[str, str]()
         if size is None:
             return []
-        if size.weaves and not self._weaves:
-            sentences.append("size: moves up and down to learn how large the others are")
-        if size.used and not self._used:
-            sentences.append(
-                f"size: the others are {size.size_m:.2f} m large, +-{size.sigma:.0%}; ranges follow from it"
-            )
-        contradictions = [one.text for one in output.reasons if one.kind is ReasonKind.SIZE]
-        if not self._contradicted:
-            sentences += contradictions
-        self._weaves, self._used, self._contradicted = size.weaves, size.used, bool(contradictions)
-        return sentences
-
-
-def _frame_period_s(config: DroneConfig) -> float:
-    """Frame period of the slowest camera."""
-    assert config.source is not None
-    rates_hz = [camera.rate_hz for camera in config.source.cameras] or [config.source.shared_memory.rate_hz]
-    return 1.0 / min(rates_hz)
+        if size.weaves:
+            told["weaves"] = "size: moves up and down to learn how large the others are"
+        if size.used:
+            found = f"{size.size_m:.2f} m large, +-{size.sigma:.0%}"
+            told["used"] = f"size: the others are {found}; ranges follow from it"
+        told |= {one.kind: one.text for one in output.reasons if one.kind is ReasonKind.SIZE}
+        new = [text for what, text in told.items() if what not in self._told]
+        self._told = set(told)
+        return new
 
 
 HISTORY_S = services.VEHICLE_STATE.timeout
