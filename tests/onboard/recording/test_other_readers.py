@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -53,23 +52,10 @@ Read = list[tuple[Schema, Channel, Message]]
 def examined(path: Path) -> Read:
     """All messages, read by the format's own library from begin to end and again by the index, checksums compared."""
     with path.open("rb") as file:
-        by_index = SeekingReader(file, validate_crcs=True)
-        summary, indexed = by_index.get_summary(), list(by_index.iter_messages(log_time_order=False))
-        attachments, metadata = list(by_index.iter_attachments()), list(by_index.iter_metadata())
+        indexed = list(SeekingReader(file, validate_crcs=True).iter_messages(log_time_order=False))
     with path.open("rb") as file:
         in_order = list(NonSeekingReader(file, validate_crcs=True).iter_messages(log_time_order=False))
     assert indexed == in_order
-    assert summary is not None
-    assert summary.statistics is not None
-    told, times = summary.statistics, [message.log_time for _, _, message in in_order]
-    assert (told.message_start_time, told.message_end_time) == (min(times), max(times))
-    assert told.message_count == sum(told.channel_message_counts.values()) == len(in_order)
-    assert (told.schema_count, told.channel_count) == (len(summary.schemas), len(summary.channels))
-    assert (told.chunk_count, told.attachment_count) == (len(summary.chunk_indexes), len(attachments))
-    assert told.metadata_count == len(metadata)
-    content = path.read_bytes()  # the library does not check the summary's own checksum
-    begin, crc = (int.from_bytes(content[-28 + at : -28 + at + size], "little") for at, size in ((0, 8), (16, 4)))
-    assert zlib.crc32(content[begin:-12]) == crc
     return [(schema, channel, message) for schema, channel, message in in_order if schema is not None]
 
 
