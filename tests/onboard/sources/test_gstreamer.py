@@ -116,7 +116,7 @@ def test_what_is_worth_nothing_is_dropped_and_counted_and_the_next_is_fine(
 )
 def test_each_way_to_fail_is_one_sentence_and_is_tried_again(start: Watch, pipeline: str, told: str) -> None:
     source = start(pipeline)
-    assert source.fault().startswith(f"camera0: {told}")
+    assert source.why().startswith(f"camera0: {told}")
     source.until(lambda status: status.counts.get("opened", 0) >= 2)
 
 

@@ -129,7 +129,7 @@ def test_what_is_worth_nothing_is_counted_and_the_next_is_fine(start: Watch, mes
     ],
 )
 def test_what_cannot_be_is_said_in_one_sentence(start: Watch, message: Any, sentence: str) -> None:
-    assert sentence in start(message).fault()
+    assert sentence in start(message).why()
 
 
 def test_a_lens_that_nobody_calibrated_contradicts_nothing(start: Watch) -> None:
@@ -141,7 +141,7 @@ def test_a_lens_that_nobody_calibrated_contradicts_nothing(start: Watch) -> None
 @pytest.mark.fault("camera-unplugged")
 def test_a_silent_topic_is_opened_again(start: Watch) -> None:
     source = start(("imag", image()), silence_s=0.2)
-    assert "/front/image_raw gave no usable image for 0.2 s" in source.fault()
+    assert "/front/image_raw gave no usable image for 0.2 s" in source.why()
     assert source.until(lambda status: status.counts.get("opened", 0) >= 2)
 
 

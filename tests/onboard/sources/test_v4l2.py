@@ -217,7 +217,7 @@ def test_an_unplugged_camera_is_reported_at_once_and_comes_back_when_plugged_in(
     assert source.next().frames.keys() == {"front", "back"}
 
     kernel.unplug("front")
-    fault = source.fault()
+    fault = source.why()
     assert fault == "front: /dev/front is not there; plug the camera in, or correct the path"
 
     kernel.send("back", JPEGS[2])
@@ -318,7 +318,7 @@ ONE_GAIN = {GAIN: FakeControl(b"Gain", 0, 255, 64, step=16)}
 def test_what_the_camera_cannot_do_is_said_in_one_sentence(
     start: Watch, camera: FakeCamera, asked: dict[str, Any], told: str
 ) -> None:
-    fault = start(FakeKernel(front=camera), _camera("front", **asked)).fault()
+    fault = start(FakeKernel(front=camera), _camera("front", **asked)).why()
     assert fault.startswith("front: /dev/front ")
     assert told in fault
 
@@ -377,4 +377,4 @@ def test_what_is_no_camera_is_reported_by_the_real_kernel(start: Watch) -> None:
     camera = CameraDeviceParameters(name="front", device="/dev/null")
     source = start(Kernel(), camera)
     sentence = "front: /dev/null is not a V4L2 camera (Inappropriate ioctl for device)"
-    assert source.fault() == sentence
+    assert source.why() == sentence

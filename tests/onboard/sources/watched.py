@@ -38,7 +38,7 @@ class WatchedSource(DeviceSource):
         found: CameraStatus = until(lambda: status if holds(status := self.one(camera)) else None, WAIT_S)
         return found
 
-    def fault(self) -> str:
+    def why(self) -> str:
         """Why no frames come, as soon as that is known."""
         return str(self.until(lambda status: status.fault is not None).fault)
 
