@@ -30,7 +30,7 @@ _MODELS = {"equidistant": "kannala_brandt"}
 
 def image(time_ns: int, camera: str, data: bytes, kind: ImageFormat) -> bytes:
     """A CompressedImage."""
-    return _packed(CompressedImage(timestamp=_stamp(time_ns), frame_id=camera, data=data, format=kind))
+    return _packed(CompressedImage, time_ns, frame_id=camera, data=data, format=kind)
 
 
 def image_data(message: bytes) -> tuple[bytes, str]:
@@ -46,15 +46,11 @@ def image_data(message: bytes) -> tuple[bytes, str]:
 def calibration(time_ns: int, camera: CameraConfig) -> bytes:
     """A CameraCalibration: what ROS 2 is told too, whose pixel centres lie at whole numbers as well."""
     told = camera_info(time_ns, camera.name, camera, camera.size_px)
-    message = CameraCalibration(
-        timestamp=_stamp(time_ns),
-        frame_id=camera.name,
-        width=told["width"],
-        height=told["height"],
-        distortion_model=_MODELS.get(told["distortion_model"], told["distortion_model"]),
-        **{name.upper(): told[name] for name in "dkrp"},
+    told["distortion_model"] = _MODELS.get(told["distortion_model"], told["distortion_model"])
+    fields = {name: told[name] for name in ("width", "height", "distortion_model")}
+    return _packed(
+        CameraCalibration, time_ns, frame_id=camera.name, **fields, **{name.upper(): told[name] for name in "dkrp"}
     )
-    return _packed(message)
 
 
 def transforms(time_ns: int, position: FloatArray, R_ned_body: FloatArray, rig: Rig) -> bytes:
@@ -64,7 +60,7 @@ def transforms(time_ns: int, position: FloatArray, R_ned_body: FloatArray, rig: 
         ("local", "body", position, R_ned_body),
         *(("body", name, place.translation, place.rotation) for name, place in mounted.items()),
     ]
-    named = [
+    named: list[Any] = [
         {
             "timestamp": _stamp(time_ns),
             "parent_frame_id": parent,
@@ -74,7 +70,7 @@ def transforms(time_ns: int, position: FloatArray, R_ned_body: FloatArray, rig: 
         }
         for parent, child, place, R in places
     ]
-    return _packed(FrameTransforms(transforms=named))
+    return bytes(FrameTransforms(transforms=named).SerializeToString())
 
 
 def odometry(time_ns: int, position: FloatArray, R_ned_body: FloatArray, velocity_ned: FloatArray) -> bytes:
@@ -82,16 +78,16 @@ def odometry(time_ns: int, position: FloatArray, R_ned_body: FloatArray, velocit
     pose = {"position": vector(position), "orientation": turn(R_ned_body)}
     velocity = vector(R_ned_body.T @ velocity_ned)
     frames = {"frame_id": "local", "body_frame_id": "body"}
-    return _packed(Odometry(timestamp=_stamp(time_ns), **frames, pose=pose, linear_velocity=velocity))
+    return _packed(Odometry, time_ns, **frames, pose=pose, linear_velocity=velocity)
 
 
 def log(time_ns: int, level: Literal["INFO", "WARNING"], text: str) -> bytes:
     """A Log."""
-    return _packed(Log(timestamp=_stamp(time_ns), level=level, message=text, name="flockd"))
+    return _packed(Log, time_ns, level=level, message=text, name="flockd")
 
 
-def _packed(message: Any) -> bytes:
-    return bytes(message.SerializeToString())
+def _packed(kind: Any, time_ns: int, **fields: Any) -> bytes:
+    return bytes(kind(timestamp=_stamp(time_ns), **fields).SerializeToString())
 
 
 def _stamp(time_ns: int) -> Tree:

@@ -103,7 +103,8 @@ def main() -> None:
             if kind == "gstreamer":
                 run(pipeline, arguments[0], output, stopping)
             else:
-                listen(*arguments, output)
+                topic, info_topic, stamps = arguments
+                listen(topic, info_topic, stamps, output)
         except (ImportError, _NoImagesError) as error:
             reason = NO_ROS if getattr(error, "name", None) == "rclpy" else str(error).splitlines()[0]
             send(output, ERROR, data=reason.encode())

@@ -133,7 +133,7 @@ def test_what_keeps_it_from_being_armed_is_a_failure_each_with_what_to_do() -> N
     ],
 )
 def test_a_clock_is_good_as_its_round_trips(error_s: float, level: Level, words: str) -> None:
-    finding = judge_clock(ClockEstimate(47_000.0, -46_765.25, error_s, 0.002, 0.003, 0.003, 20))
+    finding = judge_clock(ClockEstimate(47_000.0, -46_765.25, error_s, 0.002, 0.003, 0.003))
     assert finding.level is level
     assert words in finding.measured
     assert judge_clock(None).level is Level.WARNING
