@@ -20,16 +20,16 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_340,
+    "flockd/core": 3_280,
     "flockd/flight": 14_770,
-    "flockd/onboard": 10_910,
+    "flockd/onboard": 10_680,
     "flockd/fleet": 2_250,
     "flockd/ground": 4_850,
     "flockd/review": 3_730,
     "flockd/sim": 11_690,
     "flockd/campaign": 2_090,
     "flockd/cli": 4_100,
-    "tests": 46_920,
+    "tests": 44_970,
     "tools/checks": 2_550,
     "tools/docs": 1_070,
     "tools/measure": 1_330,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_730,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 392}
+FILES = {"flockd": 389}
 NUMBERS_OF_FLIGHT = 528
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
