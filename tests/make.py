@@ -31,6 +31,7 @@ from flockd.core.messages import (
     Wanted,
 )
 from flockd.flight.geometry import PinholeCamera, RigCamera, RigidTransform, log_polar_covariance
+from flockd.flight.safety import OFFBOARD, Action, CameraHealth, Inputs, Permission, Request, Surroundings
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
 from flockd.onboard.telemetry.topics import FlightMessage
 from flockd.sim.scenario import ScenarioConfig, load_scenario
@@ -72,6 +73,42 @@ def detection(
 def wanted(velocity: Sequence[float] | FloatArray = (0.0, 0.0), yaw_rad: float | None = 0.0, **fields: Any) -> Wanted:
     """A level velocity, m/s north and east."""
     return replace(Wanted(np.array(velocity, float), np.zeros(2), yaw_rad), **_arrays(fields))
+
+
+def around(
+    position: Sequence[float] | FloatArray = (0.0, 0.0), velocity: Sequence[float] | FloatArray = (0.0, 0.0), *,
+    neighbours: Sequence[Any] | FloatArray = (), obstacles: Sequence[Any] | FloatArray = (), **fields: Any,
+) -> Surroundings:  # fmt: skip
+    """Of a drone 5 m high, with neighbours (n, 3) that stand still and points of obstacles (m, 2), metres from it."""
+    near, points = np.reshape(np.array(neighbours, float), (-1, 3)), np.reshape(np.array(obstacles, float), (-1, 2))
+    here, moves = np.array(position, float), np.array(velocity, float)
+    nearby = Surroundings(here, moves, 0.5, near, np.zeros((len(near), 2)), 5.0, points)
+    return replace(nearby, **_arrays(fields))
+
+
+def request(
+    now_s: float, velocity: Sequence[float] | FloatArray = (0.0, 0.0), action: Action = Action.FLY,
+    surroundings: Surroundings | None = None, *, yaw_rad: float | None = 1.0, **fields: Any,
+) -> Request:  # fmt: skip
+    """For a velocity that is wanted and permitted now."""
+    want = wanted(velocity, yaw_rad)
+    asked = Request(Permission(action, now_s), want, now_s, 5.0, around() if surroundings is None else surroundings)
+    return replace(asked, **fields)
+
+
+def quiet(**changes: Any) -> Inputs:
+    """What a supervisor hears in a flight with four cameras in which nothing is the matter."""
+    sees = CameraHealth(age_s=0.02, period_s=0.033, unplugged=False, frozen=False, noisy=False)
+    fine = Inputs(
+        cameras=dict.fromkeys(("front", "right", "back", "left"), sees), dropped_share=0.01, estimate_age_s=0.4,
+        ego_motion_age_s=0.0, network_faults=0, inference_stuck=False, load=0.6, temperature_c=60.0, loop_lag_s=0.01,
+        velocity_error_m_s=0.1, velocity_late_s=0.0, dead_tasks=(), neighbours_age_s=0.4, nearest_neighbour_m=2.5,
+        refused_commands=0, obstacle_near=False, outside_fence=False, outside_heights=False, motion_age_s=0.03,
+        heartbeat_age_s=0.5, message_age_s=0.1, stream_fault=None, autopilot_failsafe=False, foreign_setpoints=None,
+        parameter_fault=None, frame_jumped=False, flight_mode=OFFBOARD, armed=True, in_air=True, battery_low=False,
+        position_lost=False, shutdown_asked=False, hold_asked=False, land_asked=False, resume_asked=False,
+    )  # fmt: skip
+    return replace(fine, **changes)
 
 
 def output(time_s: float = 0.0, **fields: Any) -> PilotOutput:
