@@ -60,7 +60,8 @@ def test_whatever_is_asked_for_what_is_sent_is_safe(seed: int, odd: float) -> No
         return float(rng.normal(0.0, scale))
 
     def numbers(scale: float, *shape: int) -> list[list[float]]:
-        return np.reshape([number(scale) for _ in range(math.prod(shape))], shape).tolist()
+        drawn: list[list[float]] = np.reshape([number(scale) for _ in range(math.prod(shape))], shape).tolist()
+        return drawn
 
     gate, last, now_s, moving, climbing = Gate(PARAMETERS), None, 0.0, 0, 0
     for _ in range(1000):

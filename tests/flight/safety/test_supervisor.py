@@ -212,7 +212,7 @@ def test_ready_offers_standstill_only_while_it_may_fly(event: Event) -> None:
 @EVENTS
 def test_a_flight_begins_only_if_nothing_is_in_its_way(event: Event) -> None:
     flight = ready().step(**{"flight_mode": OFFBOARD, **FAULTS[event].changes})
-    begins = FAULTS[event].action if FAULTS[event].before == "ready" else State.IDLE
+    begins: State | Action = FAULTS[event].action if FAULTS[event].before == "ready" else State.IDLE
     flight.then(State.READY if event is Event.NOT_OFFBOARD else begins)
 
 
@@ -501,7 +501,7 @@ def test_other_bounds_on_the_ladder_are_taken_from_the_configuration() -> None:
 # What is noticed, and when.
 
 
-def noticed_with(parameters: SafetyParameters | None = None, **changes: Any) -> list[Event]:
+def noticed_with(parameters: SafetyParameters | None = None, /, **changes: Any) -> list[Event]:
     return list(notice(quiet(**changes), parameters or SafetyParameters()))
 
 
