@@ -41,7 +41,7 @@ STATE_OF = {
     Action.SILENCE: State.SILENT, Action.OFFER: State.READY,
 }  # fmt: skip
 """And idle is silent too."""
-LADDER = [action for action in STATE_OF if action is not Action.OFFER]
+LADDER: list[Action] = [action for action in STATE_OF if action is not Action.OFFER]
 """From the top down."""
 
 
