@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+import numpy as np
 from markupsafe import Markup
+from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 
-from flockd.campaign.campaign_figures import heat_maps, label_of, parameter_curves, shown
-from flockd.campaign.conduct import is_known
-from flockd.campaign.figures import MEASURES, Interval
-from flockd.campaign.results import Results, Row
-from flockd.campaign.verdicts import LEVEL, Comparison, Verdict
-from flockd.review.report.style import inline_svg, page_template
+from flockd.campaign.figures import MEASURES, Figure, Interval, mean_interval
+from flockd.campaign.flight_plan import CASE
+from flockd.campaign.results import LEVEL, Comparison, Results, Row, Verdict
+from flockd.review.report.style import BAND, DRONE_COLOURS, MUTED, STYLE, inline_svg, page_template
 
 MOST_ROWS = 200
 """The most rows of a table; the Parquet files have all."""
@@ -57,9 +58,8 @@ def write_campaign_page(results: Results, path: Path) -> None:
         headline=f"{_count(len(results.rows), 'flight')} of {results.plan.base['scenario']} in {cells}",
         lead=_lead(results),
         facts=[
-            _fact("Flights", f"{flown}", "", f"of at most {results.plan.most_flights}"),
+            _fact("Flights", f"{flown}", "", f"of {results.plan.flights}"),
             _fact("Failed", f"{len(results.failures)}", "", "see below" if results.failures else "none"),
-            *_known_cells(results),
             _fact("Flown in", f"{results.core_s / 3600:.2g}", "hours", "on one core, all flights together"),
         ],
         sections=_parts(results),
@@ -108,24 +108,10 @@ def _durations(results: Results) -> str:
     )
 
 
-def _known_cells(results: Results) -> list[dict[str, str]]:
-    """How many cells the stop rule is content with."""
-    stop = results.plan.config.stop
-    if stop is None:
-        return []
-    known = sum(
-        is_known([row[stop.figure] for row in results.rows if row["cell"] == cell.number], stop)
-        for cell in results.plan.cells
-    )
-    wanted = f"± {stop.half_width:g} of the {MEASURES[stop.figure].name}"
-    return [_fact("Known well enough", f"{known}", f"of {_count(len(results.plan.cells), 'cell')}", wanted)]
-
-
 _CURVES = (
     "How to read this: the mean over the seeds, at each value the mean of all cells with it; the band is the 95 % "
     "confidence interval of that mean. All cells fly the same seeds."
 )
-_MAPS = "How to read this: the mean over the seeds and over all other parameters."
 _CELLS = "How to read this: mean over the seeds, and half the width of its 95 % confidence interval."
 _NEAREST = "The flights in which two drones came nearest; the command flies one again, with its full report."
 _TEST = (
@@ -137,23 +123,19 @@ _TEST = (
 
 
 def _parts(results: Results) -> list[Part]:
-    curves, maps = [], []
-    for figure in results.figures:
-        if results.parameters:
-            drawing = parameter_curves(results, figure)
-            curves.append(_svg(drawing, f"{figure}-curves", f"{label_of(figure)} over the parameters"))
-        if (two := heat_maps(results, figure)) is not None:
-            maps.append(_svg(two, f"{figure}-map", f"{label_of(figure)} over two parameters"))
-    drawn = [
-        Part("Figures over the parameters", _CURVES, curves),
-        Part("Two parameters at once", _MAPS, maps),
+    curves = [
+        Markup(
+            inline_svg(parameter_curves(results, figure), f"{figure}-curves", f"{label_of(figure)} over the parameters")
+        )
+        for figure in (results.figures if results.parameters else ())
     ]
+    drawn = [Part("Figures over the parameters", _CURVES, curves)] if curves else []
     tables = [_nearest(results), _cells(results), _failures(results)]
-    return [*(part for part in drawn if part.drawings), *(part for part in tables if part.rows)]
+    return [*drawn, *(part for part in tables if part.rows)]
 
 
 def _cells(results: Results) -> Part:
-    names = [name for name in results.parameters if name not in results.plan.drawn]
+    names = results.parameters
     rows: list[list[str | TableCell]] = []
     for cell in results.plan.cells[:MOST_ROWS]:
         count = sum(row["cell"] == cell.number and row["status"] == "flown" for row in results.rows)
@@ -222,13 +204,99 @@ def _interval(interval: Interval | None) -> str:
     return "" if interval is None else f"{interval.mean:.4g} ± {interval.half_width:.2g}"
 
 
-def _svg(drawing: Drawing, name: str, description: str) -> Markup:
-    return Markup(inline_svg(drawing, name, description))  # drawn here, from numbers
-
-
 def _fact(name: str, value: str, unit: str, remark: str) -> dict[str, str]:
     return {"name": name, "value": value, "unit": unit, "remark": remark}
 
 
 def _count(number: int, thing: str) -> str:
     return f"{number} {thing}{'' if number == 1 else 's'}"
+
+
+_DECADES: Final = 30.0
+"""A parameter whose largest value is so many times its smallest gets a logarithmic axis."""
+_COLUMNS: Final = 3
+_PANEL_IN: Final = (3.6, 2.5)
+Points = list[tuple[Any, Sequence[float]]]
+"""Values of a parameter, each with a figure's value of each seed."""
+
+
+def parameter_curves(results: Results, figure: Figure) -> Drawing:
+    """One panel a parameter: the figure's mean over its values, with the 95 % confidence interval of the mean.
+
+    With cases, one line a case.
+    """
+    parameters = [name for name in results.parameters if name != CASE] or [CASE]
+    cases: Sequence[str | None] = (None,)
+    if CASE in results.parameters and parameters != [CASE]:
+        cases = results.values_of(CASE)
+    columns = min(len(parameters), _COLUMNS)
+    rows = -(-len(parameters) // columns)
+    with rc_context(STYLE):
+        drawing = Drawing(figsize=(_PANEL_IN[0] * max(columns, 2), _PANEL_IN[1] * rows), layout="constrained")
+        panels = drawing.subplots(rows, columns, sharey=True, squeeze=False)
+        for axes, parameter in zip(panels.flat, parameters, strict=False):
+            for number, case in enumerate(cases):
+                colour = BAND if case is None else DRONE_COLOURS[number % len(DRONE_COLOURS)]
+                of_case = {} if case is None else {CASE: case}
+                points: Points = [
+                    (value, list(results.by_seed(figure, results.cells_with({**of_case, parameter: value})).values()))
+                    for value in results.values_of(parameter)
+                ]
+                _band(axes, points, colour, case, is_share=MEASURES[figure].is_share)
+            axes.set_xlabel(parameter)
+            _spread_out(axes, results.values_of(parameter))
+        for axes in panels.flat[len(parameters) :]:
+            axes.set_axis_off()
+        for axes in panels[:, 0]:
+            axes.set_ylabel(label_of(figure))
+        if len(cases) > 1:
+            drawing.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=len(cases))
+    return drawing
+
+
+def label_of(figure: Figure) -> str:
+    """Its name and unit."""
+    measure = MEASURES[figure]
+    return f"{measure.name}, {measure.unit}" if measure.unit else measure.name
+
+
+def shown(value: Any) -> str:
+    """A parameter's value."""
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _band(axes: Axes, points: Points, colour: str, label: str | None, *, is_share: bool) -> None:
+    known = [(value, seeds) for value, seeds in points if len(seeds)]
+    if not known:
+        axes.text(0.5, 0.5, "no numbers to draw", transform=axes.transAxes, ha="center", color=MUTED)
+        return
+    values = [value for value, _ in known]
+    numeric = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+    places = np.array(values if numeric else range(len(values)), dtype=float)
+    intervals = [mean_interval(s, is_share=is_share and set(s) <= {0.0, 1.0}) for _, s in known]
+    means = np.array([np.mean(seeds) for _, seeds in known])
+    ends = np.array([(np.nan, np.nan) if i is None else (i.low, i.high) for i in intervals])
+    if numeric and len(places) > 1:
+        axes.plot(places, means, color=colour, marker="o", markersize=3.5, label=label)
+        axes.fill_between(places, ends[:, 0], ends[:, 1], color=colour, alpha=0.2, linewidth=0)
+    else:
+        reach = np.abs(ends.T - means)
+        axes.errorbar(places, means, reach, color=colour, fmt="o", capsize=4, label=label)
+    if not numeric:
+        axes.set_xticks(places, [shown(value) for value in values])
+        axes.set_xlim(-0.5, len(values) - 0.5)
+
+
+def _spread_out(axes: Axes, values: Sequence[Any]) -> None:
+    """Sets a logarithmic axis for numbers over decades, with a tick at every value that has room."""
+    if not all(isinstance(value, int | float) and not isinstance(value, bool) and value > 0 for value in values):
+        return
+    if max(values) < _DECADES * min(values):
+        return
+    ticks: list[Any] = []
+    for value in sorted(values):
+        if not ticks or value >= 1.9 * ticks[-1]:
+            ticks.append(value)
+    axes.set_xscale("log")
+    axes.set_xticks(ticks, [shown(value) for value in ticks])
+    axes.minorticks_off()

@@ -4,79 +4,13 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 
-from flockd.campaign.campaign_file import StopRule
 from flockd.campaign.engine import Engine
-from flockd.campaign.figures import MEASURES, Figure, mean_interval
-from flockd.campaign.flight_kinds import FLIGHT_KINDS, FlownRun, Task
+from flockd.campaign.flight_kinds import FLIGHT_KINDS, Task
 from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.folder import CampaignFolder
-
-
-class Schedule:
-    """Without a stop rule all flights; with one a batch of a cell's seeds, and the next once all of these are done."""
-
-    def __init__(self, plan: Plan) -> None:
-        self._seeds, self._stop = plan.config.seeds, plan.config.stop
-        self._batch = self._seeds if self._stop is None else self._stop.batch
-        self._values: dict[int, dict[int, float | None]] = {cell.number: {} for cell in plan.cells}
-        """What the stop rule is about, for each cell by number of the seed."""
-        self._until = dict.fromkeys(self._values, 0)
-        """How many seeds of each cell are to be flown."""
-        self._open = set(self._values)
-        """Cells that may need more."""
-        self._waiting: deque[tuple[int, Iterator[int]]] = deque()
-        """Cells, each with seeds that are to be flown."""
-        for cell in self._values:
-            self._decide(cell)
-
-    def finished(self, runs: Iterable[tuple[Run, float | None]]) -> None:
-        """Takes note of flights, each with its value of the stop rule's figure; None where it has none."""
-        for run, value in runs:
-            self._values[run.cell][run.number] = value
-            self._decide(run.cell)
-
-    def next(self, count: int) -> tuple[Run, ...]:
-        """Up to ``count`` flights of one cell that are to be flown; empty where there are none now."""
-        found: list[Run] = []
-        while self._waiting and not found:
-            cell, numbers = self._waiting[0]
-            missing = (Run(cell, number) for number in numbers if number not in self._values[cell])
-            found = list(itertools.islice(missing, count))
-            if len(found) < count:
-                self._waiting.popleft()
-        return tuple(found)
-
-    @property
-    def most_left(self) -> int:
-        """Flights that are not done, if no open cell is known well enough before its last seed."""
-        needed = sum(self._seeds if cell in self._open else self._until[cell] for cell in self._values)
-        return needed - sum(len(values) for values in self._values.values())
-
-    def _decide(self, cell: int) -> None:
-        """Once all flights so far are done: whether the cell needs more."""
-        values = self._values[cell]
-        while cell in self._open:
-            begin = self._until[cell]
-            if len(values) < begin or not all(number in values for number in range(begin)):
-                return
-            known = self._stop is not None and is_known([values[number] for number in range(begin)], self._stop)
-            if begin == self._seeds or known:
-                self._open.remove(cell)
-            else:
-                self._until[cell] = min(begin + self._batch, self._seeds)
-                self._waiting.append((cell, iter(range(begin, self._until[cell]))))
-
-
-def is_known(values: Iterable[float | None], stop: StopRule) -> bool:
-    """Whether a cell with these values is known well enough."""
-    known = [value for value in values if value is not None]
-    interval = mean_interval(known, stop.confidence, is_share=MEASURES[stop.figure].is_share)
-    return interval is not None and interval.half_width <= stop.half_width
-
 
 Progress = Callable[[int, int], None]
 
@@ -92,39 +26,40 @@ class Conducted:
 
 
 def conduct(plan: Plan, folder: CampaignFolder, engine: Engine, progress: Progress) -> Conducted:
-    """Flies until every cell has all its seeds, or is known well enough. ``progress`` gets (done now, at most).
+    """Flies what is missing. ``progress`` gets (done now, of how many).
 
-    The tables are written at the end, and when this is interrupted.
+    The table is written at the end, and when this is interrupted.
     """
-    schedule = Schedule(plan)
-    figure = None if plan.config.stop is None else plan.config.stop.figure
-    done_before = list(folder.finished())
-    schedule.finished(_values(done_before, figure))
-    at_once = FLIGHT_KINDS[plan.config.perception].at_once
+    done_before = {one.run for one in folder.finished()}
+    tasks = _tasks(plan, done_before)
+    total = plan.flights - len(done_before)
+    waiting = next(tasks, None)
     flying = flown = failed = 0
-    progress(0, schedule.most_left)
+    progress(0, total)
     try:
-        while True:
-            while engine.room > 0 and (runs := schedule.next(at_once)):
-                engine.submit(task_of(plan, runs))
+        while flying or waiting:
+            while engine.room > 0 and waiting:
+                engine.submit(waiting)
                 flying += 1
-            if not flying:
-                break
+                waiting = next(tasks, None)
             for results in engine.wait():
                 flying -= 1
                 folder.add(results)
-                schedule.finished(_values(results, figure))
                 flown += len(results)
                 failed += sum(one.reason is not None for one in results)
-                progress(flown, flown + schedule.most_left)
+                progress(flown, total)
     finally:
-        folder.write_tables()
+        folder.write_table()
     return Conducted(flown, failed, len(done_before))
 
 
-def _values(flown: Iterable[FlownRun], figure: Figure | None) -> Iterator[tuple[Run, float | None]]:
-    """Flights, each with its value of a figure."""
-    return ((one.run, one.figures.get(figure) if figure else None) for one in flown)
+def _tasks(plan: Plan, done: Collection[Run]) -> Iterator[Task]:
+    """Of the flights that are not done; those of one cell together, as many as fly at once."""
+    at_once = FLIGHT_KINDS[plan.config.perception].at_once
+    for cell in plan.cells:
+        missing = (run for number in range(plan.config.seeds) if (run := Run(cell.number, number)) not in done)
+        while runs := tuple(itertools.islice(missing, at_once)):
+            yield task_of(plan, runs)
 
 
 def task_of(plan: Plan, runs: tuple[Run, ...]) -> Task:

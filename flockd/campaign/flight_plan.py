@@ -6,14 +6,12 @@ import hashlib
 import itertools
 import json
 import math
-import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
 from pydantic import ValidationError
 
 from flockd import __version__
@@ -175,67 +173,38 @@ class Plan:
         """All combinations, in order."""
         return tuple(Cell(number, values) for number, values in enumerate(self._combinations()))
 
-    @cached_property
-    def drawn(self) -> dict[str, Variation]:
-        """What each flight draws."""
-        return {key: variation for key, variation in self.config.vary.items() if variation.is_drawn}
-
     @property
     def wanted(self) -> tuple[Figure, ...]:
         """What is measured."""
         return self.config.measure or tuple(MEASURES)
 
     @property
-    def most_flights(self) -> int:
-        """If no cell is known well enough before."""
+    def flights(self) -> int:
+        """How many there are."""
         return len(self.cells) * self.config.seeds
-
-    def parameters(self, cell: Cell, number: int) -> Values:
-        """The values that one flight flies with: its cell's, and what it drew."""
-        seed = self.config.seed + number
-        return {**cell.parameters, **{key: _draw(variation, key, seed) for key, variation in self.drawn.items()}}
 
     def recipe(self, cell: Cell, number: int) -> Recipe:
         """What one flight is made of."""
-        parameters = self.parameters(cell, number)
-        case = parameters.pop(CASE, None)
-        of_case = {} if case is None else self.config.cases[case]
-        overrides = {**self.config.fixed, **of_case, **parameters}
+        varied = {key: value for key, value in cell.parameters.items() if key != CASE}
+        of_case = self.config.cases[cell.parameters[CASE]] if CASE in cell.parameters else {}
+        overrides = {**self.config.fixed, **of_case, **varied}
         return Recipe(self.base, overrides, self.config.seed + number, self.config.scatter_m)
 
     def _combinations(self) -> Iterator[Values]:
         axes = {CASE: tuple(self.config.cases)} if self.config.cases else {}
-        axes |= {key: values_of(variation) for key, variation in self.config.vary.items() if not variation.is_drawn}
+        axes |= {key: variation.values for key, variation in self.config.vary.items()}
         for values in itertools.product(*axes.values()):
             yield dict(zip(axes, values, strict=True))
 
 
-def values_of(variation: Variation) -> tuple[Any, ...]:
-    """The values that one key of the grid takes."""
-    if variation.values is not None:
-        return variation.values
-    low, high, steps = variation.low, variation.high, variation.steps
-    assert low is not None and high is not None and steps is not None
-    # To 12 digits: 0.3 and not 0.30000000000000004.
-    return tuple(float(f"{value:.12g}") for value in np.linspace(low, high, steps))
-
-
 def _count_of_cells(config: CampaignConfig) -> int:
-    sizes = [len(values_of(one)) for one in config.vary.values() if not one.is_drawn]
-    return max(len(config.cases), 1) * math.prod(sizes)
-
-
-def _draw(variation: Variation, key: str, seed: int) -> float:
-    """One flight's own value: by its seed and the key alone."""
-    assert variation.low is not None and variation.high is not None
-    rng = np.random.default_rng([seed, zlib.crc32(key.encode())])
-    return float(rng.uniform(variation.low, variation.high))
+    return max(len(config.cases), 1) * math.prod(len(one.values) for one in config.vary.values())
 
 
 def _idle_seeds(plan: Plan) -> str | None:
     """What is wrong where all seeds of a cell fly the very same flight."""
     config = plan.config
-    if config.seeds == 1 or config.perception == "sight" or config.scatter_m or plan.drawn or plan.errors:
+    if config.seeds == 1 or config.perception == "sight" or config.scatter_m or plan.errors:
         return None
     for cell in plan.cells:
         scenario = plan.recipe(cell, 0).scenario()
@@ -258,12 +227,7 @@ def _anchored(config: CampaignConfig, folder: Path) -> CampaignConfig:
     def all_anchored(values: Mapping[str, Any]) -> Values:
         return {key: anchored(key, value) for key, value in values.items()}
 
-    vary = {
-        key: one
-        if one.values is None
-        else one.model_copy(update={"values": tuple(anchored(key, v) for v in one.values)})
-        for key, one in config.vary.items()
-    }
+    vary = {key: Variation(values=tuple(anchored(key, v) for v in one.values)) for key, one in config.vary.items()}
     cases = {case: all_anchored(values) for case, values in config.cases.items()}
     return config.model_copy(update={"fixed": all_anchored(config.fixed), "vary": vary, "cases": cases})
 
@@ -286,7 +250,7 @@ class _Check:
         counts: dict[KeyPath, list[Any]] = {("fixed", DRONES): [config.fixed.get(DRONES, 1)]}
         counts |= {("cases", case, DRONES): [values.get(DRONES, 1)] for case, values in config.cases.items()}
         if (sizes := config.vary.get(DRONES)) is not None:
-            counts["vary", DRONES] = list(sizes.values or (None,))
+            counts["vary", DRONES] = list(sizes.values)
         most = MAX_CONTROL_DRONES if config.perception == "control" else MAX_DRONES
         wrong = [
             self._places[path].problem(f"must be whole numbers from 1 to {most}, as in `values: [5, 10]`")
@@ -312,45 +276,35 @@ class _Check:
             raise ConfigError(wrong)
 
     def cells(self, plan: Plan) -> None:
-        """Raises ConfigError with each problem of any cell, with all that is drawn at its lowest and its highest."""
-        problems: set[ConfigProblem] = set()
-        ends = ("low", "high") if plan.drawn else ("low",)
-        for cell in plan.cells:
-            for end in ends:
-                drawn = {key: getattr(variation, end) for key, variation in plan.drawn.items()}
-                problems |= set(self._problems(plan, cell, drawn, end))
+        """Raises ConfigError with each problem of any cell."""
+        problems = {problem for cell in plan.cells for problem in self._problems(plan, cell)}
         if problems:
             raise ConfigError(sorted(problems))
 
-    def _problems(self, plan: Plan, cell: Cell, drawn: Values, end: str) -> list[ConfigProblem]:
+    def _problems(self, plan: Plan, cell: Cell) -> list[ConfigProblem]:
         recipe = replace(plan.recipe(cell, 0), scatter_m=0.0)
-        places = self._places_of(plan, cell, end)
-        for key, value in {**recipe.overrides, **drawn}.items():
+        places = self._places_of(plan, cell)
+        for key, value in recipe.overrides.items():
             try:
                 merged(plan.base, {key: value})
             except ValueError as error:
                 return [places[tuple(key.split("."))].problem(str(error))]
         try:
-            replace(recipe, overrides={**recipe.overrides, **drawn}).scenario()
+            recipe.scenario()
         except ValidationError as error:
             return problems_of(error.errors(), ScenarioConfig, places)
         except UsageError as error:
             return [places[()].problem(str(error))]
         return []
 
-    def _places_of(self, plan: Plan, cell: Cell, end: str) -> Places:
+    def _places_of(self, plan: Plan, cell: Cell) -> Places:
         """Where each value of the cell's scenario stands: in the campaign's file, or in the scenario's or drone's."""
         config, places = plan.config, dict(self._of_scenario)
         origins: dict[str, KeyPath] = {key: ("fixed", key) for key in config.fixed}
         if (case := cell.parameters.get(CASE)) is not None:
             origins |= {key: ("cases", case, key) for key in config.cases[case]}
         for key, variation in config.vary.items():
-            if variation.is_drawn:
-                origins[key] = ("vary", key, end)
-            elif variation.values is not None:
-                origins[key] = ("vary", key, "values", variation.values.index(cell.parameters[key]))
-            else:
-                origins[key] = ("vary", key)
+            origins[key] = ("vary", key, "values", variation.values.index(cell.parameters[key]))
         for key, origin in origins.items():
             path = tuple(key.split("."))
             place = self._places[origin]

@@ -1,8 +1,8 @@
 """The folder of a campaign: every finished flight is in it at once, and it can be gone on with after any end.
 
 `campaign.json` is the plan. `flights.jsonl` gets a line for each finished flight; of several of one flight the first
-counts, and a last line that was cut off is none. `flights.parquet` and `timings.parquet` are written from it at the
-end, in order of cells and seeds: the first has what is the same whatever flew it, the second when, where and how long.
+counts, and a last line that was cut off is none. `flights.parquet` is written from it at the end, in order of cells and
+seeds, with what is the same whatever flew it.
 """
 
 from __future__ import annotations
@@ -29,14 +29,11 @@ from flockd.onboard.message_json import parsed
 PLAN_NAME = "campaign.json"
 LINES_NAME = "flights.jsonl"
 FLIGHTS_NAME = "flights.parquet"
-TIMINGS_NAME = "timings.parquet"
 REPORT_NAME = "report.html"
 RERUNS = "reruns"
 _LOCK = ".lock"
-_OURS = {PLAN_NAME, LINES_NAME, FLIGHTS_NAME, TIMINGS_NAME, REPORT_NAME, RERUNS, _LOCK}
+_OURS = {PLAN_NAME, LINES_NAME, FLIGHTS_NAME, REPORT_NAME, RERUNS, _LOCK}
 _FLOWN = TypeAdapter(FlownRun)
-_TIMINGS = "wall_s", "cpu_s", "began", "host", "process"
-"""What differs from one time to the next."""
 MAX_PLAN_BYTES = 1 << 26
 _TEXTS = "reason", "networks_sha256"
 """Columns of text that may be empty in all rows."""
@@ -81,16 +78,13 @@ class CampaignFolder:
         """The flights that are done. Raises UnavailableError where a line cannot be read."""
         return iter(flown_in(self.path, self._plan))
 
-    def write_tables(self) -> None:
-        """Writes both tables anew. Raises UnavailableError where a line cannot be read."""
-        flown = flown_in(self.path, self._plan)
-        rows = flight_rows(self._plan, flown)
-        timings = [{**_keys(self._plan, one), **{name: getattr(one, name) for name in _TIMINGS}} for one in flown]
-        for name, table in ((FLIGHTS_NAME, rows), (TIMINGS_NAME, timings)):
-            columns = {column: self._column(column, [row[column] for row in table]) for column in (table or [{}])[0]}
-            sink = pa.BufferOutputStream()
-            pq.write_table(pa.table(columns), sink, compression="zstd")
-            _write(self.path / name, sink.getvalue().to_pybytes())
+    def write_table(self) -> None:
+        """Writes the table anew. Raises UnavailableError where a line cannot be read."""
+        rows = flight_rows(self._plan, flown_in(self.path, self._plan))
+        columns = {column: self._column(column, [row[column] for row in rows]) for column in (rows or [{}])[0]}
+        sink = pa.BufferOutputStream()
+        pq.write_table(pa.table(columns), sink, compression="zstd")
+        _write(self.path / FLIGHTS_NAME, sink.getvalue().to_pybytes())
 
     def _column(self, name: str, values: Sequence[Any]) -> pa.Array:
         """Values of one type; those of a parameter that have none in common as JSON."""
@@ -134,8 +128,11 @@ def flight_rows(plan: Plan, flown: Sequence[FlownRun]) -> list[dict[str, Any]]:
     }
     return [
         {
-            **_keys(plan, one),
-            **plan.parameters(plan.cells[one.run.cell], one.run.number),
+            "run": one.run.name,
+            "cell": one.run.cell,
+            "number": one.run.number,
+            "seed": plan.config.seed + one.run.number,
+            **plan.cells[one.run.cell].parameters,
             "status": "flown" if one.reason is None else "failed",
             "reason": one.reason,
             **{figure: one.figures.get(figure) for figure in plan.wanted},
@@ -145,11 +142,6 @@ def flight_rows(plan: Plan, flown: Sequence[FlownRun]) -> list[dict[str, Any]]:
         }
         for one in flown
     ]
-
-
-def _keys(plan: Plan, one: FlownRun) -> dict[str, Any]:
-    run = one.run
-    return {"run": run.name, "cell": run.cell, "number": run.number, "seed": plan.config.seed + run.number}
 
 
 def _whole_lines(path: Path) -> list[bytes]:

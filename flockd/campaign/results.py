@@ -1,21 +1,24 @@
-"""The results of a campaign, as its report takes them: values of each figure by cell and seed."""
+"""The results of a campaign by cell and seed, and two campaigns compared, figure by figure, by pairs of seeds."""
 
 from __future__ import annotations
 
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from flockd.campaign.campaign_file import DRONES
 from flockd.campaign.figures import MEASURES, Figure, Interval, mean_interval
-from flockd.campaign.flight_plan import Plan
-from flockd.campaign.folder import flight_rows, flown_in, load_plan
+from flockd.campaign.flight_plan import Plan, merged
+from flockd.campaign.folder import differences, flight_rows, flown_in, load_plan
 from flockd.core.errors import UsageError
+from flockd.core.messages import FloatArray
+from flockd.sim.scenario import ScenarioConfig
 
 Row = Mapping[str, Any]
 Seeds = dict[int, float]
@@ -54,9 +57,8 @@ class Results:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """What varies: the grid's first, then what each flight draws."""
-        grid = self.plan.cells[0].parameters if self.plan.cells else {}
-        return (*grid, *self.plan.drawn)
+        """What varies."""
+        return tuple(self.plan.cells[0].parameters)
 
     def values_of(self, parameter: str) -> tuple[Any, ...]:
         """The values of a parameter of the grid, in its order."""
@@ -95,3 +97,131 @@ class Results:
 
 def _hashable(value: Any) -> Any:
     return json.dumps(value) if isinstance(value, dict | list | tuple) else value
+
+
+LEVEL = 0.05
+"""Significance level for all figures together: at most this often, one is called different where none is."""
+_DRAWS = 9_999
+_NUMBERS_AT_ONCE = 500_000
+"""How many permutations are drawn at once, so that they need little memory."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """On one figure."""
+
+    figure: Figure
+    first: float
+    second: float
+    """Means."""
+    difference: Interval
+    """Second less first, with its 95 % confidence interval."""
+    pairs: int
+    """Seeds that both flew."""
+    p: float
+    """How often a difference so large would come up if there were none, adjusted for all figures (Holm, 1979)."""
+
+    @property
+    def says(self) -> Literal["better", "worse", "no difference shown"]:
+        """The verdict on the second campaign."""
+        if self.p > LEVEL:
+            return "no difference shown"
+        return "better" if (self.difference.mean > 0) == (MEASURES[self.figure].better == "higher") else "worse"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two campaigns compared."""
+
+    first: Results
+    second: Results
+    cells: int
+    """That both have."""
+    verdicts: tuple[Verdict, ...]
+    changes: tuple[tuple[str, str, str], ...]
+    """Keys whose values differ for all flights, with both values."""
+
+    @property
+    def sentence(self) -> str:
+        """Whether the second is better, in words."""
+        better = [MEASURES[verdict.figure].name for verdict in self.verdicts if verdict.says == "better"]
+        worse = [MEASURES[verdict.figure].name for verdict in self.verdicts if verdict.says == "worse"]
+        name = f"{self.second.path}"
+        if better and worse:
+            return f"{name} is better in {_listed(better)}, but worse in {_listed(worse)}"
+        if better or worse:
+            return f"{name} is {'better' if better else 'worse'} in {_listed(better or worse)}"
+        return f"No difference is shown between {self.first.path} and {name}"
+
+
+def compare(first: Results, second: Results) -> Comparison:
+    """Over the cells that both have; seeds that both flew are pairs. Raises UsageError if nothing can be compared."""
+    theirs = {_key(cell.parameters): cell.number for cell in second.plan.cells}
+    cells = [(c.number, theirs[_key(c.parameters)]) for c in first.plan.cells if _key(c.parameters) in theirs]
+    figures = [figure for figure in first.figures if figure in second.figures]
+    verdicts = [verdict for figure in figures if (verdict := _verdict(first, second, figure, cells)) is not None]
+    if not verdicts:
+        raise UsageError(
+            f"{first.path} and {second.path} cannot be compared, without a cell and a figure that both have of two "
+            "seeds alike; vary and measure the same in both, from the same `seed` on"
+        )
+    return Comparison(
+        first, second, len(cells), _adjusted(verdicts), tuple(differences(_values(first), _values(second)))
+    )
+
+
+def _verdict(first: Results, second: Results, figure: Figure, cells: list[tuple[int, int]]) -> Verdict | None:
+    mine = first.by_seed(figure, [one for one, _ in cells])
+    theirs = second.by_seed(figure, [other for _, other in cells])
+    # Flight n of both is a pair only where the seeds are the same.
+    offset = first.plan.config.seed - second.plan.config.seed
+    common = [number for number in mine if number + offset in theirs]
+    a = np.array([mine[number] for number in common])
+    b = np.array([theirs[number + offset] for number in common])
+    difference = mean_interval((b - a).tolist())
+    if difference is None:
+        return None
+    return Verdict(figure, float(a.mean()), float(b.mean()), difference, len(common), paired_p(b - a))
+
+
+def paired_p(differences: FloatArray) -> float:
+    """By flipping signs: of (n,) differences, how often their mean is as far from zero if each could be either way.
+
+    Of all ways, or of `_DRAWS` of them where there are more.
+    """
+    from scipy.stats import permutation_test  # noqa: PLC0415 - heavy
+
+    at_once = max(_NUMBERS_AT_ONCE // len(differences), 1)
+    found = permutation_test(
+        (differences,), np.mean, permutation_type="samples", n_resamples=_DRAWS, batch=at_once, rng=0, vectorized=True
+    )
+    return float(found.pvalue)
+
+
+def _adjusted(verdicts: list[Verdict]) -> tuple[Verdict, ...]:
+    """With Holm's adjustment: the smallest p counts as many times as there are figures, the next one time less, ..."""
+    order = sorted(range(len(verdicts)), key=lambda i: verdicts[i].p)
+    adjusted, largest = list(verdicts), 0.0
+    for rank, i in enumerate(order):
+        largest = max(largest, min(verdicts[i].p * (len(verdicts) - rank), 1.0))
+        adjusted[i] = replace(verdicts[i], p=largest)
+    return tuple(adjusted)
+
+
+def _key(parameters: Mapping[str, Any]) -> str:
+    return json.dumps(dict(parameters), sort_keys=True)
+
+
+def _values(results: Results) -> Mapping[str, Any]:
+    """What holds for all flights, with every default."""
+    config = results.plan.config
+    fixed = {key: value for key, value in config.fixed.items() if key != DRONES}
+    scenario = ScenarioConfig.model_validate(merged(results.plan.base, fixed)).model_dump(mode="json")
+    own: dict[str, Any] = {"perception": config.perception, "gated": config.gated, "scatter_m": config.scatter_m}
+    own[DRONES] = config.fixed.get(DRONES)
+    own["errors"] = None if results.plan.errors is None else results.plan.errors.perception
+    return {"campaign": own, **scenario}
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -16,8 +16,7 @@ from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from flockd.campaign.flight_plan import Plan
-    from flockd.campaign.results import Results
-    from flockd.campaign.verdicts import Verdict
+    from flockd.campaign.results import Results, Verdict
 
 RUN = "run"
 COSTS = """\
@@ -113,13 +112,12 @@ def _dry_run(args: argparse.Namespace, plan: Plan, workers: int) -> int:
 
     with Phases() as phases:
         flight_s = estimate(plan, phases.of("trial flights", "cells"))
-    cells, flights, hours = len(plan.cells), plan.most_flights, plan.most_flights * flight_s / 3600 / workers
-    most = "at most " if plan.config.stop is not None else ""
+    cells, flights, hours = len(plan.cells), plan.flights, plan.flights * flight_s / 3600 / workers
     return say_result(
         args,
-        {"cells": cells, "most_flights": flights, "flight_s": flight_s, "most_hours": hours},
-        f"{cells} cells, {most}{flights} flights of {flight_s:.2g} s on one core",
-        f"{most}{hours:.2g} h with {workers} at once, if each has a core of its own",
+        {"cells": cells, "flights": flights, "flight_s": flight_s, "hours": hours},
+        f"{cells} cells, {flights} flights of {flight_s:.2g} s on one core",
+        f"{hours:.2g} h with {workers} at once, if each has a core of its own",
     )
 
 
@@ -164,8 +162,7 @@ def _report(args: argparse.Namespace) -> int:
     require(*(path for path in (args.folder, args.other) if path is not None))
     from flockd.campaign.campaign_page import write_campaign_page, write_comparison_page
     from flockd.campaign.folder import REPORT_NAME
-    from flockd.campaign.results import Results
-    from flockd.campaign.verdicts import compare
+    from flockd.campaign.results import Results, compare
 
     results = Results.load(args.folder)
     if args.other is None:
@@ -182,7 +179,7 @@ def _report(args: argparse.Namespace) -> int:
 
 
 def _verdict_line(verdict: Verdict) -> str:
-    from flockd.campaign.campaign_figures import label_of
+    from flockd.campaign.campaign_page import label_of
 
     low, high = verdict.difference.low, verdict.difference.high
     means = f"{verdict.first:.4g} and {verdict.second:.4g}"

@@ -9,13 +9,11 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from flockd.campaign.campaign_figures import parameter_curves
-from flockd.campaign.campaign_page import write_campaign_page, write_comparison_page
+from flockd.campaign.campaign_page import parameter_curves, write_campaign_page, write_comparison_page
 from flockd.campaign.flight_kinds import FLIGHT_KINDS, FlightKind
 from flockd.campaign.flight_plan import Plan
 from flockd.campaign.folder import LINES_NAME, CampaignFolder
-from flockd.campaign.results import Results
-from flockd.campaign.verdicts import compare
+from flockd.campaign.results import Results, compare
 from flockd.cli import main
 from flockd.core.errors import UnavailableError, UsageError
 from tests.campaign.flights import HEAD, Shuffled, campaign_file, flown, made_up
@@ -45,7 +43,6 @@ def test_the_same_results_in_any_order_and_after_any_interruption(plan: Plan, tm
     assert flown(plan, tmp_path / "b", Shuffled(4)).before == 12
     a, b = ((tmp_path / name / "flights.parquet").read_bytes() for name in "ab")
     assert a == b
-    assert len(pq.read_table(tmp_path / "b" / "timings.parquet")) == 12
 
 
 def test_a_kill_leaves_what_was_finished(plan: Plan, tmp_path: Path) -> None:
@@ -54,8 +51,7 @@ def test_a_kill_leaves_what_was_finished(plan: Plan, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         flown(plan, path, Shuffled(1, until=3))
     lines = (path / LINES_NAME).read_bytes()
-    for name in ("flights.parquet", "timings.parquet"):
-        (path / name).unlink()
+    (path / "flights.parquet").unlink()
     (path / LINES_NAME).write_bytes(lines[:-9])
     (path / ".flights.parquet.part").write_bytes(b"half")
     conducted = flown(plan, path, Shuffled(9))
