@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from flockd.ground.calibration.board import BoardSpec
     from flockd.ground.calibration.image_sources import ImageStream
 
-SECONDS = 120.0
-MARKER_SHARE = 0.75
-MOST_VIEWS = 60
-
 
 def add(commands: Commands) -> None:
     """Adds the command."""
@@ -43,23 +39,18 @@ def _add_shared(parser: Parser, help_of_config: str) -> None:
     option(parser, "--out FILE", "where the result goes (CAMERA.yaml or rig.yaml)", Path)
     flag(parser, "--force", "overwrite what is there")
     option(parser, "--every N", "take every Nth frame (1)", positive_count, default=1)
-    option(parser, "--seconds S", "of a live camera (120)", positive_number, default=SECONDS)
     flag(parser, "--json", "print the result as JSON")
     board = parser.add_argument_group("the board", "as it was printed; measure it, printers shrink")
     option(board, "--squares CxR", "columns x rows (7x5)", size, default=(7, 5))
     option(board, "--square-mm MM", "of a square's side (36)", positive_number, default=36.0)
-    option(board, "--marker-mm MM", "of a marker's side (0.75 of a square)", positive_number)
-    option(board, "--dictionary NAME", "of the markers (4x4_50)", default="4x4_50")
 
 
 def _board_of(args: argparse.Namespace) -> BoardSpec:
     """The board of the options. Raises UsageError for one that cannot be."""
     from flockd.ground.calibration.board import BoardSpec, CalibrationError
 
-    square_m = args.square_mm / 1000.0
-    marker_m = args.marker_mm / 1000.0 if args.marker_mm else MARKER_SHARE * square_m
     try:
-        return BoardSpec(args.squares[0], args.squares[1], square_m, marker_m, args.dictionary)
+        return BoardSpec(*args.squares, args.square_mm / 1000.0)
     except CalibrationError as error:
         raise UsageError(str(error)) from None
 
@@ -84,19 +75,15 @@ def _add_camera(commands: Commands) -> None:
     examples = (
         "flockd calibrate camera --print-board board.pdf",
         "flockd calibrate camera pictures/ --camera front",
-        "flockd calibrate camera clip.mp4 --every 5 --model wide_angle",
-        "flockd calibrate camera drone1.mcap --camera left",
+        "flockd calibrate camera drone1.mcap --camera left --every 5 --model wide_angle",
         "flockd calibrate camera --config my_drone.yaml --camera front",
     )
     description = "Measure a camera's lens from views of a ChArUco board."
     parser = commands("camera", description, examples, _camera)
-    help_of_source = "a folder of images, a video or a recording; by default --config's own camera, live"
+    help_of_source = "a folder of images or a recording; by default --config's own camera, live"
     option(parser, "SOURCE", help_of_source, nargs="?")
     option(parser, "--camera NAME", "the camera's name in the rig")
     option(parser, "--model", "default: pinhole, unless the other fits clearly better", choices=LENS_MODELS)
-    option(parser, "--views N", "use N views at most (60)", positive_count, default=MOST_VIEWS)
-    option(parser, "--max-blur PX", "widest edge of a sharp view (4)", positive_number)
-    option(parser, "--serial TEXT", "the camera's serial number, where the device does not give it")
     option(parser, "--print-board FILE", "write the board to print (.pdf)", Path)
     _add_shared(parser, "the drone, for its camera's device and serial")
 
@@ -107,11 +94,17 @@ def _camera(args: argparse.Namespace) -> int:
         return _print_board(args, board)
     from flockd.ground.calibration.board import BoardFinder
     from flockd.ground.calibration.fragment import measured_today
-    from flockd.ground.calibration.intrinsics import simplest_that_fits
-    from flockd.ground.calibration.lens_session import collect_views, fit_lenses, is_enough, lens_result, write_lens
+    from flockd.ground.calibration.lens import (
+        collect_views,
+        fit_lenses,
+        is_enough,
+        lens_result,
+        simplest_that_fits,
+        write_lens,
+    )
     from flockd.ground.calibration.views import Collector
 
-    collector = Collector(BoardFinder(board), args.views, args.max_blur)
+    collector = Collector(BoardFinder(board))
     name, images = _images(args, lambda: is_enough(collector))
     out = args.out or Path(f"{name}.yaml")
     refuse_overwriting(args, out)
@@ -120,7 +113,7 @@ def _camera(args: argparse.Namespace) -> int:
     lenses = fit_lenses(collector, args.model, _source_name(args))
     lens = simplest_that_fits(lenses)
     measured = measured_today(
-        camera=args.serial or images.identities[name],
+        camera=images.identities[name],
         source=_source_name(args),
         views=len(lens.views),
         residual_px=round(lens.rms_px, 4),
@@ -136,8 +129,7 @@ def _camera(args: argparse.Namespace) -> int:
 
 
 def _print_board(args: argparse.Namespace, board: BoardSpec) -> int:
-    from flockd.ground.calibration.board import CalibrationError
-    from flockd.ground.calibration.paper import board_pdf, page_of
+    from flockd.ground.calibration.board import CalibrationError, board_pdf, page_mm
     from flockd.onboard.recording.editing import written_whole
 
     file: Path = args.print_board
@@ -150,17 +142,17 @@ def _print_board(args: argparse.Namespace, board: BoardSpec) -> int:
         raise UsageError(f"{file}: {error}") from None
     with written_whole(file) as draft:
         draft.write_bytes(data)
+    page = "{:.0f} x {:.0f} mm".format(*page_mm(board))
     told = (
-        f"{file}: print it at 100 % on {page_of(board)}, glue it to something flat, and measure a square: "
+        f"{file}: print it at 100 % on paper of {page} or more, glue it to something flat, and measure a square: "
         f"{args.square_mm:g} mm, or say with --square-mm how large it became"
     )
-    return say_result(args, {"board": str(file), "page": page_of(board)}, told)
+    return say_result(args, {"board": str(file), "page": page}, told)
 
 
 def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, ImageStream]:
     """The images of the one camera that is meant, and its name."""
     from flockd.ground.calibration import image_sources
-    from flockd.ground.datasets.image_files import VIDEO_SUFFIXES
 
     config = loaded(args.config)
     path = None if args.source is None else Path(args.source)
@@ -168,9 +160,7 @@ def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, 
         if config is None:
             raise UsageError("no SOURCE was given; name images, a recording or a device, or --config for its camera")
         name = _name_in(config, args, str(args.config))
-        return name, image_sources.from_cameras(
-            image_sources.with_one_camera(config, name), str(args.config), args.seconds, enough
-        )
+        return name, image_sources.from_cameras(image_sources.with_one_camera(config, name), str(args.config), enough)
     if path.suffix.lower() == ".mcap":
         found, recorded = image_sources.from_recording(opened(path), args.every)
         return _name_in(recorded, args, str(path)), found
@@ -179,11 +169,9 @@ def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, 
         raise UsageError(f"--camera {name}: a camera's name has small letters, digits, _ and - only")
     if path.is_dir():
         return name, image_sources.from_folder(path, name)
-    if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file():
-        return name, image_sources.from_video(path, name, args.every)
     fault = "does not exist; check the path"
     if path.exists():
-        fault = "is no folder, video or recording; name one, or for a live camera the drone with --config"
+        fault = "is no folder or recording; name one, or for a live camera the drone with --config"
     raise UsageError(f"{path}: {fault}")
 
 
@@ -226,8 +214,7 @@ def _rig(args: argparse.Namespace) -> int:
 def _by_board(args: argparse.Namespace, out: Path) -> int:
     from flockd.flight.geometry import build_rig
     from flockd.ground.calibration.board import BoardFinder
-    from flockd.ground.calibration.extrinsics import calibrate_rig
-    from flockd.ground.calibration.rig_session import SharedCollector, collect_boards, write_fit
+    from flockd.ground.calibration.rig import SharedCollector, calibrate_rig, collect_boards, write_fit
 
     config, images = _rig_images(args)
     where, rig = str(args.config or args.source), build_rig(config.rig).cameras
@@ -273,7 +260,7 @@ def _rig_images(args: argparse.Namespace) -> tuple[DroneConfig, ImageStream]:
     if config is None:
         raise UsageError("the cameras' intrinsics are not known; name the drone's file with --config")
     if path is None:
-        return config, image_sources.from_cameras(config, str(args.config), args.seconds, lambda: False)
+        return config, image_sources.from_cameras(config, str(args.config), lambda: False)
     return config, image_sources.from_folders(path, [camera.name for camera in config.rig.cameras])
 
 

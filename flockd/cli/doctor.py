@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
-import functools
 import logging
-import signal
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,7 +12,7 @@ from typing import TYPE_CHECKING
 from flockd.cli.options import add_force, load_to_fly
 from flockd.cli.output import progress, say, say_json, tables_console
 from flockd.cli.parser import Commands, flag, option, positive_number
-from flockd.core.errors import ExitCode, UnavailableError, UsageError
+from flockd.core.errors import ExitCode, UnavailableError
 from flockd.core.printable import printable
 
 if TYPE_CHECKING:
@@ -23,7 +20,6 @@ if TYPE_CHECKING:
     from flockd.ground.doctor import Finding
 
 SECONDS = 4.0
-BENCH_MINUTES = 10.0
 STYLES = {"FAILURE": "bold red", "WARNING": "yellow", "PASS": "green"}
 """The worst first."""
 
@@ -37,7 +33,6 @@ def add(commands: Commands) -> None:
         "sudo -u flockd flockd doctor --config /etc/flockd/drone.yaml --record /var/lib/flockd",
         "flockd doctor --config config/quadrotor.yaml --only cameras --seconds 30",
         "flockd doctor --config config/simulator.yaml --json",
-        "flockd doctor --config my_drone.yaml --bench",
     )
     description = (
         "Examine a drone on the ground: cameras, models, autopilot, computer, telemetry. Changes nothing: "
@@ -46,15 +41,8 @@ def add(commands: Commands) -> None:
     parser = commands("doctor", description, examples, _run)
     option(parser, "--config FILE", "the drone's configuration", Path, required=True)
     option(parser, "--record DIR", "where `flockd run` is to record flights", Path)
-    option(parser, "--unit FILE", "the systemd unit; by default the installed one", Path)
     option(parser, "--seconds S", f"watch the cameras this long ({SECONDS:g})", positive_number, default=SECONDS)
     option(parser, "--only CHECK", f"only this one, of {', '.join(CHECKS)}", action="append", choices=CHECKS)
-    flag(
-        parser,
-        "--bench",
-        "propellers off: run the whole line, from cameras to commands, send nothing, and report on it",
-    )
-    option(parser, "--minutes M", f"how long --bench runs ({BENCH_MINUTES:g})", positive_number)
     flag(parser, "--json", "print JSON")
     add_force(parser)
 
@@ -63,17 +51,8 @@ def _run(args: argparse.Namespace) -> int:
     from flockd.ground.doctor import Level
 
     config = load_to_fly(args.config, force=args.force)
-    if args.minutes is not None and not args.bench:
-        raise UsageError("--minutes is for --bench; add it")
-    if args.bench and args.only:
-        raise UsageError("--bench is a run of its own, and --only chooses among the checks; drop one of them")
-    if args.unit is not None and not args.unit.is_file():
-        raise UsageError(f"{args.unit}: is no file; name the unit with --unit")
     logging.getLogger("flockd.onboard.autopilot").setLevel(logging.CRITICAL)  # what MAVSDK has to tell, the findings do
-    if args.bench:
-        found: Mapping[str, Sequence[Finding]] = {"bench": _bench(config, args)}
-    else:
-        found = _examine(config, args)
+    found = _examine(config, args)
     if args.json:
         say_json(_as_json(config.name, found))
     else:
@@ -93,33 +72,9 @@ def _examine(config: DroneConfig, args: argparse.Namespace) -> Mapping[str, Sequ
             stack.enter_context(only_owner(config.autopilot))
         except UnavailableError as error:
             taken = error
-        drone = Examined(config, args.config, args.record, args.unit, args.seconds, taken)
+        drone = Examined(config, args.config, args.record, args.seconds, taken)
         checks = plan(drone, args.only or CHECKS)
         return run_checks(checks, stack.enter_context(progress("examining", "checks")))
-
-
-def _bench(config: DroneConfig, args: argparse.Namespace) -> Sequence[Finding]:
-    """Ctrl-C ends it early, with a report of what was seen until then."""
-    from flockd.ground.doctor.bench import bench, judged
-    from flockd.onboard.autopilot.link_owner import only_owner
-    from flockd.onboard.simulated_time import event_loop_at
-
-    seconds = 60.0 * (args.minutes or BENCH_MINUTES)
-    stop = asyncio.Event()
-
-    async def run() -> Sequence[Finding]:
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, stop.set)
-        with progress("on the bench", "s") as tell:
-            samples = await bench(
-                config, str(args.config), seconds, stop=stop, on_second=lambda done: tell(done, int(seconds))
-            )
-        return tuple(judged(config, samples, seconds))
-
-    event_loop = functools.partial(event_loop_at, config.speed_factor)
-    with only_owner(config.autopilot), asyncio.Runner(loop_factory=event_loop) as runner:
-        return runner.run(run())
 
 
 def _as_json(drone: str, found: Mapping[str, Sequence[Finding]]) -> dict[str, object]:

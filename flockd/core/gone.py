@@ -31,6 +31,11 @@ COMMANDS: Mapping[str, str] = {
         }.items()
         for option, instead in options.items()
     },
+    **dict.fromkeys(
+        ("flockd doctor --bench", "flockd doctor --minutes"),
+        "run `flockd run` with propellers off, and watch `flockd status`",
+    ),
+    "flockd doctor --unit": "`systemd-analyze security flockd` judges the unit",
     "flockd fleet --recordings": "`flockd report FOLDER` writes a report of the recordings that plays them",
     "flockd foxglove": "watch live with `flockd fleet`, or in ROS 2 with `flockd ros`; Foxglove opens recordings",
     "flockd record export --ros2": "Foxglove opens the recording itself; record a flight's topics of `flockd ros`",
@@ -51,6 +56,17 @@ COMMANDS: Mapping[str, str] = {
         ),
         "write it in the section `perception` of a drone's file, and name that with --config",
     ),
+    **dict.fromkeys(
+        (f"flockd calibrate {what} --{option}" for what in ("camera", "rig") for option in ("dictionary", "marker-mm")),
+        "print flockd's own board with `flockd calibrate camera --print-board`",
+    ),
+    **dict.fromkeys(
+        (
+            *(f"flockd calibrate camera --{option}" for option in ("views", "max-blur", "serial", "seconds")),
+            "flockd calibrate rig --seconds",
+        ),
+        "leave it out",
+    ),
     "flockd calibrate drone": "measure from tip to tip, with propellers, and write `perception.drone_size_m`",
     "flockd calibrate camera --picture": "the command prints the coverage and each view's residual",
     "flockd view": "open the recording in Foxglove, or in Rerun after `rerun mcap convert RECORDING.mcap -o X.rrd`",
@@ -65,6 +81,7 @@ KEYS: Mapping[str, str] = {
     "desired": "write the section `mission`, with `kind: circle_then_tangent` for the same flight",
     "faults.kind": "delete it: a camera that fails sends nothing but noise",
     "faults.sigma": "delete it: a camera that fails sends nothing but noise",
+    "stop": "delete it: all `seeds` are flown",
     "safety.degraded_gusts_m_s": "write `degraded_velocity_error_m_s`",
     "safety.gate.max_drift_m_s": "delete it: wind is left to the autopilot",
     "safety.gate.response_s": "delete it, and write `reaction_s`, which contains it",

@@ -106,7 +106,7 @@ def _steps(config: DroneConfig) -> Iterator[str]:
     yield "## Before and after"
     yield ""
     for step in (
-        "`flockd doctor` and `flockd doctor --bench` without FAILURE; WARNINGs understood",
+        "`flockd doctor` without FAILURE, WARNINGs understood; ten minutes of `flockd run` on a table",
         "propellers off: offboard selected `normal`; another mode `silent` at once; a camera unplugged `degraded`",
         "words agreed: `take over`, `land now`, `stop`",
         "armed and brought up by the pilot to the height above; then offboard for ten seconds, and back by hand",

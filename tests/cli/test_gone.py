@@ -31,10 +31,13 @@ def test_a_key_that_is_gone_is_refused_with_its_line_and_what_to_use(
     key: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     *sections, name = key.split(".")
-    file = _CONFIG / ("square.yaml" if sections[:1] in (["cameras"], ["detections"], ["faults"]) else "simulator.yaml")
+    of_scenario = sections[:1] in (["cameras"], ["detections"], ["faults"])
+    named = "campaigns/separation.yaml" if key == "stop" else "square.yaml" if of_scenario else "simulator.yaml"
+    file = _CONFIG / named
     values: Any = yaml.safe_load(file.read_text(encoding="utf-8"))
-    if "drone" in values:
-        values["drone"] = str(_CONFIG / values["drone"])
+    for other in {"drone", "scenario"} & values.keys():
+        if str(values[other]).endswith(".yaml"):
+            values[other] = str(file.parent / values[other])
     inner = values
     for section in sections:
         inner = inner.setdefault(section, [{"drone": 1, "camera": "front"}] if section == "faults" else {})

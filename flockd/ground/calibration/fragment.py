@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, MeasurementConfig
+from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, MeasurementConfig
 from flockd.flight.geometry import RigidTransform, euler_from_rotation
-from flockd.ground.calibration.intrinsics import Lens
+from flockd.onboard.recording.editing import written_whole
 
 _R_FRD_RDF = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """``R_body_camera`` of a camera that is mounted without any turn."""
@@ -21,14 +22,6 @@ _R_FRD_RDF = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 def measured_today(**facts: Any) -> MeasurementConfig:
     """What is known about numbers that were measured today; ``facts``: fields of MeasurementConfig but the date."""
     return MeasurementConfig(date=datetime.now(UTC).date().isoformat(), **facts)
-
-
-def intrinsics_of(lens: Lens, measured: MeasurementConfig) -> IntrinsicsConfig:
-    """A lens as configuration: ten thousandths of a pixel, and what of the distortion makes as much."""
-    m = lens.camera.matrix
-    fx, fy, cx, cy = (round(float(m[place]), 4) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    distortion = tuple(round(k, 8) for k in lens.camera.distortion)
-    return IntrinsicsConfig(model=lens.model, fx=fx, fy=fy, cx=cx, cy=cy, distortion=distortion, measured=measured)
 
 
 def extrinsics_of(T_body_camera: RigidTransform, measured: MeasurementConfig) -> ExtrinsicsConfig:
@@ -59,3 +52,13 @@ def rig_text(cameras: Sequence[CameraConfig], comment: Sequence[str], time_offse
         {"rig": rig}, default_flow_style=None, sort_keys=False, width=math.inf, allow_unicode=True
     )
     return "".join(f"# {line}".rstrip() + "\n" for line in comment) + text
+
+
+def write_rig(out: Path, cameras: Sequence[CameraConfig], time_offset_s: float) -> None:
+    """A file with a rig section, in place of any that was there."""
+    comment = (
+        "The cameras of a drone, written by `flockd calibrate rig`. Put this in place of `rig` in your drone's file,",
+        "then run `flockd config check` on that.",
+    )
+    with written_whole(out) as draft:
+        draft.write_text(rig_text(cameras, comment, time_offset_s), encoding="utf-8")

@@ -21,8 +21,7 @@ from flockd.flight.geometry import (
     rotation_from_vector,
 )
 from flockd.ground.calibration.board import CalibrationError
-from flockd.ground.calibration.fragment import extrinsics_of, measured_today
-from flockd.ground.calibration.rig_session import write_rig
+from flockd.ground.calibration.fragment import extrinsics_of, measured_today, write_rig
 from flockd.onboard.message_json import from_json, parsed
 from flockd.onboard.recording.mcap_file import Entry, RecordingError, read_records
 from flockd.onboard.recording.reader import Recording

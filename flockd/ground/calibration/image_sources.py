@@ -1,4 +1,4 @@
-"""Images to calibrate with: from a folder, a video, a recording or a live camera, and the camera's identity."""
+"""Images to calibrate with: from a folder, a recording or a live camera, and the camera's identity."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
-
 from flockd.core.config import DroneConfig
 from flockd.core.errors import UnavailableError
 from flockd.core.messages import UInt8Array
 from flockd.ground.calibration.board import CalibrationError
-from flockd.ground.datasets.image_files import SUFFIXES, images_of_video, opened_video, read_image
+from flockd.ground.datasets.image_files import SUFFIXES, read_image
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.sources import FrameSource, open_source
 
+MOST_S = 120.0
+"""Of a live camera."""
 FIRST_FRAME_S = 10.0
 FRAME_WAIT_S = 0.2
 SYSFS = Path("/sys/class/video4linux")
@@ -71,16 +71,6 @@ def from_folders(path: Path, cameras: Sequence[str]) -> ImageStream:
     return ImageStream(sets, len(names), live=False, identities=identities)
 
 
-def from_video(path: Path, camera: str, every: int) -> ImageStream:
-    """Every ``every``-th frame of a video. Raises CalibrationError for one that cannot be decoded."""
-    with opened_video(path) as video:
-        count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-    if next(images_of_video(path), None) is None:
-        raise CalibrationError(f"{path}: is no video that can be decoded; restore it, or convert it to MP4")
-    sets = (ImageSet(f"frame {index}", {camera: image}) for index, image in images_of_video(path, every))
-    return ImageStream(sets, -(-count // every), live=False, identities={camera: f"not known (video {path.name})"})
-
-
 def from_recording(recording: Recording, every: int) -> tuple[ImageStream, DroneConfig]:
     """Every ``every``-th step of a recording, and the configuration in it. Reading raises RecordingError."""
     config = recording.config
@@ -102,7 +92,7 @@ def from_recording(recording: Recording, every: int) -> tuple[ImageStream, Drone
     return ImageStream(sets, -(-len(recording.contents.steps) // every), live=False, identities=identities), config
 
 
-def from_cameras(config: DroneConfig, file: str, seconds: float, enough: Callable[[], bool]) -> ImageStream:
+def from_cameras(config: DroneConfig, file: str, enough: Callable[[], bool]) -> ImageStream:
     """Frames of a drone's live cameras, until it is enough, the time is up or Ctrl-C. Raises ConfigError.
 
     Reading raises UnavailableError when no frame comes.
@@ -114,7 +104,7 @@ def from_cameras(config: DroneConfig, file: str, seconds: float, enough: Callabl
         camera.name: identity(Path(devices[camera.name])) if camera.name in devices else f"not known ({camera.name})"
         for camera in config.rig.cameras
     }
-    return ImageStream(_frames(source, seconds, enough), 0, live=True, identities=identities)
+    return ImageStream(_frames(source, enough), 0, live=True, identities=identities)
 
 
 def identity(device: Path, sysfs: Path = SYSFS) -> str:
@@ -136,11 +126,11 @@ def with_one_camera(config: DroneConfig, name: str) -> DroneConfig:
     return config.model_copy(update={"rig": rig, "source": source})
 
 
-def _frames(source: FrameSource, seconds: float, enough: Callable[[], bool]) -> Iterator[ImageSet]:
+def _frames(source: FrameSource, enough: Callable[[], bool]) -> Iterator[ImageSet]:
     source.start()
     began_s, seen = time.monotonic(), False
     try:
-        while (since_s := time.monotonic() - began_s) < seconds and not enough():
+        while (since_s := time.monotonic() - began_s) < MOST_S and not enough():
             frames = source.newest(FRAME_WAIT_S)
             if frames is not None:
                 seen = True

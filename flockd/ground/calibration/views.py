@@ -1,20 +1,98 @@
-"""Chooses from many images of a board those that calibrate a camera, and says why it refuses the others."""
+"""Chooses from many images of a board those that calibrate a camera, and says where the board should be held next."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import Literal
 
 import cv2
 import numpy as np
 
-from flockd.core.messages import FloatArray, UInt8Array
+from flockd.core.messages import BoolArray, FloatArray, IntArray, UInt8Array
 from flockd.ground.calibration.board import BoardDetection, BoardFinder, BoardSpec, CalibrationError
-from flockd.ground.calibration.coverage import Coverage
+
+COLUMNS, ROWS = 8, 6
+_DARK = 16
+"""Grey levels: a cell in which no image ever shows more lies outside the lens's own image."""
+_ENOUGH = 0.75
+_TILT_DEG, _TILTED = 15.0, 4
+"""So many views have to be tilted this much: only they tell the focal length from the distance."""
+_NEAR = 0.3
+"""A board in at least one view as wide as this share of the image."""
+_PLACES = (("top left", "top", "top right"), ("left", "middle", "right"), ("bottom left", "bottom", "bottom right"))
+
+
+class Coverage:
+    """A grid over the image, with the corners that were seen in each of its cells."""
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
+        self.counts: IntArray = np.zeros((ROWS, COLUMNS), np.int64)
+        self._brightest = np.zeros((ROWS, COLUMNS))
+        self._widest = 0.0
+
+    def add(self, pixels: FloatArray) -> None:
+        """Corners (n, 2) of one more view."""
+        columns = np.clip(pixels[:, 0] * COLUMNS / self.size[0], 0, COLUMNS - 1).astype(int)
+        rows = np.clip(pixels[:, 1] * ROWS / self.size[1], 0, ROWS - 1).astype(int)
+        np.add.at(self.counts, (rows, columns), 1)
+        self._widest = max(self._widest, float(np.ptp(pixels, axis=0).max()) / max(self.size))
+
+    def add_light(self, grey: UInt8Array) -> None:
+        """A (h, w) image, with a board or without: where it is dark the lens may show nothing at all."""
+        cells = cv2.resize(grey, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA)
+        self._brightest = np.maximum(self._brightest, cells)
+
+    @property
+    def imaged(self) -> BoolArray:
+        """(ROWS, COLUMNS) which cells the lens shows anything in."""
+        lit: BoolArray = (self._brightest > _DARK) | (self.counts > 0)
+        return lit
+
+    @property
+    def share(self) -> float:
+        """0 to 1: cells with a corner, of those that the lens shows anything in."""
+        cells = int(self.imaged.sum())
+        return float((self.counts > 0).sum()) / cells if cells else 0.0
+
+    @property
+    def text(self) -> tuple[str, ...]:
+        """The grid as lines of characters: full where corners were seen, dots where none, blank outside the lens."""
+        signs = np.where(self.counts > 0, "##", np.where(self.imaged, "..", "  "))
+        return tuple(" ".join(row) for row in signs)
+
+    def advice(self, tilts_deg: Sequence[float]) -> tuple[str, ...]:
+        """What is still missing, each in one sentence, the worst first; ``tilts_deg``: of the board in each view."""
+        found = []
+        tilted = sum(tilt > _TILT_DEG for tilt in tilts_deg)
+        if tilted < _TILTED:
+            found.append(
+                f"tilt the board by 30 to 45 degrees, to each side and up and down: {tilted} of {len(tilts_deg)} views "
+                f"are tilted by more than {_TILT_DEG:.0f} degrees"
+            )
+        if self.share < _ENOUGH:
+            found.append(f"hold the board at the {self._emptiest()} of the image: no corner was seen there")
+        if self._widest < _NEAR:
+            found.append(
+                f"hold the board nearer: at its largest it takes {100 * self._widest:.0f} % of the image's length"
+            )
+        return tuple(found)
+
+    def _emptiest(self) -> str:
+        empty = self.imaged & (self.counts == 0)
+        zones = [
+            (int(empty[ROWS * i // 3 : ROWS * (i + 1) // 3, a:b].sum()), abs(i - 1) + abs(j - 1), _PLACES[i][j])
+            for i in range(3)
+            for j, (a, b) in enumerate(pairwise((0, 3, 5, COLUMNS)))
+        ]
+        return max(zones)[2]
+
 
 Refusal = Literal["no board", "blurred", "moving", "like another"]
+MOST_VIEWS = 60
 _SHARP_PX, _SHARP_SHARE = 4.0, 0.003
 """Widest edge of a sharp view: so many pixels, or this share of a large image's width."""
 _ALIKE = 0.03
@@ -49,9 +127,9 @@ class Refused:
 class Collector:
     """Takes images of one camera one after the other. All are of one size: another is a CalibrationError."""
 
-    def __init__(self, finder: BoardFinder, most: int, max_edge_px: float | None = None) -> None:
+    def __init__(self, finder: BoardFinder, most: int = MOST_VIEWS) -> None:
         """Keeps at most ``most`` views: beyond that, of two that are alike one goes."""
-        self._finder, self._most, self._max_edge_px = finder, most, max_edge_px
+        self._finder, self._most = finder, most
         self._first = ""
         self._before: BoardDetection | None = None
         self.size: tuple[int, int] | None = None
@@ -74,7 +152,7 @@ class Collector:
         if seen is None:
             return self._refuse(Refused(name, "no board"))
         edge_px = edge_width_px(grey, seen, self._finder.spec)
-        if edge_px > self.max_edge_px:
+        if edge_px > sharp_px(image.shape[1]):
             return self._refuse(Refused(name, "blurred", edge_px))
         if moving and (before is None or not is_still(before, seen, image.shape[1])):
             return self._refuse(Refused(name, "moving"))
@@ -85,11 +163,6 @@ class Collector:
         if len(self.views) > self._most:
             self._drop_the_most_alike()
         return None
-
-    @property
-    def max_edge_px(self) -> float:
-        """Above it a view is blurred."""
-        return self._max_edge_px or sharp_px(self.size[0] if self.size else 0)
 
     def counts(self) -> dict[Refusal, int]:
         """How many were refused, by reason."""

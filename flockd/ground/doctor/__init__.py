@@ -71,14 +71,12 @@ def failed_from_error(about: str, sentence: str) -> Finding:
 
 
 _LIMITS_S = {
-    "limits": 5.0,
     "rig": 60.0,
     "instance": 5.0,
     "memory": 5.0,
     "disk": 20.0,
     "temperature": 10.0,
     "clock": 10.0,
-    "unit": 30.0,
     "secrets": 5.0,
     "zenoh": 20.0,
     "autopilot": 60.0,
@@ -88,7 +86,7 @@ _LIMITS_S = {
 """How long each may take, the cameras beside what they are watched. Memory before the models are loaded, and those
 last, as they heat up the computer."""
 CHECKS = tuple(_LIMITS_S)
-BESIDE_A_FLIGHT = frozenset({"limits", "instance", "memory", "disk", "temperature", "clock", "unit", "secrets"})
+BESIDE_A_FLIGHT = frozenset({"instance", "memory", "disk", "temperature", "clock", "secrets"})
 """They leave alone what a drone flies with: its autopilot, cameras and endpoints, and its computer's time."""
 
 
@@ -112,8 +110,6 @@ class Examined:
     """Its configuration's."""
     recordings: Path | None
     """Where flights are recorded; None: in the service's folder, where there is one."""
-    unit: Path | None
-    """The systemd unit to judge; None: the installed one, else the one that comes with flockd."""
     seconds: float
     """How long the cameras are watched."""
     taken: UnavailableError | None
@@ -161,13 +157,9 @@ def _check(name: str, drone: Examined) -> Iterable[Finding]:
             return check_models(config)
     from flockd.ground.doctor import setup_checks as setup
 
-    if name == "limits":
-        return setup.check_limits(config)
     if name == "secrets":
         return setup.check_secrets(config, drone.file)
-    if name == "zenoh":
-        return setup.check_fleet(config)
-    return setup.check_unit(drone.unit) if name == "unit" else setup.check_instance(drone.taken)
+    return setup.check_fleet(config) if name == "zenoh" else setup.check_instance(drone.taken)
 
 
 def run_checks(checks: Sequence[Check], on_done: Callable[[int, int], None]) -> dict[str, tuple[Finding, ...]]:

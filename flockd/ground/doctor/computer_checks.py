@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import ctypes
-import itertools
 import os
 import shutil
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -28,9 +26,6 @@ YEARS = (2026, 2100)
 """A clock that says another year was never set."""
 SYNCHRONISED_BELOW_US = 16_000_000
 """The kernel's largest error estimate; it stands there until a time service sets it."""
-SAMPLES = 20
-SAMPLE_S = 0.02
-DRIFT = 0.05
 
 
 def check_disk(config: DroneConfig, folder: Path | None, state_folder: Path = STATE_FOLDER) -> Iterator[Finding]:
@@ -144,7 +139,7 @@ def check_clock(
     error_us: Callable[[], int] = wall_clock_error_us,
     today: Callable[[], datetime] = lambda: datetime.now(UTC),
 ) -> Iterator[Finding]:
-    """The wall clock, by which recordings and logs are dated, and the monotonic one, by which it flies."""
+    """The wall clock, by which recordings and logs are dated."""
     date = today()
     if not YEARS[0] <= date.year <= YEARS[1]:
         measured = f"the wall clock shows {date:%Y-%m-%d}: recordings get wrong dates, and TLS no valid certificate"
@@ -154,20 +149,3 @@ def check_clock(
         yield warned("wall clock", measured, "start a time service, as with `timedatectl set-ntp true`")
     else:
         yield passed("wall clock", f"{date:%Y-%m-%d %H:%M} UTC, synchronised to {1e-3 * error_us():.0f} ms")
-    ticks = [time.monotonic()]
-    for _ in range(SAMPLES):
-        time.sleep(SAMPLE_S)
-        ticks.append(time.monotonic())
-    yield judge_monotonic(ticks)
-
-
-def judge_monotonic(ticks: list[float]) -> Finding:
-    """Readings with pauses of `SAMPLE_S` between them; a pause takes as long or longer."""
-    fix = "check /sys/devices/system/clocksource/clocksource0/current_clocksource, and boot with another"
-    shortest_ms, pause_ms = 1e3 * min(after - before for before, after in itertools.pairwise(ticks)), 1e3 * SAMPLE_S
-    if shortest_ms <= 0.0:
-        return failed("monotonic clock", f"it stood or went back by {-shortest_ms:.1f} ms", fix)
-    if shortest_ms < (1.0 - DRIFT) * pause_ms:
-        measured = f"{shortest_ms:.1f} ms went by in a pause of {pause_ms:.0f} ms: it is slow or coarse"
-        return failed("monotonic clock", measured, fix)
-    return passed("monotonic clock", f"runs on; {pause_ms:.0f} ms pauses took {shortest_ms:.1f} ms and more")

@@ -1,44 +1,21 @@
-"""What stands in files, and who else is there: limits of the flight, secrets, other instances, the service's unit."""
+"""Which secrets others may read, and who else is there: on this computer, on the fleet."""
 
 from __future__ import annotations
 
-import re
-import shutil
-import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 from flockd.core.config import DroneConfig
-from flockd.core.config.document import key_text
-from flockd.core.config.real_drone import beyond_envelope
-from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.core.secrets import masked
 from flockd.fleet.watcher import FleetWatcher
-from flockd.ground.doctor import Finding, failed, graded, passed, warned
+from flockd.ground.doctor import Finding, failed, passed, warned
 from flockd.onboard.telemetry.zenoh_session import SessionError, private_keys
 
-UNIT_FOLDERS = (Path("/etc/systemd/system"), Path("/usr/lib/systemd/system"), Path("/lib/systemd/system"))
-UNIT = "flockd.service"
-BAR, MUCH = 1.5, 5.0
-"""Exposure scores, from 0 to 10. systemd itself calls 5 and more at best medium."""
 LISTEN_S = 3.0
 """Others try again every second to reach this drone."""
 _READABLE, _WRITABLE = 0o004, 0o022
-
-
-def check_limits(config: DroneConfig) -> Iterator[Finding]:
-    """``config`` as it is flown."""
-    speed, layer = f"{config.flocking.max_speed_m_s:g} m/s at most", config.safety.first_flight_layer
-    if layer is None:
-        yield passed("first flight", f"off: {speed}")
-    else:
-        height = f"{config.mission.height_m:g} m above the ground at home"
-        yield passed("first flight", f"on: layer {layer}, {height}, {speed}")
-    for key, text in beyond_envelope(config).items():
-        measured, _, fix = text.partition("; ")
-        yield warned(key_text(key), measured, fix)
 
 
 def check_instance(taken: UnavailableError | None) -> Iterator[Finding]:
@@ -48,33 +25,6 @@ def check_instance(taken: UnavailableError | None) -> Iterator[Finding]:
         return
     fix = "stop it while you examine (`systemctl stop flockd`), if the drone does not fly"
     yield failed("instance", str(taken).rpartition("; ")[0], fix)
-
-
-def check_unit(unit: Path | None, folders: Sequence[Path] = UNIT_FOLDERS) -> Iterator[Finding]:
-    """The security score of ``unit``; None: of the one installed in ``folders``, else of the one that flockd brings."""
-    installed = next((folder / UNIT for folder in folders if (folder / UNIT).is_file()), None)
-    chosen = unit or installed or data_path("systemd") / UNIT
-    whose = "" if unit or installed else " (not installed)"
-    if shutil.which("systemd-analyze") is None:
-        measured = f"{chosen} was not checked, as systemd-analyze is not installed"
-        yield warned("unit", measured, "examine where flockd is to run as a service")
-        return
-    command = ["systemd-analyze", "security", "--offline=true", "--no-pager", str(chosen)]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    score = re.search(r"Overall exposure level for [^:]*: ([0-9.]+)", result.stdout)
-    if score is None:
-        reason = (result.stderr.strip().splitlines() or ["it said nothing"])[-1]
-        yield failed("unit", f"{chosen} cannot be judged ({reason})", "install systemd/flockd.service anew")
-        return
-    yield judge_exposure(float(score[1]), chosen, whose)
-
-
-def judge_exposure(score: float, unit: Path, whose: str) -> Finding:
-    """0 is closed, 10 is open."""
-    measured = f"{unit}{whose} exposes {score:.1f} of 10"
-    fix = f"compare it and its drop-ins with systemd/{UNIT}; `systemd-analyze security` lists what is open"
-    more = f", more than {BAR:g}" if BAR < score < MUCH else ""
-    return graded("unit", f"{measured}{more}", fix, failure=score >= MUCH, warning=score > BAR)
 
 
 def check_secrets(config: DroneConfig, file: Path) -> Iterator[Finding]:

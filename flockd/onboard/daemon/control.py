@@ -11,13 +11,12 @@ import numpy as np
 
 from flockd.core import services
 from flockd.core.config import DroneConfig
-from flockd.core.messages import Setpoint, VehicleState, Wanted
+from flockd.core.messages import VehicleState, Wanted
 from flockd.flight.obstacles import nearest_points
 from flockd.flight.safety import (
     Action,
     Decision,
     Event,
-    Gate,
     MissionEnd,
     Permission,
     Request,
@@ -96,20 +95,6 @@ class Control:
         self._stream(now, status, vehicle, before)
         self._requests.takeover = self._takeover()
         self._on_tick(before, self.decision)
-
-    def rehearsed(self, gate: Gate) -> Setpoint | None:
-        """What a gate would make of what the pilot wants now, if it flew; None while the pilot wants nothing yet.
-
-        Nothing of this object changes.
-        """
-        result, vehicle = self._pilot_loop.newest, self._link.vehicle_state()
-        if result is None or vehicle is None:
-            return None
-        now = self._clock()
-        around = self._around(now, self._link.status(), vehicle)
-        height_m = self._autopilot.height_m or vehicle.height_m
-        request = Request(Permission(Action.FLY, now), result.output.command, result.time_s, height_m, around)
-        return gate.step(now, request).setpoint
 
     def stand_still(self) -> None:
         """For when no tick follows: the streamer sends standstill until it notices that the control loop is late."""

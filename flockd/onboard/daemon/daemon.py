@@ -47,10 +47,6 @@ HOLD_S = 2.0
 """For the autopilot to confirm Hold after the control loop has failed."""
 
 
-Connect = Callable[..., Coroutine[Any, Any, AutopilotLink]]
-"""Connects to an autopilot, as `AutopilotLink.connect` does."""
-
-
 class DaemonError(FlockdError):
     """The flight ended because something in flockd did; the text says what."""
 
@@ -68,7 +64,6 @@ class Daemon:
         recordings: Path | None,
         service: ServiceManager,
         clock: Callable[[], float] = time.monotonic,
-        connect: Connect = AutopilotLink.connect,
     ) -> None:
         """Checks the configuration; nothing is opened before `run`.
 
@@ -80,7 +75,6 @@ class Daemon:
             recordings: the folder for recordings of flights; None: nothing is recorded.
             service: the service manager, if any.
             clock: monotonic seconds.
-            connect: connects to the autopilot.
 
         Raises ConfigError for a configuration that cannot be flown.
         """
@@ -89,7 +83,7 @@ class Daemon:
         self._source = open_source(config, file, clock=clock)
         self._config = config
         self._load_networks, self._models, self._recordings = load_networks, models, recordings
-        self._service, self._clock, self._connect = service, clock, connect
+        self._service, self._clock = service, clock
         self._operator = OperatorRequests()
         self._stopping = asyncio.Event()
         self._unusable: AutopilotError | None = None
@@ -142,7 +136,7 @@ class Daemon:
         stack.push_async_callback(_close_async, sinks.close)
         await closing.do(OPEN_S, self._source.start)
         stack.push_async_callback(_close, closing, self._source.stop)
-        networks, link = await _both(self._networks(loading), self._connect(config.autopilot, clock=clock))
+        networks, link = await _both(self._networks(loading), AutopilotLink.connect(config.autopilot, clock=clock))
         stack.push_async_callback(_close_async, link.close)
         gate = Gate(config.safety.gate)
         streamer = SetpointStreamer(

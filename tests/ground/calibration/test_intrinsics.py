@@ -13,10 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from flockd.core.choices import LENS_MODELS
 from flockd.ground.calibration.board import BoardFinder, CalibrationError
-from flockd.ground.calibration.coverage import Coverage
-from flockd.ground.calibration.intrinsics import Lens as Fitted
-from flockd.ground.calibration.intrinsics import calibrate, simplest_that_fits
-from flockd.ground.calibration.views import Collector
+from flockd.ground.calibration.lens import Lens as Fitted
+from flockd.ground.calibration.lens import calibrate, simplest_that_fits
+from flockd.ground.calibration.views import Collector, Coverage
 from tests.ground.calibration import darkroom
 from tests.ground.calibration.darkroom import PINHOLE, SPEC, WIDE, Lens, facing, photograph
 
@@ -25,7 +24,7 @@ VIEWS = 16
 
 @cache
 def collected(lens: Lens) -> Collector:
-    collector = Collector(BoardFinder(SPEC), most=60)
+    collector = Collector(BoardFinder(SPEC))
     for number, place in enumerate(darkroom.sight(lens, VIEWS)):
         collector.offer(f"{number}", photograph(lens, place, seed=number))
     return collector
@@ -78,7 +77,7 @@ def test_a_wide_lens_does_not_pass_for_a_pinhole() -> None:
 
 @pytest.mark.parametrize("lens", [PINHOLE, WIDE], ids=lambda lens: lens.model)
 def test_boards_that_are_all_parallel_to_the_image_give_no_focal_length(lens: Lens) -> None:
-    collector = Collector(BoardFinder(SPEC), most=60)
+    collector = Collector(BoardFinder(SPEC))
     for number, place in enumerate(darkroom.sight(lens, 14, seed=3, tilt_deg=0.0)):
         collector.offer(f"{number}", photograph(lens, place, seed=number))
     assert len(collector.views) >= 6
@@ -92,7 +91,7 @@ def test_too_few_views_are_refused() -> None:
 
 
 def test_a_view_that_does_not_fit_is_dropped_and_named() -> None:
-    collector = Collector(BoardFinder(SPEC), most=60)
+    collector = Collector(BoardFinder(SPEC))
     for number, place in enumerate(darkroom.sight(PINHOLE, VIEWS)):
         image = photograph(PINHOLE, place, seed=number)
         if number == 5:  # as if somebody had touched the zoom
@@ -106,7 +105,7 @@ def test_a_view_that_does_not_fit_is_dropped_and_named() -> None:
 
 def test_views_are_refused_with_the_reason() -> None:
     near = facing((0.0, 0.0, 0.28), 12.0, 40.0)
-    collector = Collector(BoardFinder(SPEC), most=60)
+    collector = Collector(BoardFinder(SPEC))
     assert collector.offer("wall", photograph(PINHOLE, facing((0.0, 0.0, -1.0)))) == "no board"
     assert collector.offer("sharp", photograph(PINHOLE, near)) is None
     assert collector.offer("again", photograph(PINHOLE, near, seed=1)) == "like another"
@@ -121,13 +120,13 @@ def test_views_are_refused_with_the_reason() -> None:
 
 
 def test_a_board_in_motion_is_no_view_and_one_held_still_is() -> None:
-    collector = Collector(BoardFinder(SPEC), most=60)
+    collector = Collector(BoardFinder(SPEC))
     here, there = (photograph(PINHOLE, facing((x, 0.0, 0.4), 12.0)) for x in (0.0, 0.02))
     assert [collector.offer("", image, moving=True) for image in (here, there, there)] == ["moving", "moving", None]
 
 
 def test_images_of_two_sizes_are_refused() -> None:
-    collector = Collector(BoardFinder(SPEC), most=60)
+    collector = Collector(BoardFinder(SPEC))
     collector.offer("a.png", np.zeros((360, 480, 3), np.uint8))
     with pytest.raises(CalibrationError, match=r"^b\.png: is 640 x 480 pixels and a\.png is 480 x 360; calibrate"):
         collector.offer("b.png", np.zeros((480, 640, 3), np.uint8))

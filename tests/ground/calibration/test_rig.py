@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 from flockd.core.config.rig import MeasurementConfig
 from flockd.flight.geometry import Camera, PinholeCamera, RigidTransform, WideAngleCamera, rotation_angle_deg
 from flockd.ground.calibration.board import BoardFinder, CalibrationError
-from flockd.ground.calibration.extrinsics import SharedBoard, calibrate_rig
 from flockd.ground.calibration.fragment import extrinsics_of
-from flockd.ground.calibration.rig_session import SharedCollector
+from flockd.ground.calibration.rig import SharedBoard, SharedCollector, calibrate_rig
 from tests.ground.calibration.darkroom import SPEC, WIDE, Lens, Place, facing, photograph
 
 FORWARD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -16,7 +16,6 @@ from flockd.ground.doctor.computer_checks import (
     check_disk,
     check_memory,
     check_temperature,
-    judge_monotonic,
     judge_room,
     wall_clock_error_us,
 )
@@ -121,29 +120,13 @@ def _clock(error_us: int = 500, today: datetime = SUMMER) -> list[Finding]:
 
 
 def test_clocks() -> None:
-    wall, monotonic = _clock()
+    (wall,) = _clock()
     assert (wall.level, wall.about) == (Level.PASS, "wall clock")
     assert wall.measured == "2026-07-01 12:00 UTC, synchronised to 0 ms"
-    assert (monotonic.level, monotonic.about) == (Level.PASS, "monotonic clock")
     assert _clock(16_000_000)[0].level is Level.WARNING
     assert "not synchronised" in _clock(16_000_000)[0].measured
     assert _clock(today=datetime(1970, 1, 1, tzinfo=UTC))[0].level is Level.FAILURE
     assert 0 <= wall_clock_error_us() <= 16_000_000
-
-
-@pytest.mark.parametrize(
-    ("ticks", "told"),
-    [
-        ([0.0, 0.02, 0.01, 0.03], "went back by 10.0 ms"),
-        ([0.0, 0.02, 0.02], "it stood"),
-        ([0.0, 0.02, 0.03], "10.0 ms went by in a pause of 20 ms"),
-    ],
-)
-def test_a_monotonic_clock_that_is_none(ticks: list[float], told: str) -> None:
-    finding = judge_monotonic(ticks)
-    assert finding.level is Level.FAILURE
-    assert told in finding.measured
-    assert judge_monotonic([0.0, 0.0201, 0.15, 0.17]).level is Level.PASS, "a busy computer sleeps longer"
 
 
 def test_a_drone_with_a_larger_queue_needs_more(tmp_path: Path) -> None:

@@ -150,8 +150,6 @@ def test_what_cannot_be_examined_is_refused(tmp_path: Path, capsys: pytest.Captu
     wrong.write_text("step_s: -1.0\n", encoding="utf-8")
     assert main(["doctor", "--config", str(wrong)]) == 78
     assert f"{wrong}:1: step_s: -1.0 is not greater than 0; write " in capsys.readouterr().err
-    assert main(["doctor", "--config", QUADROTOR, "--unit", str(tmp_path / "no.service")]) == 2
-    assert capsys.readouterr().err == f"{tmp_path / 'no.service'}: is no file; name the unit with --unit\n"
     with pytest.raises(SystemExit) as exit_:
         main(["doctor", "--config", QUADROTOR, "--only", "soul"])
     assert exit_.value.code == 2

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
-
-import pytest
 
 from flockd.core.config import DroneConfig, load_drone
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
@@ -13,14 +10,13 @@ from flockd.core.config.telemetry import TelemetryParameters
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.ground.doctor import Check, Finding, Level, run_checks
-from flockd.ground.doctor.setup_checks import check_fleet, check_instance, check_secrets, check_unit, judge_exposure
+from flockd.ground.doctor.setup_checks import check_fleet, check_instance, check_secrets
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.sim.sitl.ports import free_endpoint
 from tests.onboard.daemon.aboard import config_for
 
 QUADROTOR = load_drone(data_path("config") / "quadrotor.yaml")
-needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not here")
 
 
 def _config(*, listen: tuple[str, ...] = (), connect: tuple[str, ...] = ()) -> DroneConfig:
@@ -79,33 +75,6 @@ def test_a_second_instance() -> None:
     assert finding.level is Level.FAILURE
     assert finding.measured == "autopilot.address: another flockd (process 7) has it"
     assert "systemctl stop flockd" in finding.fix
-
-
-@needs_systemd
-def test_the_unit_that_comes_with_flockd_and_one_that_is_open(tmp_path: Path) -> None:
-    (finding,) = check_unit(None, (tmp_path,))
-    assert finding.level is Level.PASS, finding
-    assert "flockd.service (not installed) exposes 1." in finding.measured
-    (tmp_path / "flockd.service").write_text("[Service]\nExecStart=/bin/true\n", encoding="utf-8")
-    (finding,) = check_unit(None, (tmp_path,))
-    assert finding.level is Level.FAILURE
-    assert finding.measured.startswith(f"{tmp_path / 'flockd.service'} exposes 9.")
-    broken = tmp_path / "broken.service"
-    broken.write_text("[Service]\n", encoding="utf-8")
-    (finding,) = check_unit(broken)
-    assert finding.level is Level.FAILURE
-
-
-def test_without_systemd_the_unit_is_not_checked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PATH", "/nowhere")
-    (finding,) = check_unit(None)
-    assert finding.level is Level.WARNING
-    assert "systemd-analyze is not installed" in finding.measured
-
-
-def test_how_open_is_too_open() -> None:
-    levels = [judge_exposure(score, Path("u"), "").level for score in (1.5, 1.6, 4.9, 5.0)]
-    assert levels == [Level.PASS, Level.WARNING, Level.WARNING, Level.FAILURE]
 
 
 OPEN, CLOSED = "rtspsrc location=rtsp://10.0.0.7/s", "rtspsrc location=rtsp://anna:hunter2@10.0.0.7/s"
