@@ -1,59 +1,34 @@
-"""`flockd models`: which networks there are, whether they are intact, how fast they are, and their engines."""
+"""`flockd models`: which networks there are, whether they are intact, and their engines."""
 
 from __future__ import annotations
 
 import argparse
-import statistics
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flockd.cli.options import loaded
-from flockd.cli.output import noted_table, progress, say, say_facts, say_json, say_table, tables_console
-from flockd.cli.parser import Commands, Parser, commands_of, flag, option, positive_count, size
-from flockd.core.choices import PROVIDERS, Provider
-from flockd.core.errors import ExitCode, ModelError, UnavailableError, UsageError
+from flockd.cli.output import noted_table, progress, say, say_facts, say_json, tables_console
+from flockd.cli.parser import Commands, Parser, commands_of, flag, option
+from flockd.core.errors import ExitCode, ModelError, UnavailableError
 
 if TYPE_CHECKING:
     from flockd.core.config import DroneConfig
-    from flockd.flight.inference import OnnxModel
 
 THREADS = 2
-LEAST_PX = 32
-RUNS = 9
-"""Timed after one run that is not counted."""
 
 
 def add(commands: Commands) -> None:
     """Adds the command."""
     examples: tuple[str, ...] = (
-        "flockd models list", "flockd models verify", "flockd models bench --threads 1,2"
+        "flockd models list", "flockd models verify", "flockd models prepare --config my_drone.yaml"
     )  # fmt: skip
-    commands = commands_of(commands("models", "List, verify, time and prepare the networks.", examples))
+    commands = commands_of(commands("models", "List, verify and prepare the networks.", examples))
     examples = ("flockd models list", "flockd models list --json", "flockd models list --dir my_models")
     _add_options(commands("list", "List each model with its roles; a damaged one is refused.", examples, _list))
     examples = ("flockd models verify", "flockd models verify --json")
     description = "Check each model file against its manifest: hash, weights, inputs, outputs, and golden output."
     _add_options(commands("verify", description, examples, _verify))
-    examples = (
-        "flockd models bench",
-        "flockd models bench --threads 1,2,4 --size 640x480 --json",
-        "flockd models bench --dir models_of_others --provider cuda",
-    )
-    description = "Time each model, for each provider and number of threads: milliseconds a run, the median."
-    parser = _add_options(commands("bench", description, examples, _bench))
-    option(parser, "--provider NAME,...", f"{', '.join(PROVIDERS)} (default: all that are installed)")
-    option(
-        parser,
-        "--threads N,...",
-        "on the CPU (default: 1,2)",
-        lambda text: tuple(map(positive_count, text.split(","))),
-        default=(1, 2),
-    )
-    option(parser, "--size WxH", "of the image (default: 640x480)", size, default=(640, 480))
-    option(parser, "--runs N", f"to time (default: {RUNS})", positive_count, default=RUNS)
     examples = ("flockd models prepare --config my_drone.yaml", "flockd models prepare --config my_drone.yaml --json")
     description = (
         "Build what a drone's provider needs for its models and cameras, ahead of flight. TensorRT takes minutes, and "
@@ -108,81 +83,6 @@ def _verify(args: argparse.Namespace) -> int:
         for name, fault in faults.items():
             say(f"{name}: fine" if fault is None else fault)
     return ExitCode.CHECK_FAILED if any(faults.values()) else ExitCode.DONE
-
-
-@dataclass(frozen=True)
-class _Timing:
-    model: str
-    provider: str
-    threads: int
-    input: str
-    """What enters, as in `first 1x120x160x3`."""
-    median_ms: float | None
-    least_ms: float | None
-    fault: str | None
-    """Why it does not run there."""
-
-
-def _bench(args: argparse.Namespace) -> int:
-    if min(args.size) < LEAST_PX:
-        raise UsageError(f"--size: networks take images of at least {LEAST_PX}x{LEAST_PX}; name a larger one")
-    timings = []
-    providers = _providers(args.provider)
-    manifests = _manifests(args.dir)
-    with progress("timing", "combinations") as tell:
-        for timing in _timings(manifests, providers, args):
-            timings.append(timing)
-            tell(len(timings), len(manifests) * len(providers) * len(args.threads))
-    if args.json:
-        say_json([asdict(timing) for timing in timings])
-    else:
-        rows = []
-        for t in timings:
-            cells = [f"{t.median_ms:.1f}", f"{t.least_ms:.1f}", t.input] if t.fault is None else ["-", "-", t.fault]
-            rows.append([t.model, t.provider, str(t.threads), *cells])
-        say_table(("model", "provider", "threads", "ms, median", "least", "input"), rows)
-    return ExitCode.CHECK_FAILED if any(timing.fault for timing in timings) else ExitCode.DONE
-
-
-def _providers(text: str | None) -> Sequence[Provider]:
-    from flockd.flight.inference.providers import available
-
-    if text is None:
-        return available()
-    named = [provider for provider in PROVIDERS if provider in text.split(",")]
-    unknown = sorted(set(text.split(",")) - set(PROVIDERS))
-    if unknown:
-        raise UsageError(f"--provider: {unknown[0]!r} is none of {', '.join(PROVIDERS)}; choose one of these")
-    return named
-
-
-def _timings(manifests: Sequence[Path], providers: Sequence[Provider], args: argparse.Namespace) -> Iterator[_Timing]:
-    from flockd.flight.inference import OnnxModel
-    from flockd.flight.inference.feeds import feeds_for, shapes_of
-    from flockd.flight.perception.requirements import check_roles
-
-    for path in manifests:
-        for provider in providers:
-            for threads in args.threads:
-                try:
-                    model = OnnxModel(path, threads=threads, provider=provider, preparing=True, check=check_roles)
-                except ModelError as error:
-                    yield _Timing(path.stem, provider, threads, "", None, None, str(error))
-                    continue
-                feeds = feeds_for(model.manifest, args.size)
-                taken_ms = sorted(_times_ms(model, feeds, args.runs))
-                entered = ", ".join(f"{n} {'x'.join(map(str, shape))}" for n, shape in shapes_of(feeds).items())
-                yield _Timing(path.stem, provider, threads, entered, statistics.median(taken_ms), taken_ms[0], None)
-
-
-def _times_ms(model: OnnxModel, feeds: Any, runs: int) -> list[float]:
-    model.run(feeds)
-    times = []
-    for _ in range(runs):
-        begun_s = time.perf_counter()
-        model.run(feeds)
-        times.append(1e3 * (time.perf_counter() - begun_s))
-    return times
 
 
 def _prepare(args: argparse.Namespace) -> int:

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
 from flockd.cli.flight_summary import show_summary
 from flockd.cli.options import opened, refuse, require
-from flockd.cli.output import complain, progress, say, say_json, say_result, say_table
+from flockd.cli.output import complain, progress, say_result
 from flockd.cli.parser import Commands, flag, option
-from flockd.core.errors import ExitCode, UsageError
+from flockd.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
-    from flockd.onboard.recording.reader import Recording
     from flockd.review.flight_log.key_frames import KeyFrame
     from flockd.review.flight_log.log import FlightLog
-    from flockd.review.report.flight_video import VideoStep
 
 SUFFIX = ".report"
 """Ending of the folder beside a recording that its report goes to."""
@@ -33,10 +30,9 @@ def add(commands: Commands) -> None:
         "flockd report recordings",
         "flockd report kestrel-20261120T101500Z.mcap --out reports/kestrel",
         "flockd report drone1.mcap --without-pictures --json",
-        "flockd report out/calm out/windy",
-        "flockd report out/short --video short.webm --drone drone2",
+        "flockd report out/short/recordings --video short.webm --drone drone2",
     )
-    description = "Write the summary and the report of a flight, from its folder or from recordings; or compare two."
+    description = "Write the summary and the report of a flight, from its folder or from recordings."
     parser = commands("report", description, examples, _run)
     parser.add_argument(
         "flight",
@@ -44,16 +40,13 @@ def add(commands: Commands) -> None:
         type=Path,
         help="a recording, a folder of them (each drone's newest), or what `flockd sim` wrote",
     )
-    option(
-        parser, "OTHER", "another flight: the key figures of both are printed, and nothing is written", Path, nargs="?"
-    )
     flag(parser, "--force", "overwrite an earlier report, or a flight in --out")
     option(parser, "--out DIR", f"of a recording's report; default: NAME{SUFFIX} beside it", Path)
     flag(parser, "--without-pictures", "do not run the networks again for the report's images")
     option(
         parser,
         "--video FILE",
-        "write a video instead, .webm or .mp4: a drone's images with its detections, beside the map",
+        "write a video instead, .webm or .mp4: a recorded drone's images with its detections",
         Path,
     )
     option(parser, "--drone NAME", "whose images the video shows; default: the first recorded")
@@ -61,10 +54,7 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    require(*(path for path in (args.flight, args.other) if path is not None))
-    if args.other is not None:
-        refuse(args, ("out", "without_pictures", "force", "video", "drone"), "has no meaning with two flights; drop it")
-        return _compare(args)
+    require(args.flight)
     if args.video is not None:
         refuse(args, ("out", "without_pictures"), "has no meaning with --video; drop it")
         return _video(args)
@@ -94,56 +84,27 @@ def _run(args: argparse.Namespace) -> int:
     return show_summary(directory, summary, as_json=args.json)
 
 
-def _compare(args: argparse.Namespace) -> int:
-    """The key figures of two flights side by side."""
-    from flockd.review.report.comparison import compare
-    from flockd.review.report.summary import summarise
-
-    flights = (args.flight, args.other)
-    rows = compare(*(summarise(_log_of(flight)) for flight in flights))
-    if args.json:
-        say_json({"flights": [str(flight) for flight in flights], "rows": [asdict(row) for row in rows]})
-        return ExitCode.DONE
-    for name, flight in zip(("first", "second"), flights, strict=True):
-        say(f"{name}: {flight}")
-    say_table(("figure", "first", "second", "difference"), [(row.name, *row.cells) for row in rows])
-    return ExitCode.DONE
-
-
 def _video(args: argparse.Namespace) -> int:
-    """A video of the recordings, or of the folder's key frames."""
+    """A video of one of the recordings."""
     from flockd.review.flight_log.from_recordings import recordings_in
     from flockd.review.report.flight_folder import RECORDINGS
     from flockd.review.report.flight_video import check_video_path, write_video
 
     check_video_path(args.video, force=args.force)
     paths = recordings_in(args.flight / RECORDINGS) if _is_flight(args.flight) else _recordings(args.flight)
-    log = _log_of(args.flight)
-    drone, steps = _steps_shown(args, log, [opened(path) for path in paths])
+    if not paths:
+        raise UsageError(f"{args.flight}: has no recordings, of which a video is made; fly with --record")
+    recordings = [opened(path) for path in paths]
+    recording = next((one for one in recordings if args.drone in {None, one.drone}), None)
+    if recording is None:
+        raise UsageError(
+            f"--drone {args.drone}: has no recording; name one of {', '.join(r.drone for r in recordings)}"
+        )
     with progress("writing the video", "steps") as tell_progress:
-        count = write_video(args.video, log, drone, steps, tell_progress)
-    seconds = count * log.metadata.step_s
+        count = write_video(args.video, recording, tell_progress)
+    seconds = count * recording.config.step_s
     facts = {"video": str(args.video), "frames": count, "seconds": seconds}
     return say_result(args, facts, f"{args.video}: {count} frames, {seconds:g} s")
-
-
-def _steps_shown(
-    args: argparse.Namespace, log: FlightLog, recordings: Sequence[Recording]
-) -> tuple[int, Iterator[VideoStep]]:
-    """Number of the drone that --drone names, and what its cameras saw."""
-    from flockd.review.report.flight_video import VideoStep, recorded_steps
-
-    if not recordings:
-        if args.drone is not None:
-            raise UsageError(f"--drone {args.drone}: {args.flight} has no recordings; drop it, or fly with --record")
-        complain(f"{args.flight}: has no recordings, so the video shows the map alone; fly with --record")
-        return 0, (VideoStep(time_s, {}, {}) for time_s in log.time_s.tolist())
-    names = log.metadata.names or [recording.drone for recording in recordings]
-    wanted = args.drone or recordings[0].drone
-    recording = next((one for one in recordings if one.drone == wanted), None)
-    if recording is None or wanted not in names:
-        raise UsageError(f"--drone {wanted}: has no recording; name one of {', '.join(r.drone for r in recordings)}")
-    return names.index(wanted), recorded_steps(recording)
 
 
 def _is_flight(folder: Path) -> bool:

@@ -40,6 +40,7 @@ COMMANDS: Mapping[str, str] = {
     "flockd foxglove": "watch live with `flockd fleet`, or in ROS 2 with `flockd ros`; Foxglove opens recordings",
     "flockd record export --ros2": "Foxglove opens the recording itself; record a flight's topics of `flockd ros`",
     "flockd record export --format": "tables are CSV, which pandas, Polars and DuckDB read too; leave it out",
+    "flockd models bench": "`flockd replay RECORDING --profile` times the stages with the networks of --config",
     "flockd replay --speed": "leave it out: a replay shows nothing while it runs",
     "flockd report --ulog": "open PX4's log in Flight Review or PlotJuggler",
     "flockd calibrate rig --by": "fly, and take over what the flight found with `--from-flight RECORDING`",

@@ -1,4 +1,4 @@
-"""`flockd models`: the networks, listed, verified, timed and prepared."""
+"""`flockd models`: the networks, listed, verified and prepared."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import pytest
 from flockd.cli import main
 from flockd.core.config import load_drone
 from flockd.core.data import data_path
-from flockd.flight.inference import load_manifest
+from flockd.core.errors import ModelError
+from flockd.flight.inference import OnnxModel, load_manifest
+from flockd.flight.inference.providers import available
 from tests.flight.inference.foreign import one_channel_depth
 
 FLOAT = ("detector", "distance", "flow", "neighbours", "verification")
@@ -34,31 +36,11 @@ def test_verify_names_the_damaged_model(tmp_path: Path, capsys: pytest.CaptureFi
     assert "sha256" in verified["fault"]
 
 
-def test_bench_times_each_number_of_threads_and_says_what_entered(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    one_channel_depth(tmp_path, output={})
-    command = ["models", "bench", "--dir", str(tmp_path), "--provider", "cpu", "--threads", "1,2", "--runs", "3"]
-    assert main([*command, "--json"]) == 0
-    timings = json.loads(capsys.readouterr().out)
-    assert [(t["model"], t["provider"], t["threads"], t["input"]) for t in timings] == [
-        ("someones_depth", "cpu", 1, "rgb 1x3x32x48"),
-        ("someones_depth", "cpu", 2, "rgb 1x3x32x48"),
-    ]
-    assert all(0 < t["least_ms"] <= t["median_ms"] for t in timings)
-
-
-def test_bench_does_not_time_one_provider_for_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from flockd.flight.inference.providers import available
-
+def test_a_provider_that_is_not_installed_is_named(tmp_path: Path) -> None:
     if "tensorrt" in available():
         pytest.skip("this computer has TensorRT")
-    one_channel_depth(tmp_path, output={})
-    command = ["models", "bench", "--dir", str(tmp_path), "--provider", "tensorrt", "--threads", "1", "--json"]
-    assert main(command) == 1
-    (timing,) = json.loads(capsys.readouterr().out)
-    assert timing["median_ms"] is None
-    assert "has no TensorrtExecutionProvider" in timing["fault"]
+    with pytest.raises(ModelError, match="has no TensorrtExecutionProvider"):
+        OnnxModel(one_channel_depth(tmp_path, output={}), threads=1, provider="tensorrt", preparing=True)
 
 
 def test_on_the_cpu_there_is_nothing_to_prepare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

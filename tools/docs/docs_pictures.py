@@ -26,11 +26,10 @@ from PIL import Image, ImageDraw
 
 from flockd.core.messages import FloatArray
 from flockd.onboard.recording.reader import Recording
-from flockd.review.flight_log.from_recordings import flight_log
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.filmstrip import load_plates
 from flockd.review.report.flight_folder import KEY_FRAMES_NAME, LOG_NAME
-from flockd.review.report.flight_video import recorded_steps, write_video
+from flockd.review.report.flight_video import write_video
 from flockd.review.report.style import GRID, INK, MUTED, PAPER, colour_of
 from flockd.sim.scenario import load_scenario
 
@@ -79,8 +78,7 @@ def main() -> None:
 
 def save_clip(recording_file: Path, path: Path) -> None:
     """A recording's video, small enough for a page."""
-    recording = Recording(recording_file)
-    write_video(path, flight_log([recording]), 0, recorded_steps(recording), scale=CLIP_SCALE)
+    write_video(path, Recording(recording_file), scale=CLIP_SCALE)
 
 
 def save_world(scenario_file: Path, path: Path) -> None:

@@ -4,7 +4,7 @@ python -m tools.training.render_training_data DATA/test   --split test --worlds 
 python -m tools.training.render_training_data DATA/unseen --split test --worlds 25 --pairs 12 --families unseen
 python -m tools.measure.evaluate_networks --data DATA/test --unseen DATA/unseen [--json]
 
-How long they take says `flockd models bench`.
+How long they take says `flockd replay RECORDING --profile`.
 """
 
 from __future__ import annotations

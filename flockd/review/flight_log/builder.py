@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from flockd.core.messages import BoolArray, FloatArray, MissionStatus, ObstacleRanges, PilotOutput
+from flockd.core.messages import BoolArray, FloatArray, MissionStatus, PilotOutput
 from flockd.review.flight_log.log import SHAPES, FlightLog, shape_of
 from flockd.review.flight_log.metadata import FlightMetadata, LearnedSize
 
@@ -61,10 +61,6 @@ class FlightLogBuilder:
         if goals:
             self._rows["goal"][step] = Counter(goals).most_common(1)[0][0]
 
-    def add_obstacles(self, step: int, i: int, seen: ObstacleRanges) -> None:
-        """What drone ``i`` knew of them."""
-        self._rows["obstacle_range"][step, i] = np.where(seen.seen_m > 0, seen.range_m, np.nan)
-
     def add_exact_states(
         self, step: int, i: int, others: BoolArray, relative: FloatArray, velocities: FloatArray, command: FloatArray
     ) -> None:
@@ -84,8 +80,6 @@ class FlightLogBuilder:
         for neighbour in output.neighbours:
             if neighbour.confirmed:
                 self._tracked.append((float(step), float(i), float(neighbour.track), *neighbour.position.tolist()))
-        if output.obstacles is not None:
-            self.add_obstacles(step, i, output.obstacles)
         ego = output.ego_motion
         if ego is not None:
             self._rows["ego_rotation"][step, i], self._rows["ego_translation"][step, i] = ego.rotation, ego.translation
@@ -122,9 +116,8 @@ class FlightLogBuilder:
     def build(self, metadata: FlightMetadata, companion: tuple[FloatArray, FloatArray] | None) -> FlightLog:
         """The log, with positions and velocities (S, N, 3) of the companion with exact states, if there is one."""
         truth_position, truth_velocity = companion or np.zeros((2, 0, self._drones, 3))
-        rows, looked = self._rows, not np.isnan(self._rows["obstacle_range"]).all()
         return FlightLog(
-            **(rows if looked else {**rows, "obstacle_range": np.zeros((0, 0, 0))}),
+            **self._rows,
             truth_position=truth_position,
             truth_velocity=truth_velocity,
             stages_ms={stage: np.array(ms) for stage, ms in self._stages.items()},

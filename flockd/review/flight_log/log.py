@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from flockd.core.messages import SECTORS, BoolArray, FloatArray, IntArray
+from flockd.core.messages import BoolArray, FloatArray, IntArray
 from flockd.review.flight_log.metadata import FlightMetadata
 
 _S, _N = -1, -2
@@ -28,13 +28,12 @@ SHAPES: dict[str, tuple[int, ...]] = {
     "false_tracks": (_S, _N),
     "goal": (_S, 2),
     "clearance": (_S, _N),
-    "obstacle_range": (_S, _N, SECTORS),
     "truth_position": (_S, _N, 3),
     "truth_velocity": (_S, _N, 3),
 }
 """Of a log's arrays with a row a step; see `shape_of`."""
 _STAGE_PREFIX = "stage "
-_LEFT_AWAY = ("goal", "obstacles", "clearance", "obstacle_range")
+_LEFT_AWAY = ("goal", "obstacles", "clearance")
 """From the file, where they are empty."""
 _MAY_BE_EMPTY = (*_LEFT_AWAY, "truth_position", "truth_velocity")
 
@@ -96,9 +95,6 @@ class FlightLog:
     clearance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     """(S, N) m, the smallest distance of a drone's centre from an obstacle's surface from the step to the next, inside
     negative; (0, 0) without obstacles."""
-    obstacle_range: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
-    """(S, N, n) m, `ObstacleRanges.range_m` as each drone knew them; NaN where it did not look; (0, 0, 0) if none
-    did."""
 
     @property
     def has_truth(self) -> bool:

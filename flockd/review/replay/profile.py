@@ -32,8 +32,6 @@ _EIGHT_BIT = {
     "amx_int8": "AMX", "avx512_vnni": "AVX-512 VNNI", "avx_vnni": "AVX-VNNI", "i8mm": "I8MM", "asimddp": "dotprod",
 }  # fmt: skip
 """Instructions for 8-bit products, by the kernel's names: with none of these the 8-bit networks save little."""
-_VECTOR = {"avx512f": "AVX-512", "avx2": "AVX2", "sve2": "SVE2", "sve": "SVE", "asimd": "NEON"}
-"""Those for numbers in float, the widest first."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,6 @@ class ComputerFiles:
     board: Path = Path("/proc/device-tree/model")
     meminfo: Path = MEMORY
     thermal: Path = THERMAL
-    clocks: Path = Path("/sys/devices/system/cpu")
 
     def computer(self) -> dict[str, Any]:
         """What it is: board or processor, cores for this process, instructions, memory (None: not told)."""
@@ -56,14 +53,8 @@ class ComputerFiles:
             "architecture": platform.machine(),
             "cores": len(os.sched_getaffinity(0)),
             "eight_bit": [name for flag, name in _EIGHT_BIT.items() if flag in flags],
-            "vector": [name for flag, name in _VECTOR.items() if flag in flags],
             "memory_mb": None if total is None else int(total.split()[0]) * 1024 / MB,
         }
-
-    def clock_mhz(self) -> float | None:
-        """Of the fastest core now; None where it is not told."""
-        khz = [text for file in self.clocks.glob("cpu[0-9]*/cpufreq/scaling_cur_freq") if (text := _text(file).strip())]
-        return max((int(text) / 1e3 for text in khz), default=None)
 
 
 class Watch:
@@ -72,31 +63,25 @@ class Watch:
     def __init__(self, kernel: ComputerFiles | None = None) -> None:
         self.kernel = kernel or ComputerFiles()
         self._load = os.getloadavg()[0]
-        self._zone = ""
         self._temperatures_c: list[float] = []
-        self._clocks_mhz: list[float] = []
         self._slowed: set[str] = set()
         self.look()
 
     def look(self) -> None:
         """Once a step."""
-        zones, clock_mhz = dict(thermal_zones(self.kernel.thermal)), self.kernel.clock_mhz()
-        self._zone = max(zones, key=zones.__getitem__, default="")
-        self._temperatures_c += [zones[self._zone]] if zones else []
-        self._clocks_mhz += [] if clock_mhz is None else [clock_mhz]
+        zones = dict(thermal_zones(self.kernel.thermal))
+        self._temperatures_c += [max(zones.values())] if zones else []
         self._slowed.update(processors_slowed(self.kernel.thermal))
 
     def summary(self) -> dict[str, Any]:
         """Processes that wanted a core before it began (the average of a minute); temperatures in °C at the start, at
-        most and at the end; the clock at least and at most; what slowed the processor. None: not told.
+        most and at the end; what slowed the processor. None: not told.
         """
-        hot, clocks = self._temperatures_c, self._clocks_mhz
+        hot = self._temperatures_c
         return {
             "load_before": self._load,
             "temperature_c": [hot[0], max(hot), hot[-1]] if hot else None,
-            "zone": self._zone or None,
             "slowed_by": sorted(self._slowed),
-            "clock_mhz": [min(clocks), max(clocks)] if clocks else None,
         }
 
 

@@ -23,7 +23,7 @@ from flockd.review.report.trajectories import in_the_way, obstacle_figure, traje
 Drawing = tuple[Callable[[FlightLog], Figure | None], str, str]
 DRAWINGS_OF_TRUTH: dict[str, Drawing] = {
     "trajectories": (trajectories, "trajectories", "Paths and formation from above"),
-    "obstacles": (obstacle_figure, "obstacles", "Clearance over time, and what a drone knew of the obstacles"),
+    "obstacles": (obstacle_figure, "obstacles", "Clearance over time"),
     "curves": (flight_curves, "curves", "Airspeed, course, heights, distances and deviations over time"),
     "errors": (error_curves, "errors", "Errors of the estimates over time"),
 }

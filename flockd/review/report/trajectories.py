@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Patch, Rectangle, Wedge
+from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Affine2D
 
@@ -165,15 +165,12 @@ def gabriel_edges(plan: FloatArray) -> BoolArray:
 
 IN_THE_WAY: Final = "#8a7355"
 """Colour of obstacles at the heights that were flown; the others are pale."""
-_FREE: Final = "#cfe6f5"
 LEGEND: Final[dict[str, Any]] = {
     "loc": "upper right", "frameon": True, "facecolor": PAPER, "edgecolor": "none", "framealpha": 0.85,
 }  # fmt: skip
 """Over obstacles."""
 _FLOWN_BAND_M = 0.75
 """Obstacles this far above and below the flown heights count as in the way."""
-_MAP_M = 12.0
-"""Half the side of the local map's figure."""
 
 
 def add_obstacles(axes: Axes, log: FlightLog) -> None:
@@ -191,19 +188,16 @@ def in_the_way(log: FlightLog) -> BoolArray:
 
 
 def obstacle_figure(log: FlightLog) -> Figure | None:
-    """Each drone's clearance over time and, of the drone that came nearest, its map of the obstacles just then.
+    """Each drone's clearance over time.
 
     None of a flight without obstacles.
     """
     radius_m = log.metadata.drone_radius_m
     if not len(log.clearance) or radius_m is None:
         return None
-    step, drone = np.unravel_index(int(np.argmin(log.clearance)), log.clearance.shape)
     with rc_context(STYLE):
         figure = Figure(figsize=(11.0, 4.4), layout="constrained")
-        curves, local = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
-        _clearance_curves(curves, log, radius_m)
-        _local_map(local, log, int(step), int(drone), radius_m)
+        _clearance_curves(figure.subplots(), log, radius_m)
     return figure
 
 
@@ -220,44 +214,6 @@ def _clearance_curves(axes: Axes, log: FlightLog, radius_m: float) -> None:
     axes.set(xlabel="time, s", ylabel="clearance, m", title="Distance to the nearest obstacle")
     axes.set_ylim(min(-0.2, float(free_m.min()) - 0.2), min(10.0, float(free_m.max()) + 0.5))
     axes.legend(loc="upper right", ncols=2)
-
-
-def _local_map(axes: Axes, log: FlightLog, step: int, drone: int, radius_m: float) -> None:
-    drones = log.clearance.shape[1]
-    north, east = log.position[step, drone, :2]
-    sectors = _sectors(log, step, drone) if len(log.obstacle_range) else []
-    for begin_deg, end_deg, range_m in sectors:
-        reach_m, angles = min(range_m, 2 * _MAP_M), np.radians([begin_deg, end_deg])
-        axes.add_patch(Wedge((east, north), reach_m, begin_deg, end_deg, color=_FREE, linewidth=0.6, zorder=0.5))
-        if math.isfinite(range_m):
-            edge = east + range_m * np.cos(angles), north + range_m * np.sin(angles)
-            axes.plot(*edge, color=INK, linewidth=1.6, zorder=3)
-    add_obstacles(axes, log)
-    for other in range(drones):
-        place = log.position[step, other]
-        axes.add_patch(Circle((place[1], place[0]), radius_m, color=colour_of(other, drones), zorder=4))
-    axes.set(
-        xlim=(east - _MAP_M, east + _MAP_M), ylim=(north - _MAP_M, north + _MAP_M),
-        xlabel="east, m", ylabel="north, m",
-        title=f"{drone_name(drone).capitalize()} at its nearest, t = {log.time_s[step]:g} s",
-    )  # fmt: skip
-    axes.set_aspect("equal")
-    handles = [Patch(color=IN_THE_WAY, label="obstacle"), Patch(color=GRID, label="above or below")]
-    if sectors:
-        handles += [Patch(color=_FREE, label="known free"), Patch(color=INK, label="range it knew")]
-    axes.legend(handles=handles, **LEGEND)
-
-
-def _sectors(log: FlightLog, step: int, drone: int) -> list[tuple[float, float, float]]:
-    """Begin and end in degrees from east to north, as matplotlib counts them, and the range of each known sector."""
-    ranges = log.obstacle_range[step, drone]
-    width = 360.0 / len(ranges)
-    middles = 90.0 - width * np.arange(len(ranges))
-    return [
-        (middle - width / 2, middle + width / 2, float(range_m))
-        for middle, range_m in zip(middles, ranges, strict=True)
-        if not np.isnan(range_m)
-    ]
 
 
 def _outline(row: Any) -> Circle | Rectangle:

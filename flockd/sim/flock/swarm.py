@@ -187,8 +187,6 @@ class ExactStatePilots:
             others = np.arange(len(positions)) != i
             relative = positions[others] - positions[i]
             builder.add_exact_states(step, i, others, relative, velocities, commands.velocity[i])
-            if (seen := commands.obstacles[i]) is not None:
-                builder.add_obstacles(step, i, seen)
         return commands
 
     def key_frames(self) -> list[KeyFrame]:

@@ -289,7 +289,7 @@ def test_what_a_short_flight_cannot_tell_is_null(steps: int) -> None:
 def test_a_single_drone_has_no_distances() -> None:
     log = _hand_made()
     alone: dict[str, Any] = {"tracked": log.tracked[:0]}
-    shared = ("time_s", "desired", "goal", "obstacles", "obstacle_range", "stages_ms", "metadata", *alone)
+    shared = ("time_s", "desired", "goal", "obstacles", "stages_ms", "metadata", *alone)
     for name in log.__dataclass_fields__:
         value = getattr(log, name)
         if name in ("neighbour_position", "neighbour_velocity"):
