@@ -15,9 +15,8 @@ from flockd.cli.parser import Commands, flag, option, positive_number, size
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
-    from flockd.ground.cameras.found import FoundCamera, Mode
-    from flockd.ground.cameras.listing import Computer
-    from flockd.ground.cameras.watching import Measured
+    from flockd.ground.cameras.listing import Computer, FoundCamera, Mode
+    from flockd.ground.cameras.watching import Watched
 
 SECONDS = 4.0
 NONE_FOUND = (
@@ -30,15 +29,14 @@ def add(commands: Commands) -> None:
     """Adds the command."""
     examples = (
         "flockd cameras",
-        "flockd cameras --measure --picture pictures",
+        "flockd cameras --picture pictures",
         "flockd cameras --size 1280x720 --names front back --write cameras.yaml",
         "flockd cameras --turn-deg 90 --write cameras.yaml",
     )
     description = "List the cameras of this computer, measure what they give, and write the configuration of them."
     parser = commands("cameras", description, examples, _run)
-    flag(parser, "--measure", "run all cameras and measure what comes")
+    option(parser, "--picture FOLDER", "run all cameras, measure what comes, and save an image of each", Path)
     option(parser, "--seconds S", f"measure this long ({SECONDS:g})", positive_number, default=SECONDS)
-    option(parser, "--picture FOLDER", "save an image of each camera; measures too", Path)
     option(parser, "--size WxH", "of an image, the nearest to this", size, default=(640, 480))
     option(parser, "--write FILE", "write the sections `rig` and `source` for them", Path)
     option(
@@ -70,8 +68,8 @@ def run(args: argparse.Namespace, computer: Computer) -> int:
         raise UnavailableError(NONE_FOUND)
     modes = [camera.best_mode(args.size) for camera in found]
     usable = [(camera, mode) for camera, mode in zip(found, modes, strict=True) if mode is not None]
-    measured: dict[str, Measured] = {}
-    if args.measure or args.picture is not None:
+    measured: dict[str, Watched] = {}
+    if args.picture is not None:
         from flockd.ground.cameras.watching import measure
 
         complain(f"measuring {len(usable)} cameras for {args.seconds:g} s")
@@ -84,12 +82,12 @@ def run(args: argparse.Namespace, computer: Computer) -> int:
     say_facts(args, facts)
     if args.write is not None:
         _write(args.write, usable, args.names, args.turn_deg)
-    faulty = any(camera.fault for camera in found) or any(row.watched.fault for row in measured.values())
+    faulty = any(camera.fault for camera in found) or any(row.fault for row in measured.values())
     return ExitCode.CHECK_FAILED if faulty else ExitCode.DONE
 
 
 def _write(file: Path, usable: Sequence[tuple[FoundCamera, Mode]], names: Sequence[str] | None, turn_deg: int) -> None:
-    from flockd.ground.cameras.found import camera_names, sections_text
+    from flockd.ground.cameras.listing import camera_names, sections_text
 
     if not usable:
         raise UsageError(f"{file} was not written, as no camera can be used; see what is wrong with each above")
@@ -99,17 +97,17 @@ def _write(file: Path, usable: Sequence[tuple[FoundCamera, Mode]], names: Sequen
     write_checked(file, sections_text(dict(zip(names, usable, strict=True)), turn_deg))
 
 
-def _save_pictures(folder: Path, found: Sequence[FoundCamera], measured: Mapping[str, Measured]) -> dict[str, Path]:
+def _save_pictures(folder: Path, found: Sequence[FoundCamera], measured: Mapping[str, Watched]) -> dict[str, Path]:
     """By the camera's place."""
-    from flockd.ground.cameras.watching import as_png
+    import cv2
 
     folder.mkdir(parents=True, exist_ok=True)
     saved = {}
     for number, camera in enumerate(found):
         row = measured.get(camera.place)
-        if row is not None and row.watched.image is not None:
+        if row is not None and row.image is not None:
             saved[camera.place] = folder / f"camera{number}.png"
-            saved[camera.place].write_bytes(as_png(row.watched.image))
+            cv2.imwrite(str(saved[camera.place]), cv2.cvtColor(row.image, cv2.COLOR_RGB2BGR))
     return saved
 
 
@@ -130,7 +128,7 @@ def _told(mode: Mode) -> str:
 
 
 def _facts(
-    camera: FoundCamera, chosen: Mode | None, measured: Mapping[str, Measured], pictures: Mapping[str, Path]
+    camera: FoundCamera, chosen: Mode | None, measured: Mapping[str, Watched], pictures: Mapping[str, Path]
 ) -> dict[str, object]:
     def mode_json(mode: Mode) -> dict[str, object]:
         return {"pixel_format": mode.pixel_format, "size_px": list(mode.size), "rates_hz": list(mode.rates_hz)}
@@ -147,20 +145,17 @@ def _facts(
     }
     row = measured.get(camera.place)
     if row is not None:
+        from flockd.ground.cameras.watching import edge_width_px
+
+        edge_px = math.nan if row.image is None else edge_width_px(row.image)
         shown["measured"] = {
-            "fault": row.watched.fault,
-            "rate_hz": row.watched.rate_hz,
-            "jitter_s": row.watched.jitter_s(),
-            "lost": row.watched.lost,
-            "refused": dict(row.watched.refused),
-            "edge_width_px": _number(row.edge_px),
-            "mean_grey": _number(row.mean_grey),
-            "black_share": _number(row.black_share),
-            "white_share": _number(row.white_share),
+            "fault": row.fault,
+            "rate_hz": row.rate_hz,
+            "jitter_s": row.jitter_s(),
+            "lost": row.lost,
+            "refused": dict(row.refused),
+            "edge_width_px": None if math.isnan(edge_px) else edge_px,
+            "mean_grey": None if row.image is None else float(row.image.mean()),
         }
         shown["picture"] = str(pictures[camera.place]) if camera.place in pictures else None
     return shown
-
-
-def _number(value: float) -> float | None:
-    return None if math.isnan(value) else value

@@ -6,7 +6,6 @@ import argparse
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -91,13 +90,9 @@ def _run(args: argparse.Namespace) -> int:
     pictures = find_pictures(args.pictures, but_not=args.out)
     labels = None if args.labels is None else read_labels(args.labels, pictures)
     config = _perception(drone, args.drone_size)
-    with ExitStack() as stack:
-        copies = None
-        if args.out is not None:
-            copies = stack.enter_context(Copies(args.out, pictures, args.every, overwrite=args.force))
-        detector = PictureDetector(config)
-        left_out: list[str] = []
-        detected = list(_detected(args, pictures, labels, detector, cameras, copies, left_out))
+    copies = None if args.out is None else Copies(args.out, pictures, overwrite=args.force)
+    left_out: list[str] = []
+    detected = list(_detected(args, pictures, labels, PictureDetector(config), cameras, copies, left_out))
     if left_out and not detected:
         raise DatasetError("\n".join(left_out))
     result = {**_result(detected, measure=labels is not None), "left_out": left_out}
@@ -210,7 +205,7 @@ def _detected(
                 result = detector.detect(image, camera).at_least(args.min_probability)
                 seconds = time.perf_counter() - begin
                 if copies is not None:
-                    copies.write(picture, annotated(image, result, known.boxes if known else ()))
+                    copies.write(picture, name, annotated(image, result, known.boxes if known else ()))
                 yield _Detected(name, result.detections, result.proposals, known, seconds)
                 done += 1
                 tell(done, max(done, count))

@@ -43,6 +43,7 @@ COMMANDS: Mapping[str, str] = {
     "flockd models bench": "`flockd replay RECORDING --profile` times the stages with the networks of --config",
     "flockd replay --speed": "leave it out: a replay shows nothing while it runs",
     "flockd report --ulog": "open PX4's log in Flight Review or PlotJuggler",
+    "flockd cameras --measure": "`flockd cameras --picture FOLDER` measures",
     "flockd calibrate rig --by": "fly, and take over what the flight found with `--from-flight RECORDING`",
     "flockd calibrate rig --max-offset": "a flight finds the time offset: `--from-flight RECORDING`",
     "flockd sim --verbose": "the report says what was flown, and `flockd config show SCENARIO` what a file stands for",

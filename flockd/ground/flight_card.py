@@ -3,18 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 from flockd.core.config import DroneConfig
 from flockd.core.config.mission import describe
 from flockd.flight.safety.policy import Reaction, rules
 
-PEOPLE = (
-    ("safety pilot of this drone", "arms, takes off, selects offboard; the mode switch under a finger all the time"),
-    ("safety pilot", "switches to another mode when the drone goes where nobody expected: flockd is silent at once"),
-    ("operator", "watches `flockd status`, says events aloud; sends orders only when the pilots know"),
-    ("observer", "watches people, birds and weather; says `stop` when anybody or anything comes near"),
-)
 REACTIONS = {
     Reaction.NOTE: "goes on, and says so",
     Reaction.DEGRADE: "flies slower",
@@ -26,92 +19,87 @@ REACTIONS = {
 }
 
 
+TEXT = """\
+# Flight-day card: {name}
+
+| date, place | | wind, light | |
+|---|---|---|---|
+| purpose, what is new | | flockd version | |
+
+## Limits
+
+| what | limit |
+|---|---|
+{limits}
+| PX4: `COM_OF_LOSS_T`, `COM_OBL_RC_ACT`, fence (by hand) | |
+
+## What each fault does
+
+| flockd then | faults, by their names in `flockd status` |
+|---|---|
+{faults}
+
+## Who does what
+
+| who | what | name |
+|---|---|---|
+| safety pilot of this drone | arms, takes off, selects offboard; the mode switch under a finger all the time | |
+| safety pilot | switches to another mode when the drone goes where nobody expected: flockd is silent at once | |
+| operator | watches `flockd status`, says events aloud; sends orders only when the pilots know | |
+| observer | watches people, birds and weather; says `stop` when anybody or anything comes near | |
+| over telemetry | may ask for {allowed} | |
+
+## Before and after
+
+- [ ] `flockd doctor` without FAILURE, WARNINGs understood; ten minutes of `flockd run` on a table
+- [ ] propellers off: offboard selected `normal`; another mode `silent` at once; a camera unplugged `degraded`
+- [ ] words agreed: `take over`, `land now`, `stop`
+- [ ] armed and brought up by the pilot to the height above; then offboard for ten seconds, and back by hand
+- [ ] after landing: disarmed, batteries off, `flockd report recordings`, every event understood
+
+May the next step of the plan be flown? Signed:
+"""
+
+
 def card(config: DroneConfig) -> str:
     """Markdown, one page when it is printed; ``config`` is what the drone flies with (`load_real_drone`)."""
-    return "\n".join((*_head(config), *_limits(config), *_faults(config), *_people(config), *_steps(config), ""))
+    return TEXT.format(
+        name=config.name,
+        limits="\n".join(f"| {what} | {limit} |" for what, limit in _limits(config).items()),
+        faults="\n".join(f"| {does} | {', '.join(names)} |" for does, names in _faults(config).items()),
+        allowed=", ".join(config.telemetry.commands) or "nothing: only the pilot's switch ends the flight",
+    )
 
 
-def _head(config: DroneConfig) -> Iterator[str]:
-    yield f"# Flight-day card: {config.name}"
-    yield ""
-    yield "| date, place | | wind, light | |"
-    yield "|---|---|---|---|"
-    yield "| purpose, what is new | | flockd version | |"
-    yield ""
-
-
-def _limits(config: DroneConfig) -> Iterator[str]:
-    gate, layer = config.safety.gate, config.safety.first_flight_layer
+def _limits(config: DroneConfig) -> dict[str, str]:
+    safety, gate, autopilot = config.safety, config.safety.gate, config.autopilot
     fences = [] if gate.fence_radius_m is None else [f"{gate.fence_radius_m:g} m around home"]
     fences += [f"a polygon of {len(gate.fence_corners_m)} corners"] if gate.fence_corners_m else []
-    yield "## Limits"
-    yield ""
-    yield "| what | limit |"
-    yield "|---|---|"
-    yield f"| first flight | {'no' if layer is None else f'yes: layer {layer}'} |"
-    yield f"| mission | {describe(config.mission)} |"
-    yield f"| speed wanted; let through | {config.flocking.max_speed_m_s:g}; {gate.max_speed_m_s:g} m/s |"
-    yield f"| slower when something is wrong | {gate.degraded_speed_m_s:g} m/s |"
-    yield f"| height above home | {gate.min_height_m:g} to {gate.max_height_m:g} m |"
-    yield f"| it flies at | {_height(config)} |"
-    yield f"| fence | {' and '.join(fences) or 'NONE'} |"
-    yield f"| level distance to a neighbour | {gate.min_separation_m:g} m |"
-    safety = config.safety
-    limits = f"{safety.degraded_velocity_error_m_s:g}; {safety.max_velocity_error_m_s:g} m/s"
-    yield f"| velocity off its setpoints: slower; Hold | {limits} |"
-    if config.autopilot is not None:
-        yield f"| battery counts as low at | {100 * config.autopilot.low_battery_share:.0f} % |"
-    alone_s = config.safety.alone_s
-    yield f"| alone for so long: Hold | {'never' if alone_s is None else f'{alone_s:g} s'} |"
-    yield "| PX4: `COM_OF_LOSS_T`, `COM_OBL_RC_ACT`, fence (by hand) | |"
-    yield ""
+    own_m = config.mission.height_m
+    height_m = own_m if own_m is not None or autopilot is None else autopilot.height_m
+    off = f"{safety.degraded_velocity_error_m_s:g}; {safety.max_velocity_error_m_s:g} m/s"
+    return {
+        "first flight": "no" if safety.first_flight_layer is None else f"yes: layer {safety.first_flight_layer}",
+        "mission": describe(config.mission),
+        "speed wanted; let through": f"{config.flocking.max_speed_m_s:g}; {gate.max_speed_m_s:g} m/s",
+        "slower when something is wrong": f"{gate.degraded_speed_m_s:g} m/s",
+        "height above home": f"{gate.min_height_m:g} to {gate.max_height_m:g} m",
+        "it flies at": (
+            "the height at which it is handed over" if height_m is None else f"{height_m:g} m above the ground at home"
+        ),
+        "fence": " and ".join(fences) or "NONE",
+        "level distance to a neighbour": f"{gate.min_separation_m:g} m",
+        "velocity off its setpoints: slower; Hold": off,
+        **({} if autopilot is None else {"battery counts as low at": f"{100 * autopilot.low_battery_share:.0f} %"}),
+        "alone for so long: Hold": "never" if safety.alone_s is None else f"{safety.alone_s:g} s",
+    }
 
 
-def _height(config: DroneConfig) -> str:
-    height_m = config.mission.height_m
-    if height_m is None and config.autopilot is not None:
-        height_m = config.autopilot.height_m
-    return "the height at which it is handed over" if height_m is None else f"{height_m:g} m above the ground at home"
-
-
-def _faults(config: DroneConfig) -> Iterator[str]:
-    yield "## What each fault does"
-    yield ""
-    yield "| flockd then | faults, by their names in `flockd status` |"
-    yield "|---|---|"
+def _faults(config: DroneConfig) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for event, rule in rules(config.safety).items():
         found.setdefault(REACTIONS[rule.reaction], []).append(f"`{event.value}`")
         if math.isfinite(rule.after_s):
             later = f"{REACTIONS[rule.later]} after {rule.after_s:g} s"
             found.setdefault(later, []).append(f"`{event.value}`")
-    for does, names in found.items():
-        yield f"| {does} | {', '.join(names)} |"
-    yield ""
-
-
-def _people(config: DroneConfig) -> Iterator[str]:
-    yield "## Who does what"
-    yield ""
-    yield "| who | what | name |"
-    yield "|---|---|---|"
-    for who, what in PEOPLE:
-        yield f"| {who} | {what} | |"
-    allowed = ", ".join(config.telemetry.commands) or "nothing: only the pilot's switch ends the flight"
-    yield f"| over telemetry | may ask for {allowed} | |"
-    yield ""
-
-
-def _steps(config: DroneConfig) -> Iterator[str]:
-    yield "## Before and after"
-    yield ""
-    for step in (
-        "`flockd doctor` without FAILURE, WARNINGs understood; ten minutes of `flockd run` on a table",
-        "propellers off: offboard selected `normal`; another mode `silent` at once; a camera unplugged `degraded`",
-        "words agreed: `take over`, `land now`, `stop`",
-        "armed and brought up by the pilot to the height above; then offboard for ten seconds, and back by hand",
-        "after landing: disarmed, batteries off, `flockd report recordings`, every event understood",
-    ):  # fmt: skip
-        yield f"- [ ] {step}"
-    yield ""
-    yield "May the next step of the plan be flown? Signed:"
+    return found

@@ -14,7 +14,7 @@ import numpy as np
 
 from flockd.core.config.source import SourceParameters
 from flockd.core.messages import UInt8Array
-from flockd.ground.cameras.found import FoundCamera, Mode
+from flockd.ground.cameras.listing import FoundCamera, Mode
 from flockd.onboard.sources.device_source import Devices, DeviceSource
 from flockd.onboard.sources.frames import CameraStatus, Count, FrameSource, RawFrame
 from flockd.onboard.sources.image_formats import CorruptImageError
@@ -145,40 +145,14 @@ _LEAST_CONTRAST = 30.0
 """Grey levels; a weaker edge has more noise than slope."""
 _SILENCE_S = 3.0
 """A camera without an image for this long is opened again: longer than two images of any are apart."""
-_BLACK, _WHITE = 4, 251
-"""Grey levels beyond which nothing can be told apart."""
 
 
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """One camera in one mode; numbers are NaN without an image."""
-
-    mode: Mode
-    watched: Watched
-    edge_px: float = math.nan
-    """See ``edge_width_px``."""
-    mean_grey: float = math.nan
-    """Mean grey, 0 to 255."""
-    black_share: float = math.nan
-    white_share: float = math.nan
-
-
-def measure(cameras: Sequence[tuple[FoundCamera, Mode]], seconds: float, kernel: Kernel) -> list[Measured]:
+def measure(cameras: Sequence[tuple[FoundCamera, Mode]], seconds: float, kernel: Kernel) -> list[Watched]:
     """Runs all cameras side by side, for ``seconds`` from their first image on."""
     modes = {f"camera{number}": mode for number, (_, mode) in enumerate(cameras)}
     entries = [camera.parameters(name, mode) for name, (camera, mode) in zip(modes, cameras, strict=True)]
     source = SourceParameters(kind="v4l2").model_copy(update={"cameras": entries, "silence_s": _SILENCE_S})
-    watched = watch({name: mode.size for name, mode in modes.items()}, source, seconds, Devices(kernel))
-    measured = []
-    for name, mode in modes.items():
-        image = watched[name].image
-        if image is None:
-            measured.append(Measured(mode, watched[name]))
-            continue
-        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        black, white = (float(np.mean(beyond)) for beyond in (grey <= _BLACK, grey >= _WHITE))
-        measured.append(Measured(mode, watched[name], edge_width_px(image), float(grey.mean()), black, white))
-    return measured
+    return list(watch({name: mode.size for name, mode in modes.items()}, source, seconds, Devices(kernel)).values())
 
 
 def edge_width_px(image: UInt8Array) -> float:
@@ -193,8 +167,3 @@ def edge_width_px(image: UInt8Array) -> float:
     contrast = np.asarray(cv2.dilate(grey, around) - cv2.erode(grey, around))
     steep = (slope >= np.percentile(slope, 100.0 - _STEEPEST)) & (contrast >= _LEAST_CONTRAST) & (slope > 0.0)
     return float(np.median(contrast[steep] / slope[steep])) if steep.any() else math.nan
-
-
-def as_png(image: UInt8Array) -> bytes:
-    """An RGB image as a file."""
-    return bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1])

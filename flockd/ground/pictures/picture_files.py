@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import cv2
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from flockd.core.config.base import Positive
@@ -65,12 +64,6 @@ class PictureFile:
             yield f"{self.path}#{index}", image
         if index is None:
             raise DatasetError(f"{self.path}: is no video that can be decoded; restore it, or convert it to MP4")
-
-    def rate_hz(self) -> float:
-        """Frames a second of a video; 30 where it does not say."""
-        with opened_video(self.path) as opened:
-            rate = float(opened.get(cv2.CAP_PROP_FPS))
-        return rate if np.isfinite(rate) and rate > 0 else 30.0
 
 
 def find_pictures(paths: Sequence[Path], but_not: Path | None = None) -> list[PictureFile]:

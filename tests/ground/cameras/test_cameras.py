@@ -126,8 +126,7 @@ def test_all_are_measured_side_by_side_and_pictured(computer: type[_Shelf], caps
         image = read_image(Path(row["picture"]))
         assert image[240, 100, 0] > 200
         assert image[240, 600, 0] < 100
-        assert row["measured"]["mean_grey"] == pytest.approx(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).mean(), abs=0.1)
-        assert row["measured"]["black_share"] == row["measured"]["white_share"] == 0.0
+        assert row["measured"]["mean_grey"] == pytest.approx(image.mean(), abs=0.1)
     assert third["picture"] is None
     assert "gave no usable image for 3 s; try another cable" in third["measured"]["fault"]
 

@@ -151,9 +151,7 @@ def test_frames_of_a_video_are_pictures(capsys: Capture, tmp_path: Path) -> None
     result = told_json(capsys, clip, *FOV, "--every", 2, "--out", tmp_path / "drawn")
     assert [picture["file"] for picture in result["pictures"]] == [f"{clip}#{k}" for k in (0, 2, 4)]
     assert all(len(picture["detections"]) == 1 for picture in result["pictures"])
-    drawn = cv2.VideoCapture(str(tmp_path / "drawn" / "clip.mp4"))
-    assert drawn.get(cv2.CAP_PROP_FRAME_COUNT) == 3
-    assert drawn.get(cv2.CAP_PROP_FPS) == pytest.approx(5.0)
+    assert {path.name for path in (tmp_path / "drawn").iterdir()} == {f"clip-{k}.png" for k in (0, 2, 4)}
 
 
 def drone_file(path: Path, cameras: tuple[str, ...] = ("front",)) -> Path:
