@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.options import add_force, permit, refuse_overwriting
+from flockd.cli.options import add_force, add_settings, permit, refuse_overwriting
 from flockd.cli.output import say, say_json, say_result
 from flockd.cli.parser import Commands, Parser, commands_of, flag, option
 from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, ModelError, UsageError
@@ -179,23 +179,8 @@ def _schema(args: argparse.Namespace) -> int:
 def _add_new_options(parser: Parser, kind: str) -> None:
     option(parser, "FILE", "to write", Path)
     flag(parser, "--force", "overwrite the file if it exists")
-    option(
-        parser,
-        "--set KEY=VALUE",
-        "write this value, as in `--set seed=3` or `--set 'mission={kind: hover}'`; may be given again",
-        _setting,
-        action="append",
-        default=[],
-        dest="settings",
-    )
+    add_settings(parser, "write this value")
     parser.set_defaults(kind=kind)
-
-
-def _setting(text: str) -> tuple[str, str]:
-    key, equals, value = text.partition("=")
-    if not equals or re.fullmatch(r"\w+(\.\w+)*", key) is None:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a key and its value, as in seed=3")
-    return key, value
 
 
 def _new(args: argparse.Namespace) -> int:

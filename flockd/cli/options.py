@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import getpass
+import re
 import socket
 from collections.abc import Sequence
 from pathlib import Path
@@ -60,6 +61,26 @@ def endpoints(args: argparse.Namespace) -> tuple[list[str], list[str]]:
     """Where to listen and what to connect to, as the options say; else the default alone."""
     listen, connect = args.drones_at or [], args.connect or []
     return listen, connect if connect or listen else [ENDPOINT]
+
+
+def add_settings(parser: Parser, what: str) -> None:
+    """Adds --set, whose keys and values, as they were written, are `settings`."""
+    option(
+        parser,
+        "--set KEY=VALUE",
+        f"{what}, as in `--set seed=3` or `--set 'mission={{kind: hover}}'`; may be given again",
+        _setting,
+        action="append",
+        default=[],
+        dest="settings",
+    )
+
+
+def _setting(text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not equals or re.fullmatch(r"\w+(\.\w+)*", key) is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a key and its value, as in seed=3")
+    return key, value
 
 
 def require(*paths: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import html
-import math
 import os
 import re
 import signal
@@ -19,18 +18,19 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 from flockd.cli.fleet import HERE, PORT, serve_page
 from flockd.cli.flight_summary import report_flight
-from flockd.cli.options import ENDPOINT, add_operator_option
+from flockd.cli.options import ENDPOINT, add_operator_option, add_settings
 from flockd.cli.output import Phases, complain, say
 from flockd.cli.parser import Commands, flag, option, port_number, positive_count, positive_number, whole_number
-from flockd.core.choices import TRUTH_ROLES, AutopilotKind, CameraPreset, HeightSource, ScaleSource, SimulatedPerception
+from flockd.core.choices import TRUTH_ROLES, AutopilotKind, SimulatedPerception
 from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, UsageError
 
 if TYPE_CHECKING:
     from flockd.core.config import Overrides
+    from flockd.core.config.document import Value
     from flockd.fleet.page.page_server import PageServer
     from flockd.onboard.recording import Recorder
     from flockd.sim.scenario import ScenarioConfig
@@ -45,18 +45,8 @@ costs, with five drones on a processor without 8-bit instructions:
   disk       31 MB for the report and what it is made of
   --record   another 4.5 MB a drone and simulated second: 2.5 GB for the whole flight
 Try `--duration 10 --drones 3` first. Ctrl-C ends a flight early, with a report of what was flown and exit code 130."""
-OPTIONS = {
-    "duration": "duration_s",
-    "seed": "seed",
-    "flow": "drone.perception.flow",
-    "scale": "drone.perception.scale",
-    "height": "drone.perception.height",
-    "wind": "vehicle.wind_m_s",
-    "speed": "drone.mission.speed_m_s",
-    "radius": "drone.mission.radius_m",
-    "cameras": "cameras.preset",
-}
-"""Which key of the configuration an option sets."""
+OPTIONS = {"duration": "duration_s", "seed": "seed"}
+"""Which key of the scenario an option sets."""
 _NOT_LIVE = {
     "telemetry": "--live has --telemetry in it; drop one of them",
     "record": "--live keeps nothing; fly with --record and without --live",
@@ -79,13 +69,13 @@ def add(commands: Commands) -> None:
     examples = (
         "flockd sim --duration 10 --drones 3",
         "flockd sim",
-        "flockd sim --duration 20 --wind 3,-1 --speed 1.5 --radius 15 --out out/windy",
+        "flockd sim --duration 20 --set vehicle.wind_m_s=[3,-1] --set drone.mission.speed_m_s=1.5 --out out/windy",
         "flockd sim --perception truth --json > truth.json",
         "flockd sim --live --perception truth",
         "flockd sim --live config/forest.yaml --drones 3",
         "flockd sim --perception truth --telemetry --drones 25 --duration 600",
-        "flockd sim my_flight.yaml --flow dis --seed 7",
-        "flockd sim config/fisheye_flight.yaml --cameras realistic --duration 20",
+        "flockd sim my_flight.yaml --set drone.perception.flow=dis --seed 7",
+        "flockd sim config/fisheye_flight.yaml --set cameras.preset=realistic --duration 20",
         "flockd sim --record --duration 20",
         "flockd sim --autopilot standin --drones 2 --duration 20",
         "flockd sim config/px4_flight.yaml --autopilot px4",
@@ -112,17 +102,9 @@ def add(commands: Commands) -> None:
         f"with --autopilot: how fast simulated time passes (default: {DEFAULT_SPEED_FACTOR})",
         positive_number,
     )
-    option(parser, "--flow NAME", "the model for optical flow, or `dis`")
-    option(parser, "--scale", "where the background's scale comes from", choices=get_args(ScaleSource))
-    option(
-        parser, "--height", "what measures the height above ground that gives the scale", choices=get_args(HeightSource)
-    )
-    option(parser, "--cameras", "as bad as real ones, or without any of their faults", choices=get_args(CameraPreset))
+    add_settings(parser, "fly with this value of the scenario's, or of the drone's below `drone.`")
     option(parser, "--drones N", "size of the flock", _flock_size)
     option(parser, "--duration S", "seconds to fly; it changes the world", positive_number)
-    option(parser, "--wind N,E", "mean wind in m/s, to the north and to the east", _wind)
-    option(parser, "--speed V", "desired speed of the flock in m/s", positive_number)
-    option(parser, "--radius R", "of the circle in m, measured at the flock's centre", positive_number)
     option(parser, "--seed N", "of the world and of all noise", whole_number("a whole number, 0 or more"))
     option(
         parser,
@@ -170,16 +152,6 @@ def add(commands: Commands) -> None:
     flag(parser, "--json", "print the summary as JSON")
 
 
-def _wind(text: str) -> tuple[float, float]:
-    try:
-        north, east = (float(number) for number in text.split(","))
-    except ValueError:
-        north = east = math.nan
-    if not (math.isfinite(north) and math.isfinite(east)):
-        raise argparse.ArgumentTypeError(f"{text!r} is not two numbers such as 2.0,-1.5")
-    return north, east
-
-
 def _flock_size(text: str) -> int:
     from flockd.sim.scenario import MAX_DRONES
 
@@ -199,8 +171,8 @@ def _roles(text: str) -> frozenset[str]:
 
 def _run(args: argparse.Namespace) -> int:
     _check_options(args)
-    args.settings = _settings_of(args)
     scenario = _scenario(args)
+    args.settings = _settings_of(args)
     if args.live:
         return _fly_live(args, scenario, _plain(scenario.scenario))
     directory = _folder(scenario, args)
@@ -280,9 +252,10 @@ def _check_options(args: argparse.Namespace) -> None:
     _check_live(args)
     _check_fleet(args)
     if args.perception == "truth":
-        idle = [option for option in ("flow", "scale", "height", "cameras", "swap", "record") if getattr(args, option)]
+        idle = [f"--set {key}" for key, _ in args.settings if key.startswith(("drone.perception.", "cameras."))]
+        idle += [f"--{option}" for option in ("swap", "record") if getattr(args, option)]
         if idle:
-            raise UsageError(f"--{idle[0]} has no meaning without networks; drop it or --perception truth")
+            raise UsageError(f"{idle[0]} has no meaning without networks; drop it or --perception truth")
 
 
 def _scenario(args: argparse.Namespace) -> ScenarioConfig:
@@ -292,7 +265,8 @@ def _scenario(args: argparse.Namespace) -> ScenarioConfig:
     from flockd.sim.scenario import load_scenario
 
     overrides: Overrides = {
-        key: getattr(args, option) for option, key in OPTIONS.items() if getattr(args, option) is not None
+        **{key: _value(key, text) for key, text in args.settings},
+        **{key: getattr(args, option) for option, key in OPTIONS.items() if getattr(args, option) is not None},
     }
     try:
         scenario = load_scenario(args.scenario or data_path("config") / SCENARIO, overrides)
@@ -305,14 +279,30 @@ def _scenario(args: argparse.Namespace) -> ScenarioConfig:
     return scenario
 
 
+def _value(key: str, text: str) -> Value:
+    """What was written behind --set, as a file would hold it."""
+    import yaml
+
+    def with_tuples(value: Any) -> Value:
+        if isinstance(value, dict):
+            return {str(name): with_tuples(inner) for name, inner in value.items()}
+        return tuple(with_tuples(inner) for inner in value) if isinstance(value, list) else value
+
+    try:
+        return with_tuples(yaml.safe_load(text))
+    except yaml.YAMLError as error:
+        raise UsageError(f"--set {key}: {text!r} is no YAML ({str(error).splitlines()[0]}); quote it") from error
+
+
 def _of_option(problem: ConfigProblem) -> ConfigProblem:
     """With the option's name where an option gave the value."""
     from flockd.core.config.loader import OVERRIDE
 
     options = {key: option for option, key in OPTIONS.items()}
-    if problem.file != OVERRIDE or problem.key not in options:
+    if problem.file != OVERRIDE:
         return problem
-    return replace(problem, file=f"--{options[problem.key]}", key="")
+    option = options.get(problem.key)
+    return replace(problem, file="--set") if option is None else replace(problem, file=f"--{option}", key="")
 
 
 def _folder(scenario: ScenarioConfig, args: argparse.Namespace) -> Path:
@@ -329,27 +319,21 @@ def _folder(scenario: ScenarioConfig, args: argparse.Namespace) -> Path:
 
 
 def _folder_name(scenario: ScenarioConfig, args: argparse.Namespace) -> str:
-    set_otherwise = "".join(
-        f"-{option}" if value == "yes" else f"-{option}_{re.sub('[^A-Za-z0-9_.,+-]+', '-', Path(value).name)}"
-        for option, value in args.settings.items()
-        if option != "seed"
-    )
+    told = {
+        name: re.sub("[^A-Za-z0-9_.,+-]+", "-", Path(value).name).strip("-") for name, value in args.settings.items()
+    }
+    set_otherwise = "".join(f"-{k}" if v == "yes" else f"-{k}_{v}" for k, v in told.items() if k != "seed")
     return f"{_plain(scenario.scenario)}-{args.autopilot or args.perception}{set_otherwise}-seed{scenario.seed}"
 
 
 def _settings_of(args: argparse.Namespace) -> dict[str, str]:
     """What options set otherwise than the scenario's file, as text; what differs between two flights of it."""
     values = {option: getattr(args, option) for option in (*OPTIONS, "drones")}
-    settings = {option: _as_text(value) for option, value in values.items() if value is not None}
+    settings = {option: f"{value:g}" for option, value in values.items() if value is not None}
+    settings |= {key.rpartition(".")[2]: value for key, value in args.settings}
     if args.swap:
         settings["swap"] = ",".join(sorted(args.swap))
     return settings if args.gated else {**settings, "no-gate": "yes"}
-
-
-def _as_text(value: object) -> str:
-    if isinstance(value, tuple):
-        return ",".join(_as_text(part) for part in value)
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _plain(name: str) -> str:

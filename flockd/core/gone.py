@@ -46,6 +46,18 @@ COMMANDS: Mapping[str, str] = {
     "flockd cameras --measure": "`flockd cameras --picture FOLDER` measures",
     "flockd calibrate rig --by": "fly, and take over what the flight found with `--from-flight RECORDING`",
     "flockd calibrate rig --max-offset": "a flight finds the time offset: `--from-flight RECORDING`",
+    **{
+        f"flockd sim --{option}": f"write `--set {key}=VALUE`"
+        for option, key in {
+            "flow": "drone.perception.flow",
+            "scale": "drone.perception.scale",
+            "height": "drone.perception.height",
+            "wind": "vehicle.wind_m_s",
+            "speed": "drone.mission.speed_m_s",
+            "radius": "drone.mission.radius_m",
+            "cameras": "cameras.preset",
+        }.items()
+    },
     "flockd sim --verbose": "the report says what was flown, and `flockd config show SCENARIO` what a file stands for",
     **dict.fromkeys(
         (f"flockd calibrate camera --{option}" for option in ("size", "pixel-format", "turn-deg")),
