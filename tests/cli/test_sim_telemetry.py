@@ -53,18 +53,8 @@ SECONDS_TO_FAIL = 240.0
 def test_an_order_is_flown_by_sight(tmp_path: Path) -> None:
     """The command as a process: drones that see take an order over telemetry and fly there; Ctrl-C ends it in order."""
     endpoint, out = free_endpoint(), tmp_path / "out"
-    options = [
-        "--duration",
-        "60",
-        "--drones",
-        "2",
-        "--set",
-        "drone.perception.flow=dis",
-        "--out",
-        str(out),
-        "--telemetry-at",
-        endpoint,
-    ]
+    options = ["--duration", "60", "--drones", "2", "--out", str(out), "--telemetry-at", endpoint]
+    options += ["--set", "drone.perception.flow=dis"]
     command = [sys.executable, "-c", RUN, "sim", "--telemetry", *options]
     drones = ("paper_flight/drone1", "paper_flight/drone2")
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as flight:
