@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from flockd.review.replay.dataset_flight import Depth
 
 _OF_RECORDINGS = ("start", "end", "out", "diff", "reference", "update_reference", "tolerance")
-_OF_DATASETS = ("depth", "stride", "flow", "calibration", "trajectory")
+_OF_DATASETS = ("depth", "stride", "flow")
 
 
 def add(commands: Commands) -> None:
@@ -34,7 +34,7 @@ def add(commands: Commands) -> None:
         "flockd replay drone1.mcap --config my_drone.yaml --out again.mcap",
         "flockd replay drone1.mcap --diff --reference drone1.expected --tolerance command=1e-6",
         "flockd replay drone1.mcap --reference drone1.expected --update-reference",
-        "flockd replay rgbd_folder --depth recorded --stride 3 --trajectory path.txt",
+        "flockd replay rgbd_dataset_freiburg1_xyz --depth recorded --stride 3",
         "flockd replay flight_bag --config my_drone.yaml --vehicle /mavros/local_position/odom",
     )
     description = "Run the pilot on a recorded flight again: the same frames and vehicle states, the same code."
@@ -238,20 +238,17 @@ def _add_dataset(parser: Parser) -> None:
     )
     option(group, "--stride N", "pair frame i with frame i + N (default: 1)", positive_count)
     option(group, "--flow NAME", "use this flow model, or `dis`")
-    option(group, "--calibration FILE", "K.txt, or a drone's YAML with one camera", Path)
-    option(group, "--trajectory FILE", "write the integrated path in TUM format", Path)
 
 
 def _run_dataset(args: argparse.Namespace) -> int:
     """Runs the command for a dataset."""
     refuse(args, _OF_RECORDINGS, "is for recordings of flockd, and this is none; leave it out")
-    refuse_overwriting(args, args.trajectory)
     from flockd.ground.datasets.image_folder import open_dataset
-    from flockd.review.replay.dataset_flight import dataset_config, dataset_result, replay_dataset, write_trajectory
+    from flockd.review.replay.dataset_flight import dataset_config, dataset_result, replay_dataset
 
     stride = args.stride or 1
     depth: Depth = args.depth or "network"
-    dataset = open_dataset(args.recording, args.calibration)
+    dataset = open_dataset(args.recording)
     if depth == "recorded" and not dataset.has_depth:
         raise UsageError(f"{dataset.path}: has no recorded depth; replay it with --depth network")
     if stride >= len(dataset):
@@ -265,13 +262,6 @@ def _run_dataset(args: argparse.Namespace) -> int:
     with progress("replaying", "pairs") as show_progress:
         pairs = replay_dataset(dataset, config, stride, depth, show_progress)
     result = {**dataset_result(pairs), "stride": stride, "depth": depth, "flow": config.perception.flow}
-    if args.trajectory is not None:
-        broken = write_trajectory(args.trajectory, pairs, stride)
-        if broken is not None:
-            complain(
-                f"{args.trajectory}: ends at frame {broken.before.index}, as the motion to frame {broken.after.index} "
-                f"could not be estimated: {broken.reason}"
-            )
     lines = [f"not estimated: {p['from']} to {p['to']}: {p['reason']}" for p in result["pairs"] if not p["estimated"]]
     say_facts(args, result if args.json else {**result, "pairs": len(pairs)}, *lines)
     if not any(pair.found for pair in pairs):

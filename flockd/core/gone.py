@@ -41,6 +41,8 @@ COMMANDS: Mapping[str, str] = {
     "flockd record export --ros2": "Foxglove opens the recording itself; record a flight's topics of `flockd ros`",
     "flockd record export --format": "tables are CSV, which pandas, Polars and DuckDB read too; leave it out",
     "flockd models bench": "`flockd replay RECORDING --profile` times the stages with the networks of --config",
+    "flockd replay --trajectory": "`--json` gives the motion of each pair, to be put together",
+    "flockd replay --calibration": "write the camera's matrix into the dataset's K.txt",
     "flockd replay --speed": "leave it out: a replay shows nothing while it runs",
     "flockd report --ulog": "open PX4's log in Flight Review or PlotJuggler",
     "flockd cameras --measure": "`flockd cameras --picture FOLDER` measures",

@@ -4,7 +4,7 @@
     python -m tools.training.render_drone_crops OUT --mesh MY.glb --size-m 0.55 --worlds 40
 
 Only the window of the camera's image that the crops show is drawn. Every drone stands in another place. One file a
-world. With --mesh (glTF, STL or OBJ) that drone alone flies. With --held-out, in test worlds and with ranges, that
+world. With --mesh (glTF) that drone alone flies. With --held-out, in test worlds and with ranges, that
 drone, or the families that no network learns from.
 """
 
@@ -25,7 +25,7 @@ from flockd.sim.renderer.drone_models import drone_model
 from tools.training import worlds
 from tools.training.dataset import FOCAL_PX, HEIGHT, R_BODY_CAMERA, WIDTH
 from tools.training.drone_generator import generated_drone
-from tools.training.own_mesh import UP_AXES, painted, read_meshes
+from tools.training.own_mesh import painted, read_meshes
 from tools.training.samples import DroneInView, crop_around, crop_at, sample_of, sample_without_drone
 
 Array = NDArray[Any]
@@ -82,9 +82,6 @@ def add_mesh(parser: argparse.ArgumentParser) -> None:
     """What says which drone flies."""
     parser.add_argument("--mesh", type=Path, nargs="+", help="of a drone, with propellers and colours; several: any")
     parser.add_argument("--size-m", type=float, help="of --mesh: widest horizontal distance, propeller tip to tip, m")
-    parser.add_argument(
-        "--up", choices=UP_AXES, help="the mesh's axis that points up: by default y of glTF, z of others"
-    )
 
 
 def own_drone(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> list[DroneModel]:
@@ -94,7 +91,7 @@ def own_drone(parser: argparse.ArgumentParser, arguments: argparse.Namespace) ->
     if arguments.size_m is None:
         parser.error("--mesh needs --size-m, the drone's size: a mesh's unit and a range are nothing without it")
     try:
-        drones = read_meshes(arguments.mesh, arguments.size_m, arguments.up)
+        drones = read_meshes(arguments.mesh, arguments.size_m)
     except ValueError as error:
         parser.error(str(error))
     for path, drone in zip(arguments.mesh, drones, strict=True):

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -28,13 +27,11 @@ from flockd.flight.geometry import (
     RigidTransform,
     ZMap,
     build_rig,
-    quaternion_from_rotation,
     rotation_angle_deg,
 )
 from flockd.flight.perception import Crop, ImageNetworks, OneByOne, RangeEstimate, SceneMaps, load_networks
 from flockd.flight.pilot import FlockPilot
 from flockd.ground.datasets.image_folder import Dataset, DatasetFrame
-from flockd.onboard.recording.editing import written_whole
 
 Depth = Literal["recorded", "network"]
 
@@ -85,14 +82,6 @@ def dataset_result(pairs: Sequence[Pair]) -> dict[str, Any]:
         "translation_error_m": _spread([translation for _, translation in errors]),
         "estimated_ratio": sum(pair.found is not None for pair in pairs) / len(pairs),
     }
-
-
-def write_trajectory(path: Path, pairs: Sequence[Pair], stride: int) -> Pair | None:
-    """Writes the integrated path in TUM format; returns the pair that it ends before, None for a whole path."""
-    track, broken = integrate(pairs, stride)
-    with written_whole(path) as draft:
-        draft.write_text(tum_text(track), encoding="utf-8")
-    return broken
 
 
 def _pair_result(pair: Pair) -> dict[str, Any]:
@@ -212,30 +201,3 @@ def fly_pairs(
 
 def _blind(moment: DatasetFrame, output: PilotOutput) -> list[str]:
     return [f"frame {moment.index}: {reason}" for reason in output.reasons if reason.kind is ReasonKind.CAMERA]
-
-
-def integrate(pairs: Iterable[Pair], stride: int) -> tuple[list[tuple[float, RigidTransform]], Pair | None]:
-    """Times and camera poses (``T_world_camera``) by one motion after the other, every ``stride``-th frame.
-
-    It begins at the first frame's true pose, or at the origin. It ends before the first motion that is not known,
-    which is given too: where the camera went then is not known.
-    """
-    path: list[tuple[float, RigidTransform]] = []
-    for pair in pairs:
-        if pair.before.index % stride:
-            continue
-        if not path:
-            path.append((pair.before.time_s, pair.before.T_world_camera or RigidTransform.identity()))
-        if pair.found is None:
-            return path, pair
-        path.append((pair.after.time_s, path[-1][1] @ pair.found))
-    return path, None
-
-
-def tum_text(path: Iterable[tuple[float, RigidTransform]]) -> str:
-    """The path in the TUM format: time, position, quaternion x y z w; one pose a line."""
-    lines = ["# timestamp tx ty tz qx qy qz qw"]
-    for time_s, pose in path:
-        numbers = (*pose.translation, *quaternion_from_rotation(pose.rotation))
-        lines.append(f"{time_s:.6f} {' '.join(f'{number:.9f}' for number in numbers)}")
-    return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""A short scene of a rendered world with exact depth and poses, written down in each layout."""
+"""A short scene of a rendered world with exact depth and poses, written down as a dataset."""
 
 from __future__ import annotations
 
@@ -84,20 +84,8 @@ def times_s() -> list[float]:
     return [START_S + PERIOD_S * k for k in range(FRAMES)]
 
 
-def write_rgbd_folder(scene: Scene, path: Path) -> Path:
-    for folder in ("images", "depth"):
-        (path / folder).mkdir(parents=True)
-    for k, (image, depth) in enumerate(zip(scene.images, scene.depth, strict=True)):
-        name = f"{10 + 3 * k:05}.png"  # numbers have gaps
-        _write(path / "images" / name, image)
-        cv2.imwrite(str(path / "depth" / name), _units(depth, 1000.0))
-    np.savetxt(path / "K.txt", OTHERS_MATRIX)
-    np.savetxt(path / "poses.txt", scene.poses.reshape(-1, 16), fmt="%.6e")
-    return path
-
-
 def write_tum(scene: Scene, path: Path) -> Path:
-    """Depth 4 ms after its image; one image more, without any; poses at other times than the images."""
+    """Depth 4 ms after its image; poses at other times than the images."""
     for folder in ("rgb", "depth"):
         (path / folder).mkdir(parents=True)
     rgb, maps = ["# color images", "# timestamp filename"], ["# depth maps"]
@@ -107,9 +95,6 @@ def write_tum(scene: Scene, path: Path) -> Path:
         _write(path / "rgb" / f"{time_s:.6f}.png", image)
         maps.append(f"{time_s + 0.004:.6f} depth/{time_s + 0.004:.6f}.png")
         cv2.imwrite(str(path / "depth" / f"{time_s + 0.004:.6f}.png"), _units(depth, 5000.0))
-    late_s = times_s()[-1] + PERIOD_S / 2
-    rgb.append(f"{late_s:.6f} rgb/{late_s:.6f}.png")
-    _write(path / "rgb" / f"{late_s:.6f}.png", scene.images[-1])
     (path / "rgb.txt").write_text("\n".join(rgb) + "\n")
     (path / "depth.txt").write_text("\n".join(maps) + "\n")
     np.savetxt(path / "K.txt", OTHERS_MATRIX)

@@ -1,4 +1,4 @@
-"""Datasets of others, replayed: each layout gives the motions that were rendered, or one sentence about itself."""
+"""Datasets of others, replayed: they give the motions that were rendered, or one sentence about themselves."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def onlooker(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def folder(scene: Scene, tmp_path: Path, onlooker: None) -> Path:
-    return rendered_dataset.write_rgbd_folder(scene, tmp_path / "folder")
+    return rendered_dataset.write_tum(scene, tmp_path / "folder")
 
 
 def replayed(capsys: Capture, *arguments: str | Path) -> dict[str, Any]:
@@ -43,25 +43,11 @@ def replayed(capsys: Capture, *arguments: str | Path) -> dict[str, Any]:
     return result
 
 
-def rgbd_folder(scene: Scene, path: Path) -> list[str | Path]:
-    return [rendered_dataset.write_rgbd_folder(scene, path), "--depth", "recorded"]
-
-
-def tum(scene: Scene, path: Path) -> list[str | Path]:
-    return [rendered_dataset.write_tum(scene, path), "--depth", "recorded"]
-
-
-@pytest.mark.parametrize("layout", [rgbd_folder, tum])
 @pytest.mark.parametrize("stride", [1, 2])
-def test_each_layout_gives_the_motions_that_were_rendered(
-    layout: Callable[[Scene, Path], list[str | Path]],
-    stride: int,
-    scene: Scene,
-    tmp_path: Path,
-    onlooker: None,
-    capsys: Capture,
+def test_a_dataset_gives_the_motions_that_were_rendered(
+    stride: int, scene: Scene, folder: Path, capsys: Capture
 ) -> None:
-    result = replayed(capsys, *layout(scene, tmp_path), "--stride", f"{stride}", "--flow", "dis")
+    result = replayed(capsys, folder, "--depth", "recorded", "--stride", f"{stride}", "--flow", "dis")
     assert [(pair["from"], pair["to"]) for pair in result["pairs"]] == [(k, k + stride) for k in range(FRAMES - stride)]
     for pair in result["pairs"]:
         motion = scene.motion(pair["from"], pair["to"])
@@ -83,35 +69,16 @@ def test_the_figures_are_those_of_the_pairs(folder: Path, capsys: Capture) -> No
         assert result[error] == pytest.approx(expected)
 
 
-def test_the_trajectory_is_the_path_that_was_rendered(
-    scene: Scene, folder: Path, tmp_path: Path, capsys: Capture
-) -> None:
-    path = tmp_path / "path.txt"
-    replayed(capsys, folder, "--depth", "recorded", "--stride", "2", "--trajectory", path)
-    rows = np.loadtxt(path)
-    assert rows[:, 0].tolist() == [0.0, 2.0, 4.0]
-    for row, pose in zip(rows, scene.poses[::2], strict=True):
-        assert np.allclose(row[1:4], pose[:3, 3], atol=0.03)
-        off = Rotation.from_quat(row[4:]) * Rotation.from_matrix(pose[:3, :3]).inv()
-        assert np.degrees(off.magnitude()) < 0.2
-
-
-def test_a_pair_without_an_estimate_says_why_and_is_no_standstill(
-    folder: Path, tmp_path: Path, capsys: Capture
-) -> None:
-    image = sorted((folder / "images").iterdir())[3]
+def test_a_pair_without_an_estimate_says_why_and_is_no_standstill(folder: Path, capsys: Capture) -> None:
+    image = sorted((folder / "rgb").iterdir())[3]
     cv2.imwrite(str(image), np.full((HEIGHT, WIDTH, 3), 90, np.uint8))  # somebody's hand over the lens
-    path = tmp_path / "path.txt"
-    assert main(["replay", str(folder), "--depth", "recorded", "--json", "--trajectory", str(path)]) == 0
-    captured = capsys.readouterr()
-    pairs = json.loads(captured.out)["pairs"]
+    result = replayed(capsys, folder, "--depth", "recorded")
+    pairs = result["pairs"]
     assert [pair["estimated"] for pair in pairs] == [True, True, False, False, True]
     for pair in pairs[2:4]:
         assert "frame 3: camera camera: no frame" in pair["reason"]
         assert pair["rotation_error_deg"] is pair["translation_error_m"] is pair["inlier_ratio"] is None
-    assert json.loads(captured.out)["estimated_ratio"] == pytest.approx(0.6)
-    assert len(np.loadtxt(path)) == 3  # where it went then, nobody saw
-    assert "path.txt: ends at frame 2" in captured.err
+    assert result["estimated_ratio"] == pytest.approx(0.6)
 
 
 def test_too_little_depth_is_no_motion(folder: Path, capsys: Capture) -> None:
@@ -125,12 +92,11 @@ def test_too_little_depth_is_no_motion(folder: Path, capsys: Capture) -> None:
     assert "no motion could be estimated: ego-motion: fewer than three pairs" in captured.err
 
 
-def test_an_image_without_depth_of_its_time_is_left_out_and_reported(
-    scene: Scene, tmp_path: Path, onlooker: None, capsys: Capture
-) -> None:
-    rendered_dataset.write_tum(scene, tmp_path)
-    assert main(["replay", str(tmp_path), "--depth", "recorded"]) == 0
-    assert "1 of 7 images have no depth map within 0.02 s" in capsys.readouterr().err
+def test_an_image_without_depth_of_its_time_is_left_out_and_reported(folder: Path, capsys: Capture) -> None:
+    maps = folder / "depth.txt"
+    maps.write_text("".join(maps.read_text().splitlines(keepends=True)[:-1]))
+    assert main(["replay", str(folder), "--depth", "recorded"]) == 0
+    assert "1 of 6 images have no depth map within 0.02 s" in capsys.readouterr().err
 
 
 # What people's files come with.
@@ -141,12 +107,12 @@ def third(folder: Path) -> Path:
 
 
 def cut_short(folder: Path) -> None:
-    file = third(folder / "images")
+    file = third(folder / "rgb")
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
 
 
 def flip_a_bit(folder: Path) -> None:
-    file = third(folder / "images")
+    file = third(folder / "rgb")
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 1
     file.write_bytes(data)
@@ -154,28 +120,23 @@ def flip_a_bit(folder: Path) -> None:
 
 def cut_jpeg(folder: Path) -> None:
     _, data = cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8))
-    third(folder / "images").write_bytes(data.tobytes()[:-500])
-
-
-def with_poses(change: Callable[[np.ndarray], object]) -> Callable[[Path], None]:
-    """``change`` is given the matrices (n, 4, 4), and changes them."""
-
-    def happen(folder: Path) -> None:
-        poses = np.loadtxt(folder / "poses.txt").reshape(-1, 4, 4)
-        change(poses)
-        np.savetxt(folder / "poses.txt", poses.reshape(-1, 16))
-
-    return happen
-
-
-def transpose(poses: np.ndarray) -> None:
-    """Their translation comes into the last row."""
-    poses[:] = poses.transpose(0, 2, 1).copy()
+    third(folder / "rgb").write_bytes(data.tobytes()[:-500])
 
 
 def drawn(kind: str, image: np.ndarray) -> Callable[[Path], object]:
     """In the place of the third image or depth map."""
     return lambda folder: cv2.imwrite(str(third(folder / kind)), image)
+
+
+def with_poses(change: Callable[[np.ndarray], object]) -> Callable[[Path], None]:
+    """``change`` is given the rows of time, place and quaternion, and changes them."""
+
+    def happen(folder: Path) -> None:
+        rows = np.loadtxt(folder / "groundtruth.txt")
+        change(rows)
+        np.savetxt(folder / "groundtruth.txt", rows)
+
+    return happen
 
 
 def calibrated(matrix: np.ndarray) -> Callable[[Path], object]:
@@ -190,28 +151,29 @@ ODD = "200 0 160\n0 200 120\n0 0 one\n"
 @pytest.mark.parametrize(
     ("happen", "code", "words"),
     [
-        (cut_short, 1, "00016.png: the PNG ends too early"),
-        (flip_a_bit, 1, "00016.png: the PNG is damaged at byte"),
-        (cut_jpeg, 1, "00016.png: the JPEG ends too early"),
-        (lambda folder: third(folder / "images").unlink(), 1, "depth/00016.png: its image is missing"),
-        (lambda folder: third(folder / "depth").unlink(), 1, "depth/00016.png: is missing; each image needs its depth"),
-        (lambda folder: np.savetxt(folder / "poses.txt", np.ones((5, 16))), 1, "poses.txt: has 5 poses, and"),
-        (with_poses(transpose), 1, "poses.txt: pose 1: its last row is not 0 0 0 1"),
-        (with_poses(lambda poses: poses[4, :3].__imul__(1.1)), 1, "pose 5: its first three columns are no rotation"),
-        (with_poses(lambda poses: poses[4].fill(-np.inf)), 1, "poses.txt:5: does not fit"),
-        (drawn("depth", np.zeros((HEIGHT, WIDTH), np.uint16)), 1, "00016.png: its depth is 0 everywhere"),
+        (cut_short, 1, ".png: the PNG ends too early"),
+        (flip_a_bit, 1, ".png: the PNG is damaged at byte"),
+        (cut_jpeg, 1, ".png: the JPEG ends too early"),
+        (lambda folder: third(folder / "rgb").unlink(), 1, ".png: is missing; restore it"),
+        (lambda folder: (folder / "rgb.txt").unlink(), 1, "is no dataset; it needs rgb.txt"),
+        (lambda folder: (folder / "rgb.txt").write_text("1.0 rgb/a\0b.png\n"), 1, "(embedded null byte)"),
+        (with_poses(lambda rows: rows[:, :1].__iadd__(1000.0)), 1, "has no pose at the time of any image"),
+        (with_poses(lambda rows: rows[:, :1].fill(1.0)), 1, "groundtruth.txt: its times do not increase"),
+        (with_poses(lambda rows: rows[4].fill(-np.inf)), 1, "groundtruth.txt:5: does not fit"),
+        (with_poses(lambda rows: rows[4, 4:].fill(0.0)), 1, "groundtruth.txt: a quaternion is all zero"),
+        (drawn("depth", np.zeros((HEIGHT, WIDTH), np.uint16)), 1, ".png: its depth is 0 everywhere"),
         (drawn("depth", np.full((HEIGHT, WIDTH), 200, np.uint8)), 1, "is no depth map; it needs one channel of 16"),
-        (drawn("depth", np.full(SMALL, 2000, np.uint16)), 1, "00016.png: is 160 x 120 pixels, and the camera 320"),
-        (drawn("images", np.zeros((*SMALL, 3), np.uint8)), 1, "00016.png: is 160 x 120 pixels, and the camera 320"),
+        (drawn("depth", np.full(SMALL, 2000, np.uint16)), 1, ".png: is 160 x 120 pixels, and the camera 320"),
+        (drawn("rgb", np.zeros((*SMALL, 3), np.uint8)), 1, ".png: is 160 x 120 pixels, and the camera 320"),
         (calibrated(DOUBLED), 78, "K.txt: is the calibration of another size"),
         (calibrated(HALVED), 78, "K.txt: is the calibration of another size"),
         (lambda folder: (folder / "K.txt").unlink(), 78, "K.txt: does not exist"),
         (lambda folder: (folder / "K.txt").write_text(ODD), 1, "K.txt:3: does not fit; it needs a 3x3 matrix"),
     ],
     ids=[
-        "cut short", "flipped bit", "cut JPEG", "no image", "no depth map", "a pose too few", "poses turned round",
-        "scaled pose", "lost track", "no depth", "coarse depth", "small depth", "small image", "doubled calibration",
-        "halved calibration", "no calibration", "odd calibration",
+        "cut short", "flipped bit", "cut JPEG", "no image", "no list", "odd name", "poses of another time",
+        "one time", "lost track", "no turn", "no depth", "coarse depth", "small depth", "small image",
+        "doubled calibration", "halved calibration", "no calibration", "odd calibration",
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_one_sentence(
@@ -219,37 +181,14 @@ def test_what_is_wrong_is_one_sentence(
     code: int,
     words: str,
     folder: Path,
-    tmp_path: Path,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     happen(folder)
-    path = tmp_path / "path.txt"
-    assert main(["replay", str(folder), "--depth", "recorded", "--json", "--trajectory", str(path)]) == code
+    assert main(["replay", str(folder), "--depth", "recorded", "--json"]) == code
     captured = capfd.readouterr()
     assert words in captured.err
     assert captured.err.count("\n") == 1
     assert captured.out == ""
-    assert not list(tmp_path.glob("*path.txt*"))
-
-
-def test_a_listed_image_that_is_gone_is_named(
-    scene: Scene, tmp_path: Path, onlooker: None, capfd: pytest.CaptureFixture[str]
-) -> None:
-    rendered_dataset.write_tum(scene, tmp_path)
-    gone = sorted((tmp_path / "rgb").iterdir())[3]
-    gone.unlink()
-    assert main(["replay", str(tmp_path), "--depth", "network"]) == 1
-    assert f"{gone}: is missing" in capfd.readouterr().err
-
-
-def test_poses_of_another_time_are_named(scene: Scene, tmp_path: Path, onlooker: None, capsys: Capture) -> None:
-    rendered_dataset.write_tum(scene, tmp_path)
-    truth = tmp_path / "groundtruth.txt"
-    rows = np.loadtxt(truth)
-    rows[:, 0] += 1000.0
-    np.savetxt(truth, rows)
-    assert main(["replay", str(tmp_path), "--depth", "recorded"]) == 1
-    assert "groundtruth.txt: has no pose at the time of any image" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -257,30 +196,17 @@ def test_poses_of_another_time_are_named(scene: Scene, tmp_path: Path, onlooker:
     [
         (["--diff"], "--diff is for recordings of flockd"),
         (["--stride", "6"], "has 6 frames, and none 6 after another"),
-        (["--trajectory", "K.txt"], "K.txt: exists; name another file"),
     ],
 )
 def test_what_cannot_be_asked_of_a_dataset(arguments: list[str], words: str, folder: Path, capsys: Capture) -> None:
-    arguments = [str(folder / "K.txt") if argument == "K.txt" else argument for argument in arguments]
     assert main(["replay", str(folder), *arguments]) == 2
     assert words in capsys.readouterr().err
 
 
 def test_a_folder_without_depth_says_so(folder: Path, capsys: Capture) -> None:
-    shutil.rmtree(folder / "depth")
+    (folder / "depth.txt").unlink()
     assert main(["replay", str(folder), "--depth", "recorded"]) == 2
     assert "has no recorded depth; replay it with --depth network" in capsys.readouterr().err
-
-
-def test_a_folder_of_something_else_is_no_dataset(tmp_path: Path, capsys: Capture) -> None:
-    assert main(["replay", str(tmp_path)]) == 1
-    assert "is no folder of images; it needs images/, or rgb.txt" in capsys.readouterr().err
-
-
-def test_a_name_that_cannot_be_a_path_is_one_sentence(tmp_path: Path, capsys: Capture) -> None:
-    (tmp_path / "rgb.txt").write_text("1.0 rgb/a\0b.png\n", encoding="utf-8")
-    assert main(["replay", str(tmp_path)]) == 1
-    assert "b.png: cannot be read (embedded null byte); restore it" in capsys.readouterr().err
 
 
 def test_real_images_give_real_motions(tmp_path: Path, capsys: Capture) -> None:
@@ -288,13 +214,17 @@ def test_real_images_give_real_motions(tmp_path: Path, capsys: Capture) -> None:
     data = Path(os.environ.get("FLOCKD_DATA", "/nonexistent")) / "hololens"
     if not data.is_dir():
         pytest.skip("FLOCKD_DATA does not name a folder with hololens/ in it")
-    for folder in ("images", "depth"):
-        (tmp_path / folder).mkdir()
-        for file in sorted((data / folder).iterdir())[:6]:
-            shutil.copy(file, tmp_path / folder)
+    times = range(6)
+    images, maps = (sorted((data / name).iterdir()) for name in ("images", "depth"))
+    for k in times:
+        shutil.copy(images[k], tmp_path)
+        cv2.imwrite(str(tmp_path / f"depth{k}.png"), 5 * cv2.imread(str(maps[k]), cv2.IMREAD_UNCHANGED))
+    (tmp_path / "rgb.txt").write_text("".join(f"{k} {images[k].name}\n" for k in times))
+    (tmp_path / "depth.txt").write_text("".join(f"{k} depth{k}.png\n" for k in times))
+    poses = np.loadtxt(data / "poses.txt").reshape(-1, 4, 4)[: len(times)]
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    np.savetxt(tmp_path / "groundtruth.txt", np.column_stack([times, poses[:, :3, 3], turns]))
     shutil.copy(data / "K.txt", tmp_path)
-    poses = (data / "poses.txt").read_text().splitlines()[:6]
-    (tmp_path / "poses.txt").write_text("\n".join(poses))
     result = replayed(capsys, tmp_path, "--depth", "recorded", "--flow", "dis")
     assert result["estimated_ratio"] == 1.0
     assert result["rotation_error_deg"]["median"] < 0.3

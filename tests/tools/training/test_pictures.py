@@ -138,8 +138,8 @@ def test_a_mesh_without_the_drones_size_is_refused(capsys: pytest.CaptureFixture
 def test_a_drone_of_a_mesh_flies_alone_and_a_network_is_measured_on_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bars = [trimesh.creation.box(size) for size in ((0.6, 0.08, 0.05), (0.08, 0.6, 0.05))]
-    mesh = tmp_path / "drone.stl"
+    bars = [trimesh.creation.box(size) for size in ((0.6, 0.05, 0.08), (0.08, 0.05, 0.6))]
+    mesh = tmp_path / "drone.glb"
     whole: Any = trimesh.util.concatenate(bars)
     whole.export(mesh)
     parser = argparse.ArgumentParser()
