@@ -1,13 +1,13 @@
-"""`flockd calibrate`: measures the lenses of cameras and their places in the rig, by a board or by a flight."""
+"""`flockd calibrate`: measures the lenses of cameras by a board, and their mountings by a flight."""
 
 from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from flockd.cli.options import loaded, opened, refuse_overwriting
 from flockd.cli.output import complain, progress, say_facts, say_result
@@ -26,23 +26,18 @@ def add(commands: Commands) -> None:
     examples = (
         "flockd calibrate camera --print-board board.pdf",
         "flockd calibrate camera pictures/ --camera front",
-        "flockd calibrate rig --config my_drone.yaml",
+        "flockd calibrate rig --from-flight drone1.mcap",
     )
     commands = commands_of(commands("calibrate", "Measure the cameras: lenses, mountings, time offsets.", examples))
     _add_camera(commands)
     _add_rig(commands)
 
 
-def _add_shared(parser: Parser, help_of_config: str) -> None:
+def _add_shared(parser: Parser) -> None:
     """Adds what both commands have."""
-    option(parser, "--config FILE", help_of_config, Path)
     option(parser, "--out FILE", "where the result goes (CAMERA.yaml or rig.yaml)", Path)
     flag(parser, "--force", "overwrite what is there")
-    option(parser, "--every N", "take every Nth frame (1)", positive_count, default=1)
     flag(parser, "--json", "print the result as JSON")
-    board = parser.add_argument_group("the board", "as it was printed; measure it, printers shrink")
-    option(board, "--squares CxR", "columns x rows (7x5)", size, default=(7, 5))
-    option(board, "--square-mm MM", "of a square's side (36)", positive_number, default=36.0)
 
 
 def _board_of(args: argparse.Namespace) -> BoardSpec:
@@ -85,7 +80,12 @@ def _add_camera(commands: Commands) -> None:
     option(parser, "--camera NAME", "the camera's name in the rig")
     option(parser, "--model", "default: pinhole, unless the other fits clearly better", choices=LENS_MODELS)
     option(parser, "--print-board FILE", "write the board to print (.pdf)", Path)
-    _add_shared(parser, "the drone, for its camera's device and serial")
+    option(parser, "--config FILE", "the drone, for its camera's device and serial", Path)
+    option(parser, "--every N", "take every Nth frame (1)", positive_count, default=1)
+    _add_shared(parser)
+    board = parser.add_argument_group("the board", "as it was printed; measure it, printers shrink")
+    option(board, "--squares CxR", "columns x rows (7x5)", size, default=(7, 5))
+    option(board, "--square-mm MM", "of a square's side (36)", positive_number, default=36.0)
 
 
 def _camera(args: argparse.Namespace) -> int:
@@ -109,11 +109,11 @@ def _camera(args: argparse.Namespace) -> int:
     out = args.out or Path(f"{name}.yaml")
     refuse_overwriting(args, out)
     with progress("detecting the board", "images") as on_image, _ended_by_ctrl_c(images.live):
-        collect_views(images, name, collector, on_image, complain)
+        collect_views(images, collector, on_image, complain)
     lenses = fit_lenses(collector, args.model, _source_name(args))
     lens = simplest_that_fits(lenses)
     measured = measured_today(
-        camera=images.identities[name],
+        camera=images.identity,
         source=_source_name(args),
         views=len(lens.views),
         residual_px=round(lens.rms_px, 4),
@@ -160,15 +160,16 @@ def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, 
         if config is None:
             raise UsageError("no SOURCE was given; name images, a recording or a device, or --config for its camera")
         name = _name_in(config, args, str(args.config))
-        return name, image_sources.from_cameras(image_sources.with_one_camera(config, name), str(args.config), enough)
+        return name, image_sources.from_camera(config, str(args.config), name, enough)
     if path.suffix.lower() == ".mcap":
-        found, recorded = image_sources.from_recording(opened(path), args.every)
-        return _name_in(recorded, args, str(path)), found
+        recording = opened(path)
+        name = _name_in(recording.config, args, str(path))
+        return name, image_sources.from_recording(recording, name, args.every)
     name = args.camera or "camera" if config is None else _name_in(config, args, str(args.config))
     if not re.fullmatch("[a-z0-9_-]+", name):
         raise UsageError(f"--camera {name}: a camera's name has small letters, digits, _ and - only")
     if path.is_dir():
-        return name, image_sources.from_folder(path, name)
+        return name, image_sources.from_folder(path)
     fault = "does not exist; check the path"
     if path.exists():
         fault = "is no folder or recording; name one, or for a live camera the drone with --config"
@@ -186,84 +187,17 @@ def _name_in(config: DroneConfig, args: argparse.Namespace, where: str) -> str:
 
 def _add_rig(commands: Commands) -> None:
     """Adds the command."""
-    examples = (
-        "flockd calibrate rig --config my_drone.yaml",
-        "flockd calibrate rig pictures/ --config my_drone.yaml --reference front",
-        "flockd calibrate rig --from-flight drone1.mcap",
-    )
-    description = (
-        "Measure the cameras' mountings: relative poses, from a board that two of them see at once; or what a "
-        "flight found of orientation in the body, time offset and focal length."
-    )
-    parser = commands("rig", description, examples, _rig)
-    help_of_source = (
-        "a folder with a folder of images for each camera, or a recording; by default --config's cameras, live"
-    )
-    option(parser, "SOURCE", help_of_source, nargs="?")
-    option(parser, "--reference NAME", "the camera whose mounting --config gives (default: the first)")
-    option(parser, "--from-flight RECORDING", "take over what this flight found of its own rig", Path)
-    _add_shared(parser, "the drone, with its cameras' intrinsics; a recording has its own")
+    description = "Take over what a flight found of its own rig: the cameras' mountings, time offset and focal lengths."
+    parser = commands("rig", description, ("flockd calibrate rig --from-flight drone1.mcap",), _rig)
+    option(parser, "--from-flight RECORDING", "the flight", Path, required=True)
+    _add_shared(parser)
 
 
 def _rig(args: argparse.Namespace) -> int:
-    out = args.out or Path("rig.yaml")
-    refuse_overwriting(args, out)
-    return _by_board(args, out) if args.from_flight is None else _from_flight(args, out)
-
-
-def _by_board(args: argparse.Namespace, out: Path) -> int:
-    from flockd.flight.geometry import build_rig
-    from flockd.ground.calibration.board import BoardFinder
-    from flockd.ground.calibration.rig import SharedCollector, calibrate_rig, collect_boards, write_fit
-
-    config, images = _rig_images(args)
-    where, rig = str(args.config or args.source), build_rig(config.rig).cameras
-    if len(rig) < 2:
-        raise UsageError(f"{where}: has one camera; a rig that is calibrated by a board has two or more")
-    reference = args.reference or next(iter(rig))
-    if reference not in rig:
-        raise UsageError(f"{where}: has no camera {reference!r}; choose --reference from {', '.join(rig)}")
-    collector = SharedCollector(BoardFinder(_board_of(args)))
-    with progress("detecting the board", "images") as on_image, _ended_by_ctrl_c(images.live):
-        collect_boards(
-            images, config, where, collector, on_image,
-            lambda links: complain(f"boards seen together: {links}; Ctrl-C ends it"),
-        )  # fmt: skip
-    cameras = {name: one.camera for name, one in rig.items()}
-    mountings = calibrate_rig(cameras, collector.boards, reference, rig[reference].T_body_camera)
-    return _say_rig(args, write_fit(mountings, config, where, _source_name(args), images.identities, out))
-
-
-def _from_flight(args: argparse.Namespace, out: Path) -> int:
-    from flockd.core.errors import ConfigError
     from flockd.ground.calibration.from_flight import corrected_rig
 
-    if args.source is not None:
-        raise UsageError("--from-flight names the recording; drop SOURCE")
-    recording, config = opened(args.from_flight), loaded(args.config)
-    if config is not None and config.rig != recording.config.rig:
-        message = f"is not the rig that {args.from_flight} was flown with, which is what it found the errors of"
-        raise ConfigError.at(str(args.config), f"{message}; drop --config", "rig")
-    result = corrected_rig(recording, str(args.from_flight), out)
-    return _say_rig(args, result)
-
-
-def _rig_images(args: argparse.Namespace) -> tuple[DroneConfig, ImageStream]:
-    """And the drone they are of: that of --config before that of the recording."""
-    from flockd.ground.calibration import image_sources
-
-    config = loaded(args.config)
-    path = None if args.source is None else Path(args.source)
-    if path is not None and not path.is_dir():
-        found, recorded = image_sources.from_recording(opened(path), args.every)
-        return config or recorded, found
-    if config is None:
-        raise UsageError("the cameras' intrinsics are not known; name the drone's file with --config")
-    if path is None:
-        return config, image_sources.from_cameras(config, str(args.config), lambda: False)
-    return config, image_sources.from_folders(path, [camera.name for camera in config.rig.cameras])
-
-
-def _say_rig(args: argparse.Namespace, result: Mapping[str, Any]) -> int:
+    out = args.out or Path("rig.yaml")
+    refuse_overwriting(args, out)
+    result = corrected_rig(opened(args.from_flight), str(args.from_flight), out)
     advice = "put it in place of rig in your drone's file, then run flockd config check on that"
-    return say_facts(args, result, f"written: {result['out']}; {advice}")
+    return say_facts(args, result, f"written: {out}; {advice}")

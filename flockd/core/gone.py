@@ -46,7 +46,13 @@ COMMANDS: Mapping[str, str] = {
     "flockd replay --speed": "leave it out: a replay shows nothing while it runs",
     "flockd report --ulog": "open PX4's log in Flight Review or PlotJuggler",
     "flockd cameras --measure": "`flockd cameras --picture FOLDER` measures",
-    "flockd calibrate rig --by": "fly, and take over what the flight found with `--from-flight RECORDING`",
+    **dict.fromkeys(
+        (
+            f"flockd calibrate rig --{option}"
+            for option in ("by", "reference", "config", "every", "squares", "square-mm")
+        ),
+        "measure with a tape, fly, and take over what the flight found with `--from-flight RECORDING`",
+    ),
     "flockd calibrate rig --max-offset": "a flight finds the time offset: `--from-flight RECORDING`",
     **{
         f"flockd sim --{option}": f"write `--set {key}=VALUE`"
@@ -73,14 +79,11 @@ COMMANDS: Mapping[str, str] = {
         "write it in the section `perception` of a drone's file, and name that with --config",
     ),
     **dict.fromkeys(
-        (f"flockd calibrate {what} --{option}" for what in ("camera", "rig") for option in ("dictionary", "marker-mm")),
+        (f"flockd calibrate camera --{option}" for option in ("dictionary", "marker-mm")),
         "print flockd's own board with `flockd calibrate camera --print-board`",
     ),
     **dict.fromkeys(
-        (
-            *(f"flockd calibrate camera --{option}" for option in ("views", "max-blur", "serial", "seconds")),
-            "flockd calibrate rig --seconds",
-        ),
+        (f"flockd calibrate camera --{option}" for option in ("views", "max-blur", "serial", "seconds")),
         "leave it out",
     ),
     "flockd calibrate drone": "measure from tip to tip, with propellers, and write `perception.drone_size_m`",

@@ -17,7 +17,7 @@ import pytest
 
 from flockd.cli import main
 from flockd.core.config import DroneConfig, load_drone
-from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
+from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.messages import Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
 from flockd.ground.calibration.board import BoardFinder, BoardSpec
 from flockd.ground.calibration.image_sources import identity
@@ -26,7 +26,6 @@ from flockd.onboard.sources import CameraStatus
 from flockd.onboard.sources.device_source import Devices
 from tests.ground.calibration import darkroom
 from tests.ground.calibration.darkroom import PINHOLE, WIDE, facing, photograph
-from tests.ground.calibration.test_rig import MOUNTS, boards_between, in_camera
 from tests.make import filled
 from tests.onboard.sources.fake_kernel import FakeCamera, FakeKernel
 
@@ -239,56 +238,6 @@ def test_the_board_is_printed_in_its_true_size(tmp_path: Path, capsys: Capture) 
 
 
 WIDE_LENS = IntrinsicsConfig(model="wide_angle", fx=WIDE.fx, fy=WIDE.fy, cx=WIDE.cx, cy=WIDE.cy, distortion=WIDE.k)
-
-
-def drone(*names: str) -> DroneConfig:
-    """Its front camera known, the others about where somebody thinks they are."""
-    places = {
-        "front": ExtrinsicsConfig(position_m=(0.10, 0.01, 0.02), yaw_deg=2.0, pitch_deg=-10.0, roll_deg=1.0),
-        "right": ExtrinsicsConfig(yaw_deg=90.0),
-        "left": ExtrinsicsConfig(position_m=(0.0, -0.1, 0.0), yaw_deg=-90.0),
-    }
-    cameras = tuple(
-        CameraConfig(name=name, size_px=WIDE.size, intrinsics=WIDE_LENS, extrinsics=places[name]) for name in names
-    )
-    return DroneConfig(rig=RigConfig(cameras=cameras))
-
-
-def test_a_rig_is_calibrated_from_folders(tmp_path: Path, capsys: Capture) -> None:
-    config, shots, out = tmp_path / "drone.yaml", tmp_path / "shots", tmp_path / "rig.yaml"
-    config.write_text(json.dumps(drone("front", "right").model_dump(mode="json", exclude_defaults=True)))
-    for name in ("front", "right"):
-        (shots / name).mkdir(parents=True)
-    for number, board in enumerate(boards_between("front", "right", 7, 1)):
-        for k, name in enumerate(("front", "right")):
-            write(
-                shots / name / f"{number}.png", photograph(WIDE, in_camera(board, MOUNTS[name]), seed=10 * number + k)
-            )
-    command = ("calibrate", "rig", shots, "--config", config, "--out", out)
-    text = told(capsys, 0, *command)
-    assert "reference: front" in text
-    assert re.search(r"yaw_deg: 8[78]\.\d+", text)
-    told(capsys, 0, "config", "check", out)
-    front, right = load_drone(out).rig.cameras
-    assert front.extrinsics == drone("front").rig.cameras[0].extrinsics
-    assert (right.extrinsics.yaw_deg, right.extrinsics.pitch_deg) == pytest.approx((88.0, 3.0), abs=0.2)
-    assert right.extrinsics.position_m == pytest.approx((-0.01, 0.11, 0.0), abs=0.002)
-    assert right.extrinsics.measured is not None
-    assert right.extrinsics.measured.source.endswith("against front")
-    assert "exists" in told(capsys, 2, *command)
-    assert "has no camera 'up'" in told(capsys, 2, *command, "--force", "--reference", "up")
-    assert "name the drone's file with --config" in told(capsys, 2, "calibrate", "rig", shots, "--out", tmp_path / "a")
-    small = drone("front", "right").model_dump(mode="json", exclude_defaults=True)
-    small["rig"]["cameras"][1]["size_px"] = [640, 480]
-    config.write_text(json.dumps(small))
-    assert "of camera 'right' is 640 x 480, and its image 0 has 480 x 360 pixels" in told(
-        capsys, 78, *command, "--force"
-    )
-    for file in (shots / "right").glob("[3-9].png"):
-        file.unlink()
-    (shots / "right" / "0.png").unlink()
-    config.write_text(json.dumps(drone("front", "right").model_dump(mode="json", exclude_defaults=True)))
-    assert "camera 'right' shares 2 boards with front, and needs 3" in told(capsys, 1, *command, "--force")
 
 
 def record_walls(path: Path, steps: int) -> None:

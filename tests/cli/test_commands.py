@@ -83,8 +83,8 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["sims"], "flockd: 'sims' is not a command; did you mean `flockd sim`?; see flockd --help"),
         (["status", "--once"], "flockd status: unknown argument --once; see flockd status --help"),
         (
-            ["calibrate", "rig", "--once", "2"],
-            "flockd calibrate rig: unknown argument --once; see flockd calibrate rig",
+            ["calibrate", "camera", "--once", "2"],
+            "flockd calibrate camera: unknown argument --once; see flockd calibrate camera",
         ),
         (["record", "xyz"], "flockd record: 'xyz' is not a command, of info, recover, cut, export; see "),
         (["fleet", "--port", "99999"], "flockd fleet: argument --port: '99999' is not a port"),

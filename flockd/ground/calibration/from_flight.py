@@ -104,8 +104,6 @@ def corrected_rig(recording: Recording, source: str, out: Path) -> dict[str, Any
     total_s = round(config.time_offset_s + (offset_s or 0.0), 4)
     write_rig(out, cameras, total_s)
     return {
-        "by": "flight",
-        "reference": None,
         "cameras": results,
         "time_offset_s": total_s,
         "notes": notes,

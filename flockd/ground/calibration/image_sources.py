@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,88 +23,55 @@ SYSFS = Path("/sys/class/video4linux")
 
 
 @dataclass(frozen=True, eq=False)
-class ImageSet:
-    """What several cameras saw at one time."""
-
-    name: str
-    images: Mapping[str, UInt8Array]
-    """(h, w, 3) RGB by camera."""
-
-
-@dataclass(frozen=True, eq=False)
 class ImageStream:
-    """Sets of images, one after the other."""
+    """One camera's images, one after the other."""
 
-    sets: Iterator[ImageSet]
+    images: Iterator[tuple[str, UInt8Array]]
+    """Name, and (h, w, 3) RGB."""
     count: int
     """How many there are about; 0 for a live camera."""
     live: bool
-    identities: Mapping[str, str]
-    """What identifies each camera: its serial number where it has one."""
+    identity: str
+    """What identifies the camera: its serial number where it has one."""
 
 
-def from_folder(path: Path, camera: str) -> ImageStream:
-    """All images of a folder, by name, as those of one camera. Raises CalibrationError where there are none."""
-    files = _images(path)
+def from_folder(path: Path) -> ImageStream:
+    """All images of a folder, by name. Raises CalibrationError where there are none."""
+    files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
     if not files:
         raise CalibrationError(f"{path}: has no images; name the folder they are in")
-    sets = (ImageSet(file.name, {camera: read_image(file)}) for file in files)
-    return ImageStream(sets, len(files), live=False, identities={camera: f"not known (images in {path.name})"})
+    images = ((file.name, read_image(file)) for file in files)
+    return ImageStream(images, len(files), live=False, identity=f"not known (images in {path.name})")
 
 
-def from_folders(path: Path, cameras: Sequence[str]) -> ImageStream:
-    """A folder for each camera within one; images of the same name were taken at the same time."""
-    missing = [camera for camera in cameras if not (path / camera).is_dir()]
-    if missing:
-        raise CalibrationError(
-            f"{path / missing[0]}: is no folder; make one for each camera of the rig, with its images"
-        )
-    files = {camera: {file.stem: file for file in _images(path / camera)} for camera in cameras}
-    names = sorted({name for of_camera in files.values() for name in of_camera})
-    if not names:
-        raise CalibrationError(f"{path}: has no images in its cameras' folders")
-    sets = (
-        ImageSet(name, {camera: read_image(found[name]) for camera, found in files.items() if name in found})
-        for name in names
-    )
-    identities = {camera: f"not known (images in {path.name}/{camera})" for camera in cameras}
-    return ImageStream(sets, len(names), live=False, identities=identities)
-
-
-def from_recording(recording: Recording, every: int) -> tuple[ImageStream, DroneConfig]:
-    """Every ``every``-th step of a recording, and the configuration in it. Reading raises RecordingError."""
+def from_recording(recording: Recording, name: str, every: int) -> ImageStream:
+    """A camera's images in every ``every``-th step of a recording. Reading raises RecordingError."""
     config = recording.config
-    sets = (
-        ImageSet(
-            f"{step.frames.time_s - recording.start_s:.2f} s",
-            {name: frame.image for name, frame in step.frames.frames.items()},
-        )
+    images = (
+        (f"{step.frames.time_s - recording.start_s:.2f} s", step.frames.frames[name].image)
         for step in recording.steps()
-        if step.number % every == 0
+        if step.number % every == 0 and name in step.frames.frames
     )
-    places = {} if config.source is None else {camera.name: f", {camera.place}" for camera in config.source.cameras}
-    identities = {
-        camera.name: camera.intrinsics.measured.camera
-        if camera.intrinsics.measured
-        else f"not known ({camera.name} of {recording.drone}{places.get(camera.name, '')})"
-        for camera in config.rig.cameras
-    }
-    return ImageStream(sets, -(-len(recording.contents.steps) // every), live=False, identities=identities), config
+    cameras = () if config.source is None else config.source.cameras
+    places = {camera.name: f", {camera.place}" for camera in cameras}
+    measured = next(camera.intrinsics.measured for camera in config.rig.cameras if camera.name == name)
+    known = measured.camera if measured else f"not known ({name} of {recording.drone}{places.get(name, '')})"
+    return ImageStream(images, -(-len(recording.contents.steps) // every), live=False, identity=known)
 
 
-def from_cameras(config: DroneConfig, file: str, enough: Callable[[], bool]) -> ImageStream:
-    """Frames of a drone's live cameras, until it is enough, the time is up or Ctrl-C. Raises ConfigError.
+def from_camera(config: DroneConfig, file: str, name: str, enough: Callable[[], bool]) -> ImageStream:
+    """Frames of a drone's live camera, until it is enough, the time is up or Ctrl-C. Raises ConfigError.
 
     Reading raises UnavailableError when no frame comes.
     """
-    source = open_source(config, file)
-    cameras = () if config.source is None else config.source.cameras
-    devices = {camera.name: camera.device for camera in cameras if camera.device}
-    identities = {
-        camera.name: identity(Path(devices[camera.name])) if camera.name in devices else f"not known ({camera.name})"
-        for camera in config.rig.cameras
-    }
-    return ImageStream(_frames(source, enough), 0, live=True, identities=identities)
+    rig = config.rig.model_copy(update={"cameras": tuple(one for one in config.rig.cameras if one.name == name)})
+    source, device = config.source, None
+    if source is not None and source.cameras:
+        source = source.model_copy(update={"cameras": tuple(one for one in source.cameras if one.name == name)})
+        device = source.cameras[0].device
+    images = _frames(open_source(config.model_copy(update={"rig": rig, "source": source}), file), name, enough)
+    known = identity(Path(device)) if device else f"not known ({name})"
+    return ImageStream(images, 0, live=True, identity=known)
 
 
 def identity(device: Path, sysfs: Path = SYSFS) -> str:
@@ -117,16 +84,7 @@ def identity(device: Path, sysfs: Path = SYSFS) -> str:
     return f"{_text(entry / 'name') or 'not known'}, {device}"
 
 
-def with_one_camera(config: DroneConfig, name: str) -> DroneConfig:
-    """The same drone with one camera."""
-    rig = config.rig.model_copy(update={"cameras": tuple(one for one in config.rig.cameras if one.name == name)})
-    source = config.source
-    if source is not None and source.cameras:
-        source = source.model_copy(update={"cameras": tuple(one for one in source.cameras if one.name == name)})
-    return config.model_copy(update={"rig": rig, "source": source})
-
-
-def _frames(source: FrameSource, enough: Callable[[], bool]) -> Iterator[ImageSet]:
+def _frames(source: FrameSource, name: str, enough: Callable[[], bool]) -> Iterator[tuple[str, UInt8Array]]:
     source.start()
     began_s, seen = time.monotonic(), False
     try:
@@ -134,7 +92,8 @@ def _frames(source: FrameSource, enough: Callable[[], bool]) -> Iterator[ImageSe
             frames = source.newest(FRAME_WAIT_S)
             if frames is not None:
                 seen = True
-                yield ImageSet(f"{since_s:.1f} s", {name: one.image for name, one in frames.frames.items()})
+                if name in frames.frames:
+                    yield f"{since_s:.1f} s", frames.frames[name].image
             elif not seen and since_s > FIRST_FRAME_S:
                 break
         if not seen:
@@ -142,10 +101,6 @@ def _frames(source: FrameSource, enough: Callable[[], bool]) -> Iterator[ImageSe
             raise UnavailableError(faults[0] if faults else "no camera gave a frame; check how it is plugged in")
     finally:
         source.stop()
-
-
-def _images(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
 
 
 def _text(file: Path) -> str:

@@ -266,20 +266,18 @@ ENOUGH_VIEWS, ENOUGH_SHARE = 20, 0.9
 
 def collect_views(
     images: ImageStream,
-    camera: str,
     collector: Collector,
     on_image: Callable[[int, int], None],
     on_advice: Callable[[str], None],
 ) -> None:
-    """Gives the collector every image of one camera.
+    """Gives the collector every image.
 
     ``on_image`` is called with the number of images done and the number there are; ``on_advice``, with a live camera
     only, with what the person who holds the board should do next, each time that changes.
     """
     advised = ""
-    for number, one in enumerate(images.sets, start=1):
-        if camera in one.images:
-            collector.offer(one.name, one.images[camera], moving=images.live)
+    for number, (name, image) in enumerate(images.images, start=1):
+        collector.offer(name, image, moving=images.live)
         on_image(number, images.count or number)
         if images.live and (advice := _next_step(collector)) != advised:
             on_advice(advice)
@@ -306,7 +304,7 @@ def fit_lenses(collector: Collector, model: LensModel | None, source: str) -> li
         why = ", ".join(f"{count} {reason}" for reason, count in counts.items())
         raise CalibrationError(
             f"{source}: the board is in none of the {sum(counts.values())} images ({why}); check "
-            "--squares and --dictionary, and that it fills a good part of the image"
+            "--squares, and that it fills a good part of the image"
         )
     found, faults = [], []
     for one in (model,) if model else LENS_MODELS:

@@ -317,7 +317,7 @@ def sections_text(cameras: Mapping[str, tuple[FoundCamera, Mode]], turn_deg: int
     comment = (
         "Written by `flockd cameras`: the cameras of this computer, as sections of a drone's configuration.",
         "Fill in which camera looks where: exchange the names. `flockd cameras --picture FOLDER` shows what each sees.",
-        "Fill in intrinsics and extrinsics, by `flockd calibrate camera` and `flockd calibrate rig`.",
+        "Fill in intrinsics, by `flockd calibrate camera`, and extrinsics, by a tape and the frame's drawing.",
     )
     lines = [
         rig_text([_evenly(number, sizes, name) for number, name in enumerate(sizes)], comment).rstrip(),
