@@ -1,4 +1,4 @@
-"""The report of a campaign, and of two compared: one self-contained page each."""
+"""The report of a campaign: one self-contained page."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from matplotlib.figure import Figure as Drawing
 
 from flockd.campaign.figures import MEASURES, Figure, Interval, mean_interval
 from flockd.campaign.flight_plan import CASE
-from flockd.campaign.results import LEVEL, Comparison, Results, Row, Verdict
+from flockd.campaign.results import Results, Row
 from flockd.review.report.style import BAND, DRONE_COLOURS, MUTED, STYLE, inline_svg, page_template
 
 MOST_ROWS = 200
-"""The most rows of a table; the Parquet files have all."""
+"""The most rows of a table; `flights.csv` has all."""
 NEAREST = 5
 """Flights with the smallest distances are named."""
 
@@ -51,8 +51,7 @@ def write_campaign_page(results: Results, path: Path) -> None:
     config = results.plan.config
     flown = len(results.rows) - len(results.failures)
     cells = _count(len(results.plan.cells), "cell")
-    _write(
-        path,
+    page = page_template(Path(__file__).with_name("campaign.html")).render(
         title=f"flockd campaign: {config.campaign}",
         eyebrow=f"Campaign report · {config.campaign} · flockd {results.rows[0]['flockd_version']}",
         headline=f"{_count(len(results.rows), 'flight')} of {results.plan.base['scenario']} in {cells}",
@@ -64,31 +63,6 @@ def write_campaign_page(results: Results, path: Path) -> None:
         ],
         sections=_parts(results),
     )
-
-
-def write_comparison_page(comparison: Comparison, path: Path) -> None:
-    """Writes the report of two campaigns."""
-    first, second = comparison.first, comparison.second
-    figures = [verdict for verdict in comparison.verdicts if verdict.says != "no difference shown"]
-    _write(
-        path,
-        title=f"flockd campaigns: {first.path.name} and {second.path.name}",
-        eyebrow=f"Comparison of two campaigns · {first.path} and {second.path}",
-        headline=comparison.sentence,
-        lead=(
-            f"Over {_count(comparison.cells, 'cell')} that both flew. {second.path} is compared with {first.path}: a "
-            "difference is its figure less the other’s."
-        ),
-        facts=[
-            _fact("Figures that differ", f"{len(figures)}", f"of {len(comparison.verdicts)}", "all tests together"),
-            _fact("Pairs", f"{max(v.pairs for v in comparison.verdicts)}", "", "seeds that both flew"),
-        ],
-        sections=_comparison_parts(comparison),
-    )
-
-
-def _write(path: Path, **texts: Any) -> None:
-    page = page_template(Path(__file__).with_name("campaign.html")).render(**texts)
     path.write_text(page, encoding="utf-8")
 
 
@@ -114,12 +88,6 @@ _CURVES = (
 )
 _CELLS = "How to read this: mean over the seeds, and half the width of its 95 % confidence interval."
 _NEAREST = "The flights in which two drones came nearest; the command flies one again, with its full report."
-_TEST = (
-    "Flights with the same seed have the same starts, gusts and worlds, so they are pairs. The permutation test gives "
-    "each pair’s difference either sign: p is the share of all ways in which the mean difference would be as large, if "
-    f"it did not matter which campaign a flight is of. p is adjusted for the number of figures (Holm); below {LEVEL:g} "
-    "a difference is called one."
-)
 
 
 def _parts(results: Results) -> list[Part]:
@@ -144,7 +112,7 @@ def _cells(results: Results) -> Part:
             [f"c{cell.number}", *(TableCell(shown(cell.parameters[n])) for n in names), TableCell(f"{count}"), *of_cell]
         )
     left_out = len(results.plan.cells) - MOST_ROWS
-    note = f"{_CELLS} {left_out} more cells are in flights.parquet." if left_out > 0 else _CELLS
+    note = f"{_CELLS} {left_out} more cells are in flights.csv." if left_out > 0 else _CELLS
     return Part("All cells", note, (), ["cell", *names, "flights", *(label_of(f) for f in results.figures)], rows)
 
 
@@ -169,35 +137,6 @@ def _failures(results: Results) -> Part:
 
 def _rerun(results: Results, row: Row) -> str:
     return f"flockd campaign rerun {results.path / row['run']}"
-
-
-def _comparison_parts(comparison: Comparison) -> list[Part]:
-    names = [str(one.path) for one in (comparison.first, comparison.second)]
-    columns = ["figure", *names, "difference", "95 % confidence", "pairs", "p", names[1]]
-    parts = [
-        Part("Differences", "", (), columns, [_verdict_row(verdict) for verdict in comparison.verdicts]),
-        Part("The test", _TEST),
-    ]
-    if comparison.changes:
-        rows: list[list[str | TableCell]] = [
-            [key, TableCell(was, kind="text"), TableCell(now, kind="text")] for key, was, now in comparison.changes
-        ]
-        parts.append(Part("What differs for all flights", "", (), ["key", *names], rows))
-    return parts
-
-
-def _verdict_row(verdict: Verdict) -> list[str | TableCell]:
-    difference = verdict.difference
-    return [
-        label_of(verdict.figure),
-        TableCell(f"{verdict.first:.4g}"),
-        TableCell(f"{verdict.second:.4g}"),
-        TableCell(f"{difference.mean:+.3g}"),
-        TableCell(f"{difference.low:+.3g} to {difference.high:+.3g}"),
-        TableCell(f"{verdict.pairs}"),
-        TableCell(f"{verdict.p:.2g}"),
-        TableCell(verdict.says, kind="met" if verdict.says == "better" else ""),
-    ]
 
 
 def _interval(interval: Interval | None) -> str:

@@ -1,13 +1,15 @@
 """The folder of a campaign: every finished flight is in it at once, and it can be gone on with after any end.
 
 `campaign.json` is the plan. `flights.jsonl` gets a line for each finished flight; of several of one flight the first
-counts, and a last line that was cut off is none. `flights.parquet` is written from it at the end, in order of cells and
+counts, and a last line that was cut off is none. `flights.csv` is written from it at the end, in order of cells and
 seeds, with what is the same whatever flew it.
 """
 
 from __future__ import annotations
 
+import csv
 import fcntl
+import io
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,8 +18,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from pydantic import TypeAdapter, ValidationError
 
 from flockd import __version__
@@ -28,15 +28,13 @@ from flockd.onboard.message_json import parsed
 
 PLAN_NAME = "campaign.json"
 LINES_NAME = "flights.jsonl"
-FLIGHTS_NAME = "flights.parquet"
+FLIGHTS_NAME = "flights.csv"
 REPORT_NAME = "report.html"
 RERUNS = "reruns"
 _LOCK = ".lock"
 _OURS = {PLAN_NAME, LINES_NAME, FLIGHTS_NAME, REPORT_NAME, RERUNS, _LOCK}
 _FLOWN = TypeAdapter(FlownRun)
 MAX_PLAN_BYTES = 1 << 26
-_TEXTS = "reason", "networks_sha256"
-"""Columns of text that may be empty in all rows."""
 
 
 class CampaignFolder:
@@ -81,21 +79,16 @@ class CampaignFolder:
     def write_table(self) -> None:
         """Writes the table anew. Raises UnavailableError where a line cannot be read."""
         rows = flight_rows(self._plan, flown_in(self.path, self._plan))
-        columns = {column: self._column(column, [row[column] for row in rows]) for column in (rows or [{}])[0]}
-        sink = pa.BufferOutputStream()
-        pq.write_table(pa.table(columns), sink, compression="zstd")
-        _write(self.path / FLIGHTS_NAME, sink.getvalue().to_pybytes())
+        text = io.StringIO()
+        table = csv.DictWriter(text, list(rows[0]) if rows else (), lineterminator="\n")
+        table.writeheader()
+        table.writerows({name: _shown(value) for name, value in row.items()} for row in rows)
+        _write(self.path / FLIGHTS_NAME, text.getvalue().encode())
 
-    def _column(self, name: str, values: Sequence[Any]) -> pa.Array:
-        """Values of one type; those of a parameter that have none in common as JSON."""
-        if name in self._plan.wanted:
-            return pa.array(values, pa.float64())
-        if name in _TEXTS:
-            return pa.array(values, pa.string())
-        kinds = {type(value) for value in values}
-        if kinds <= {int, float} or kinds in ({bool}, {str}):
-            return pa.array(values)
-        return pa.array([value if isinstance(value, str) else json.dumps(value) for value in values])
+
+def _shown(value: Any) -> str:
+    """As JSON; texts as they are, None as nothing."""
+    return value if isinstance(value, str) else "" if value is None else json.dumps(value)
 
 
 def flown_in(path: Path, plan: Plan) -> list[FlownRun]:
@@ -187,7 +180,7 @@ def _check(path: Path, plan: Plan) -> None:
         raise UsageError(f"{path}: is a file; name a folder with --out")
     if not path.is_dir() or not any(path.iterdir()):
         return
-    others = {entry.name for entry in path.iterdir() if entry.suffix != ".part" and not entry.match("versus_*.html")}
+    others = {entry.name for entry in path.iterdir() if entry.suffix != ".part"}
     if others - _OURS:
         raise UsageError(f"{path}: holds other files than a campaign's; name a new or empty folder with --out")
     if not (path / PLAN_NAME).exists():

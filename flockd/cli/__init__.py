@@ -36,7 +36,7 @@ from flockd.core.jpeg_header import MAX_IMAGE_PIXELS
 # Packages of an extra: without them a command is unavailable, not broken.
 EXTRAS = {
     **dict.fromkeys(("numba", "llvmlite", "matplotlib", "jinja2", "markupsafe"), "sim"),
-    **dict.fromkeys(("joblib", "pyarrow"), "campaign"),
+    "joblib": "campaign",
     "ray": "ray",
     "argcomplete": "completion",
     **dict.fromkeys(("aiohttp", "plotly"), "fleet"),

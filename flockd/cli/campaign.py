@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.options import require
+from flockd.cli.options import refuse, require
 from flockd.cli.output import Phases, complain, say_result
 from flockd.cli.parser import Commands, commands_of, flag, option, positive_count
 from flockd.core.errors import ExitCode, UsageError
@@ -71,7 +71,7 @@ def add(commands: Commands) -> None:
     parser = commands("report", "Write the report of a campaign, or compare a second one with it.", examples, _report)
     option(parser, "FOLDER", "of a campaign", Path)
     option(parser, "OTHER", "is compared with it: is this one better?", Path, nargs="?")
-    option(parser, "--out FILE", "default: report.html, or OTHER/versus_NAME.html of two", Path)
+    option(parser, "--out FILE", "default: report.html in the folder", Path)
     flag(parser, "--json", "print the figures as JSON")
 
 
@@ -160,7 +160,7 @@ def _rerun(args: argparse.Namespace) -> int:
 
 def _report(args: argparse.Namespace) -> int:
     require(*(path for path in (args.folder, args.other) if path is not None))
-    from flockd.campaign.campaign_page import write_campaign_page, write_comparison_page
+    from flockd.campaign.campaign_page import write_campaign_page
     from flockd.campaign.folder import REPORT_NAME
     from flockd.campaign.results import Results, compare
 
@@ -169,13 +169,13 @@ def _report(args: argparse.Namespace) -> int:
         path = args.out or args.folder / REPORT_NAME
         write_campaign_page(results, path)
         return say_result(args, _cell_figures(results), f"report: {path}")
+    refuse(args, ("out",), "is for the report of one campaign; drop it")
     comparison = compare(results, Results.load(args.other))
-    path = args.out or args.other / f"versus_{args.folder.resolve().name}.html"
-    write_comparison_page(comparison, path)
     verdicts = comparison.verdicts
     facts = [{**asdict(one), "difference": one.difference._asdict(), "says": one.says} for one in verdicts]
-    lines = (f"  {_verdict_line(one)}" for one in verdicts)
-    return say_result(args, facts, f"{comparison.sentence}.", *lines, f"report: {path}")
+    lines = [f"  {_verdict_line(one)}" for one in verdicts]
+    changes = [f"  for all flights {key} was {was} and is {now}" for key, was, now in comparison.changes]
+    return say_result(args, facts, f"{comparison.sentence}.", *lines, *changes)
 
 
 def _verdict_line(verdict: Verdict) -> str:
