@@ -1,4 +1,4 @@
-"""A campaign's file: which flights are flown, what is measured, and when a cell is known well enough."""
+"""A campaign's file: which flights are flown, and what is measured."""
 
 from __future__ import annotations
 
