@@ -66,7 +66,7 @@ def add(commands: Commands) -> None:
     option(parser, "--out DIR", "default: FOLDER/reruns/NAME", Path)
     flag(parser, "--force", "overwrite an earlier flight in that folder")
     flag(parser, "--json", "print the summary as JSON")
-    parser.set_defaults(quiet=False, settings={})
+    parser.set_defaults(quiet=False)
     examples = ("flockd campaign report out/separation", "flockd campaign report out/old_networks out/new_networks")
     parser = commands("report", "Write the report of a campaign, or compare a second one with it.", examples, _report)
     option(parser, "FOLDER", "of a campaign", Path)

@@ -37,15 +37,13 @@ def tables_console() -> Console:
     return Console(markup=False, highlight=False, width=None if sys.stdout.isatty() else PIPED_COLUMNS)
 
 
-def say_table(heads: Sequence[str], rows: Iterable[Sequence[str]], *, right: bool = False) -> None:
-    """Prints rows below their heads, if they have any; ``right``: what follows the first column ends at the right."""
+def say_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Prints rows below their heads, if they have any."""
     from rich.table import Table
 
     table = Table(*heads, box=None, pad_edge=False, show_header=bool(heads))
     for row in rows:
         table.add_row(*row)
-    for column in table.columns[1:]:
-        column.justify = "right" if right else "left"
     tables_console().print(table)
 
 

@@ -69,7 +69,7 @@ def _run(args: argparse.Namespace) -> int:
         log = _log_of(directory)
         if (directory / REPORT_NAME).is_file() and not args.force:
             complain(f"{directory / REPORT_NAME}: is left as it was; --force writes it again")
-            return show_summary(directory, summarise(log), as_json=args.json)
+            return show_summary(directory, log, summarise(log), as_json=args.json)
     else:
         paths = _recordings(directory)
         named = paths[0] if len(paths) == 1 else directory
@@ -81,7 +81,7 @@ def _run(args: argparse.Namespace) -> int:
 
     with progress("writing the report", "figures") as tell_progress:
         summary = write_report_files(directory, log, tell_progress)
-    return show_summary(directory, summary, as_json=args.json)
+    return show_summary(directory, log, summary, as_json=args.json)
 
 
 def _video(args: argparse.Namespace) -> int:
@@ -114,12 +114,10 @@ def _is_flight(folder: Path) -> bool:
 
 
 def _log_of(flight: Path) -> FlightLog:
-    """The log in a flight's folder, or the one that recordings make."""
+    """The log in a flight's folder."""
     from flockd.review.flight_log.log import FlightLog
     from flockd.review.report.flight_folder import LOG_NAME
 
-    if not _is_flight(flight):
-        return _flight(_recordings(flight), pictured=False)[0]
     path = flight / LOG_NAME
     try:
         return FlightLog.load(path)

@@ -172,7 +172,6 @@ def _roles(text: str) -> frozenset[str]:
 def _run(args: argparse.Namespace) -> int:
     _check_options(args)
     scenario = _scenario(args)
-    args.settings = _settings_of(args)
     if args.live:
         return _fly_live(args, scenario, _plain(scenario.scenario))
     directory = _folder(scenario, args)
@@ -320,14 +319,14 @@ def _folder(scenario: ScenarioConfig, args: argparse.Namespace) -> Path:
 
 def _folder_name(scenario: ScenarioConfig, args: argparse.Namespace) -> str:
     told = {
-        name: re.sub("[^A-Za-z0-9_.,+-]+", "-", Path(value).name).strip("-") for name, value in args.settings.items()
+        name: re.sub("[^A-Za-z0-9_.,+-]+", "-", Path(text).name).strip("-") for name, text in _settings(args).items()
     }
     set_otherwise = "".join(f"-{k}" if v == "yes" else f"-{k}_{v}" for k, v in told.items() if k != "seed")
     return f"{_plain(scenario.scenario)}-{args.autopilot or args.perception}{set_otherwise}-seed{scenario.seed}"
 
 
-def _settings_of(args: argparse.Namespace) -> dict[str, str]:
-    """What options set otherwise than the scenario's file, as text; what differs between two flights of it."""
+def _settings(args: argparse.Namespace) -> dict[str, str]:
+    """What options set otherwise than the scenario's file, as text."""
     values = {option: getattr(args, option) for option in (*OPTIONS, "drones")}
     settings = {option: f"{value:g}" for option, value in values.items() if value is not None}
     settings |= {key.rpartition(".")[2]: value for key, value in args.settings}

@@ -142,8 +142,6 @@ class FlightMetadata(BaseModel):
     """Whether simulated drones flew through their gates; None where that is not known."""
     slowed_share: float | None = None
     """Share of their time in which gates let drones fly otherwise than their pilots asked for; None: not known."""
-    settings: dict[str, str] = {}
-    """What the command line set otherwise than the scenario's file, by option."""
     slowed_by: dict[str, float] = {}
     """The same by cause (`flockd.sim.flock.slowing.Cause`); a moment may have several."""
     handed_over: dict[int, HandedOver] = {}

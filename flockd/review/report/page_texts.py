@@ -35,10 +35,10 @@ def page_texts(summary: Summary, log: FlightLog) -> dict[str, Any]:
     return {
         **summary,
         "setting": _setting(summary),
-        "headline": _headline(summary),
+        "headline": headline(summary),
         "colophon": _colophon(summary),
         "lead": _lead(summary),
-        "facts": list(_facts(summary, log)),
+        "facts": list(facts(summary, log)),
         "by_sight": by_sight,
         "companion": log.companion is not None,
         "few": FEW,
@@ -71,7 +71,8 @@ def _colophon(summary: Summary) -> str:
     return ", ".join(parts + ["interrupted before its end"] * bool(summary["interrupted"]))
 
 
-def _headline(summary: Summary) -> str:
+def headline(summary: Summary) -> str:
+    """What happened, in one sentence."""
     drones, flock = summary["drones"], summary["flock"]
     means = "with exact states" if summary["perception"] == EXACT_STATES else "by sight"
     means += f" ({summary['perception']})" * (summary["perception"] not in {EXACT_STATES, "learned"})
@@ -110,7 +111,8 @@ def _whose(summary: Summary) -> str:
     return f" What was estimated and timed here is by {', '.join(recorded)} alone; the truth is of all drones."
 
 
-def _facts(summary: Summary, log: FlightLog) -> Iterator[dict[str, str]]:
+def facts(summary: Summary, log: FlightLog) -> Iterator[dict[str, str]]:
+    """The key figures, each with its name, value, unit and a remark."""
     flock, neighbours, obstacles = summary["flock"], summary["neighbours"], summary["obstacles"]
     mission, held = summary["mission"], summary["handed_over"]
     if summary["drones"] > 1 and summary["has_truth"]:

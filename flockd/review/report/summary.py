@@ -75,7 +75,7 @@ def summarise(log: FlightLog) -> Json:
 _FROM_METADATA = (
     "scenario", "perception", "flow", "scale", "drones", "duration_s", "step_s", "seed", "wall_s", "circle_until_s",
     "desired_distance_m", "gated", "slowed_share", "slowed_by", "sizes",
-    "settings", "recorded", "began", "version", "interrupted", "autopilot", "fleet",
+    "recorded", "began", "version", "interrupted", "autopilot", "fleet",
 )  # fmt: skip
 
 
