@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from flockd.campaign.campaign_file import CampaignConfig
-from flockd.cli import _parser
+from flockd.cli import EXIT_CODES, _parser
 from flockd.core.config import DroneConfig
 from flockd.core.config.safety import SafetyParameters
 from flockd.core.consistency import CHECKS
@@ -216,6 +216,7 @@ def _kind(value: Mapping[str, Any]) -> str:
 
 def commands_page() -> str:
     """Every command with its options and examples."""
+    codes = EXIT_CODES.splitlines()[1:]
     lines = [
         "# Command-line reference",
         "",
@@ -225,12 +226,7 @@ def commands_page() -> str:
         "",
         "| exit code | meaning |",
         "|---|---|",
-        "| 0 | done |",
-        "| 1 | a check failed |",
-        "| 2 | wrong usage of the command line |",
-        "| 69 | something needed is unavailable: a device, a program, an optional package |",
-        "| 78 | a configuration file is wrong |",
-        "| 130 | interrupted by Ctrl-C; what there is of the flight's report is written |",
+        *(f"| {code} | {meaning.strip()} |" for code, meaning in (line.split(maxsplit=1) for line in codes)),
         "",
         "No command overwrites a file or an earlier flight, unless `--force` is given.",
         "",
