@@ -144,7 +144,8 @@ def test_without_a_command_the_help_is_shown(command: list[str], capsys: pytest.
 )
 def test_options_of_sight_are_refused_without_sight(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sim", "--perception", "truth", *option]) == 2
-    assert capsys.readouterr().err.startswith(f"{option[0]} has no meaning without networks; ")
+    given = " ".join(option).partition("=")[0] if option[0] == "--set" else option[0]
+    assert capsys.readouterr().err.startswith(f"{given} has no meaning without networks; ")
 
 
 @pytest.mark.parametrize("command", [["config", "check"], ["config", "show"], ["sim"]], ids=" ".join)
