@@ -45,7 +45,7 @@ def _board_of(args: argparse.Namespace) -> BoardSpec:
     from flockd.ground.calibration.board import BoardSpec, CalibrationError
 
     try:
-        return BoardSpec(*args.squares, args.square_mm / 1000.0)
+        return BoardSpec(*args.squares, square_m=args.square_mm / 1000.0)
     except CalibrationError as error:
         raise UsageError(str(error)) from None
 
