@@ -44,8 +44,9 @@ def _board_of(args: argparse.Namespace) -> BoardSpec:
     """The board of the options. Raises UsageError for one that cannot be."""
     from flockd.ground.calibration.board import BoardSpec, CalibrationError
 
+    columns, rows = args.squares
     try:
-        return BoardSpec(*args.squares, square_m=args.square_mm / 1000.0)
+        return BoardSpec(columns, rows, args.square_mm / 1000.0)
     except CalibrationError as error:
         raise UsageError(str(error)) from None
 

@@ -218,7 +218,9 @@ def test_real_images_give_real_motions(tmp_path: Path, capsys: Capture) -> None:
     images, maps = (sorted((data / name).iterdir()) for name in ("images", "depth"))
     for k in times:
         shutil.copy(images[k], tmp_path)
-        cv2.imwrite(str(tmp_path / f"depth{k}.png"), np.multiply(cv2.imread(str(maps[k]), cv2.IMREAD_UNCHANGED), 5))
+        depth = cv2.imread(str(maps[k]), cv2.IMREAD_UNCHANGED)
+        assert depth is not None
+        cv2.imwrite(str(tmp_path / f"depth{k}.png"), np.multiply(depth, 5))
     (tmp_path / "rgb.txt").write_text("".join(f"{k} {images[k].name}\n" for k in times))
     (tmp_path / "depth.txt").write_text("".join(f"{k} depth{k}.png\n" for k in times))
     poses = np.loadtxt(data / "poses.txt").reshape(-1, 4, 4)[: len(times)]
