@@ -95,7 +95,7 @@ def _camera(args: argparse.Namespace) -> int:
         return _print_board(args, board)
     from flockd.ground.calibration.board import BoardFinder
     from flockd.ground.calibration.fragment import measured_today
-    from flockd.ground.calibration.lens import (
+    from flockd.ground.calibration.lens_fit import (
         collect_views,
         fit_lenses,
         is_enough,

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from flockd.core.choices import LENS_MODELS
 from flockd.ground.calibration.board import BoardFinder, CalibrationError
-from flockd.ground.calibration.lens import Lens as Fitted
-from flockd.ground.calibration.lens import calibrate, simplest_that_fits
+from flockd.ground.calibration.lens_fit import Lens as Fitted
+from flockd.ground.calibration.lens_fit import calibrate, simplest_that_fits
 from flockd.ground.calibration.views import Collector, Coverage
 from tests.ground.calibration import darkroom
 from tests.ground.calibration.darkroom import PINHOLE, SPEC, WIDE, Lens, facing, photograph
