@@ -172,12 +172,17 @@ def fit(samples: Sequence[Samples]) -> dict[str, Any]:
                 "bearing_error_deg": _spread(bearing[seen]),
                 "velocity_error_m_s": _spread(velocity[seen]),
             }
-        mean_m, share = round(float(distance[here].mean()), 2), round(float(missed[here].mean()), 5)
-        entries.append({"distance_m": mean_m, "missed": share, **spreads, "samples": int(here.sum())})
+        mean_m, missing = round(float(distance[here].mean()), 2), round(float(missed[here].mean()), 5)
+        entries.append({"distance_m": mean_m, "missed": missing, **spreads, "samples": int(here.sum())})
     step_s = samples[0].step_s
     own = np.concatenate([s.own.reshape(-1, 2) for s in samples])
     ranges = [np.where(s.counts, s.log_range, np.nan) for s in samples]
-    misses = [np.where(s.counts, np.isnan(s.log_range), np.nan) for s in samples]
+    far_m, share = ([entry[key] for entry in entries] for key in ("distance_m", "missed"))
+    # Whoever is far or hidden is missed for long: that is no error that lasts.
+    misses = [
+        np.where(c, np.isnan(s.log_range) - np.interp(s.distance, far_m, share), np.nan)
+        for s, c in zip(samples, clear, strict=True)
+    ]
     return {
         "by_distance": entries,
         "range_limit_m": round(float(distance.max()), 1),

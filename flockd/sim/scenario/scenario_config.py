@@ -196,7 +196,7 @@ class DetectionsConfig(Section):
     error_time_s: NonNegative = 1.85
     """How long errors stay about the same; 0: each step has its own. By default as of the shipped networks
     (config/perceived/shipped_networks.yaml) ..."""
-    missed_time_s: NonNegative = 4.24
+    missed_time_s: NonNegative = 3.04
     """... and the same of what is missed."""
 
 
