@@ -59,8 +59,8 @@ class TrackingParameters(Section):
 
     detection_probability: Probability = 0.7
     """P_D: of a neighbour that the cameras can show being detected in one frame set. Less than what the shipped
-    networks detect of drones at least 12 px wide, because misses come in runs: at 0.7 a track stays confirmed through three
-    frame sets in a row without a detection."""
+    networks detect of drones at least 12 px wide, because misses come in runs: at 0.7 a track stays confirmed through
+    three frame sets in a row without a detection."""
     clutter_density: Positive = 0.01
     """False detections in one frame set, per steradian, unit of log range and unit of log size. More than the shipped
     networks give on average (9 in 500 images of 1.5 sr, at 0.5 to 20 m and 0.15 to 1.2 m large, are 0.0016), because
