@@ -48,12 +48,13 @@ class CampaignConfig(Section):
     """The path of the scenario's file, relative to this one."""
     perception: FlightKindName = "truth"
     """`truth`: on exact relative states, without images; `sight`: on networks, from rendered images; `control`: at
-    control level, with flocks of any size, many flights at once, on exact states or with `errors`."""
+    control level, with flocks of any size, many flights at once, by the law alone, on exact states or with `errors`."""
     errors: str | None = None
     """For `control`: the path of a file of perception's errors, relative to this one, as
-    `tools.training.fit_perception` writes it. none: exact states. Ranges to obstacles are exact in any case."""
+    `tools.training.fit_perception` writes it. none: exact states."""
     gated: bool = True
-    """Whether each drone flies through its safety gate, as in the daemon; false: to study the flocking law alone."""
+    """Whether each drone flies through its safety gate, as in the daemon; false: to study the flocking law alone,
+    as at control level in any case."""
     seed: Annotated[int, Field(ge=0, le=2**53)] = 0
     """Flight n of each cell, from 0, flies with the scenario's seed `seed` + n, in all cells alike: so differences
     between cells and between campaigns are of flights with the same gusts and worlds."""
@@ -72,6 +73,12 @@ class CampaignConfig(Section):
     measure: Annotated[tuple[Figure, ...], Field(min_length=1)] | None = None
     """Figures to keep; none: all."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _at_control_level_the_law_flies_alone(cls, values: Any) -> Any:
+        alone = isinstance(values, Mapping) and values.get("perception") == "control"
+        return {"gated": False, **values} if alone else values
+
     @model_validator(mode="after")
     def _says_nothing_twice(self) -> Self:
         faults: dict[tuple[str | int, ...], str] = {}
@@ -89,6 +96,8 @@ class CampaignConfig(Section):
                 faults["cases", case, "seed"] = "is set for each flight; write `seed` and `seeds` at the top level"
         if self.errors is not None and self.perception != "control":
             faults["errors",] = "is for `perception: control`; delete one of them"
+        if self.perception == "control" and self.gated:
+            faults["gated",] = "is not for `perception: control`, by the law alone; delete it, or write `truth` there"
         refuse(self, faults)
         return self
 

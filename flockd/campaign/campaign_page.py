@@ -70,7 +70,7 @@ def _lead(results: Results) -> str:
     config = results.plan.config
     varied = ", ".join(results.parameters)
     how = {"truth": "on exact states", "sight": "by sight", "control": "at control level"}[config.perception]
-    how += "" if config.gated else ", without safety gates"
+    how += "" if config.gated and config.perception != "control" else ", without safety gates"
     unheld = "" if config.perception != "control" else "No supervisor flies along: wind slows and holds nobody. "
     return f"Each flight lasts {_durations(results)} {how}. {unheld}" + (f"What varies: {varied}." if varied else "")
 

@@ -17,8 +17,7 @@ from joblib.externals.loky import ProcessPoolExecutor
 from flockd.campaign.flight_kinds import FlownRun, Task, fly_task
 from flockd.campaign.flight_plan import Run
 from flockd.core.errors import UnavailableError
-from flockd.core.side_process import with_package
-from flockd.sim.sitl.bound_to_parent import bind
+from flockd.sim.sitl.bound_to_parent import bind, with_package
 
 EngineName = Literal["processes", "ray"]
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")

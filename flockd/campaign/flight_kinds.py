@@ -67,7 +67,7 @@ def _alone(perception: SimulatedPerception) -> Fly:
 
 def _at_control_level(scenarios: Sequence[ScenarioConfig], task: Task) -> list[Figures]:
     """All at once, on this thread."""
-    flown = fly_flocks(scenarios, errors=task.errors, gated=task.gated)
+    flown = fly_flocks(scenarios, errors=task.errors)
     found = ({figure: one.get(figure) for figure in task.wanted} for one in flown)
     return [{figure: None if value is None else float(value) for figure, value in one.items()} for one in found]
 

@@ -151,7 +151,7 @@ def _rerun(args: argparse.Namespace) -> int:
         flight = fly(
             scenario,
             perception=perception,
-            gated=plan.config.gated,
+            gated=plan.config.gated and plan.config.perception != "control",
             progress=phases.of("flying", "steps"),
             preparing=phases.of("loading networks and building the world", "parts"),
         )

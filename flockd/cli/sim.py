@@ -77,7 +77,7 @@ def add(commands: Commands) -> None:
         "flockd sim my_flight.yaml --set drone.perception.flow=dis --seed 7",
         "flockd sim config/fisheye_flight.yaml --set cameras.preset=realistic --duration 20",
         "flockd sim --record --duration 20",
-        "flockd sim --autopilot standin --drones 2 --duration 20",
+        "flockd sim --autopilot fake --drones 2 --duration 20",
         "flockd sim config/px4_flight.yaml --autopilot px4",
     )
     parser = commands("sim", "Fly a simulated flock, and write a report of the flight.", examples, _run, notes=COSTS)
@@ -194,11 +194,11 @@ def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespac
         shown = None
         if args.telemetry:
             from flockd.onboard.telemetry.publisher import ZenohTelemetry
-            from flockd.sim.flock.shown_flock import Repeater, ShownFlock
+            from flockd.sim.flock.flock_telemetry import FlockTelemetry, Repeater
 
             endpoint = args.telemetry_at or ENDPOINT
             zenoh = stack.enter_context(ZenohTelemetry(_plain(scenario.scenario), listen=[endpoint]))
-            shown = ShownFlock(scenario, zenoh, stack.enter_context(Repeater(zenoh)))
+            shown = FlockTelemetry(scenario, zenoh, stack.enter_context(Repeater(zenoh)))
             if not args.quiet:
                 complain(f"the flock is at {endpoint}: `flockd fleet` shows it in a browser and sends it places")
         phases = stack.enter_context(Phases(quiet=args.quiet))
@@ -360,15 +360,15 @@ def _fly_live(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) ->
     from flockd.fleet.simulation import SimulationLink, key_of
     from flockd.fleet.watcher import FleetWatcher
     from flockd.onboard.telemetry.publisher import ZenohTelemetry
+    from flockd.sim.flock.flock_telemetry import FlockTelemetry, Repeater
     from flockd.sim.flock.live_flight import LiveControls, answered, fly_live
-    from flockd.sim.flock.shown_flock import Repeater, ShownFlock
 
     endpoint = args.telemetry_at or ENDPOINT
     with suppress(KeyboardInterrupt), ExitStack() as stack:
         zenoh = stack.enter_context(ZenohTelemetry(fleet, listen=[endpoint]))
         controls = LiveControls(scenario, zenoh.identity, by_sight=args.perception != "truth")
         zenoh.reply_to(f"{key_of(fleet)}/**", answered(controls))
-        shown = ShownFlock(scenario, zenoh, stack.enter_context(Repeater(zenoh)))
+        shown = FlockTelemetry(scenario, zenoh, stack.enter_context(Repeater(zenoh)))
         watcher = stack.enter_context(FleetWatcher(fleet, listen=[], connect=[endpoint]))
         source = stack.enter_context(LiveFleet(watcher))
         access, link = PageAccess(), stack.enter_context(SimulationLink(fleet, watcher))

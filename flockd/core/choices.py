@@ -50,5 +50,5 @@ SimulatedPerception = Literal["learned", "truth"]
 CameraPreset = Literal["ideal", "realistic"]
 """How good a simulated drone's cameras are."""
 
-AutopilotKind = Literal["standin", "px4"]
+AutopilotKind = Literal["fake", "px4"]
 """Which autopilot a simulated fleet flies with."""

@@ -22,7 +22,7 @@ from flockd.campaign.engine import ENGINES, Engine
 from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.folder import LINES_NAME, CampaignFolder
-from flockd.core.side_process import with_package
+from flockd.sim.sitl.bound_to_parent import with_package
 from tests.campaign.flights import PAPER, Shuffled, campaign_file, flown
 
 FEW = f"campaign: test\nscenario: {PAPER}\nseeds: 3\nscatter_m: 0.5\nfixed: {{duration_s: 2}}\n"

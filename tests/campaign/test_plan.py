@@ -115,6 +115,10 @@ def test_a_plan_is_its_own_copy(tmp_path: Path) -> None:
             "errors: shipped_networks.yaml\n",
             "FILE:5: errors: is for `perception: control`; delete one of them",
         ),
+        (
+            "perception: control\ngated: true\n",
+            "FILE:6: gated: is not for `perception: control`",
+        ),
         ("perception: guess\n", "FILE:5: perception: guess is not known; write `truth` or `sight` or `control`"),
     ],
 )

@@ -215,7 +215,7 @@ async def test_a_flock_is_disturbed_and_begun_again_from_the_page() -> None:
     [
         (["--live", "--record"], "--live keeps nothing"),
         (["--live", "--telemetry"], "--live has --telemetry in it"),
-        (["--live", "--autopilot", "standin"], "drop --autopilot"),
+        (["--live", "--autopilot", "fake"], "drop --autopilot"),
         (["--live", "--duration", "5"], "flies on until Ctrl-C"),
         (["--port", "8000"], "--port is for --live"),
         (["--no-browser"], "--no-browser is for --live"),

@@ -34,7 +34,7 @@ def test_the_daemons_of_a_simulation_connect_where_they_are_told(
         raise UnavailableError("no autopilot for this test; end here")
 
     monkeypatch.setattr("flockd.sim.sitl.fleet.fly_fleet", fly_fleet)
-    flight = ["sim", "--autopilot", "standin", "--drones", "2", "--out"]
+    flight = ["sim", "--autopilot", "fake", "--drones", "2", "--out"]
     assert main([*flight, str(tmp_path / "one")]) == 69
     assert main([*flight, str(tmp_path / "two"), "--telemetry-at", "tcp/127.0.0.1:7999"]) == 69
     assert connected == [("tcp/127.0.0.1:7447",), ("tcp/127.0.0.1:7999",)]

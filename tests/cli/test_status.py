@@ -11,7 +11,7 @@ import pytest
 from flockd.fleet.drone_rows import status_rows
 from flockd.fleet.watcher import Heard, Watched
 from flockd.onboard.telemetry.topics import ComputerMessage
-from flockd.sim.flock.shown_flock import Repeater
+from flockd.sim.flock.flock_telemetry import Repeater
 from tests.make import flight_message
 
 NOW_S = 1000.0

@@ -68,7 +68,7 @@ def fly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record_property: Callab
         flight = fleet.fly_fleet(
             load_scenario(data_path("config") / "head_on.yaml").model_copy(update=changes),
             load_drone(data_path("config") / "px4_sitl.yaml"),
-            kind="standin",
+            kind="fake",
             speed_factor=SPEED_FACTOR,
             logs=tmp_path / "logs",
             recordings=None,

@@ -24,7 +24,7 @@ def test_the_simulator_is_killed_in_flight(tmp_path: Path, reacted: Reacted) -> 
     scenario = _scenario(tmp_path, drones=2)
     scenario.write_text(scenario.read_text(encoding="utf-8").replace('"duration_s": 3.0', '"duration_s": 60.0'))
     run = "from flockd.cli import program; program()"
-    options = ["--autopilot", "standin", "--speed-factor", "1", "--out", str(tmp_path / "out"), "--record"]
+    options = ["--autopilot", "fake", "--speed-factor", "1", "--out", str(tmp_path / "out"), "--record"]
     with subprocess.Popen(
         [sys.executable, "-c", run, "sim", str(scenario), *options], env={**os.environ, "TMPDIR": str(tmp_path)},
         stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2],

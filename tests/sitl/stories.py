@@ -11,8 +11,8 @@ import socket
 import tempfile
 import threading
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
-from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -32,7 +32,6 @@ from flockd.sim.flock.start import with_drones
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.sitl.autopilots import BY_HAND, Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.sitl.ports import free_port
-from flockd.sim.sitl.processes import Program
 from tests.onboard.autopilot.pilots_link import PilotsLink
 from tests.sitl.sitl_run import Meddler
 
@@ -67,10 +66,7 @@ class Relay:
         self._near.bind(("127.0.0.1", autopilot_port))
         self._far = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._far.bind(("127.0.0.1", 0))
-        self.cut = False
-        """True: nothing passes, either way."""
-        self.companion_port = flockd_port
-        """Of this computer, where the packets of the autopilot go."""
+        self._flockd = ("127.0.0.1", flockd_port)
         self._autopilot = ("", 0)
         self._closing = threading.Event()
         self._threads = [threading.Thread(target=run, daemon=True) for run in (self._inward, self._outward)]
@@ -90,8 +86,8 @@ class Relay:
             try:
                 data, self._autopilot = self._near.recvfrom(65536)
                 kept = b"".join(packet for number, packet in _packets(data) if not self.losing(number))
-                if kept and not self.cut:
-                    self._far.sendto(kept, ("127.0.0.1", self.companion_port))
+                if kept:
+                    self._far.sendto(kept, self._flockd)
             except OSError:
                 return
 
@@ -99,7 +95,7 @@ class Relay:
         while not self._closing.is_set():
             try:
                 data, _ = self._far.recvfrom(65536)
-                if self._autopilot[1] and not self.cut:
+                if self._autopilot[1]:
                     self._near.sendto(data, self._autopilot)
             except OSError:
                 return
@@ -122,17 +118,11 @@ class World:
     station: Meddler
     relay: Relay
     restart: Callable[[], None]
-    stack: ExitStack
-    """Ends what a story starts for those after it."""
     speed_factor: float
     clock: Callable[[], float]
     """Simulated seconds."""
-    wanted: Callable[[], FloatArray] = lambda: _in_circles()  # noqa: PLW0108 - it stands below
-    """The velocity (2,) m/s that flockd's flight asks for."""
     stick: int = 0
     """Where a pilot moves the remote control's stick: forward, of 1000."""
-    companion: tuple[int, Program] | None = None
-    """A process that a story has started for a later one, and the port that it listens at."""
     rows: list[Row] = field(default_factory=list)
     reports: list[str] = field(default_factory=list)
     """All that the link has reported."""
@@ -348,51 +338,8 @@ def _rate(world: World) -> bool:
     return world.link.received.restarts > 0 and not world.link.received.check_events.incomplete
 
 
-@dataclass(frozen=True)
-class Stories:
-    """What is flown, on one autopilot after the other."""
-
-    told: tuple[Callable[[World], Awaitable[None]], ...]
-    remote_control: bool = False
-    """A pilot holds one, and its sticks are heard."""
-    max_gap_s: float = AutopilotParameters().max_gap_s
-    """flockd's, between two setpoints."""
-
-
-CONTRACT = Stories(
-    (on_the_ground, take_off, in_flight, others_interfere, landing, starting_anew),
-)
-
-
-@asynccontextmanager
-async def _linked(
-    stories: Stories, speed_factor: float, autopilots: Autopilots, stack: ExitStack, restart: Callable[[], None]
-) -> AsyncIterator[World]:
-    clock = clock_at(speed_factor)
-    ports, flockd_port = autopilots.ports[0], free_port()
-    relay = stack.enter_context(Relay(ports.offboard, flockd_port))
-    station = stack.enter_context(Meddler([ports.truth], clock))
-    autopilots.start()
-    begun = time.monotonic()
-    while not station.is_connected(0):
-        if time.monotonic() - begun > START_S:
-            raise UnavailableError("the autopilot sends nothing")
-        await asyncio.sleep(0.05)
-    station.request_messages()
-    parameters = AutopilotParameters(address=f"udpin://127.0.0.1:{flockd_port}", max_gap_s=stories.max_gap_s)
-    link = await PilotsLink.connect(parameters, timeout_s=START_S, clock=clock)
-    streamer = SetpointStreamer(link.send_setpoint, link.status, _pass, parameters, SafetyParameters(), clock=clock)
-    streamer.start()
-    world = World(link, streamer, station, relay, restart, stack, speed_factor, clock)
-    runs = [link.attend(), link.synchronise(), _offer(world), _ask(link)]
-    tasks = [asyncio.create_task(run) for run in (*runs, *([_move_stick(world)] if stories.remote_control else []))]
-    try:
-        yield world
-    finally:
-        for task in tasks:
-            task.cancel()
-        streamer.close()
-        await link.close()
+Story = Callable[[World], Awaitable[None]]
+CONTRACT: tuple[Story, ...] = (on_the_ground, take_off, in_flight, others_interfere, landing, starting_anew)
 
 
 def _pass(now_s: float, request: Request) -> Verdict:
@@ -410,7 +357,7 @@ async def _offer(world: World) -> None:
     nowhere = Surroundings(np.zeros(2), np.zeros(2), 0.0, np.empty((0, 3)), np.empty((0, 2)), HEIGHT_M)
     while True:
         now = world.clock()
-        wanted = Wanted(world.wanted(), np.zeros(2), 0.0, height_m=HEIGHT_M)
+        wanted = Wanted(_in_circles(), np.zeros(2), 0.0, height_m=HEIGHT_M)
         world.streamer.offer(Request(Permission(Action.FLY, now), wanted, now, 0.0, nowhere))
         world.streamer.beat()
         await asyncio.sleep(0.05)
@@ -434,59 +381,76 @@ async def _ask(link: AutopilotLink) -> None:
         await asyncio.sleep(1.0)
 
 
-async def _fly(
-    stories: Stories, speed_factor: float, autopilots: Autopilots, stack: ExitStack, restart: Callable[[], None]
-) -> list[Row]:
-    async with _linked(stories, speed_factor, autopilots, stack, restart) as world:
-        for story in stories.told:
-            try:
-                await story(world)
-            except (UnavailableError, AutopilotError) as error:
-                world.rows.append(Row(story.__name__, f"ended: {error}"))
-        return world.rows
-
-
 def _scenario() -> ScenarioConfig:
     scenario = with_drones(load_scenario(data_path("config") / "px4_flight.yaml"), 1)
     place = scenario.vehicles[0].model_copy(update={"position_m": (0.0, 0.0, -HEIGHT_M)})
     return scenario.model_copy(update={"vehicles": (place,)})
 
 
-@contextmanager
-def _fake(
-    parameters: Mapping[str, str], speed_factor: float
-) -> Iterator[tuple[Autopilots, ExitStack, Callable[[], None]]]:
+Make = Callable[[float, Mapping[str, str], ExitStack], tuple[Autopilots, Callable[[], None]]]
+"""An autopilot at a speed factor with PX4's parameters, and what starts it anew."""
+
+
+def _fake(speed_factor: float, _: Mapping[str, str], stack: ExitStack) -> tuple[Autopilots, Callable[[], None]]:
+    fakes = SimulatedAutopilots(_scenario(), speed_factor, lambda north, _: np.zeros_like(north))
+    return stack.enter_context(fakes), lambda: fakes.fakes[0].restart()  # noqa: PLW0108 - there is none before it starts
+
+
+def _px4(speed_factor: float, parameters: Mapping[str, str], stack: ExitStack) -> tuple[Autopilots, Callable[[], None]]:
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="contract-")))
+    first, again = (
+        stack.enter_context(Px4s(_scenario(), speed_factor, os.environ, folder / name, parameters))
+        for name in ("first", "again")
+    )
+
+    def restart() -> None:
+        first.__exit__(None, None, None)
+        again.start()
+
+    return first, restart
+
+
+async def _fly(told: Sequence[Story], make: Make, speed_factor: float, *, remote_control: bool) -> list[Row]:
+    clock = clock_at(speed_factor)
     with ExitStack() as stack:
-        fakes = stack.enter_context(
-            SimulatedAutopilots(_scenario(), speed_factor, lambda north, _: np.zeros_like(north))
-        )
-        yield fakes, stack, lambda: fakes.fakes[0].restart()  # noqa: PLW0108 - there is none before it starts
+        autopilots, restart = make(speed_factor, REMOTE_CONTROL if remote_control else {}, stack)
+        ports, flockd_port = autopilots.ports[0], free_port()
+        relay = stack.enter_context(Relay(ports.offboard, flockd_port))
+        station = stack.enter_context(Meddler([ports.truth], clock))
+        autopilots.start()
+        begun = time.monotonic()
+        while not station.is_connected(0):
+            if time.monotonic() - begun > START_S:
+                raise UnavailableError("the autopilot sends nothing")
+            await asyncio.sleep(0.05)
+        station.request_messages()
+        parameters = AutopilotParameters(address=f"udpin://127.0.0.1:{flockd_port}")
+        link = await PilotsLink.connect(parameters, timeout_s=START_S, clock=clock)
+        streamer = SetpointStreamer(link.send_setpoint, link.status, _pass, parameters, SafetyParameters(), clock=clock)
+        streamer.start()
+        world = World(link, streamer, station, relay, restart, speed_factor, clock)
+        runs = [link.attend(), link.synchronise(), _offer(world), _ask(link)]
+        tasks = [asyncio.create_task(run) for run in (*runs, *([_move_stick(world)] if remote_control else []))]
+        try:
+            for story in told:
+                try:
+                    await story(world)
+                except (UnavailableError, AutopilotError) as error:
+                    world.rows.append(Row(story.__name__, f"ended: {error}"))
+            return world.rows
+        finally:
+            for task in tasks:
+                task.cancel()
+            streamer.close()
+            await link.close()
 
 
-@contextmanager
-def _px4(
-    parameters: Mapping[str, str], speed_factor: float
-) -> Iterator[tuple[Autopilots, ExitStack, Callable[[], None]]]:
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="contract-")))
-        first, again = (
-            Px4s(_scenario(), speed_factor, os.environ, folder / name, parameters) for name in ("first", "again")
-        )
-        stack.push(first.__exit__)
-        stack.push(again.__exit__)
-
-        def restart() -> None:
-            first.__exit__(None, None, None)
-            again.start()
-
-        yield first, stack, restart
-
-
-def seen(autopilot: str, stories: Stories = CONTRACT, speed_factor: float = 1.0) -> list[Row]:
-    """What flockd sees of one of them. Raises UnavailableError."""
+def seen(
+    autopilot: str, told: Sequence[Story] = CONTRACT, speed_factor: float = 1.0, *, remote_control: bool = False
+) -> list[Row]:
+    """What flockd sees of one of them; `remote_control`: a pilot holds one. Raises UnavailableError."""
     make = {"fake": _fake, "px4": _px4}[autopilot]
-    with make(REMOTE_CONTROL if stories.remote_control else {}, speed_factor) as (autopilots, stack, restart):
-        rows = asyncio.run(_fly(stories, speed_factor, autopilots, stack, restart))
+    rows = asyncio.run(_fly(told, make, speed_factor, remote_control=remote_control))
     for row in rows:
         print(f"{row.story:32}{row.what}" + ("" if row.after_s is None else f", after {row.after_s:.1f} s"))  # noqa: T201
     return rows

@@ -1,8 +1,6 @@
-"""Run for long and see what grows: the pilot's steps, or a whole daemon.
+"""Run a whole daemon for long and see what grows: a real `flockd run`, a fake autopilot, rendered frames.
 
-python -m tools.checks.soak --steps 100000              # the pilot with the shipped networks on small images
-python -m tools.checks.soak --steps 100000 --minutes 80 # as many of them as this computer does in that time
-python -m tools.checks.soak --daemon --minutes 60       # a real `flockd run`, a fake autopilot, rendered frames
+python -m tools.checks.soak --minutes 60
 
 Prints for memory, file descriptors, threads, latency and what waits or is lost: how much it grew in the first tenth of
 the run, which is the warm-up. Then the mean of the next and of the last tenth, and the slope over the rest with its 95
@@ -28,9 +26,8 @@ from scipy import stats
 
 from flockd.core.config import DroneConfig
 from flockd.core.data import data_path
-from flockd.core.messages import FloatArray, Frame, FrameSet, VehicleState
+from flockd.core.messages import FloatArray
 from flockd.fleet.watcher import FleetWatcher
-from flockd.flight.pilot import FlockPilot
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.scenario import ScenarioConfig, load_scenario
@@ -41,26 +38,18 @@ from flockd.sim.sitl.ports import free_endpoint, free_port
 from tools.measure.bench_daemon import at, of_the_unit
 
 SHRINK = 4
-"""Factor on the simulator's front camera, the only one: 120 x 160 pixels, so that 100,000 steps are hours and not
-days."""
-ROUND_STEPS = 40
-"""After so many steps the drone is where it began: the same images again."""
-SWING_M, HEIGHT_M = 2.0, 4.0
-NEIGHBOUR_M, PILOTS_NEIGHBOUR_M = 2.0, 1.0
+"""Factor on the simulator's front camera, the only one: 120 x 160 pixels, so that much else fits beside it."""
+HEIGHT_M = 4.0
+NEIGHBOUR_M = 2.0
 """How far away the other drone is. In images as small as this it is detected up to a metre; a daemon that really flies
 would keep away from it there, for ever, so that it flies as if alone."""
 STRETCHES = 20
-SAMPLES, MIN_SAMPLES = 400, 40
-MOST_STEPS = 8
-"""From one sample to the next: a run that is bounded in time may end after few."""
 SAMPLE_S = 2.0
-DAEMON_MINUTES = 60.0
 PATIENCE_S = 600.0
 """For the daemon to become ready: a busy computer compiles the renderer for minutes."""
 ALLOWED = {
     "memory, MB": 0.03,
     "own memory, MB": 0.03,
-    "python blocks": 0.01,
     "descriptors": 0.02,
     "threads": 0.02,
     "step, ms": 0.15,
@@ -120,9 +109,6 @@ def process_facts(pid: int) -> dict[str, float]:
     }
 
 
-# --------------------------------------------------------------------------------------------------------------- pilot
-
-
 def small(config: DroneConfig) -> DroneConfig:
     """With a front camera of a quarter of the width and height, and no other."""
     cameras = []
@@ -141,60 +127,15 @@ def scenario() -> ScenarioConfig:
     return paper.model_copy(update={"drone": small(paper.drone), "vehicles": paper.vehicles[:2]})
 
 
-def round_trip(phase: float) -> tuple[Poses, FloatArray]:
-    """Both drones at a phase from 0 to 1 of a swing to and fro, level, and the first's velocity a phase."""
-    angle = 2 * np.pi * phase
-    place = np.array([SWING_M * np.sin(angle), SWING_M * np.cos(angle), -HEIGHT_M])
-    velocity = 2 * np.pi * SWING_M * np.array([np.cos(angle), -np.sin(angle), 0.0])
-    return follower(place, velocity, np.eye(3), PILOTS_NEIGHBOUR_M), velocity
-
-
-def follower(place: FloatArray, velocity: FloatArray, rotation: FloatArray, distance_m: float = NEIGHBOUR_M) -> Poses:
+def follower(place: FloatArray, velocity: FloatArray, rotation: FloatArray) -> Poses:
     """The drone, and a neighbour north of it that does as it does."""
-    beside = np.array([distance_m, 0.0, 0.0])
+    beside = np.array([NEIGHBOUR_M, 0.0, 0.0])
     return Poses(np.stack([place, place + beside]), np.stack([velocity, velocity]), np.stack([rotation, rotation]))
-
-
-def soak_pilot(steps: int, minutes: float) -> tuple[int, dict[str, array[float]]]:
-    """How many steps were made in the time, and samples of each quantity."""
-    world = scenario()
-    cameras, pilot, period_s = CameraSimulator(world), FlockPilot(world.drone), world.drone.step_s
-    scenes = []
-    for number in range(ROUND_STEPS):
-        poses, velocity = round_trip(number / ROUND_STEPS)
-        scenes.append((cameras.capture(0, number, 0.0, poses)[0], velocity / (ROUND_STEPS * period_s)))
-    samples: dict[str, array[float]] = {}
-    every, took_s = min(max(steps // SAMPLES, 1), MOST_STEPS), 0.0
-    until_s = time.monotonic() + 60.0 * minutes
-    for number in range(steps):
-        if time.monotonic() > until_s and number >= MIN_SAMPLES * every:
-            return number, samples
-        seen, velocity = scenes[number % ROUND_STEPS]
-        time_s = 1000.0 + number * period_s
-        frames = {name: Frame(name, frame.image, time_s, number) for name, frame in seen.frames.items()}
-        vehicle = VehicleState(time_s, np.eye(3), HEIGHT_M, velocity)
-        begun_s = time.perf_counter()
-        output = pilot.step(FrameSet(time_s, frames), vehicle)
-        took_s += time.perf_counter() - begun_s
-        if (number + 1) % every == 0:
-            facts = {
-                **process_facts(os.getpid()),
-                "python blocks": float(sys.getallocatedblocks()),
-                "step, ms": 1e3 * took_s / every,
-                "tracks": float(len(output.neighbours)),
-                "detections": float(len(output.detections)),
-            }
-            _add(samples, facts)
-            took_s = 0.0
-    return steps, samples
 
 
 def _add(samples: dict[str, array[float]], facts: Mapping[str, float]) -> None:
     for name, value in facts.items():
-        samples.setdefault(name, array("d")).append(value)  # a list's would be counted among the pilot's blocks
-
-
-# -------------------------------------------------------------------------------------------------------------- daemon
+        samples.setdefault(name, array("d")).append(value)  # small
 
 
 def soak_daemon(minutes: float) -> dict[str, array[float]]:
@@ -292,24 +233,14 @@ def _told(watcher: FleetWatcher) -> Mapping[str, float]:
     }
 
 
-# -------------------------------------------------------------------------------------------------------------- report
-
-
 def main() -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=5000, help="of the pilot (default: 5000)")
-    parser.add_argument("--daemon", action="store_true", help="a whole daemon instead")
-    parser.add_argument("--minutes", type=float, help="of the daemon (default: 60), or the most that steps may take")
-    args = parser.parse_args()
-    if args.daemon:
-        minutes = args.minutes or DAEMON_MINUTES
-        what, samples = f"{minutes:g} minutes of a daemon", soak_daemon(minutes)
-    else:
-        done, samples = soak_pilot(args.steps, args.minutes or np.inf)
-        what = f"{done} steps of the pilot"
+    parser.add_argument("--minutes", type=float, default=60.0, help="(default: 60)")
+    minutes = parser.parse_args().minutes
+    samples = soak_daemon(minutes)
     slopes = {name: slope_of(name, _filled(values)) for name, values in samples.items()}
-    print(f"{what}, {len(next(iter(samples.values())))} samples")
+    print(f"{minutes:g} minutes of a daemon, {len(next(iter(samples.values())))} samples")
     print(f"{'':20}{'warm-up':>10}{'first':>10}{'last':>10}{'growth after the warm-up, 95 %':>34}")
     for name, one in slopes.items():
         verdict = "  GROWS" if one.grows else ""

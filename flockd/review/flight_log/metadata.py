@@ -19,35 +19,17 @@ _WITH_GOALS = ("waypoints", "operator")
 _FROZEN = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="constants")
 
 
-class Percentiles(BaseModel):
-    """Percentiles of a set of durations."""
-
-    model_config = _FROZEN
-
-    p50: float
-    p95: float
-
-
 class FleetMetadata(BaseModel):
     """How a fleet of real daemons flew with the simulator."""
 
-    model_config = _FROZEN
+    model_config = ConfigDict(frozen=True, extra="ignore", ser_json_inf_nan="constants")  # earlier ones had more
 
     speed_factor: float
     """How fast simulated time passed."""
-    cores: dict[str, float]
-    """How many processor cores each kind of program kept busy."""
     frame_sets: int
     """Rendered for each drone."""
-    frame_sets_looked_at: dict[str, int]
-    """Processed by each drone's pilot, by its name."""
     longest_step_s: float
-    motions_over_more_than_one_frame_set: int
-    """Ego-motions that are not in the log, as the pilot had skipped a frame set."""
-    frames_late_s: Percentiles
-    """Simulated seconds until the last drone had its frames."""
     order_last_20s: float
-    union_last_20s: float
     handed_over: dict[str, str]
     """Why a drone did not fly to the end, by its name."""
     mission_over: dict[str, str] = {}
@@ -143,7 +125,7 @@ class FlightMetadata(BaseModel):
     slowed_share: float | None = None
     """Share of their time in which gates let drones fly otherwise than their pilots asked for; None: not known."""
     slowed_by: dict[str, float] = {}
-    """The same by cause (`flockd.sim.flock.slowing.Cause`); a moment may have several."""
+    """The same by cause (as `flockd.sim.flock.control_loop.SlowedTime` names it); a moment may have several."""
     handed_over: dict[int, HandedOver] = {}
     """By the number of a simulated drone, from 0: when and why it did not fly on."""
     sizes: dict[int, LearnedSize] = {}

@@ -80,20 +80,14 @@ _FROM_METADATA = (
 
 
 _CAUSES = {
-    "neighbour": "neighbours",
-    "uncertainty": "their uncertainty",
-    "false_detection": "false detections",
-    "obstacle": "obstacles",
-    "fence": "the fence",
-    "wind": "wind",
-    "camera": "a lost camera",
+    "neighbour": "neighbours", "obstacle": "obstacles", "fence": "the fence", "camera": "a lost camera",
     "other": "other limits",
-}
+}  # fmt: skip
 
 
 def causes_text(summary: Mapping[str, Any]) -> str:
     """What gates slowed drones down for, and for how much of the time; a moment may have several causes."""
-    return ", ".join(f"{_CAUSES[cause]} {100 * part:.1f} %" for cause, part in summary["slowed_by"].items())
+    return ", ".join(f"{_CAUSES.get(cause, cause)} {100 * part:.1f} %" for cause, part in summary["slowed_by"].items())
 
 
 def sizes_text(summary: Mapping[str, Any]) -> str:

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from flockd.core.messages import FloatArray, RangeReading
-
-if TYPE_CHECKING:  # the fake autopilot runs as a program of its own, which begins sooner without the configuration
-    from flockd.sim.scenario import RangeFinderConfig
+from flockd.sim.scenario import RangeFinderConfig
 
 Ground = Callable[[FloatArray, FloatArray], FloatArray]
 """Height above z = 0 of the ground at points (n,) north and (n,) east, metres."""

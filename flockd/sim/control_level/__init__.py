@@ -1,8 +1,7 @@
-"""Flocks without images: law, missions, avoidance and vehicles of many drones and many flights at once.
+"""Flocks without images: law, missions and vehicles of many drones and many flights at once.
 
 For questions that need hundreds of drones or thousands of flights. Each drone is given the others' exact states, or
-what it would perceive with the errors of the networks' flights (`flockd.sim.scenario.perceived`), and exact ranges to
-obstacles.
+what it would perceive with the errors of the networks' flights (`flockd.sim.scenario.perceived`).
 """
 
 from __future__ import annotations

@@ -12,12 +12,10 @@ from scipy.sparse.csgraph import connected_components
 
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.geometry import closest_approach
-from flockd.review.report.summary import NEAR_M, TAIL_S
-from flockd.sim.control_level.near import Near
+from flockd.review.report.summary import TAIL_S
+from flockd.sim.control_level.perceived_flock import Near
 from flockd.sim.flock.exact_states import step_times
 from flockd.sim.scenario import ScenarioConfig
-from flockd.sim.world.obstacle_worlds import clearances
-from flockd.sim.world.obstacles import Obstacles
 
 Figures = dict[str, float | int | bool | None]
 SAFE_M = 1.0
@@ -92,22 +90,17 @@ def orders(velocity: FloatArray) -> FloatArray:
 class FlightFigures:
     """Collects the figures of a batch of flights, one step after the other."""
 
-    def __init__(
-        self, scenario: ScenarioConfig, worlds: Sequence[Obstacles], goal: FloatArray | None, reached_m: float
-    ) -> None:
-        """`worlds` of the flights; `goal` (2,) m, where their drones have one, is reached within `reached_m`."""
-        self._scenario, self._worlds, self._goal, self._reached_m = scenario, worlds, goal, reached_m
+    def __init__(self, scenario: ScenarioConfig, flights: int) -> None:
+        self._scenario = scenario
         self._times = step_times(scenario)
         self._tail = self._times > self._times[-1] + scenario.drone.step_s - TAIL_S - 1e-6
         self._before: FloatArray | None = None
-        self._touching = np.zeros((len(worlds), len(scenario.vehicles)), dtype=bool)
+        self._touching = np.zeros((flights, len(scenario.vehicles)), dtype=bool)
         self._steps: list[dict[str, FloatArray]] = []
         """Of each step (flights,) values by name."""
-        self._flown: list[FloatArray] = []
-        """States, where there are obstacles."""
 
-    def add(self, states: FloatArray, near: Near, to_the_last: BoolArray) -> None:
-        """The next step begins at `states` (6, flights, n); `to_the_last`: whose flock is on the way to its goal."""
+    def add(self, states: FloatArray, near: Near) -> None:
+        """The next step begins at `states` (6, flights, n)."""
         found = nearest_distances(near, states if self._before is None else self._before, states)
         touching = found.since < 2 * self._scenario.vehicle.radius_m
         middles = states[:2].mean(axis=2, keepdims=True)
@@ -115,25 +108,18 @@ class FlightFigures:
             "level_since": found.level_since.min(axis=1), "since": found.since.min(axis=1),
             "now": found.now.min(axis=1), "level_now": found.level_now.mean(axis=1), "unsafe": found.unsafe.sum(axis=1),
             "contacts": (touching & ~self._touching).sum(axis=1),
-            "to_the_last": to_the_last, "order": orders(states[3:5]),
+            "order": orders(states[3:5]),
             "extent": np.sqrt(((states[:2] - middles) ** 2).sum(axis=0).mean(axis=1)),
         }  # fmt: skip
         if self._tail[len(self._steps)]:
             reach_m = self._scenario.drone.flocking.observation_distance_m
             of_step["union"] = unions(near, touching.shape, reach_m)
-        if self._goal is not None:
-            of_step["away"] = np.hypot(*(middles[:, :, 0] - self._goal[:, None]))
-        if any(world.solids for world in self._worlds):
-            self._flown.append(states.copy())
         self._steps.append(of_step)
         self._before, self._touching = states.copy(), touching
 
     def of_flights(self) -> list[Figures]:
         """The figures of each flight; None where there is nothing to say."""
-        return [
-            {**self._of_flock(k), **self._of_goal(k), **self._of_obstacles(k, world)}
-            for k, world in enumerate(self._worlds)
-        ]
+        return [self._of_flock(k) for k in range(len(self._touching))]
 
     def _values(self, name: str, flight: int) -> FloatArray:
         """One flight's, of each step that has them."""
@@ -167,33 +153,6 @@ class FlightFigures:
             "drone_collisions": int(values("contacts").sum()),
             "mean_nearest_tail_m": tail_mean("level_now") if pairs else None,
             "rms_radius_tail_m": tail_mean("extent"),
-        }
-
-    def _of_goal(self, flight: int) -> Figures:
-        """Whether and when the flock's true middle was at the last goal, once that was the one to fly to."""
-        if self._goal is None:
-            return dict.fromkeys(("arrived", "arrival_time_s", "final_error_m"))
-        away_m, elsewhere = self._values("away", flight), np.flatnonzero(self._values("to_the_last", flight) == 0)
-        there = np.flatnonzero(away_m <= self._reached_m)
-        there = there[there > (elsewhere[-1] if len(elsewhere) else -1)]
-        return {
-            "arrived": bool(away_m[-1] <= self._reached_m),
-            "arrival_time_s": float(self._times[there[0]]) if len(there) else None,
-            "final_error_m": float(away_m[-1]),
-        }
-
-    def _of_obstacles(self, flight: int, world: Obstacles) -> Figures:
-        """As `flockd.review.report.summary.obstacle_figures`."""
-        if not world.solids:
-            return dict.fromkeys(("collisions", "min_clearance_m", "time_within_1m_s"))
-        flown = np.array(self._flown)[:, :, flight].transpose(1, 0, 2)
-        places, velocities = np.moveaxis(flown[:3], 0, -1), np.moveaxis(flown[3:], 0, -1)
-        free_m = clearances(world, self._times, places, velocities) - self._scenario.vehicle.radius_m
-        touching = np.vstack([np.zeros(free_m.shape[1], dtype=bool), free_m < 0])
-        return {
-            "collisions": int((touching[1:] & ~touching[:-1]).sum()),
-            "min_clearance_m": float(free_m.min()),
-            "time_within_1m_s": float((free_m < NEAR_M).sum() * self._scenario.drone.step_s),
         }
 
 

@@ -11,38 +11,29 @@ from flockd.core.errors import UsageError
 from flockd.core.messages import FloatArray, IntArray
 from flockd.flight.flocking import FlockingLaw, level_offsets, lookahead_s
 from flockd.flight.mission import Moment, Navigator
-from flockd.flight.mission.places import place_of_waypoint
-from flockd.sim.control_level.flight_code import FlightCode, Known
 from flockd.sim.control_level.flock_figures import Figures, FlightFigures
-from flockd.sim.control_level.near import Near
-from flockd.sim.control_level.perceived_flock import Perception, Seen
+from flockd.sim.control_level.perceived_flock import Near, Perception, Seen
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.scenario.perceived import PerceivedErrors
 from flockd.sim.vehicles.vehicles import REFERENCE_DEG, Motion, limit_norms
-from flockd.sim.world.obstacle_worlds import obstacles_of
-from flockd.sim.world.obstacles import true_ranges
 
-_HOME_DEG = np.array(REFERENCE_DEG)
+_PLACELESS = ("circle_then_tangent", "velocity", "hover", "follow")
 _PAIRS = 1_000_000
 """Most pairs of drones of flights that are flown side by side, but for one flight alone: they take 0.3 GB."""
 
 
-def fly_flocks(
-    scenarios: Sequence[ScenarioConfig], *, errors: PerceivedErrors | None = None, gated: bool = False
-) -> list[Figures]:
+def fly_flocks(scenarios: Sequence[ScenarioConfig], *, errors: PerceivedErrors | None = None) -> list[Figures]:
     """Flies each scenario once; the figures of each flight, in their order.
 
     Those that differ in nothing but seed, start positions and start velocities fly side by side. A flight is the same
     bit for bit whatever others are flown with it.
 
     Args:
-        scenarios: with any number of vehicles (`flockd.sim.flock.start`). The seed rules gusts,
-            obstacles and the errors of perception. Rig and sensors do not count.
-        errors: of what the drones perceive of each other; None: they are given exact states. Ranges to obstacles are
-            exact in any case.
-        gated: whether each drone flies through its safety gate (`flockd.flight.safety.Gate`), on what it perceives.
+        scenarios: with any number of vehicles (`flockd.sim.flock.start`). The seed rules gusts and the
+            errors of perception. Rig, sensors and safety gates do not count.
+        errors: of what the drones perceive of each other; None: they are given exact states.
 
-    Raises UsageError for what cannot be flown without images, and for obstacles that do not fit into their world.
+    Raises UsageError for drones flown by hand, missions that go by places, and worlds with obstacles.
     """
     alike: dict[str, list[int]] = {}
     for number, scenario in enumerate(scenarios):
@@ -54,7 +45,7 @@ def fly_flocks(
         side_by_side = max(_PAIRS // len(scenarios[numbers[0]].vehicles) ** 2, 1)
         for begin in range(0, len(numbers), side_by_side):
             batch = numbers[begin : begin + side_by_side]
-            flights = FlockFlights([scenarios[number] for number in batch], errors, gated=gated)
+            flights = FlockFlights([scenarios[number] for number in batch], errors)
             for step in range(flights.steps):
                 flights.step(step)
             found |= zip(batch, flights.figures(), strict=True)
@@ -64,10 +55,10 @@ def fly_flocks(
 class FlockFlights:
     """A batch of flights that differ in seeds and starts only, all at the same time; see `fly_flocks`."""
 
-    def __init__(
-        self, scenarios: Sequence[ScenarioConfig], errors: PerceivedErrors | None = None, *, gated: bool = False
-    ) -> None:
+    def __init__(self, scenarios: Sequence[ScenarioConfig], errors: PerceivedErrors | None = None) -> None:
         scenario = scenarios[0]
+        if scenario.world.obstacles is not None:
+            raise UsageError("flights at control level have no obstacles; fly on exact states, or delete them")
         drone, seeds = scenario.drone, [one.seed for one in scenarios]
         f, n = self._shape = len(scenarios), len(scenario.vehicles)
         self._drone, self._law = drone, FlockingLaw(drone.flocking)
@@ -77,81 +68,48 @@ class FlockFlights:
         """(6, flights, n) m and m/s: position and velocity, NED."""
         self._missions = Missions(scenario, f)
         self._perception = None if errors is None else Perception(errors, drone.step_s, seeds, n)
-        worlds = [obstacles_of(one) for one in scenarios]
-        self._worlds = worlds if drone.obstacles.enabled and scenario.world.obstacles is not None else []
-        self._gated = gated
-        self._code = FlightCode(drone, f * n) if gated or self._worlds else None
         self._motion = Motion(scenario.vehicle, seeds, n)
-        self._figures = FlightFigures(scenario, worlds, self._missions.goal, self._missions.reached_m)
+        self._figures = FlightFigures(scenario, f)
         p = drone.flocking
         self._reach_m = max(p.observation_distance_m, p.separation_distance_m)
         if errors is not None:
             self._reach_m = min(errors.range_limit_m, 2 * self._reach_m)
         self.sums = np.zeros((2, f, n))
         """u of Eq. 38 without u_vf, m/s^2, as last perceived."""
-        self.commands = np.zeros((2, f, n))
-        """Velocities that drones were asked to fly with in the last step, m/s."""
-        self._middles = np.zeros((f * n, 2))
         self._own = np.zeros((f * n, 2))
 
     def step(self, step: int) -> None:
         """One step of all flights."""
-        near, seen = self.perceive(step)
+        near = self.perceive(step)
         begin_s, for_s = step * self._drone.step_s, self._drone.step_s
-        desired, heights = self._missions.step(begin_s, _rows(self.states[:2]), self._middles)
-        self._figures.add(self.states, near, self._missions.to_the_last)
+        desired, heights = self._missions.step(begin_s, len(self._own))
+        self._figures.add(self.states, near)
         p = self._drone.flocking
         u = limit_norms(_rows(self.sums) + p.velocity * p.own_weight * desired, p.max_acceleration_m_s2)
         commands = limit_norms(self._own + u * lookahead_s(for_s), p.max_speed_m_s)
-        known = [] if self._code is None else self._known(begin_s, seen)
-        for i, (one, ranges) in enumerate(known):
-            if self._code is not None and (self._gated or ranges is not None):
-                commands[i] = self._code.ask(i, self._own[i], commands[i].copy(), desired[i], one, ranges)
-        self.commands = np.ascontiguousarray(commands.T).reshape(2, *self._shape)
+        setpoints = np.ascontiguousarray(commands.T).reshape(2, *self._shape)
+        self._motion.fly(begin_s, for_s, self.states, setpoints, heights.reshape(self._shape))
 
-        def fly(now_s: float, for_s: float, velocities: FloatArray, heights_m: FloatArray) -> None:
-            shaped = velocities.reshape(2, *self._shape), heights_m.reshape(self._shape)
-            self._motion.fly(now_s, for_s, self.states, *shaped)
-
-        if self._code is None or not self._gated:
-            fly(begin_s, for_s, self.commands, heights)
-        else:
-            flat = self.states.reshape(6, -1), self.commands.reshape(2, -1)
-            self._code.fly_gated(begin_s, *flat, heights, known, fly)
-
-    def _known(self, time_s: float, seen: Seen) -> list[Known]:
-        edges, n = np.searchsorted(seen.owners, np.arange(len(self._own) + 1)), self._shape[1]
-        known = []
-        for i in range(len(self._own)):
-            world, place = self._worlds[i // n] if self._worlds else None, self.states[:3, i // n, i % n].copy()
-            ranges = true_ranges(world, time_s, place) if world is not None and world.solids else None
-            known.append((seen.of(slice(edges[i], edges[i + 1])), ranges))
-        return known
-
-    def perceive(self, step: int) -> tuple[Near, Seen]:
-        """What each drone sees of the others now; what the law makes of it is in `sums`."""
+    def perceive(self, step: int) -> Near:
+        """Who is near whom now; what the law makes of what each drone sees of the others is in `sums`."""
         near, states, p = Near(self.states), _rows(self.states), self._drone.flocking
         who, reach_m = np.arange(len(states)), np.full(len(states), self._reach_m)
         if self._perception is None:
-            if p.weight.kind == "nearest" and self._code is None and self._missions.goal is None:  # no one else counts
+            if p.weight.kind == "nearest":  # no one else counts
                 counts_m = np.maximum(near.nearest(p.weight.nearest)[0], p.separation_distance_m)
                 reach_m = np.minimum(reach_m, counts_m)
             owners, others = near.pairs(who, reach_m)
             places, velocities = states[others, :3] - states[owners, :3], states[others, 3:]
             self._own, ages_s = states[:, 3:5], np.full(len(owners), math.inf)
-            seen, offsets = Seen(owners, places, velocities, ages_s, others), places[:, :2]
-            middle_of = np.hypot(*offsets.T) <= p.observation_distance_m
+            seen, offsets = Seen(owners, places, velocities, ages_s), places[:, :2]
         else:
             self._own = self._perception.own_velocities(states[:, 3:5], step)
             seen = self._perception.perceive(who, reach_m, near, states, step)
-            offsets, middle_of = level_offsets(seen.offsets), np.ones(len(seen.owners), dtype=bool)
+            offsets = level_offsets(seen.offsets)
         still = np.zeros_like(self._own)
         u = self._law.accelerations(self._own, seen.owners, offsets, seen.velocities[:, :2], still, seen.ages_s)
-        owners = seen.owners[middle_of]
-        count = np.bincount(owners, minlength=len(states)) + 1
-        middles = [np.bincount(owners, axis, len(states)) / count for axis in offsets[middle_of].T]
-        self.sums, self._middles = u.T.reshape(2, *self._shape), np.column_stack(middles)
-        return near, seen
+        self.sums = u.T.reshape(2, *self._shape)
+        return near
 
     def figures(self) -> list[Figures]:
         """The figures of each flight."""
@@ -159,48 +117,29 @@ class FlockFlights:
 
 
 class Missions:
-    """What the drones of all flights want: a mission that goes by no place is asked once, waypoints for each drone."""
+    """What the drones of all flights want: each mission is asked once, as none goes by a drone's place."""
 
     def __init__(self, scenario: ScenarioConfig, flights: int) -> None:
         missions, n = [mission for mission, _ in scenario.missions], len(scenario.vehicles)
-        for i, (_, by_hand) in enumerate(scenario.missions):
-            if by_hand:
-                raise UsageError(
-                    f"vehicles[{i}] is flown by hand, which flights at control level do not have; delete `by_hand`"
-                )
-        self._flights, self._navigators = flights, list[tuple[Navigator, IntArray]]()
-        self.goal: FloatArray | None = None
-        """(2,) m: the last one of the largest group of drones that has any."""
-        self.to_the_last = np.zeros(flights, dtype=bool)
-        """Whether one of that group flies to it."""
-        self.reached_m = max(mission.reached_m for mission in missions)
-        largest = 0
+        for i, (mission, by_hand) in enumerate(scenario.missions):
+            if by_hand or mission.kind not in _PLACELESS:
+                fault = "is flown by hand" if by_hand else f"has the mission `{mission.kind}`, which goes by places"
+                raise UsageError(f"vehicles[{i}] {fault}, which control level does not have; fly on exact states")
+        self._navigators = list[tuple[Navigator, IntArray]]()
         for mission in dict.fromkeys(missions):
-            of_mission = [i for i in range(n) if missions[i] == mission]
-            rows = (n * np.arange(flights)[:, None] + of_mission).ravel()
-            is_led = mission.kind == "waypoints"
-            held = mission.model_copy(update={"at_end": "hold"})  # no autopilot takes over
-            for of_one in rows[:, None] if is_led else (rows,):
-                self._navigators.append((Navigator(held, scenario.drone.safety.gate), of_one))
-            if is_led and len(of_mission) > largest:
-                largest, self._led = len(of_mission), rows
-                self.goal = place_of_waypoint(mission.waypoints[-1], np.array(mission.origin_m), _HOME_DEG)
+            rows = n * np.arange(flights)[:, None] + np.flatnonzero([one == mission for one in missions])
+            self._navigators.append((Navigator(mission, scenario.drone.safety.gate), rows.ravel()))
 
-    def step(self, time_s: float, positions: FloatArray, middles: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def step(self, time_s: float, drones: int) -> tuple[FloatArray, FloatArray]:
         """Desired velocities (drones, 2) m/s, times the pull, and heights (drones,) m, up positive, NaN: as now.
 
-        `positions` (drones, 2) m; `middles` (drones, 2) m from each to the middle of those that it sees. Called in
-        order of time.
+        Called in order of time.
         """
-        desired, heights, goals = np.zeros(positions.shape), np.full(len(positions), np.nan), np.zeros(positions.shape)
+        desired, heights = np.zeros((drones, 2)), np.full(drones, np.nan)
         for navigator, rows in self._navigators:
-            first = rows[0]
-            guidance = navigator.step(Moment(time_s, positions[first], middles[first], _HOME_DEG))
+            guidance = navigator.step(Moment(time_s, np.zeros(2), np.zeros(2), np.array(REFERENCE_DEG)))
             desired[rows] = navigator.pull(guidance)
             heights[rows] = np.nan if guidance.height_m is None else guidance.height_m
-            goals[rows] = np.nan if guidance.goal is None else guidance.goal
-        if self.goal is not None:
-            self.to_the_last = (goals[self._led] == self.goal).all(axis=1).reshape(self._flights, -1).any(axis=1)
         return desired, heights
 
 

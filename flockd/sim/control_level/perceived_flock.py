@@ -1,4 +1,4 @@
-"""What each drone perceives of the others with the errors of cameras and networks.
+"""Who is near whom in many flights, and what each drone perceives of the others with errors as of the networks.
 
 Errors are drawn without a memory: each is a function of the flight's seed, the two drones and the time, between normal
 numbers at the ends of a stretch of time that the next stretch shares. So a flight is the same whatever is flown beside
@@ -7,14 +7,15 @@ it, and only those near are looked at.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from flockd.core.messages import BoolArray, FloatArray, IntArray
-from flockd.sim.control_level.near import Near
 from flockd.sim.scenario.perceived import PerceivedErrors, Spread
 
 DISTANCE, MISSED, BIAS, RANGE, BEARING, VELOCITY = 0, 1, 2, 3, 5, 7
@@ -28,6 +29,39 @@ _MOST_FALSE = 4
 _LEAST_RANGE_M = 1e-3
 
 
+_APART_M = 1e7
+"""The flights' planes lie so far above each other in the tree; a distance beyond half of that counts as infinite."""
+
+
+class Near:
+    """The drones of all flights by their level places; a drone's number counts through all flights."""
+
+    def __init__(self, states: FloatArray) -> None:
+        """`states` (6, flights, n) m and m/s, NED."""
+        _, flights, n = states.shape
+        planes = np.repeat(_APART_M * np.arange(flights), n)
+        self._places = np.column_stack([*states[:2].reshape(2, -1), planes])
+        self._tree = cKDTree(self._places)
+
+    def nearest(self, k: int) -> tuple[FloatArray, IntArray]:
+        """Level distance (drones,) m to the k-th nearest other drone, and which: infinite and itself where none is."""
+        found_m, found = self._tree.query(self._places, k=[k + 1], distance_upper_bound=_APART_M / 2)
+        numbers = np.arange(len(self._places))
+        return found_m[:, 0], np.where(np.isinf(found_m[:, 0]), numbers, found[:, 0])
+
+    def pairs(self, who: IntArray, reach_m: FloatArray) -> tuple[IntArray, IntArray]:
+        """Of the drones `who` (m,), (p,) of `who`, in order, and the number (p,) of another within its `reach_m` (m,).
+
+        A drone's others are in ascending order; there may be some that are farther by a rounding error.
+        """
+        reach = np.minimum(reach_m * (1.0 + 1e-9), _APART_M / 2)
+        found = self._tree.query_ball_point(self._places[who], reach, return_sorted=True)
+        counts = np.fromiter(map(len, found), np.int64, len(who))
+        others = np.fromiter(itertools.chain.from_iterable(found), np.int64, counts.sum())
+        owners = np.repeat(who, counts)
+        return owners[owners != others], others[owners != others]
+
+
 class Seen(NamedTuple):
     """What drones know of their neighbours, as p pairs."""
 
@@ -39,8 +73,6 @@ class Seen(NamedTuple):
     """(p, 3) m/s, NED, over ground."""
     ages_s: FloatArray
     """(p,) for how long it has known them."""
-    numbers: IntArray
-    """(p,) of the neighbours; below 0: not known from step to step."""
 
     def of(self, chosen: IntArray | slice) -> Self:
         """Some of the pairs."""
@@ -95,11 +127,10 @@ class Perception:
         z = self._normals(owners, pairs, 3, step, errors.error_time_s)
         velocities[:, :2] += _error(table, ranges[:, None], VELOCITY, z)
         offsets = np.column_stack([north * cos - east * sin, north * sin + east * cos, down])
-        true = Seen(owners, offsets, velocities, np.full(len(owners), math.inf), owners)
+        true = Seen(owners, offsets, velocities, np.full(len(owners), math.inf))
         false = self._false(who, reach_m, states, step)
         seen = Seen._make(np.concatenate(parts) for parts in zip(true, false, strict=True))
-        seen = seen.of(np.argsort(seen.owners, kind="stable"))
-        return seen._replace(numbers=-1 - np.arange(len(seen.owners)))
+        return seen.of(np.argsort(seen.owners, kind="stable"))
 
     def _false(self, who: IntArray, reach_m: FloatArray, states: FloatArray, step: int) -> Seen:
         """Neighbours that are none, which fly as the drone itself does."""
@@ -115,7 +146,7 @@ class Perception:
         range_m, bearing, at = range_m[which, number], bearing[which, number], at[which, number]
         offsets = np.column_stack([range_m * np.cos(bearing), range_m * np.sin(bearing), np.zeros(len(which))])
         ages_s = (at - np.floor(at)) * false.lifetime_s
-        return Seen(who[which], offsets, states[who[which], 3:], ages_s, who[which])
+        return Seen(who[which], offsets, states[who[which], 3:], ages_s)
 
     def _visible(self, owners: IntArray, rays: FloatArray, widths: FloatArray) -> BoolArray:
         """Who is not hidden, (p,), of pairs from near to far.

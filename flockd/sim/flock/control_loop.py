@@ -10,16 +10,18 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from flockd.core.config.safety import GateParameters, SafetyParameters
+from flockd.core.config.safety import SafetyParameters
 from flockd.core.messages import NO_STATUS, FloatArray, MissionStatus, Neighbour, ObstacleRanges, Setpoint, Wanted
 from flockd.flight.obstacles import nearest_points
 from flockd.flight.safety import (
     OFFBOARD,
+    Action,
     CameraHealth,
     Decision,
     Event,
     Gate,
     Inputs,
+    Objection,
     Permission,
     Request,
     State,
@@ -31,8 +33,6 @@ from flockd.flight.safety import (
 )
 from flockd.flight.safety.surroundings import surroundings
 from flockd.review.flight_log.metadata import HandedOver
-from flockd.sim.flock.made_up_detections import lost_cameras
-from flockd.sim.flock.slowing import Cause, SlowedTime, causes_of, is_slowed, which_are_drones
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances, Vehicles
 
@@ -178,6 +178,46 @@ class WindSupervisor:
         return decision
 
 
+_OBJECTED = {Objection.SEPARATION: "neighbour", Objection.OBSTACLE: "obstacle", Objection.FENCE: "fence"}
+_DEGRADED = {
+    Event.VELOCITY_OFF: "wind", Event.NO_ROOM_TO_HOLD: "wind", Event.CAMERA_LOST: "camera", Event.FENCE_LEFT: "fence",
+}  # fmt: skip
+"""Causes by the gate's objection, and by why the supervisor had a drone fly slower; all else is `other`."""
+_SLOWED = 0.05
+"""A velocity that differs from the one asked for by a smaller share of it counts as the same."""
+
+
+class SlowedTime:
+    """For how long gates let drones fly otherwise than they were asked to, by cause; a moment may have several."""
+
+    def __init__(self) -> None:
+        self._flown_s = self._slowed_s = 0.0
+        self._by_cause_s: dict[str, float] = {}
+
+    def add(self, period_s: float, request: Request, verdict: Verdict, degraded_by: Collection[Event] = ()) -> None:
+        """A drone flew for so long; `degraded_by`: why it was last degraded."""
+        self._flown_s += period_s
+        asked, setpoint = request.wanted.velocity, verdict.setpoint
+        if setpoint is None or math.hypot(*(setpoint.velocity - asked)) <= _SLOWED * math.hypot(*asked):
+            return
+        self._slowed_s += period_s
+        causes = {_OBJECTED[objection] for objection in verdict.objections if objection in _OBJECTED}
+        if request.permission.action is Action.FLY_DEGRADED:
+            causes |= {_DEGRADED.get(event, "other") for event in degraded_by}
+        for cause in sorted(causes or {"other"}):
+            self._by_cause_s[cause] = self._by_cause_s.get(cause, 0.0) + period_s
+
+    @property
+    def share(self) -> float | None:
+        """Of the time flown; None: none was."""
+        return self._slowed_s / self._flown_s if self._flown_s else None
+
+    @property
+    def by_cause(self) -> dict[str, float]:
+        """Shares of the time flown."""
+        return {cause: slowed_s / self._flown_s for cause, slowed_s in sorted(self._by_cause_s.items())}
+
+
 PERIOD_S = 0.05
 """Between two setpoints, as `autopilot.setpoint_rate_hz` is by default."""
 _SAME_TIME_S = 1e-9
@@ -199,14 +239,6 @@ class _Drone(NamedTuple):
 
     gate: Gate
     supervisor: WindSupervisor
-    parameters: GateParameters
-
-
-class FlightStatus(NamedTuple):
-    """Who flies a drone, and why, as in telemetry."""
-
-    state: State
-    reasons: tuple[str, ...]
 
 
 class ControlLoop:
@@ -248,15 +280,14 @@ class ControlLoop:
         if i in self._drones:
             self._drones[i] = _drone(self._scenario, i)
 
-    def status(self, i: int) -> FlightStatus:
-        """Who flies a drone, and why."""
+    def status(self, i: int) -> tuple[State, tuple[str, ...]]:
+        """Who flies a drone, and why, as in telemetry."""
         if i in self._handover.taken:
-            reasons = (self.handed_over[i].reason,) if i in self.handed_over else ()
-            return FlightStatus(State.ASKING, reasons)
+            return State.ASKING, (self.handed_over[i].reason,) if i in self.handed_over else ()
         decision = self._supervised.get(i)
         if decision is None:
-            return FlightStatus(State.NORMAL, ())
-        return FlightStatus(decision.state, tuple(reason.sentence for reason in decision.reasons))
+            return State.NORMAL, ()
+        return decision.state, tuple(reason.sentence for reason in decision.reasons)
 
     def velocity_error_m_s(self, i: int) -> float:
         """By how much a drone's velocity is off its setpoints, as its gate finds; 0 without one."""
@@ -295,70 +326,40 @@ class ControlLoop:
 
     def _setpoint(self, i: int, now_s: float, period_s: float, vehicles: Vehicles, order: _Order) -> Setpoint:
         """What the gate of a drone makes of its order now; its supervisor may hand it over instead."""
-        drone = self._drones[i]
-        around = self._around(i, now_s, vehicles, order)
-        lost = self._lost_cameras(i, now_s)
+        drone, commands, here = self._drones[i], order.commands, vehicles.known_position[i]
+        ranges, yaw_rad = commands.obstacles[i], float(commands.yaw_rad[i])
+        around = surroundings(
+            commands.neighbours[i],
+            now_s - order.time_s,
+            moved=here - order.places[i],
+            position=here[:2],
+            velocity=vehicles.known_velocity[i],
+            yaw_rad=yaw_rad,
+            height_m=float(-here[2]),
+            obstacles=np.empty((0, 2)) if ranges is None else nearest_points(ranges, self._sigmas),
+        )
+        lost = self._disturbed.cameras_off_of(i)
+        if self._scenario.detections is not None:
+            lost |= self._scenario.lost_cameras(i, now_s)
         decision = drone.supervisor.step(now_s, drone.gate, around, lost=lost)
         self._supervised[i] = decision
         if decision.state is State.ASKING:
             self._hand_over(i, now_s, vehicles, decision.reasons[0].sentence)
-        request = self._request(i, Permission(decision.action, now_s), around, order)
+        height_m = float(commands.height_m[i])
+        wanted = Wanted(commands.velocity[i], commands.acceleration[i], yaw_rad)
+        held_m = height_m if math.isfinite(height_m) else self._start_m[i]
+        request = Request(Permission(decision.action, now_s), wanted, order.time_s, held_m, around)
         verdict = drone.gate.step(now_s, request)
         assert verdict.setpoint is not None, "all that it is told is finite and of now"
         if decision.state is not State.ASKING:
-            slowed = is_slowed(request, verdict)
-            self.slowed.add(period_s, self._causes(i, request, verdict, vehicles) if slowed else frozenset())
+            self.slowed.add(period_s, request, verdict, drone.supervisor.degraded_by)
         return verdict.setpoint
 
     def _hand_over(self, i: int, now_s: float, vehicles: Vehicles, why: str) -> None:
         self._handover.hold(i, vehicles.known_position[i], vehicles.known_velocity[i])
         self.handed_over[i] = HandedOver(time_s=now_s, reason=why)
 
-    def _lost_cameras(self, i: int, now_s: float) -> frozenset[str]:
-        """Those that are off, and those of a drone that flies on made-up detections that have a fault."""
-        off = self._disturbed.cameras_off_of(i)
-        return off if self._scenario.detections is None else off | lost_cameras(self._scenario, i, now_s)
-
-    def _causes(self, i: int, request: Request, verdict: Verdict, vehicles: Vehicles) -> frozenset[Cause]:
-        truth = _truth(i, vehicles)
-        is_drone = which_are_drones(request.around.neighbours, truth.neighbours)
-        drone = self._drones[i]
-        return causes_of(drone.parameters, request, verdict, truth, is_drone, drone.supervisor.degraded_by)
-
-    def _around(self, i: int, now_s: float, vehicles: Vehicles, order: _Order) -> Surroundings:
-        here, commands = vehicles.known_position[i], order.commands
-        ranges = commands.obstacles[i]
-        return surroundings(
-            commands.neighbours[i],
-            now_s - order.time_s,
-            moved=here - order.places[i],
-            position=here[:2],
-            velocity=vehicles.known_velocity[i],
-            yaw_rad=float(commands.yaw_rad[i]),
-            height_m=float(-here[2]),
-            obstacles=np.empty((0, 2)) if ranges is None else nearest_points(ranges, self._sigmas),
-        )
-
-    def _request(self, i: int, permission: Permission, around: Surroundings, order: _Order) -> Request:
-        height_m, commands = float(order.commands.height_m[i]), order.commands
-        wanted = Wanted(commands.velocity[i], commands.acceleration[i], float(commands.yaw_rad[i]))
-        held_m = height_m if math.isfinite(height_m) else self._start_m[i]
-        return Request(permission, wanted, order.time_s, held_m, around)
-
 
 def _drone(scenario: ScenarioConfig, i: int) -> _Drone:
     safety, cameras = scenario.drone_of(i).safety, [camera.name for camera in scenario.drone.rig.cameras]
-    return _Drone(Gate(safety.gate), WindSupervisor(safety, cameras), safety.gate)
-
-
-def _truth(i: int, vehicles: Vehicles) -> Surroundings:
-    """Where the other drones truly are."""
-    others = np.arange(len(vehicles.position)) != i
-    return Surroundings(
-        position=vehicles.position[i, :2],
-        velocity=vehicles.velocity[i, :2],
-        yaw_rad=0.0,
-        neighbours=vehicles.position[others] - vehicles.position[i],
-        neighbour_velocities=vehicles.velocity[others, :2],
-        height_m=float(-vehicles.position[i, 2]),
-    )
+    return _Drone(Gate(safety.gate), WindSupervisor(safety, cameras))

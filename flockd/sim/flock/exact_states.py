@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import ndtri
 
-from flockd.core.messages import FloatArray, MissionOrder, MissionStatus, Neighbour, ObstacleRanges
+from flockd.core.messages import BoolArray, FloatArray, MissionOrder, MissionStatus, Neighbour
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.flocking.passing import Passing
 from flockd.flight.geometry import build_rig, rotation_from_euler
@@ -16,15 +18,12 @@ from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
 from flockd.flight.obstacles import Avoidance
 from flockd.flight.safety.surroundings import limits_towards
+from flockd.flight.tracking import Measurement, Tracker
 from flockd.sim.flock.control_loop import Commands, ControlLoop
-from flockd.sim.flock.made_up_detections import TrackedNeighbours
-from flockd.sim.scenario import ScenarioConfig
+from flockd.sim.scenario import DetectionsConfig, ScenarioConfig
 from flockd.sim.vehicles.vehicles import REFERENCE_DEG, UNDISTURBED, Disturbances, Vehicles
 from flockd.sim.world.obstacle_worlds import obstacles_of
 from flockd.sim.world.obstacles import true_ranges
-
-Orders = Mapping[int, Sequence[tuple[float, MissionOrder]]]
-"""What operators ordered of a flight's drones, by the drone's number from 0, and when, s; in order of time."""
 
 
 class ExactFlock:
@@ -33,11 +32,9 @@ class ExactFlock:
     The states are exact, or tracked from made-up detections where the scenario has `detections`.
     """
 
-    def __init__(self, scenario: ScenarioConfig, orders: Orders | None = None, *, passes: bool = True) -> None:
+    def __init__(self, scenario: ScenarioConfig, *, passes: bool = True) -> None:
         """``passes``: drones keep clear of those that would come too near, as pilots ask for; else the law alone."""
         drone, self._passes = scenario.drone, passes
-        self._orders = {i: list(of_drone) for i, of_drone in (orders or {}).items()}
-        self._new: Mapping[int, MissionOrder] = {}
         self._law, self._step_s = FlockingLaw(drone.flocking), drone.step_s
         self._pilots = [
             HandPilot(scenario, i) if vehicle.by_hand else Navigator(scenario.drone_of(i).mission, drone.safety.gate)
@@ -66,64 +63,47 @@ class ExactFlock:
 
         `own` (n, 3) m/s: what each takes for its own velocity; None: the exact one.
 
-        `orders` are operators' of now, by drone, beside those that were given at the beginning. In the view of a camera
-        that is off, as `disturbed` says, a drone knows of nobody.
+        `orders` are operators' of now, by drone. In the view of a camera that is off, as `disturbed` says, a drone
+        knows of nobody.
         """
-        self._new = orders or {}
-        seen = [true_ranges(self._obstacles, time_s, place) if self._obstacles.solids else None for place in positions]
-        known = [
-            self._neighbours(i, time_s, positions, velocities, disturbed.cameras_off_of(i))
-            for i in range(len(positions))
-        ]
-        own = velocities if own is None else own
-        found = [self._of(i, time_s, positions, own, known[i], ranges) for i, ranges in enumerate(seen)]
-        velocity, acceleration, yaw_rad, height_m, missions, desired = zip(*found, strict=True)
-        self._yaw_rad = np.array(yaw_rad)
-        return Commands(
-            np.array(velocity), np.array(acceleration), self._yaw_rad, np.array(height_m), missions, np.array(desired),
-            tuple(seen), tuple(known),
-        )  # fmt: skip
-
-    def _of(
-        self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray, known: tuple[Neighbour, ...],
-        ranges: ObstacleRanges | None,
-    ) -> tuple[FloatArray, FloatArray, float, float, MissionStatus, FloatArray]:  # fmt: skip
-        here, moving = positions[:, :2], velocities[:, :2]
-        pilot = self._pilots[i]
-        if isinstance(pilot, HandPilot):
-            flown = pilot.step(time_s, here[i])
-            return flown.velocity, np.zeros(2), float(self._yaw_rad[i]), flown.height_m, flown.status, flown.velocity
-        seen = [one for one in known if one.confirmed]
-        places = np.reshape([one.position for one in seen], (len(seen), 3))
-        others = np.reshape([one.velocity for one in seen], (len(seen), 3))[:, :2]
-        ages_s = np.array([one.age_s for one in seen]) if self._tracked else math.inf
-        order = self._newest_order(i, time_s)
-        guidance = pilot.step(Moment(time_s, here[i], middle_of(places[:, :2]), np.array(REFERENCE_DEG), order=order))
-        desired = pilot.pull(guidance)
-        if ranges is None or not self._avoids:
-            if self._passes:
-                tracks = [one.track for one in seen]
-                command, acceleration = self._passings[i].command(
-                    moving[i], places, others, desired, self._step_s, tracks, limits_towards(known, self._gate), ages_s
+        own, orders = velocities if own is None else own, orders or {}
+        commands = Commands.of(len(positions))
+        commands.yaw_rad[:] = self._yaw_rad
+        missions, ranges, known = list(commands.missions), list(commands.obstacles), list(commands.neighbours)
+        for i, pilot in enumerate(self._pilots):
+            here, moving = positions[i, :2], own[i, :2]
+            known[i] = self._neighbours(i, time_s, positions, velocities, disturbed.cameras_off_of(i))
+            if self._obstacles.solids:
+                ranges[i] = true_ranges(self._obstacles, time_s, positions[i])
+            if isinstance(pilot, HandPilot):
+                flown = pilot.step(time_s, here)
+                commands.velocity[i] = commands.desired[i] = flown.velocity
+                commands.height_m[i], missions[i] = flown.height_m, flown.status
+                continue
+            seen = [one for one in known[i] if one.confirmed]
+            places = np.reshape([one.position for one in seen], (len(seen), 3))
+            others = np.reshape([one.velocity for one in seen], (len(seen), 3))[:, :2]
+            ages_s = np.array([one.age_s for one in seen]) if self._tracked else math.inf
+            moment = Moment(time_s, here, middle_of(places[:, :2]), np.array(REFERENCE_DEG), order=orders.get(i))
+            guidance = pilot.step(moment)
+            desired, around = pilot.pull(guidance), ranges[i]
+            if around is not None and self._avoids:
+                flown_as = self._avoidances[i].command(self._law, moving, places, others, desired, around, ages_s)
+            elif self._passes:
+                tracks, limits = [one.track for one in seen], limits_towards(known[i], self._gate)
+                flown_as = self._passings[i].command(
+                    moving, places, others, desired, self._step_s, tracks, limits, ages_s
                 )
             else:
-                command, acceleration = self._law.command(
-                    moving[i], places[:, :2], others, desired, self._step_s, ages_s
-                )
-        else:
-            command, acceleration = self._avoidances[i].command(
-                self._law, moving[i], places, others, desired, ranges, ages_s
-            )
-        yaw_rad = float(self._yaw_rad[i]) if guidance.course_rad is None else guidance.course_rad
-        height_m = np.nan if guidance.height_m is None else guidance.height_m
-        return command, acceleration, yaw_rad, height_m, pilot.status(guidance), desired
-
-    def _newest_order(self, i: int, time_s: float) -> MissionOrder | None:
-        """The last one until now that was not flown yet."""
-        waiting, newest = self._orders.get(i, []), self._new.get(i)
-        while waiting and waiting[0][0] <= time_s:
-            newest = waiting.pop(0)[1]
-        return newest
+                flown_as = self._law.command(moving, places[:, :2], others, desired, self._step_s, ages_s)
+            commands.velocity[i], commands.acceleration[i] = flown_as
+            commands.desired[i], missions[i] = desired, pilot.status(guidance)
+            if guidance.course_rad is not None:
+                commands.yaw_rad[i] = guidance.course_rad
+            if guidance.height_m is not None:
+                commands.height_m[i] = guidance.height_m
+        self._yaw_rad = commands.yaw_rad
+        return replace(commands, missions=tuple(missions), obstacles=tuple(ranges), neighbours=tuple(known))
 
     def _neighbours(
         self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray, cameras_off: frozenset[str]
@@ -143,6 +123,67 @@ class ExactFlock:
             )
             for j in np.flatnonzero(seen)
         )  # fmt: skip
+
+
+_OWN_MOTION_ERROR_M = 0.02
+"""Standard deviation of a drone's motion in a step, each axis, of which the tracker is told. Where the scenario is
+`ideal` the motion is exact."""
+
+
+class TrackedNeighbours:
+    """What one drone knows of the others as its own tracker makes it of detections that are made up from the truth."""
+
+    def __init__(self, scenario: ScenarioConfig, config: DetectionsConfig, drone: int) -> None:
+        self._config, self._drone, self._step_s = config, drone, scenario.drone.step_s
+        self._scenario, self._rig = scenario, build_rig(scenario.drone.rig)
+        self._tracker = Tracker(scenario.drone.tracking)
+        self._random = np.random.default_rng([scenario.seed, drone])
+        self._errors = self._random.normal(size=(len(scenario.vehicles) - 1, 5))
+        """Of each other drone, in standard deviations: of the range's logarithm and the bearing (3), and the normal
+        number that decides whether it is missed."""
+        self._position: FloatArray | None = None
+
+    def step(
+        self, time_s: float, positions: FloatArray, velocities: FloatArray, yaw_rad: float = 0.0,
+        cameras_off: frozenset[str] = frozenset(),
+    ) -> tuple[Neighbour, ...]:  # fmt: skip
+        """With all drones at (n, 3) m and (n, 3) m/s in NED, and the drone's own heading; called once a step.
+
+        Nobody is detected but in the view of a camera that has no fault and is on.
+        """
+        here = positions[self._drone]
+        if self._position is not None:
+            wrong_m = 0.0 if self._scenario.ideal else self._random.normal(0.0, _OWN_MOTION_ERROR_M, 3)
+            self._tracker.predict(self._step_s, here - self._position + wrong_m, _OWN_MOTION_ERROR_M)
+        self._position = here
+        offsets = np.delete(positions, self._drone, axis=0) - here
+        times_s = (self._config.error_time_s,) * 4 + (self._config.missed_time_s,)
+        keep = np.array([math.exp(-self._step_s / time_s) if time_s else 0.0 for time_s in times_s])
+        fresh = self._random.normal(size=self._errors.shape)
+        self._errors = keep * self._errors + np.sqrt(1.0 - keep**2) * fresh
+        made_up = (self._detection(*pair) for pair in zip(offsets, self._errors, strict=True))
+        found = [detection for detection in made_up if detection is not None]
+        gone = self._scenario.lost_cameras(self._drone, time_s) | cameras_off
+        R_ned_body = rotation_from_euler(0.0, 0.0, yaw_rad)
+
+        def shown(places: FloatArray, radius_m: float) -> BoolArray:
+            return self._rig.shows(places @ R_ned_body, radius_m, gone)
+
+        found = [one for one in found if shown(one.position[None], 0.0)[0]]
+        self._tracker.update(time_s, found, velocities[self._drone], shown)
+        return self._tracker.neighbours()
+
+    def _detection(self, offset: FloatArray, errors: FloatArray) -> Measurement | None:
+        config = self._config
+        range_m = float(np.linalg.norm(offset))
+        if range_m > config.range_m or errors[4] < ndtri(config.missed):
+            return None
+        bearing = offset / range_m + config.bearing_error_rad * errors[1:4]
+        bearing /= np.linalg.norm(bearing)
+        across, along = config.bearing_error_rad**2, config.range_error**2
+        covariance = across * np.eye(3) + (along - across) * np.outer(bearing, bearing)
+        log_range = float(np.log(range_m) + config.range_error * errors[0])
+        return Measurement(bearing, log_range, covariance, 0.6, 0.95)
 
 
 class FlownByHand(NamedTuple):
@@ -188,18 +229,14 @@ def vehicles_of(scenario: ScenarioConfig) -> Vehicles:
     )
 
 
-def fly_exact_states(
-    scenario: ScenarioConfig, *, gated: bool = True, orders: Orders | None = None
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def fly_exact_states(scenario: ScenarioConfig, *, gated: bool = True) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Times (S,) s, positions (S, N, 3) m and velocities (S, N, 3) m/s in NED, as each step begins.
-
-    `orders` are flown at the first step after them.
 
     The paper's "UAV flocking based on ground truth cluster state": each vehicle gets what the flocking law commands on
     the true positions and velocities of all.
     """
     times = step_times(scenario)
-    flock, loop = ExactFlock(scenario, orders, passes=gated), ControlLoop(scenario, gated=gated)
+    flock, loop = ExactFlock(scenario, passes=gated), ControlLoop(scenario, gated=gated)
     vehicles = vehicles_of(scenario)
     positions, velocities = [], []
     for time_s in times:
@@ -209,11 +246,9 @@ def fly_exact_states(
     return times, np.array(positions), np.array(velocities)
 
 
-def exact_states_at(
-    times: FloatArray, scenario: ScenarioConfig, orders: Orders | None = None
-) -> tuple[FloatArray, FloatArray]:
+def exact_states_at(times: FloatArray, scenario: ScenarioConfig) -> tuple[FloatArray, FloatArray]:
     """Positions (S, N, 3) m and velocities (S, N, 3) m/s of `fly_exact_states`, interpolated at ``times`` (S,) s."""
-    steps_s, position, velocity = fly_exact_states(scenario, orders=orders)
+    steps_s, position, velocity = fly_exact_states(scenario)
     flat = [values.reshape(len(steps_s), -1) for values in (position, velocity)]
     at = [np.stack([np.interp(times, steps_s, column) for column in values.T], axis=1) for values in flat]
     shape = (len(times), *position.shape[1:])

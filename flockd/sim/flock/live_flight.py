@@ -17,8 +17,8 @@ from flockd.onboard.telemetry.order_messages import parse_ask
 from flockd.onboard.telemetry.topics import AnswerMessage
 from flockd.sim.flock.control_loop import ControlLoop
 from flockd.sim.flock.exact_states import vehicles_of
+from flockd.sim.flock.flock_telemetry import FlockTelemetry
 from flockd.sim.flock.pilot_pool import PilotPool
-from flockd.sim.flock.shown_flock import ShownFlock
 from flockd.sim.flock.swarm import ExactStatePilots, VisionPilots
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances
@@ -220,7 +220,7 @@ def answered(controls: LiveControls) -> Callable[[str, bytes], Mapping[str, obje
 
 def fly_live(
     scenario: ScenarioConfig,
-    shown: ShownFlock,
+    shown: FlockTelemetry,
     controls: LiveControls,
     *,
     perception: SimulatedPerception = "learned",
@@ -249,7 +249,7 @@ def fly_live(
 def _fly_once(
     scenario: ScenarioConfig,
     pilots: ExactStatePilots | VisionPilots,
-    shown: ShownFlock,
+    shown: FlockTelemetry,
     controls: LiveControls,
     *,
     gated: bool,

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing import get_context
 from typing import TYPE_CHECKING, Self
 
+from flockd.core.errors import UnavailableError
 from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, VehicleState
-from flockd.core.side_process import SideProcess
 from flockd.flight.perception import ImageNetworks, load_networks
 from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.review.flight_log.key_frames import KeyFrame, capture
-from flockd.sim.flock.truth_perception import RenderTruth, TruthPerception
 from flockd.sim.scenario import ScenarioConfig
+from flockd.sim.sitl.bound_to_parent import bind
 
 if TYPE_CHECKING:  # a process of pilots does not load the renderer, unless truths need it
     from flockd.sim.flock.truth_perception import RenderTruth, TruthPerception
@@ -73,6 +76,28 @@ class Pilots:
         return FlockPilot(self._scenario.drone_of(drone), networks, stopwatch=time.perf_counter)
 
 
+_HERE: list[Pilots] = []
+"""Those of a process that has no others' work."""
+
+
+@contextmanager
+def _deaf_children() -> Iterator[None]:
+    """Processes that start here do not hear Ctrl-C, which is for the simulator. For the main thread."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _load(scenario: ScenarioConfig, drones: Sequence[int], swap: Swap | None) -> None:
+    _HERE.append(Pilots(scenario, drones, swap))
+
+
+def _step(*inputs: object) -> Stepped:
+    return _HERE[0](*inputs)  # type: ignore[arg-type]
+
+
 class PilotPool:
     """Between ``__enter__`` and ``__exit__``. Pilots share nothing but networks, so their order does not matter.
 
@@ -95,32 +120,33 @@ class PilotPool:
             from flockd.sim.flock.truth_perception import TruthPerception  # noqa: PLC0415 - see above
 
             self._swap = partial(TruthPerception, swap=swap)
-        self._processes: list[SideProcess] = []
+        self._executors: list[Executor] = []
+        self._loaded: list[Future[None]] = []
         self._here: Pilots | None = None
-        self._stack = ExitStack()
-        self._threads = [ThreadPoolExecutor(1, thread_name_prefix="pilots") for _ in self._shares]
 
     def __enter__(self) -> Self:
-        """Starts the processes, which load their networks while the caller goes on."""
-        with ExitStack() as stack:
-            for share in self._shares if len(self._shares) > 1 else ():
-                names = ", ".join(f"drone{drone + 1}" for drone in share)
-                process = SideProcess(f"flew {names}", Pilots, self._scenario, share, self._swap)
-                self._processes.append(stack.enter_context(process))
-            self._stack = stack.pop_all()
+        """Starts the processes, which load their networks while the caller goes on. For the main thread."""
+        if len(self._shares) == 1:
+            self._executors.append(ThreadPoolExecutor(1, thread_name_prefix="pilots"))
+            return self
+        for share in self._shares:
+            executor = ProcessPoolExecutor(1, get_context("spawn"), initializer=bind, initargs=(os.getpid(),))
+            self._executors.append(executor)
+            with _deaf_children():
+                self._loaded.append(executor.submit(_load, self._scenario, share, self._swap))
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stack.close()
-        for thread in self._threads:
-            thread.shutdown()
+        for executor in self._executors:
+            executor.shutdown(cancel_futures=True)
 
     def wait_until_ready(self) -> None:
         """Until all networks are loaded. Raises ModelError, and UnavailableError when a process has ended."""
-        if not self._processes:
+        if len(self._shares) == 1:
             self._here = Pilots(self._scenario, self.drones, self._swap)
-        for process in self._processes:
-            process.wait_until_ready()
+        for drone, loaded in zip(self.drones, self._loaded, strict=False):
+            with self._named(drone):
+                loaded.result()
 
     def step(
         self,
@@ -133,12 +159,29 @@ class PilotPool:
         order: MissionOrder | None = None,
         begins: bool = False,
     ) -> Future[Stepped]:
-        """Steps a drone's pilot, see `Pilots`; the result is there once the drone's process has come to it."""
-        place = self.drones.index(drone) % len(self._shares)
-        pilots: Callable[..., Stepped] = self._here or self._processes[place].ask
+        """Steps a drone's pilot, see `Pilots`; `stepped` waits until the drone's process has come to it."""
         inputs = (drone, frames, vehicle, truth if self._swap else None, pictured, order, begins)
-        if not self.on_this_thread:
-            return self._threads[place].submit(pilots, *inputs)
-        stepped: Future[Stepped] = Future()
-        stepped.set_result(pilots(*inputs))
-        return stepped
+        if self._here is not None and self.on_this_thread:
+            done: Future[Stepped] = Future()
+            done.set_result(self._here(*inputs))
+            return done
+        pilots: Callable[..., Stepped] = self._here or _step
+        with self._named(drone):
+            return self._executors[self._place(drone)].submit(pilots, *inputs)
+
+    def stepped(self, drone: int, stepping: Future[Stepped]) -> Stepped:
+        """What its pilot did. Raises UnavailableError when its process has ended."""
+        with self._named(drone):
+            return stepping.result()
+
+    def _place(self, drone: int) -> int:
+        return self.drones.index(drone) % len(self._shares)
+
+    @contextmanager
+    def _named(self, drone: int) -> Iterator[None]:
+        try:
+            yield
+        except BrokenProcessPool:
+            flew = ", ".join(f"drone{one + 1}" for one in self._shares[self._place(drone)])
+            fix = "if nobody ended it, free some memory, and try again"
+            raise UnavailableError(f"the process that flew {flew} has ended; {fix}") from None

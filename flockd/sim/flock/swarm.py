@@ -31,8 +31,8 @@ from flockd.sim.flock.exact_states import (
     step_times,
     vehicles_of,
 )
+from flockd.sim.flock.flock_telemetry import FlockTelemetry, RealTime, orders_of
 from flockd.sim.flock.pilot_pool import PilotPool, Stepped
-from flockd.sim.flock.shown_flock import RealTime, ShownFlock, orders_of
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.pose_trail import LateAttitude
 from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances, SimulatedAutopilot, Vehicles
@@ -58,7 +58,7 @@ def fly(
     perception: SimulatedPerception = "learned",
     swap: frozenset[str] = frozenset(),
     gated: bool = True,
-    shown: ShownFlock | None = None,
+    shown: FlockTelemetry | None = None,
     recorders: Sequence[Recorder] = (),
     processes: int | None = None,
     pictured: bool = True,
@@ -155,7 +155,7 @@ _PREPARATIONS = 4
 class ExactStatePilots:
     """The flocking law on the exact states of all drones."""
 
-    def __init__(self, scenario: ScenarioConfig, shown: ShownFlock | None, *, gated: bool) -> None:
+    def __init__(self, scenario: ScenarioConfig, shown: FlockTelemetry | None, *, gated: bool) -> None:
         self._scenario, self._gated, self._shown = scenario, gated, shown
         self.begin_again()
         self._by_hand = [vehicle.by_hand for vehicle in scenario.vehicles]
@@ -201,7 +201,7 @@ class VisionPilots:
         self,
         scenario: ScenarioConfig,
         pool: PilotPool,
-        shown: ShownFlock | None,
+        shown: FlockTelemetry | None,
         recorders: Sequence[Recorder],
         companion: tuple[FloatArray, FloatArray] | None,
         preparing: Callable[[int, int], None],
@@ -270,7 +270,7 @@ class VisionPilots:
                 ),
             )
         self._begins = set()
-        self._stepped = {i: future.result() for i, (_, _, future) in steps.items()}
+        self._stepped = {i: self._pool.stepped(i, stepping) for i, (_, _, stepping) in steps.items()}
         truth = None if self._companion is None else self._truth(step, time_s, vehicles, self._companion)
         for i, stepped in self._stepped.items():
             frames, state, _ = steps[i]

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from flockd.sim.world.baking import sun_reaches
+from flockd.sim.world.baking import GROUND_MAP_BITS, sun_reaches
+from flockd.sim.world.sky import SKY_BITS
 from flockd.sim.world.textures import TEXTURE_BITS
 
 SUBSAMPLES = 3
@@ -218,6 +219,92 @@ def _put(rgb: Any, y: int, x: int, tone: Any, red: float, green: float, blue: fl
     rgb[y, x, 0] = _encode(tone, red)
     rgb[y, x, 1] = _encode(tone, green)
     rgb[y, x, 2] = _encode(tone, blue)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def shade_scene(hit: Any, planes: Any, eye: Any, scene: Any, blobs: Any, rgb: Any, depth: Any) -> None:
+    """Colour and metric depth of every pixel from its triangle index, inf for sky.
+
+    ``blobs`` (k, 9): a drone's place, radius and darkness; left, top, right and bottom of where its shadow may be.
+    """
+    inverse_K, R, origin = eye.inverse_K, eye.R, eye.origin
+    light, tone, texture_area = scene.light, scene.tone, ((4 << (2 * TEXTURE_BITS)) - 1) // 3
+    sun, size, limit = light[0], 1 << GROUND_MAP_BITS, 0.5 - 0.51 / (1 << SKY_BITS)  # off the opposite border
+    sharper, of_map = math.log2(eye.focal) + 0.4, GROUND_MAP_BITS - math.log2(2.0 * scene.extent_m)
+    for y in range(hit.shape[0]):
+        for x in range(hit.shape[1]):
+            t = hit[y, x]
+            cx = inverse_K[0, 0] * (x + 0.5) + inverse_K[0, 1] * (y + 0.5) + inverse_K[0, 2]
+            cy = inverse_K[1, 1] * (y + 0.5) + inverse_K[1, 2]
+            rn = R[0, 0] * cx + R[0, 1] * cy + R[0, 2]
+            re = R[1, 0] * cx + R[1, 1] * cy + R[1, 2]
+            rd = R[2, 0] * cx + R[2, 1] * cy + R[2, 2]
+            if t < 0:  # on the sky's map: an octahedral one of the upper half
+                depth[y, x] = np.inf
+                scale = 0.5 / max(1e-9, abs(rn) + abs(re) + max(0.0, -rd))
+                u = max(-limit, min(limit, (rn + re) * scale)) + 0.5
+                v = max(-limit, min(limit, (rn - re) * scale)) + 0.5
+                found = sample(scene.sky, 0, SKY_BITS, u, v, 0.0)
+                _put(rgb, y, x, tone, 4.0 * _byte(found, 0), 4.0 * _byte(found, 32), 4.0 * _byte(found, 16))
+                continue
+            z = 1.0 / (planes[t, 9] * (x + 0.5) + planes[t, 10] * (y + 0.5) + planes[t, 11])
+            depth[y, x] = z
+            n, e, d = origin[0] + rn * z, origin[1] + re * z, origin[2] + rd * z
+            nn, ne, nd = scene.normals[t, 0], scene.normals[t, 1], scene.normals[t, 2]
+            length = math.sqrt(cx * cx + cy * cy + 1.0)
+            facing = max(0.02 * length, -(rn * nn + re * ne + rd * nd))
+            # A pixel's footprint: midway between its short side and its long one, which grazing views stretch; a
+            # little sharper than that.
+            level = 0.5 * math.log2(z * z * length / facing) - sharper
+            lit = 1.0
+            for k in range(blobs.shape[0]):
+                if blobs[k, 5] <= x < blobs[k, 7] and blobs[k, 6] <= y < blobs[k, 8]:
+                    lit *= _left_by(blobs[k], sun, n, e, d)
+            kind = scene.texture[t]
+            if kind < 0:
+                u, v = _mirrored(0.5 * e / scene.extent_m + 0.5), _mirrored(0.5 * n / scene.extent_m + 0.5)
+                mapped = sample(scene.ground_map, 0, GROUND_MAP_BITS, u, v, level + of_map)
+                red, green, blue, baked = _byte(mapped, 0), _byte(mapped, 32), _byte(mapped, 16), _byte(mapped, 48)
+                # The ground's sunlight is baked into its map, and beyond that there is no shade.
+                lit *= -sun[2] if max(abs(n), abs(e)) > scene.extent_m else baked
+                ground = scene.ground_kind[min(int(v * size), size - 1), min(int(u * size), size - 1)]
+                kind, tiles = int(scene.ground_detail[ground, 0]), scene.ground_detail[ground, 1]
+                u, v, level, nd = e * tiles, n * tiles, level + scene.ground_detail[ground, 2], -1.0
+            else:
+                red, green, blue, of = scene.tint[t, 0], scene.tint[t, 1], scene.tint[t, 2], scene.uv[t]
+                u = of[0, 0] * n + of[0, 1] * e + of[0, 2] * d + of[0, 3]
+                v = of[1, 0] * n + of[1, 1] * e + of[1, 2] * d + of[1, 3]
+                level += scene.level[t]
+                cosine = max(0.0, nn * sun[0] + ne * sun[1] + nd * sun[2])
+                if cosine > 0.0:
+                    at = n + 0.08 * nn, e + 0.08 * ne, d + 0.08 * nd
+                    cosine *= sun_reaches(scene.shadow_map, scene.shadow_frame, at[0], at[1], at[2])
+                lit *= cosine
+            fine = sample(scene.texels, kind * texture_area, TEXTURE_BITS, u, v, level)
+            of_red, of_green, of_blue = _light(light, nd, lit)
+            clear = math.exp(-scene.fog_per_m * z * length)
+            red = 2.0 * red * _byte(fine, 0) * of_red * clear + light[4, 0] * (1.0 - clear)
+            green = 2.0 * green * _byte(fine, 32) * of_green * clear + light[4, 1] * (1.0 - clear)
+            blue = 2.0 * blue * _byte(fine, 16) * of_blue * clear + light[4, 2] * (1.0 - clear)
+            _put(rgb, y, x, tone, red, green, blue)
+
+
+@njit(cache=True, error_model="numpy")
+def _mirrored(share: float) -> float:
+    """Beyond 0 and 1 a map goes on as its mirror image."""
+    return 1.0 - abs(1.0 - (share - 2.0 * math.floor(0.5 * share)))
+
+
+@njit(cache=True, error_model="numpy")
+def _left_by(blob: Any, sun: Any, n: float, e: float, d: float) -> float:
+    """Share of sunlight that a drone leaves: of a disc whose edge softens with distance, as the sun is not a point."""
+    bn, be, bd = blob[0] - n, blob[1] - e, blob[2] - d
+    along = bn * sun[0] + be * sun[1] + bd * sun[2]
+    if along <= 0.0:
+        return 1.0
+    off = math.sqrt(max(0.0, bn * bn + be * be + bd * bd - along * along))
+    soft = 0.35 * blob[3] + 0.01 * along
+    return float(1.0 - blob[4] * max(0.0, min(1.0, (blob[3] + 0.5 * soft - off) / soft)))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
-from flockd.sim.renderer import _raster, _shading
+from flockd.sim.renderer import _raster
 from flockd.sim.renderer._raster import Eye, Scene, Thing
 from flockd.sim.renderer.airframe import Solid, machine_texels
 from flockd.sim.world.mesh import face_normals
@@ -89,7 +89,7 @@ class Renderer:
         depth = np.empty((height, width), dtype=np.float32)
         sharp = np.empty((height, width, 3), dtype=np.uint8)
         planes, hit, _ = rasterized(world.vertices, world.triangles, P, origin, width, height)
-        _shading.shade_scene(hit, planes, eye, self._scene, blobs, sharp, depth)
+        _raster.shade_scene(hit, planes, eye, self._scene, blobs, sharp, depth)
         view = View(rgb=sharp.copy(), depth=depth, ids=np.zeros((height, width), dtype=np.uint8))
         _raster.smooth_edges(hit, world.texture, planes, self._linear, world.tone, sharp, view.rgb)
         chosen = np.arange(count)[np.asarray(shown)] if len(np.asarray(shown)) else np.arange(0)

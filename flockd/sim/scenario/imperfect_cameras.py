@@ -94,7 +94,7 @@ class CameraTimingConfig(Section):
 
 class LateAttitudeConfig(Section):
     """The attitude that the autopilot reports, beside `sensors.attitude_error_deg`. In daemons' flights, with PX4 or
-    its stand-in, it is the autopilot's own, and this does nothing."""
+    the fake, it is the autopilot's own, and this does nothing."""
 
     late_s: _Late = 0.0
     """It is so much older than it says."""

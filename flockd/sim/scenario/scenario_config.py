@@ -255,8 +255,6 @@ class ScenarioConfig(Section):
     """How far drones' clocks are apart: standard deviation of when each leaves the paper's circle. null: 0.2 s;
     nothing where `ideal`."""
     vehicles: Annotated[tuple[StartConfig, ...], Field(min_length=1, max_length=MAX_DRONES)]
-    take_off_apart_s: NonNegative = 0.0
-    """With real daemons (`--autopilot`): one drone takes off so long after the other."""
     vehicle: VehicleConfig = VehicleConfig()
     sensors: SensorConfig = SensorConfig()
     cameras: CamerasConfig | None = None
@@ -280,6 +278,11 @@ class ScenarioConfig(Section):
             late_s = self._clocks_apart_s * random.Random(f"clock {self.seed} {vehicle}").gauss(0.0, 1.0)
             mission = mission.model_copy(update={"circle_until_s": max(mission.circle_until_s + late_s, 0.0)})
         return self.drone if mission is self.drone.mission else self.drone.model_copy(update={"mission": mission})
+
+    def lost_cameras(self, vehicle: int, time_s: float) -> frozenset[str]:
+        """The names of one vehicle's cameras that have a fault at a time of the flight."""
+        of_vehicle = [fault for fault in self.faults if fault.drone == vehicle + 1]
+        return frozenset(fault.camera for fault in of_vehicle if fault.begin_s <= time_s < fault.end_s)
 
     @property
     def _clocks_apart_s(self) -> float:

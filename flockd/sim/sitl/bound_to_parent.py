@@ -12,6 +12,10 @@ import ctypes
 import os
 import signal
 import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import flockd
 
 PR_SET_PDEATHSIG = 1
 _MODULE = "flockd.sim.sitl.bound_to_parent"
@@ -28,6 +32,14 @@ def bind(parent: int) -> None:
         raise OSError(ctypes.get_errno(), "the parent's end cannot be watched")
     if os.getppid() != parent:
         sys.exit(128 + signal.SIGTERM)
+
+
+def with_package(environment: Mapping[str, str]) -> dict[str, str]:
+    """The environment, in which Python finds this package wherever it runs."""
+    package, known = str(Path(flockd.__file__).parents[1]), environment.get("PYTHONPATH")
+    if known and package in known.split(os.pathsep):
+        return dict(environment)
+    return {**environment, "PYTHONPATH": f"{package}{os.pathsep}{known}" if known else package}
 
 
 def main() -> None:

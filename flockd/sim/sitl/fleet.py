@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import tempfile
 import time
@@ -17,15 +16,16 @@ from flockd.core.choices import AutopilotKind
 from flockd.core.config import DroneConfig
 from flockd.core.errors import UnavailableError
 from flockd.onboard.simulated_time import clock_at
+from flockd.sim.autopilot.fake_telemetry import Mode
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.exact_states import HandPilot, exact_states_at
 from flockd.sim.flock.swarm import Flight
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.sitl.autopilots import Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.sitl.daemons import Daemons, fleet_configs
-from flockd.sim.sitl.fleet_log import FleetFrame, FleetRun, fleet_key_frames, fleet_log, recorded_orders
+from flockd.sim.sitl.fleet_log import FleetFrame, FleetRun, fleet_key_frames, fleet_log, were_ordered
 from flockd.sim.sitl.frame_server import FrameServer
-from flockd.sim.sitl.ground_station import GroundStation, Mode
+from flockd.sim.sitl.ground_station import GroundStation
 from flockd.sim.sitl.ports import free_endpoint
 from flockd.sim.sitl.processes import Program
 from flockd.sim.world.obstacle_worlds import with_obstacles
@@ -104,11 +104,8 @@ def fly_fleet(
         run = fleet.fly(progress)
         fleet.land(run)
         times = np.array([frame.time_s - run.frames[0].time_s for frame in run.frames])
-        orders = {
-            i: recorded_orders(recorded, config.name, run.frames[0].time_s)
-            for i, config in zip(fleet.drones, configs, strict=True)
-        }
-        companion = exact_states_at(times, scenario, orders)
+        ordered = any(were_ordered(recorded, config.name) for config in configs)
+        companion = None if ordered else exact_states_at(times, scenario)
         log = fleet_log(scenario, configs, run, recorded, speed_factor, companion)
         return Flight(with_obstacles(log, scenario), fleet_key_frames(recorded, run))
 
@@ -130,8 +127,6 @@ class _Fleet:
         """Programs that have to run now; `_poll` raises when one has ended."""
         self._left_s: dict[int, float] = {}
         """When a drone was first seen out of offboard, in seconds of the flight."""
-        self._began_s = 0.0
-        """When the drones began to take off."""
         self._climbed_s = dict.fromkeys(self._all, -np.inf)
         """When a drone rose or sank last."""
 
@@ -153,9 +148,8 @@ class _Fleet:
     def take_off(self) -> None:
         """Arms, climbs to the drone's own height, and selects offboard when flockd is ready."""
         station = self._station
-        self._began_s, apart_s = self._clock(), self._scenario.take_off_apart_s * (len(self._all) - 1)
-        up_s, late = ARM_S + CLIMB_S + apart_s, "could not be armed or did not reach its height"
-        self._until(self._is_up, up_s, late, request=self._request_climb)
+        late = "could not be armed or did not reach its height"
+        self._until(self._is_up, ARM_S + CLIMB_S, late, request=self._request_climb)
         self._until(
             lambda i: self._status(i).startswith("ready") and station.mode_is(i, "LOITER"), READY_S,
             "had no flockd that was ready to fly it", of=self.drones,
@@ -170,7 +164,7 @@ class _Fleet:
     def fly(self, progress: Progress) -> FleetRun:
         """Monitors the flight until its time is over, or until KeyboardInterrupt once there is something to report."""
         run = FleetRun(self._clock(), began=datetime.now(UTC).isoformat(timespec="seconds"))
-        wall_s, cpu_s, total_s = time.monotonic(), self._cpu_s(), self._scenario.duration_s
+        wall_s, total_s = time.monotonic(), self._scenario.duration_s
         try:
             while (flying_s := self._clock() - run.began_s) < total_s:
                 progress(int(flying_s), int(total_s))
@@ -186,7 +180,6 @@ class _Fleet:
             run.interrupted = True
         self._note_handovers(run, np.inf)
         run.ended_s, run.wall_s = self._clock(), time.monotonic() - wall_s
-        run.cores = {kind: (after - cpu_s[kind]) / run.wall_s for kind, after in self._cpu_s().items()}
         version = self._station.version(0)
         is_fake = self._autopilots.name == SimulatedAutopilots.name
         run.autopilot = self._autopilots.name if is_fake or version is None else f"{self._autopilots.name} {version}"
@@ -268,9 +261,7 @@ class _Fleet:
         return level and abs(error_m) < AT_HEIGHT_M and self._station.mode_is(i, "LOITER")
 
     def _request_climb(self, i: int) -> None:
-        """When its turn has come; once it has left the ground, another take-off would lead higher."""
-        if self._clock() - self._began_s < i * self._scenario.take_off_apart_s:
-            return
+        """Once it has left the ground, another take-off would lead higher."""
         if not self._station.is_armed(i):
             self._station.arm(i)
         elif self._height_m(i) < ON_GROUND_M:
@@ -311,17 +302,6 @@ class _Fleet:
             if program.ended is not None:
                 raise UnavailableError(f"{program.name} ended with exit code {program.ended} ({program.last_output()})")
         time.sleep(POLL_S)
-
-    def _cpu_s(self) -> dict[str, float]:
-        def used(programs: Sequence[Program]) -> float:
-            return sum(program.cpu_s() for program in programs)
-
-        own = os.times()
-        return {
-            "daemons": used(self._daemons.programs()),
-            "autopilots": used(self._autopilots.programs()),
-            "simulator": own.user + own.system,
-        }
 
 
 def _at_standstill(scenario: ScenarioConfig) -> ScenarioConfig:

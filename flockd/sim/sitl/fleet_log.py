@@ -11,8 +11,8 @@ import numpy as np
 
 from flockd import __version__
 from flockd.core.config import DroneConfig
-from flockd.core.messages import NO_STATUS, FloatArray, MissionOrder, MissionStatus, PilotOutput
-from flockd.flight.flocking.metrics import order, union
+from flockd.core.messages import NO_STATUS, FloatArray, MissionStatus, PilotOutput
+from flockd.flight.flocking.metrics import order
 from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.flight.perception import load_networks
 from flockd.flight.pilot import FlockPilot, StepTrace
@@ -23,11 +23,11 @@ from flockd.onboard.recording.streams import ORDER, OUTPUT
 from flockd.review.flight_log.builder import FlightLogBuilder
 from flockd.review.flight_log.key_frames import KeyFrame, capture, key_frame_steps
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.flight_log.metadata import FleetMetadata, FlightMetadata, MissionMetadata, Percentiles
+from flockd.review.flight_log.metadata import FleetMetadata, FlightMetadata, MissionMetadata
 from flockd.sim.scenario import ScenarioConfig
 
 END_OF_FLIGHT_S = 20.0
-"""Over which order and union at the end are averaged."""
+"""Over which order at the end is averaged."""
 KEY_FRAME_DRONE = 0
 
 
@@ -43,8 +43,6 @@ class FleetFrame:
     """(n, 3) m/s NED."""
     R_ned_body: FloatArray
     """(n, 3, 3)"""
-    delay_s: float
-    """Simulated seconds until the last drone had its frames."""
 
 
 @dataclass
@@ -58,8 +56,6 @@ class FleetRun:
     ended_s: float = 0.0
     wall_s: float = 0.0
     frames: tuple[FleetFrame, ...] = ()
-    cores: dict[str, float] = field(default_factory=dict)
-    """How many processor cores each kind of program kept busy."""
     handed_over: dict[str, str] = field(default_factory=dict)
     """Why a drone did not fly to the end, by its name; also where its mission ends so."""
     modes: dict[str, list[str]] = field(default_factory=dict)
@@ -75,11 +71,12 @@ def fleet_log(
     run: FleetRun,
     recordings: Path,
     speed_factor: float,
-    companion: tuple[FloatArray, FloatArray],
+    companion: tuple[FloatArray, FloatArray] | None,
 ) -> FlightLog:
     """The flight's log: the simulator's truth, and what the daemons recorded of their pilots.
 
-    ``companion`` holds positions and velocities (S, N, 3) of the same flight on exact states, at the S frames' times.
+    ``companion``: positions and velocities (S, N, 3) of the same flight on exact states, at the S frames' times; None:
+    operators ordered something else.
     """
     frames, drone = run.frames, configs[0]
     begin_s = frames[0].time_s
@@ -90,9 +87,8 @@ def fleet_log(
     rows = {frame.time_s: row for row, frame in enumerate(frames)}
     flown = [i for i, vehicle in enumerate(scenario.vehicles) if not vehicle.by_hand]
     statuses: list[dict[int, MissionStatus]] = [{} for _ in frames]
-    processed: dict[str, int] = {}
     over: set[str] = set()
-    longest_s, spanning = 0.0, 0
+    longest_s = 0.0
     for i, config in zip(flown, configs, strict=True):
         found = (from_json(PilotOutput, json.loads(e.data)) for e in _entries(recordings, config.name, OUTPUT.topic))
         steps: list[tuple[int, PilotOutput]] = [(rows[one.time_s], one) for one in found if one.time_s in rows]
@@ -101,28 +97,19 @@ def fleet_log(
             if before is not None:
                 longest_s = max(longest_s, float(times[row] - times[before[0]]))
                 spans_more = row - before[0] != 1 and output.ego_motion is not None
-                spanning += spans_more
             # The log compares a motion with the truth of one frame set before: it cannot take one that spans more.
             kept = replace(output, ego_motion=None) if spans_more else output
             builder.add_output(row, i, kept, output.stages_ms)
             statuses[row][i] = output.mission
             if output.mission.takeover is not None:
                 over.add(config.name)
-        processed[config.name] = len(steps)
     _add_missions(builder, scenario, frames, times, statuses)
-    delays_s = [frame.delay_s for frame in frames]
     end = [frame for frame, time_s in zip(frames, times, strict=True) if time_s >= times[-1] - END_OF_FLIGHT_S]
-    reach_m = drone.flocking.observation_distance_m
     fleet = FleetMetadata(
         speed_factor=speed_factor,
-        cores={name: round(cores, 3) for name, cores in run.cores.items()},
         frame_sets=len(frames),
-        frame_sets_looked_at=processed,
         longest_step_s=longest_s,
-        motions_over_more_than_one_frame_set=spanning,
-        frames_late_s=Percentiles(p50=float(np.percentile(delays_s, 50)), p95=float(np.percentile(delays_s, 95))),
         order_last_20s=float(np.mean([order(frame.velocity[:, :2]) for frame in end])),
-        union_last_20s=float(np.mean([union(frame.position[:, :2], reach_m) for frame in end])),
         handed_over={name: why for name, why in run.handed_over.items() if name not in over},
         mission_over={name: why for name, why in run.handed_over.items() if name in over},
         modes=run.modes,
@@ -177,12 +164,9 @@ def _entries(recordings: Path, drone: str, topic: str) -> Iterator[Entry]:
         yield from (one for one in read_records(path) if isinstance(one, Entry) and one.stream.topic == topic)
 
 
-def recorded_orders(recordings: Path, drone: str, zero_s: float) -> list[tuple[float, MissionOrder]]:
-    """What operators ordered of a drone in flight, and when, in seconds from `zero_s` of the recording's clock."""
-    return [
-        (entry.time_ns / 1e9 - zero_s, from_json(MissionOrder, json.loads(entry.data)))
-        for entry in _entries(recordings, drone, ORDER.topic)
-    ]
+def were_ordered(recordings: Path, drone: str) -> bool:
+    """Whether an operator ordered something of a drone in flight, so that its flight is not the scenario's any more."""
+    return any(True for _ in _entries(recordings, drone, ORDER.topic))
 
 
 def fleet_key_frames(recordings: Path, run: FleetRun) -> tuple[KeyFrame, ...]:

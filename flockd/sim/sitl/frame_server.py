@@ -75,5 +75,4 @@ class FrameServer:
             frames, _ = self._cameras.capture(i, number, time_s, poses)
             for frame in frames.frames.values():
                 self._publisher.publish(drone, frame)
-        delay_s = self._clock() - time_s
-        self._frames.append(FleetFrame(time_s, poses.position, poses.velocity, poses.R_ned_body, delay_s))
+        self._frames.append(FleetFrame(time_s, poses.position, poses.velocity, poses.R_ned_body))

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from pymavlink import mavutil
@@ -24,11 +24,9 @@ from flockd.core.errors import UnavailableError
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry import rotation_from_euler, rotation_from_quaternion
 from flockd.onboard.autopilot.mavlink_messages import StatusText
+from flockd.sim.autopilot.fake_telemetry import Mode
 from flockd.sim.autopilot.sticks import stick_curve
 from flockd.sim.vehicles.vehicles import REFERENCE_DEG
-
-Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "ACRO", "OFFBOARD"]
-"""By pymavlink's names; LOITER is Hold."""
 
 SYSTEM_ID = 255
 HEARTBEAT_S = 1.0

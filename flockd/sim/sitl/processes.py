@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Self
 
-from flockd.core.side_process import with_package
-from flockd.sim.sitl.bound_to_parent import bound
+from flockd.sim.sitl.bound_to_parent import bound, with_package
 
 END_S = 30.0
 """To end after SIGTERM, before it is killed."""

@@ -383,19 +383,6 @@ def test_one_of_five_knows_the_goal_and_all_arrive_within_ten_metres() -> None:
     assert np.linalg.norm(plan - [25.0, 10.0], axis=1).max() < 10.0
 
 
-def test_the_flight_with_exact_states_flies_orders_when_they_were_given() -> None:
-    """The paper's circle until 5 s; then all go to a goal that is not on it."""
-    scenario = load_scenario(CONFIG / "paper_flight.yaml", {"duration_s": 30.0, "ideal": True})
-    goal = np.array([-5.0, -8.0])
-    ordered = {i: [(5.0, MissionOrder(place=goal))] for i in range(len(scenario.vehicles))}
-    times, position, _ = fly_exact_states(scenario, orders=ordered)
-    _, free, _ = fly_exact_states(scenario.model_copy(update={"duration_s": 5.5}))
-    np.testing.assert_array_equal(position[times <= 5.0], free[: len(position[times <= 5.0])])
-    away_m = np.linalg.norm(position[..., :2].mean(axis=1) - goal, axis=1)
-    assert away_m[times == 5.0][0] > 5.0
-    assert away_m[-1] < 1.0
-
-
 def test_those_who_see_a_drone_that_is_flown_by_hand_go_with_it() -> None:
     scenario = load_scenario(CONFIG / "led_by_hand.yaml", {"duration_s": 65.0})
     _, position, velocity = fly_exact_states(scenario)

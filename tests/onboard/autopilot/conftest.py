@@ -1,4 +1,4 @@
-"""A free UDP port, an autopilot stand-in that hovers there, and its addresses: that port, and a serial device."""
+"""A free UDP port, a fake autopilot that hovers there, and its addresses: that port, and a serial device."""
 
 from __future__ import annotations
 

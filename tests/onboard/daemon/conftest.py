@@ -1,4 +1,4 @@
-"""The autopilot stand-in of the autopilot's own stories."""
+"""The fake autopilot of the autopilot's own stories."""
 
 from tests.onboard.autopilot.conftest import fake_autopilot, port
 

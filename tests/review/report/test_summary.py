@@ -433,12 +433,12 @@ def test_what_happens_once_flockd_does_not_fly_any_more_counts_apart() -> None:
 
 
 def test_what_gates_slowed_drones_down_for_is_told_apart() -> None:
-    log, by_cause = _hand_made(), {"neighbour": 0.011, "false_detection": 0.0009}
+    log, by_cause = _hand_made(), {"neighbour": 0.011, "wind": 0.0009}
     facts = {"gated": True, "slowed_share": 0.03, "slowed_by": by_cause}
     summary = summarise(replace(log, metadata=log.metadata.model_copy(update=facts)))
-    assert causes_text(summary) == "neighbours 1.1 %, false detections 0.1 %"
+    assert causes_text(summary) == "neighbours 1.1 %, wind 0.1 %"
     (slowed,) = [fact for fact in page_texts(summary, log)["facts"] if fact["name"] == "Slowed"]
-    assert slowed["remark"] == "of the time, by safety gates: neighbours 1.1 %, false detections 0.1 %"
+    assert slowed["remark"] == "of the time, by safety gates: neighbours 1.1 %, wind 0.1 %"
 
 
 def test_what_drones_learned_of_the_others_size_is_told() -> None:

@@ -88,8 +88,6 @@ def test_two_drones_at_one_spot_are_pushed_as_the_law_pushes_them() -> None:
         (flock(duration_s=20.0, drone__flocking__weight__kind="uniform"), 5),
         (flock(duration_s=15.0, vehicle__gust_m_s=0.2, seed=3), 3),
         (flock(duration_s=10.0, drone__flocking__weight__nearest=3), 12),
-        (flock("square", duration_s=50.0), 2),
-        (flock("one_knows", duration_s=15.0), 3),
         (flock(duration_s=15.0, drone__mission__height_m=9.0), 2),
     ],
 )
@@ -201,15 +199,13 @@ def test_a_flight_is_the_same_in_any_batch(weight: str) -> None:
     assert alone[0] != alone[1]  # the seed moves the starts
 
 
-def test_a_flight_that_arrives_says_when() -> None:
-    figures = fly_flocks([flock("square", duration_s=190.0)])[0]
-    assert figures["arrived"] is True
-    assert figures["arrival_time_s"] == 160.0  # as `flockd sim config/square.yaml --perception truth` says
-
-
-def test_drones_flown_by_hand_are_refused() -> None:
-    with pytest.raises(UsageError, match=r"vehicles\[0\] is flown by hand"):
-        fly_flocks([flock("led_by_hand")])
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [("led_by_hand", r"vehicles\[0\] is flown by hand"), ("forest", "obstacles"), ("one_knows", "places")],
+)
+def test_what_takes_more_than_the_law_is_refused(name: str, why: str) -> None:
+    with pytest.raises(UsageError, match=why):
+        fly_flocks([flock(name)])
 
 
 def test_at_10_hz_a_flock_with_measured_errors_keeps_the_order_that_it_has_at_2_hz() -> None:

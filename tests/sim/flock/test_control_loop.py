@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from flockd.core.data import data_path
-from flockd.core.messages import FloatArray
+from flockd.core.messages import FloatArray, Setpoint, Wanted
 from flockd.flight.flocking.metrics import min_distance
-from flockd.flight.safety import Gate, Request, Verdict
-from flockd.sim.flock.control_loop import Commands, ControlLoop
+from flockd.flight.safety import Action, Event, Gate, Objection, Permission, Request, Surroundings, Verdict
+from flockd.sim.flock.control_loop import Commands, ControlLoop, SlowedTime
 from flockd.sim.flock.exact_states import ExactFlock, step_times, vehicles_of
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import CameraFaultConfig, ScenarioConfig, load_scenario
@@ -90,6 +90,31 @@ def test_a_lost_camera_is_no_wind() -> None:
     loop, _ = _flown(scenario, Vehicles(scenario.vehicles, scenario.vehicle))
     assert "wind" not in loop.slowed.by_cause
     assert loop.slowed.by_cause["camera"] == pytest.approx(6.0 / 20.0, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("action", "objections", "degraded_by", "causes"),
+    [
+        (Action.FLY, (Objection.SEPARATION, Objection.FENCE), (Event.CAMERA_LOST,), {"neighbour", "fence"}),
+        (Action.FLY, (Objection.OBSTACLE,), (), {"obstacle"}),
+        (Action.FLY, (Objection.COMMAND_TOO_LARGE,), (), {"other"}),
+        (Action.FLY_DEGRADED, (), (Event.VELOCITY_OFF, Event.CAMERA_LOST), {"wind", "camera"}),
+        (Action.FLY_DEGRADED, (Objection.SEPARATION,), (Event.HEIGHTS_LEFT,), {"neighbour", "other"}),
+    ],
+)
+def test_what_a_gate_slowed_its_drone_down_for(
+    action: Action, objections: tuple[Objection, ...], degraded_by: tuple[Event, ...], causes: set[str]
+) -> None:
+    """For a quarter of the time; in the rest it flew as it was asked to, but for 4 %."""
+    alone = Surroundings(np.zeros(2), np.zeros(2), 0.0, np.empty((0, 3)), np.empty((0, 2)), 5.0)
+    wanted = Wanted(np.array([1.0, 0.0]), np.zeros(2), 0.0)
+    request, slowed = Request(Permission(action, 0.0), wanted, 0.0, 5.0, alone), SlowedTime()
+    assert (slowed.share, slowed.by_cause) == (None, {})
+    for period_s, north_m_s in ((1.0, 0.5), (3.0, 0.96)):
+        setpoint = Setpoint(0.0, np.array([north_m_s, 0.0]), 5.0, 0.0)
+        slowed.add(period_s, request, Verdict(setpoint, objections), degraded_by)
+    assert slowed.share == 0.25
+    assert slowed.by_cause == dict.fromkeys(causes, 0.25)
 
 
 def test_in_gusts_nothing_touches_among_trees() -> None:

@@ -2,45 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import pytest
 
 from flockd.core.config import Overrides
 from flockd.core.data import data_path
-from flockd.onboard.telemetry.publisher import Ask, NewestImage
-from flockd.onboard.telemetry.topics import AboutMessage
+from flockd.sim.flock.flock_telemetry import FlockTelemetry, Repeater
 from flockd.sim.flock.live_flight import LiveControls, fly_live
-from flockd.sim.flock.shown_flock import Repeater, ShownFlock
 from flockd.sim.flock.start import with_drones
 from flockd.sim.scenario import load_scenario
 from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances
+from tests.sim.flock.watching import Watching
 
 STEPS = 3
 FRONT_OFF = Disturbances(cameras_off=frozenset({(0, "front")}), removed=frozenset({1}))
-
-
-class Watching:
-    """What watchers would be told, and which drones are there."""
-
-    identity = "f10c"
-
-    def __init__(self) -> None:
-        self.commands: list[tuple[str, Mapping[str, object]]] = []
-        self.reasons: dict[str, object] = {}
-        self.images: dict[str, NewestImage] = {}
-
-    def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
-        self.images[drone] = newest_image
-
-    def withdraw(self, drone: str) -> None:
-        del self.images[drone]
-
-    def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
-        if topic == "command":
-            self.commands.append((drone, message))
-        if topic == "flight":
-            self.reasons[drone] = message["reasons"]
 
 
 class ThreeFlights(LiveControls):
@@ -53,7 +27,7 @@ class ThreeFlights(LiveControls):
         super().begin()
         self.flight += 1
         if self.flight == 2:
-            assert sorted(self.seen.images) == ["drone1", "drone2"]
+            assert sorted(self.seen.image) == ["drone1", "drone2"]
 
     def wait(self, time_s: float) -> bool:
         if self.flight == 3 and time_s == 1.0:
@@ -71,13 +45,13 @@ def test_a_flight_begun_again_is_the_same_and_a_camera_that_is_off_shows_nothing
     watching, controls = Watching(), ThreeFlights(flown, "f10c", by_sight=True)
     controls.seen = watching
     with pytest.raises(KeyboardInterrupt):
-        fly_live(flown, ShownFlock(flown, watching, Repeater(watching)), controls)
+        fly_live(flown, FlockTelemetry(flown, watching, Repeater(watching)), controls)
     of_one = 2 * STEPS
     first, again, disturbed = (watching.commands[begin : begin + of_one] for begin in (0, of_one, 2 * of_one))
     assert first == again, "the same world, the same noise, and pilots that know nothing of the first flight"
     assert [drone for drone, _ in disturbed] == ["drone1", "drone1"], "drone2 is not there any more"
-    assert sorted(watching.images) == ["drone1"]
-    assert (watching.images["drone1"]("front"), watching.images["drone1"]("back") is None) == (None, False)
-    told = [reason["sentence"] for reason in watching.reasons["drone1"]]  # type: ignore[attr-defined]
+    assert sorted(watching.image) == ["drone1"]
+    assert (watching.image["drone1"]("front"), watching.image["drone1"]("back") is None) == (None, False)
+    told = [reason["sentence"] for reason in watching.flights["drone1"][-1]["reasons"]]
     assert told[0] == "a camera is lost: front unplugged"
     assert "camera front: no frame" in told

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from flockd.sim.flock.control_loop import Commands, ControlLoop
-from flockd.sim.flock.exact_states import fly_exact_states
-from flockd.sim.flock.made_up_detections import TrackedNeighbours
+from flockd.sim.flock.exact_states import TrackedNeighbours, fly_exact_states
 from flockd.sim.scenario import CameraFaultConfig, DetectionsConfig, ScenarioConfig, load_scenario
 from flockd.sim.vehicles.vehicles import Vehicles
 from tests.sim.flock.test_encounters import nearest_m

@@ -13,14 +13,14 @@ from flockd.core.config import Overrides
 from flockd.core.data import data_path
 from flockd.core.messages import FrameSet, VehicleState
 from flockd.onboard.telemetry import TelemetrySink
-from flockd.onboard.telemetry.publisher import Ask, NewestImage, ZenohTelemetry
-from flockd.onboard.telemetry.topics import AboutMessage
+from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.review.flight_log.log import FlightLog
+from flockd.sim.flock.flock_telemetry import FlockTelemetry, Repeater
 from flockd.sim.flock.pilot_pool import PilotPool
-from flockd.sim.flock.shown_flock import Repeater, ShownFlock
 from flockd.sim.flock.start import with_drones
 from flockd.sim.flock.swarm import Flight, fly
 from flockd.sim.scenario import ScenarioConfig, load_scenario
+from tests.sim.flock.watching import Watching
 
 STEPS = 3
 
@@ -33,25 +33,10 @@ def scenario(duration_s: float = 0.5 * STEPS, height: str = "best", *, ideal: bo
     return with_drones(load_scenario(data_path("config") / "paper_flight.yaml", overrides), 2)
 
 
-class Announced:
-    """Where a flock is announced; it keeps what gives the drones' pictures."""
-
-    identity = "f10c"
-
-    def __init__(self) -> None:
-        self.images: dict[str, NewestImage] = {}
-
-    def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
-        self.images[drone] = newest_image
-
-    def withdraw(self, drone: str) -> None:
-        raise AssertionError(drone)
-
-
 def flown(telemetry: TelemetrySink) -> FlightLog:
-    announced = Announced()
-    log = fly(scenario(), shown=ShownFlock(scenario(), announced, Repeater(telemetry)), processes=1).log
-    pictures = [newest("front") for newest in announced.images.values()]
+    announced = Watching()
+    log = fly(scenario(), shown=FlockTelemetry(scenario(), announced, Repeater(telemetry)), processes=1).log
+    pictures = [newest("front") for newest in announced.image.values()]
     assert [picture[:2] for picture in pictures if picture is not None] == [b"\xff\xd8"] * 2, "JPEGs of both"
     return log
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from flockd.core.messages import Float32Array, FloatArray, UInt8Array
-from flockd.sim.renderer import _raster, _shading
+from flockd.sim.renderer import _raster
 from flockd.sim.renderer.renderer import rasterized, scene_of
 from flockd.sim.world import textures
 from flockd.sim.world.baking import GROUND_MAP_BITS, sun_reaches
@@ -17,7 +17,6 @@ from flockd.sim.world.sky import SKY_BITS
 from flockd.sim.world.world import GROUND, World
 
 SIZE = (250, 331)
-"""No multiple of a tile's."""
 K = np.array([[130.0, 0.0, 121.0], [0.0, 128.0, 160.0], [0.0, 0.0, 1.0]])
 LEVEL = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """From a level camera that looks north to NED."""
@@ -47,7 +46,7 @@ class Shot:
         everywhere = np.tile([0.0, 0.0, width, height], (len(drones), 1))
         eye = _raster.Eye(K, self.inverse_K, self.R, origin, math.sqrt(K[0, 0] * K[1, 1]))
         blobs = np.hstack([drones, everywhere])
-        _shading.shade_scene(self.hit, self.planes, eye, scene_of(world), blobs, self.rgb, self.depth)
+        _raster.shade_scene(self.hit, self.planes, eye, scene_of(world), blobs, self.rgb, self.depth)
 
     def expected(self, y: int, x: int) -> tuple[float, list[int]]:
         """Depth and colour of one pixel, in float64, with the library's logarithms."""

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
+from random import Random
 
 import pytest
 
 from flockd.campaign.campaign_file import load_campaign
 from flockd.core.config import DroneConfig, Overrides, load_drone
 from flockd.core.errors import ConfigError
+from flockd.flight.geometry import build_rig
 from flockd.sim.renderer.drone_models import FAMILIES
-from flockd.sim.scenario import DRONE_FAMILIES, load_scenario, scenario_schema
+from flockd.sim.scenario import DRONE_FAMILIES, load_scenario, load_with_places, scenario_schema
 from tests.core.config.test_loader import CONFIG, DRONE, places_of, problems_in, with_line
+from tests.hostile import CORPUS, hostile, own_errors, put, text_of
 
 SCENARIO = """\
 scenario: two
@@ -159,3 +163,21 @@ def test_a_scenario_may_hold_its_drone(tmp_path: Path) -> None:
 
 def test_the_configuration_knows_how_many_families_the_simulator_has() -> None:
     assert DRONE_FAMILIES == FAMILIES
+
+
+def test_a_changed_configuration_is_read_or_refused(tmp_path: Path) -> None:
+    shutil.copytree(CONFIG, tmp_path, dirs_exist_ok=True)
+    small = [path.read_text(encoding="utf-8") for path in sorted(CORPUS.glob("*.yaml"))]
+    shipped = [path.read_text(encoding="utf-8") for path in sorted(tmp_path.glob("*.yaml"))]
+    texts = [*small * 4, *shipped]  # the large ones are parsed slowly
+    file = tmp_path / "mutated.yaml"
+
+    @hostile(12)
+    def check(random: Random) -> None:
+        put(random, file, lambda: text_of(random, texts))
+        with own_errors():
+            config, _ = load_with_places(file)
+            drone = config.drone if hasattr(config, "drone") else config
+            build_rig(drone.rig)
+
+    check()

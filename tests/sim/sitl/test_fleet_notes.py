@@ -48,9 +48,8 @@ class _World:
         if mode == "LAND" and self.px4s[i].ended is None:
             self.armed[i] = False
 
-    def fleet(self, apart_s: float = 0.0) -> _Fleet:
+    def fleet(self) -> _Fleet:
         scenario = with_drones(load_scenario(data_path("config") / "paper_flight.yaml"), 2)
-        scenario = scenario.model_copy(update={"take_off_apart_s": apart_s})
         height_m = np.array([-vehicle.position_m[2] for vehicle in scenario.vehicles])
         station = SimpleNamespace(
             mode_is=lambda i, mode: self.modes[i] == mode,
@@ -130,16 +129,15 @@ def test_a_drone_that_still_climbs_is_not_at_its_height() -> None:
     assert fleet._is_up(0)
 
 
-def test_one_drone_arms_and_takes_off_so_long_after_the_other() -> None:
+def test_a_drone_is_armed_and_then_asked_to_climb_until_it_has_left_the_ground() -> None:
     world = _World(armed=[False, False], up=0.0)
-    fleet, done = world.fleet(apart_s=5.0), []
-    for world.now_s in (0.0, 1.0, 4.9, 5.0, 6.0):
-        for i in range(2):
-            fleet._request_climb(i)
-        done.append((list(world.armed), list(world.selected)))
-    first, both = (0, "TAKEOFF"), [(0, "TAKEOFF"), (1, "TAKEOFF")]
-    assert [armed for armed, _ in done] == [[True, False]] * 3 + [[True, True]] * 2
-    assert [selected for _, selected in done] == [[], [first], [first] * 2, [first] * 3, [first] * 3 + both]
+    fleet = world.fleet()
+    for armed, selected in ((False, []), (True, []), (True, [(0, "TAKEOFF")])):
+        assert (world.armed[0], world.selected) == (armed, selected)
+        fleet._request_climb(0)
+    world.up, world.selected[:] = 0.5, []
+    fleet._request_climb(0)
+    assert world.selected == []
 
 
 def test_a_long_text_of_the_autopilot_is_joined_from_its_chunks() -> None:

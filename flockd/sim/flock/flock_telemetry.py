@@ -24,6 +24,7 @@ from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage, FlightM
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.control_loop import Commands, ControlLoop
 from flockd.sim.scenario import ScenarioConfig
+from flockd.sim.vehicles.pose_trail import FlockPose
 from flockd.sim.vehicles.vehicles import REFERENCE_DEG, UNDISTURBED, Disturbances, Vehicles
 
 EVERY_S = 1.0
@@ -87,7 +88,7 @@ REQUESTS = frozenset({"hold", "resume"})
 """Of an operator, beside orders: to the drone's autopilot, and back."""
 
 
-class ShownFlock:
+class FlockTelemetry:
     """Publishes what the drones do, and keeps the orders that they are given until their pilots take them.
 
     Of what an autopilot does it has Hold alone. Queries come on threads of zenoh's.
@@ -152,13 +153,13 @@ class ShownFlock:
         """Publishes who flies each drone, and why."""
         now_s = time.monotonic()
         for i in self._there():
-            status, reasons = loop.status(i), self._reasons.get(i, ())
-            held = status.state is State.ASKING
-            state = State.DEGRADED if status.state is State.NORMAL and reasons else status.state
+            (state, why), reasons = loop.status(i), self._reasons.get(i, ())
+            held = state is State.ASKING
+            state = State.DEGRADED if state is State.NORMAL and reasons else state
             message = FlightMessage(
                 time_s=time_s,
                 state=state.value,
-                reasons=[ReasonMessage(event="simulated", sentence=one) for one in (*status.reasons, *reasons)],
+                reasons=[ReasonMessage(event="simulated", sentence=one) for one in (*why, *reasons)],
                 flight_mode="hold" if held else "simulated",
                 armed=True, in_air=True, heartbeat_age_s=None, heartbeats_lost=0, battery_share=None,
                 height_m=self._states[i].height_m, velocity_trim=[0.0, 0.0],
@@ -188,7 +189,7 @@ class ShownFlock:
         """Publishes a step of all drones that fly on exact states; pictures of it are drawn when someone asks."""
         if self._drawn is None:
             self._drawn = _DrawnOnRequest(self._scenario, self._disturbed)
-        self._drawn.poses = _Poses(step, time_s, vehicles.position.copy(), vehicles.R_ned_body.copy())
+        self._drawn.newest = step, FlockPose(time_s, vehicles.position, vehicles.R_ned_body)
         for i in self._there():
             position, velocity = vehicles.position[i], vehicles.velocity[i]
             state = VehicleState(
@@ -256,19 +257,13 @@ class RealTime:
         self._sleep(max(0.0, self._began_s + time_s - self._clock()))
 
 
-class _Poses:
-    """Where all drones were in one step."""
-
-    def __init__(self, step: int, time_s: float, position: np.ndarray, R_ned_body: np.ndarray) -> None:
-        self.step, self.time_s, self.position, self.R_ned_body = step, time_s, position, R_ned_body
-
-
 class _DrawnOnRequest:
     """Camera images of a flight whose drones look at none. The world is built when the first is asked for."""
 
     def __init__(self, scenario: ScenarioConfig, disturbed: Disturbances) -> None:
         self._scenario, self.disturbed = scenario, disturbed
-        self.poses: _Poses | None = None
+        self.newest: tuple[int, FlockPose] | None = None
+        """A step, and where all drones were in it."""
         self._cameras: CameraSimulator | None = None
         self._building: threading.Thread | None = None
         self._lock = threading.Lock()
@@ -277,23 +272,21 @@ class _DrawnOnRequest:
     def frames(self, drone: int) -> FrameSet | None:
         """Of the newest step; None while the world is being built."""
         with self._lock:
-            poses, cameras = self.poses, self._cameras
-            if cameras is None or poses is None:
+            newest, cameras = self.newest, self._cameras
+            if cameras is None or newest is None:
                 if self._building is None:
                     self._building = threading.Thread(target=self._build, name="world", daemon=True)
                     self._building.start()
                 return None
-            known = self._frames.get(drone)
+            (step, poses), known = newest, self._frames.get(drone)
             if known is None or known.time_s != poses.time_s:
-                self._frames[drone] = cameras.capture(drone, poses.step, poses.time_s, poses, disturbed=self.disturbed)[
-                    0
-                ]
+                self._frames[drone], _ = cameras.capture(drone, step, poses.time_s, poses, disturbed=self.disturbed)
             return self._frames[drone]
 
     def begin_again(self) -> None:
         """For another flight from the beginning in the same world."""
         with self._lock:
-            self._frames, self.poses = {}, None
+            self._frames, self.newest = {}, None
             if self._cameras is not None:
                 self._cameras.begin_again()
 
@@ -301,7 +294,7 @@ class _DrawnOnRequest:
         self._cameras = CameraSimulator(self._scenario, threads=1)
 
 
-def orders_of(shown: ShownFlock | None, drones: Sequence[int]) -> dict[int, MissionOrder]:
+def orders_of(shown: FlockTelemetry | None, drones: Sequence[int]) -> dict[int, MissionOrder]:
     """What operators have ordered since the last step, by drone."""
     taken = {} if shown is None else {i: shown.take_order(i) for i in drones}
     return {i: order for i, order in taken.items() if order is not None}

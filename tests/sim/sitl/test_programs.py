@@ -1,4 +1,4 @@
-"""No program outlives the simulator that has started it, even one that was killed."""
+"""Programs beside the simulator: none outlives it, even one that was killed, and where they write."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from pathlib import Path
 
 import pytest
 
+from flockd.core.config import load_drone
+from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
+from flockd.sim.sitl.daemons import Daemons
 from flockd.sim.sitl.ground_station import GroundStation
-
-pytestmark = pytest.mark.fault("simulator-killed")
 
 PARENT = """\
 import os, sys, time
@@ -47,6 +48,7 @@ def _until_gone(pids: list[int], timeout_s: float = 20.0) -> None:
     assert not left
 
 
+@pytest.mark.fault("simulator-killed")
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_what_a_killed_simulator_has_started_ends_with_it(number: signal.Signals, tmp_path: Path) -> None:
     command = [sys.executable, "-c", PARENT, str(tmp_path)]
@@ -62,6 +64,7 @@ def test_what_a_killed_simulator_has_started_ends_with_it(number: signal.Signals
     _until_gone(pids)
 
 
+@pytest.mark.fault("simulator-killed")
 def test_a_program_whose_parent_has_ended_already_does_not_start(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "flockd.sim.sitl.bound_to_parent", "1", "touch", str(tmp_path / "started")]
     ended = subprocess.run(command, check=False, cwd=Path(__file__).parents[3])
@@ -75,3 +78,22 @@ def test_a_port_that_is_used_is_named_with_what_to_do() -> None:
         port = taken.getsockname()[1]
         with pytest.raises(UnavailableError, match=rf"^UDP port {port} .* end the other program .*sport = :{port}`"):
             GroundStation([port], time.monotonic)
+
+
+def test_recordings_go_where_the_simulator_was_told_though_daemons_run_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`--out out/flight` is relative to where the person is; a daemon's folder is deleted after the flight."""
+    config = load_drone(data_path("config") / "px4_sitl.yaml")
+    folder = tmp_path / "f"
+    folder.mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("flockd.sim.sitl.daemons._RUN", "import sys; print(sys.argv[sys.argv.index('--record') + 1])")
+    with Daemons([config], folder=folder, recordings=Path("recordings"), environment=os.environ) as daemons:
+        daemons.start()
+        (program,) = daemons.programs()
+        end_s = time.monotonic() + 60.0
+        while program.ended is None:
+            assert time.monotonic() < end_s
+            time.sleep(0.05)
+        assert Path(program.log.read_text(encoding="utf-8").strip()) == tmp_path / "recordings"

@@ -2,61 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import pytest
 
 from flockd.core.data import data_path
-from flockd.onboard.telemetry.publisher import Ask, NewestImage
-from flockd.onboard.telemetry.topics import AboutMessage
-from flockd.sim.flock.shown_flock import RealTime, Repeater, ShownFlock
+from flockd.sim.flock.flock_telemetry import FlockTelemetry, RealTime, Repeater
 from flockd.sim.flock.start import with_drones
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import ScenarioConfig, load_scenario
+from tests.sim.flock.watching import Watching
 
 SECONDS_TO_FAIL = 120.0
-
-
-class Watching:
-    """Announcements and messages, as zenoh would pass them on."""
-
-    identity = "f10c"
-
-    def __init__(self) -> None:
-        self.about: dict[str, AboutMessage] = {}
-        self.ask: dict[str, Ask] = {}
-        self.image: dict[str, NewestImage] = {}
-        self.states: dict[str, list[Mapping[str, object]]] = {}
-        self.flights: dict[str, list[Mapping[str, Any]]] = {}
-        self.asked = 0
-
-    def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
-        self.about[drone], self.ask[drone], self.image[drone] = about, ask, newest_image
-
-    def withdraw(self, drone: str) -> None:
-        del self.ask[drone], self.states[drone]
-
-    def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
-        if topic == "state":
-            self.states.setdefault(drone, []).append(message)
-        if topic == "flight":
-            self.flights.setdefault(drone, []).append(message)
-
-    def goto(self, drone: str, north_m: float, east_m: float) -> tuple[bool, str]:
-        return self.command(drone, "goto", {"north_m": north_m, "east_m": east_m})
-
-    def command(self, drone: str, command: str, order: dict[str, float] | None = None) -> tuple[bool, str]:
-        self.asked += 1
-        asked = {
-            "operator": "anna", "session": "s", "sequence": self.asked, "time_s": time.monotonic(),
-            "identity": self.identity, "order": order,
-        }  # fmt: skip
-        answer = self.ask[drone](command, json.dumps(asked).encode())
-        return answer["accepted"], answer["sentence"]
 
 
 def scenario(duration_s: float) -> ScenarioConfig:
@@ -68,7 +26,7 @@ def test_a_flock_on_exact_states_is_seen_and_goes_where_it_is_sent(monkeypatch: 
     monkeypatch.setattr(RealTime, "wait", lambda self, time_s: None)
     watching = Watching()
     flown = scenario(60.0)
-    shown = ShownFlock(flown, watching, Repeater(watching))
+    shown = FlockTelemetry(flown, watching, Repeater(watching))
     assert not watching.goto("drone1", 1.0, 2.0)[0], "not before it knows where it is"
 
     def order_when_due(done: int, total: int) -> None:
@@ -114,7 +72,7 @@ def test_a_drone_is_held_where_it_would_stop_and_flies_on_when_it_is_resumed(mon
             assert watching.command("drone1", "hold" if done == 20 else "resume")[0]
 
     log = fly(
-        flown, perception="truth", shown=ShownFlock(flown, watching, Repeater(watching)), progress=ask_when_due
+        flown, perception="truth", shown=FlockTelemetry(flown, watching, Repeater(watching)), progress=ask_when_due
     ).log
     told = [(one["state"], one["flight_mode"]) for one in watching.flights["drone1"]]
     assert told == [("normal", "simulated")] * 20 + [("asking", "hold")] * 20 + [("normal", "simulated")] * 20
