@@ -474,6 +474,22 @@ def test_an_uncertain_neighbour_counts_as_nearer_and_faster() -> None:
     assert fastest(4.0, 1.0, neighbour_margins=[[0.2, 0.4]]) >= 1.0
 
 
+def test_a_drone_that_follows_late_keeps_room_for_that_too() -> None:
+    """As one that is configured to react so much later, before neighbours as before obstacles."""
+    places: list[dict[str, Any]] = [
+        {"neighbours": [[4.0, 0.0, 0.0]], "neighbour_velocities": [[-1.0, 0.0]]}, {"obstacles": [[3.0, 0.0]]},
+    ]  # fmt: skip
+    for place in places:
+        late, slow, prompt = (Stream(reaction_s=r, neighbour_reaction_s=r) for r in (0.5, 1.0, 0.5))
+        for one in (late, slow, prompt):
+            one.step([2.5, 0.0], near=around(**place))
+        late.gate._response.late_s = 0.5
+        assert late.gate.velocity_late_s == 0.5
+        a, b, c = (sent(one.step([2.5, 0.0], near=around(**place))).velocity[0] for one in (late, slow, prompt))
+        assert a == pytest.approx(b)
+        assert a < c - 0.1
+
+
 @pytest.mark.fault("neighbour-too-near")
 @pytest.mark.parametrize(("lag_s", "period_s", "least_m"), [(0.0, 0.05, 1.0), (0.35, 0.5, 0.999)])
 def test_two_that_fly_at_each_other_at_3_m_s_stop_before_the_minimum_distance(
