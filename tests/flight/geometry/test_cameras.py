@@ -1,20 +1,43 @@
-"""The cameras against OpenCV's, which counts pixels from their centres: its pixel 0 is our 0.5."""
+"""The cameras against OpenCV's, which counts pixels from their centres: its pixel 0 is our 0.5; and rigs of them."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from flockd.core.config import load_drone
+from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.core.data import data_path
 from flockd.core.messages import FloatArray
-from flockd.flight.geometry import Camera, PinholeCamera, WideAngleCamera
+from flockd.flight.geometry import (
+    Camera,
+    PinholeCamera,
+    Rig,
+    RigidTransform,
+    WideAngleCamera,
+    ZMap,
+    build_rig,
+    range_map,
+    z_map,
+)
+from tests.make import camera as camera_config
+
+from .synthetic_world import four_camera_rig
 
 MATRIX = np.array([[300.0, 0.0, 322.5], [0.0, 310.0, 236.5], [0.0, 0.0, 1.0]])
 OPENCV_MATRIX = MATRIX - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
 SIZE = (640, 480)
 NOTHING = np.zeros(3)
-PINHOLE_LENSES = [(), (-0.25, 0.08, 0.002, -0.001), (-0.3, 0.12, -0.001, 0.002, -0.02), (0.1, 0.02, 0.0, 0.0)]
-WIDE_LENSES = [(), (-0.02, 0.003, -0.001, 0.0001), (0.05, -0.01, 0.002, -0.0002)]
+PINHOLES = [
+    PinholeCamera(MATRIX, SIZE, lens)
+    for lens in ((), (-0.25, 0.08, 0.002, -0.001), (-0.3, 0.12, -0.001, 0.002, -0.02), (0.1, 0.02, 0.0, 0.0))
+]
+WIDE_ANGLES = [
+    WideAngleCamera(MATRIX, SIZE, lens) for lens in ((), (-0.02, 0.003, -0.001, 0.0001), (0.05, -0.01, 0.002, -0.0002))
+]
+ALL = pytest.mark.parametrize("camera", [*PINHOLES, *WIDE_ANGLES])
 
 
 def points_ahead(count: int = 200) -> FloatArray:
@@ -23,48 +46,43 @@ def points_ahead(count: int = 200) -> FloatArray:
     return np.stack([random.uniform(-0.9, 0.9, count) * z, random.uniform(-0.7, 0.7, count) * z, z], axis=1)
 
 
-@pytest.mark.parametrize("lens", PINHOLE_LENSES)
-def test_pinhole_projects_as_opencv_does(lens: tuple[float, ...]) -> None:
-    points = points_ahead()
-    expected, derivative = cv2.projectPoints(points, NOTHING, NOTHING, OPENCV_MATRIX, np.array(lens or (0.0,) * 4))
-    camera = PinholeCamera(MATRIX, SIZE, lens)
+@ALL
+def test_it_projects_as_opencv_does_and_lifts_a_pixel_to_a_range_along_its_ray(camera: Camera) -> None:
+    points, lens = points_ahead(), np.array(camera.distortion or (0.0,) * 4)
+    if isinstance(camera, PinholeCamera):
+        expected, derivative = cv2.projectPoints(points, NOTHING, NOTHING, OPENCV_MATRIX, lens)
+        by_point = derivative[:, 3:6]  # by the translation, which without a rotation is by the point
+    else:
+        expected, derivative = cv2.fisheye.projectPoints(points[:, None], NOTHING, NOTHING, OPENCV_MATRIX, lens)
+        by_point = derivative[:, 11:14]  # behind focal lengths 2, centre 2, distortion 4, rotation 3
     assert np.allclose(camera.project(points), expected[:, 0] + 0.5, atol=1e-9)
-    # OpenCV's derivative by the translation is, without a rotation, the one by the point.
-    assert np.allclose(camera.jacobian(points), derivative[:, 3:6].reshape(-1, 2, 3), atol=1e-6)
-
-
-@pytest.mark.parametrize("lens", WIDE_LENSES)
-def test_wide_angle_projects_as_opencv_does_ahead(lens: tuple[float, ...]) -> None:
-    points = points_ahead()
-    expected, derivative = cv2.fisheye.projectPoints(
-        points[:, None], NOTHING, NOTHING, OPENCV_MATRIX, np.array(lens or (0.0,) * 4)
-    )
-    camera = WideAngleCamera(MATRIX, SIZE, lens)
-    assert np.allclose(camera.project(points), expected[:, 0] + 0.5, atol=1e-9)
-    # OpenCV's columns: focal lengths 2, centre 2, distortion 4, rotation 3, translation 3, skew 1.
-    assert np.allclose(camera.jacobian(points), derivative[:, 11:14].reshape(-1, 2, 3), atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    "camera",
-    [
-        *(PinholeCamera(MATRIX, SIZE, k) for k in PINHOLE_LENSES),
-        *(WideAngleCamera(MATRIX, SIZE, k) for k in WIDE_LENSES),
-    ],
-)
-def test_every_lens_lifts_a_pixel_to_a_range_along_its_ray(camera: Camera) -> None:
-    points = points_ahead()
+    assert np.allclose(camera.jacobian(points), by_point.reshape(-1, 2, 3), atol=1e-6)
     lifted = camera.unproject(camera.project(points), np.linalg.norm(points, axis=1))
     assert np.allclose(lifted, points, atol=1e-8)
 
 
-@pytest.mark.parametrize("camera", [PinholeCamera(MATRIX, SIZE), WideAngleCamera(MATRIX, SIZE)])
+@ALL
+def test_a_map_of_z_lifts_a_pixel_to_where_it_is_and_there_and_back_is_the_same_map(camera: Camera) -> None:
+    """A wall across the optical axis: its z is the same everywhere."""
+    wall = ZMap(np.full(SIZE[::-1], 5.0, np.float32))
+    ranges = range_map(wall, camera)
+    for off_axis_deg in (0.0, 15.0, 30.0):
+        point = 5.0 * np.array([[0.0, np.tan(np.radians(off_axis_deg)), 1.0]])
+        pixel = camera.project(point)
+        column, row = pixel[0].astype(int)
+        lifted = camera.unproject(pixel, np.array([ranges[row, column]], np.float64))
+        np.testing.assert_allclose(lifted, point, atol=0.02)  # half a pixel off
+    back = z_map(ranges, camera)  # NaN where a lens images nothing
+    np.testing.assert_allclose(back[np.isfinite(back)], 5.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("camera", [PINHOLES[0], WIDE_ANGLES[0]])
 def test_the_angle_of_a_pixel_is_what_the_jacobian_says_of_its_longer_way(camera: Camera) -> None:
     points = points_ahead()
     rays = points / np.linalg.norm(points, axis=1, keepdims=True)
     # Across the ray, the singular values of the derivative are pixels per radian along the ellipse's axes.
     singular = np.linalg.svd(camera.jacobian(rays), compute_uv=False)
-    # Both focal lengths of the matrix are near, not equal; the mean of both is what is said.
+    # Focal lengths differ by 3 % between both ways; the mean of both is what is said.
     np.testing.assert_allclose(camera.pixel_angle(rays), 1.0 / singular[:, 1], rtol=0.02)
 
 
@@ -79,19 +97,21 @@ def test_wide_angle_sees_behind_its_own_plane() -> None:
 
 
 def test_wide_angle_is_smooth_on_its_axis() -> None:
-    camera = WideAngleCamera(MATRIX, SIZE, WIDE_LENSES[1])
+    camera = WIDE_ANGLES[1]
     assert np.allclose(camera.project(np.array([[0.0, 0.0, 4.0]])), [[322.5, 236.5]])
     assert np.allclose(camera.rays(np.array([[322.5, 236.5]])), [[0.0, 0.0, 1.0]])
     assert np.allclose(camera.jacobian(np.array([[0.0, 0.0, 4.0]]))[0], [[75.0, 0, 0], [0, 77.5, 0]], atol=1e-6)
 
 
-def test_what_lies_behind_a_pinhole_has_no_pixel() -> None:
-    camera = PinholeCamera(MATRIX, SIZE)
+def test_what_lies_behind_a_pinhole_has_no_pixel_and_image_borders_are_half_open() -> None:
+    camera = PINHOLES[0]
     pixels = camera.project(np.array([[0.0, 0.0, 5.0], [0.0, 0.0, -5.0], [1.0, 1.0, 0.0], [np.nan, 0.0, 1.0]]))
     assert pixels[0] == pytest.approx([322.5, 236.5])
     assert np.isnan(pixels[1:3]).all()
     assert np.isnan(pixels[3, 0])
     assert camera.in_image(pixels).tolist() == [True, False, False, False]
+    pixels = np.array([[0.0, 0.0], [639.99, 479.99], [640.0, 10.0], [10.0, 480.0], [-0.01, 10.0]])
+    assert camera.in_image(pixels).tolist() == [True, True, False, False, False]
 
 
 def test_a_barrel_lens_does_not_fold_far_directions_back_into_the_image() -> None:
@@ -104,12 +124,6 @@ def test_a_barrel_lens_does_not_fold_far_directions_back_into_the_image() -> Non
     # And a pixel outside the largest imaged circle, 0.703 focal lengths, shows nothing.
     assert np.isfinite(camera.rays(np.array([[322.5 + 0.70 * 300.0, 236.5]]))).all()
     assert np.isnan(camera.rays(np.array([[322.5 + 0.71 * 300.0, 236.5]]))).all()
-
-
-def test_image_borders_are_half_open() -> None:
-    camera = PinholeCamera(MATRIX, SIZE)
-    pixels = np.array([[0.0, 0.0], [639.99, 479.99], [640.0, 10.0], [10.0, 480.0], [-0.01, 10.0]])
-    assert camera.in_image(pixels).tolist() == [True, True, False, False, False]
 
 
 @pytest.mark.parametrize(
@@ -128,3 +142,105 @@ def test_what_is_no_camera_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=reason):
         PinholeCamera(matrix, size, lens)
+
+
+# Rigs: where cameras look, from the configuration's angles.
+
+
+def mounted(**extrinsics: float) -> RigidTransform:
+    config = camera_config("one", position_m=(0.1, 0.2, 0.3), **extrinsics)
+    return build_rig(RigConfig(cameras=(config,))).cameras["one"].T_body_camera
+
+
+@pytest.mark.parametrize(
+    ("extrinsics", "right", "down", "ahead"),
+    [
+        ({}, (0, 1, 0), (0, 0, 1), (1, 0, 0)),
+        ({"yaw_deg": 90.0}, (-1, 0, 0), (0, 0, 1), (0, 1, 0)),
+        ({"pitch_deg": 90.0}, (0, 1, 0), (1, 0, 0), (0, 0, -1)),
+        ({"roll_deg": 90.0}, (0, 0, 1), (0, -1, 0), (1, 0, 0)),
+    ],
+)
+def test_a_camera_faces_where_its_angles_say(
+    extrinsics: dict[str, float], right: tuple[int, ...], down: tuple[int, ...], ahead: tuple[int, ...]
+) -> None:
+    mount = mounted(**extrinsics)
+    assert np.allclose(mount.rotation.T, [right, down, ahead], atol=1e-12)
+    assert mount.translation.tolist() == [0.1, 0.2, 0.3]
+
+
+def test_all_three_angles_turn_in_aerospace_order() -> None:
+    turn = Rotation.from_euler("ZYX", [40.0, -25.0, 10.0], degrees=True).as_matrix()
+    assert np.allclose(mounted(yaw_deg=40.0, pitch_deg=-25.0, roll_deg=10.0).rotation[:, [2, 0, 1]], turn)
+
+
+def test_the_configuration_chooses_the_projection() -> None:
+    def camera(name: str, model: str, lens: tuple[float, ...]) -> CameraConfig:
+        plain = camera_config(name)
+        fields = {**plain.intrinsics.model_dump(), "model": model, "distortion": lens}
+        return plain.model_copy(update={"intrinsics": IntrinsicsConfig(**fields)})
+
+    rig = build_rig(RigConfig(cameras=(camera("a", "pinhole", (0.1, 0, 0, 0)), camera("b", "wide_angle", ()))))
+    assert {name: type(one.camera) for name, one in rig.cameras.items()} == {"a": PinholeCamera, "b": WideAngleCamera}
+    assert rig.cameras["a"].camera.distortion == (0.1, 0, 0, 0)
+    with pytest.raises(ValueError, match="coefficients"):
+        build_rig(RigConfig(cameras=(camera("a", "pinhole", (0.1,)),)))
+
+
+def towards(azimuth_deg: FloatArray | float, down_deg: FloatArray | float = 0.0) -> FloatArray:
+    """(n, 3) directions in body axes, from ahead to the right and down."""
+    azimuth, down = np.meshgrid(np.radians(azimuth_deg), np.radians(down_deg))
+    across = np.cos(down)
+    return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(down)], -1).reshape(-1, 3)
+
+
+def test_four_upright_cameras_see_all_around_but_not_straight_down() -> None:
+    rig = four_camera_rig()
+    assert rig.covers(towards(np.arange(0.0, 360.0, 5.0))).all()
+    assert not rig.covers(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])).any()
+    # 640 rows at f = 222 reach atan(320 / 222) = 55.2 degrees down.
+    assert rig.covers(towards(0.0, np.array([55.0, 55.5]))).tolist() == [True, False]
+
+
+def test_a_point_lands_in_the_cameras_that_see_it_with_their_lever_arms() -> None:
+    pixels = four_camera_rig().pixels_of(np.array([[2.1, 1.0, 0.5], [-2.1, 0.0, 0.0]]))
+    # The front camera sits 0.1 m ahead: 2 m in front of it, 1 m right and 0.5 m down.
+    assert pixels["front"][0] == pytest.approx([240.0 + 111.0, 320.0 + 55.5])
+    assert pixels["back"][1] == pytest.approx([240.0, 320.0])
+    for name, points in (("front", [1]), ("back", [0]), ("left", [0, 1]), ("right", [0])):
+        assert np.isnan(pixels[name][points]).all()  # the first is ahead of the right one, but outside its image
+
+
+@pytest.mark.parametrize(
+    ("right_deg", "down_deg", "radius_m", "without", "shown"),
+    [
+        (30.0, 0.0, 0.3, (), True),
+        (45.0, 0.0, 0.0, (), True),
+        (45.0, 0.0, 0.3, (), False),  # each of two cameras shows a part of it
+        (0.0, 47.0, 0.3, (), True),
+        (0.0, 53.0, 0.3, (), False),
+        (0.0, 53.0, 0.0, (), True),
+        (30.0, 0.0, 0.0, ("front",), False),
+        (45.0, 0.0, 0.0, ("front",), True),
+    ],
+)
+def test_all_of_a_drone_is_shown_where_one_camera_images_all_of_it(
+    right_deg: float, down_deg: float, radius_m: float, without: tuple[str, ...], shown: bool
+) -> None:
+    """The front camera's image ends 47.2 degrees to the right of ahead and the right one's begins at 42.8; a drone of
+    0.3 m radius 3 m away is 11.5 degrees wide.
+    """
+    place = 3.0 * towards(right_deg, down_deg)
+    assert four_camera_rig().shows(place, radius_m, frozenset(without)).tolist() == [shown]
+
+
+def test_a_rig_without_cameras_or_with_a_misfiled_one_is_refused() -> None:
+    for cameras, reason in (({}, "at least one"), ({"back": four_camera_rig().cameras["front"]}, "'front'.*'back'")):
+        with pytest.raises(ValueError, match=reason):
+            Rig(cameras)
+
+
+def test_the_simulators_rig_has_no_blind_sector_for_neighbours() -> None:
+    """Every direction from 45 degrees below to 45 degrees above the horizon is in some camera's view."""
+    rig = build_rig(load_drone(data_path("config") / "simulator.yaml").rig)
+    assert rig.covers(towards(np.arange(0.0, 360.0, 0.5), np.arange(-45.0, 45.1, 0.5))).all()
