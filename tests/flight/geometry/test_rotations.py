@@ -1,4 +1,4 @@
-"""Rotations and rigid transforms against scipy."""
+"""Rotations, rigid transforms and their fits against scipy; the closest approach of two points by hand."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry import (
     RigidTransform,
+    closest_approach,
     euler_from_rotation,
     fit_rigid,
     rotation_angle_deg,
@@ -40,7 +41,7 @@ def test_the_angle_of_a_rotation_survives_from_tiny_to_half_a_turn(degrees: floa
     assert rotation_angle_deg(rotation) == pytest.approx(degrees, abs=1e-9)
 
 
-def test_rotation_vectors_agree_with_scipy() -> None:
+def test_rotation_vectors_agree_with_scipy_both_ways_up_to_half_a_turn() -> None:
     random = np.random.default_rng(1)
     for scale in (0.0, 1e-200, 1e-12, 1e-6, 0.1, 3.0, 20.0):
         vector = random.normal(0.0, scale, 3)
@@ -48,10 +49,6 @@ def test_rotation_vectors_agree_with_scipy() -> None:
         assert np.allclose(rotation_from_vector(vector), expected, rtol=0.0, atol=1e-14)
         assert np.allclose(rotation_from_vector(vector[None])[0], expected, rtol=0.0, atol=1e-14)
     assert np.isnan(rotation_from_vector(np.array([0.0, np.inf, 1.0]))).all()
-
-
-def test_vectors_of_single_rotations_agree_with_scipy_up_to_half_a_turn() -> None:
-    random = np.random.default_rng(4)
     for degrees in (0.0, 1e-9, 0.01, 30.0, 120.0, 170.0, 179.9):
         for axis in random.normal(size=(20, 3)):
             rotation = Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis))
@@ -60,17 +57,13 @@ def test_vectors_of_single_rotations_agree_with_scipy_up_to_half_a_turn() -> Non
 
 def test_transforms_chain_and_invert_like_4x4_matrices() -> None:
     random = np.random.default_rng(2)
-    homogeneous, transforms = [], []
-    for _ in range(2):
-        rotation, translation = Rotation.random(rng=random).as_matrix(), random.normal(size=3)
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = rotation, translation
-        homogeneous.append(matrix)
-        transforms.append(RigidTransform(rotation, translation))
+    one, other = np.tile(np.eye(4), (2, 1, 1))
+    for matrix in (one, other):
+        matrix[:3, :3], matrix[:3, 3] = Rotation.random(rng=random).as_matrix(), random.normal(size=3)
+    transforms = [RigidTransform(matrix[:3, :3], matrix[:3, 3]) for matrix in (one, other)]
     points = random.normal(size=(5, 3))
-    padded = np.concatenate([points, np.ones((5, 1))], axis=1)
     chained = (transforms[0] @ transforms[1].inverse()).apply(points)
-    expected = padded @ (homogeneous[0] @ np.linalg.inv(homogeneous[1])).T
+    expected = np.column_stack([points, np.ones(5)]) @ (one @ np.linalg.inv(other)).T
     assert np.allclose(chained, expected[:, :3])
     assert np.array_equal(RigidTransform.identity().apply(points), points)
 
@@ -97,28 +90,20 @@ SQUARE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0,
 LINE = np.outer(np.arange(5.0), [1.0, 2.0, -1.0]) + np.array([3.0, 0.0, 1.0])
 
 
-def test_a_known_motion_is_found_exactly() -> None:
-    random = np.random.default_rng(0)
-    for count in (3, 4, 50):
-        rotation, translation = Rotation.random(rng=random).as_matrix(), random.normal(size=3)
-        source = random.normal(0.0, 5.0, (count, 3))
-        found = fit_rigid(source, source @ rotation.T + translation)
-        assert np.allclose(found.rotation, rotation, atol=1e-9)
-        assert np.allclose(found.translation, translation, atol=1e-9)
-
-
 @pytest.mark.parametrize("weighted", [False, True])
-def test_noisy_points_give_scipys_least_squares_result(weighted: bool) -> None:
+@pytest.mark.parametrize(("count", "noise_m"), [(3, 0.0), (4, 0.0), (50, 0.0), (30, 0.5)])
+def test_points_give_scipys_least_squares_result(weighted: bool, count: int, noise_m: float) -> None:
     random = np.random.default_rng(1)
-    for _ in range(20):
-        source = random.normal(0.0, 5.0, (30, 3))
-        target = Rotation.random(rng=random).apply(source) + random.normal(size=3) + random.normal(0.0, 0.5, (30, 3))
-        weights = random.uniform(0.0, 2.0, 30) if weighted else np.ones(30)
+    for _ in range(10):
+        source, turn, shift = random.normal(0.0, 5.0, (count, 3)), Rotation.random(rng=random), random.normal(size=3)
+        target = turn.apply(source) + shift + random.normal(0.0, noise_m, (count, 3))
+        weights = random.uniform(0.1, 2.0, count) if weighted else np.ones(count)
         source_mean, target_mean = (np.average(p, axis=0, weights=weights) for p in (source, target))
         expected, _ = Rotation.align_vectors(target - target_mean, source - source_mean, weights=weights)
         found = fit_rigid(source, target, weights if weighted else None)
         assert np.allclose(found.rotation, expected.as_matrix(), atol=1e-9)
         assert np.allclose(found.translation, target_mean - expected.apply(source_mean), atol=1e-9)
+        assert noise_m > 0 or np.allclose(found.rotation, turn.as_matrix(), atol=1e-9)
 
 
 def test_a_mirror_image_is_answered_by_a_rotation_and_never_a_reflection() -> None:
@@ -135,7 +120,7 @@ def test_a_mirror_image_is_answered_by_a_rotation_and_never_a_reflection() -> No
     [
         (SQUARE[:2], SQUARE[:2], None, "fewer than three pairs"),
         (SQUARE[:0], SQUARE[:0], None, "fewer than three pairs"),
-        (SQUARE, SQUARE[:3], None, "mismatched lengths: 4 source points, 3 target points"),
+        (SQUARE, SQUARE[:3], None, "4 source points, 3 target points"),
         (SQUARE[:, :2], SQUARE[:, :2], None, r"\(n, 3\)"),
         (np.where(SQUARE > 0.5, np.nan, SQUARE), SQUARE, None, "not finite"),
         (SQUARE, np.where(SQUARE > 0.5, np.inf, SQUARE), None, "not finite"),
@@ -154,3 +139,43 @@ def test_degenerate_input_is_refused_with_its_reason(
 ) -> None:
     with pytest.raises(ValueError, match=reason):
         fit_rigid(source, target, weights)
+
+
+# The closest approach of two points.
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "least_m"),
+    [
+        pytest.param([1.0, 0.34, 0.0], [-1.0, 0.34, 0.0], 0.34, id="head-on, past each other"),
+        pytest.param([1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], 0.0, id="through each other"),
+        pytest.param([5.0, 0.0, 0.0], [3.0, 0.0, 0.0], 3.0, id="not there yet"),
+        pytest.param([3.0, 4.0, 0.0], [6.0, 8.0, 0.0], 5.0, id="going away"),
+        pytest.param([1.0, 2.0, 2.0], [1.0, 2.0, 2.0], 3.0, id="both standing still"),
+        pytest.param([0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0, id="standing at one place"),
+        pytest.param([4.0, 0.0], [0.0, 3.0], 2.4, id="height of a triangle of 3, 4 and 5"),
+        pytest.param([0.0, 2.0, -1.0], [0.0, 2.0, 3.0], 2.0, id="one climbs past the other"),
+    ],
+)
+def test_two_points_are_closest_where_algebra_says(begin: list[float], end: list[float], least_m: float) -> None:
+    assert closest_approach(np.array(begin), np.array(end)) == pytest.approx(least_m, abs=1e-12)
+    assert closest_approach(np.array(end), np.array(begin)) == pytest.approx(least_m, abs=1e-12)
+
+
+def test_many_pairs_at_once_keep_their_shape() -> None:
+    begin = np.zeros((4, 5, 5, 3))
+    begin[..., 1] = 1.0
+    end = begin + np.array([0.0, -3.0, 0.0])
+    end[2, 3, 4] = begin[2, 3, 4] + np.array([2.0, 0.0, 0.0])
+    found = closest_approach(begin, end)
+    assert found.shape == (4, 5, 5)
+    assert found[2, 3, 4] == 1.0
+    assert found.sum() == 1.0
+
+
+@pytest.mark.parametrize("begin_m", [0.6, 1.0, 3.0])
+def test_who_brakes_errs_by_no_more_than_the_bound(begin_m: float) -> None:
+    """At 1 m/s towards each other, braked by 4 m/s^2: they turn 1/8 m nearer after 0.25 s, and are back at 0.5 s."""
+    found = float(closest_approach(np.array([begin_m]), np.array([begin_m])))
+    assert found == begin_m
+    assert found - (begin_m - 1.0 / 8.0) == pytest.approx(4.0 * 0.5**2 / 8)
