@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -79,15 +81,10 @@ def test_the_polish_is_several_times_closer_than_algorithm_1(flaws: Flaws, limit
 def test_drones_in_view_do_not_enter_the_own_motion() -> None:
     pairs, truth = flight(1, EXACT)
     on_drone = np.arange(len(pairs)) % 2 == 1
-    drifting = PointPairs(
-        previous=pairs.previous,
-        current=np.where(on_drone[:, None], pairs.current + np.array([0.0, 0.3, 0.0]), pairs.current),
-        labels=np.where(on_drone, 3, 0),
-        camera_names=pairs.camera_names,
-        pixels_previous=pairs.pixels_previous,
-        pixels_current=pairs.pixels_current,
-    )
-    motion = estimate_ego_motion(drifting, RIG, 0.5, POLISHED)
+    drifting = pairs.current + np.where(on_drone[:, None], [0.0, 0.3, 0.0], 0.0)
+    motion = estimate_ego_motion(
+        replace(pairs, current=drifting, labels=np.where(on_drone, 3, 0)), RIG, 0.5, POLISHED
+    )  # fmt: skip
     assert motion.pairs == np.count_nonzero(~on_drone)
     assert motion.inliers > 0.9 * motion.pairs
     assert errors(motion, truth)[1] < 1e-4
@@ -107,9 +104,12 @@ def test_a_polish_that_costs_more_than_its_start_is_refused(monkeypatch: pytest.
     assert (refine_ego_motion(pairs, RIG, truth) is None) == rises
 
 
-def test_a_refused_polish_leaves_algorithm_1s_result(monkeypatch: pytest.MonkeyPatch) -> None:
-    pairs, _ = flight(3, Flaws())
-    monkeypatch.setattr(ego_motion, "refine_ego_motion", lambda *_, **__: None)
+@pytest.mark.parametrize("polished", ["refused", "leaves the matches behind"])
+def test_a_polish_that_is_no_better_leaves_algorithm_1s_result(monkeypatch: pytest.MonkeyPatch, polished: str) -> None:
+    """Its robust cost falls where most matches are false, and it explains the others."""
+    pairs, truth = flight(6, EXACT)
+    astray = RigidTransform(rotation_from_euler(0.0, 0.0, 0.03), np.zeros(3)) @ truth
+    monkeypatch.setattr(ego_motion, "refine_ego_motion", lambda *_, **__: None if polished == "refused" else astray)
     raw, kept = (estimate_ego_motion(pairs, RIG, 0.5, parameters) for parameters in (UNPOLISHED, POLISHED))
     assert np.array_equal(raw.rotation, kept.rotation)
     assert np.array_equal(raw.translation, kept.translation)
@@ -125,26 +125,15 @@ def with_false_matches(pairs: PointPairs, share: float) -> PointPairs:
         pixels[mine] += random.uniform(20.0, 40.0, (len(mine), 2)) * random.choice([-1.0, 1.0], (len(mine), 2))
         depth = camera.T_body_camera.inverse().apply(points[mine])[:, 2]
         points[mine] = camera.T_body_camera.apply(camera.camera.unproject(pixels[mine], depth))
-    return PointPairs(pairs.previous, points, pairs.labels, pairs.camera_names, pairs.pixels_previous, pixels)
+    return replace(pairs, current=points, pixels_current=pixels)
 
 
 @pytest.mark.parametrize("parameters", [POLISHED, UNPOLISHED])
 def test_a_motion_that_explains_none_of_its_matches_is_no_estimate(parameters: GeometryParameters) -> None:
     """Within metres there are always some that agree: false matches on nearby surfaces are not far apart in space."""
     pairs, _ = flight(6, EXACT)
-    with pytest.raises(
-        ValueError,
-        match=r"explains only \d\.\d% of \d+ matches within 3 px|no motion has more than 20%|better than chance",
-    ):
+    with pytest.raises(ValueError, match=r"explains only|no motion|better than chance"):
         estimate_ego_motion(with_false_matches(pairs, 0.99), RIG, 0.5, parameters)
-
-
-def test_a_polish_that_leaves_the_matches_behind_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its robust cost falls where most matches are false, and it explains the others."""
-    pairs, truth = flight(6, EXACT)
-    astray = RigidTransform(rotation_from_euler(0.0, 0.0, 0.03), np.zeros(3)) @ truth
-    monkeypatch.setattr(ego_motion, "refine_ego_motion", lambda *_, **__: astray)
-    assert errors(estimate_ego_motion(pairs, RIG, 0.5, POLISHED), truth)[0] < 0.01
 
 
 @pytest.mark.parametrize("parameters", [POLISHED, UNPOLISHED])
@@ -167,5 +156,5 @@ def test_a_start_some_degrees_and_decimetres_off_converges() -> None:
 
 def test_pairs_of_an_unknown_camera_are_refused() -> None:
     pairs, _ = flight(5, EXACT)
-    with pytest.raises(ValueError, match="'back', which is not in the rig"):
+    with pytest.raises(ValueError, match="'back'"):
         estimate_ego_motion(pairs, Rig({"front": RIG.cameras["front"]}), 0.5, POLISHED)

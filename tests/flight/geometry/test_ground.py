@@ -72,9 +72,9 @@ def test_a_wide_angle_camera_gets_the_inverse_of_z_too() -> None:
 
 @pytest.mark.fault("ground-reached")
 def test_a_camera_on_the_ground_and_a_stride_that_does_not_fit_are_refused() -> None:
-    with pytest.raises(ValueError, match="'front' is not above the ground"):
+    with pytest.raises(ValueError, match=r"'front'.*ground"):
         ground_inverse_depth(RIG.cameras["front"], LEVEL, 0.0)
-    with pytest.raises(ValueError, match="stride of 7 does not divide an image of 480x640"):
+    with pytest.raises(ValueError, match=r"7.*480x640"):
         ground_inverse_depth(RIG.cameras["front"], LEVEL, 4.0, stride=7)
 
 
