@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -147,7 +149,7 @@ def test_what_is_no_camera_is_refused(
 # Rigs: where cameras look, from the configuration's angles.
 
 
-def mounted(**extrinsics: float) -> RigidTransform:
+def mounted(**extrinsics: Any) -> RigidTransform:
     config = camera_config("one", position_m=(0.1, 0.2, 0.3), **extrinsics)
     return build_rig(RigConfig(cameras=(config,))).cameras["one"].T_body_camera
 

@@ -640,7 +640,7 @@ def _ways(density: float, steps: int, seed: int) -> Array:
     return np.column_stack([ways, np.zeros(steps)])
 
 
-def _manoeuvred(ways: Iterable[Array | None], sigma_m: float = 0.0, step_s: float = STEP_S, **how: float) -> Manoeuvres:
+def _manoeuvred(ways: Iterable[Array | None], sigma_m: float = 0.0, step_s: float = STEP_S, **how: Any) -> Manoeuvres:
     """What is known after these ways of one step each."""
     manoeuvres = Manoeuvres(TrackingParameters(**how))
     for way in ways:
