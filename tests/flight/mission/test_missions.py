@@ -15,16 +15,17 @@ from flockd.core.config import DroneConfig, load_drone
 from flockd.core.config.mission import fault_of_place
 from flockd.core.config.safety import GateParameters
 from flockd.core.errors import ConfigError
-from flockd.core.messages import FloatArray, MissionOrder, Setpoint, VehicleState, Wanted
+from flockd.core.messages import FloatArray, MissionOrder, Setpoint
+from flockd.flight.geometry import euler_from_rotation
 from flockd.flight.mission import Guidance, MissionParameters, Moment, Navigator, order_fault
 from flockd.flight.mission.navigator import middle_of
-from flockd.flight.safety import Action, Gate, Permission, Request, outside_fence
-from flockd.flight.safety.surroundings import surroundings
+from flockd.flight.safety import Gate, outside_fence
 from flockd.onboard.telemetry.order_messages import order_message, parse_order
 from flockd.sim.autopilot.fake_vehicle import Demand, PointMass
 from flockd.sim.flock.exact_states import fly_exact_states
 from flockd.sim.scenario import load_scenario
 from tests.core.config.test_loader import CONFIG, DRONE
+from tests.make import around, changed, request, vehicle
 from tests.sim.scenario.test_scenario_file import SCENARIO
 
 GATE = GateParameters()
@@ -135,14 +136,14 @@ def test_degrees_are_metres_from_home() -> None:
     place = {"latitude_deg": 47.4 + 10 / 111_170, "longitude_deg": 8.5 - 20 / 75_450}
     navigator = Navigator(mission(kind="waypoints", waypoints=(place,)), GATE)
     blind = navigator.step(Moment(0.0, ORIGIN))
-    assert blind.sentence == "waits for home in degrees, which the autopilot has not sent"
+    assert "home" in blind.sentence
     np.testing.assert_allclose(blind.velocity, ORIGIN)
     goal = navigator.step(Moment(0.5, ORIGIN, home_deg=np.array([47.4, 8.5]))).goal
     assert goal is not None
     np.testing.assert_allclose(goal, [10.0, -20.0], atol=0.05)
     far = Navigator(mission(kind="waypoints", waypoints=(place,)), GATE)
     outside = far.step(Moment(0.0, ORIGIN, home_deg=np.array([47.5, 8.5])))
-    assert outside.sentence == "the goal is outside the fence"
+    assert "fence" in outside.sentence
     np.testing.assert_allclose(outside.velocity, ORIGIN)
 
 
@@ -174,7 +175,7 @@ def test_hover_and_follow_want_no_velocity_and_a_velocity_is_kept() -> None:
 
 def test_an_operators_velocity_and_goal_hold_for_two_seconds() -> None:
     point = Point(mission(kind="operator"))
-    assert point.step().sentence == "hovers until an operator's next order"
+    assert "hovers" in point.step().sentence
     for order in (MissionOrder(velocity=np.array([0.5, 0.0])), MissionOrder(place=np.array([40.0, 0.0]))):
         speeds = [math.hypot(*point.step(order).velocity), *(math.hypot(*point.step().velocity) for _ in range(5))]
         assert [speed > 0 for speed in speeds] == [True, True, True, True, False, False]
@@ -250,12 +251,12 @@ def config(tmp_path: Path) -> DroneConfig:
     ("message", "command", "refusal"),
     [
         ({"north_m": 90.0, "east_m": 0.0}, "goto", None),
-        ({"north_m": 90.0, "east_m": 80.0}, "goto", "the goal is 120.4 m from home, outside the fence of 100 m"),
-        ({"latitude_deg": 48.0, "longitude_deg": 8.0}, "goto", "does not know its home in degrees"),
-        ({"north_m": 9.0, "east_m": 0.0, "height_m": 31.0}, "goto", "leads to a height of 31 m"),
-        ({"north_m": 9.0, "east_m": 0.0, "speed_m_s": 3.5}, "goto", "3.5 m/s is above"),
+        ({"north_m": 90.0, "east_m": 80.0}, "goto", "120.4 m from home, outside the fence of 100 m"),
+        ({"latitude_deg": 48.0, "longitude_deg": 8.0}, "goto", "home in degrees"),
+        ({"north_m": 9.0, "east_m": 0.0, "height_m": 31.0}, "goto", "31 m"),
+        ({"north_m": 9.0, "east_m": 0.0, "speed_m_s": 3.5}, "goto", "3.5 m/s"),
         ({"velocity_ne": [3.0, 0.0]}, "velocity", None),
-        ({"velocity_ne": [3.0, 2.0]}, "velocity", "3.60555 m/s is above"),
+        ({"velocity_ne": [3.0, 2.0]}, "velocity", "3.60555 m/s"),
     ],
 )
 def test_an_order_that_cannot_be_flown_is_refused_with_the_reason(
@@ -263,29 +264,25 @@ def test_an_order_that_cannot_be_flown_is_refused_with_the_reason(
 ) -> None:
     order = parse_order(command, message)
     assert order_message(order) == message
-    vehicle = VehicleState(0.0, np.eye(3), 5.0, np.zeros(3), ORIGIN)
-    fault = order_fault(config, order, vehicle)
+    fault = order_fault(config, order, vehicle())
     assert fault is None if refusal is None else fault is not None and refusal in fault
     assert order_fault(config, order, None) is not None
 
 
 def test_in_first_flights_no_order_takes_a_drone_out_of_its_layer(config: DroneConfig) -> None:
-    vehicle = VehicleState(0.0, np.eye(3), 5.0, np.zeros(3), ORIGIN)
     order = MissionOrder(place=np.array([9.0, 0.0]), height_m=7.0)
-    assert order_fault(config, order, vehicle) is None
-    first = config.safety.model_copy(update={"first_flight_layer": 1})
-    config = config.model_copy(update={"safety": first})
-    assert "keeps to its layer" in str(order_fault(config, order, vehicle))
-    assert order_fault(config, replace(order, height_m=None), vehicle) is None
+    assert order_fault(config, order, vehicle()) is None
+    first = changed(config, safety__first_flight_layer=1)
+    assert "layer" in str(order_fault(first, order, vehicle()))
+    assert order_fault(first, replace(order, height_m=None), vehicle()) is None
 
 
 def test_a_velocity_that_leads_out_of_the_fence_is_refused_and_one_back_is_not(config: DroneConfig) -> None:
-    edge = VehicleState(0.0, np.eye(3), 5.0, np.zeros(3), np.array([98.0, 0.0]))
+    edge = vehicle(position=[98.0, 0.0])
     outward, inward = (MissionOrder(velocity=np.array([speed, 0.0])) for speed in (1.5, -1.5))
-    assert "in 2 s the drone is 101.0 m from home" in str(order_fault(config, outward, edge))
+    assert "101.0 m" in str(order_fault(config, outward, edge))
     assert order_fault(config, inward, edge) is None
-    beyond = replace(edge, position=np.array([130.0, 0.0]))
-    assert order_fault(config, inward, beyond) is None
+    assert order_fault(config, inward, vehicle(position=[130.0, 0.0])) is None
 
 
 @pytest.mark.parametrize(
@@ -296,11 +293,9 @@ def test_a_velocity_that_leads_out_of_the_fence_is_refused_and_one_back_is_not(c
 def test_a_goal_that_no_mission_can_have_is_refused_without_a_fence_too(
     config: DroneConfig, message: dict[str, float]
 ) -> None:
-    gate = config.safety.gate.model_copy(update={"fence_radius_m": None, "fence_corners_m": ()})
-    config = config.model_copy(update={"safety": config.safety.model_copy(update={"gate": gate})})
-    vehicle = VehicleState(0.0, np.eye(3), 5.0, np.zeros(3), ORIGIN, np.array([47.4, 8.5]))
-    order = parse_order("goto", message)
-    assert "farther than any mission leads" in str(order_fault(config, order, vehicle))
+    unfenced = changed(config, safety__gate__fence_radius_m=None)
+    here = vehicle(home_deg=[47.4, 8.5])
+    assert "farther" in str(order_fault(unfenced, parse_order("goto", message), here))
 
 
 @pytest.mark.parametrize(
@@ -317,28 +312,24 @@ def test_what_is_no_order_is_refused_with_a_sentence(message: dict[str, object] 
 @pytest.mark.parametrize(
     ("written", "told"),
     [
-        ("{kind: spiral}", "drone.yaml:6: mission.kind: spiral is not known"),
-        ("{kind: hover, radius_m: 5.0}", "has no meaning with kind `hover`, only with `circle_then_tangent`"),
-        ("{kind: waypoints}", "mission.kind: `waypoints` needs `waypoints`"),
-        ("{kind: velocity}", "mission.kind: `velocity` needs `velocity_m_s`"),
-        ("{kind: velocity, velocity_m_s: [3, 3]}", "mission.velocity_m_s: 4.24264 m/s is above"),
-        ("{speed_m_s: 4.5}", "mission.speed_m_s: 4.5 m/s is above"),
-        ("{kind: hover, height_m: 40}", "mission.height_m: leads to a height of 40 m"),
-        (
-            "{kind: waypoints, waypoints: [{north_m: 1, east_m: 2}, {north_m: 90, east_m: 50}]}",
-            "mission.waypoints[1]: is 103.0 m from home, outside the fence of 100 m",
-        ),
-        ("{kind: waypoints, waypoints: [{north_m: 1}]}", "a waypoint needs `north_m` and `east_m`"),
+        ("{kind: spiral}", "mission.kind: "),
+        ("{kind: hover, radius_m: 5.0}", "mission.radius_m: "),
+        ("{kind: waypoints}", "mission.kind: .*`waypoints`"),
+        ("{kind: velocity}", "mission.kind: .*`velocity_m_s`"),
+        ("{kind: velocity, velocity_m_s: [3, 3]}", "mission.velocity_m_s: 4.24264 m/s"),
+        ("{speed_m_s: 4.5}", "mission.speed_m_s: 4.5 m/s"),
+        ("{kind: hover, height_m: 40}", "mission.height_m: .* 40 m"),
+        ("{kind: waypoints, waypoints: [{north_m: 1, east_m: 2}, {north_m: 90, east_m: 50}]}",
+         r"mission.waypoints\[1\]: .*103.0 m"),
+        ("{kind: waypoints, waypoints: [{north_m: 1}]}", r"mission.waypoints\[0\].*`east_m`"),
     ],
-)
+)  # fmt: skip
 def test_a_bad_mission_is_refused_with_line_and_key(tmp_path: Path, written: str, told: str) -> None:
     path = tmp_path / "drone.yaml"
     path.write_text(f"{DRONE}mission: {written}\n", encoding="utf-8")
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(ConfigError, match=f"drone.yaml:6: {told}") as caught:
         load_drone(path)
-    (line,) = str(caught.value).splitlines()
-    assert "drone.yaml:6" in line
-    assert told.removeprefix("drone.yaml:6: ") in line
+    assert len(str(caught.value).splitlines()) == 1
 
 
 def test_in_a_scenario_the_mission_is_of_all_and_one_drone_may_have_its_own(tmp_path: Path) -> None:
@@ -353,7 +344,7 @@ def test_in_a_scenario_the_mission_is_of_all_and_one_drone_may_have_its_own(tmp_
     with pytest.raises(ConfigError, match=r"scenario.yaml:7: drone.mission.kind|scenario.yaml:7: mission.kind"):
         load_scenario(path)
     path.write_text(f"{SCENARIO}{own.replace('[1, 0]', '[9, 0]')}", encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"scenario.yaml:6: vehicles\[2\].mission.velocity_m_s: 9 m/s is above"):
+    with pytest.raises(ConfigError, match=r"scenario.yaml:6: vehicles\[2\].mission.velocity_m_s: 9 m/s"):
         load_scenario(path)
 
 
@@ -361,7 +352,7 @@ def test_one_drone_at_least_is_left_to_flockd(tmp_path: Path) -> None:
     (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
     path = tmp_path / "scenario.yaml"
     path.write_text(SCENARIO.replace("4]}", "4], by_hand: true}"), encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"scenario.yaml:4: vehicles\[0\].by_hand: flies the last drone by hand too"):
+    with pytest.raises(ConfigError, match=r"scenario.yaml:4: vehicles\[0\].by_hand: "):
         load_scenario(path)
     assert main(["sim", str(CONFIG / "led_by_hand.yaml"), "--drones", "1", "--perception", "truth"]) == 2
 
@@ -408,50 +399,35 @@ def test_a_mission_changes_the_height_and_lands_at_its_end() -> None:
 # Laps: mission, gate and vehicle in closed loop, turning to one side all the time.
 
 
-PERIOD_S, PERIODS = 0.1, 5
-"""Of the gate; and how many a step of the mission has."""
-SIDE_M, SPEED_M_S, SQUARES, HEIGHT_M = 12.0, 1.5, 10, 5.0
-TURN_RAD_S = 0.2
-"""The heading turns no faster."""
-
-
 @pytest.mark.parametrize("side", [1.0, -1.0], ids=["to the right", "to the left"])
 def test_ten_squares_are_flown_without_standing_and_with_the_heading_along(side: float) -> None:
-    corners = [(SIDE_M, 0.0), (SIDE_M, side * SIDE_M), (0.0, side * SIDE_M), (0.0, 0.0)] * SQUARES
-    waypoints = tuple({"north_m": north, "east_m": east} for north, east in corners)
-    mission = MissionParameters.model_validate(
-        {"kind": "waypoints", "speed_m_s": SPEED_M_S, "reached_m": 1.0, "waypoints": waypoints}
-    )
-    navigator, gate = Navigator(mission, GateParameters()), Gate(GateParameters())
-    vehicle = PointMass(np.array([0.0, 0.0, -HEIGHT_M]))
-    state = vehicle(Demand(np.zeros(2), -HEIGHT_M, 0.0), 0.0)
+    """Of 12 m at 1.5 m/s; the gate is stepped each 0.1 s, the mission each 0.5 s."""
+    corners = [(12.0, 0.0), (12.0, side * 12.0), (0.0, side * 12.0), (0.0, 0.0)] * 10
+    navigator, gate = Navigator(to(*corners, speed_m_s=1.5, reached_m=1.0), GATE), Gate(GATE)
+    fly = PointMass(np.array([0.0, 0.0, -5.0]))
+    state = fly(Demand(np.zeros(2), -5.0, 0.0), 0.0)
     setpoints: list[Setpoint] = []
-    turned_rad = now_s = 0.0
-    for _ in range(1200):
-        guidance = navigator.step(Moment(now_s, state.position[:2]))
-        if guidance.arrived:
-            break
-        wanted, wanted_s = Wanted(guidance.velocity, np.zeros(2), guidance.course_rad), now_s
-        for _ in range(PERIODS):
-            R = state.R_ned_body
-            around = surroundings(
-                (), 0.0, moved=np.zeros(3), position=state.position[:2], velocity=state.velocity,
-                yaw_rad=math.atan2(R[1, 0], R[0, 0]), height_m=HEIGHT_M, obstacles=np.empty((0, 2)),
-            )  # fmt: skip
-            verdict = gate.step(now_s, Request(Permission(Action.FLY, now_s), wanted, wanted_s, HEIGHT_M, around))
-            assert verdict.objections == ()
-            assert verdict.setpoint is not None
-            setpoints.append(verdict.setpoint)
-            before_rad = math.atan2(R[1, 0], R[0, 0])
-            state = vehicle(Demand(verdict.setpoint.velocity, -HEIGHT_M, verdict.setpoint.yaw_rad), PERIOD_S)
-            R = state.R_ned_body
-            turned_rad += math.remainder(math.atan2(R[1, 0], R[0, 0]) - before_rad, math.tau)
-            now_s += PERIOD_S
-    assert guidance.sentence == f"at waypoint {4 * SQUARES} of {4 * SQUARES}"
-    assert turned_rad == pytest.approx(side * math.tau * SQUARES, abs=2.0), "as often as it went around"
+    turned_rad, yaw_rad = 0.0, 0.0
+    for tick in range(6000):
+        now_s = 0.1 * tick
+        if tick % 5 == 0:
+            guidance, wanted_s = navigator.step(Moment(now_s, state.position[:2])), now_s
+            if guidance.arrived:
+                break
+        near = around(state.position[:2], state.velocity[:2], yaw_rad=yaw_rad)
+        asked = request(now_s, guidance.velocity, surroundings=near, yaw_rad=guidance.course_rad, wanted_s=wanted_s)
+        verdict = gate.step(now_s, asked)
+        assert verdict.objections == ()
+        assert verdict.setpoint is not None
+        setpoints.append(verdict.setpoint)
+        state = fly(Demand(verdict.setpoint.velocity, -5.0, verdict.setpoint.yaw_rad), 0.1)
+        before_rad, yaw_rad = yaw_rad, euler_from_rotation(state.R_ned_body)[2]
+        turned_rad += math.remainder(yaw_rad - before_rad, math.tau)
+    assert guidance.sentence == "at waypoint 40 of 40"
+    assert turned_rad == pytest.approx(10 * side * math.tau, abs=2.0), "as often as it went around"
     speeds = np.hypot(*np.array([setpoint.velocity for setpoint in setpoints[10:-40]]).T)
-    assert speeds.min() > 0.5 * SPEED_M_S, "it never stands"
+    assert speeds.min() > 0.75, "it never stands"
     headings = [setpoint.yaw_rad for setpoint in setpoints]
     assert all(-math.pi < heading <= math.pi for heading in headings)
     jumps = [abs(math.remainder(after - before, math.tau)) for before, after in pairwise(headings)]
-    assert max(jumps) <= TURN_RAD_S * PERIODS * PERIOD_S + 1e-9
+    assert max(jumps) <= 0.2 * 0.5 + 1e-9  # turns no faster than 0.2 rad/s, a step of 0.5 s at once
