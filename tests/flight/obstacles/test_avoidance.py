@@ -11,15 +11,14 @@ from flockd.core.config.avoidance import ObstacleParameters
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.config.mission import MissionParameters
 from flockd.core.config.safety import GateParameters
-from flockd.core.data import data_path
 from flockd.core.messages import FloatArray, ObstacleRanges
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.obstacles import Avoidance
 from flockd.flight.obstacles.steering import Steering, free_way
 from flockd.sim.flock.exact_states import ExactFlock
-from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.vehicles.vehicles import Vehicles
 from flockd.sim.world.obstacles import Box, Frustum, Obstacles, Solid, true_ranges
+from tests.make import changed, scenario
 
 PARAMETERS = ObstacleParameters(enabled=True)
 GATE = GateParameters()
@@ -35,6 +34,10 @@ def around(*solids: Solid) -> ObstacleRanges:
 
 def trunk(north: float, east: float, radius: float = 0.2) -> Frustum:
     return Frustum(north, east, radius, radius, -0.5, 10.0)
+
+
+def wall(north: float, east: float, half_north: float, half_east: float) -> Box:
+    return Box(north, east, half_north, half_east, 0.0, -0.5, 8.0)
 
 
 def steered(wanted: tuple[float, float], ranges: ObstacleRanges, flock: FloatArray = STILL) -> FloatArray:
@@ -68,13 +71,13 @@ def test_where_nothing_stands_the_wanted_velocity_is_flown() -> None:
 
 def test_a_drone_that_its_flock_pulls_takes_the_way_that_is_free_for_the_flocks_speed() -> None:
     """A wall 6.5 m away: at 3 m/s the way to it is too short, at the flock's 1.2 m/s it is not. Alone it turns off."""
-    wall = around(Box(6.7, 0.0, 0.2, 6.0, 0.0, -0.5, 8.0))
-    north, east = steered((3.0, 0.0), wall, np.array([1.2, 0.0]))
+    ahead = around(wall(6.7, 0.0, 0.2, 6.0))
+    north, east = steered((3.0, 0.0), ahead, np.array([1.2, 0.0]))
     assert abs(math.atan2(east, north)) < 0.1
     assert 1.5 < math.hypot(north, east) < (6.5 - PARAMETERS.clearance_m) / PARAMETERS.horizon_s
-    north, east = steered((3.0, 0.0), wall)
+    north, east = steered((3.0, 0.0), ahead)
     assert abs(math.atan2(east, north)) > 0.7
-    north, east = steered((3.0, 0.0), wall, np.array([2.8, 0.0]))
+    north, east = steered((3.0, 0.0), ahead, np.array([2.8, 0.0]))
     assert abs(math.atan2(east, north)) > 0.7
 
 
@@ -103,16 +106,16 @@ def test_of_two_ways_alike_the_flocks_is_taken() -> None:
 
 
 def test_before_a_wall_it_slides_along() -> None:
-    wall = around(Box(1.5, 0.0, 0.2, 30.0, 0.0, -0.5, 8.0))
-    north, east = steered((1.5, 0.0), wall)
+    ahead = around(wall(1.5, 0.0, 0.2, 30.0))
+    north, east = steered((1.5, 0.0), ahead)
     assert east > 0.5
     assert abs(north) < 0.3 * east
 
 
 def test_a_way_that_leads_back_is_flown_at_less_than_a_third_of_the_speed_and_more_than_none() -> None:
     court = around(
-        Box(2.0, 0.0, 0.2, 8.0, 0.0, -0.5, 8.0), Box(0.0, 2.0, 8.0, 0.2, 0.0, -0.5, 8.0),
-        Box(0.0, -2.0, 8.0, 0.2, 0.0, -0.5, 8.0),
+        wall(2.0, 0.0, 0.2, 8.0), wall(0.0, 2.0, 8.0, 0.2),
+        wall(0.0, -2.0, 8.0, 0.2),
     )  # fmt: skip
     north, east = steered((2.4, 0.0), court)
     assert north < 0.0
@@ -121,8 +124,8 @@ def test_a_way_that_leads_back_is_flown_at_less_than_a_third_of_the_speed_and_mo
 
 def test_an_obstacle_that_may_be_nearer_is_met_more_slowly() -> None:
     dead_end = around(
-        Box(3.0, 0.0, 0.2, 5.0, 0.0, -0.5, 8.0), Box(0.0, 1.8, 5.0, 0.2, 0.0, -0.5, 8.0),
-        Box(0.0, -1.8, 5.0, 0.2, 0.0, -0.5, 8.0), Box(-3.0, 0.0, 0.2, 5.0, 0.0, -0.5, 8.0),
+        wall(3.0, 0.0, 0.2, 5.0), wall(0.0, 1.8, 5.0, 0.2),
+        wall(0.0, -1.8, 5.0, 0.2), wall(-3.0, 0.0, 0.2, 5.0),
     )  # fmt: skip
     sure = np.linalg.norm(steered((1.5, 0.0), dead_end))
     found = np.isfinite(dead_end.range_m)
@@ -151,8 +154,8 @@ def test_the_command_can_be_stopped_a_step_later() -> None:
     """From full speed towards a wall: however the law pulls, the way of a step, reaction and braking is left."""
     avoidance, law = Avoidance(PARAMETERS, GATE, 0.5), FlockingLaw(FlockingParameters())
     for away_m in np.arange(1.0, 8.0, 0.25):
-        wall = around(Box(away_m + 0.2, 0.0, 0.2, 30.0, 0.0, -0.5, 8.0))
-        command, _ = avoidance.command(law, np.array([1.5, 0.0]), NOBODY, NOBODY[:, :2], np.array([3.0, 0.0]), wall)
+        ahead = around(wall(away_m + 0.2, 0.0, 0.2, 30.0))
+        command, _ = avoidance.command(law, np.array([1.5, 0.0]), NOBODY, NOBODY[:, :2], np.array([3.0, 0.0]), ahead)
         speed = max(float(command[0]), 0.0)
         assert speed * 1.0 + speed**2 / 3.0 <= max(away_m - PARAMETERS.clearance_m, 0.0) + 1e-6
 
@@ -173,28 +176,16 @@ def test_without_obstacles_the_command_is_the_laws() -> None:
 
 def flight(solids: list[Solid], duration_s: float) -> tuple[float, FloatArray]:
     """The smallest clearance of five drones that fly north at 1.5 m/s, and where they end, (5, 3) m."""
-    scenario = load_scenario(data_path("config") / "square.yaml", {"ideal": True})
-    drone = scenario.drone.model_copy(
-        update={
-            "mission": MissionParameters(kind="velocity", velocity_m_s=(1.5, 0.0)),
-            "obstacles": PARAMETERS,
-        }
-    )
-    scenario = scenario.model_copy(update={"drone": drone})
-    flock, vehicles = _flock_among(scenario, solids), Vehicles(scenario.vehicles, scenario.vehicle)
-    nearest_m, obstacles = math.inf, Obstacles(solids)
+    mission = MissionParameters(kind="velocity", velocity_m_s=(1.5, 0.0))
+    given = changed(scenario({"ideal": True}, "square"), drone__mission=mission, drone__obstacles=PARAMETERS)
+    flock, vehicles, nearest_m = ExactFlock(given), Vehicles(given.vehicles, given.vehicle), math.inf
+    flock._obstacles = obstacles = Obstacles(solids)
     for step in range(round(duration_s / 0.5)):
         commands = flock.step(0.5 * step, vehicles.position, vehicles.velocity)
         for _ in range(5):
             vehicles.step(commands.velocity, np.zeros(5), 0.1)
             nearest_m = min(nearest_m, float(obstacles.clearance(vehicles.position).min()))
     return nearest_m, vehicles.position
-
-
-def _flock_among(scenario: ScenarioConfig, solids: list[Solid]) -> ExactFlock:
-    flock = ExactFlock(scenario)
-    flock._obstacles = Obstacles(solids)
-    return flock
 
 
 def test_a_flock_flies_between_trunks_and_hits_none() -> None:
@@ -205,7 +196,7 @@ def test_a_flock_flies_between_trunks_and_hits_none() -> None:
 
 
 def test_a_flock_gets_around_a_wall_across_its_way() -> None:
-    nearest_m, ends = flight([Box(8.0, 2.0, 0.2, 6.0, 0.0, -0.5, 8.0)], 22.0)
+    nearest_m, ends = flight([wall(8.0, 2.0, 0.2, 6.0)], 22.0)
     assert nearest_m > 0.6
     assert ends[:, 0].min() > 9.0
     assert np.ptp(ends[:, :2], axis=0).max() < 12.0

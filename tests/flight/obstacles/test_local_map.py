@@ -24,8 +24,9 @@ def ranges(time_s: float, found: dict[int, float], sigma_m: float = 0.1, seen_m:
     return ObstacleRanges(time_s, range_m, sigmas_m, np.minimum(range_m, seen_m))
 
 
-def obstacles_in(view: ObstacleRanges) -> dict[int, float]:
-    return {int(sector): float(view.range_m[sector]) for sector in np.flatnonzero(np.isfinite(view.range_m))}
+def obstacles_in(view: ObstacleRanges | FloatArray) -> dict[int, float]:
+    range_m = view.range_m if isinstance(view, ObstacleRanges) else view
+    return {int(sector): float(range_m[sector]) for sector in np.flatnonzero(~np.isposinf(range_m))}
 
 
 def test_an_obstacle_stays_where_it_is_while_the_drone_passes_it_unseeing() -> None:
@@ -108,27 +109,23 @@ NO_POINTS = np.empty((0, 2))
 BEHIND, LEFT = SECTORS // 2, 3 * SECTORS // 4
 
 
-def sectors_with(free_m: FloatArray) -> dict[int, float]:
-    """By sector; all others are free."""
-    assert not np.isnan(free_m).any()
-    return {int(sector): float(free_m[sector]) for sector in np.flatnonzero(np.isfinite(free_m))}
-
-
-@pytest.mark.parametrize(("heading_deg", "sector"), [(0.0, EAST), (90.0, NORTH), (180.0, LEFT), (-90.0, BEHIND)])
-def test_an_obstacle_in_the_east_is_where_it_is_from_the_nose(heading_deg: float, sector: int) -> None:
-    free_m = free_ahead(np.array([[0.0, 4.0]]), SEEN_M, 0.0, math.radians(heading_deg), 15.0)
-    assert sectors_with(free_m) == {sector: pytest.approx(4.0)}
-
-
-def test_between_two_sectors_both_have_it() -> None:
-    """Heading 2 degrees: the sector of 90 degrees spans 85.5 to 90.5 from the nose, so over those of 85 and 90."""
-    free_m = free_ahead(np.array([[0.0, 4.0]]), SEEN_M, 0.0, math.radians(2.0), 15.0)
-    assert sectors_with(free_m) == {EAST - 1: pytest.approx(4.0), EAST: pytest.approx(4.0)}
-
-
-def test_of_two_in_a_sector_the_nearer_counts() -> None:
-    free_m = free_ahead(np.array([[4.0, 0.0], [3.0, 0.0], [9.0, 0.0]]), SEEN_M, 0.0, 0.0, 15.0)
-    assert sectors_with(free_m) == {0: 3.0}
+@pytest.mark.parametrize(
+    ("points", "heading_deg", "found"),
+    [
+        ([[0.0, 4.0]], 0.0, {EAST: 4.0}),
+        ([[0.0, 4.0]], 90.0, {NORTH: 4.0}),
+        ([[0.0, 4.0]], 180.0, {LEFT: 4.0}),
+        ([[0.0, 4.0]], -90.0, {BEHIND: 4.0}),
+        # The sector of 90 degrees spans 85.5 to 90.5 from the nose, so over those of 85 and 90.
+        ([[0.0, 4.0]], 2.0, {EAST - 1: 4.0, EAST: 4.0}),
+        ([[4.0, 0.0], [3.0, 0.0], [9.0, 0.0]], 0.0, {NORTH: 3.0}),  # the nearest counts
+    ],
+)
+def test_an_obstacle_is_where_it_is_from_the_nose(
+    points: list[list[float]], heading_deg: float, found: dict[int, float]
+) -> None:
+    free_m = free_ahead(np.array(points), SEEN_M, 0.0, math.radians(heading_deg), 15.0)
+    assert obstacles_in(free_m) == pytest.approx(found)
 
 
 def test_what_was_not_looked_at_is_unknown_and_so_is_what_only_touches_it() -> None:

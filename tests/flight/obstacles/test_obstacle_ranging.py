@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 
 from flockd.core.config.avoidance import ObstacleParameters
-from flockd.core.data import data_path
-from flockd.core.messages import SECTORS, UNCLASSED, EgoMotion, FloatArray, GroundEstimate, ObstacleRanges, VehicleState
-from flockd.flight.geometry import RangeMap, Rig, ZMap, build_rig, grid_pixels, ground_inverse_depth, range_map
+from flockd.core.messages import SECTORS, UNCLASSED, EgoMotion, FloatArray, GroundEstimate, ObstacleRanges
+from flockd.flight.geometry import (
+    RangeMap,
+    Rig,
+    RigCamera,
+    ZMap,
+    build_rig,
+    grid_pixels,
+    ground_inverse_depth,
+    range_map,
+    rotation_from_euler,
+)
 from flockd.flight.obstacles import ObstacleRanging
 from flockd.flight.perception import CameraObservation, Observation
-from flockd.sim.scenario import load_scenario
 from tests.flight.geometry.synthetic_world import four_camera_rig
+from tests.make import scenario, vehicle
 
-RIG = build_rig(load_scenario(data_path("config") / "square.yaml").drone.rig)
+RIG = build_rig(scenario(name="square").drone.rig)
 PARAMETERS = ObstacleParameters(range_m=12.0, range_sigma=0.1, min_pixels=4)
 RANGING = ObstacleRanging(RIG, PARAMETERS)
 HEIGHT_M = 3.0
@@ -34,12 +44,28 @@ def towards_trunk(origin: FloatArray, rays: FloatArray, place: tuple[float, floa
     return np.where(ahead > 0, ahead, np.inf)
 
 
+def blank(camera: RigCamera, depth: FloatArray, flow: FloatArray | None = None, **fields: Any) -> CameraObservation:
+    """What a camera shows of depths of its pixels, in a row."""
+    width, height = camera.camera.size
+    moved = None if flow is None else flow.reshape(height, width, 2).astype(np.float32)
+    shown: dict[str, Any] = {"image": np.zeros((height, width, 3), np.uint8), "flow": moved}
+    shown["labels"] = np.zeros((height, width), np.uint8)
+    return CameraObservation(depth=RangeMap(depth.reshape(height, width).astype(np.float32)), **shown | fields)
+
+
+def rays_of(camera: RigCamera, R_ned_body: FloatArray = LEVEL) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of each pixel: where it is, where the rays begin, m NED from the drone, and how they go."""
+    pixels = grid_pixels(camera.camera.size, 1)
+    rays = camera.camera.unproject(pixels, np.ones(len(pixels))) @ (R_ned_body @ camera.T_body_camera.rotation).T
+    return pixels, R_ned_body @ camera.T_body_camera.translation, rays
+
+
 def seen(
     *trunks: tuple[float, float, float],
     R_ned_body: FloatArray = LEVEL,
     rig: Rig = RIG,
     labels: int = 0,
-    of_label: tuple[float, float, float] | None = None,
+    of_label: tuple[float, float, float] = (1e6, 0.0, 0.1),
     down_m: tuple[float, float] = (-math.inf, math.inf),
     parameters: ObstacleParameters = PARAMETERS,
 ) -> ObstacleRanges:
@@ -49,27 +75,17 @@ def seen(
     """
     cameras = {}
     for name, camera in rig.cameras.items():
-        width, height = camera.camera.size
-        pixels = grid_pixels((width, height), 1)
-        to_ned = R_ned_body @ camera.T_body_camera.rotation
-        rays = camera.camera.unproject(pixels, np.ones(len(pixels))) @ to_ned.T
-        origin = R_ned_body @ camera.T_body_camera.translation
+        _, origin, rays = rays_of(camera, R_ned_body)
         depth = np.where(rays[:, 2] > 0, (HEIGHT_M - origin[2]) / np.maximum(rays[:, 2], 1e-9), SKY_M)
-        mask = np.zeros(len(pixels), np.uint8)
         for north, east, radius in trunks:
             trunk = towards_trunk(origin, rays, (north, east), radius)
             down = origin[2] + np.where(np.isfinite(trunk), trunk, 0.0) * rays[:, 2]
             depth = np.where((down >= down_m[0]) & (down <= down_m[1]), np.minimum(depth, trunk), depth)
-        if of_label is not None:
-            masked = towards_trunk(origin, rays, of_label[:2], of_label[2])
-            mask[masked < depth] = labels
-            depth = np.minimum(depth, masked)
-        shape = (height, width)
-        image = np.zeros((*shape, 3), np.uint8)
-        ranges = RangeMap(depth.reshape(shape).astype(np.float32))
-        cameras[name] = CameraObservation(image, ranges, mask.reshape(shape), None)
+        masked = towards_trunk(origin, rays, of_label[:2], of_label[2])
+        mask = np.where(masked < depth, labels, 0).astype(np.uint8).reshape(camera.camera.size[::-1])
+        cameras[name] = blank(camera, np.minimum(depth, masked), labels=mask)
     ranging = ObstacleRanging(rig, parameters)
-    return ranging.ranges(Observation(2.0, VehicleState(2.0, R_ned_body, HEIGHT_M), cameras, (), None))
+    return ranging.ranges(Observation(2.0, vehicle(2.0, HEIGHT_M, R_ned_body=R_ned_body), cameras, (), None))
 
 
 def found(ranges: ObstacleRanges) -> dict[int, float]:
@@ -98,10 +114,7 @@ def test_a_trunk_is_seen_where_it_stands(azimuth_deg: float, away_m: float) -> N
 
 def test_the_attitude_turns_the_directions_and_keeps_the_heights() -> None:
     """Facing east and 20 degrees nose down, a trunk to the north stands where it stood."""
-    c, s = math.cos(math.radians(-20.0)), math.sin(math.radians(-20.0))
-    east = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    pitched = east @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-    ranges = seen((5.0, 0.0, 0.2), R_ned_body=pitched)
+    ranges = seen((5.0, 0.0, 0.2), R_ned_body=rotation_from_euler(0.0, math.radians(-20.0), math.pi / 2))
     assert set(found(ranges)) <= {0, 1, SECTORS - 1}
     assert ranges.range_m[0] == pytest.approx(4.8, rel=0.06)
 
@@ -139,23 +152,14 @@ def test_what_no_camera_shows_is_not_seen() -> None:
     assert ranges.seen_m[5] == 12.0
 
 
-def test_depth_without_a_scale_shows_nothing() -> None:
-    shape = (640, 480)
-    blank = CameraObservation(
-        np.zeros((*shape, 3), np.uint8), RangeMap(np.full(shape, np.nan, np.float32)), np.zeros(shape, np.uint8), None
-    )
-    vehicle = VehicleState(0.0, LEVEL, HEIGHT_M)
-    ranges = RANGING.ranges(Observation(0.0, vehicle, {"front": blank}, (), None))
-    assert found(ranges) == {}
-    np.testing.assert_array_equal(ranges.seen_m, 0.0)
-
-
-def test_a_few_wrong_pixels_are_no_obstacle() -> None:
-    pixels = RangeMap(np.full((640, 480), SKY_M, np.float32))
-    pixels[318:330:4, 242] = 1.0  # three of those that are taken
-    camera = CameraObservation(np.zeros((640, 480, 3), np.uint8), pixels, np.zeros((640, 480), np.uint8), None)
-    vehicle = VehicleState(0.0, LEVEL, HEIGHT_M)
-    assert found(RANGING.ranges(Observation(0.0, vehicle, {"front": camera}, (), None))) == {}
+def test_depth_without_a_scale_and_a_few_wrong_pixels_show_nothing() -> None:
+    front, nothing = RIG.cameras["front"], np.full(640 * 480, np.nan)
+    few = np.full((640, 480), SKY_M)
+    few[318:330:4, 242] = 1.0  # three of those that are taken
+    for depth, most_m in ((nothing, 0.0), (few.ravel(), 12.0)):
+        ranges = RANGING.ranges(Observation(0.0, vehicle(), {"front": blank(front, depth)}, (), None))
+        assert found(ranges) == {}
+        assert ranges.seen_m.max() == most_m
 
 
 def flown(
@@ -172,22 +176,17 @@ def flown(
     """
     before, now = {}, {}
     for name, camera in RIG.cameras.items():
-        width, height = camera.camera.size
-        blank = {"image": np.zeros((height, width, 3), np.uint8), "labels": np.zeros((height, width), np.uint8)}
-        said = RangeMap(np.full((height, width), depth_map_m, np.float32))
-        pixels = grid_pixels((width, height), 1)
-        turn, origin = camera.T_body_camera.rotation, camera.T_body_camera.translation
-        rays = camera.camera.unproject(pixels, np.ones(len(pixels))) @ turn.T
+        pixels, origin, rays = rays_of(camera)
+        said = np.full(len(pixels), depth_map_m)
         ground = np.where(rays[:, 2] > 0, (HEIGHT_M - origin[2]) / np.maximum(rays[:, 2], 1e-9), 1e4)
         stands = towards_trunk(origin, rays, trunk[:2], trunk[2])
         is_trunk = origin[2] + np.where(np.isfinite(stands), stands, 0.0) * rays[:, 2] >= top_m
         depth = np.where(is_trunk, np.minimum(ground, stands), ground)
         points = (origin + rays * depth[:, None] - way) @ R_ned_body  # in the body now
-        flow = camera.camera.project((points - origin) @ turn) - pixels
-        before[name] = CameraObservation(depth=said, flow=None, **blank)
-        now[name] = CameraObservation(depth=said, flow=flow.reshape(height, width, 2).astype(np.float32), **blank)
-    first = Observation(0.0, VehicleState(0.0, LEVEL, HEIGHT_M), before, (), None)
-    return Observation(0.5, VehicleState(0.5, R_ned_body, HEIGHT_M - way[2]), now, (), first)
+        flow = camera.camera.project((points - origin) @ camera.T_body_camera.rotation) - pixels
+        before[name], now[name] = blank(camera, said), blank(camera, said, flow)
+    first = Observation(0.0, vehicle(0.0, HEIGHT_M), before, (), None)
+    return Observation(0.5, vehicle(0.5, HEIGHT_M - way[2], R_ned_body=R_ned_body), now, (), first)
 
 
 @pytest.mark.parametrize(
@@ -201,8 +200,7 @@ def test_what_depth_does_not_show_the_flow_does(
     trunk: tuple[float, float, float], way: FloatArray, yaw_deg: float, top_m: float
 ) -> None:
     """The drone flies 0.6 m and yaws; depth is that of the sky, as of a network that knows no trunks."""
-    way, yaw = np.array(way), math.radians(yaw_deg)
-    R_ned_body = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1.0]])
+    way, R_ned_body = np.array(way), rotation_from_euler(0.0, 0.0, math.radians(yaw_deg))
     observation = flown(trunk, way, R_ned_body, top_m=top_m)
     assert found(RANGING.ranges(observation)) == {}
     ranges = RANGING.ranges(observation, EgoMotion(R_ned_body, way, 0.5, 100, 100, 0.01))
@@ -237,9 +235,8 @@ def test_a_hillside_ahead_is_ground_and_no_obstacle() -> None:
     for name, camera in rig.cameras.items():
         inverse = ground_inverse_depth(camera, LEVEL, height_m, slope=slope)
         depth = range_map(ZMap((1.0 / np.maximum(inverse, 1e-3)).astype(np.float32)), camera.camera)
-        nothing = np.zeros(inverse.shape, np.uint8)
-        cameras[name] = CameraObservation(np.zeros((*inverse.shape, 3), np.uint8), depth, nothing, None)
-    seen_hill = Observation(0.0, VehicleState(0.0, LEVEL, height_m), cameras, (), None)
+        cameras[name] = blank(camera, depth)
+    seen_hill = Observation(0.0, vehicle(height_m=height_m), cameras, (), None)
     ranging = ObstacleRanging(rig, ObstacleParameters())
     assert np.isfinite(ranging.ranges(seen_hill).range_m[0]), "of level ground below, the hill would stand on it"
     told = GroundEstimate(height_m, np.array(slope), "range_finder")
