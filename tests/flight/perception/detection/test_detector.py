@@ -14,7 +14,7 @@ from flockd.flight.geometry import ZMap
 from flockd.flight.perception import Crop, Instance, RangeEstimate, SceneMaps
 from flockd.flight.perception.detection.detector import DetectionTrace, Detector
 from flockd.flight.perception.detection.masks import DroneLogits, DroneMasks, first_stage_labels, without_borders
-from flockd.flight.perception.detection.proposals import largest_blobs, propose_residuals
+from flockd.flight.perception.detection.proposals import propose_residuals
 from tests.flight.perception.shipped import SECOND_STAGE
 from tests.flight.pilot.flyer import Flyer, SpoilableTruth, scenario_with
 
@@ -79,8 +79,7 @@ def test_two_drones_that_the_first_stage_takes_for_one_are_two() -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0), (6.0, -0.6, -4.0)))
     flyer.truth.instead["ranges"] = with_discs(flyer.truth, 9.0)
     scene = Scene(flyer)
-    near, far = scene.maps.instances
-    true = scene.maps.labels
+    (near, far), true = scene.maps.instances, scene.maps.labels
     pixels = true > 0
     both = replace(near, box=np.concatenate([np.minimum(near.box, far.box)[:2], np.maximum(near.box, far.box)[2:]]))
     labels = np.where(pixels, np.uint8(near.label), np.uint8(0))
@@ -126,20 +125,6 @@ def test_a_drone_painted_like_the_one_before_it_is_still_proposed() -> None:
     place = flyer.vehicles.R_ned_body[0].T @ (flyer.vehicles.position[2] - flyer.vehicles.position[0])
     assert proposal.roi.direction @ place / np.linalg.norm(place) > np.cos(0.02)
     assert not propose_residuals(rig, scenes, {scene.camera: by_colours}, SECOND_STAGE.rules, PARAMETERS)
-
-
-def test_an_image_full_of_false_ones_gives_only_the_largest_residuals() -> None:
-    """What the first stage is certain of in a hundred places; only the largest are proposed, and no mere specks."""
-    pixels = np.zeros((640, 480), np.bool_)
-    for k in range(100):
-        pixels[60 * (k // 10) : 60 * (k // 10) + 5 + k // 5, 45 * (k % 10) : 45 * (k % 10) + 20] = True
-    blobs = largest_blobs(pixels, max_blobs=6, min_px=24)
-    assert [blob.area_px for blob in blobs] == [20.0 * (5 + k // 5) for k in (95, 96, 97, 98, 99, 90)]
-    assert list(blobs[0].box) == [225.0, 540.0, 245.0, 564.0]
-    speck = np.zeros((640, 480), np.bool_)
-    speck[100:103, 200:207] = True
-    assert not largest_blobs(speck, max_blobs=6, min_px=24)
-    assert not largest_blobs(np.zeros_like(speck), max_blobs=6, min_px=24)
 
 
 def test_instances_get_the_labels_of_their_detections() -> None:

@@ -1,133 +1,297 @@
-"""How many regions of one image the second stage is given, and which."""
+"""Regions of interest: of instances, of a detector's boxes and of residuals; how wide, how many, which are alike."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+import yaml
 
 from flockd.core.config.perception import DetectionParameters
-from flockd.core.messages import UNCLASSED, Float32Array
-from flockd.flight.geometry import Rig, ZMap
+from flockd.core.data import data_path
+from flockd.core.messages import UNCLASSED, Float32Array, FloatArray, UInt8Array
+from flockd.flight.geometry import Rig, RigCamera, WideAngleCamera, ZMap
+from flockd.flight.inference import OnnxModel
 from flockd.flight.perception import Instance, SceneMaps, group_instances
-from flockd.flight.perception.detection.proposals import propose_instances, propose_residuals
+from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes, with_boxes
+from flockd.flight.perception.detection.proposals import largest_blobs, propose_instances, propose_residuals
+from flockd.flight.perception.detection.roi import Roi, angle_between, roi_of_instance, take_crop
 from tests.flight.perception.shipped import SECOND_STAGE
 from tests.make import rig_camera
 
 RULES = SECOND_STAGE.rules
+CAMERA = rig_camera(320.0, (640, 480))
 SIZE = (160, 120)
 RIG = Rig({"front": rig_camera(100.0, SIZE)})
 
 
+def instance(label: int, box: tuple[float, ...] | FloatArray, area_px: float = 100.0, score: float = 1.0) -> Instance:
+    corners = np.array(box, float)
+    return Instance(label, (corners[:2] + corners[2:]) / 2, corners, area_px, score)
+
+
+def roi_of(box: tuple[float, ...], camera: RigCamera = CAMERA) -> Roi | None:
+    return roi_of_instance(camera, instance(1, box), RULES)
+
+
+# How wide.
+
+
+def test_of_a_drone_that_the_images_border_cuts_a_wider_region_is_taken() -> None:
+    def half_angle(left: float) -> float:
+        roi = roi_of((left, 220.0, left + 60.0, 260.0))
+        assert roi is not None
+        return roi.half_angle
+
+    assert half_angle(0.0) > 1.3 * half_angle(10.0)
+    assert half_angle(640 - 60.0) > 1.3 * half_angle(640 - 70.0)
+    assert half_angle(2.0) < 1.1 * half_angle(10.0), "the first stage's maps have two image pixels a pixel"
+
+
+def test_where_a_lens_images_nothing_the_rest_of_a_box_counts() -> None:
+    """A lens of 60 degrees in a circle of 160 px radius; a corner of the box lies outside it, or all of it does."""
+    matrix = np.array([[160.0 / (math.pi / 3), 0.0, 320.0], [0.0, 160.0 / (math.pi / 3), 240.0], [0.0, 0.0, 1.0]])
+    lens = WideAngleCamera(matrix, (640, 480), (-1.0 / (3.0 * (math.pi / 3) ** 2), 0.0, 0.0, 0.0))
+    camera = RigCamera("front", lens, CAMERA.T_body_camera)
+    radius = 160.0 * (1.0 - 1.0 / 3.0)  # where the polynomial turns
+    assert np.isnan(lens.rays(np.array([[320.0 + 1.01 * radius, 240.0]]))).all()
+    partly = roi_of((370.0, 290.0, 410.0, 330.0), camera)
+    assert partly is not None
+    assert np.isfinite([*partly.direction, partly.half_angle]).all()
+    assert roi_of((600.0, 440.0, 640.0, 480.0), camera) is None
+
+
+def test_a_region_suits_a_drones_size_and_stays_near_the_last_one() -> None:
+    assert RULES.half_angle(0.5, 4.0, 0.003) == pytest.approx(math.atan(0.68 * 0.125))
+    assert RULES.half_angle(0.5, 4.0, 0.003, before=0.4) == pytest.approx(0.4 / 1.7)
+    assert RULES.half_angle(0.5, 400.0, 0.003) == pytest.approx(0.012), "4 px of the image"
+    assert RULES.half_angle(50.0, 1.0, 0.003) == pytest.approx(math.radians(35.0))
+
+
+@pytest.mark.parametrize("fov_deg", [25.0, 40.0, 60.0, 90.0])
+def test_the_crop_of_a_small_drone_shows_the_same_pixels_whatever_the_lens_is_said_to_be(fov_deg: float) -> None:
+    """A drone 8 px wide; before the crop was at least 2 degrees wide, 32 px of a lens of 40 degrees."""
+    camera = rig_camera(320.0 / math.tan(math.radians(fov_deg / 2)), (640, 480))
+    roi = roi_of((316.0, 237.0, 324.0, 243.0), camera)
+    assert roi is not None
+    assert math.tan(roi.half_angle) * camera.camera.focal_px == pytest.approx(0.95 * math.hypot(4, 3), rel=0.001)
+
+
+@pytest.mark.parametrize(
+    ("moved", "factor", "alike"), [(0.0, 1.0, True), (0.004, 1.0, False), (0.002, 1.04, True), (0.0, 1.06, False)]
+)
+def test_a_crop_would_repeat_when_it_is_hardly_moved_or_resized(moved: float, factor: float, alike: bool) -> None:
+    ahead = Roi(np.array([0.0, 0.0, 1.0]), 0.1)
+    further = Roi(np.array([math.sin(moved), 0.0, math.cos(moved)]), 0.1 * factor)
+    assert ahead.resembles(further, shift=0.03, resize=1.05) is alike
+
+
+def test_a_crop_shows_what_lies_in_its_direction() -> None:
+    image = np.zeros((480, 640, 3), np.uint8)
+    image[230:250, 470:490] = 255  # 160 px right of the centre: half a focal length
+    direction = np.array([0.5, 0.0, 1.0]) / math.hypot(0.5, 1.0)
+    crop, view = take_crop(Rig({"front": CAMERA}), {"front": image}, Roi(direction, 0.1), 96)
+    assert crop.image.shape == (96, 96, 3)
+    assert angle_between(view.T_body_virtual.rotation[:, 2], direction) < 1e-9
+    assert crop.image[48, 48].min() == 255
+    assert crop.image[5, 5].max() == 0
+    assert crop.camera.focal_px == pytest.approx(48 / math.tan(0.1))
+
+
+# How many.
+
+
 def scene_of(*scores: float) -> SceneMaps:
     """Squares of 8 x 8 pixels in a row, one for each score, and certain of all."""
-    labels = np.zeros(SIZE[::-1], np.uint8)
-    instances = []
+    labels, instances = np.zeros(SIZE[::-1], np.uint8), []
     for k, score in enumerate(scores):
         left, top = 4 + 14 * (k % 11), 10 + 30 * (k // 11)
         labels[top : top + 8, left : left + 8] = k + 1
-        box = np.array([left, top, left + 8, top + 8], np.float64)
-        instances.append(Instance(k + 1, box.reshape(2, 2).mean(0), box, 64.0, score))
+        instances.append(instance(k + 1, (left, top, left + 8, top + 8), 64.0, score))
     uncertain = np.zeros(labels.shape, np.bool_)
     return SceneMaps(ZMap(np.full(labels.shape, 5.0, np.float32)), labels, tuple(instances), uncertain=uncertain)
 
 
-def proposed(scene: SceneMaps, parameters: DetectionParameters) -> list[int]:
-    proposals = propose_instances(RIG, {"front": scene}, RULES, parameters)
-    return [one.instance.label for one in proposals if one.instance]
+@pytest.mark.parametrize(("most", "kept"), [(None, [1, 2, 3, 4, 5, 6]), (3, [1, 3, 4]), (1, [4])])
+def test_of_too_many_the_best_are_proposed_in_their_order(most: int | None, kept: list[int]) -> None:
+    parameters = DetectionParameters() if most is None else DetectionParameters(max_proposals=most)
+    scenes = {"front": scene_of(3.0, 0.5, 2.0, 4.0, 1.0, 2.0)}
+    proposals = propose_instances(RIG, scenes, RULES, parameters)
+    assert [one.instance.label for one in proposals if one.instance] == kept
 
 
-def test_the_score_is_the_highest_logit_over_the_threshold() -> None:
-    logit = np.full((30, 40), -5.0, np.float32)
-    logit[10:16, 10:16] = 1.0
-    logit[12, 13] = 3.5
-    offset = np.stack([12.5 - np.arange(40.0) * np.ones((30, 1)), 12.5 - np.arange(30.0)[:, None] * np.ones((1, 40))])
-    _, (one,) = group_instances(logit, offset.astype(np.float32), scale=2)
-    assert one.score == 3.5
-
-
-def test_of_too_many_the_best_are_proposed_in_their_order() -> None:
-    scene = scene_of(3.0, 0.5, 2.0, 4.0, 1.0, 2.0)
-    assert proposed(scene, DetectionParameters()) == [1, 2, 3, 4, 5, 6]
-    assert proposed(scene, DetectionParameters(max_proposals=3)) == [1, 3, 4]
-    assert proposed(scene, DetectionParameters(max_proposals=1)) == [4]
-
-
-def test_residuals_count_among_the_proposals_and_bring_nothing_back() -> None:
+@pytest.mark.parametrize(("most", "count"), [(12, 4), (30, 6), (8, 0)])
+def test_residuals_count_among_the_proposals_and_bring_nothing_back(most: int, count: int) -> None:
     """No mask explains any of eight certain instances, as where the second stage had no mask for them."""
     scene = scene_of(*range(8, 0, -1))
     masks = {"front": np.where(scene.labels > 0, np.uint8(UNCLASSED), np.uint8(0))}
+    parameters = DetectionParameters(max_proposals=most, max_residuals=6)
+    assert len(propose_residuals(RIG, {"front": scene}, masks, RULES, parameters)) == count
 
-    def residuals(most: int) -> list[float]:
-        parameters = DetectionParameters(max_proposals=most, max_residuals=6)
-        found = propose_residuals(RIG, {"front": scene}, masks, RULES, parameters)
-        return sorted(one.instance.box[0] for one in found if one.instance)
 
-    assert len(residuals(12)) == 4
-    assert len(residuals(30)) == 6
-    assert residuals(8) == []
+def test_an_image_full_of_false_ones_gives_only_the_largest_residuals() -> None:
+    """What the first stage is certain of in a hundred places; only the largest are proposed, and no mere specks."""
+    pixels = np.zeros((640, 480), np.bool_)
+    for k in range(100):
+        pixels[60 * (k // 10) : 60 * (k // 10) + 5 + k // 5, 45 * (k % 10) : 45 * (k % 10) + 20] = True
+    blobs = largest_blobs(pixels, max_blobs=6, min_px=24)
+    assert [blob.area_px for blob in blobs] == [20.0 * (5 + k // 5) for k in (95, 96, 97, 98, 99, 90)]
+    assert list(blobs[0].box) == [225.0, 540.0, 245.0, 564.0]
+    speck = np.zeros((640, 480), np.bool_)
+    assert not largest_blobs(speck, max_blobs=6, min_px=24)
+    speck[100:103, 200:207] = True
+    assert not largest_blobs(speck, max_blobs=6, min_px=24)
 
 
 # Two drones in one mask are told apart by the centres that their pixels vote for.
 
 
 def painted(
-    shape: tuple[int, int], discs: list[tuple[float, float, float]], error_px: float = 0.0
+    shape: tuple[int, int], *discs: tuple[float, float, float], error_px: float = 0.0
 ) -> tuple[Float32Array, Float32Array]:
     """Logit and offset maps of discs (u, v, radius); the later covers the earlier."""
-    rng = np.random.default_rng(1)
-    logit = np.full(shape, -5.0, np.float32)
-    offset = np.zeros((2, *shape), np.float32)
+    logit, offset = np.full(shape, -5.0, np.float32), np.zeros((2, *shape), np.float32)
     v, u = np.mgrid[: shape[0], : shape[1]] + 0.5
     for cu, cv, radius in discs:
         inside = (u - cu) ** 2 + (v - cv) ** 2 < radius**2
         logit[inside] = 5.0
-        offset[0][inside] = (cu - u)[inside]
-        offset[1][inside] = (cv - v)[inside]
-    offset += rng.normal(0, error_px, offset.shape).astype(np.float32)
+        offset[:, inside] = (cu - u)[inside], (cv - v)[inside]
+    offset += np.random.default_rng(1).normal(0, error_px, offset.shape).astype(np.float32)
     return logit, offset
 
 
-@pytest.mark.parametrize("discs", [[], [(30.5, 30.5, 0.6)]], ids=["nothing", "a speck"])
-def test_an_empty_mask_and_specks_are_no_drones(discs: list[tuple[float, float, float]]) -> None:
-    labels, instances = group_instances(*painted((60, 80), discs), scale=2)
-    assert instances == ()
-    assert not labels.any()
+@pytest.mark.parametrize(
+    ("maps", "centres"),
+    [
+        pytest.param(painted((60, 80)), [], id="nothing"),
+        pytest.param(painted((60, 80), (30.5, 30.5, 0.6)), [], id="a speck"),
+        pytest.param(
+            painted((120, 160), (60.0, 60.0, 20.0), (84.0, 64.0, 14.0), error_px=0.7), [(120, 120), (168, 128)],
+            id="overlapping",
+        ),
+        pytest.param(painted((240, 320), (150.0, 120.0, 60.0), error_px=4.0), [(300, 240)], id="scattered votes"),
+        pytest.param(painted((100, 100), (-6.0, 50.0, 15.0)), [(-12, 100)], id="cut by the border"),
+    ],
+)  # fmt: skip
+def test_drones_are_as_many_as_centres(maps: tuple[Float32Array, Float32Array], centres: list[tuple[int, int]]) -> None:
+    labels, instances = group_instances(*maps, scale=2)
+    found = np.reshape([one.centre for one in instances], (-1, 2))
+    np.testing.assert_allclose(found, np.reshape(centres, (-1, 2)), atol=2.0)
+    assert {*np.unique(labels)} == {0, *(one.label for one in instances)}
+    assert all(one.box.min() >= 0.0 for one in instances)
 
 
-def test_overlapping_drones_are_two() -> None:
-    logit, offset = painted((120, 160), [(60.0, 60.0, 20.0), (84.0, 64.0, 14.0)], error_px=0.7)
-    labels, instances = group_instances(logit, offset, scale=2)
-    assert len(instances) == 2
-    assert np.allclose(instances[0].centre, [120.0, 120.0], atol=2.0)
-    assert np.allclose(instances[1].centre, [168.0, 128.0], atol=2.0)
-    assert labels[60, 45] == instances[0].label
-    assert labels[64, 90] == instances[1].label
-
-
-def test_one_large_drone_stays_one_though_its_votes_scatter() -> None:
-    logit, offset = painted((240, 320), [(150.0, 120.0, 60.0)], error_px=4.0)
-    _, instances = group_instances(logit, offset, scale=2)
-    assert len(instances) == 1
-
-
-def test_a_drone_cut_by_the_border_points_outside() -> None:
-    logit, offset = painted((100, 100), [(-6.0, 50.0, 15.0)])
-    _, instances = group_instances(logit, offset, scale=2)
-    assert len(instances) == 1
-    assert np.allclose(instances[0].centre, [-12.0, 100.0], atol=2.0)
-    assert instances[0].box[0] == 0.0
-
-
-def test_a_dozen_drones_keep_their_own_pixels() -> None:
+def test_a_dozen_drones_keep_their_own_pixels_and_the_score_is_the_highest_logit() -> None:
     discs = [(30.0 + 50 * (i % 4), 30.0 + 50 * (i // 4), 6.0 + i) for i in range(12)]
-    logit, offset = painted((160, 220), discs)
+    logit, offset = painted((160, 220), *discs)
+    logit[30, 30] = 7.5  # of the smallest
     v, u = np.mgrid[:160, :220] + 0.5
     labels, instances = group_instances(logit, offset, scale=2)
-    assert len(instances) == 12
-    for instance, (cu, cv, radius) in zip(instances, reversed(discs), strict=True):  # the largest first
+    assert [one.score for one in instances] == [5.0] * 11 + [7.5]
+    for one, (cu, cv, radius) in zip(instances, reversed(discs), strict=True):  # the largest first
         own = (u - cu) ** 2 + (v - cv) ** 2 < radius**2
-        assert np.array_equal(labels == instance.label, own)
-        assert instance.area_px == 4 * own.sum()
-        assert instance.centre.tolist() == [2 * cu, 2 * cv]
+        assert np.array_equal(labels == one.label, own)
+        assert one.area_px == 4 * own.sum()
+        assert one.centre.tolist() == [2 * cu, 2 * cv]
         rows, columns = np.nonzero(own)
-        assert instance.box.tolist() == [2 * columns.min(), 2 * rows.min(), 2 * columns.max() + 2, 2 * rows.max() + 2]
+        assert one.box.tolist() == [2 * columns.min(), 2 * rows.min(), 2 * columns.max() + 2, 2 * rows.max() + 2]
+
+
+# A detector's boxes beside the instances of the segmentation.
+
+BOXES = BoxRules(least_probability=0.05, overlap=0.5, gain=0.5, large=4.0, small=3.0, no_box=-2.0)
+DRONE = (100.0, 50.0, 140.0, 70.0)
+
+
+@pytest.mark.parametrize(
+    ("rows", "scale", "kept", "odds"),
+    [
+        pytest.param(
+            [(50, 40, 20, 10, 0.6), (51, 40, 20, 10, 0.8), (90, 40, 20, 10, 0.5)], (1.0, 1.0),
+            [(41, 35, 61, 45), (80, 35, 100, 45)], [math.log(4.0), 0.0], id="of two boxes of one drone the surer one",
+        ),
+        pytest.param(
+            [(50, 40, 20, 10, 1.0)], (1.0, 1.0), [(40, 35, 60, 45)], [math.log(19.0)], id="never surer than 19 of 20"
+        ),
+        pytest.param([(50, 40, 20, 10, 0.5)], (0.5, 0.25), [(80, 140, 120, 180)], [0.0], id="pixels of the image"),
+        pytest.param([(50, 40, 20, 10, 0.04)], (1.0, 1.0), [], [], id="improbable"),
+    ],
+)  # fmt: skip
+def test_boxes_that_are_kept(
+    rows: list[tuple[float, ...]], scale: tuple[float, float], kept: list[tuple[float, ...]], odds: list[float]
+) -> None:
+    """Of a detector that gives centre, size and probability."""
+    names = ("centre_right_px", "centre_down_px", "width_px", "height_px", "drone_probability")
+    given = dict(zip(names, np.array(rows, np.float32).T, strict=True))
+    boxes, found = kept_boxes(*probable_boxes(given, BOXES, scale), BOXES)
+    assert boxes == pytest.approx(np.reshape(np.array(kept, float), (-1, 4)))
+    assert found == pytest.approx(odds, abs=1e-6)
+
+
+def merged(
+    instances: tuple[Instance, ...], boxes: list[tuple[float, ...]], odds: list[float], labels: UInt8Array | None = None
+) -> tuple[UInt8Array, tuple[Instance, ...]]:
+    empty = np.zeros((100, 200), np.uint8)
+    corners = np.reshape(np.array(boxes, float), (-1, 4))
+    return with_boxes(empty if labels is None else labels, instances, corners, np.array(odds), BOXES)
+
+
+def labelled(*boxes: tuple[int, int, int, int]) -> UInt8Array:
+    """Each box with its number."""
+    labels = np.zeros((100, 200), np.uint8)
+    for number, (left, top, right, bottom) in enumerate(boxes, 1):
+        labels[top:bottom, left:right] = number
+    return labels
+
+
+def test_an_instance_takes_the_box_that_is_the_same_drone_and_keeps_its_label() -> None:
+    marked, (drone,) = merged((instance(1, (105, 55, 135, 65)),), [DRONE], [2.0], labelled((105, 55, 135, 65)))
+    assert (drone.label, drone.area_px) == (1, 100.0)
+    assert drone.box == pytest.approx(DRONE)
+    assert drone.centre == pytest.approx([120, 60])
+    assert drone.evidence == pytest.approx(0.5 * 2.0)
+    assert set(np.unique(marked)) == {0, 1}
+
+
+def test_what_only_one_of_both_finds_is_kept_too() -> None:
+    """The detector's gets a label of its own and comes first; the segmentation's is less likely a drone."""
+    _, seen = merged((instance(1, (10, 10, 20, 20)),), [DRONE], [-1.0])
+    assert [one.label for one in sorted(seen, key=lambda one: -one.score)] == [2, 1]
+    assert [one.evidence for one in seen] == pytest.approx([-0.5, BOXES.no_box])
+    _, (alone,) = merged((instance(1, (10, 10, 20, 20)),), [], [])
+    assert alone.evidence == BOXES.no_box
+
+
+def test_the_parts_of_a_large_drone_are_one_with_it() -> None:
+    parts = (101, 52, 108, 56), (131, 52, 139, 56)
+    marked, (drone,) = merged((instance(1, parts[0]), instance(2, parts[1])), [DRONE], [3.0], labelled(*parts))
+    assert set(np.unique(marked)) == {0, drone.label}
+    assert (marked == drone.label).sum() == 4 * 7 + 4 * 8
+
+
+def test_a_smaller_drone_before_a_large_one_stays_where_it_has_a_box_of_its_own() -> None:
+    small = (102.0, 52.0, 116.0, 58.0)
+    _, seen = merged((instance(1, small),), [small, DRONE], [3.0, 2.0])
+    assert [one.box.tolist() for one in seen] == [list(small), list(DRONE)]
+
+
+@pytest.mark.parametrize(
+    ("width_px", "added"),
+    [(5, 3.0), (8, 3.0), (160**0.5, 1.5), (20, 0.0), (40, 0.0), (40 * 7.5**0.5, 2.0), (300, 4.0), (600, 4.0)],
+)
+def test_what_the_second_stage_says_against_a_small_or_a_large_box_counts_less(width_px: float, added: float) -> None:
+    box = np.array([0.0, 0.0, width_px, 20.0])
+    assert BOXES.evidence(box, -4.0) == pytest.approx(0.5 * -4.0 + added)
+    for odds in (2.0, math.log(19.0)):
+        assert width_px > 8 or BOXES.evidence(box, odds) == pytest.approx(0.5 * math.log(19.0)), "no more than surest"
+
+
+def test_the_shipped_rules_are_those_of_its_manifest() -> None:
+    path = data_path("models") / "detector.yaml"
+    given = yaml.safe_load(path.read_text(encoding="utf-8"))["thresholds"]
+    rules = BoxRules.of(OnnxModel(path, threads=1).manifest)
+    found = (rules.gain, rules.large, rules.small, rules.no_box)
+    names = ("evidence_gain", "large_box_evidence", "small_box_evidence", "no_box_evidence")
+    assert found == tuple(given[name] for name in names)
+    assert len(set(found)) == 4

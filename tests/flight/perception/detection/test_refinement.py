@@ -1,18 +1,47 @@
-"""The cascade of crops: how often, how wide, and what becomes of contradictions."""
+"""The cascade of crops, the range by a known size, and which of the candidates are one drone."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
-from flockd.flight.perception import Crop, RangeEstimate
-from flockd.flight.perception.maps import SceneMaps
+from flockd.core.config.perception import DetectionParameters, PerceptionConfig
+from flockd.core.messages import FloatArray
+from flockd.flight.geometry import log_polar
+from flockd.flight.perception import Crop, Instance, Perception, RangeEstimate
+from flockd.flight.perception.detection.nms import fuse, suppress, without_occluded
+from flockd.flight.perception.detection.proposals import Proposal
+from flockd.flight.perception.detection.refinement import Candidate
+from flockd.flight.perception.detection.roi import Roi
+from flockd.flight.perception.maps import KnownSize, SceneMaps
+from flockd.flight.tracking import Prediction
+from flockd.sim.flock.truth_perception import _SIZE_M
 from tests.flight.pilot.flyer import Flyer, scenario_with
+
+
+@pytest.fixture
+def flyer() -> Flyer:
+    """Another drone is 3 m ahead."""
+    return Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
+
+
+def answering(flyer: Flyer, change: Callable[[int, Crop, RangeEstimate], RangeEstimate]) -> list[Crop]:
+    """Has each estimate of the second stage changed, by how often it was asked before; the crops that it gets."""
+    estimates, crops = flyer.truth.sound("ranges"), list[Crop]()
+
+    def ranges(asked: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+        given = [change(len(crops), crop, one) for crop, one in zip(asked, estimates(asked), strict=True)]
+        crops.extend(asked)
+        return tuple(given)
+
+    flyer.truth.instead["ranges"] = ranges
+    return crops
 
 
 @pytest.mark.parametrize(
@@ -26,40 +55,31 @@ from tests.flight.pilot.flyer import Flyer, scenario_with
         ((1.6, 1.3, 1.6, 1.0), 4),
     ],
 )
-def test_a_proposal_is_cropped_again_until_the_crop_suits_the_drone(wrong_by: tuple[float, ...], wanted: int) -> None:
+def test_a_proposal_is_cropped_again_until_the_crop_suits_the_drone(
+    flyer: Flyer, wrong_by: tuple[float, ...], wanted: int
+) -> None:
     """What a badly cut crop says of the range cuts the next one; the last estimate counts."""
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.3, -4.5)))
-    estimates = flyer.truth.sound("ranges")
-    asked: list[int] = []
-
-    def ranges(crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        asked.append(len(crops))
-        factor = wrong_by[min(len(asked), len(wrong_by)) - 1]
-        return tuple(replace(one, log_range=math.log(factor) + one.log_range) for one in estimates(crops))
-
-    flyer.truth.instead["ranges"] = ranges
+    factors = [math.log(factor) for factor in wrong_by]
+    crops = answering(
+        flyer, lambda asked, _, one: replace(one, log_range=factors[min(asked, len(factors) - 1)] + one.log_range)
+    )
     (detection,) = flyer.step().detections
-    assert asked == [1] * (wanted + 1)
-    assert np.linalg.norm(detection.position) == pytest.approx(math.hypot(3.0, 0.3), rel=0.01)
+    assert len(crops) == wanted + 1
+    assert detection.range_m == pytest.approx(3.0, rel=0.01)
 
 
-def test_the_mirrored_crop_is_weighted_by_its_variance() -> None:
+def test_the_mirrored_crop_is_weighted_by_its_variance(flyer: Flyer) -> None:
     """A drone is 3 m away: the last crop says 3 m, its mirror image 6."""
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
-    estimates = flyer.truth.sound("ranges")
-    mirrors: list[bool] = []
 
-    def ranges(crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        mirrors.extend(crop.mirrored for crop in crops)
-        given = [replace(one, log_range_sigma=0.05, drone_probability=0.9) for one in estimates(crops)]
-        if mirrors[-1]:
-            given[0] = replace(given[0], log_range=math.log(6.0), log_range_sigma=0.1, drone_probability=0.85)
-        return tuple(given)
+    def judged(asked: int, crop: Crop, one: RangeEstimate) -> RangeEstimate:
+        if crop.mirrored:
+            return replace(one, log_range=math.log(6.0), log_range_sigma=0.1, drone_probability=0.85)
+        return replace(one, log_range_sigma=0.05, drone_probability=0.9)
 
-    flyer.truth.instead["ranges"] = ranges
+    crops = answering(flyer, judged)
     (detection,) = flyer.step().detections
-    assert mirrors == [False, False, True]
-    assert np.linalg.norm(detection.position) == pytest.approx(3.0 * 2 ** (1 / 5), rel=0.005)  # 1 of 1 + 4
+    assert [crop.mirrored for crop in crops] == [False, False, True]
+    assert detection.range_m == pytest.approx(3.0 * 2 ** (1 / 5), rel=0.005)  # 1 of 1 + 4
     assert detection.drone_probability == pytest.approx(0.85)
 
 
@@ -73,46 +93,167 @@ def test_the_mirrored_crop_is_weighted_by_its_variance() -> None:
         ((0.9, 0.9, 0.75), 0),
     ],
 )
-def test_a_low_probability_of_the_first_crop_does_not_outlive_the_next(given: tuple[float, ...], found: int) -> None:
+def test_a_low_probability_of_the_first_crop_does_not_outlive_the_next(
+    flyer: Flyer, given: tuple[float, ...], found: int
+) -> None:
     """Only a very low one rejects at once; the first crop was not cut to this drone."""
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
-    estimates, probabilities = flyer.truth.sound("ranges"), list(given)
-    flyer.truth.instead["ranges"] = lambda crops: tuple(
-        replace(one, drone_probability=probabilities.pop(0)) for one in estimates(crops)
-    )
+    answering(flyer, lambda asked, _, one: replace(one, drone_probability=given[asked]))
     assert len(flyer.step().detections) == found
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")
 @pytest.mark.parametrize("wrong", [{"log_range": math.inf}, {"log_range": math.nan}, {"log_range_sigma": 0.0}])
-def test_nonsense_for_the_mirrored_crop_gives_no_detection(wrong: dict[str, Any]) -> None:
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
-    estimates = flyer.truth.sound("ranges")
-
-    def ranges(crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        return tuple(
-            replace(estimate, **wrong) if crop.mirrored else estimate
-            for crop, estimate in zip(crops, estimates(crops), strict=True)
-        )
-
-    flyer.truth.instead["ranges"] = ranges
+def test_nonsense_for_the_mirrored_crop_gives_no_detection(flyer: Flyer, wrong: dict[str, Any]) -> None:
+    answering(flyer, lambda _, crop, one: replace(one, **wrong) if crop.mirrored else one)
     assert not flyer.step().detections
 
 
-def test_every_crop_of_a_proposal_carries_what_a_detector_said_of_it() -> None:
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
-    estimates, scenes = flyer.truth.sound("ranges"), flyer.truth.sound("scene")
-    carried: list[float] = []
+def test_every_crop_of_a_proposal_carries_what_a_detector_said_of_it(flyer: Flyer) -> None:
+    scenes = flyer.truth.sound("scene")
 
     def scene(*arguments: Any) -> SceneMaps:
         maps: SceneMaps = scenes(*arguments)
         return replace(maps, instances=tuple(replace(one, evidence=2.5) for one in maps.instances))
 
-    def ranges(crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        carried.extend(crop.evidence for crop in crops)
-        given: tuple[RangeEstimate, ...] = estimates(crops)
-        return given
-
-    flyer.truth.instead |= {"scene": scene, "ranges": ranges}
+    flyer.truth.instead["scene"] = scene
+    crops = answering(flyer, lambda _, __, one: one)
     assert flyer.step().detections
-    assert carried == [2.5] * 3
+    assert [crop.evidence for crop in crops] == [2.5] * 3
+
+
+# A known size: the range is the size over the apparent size, and its deviation is the networks' and the size's.
+
+ESTIMATE = RangeEstimate(math.log(4.0), 0.03, np.array([48.0, 48.0]), size_m=0.8, drone_probability=0.9)
+"""0.8 m at 4 m: a fifth of a radian wide."""
+
+
+def test_range_is_size_over_apparent_size() -> None:
+    """A drone of 0.5 m that is a fifth of a radian wide is 2.5 m away, and 4 % of it are its size's, whatever the
+    network said of that."""
+    known = replace(ESTIMATE, log_size_sigma=0.3).of_size(KnownSize(0.5, 0.02))
+    assert math.exp(known.log_range) == pytest.approx(2.5)
+    assert (known.log_range_sigma, known.log_size_sigma) == pytest.approx((0.03, 0.04))
+    assert known.size_m == 0.5
+    assert (known.drone_probability, known.centre.tolist()) == (0.9, [48.0, 48.0])
+    for size_m in (0.0, math.inf, math.nan):
+        assert math.isnan(replace(ESTIMATE, size_m=size_m).of_size(KnownSize(0.5, 0.02)).log_range)
+
+
+def test_a_size_that_was_learned_is_that_of_drones_that_look_as_those_did(flyer: Flyer) -> None:
+    """Those looked 0.9 m large and were found to be 0.6 m; one that looks 1.4 m large is of another type."""
+    taken = flyer.take_frames()
+    (true,) = flyer.perception().observe(*taken, None).detections
+    for looks, factor in ((1.0, 0.7), (1.4, 0.7), (1.6, 1.0), (0.6, 1.0)):
+        learned = KnownSize(0.7 * true.size_m, 0.01, looks_m=looks * true.size_m)
+        (known,) = flyer.perception().observe(*taken, None, learned_size=learned).detections
+        assert known.range_m == pytest.approx(factor * true.range_m, rel=0.02)
+
+
+@pytest.mark.parametrize("size_known", [True, False])
+def test_where_a_track_is_predicted_its_own_size_counts(
+    flyer: Flyer, monkeypatch: pytest.MonkeyPatch, size_known: bool
+) -> None:
+    """The first stage misses the drone; the track is 0.7 times as far as the size that is judged would have it."""
+    for proposes in ("propose_instances", "propose_residuals"):
+        monkeypatch.setattr(f"flockd.flight.perception.detection.detector.{proposes}", lambda *_: [])
+    place = np.array([0.7 * 3.0, 0.0, 0.0])
+    track = Prediction(place, 0.01 * np.eye(3), 0.7 * _SIZE_M, 0.99, size_known=size_known)
+    found = flyer.perception().observe(*flyer.take_frames(), None, [track]).detections
+    assert [one.range_m for one in found] == pytest.approx([0.7 * 3.0] * size_known, rel=0.05)
+
+
+def test_a_flights_detections_are_ranged_by_the_size_that_was_said(flyer: Flyer) -> None:
+    """With exact networks, which know the drone's true size: a size said wrong by a factor moves the drone by it."""
+    taken = flyer.take_frames()
+    (true,) = flyer.perception().observe(*taken, None).detections
+    for factor in (0.8, 1.0, 1.25):
+        said = {"scale": "network", "drone_size_m": factor * true.size_m, "drone_size_sigma_m": 0.1 * true.size_m}
+        config = flyer.scenario.drone.perception.model_copy(update=said)
+        (known,) = Perception(flyer.cameras.rig, flyer.truth, config).observe(*taken, None).detections
+        assert known.range_m == pytest.approx(factor * true.range_m, rel=0.01)
+        assert known.size_m == pytest.approx(factor * true.size_m)
+        wanted = math.hypot(true.range_sigma_m / true.range_m, 0.1 / factor)
+        assert known.range_sigma_m / known.range_m == pytest.approx(wanted, rel=0.05)
+        assert known.bearing == pytest.approx(true.bearing, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"drone_size_m": 0.04},
+        {"drone_size_m": 5.1},
+        {"drone_size_m": math.nan},
+        {"drone_size_m": 0.35, "drone_size_sigma_m": -0.01},
+        {"drone_size_m": 0.35, "drone_size_sigma_m": 0.2},
+        {"drone_size_m": 0.35, "distance": "none"},
+    ],
+)
+def test_sizes_that_cannot_be_are_refused(values: dict[str, object]) -> None:
+    with pytest.raises(ValidationError, match="drone_size"):
+        PerceptionConfig.model_validate(values)
+
+
+# Non-maximum suppression: what is one drone, what hides another, and what the fused detection says.
+
+PARAMETERS = DetectionParameters()
+
+
+def candidate(
+    range_m: float, sigma: float, *, turned_deg: float = 0.0, size_m: float = 0.7, camera: str = "front"
+) -> Candidate:
+    turned = math.radians(turned_deg)
+    bearing, log_range = log_polar(range_m * np.array([math.cos(turned), math.sin(turned), 0.0]))
+    box: FloatArray = np.array([10.0, 10.0, 50.0, 40.0])
+    proposal = Proposal((camera,), Roi(bearing, 0.2), Instance(1, np.array([30.0, 25.0]), box, 600.0))
+    return Candidate(proposal, bearing, log_range, sigma, 0.004, size_m, 0.9)
+
+
+@pytest.mark.parametrize(
+    ("range_m", "turned_deg", "sigma", "same"),
+    [
+        (4.2, 0.5, 0.025, True),  # at the same spot
+        (4.7, 1.0, 0.05, True),  # 16 % farther, where each range is known to 5 %
+        (4.7, 1.0, 0.01, False),  # the same, where each is known to 1 %
+        (7.0, 1.0, 0.05, False),  # too far behind
+        (4.2, 8.0, 0.025, False),  # beside it: 0.56 m
+        (4.0, 5.0, 0.025, True),  # 0.35 m beside it: half a drone's size
+    ],
+)
+def test_candidates_are_one_drone_by_their_mahalanobis_distance(
+    range_m: float, turned_deg: float, sigma: float, same: bool
+) -> None:
+    both = [candidate(4.0, sigma), candidate(range_m, sigma, turned_deg=turned_deg, camera="left")]
+    assert len(suppress(both, PARAMETERS).detections) == (1 if same else 2)
+
+
+@pytest.mark.parametrize(
+    ("range_m", "turned_deg", "kept_m"),
+    [
+        (12.0, 1.0, [3.0]),  # half of a drone at an image's border: nothing could be seen there, behind the whole one
+        (12.0, 6.0, [3.0, 12.0]),  # beside it
+        (1.0, 1.0, [1.0, 3.0]),  # near, however uncertain: that is never overlooked
+        (3.5, 1.0, [3.0, 3.5]),  # the two may be one
+    ],
+)
+def test_an_uncertain_one_behind_another_is_suppressed(range_m: float, turned_deg: float, kept_m: list[float]) -> None:
+    certain = candidate(3.0, 0.017, size_m=0.5)
+    uncertain = candidate(range_m, 0.2, turned_deg=turned_deg, size_m=0.5, camera="left")
+    kept = without_occluded([uncertain, certain], PARAMETERS)
+    assert sorted(one.range_m for one in kept) == pytest.approx(kept_m)
+
+
+def test_a_fused_detection_is_the_weighted_mean_with_the_best_ones_variance() -> None:
+    """Weights 4 and 1; log 4 and log 5."""
+    fused = fuse([candidate(4.0, 0.05), candidate(5.0, 0.1, camera="left")], 3)
+    assert fused.range_m == pytest.approx(math.exp(0.8 * math.log(4.0) + 0.2 * math.log(5.0)))
+    assert fused.range_sigma_m == pytest.approx(0.05 * fused.range_m)
+    assert (fused.cameras, fused.label) == (("front", "left"), 3)
+    assert np.trace(fused.covariance) == pytest.approx(0.05**2 + 2 * 0.004**2)
+
+
+def test_a_size_that_is_not_known_makes_the_range_uncertain_too() -> None:
+    """3 % by the apparent size and 40 % by the size are 40.1 %."""
+    fused = fuse([replace(candidate(4.0, 0.03), log_size_sigma=0.4)], 1)
+    assert fused.log_size_sigma == 0.4
+    assert fused.range_sigma_m / fused.range_m == pytest.approx(math.hypot(0.03, 0.4))
+    assert np.trace(fused.covariance) == pytest.approx(0.03**2 + 2 * 0.004**2), "all its views are off alike"
