@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytest
 
 from flockd.core.config import DroneConfig
-from flockd.core.data import data_path
 from flockd.core.messages import SECTORS, FrameSet, PilotOutput, VehicleState
 from flockd.flight.perception import Observation
 from flockd.flight.pilot import FlockPilot
-from flockd.sim.scenario import load_scenario
 from flockd.sim.world.obstacles import Box, Obstacles, true_ranges
-from tests.make import frames, vehicle
+from tests.make import changed, frames, scenario, vehicle
 
 WALL = Obstacles([Box(3.0, 0.0, 0.2, 30.0, 0.0, -0.5, 8.0)])
 """Its surface is 2.8 m north."""
@@ -27,25 +25,16 @@ class Observer:
     def __init__(self, *, sees: bool) -> None:
         self.sees = sees
 
-    def observe(
-        self,
-        frames: FrameSet,
-        vehicle: VehicleState,
-        ground: Any,
-        predictions: Any,
-        trace: Any,
-        lap: Callable[[str], None],
-        learned_size: Any,
-    ) -> Observation:
+    def observe(self, frames: FrameSet, vehicle: VehicleState, *_: object) -> Observation:
         ranges = true_ranges(WALL, frames.time_s, np.array([0.0, 0.0, -4.0])) if self.sees else None
         return Observation(frames.time_s, vehicle, {}, (), None, obstacles=ranges)
 
 
 def drone(*, enabled: bool) -> DroneConfig:
-    config = load_scenario(data_path("config") / "square.yaml").drone
-    mission = config.mission.model_copy(update={"kind": "velocity", "velocity_m_s": (1.5, 0.0), "waypoints": ()})
-    obstacles = config.obstacles.model_copy(update={"enabled": enabled})
-    return config.model_copy(update={"mission": mission, "obstacles": obstacles, "own_velocity": "autopilot"})
+    return changed(
+        scenario(name="square").drone, mission__kind="velocity", mission__velocity_m_s=(1.5, 0.0),
+        mission__waypoints=(), obstacles__enabled=enabled, own_velocity="autopilot",
+    )  # fmt: skip
 
 
 def flown(config: DroneConfig, sees: Sequence[bool]) -> list[PilotOutput]:

@@ -7,28 +7,27 @@ import math
 import numpy as np
 import pytest
 
-from flockd.core.messages import EgoMotion, FloatArray, VehicleState, Wanted
+from flockd.core.messages import EgoMotion, FloatArray, VehicleState
 from flockd.flight.flocking import FlockingLaw, FlockingParameters
+from flockd.flight.geometry import rotation_from_euler
 from flockd.flight.pilot.trim import VelocityTrim
-from flockd.flight.safety import Action, Gate, GateParameters, Permission, Request, Surroundings
+from flockd.flight.safety import Gate, GateParameters
+from tests import make
 
 STEP_S = 0.5
 GATE_M_S = 4.0
-YAW_RAD = 0.7
-R_NED_BODY = np.array(
-    [[math.cos(YAW_RAD), -math.sin(YAW_RAD), 0], [math.sin(YAW_RAD), math.cos(YAW_RAD), 0], [0, 0, 1]]
-)
+R_NED_BODY = rotation_from_euler(0.0, 0.0, 0.7)
 
 
-def vehicle(step: int, believed: FloatArray | None) -> VehicleState:
-    return VehicleState(STEP_S * step, R_NED_BODY, 4.0, believed)
+def vehicle(step: int, believed: FloatArray | None, step_s: float = STEP_S) -> VehicleState:
+    return make.vehicle(step_s * step, R_ned_body=R_NED_BODY, velocity_ned=believed)
 
 
-def ego(moved_with: FloatArray | None) -> EgoMotion | None:
+def ego(moved_with: FloatArray | None, step_s: float = STEP_S) -> EgoMotion | None:
     """As measured by a pilot whose drone moved so (NED m/s) since the last step."""
     if moved_with is None:
         return None
-    return EgoMotion(np.eye(3), R_NED_BODY.T @ moved_with * STEP_S, STEP_S, 100, 90, 0.1)
+    return EgoMotion(np.eye(3), R_NED_BODY.T @ moved_with * step_s, step_s, 100, 90, 0.1)
 
 
 def test_a_drone_flies_as_commanded_although_its_autopilot_errs() -> None:
@@ -82,7 +81,6 @@ def test_what_cannot_be_compared_leaves_the_trim_as_it_is() -> None:
 
 def test_a_law_and_a_trim_at_their_limits_pass_the_gate_though_rounding_adds_up() -> None:
     """3.5 and 0.5 m/s in one direction, where the gate refuses more than 4 m/s: 2,000 directions."""
-    around = Surroundings(np.zeros(2), np.zeros(2), 0.0, np.empty((0, 3)), np.empty((0, 2)), 5.0)
     gate = Gate(GateParameters(max_speed_m_s=GATE_M_S))
     for angle in np.random.default_rng(1).uniform(0, 2 * math.pi, 2000):
         direction = np.array([math.cos(angle), math.sin(angle)])
@@ -90,9 +88,9 @@ def test_a_law_and_a_trim_at_their_limits_pass_the_gate_though_rounding_adds_up(
         trim.update(vehicle(0, np.array([*direction, 0.0])), ego(None))
         trim.update(vehicle(1, np.array([*direction, 0.0])), ego(np.zeros(3)))
         law, _ = FlockingLaw(FlockingParameters(max_speed_m_s=3.5)).limited(9.0 * direction, np.zeros(2), 0.5)
-        wanted = Wanted(trim.corrected(law), np.zeros(2), 0.0)
-        assert math.hypot(*wanted.velocity) == pytest.approx(4.0)
-        gate.step(0.0, Request(Permission(Action.FLY, 0.0), wanted, 0.0, 5.0, around))
+        wanted = trim.corrected(law)
+        assert math.hypot(*wanted) == pytest.approx(4.0)
+        gate.step(0.0, make.request(0.0, wanted))
     assert gate.counts == {}
 
 
@@ -101,8 +99,8 @@ def test_short_steps_forget_as_much_in_half_a_second_as_one_long_step() -> None:
     for step_s in (0.5, 0.1):
         trim = VelocityTrim(0.5, 0.7, GATE_M_S)
         for step in range(round(2.0 / step_s) + 1):
-            moved = EgoMotion(np.eye(3), R_NED_BODY.T @ np.array([-0.2, 0.1, 0.0]) * step_s, step_s, 100, 90, 0.1)
-            trim.update(VehicleState(step * step_s, R_NED_BODY, 4.0, np.zeros(3)), moved if step else None)
+            moved = ego(np.array([-0.2, 0.1, 0.0]) if step else None, step_s)
+            trim.update(vehicle(step, np.zeros(3), step_s), moved)
         trims.append(trim.velocity)
     assert trims[1] == pytest.approx(trims[0])
     assert trims[0] == pytest.approx((1.0 - 0.7**4) * np.array([0.2, -0.1]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,12 +12,13 @@ from scipy.interpolate import RegularGridInterpolator
 
 from flockd.core.choices import HeightSource
 from flockd.core.config.perception import RangeFinderParameters
-from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, Reason, ReasonKind, VehicleState
+from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, Reason, ReasonKind
 from flockd.flight.geometry import rotation_from_euler
 from flockd.flight.pilot.ground import GroundFilter
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.sim.scenario import RangeFinderConfig
 from flockd.sim.world.terrain import hills
+from tests.make import vehicle
 
 pytestmark = pytest.mark.fault("range-finder-lies")
 
@@ -32,7 +34,7 @@ class Drone:
 
     def __init__(self, source: HeightSource = "best", height_m: float = 4.0, **parameters: float) -> None:
         self.below = GroundFilter(source, RangeFinderParameters.model_validate(parameters))
-        self.time_s, self.height_m, self.north_m, self.east_m = 0.0, height_m, 0.0, 0.0
+        self.time_s, self.height_m, self.north_m = 0.0, height_m, 0.0
 
     def step(
         self,
@@ -48,18 +50,9 @@ class Drone:
         self.height_m += climb_m_s * STEP_S
         self.north_m += north_m_s * STEP_S
         said = RangeReading(self.time_s, self.height_m if range_m is None else range_m, min_m=0.1, max_m=40.0)
-        place = np.array([self.north_m, self.east_m])
-        attitude = np.eye(3) if R is None else R
-        return self.below.update(
-            VehicleState(
-                self.time_s,
-                attitude,
-                self.height_m,
-                np.zeros(3) if believed is None else believed,
-                place,
-                ground_range=said,
-            )
-        )
+        flies = {"R_ned_body": np.eye(3) if R is None else R, "position": [self.north_m, 0.0]}
+        flies["velocity_ned"] = np.zeros(3) if believed is None else believed
+        return self.below.update(vehicle(self.time_s, self.height_m, **flies, ground_range=said))
 
     def hovers(self, seconds: float, range_m: float | None = None) -> list[Told]:
         return [self.step(range_m) for _ in range(round(seconds / STEP_S))]
@@ -163,10 +156,9 @@ def test_what_is_suddenly_in_the_beam_is_not_the_ground(range_m: float) -> None:
 def test_alone_it_gives_no_scale() -> None:
     drone = Drone("range_finder")
     drone.hovers(3.0)
-    assert drone.hovers(2.0, 0.3)[-1] == (
-        None,
-        Reason(ReasonKind.HEIGHT, "height: the range contradicts the barometer; there is no scale"),
-    )
+    ground, why = drone.hovers(2.0, 0.3)[-1]
+    assert ground is None
+    assert why is not None and why.kind is ReasonKind.HEIGHT and "contradicts" in why.text and "no scale" in why.text
 
 
 def test_what_is_in_the_beam_from_the_start_contradicts_home() -> None:
@@ -254,7 +246,8 @@ def test_hills_of_fifteen_per_cent_never_contradict_the_barometer(seed: int) -> 
         position = velocity * time_s + np.array([0.0, 0.0, -8.0])
         reading = sensor.read(time_s, position, velocity, R)
         drift_m = 0.3 / 60.0 * time_s + float(rng.normal(0.0, 0.02))
-        told.add(below.update(VehicleState(time_s, R, 8.0 + drift_m, velocity, position[:2], ground_range=reading))[1])
+        heard = vehicle(time_s, 8.0 + drift_m, R_ned_body=R, velocity_ned=velocity, position=position[:2])
+        told.add(below.update(replace(heard, ground_range=reading))[1])
         rises_m.append(float(ground(position[:1], position[1:2])[0]))
     assert told == {None}
     assert np.ptp(rises_m) > 1.0, "there were hills"
