@@ -1,7 +1,9 @@
-"""A manifest says everything about a network's interface; what it says wrongly is refused in one sentence."""
+"""A manifest says everything about a network's interface; what it says wrongly is refused at its line and key."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +12,15 @@ import pytest
 import yaml
 from onnx import helper
 
+from flockd.core.choices import ROLES
+from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
 from flockd.core.errors import ModelError
-from flockd.flight.inference import OnnxModel, read_manifest
+from flockd.flight.inference import OnnxModel, manifests_of, read_manifest
 from flockd.flight.inference.feeds import feeds_for, golden_feeds
 from flockd.flight.inference.fitting import fit
 from flockd.flight.inference.manifest import Manifest
+from flockd.flight.perception.requirements import REQUIREMENTS, check_roles
 from tests.flight.inference.foreign import (
     SIZE,
     constant_flow,
@@ -23,28 +28,32 @@ from tests.flight.inference.foreign import (
     map_output,
     one_channel_depth,
     write_manifest,
+    write_model,
 )
-from tests.flight.inference.foreign import write_model as write
 
 WIDTH, HEIGHT = SIZE
+MODELS = data_path("models")
 CROP = {
     "fill": 0.5, "first_margin": 1.0, "cut_margin": 1.5, "mirror_scale": 0.9, "min_half_width_px": 4.0,
     "max_half_angle_deg": 30.0, "max_resize": 2.0, "max_crops": 3,
 }  # fmt: skip
+GONE = object()
 
 
-def changed(path: Path, section: str, key: str, changes: dict[str, Any]) -> None:
+def changed(path: Path, changes: dict[str, Any], into: Path | None = None) -> Path:
+    """The manifest with other values at dotted keys, in place or as this file."""
     document = yaml.safe_load(path.read_text())
-    document[section][key] |= changes
-    write_manifest(path, document)
-
-
-def set_key(path: Path, **keys: Any) -> None:
-    write_manifest(path, yaml.safe_load(path.read_text()) | keys)
-
-
-def line_of(path: Path, start: str) -> int:
-    return next(n for n, line in enumerate(path.read_text().splitlines(), 1) if line.strip().startswith(start))
+    for key, value in changes.items():
+        *way, last = (int(name) if name.isdigit() else name for name in key.split("."))
+        section = document
+        for name in way:
+            section = section[name]
+        if value is GONE:
+            del section[last]
+        else:
+            section[last] = value
+    write_manifest(into or path, document)
+    return into or path
 
 
 def crop_regressor(folder: Path, **keys: Any) -> Path:
@@ -57,7 +66,7 @@ def crop_regressor(folder: Path, **keys: Any) -> Path:
         helper.make_node("Sub", ["column", "ends"], ["difference"]),
         helper.make_node("Abs", ["difference"], ["numbers"]),
     ]
-    return write(
+    return write_model(
         folder, "regressor", "anything", nodes,
         inputs={"patch": image_input(shape=["n", 3, 24, 24])},
         outputs={"numbers": map_output(["n", 2], columns=["brightness", "darkness"])},
@@ -66,176 +75,140 @@ def crop_regressor(folder: Path, **keys: Any) -> Path:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("changes", "at", "complaint"),
-    [
-        ({"colour": "grey"}, "shape:", r"inputs\.rgb\.shape\[1\]: 3 is not the 1 of a grey image in nchw; correct"),
-        ({"mean": [0.5]}, "mean:", r"inputs\.rgb\.mean: has 1 numbers for 3 channels; write one for each channel"),
-        ({"layout": "nhcw"}, "layout:", r"inputs\.rgb\.layout: nhcw is not known; did you mean `nhwc`\?"),
-        ({"shape": [1, 3, 32]}, "shape:", r"inputs\.rgb\.shape: has 3 axes; write the 4"),
-        ({"white": 0}, "white:", r"inputs\.rgb\.white: 0 is not greater than 0; write a positive number"),
-        ({"colors": "rgb"}, "colors:", r"inputs\.rgb\.colors: is not a known key; did you mean `colour`\?"),
-        ({"kind": "planes"}, "rgb:", r"inputs: has no image; give one input `kind: image`"),
-        (
-            {"shape": [1, 3, 32, 64]}, "shape:",
-            r"inputs\.rgb\.shape: the manifest says \[1, 3, 32, 64\] but the model file \[1, 3, 32, 48\]; make them",
-        ),
-        (
-            {"shape": ["n", 3, 32, 48]}, "shape:",
-            r"inputs\.rgb\.shape: the manifest says \[n, 3, 32, 48\] but the model file \[1, 3, 32, 48\]; make them",
-        ),
-        ({"dtype": "float16"}, "dtype:", r"inputs\.rgb\.dtype: the manifest says float16 but the model file float32"),
-    ],
-)  # fmt: skip
-def test_an_input_that_cannot_be_is_refused_with_file_line_key_and_what_to_do(
-    tmp_path: Path, changes: dict[str, Any], at: str, complaint: str
-) -> None:
-    path = one_channel_depth(tmp_path, output={})
-    changed(path, "inputs", "rgb", changes)
-    with pytest.raises(ModelError, match=complaint) as refused:
-        OnnxModel(path, threads=1)
-    line = line_of(path, at) + (2 if "shape[1]" in str(refused.value) else -1 if at == "rgb:" else 0)
-    assert str(refused.value).startswith(f"{path}:{line}: ")
-    assert "\n" not in str(refused.value)
+def with_planes(folder: Path) -> Path:
+    """A network with an image of free size and two planes beside it."""
+    inputs = {
+        "image": image_input(shape=[1, 3, "h", "w"]),
+        "rays": {**map_output([1, 2, "h/4", "w/4"]), "kind": "planes"},
+    }
+    changes = {"inputs": inputs, "map_stride": 4, "size_multiple": 32, "golden_size": [64, 32]}
+    return changed(one_channel_depth(folder, output={}), changes)
+
+
+def depth(folder: Path) -> Path:
+    return one_channel_depth(folder, output={})
+
+
+def shipped(name: str) -> Callable[[Path], Path]:
+    return lambda folder: changed(MODELS / f"{name}.yaml", {}, folder / f"{name}.yaml")
 
 
 @pytest.mark.parametrize(
-    ("keys", "complaint"),
+    ("model", "changes", "key"),
     [
-        ({"map_stride": 0}, r":\d+: map_stride: 0 is not at least 1; write a whole number from 1 to 64"),
-        ({"crop": {**CROP, "fill": -1.0}}, r":\d+: crop\.fill: -1\.0 is not greater than 0; write a positive number"),
-        ({"crop": {**CROP, "size": 24}}, r":\d+: crop\.size: is not a known key; the keys here are cut_margin, fill"),
-        ({"crop": {"fill": 0.5}}, r":\d+: crop\.cut_margin: is missing; add it with a positive number"),
-        ({"thresholds": {"p": float("nan")}}, r":\d+: thresholds\.p: \.nan is not finite; write a number"),
-        ({"sha256": "123"}, r":\d+: sha256: '123' is not a SHA-256; write a SHA-256, 64 hex"),
-        ({"outputs": {}}, r":\d+: outputs: a section; write a section"),
+        (depth, {"inputs.rgb.colour": "grey"}, "inputs.rgb.shape[1]"),
+        (depth, {"inputs.rgb.mean": [0.5]}, "inputs.rgb.mean"),
+        (depth, {"inputs.rgb.layout": "nhcw"}, "inputs.rgb.layout"),
+        (depth, {"inputs.rgb.shape": [1, 3, 32]}, "inputs.rgb.shape"),
+        (depth, {"inputs.rgb.white": 0}, "inputs.rgb.white"),
+        (depth, {"inputs.rgb.colors": "rgb"}, "inputs.rgb.colors"),
+        (depth, {"inputs.rgb.kind": "planes"}, "inputs"),
+        # other than the model file
+        (depth, {"inputs.rgb.shape": [1, 3, 32, 64]}, "inputs.rgb.shape"),
+        (depth, {"inputs.rgb.shape": ["n", 3, 32, 48]}, "inputs.rgb.shape"),
+        (depth, {"inputs.rgb.dtype": "float16"}, "inputs.rgb.dtype"),
+        (depth, {"inputs.more": image_input()}, "inputs"),
+        (depth, {"outputs.moved": map_output([1, 2]) | {"golden_mean": 0.0, "golden_deviation": 0.0}}, "outputs"),
+        (crop_regressor, {"map_stride": 0}, "map_stride"),
+        (crop_regressor, {"crop.fill": -1.0}, "crop.fill"),
+        (crop_regressor, {"crop.size": 24}, "crop.size"),
+        (crop_regressor, {"crop.cut_margin": GONE}, "crop.cut_margin"),
+        (crop_regressor, {"thresholds": {"p": float("nan")}}, "thresholds.p"),
+        (crop_regressor, {"sha256": "123"}, "sha256"),
+        (crop_regressor, {"outputs": {}}, "outputs"),
+        (crop_regressor, {"outputs.numbers.columns": ["a", "a"]}, "outputs.numbers.columns"),
+        (crop_regressor, {"outputs.numbers.columns": ["a"]}, "outputs.numbers.columns"),
+        (crop_regressor, {"outputs.numbers.columns": ["a", "b", "c"]}, "outputs.numbers.columns"),
+        (crop_regressor, {"inputs.patch.shape": ["n", 3, 24, 32]}, "crop"),
+        (crop_regressor, {"inputs.patch.shape": ["n", 3, "h", "w"]}, "crop"),
+        (with_planes, {"map_stride": GONE}, "map_stride"),
+        (with_planes, {"inputs.rays.dtype": "uint8"}, "inputs.rays.dtype"),
+        (with_planes, {"inputs.rays.shape": [1, "k", 8, 8]}, "inputs.rays.shape[1]"),
+        (with_planes, {"inputs.rays.shape": [2, 8, 8]}, "inputs.rays.shape"),
+        (with_planes, {"inputs.rays.carries": "image"}, "inputs"),
+        # for the roles of shipped ones
+        (shipped("flow"), {"roles": ["stereo"]}, "roles[0]"),
+        (shipped("flow"), {"roles": ["depth"]}, "inputs"),
+        (shipped("flow"), {"outputs.flow.gives": "motion"}, "outputs"),
+        (shipped("flow"), {"thresholds": {"p": 1.0}}, "thresholds.p"),
+        (shipped("distance"), {"crop": GONE}, "crop"),
+        (shipped("distance"), {"thresholds.drone_probability": GONE}, "thresholds.drone_probability"),
+        (shipped("distance"), {"thresholds.drone_probability": 80}, "thresholds.drone_probability"),
+        (shipped("distance"), {"thresholds.sure": 0.5}, "thresholds.sure"),
+        (shipped("distance"), {"outputs.range.columns.2": "up_px"}, "outputs.range.columns"),
+        (shipped("distance"), {"outputs.mask.shape.1": 48}, "outputs.mask.shape"),
+        (shipped("distance"), {"inputs.picture.carries": GONE}, "inputs"),
+        (shipped("verification"), {"thresholds.distance_logit_limit": GONE}, "thresholds.distance_logit_limit"),
+        (shipped("verification"), {"outputs.drone.columns": ["sure"]}, "outputs.drone.columns"),
+        (shipped("neighbours"), {"map_stride": GONE}, "map_stride"),
+        (shipped("neighbours"), {"inputs.geometry.kind": GONE}, "inputs.geometry.shape[3]"),
+        (shipped("neighbours"), {"inputs.geometry.carries": "sound"}, "inputs.geometry"),
+        (shipped("neighbours"), {"thresholds.mask_logit": 51.0}, "thresholds.mask_logit"),
     ],
 )
-def test_a_key_that_cannot_be_is_refused_with_file_line_key_and_what_to_do(
-    tmp_path: Path, keys: dict[str, Any], complaint: str
+def test_what_cannot_be_is_refused_in_one_sentence_with_file_line_and_key(
+    tmp_path: Path, model: Callable[[Path], Path], changes: dict[str, Any], key: str
 ) -> None:
-    path = crop_regressor(tmp_path)
-    set_key(path, **keys)
-    with pytest.raises(ModelError, match=complaint) as refused:
-        read_manifest(path)
-    assert str(refused.value).startswith(f"{path}:")
-    assert "\n" not in str(refused.value)
+    path = changed(model(tmp_path), changes)
+    with pytest.raises(ModelError) as refused:
+        if model is depth:
+            OnnxModel(path, threads=1)
+        else:
+            read_manifest(path, check_roles if model not in (crop_regressor, with_planes) else lambda _: ())
+    found = re.fullmatch(rf"{re.escape(str(path))}:(\d+): {re.escape(key)}: .*; .*", str(refused.value))
+    assert found, refused.value
+    line = path.read_text().splitlines()[int(found[1]) - 1].strip()
+    names = re.split(r"[.\[]", key.removesuffix("]"))
+    assert line.startswith(("- ", *(f"{name}:" for name in names[-2:]))) or (found[1] == "1" and len(names) == 1)
 
 
-@pytest.mark.parametrize(
-    ("columns", "complaint"),
-    [
-        (["a", "a"], r"outputs\.numbers\.columns: names 'a' twice; give each column its own name"),
-        (["a"], r"outputs\.numbers\.columns: has 1 names for the shape \[n, 2\]; name each column of \(n, k\)"),
-        (["a", "b", "c"], r"outputs\.numbers\.columns: has 3 names for the shape \[n, 2\]; name each"),
-    ],
-)
-def test_columns_that_do_not_name_each_number_once_are_refused(
-    tmp_path: Path, columns: list[str], complaint: str
-) -> None:
-    path = crop_regressor(tmp_path)
-    changed(path, "outputs", "numbers", {"columns": columns})
-    with pytest.raises(ModelError, match=complaint):
-        read_manifest(path)
+def test_each_role_of_the_configuration_has_its_requirements() -> None:
+    assert tuple(REQUIREMENTS) == ROLES
+    config = PerceptionConfig()
+    assert config.networks == {role: getattr(config, role) for role in ROLES}
+    without = PerceptionConfig(flow="dis", distance="none")
+    assert list(without.networks) == ["depth", "segmentation"]
+    assert [path.stem for path in manifests_of(without)] == ["neighbours_int8"]
 
 
 def test_an_output_is_read_by_the_names_of_its_columns(tmp_path: Path) -> None:
     for columns in (["brightness", "darkness"], ["darkness", "brightness"]):
-        path = crop_regressor(tmp_path)
-        changed(path, "outputs", "numbers", {"columns": columns})
-        model = OnnxModel(path, threads=1)
+        model = OnnxModel(changed(crop_regressor(tmp_path), {"outputs.numbers.columns": columns}), threads=1)
         crops = [np.full((24, 24, 3), grey, np.uint8) for grey in (51, 204)]
         values = model.infer({"patch": crops})["numbers"]
         named = model.manifest.outputs["numbers"].by_column(values)
         np.testing.assert_allclose(named[columns[0]], [0.2, 0.8], rtol=1e-5)
         np.testing.assert_allclose(named[columns[1]], [0.8, 0.2], rtol=1e-5)
-    with pytest.raises(ValueError, match=r"shape \(2, 3\) has not the columns darkness, brightness"):
+    with pytest.raises(ValueError, match="columns darkness, brightness"):
         model.manifest.outputs["numbers"].by_column(np.zeros((2, 3), np.float32))
 
 
-def test_crop_size_and_thresholds_come_from_the_manifest(tmp_path: Path) -> None:
+def test_crop_size_thresholds_and_a_batchs_size_come_from_the_manifest(tmp_path: Path) -> None:
     manifest = read_manifest(crop_regressor(tmp_path, thresholds={"probability": 0.25})).manifest
     assert manifest.crop_size_px == 24
     assert manifest.crop is not None
     assert (manifest.crop.fill, manifest.crop.max_crops) == (0.5, 3)
     assert manifest.threshold("probability") == 0.25
-    with pytest.raises(ModelError, match=r"model regressor has no thresholds\.p; add it to its manifest"):
+    assert feeds_for(manifest, (640, 480), 5)["patch"].shape == (5, 3, 24, 24)
+    with pytest.raises(ModelError, match=r"thresholds\.p;"):
         manifest.threshold("p")
-    whole = read_manifest(one_channel_depth(tmp_path, output={})).manifest
-    with pytest.raises(ModelError, match="model someones_depth takes no crops"):
+    whole = read_manifest(depth(tmp_path), check_roles).manifest
+    assert (whole.map_stride, whole.crop, whole.thresholds) == (None, None, {})
+    with pytest.raises(ModelError, match="crop"):
         _ = whole.crop_size_px
 
 
-def test_crops_that_are_not_square_or_of_free_size_are_refused(tmp_path: Path) -> None:
-    for shape in (["n", 3, 24, 32], ["n", 3, "h", "w"]):
-        path = crop_regressor(tmp_path)
-        changed(path, "inputs", "patch", {"shape": shape})
-        with pytest.raises(ModelError, match="crop: is for models whose image input is square and of a fixed size"):
-            read_manifest(path)
-
-
-def test_a_batch_of_crops_enters_at_the_models_own_size(tmp_path: Path) -> None:
-    manifest = read_manifest(crop_regressor(tmp_path)).manifest
-    assert feeds_for(manifest, (640, 480), 5)["patch"].shape == (5, 3, 24, 24)
-
-
-def planes_document(tmp_path: Path) -> dict[str, Any]:
-    """The manifest of a network with an image of free size and two planes beside it."""
-    document: dict[str, Any] = yaml.safe_load(one_channel_depth(tmp_path, output={}).read_text())
-    document["inputs"] = {
-        "image": image_input(shape=[1, 3, "h", "w"]),
-        "rays": {**map_output([1, 2, "h/4", "w/4"]), "kind": "planes"},
-    }
-    return document | {"map_stride": 4, "size_multiple": 32, "golden_size": [64, 32]}
-
-
 def test_planes_enter_at_the_stride_of_the_manifest(tmp_path: Path) -> None:
-    manifest = Manifest.model_validate(planes_document(tmp_path), strict=False)
+    manifest = Manifest.model_validate(yaml.safe_load(with_planes(tmp_path).read_text()), strict=False)
     assert not list(manifest.faults())
     assert golden_feeds(manifest)["rays"].shape == (1, 2, 8, 16)
     assert feeds_for(manifest, (100, 40))["rays"].shape == (1, 2, 16, 32)  # padded to 128 x 64
 
 
-@pytest.mark.parametrize(
-    ("spoil", "complaint"),
-    [
-        (lambda d: d.pop("map_stride"), r"map_stride: is missing; write how many image pixels one number"),
-        (lambda d: d["inputs"]["rays"].update(dtype="uint8"), r"inputs\.rays\.dtype: uint8 is for images; write float"),
-        (
-            lambda d: d["inputs"]["rays"].update(shape=[1, "k", 8, 8]),
-            r"inputs\.rays\.shape\[1\]: k is not fixed",
-        ),
-        (
-            lambda d: d["inputs"]["rays"].update(shape=[2, 8, 8]),
-            r"inputs\.rays\.shape: has 3 axes; write the 4",
-        ),
-        (lambda d: d["inputs"]["rays"].update(carries="image"), r"inputs: has two of which each carries 'image'; corr"),
-    ],
-)
-def test_planes_that_nothing_can_fill_are_refused(tmp_path: Path, spoil: Any, complaint: str) -> None:
-    document = planes_document(tmp_path)
-    spoil(document)
-    write_manifest(tmp_path / "planes.yaml", document)
-    with pytest.raises(ModelError, match=complaint):
-        read_manifest(tmp_path / "planes.yaml")
-
-
 def test_sizes_that_the_file_leaves_free_the_manifest_may_fix(tmp_path: Path) -> None:
     path = constant_flow(tmp_path, (1.0, 1.0), ("w", "h"))
-    for name in ("a", "b"):
-        changed(path, "inputs", name, {"shape": [1, HEIGHT, WIDTH, 1]})
+    changed(path, {f"inputs.{name}.shape": [1, HEIGHT, WIDTH, 1] for name in "ab"})
     assert OnnxModel(path, threads=1).manifest.fixed_size == SIZE
-
-
-def test_an_output_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    path = constant_flow(tmp_path, (3.0, -2.0))
-    document = yaml.safe_load(path.read_text())
-    document["outputs"] = {"moved": document["outputs"]["motion"]}
-    write_manifest(path, document)
-    with pytest.raises(
-        ModelError, match=r"outputs: the manifest names \['moved'\] but the model file has \['motion'\]"
-    ):
-        OnnxModel(path, threads=1)
 
 
 @pytest.mark.parametrize(
@@ -252,5 +225,4 @@ def test_a_small_image_enters_no_smaller_than_the_manifest_says(
     image: tuple[int, int], enters: tuple[int, int]
 ) -> None:
     """The shipped flow sees images of an eighth of the size, and of 60 pixels at least along the shorter side."""
-    manifest = read_manifest(data_path("models") / "flow.yaml").manifest
-    assert fit(manifest, image).inner == enters
+    assert fit(read_manifest(MODELS / "flow.yaml").manifest, image).inner == enters

@@ -36,56 +36,50 @@ def refused(complaint: str) -> Iterator[None]:
 
 @pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")], ids=["FIFO", "device"])
 def test_what_has_no_end_is_refused_without_waiting_for_it(tmp_path: Path, make: Callable[[Path], None]) -> None:
-    path = tmp_path / "endless.yaml"
+    path = one_channel_depth(tmp_path, output={})
+    path.with_suffix(".onnx").unlink()
+    make(path.with_suffix(".onnx"))
+    with refused(rf"^{path}:4: file: .*not an ordinary file; "):
+        load_manifest(path)
+    path.unlink()
     make(path)
-    with refused(rf"^{path}: is not an ordinary file; copy the manifest to one"):
+    with refused(rf"^{path}: .*not an ordinary file; "):
         read_manifest(path)
 
 
-def test_a_model_file_that_is_a_fifo_or_a_device_is_refused(tmp_path: Path) -> None:
-    path = one_channel_depth(tmp_path, output={})
-    model = path.with_suffix(".onnx")
-    model.unlink()
-    os.mkfifo(model)
-    with refused(rf"^{path}:4: file: {model} is not an ordinary file; name the ONNX file"):
-        load_manifest(path)
-    model.unlink()
-    model.symlink_to("/dev/zero")
-    with refused(rf"^{path}:4: file: {model} is not an ordinary file"):
-        load_manifest(path)
-
-
-def test_a_model_file_larger_than_any_onnx_file_is_refused_unread(tmp_path: Path) -> None:
+def test_a_model_file_larger_than_any_onnx_file_is_refused_unread_and_a_missing_one_at_its_key(tmp_path: Path) -> None:
     path = one_channel_depth(tmp_path, output={})
     with path.with_suffix(".onnx").open("wb") as stream:
         stream.truncate((2 << 30) + 1)  # sparse: it takes no room on the disk
-    with refused(rf"^{path}:4: file: .* is larger than 2 GiB"):
+    with refused(rf"^{path}:4: file: .* 2 GiB"):
+        load_manifest(path)
+    path.with_suffix(".onnx").unlink()
+    with refused(rf"^{path}:4: file: .*someones_depth\.onnx \(No such file"):
         load_manifest(path)
 
 
 @pytest.mark.parametrize(
     ("content", "complaint"),
     [
-        (b"", r"yaml: is empty; write the manifest into it"),
-        (b"inputs: " + b"[" * 100_000, r"yaml:1: is nested more than 32 levels deep; flatten it"),
-        (b"name: a\n" * 200_000, r"yaml: is larger than 1024 KiB, which no manifest is; check the path"),
-        (b"- flow\n", r"yaml:1: is a list at its top level"),
+        (None, "yaml: does not exist"),
+        (b"", "yaml: is empty"),
+        (b"inputs: " + b"[" * 100_000, "yaml:1: .* 32 levels"),
+        (b"name: a\n" * 200_000, "yaml: .* 1024 KiB"),
+        (b"- flow\n", "yaml:1: .* list"),
     ],
-    ids=lambda value: value[:20] if isinstance(value, bytes) else "",
+    ids=["nothing", "empty", "deep", "large", "list"],
 )
-def test_a_file_that_is_no_manifest_is_refused_in_one_sentence(tmp_path: Path, content: bytes, complaint: str) -> None:
+def test_a_file_that_is_no_manifest_is_refused_in_one_sentence(
+    tmp_path: Path, content: bytes | None, complaint: str
+) -> None:
     """As the configuration's files, which have the same reader."""
     path = tmp_path / "model.yaml"
-    path.write_bytes(content)
+    if content is not None:
+        path.write_bytes(content)
     with refused(complaint):
         read_manifest(path)
-
-
-def test_a_folder_and_nothing_are_refused(tmp_path: Path) -> None:
-    with refused(rf"^{tmp_path}: is a folder"):
+    with refused("folder"):
         read_manifest(tmp_path)
-    with refused(r"none\.yaml: does not exist; check the path"):
-        read_manifest(tmp_path / "none.yaml")
 
 
 def test_words_that_older_yaml_takes_for_booleans_are_words(tmp_path: Path) -> None:
@@ -93,13 +87,6 @@ def test_words_that_older_yaml_takes_for_booleans_are_words(tmp_path: Path) -> N
     path = tmp_path / "model.yaml"
     path.write_text((data_path("models") / "distance.yaml").read_text().replace("- n\n", "- y\n"))
     assert read_manifest(path).manifest.inputs["picture"].shape == ("y", 96, 96, 3)
-
-
-def test_a_missing_model_file_is_reported_at_the_key_that_names_it(tmp_path: Path) -> None:
-    path = one_channel_depth(tmp_path, output={})
-    path.with_suffix(".onnx").unlink()
-    with refused(rf"^{path}:4: file: cannot read .*someones_depth\.onnx \(No such file.*; put the model file back or"):
-        load_manifest(path)
 
 
 def test_a_hostile_manifest_is_read_or_refused(tmp_path: Path) -> None:

@@ -104,7 +104,5 @@ def test_a_run_can_be_ended_and_the_next_one_is_whole() -> None:
 def test_where_it_is_not_installed_one_sentence_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     config = PerceptionConfig.model_validate({"provider": "openvino"})
-    with pytest.raises(
-        ModelError, match=r"perception\.provider: OpenVINO is not installed; install flockd\[openvino\]"
-    ):
+    with pytest.raises(ModelError, match=r"perception\.provider: .*; install flockd\[openvino\]"):
         OnnxNetworks(config, MODELS)
