@@ -1,4 +1,4 @@
-"""Models of other people: their manifest says what they take and what their outputs mean."""
+"""Models of other people: their manifest says what they take and mean; height says how far, where they do not."""
 
 from __future__ import annotations
 
@@ -9,28 +9,34 @@ import numpy as np
 import pytest
 
 from flockd.core.config.perception import PerceptionConfig
+from flockd.core.config.rig import RigConfig
 from flockd.core.data import data_path
 from flockd.core.errors import ModelError
-from flockd.core.messages import Frame
+from flockd.core.messages import BoolArray, Float32Array, FloatArray, Frame, UInt8Array
+from flockd.flight.geometry import Rig, build_rig, ground_inverse_depth, z_map
 from flockd.flight.inference import OnnxModel
 from flockd.flight.inference.fitting import fit
-from flockd.flight.perception import OnnxFlow, OnnxNetworks, OpenDepth
+from flockd.flight.perception import OnnxFlow, OnnxNetworks, OpenDepth, Perception, SceneMaps
+from flockd.flight.perception.metric_depth import metric_depth
+from flockd.flight.pilot.ground import level_ground
 from tests.flight.inference.foreign import SIZE, constant_flow, one_channel_depth
-from tests.make import rig_camera
+from tests.make import camera, frames, rig_camera, vehicle
 
-WIDTH, HEIGHT = SIZE
+RELATIVE = {"depth": {"quantity": "inverse_depth", "unknown": "scale_and_shift"}}
 
 
 def perception_with(depth: Path, **config: Any) -> OnnxNetworks:
     return OnnxNetworks(PerceptionConfig(flow="dis", depth=str(depth), distance="none", **config), data_path("models"))
 
 
-def plain(colour: tuple[int, int, int], size: tuple[int, int] = SIZE) -> np.ndarray:
+def plain(colour: tuple[int, int, int], size: tuple[int, int] = SIZE) -> UInt8Array:
     return np.full((size[1], size[0], 3), colour, np.uint8)
 
 
-def front(image: np.ndarray) -> Frame:
-    return Frame("front", image, 0.0, 0)
+def depth_of(path: Path, image: UInt8Array, focal_px: float = 40.0, scale: str = "network") -> Any:
+    """What a network says of one image of a camera."""
+    front = rig_camera(focal_px, (image.shape[1], image.shape[0]))
+    return perception_with(path, scale=scale).scene(Frame("front", image, 0.0, 0), front, None).depth
 
 
 @pytest.mark.parametrize(
@@ -46,9 +52,7 @@ def test_an_image_enters_in_the_order_range_and_normalisation_of_the_manifest(
 ) -> None:
     imagenet = {"mean": [0.485, 0.456, 0.406], "deviation": [0.229, 0.224, 0.225]}
     path = one_channel_depth(tmp_path, channel=channel, output={}, colour=colour, **imagenet)
-    seen = perception_with(path, scale="network").scene(front(plain((200, 100, 50))), rig_camera(40.0, SIZE), None)
-    assert isinstance(seen.depth, np.ndarray)
-    np.testing.assert_allclose(seen.depth, expected, rtol=1e-5)
+    np.testing.assert_allclose(depth_of(path, plain((200, 100, 50))), expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -67,14 +71,12 @@ def test_flow_of_a_network_of_fixed_size_comes_back_in_pixels_of_the_image(
 
 
 def test_what_lies_right_in_the_image_lies_right_in_the_map_although_its_input_was_padded(tmp_path: Path) -> None:
-    path = one_channel_depth(tmp_path, output={})
     image = plain((0, 0, 0), (64, 64))  # half as wide again is black border in an input of 48 x 32
     image[:, 32:] = 255
-    seen = perception_with(path, scale="network").scene(front(image), rig_camera(40.0, (64, 64)), None)
-    assert isinstance(seen.depth, np.ndarray)
-    assert seen.depth.shape == (64, 64)
-    np.testing.assert_allclose(seen.depth[:, :30], 0.0, atol=1e-6)
-    np.testing.assert_allclose(seen.depth[:, 34:], 1.0, atol=1e-6)
+    depth = depth_of(one_channel_depth(tmp_path, output={}), image)
+    assert depth.shape == (64, 64)
+    np.testing.assert_allclose(depth[:, :30], 0.0, atol=1e-6)
+    np.testing.assert_allclose(depth[:, 34:], 1.0, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -89,27 +91,92 @@ def test_depth_becomes_metres_of_the_camera(
     tmp_path: Path, output: dict[str, Any], focal_px: float, red: int, size: tuple[int, int], expected: float
 ) -> None:
     path = one_channel_depth(tmp_path, output=output)
-    image = plain((red, 0, 0), size)
-    seen = perception_with(path, scale="network").scene(front(image), rig_camera(focal_px, size), None)
-    assert isinstance(seen.depth, np.ndarray)
-    np.testing.assert_allclose(seen.depth, expected, rtol=1e-3)
+    np.testing.assert_allclose(depth_of(path, plain((red, 0, 0), size), focal_px), expected, rtol=1e-3)
 
 
 def test_a_relative_network_is_refused_where_nothing_fixes_its_scale(tmp_path: Path) -> None:
-    relative = {"depth": {"quantity": "inverse_depth", "unknown": "scale_and_shift"}}
-    path = one_channel_depth(tmp_path, output=relative)
-    with pytest.raises(ModelError, match=r"perception\.scale: .* has no metric scale .* write height, or choose"):
-        perception_with(path, scale="network")
-    seen = perception_with(path, scale="height").scene(front(plain((51, 0, 0))), rig_camera(40.0, SIZE), None)
-    assert isinstance(seen.depth, OpenDepth)
-    assert seen.depth.shift
-    np.testing.assert_allclose(seen.depth.inverse, 0.2, rtol=1e-5)
+    with pytest.raises(ModelError, match=r"perception\.scale: "):
+        perception_with(one_channel_depth(tmp_path, output=RELATIVE), scale="network")
 
 
-def test_a_metric_network_leaves_its_scale_to_the_autopilot_where_that_is_asked_for(tmp_path: Path) -> None:
-    path = one_channel_depth(tmp_path, output={})
-    # it takes no ground as an input, so height has to align what it says
-    seen = perception_with(path, scale="height").scene(front(plain((51, 0, 0))), rig_camera(40.0, SIZE), None)
-    assert isinstance(seen.depth, OpenDepth)
-    assert not seen.depth.shift
-    np.testing.assert_allclose(seen.depth.inverse, 5.0, rtol=1e-5)
+@pytest.mark.parametrize(("output", "shift", "inverse"), [(RELATIVE, True, 0.2), ({}, False, 5.0)])
+def test_the_scale_is_left_to_height_where_that_is_asked_for(
+    tmp_path: Path, output: dict[str, Any], shift: bool, inverse: float
+) -> None:
+    """Also a metric network's: it takes no ground as an input, so height has to align what it says."""
+    depth = depth_of(one_channel_depth(tmp_path, output=output), plain((51, 0, 0)), scale="height")
+    assert isinstance(depth, OpenDepth)
+    assert depth.shift is shift
+    np.testing.assert_allclose(depth.inverse, inverse, rtol=1e-5)
+
+
+# Depth without metres: the height above ground says how far away things are.
+
+WIDTH, HEIGHT = 160, 120
+FACTOR, SHIFT = 2.5, 0.03
+
+
+def rig_of(size: tuple[int, int] = (WIDTH, HEIGHT)) -> Rig:
+    return build_rig(RigConfig(cameras=(camera("front", size, size[0] / 2),)))
+
+
+FRONT = rig_of().cameras["front"]
+U, V = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
+AXIAL_SHARE = 1.0 / np.sqrt(1.0 + (U**2 + V**2) / (WIDTH / 2) ** 2)
+"""z over range in each pixel, by Pythagoras."""
+
+
+def opened(depth: FloatArray, *, shift: bool, labels: UInt8Array | None = None) -> SceneMaps:
+    """What a network says that knows this depth up to the factor and shift above."""
+    inverse = (1.0 / depth - (SHIFT if shift else 0.0)) / FACTOR
+    nothing = np.zeros(depth.shape, np.uint8)
+    return SceneMaps(OpenDepth(inverse.astype(np.float32), shift=shift), nothing if labels is None else labels, ())
+
+
+def depth_of_ground(height_m: float) -> tuple[FloatArray, Float32Array, BoolArray]:
+    """Level ground under a camera that looks ahead, with things standing on 40 % of it; and where it is bare."""
+    ground = ground_inverse_depth(FRONT, np.eye(3), height_m, stride=1)
+    depth = 1.0 / np.maximum(ground, 1e-3)
+    covered = np.random.default_rng(0).random((HEIGHT // 8, WIDTH // 8)) < 0.4
+    covered_px = np.kron(covered, np.ones((8, 8), np.bool_))
+    scene = np.where(covered_px, depth * np.random.default_rng(1).uniform(0.3, 0.8, depth.shape), depth)
+    return scene, ground_inverse_depth(FRONT, np.eye(3), height_m, stride=2), ~covered_px & (ground > 0)
+
+
+@pytest.mark.parametrize("shift", [False, True])
+@pytest.mark.parametrize("drones", [False, True])
+def test_height_finds_the_ground_under_what_stands_on_it_and_drones_before_it_do_not_count(
+    shift: bool, drones: bool
+) -> None:
+    scene, ground, bare = depth_of_ground(3.0)
+    labels, seen = np.zeros(scene.shape, np.uint8), scene.copy()
+    if drones:
+        labels[HEIGHT // 2 :, : WIDTH // 3] = 1
+        seen[labels > 0] *= 0.2
+    fixed = metric_depth(opened(seen, shift=shift, labels=labels), ground, FRONT.camera)
+    right = (labels == 0) & (bare | (scene < 20.0))
+    np.testing.assert_allclose(fixed[right], (scene / AXIAL_SHARE)[right], rtol=0.02)
+
+
+def test_without_ground_in_view_height_says_nothing() -> None:
+    """Above the horizon, or where nothing in the picture looks like ground."""
+    wall = np.random.default_rng(0).uniform(1.0, 30.0, (HEIGHT, WIDTH))
+    for ground in (np.zeros((HEIGHT // 2, WIDTH // 2), np.float32), depth_of_ground(3.0)[1]):
+        with pytest.raises(ValueError, match="too little"):
+            metric_depth(opened(wall, shift=True), ground, FRONT.camera)
+
+
+def test_a_foreign_relative_network_sees_metres_by_height(tmp_path: Path) -> None:
+    """Its image is painted so that it sees level ground, in a unit of its own."""
+    rig, state = rig_of(SIZE), vehicle(height_m=2.0)
+    inverse = ground_inverse_depth(rig.cameras["front"], np.eye(3), 2.0, stride=1)
+    grey = np.round(20 + 200 * inverse / inverse.max()).astype(np.uint8)
+    networks = perception_with(one_channel_depth(tmp_path, output=RELATIVE), scale="height")
+    config = PerceptionConfig(flow="dis", distance="none", scale="height")
+    shown = frames(0.0, {"front": np.repeat(grey[:, :, None], 3, axis=2)})
+    observation = Perception(rig, networks, config).observe(shown, state, level_ground(state))
+    assert observation.reasons == ()
+    rows = slice(SIZE[1] * 3 // 4, None)
+    depth = observation.cameras["front"].depth
+    assert depth is not None
+    np.testing.assert_allclose(z_map(depth, rig.cameras["front"].camera)[rows], 1.0 / inverse[rows], rtol=0.05)
