@@ -13,9 +13,11 @@ import pytest
 from flockd.core.config import DroneConfig, load_drone
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import Frame, FrameSet, PilotOutput, VehicleState
+from flockd.flight.geometry import rotation_from_euler
 from flockd.flight.perception import load_networks
 from flockd.flight.pilot import FlockPilot
-from flockd.flight.safety import Action, Gate, Permission, Request, Surroundings
+from flockd.flight.safety import Action, Gate
+from tests import make
 from tests.flight.safety.test_gate_properties import assert_safe
 from tests.hostile import CORPUS, any_float, hostile
 
@@ -95,9 +97,8 @@ def _numbers(random: Random, shape: tuple[int, ...]) -> Any:
 
 def _vehicle(random: Random, time_s: float) -> VehicleState:
     R = np.linalg.qr(np.random.default_rng(random.getrandbits(32)).normal(size=(3, 3)))[0]
-    if random.random() < 0.7:  # level, or nearly so
-        angle = random.uniform(-math.pi, math.pi)
-        R = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1.0]])
+    if random.random() < 0.7:
+        R = rotation_from_euler(0.0, 0.0, random.uniform(-math.pi, math.pi))
     if random.random() < 0.05:
         R = R * any_float(random)
     velocity = None if random.random() < 0.2 else np.array([any_float(random) for _ in range(3)])
@@ -116,14 +117,11 @@ def _assert_within_limits(output: PilotOutput, config: DroneConfig) -> None:
 
 
 def _through_gate(random: Random, gate: Gate, p: GateParameters, output: PilotOutput, now_s: float) -> None:
-    around = Surroundings(
-        np.array([any_float(random), any_float(random)]),
-        np.array([any_float(random), any_float(random)]),
-        any_float(random),
-        np.array([n.position for n in output.neighbours]).reshape(-1, 3),
-        np.array([n.velocity[:2] for n in output.neighbours]).reshape(-1, 2),
-        any_float(random),
-    )
+    near = make.around(
+        [any_float(random), any_float(random)], [any_float(random), any_float(random)],
+        neighbours=[n.position for n in output.neighbours], yaw_rad=any_float(random), height_m=any_float(random),
+        neighbour_velocities=np.array([n.velocity[:2] for n in output.neighbours]).reshape(-1, 2),
+    )  # fmt: skip
     action = random.choice((Action.FLY, Action.FLY_DEGRADED))
-    request = Request(Permission(action, now_s), output.command, now_s, any_float(random), around)
-    assert_safe(gate.step(now_s, request), p, action, around)
+    asked = make.request(now_s, action=action, surroundings=near, wanted=output.command, height_m=any_float(random))
+    assert_safe(gate.step(now_s, asked), p, action, near)
