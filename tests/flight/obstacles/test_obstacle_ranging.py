@@ -44,7 +44,9 @@ def towards_trunk(origin: FloatArray, rays: FloatArray, place: tuple[float, floa
     return np.where(ahead > 0, ahead, np.inf)
 
 
-def blank(camera: RigCamera, depth: FloatArray, flow: FloatArray | None = None, **fields: Any) -> CameraObservation:
+def blank(
+    camera: RigCamera, depth: FloatArray | RangeMap, flow: FloatArray | None = None, **fields: Any
+) -> CameraObservation:
     """What a camera shows of depths of its pixels, in a row."""
     width, height = camera.camera.size
     moved = None if flow is None else flow.reshape(height, width, 2).astype(np.float32)
