@@ -46,7 +46,7 @@ def test_a_table_says_median_and_worst_beside_the_exact_and_the_blind() -> None:
 
     part = {
         "commit": "0" * 40, "date": "2026-11-28", "command": "python -m nothing", "machine": "none",
-        "figures": {"order_tail": {"name": "order at the end", "unit": ""}},
+        "durations_s": {"square": 30.0}, "figures": {"order_tail": {"name": "order at the end", "unit": ""}},
         "scenarios": {"square": {"sight": eyes(0.9), "blind": eyes(0.5), "exact": eyes(0.99)}},
     }  # fmt: skip
     page = written("<!-- figures: flights -->\nold\n<!-- end of figures -->", {"flights": part})

@@ -73,7 +73,7 @@ def _flights(parts: Mapping[str, Part], scenarios: Iterable[str] | None = None, 
             if any(figure in eyes[kind]["figures"] for kind in EYES)
         ]
         count = eyes["sight"]["flights"] - eyes["sight"]["failed"]
-        head = f"{scenario}: {count} flight{'s' * (count != 1)}, median (worst)"
+        head = f"{scenario}: {count} flight{'s' * (count != 1)} of {part['durations_s'][scenario]:g} s, median (worst)"
         tables.append(_table((head, *(f"by {kind}" if kind == "sight" else kind for kind in EYES)), rows))
     return "\n\n".join(tables) + "\n" + _origin(part)
 

@@ -249,14 +249,18 @@ def document(commit: str, lines: Sequence[Line], *, quick: bool) -> dict[str, An
     """What docs/figures.json holds of the flights."""
     files = {name: one.file for name, one in SCENARIOS.items()}
     networks: dict[str, str] = {}
-    for file in sorted(set(files.values())):
-        networks |= model_hashes(load_scenario(data_path("config") / file).drone.perception)
+    durations_s = {}
+    for name, file in files.items():
+        scenario = load_scenario(data_path("config") / file)
+        networks |= model_hashes(scenario.drone.perception)
+        durations_s[name] = (SCENARIOS[name].quick if quick else SCENARIOS[name].whole)[1] or scenario.duration_s
     return {
         **_measured_by(commit, f"python -m tools.measure.card{' --quick' * quick} --parts flights"),
         "networks": networks,
         "flown_s": round(sum(line["wall_s"] for line in lines)),
         "figures": {figure: {"name": MEASURES[figure].name, "unit": MEASURES[figure].unit} for figure in FIGURES},
         "files": files,
+        "durations_s": durations_s,
         "scenarios": table_of(lines),
     }
 

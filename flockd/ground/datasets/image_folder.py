@@ -1,7 +1,8 @@
 """A folder of one camera's images, with their times, depth maps and poses where those are known.
 
-As TUM's RGB-D sets are published: `rgb.txt`, `depth.txt` and `groundtruth.txt` list files and poses by time; and
-`K.txt` is the camera's matrix.
+As TUM's RGB-D sets are published: `rgb.txt`, `depth.txt` and `groundtruth.txt` list files and poses by time, and
+`K.txt` is the camera's matrix. Or without lists: the files of `images/` and `depth/` in order of their names, a second
+apart, and in `poses.txt` a 4x4 camera-to-world matrix a line.
 """
 
 from __future__ import annotations
@@ -18,14 +19,16 @@ from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.errors import ConfigError
 from flockd.core.messages import FloatArray, UInt8Array
 from flockd.flight.geometry import RigidTransform, ZMap, build_rig
-from flockd.ground.datasets.image_files import DatasetError, read_depth, read_image
+from flockd.ground.datasets.image_files import SUFFIXES, DatasetError, read_depth, read_image
 
-_UNITS_PER_M = 5000.0
+_TUM_UNITS_PER_M, _UNITS_PER_M = 5000.0, 1000.0
 """Of depth maps, 16 bits a pixel."""
 _MAX_OFFSET_S = 0.02
 """An image and a depth map farther apart in time do not belong together."""
 _MAX_GAP_S = 0.1
 """Between poses farther apart in time nothing is known."""
+_ROUNDING = 1e-2
+"""How far from a rotation a matrix of rounded numbers may be."""
 
 CAMERA = "camera"
 """Its name where the file has none."""
@@ -61,6 +64,7 @@ class Dataset:
     camera: CameraConfig
     """The one that took it; pixel centres at +0.5."""
     moments: tuple[DatasetFrame, ...]
+    depth_units_per_m: float
     notes: tuple[str, ...]
     """What a person should know although nothing is wrong: each is one sentence."""
 
@@ -77,7 +81,7 @@ class Dataset:
         none; None where they were not asked for. Raises DatasetError at a file that is missing or damaged."""
         size = self.camera.size_px
         for one in self.moments:
-            depth = ZMap(read_depth(one.depth, size, _UNITS_PER_M)) if with_depth and one.depth else None
+            depth = ZMap(read_depth(one.depth, size, self.depth_units_per_m)) if with_depth and one.depth else None
             yield one, read_image(one.image, size), depth
 
 
@@ -87,12 +91,17 @@ def open_dataset(path: Path) -> Dataset:
     Where there is depth, images without a map of their time are left out. Raises DatasetError, and ConfigError for a
     calibration that cannot be used.
     """
-    if not (path / "rgb.txt").is_file():
-        raise DatasetError(f"{path}: is no dataset; it needs rgb.txt, with the times and names of its images")
-    times_s, images = _listed(path / "rgb.txt")
+    listed = (path / "rgb.txt").is_file()
+    if not listed and not (path / "images").is_dir():
+        raise DatasetError(f"{path}: is no folder of images; it needs images/, or rgb.txt with their times and names")
+    times_s, images = _listed(path / "rgb.txt") if listed else _counted(path / "images")
     camera = read_calibration(path / "K.txt", read_image(images[0]).shape[1::-1])
-    depth = _depth_by_time(path / "depth.txt", times_s)
-    poses = _poses_by_time(path / "groundtruth.txt", times_s)
+    if listed:
+        depth, units_per_m = _depth_by_time(path / "depth.txt", times_s), _TUM_UNITS_PER_M
+        poses = _poses_by_time(path / "groundtruth.txt", times_s)
+    else:
+        depth, units_per_m = _depth_by_name(path / "depth", images), _UNITS_PER_M
+        poses = _poses_in_order(path / "poses.txt", images)
     kept = [index for index in range(len(images)) if not depth or index in depth]
     moments = tuple(
         DatasetFrame(number, images[k].name, float(times_s[k]), images[k], depth.get(k), poses[k])
@@ -103,7 +112,7 @@ def open_dataset(path: Path) -> Dataset:
             raise DatasetError(f"{file}: is missing; restore it, or leave its frame out")
     left_out = len(images) - len(kept)
     note = f"{path}: {left_out} of {len(images)} images have no depth map within {_MAX_OFFSET_S:g} s, and are left out"
-    return Dataset(path, camera, moments, (note,) if left_out else ())
+    return Dataset(path, camera, moments, units_per_m, (note,) if left_out else ())
 
 
 def _listed(file: Path) -> tuple[FloatArray, list[Path]]:
@@ -129,6 +138,13 @@ def _increasing(file: Path, times_s: FloatArray) -> FloatArray:
     return times_s
 
 
+def _counted(folder: Path) -> tuple[FloatArray, list[Path]]:
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
+    if not files:
+        raise DatasetError(f"{folder}: holds no images; put them there")
+    return np.arange(len(files), dtype=float), files
+
+
 def _depth_by_time(file: Path, image_times_s: FloatArray) -> dict[int, Path]:
     """By the image's index, the depth map nearest in time; none without a list."""
     if not file.exists():
@@ -139,6 +155,20 @@ def _depth_by_time(file: Path, image_times_s: FloatArray) -> dict[int, Path]:
     if not close.any():
         raise DatasetError(f"{file}: has no depth map at the time of any image; it belongs to another rgb.txt")
     return {int(index): maps[nearest[index]] for index in np.flatnonzero(close)}
+
+
+def _depth_by_name(folder: Path, images: Sequence[Path]) -> dict[int, Path]:
+    """Checked against the images both ways: a file too many may belong to an image that is gone."""
+    if not folder.is_dir():
+        return {}
+    maps = {file.stem: file for file in _counted(folder)[1]}
+    stems = [image.stem for image in images]
+    for stem in stems:
+        if stem not in maps:
+            raise DatasetError(f"{folder / stem}.png: is missing; each image needs its depth")
+    for alone in sorted(maps.keys() - set(stems)):
+        raise DatasetError(f"{maps[alone]}: its image is missing in {images[0].parent}; restore it, or delete both")
+    return {index: maps[stem] for index, stem in enumerate(stems)}
 
 
 def _poses_by_time(file: Path, image_times_s: FloatArray) -> _Poses:
@@ -160,6 +190,27 @@ def _poses_by_time(file: Path, image_times_s: FloatArray) -> _Poses:
     turns = Slerp(times_s, Rotation.from_quat(rows[:, 4:]))(at_s).as_matrix()
     places = np.column_stack([np.interp(at_s, times_s, rows[:, axis]) for axis in (1, 2, 3)])
     return [RigidTransform(*pose) if there else None for there, *pose in zip(known, turns, places, strict=True)]
+
+
+def _poses_in_order(file: Path, images: Sequence[Path]) -> _Poses:
+    if not file.exists():
+        return [None] * len(images)
+    rows = read_rows(file, columns=16, what="one 4x4 camera-to-world matrix a line, 16 numbers")
+    if len(rows) != len(images):
+        raise DatasetError(
+            f"{file}: has {len(rows)} poses, and {images[0].parent} {len(images)} images; give each image its line"
+        )
+    poses = []
+    for number, row in enumerate(rows, start=1):
+        matrix, where = row.reshape(4, 4), f"{file}: pose {number}"
+        u, _, vt = np.linalg.svd(matrix[:3, :3])
+        rotation = u @ vt  # the nearest: the numbers were rounded when they were written
+        if np.abs(rotation - matrix[:3, :3]).max() > _ROUNDING or np.linalg.det(rotation) < 0:
+            raise DatasetError(f"{where}: its first three columns are no rotation; write a camera-to-world matrix")
+        if not np.allclose(matrix[3], (0, 0, 0, 1), atol=_ROUNDING):
+            raise DatasetError(f"{where}: its last row is not 0 0 0 1; write a camera-to-world matrix")
+        poses.append(RigidTransform(rotation, matrix[:3, 3]))
+    return poses
 
 
 def read_calibration(file: Path, size: tuple[int, ...]) -> CameraConfig:

@@ -71,6 +71,7 @@ def failed_from_error(about: str, sentence: str) -> Finding:
 
 
 _LIMITS_S = {
+    "limits": 5.0,
     "rig": 60.0,
     "instance": 5.0,
     "memory": 5.0,
@@ -86,7 +87,7 @@ _LIMITS_S = {
 """How long each may take, the cameras beside what they are watched. Memory before the models are loaded, and those
 last, as they heat up the computer."""
 CHECKS = tuple(_LIMITS_S)
-BESIDE_A_FLIGHT = frozenset({"instance", "memory", "disk", "temperature", "clock", "secrets"})
+BESIDE_A_FLIGHT = frozenset({"limits", "instance", "memory", "disk", "temperature", "clock", "secrets"})
 """They leave alone what a drone flies with: its autopilot, cameras and endpoints, and its computer's time."""
 
 
@@ -157,6 +158,8 @@ def _check(name: str, drone: Examined) -> Iterable[Finding]:
             return check_models(config)
     from flockd.ground.doctor import setup_checks as setup
 
+    if name == "limits":
+        return setup.check_limits(config)
     if name == "secrets":
         return setup.check_secrets(config, drone.file)
     return setup.check_fleet(config) if name == "zenoh" else setup.check_instance(drone.taken)

@@ -1,4 +1,4 @@
-"""Which secrets others may read, and who else is there: on this computer, on the fleet."""
+"""Limits of the flight, which secrets others may read, and who else is there: on this computer, on the fleet."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from flockd.core.config import DroneConfig
+from flockd.core.config.document import key_text
+from flockd.core.config.real_drone import beyond_envelope
 from flockd.core.errors import UnavailableError
 from flockd.core.secrets import masked
 from flockd.fleet.watcher import FleetWatcher
@@ -16,6 +18,19 @@ from flockd.onboard.telemetry.zenoh_session import SessionError, private_keys
 LISTEN_S = 3.0
 """Others try again every second to reach this drone."""
 _READABLE, _WRITABLE = 0o004, 0o022
+
+
+def check_limits(config: DroneConfig) -> Iterator[Finding]:
+    """``config`` as it is flown."""
+    speed, layer = f"{config.flocking.max_speed_m_s:g} m/s at most", config.safety.first_flight_layer
+    if layer is None:
+        yield passed("first flight", f"off: {speed}")
+    else:
+        height = f"{config.mission.height_m:g} m above the ground at home"
+        yield passed("first flight", f"on: layer {layer}, {height}, {speed}")
+    for key, text in beyond_envelope(config).items():
+        measured, _, fix = text.partition("; ")
+        yield warned(key_text(key), measured, fix)
 
 
 def check_instance(taken: UnavailableError | None) -> Iterator[Finding]:

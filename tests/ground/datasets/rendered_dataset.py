@@ -84,6 +84,18 @@ def times_s() -> list[float]:
     return [START_S + PERIOD_S * k for k in range(FRAMES)]
 
 
+def write_rgbd_folder(scene: Scene, path: Path) -> Path:
+    for folder in ("images", "depth"):
+        (path / folder).mkdir(parents=True)
+    for k, (image, depth) in enumerate(zip(scene.images, scene.depth, strict=True)):
+        name = f"{10 + 3 * k:05}.png"  # numbers have gaps
+        _write(path / "images" / name, image)
+        cv2.imwrite(str(path / "depth" / name), _units(depth, 1000.0))
+    np.savetxt(path / "K.txt", OTHERS_MATRIX)
+    np.savetxt(path / "poses.txt", scene.poses.reshape(-1, 16), fmt="%.6e")
+    return path
+
+
 def write_tum(scene: Scene, path: Path) -> Path:
     """Depth 4 ms after its image; poses at other times than the images."""
     for folder in ("rgb", "depth"):

@@ -43,11 +43,18 @@ def replayed(capsys: Capture, *arguments: str | Path) -> dict[str, Any]:
     return result
 
 
-@pytest.mark.parametrize("stride", [1, 2])
-def test_a_dataset_gives_the_motions_that_were_rendered(
-    stride: int, scene: Scene, folder: Path, capsys: Capture
+@pytest.fixture
+def unlisted(scene: Scene, tmp_path: Path, onlooker: None) -> Path:
+    return rendered_dataset.write_rgbd_folder(scene, tmp_path / "unlisted")
+
+
+@pytest.mark.parametrize(("layout", "stride"), [("folder", 1), ("folder", 2), ("unlisted", 1)])
+def test_each_layout_gives_the_motions_that_were_rendered(
+    layout: str, stride: int, scene: Scene, request: pytest.FixtureRequest, capsys: Capture
 ) -> None:
-    result = replayed(capsys, folder, "--depth", "recorded", "--stride", f"{stride}", "--flow", "dis")
+    result = replayed(
+        capsys, request.getfixturevalue(layout), "--depth", "recorded", "--stride", f"{stride}", "--flow", "dis"
+    )
     assert [(pair["from"], pair["to"]) for pair in result["pairs"]] == [(k, k + stride) for k in range(FRAMES - stride)]
     for pair in result["pairs"]:
         motion = scene.motion(pair["from"], pair["to"])
@@ -67,6 +74,24 @@ def test_the_figures_are_those_of_the_pairs(folder: Path, capsys: Capture) -> No
         errors = [pair[error] for pair in result["pairs"]]
         expected = {"median": np.median(errors), "p95": np.percentile(errors, 95), "max": max(errors)}
         assert result[error] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [
+        (lambda folder: third(folder / "images").unlink(), "depth/00016.png: its image is missing"),
+        (lambda folder: third(folder / "depth").unlink(), "depth/00016.png: is missing; each image needs its depth"),
+        (lambda folder: np.savetxt(folder / "poses.txt", np.ones((5, 16))), "poses.txt: has 5 poses, and"),
+        (lambda folder: np.savetxt(folder / "poses.txt", np.ones((6, 16))), "pose 1: its first three columns are no"),
+    ],
+    ids=["no image", "no depth map", "a pose too few", "no rotation"],
+)
+def test_a_folder_without_lists_that_is_not_whole_is_refused(
+    damage: Callable[[Path], object], told: str, unlisted: Path, capsys: Capture
+) -> None:
+    damage(unlisted)
+    assert main(["replay", str(unlisted), "--depth", "recorded"]) == 1
+    assert told in capsys.readouterr().err
 
 
 def test_a_pair_without_an_estimate_says_why_and_is_no_standstill(folder: Path, capsys: Capture) -> None:
@@ -155,7 +180,7 @@ ODD = "200 0 160\n0 200 120\n0 0 one\n"
         (flip_a_bit, 1, ".png: the PNG is damaged at byte"),
         (cut_jpeg, 1, ".png: the JPEG ends too early"),
         (lambda folder: third(folder / "rgb").unlink(), 1, ".png: is missing; restore it"),
-        (lambda folder: (folder / "rgb.txt").unlink(), 1, "is no dataset; it needs rgb.txt"),
+        (lambda folder: (folder / "rgb.txt").unlink(), 1, "is no folder of images; it needs images/, or rgb.txt"),
         (lambda folder: (folder / "rgb.txt").write_text("1.0 rgb/a\0b.png\n"), 1, "(embedded null byte)"),
         (with_poses(lambda rows: rows[:, :1].__iadd__(1000.0)), 1, "has no pose at the time of any image"),
         (with_poses(lambda rows: rows[:, :1].fill(1.0)), 1, "groundtruth.txt: its times do not increase"),
