@@ -11,29 +11,32 @@ import numpy as np
 import pytest
 
 from flockd.core.config.mission import MissionParameters
-from flockd.core.messages import (
-    Detection,
-    Float32Array,
-    FloatArray,
-    Frame,
-    FrameSet,
-    Reason,
-    ReasonKind,
-    VehicleState,
-)
-from flockd.flight.geometry import RigCalibration, RigCamera, rotation_angle_deg
+from flockd.core.messages import Float32Array, Frame, FrameSet, Reason, ReasonKind, VehicleState
+from flockd.flight.geometry import RigCalibration, RigCamera, rotation_angle_deg, rotation_from_euler
 from flockd.flight.perception import Observation, SceneMaps
 from flockd.flight.pilot import FlockPilot
-from tests.flight.pilot.flyer import STEP_S, Flyer, scenario_with
+from tests.flight.pilot.flyer import STEP_S, Flyer, SpoilableTruth, scenario_with
+from tests.make import changed, detection, frames, vehicle
+
+NEVER_ASKED = SpoilableTruth()
+"""Networks of a pilot that gets no images."""
+ALONE = scenario_with((0.0, 0.0, -4.0))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def flyer() -> Flyer:
+    """With a neighbour 3 m ahead."""
+    return Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+
+
+def without(frames: FrameSet, camera: str) -> FrameSet:
+    return FrameSet(frames.time_s, {name: frame for name, frame in frames.frames.items() if name != camera})
+
+
+@pytest.mark.fault("time-stamps-backwards")
+def test_true_maps_give_true_motions_and_a_repeated_time_stamp_restarts_the_pair() -> None:
     """A neighbour 3 m ahead to the right: after the turn on the border between the front and the right camera."""
-    return Flyer(scenario_with((0.0, 0.0, -4.0), (1.8, 2.4, -3.6)))
-
-
-def test_true_maps_give_true_motions(flyer: Flyer) -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (1.8, 2.4, -3.6)))
     first = flyer.step()
     assert first.ego_motion is None
     before = flyer.vehicles
@@ -54,30 +57,22 @@ def test_true_maps_give_true_motions(flyer: Flyer) -> None:
     assert np.allclose(R_before @ motion.velocity, (after.position[1] - q_before) / STEP_S, atol=0.1)
     (detection,) = second.detections
     assert set(detection.cameras) == {"front", "right"}
+    again = flyer.step()
+    assert again.ego_motion is None
+    assert any(reason.kind is ReasonKind.PAIR for reason in again.reasons)
 
 
-@pytest.mark.fault("time-stamps-backwards")
-def test_a_repeated_time_stamp_restarts_the_pair_and_says_so(flyer: Flyer) -> None:
-    flyer.step()
-    output = flyer.step()
-    assert output.ego_motion is None
-    assert any(reason.kind is ReasonKind.PAIR for reason in output.reasons)
-
-
-def test_the_others_of_the_rig_fly_on_without_one_camera() -> None:
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+def test_the_others_of_the_rig_fly_on_without_one_camera(flyer: Flyer) -> None:
     flyer.step()
     flyer.move()
     frames, state = flyer.take_frames()
-    without_left = FrameSet(frames.time_s, {n: f for n, f in frames.frames.items() if n != "left"})
-    output = flyer.pilot.step(without_left, state)
+    output = flyer.pilot.step(without(frames, "left"), state)
     assert output.counts["camera left: no frame"] == 1
     assert output.ego_motion is not None
     assert len(output.detections) == 1
 
 
-def test_a_camera_that_is_elsewhere_is_flown_without(monkeypatch: pytest.MonkeyPatch) -> None:
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+def test_a_camera_that_is_elsewhere_is_flown_without(flyer: Flyer, monkeypatch: pytest.MonkeyPatch) -> None:
     assert flyer.step().noisy_cameras == ()
     flyer.move()
     monkeypatch.setattr(RigCalibration, "elsewhere", lambda calibration: ("front",))
@@ -88,16 +83,17 @@ def test_a_camera_that_is_elsewhere_is_flown_without(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize(("gone", "less_probable"), [("front", False), ("back", True)])
-def test_a_neighbour_before_a_camera_that_is_gone_is_as_probable_as_before(gone: str, less_probable: bool) -> None:
+def test_a_neighbour_before_a_camera_that_is_gone_is_as_probable_as_before(
+    flyer: Flyer, gone: str, less_probable: bool
+) -> None:
     """It flies ahead and then is not found twice: because no camera points there, or although one does."""
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
     for _ in range(3):
         (before,) = flyer.step().neighbours
         flyer.move()
     flyer.vehicles.position[1] += [0.0, 0.0, -60.0]  # far above, where no camera points
     for _ in range(2):
         frames, state = flyer.take_frames()
-        output = flyer.pilot.step(FrameSet(frames.time_s, {n: f for n, f in frames.frames.items() if n != gone}), state)
+        output = flyer.pilot.step(without(frames, gone), state)
         flyer.move()
     (neighbour,) = output.neighbours
     assert neighbour.unseen_s == pytest.approx(2 * STEP_S)
@@ -108,9 +104,7 @@ def test_a_neighbour_before_a_camera_that_is_gone_is_as_probable_as_before(gone:
 
 def test_a_neighbour_pulls_by_how_long_it_has_been_seen() -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (8.0, 0.0, -3.6)))
-    drone = flyer.scenario.drone
-    as_in_paper = drone.flocking.model_copy(update={"cohesion_time_s": None})
-    other = FlockPilot(drone.model_copy(update={"flocking": as_in_paper}), flyer.truth)
+    other = FlockPilot(changed(flyer.scenario.drone, flocking__cohesion_time_s=None), flyer.truth)
     for step in range(5):
         frames, state = flyer.take_frames()
         ours, papers = flyer.pilot.step(frames, state), other.step(frames, state)
@@ -160,8 +154,7 @@ def test_what_is_not_finite_costs_no_more_than_what_it_is_of(
 
 
 @pytest.mark.parametrize("still_there", [True, False])
-def test_a_drone_that_segmentation_misses_is_found_where_it_is_predicted(still_there: bool) -> None:
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+def test_a_drone_that_segmentation_misses_is_found_where_it_is_predicted(flyer: Flyer, still_there: bool) -> None:
     for _ in range(3):
         flyer.step()
         flyer.move()
@@ -182,20 +175,17 @@ def test_a_drone_that_segmentation_misses_is_found_where_it_is_predicted(still_t
 
 
 def test_blind_cameras_still_give_a_finite_command() -> None:
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0)))
-    _, state = flyer.take_frames()
-    output = flyer.pilot.step(FrameSet(flyer.time_s, {}), state)
+    output = FlockPilot(ALONE.drone, NEVER_ASKED).step(frames(0.0), vehicle(height_m=4.0))
     assert output.ego_motion is None
     assert len(output.reasons) == 4
-    assert np.isfinite(output.command.velocity).all()
-    assert output.command.yaw_rad is not None
-    assert math.isfinite(output.command.yaw_rad)
+    assert np.isfinite([*output.command.velocity, output.command.yaw_rad]).all()
 
 
 @pytest.mark.parametrize(("height_m", "blind"), [(0.0, 2), (-0.5, 4), (-2.0, 4)], ids=["at", "below", "far below"])
-def test_at_the_ground_or_below_there_is_no_depth_and_the_flight_goes_on_above(height_m: float, blind: int) -> None:
+def test_at_the_ground_or_below_there_is_no_depth_and_the_flight_goes_on_above(
+    flyer: Flyer, height_m: float, blind: int
+) -> None:
     """At a height of 0, a tilted drone has cameras on one side below the ground."""
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
     flyer.step()
     flyer.move()
     frames, state = flyer.take_frames()
@@ -209,32 +199,22 @@ def test_at_the_ground_or_below_there_is_no_depth_and_the_flight_goes_on_above(h
     assert flyer.step().ego_motion is not None
 
 
-def facing(yaw_rad: float) -> FloatArray:
-    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-
-
 def blown_about(yaw: str, *headings_rad: float, height_m: float = 4.0) -> list[float | None]:
     """The headings that are asked for while the wind turns a drone without cameras."""
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0)))
-    config = flyer.scenario.drone
-    pilot = FlockPilot(config.model_copy(update={"yaw": yaw, "mission": MissionParameters(kind="hover")}), flyer.truth)
-    _, state = flyer.take_frames()
-    state = replace(state, height_m=height_m)
-    return [
-        pilot.step(FrameSet(float(i), {}), replace(state, R_ned_body=facing(heading_rad))).command.yaw_rad
-        for i, heading_rad in enumerate(headings_rad)
-    ]
+    pilot = FlockPilot(changed(ALONE.drone, yaw=yaw, mission=MissionParameters(kind="hover")), NEVER_ASKED)
+    asked = []
+    for i, heading_rad in enumerate(headings_rad):
+        state = vehicle(float(i), height_m, R_ned_body=rotation_from_euler(0.0, 0.0, heading_rad))
+        asked.append(pilot.step(frames(float(i)), state).command.yaw_rad)
+    return asked
 
 
 def test_a_mission_is_unknown_before_the_first_good_step_and_stays_known_in_refused_ones() -> None:
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0)))
-    _, state = flyer.take_frames()
-    refused = replace(state, height_m=math.nan)
-    statuses = [flyer.pilot.step(FrameSet(0.5 * i, {}), s).mission for i, s in enumerate((refused, state, refused))]
-    assert [(status.kind, status.known) for status in statuses] == [
-        ("unknown", False), ("circle_then_tangent", True), ("circle_then_tangent", True)
-    ]  # fmt: skip
+    pilot = FlockPilot(ALONE.drone, NEVER_ASKED)
+    heights_m = (math.nan, 4.0, math.nan)  # refused, good, refused
+    statuses = [pilot.step(frames(0.5 * i), vehicle(0.5 * i, height_m)).mission for i, height_m in enumerate(heights_m)]
+    known = ("circle_then_tangent", True)
+    assert [(status.kind, status.known) for status in statuses] == [("unknown", False), known, known]
     np.testing.assert_allclose(statuses[2].desired, [1.0, 0.0])  # where the paper's circle begins
 
 
@@ -254,32 +234,27 @@ def test_a_heading_to_hold_is_the_first_good_one(
     assert blown_about(yaw, *headings_rad, height_m=height_m) == [one and pytest.approx(one) for one in asked_rad]
 
 
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({"frames_s": math.nan}, "a time is not finite"),
-        ({"frames_s": math.inf}, "a time is not finite"),
-        ({"time_s": math.nan}, "a time is not finite"),
-        ({"R_ned_body": np.full((3, 3), math.nan)}, "the attitude is not a rotation"),
-        ({"R_ned_body": 2.0 * np.eye(3)}, "the attitude is not a rotation"),
-        ({"R_ned_body": np.diag([1.0, 1.0, -1.0])}, "the attitude is not a rotation"),
-        ({"height_m": -math.inf}, "the height is not finite"),
-        ({"velocity_ned": np.array([0.0, math.nan, 0.0])}, "the autopilot's velocity is not finite"),
-    ],
-)
-def test_input_that_cannot_be_is_refused_and_the_next_step_is_as_if_it_had_not_come(
-    changes: dict[str, Any], reason: str
-) -> None:
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+def test_input_that_cannot_be_is_refused_and_the_next_step_is_as_if_it_had_not_come(flyer: Flyer) -> None:
     flyer.step()
-    frames, state = flyer.take_frames()
-    spoilt = replace(state, **{name: value for name, value in changes.items() if name != "frames_s"})
-    output = flyer.pilot.step(FrameSet(changes.get("frames_s", frames.time_s), frames.frames), spoilt)
-    assert output.reasons == (Reason(ReasonKind.INPUT, f"input refused: {reason}"),)
-    np.testing.assert_array_equal(output.command.velocity, [0.0, 0.0])
-    assert math.isfinite(output.time_s)
-    assert output.command.yaw_rad is not None
-    assert math.isfinite(output.command.yaw_rad)
+    changes: dict[str, list[Any]] = {
+        "frames_s": [math.nan, math.inf],
+        "time_s": [math.nan],
+        "R_ned_body": [np.full((3, 3), math.nan), 2.0 * np.eye(3), np.diag([1.0, 1.0, -1.0])],
+        "height_m": [-math.inf],
+        "velocity_ned": [np.array([0.0, math.nan, 0.0])],
+    }
+    taken, state = flyer.take_frames()
+    for field, value in ((field, value) for field, values in changes.items() for value in values):
+        shown = FrameSet(value, taken.frames) if field == "frames_s" else taken
+        output = flyer.pilot.step(shown, state if field == "frames_s" else replace(state, **{field: value}))
+        (reason,) = output.reasons
+        assert reason.kind is ReasonKind.INPUT
+        assert {"R_ned_body": "attitude", "height_m": "height", "velocity_ned": "velocity"}.get(field, "time") in (
+            reason.text
+        )
+        np.testing.assert_array_equal(output.command.velocity, [0.0, 0.0])
+        assert output.command.yaw_rad is not None
+        assert np.isfinite([output.time_s, output.command.yaw_rad]).all()
     flyer.move()
     after = flyer.step()
     assert after.reasons == ()
@@ -288,9 +263,8 @@ def test_input_that_cannot_be_is_refused_and_the_next_step_is_as_if_it_had_not_c
 
 
 @pytest.mark.parametrize("off", [1e-7, 3e-5, 4e-4])
-def test_an_attitude_that_is_rounded_is_flown_with(off: float) -> None:
+def test_an_attitude_that_is_rounded_is_flown_with(flyer: Flyer, off: float) -> None:
     """A share by which its axes are too long; 5e-4 is refused, as R R^T is then off by 1e-3."""
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
     for _ in range(2):
         flyer.move()
         frames, state = flyer.take_frames()
@@ -304,24 +278,21 @@ def test_an_attitude_that_is_rounded_is_flown_with(off: float) -> None:
 
 def test_a_detection_that_the_tracker_refuses_costs_that_neighbour_only() -> None:
     """Two neighbours: one's probability came out above 1."""
-    covariance = np.diag([1e-2, 1e-4, 1e-4])
-    sound = Detection(np.array([1.0, 0.0, 0.0]), math.log(3.0), covariance, 0.9, 0.4, ("front",), 1)
-    spoilt = replace(sound, bearing=np.array([0.0, 1.0, 0.0]), drone_probability=1.5, label=2)
+    sound = detection((3.0, 0.0, 0.0))
+    spoilt = replace(detection((0.0, 3.0, 0.0), label=2), drone_probability=1.5)
 
     class Observer:
         def observe(self, frames: FrameSet, vehicle: VehicleState, *_: object) -> Observation:
             return Observation(frames.time_s, vehicle, {}, (spoilt, sound), None)
 
-    networks: Any = object()  # never asked for anything
-    pilot = FlockPilot(scenario_with((0.0, 0.0, -4.0)).drone, networks, observer=Observer())
-    output = pilot.step(FrameSet(0.0, {}), VehicleState(0.0, np.eye(3), 4.0))
+    output = FlockPilot(ALONE.drone, NEVER_ASKED, observer=Observer()).step(frames(0.0), vehicle(height_m=4.0))
     assert [reason.kind for reason in output.reasons] == [ReasonKind.NEIGHBOUR]
     assert output.detections == (sound,)
     assert output.detection_tracks == tuple(neighbour.track for neighbour in output.neighbours)
 
 
 def test_a_time_before_the_first_step_is_no_error() -> None:
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0)))
+    flyer = Flyer(ALONE)
     flyer.step()
     flyer.time_s -= 5.0
     assert np.isfinite(flyer.step().command.velocity).all()
@@ -329,7 +300,7 @@ def test_a_time_before_the_first_step_is_no_error() -> None:
 
 def test_an_impossible_ego_motion_is_refused_but_not_for_ever() -> None:
     """No vehicle jumps 4 m in a step. If it goes on, it was the past that was wrong."""
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0)))
+    flyer = Flyer(ALONE)
     flyer.step()
     flyer.move()
     assert flyer.step().ego_motion is not None
