@@ -60,7 +60,7 @@ RANGE_FINDER = Service("range finder", 30.0, 0.5, "the autopilot's own distance 
 OBSTACLE_DISTANCE = Service(
     "`OBSTACLE_DISTANCE`, to the autopilot", 10.0, 0.5, "PX4 stops in Position mode, and goes to Hold after 5 s"
 )
-TIME_SYNC = Service("reply to a clock exchange", 10.0, 1.0, "it is not used")
+TIME_SYNC = Service("reply to a clock exchange", 5.0, 1.0, "it is not used")
 STEP_TOPIC = Service("telemetry of a step", 2.0, 1.5, "watchers show nothing for it")
 PREVIEW = Service("picture with detections", 2.0, 2.0, "the newest picture is shown without them")
 ORDER = Service("an operator's order", 1.0, 5.0, "it is refused; its sender gives it again")

@@ -492,8 +492,9 @@ def _range_reading(fields: Fields, time_s: float) -> RangeReading:
 def _vector(fields: Fields, *names: str) -> FloatArray | None:
     """The named numbers, or None where one is missing, null, which is how NaN comes, or infinite."""
     numbers = [fields.get(name) for name in names]
-    vector = np.array([math.nan if number is None else number for number in numbers], dtype=float)
-    return vector if np.isfinite(vector).all() else None
+    if any(number is None or not math.isfinite(number) for number in numbers):
+        return None
+    return np.array(numbers, dtype=float)
 
 
 def _attitude(fields: Fields) -> FloatArray | None:

@@ -14,6 +14,7 @@ from flockd.flight.geometry import (
     fit_rigid,
     rotation_angle_deg,
     rotation_from_euler,
+    rotation_from_quaternion,
 )
 from flockd.flight.geometry.rotations import rotation_from_vector, vector_from_rotation
 
@@ -53,6 +54,13 @@ def test_rotation_vectors_agree_with_scipy_both_ways_up_to_half_a_turn() -> None
         for axis in random.normal(size=(20, 3)):
             rotation = Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis))
             assert vector_from_rotation(rotation.as_matrix()) == pytest.approx(rotation.as_rotvec(), abs=1e-12)
+
+
+def test_quaternions_of_any_length_agree_with_scipy() -> None:
+    for quaternion in np.random.default_rng(3).normal(size=(50, 4)):
+        np.testing.assert_allclose(
+            rotation_from_quaternion(quaternion), Rotation.from_quat(quaternion).as_matrix(), atol=1e-14
+        )
 
 
 def test_transforms_chain_and_invert_like_4x4_matrices() -> None:
