@@ -21,7 +21,7 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_190,
-    "flockd/flight": 14_770,
+    "flockd/flight": 14_780,
     "flockd/onboard": 10_660,
     "flockd/fleet": 2_250,
     "flockd/ground": 4_040,
