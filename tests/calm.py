@@ -33,12 +33,14 @@ class CalmClock:
         self._real = real
         self._read_s = self._now_s = real()
         self._lock = threading.Lock()
+        self.stands: Callable[[], bool] = lambda: False
+        """No time passes while it is so: a story may wait for what takes real time, as a message on its way."""
 
     def __call__(self) -> float:
         """Now."""
         with self._lock:
             read_s = self._real()
-            self._now_s += min(read_s - self._read_s, MOST_S)
+            self._now_s += 0.0 if self.stands() else min(read_s - self._read_s, MOST_S)
             self._read_s = read_s
             return self._now_s
 

@@ -24,6 +24,7 @@ from flockd.ground.calibration.image_sources import identity
 from flockd.onboard.recording import Recorder
 from flockd.onboard.sources import CameraStatus
 from flockd.onboard.sources.device_source import Devices
+from tests.cli.conftest import Told
 from tests.ground.calibration import darkroom
 from tests.ground.calibration.darkroom import PINHOLE, WIDE, facing, photograph
 from tests.make import filled
@@ -53,25 +54,14 @@ def write(path: Path, image: UInt8Array) -> None:
     assert cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
 
 
-def told(capsys: Capture, code: int, *arguments: object) -> str:
-    """What stands on stdout, or the one sentence on stderr."""
-    capsys.readouterr()
-    assert main([str(argument) for argument in arguments]) == code
-    captured = capsys.readouterr()
-    if code:
-        assert captured.err.count("\n") == 1, captured.err
-        assert captured.out == ""
-    return captured.out if code == 0 else captured.err
-
-
-def test_a_folder_of_images_becomes_a_camera_that_checks(folder: Path, capsys: Capture) -> None:
+def test_a_folder_of_images_becomes_a_camera_that_checks(folder: Path, told: Told) -> None:
     out = folder.with_name("front.yaml")
     command = ("calibrate", "camera", folder, "--camera", "front", "--out", out)
-    text = told(capsys, 0, *command, "--model", "pinhole")
+    text = told(0, *command, "--model", "pinhole")
     assert "refused: {blurred: 1, no board: 1}" in text
     assert re.search(r"blurred: \{soft\.png: \d\.\d+\}", text)
     assert re.search(r"## where corners of the board were seen:\n(## |\.\. ){7}", text)
-    told(capsys, 0, "config", "check", out)
+    told(0, "config", "check", out)
     camera = load_drone(out).rig.cameras[0]
     assert (camera.name, camera.size_px) == ("front", (480, 360))
     assert camera.intrinsics.fx == pytest.approx(PINHOLE.fx, rel=0.005)
@@ -84,35 +74,35 @@ def test_a_folder_of_images_becomes_a_camera_that_checks(folder: Path, capsys: C
     # A whole drone takes it as it is.
     drone = folder.with_name("drone.yaml")
     drone.write_text("name: d\nstep_s: 0.2\n" + out.read_text(), encoding="utf-8")
-    told(capsys, 0, "config", "check", drone)
+    told(0, "config", "check", drone)
     # Nothing that is there is lost by accident.
     before = out.read_bytes()
-    assert f"{out}: exists; name another file, or overwrite it with --force" in told(capsys, 2, *command)
+    assert f"{out}: exists; name another file, or overwrite it with --force" in told(2, *command)
     assert out.read_bytes() == before
-    facts = json.loads(told(capsys, 0, *command, "--force", "--json"))
+    facts = json.loads(told(0, *command, "--force", "--json"))
     assert set(facts["models"]) == {"pinhole", "wide_angle"}
     assert facts["intrinsics"]["model"] == "pinhole"
     assert facts["refused"] == {"no board": 1, "blurred": 1}
     assert set(facts["residual_px"]["views"]) == {f"{number:02}.png" for number in range(12)}
 
 
-def test_what_is_not_enough_is_said_in_one_sentence(folder: Path, capsys: Capture, tmp_path: Path) -> None:
+def test_what_is_not_enough_is_said_in_one_sentence(folder: Path, told: Told, tmp_path: Path) -> None:
     out = tmp_path / "out.yaml"
     command = ("calibrate", "camera", folder, "--out", out)
     for file in sorted(folder.glob("0[4-9].png")) + sorted(folder.glob("1*.png")):
         file.unlink()
-    assert "4 usable views of the board are too few; show it at least 6 times" in told(capsys, 1, *command)
+    assert "4 usable views of the board are too few; show it at least 6 times" in told(1, *command)
     write(folder / "zz.png", np.zeros((100, 100, 3), np.uint8))
-    assert "zz.png: is 100 x 100 pixels and 00.png is 480 x 360" in told(capsys, 1, *command)
+    assert "zz.png: is 100 x 100 pixels and 00.png is 480 x 360" in told(1, *command)
     for file in folder.glob("*.png"):
         file.unlink()
-    assert "has no images" in told(capsys, 1, *command)
+    assert "has no images" in told(1, *command)
     write(folder / "wall.png", np.full((360, 480, 3), 90, np.uint8))
-    assert "the board is in none of the 1 images (1 no board)" in told(capsys, 1, *command)
-    assert "does not exist" in told(capsys, 2, "calibrate", "camera", tmp_path / "nowhere", "--out", out)
-    assert "does not exist" in told(capsys, 1, "calibrate", "camera", tmp_path / "no.mcap", "--out", out)
-    assert "no SOURCE was given" in told(capsys, 2, "calibrate", "camera", "--out", out)
-    assert "needs 70 markers" in told(capsys, 2, *command, "--squares", "10x14")
+    assert "the board is in none of the 1 images (1 no board)" in told(1, *command)
+    assert "does not exist" in told(2, "calibrate", "camera", tmp_path / "nowhere", "--out", out)
+    assert "does not exist" in told(1, "calibrate", "camera", tmp_path / "no.mcap", "--out", out)
+    assert "no SOURCE was given" in told(2, "calibrate", "camera", "--out", out)
+    assert "needs 70 markers" in told(2, *command, "--squares", "10x14")
     assert not out.exists()
 
 
@@ -194,10 +184,10 @@ def test_a_v4l2_camera_is_read(tmp_path: Path, capsys: Capture, monkeypatch: pyt
     assert re.search(r"the board is in none of the \d+ images \(\d+ no board\)", capsys.readouterr().err)
 
 
-def test_a_camera_that_is_not_there_is_unavailable(tmp_path: Path, capsys: Capture, monkeypatch: Any) -> None:
+def test_a_camera_that_is_not_there_is_unavailable(tmp_path: Path, told: Told, monkeypatch: Any) -> None:
     monkeypatch.setattr("flockd.ground.calibration.image_sources.FIRST_FRAME_S", 0.2)
     assert "/dev/video93 is not there; plug the camera in" in told(
-        capsys, 69, "calibrate", "camera", "--config", plugged_in(tmp_path, "/dev/video93"), "--out", tmp_path / "a"
+        69, "calibrate", "camera", "--config", plugged_in(tmp_path, "/dev/video93"), "--out", tmp_path / "a"
     )
 
 
@@ -213,9 +203,9 @@ def test_a_usb_camera_is_known_by_its_serial_number(tmp_path: Path) -> None:
     assert identity(Path("/dev/video4"), tmp_path / "class") == "not known, /dev/video4"
 
 
-def test_the_board_is_printed_in_its_true_size(tmp_path: Path, capsys: Capture) -> None:
+def test_the_board_is_printed_in_its_true_size(tmp_path: Path, told: Told) -> None:
     page = tmp_path / "board.pdf"
-    assert "print it at 100 % on paper of 276 x 204 mm" in told(capsys, 0, "calibrate", "camera", "--print-board", page)
+    assert "print it at 100 % on paper of 276 x 204 mm" in told(0, "calibrate", "camera", "--print-board", page)
     text = page.read_bytes()
     box = re.search(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", text)
     assert box is not None
@@ -233,8 +223,8 @@ def test_the_board_is_printed_in_its_true_size(tmp_path: Path, capsys: Capture) 
     table = int(text.split(b"startxref\n")[1].split()[0])
     for number, entry in enumerate(text[table:].split(b"\n")[3:8], start=1):
         assert text[int(entry[:10]) :].startswith(b"%d 0 obj" % number)
-    assert "is written as .pdf" in told(capsys, 2, "calibrate", "camera", "--print-board", tmp_path / "b.gif")
-    assert "exists" in told(capsys, 2, "calibrate", "camera", "--print-board", page)
+    assert "is written as .pdf" in told(2, "calibrate", "camera", "--print-board", tmp_path / "b.gif")
+    assert "exists" in told(2, "calibrate", "camera", "--print-board", page)
 
 
 WIDE_LENS = IntrinsicsConfig(model="wide_angle", fx=WIDE.fx, fy=WIDE.fy, cx=WIDE.cx, cy=WIDE.cy, distortion=WIDE.k)
@@ -253,12 +243,12 @@ def record_walls(path: Path, steps: int) -> None:
             recorder.drain()
 
 
-def test_a_recording_is_searched_for_the_board(tmp_path: Path, capsys: Capture) -> None:
+def test_a_recording_is_searched_for_the_board(tmp_path: Path, told: Told) -> None:
     flight = tmp_path / "drone1.mcap"
     record_walls(flight, steps=3)
     assert "the board is in none of the 3 images (3 no board)" in told(
-        capsys, 1, "calibrate", "camera", flight, "--out", tmp_path / "left.yaml"
+        1, "calibrate", "camera", flight, "--out", tmp_path / "left.yaml"
     )
     assert "has no camera 'up'; choose with --camera from left" in told(
-        capsys, 2, "calibrate", "camera", flight, "--camera", "up"
+        2, "calibrate", "camera", flight, "--camera", "up"
     )

@@ -15,9 +15,7 @@ from typing import Any
 
 import aiohttp
 import numpy as np
-import pytest
 
-from flockd.cli import main
 from flockd.sim.sitl.ports import free_endpoint
 
 ROOT = Path(__file__).parents[2]
@@ -208,21 +206,3 @@ async def test_a_flock_is_disturbed_and_begun_again_from_the_page() -> None:
         assert page.now["time_s"] < first_s
         assert (page.now["cameras_off"], page.now["removed"], page.now["gust_m_s"]) == ({}, [], 0.0)
         await page.until(lambda: all(row["mission"] == "on the circle" for row in page.rows.values()))
-
-
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        (["--live", "--record"], "--live keeps nothing"),
-        (["--live", "--telemetry"], "--live has --telemetry in it"),
-        (["--live", "--autopilot", "fake"], "drop --autopilot"),
-        (["--live", "--duration", "5"], "flies on until Ctrl-C"),
-        (["--port", "8000"], "--port is for --live"),
-        (["--no-browser"], "--no-browser is for --live"),
-    ],
-)
-def test_options_that_do_not_go_together_are_refused(
-    options: list[str], told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["sim", *options]) == 2
-    assert told in capsys.readouterr().err

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,21 +14,19 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
+from flockd.onboard.autopilot.mavlink_messages import ReceivedMessages
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from flockd.sim.autopilot.fake_telemetry import Mode
+from flockd.sim.autopilot.fake_telemetry import Mode, TelemetryStreams
 from flockd.sim.autopilot.fake_vehicle import Demand
 from tests.calm import clock
 from tests.faults.conftest import InTheAir, never_alone
 from tests.faults.process import flying
 from tests.faults.stories import Reacted
-from tests.make import changed
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import Foreigner, until
-from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, Watched, aboard
+from tests.onboard.daemon.aboard import QUIET_S, SECONDS_TO_FAIL, aboard
 
 pytestmark = pytest.mark.slow
-QUIET_S = 1.5
-"""For which nothing may be sent; PX4 would be back in offboard with one setpoint."""
 REASON = "Arming and offboard are denied: the estimator of this vehicle has not converged yet"
 
 
@@ -36,13 +37,11 @@ async def test_the_link_is_lost_and_comes_back(tmp_path: Path, reacted: Reacted)
         fault_s = time.monotonic()
         await process.until_event("silent: no position and velocity from the autopilot for 2.")
         reacted("link-lost", time.monotonic() - fault_s)
-        await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        await process.until_mode()
         assert process.fake_autopilot.failsafe
         process.fake_autopilot.silent = False
-        sent = len(process.fake_autopilot.setpoints)
-        await until(lambda: process.heard()["flight"].message["heartbeat_age_s"] < 1.0, SECONDS_TO_FAIL)
-        await asyncio.sleep(QUIET_S)
-        assert len(process.fake_autopilot.setpoints) == sent
+        async with process.sends_nothing():
+            await process.until_linked()
         assert process.state() == "silent"
 
 
@@ -54,54 +53,28 @@ async def test_the_pilot_takes_over(tmp_path: Path, reacted: Reacted) -> None:
         await process.until_event("silent: the flight mode is position")
         await asyncio.sleep(QUIET_S)
         reacted("pilot-takes-over", max(0.0, process.last_setpoint_s() - fault_s))
-        sent = len(process.fake_autopilot.setpoints)
-        process.fake_autopilot.pilot_selects("LOITER")
-        await asyncio.sleep(QUIET_S)
-        assert len(process.fake_autopilot.setpoints) == sent
-        assert process.fake_autopilot.mode == "LOITER"
-        assert process.state() == "silent"
+        async with process.sends_nothing():
+            process.fake_autopilot.pilot_selects("LOITER")
+        assert (process.fake_autopilot.mode, process.state()) == ("LOITER", "silent")
 
 
-class _Refuses(FakeAutopilot):
-    """Offboard, with a reason that takes two messages."""
+class _Particular(FakeAutopilot):
+    """Notes the commands with which somebody has asked it to arm or to change its mode; it may refuse to change it."""
+
+    refuses: Callable[[Mode], bool] = staticmethod(lambda mode: False)
+    reason = ""
+    """Of its refusals, in messages of 50 bytes."""
+
+    def __init__(self, port: int, **options: Any) -> None:
+        super().__init__(port, **{"heartbeat_s": HEARTBEAT_S, "clock": clock, **options})
+        self.asked: list[int] = []
 
     def _select(self, mode: Mode, component: int) -> bool:
-        if mode != "OFFBOARD":
+        if not self.refuses(mode):
             return super()._select(mode, component)
-        for number in range(2):
-            part = REASON[50 * number : 50 * number + 50].encode()
-            self._mav.statustext_send(2, part, id=17, chunk_seq=number)
+        for at in range(0, len(self.reason), 50):
+            self._mav.statustext_send(2, self.reason[at : at + 50].encode(), id=17, chunk_seq=at // 50)
         return False
-
-
-@pytest.mark.fault("offboard-refused", within_s=2.0)
-@pytest.mark.fault("text-in-chunks")
-async def test_offboard_is_refused_and_the_whole_reason_reported(tmp_path: Path, port: int, reacted: Reacted) -> None:
-    with _Refuses(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
-        async with aboard(autopilot, port, tmp_path, change=never_alone) as ship:
-            await ship.is_ready_in_the_air()
-            await until(lambda: autopilot.has_ground_station, SECONDS_TO_FAIL)
-            asked_s = clock()
-            autopilot.send_from_elsewhere(_offboard())
-            await ship.until_event(f"the autopilot says: {REASON}")
-            reacted("offboard-refused", clock() - asked_s)
-            await asyncio.sleep(QUIET_S)
-            assert (ship.state(), autopilot.mode) == ("ready", "LOITER")
-
-
-def _offboard() -> bytes:
-    """A ground station's request."""
-    station = mavlink.MAVLink(None, srcSystem=255, srcComponent=mavlink.MAV_COMP_ID_MISSIONPLANNER)
-    request = station.command_long_encode(1, 1, mavlink.MAV_CMD_DO_SET_MODE, 0, 1, 6, 0, 0, 0, 0, 0)
-    return bytes(request.pack(station))
-
-
-class _Noting(FakeAutopilot):
-    """The commands with which somebody has asked it to arm or to change its mode."""
-
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self.asked: list[int] = []
 
     def _obey(self, command: int, message: Any) -> int:
         if command in {mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, mavlink.MAV_CMD_NAV_TAKEOFF}:
@@ -109,14 +82,49 @@ class _Noting(FakeAutopilot):
         return super()._obey(command, message)
 
 
+@pytest.mark.fault("offboard-refused", within_s=2.0)
+@pytest.mark.fault("text-in-chunks")
+async def test_offboard_is_refused_and_the_whole_reason_reported(tmp_path: Path, port: int, reacted: Reacted) -> None:
+    with _Particular(port, height_m=HOVER_M) as autopilot:
+        autopilot.refuses, autopilot.reason = (lambda mode: mode == "OFFBOARD"), REASON
+        async with aboard(autopilot, port, tmp_path, change=never_alone) as ship:
+            await ship.is_ready_in_the_air()
+            await until(lambda: autopilot.has_ground_station, SECONDS_TO_FAIL)
+            asked_s = clock()
+            station = mavlink.MAVLink(None, srcSystem=255, srcComponent=mavlink.MAV_COMP_ID_MISSIONPLANNER)
+            request = station.command_long_encode(1, 1, mavlink.MAV_CMD_DO_SET_MODE, 0, 1, 6, 0, 0, 0, 0, 0)
+            autopilot.send_from_elsewhere(bytes(request.pack(station)))
+            await ship.until_event(f"the autopilot says: {REASON}")
+            reacted("offboard-refused", clock() - asked_s)
+            await asyncio.sleep(QUIET_S)
+            assert (ship.state(), autopilot.mode) == ("ready", "LOITER")
+
+
+@pytest.mark.fault("silent-autopilot", within_s=2.0)
+async def test_an_autopilot_that_refuses_without_a_word_is_told_as_such(
+    tmp_path: Path, port: int, reacted: Reacted
+) -> None:
+    with _Particular(port, height_m=HOVER_M) as autopilot:
+        async with aboard(autopilot, port, tmp_path, change=never_alone) as ship:
+            await ship.is_ready_in_the_air()
+            await ship.flies()
+            autopilot.refuses = lambda mode: True
+            assert (await ship.ask("ask/land"))["accepted"] is True
+            asked_s = clock()
+            await ship.until_event("the autopilot was asked for hold, which was refused for now without a reason")
+            reacted("silent-autopilot", clock() - asked_s)
+            autopilot.refuses = lambda mode: False
+            await ship.until_mode("LAND")
+
+
 @pytest.mark.fault("landed-after-a-restart")
 async def test_started_in_the_air_and_landed_by_the_pilot_it_asks_for_nothing(tmp_path: Path, port: int) -> None:
-    with _Noting(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
+    with _Particular(port, height_m=HOVER_M) as autopilot:
         async with aboard(autopilot, port, tmp_path) as ship:
-            await until(lambda: "started" in ship.matters(), SECONDS_TO_FAIL)
+            await ship.until_matters("started")
             autopilot.pilot_selects("LAND")
             await until(lambda: not autopilot.armed, SECONDS_TO_FAIL)
-            await until(lambda: "not_armed" in ship.matters() and "started" not in ship.matters(), SECONDS_TO_FAIL)
+            await ship.until_matters("not_armed", over=("started",))
             await asyncio.sleep(2 * QUIET_S)
             assert (autopilot.armed, autopilot.asked, len(autopilot.setpoints)) == (False, [], 0)
 
@@ -125,9 +133,9 @@ async def test_started_in_the_air_and_landed_by_the_pilot_it_asks_for_nothing(tm
 async def test_the_pilot_changes_the_mode_while_it_climbs_and_by_hand_and_it_asks_for_nothing(
     tmp_path: Path, port: int
 ) -> None:
-    with _Noting(port, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
+    with _Particular(port) as autopilot:
         async with aboard(autopilot, port, tmp_path) as ship:
-            await until(lambda: "not_armed" in ship.matters() and "started" not in ship.matters(), SECONDS_TO_FAIL)
+            await ship.until_matters("not_armed", over=("started",))
             autopilot.pilot_arms()
             autopilot.pilot_selects("TAKEOFF")
             await until(lambda: float(autopilot.state.position[2]) < -0.5 * HOVER_M, SECONDS_TO_FAIL)
@@ -138,56 +146,115 @@ async def test_the_pilot_changes_the_mode_while_it_climbs_and_by_hand_and_it_ask
                 assert (autopilot.mode, autopilot.asked) == (mode, [])
 
 
-@pytest.mark.fault("battery-or-estimate", within_s=3.0)
-@pytest.mark.parametrize(
-    ("what", "value", "event", "configured", "mode"),
-    [
-        ("battery_share", 0.05, "battery_low", {}, "LOITER"),
-        ("battery_share", 0.05, "battery_low", {"safety__on_battery_low": "return"}, "RTL"),
-        ("estimate_ok", False, "position_lost", {}, "LOITER"),
-    ],
-    ids=["battery", "battery, to return", "estimate"],
+Happens = Callable[[FakeAutopilot], AbstractContextManager[object]]
+
+
+def _sets(**values: Any) -> Happens:
+    """Attributes of the autopilot, from now on."""
+    return lambda autopilot: nullcontext(vars(autopilot).update(values))
+
+
+def _parameter(autopilot: FakeAutopilot, **values: float) -> AbstractContextManager[object]:
+    return nullcontext(autopilot.parameters.update(values))
+
+
+def _jumps(*frame_off: float, heading_off_rad: float = 0.0) -> Happens:
+    return _sets(frame_off=np.array(frame_off), heading_off_rad=heading_off_rad)
+
+
+JUMPED = "asking: the autopilot's estimate of position or heading has jumped"
+FRAME = (JUMPED, "the autopilot's local frame jumped by ")
+FOREIGN = ("asking: another program sends setpoints: the autopilot follows ",)
+CHANGED = (
+    "the autopilot's COM_OBL_RC_ACT was changed in flight from 5 to -1",
+    "asking: the autopilot's COM_OBL_RC_ACT is -1: it would not stop",
 )
-async def test_the_battery_is_low_or_the_position_lost(
-    what: str, value: float, event: str, configured: dict[str, Any], mode: Mode, tmp_path: Path,
-    reacted: Reacted,
+
+
+@pytest.mark.fault("battery-or-estimate", within_s=3.0)
+@pytest.mark.fault("others-interfere", within_s=2.0)
+@pytest.mark.fault("frame-jumps", within_s=2.0)
+@pytest.mark.parametrize(
+    ("fault", "happens", "matter", "told", "mode"),
+    [
+        ("battery-or-estimate", _sets(battery_share=0.05), "battery_low", ("silent: ",), "LOITER"),
+        ("battery-or-estimate", _sets(battery_share=0.05), "battery_low", ("silent: ",), "RTL"),
+        ("battery-or-estimate", _sets(estimate_ok=False), "position_lost", ("silent: ",), "LOITER"),
+        ("others-interfere", partial(Foreigner, north_m_s=0.0, east_m_s=3.0), "foreign_setpoints", FOREIGN, "LOITER"),
+        ("others-interfere", partial(_parameter, COM_OBL_RC_ACT=-1), "parameters_unsuitable", CHANGED, "LOITER"),
+        ("frame-jumps", _jumps(0.0, 0.0, -4.0), "frame_jumped", FRAME, "LOITER"),
+        ("frame-jumps", _jumps(0.0, 0.0, 30.0), "frame_jumped", FRAME, "LOITER"),
+        ("frame-jumps", _jumps(20.0, 0.0, 0.0), "frame_jumped", FRAME, "LOITER"),
+        (
+            "frame-jumps", _jumps(0.0, 0.0, 0.0, heading_off_rad=0.8), "frame_jumped",
+            (JUMPED, "the autopilot's heading jumped by "), "LOITER",
+        ),
+    ],
+    ids=["battery", "battery, to return", "estimate", "foreign setpoints", "a parameter of the failsafe is changed",
+         "4 m up", "30 m down", "20 m north", "heading"],
+)  # fmt: skip
+async def test_what_it_must_not_fly_with_is_told_once_and_ends_in_hold(
+    fault: str, happens: Happens, matter: str, told: tuple[str, ...], mode: str, in_flight: InTheAir,
+    fake_autopilot: FakeAutopilot, reacted: Reacted,
 ) -> None:  # fmt: skip
-    async with flying(tmp_path, change=lambda config: changed(config, **configured)) as process:
-        setattr(process.fake_autopilot, what, value)
-        fault_s = time.monotonic()
-        await until(lambda: process.fake_autopilot.mode == mode, SECONDS_TO_FAIL)
-        reacted("battery-or-estimate", time.monotonic() - fault_s)
-        await process.until_event("silent: ")
-        await until(lambda: event in process.matters(), SECONDS_TO_FAIL)
-        sent = len(process.fake_autopilot.setpoints)
-        await asyncio.sleep(QUIET_S)
-        assert len(process.fake_autopilot.setpoints) == sent
+    """Not even one setpoint follows a jump."""
+    async with in_flight(partial(never_alone, on_battery_low="return" if mode == "RTL" else "hold")) as ship:
+        await asyncio.sleep(2.0)  # all parameters have been read
+        height_m, began_s = -float(fake_autopilot.state.position[2]), clock()
+        with happens(fake_autopilot):
+            await ship.until_event(told[0])
+            reacted(fault, clock() - began_s)
+            await ship.until_mode(mode)
+            assert clock() - began_s < 3.5
+            await ship.until_matters(matter)
+        assert not fake_autopilot.failsafe or matter == "position_lost"
+        await ship.until_state("silent")
+        async with ship.sends_nothing():
+            for beginning in told[1:]:
+                await ship.until_event(beginning)
+        assert [sum(event.startswith(beginning) for event in ship.events) for beginning in told] == [1] * len(told)
+        sunk_m_s = [asked.sink_m_s for at_s, asked in list(fake_autopilot.setpoints) if at_s > began_s]
+        assert max(map(abs, sunk_m_s), default=0.0) < 0.3
+        assert mode == "RTL" or -float(fake_autopilot.state.position[2]) == pytest.approx(height_m, abs=0.4)
 
 
 @pytest.mark.fault("heartbeats-lost", within_s=2.5)
 async def test_forty_heartbeats_are_lost_one_at_a_time_and_no_flight_ends(
-    tmp_path: Path, port: int, reacted: Reacted
+    tmp_path: Path, port: int, reacted: Reacted, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of PX4's, one a second; each of the forty could end a flight."""
+    """Of PX4's, one a second; each of the forty could end a flight. Time stands still while one is on its way."""
+    send, take, way_s = TelemetryStreams._send_heartbeat, ReceivedMessages._count_heartbeats, {"sent": 0.0, "came": 0.0}
+
+    def sends(streams: TelemetryStreams) -> None:
+        way_s["sent"] = 0.0 if streams.heartbeats_to_lose else time.monotonic()
+        send(streams)
+
+    def takes(messages: ReceivedMessages, time_s: float) -> None:
+        take(messages, time_s)
+        way_s["came"] = time.monotonic()
+
+    monkeypatch.setattr(TelemetryStreams, "_send_heartbeat", sends)
+    monkeypatch.setattr(ReceivedMessages, "_count_heartbeats", takes)
     with FakeAutopilot(port, height_m=HOVER_M, clock=clock) as autopilot:
         async with aboard(autopilot, port, tmp_path, change=never_alone) as ship:
             await ship.is_ready_in_the_air()
             await ship.flies()
+
+            def lost() -> int:
+                return int(ship.heard()["flight"].message["heartbeats_lost"])
+
+            monkeypatch.setattr(clock, "stands", lambda: way_s["sent"] > way_s["came"])
             slowest_s = 0.0
             for number in range(1, 41):
                 lost_s = clock()
                 autopilot.lose_heartbeats(1)
-                await until(lambda n=number: _heartbeats_lost(ship) >= n, SECONDS_TO_FAIL)  # type: ignore[misc]
+                await until(lambda n=number: lost() >= n, SECONDS_TO_FAIL)  # type: ignore[misc]
                 slowest_s = max(slowest_s, clock() - lost_s)
                 assert autopilot.mode == "OFFBOARD"
                 assert ship.state() in {"normal", "degraded"}
             reacted("heartbeats-lost", slowest_s - 1.0)
-            assert _heartbeats_lost(ship) == 40
+            assert lost() == 40
             assert sum(event.startswith("the autopilot's heartbeat did not come") for event in ship.events) <= 1
-
-
-def _heartbeats_lost(ship: Watched) -> int:
-    return int(ship.heard()["flight"].message["heartbeats_lost"])
 
 
 @pytest.mark.fault("failsafe-then-resume", within_s=2.0)
@@ -213,20 +280,6 @@ async def test_after_the_autopilots_failsafe_it_says_what_to_select_and_is_not_r
         fake_autopilot.pilot_selects("LOITER")
         await ship.until_state("ready")
         await ship.flies()
-
-
-@pytest.mark.fault("others-interfere", within_s=2.0)
-async def test_setpoints_of_another_program_are_told_and_end_in_hold(
-    in_flight: InTheAir, fake_autopilot: FakeAutopilot, reacted: Reacted
-) -> None:
-    async with in_flight() as ship:
-        began_s = clock()
-        with Foreigner(fake_autopilot, north_m_s=0.0, east_m_s=3.0):
-            await until(lambda: "foreign_setpoints" in ship.matters(), SECONDS_TO_FAIL)
-            reacted("others-interfere", clock() - began_s)
-            await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        assert not fake_autopilot.failsafe
-        await ship.until_event("asking: another program sends setpoints: the autopilot follows ")
 
 
 @pytest.mark.fault("setpoints-clipped", within_s=4.0)
@@ -267,46 +320,6 @@ async def test_a_small_jump_of_the_local_frame_is_said_and_flown_through(
             await asyncio.sleep(0.02)
 
 
-@pytest.mark.fault("frame-jumps", within_s=2.0)
-@pytest.mark.parametrize(
-    ("frame_off", "heading_off_rad"),
-    [((0.0, 0.0, -4.0), 0.0), ((0.0, 0.0, 30.0), 0.0), ((20.0, 0.0, 0.0), 0.0), ((0.0, 0.0, 0.0), 0.8)],
-    ids=["4 m up", "30 m down", "20 m north", "heading"],
-)
-async def test_a_large_jump_of_the_local_frame_or_the_heading_ends_in_hold(
-    frame_off: tuple[float, float, float],
-    heading_off_rad: float,
-    in_flight: InTheAir,
-    fake_autopilot: FakeAutopilot,
-    reacted: Reacted,
-) -> None:
-    async with in_flight() as ship:
-        height_m, jumped_s = -float(fake_autopilot.state.position[2]), clock()
-        fake_autopilot.frame_off, fake_autopilot.heading_off_rad = np.array(frame_off), heading_off_rad
-        await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted("frame-jumps", clock() - jumped_s)
-        assert not fake_autopilot.failsafe
-        await ship.until_event("asking: the autopilot's estimate of position or heading has jumped")
-        what = "heading" if heading_off_rad else "local frame"
-        assert sum(event.startswith(f"the autopilot's {what} jumped by ") for event in ship.events) == 1
-        asked_m_s = [asked.sink_m_s for at_s, asked in list(fake_autopilot.setpoints) if at_s > jumped_s]
-        assert all(abs(sink_m_s) < 0.3 for sink_m_s in asked_m_s), "not even one setpoint follows the jump"
-        assert -float(fake_autopilot.state.position[2]) == pytest.approx(height_m, abs=0.4)
-
-
-@pytest.mark.fault("others-interfere", within_s=2.0)
-async def test_a_parameter_of_the_failsafe_that_is_changed_in_flight_is_told_and_ends_in_hold(
-    in_flight: InTheAir, fake_autopilot: FakeAutopilot, reacted: Reacted
-) -> None:
-    async with in_flight() as ship:
-        await asyncio.sleep(2.0)  # all have been read
-        changed_s, fake_autopilot.parameters["COM_OBL_RC_ACT"] = clock(), -1
-        await ship.until_event("the autopilot's COM_OBL_RC_ACT was changed in flight from 5 to -1")
-        reacted("others-interfere", clock() - changed_s)
-        await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        await ship.until_event("asking: the autopilot's COM_OBL_RC_ACT is -1: it would not stop")
-
-
 @pytest.mark.fault("parameters-unsuitable")
 @pytest.mark.parametrize(("name", "value"), [("COM_OF_LOSS_T", 20.0), ("COM_OBL_RC_ACT", -1)])
 async def test_a_drone_whose_failsafe_would_not_stop_it_waits_and_says_why(
@@ -314,35 +327,12 @@ async def test_a_drone_whose_failsafe_would_not_stop_it_waits_and_says_why(
 ) -> None:
     fake_autopilot.parameters[name] = value
     async with aboard(fake_autopilot, port, tmp_path, change=never_alone) as ship:
-        await until(lambda: "parameters_unsuitable" in ship.matters(), SECONDS_TO_FAIL)
+        await ship.until_matters("parameters_unsuitable")
         assert any(f"the autopilot's {name} is {value:g}: " in str(heard.message) for heard in ship.heard().values())
         await asyncio.sleep(1.0)
         assert (ship.state(), len(fake_autopilot.setpoints)) == ("idle", 0)
         fake_autopilot.parameters[name] = {"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": 5}[name]
-        await until(lambda: "parameters_unsuitable" not in ship.matters(), SECONDS_TO_FAIL)
-
-
-class _RefusesToLeave(FakeAutopilot):
-    refuses = True
-
-    def _select(self, mode: Mode, component: int) -> bool:
-        return not self.refuses and super()._select(mode, component)
-
-
-@pytest.mark.fault("silent-autopilot", within_s=2.0)
-async def test_an_autopilot_that_refuses_without_a_word_is_told_as_such(
-    tmp_path: Path, port: int, reacted: Reacted
-) -> None:
-    with _RefusesToLeave(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
-        async with aboard(autopilot, port, tmp_path, change=never_alone) as ship:
-            await ship.is_ready_in_the_air()
-            await ship.flies()
-            assert (await ship.ask("ask/land"))["accepted"] is True
-            asked_s = clock()
-            await ship.until_event("the autopilot was asked for hold, which was refused for now without a reason")
-            reacted("silent-autopilot", clock() - asked_s)
-            autopilot.refuses = False
-            await until(lambda: autopilot.mode == "LAND", SECONDS_TO_FAIL)
+        await ship.until_matters(over=("parameters_unsuitable",))
 
 
 @pytest.mark.fault("landed-after-an-order", within_s=2.0)
@@ -353,7 +343,7 @@ async def test_landed_and_disarmed_after_an_operators_order_the_next_flight_may_
         assert (await ship.ask("ask/land"))["accepted"] is True
         await until(lambda: not fake_autopilot.armed, SECONDS_TO_FAIL)
         disarmed_s = clock()
-        await until(lambda: "not_armed" in ship.matters() and "land_asked" not in ship.matters(), SECONDS_TO_FAIL)
+        await ship.until_matters("not_armed", over=("land_asked",))
         reacted("landed-after-an-order", clock() - disarmed_s)
         fake_autopilot.pilot_arms()
         fake_autopilot.pilot_selects("TAKEOFF")

@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import re
 import resource
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
-import yaml
 
 from flockd.onboard.daemon import DaemonError
-from flockd.sim.sitl.ports import free_endpoint, free_port
 from tests.calm import SPEED_FACTOR, clock
 from tests.faults.conftest import InTheAir, never_alone
 from tests.faults.process import flying
 from tests.faults.stories import Reacted
 from tests.onboard.autopilot.flight import until
-from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, Aboard, config_for
+from tests.onboard.daemon.aboard import SECONDS_TO_FAIL
 
 pytestmark = pytest.mark.slow
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.fault("network-not-finite", within_s=2.0)
@@ -53,13 +49,10 @@ async def test_a_step_ends_in_an_error_that_nobody_expects(in_flight: InTheAir, 
 
         ship.perceiver.unexpected = 3
         fault_s = clock()
-        await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        await ship.until_mode()
         reacted("step-exception", clock() - fault_s)
         assert not ship.fake_autopilot.failsafe
-        with pytest.raises(
-            DaemonError,
-            match=r"StepsFailedError.*3 steps in a row failed",
-        ):
+        with pytest.raises(DaemonError, match=r"StepsFailedError.*3 steps in a row failed"):
             await ship.ending
 
 
@@ -73,30 +66,23 @@ async def test_a_network_never_returns(in_flight: InTheAir, reacted: Reacted) ->
         await ship.until_event("a step failed: a network call took longer than 0.5 s")
         # A network's deadlines pass in real time, which the flight's clock outruns.
         reacted("network-stuck", (clock() - fault_s) / SPEED_FACTOR)
-        await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        await ship.until_mode()
         assert not ship.fake_autopilot.failsafe
-        fed = ship.service.count("WATCHDOG=1")
-        await until(lambda: _is_not_fed(ship), SECONDS_TO_FAIL)
-        assert ship.service.count("WATCHDOG=1") >= fed
+        components = ship.daemon.components
+        assert components is not None
+        await until(lambda: components.networks.hopeless, SECONDS_TO_FAIL)
         before = ship.service.count("WATCHDOG=1")
         await asyncio.sleep(1.5)
         assert ship.service.count("WATCHDOG=1") == before, "only a new process can help"
 
 
-def _is_not_fed(ship: Aboard) -> bool:
-    components = ship.daemon.components
-    return components is not None and components.networks.hopeless
-
-
 @pytest.mark.fault("overrun", within_s=8.0)
 async def test_steps_take_longer_than_they_may(in_flight: InTheAir, reacted: Reacted) -> None:
     """Frames are not queued: each step takes the newest; the drone hovers and asks for Hold."""
-    change = functools.partial(never_alone, degraded_load=1.05, max_load=1.1)
-
-    async with in_flight(change) as ship:
+    async with in_flight(functools.partial(never_alone, degraded_load=1.05, max_load=1.1)) as ship:
         ship.perceiver.slow_s = 0.15
         fault_s = clock()
-        await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        await ship.until_mode()
         reacted("overrun", clock() - fault_s)
         assert not ship.fake_autopilot.failsafe
         (hover,) = [event for event in ship.events if event.startswith("hover: ")]
@@ -116,26 +102,9 @@ async def test_it_gets_too_hot(in_flight: InTheAir, reacted: Reacted, monkeypatc
         assert ship.fake_autopilot.mode == "OFFBOARD"
         temperature_c[0] = 97.0
         fault_s = clock()
-        await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        await ship.until_mode()
         reacted("overrun", clock() - fault_s)
         assert not ship.fake_autopilot.failsafe
-
-
-@pytest.mark.fault("task-dies", within_s=2.0)
-async def test_a_task_dies(in_flight: InTheAir, reacted: Reacted, monkeypatch: pytest.MonkeyPatch) -> None:
-    async with in_flight() as ship:
-
-        def dies(*_: object) -> None:
-            raise ArithmeticError("for the test")
-
-        monkeypatch.setattr("flockd.onboard.daemon.status._computer_message", dies)
-        fault_s = clock()
-        await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted("task-dies", clock() - fault_s)
-        assert not ship.fake_autopilot.failsafe
-        with pytest.raises(DaemonError, match="telemetry: ArithmeticError") as ended:
-            await ship.ending
-        assert ended.value.exit_code != 0
 
 
 @pytest.mark.fault("clock-jump")
@@ -157,7 +126,7 @@ async def test_the_memory_is_used_up_in_flight(tmp_path: Path, reacted: Reacted)
     async with flying(tmp_path) as process:
         fault_s = time.monotonic()
         resource.prlimit(process.program.process.pid, resource.RLIMIT_AS, (1, 1))
-        await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        await process.until_mode()
         reacted("out-of-memory", time.monotonic() - fault_s)
         process.signal(signal.SIGKILL)
         assert await process.ended() == -signal.SIGKILL
@@ -171,33 +140,22 @@ async def test_the_memory_is_used_up_in_flight(tmp_path: Path, reacted: Reacted)
 
 
 @pytest.mark.fault("computer-stalls", within_s=0.5)
-async def test_the_computer_stalls_for_seconds(tmp_path: Path, reacted: Reacted) -> None:
-    """Stopped for 3 s: the failsafe acts, and when it goes on it stays silent and says what happened."""
+@pytest.mark.fault("event-loop-stuck")
+async def test_the_computer_stalls(tmp_path: Path, reacted: Reacted) -> None:
+    """For 0.3 s, setpoints keep PX4's 2 Hz; for 3 s, the failsafe acts, and it stays silent and says what happened."""
     async with flying(tmp_path) as process:
+        process.signal(signal.SIGSTOP)
+        await asyncio.sleep(0.3)
+        process.signal(signal.SIGCONT)
+        sent = len(process.fake_autopilot.setpoints)
+        await until(lambda: len(process.fake_autopilot.setpoints) > sent + 20, SECONDS_TO_FAIL)
+        assert process.fake_autopilot.mode == "OFFBOARD"
         stopped_s = process.signal(signal.SIGSTOP)
         await asyncio.sleep(3.0)
         process.signal(signal.SIGCONT)
         reacted("computer-stalls", max(0.0, process.last_setpoint_s() - stopped_s))
         assert process.fake_autopilot.failsafe
         await process.until_event("silent: ")
-        sent = len(process.fake_autopilot.setpoints)
-        await asyncio.sleep(1.5)
-        assert len(process.fake_autopilot.setpoints) == sent, "one more, and PX4 would be in offboard again"
-        assert any("stall" in event or "stopped" in event or "late" in event for event in process.events)
-
-
-@pytest.mark.fault("nothing-left-at-start")
-def test_no_descriptors_are_left_at_the_start(tmp_path: Path) -> None:
-    """One sentence and exit code 69, however few there are; never an abort."""
-    config = config_for(free_port(), free_endpoint(), free_endpoint())
-    path = tmp_path / "drone.yaml"
-    path.write_text(yaml.safe_dump(config.model_dump(mode="json", exclude_defaults=True)), encoding="utf-8")
-    run = "from flockd.cli import program; program()"
-    for limit, count in ((resource.RLIMIT_NOFILE, 24), (resource.RLIMIT_NOFILE, 40), (resource.RLIMIT_AS, 450 << 20)):
-        ended = subprocess.run(
-            [sys.executable, "-c", run, "run", "--config", str(path)], cwd=ROOT, capture_output=True, text=True,
-            check=False, timeout=60.0,
-            preexec_fn=functools.partial(resource.setrlimit, limit, (count, count)),
-        )  # fmt: skip
-        assert ended.returncode == 69, ended.stderr[-1000:]
-        assert "Traceback" not in ended.stderr
+        async with process.sends_nothing():
+            pass
+        assert any(re.match(r"silent: .*the event loop is [23]\.\d+ s late", event) for event in process.events)

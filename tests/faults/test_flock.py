@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from flockd.core.config import DroneConfig
 from flockd.core.messages import FrameSet, Neighbour, PilotOutput, VehicleState
 from flockd.flight.pilot import FlockPilot
 from flockd.flight.tracking.tracker import Tracker
@@ -39,7 +39,7 @@ async def test_a_neighbour_comes_too_near(
         fault_s = clock()
         await until(lambda: ship.fake_autopilot.setpoints[-1][1].velocity[0] <= 0.01, SECONDS_TO_FAIL)
         reacted("neighbour-too-near", clock() - fault_s)
-        await until(lambda: "neighbour_close" in ship.matters(), SECONDS_TO_FAIL)
+        await ship.until_matters("neighbour_close")
         near_s = clock()
         await until(lambda: clock() > near_s + 1.0, SECONDS_TO_FAIL)
         sent = [setpoint.velocity[0] for at_s, setpoint in list(ship.fake_autopilot.setpoints) if at_s > near_s]
@@ -55,10 +55,7 @@ async def test_all_neighbours_are_lost(in_the_air: InTheAir, reacted: Reacted, m
     """It flies on as desired, to the north, and not after the one that was last seen in the east; then Hold."""
     seen = [neighbour([0.0, 3.5, 0.0], [1.0, 0.0, 0.0])]
     monkeypatch.setattr(Tracker, "neighbours", lambda _: tuple(seen))
-
-    def change(config: DroneConfig) -> DroneConfig:
-        return changed(config, safety__neighbours_timeout_s=1.0, safety__alone_s=3.0)
-
+    change = partial(changed, safety__neighbours_timeout_s=1.0, safety__alone_s=3.0)
     async with in_the_air(change=change) as ship:
         await ship.until_state("idle")
         await until(lambda: ship.matters() == {"started", "not_offboard"}, SECONDS_TO_FAIL)
@@ -67,11 +64,11 @@ async def test_all_neighbours_are_lost(in_the_air: InTheAir, reacted: Reacted, m
         await ship.flies()
         seen.clear()
         fault_s = clock()
-        await until(lambda: "neighbours_lost" in ship.matters(), SECONDS_TO_FAIL)
+        await ship.until_matters("neighbours_lost")
         assert ship.fake_autopilot.mode == "OFFBOARD"
         velocity = ship.fake_autopilot.setpoints[-1][1].velocity
         np.testing.assert_allclose(velocity, [1.0, 0.0], atol=0.2)
-        await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        await ship.until_mode()
         reacted("alone", clock() - fault_s)
         assert not ship.fake_autopilot.failsafe
         await ship.until_event("asking: no neighbour seen for ")
@@ -113,11 +110,7 @@ async def test_a_command_that_cannot_be_flown(
 @pytest.mark.fault("fence-left", within_s=6.0)
 async def test_the_fence_is_left(tmp_path: Path, reacted: Reacted) -> None:
     """It wants to go on to the north, stops before the fence 4 m from home, and is carried over it."""
-
-    def fenced(config: DroneConfig) -> DroneConfig:
-        return changed(never_alone(config), safety__gate__fence_radius_m=4.0)
-
-    async with flying(tmp_path, change=fenced) as process:
+    async with flying(tmp_path, change=partial(never_alone, gate__fence_radius_m=4.0)) as process:
         autopilot = process.fake_autopilot
         await until(lambda: float(autopilot.state.position[0]) > 2.5, SECONDS_TO_FAIL)
         while float(autopilot.state.position[0]) < 4.6:  # a tick of its own thread brakes it

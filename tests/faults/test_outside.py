@@ -5,13 +5,13 @@ from __future__ import annotations
 import itertools
 import json
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
 
-from flockd.core.config import DroneConfig
 from flockd.sim.sitl.ports import free_endpoint
 from tests.faults.process import Process, flying
 from tests.make import changed
@@ -19,8 +19,6 @@ from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, client
 
 pytestmark = pytest.mark.slow
-RUN = "from flockd.cli import program; program()"
-ROOT = Path(__file__).parents[2]
 
 
 async def _flies_on(process: Process) -> None:
@@ -44,12 +42,8 @@ def _router(endpoint: str) -> tuple[Any, list[str]]:
 @pytest.mark.fault("telemetry-router-gone")
 async def test_the_router_of_the_telemetry_goes_and_comes_back(tmp_path: Path) -> None:
     endpoint = free_endpoint()
-
-    def through_a_router(config: DroneConfig) -> DroneConfig:
-        return changed(config, telemetry__connect=(endpoint,))
-
     router, keys = _router(endpoint)
-    async with flying(tmp_path, change=through_a_router) as process:
+    async with flying(tmp_path, change=partial(changed, telemetry__connect=(endpoint,))) as process:
         await until(lambda: "flockd/v1/test/tiny/flight" in keys, SECONDS_TO_FAIL)
         gone_s = time.monotonic()
         router.close()

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from flockd.core.choices import HeightSource
-from flockd.core.config import DroneConfig
 from flockd.core.messages import FloatArray, RangeReading
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
@@ -29,7 +27,6 @@ pytestmark = pytest.mark.slow
 LIE, WORKS = "height: the range contradicts the barometer", "height: the range finder works again"
 NOTICED_M = 1.3
 """A contradiction of a metre and 8 % of the range is noticed."""
-QUIET_S = 1.5
 
 
 class _Lying(FakeRangeFinder):
@@ -45,13 +42,6 @@ class _Lying(FakeRangeFinder):
     ) -> RangeReading | None:
         reading, lie = super().read(time_s, position, velocity, R_ned_body), self.lie
         return reading if reading is None or lie is None else replace(reading, range_m=lie(reading.range_m), quality=1)
-
-
-def _by(source: HeightSource) -> Callable[[DroneConfig], DroneConfig]:
-    def change(config: DroneConfig) -> DroneConfig:
-        return changed(config, perception__height=source)
-
-    return change
 
 
 def _climbing(autopilot: FakeAutopilot) -> Demand:
@@ -81,7 +71,7 @@ async def test_the_range_finder_lies(
     lie: Callable[[float], float], climbs: bool, tmp_path: Path, reacted: Reacted
 ) -> None:
     sensor = _Lying()
-    async with drone(tmp_path, change=_by("best"), range_finder=sensor) as process:
+    async with drone(tmp_path, change=partial(changed, perception__height="best"), range_finder=sensor) as process:
         await _flies_by_range(process)
         autopilot, told = process.fake_autopilot, len(process.events)
         sensor.lie = lie
@@ -104,15 +94,15 @@ async def test_the_range_finder_lies(
 @pytest.mark.fault("range-finder-lies", within_s=3.0)
 async def test_without_the_barometer_a_lie_is_no_scale_and_ends_in_hold(tmp_path: Path, reacted: Reacted) -> None:
     sensor = _Lying()
-    async with drone(tmp_path, change=_by("range_finder"), range_finder=sensor) as process:
+    async with drone(
+        tmp_path, change=partial(changed, perception__height="range_finder"), range_finder=sensor
+    ) as process:
         await _flies_by_range(process)
         sensor.lie = lambda range_m: 0.3
         fault_s = time.monotonic()
         await process.until_event(f"{LIE}; there is no scale")
         reacted("range-finder-lies", time.monotonic() - fault_s)
-        await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        await process.until_mode()
         await process.until_event("silent: ")
-        sensor.lie = None
-        sent = len(process.fake_autopilot.setpoints)
-        await asyncio.sleep(QUIET_S)
-        assert len(process.fake_autopilot.setpoints) == sent, "no return by itself"
+        async with process.sends_nothing():
+            sensor.lie = None

@@ -15,7 +15,6 @@ from flockd.onboard.recording.reader import Recording
 from tests.faults.process import Process, flying
 from tests.faults.stories import Reacted
 from tests.onboard.autopilot.flight import until
-from tests.onboard.daemon.aboard import SECONDS_TO_FAIL
 
 pytestmark = pytest.mark.slow
 MB = 1 << 20
@@ -37,7 +36,7 @@ async def test_sigterm_in_flight(tmp_path: Path, reacted: Reacted) -> None:
         path = _recording(process)
         await asyncio.sleep(2.0)
         asked_s = process.signal(signal.SIGTERM)
-        await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        await process.until_mode()
         reacted("sigterm", time.monotonic() - asked_s)
         assert not process.fake_autopilot.failsafe, "Hold was asked for"
         assert process.standing_still(asked_s + 0.3) or process.last_setpoint_s() < asked_s + 0.3
@@ -56,7 +55,7 @@ async def test_it_is_killed_while_it_records(
     async with flying(tmp_path) as process:
         found.append(await _has_recorded(process, 150_000))
         killed_s = process.signal(signal.SIGKILL)
-        await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        await process.until_mode()
         reacted("killed-while-recording", time.monotonic() - killed_s)
         assert process.fake_autopilot.failsafe, "nobody was there to ask for Hold"
     whole = tmp_path / "whole.mcap"

@@ -172,25 +172,6 @@ def test_without_px4_it_says_what_to_do(
     assert capsys.readouterr().err.endswith(f"\nthere is no PX4 in {tmp_path}, which FLOCKD_PX4 names; {wanted}")
 
 
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        (["--speed-factor", "0.5"], "--speed-factor is for real daemons; drop it, or name their --autopilot"),
-        (
-            ["--autopilot", "fake", "--speed-factor", "0.01"],
-            "--speed-factor 0.01 is not from 0.02 to 10; choose another",
-        ),
-        (
-            ["--autopilot", "fake", "--perception", "truth"],
-            "--perception truth has no meaning with real daemons, which have their own; drop it",
-        ),
-    ],
-)
-def test_options_that_do_not_go_together(options: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["sim", *options]) == 2
-    assert capsys.readouterr().err == f"{told}\n"
-
-
 def test_the_ground_station_knows_where_everybody_truly_is() -> None:
     """Two metres up, three north and four east of the world's origin, told in degrees and turned by a quarter."""
     port = free_port()

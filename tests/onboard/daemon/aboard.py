@@ -49,6 +49,8 @@ SPEED_M_S = 1.0
 COMMANDS: tuple[OperatorCommand, ...] = ("resume", "land", "goto", "velocity")
 SECONDS_TO_FAIL = 60.0
 """Limit on the event loop's clock. Nothing is promised within it: it ends a story that hangs."""
+QUIET_S = 1.5
+"""For which nothing may be sent; PX4 would be back in offboard with one setpoint."""
 PATIENT = SafetyParameters(degraded_load=50.0, max_load=100.0, max_loop_lag_s=2.0, recovery_s=0.5)
 """These stories are not about how fast the computer is that tells them."""
 
@@ -213,6 +215,26 @@ class Watched:
 
     async def until_event(self, beginning: str) -> None:
         await until(lambda: any(event.startswith(beginning) for event in self.events), SECONDS_TO_FAIL)
+
+    async def until_matters(self, *events: str, over: tuple[str, ...] = ()) -> None:
+        """Until these events of the supervisor are there, and those that are ``over`` are not."""
+        await until(lambda: {*events} <= self.matters() and not {*over} & self.matters(), SECONDS_TO_FAIL)
+
+    async def until_mode(self, mode: str = "LOITER") -> None:
+        """Until the autopilot is in it; ours is Hold."""
+        await until(lambda: self.fake_autopilot.mode == mode, SECONDS_TO_FAIL)
+
+    async def until_linked(self) -> None:
+        """Until the autopilot's heartbeats come."""
+        await until(lambda: self.heard()["flight"].message["heartbeat_age_s"] < 1.0, SECONDS_TO_FAIL)
+
+    @asynccontextmanager
+    async def sends_nothing(self) -> AsyncIterator[None]:
+        """No setpoint meanwhile, nor for a while afterwards."""
+        sent = len(self.fake_autopilot.setpoints)
+        yield
+        await asyncio.sleep(QUIET_S)
+        assert len(self.fake_autopilot.setpoints) == sent, "one more, and PX4 would be in offboard again"
 
     async def steps_on(self, more: int = 4) -> None:
         """Until so many steps more were made, and one."""

@@ -22,6 +22,7 @@ from flockd.onboard.recording.reader import Recording
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.sitl.ports import free_port
 from tests.calm import clock
+from tests.faults.stories import Reacted
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import CAMERAS, PATIENT, SECONDS_TO_FAIL, SPEED_M_S, STEP_S, TinyPerceiver, aboard
@@ -236,17 +237,19 @@ async def test_at_its_end_a_mission_hands_over_to_the_autopilot(
         await ship.until_state("silent", "idle")
 
 
-@pytest.mark.fault("task-dies")
+@pytest.mark.fault("task-dies", within_s=2.0)
 @pytest.mark.parametrize(
     ("task", "function"),
     [
         ("control", "flockd.onboard.daemon.control.Control.tick"),
         ("pilot", "flockd.onboard.daemon.pilot_loop.PilotLoop._step"),
+        ("telemetry", "flockd.onboard.daemon.status._computer_message"),
     ],
 )
 async def test_a_dead_task_is_held_by_the_last_resort(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch, task: str, function: str
-) -> None:
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch, task: str,
+    function: str, reacted: Reacted,
+) -> None:  # fmt: skip
     async with aboard(fake_autopilot, port, tmp_path) as ship:
         await ship.is_ready_in_the_air()
         await ship.flies()
@@ -255,10 +258,13 @@ async def test_a_dead_task_is_held_by_the_last_resort(
             raise ArithmeticError("for the test")
 
         monkeypatch.setattr(function, dies)
-        await until(lambda: fake_autopilot.mode == "LOITER", 2.0)
+        fault_s = clock()
+        await ship.until_mode()
+        reacted("task-dies", clock() - fault_s)
         assert not fake_autopilot.failsafe
-        with pytest.raises(DaemonError, match=rf"a task died \({task}: ArithmeticError\('for the test'\)\)"):
+        with pytest.raises(DaemonError, match=rf"{task}: ArithmeticError") as ended:
             await ship.ending
+        assert ended.value.exit_code != 0
 
 
 async def test_the_pilot_brings_it_up_and_it_flies_at_the_height_that_is_configured(tmp_path: Path, port: int) -> None:
