@@ -42,10 +42,11 @@ test-all: lint ### lint and all tests, those too that take minutes each
 ros: $(ROS_VENV)/ros.installed ### what needs ROS 2: nodes in processes of their own, cameras by topic; with the times it takes
 	$(ROS_VENV)/bin/python -m pytest -m ros -rP tests/fleet/ros tests/tools/release/test_licences.py
 
-faults: $(VENV)/test.installed ### the slow stories of faults of a whole daemon
+faults: $(VENV)/test.installed ### the slow stories of faults of a whole drone, and 20 s of flight from pixels; in about MINUTES minutes
 	$(BIN)/python -m pytest -n 2 -m "slow and fault and not whole_flight and not browser and not ros" --durations=10
+	$(BIN)/python -m pytest -m slow tests/sim/flock/test_swarm.py -k twenty_seconds_from_pixels
 
-flights: $(VENV)/test.installed ### flights of minutes: encounters, 20 s from pixels, two daemons, PX4's test card; in about half an hour
+flights: $(VENV)/test.installed ### flights of minutes: encounters, two daemons, PX4's test card; in about half an hour
 	$(BIN)/python -m pytest -n 2 -m "slow and whole_flight and not browser and not ros" --durations=10
 
 training: $(VENV)/test.installed $(VENV)/train.installed ### the tests of the networks' training, with torch (0.9 GB; with CUDA several)

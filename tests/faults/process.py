@@ -6,7 +6,7 @@ import functools
 import os
 import signal
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from flockd.core.config import DroneConfig
 from flockd.core.messages import UInt8Array
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.sim.sitl.daemons import Daemons
 from flockd.sim.sitl.ports import free_endpoint, free_port
 from flockd.sim.sitl.processes import Program
@@ -64,18 +62,6 @@ class Process(Watched):
         self.program.process.send_signal(number)
         return time.monotonic()
 
-    def last_setpoint_s(self) -> float:
-        """When the newest came, on the monotonic clock."""
-        return self.fake_autopilot.setpoints[-1][0]
-
-    def standing_still(self, after_s: float) -> bool:
-        """Setpoints came after this time, and all of them command standstill.
-
-        But for what the gate adds to bring a drone there that still moves.
-        """
-        sent = [setpoint for at_s, setpoint in list(self.fake_autopilot.setpoints) if at_s > after_s]
-        return bool(sent) and all(np.linalg.norm(one.velocity) < 0.2 for one in sent)
-
     async def ended(self, timeout_s: float = SECONDS_TO_START) -> int:
         """Its exit code, once it has ended."""
         await until(lambda: self.program.ended is not None, timeout_s)
@@ -84,59 +70,26 @@ class Process(Watched):
 
 
 @asynccontextmanager
-async def drone(
-    folder: Path,
-    *,
-    change: Callable[[DroneConfig], DroneConfig] = lambda config: config,
-    height_m: float = HOVER_M,
-    environment: Mapping[str, str] | None = None,
-    range_finder: FakeRangeFinder | None = None,
-) -> AsyncIterator[Process]:
-    """A daemon with the shipped networks, started beside a vehicle in the air; its recordings go to ``folder``.
+async def flying(folder: Path) -> AsyncIterator[Process]:
+    """A daemon with the shipped networks in offboard flight at cruise speed; its recordings go to ``folder``.
 
-    Flying alone is no fault to it unless ``change`` says so.
-
-    Args:
-        folder: an existing one, whose path is short enough for a socket.
-        change: makes another configuration of the usual one.
-        height_m: of the vehicle at the start; 0 for the ground.
-        environment: beside this process's own.
-        range_finder: the autopilot's.
+    Flying alone is no fault to it. The folder exists, and its path is short enough for a socket.
     """
     port, frames, telemetry = free_port(), free_endpoint(), free_endpoint()
-    config = config_for(port, frames, telemetry)
-    config = change(changed(config, safety__alone_s=None))
+    config = changed(config_for(port, frames, telemetry), safety__alone_s=None)
     cameras = Cameras(frames, view)
-    known = {**os.environ, **(environment or {})}
     try:
         with (
-            FakeAutopilot(port, height_m=height_m, heartbeat_s=HEARTBEAT_S, range_finder=range_finder) as autopilot,
-            Daemons([config], folder=folder, recordings=folder, environment=known) as daemons,
+            FakeAutopilot(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S) as autopilot,
+            Daemons([config], folder=folder, recordings=folder, environment=os.environ) as daemons,
             watched(telemetry) as (watcher, session, events),
         ):
             daemons.start()
             process = Process(config, autopilot, cameras, watcher, session, events, daemons, folder)
+            await until(lambda: daemons.is_ready(0) or process.program.ended is not None, SECONDS_TO_START)
+            assert process.program.ended is None, process.program.last_output()
+            await process.is_ready_in_the_air()
+            await process.flies()
             yield process
     finally:
         cameras.close()
-
-
-async def started(process: Process) -> None:
-    """It has said that it is ready."""
-    await until(lambda: process.daemons.is_ready(0) or process.program.ended is not None, SECONDS_TO_START)
-    assert process.program.ended is None, process.program.last_output()
-
-
-@asynccontextmanager
-async def flying(
-    folder: Path,
-    *,
-    change: Callable[[DroneConfig], DroneConfig] = lambda config: config,
-    range_finder: FakeRangeFinder | None = None,
-) -> AsyncIterator[Process]:
-    """The same, in offboard flight at cruise speed."""
-    async with drone(folder, change=change, range_finder=range_finder) as process:
-        await started(process)
-        await process.is_ready_in_the_air()
-        await process.flies()
-        yield process

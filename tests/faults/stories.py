@@ -2,7 +2,7 @@
 
 A story is a test with the marker ``@pytest.mark.fault(NAME, within_s=...)``. It asserts what `faults.yaml` promises,
 and with the fixture `reacted` notes how long the reaction took, which `within_s` limits. `pytest -m fault` runs
-all, with `--fault NAME` those of one; most of the slow ones start a whole drone (`tests.faults.process`).
+all, with `--fault NAME` those of one; those of the process itself start one (`tests.faults.process`).
 """
 
 from __future__ import annotations
@@ -37,6 +37,8 @@ class Story(NamedTuple):
     fault: str
     test: str
     within_s: float | None
+    runs: str
+    """Where: in CI, by hand with `make flights`, or with PX4."""
 
 
 @cache
@@ -63,8 +65,9 @@ def stories() -> list[Story]:
 
 
 def _of_file(path: Path) -> Iterator[Story]:
-    file = str(path.relative_to(ROOT))
-    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+    file, source = str(path.relative_to(ROOT)), path.read_text(encoding="utf-8")
+    runs = "PX4" if file.startswith("tests/sitl/") else "flights" if "pytest.mark.whole_flight" in source else "CI"
+    for node in ast.parse(source).body:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             marked, test = list[ast.AST](node.decorator_list), f"{file}::{node.name}"
         elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "pytestmark":
@@ -74,4 +77,4 @@ def _of_file(path: Path) -> Iterator[Story]:
         for call in (call for one in marked for call in ast.walk(one) if isinstance(call, ast.Call)):
             if ast.unparse(call.func) == "pytest.mark.fault":
                 within_s = {key.arg: ast.literal_eval(key.value) for key in call.keywords}.get("within_s")
-                yield Story(ast.literal_eval(call.args[0]), test, within_s)
+                yield Story(ast.literal_eval(call.args[0]), test, within_s, runs)

@@ -20,7 +20,6 @@ from flockd.sim.autopilot.fake_telemetry import Mode, TelemetryStreams
 from flockd.sim.autopilot.fake_vehicle import Demand
 from tests.calm import clock
 from tests.faults.conftest import InTheAir, never_alone
-from tests.faults.process import flying
 from tests.faults.stories import Reacted
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import Foreigner, until
@@ -31,31 +30,31 @@ REASON = "Arming and offboard are denied: the estimator of this vehicle has not 
 
 
 @pytest.mark.fault("link-lost", within_s=3.5)
-async def test_the_link_is_lost_and_comes_back(tmp_path: Path, reacted: Reacted) -> None:
-    async with flying(tmp_path) as process:
-        process.fake_autopilot.silent = True
-        fault_s = time.monotonic()
-        await process.until_event("silent: no position and velocity from the autopilot for 2.")
-        reacted("link-lost", time.monotonic() - fault_s)
-        await process.until_mode()
-        assert process.fake_autopilot.failsafe
-        process.fake_autopilot.silent = False
-        async with process.sends_nothing():
-            await process.until_linked()
-        assert process.state() == "silent"
+async def test_the_link_is_lost_and_comes_back(in_flight: InTheAir, reacted: Reacted) -> None:
+    async with in_flight() as ship:
+        ship.fake_autopilot.silent = True
+        fault_s = clock()
+        await ship.until_event("silent: no position and velocity from the autopilot for 2.")
+        reacted("link-lost", clock() - fault_s)
+        await ship.until_mode()
+        assert ship.fake_autopilot.failsafe
+        ship.fake_autopilot.silent = False
+        async with ship.sends_nothing():
+            await ship.until_linked()
+        assert ship.state() == "silent"
 
 
 @pytest.mark.fault("pilot-takes-over", within_s=0.3)
-async def test_the_pilot_takes_over(tmp_path: Path, reacted: Reacted) -> None:
-    async with flying(tmp_path) as process:
-        fault_s = time.monotonic()
-        process.fake_autopilot.pilot_selects("POSCTL")
-        await process.until_event("silent: the flight mode is position")
+async def test_the_pilot_takes_over(in_flight: InTheAir, reacted: Reacted) -> None:
+    async with in_flight() as ship:
+        fault_s = clock()
+        ship.fake_autopilot.pilot_selects("POSCTL")
+        await ship.until_event("silent: the flight mode is position")
         await asyncio.sleep(QUIET_S)
-        reacted("pilot-takes-over", max(0.0, process.last_setpoint_s() - fault_s))
-        async with process.sends_nothing():
-            process.fake_autopilot.pilot_selects("LOITER")
-        assert (process.fake_autopilot.mode, process.state()) == ("LOITER", "silent")
+        reacted("pilot-takes-over", max(0.0, ship.last_setpoint_s() - fault_s))
+        async with ship.sends_nothing():
+            ship.fake_autopilot.pilot_selects("LOITER")
+        assert (ship.fake_autopilot.mode, ship.state()) == ("LOITER", "silent")
 
 
 class _Particular(FakeAutopilot):
@@ -352,17 +351,16 @@ async def test_landed_and_disarmed_after_an_operators_order_the_next_flight_may_
 
 
 @pytest.mark.fault("ground-reached", within_s=6.0)
-async def test_the_ground_is_reached_in_flight(tmp_path: Path, reacted: Reacted) -> None:
-    """The vehicle sinks whatever it is told; its barometer says zero and less. Landing is reported and recorded."""
-    async with flying(tmp_path) as process:
-        autopilot = process.fake_autopilot
+async def test_the_ground_is_reached_in_flight(in_flight: InTheAir, reacted: Reacted) -> None:
+    """The vehicle sinks whatever it is told; its barometer says zero and less. Landing is reported."""
+    async with in_flight() as ship:
+        autopilot = ship.fake_autopilot
         autopilot._demand = lambda: Demand(np.zeros(2), 0.4, 0.0)  # type: ignore[method-assign]
         await until(lambda: float(autopilot.state.position[2]) > -0.1, SECONDS_TO_FAIL)
-        fault_s = time.monotonic()
-        await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted("ground-reached", time.monotonic() - fault_s)
-        await until(lambda: process.heard()["flight"].message["in_air"] is False, SECONDS_TO_FAIL)
-        assert any("land" in event or "ground" in event for event in process.events), process.events
-        await process.steps_on(3)
-        assert process.program.ended is None
-        assert "Traceback" not in process.log()
+        fault_s = clock()
+        await ship.until_mode()
+        reacted("ground-reached", clock() - fault_s)
+        await until(lambda: ship.heard()["flight"].message["in_air"] is False, SECONDS_TO_FAIL)
+        assert any("land" in event or "ground" in event for event in ship.events), ship.events
+        await ship.steps_on(3)
+        assert not ship.ending.done()

@@ -1,4 +1,4 @@
-"""Faults of cameras, while a whole drone flies: `flockd run` as a process of its own, with the shipped networks."""
+"""Faults of cameras, while a whole drone flies."""
 
 from __future__ import annotations
 
@@ -11,40 +11,44 @@ from pathlib import Path
 import pytest
 
 from flockd.core.messages import Frame
+from tests.calm import clock
+from tests.faults.conftest import InTheAir
 from tests.faults.process import Process, flying
 from tests.faults.stories import Reacted
 from tests.onboard.autopilot.flight import until
-from tests.onboard.daemon.aboard import CAMERAS, SECONDS_TO_FAIL
+from tests.onboard.daemon.aboard import CAMERAS, SECONDS_TO_FAIL, Watched
 
 pytestmark = pytest.mark.slow
 NOTICED_S = 0.8
 """Three frame periods at 5 Hz, and some."""
+STANDS_S = 1.4
+"""From the last good frame: another period, these, and to brake from 1 m/s."""
 
 
 @pytest.mark.fault("camera-unplugged", within_s=3.0)
 @pytest.mark.fault("frozen-frames", within_s=3.0)
 @pytest.mark.parametrize("fault", ["camera-unplugged", "frozen-frames"])
-async def test_no_camera_delivers_anything_new(fault: str, tmp_path: Path, reacted: Reacted) -> None:
-    async with flying(tmp_path) as process:
+async def test_no_camera_delivers_anything_new(fault: str, in_flight: InTheAir, reacted: Reacted) -> None:
+    async with in_flight() as ship:
         if fault == "camera-unplugged":
-            process.cameras.silent |= set(CAMERAS)
+            ship.cameras.silent |= set(CAMERAS)
         else:
-            process.cameras.spoil = lambda frame: replace(frame, sequence=17)
-        fault_s = time.monotonic()
-        await process.until_mode()
-        reacted(fault, time.monotonic() - fault_s)
-        assert not process.fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
-        assert process.standing_still(fault_s + NOTICED_S + 0.3)
+            ship.cameras.spoil = lambda frame: replace(frame, sequence=17)
+        fault_s = clock()
+        await ship.until_mode()
+        reacted(fault, clock() - fault_s)
+        assert not ship.fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
+        assert ship.standing_still(fault_s + STANDS_S)
         why = "front silent, back silent" if fault == "camera-unplugged" else "front frozen, back frozen"
-        await process.until_event(f"hover: too few cameras deliver images: {why}")
-        await process.until_event("silent: ")
-        async with process.sends_nothing():
-            process.cameras.silent.clear()
-            _good_again(process)
-            await until(lambda: _all_see(process), SECONDS_TO_FAIL)
-            await process.until_state("silent")
-        assert (await process.ask("ask/resume"))["accepted"] is True
-        await process.until_state("ready")
+        await ship.until_event(f"hover: too few cameras deliver images: {why}")
+        await ship.until_event("silent: ")
+        async with ship.sends_nothing():
+            ship.cameras.silent.clear()
+            _good_again(ship)
+            await until(lambda: _all_see(ship), SECONDS_TO_FAIL)
+            await ship.until_state("silent")
+        assert (await ship.ask("ask/resume"))["accepted"] is True
+        await ship.until_state("ready")
 
 
 def _stamped_back(frame: Frame) -> Frame:
@@ -65,59 +69,59 @@ def _cut_off(frame: Frame) -> Frame:
     ],
 )
 async def test_every_second_frame_is_worth_nothing(
-    fault: str, spoil: Callable[[Frame], Frame], counts: tuple[str, ...], tmp_path: Path, reacted: Reacted
+    fault: str, spoil: Callable[[Frame], Frame], counts: tuple[str, ...], in_flight: InTheAir, reacted: Reacted
 ) -> None:
     """They are dropped and counted, and the drone flies on, slower, by the others."""
-    async with flying(tmp_path) as process:
-        process.cameras.spoil = spoil
-        fault_s = time.monotonic()
-        await process.until_matters("frames_dropped")
-        reacted(fault, time.monotonic() - fault_s)
-        await process.steps_on(3)
-        assert process.fake_autopilot.mode == "OFFBOARD"
-        assert sum(_counted(process, "front", what) for what in counts) > 1
-        _good_again(process)
-        await process.until_matters(over=("frames_dropped",))
-        await process.until_state("normal")
+    async with in_flight() as ship:
+        ship.cameras.spoil = spoil
+        fault_s = clock()
+        await ship.until_matters("frames_dropped")
+        reacted(fault, clock() - fault_s)
+        await ship.steps_on(3)
+        assert ship.fake_autopilot.mode == "OFFBOARD"
+        assert sum(_counted(ship, "front", what) for what in counts) > 1
+        _good_again(ship)
+        await ship.until_matters(over=("frames_dropped",))
+        await ship.until_state("normal")
 
 
 @pytest.mark.fault("one-camera-gone", within_s=2.0)
-async def test_one_of_two_cameras_is_gone_and_comes_back(tmp_path: Path, reacted: Reacted) -> None:
-    async with flying(tmp_path) as process:
-        process.cameras.silent.add("back")
-        fault_s = time.monotonic()
-        await process.until_event("degraded: a camera is lost: back silent")
-        reacted("one-camera-gone", time.monotonic() - fault_s)
-        await process.steps_on(3)
-        assert process.fake_autopilot.mode == "OFFBOARD"
-        await process.until_matters("camera_lost")  # as often as it is published
-        process.cameras.silent.clear()
-        await process.until_matters(over=("camera_lost",))
-        await process.until_state("normal")
+async def test_one_of_two_cameras_is_gone_and_comes_back(in_flight: InTheAir, reacted: Reacted) -> None:
+    async with in_flight() as ship:
+        ship.cameras.silent.add("back")
+        fault_s = clock()
+        await ship.until_event("degraded: a camera is lost: back silent")
+        reacted("one-camera-gone", clock() - fault_s)
+        await ship.steps_on(3)
+        assert ship.fake_autopilot.mode == "OFFBOARD"
+        await ship.until_matters("camera_lost")  # as often as it is published
+        ship.cameras.silent.clear()
+        await ship.until_matters(over=("camera_lost",))
+        await ship.until_state("normal")
 
 
 @pytest.mark.fault("time-stamps-jump", within_s=4.0)
 @pytest.mark.parametrize("ahead_s", [3.0, 86_400.0, -86_400.0, 1e300], ids=["3 s", "a day", "a day ago", "absurd"])
-async def test_a_frame_of_another_time_silences_nobody(ahead_s: float, tmp_path: Path, reacted: Reacted) -> None:
+async def test_a_frame_of_another_time_silences_nobody(ahead_s: float, in_flight: InTheAir, reacted: Reacted) -> None:
     """Three frames of one camera; all good ones after it are used at once."""
     spoiled: list[float] = []
 
     def of_another_time(frame: Frame) -> Frame:
         if frame.camera != "front" or len(spoiled) >= 3:
             return frame
-        spoiled.append(time.monotonic())
+        spoiled.append(clock())
         return replace(frame, time_s=frame.time_s + ahead_s)
 
-    async with flying(tmp_path) as process:
-        steps = process.heard()["computer"].message["steps"]
-        process.cameras.spoil = of_another_time
+    async with in_flight() as ship:
+        steps = ship.heard()["computer"].message["steps"]
+        ship.cameras.spoil = of_another_time
         await until(lambda: len(spoiled) == 3, SECONDS_TO_FAIL)
-        await until(lambda: _counted(process, "front", "time_stamp") == 3, SECONDS_TO_FAIL)
-        await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
-        await until(lambda: _all_see(process), SECONDS_TO_FAIL)
-        reacted("time-stamps-jump", time.monotonic() - spoiled[-1])
-        assert process.fake_autopilot.mode == "OFFBOARD"
-        await process.until_state("normal")
+        await until(lambda: _counted(ship, "front", "time_stamp") == 3, SECONDS_TO_FAIL)
+        await until(lambda: ship.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+        await until(lambda: _all_see(ship), SECONDS_TO_FAIL)
+        reacted("time-stamps-jump", clock() - spoiled[-1])
+        assert ship.fake_autopilot.mode == "OFFBOARD"
+        await ship.until_state("normal")
 
 
 @pytest.mark.fault("noisy-camera", within_s=4.0)
@@ -145,14 +149,14 @@ def _speed_north(process: Process) -> float:
     return float(process.heard()["command"].message["velocity_ne"][0])
 
 
-def _counted(process: Process, camera: str, what: str) -> int:
-    return int(process.heard()["computer"].message["cameras"][camera]["counts"].get(what, 0))
+def _counted(ship: Watched, camera: str, what: str) -> int:
+    return int(ship.heard()["computer"].message["cameras"][camera]["counts"].get(what, 0))
 
 
-def _all_see(process: Process) -> bool:
-    cameras = process.heard()["computer"].message["cameras"].values()
+def _all_see(ship: Watched) -> bool:
+    cameras = ship.heard()["computer"].message["cameras"].values()
     return all(camera["fault"] is None and camera["age_s"] < NOTICED_S for camera in cameras)
 
 
-def _good_again(process: Process) -> None:
-    process.cameras.spoil = lambda frame: frame
+def _good_again(ship: Watched) -> None:
+    ship.cameras.spoil = lambda frame: frame

@@ -142,10 +142,10 @@ async def test_the_memory_is_used_up_in_flight(tmp_path: Path, reacted: Reacted)
 @pytest.mark.fault("computer-stalls", within_s=0.5)
 @pytest.mark.fault("event-loop-stuck")
 async def test_the_computer_stalls(tmp_path: Path, reacted: Reacted) -> None:
-    """For 0.3 s, setpoints keep PX4's 2 Hz; for 3 s, the failsafe acts, and it stays silent and says what happened."""
+    """For 0.2 s, setpoints keep PX4's 2 Hz; for 3 s, the failsafe acts, and it stays silent and says what happened."""
     async with flying(tmp_path) as process:
         process.signal(signal.SIGSTOP)
-        await asyncio.sleep(0.3)
+        await asyncio.sleep(0.2)
         process.signal(signal.SIGCONT)
         sent = len(process.fake_autopilot.setpoints)
         await until(lambda: len(process.fake_autopilot.setpoints) > sent + 20, SECONDS_TO_FAIL)

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
-import time
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,11 +12,12 @@ import pytest
 from flockd.core.messages import FrameSet, Neighbour, PilotOutput, VehicleState
 from flockd.flight.pilot import FlockPilot
 from flockd.flight.tracking.tracker import Tracker
+from flockd.sim.autopilot.fake_vehicle import Demand
 from tests.calm import clock
 from tests.faults.conftest import InTheAir, never_alone
-from tests.faults.process import flying
 from tests.faults.stories import Reacted
 from tests.make import changed, neighbour
+from tests.onboard.autopilot.conftest import HOVER_M
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL
 
@@ -108,20 +106,21 @@ async def test_a_command_that_cannot_be_flown(
 
 
 @pytest.mark.fault("fence-left", within_s=6.0)
-async def test_the_fence_is_left(tmp_path: Path, reacted: Reacted) -> None:
+async def test_the_fence_is_left(in_flight: InTheAir, reacted: Reacted) -> None:
     """It wants to go on to the north, stops before the fence 4 m from home, and is carried over it."""
-    async with flying(tmp_path, change=partial(never_alone, gate__fence_radius_m=4.0)) as process:
-        autopilot = process.fake_autopilot
+    async with in_flight(partial(never_alone, gate__fence_radius_m=4.0)) as ship:
+        autopilot = ship.fake_autopilot
         await until(lambda: float(autopilot.state.position[0]) > 2.5, SECONDS_TO_FAIL)
-        while float(autopilot.state.position[0]) < 4.6:  # a tick of its own thread brakes it
-            autopilot.state.velocity[0] = 2.0
-            await asyncio.sleep(0.01)
-        fault_s = time.monotonic()
-        await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        reacted("fence-left", time.monotonic() - fault_s)
+        obeys = autopilot._demand
+        autopilot._demand = lambda: Demand(np.array([2.0, 0.0]), -HOVER_M, 0.0)  # type: ignore[method-assign]
+        await until(lambda: float(autopilot.state.position[0]) > 4.6, SECONDS_TO_FAIL)
+        autopilot._demand = obeys  # type: ignore[method-assign]
+        fault_s = clock()
+        await ship.until_mode()
+        reacted("fence-left", clock() - fault_s)
         assert not autopilot.failsafe
         assert float(autopilot.state.position[0]) < 6.0
         late = [setpoint.velocity[0] for at_s, setpoint in list(autopilot.setpoints) if at_s > fault_s + 1.0]
         assert late
         assert max(late) < 0.05, "nothing outward"
-        assert any("outside the fence" in event for event in process.events)
+        assert any("outside the fence" in event for event in ship.events)

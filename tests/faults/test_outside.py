@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import json
-import time
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
 
 from flockd.sim.sitl.ports import free_endpoint
-from tests.faults.process import Process, flying
+from tests.calm import clock
+from tests.faults.conftest import InTheAir, never_alone
 from tests.make import changed
 from tests.onboard.autopilot.flight import until
-from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, client
+from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, Aboard, client
 
 pytestmark = pytest.mark.slow
 
 
-async def _flies_on(process: Process) -> None:
-    await process.steps_on()
-    assert process.fake_autopilot.mode == "OFFBOARD"
-    assert process.program.ended is None
+async def _flies_on(ship: Aboard) -> None:
+    await ship.steps_on()
+    assert ship.fake_autopilot.mode == "OFFBOARD"
+    assert not ship.ending.done()
 
 
 def _router(endpoint: str) -> tuple[Any, list[str]]:
@@ -40,15 +39,15 @@ def _router(endpoint: str) -> tuple[Any, list[str]]:
 
 
 @pytest.mark.fault("telemetry-router-gone")
-async def test_the_router_of_the_telemetry_goes_and_comes_back(tmp_path: Path) -> None:
+async def test_the_router_of_the_telemetry_goes_and_comes_back(in_flight: InTheAir) -> None:
     endpoint = free_endpoint()
     router, keys = _router(endpoint)
-    async with flying(tmp_path, change=partial(changed, telemetry__connect=(endpoint,))) as process:
+    async with in_flight(lambda config: changed(never_alone(config), telemetry__connect=(endpoint,))) as ship:
         await until(lambda: "flockd/v1/test/tiny/flight" in keys, SECONDS_TO_FAIL)
-        gone_s = time.monotonic()
+        gone_s = clock()
         router.close()
-        await _flies_on(process)
-        sent = [at_s for at_s, _ in list(process.fake_autopilot.setpoints) if at_s > gone_s]
+        await _flies_on(ship)
+        sent = [at_s for at_s, _ in list(ship.fake_autopilot.setpoints) if at_s > gone_s]
         gaps = [after - before for before, after in itertools.pairwise(sent)]
         assert max(gaps) < 0.5, "PX4 wants two setpoints a second"
         router, keys = _router(endpoint)
@@ -57,17 +56,21 @@ async def test_the_router_of_the_telemetry_goes_and_comes_back(tmp_path: Path) -
 
 
 @pytest.mark.fault("malformed-telemetry")
-async def test_nonsense_on_the_telemetry_bus(tmp_path: Path) -> None:
+async def test_nonsense_on_the_telemetry_bus(in_flight: InTheAir) -> None:
     """The drone reads nothing but questions; `hold` is not among `telemetry.commands` of this one."""
-    async with flying(tmp_path) as process:
-        session = zenoh.open(client(process.config.telemetry.listen[0]))
+    async with in_flight() as ship:
+        session = zenoh.open(client(ship.config.telemetry.listen[0]))
         key = "flockd/v1/test/tiny"
         for payload in (b"\xff\x00", b"[" * 10_000, b"", json.dumps({"time_s": "now"}).encode()):
             for topic in ("state", "flight", "ask/hold", "ask/land", "about", "alive", "image/front", "x/y/z"):
                 session.put(f"{key}/{topic}", payload)
         for question in ("ask/hold", "ask/HOLD", "ask/land/now", "ask/*", "image/none", "image/" + "x" * 500):
-            list(session.get(f"{key}/{question}", payload=b"\xff" * 1000, timeout=1.0))
-        assert (await process.ask("ask/hold"))["accepted"] is False
-        await _flies_on(process)
-        assert not any("asked for land" in event for event in process.events)
+            await asyncio.to_thread(_asked, session, f"{key}/{question}")
+        assert (await ship.ask("ask/hold"))["accepted"] is False
+        await _flies_on(ship)
+        assert not any("asked for land" in event for event in ship.events)
         session.close()  # type: ignore[no-untyped-call]
+
+
+def _asked(session: zenoh.Session, question: str) -> None:
+    list(session.get(question, payload=b"\xff" * 1000, timeout=1.0))

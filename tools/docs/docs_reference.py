@@ -403,17 +403,19 @@ def _stories() -> list[str]:
         "## Stories",
         "",
         "The faults that flockd has to survive, by the name that `pytest -m fault --fault NAME` takes, and the tests",
-        "that inject each. Seconds: the longest reaction that they allow.",
+        "that inject each. s: the longest reaction that they allow. Run: by CI (`.ci/run`), by hand (`make flights`),",
+        "or with PX4.",
         "",
-        "| | fault | what happens | what flockd does | s | shown by |",
-        "|---|---|---|---|---|---|",
+        "| | fault | what happens | what flockd does | s | run | shown by |",
+        "|---|---|---|---|---|---|---|",
     ]
-    told = stories()
+    known = stories()
     for name, fault in faults().items():
-        limits = [story.within_s for story in told if story.fault == name and story.within_s is not None]
-        tests = ", ".join(f"`{story.test.removeprefix('tests/')}`" for story in told if story.fault == name)
-        within = f"{max(limits):g}" if limits else ""
-        lines.append(f"| {fault.row} | `{name}` | {fault.fault} | {fault.reaction} | {within} | {tests} |")
+        told = [story for story in known if story.fault == name]
+        limits = [story.within_s for story in told if story.within_s is not None]
+        tests = ", ".join(f"`{story.test.removeprefix('tests/')}`" for story in told)
+        within, runs = f"{max(limits):g}" if limits else "", ", ".join(sorted({story.runs for story in told}))
+        lines.append(f"| {fault.row} | `{name}` | {fault.fault} | {fault.reaction} | {within} | {runs} | {tests} |")
     return lines
 
 

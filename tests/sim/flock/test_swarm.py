@@ -135,7 +135,6 @@ def test_each_drone_decides_from_its_own_images_alone() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.whole_flight
 def test_twenty_seconds_from_pixels() -> None:
     """Seed 0: 2.25 m, 0.9996, 0.968 (confirmation takes time). Of a flock that sees nobody, two come within 1.2 m."""
     from flockd.review.report.summary import summarise
