@@ -150,12 +150,17 @@ def fly(flight: Flight, kind: AutopilotKind, speed_factor: float, out: Path) -> 
     scenario = _scenario(flight, out)
     if not flight.by_sight:
         sitl = sitl.model_copy(update={"safety": sitl.safety.model_copy(update={"alone_s": None})})
-    operator = _Order(flight.order, flight.order_at_s if flight.order else None, endpoint)
-    origin = _Origin(flight.origin_up_m)
+    once: list[tuple[float, list[str]]] = []
+    if flight.order:
+        once.append((flight.order_at_s, [sys.executable, "-c", _RUN, "fleet", *flight.order, "--listen", endpoint]))
+    if flight.origin_up_m:  # of the first instance, which begins at sea level
+        place = (*REFERENCE_DEG, flight.origin_up_m)
+        program = str(px4_folder(os.environ) / "bin/px4-commander")
+        once.append((SET_ORIGIN_S, [program, "--instance", "0", "set_ekf_origin", *(f"{one:g}" for one in place)]))
 
     def progress(flown_s: int, of_s: int) -> None:
-        operator.progress(flown_s, of_s)
-        origin.progress(flown_s)
+        while once and flown_s >= once[0][0]:
+            subprocess.Popen(once.pop(0)[1], stdout=subprocess.DEVNULL)
 
     with ExitStack() as stack:
         if flight.busy:
@@ -218,41 +223,6 @@ def _worst(off_m_s: FloatArray) -> float:
     """Root mean square over the steps of each drone of (S, N) m/s, the largest; NaN where none flew."""
     flown = off_m_s[:, np.isfinite(off_m_s).any(axis=0)]
     return round(float(np.sqrt(np.nanmean(flown**2, axis=0)).max(initial=0.0)), 3) if flown.size else float("nan")
-
-
-class _Order:
-    """An operator's order, sent once by `flockd fleet` while the flight goes on."""
-
-    def __init__(self, words: Sequence[str], at_s: float | None, endpoint: str) -> None:
-        """``words``: what is typed after `flockd fleet`; ``at_s``: when; None: never."""
-        self._words, self._at_s, self._endpoint = words, at_s, endpoint
-        self._sent: subprocess.Popen[bytes] | None = None
-
-    def progress(self, flown_s: int, of_s: int) -> None:
-        """Called again and again while the fleet flies."""
-        if self._at_s is None or flown_s < self._at_s or self._sent is not None:
-            return
-        self._sent = subprocess.Popen(
-            [sys.executable, "-c", _RUN, "fleet", *self._words, "--listen", self._endpoint],
-            stdout=subprocess.DEVNULL,
-        )  # fmt: skip
-
-
-class _Origin:
-    """Sets the origin of PX4's first instance once, which begins at sea level."""
-
-    def __init__(self, up_m: float) -> None:
-        self._up_m, self._done = up_m, up_m == 0.0
-
-    def progress(self, flown_s: int) -> None:
-        """Called again and again while it flies."""
-        if self._done or flown_s < SET_ORIGIN_S:
-            return
-        self._done = True
-        north_deg, east_deg = REFERENCE_DEG
-        program = px4_folder(os.environ) / "bin/px4-commander"
-        place = f"{north_deg:g}", f"{east_deg:g}", f"{self._up_m:g}"
-        subprocess.run([program, "--instance", "0", "set_ekf_origin", *place], check=True, capture_output=True)
 
 
 def _scenario(flight: Flight, folder: Path) -> ScenarioConfig:
