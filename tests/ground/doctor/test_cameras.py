@@ -5,8 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,9 +49,12 @@ def _config(*names: str, controls: Sequence[ControlParameters] = BY_HAND) -> Dro
     return DroneConfig(rig=rig, source=SourceParameters(kind="v4l2", cameras=devices))
 
 
-def _examined(config: DroneConfig, kernel: FakeKernel, start_s: float = 60.0) -> dict[str, list[Finding]]:
+def _examined(
+    config: DroneConfig, devices: FakeKernel | Devices | None = None, start_s: float = 60.0
+) -> dict[str, list[Finding]]:
     found: dict[str, list[Finding]] = {}
-    for finding in check_cameras(config, SECONDS, Devices(kernel), start_s):
+    used = Devices(devices) if isinstance(devices, FakeKernel) else devices
+    for finding in check_cameras(config, SECONDS, used, start_s):
         found.setdefault(finding.about, []).append(finding)
     return found
 
@@ -68,6 +70,11 @@ def test_two_cameras_that_run_as_they_should() -> None:
         assert "calibration fits 640x480, 94 degrees wide" in finding.measured
     assert found["rig"][0].level is Level.WARNING, "both look forward"
     assert not kernel.open_files, "all are given back"
+    with filming(kernel, "front"):
+        found = _examined(_config("front", controls=()), kernel)
+    _problem(found, Level.WARNING, "its exposure is not configured")
+    cameras, camera, _ = check_cameras(_config("front").model_copy(update={"source": None}), SECONDS)
+    assert (cameras.level, camera.level) == (Level.WARNING, Level.PASS), "without a source it can be simulated"
 
 
 def _problem(found: dict[str, list[Finding]], level: Level, told: str, about: str = "camera front") -> Finding:
@@ -119,13 +126,6 @@ def test_time_stamps_of_another_clock_are_no_image_at_all() -> None:
     _problem(found, Level.FAILURE, "gave no usable image for 3 s (the last was refused: time stamp)")
 
 
-def test_an_exposure_that_is_not_configured() -> None:
-    kernel = FakeKernel(front=FakeCamera())
-    with filming(kernel, "front"):
-        found = _examined(_config("front", controls=()), kernel)
-    _problem(found, Level.WARNING, "its exposure is not configured")
-
-
 def test_cameras_that_do_not_open_are_reported_one_by_one() -> None:
     taken, small, busless = FakeCamera(), FakeCamera(formats=((320, 240, b"MJPG"),)), FakeCamera(rates=(10,))
     kernel = FakeKernel(taken=taken, small=small, busless=busless, controlled=FakeCamera())
@@ -167,67 +167,41 @@ def test_a_pipeline_is_watched_as_a_device_is() -> None:
     rig = RigConfig(cameras=tuple(CameraConfig(name=name, size_px=(64, 48), intrinsics=lens) for name in names))
     cameras = tuple(CameraDeviceParameters(name=n, pipeline=text, rate_hz=40.0) for n, text in names.items())
     config = DroneConfig(rig=rig, source=SourceParameters(kind="gstreamer", cameras=cameras))
-    found: dict[str, list[Finding]] = {}
-    for finding in check_cameras(config, SECONDS, Devices(command=fake)):
-        found.setdefault(finding.about, []).append(finding)
+    found = _examined(config, Devices(command=fake), 10.0)
     told = " ".join(finding.measured for finding in found["camera front"])
     assert "images a second" in told
     assert "exposure is not configured" not in told, "a pipeline sets its own"
     _problem(found, Level.FAILURE, "its pipeline has failed (no such sensor)", "camera back")
 
 
-def _shared(endpoint: str) -> DroneConfig:
+def test_frames_of_another_program() -> None:
+    """Those that fit, those of another size, and none at all."""
+    endpoint, ended, width = free_endpoint(), threading.Event(), 64
     lens = IntrinsicsConfig(fx=32.0, fy=32.0, cx=32.0, cy=24.0)
     rig = RigConfig(cameras=(CameraConfig(name="front", size_px=(64, 48), intrinsics=lens),))
     where = SharedMemoryParameters(drone="tiny", connect=(endpoint,), rate_hz=20.0)
-    return DroneConfig(rig=rig, source=SourceParameters(kind="shared_memory", shared_memory=where))
-
-
-@contextmanager
-def _publishing(endpoint: str, size: tuple[int, int]) -> Iterator[None]:
-    ended = threading.Event()
+    config = DroneConfig(rig=rig, source=SourceParameters(kind="shared_memory", shared_memory=where))
     publisher = FramePublisher(listen=[endpoint])
 
     def publish() -> None:
         rng, number, began_s = np.random.default_rng(0), 0, time.monotonic()
         while not ended.wait(0.05):
             number += 1
-            image = rng.integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+            image = rng.integers(0, 256, (48, width, 3), dtype=np.uint8)
             publisher.publish("tiny", Frame("front", image, began_s + 0.05 * number, number))
 
     thread = threading.Thread(target=publish)
     thread.start()
     try:
-        yield
+        found = _examined(config)["camera front"]
+        assert "20.0 of 20 images a second, jitter 0.0 ms, no gaps" in found[0].measured
+        width = 32
+        _problem(_examined(config), Level.FAILURE, "frames are 32x48, but the rig has 64x48")
     finally:
         ended.set()
         thread.join()
         publisher.close()
-
-
-def test_frames_of_another_program() -> None:
-    endpoint = free_endpoint()
-    with _publishing(endpoint, (64, 48)):
-        found = {finding.about: finding for finding in check_cameras(_shared(endpoint), SECONDS)}
-    assert "20.0 of 20 images a second, jitter 0.0 ms, no gaps" in found["camera front"].measured
-
-
-def test_frames_of_the_wrong_size_and_none_at_all() -> None:
-    endpoint = free_endpoint()
-    with _publishing(endpoint, (32, 48)):
-        problem = next(iter(check_cameras(_shared(endpoint), SECONDS)))
-    assert (problem.level, problem.measured) == (Level.FAILURE, "frames are 32x48, but the rig has 64x48")
-    problem = next(iter(check_cameras(_shared(endpoint), SECONDS, start_s=0.3)))
-    assert problem.level is Level.FAILURE
-    assert problem.measured == f"no frame of tiny/front came from {endpoint} within 0.3 s"
-
-
-def test_a_drone_without_a_source_is_only_for_the_simulator() -> None:
-    config = _config("front").model_copy(update={"source": None})
-    first, camera, _ = check_cameras(config, SECONDS)
-    assert (first.level, first.about) == (Level.WARNING, "cameras")
-    assert camera.level is Level.PASS
-    assert camera.measured == "calibration fits 640x480, 94 degrees wide"
+    _problem(_examined(config, start_s=0.3), Level.FAILURE, f"no frame of tiny/front came from {endpoint} within 0.3 s")
 
 
 QUADROTOR = load_drone(data_path("config") / "quadrotor.yaml").rig
@@ -272,8 +246,10 @@ def test_a_calibration_of_another_size_or_lens_is_reported(lens: dict[str, objec
 
 
 def test_four_cameras_see_all_around_and_three_do_not() -> None:
+    """And how far off the horizon: between two pinholes, 45 degrees off each axis, an edge at 320 of 222 px is at
+    atan(320 / 222 * cos 45)."""
     assert coverage(QUADROTOR).level is Level.PASS
-    assert coverage(SIMULATOR).level is Level.PASS
+    assert "all around to 45 degrees off it" in coverage(SIMULATOR).measured
     three = RigConfig(cameras=tuple(camera for camera in QUADROTOR.cameras if camera.name != "back"))
     found = coverage(three)
     assert found.level is Level.WARNING
@@ -281,16 +257,6 @@ def test_four_cameras_see_all_around_and_three_do_not() -> None:
     assert "from 139 to 221 degrees" in found.measured
     ahead_is_blind = RigConfig(cameras=tuple(camera for camera in QUADROTOR.cameras if camera.name != "front"))
     assert "from 319 to 41 degrees" in coverage(ahead_is_blind).measured
-
-
-def test_it_says_how_far_up_and_down_they_see_all_around() -> None:
-    """Between two pinholes, 45 degrees off each axis, an edge at 320 of 222 px is at atan(320 / 222 * cos 45)."""
-    assert "all around to 45 degrees off it" in coverage(SIMULATOR).measured
-
-
-def test_cameras_that_face_the_ground_see_no_horizon() -> None:
-    down = [
-        camera.model_copy(update={"extrinsics": camera.extrinsics.model_copy(update={"pitch_deg": -90.0})})
-        for camera in SIMULATOR.cameras
-    ]
-    assert coverage(RigConfig(cameras=tuple(down[:1]))).level is Level.FAILURE
+    front = SIMULATOR.cameras[0]
+    down = front.model_copy(update={"extrinsics": front.extrinsics.model_copy(update={"pitch_deg": -90.0})})
+    assert coverage(RigConfig(cameras=(down,))).level is Level.FAILURE

@@ -10,7 +10,7 @@ from flockd.core.config.drone import DroneConfig
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.messages import PilotOutput
-from flockd.ground.doctor import Check, Level, run_checks
+from flockd.ground.doctor import Level
 from flockd.ground.doctor.model_checks import STEPS, check_models, judge_steps, meadow, time_steps
 from tests.flight.inference.conftest import copies
 from tests.onboard.daemon.aboard import TinyPerceiver
@@ -29,41 +29,21 @@ def test_a_flipped_bit_is_a_failure_of_that_model_alone(copies: Path) -> None:
     content = bytearray((copies / "distance_int8.onnx").read_bytes())
     content[len(content) // 2] ^= 1
     (copies / "distance_int8.onnx").write_bytes(content)
-    flow, neighbours, detector, distance, verification = check_models(_with(models_dir=str(copies)))
-    good = {
-        "flow_int8": flow,
-        "neighbours_int8": neighbours,
-        "detector": detector,
-        "verification_int8": verification,
-    }
-    for name, finding in good.items():
-        assert (finding.level, finding.about) == (Level.PASS, f"model {name}")
-        assert "hash and golden output are right" in finding.measured
-        assert "run by CPUExecutionProvider" in finding.measured
-    assert (distance.level, distance.about) == (Level.FAILURE, "model distance_int8")
-    assert "was changed or damaged" in distance.measured
-    assert distance.fix == "restore it, or export it again with its manifest"
-
-
-def test_a_folder_that_is_not_there_is_a_failure(tmp_path: Path) -> None:
-    check = Check("models", lambda: check_models(_with(models_dir=str(tmp_path / "none"))), 60.0)
-    (finding,) = run_checks([check], lambda done, total: None)["models"]
-    assert finding.level is Level.FAILURE
-    assert finding.measured == f"perception.models_dir: {tmp_path / 'none'} is no folder"
+    found = {finding.about: finding for finding in check_models(_with(models_dir=str(copies)))}
+    names = ("flow_int8", "neighbours_int8", "detector", "distance_int8", "verification_int8")
+    assert list(found) == [f"model {name}" for name in names]
+    failed = [about for about, finding in found.items() if finding.level is not Level.PASS]
+    assert failed == ["model distance_int8"]
+    assert "was changed or damaged" in found["model distance_int8"].measured
 
 
 def test_whole_steps_are_timed_and_the_pilot_sees_its_way() -> None:
+    first, second = meadow((64, 48), 0), meadow((64, 48), 1)
+    assert (first[24:, 4:] == second[24:, :-4]).all(), "the grass passes by"
     timed = time_steps(TINY, TinyPerceiver())
     assert len(timed) == STEPS
     assert all(seconds > 0.0 for seconds, _ in timed)
     assert timed[-1][1].stages_ms.keys() >= {"scene", "flow", "detection"}
-
-
-def test_the_grass_passes_by() -> None:
-    first, second = meadow((64, 48), 0), meadow((64, 48), 1)
-    assert first.shape == (48, 64, 3)
-    assert (first[24:, 4:] == second[24:, :-4]).all()
-    assert (first != second).any()
 
 
 def _timed(seconds: float) -> list[tuple[float, PilotOutput]]:
@@ -79,9 +59,4 @@ def test_the_first_step_warms_up_and_the_others_have_half_a_second(seconds: floa
     finding = judge_steps(TINY, _timed(seconds), busy=0.5, cores=2)
     assert (finding.level, finding.about) == (level, "step")
     assert f"a step takes {1e3 * seconds:.0f} of 500 ms with 2 threads and 1 camera" in finding.measured
-
-
-def test_a_busy_computer_is_reported() -> None:
-    assert judge_steps(TINY, _timed(0.7), busy=9.0, cores=2).fix.startswith(
-        "stop other programs first (a load of 9 on 2 cores)"
-    )
+    assert judge_steps(TINY, _timed(0.7), busy=9.0, cores=2).fix.startswith("stop other programs first")

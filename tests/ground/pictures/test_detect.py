@@ -40,13 +40,8 @@ def told_json(capsys: Capture, *arguments: object) -> dict[str, Any]:
 
 def test_a_labelled_folder_is_measured(capsys: Capture) -> None:
     result = told_json(capsys, RENDERED, *FOV, "--labels", LABELS)
-    assert list(result) == [
-        "images", "pictures", "proposals_per_image", "ms_per_image", "boxes", "by_width", "ap50",
-         "measured", "false", "false_per_picture", "false_per_picture_95", "left_out",
-    ]  # fmt: skip
-    assert (result["images"], result["boxes"]) == (10, 9)
-    assert result["proposals_per_image"] > 0
-    assert result["ms_per_image"] > 0
+    assert (result["images"], result["boxes"], result["measured"], result["left_out"]) == (10, 9, 10, [])
+    assert min(result["proposals_per_image"], result["ms_per_image"]) > 0
     distances, boxes = truth()
     widths = [box[2] for box in boxes.values()]
     by_width = result["by_width"]
@@ -63,7 +58,6 @@ def test_a_labelled_folder_is_measured(capsys: Capture) -> None:
         assert picture["file"] == str(RENDERED / name)
         if name in before_sky:
             (one,) = picture["detections"]
-            assert list(one) == ["box", "probability", "range_m", "range_sigma_m", "size_m"]
             left, top, width, height = boxes[name]
             assert np.allclose(one["box"], (left, top, left + width, top + height), atol=8)
             assert one["range_m"] == pytest.approx(distances[name], rel=0.06)
@@ -72,24 +66,19 @@ def test_a_labelled_folder_is_measured(capsys: Capture) -> None:
 
 
 @pytest.mark.parametrize(
-    ("image", "given"),
+    ("image", "camera", "given"),
     [
-        (None, "not None; cv2.imread gives None for a file that it cannot read"),
-        (np.zeros((360, 480), np.uint8), r"not uint8 of the shape \(360, 480\)"),
-        (np.zeros((360, 480, 3)), r"not float64 of the shape \(360, 480, 3\)"),
+        (None, {}, "not None; cv2.imread gives None for a file that it cannot read"),
+        (np.zeros((360, 480), np.uint8), {}, r"not uint8 of the shape \(360, 480\)"),
+        (np.zeros((360, 480, 3)), {}, r"not float64 of the shape \(360, 480, 3\)"),
+        (np.zeros((360, 480, 3), np.uint8), {}, "and not both"),
+        (np.zeros((360, 480, 3), np.uint8), {"camera": camera_with_fov(SIZE, FOV_DEG), "fov_deg": 70.0}, "not both"),
     ],
-    ids=["not read", "grey", "floats"],
+    ids=["not read", "grey", "floats", "no camera", "two cameras"],
 )
-def test_what_is_no_rgb_image_is_refused(image: Any, given: str) -> None:
+def test_what_is_no_rgb_image_of_one_camera_is_refused(image: Any, camera: dict[str, Any], given: str) -> None:
     with pytest.raises(ValueError, match=given):
-        PictureDetector().detect(image, fov_deg=FOV_DEG)
-
-
-def test_a_pictures_camera_is_given_once() -> None:
-    detector, image = PictureDetector(), np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-    for arguments in ({}, {"camera": camera_with_fov(SIZE, FOV_DEG), "fov_deg": FOV_DEG}):
-        with pytest.raises(ValueError, match="and not both"):
-            detector.detect(image, **arguments)  # type: ignore[arg-type]
+        PictureDetector().detect(image, **camera)
 
 
 @pytest.mark.parametrize("fov_deg", [25.0, 90.0, 120.0, 150.0])
@@ -124,17 +113,13 @@ def test_copies_show_what_was_found_and_nothing_is_lost(capsys: Capture, tmp_pat
     before, after = (cv2.imread(str(path)) for path in (tmp_path / "a.jpg", out / "a.jpg"))
     assert before is not None
     assert after is not None
-    assert after.shape == before.shape
     left, top, width, height = (round(value) for value in truth()[1]["2.5_m_0.jpg"])
     changed = np.abs(after.astype(int) - before).max(axis=2) > 40
     assert changed[top - 4 : top + height + 4, left - 4 : left + width + 4].mean() > 0.1
     assert changed[:, left + width + 80 :].mean() < 0.001
-    assert "exists; name another folder, or overwrite it with --force" in told(
-        capsys, 2, "detect", tmp_path / "a.jpg", *FOV, "--out", out
-    )
-    assert "is one of the pictures themselves" in told(
-        capsys, 2, "detect", tmp_path / "a.jpg", *FOV, "--out", tmp_path, "--force"
-    )
+    assert "exists; name another folder" in told(capsys, 2, "detect", tmp_path / "a.jpg", *FOV, "--out", out)
+    own = (tmp_path / "a.jpg", *FOV, "--out", tmp_path, "--force")
+    assert "is one of the pictures themselves" in told(capsys, 2, "detect", *own)
     told(capsys, 0, "detect", tmp_path / "a.jpg", *FOV, "--out", out, "--force", "--min-probability", 1)
     again = cv2.imread(str(out / "a.jpg"))
     assert again is not None
@@ -213,19 +198,22 @@ def test_options_out_of_range_are_usage_errors(capsys: Capture, option: tuple[st
 
 
 @pytest.mark.parametrize(
-    ("content", "sentence"),
+    ("name", "content", "sentence"),
     [
-        (b"", "is empty"),
-        (b"no picture", "is no image"),
-        (NEAR.read_bytes()[:9000], "the JPEG ends too early"),
-        (b"P6\n60000 60000\n255\n", "has more pixels than any camera, or none"),
-        (b"P6\n600 600\n255\n", "is no image"),
+        ("a.jpg", b"", "is empty"),
+        ("a.jpg", b"no picture", "is no image"),
+        ("a.jpg", NEAR.read_bytes()[:9000], "the JPEG ends too early"),
+        ("a.jpg", b"P6\n60000 60000\n255\n", "has more pixels than any camera, or none"),
+        ("a.jpg", b"P6\n600 600\n255\n", "is no image"),
+        ("a.mp4", b"no video", "is no video that can be decoded"),
     ],
-    ids=["empty", "text", "cut", "huge PPM", "cut PPM"],
+    ids=["empty", "text", "cut", "huge PPM", "cut PPM", "video"],
 )
-def test_a_picture_that_cannot_be_read_ends_it(capsys: Capture, tmp_path: Path, content: bytes, sentence: str) -> None:
-    (tmp_path / "a.jpg").write_bytes(content)
-    assert f"{tmp_path / 'a.jpg'}: {sentence}" in told(capsys, 1, "detect", tmp_path, *FOV)
+def test_a_picture_that_cannot_be_read_ends_it(
+    capsys: Capture, tmp_path: Path, name: str, content: bytes, sentence: str
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    assert f"{tmp_path / name}: {sentence}" in told(capsys, 1, "detect", tmp_path, *FOV)
 
 
 def test_one_truncated_picture_among_others_is_left_out_and_said(capsys: Capture, tmp_path: Path) -> None:
@@ -241,11 +229,6 @@ def test_one_truncated_picture_among_others_is_left_out_and_said(capsys: Capture
     assert result["left_out"] == [fault]
     assert captured.err.splitlines()[-2:] == [f"written: 2 copies in {tmp_path / 'drawn'}", f"left out: {fault}"]
     assert sorted(path.name for path in (tmp_path / "drawn").iterdir()) == ["a.jpg", "c.jpg"]
-
-
-def test_a_video_that_cannot_be_decoded_ends_it(capsys: Capture, tmp_path: Path) -> None:
-    (tmp_path / "a.mp4").write_bytes(b"no video")
-    assert "is no video that can be decoded" in told(capsys, 1, "detect", tmp_path, *FOV)
 
 
 def test_a_phones_picture_is_turned_as_it_was_held(capsys: Capture, tmp_path: Path) -> None:

@@ -29,16 +29,12 @@ def moved(right: float) -> Box:
     return BOX[0] + right, BOX[1], BOX[2] + right, BOX[3]
 
 
-def test_boxes_fall_into_classes_by_their_width() -> None:
-    assert [width_class((0, 0, w, 5)) for w in (3, 6, 11.9, 12, 29, 30, 79, 80, 300)] == [
-        "0-6", "6-12", "6-12", "12-30", "12-30", "30-80", "30-80", "80-", "80-",
-    ]  # fmt: skip
-
-
 @pytest.mark.parametrize(("right", "iou"), [(0.0, 1.0), (10.0, 100 / 300), (5.0, 150 / 250), (20.0, 0.0), (-30.0, 0.0)])
 def test_intersection_over_union(right: float, iou: float) -> None:
     """Boxes 20 x 10 are moved against each other."""
     assert intersection_over_union(BOX, moved(right)) == pytest.approx(iou)
+    classes = ("0-6", "6-12", "6-12", "12-30", "12-30", "30-80", "30-80", "80-", "80-")
+    assert tuple(width_class((0, 0, w, 5)) for w in (3, 6, 11.9, 12, 29, 30, 79, 80, 300)) == classes
 
 
 def test_a_box_is_found_once_by_the_most_probable_and_all_else_is_false() -> None:

@@ -124,16 +124,8 @@ def test_the_flights_own_facts_are_carried_over() -> None:
     }  # fmt: skip
     assert (summary["duration_s"], summary["step_s"], summary["wall_s"]) == (15.0, 0.5, 60.0)
     assert summary["realtime_factor"] == 0.25
+    assert json.loads(json.dumps(summary, allow_nan=False)) == summary, "strict JSON"
     assert summary["stages_ms"] == {"flow": {"p50": 51.0, "p95": 96.0}}
-
-
-def test_a_flock_that_wants_to_stand_still_in_the_mean_has_a_summary_without_a_warning() -> None:
-    """As two drones that want to fly at each other do: obj1 has no desired velocity to compare with."""
-    log = _hand_made()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        flock = summarise(replace(log, desired=np.zeros_like(log.desired)))["flock"]
-    assert flock["min_distance_m"] == pytest.approx(math.hypot(0.6, 0.5))
 
 
 def test_table_2_by_hand() -> None:
@@ -174,6 +166,10 @@ def test_table_3_by_hand() -> None:
     # -0.5 each on the circle, so obj1 cannot have converged before its end.
     assert table["truth"]["obj1"] == pytest.approx({"time_s": 2.0, "error": 0.0, "shape_bias": 0.0})
     assert table["truth"]["obj2"] == pytest.approx({"time_s": 0.0, "error": 0.0, "shape_bias": 0.0}, abs=1e-12)
+    none = np.empty((0, DRONES, 3))  # no companion, no truth and no bias
+    table = summarise(replace(_hand_made(), truth_position=none, truth_velocity=none))["table3"]
+    assert table["truth"]["obj2"] == {"time_s": None, "error": None, "shape_bias": None}
+    assert table["vision"]["obj2"] == {"time_s": 3.0, "error": pytest.approx(0.02), "shape_bias": None}
 
 
 def test_a_sum_that_leaves_its_band_at_the_last_step_has_not_converged() -> None:
@@ -205,12 +201,34 @@ def test_the_flocks_figures_by_hand() -> None:
     assert flock["min_distance_after_10s_m"] == pytest.approx(math.hypot(3.99, 0.5))
     assert (flock["order_tail"], flock["union_tail"], flock["connectivity_tail"]) == pytest.approx((1.0, 1.0, 1.0))
     assert flock["safety"] == pytest.approx(29 / 30)  # nearer than 1 m at one step
+    # Of drones that stand still, what is left of a velocity points anywhere.
+    log = _hand_made()
+    assert summarise(replace(log, velocity=0.099 * log.velocity))["flock"]["order_tail"] is None
+    assert summarise(replace(log, velocity=0.101 * log.velocity))["flock"]["order_tail"] == pytest.approx(1.0)
+    with warnings.catch_warnings():  # two drones that want to fly at each other want to stand still in the mean
+        warnings.simplefilter("error")
+        assert summarise(replace(log, desired=np.zeros_like(log.desired)))["flock"]["union_tail"] == 1.0
 
 
-def test_neighbours_by_hand() -> None:
-    neighbours = summarise(_hand_made())["neighbours"]
-    assert neighbours["recall_within_10m"] == pytest.approx(57 / 60)
-    assert neighbours["false_per_drone_minute"] == pytest.approx(2 / (2 * 0.25))
+@pytest.mark.parametrize(
+    ("changes", "recall", "false"),
+    [
+        ({}, 57 / 60, 2),
+        ({"position": (np.s_[:15, 1, 1], 10.5)}, 1.0, 2),  # beyond ten metres they do not count
+        ({"position": (np.s_[:15, 1, 1], 9.9)}, 57 / 60, 2),
+        ({"false_tracks": (np.s_[4, 0], 3)}, 57 / 60, 4),  # each of a step counts
+        ({"command_velocity": (np.s_[:], np.nan)}, None, None),  # no step was recorded
+    ],
+)
+def test_neighbours_by_hand(changes: dict[str, Any], recall: float | None, false: int | None) -> None:
+    log = _hand_made()
+    for name, (where, value) in changes.items():
+        array = getattr(log, name).copy()
+        array[where] = value
+        log = replace(log, **{name: array})
+    neighbours = summarise(log)["neighbours"]
+    assert neighbours["recall_within_10m"] == pytest.approx(recall)
+    assert neighbours["false_per_drone_minute"] == pytest.approx(None if false is None else false / (2 * 0.25))
 
 
 def test_every_track_near_a_drone_counts_with_its_error_and_any_other_as_false() -> None:
@@ -228,34 +246,6 @@ def test_every_track_near_a_drone_counts_with_its_error_and_any_other_as_false()
     assert first["false_share"] == pytest.approx(18 / 60)
 
 
-def test_where_no_step_was_recorded_nothing_is_said_of_neighbours() -> None:
-    log = _hand_made()
-    nothing = np.full_like(log.command_velocity, np.nan)
-    summary = summarise(replace(log, tracked=log.tracked[:0], command_velocity=nothing))
-    assert summary["neighbours"]["recall_within_10m"] is None
-    assert summary["neighbours"]["false_share"] is None
-    json.dumps(summary, allow_nan=False)
-
-
-def test_drones_beyond_ten_metres_do_not_count_for_recall() -> None:
-    log = _hand_made()
-    position = log.position.copy()
-    position[:15, 1, 1] = 10.5
-    neighbours = summarise(replace(log, position=position))["neighbours"]
-    assert neighbours["recall_within_10m"] == 1.0
-    position[:15, 1, 1] = 9.9
-    neighbours = summarise(replace(log, position=position))["neighbours"]
-    assert neighbours["recall_within_10m"] == pytest.approx(57 / 60)
-
-
-def test_each_false_track_of_a_step_counts() -> None:
-    log = _hand_made()
-    false_tracks = log.false_tracks.copy()
-    false_tracks[4, 0] = 3
-    neighbours = summarise(replace(log, false_tracks=false_tracks))["neighbours"]
-    assert neighbours["false_per_drone_minute"] == pytest.approx(4 / (2 * 0.25))
-
-
 def test_a_flight_with_exact_states_has_no_estimates_and_is_the_truth() -> None:
     log = _hand_made()
     summary = summarise(replace(log, metadata=log.metadata.model_copy(update={"perception": "truth"})))
@@ -264,15 +254,6 @@ def test_a_flight_with_exact_states_has_no_estimates_and_is_the_truth() -> None:
     assert set(summary["neighbours"].values()) == {None}
     assert summary["table3"]["truth"]["obj2"] == pytest.approx({"time_s": 3.0, "error": 0.02, "shape_bias": 0.0})
     assert summary["table3"]["vision"]["obj1"] == {"time_s": None, "error": None, "shape_bias": None}
-
-
-def test_a_flight_without_companion_has_no_truth_and_no_bias() -> None:
-    log = _hand_made()
-    none = np.empty((0, DRONES, 3))
-    table = summarise(replace(log, truth_position=none, truth_velocity=none))["table3"]
-    assert table["truth"]["obj2"] == {"time_s": None, "error": None, "shape_bias": None}
-    assert table["vision"]["obj2"]["shape_bias"] is None
-    assert table["vision"]["obj2"]["error"] == pytest.approx(0.02)
 
 
 @pytest.mark.parametrize("steps", [1, 3, 20])
@@ -301,11 +282,6 @@ def test_a_single_drone_has_no_distances() -> None:
     assert summary["flock"]["safety"] == 1.0
     assert summary["neighbours"]["recall_within_10m"] is None
     json.dumps(summary, allow_nan=False)
-
-
-def test_the_summary_is_strict_json() -> None:
-    summary = summarise(_hand_made())
-    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
 
 
 def test_a_log_survives_its_file(tmp_path: Path) -> None:
@@ -368,25 +344,11 @@ def test_a_mission_has_arrived_where_the_middle_is_at_the_last_goal() -> None:
     over = summarise(landed)["mission"]
     assert (over["arrived"], over["time_s"]) == (True, 11.0)
     assert over["final_error_m"] == pytest.approx(0.5, abs=0.01)
+    # At 11 s the middle was 1 m from there already; until the order at 11.5 s there was no goal.
+    ordered = np.where(np.arange(STEPS)[:, None] < 23, np.nan, [12.0, 2.0])
+    assert summarise(replace(log, goal=ordered))["mission"]["time_s"] == 11.5
     nowhere = summarise(_hand_made())["mission"]
     assert (nowhere["arrived"], nowhere["time_s"], nowhere["final_error_m"]) == (None, None, None)
-
-
-def test_a_flock_that_hovers_has_no_order() -> None:
-    """Of drones that stand still, what is left of a velocity points anywhere."""
-    log = _hand_made()
-    assert summarise(replace(log, velocity=0.099 * log.velocity))["flock"]["order_tail"] is None
-    assert summarise(replace(log, velocity=0.101 * log.velocity))["flock"]["order_tail"] == pytest.approx(1.0)
-
-
-def test_a_goal_counts_from_when_it_was_ordered() -> None:
-    """The middle was 1 m from there at 11 s already; until the order at 11.5 s there was no goal."""
-    goal = np.full((STEPS, 2), np.nan)
-    goal[23:] = [12.0, 2.0]
-    log = _hand_made()
-    mission = MissionMetadata(kind="operator", reached_m=1.2)
-    log = replace(log, goal=goal, metadata=log.metadata.model_copy(update={"mission": mission}))
-    assert summarise(log)["mission"]["time_s"] == 11.5
 
 
 def test_where_a_person_leads_it_is_the_persons_drone_that_arrives() -> None:
