@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
 from flockd.cli.flight_summary import show_summary
-from flockd.cli.options import opened, refuse, require
+from flockd.cli.options import opened, refuse, refuse_overwriting, require
 from flockd.cli.output import complain, progress, say_result
 from flockd.cli.parser import Commands, flag, option
 from flockd.core.errors import UsageError
@@ -59,14 +59,25 @@ def _run(args: argparse.Namespace) -> int:
         refuse(args, ("out", "without_pictures"), "has no meaning with --video; drop it")
         return _video(args)
     refuse(args, ("drone",), "is for --video; drop it")
-    from flockd.review.report.flight_folder import REPORT_NAME, prepare_report_folder, save_flight
+    from flockd.review.flight_log.log import FlightLog
+    from flockd.review.report.flight_folder import (
+        LOG_NAME,
+        REPORT_NAME,
+        prepare_report_folder,
+        save_flight,
+        write_report_files,
+    )
     from flockd.review.report.summary import summarise
 
     directory: Path = args.flight
     if _is_flight(directory):
         why = f"is for recordings, and {directory} is a flight's folder, whose report is written into it; drop it"
         refuse(args, ("out", "without_pictures"), why)
-        log = _log_of(directory)
+        try:
+            log = FlightLog.load(directory / LOG_NAME)
+        except (ValueError, EOFError, BadZipFile) as error:
+            told = f"is not a whole flight log ({error}); fly again with `flockd sim`"
+            raise UsageError(f"{directory / LOG_NAME}: {told}") from error
         if (directory / REPORT_NAME).is_file() and not args.force:
             complain(f"{directory / REPORT_NAME}: is left as it was; --force writes it again")
             return show_summary(directory, log, summarise(log), as_json=args.json)
@@ -77,8 +88,6 @@ def _run(args: argparse.Namespace) -> int:
         with prepare_report_folder(directory, force=args.force):
             log, pictures = _flight(paths, pictured=not args.without_pictures)
         save_flight(directory, log, pictures)
-    from flockd.review.report.flight_folder import write_report_files
-
     with progress("writing the report", "figures") as tell_progress:
         summary = write_report_files(directory, log, tell_progress)
     return show_summary(directory, log, summary, as_json=args.json)
@@ -88,9 +97,11 @@ def _video(args: argparse.Namespace) -> int:
     """A video of one of the recordings."""
     from flockd.review.flight_log.from_recordings import recordings_in
     from flockd.review.report.flight_folder import RECORDINGS
-    from flockd.review.report.flight_video import check_video_path, write_video
+    from flockd.review.report.flight_video import CODECS, write_video
 
-    check_video_path(args.video, force=args.force)
+    if args.video.suffix.lower() not in CODECS:
+        raise UsageError(f"{args.video}: a video's name ends in {' or '.join(CODECS)}; give it another")
+    refuse_overwriting(args, args.video)
     paths = recordings_in(args.flight / RECORDINGS) if _is_flight(args.flight) else _recordings(args.flight)
     if not paths:
         raise UsageError(f"{args.flight}: has no recordings, of which a video is made; fly with --record")
@@ -111,18 +122,6 @@ def _is_flight(folder: Path) -> bool:
     from flockd.review.report.flight_folder import LOG_NAME
 
     return (folder / LOG_NAME).is_file()
-
-
-def _log_of(flight: Path) -> FlightLog:
-    """The log in a flight's folder."""
-    from flockd.review.flight_log.log import FlightLog
-    from flockd.review.report.flight_folder import LOG_NAME
-
-    path = flight / LOG_NAME
-    try:
-        return FlightLog.load(path)
-    except (ValueError, EOFError, BadZipFile) as error:
-        raise UsageError(f"{path}: is not a whole flight log ({error}); fly again with `flockd sim`") from error
 
 
 def _recordings(path: Path) -> tuple[Path, ...]:

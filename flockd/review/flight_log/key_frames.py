@@ -57,18 +57,6 @@ class KeyFrame:
             flow={name: _thin(flow) for name, flow in self.flow.items()},
         )
 
-    def __post_init__(self) -> None:
-        for camera in self.cameras:
-            if camera not in self.images:
-                raise ValueError(f"key frame at {self.time_s:g} s: camera {camera!r} has no image")
-            size = self.images[camera].shape[:2]
-            for name, maps in (("the depth", self.depth), ("the labels", self.labels), ("the flow", self.flow)):
-                if camera in maps and maps[camera].shape[:2] != size:
-                    raise ValueError(
-                        f"key frame at {self.time_s:g} s, camera {camera!r}: {name} is {maps[camera].shape[:2]},"
-                        f" the image {size}"
-                    )
-
 
 def _thin(image: NDArray[_Pixel]) -> NDArray[_Pixel]:
     """Every second pixel: means across a silhouette would invent depths and labels."""

@@ -62,18 +62,18 @@ def _flight_column(axes: Mapping[str, Axes], log: FlightLog, position: FloatArra
     speed, course = axes["airspeed, m/s"], axes["course, °"]
     sums = objective_sums(log, position, velocity)
 
-    _flock_lines(speed, time_s, np.linalg.norm(velocity[..., :2], axis=2))
+    flock_lines(speed, time_s, np.linalg.norm(velocity[..., :2], axis=2))
     speed.plot(time_s, np.linalg.norm(desired, axis=1), **_DESIRED)
     speed.set_ylim(bottom=0)
 
     asked_deg = np.degrees(np.unwrap(np.arctan2(desired[:, 1], desired[:, 0])))
     course_deg = np.degrees(np.arctan2(velocity[..., 1], velocity[..., 0]))
     # The turn of the course nearest to the desired one, so that no line jumps by 360.
-    _flock_lines(course, time_s, asked_deg[:, None] + (course_deg - asked_deg[:, None] + 180) % 360 - 180)
+    flock_lines(course, time_s, asked_deg[:, None] + (course_deg - asked_deg[:, None] + 180) % 360 - 180)
     course.plot(time_s, asked_deg, **_DESIRED)
     course.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 3, 4.5, 9, 10]))
 
-    _flock_lines(axes["height, m"], time_s, -position[..., 2])
+    flock_lines(axes["height, m"], time_s, -position[..., 2])
 
     for steps in _windows(log):  # obj1 is another figure on the circle and after it, so no line joins the two
         axes["Σ obj1"].plot(time_s[steps], sums["obj1"][steps], color=INK)
@@ -102,7 +102,7 @@ def _distance_lines(axes: Axes, time_s: FloatArray, position: FloatArray) -> Non
     distances = closest_distances(position[..., :2])
     if drones > FEW:
         nearest = np.where(np.eye(drones, dtype=bool), np.inf, distances).min(axis=2)
-        _flock_lines(axes, time_s, nearest)
+        flock_lines(axes, time_s, nearest)
         return
     for i, j in combinations(range(drones), 2):
         axes.plot(
@@ -111,7 +111,7 @@ def _distance_lines(axes: Axes, time_s: FloatArray, position: FloatArray) -> Non
         )  # fmt: skip
 
 
-def _flock_lines(axes: Axes, time_s: FloatArray, values: FloatArray) -> None:
+def flock_lines(axes: Axes, time_s: FloatArray, values: FloatArray) -> None:
     """(S, K) values: a line for each of few drones, a band for many."""
     count = values.shape[1]
     if count <= FEW:
@@ -136,9 +136,6 @@ def _legend(figure: Figure, log: FlightLog, *more: Line2D) -> None:
     if _circle_ends(log):
         handles.append(Line2D([], [], color=MUTED, linewidth=0.8, label="circle ends"))
     figure.legend(handles=handles, loc="outside upper left", ncols=len(handles), handlelength=1.8, columnspacing=1.4)
-
-
-# ---------------------------------------------------------------------------------------------------- without truth
 
 
 def account_curves(log: FlightLog) -> Figure:
@@ -194,9 +191,6 @@ def _tracked_lines(axes: Axes, log: FlightLog) -> None:
         axes.text(0.5, 0.5, "no neighbour was tracked", transform=axes.transAxes, ha="center", color=MUTED)
 
 
-# -------------------------------------------------------------------------------------------------- errors of Fig. 5
-
-
 def error_curves(log: FlightLog) -> Figure | None:
     """Errors of the estimated own motion and of the distance to the tracked neighbours; None without any estimate."""
     errors = estimation_errors(log)
@@ -216,7 +210,7 @@ def error_curves(log: FlightLog) -> Figure | None:
             if drones <= FEW:
                 _error_lines(axes, log.time_s, values)
             else:
-                _flock_lines(axes, log.time_s, values.reshape(len(values), -1))
+                flock_lines(axes, log.time_s, values.reshape(len(values), -1))
             axes.axhline(0.0, color=MUTED, linewidth=0.7, zorder=1)
             _paper_maxima(axes, log, column)
             _mark_circle(axes, log)

@@ -91,32 +91,19 @@ CODECS = {".webm": "VP90", ".mp4": "vp09"}
 """VP9 in both: free of royalties, in OpenCV's own build, and shown by every browser."""
 _HEAD_PX, _GAP_PX, _IMAGES_PX = 36, 6, 640
 """Heights of the line above, of the gaps between images, and of all images together."""
-Progress = Callable[[int, int], None]
 
 
-def check_video_path(path: Path, *, force: bool) -> None:
-    """Raises UsageError for what cannot be written, or must not be."""
-    if path.suffix.lower() not in CODECS:
-        raise UsageError(f"{path}: a video's name ends in {' or '.join(CODECS)}; give it another")
-    if path.exists() and not force:
-        raise UsageError(f"{path} exists; name another file, or overwrite it with --force")
-    if not path.parent.is_dir():
-        raise UsageError(f"{path.parent} is not a folder; make it first")
-
-
-def write_video(
-    path: Path, recording: Recording, progress: Progress = lambda done, total: None, *, scale: float = 1.0
-) -> int:
+def write_video(path: Path, recording: Recording, progress: Callable[[int, int], None]) -> int:
     """Writes the video, a frame a step in real time, and gives the number of frames.
 
-    ``scale`` makes the frames smaller. The file appears when it is whole. Raises UnavailableError where OpenCV has no
-    encoder, and RecordingError where the recording is damaged.
+    The file appears when it is whole. Raises UnavailableError where OpenCV has no encoder, and RecordingError where
+    the recording is damaged.
     """
     draft = path.with_name(f".{path.stem}.part{path.suffix}")
     count, video = 0, None
     try:
         for step in recorded_steps(recording):
-            frame = _scaled(drawn(step, recording.drone), scale)
+            frame = drawn(step, recording.drone)
             video = video or _opened(draft, 1.0 / recording.config.step_s, (frame.shape[1], frame.shape[0]))
             video.write(np.ascontiguousarray(frame[..., ::-1]))
             count += 1
@@ -128,14 +115,6 @@ def write_video(
     finally:
         draft.unlink(missing_ok=True)
     return count
-
-
-def _scaled(image: UInt8Array, scale: float) -> UInt8Array:
-    """Both sides stay even, as encoders want them."""
-    if scale == 1.0:
-        return image
-    height, width = (2 * round(side * scale / 2) for side in image.shape[:2])
-    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _opened(path: Path, rate_hz: float, size: tuple[int, int]) -> cv2.VideoWriter:

@@ -112,20 +112,10 @@ def rgb(colour: str) -> Colour:
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
 
 
-def fixed_point(pixels: FloatArray) -> UInt8Array:
-    """Pixels, whose middles are at halves, as OpenCV wants them with a shift."""
-    return np.round((pixels - 0.5) * (1 << _SHIFT)).astype(np.int32)
-
-
-def ring(image: UInt8Array, middle: FloatArray, radius_px: float, colour: str, thick: int) -> None:
-    """A circle around (2,) pixels; of thickness -1 a disc."""
-    at = tuple(fixed_point(middle).tolist())
-    cv2.circle(image, at, round(radius_px * (1 << _SHIFT)), rgb(colour), thick, cv2.LINE_AA, _SHIFT)
-
-
 def line(image: UInt8Array, pixels: FloatArray, colour: str, thick: int) -> None:
-    """Through (n, 2) pixels."""
-    cv2.polylines(image, [fixed_point(pixels)], False, rgb(colour), thick, cv2.LINE_AA, _SHIFT)
+    """Through (n, 2) pixels, whose middles are at halves."""
+    fixed = np.round((pixels - 0.5) * (1 << _SHIFT)).astype(np.int32)  # as OpenCV wants them with a shift
+    cv2.polylines(image, [fixed], False, rgb(colour), thick, cv2.LINE_AA, _SHIFT)
 
 
 def width_of(text: str, size: float) -> int:

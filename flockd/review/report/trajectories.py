@@ -18,8 +18,8 @@ from matplotlib.transforms import Affine2D
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.flocking.metrics import pair_distances
 from flockd.review.flight_log.log import FlightLog
+from flockd.review.report.curves import flock_lines
 from flockd.review.report.style import (
-    BAND,
     FEW,
     GRID,
     INK,
@@ -30,7 +30,6 @@ from flockd.review.report.style import (
     STYLE,
     colour_of,
     drone_handles,
-    drone_name,
 )
 from flockd.review.report.summary import SAME_GOAL_M
 
@@ -75,12 +74,8 @@ def trajectories(log: FlightLog) -> Figure:
             _formation(axes, log.position[step], log.velocity[step])
         if exact and formations:
             ideal = _centred(exact[0][-1])
-            ring: dict[str, Any] = {
-                "color": MUTED,
-                "markerfacecolor": "none",
-                "markersize": 11 if drones <= NAMED else 7,
-            }
-            formations[-1].plot(ideal[:, 1], ideal[:, 0], "o", **ring)
+            size = 11 if drones <= NAMED else 7
+            formations[-1].plot(ideal[:, 1], ideal[:, 0], "o", color=MUTED, markerfacecolor="none", markersize=size)
     return figure
 
 
@@ -188,32 +183,21 @@ def in_the_way(log: FlightLog) -> BoolArray:
 
 
 def obstacle_figure(log: FlightLog) -> Figure | None:
-    """Each drone's clearance over time.
-
-    None of a flight without obstacles.
-    """
+    """Each drone's clearance over time; None of a flight without obstacles."""
     radius_m = log.metadata.drone_radius_m
     if not len(log.clearance) or radius_m is None:
         return None
+    drones, free_m = log.clearance.shape[1], log.clearance - radius_m
     with rc_context(STYLE):
         figure = Figure(figsize=(11.0, 4.4), layout="constrained")
-        _clearance_curves(figure.subplots(), log, radius_m)
+        axes = figure.subplots()
+        flock_lines(axes, log.time_s, free_m)
+        axes.axhline(0.0, color=INK, linewidth=1.0, linestyle=(0, (4, 3)))
+        axes.set(xlabel="time, s", ylabel="clearance, m", title="Distance to the nearest obstacle")
+        axes.set_ylim(min(-0.2, float(free_m.min()) - 0.2), min(10.0, float(free_m.max()) + 0.5))
+        if drones <= FEW:
+            axes.legend(handles=drone_handles(drones), loc="upper right", ncols=2)
     return figure
-
-
-def _clearance_curves(axes: Axes, log: FlightLog, radius_m: float) -> None:
-    drones = log.clearance.shape[1]
-    free_m = log.clearance - radius_m
-    if drones <= FEW:
-        for number in range(drones):
-            axes.plot(log.time_s, free_m[:, number], color=colour_of(number, drones), label=drone_name(number))
-    else:
-        axes.fill_between(log.time_s, free_m.min(axis=1), free_m.max(axis=1), color=BAND, alpha=0.25, linewidth=0)
-        axes.plot(log.time_s, free_m.min(axis=1), color=BAND, label="the nearest drone")
-    axes.axhline(0.0, color=INK, linewidth=1.0, linestyle=(0, (4, 3)))
-    axes.set(xlabel="time, s", ylabel="clearance, m", title="Distance to the nearest obstacle")
-    axes.set_ylim(min(-0.2, float(free_m.min()) - 0.2), min(10.0, float(free_m.max()) + 0.5))
-    axes.legend(loc="upper right", ncols=2)
 
 
 def _outline(row: Any) -> Circle | Rectangle:

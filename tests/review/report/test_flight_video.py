@@ -78,7 +78,7 @@ def test_a_recording_becomes_a_video(tmp_path: Path, capfd: Capture) -> None:
         assert main(["report", *options]) == 2
         return capfd.readouterr().err
 
-    assert refused(str(NORMAL), "--video", str(video)).startswith(f"{video} exists; ")
+    assert refused(str(NORMAL), "--video", str(video)).startswith(f"{video}: exists; ")
     assert "ends in .webm or .mp4" in refused(str(NORMAL), "--video", "flight.avi")
     assert "make it first" in refused(str(NORMAL), "--video", str(tmp_path / "nowhere" / "flight.webm"))
     assert "--out has no meaning" in refused(str(NORMAL), "--video", "new.webm", "--out", "x")
