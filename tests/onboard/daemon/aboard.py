@@ -281,14 +281,17 @@ class Watched:
         await self.until_state("ready")
 
     async def flies(self) -> None:
-        """The pilot selects offboard; and again, if the computer was busy elsewhere before the drone had its speed."""
+        """The pilot selects offboard; and again, where a busy computer let go of it before the drone had its speed."""
         await until(lambda: len(self.fake_autopilot.setpoints) > 5, SECONDS_TO_FAIL)
         self.fake_autopilot.pilot_selects("OFFBOARD")
-        await until(lambda: self.speed() > 0.8 * SPEED_M_S or self.state() == "silent", SECONDS_TO_FAIL)
-        if self.state() == "silent":
+        await asyncio.sleep(0.5)
+        await until(lambda: self.speed() > 0.8 * SPEED_M_S or self.fake_autopilot.mode != "OFFBOARD", SECONDS_TO_FAIL)
+        if self.fake_autopilot.mode != "OFFBOARD":
             self.fake_autopilot.pilot_selects("LOITER")
-            assert (await self.ask("ask/resume"))["accepted"] is True
-            await self.until_state("ready")
+            async with asyncio.timeout(SECONDS_TO_FAIL):
+                while self.state() != "ready":
+                    await self.ask("ask/resume")
+                    await asyncio.sleep(0.5)
             self.events.clear()
             await self.flies()
 
