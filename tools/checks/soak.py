@@ -35,7 +35,7 @@ from flockd.sim.sitl.daemons import Daemons
 from flockd.sim.sitl.frame_server import FrameServer
 from flockd.sim.sitl.ground_station import Poses
 from flockd.sim.sitl.ports import free_endpoint, free_port
-from tools.measure.bench_daemon import at, of_the_unit
+from tools.measure.bench_daemon import at, of_the_unit, status_mb
 
 SHRINK = 4
 """Factor on the simulator's front camera, the only one: 120 x 160 pixels, so that much else fits beside it."""
@@ -98,12 +98,10 @@ def slope_of(name: str, values: Sequence[float]) -> Slope:
 
 def process_facts(pid: int) -> dict[str, float]:
     """What Linux counts of a process. Raises OSError when it has ended."""
-    folder = Path(f"/proc/{pid}")
-    lines = (line.split() for line in (folder / "status").read_text(encoding="ascii").splitlines())
-    kilobytes = {words[0]: int(words[1]) for words in lines if words[-1] == "kB"}
+    folder, known = Path(f"/proc/{pid}"), status_mb(pid)
     return {
-        "memory, MB": 1.024e-3 * kilobytes["VmRSS:"],
-        "own memory, MB": 1.024e-3 * kilobytes["RssAnon:"],  # without files' pages, as of libraries first used late
+        "memory, MB": known["VmRSS"],
+        "own memory, MB": known["RssAnon"],  # without files' pages, as of libraries first used late
         "descriptors": float(len(list((folder / "fd").iterdir()))),
         "threads": float(len(list((folder / "task").iterdir()))),
     }
