@@ -62,25 +62,19 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", metavar="WORD", default="", help="those whose name or file contains it")
     parser.add_argument("--mutants", metavar="N", type=int, help="N mutants of the safety layer instead; 0: all")
-    parser.add_argument("--seed", metavar="TEXT", help="to draw them with (default: a hash of the sources)")
-    parser.add_argument("--list", action="store_true", help="print them and run nothing")
-    parser.add_argument("--jobs", metavar="N", type=int, default=os.cpu_count() or 1, help="so many at once")
     arguments = parser.parse_args()
     listed = yaml.safe_load(LIST.read_text(encoding="utf-8"))
     try:
         if arguments.mutants is None:
             chosen = fixed(listed["breakages"])
         else:
-            chosen = small_changes(arguments.mutants, arguments.seed, listed["tests of mutants"])
+            chosen = small_changes(arguments.mutants, listed["tests of mutants"])
     except StaleError as error:
         print(f"{LIST.name}: {error}", file=sys.stderr)
         return 1
     chosen = [one for one in chosen if arguments.only in f"{one.name} {one.file}"]
-    if arguments.list:
-        print(*(f"{one.file}: {one.name}" for one in chosen), sep="\n")
-        return 0
     with tempfile.TemporaryDirectory(prefix="flockd-broken-") as folder:
-        folders = [Path(folder) / str(number) for number in range(max(1, min(arguments.jobs, len(chosen))))]
+        folders = [Path(folder) / str(number) for number in range(max(1, min(os.cpu_count() or 1, len(chosen))))]
         prepare(folders, sorted({test for one in chosen for test in one.tests}))
         survivors = list(surviving(chosen, folders))
     whole = arguments.mutants == 0 and not arguments.only
@@ -102,10 +96,10 @@ def fixed(entries: Sequence[Mapping[str, Any]]) -> list[Breakage]:
     return found
 
 
-def small_changes(count: int, seed: str | None, tests: Mapping[str, Sequence[str]]) -> list[Breakage]:
+def small_changes(count: int, tests: Mapping[str, Sequence[str]]) -> list[Breakage]:
     """So many mutants of the safety layer; 0: all."""
     mutants: list[Mutant] = [mutant for path in FILES for mutant in mutants_of(path)]
-    mutants = sample(mutants, count, seed) if count else mutants
+    mutants = sample(mutants, count) if count else mutants
     return [
         Breakage(
             one.name, SAFETY / one.file, one.source,
