@@ -8,9 +8,10 @@ import fcntl
 import mmap
 import os
 import select
-from typing import ClassVar
+from typing import Any, ClassVar
 
-NAME_LENGTH = 32
+def _words(names: str, kind: type[Any] = ctypes.c_uint32) -> list[tuple[str, type[Any]]]:
+    return [(name, kind) for name in names.split()]
 
 
 class Capability(ctypes.Structure):
@@ -20,9 +21,7 @@ class Capability(ctypes.Structure):
         ("driver", ctypes.c_char * 16),
         ("card", ctypes.c_char * 32),
         ("bus_info", ctypes.c_char * 32),
-        ("version", ctypes.c_uint32),
-        ("capabilities", ctypes.c_uint32),
-        ("device_caps", ctypes.c_uint32),
+        *_words("version capabilities device_caps"),
         ("reserved", ctypes.c_uint32 * 3),
     ]
 
@@ -31,14 +30,7 @@ class Format(ctypes.Structure):
     """struct v4l2_format with its v4l2_pix_format; the union it sits in is 200 bytes long and aligned to 8."""
 
     _fields_: ClassVar = [
-        ("type", ctypes.c_uint32),
-        ("padding", ctypes.c_uint32),
-        ("width", ctypes.c_uint32),
-        ("height", ctypes.c_uint32),
-        ("pixelformat", ctypes.c_uint32),
-        ("field", ctypes.c_uint32),
-        ("bytesperline", ctypes.c_uint32),
-        ("sizeimage", ctypes.c_uint32),
+        *_words("type padding width height pixelformat field bytesperline sizeimage"),
         ("rest", ctypes.c_uint8 * 176),
     ]
 
@@ -47,46 +39,27 @@ class StreamParameters(ctypes.Structure):
     """struct v4l2_streamparm with its v4l2_captureparm; the union is 200 bytes long."""
 
     _fields_: ClassVar = [
-        ("type", ctypes.c_uint32),
-        ("capability", ctypes.c_uint32),
-        ("capturemode", ctypes.c_uint32),
-        ("numerator", ctypes.c_uint32),
-        ("denominator", ctypes.c_uint32),
+        *_words("type capability capturemode numerator denominator"),
         ("rest", ctypes.c_uint8 * 184),
     ]
 
 
 class RequestBuffers(ctypes.Structure):
-    """struct v4l2_requestbuffers"""
+    """struct v4l2_requestbuffers; the last word is its flags and what is reserved."""
 
-    _fields_: ClassVar = [
-        ("count", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("memory", ctypes.c_uint32),
-        ("capabilities", ctypes.c_uint32),
-        ("flags", ctypes.c_uint8),
-        ("reserved", ctypes.c_uint8 * 3),
-    ]
+    _fields_: ClassVar = _words("count type memory capabilities flags")
 
 
 class Buffer(ctypes.Structure):
     """struct v4l2_buffer as 64-bit kernels lay it out"""
 
     _fields_: ClassVar = [
-        ("index", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("bytesused", ctypes.c_uint32),
-        ("flags", ctypes.c_uint32),
-        ("field", ctypes.c_uint32),
-        ("seconds", ctypes.c_int64),
-        ("microseconds", ctypes.c_int64),
+        *_words("index type bytesused flags field"),
+        *_words("seconds microseconds", ctypes.c_int64),
         ("timecode", ctypes.c_uint8 * 16),
-        ("sequence", ctypes.c_uint32),
-        ("memory", ctypes.c_uint32),
+        *_words("sequence memory"),
         ("offset", ctypes.c_uint64),
-        ("length", ctypes.c_uint32),
-        ("reserved2", ctypes.c_uint32),
-        ("request_fd", ctypes.c_int32),
+        *_words("length reserved2 request_fd"),
     ]
 
 
@@ -94,13 +67,9 @@ class QueryControl(ctypes.Structure):
     """struct v4l2_queryctrl"""
 
     _fields_: ClassVar = [
-        ("id", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("name", ctypes.c_char * NAME_LENGTH),
-        ("minimum", ctypes.c_int32),
-        ("maximum", ctypes.c_int32),
-        ("step", ctypes.c_int32),
-        ("default_value", ctypes.c_int32),
+        *_words("id type"),
+        ("name", ctypes.c_char * 32),
+        *_words("minimum maximum step default_value", ctypes.c_int32),
         ("flags", ctypes.c_uint32),
         ("reserved", ctypes.c_uint32 * 2),
     ]
@@ -116,9 +85,7 @@ class FormatDescription(ctypes.Structure):
     """struct v4l2_fmtdesc"""
 
     _fields_: ClassVar = [
-        ("index", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("flags", ctypes.c_uint32),
+        *_words("index type flags"),
         ("description", ctypes.c_char * 32),
         ("pixelformat", ctypes.c_uint32),
         ("reserved", ctypes.c_uint32 * 4),
@@ -128,27 +95,14 @@ class FormatDescription(ctypes.Structure):
 class FrameSize(ctypes.Structure):
     """struct v4l2_frmsizeenum; of a range of sizes the first two numbers are the smallest and the largest width."""
 
-    _fields_: ClassVar = [
-        ("index", ctypes.c_uint32),
-        ("pixel_format", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("width", ctypes.c_uint32),
-        ("height", ctypes.c_uint32),
-        ("rest", ctypes.c_uint32 * 6),
-    ]
+    _fields_: ClassVar = [*_words("index pixel_format type width height"), ("rest", ctypes.c_uint32 * 6)]
 
 
 class FrameInterval(ctypes.Structure):
     """struct v4l2_frmivalenum; of a range the shortest interval."""
 
     _fields_: ClassVar = [
-        ("index", ctypes.c_uint32),
-        ("pixel_format", ctypes.c_uint32),
-        ("width", ctypes.c_uint32),
-        ("height", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("numerator", ctypes.c_uint32),
-        ("denominator", ctypes.c_uint32),
+        *_words("index pixel_format width height type numerator denominator"),
         ("rest", ctypes.c_uint32 * 6),
     ]
 
