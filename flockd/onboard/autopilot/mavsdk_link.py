@@ -90,7 +90,9 @@ MOST_OPEN = 20
 REASON_S = 0.5
 """For how long a refusal waits for the autopilot's text, which comes after it."""
 ATTEND_S, ANNOUNCE_S, PARAMETER_S = 0.1, 1.0, 0.4
-"""Between two requests for events that are missing; two announcements; and two readings of a parameter."""
+"""Between two looks at what is missing; two announcements; and two readings of a parameter."""
+CHECKS_AGAIN_S = 1.0
+"""Between two requests for the list of failed checks, of which events were lost."""
 ANNOUNCEMENT = {
     "type": 6, "autopilot": 8, "base_mode": 0, "custom_mode": 0, "system_status": 4, "mavlink_version": 3
 }  # fmt: skip
@@ -151,8 +153,6 @@ class AutopilotLink:
         self._time_syncs: deque[int] = deque(maxlen=MOST_OPEN)
         """This computer's times in nanoseconds of exchanges that were not answered yet."""
         self._text_ids = cycle(range(1, 0x10000))
-        self._missing: deque[tuple[int, int]] = deque(maxlen=MOST_OPEN)
-        """First and last numbers of events to request."""
         for name in (*RECEIVED, TIME_SYNC):
             self._direct.subscribe_message(name, self._receive)
 
@@ -254,7 +254,8 @@ class AutopilotLink:
 
     def knows_checks(self) -> bool:
         """Whether the autopilot's list of failed checks is here, and whole."""
-        return not self.received.check_events.incomplete
+        events = self.received.check_events
+        return events.report is not None and not events.lost
 
     async def ask_for_checks(self) -> None:
         """Asks it to send its list of failed checks. Raises AutopilotError where it cannot."""
@@ -272,8 +273,8 @@ class AutopilotLink:
     async def attend(self) -> None:
         """Keeps all coming that an autopilot sends on request only, until cancelled.
 
-        So it announces flockd as a ground station, for the autopilot's texts; requests events that are missing;
-        requests all streams anew of an autopilot that has started or been plugged in anew; reads the parameters that
+        So it announces flockd as a ground station, for the autopilot's texts; asks anew for checks of which events were
+        lost; requests all streams again of an autopilot that has started or been plugged in; reads the parameters that
         flockd relies on; and listens for a second autopilot where any would do.
         """
         async with asyncio.TaskGroup() as group:
@@ -305,13 +306,12 @@ class AutopilotLink:
         return acts == 0 and self.received.flight_mode() != "mission"
 
     async def _request_what_is_missing(self) -> None:
-        beginnings = self._beginnings()
+        beginnings, asked_s = self._beginnings(), -math.inf
         while True:
-            while self._missing:
-                first, last = self._missing.popleft()
-                with suppress(MavlinkDirectError):
-                    fields = {"first_sequence": first, "last_sequence": last}
-                    self._direct.send_message(self._message("REQUEST_EVENT", fields))
+            if self.received.check_events.lost and self._clock() - asked_s >= CHECKS_AGAIN_S:
+                asked_s = self._clock()
+                with suppress(AutopilotError):
+                    await self.ask_for_checks()
             if self._beginnings() != beginnings:
                 beginnings = self._beginnings()
                 await self._request_streams()
@@ -430,9 +430,6 @@ class AutopilotLink:
             self._take_time(json.loads(message.fields_json), now)
         else:
             self.received.add(message.message_name, json.loads(message.fields_json), now)
-            missing = self.received.check_events.missing(now)
-            if missing is not None:
-                self._missing.append(missing)
 
     def _take_time(self, fields: Fields, now: float) -> None:
         """Takes the reply to an exchange of ours; the autopilot asks in the same message, which is left to others."""

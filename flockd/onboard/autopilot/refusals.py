@@ -6,9 +6,7 @@ each check, and a second summary at the end.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -44,6 +42,9 @@ ERROR, WARNING = 3, 4
 """PX4's log levels, which are worse the smaller."""
 MOST_CHECKS = 300
 """That a report may name as failed: PX4 has fewer."""
+NUMBERS = 1 << 16
+MOST_LATE = 20
+"""A number that is farther back is none of a message that came late: the autopilot counts anew."""
 SEQUENCE_RESET = 1
 """MAV_EVENT_CURRENT_SEQUENCE_FLAGS."""
 PREARM_CHECK = 1 << 28
@@ -97,55 +98,62 @@ class CheckReport:
 
 
 class CheckEvents:
-    """Puts reports together from EVENT messages."""
+    """Puts reports together from EVENT messages. Where one is lost the whole list is asked for anew."""
 
     def __init__(self) -> None:
         self.report: CheckReport | None = None
         """The newest whole one."""
-        self.incomplete = True
-        """There is none yet, or events were lost since."""
+        self.lost = False
+        """Events were lost since."""
         self.denied: tuple[float, str] | None = None
         """When a request was last refused, and why: a switch to offboard, for want of setpoints."""
         self.denied_mode: tuple[float, FlightMode] | None = None
         """When a ground station was last refused another mode, and which; PX4 tells of no other request."""
-        self._order = EventOrder()
+        self._last: int | None = None
+        """Number of the newest event that the autopilot has sent."""
         self._begun: tuple[int, int] | None = None
         self._failed: list[FailedCheck] = []
 
     def add(self, fields: Mapping[str, Any], time_s: float) -> None:
-        """Takes an EVENT; one that is none is ignored."""
-        gaps = self._order.gaps
-        self._take_all(self._order.add(fields), gaps, time_s)
-
-    def announce(self, fields: Mapping[str, Any]) -> None:
-        """Takes a CURRENT_EVENT_SEQUENCE; one that is none is ignored."""
-        with suppress(KeyError, TypeError, ValueError, OverflowError):
-            self._order.announce(int(fields["sequence"]) & 0xFFFF, reset=bool(int(fields["flags"]) & SEQUENCE_RESET))
-
-    def missing(self, now_s: float) -> tuple[int, int] | None:
-        """First and last number of events to request now; None: none. After a second without them they are given up."""
-        gaps = self._order.gaps
-        self._take_all(self._order.give_up(), gaps, now_s)
-        return self._order.missing(now_s)
-
-    def _take_all(self, events: Sequence[Mapping[str, Any]], gaps: int, time_s: float) -> None:
-        if self._order.gaps != gaps:
-            self._begun, self.incomplete = None, True
-        for event in events:
-            self._take(event, time_s)
-
-    def _take(self, fields: Mapping[str, Any], time_s: float) -> None:
+        """Takes an EVENT; one that is none, or came already, is ignored."""
         try:
-            number = int(fields["id"])
+            sequence, number = int(fields["sequence"]) % NUMBERS, int(fields["id"])
             arguments, level = bytes(fields["arguments"]), int(fields["log_levels"]) & 0xF
         except (KeyError, TypeError, ValueError, OverflowError):
             return
+        ahead = self._ahead(sequence)
+        if ahead > 0:
+            self._last = sequence
+            if ahead > 1:
+                self._lose()
+            self._take(number, arguments, level, time_s)
+
+    def announce(self, fields: Mapping[str, Any]) -> None:
+        """Takes a CURRENT_EVENT_SEQUENCE, the number of the newest event; one that is none is ignored."""
+        try:
+            newest, reset = int(fields["sequence"]) % NUMBERS, bool(int(fields["flags"]) & SEQUENCE_RESET)
+        except (KeyError, TypeError, ValueError, OverflowError):
+            return
+        known, ahead = self._last is not None, self._ahead(newest)
+        if not known or ahead > 0 or ahead < (0 if reset else -MOST_LATE):
+            self._last = newest
+            if known:
+                self._lose()
+
+    def _ahead(self, number: int) -> int:
+        """Of the newest; numbers begin again after the last. 1 for the first of all."""
+        half = NUMBERS // 2
+        return 1 if self._last is None else (number - self._last + half) % NUMBERS - half
+
+    def _lose(self) -> None:
+        self._begun, self.lost = None, True
+
+    def _take(self, number: int, arguments: bytes, level: int, time_s: float) -> None:
         if number == BEGINS:
             self._begun, self._failed = (_word(arguments, 9), _word(arguments, 13)), []
         elif number == ENDS:
             if self._begun is not None:
-                self.report = CheckReport(*self._begun, tuple(self._failed))
-                self.incomplete = False
+                self.report, self.lost = CheckReport(*self._begun, tuple(self._failed)), False
             self._begun = None
         elif number in DENIALS:
             self.denied = time_s, NAMES[number]
@@ -273,80 +281,3 @@ def _refusal(name: str, refused: str) -> Refusal:
 
 def _word(data: bytes, offset: int) -> int:
     return int.from_bytes(data[offset : offset + 4], "little")
-
-
-Fields = Mapping[str, Any]
-NUMBERS = 1 << 16
-MOST_MISSING = 20
-"""PX4 keeps so many events."""
-ASK_AGAIN_S, MOST_REQUESTS = 0.3, 3
-
-
-class EventOrder:
-    """Hands out events by their numbers; one that is missing holds the others up until it comes or is given up."""
-
-    def __init__(self) -> None:
-        self._next: int | None = None
-        self._last = 0
-        """The newest number that the autopilot has used."""
-        self._waiting: dict[int, Fields] = {}
-        self._asked_s, self._requests = -math.inf, 0
-        self.gaps = 0
-        """How often events were given up."""
-
-    def add(self, fields: Fields) -> list[Fields]:
-        """Takes an EVENT; those that follow without a gap now, in order. One without a number is ignored."""
-        try:
-            number = int(fields["sequence"]) % NUMBERS
-        except (KeyError, TypeError, ValueError, OverflowError):
-            return []
-        if self._next is None:
-            self._next = self._last = number
-        if self._ahead(number) < 0:
-            return []  # it came already
-        self._waiting[number] = fields
-        self._last = max(self._last, number, key=self._ahead)
-        if self._ahead(number) > MOST_MISSING:
-            self._skip()
-        return self._follow()
-
-    def announce(self, number: int, *, reset: bool) -> None:
-        """The autopilot says that this is the number of its newest event; ``reset``: it counts anew."""
-        if reset or self._next is None or abs(self._ahead(number)) > MOST_MISSING:
-            self._next, self._last, self._waiting = (number + 1) % NUMBERS, number, {}
-        self._last = max(self._last, number, key=self._ahead)
-
-    def missing(self, now_s: float) -> tuple[int, int] | None:
-        """The first and the last number to request now; None: none is missing, or it is too early to ask again."""
-        if self._next is None or self._ahead(self._last) < 0 or now_s - self._asked_s < ASK_AGAIN_S:
-            return None
-        self._asked_s, self._requests = now_s, self._requests + 1
-        first = last = self._next
-        while last != self._last and (last + 1) % NUMBERS not in self._waiting:
-            last = (last + 1) % NUMBERS
-        return first, last
-
-    def give_up(self) -> list[Fields]:
-        """The events after those that were requested in vain."""
-        if self._requests <= MOST_REQUESTS:
-            return []
-        self._skip()
-        return self._follow()
-
-    def _ahead(self, number: int) -> int:
-        """Of the number that comes next; negative: before it. Numbers begin again after the last."""
-        assert self._next is not None
-        half = NUMBERS // 2
-        return (number - self._next + half) % NUMBERS - half
-
-    def _skip(self) -> None:
-        self.gaps += 1
-        self._next = min(self._waiting, key=self._ahead, default=(self._last + 1) % NUMBERS)
-        self._requests = 0
-
-    def _follow(self) -> list[Fields]:
-        ready = []
-        while self._next in self._waiting:
-            ready.append(self._waiting.pop(self._next))
-            self._next, self._requests = (self._next + 1) % NUMBERS, 0
-        return ready

@@ -454,8 +454,6 @@ class FakeAutopilot:
                 self._set_parameter(message.param_id, message.param_value)
             case "HEARTBEAT" if on_link and message.type == mavlink.MAV_TYPE_GCS:
                 self.checks.hear_ground_station(self._clock())
-            case "UNKNOWN_412":  # REQUEST_EVENT, which pymavlink does not have
-                self.checks.send_again(*struct.unpack("<HH", bytes(message.get_msgbuf())[10:14]))
             case _:
                 pass
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import struct
-from collections import deque
 from collections.abc import Iterable
 
 from pymavlink.dialects.v20 import development as mavlink
@@ -19,8 +18,6 @@ TEXT_CHUNK = 50
 """Characters of a STATUSTEXT."""
 GROUND_STATION_S = 2.5
 """PX4 sends texts for so long after a ground station's heartbeat."""
-EVENTS_KEPT = 20
-"""PX4 sends no older ones again."""
 SEQUENCE_S = 1.0
 """Between two messages that name the newest event."""
 BOOT_MS = 0
@@ -33,7 +30,6 @@ class FakeChecks:
     def __init__(self, link: mavlink.MAVLink) -> None:
         self._mav = link
         self._sequence = self._texts = 0
-        self._kept: deque[tuple[int, _Event]] = deque(maxlen=EVENTS_KEPT)
         self._ground_station_s = -math.inf
         self._announced_s = -math.inf
         self.events_to_lose = 0
@@ -48,17 +44,11 @@ class FakeChecks:
         """One was heard a moment ago."""
         return now_s - self._ground_station_s <= GROUND_STATION_S
 
-    def send_again(self, first: int, last: int) -> None:
-        """Sends the events of these numbers that it has still."""
-        for number, event in self._kept:
-            if (number - first) & 0xFFFF <= (last - first) & 0xFFFF:
-                self._mav.send(event)
-
     def announce(self, now_s: float) -> None:
         """Names the newest event's number, once a second."""
         if now_s - self._announced_s >= SEQUENCE_S:
             self._announced_s = now_s
-            self._mav.send(_EventSequence(self._sequence, reset=not self._kept))
+            self._mav.send(_EventSequence(self._sequence, reset=self._told is None))
 
     def tell_changes(self, failing: Iterable[str]) -> None:
         """Sends the list if it is not the one sent last."""
@@ -91,12 +81,10 @@ class FakeChecks:
 
     def _send(self, number: int, level: int, arguments: bytes) -> None:
         self._sequence = (self._sequence + 1) & 0xFFFF
-        event = _Event(number, self._sequence, level << 4 | level, arguments)
-        self._kept.append((self._sequence, event))
         if self.events_to_lose > 0:
             self.events_to_lose -= 1
         else:
-            self._mav.send(event)
+            self._mav.send(_Event(number, self._sequence, level << 4 | level, arguments))
 
 
 class _Raw:

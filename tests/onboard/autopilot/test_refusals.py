@@ -67,7 +67,6 @@ def test_a_drone_that_may_be_armed_has_nothing_to_say_while_flockd_does_not_stre
     story = Story()
     story.report(0x807F3AB0, 0x807F3AB0, *IDLE_IN_SITL)
     assert story.sentences() == []
-    assert not story.received.check_events.incomplete
     (refusal,) = story.received.refusals(story.now_s, streams=True)
     assert (refusal.reason, refusal.refused) == ("check_modes_offboard_signal_lost", "offboard")
     assert "it receives no setpoints although flockd sends them; check that" in refusal.sentence
@@ -101,51 +100,36 @@ def test_the_cause_comes_first_each_reason_once_and_no_more_than_five() -> None:
     assert sentences[-1].endswith("(1 further reason)")
 
 
-def test_a_list_with_a_lost_event_is_not_believed_and_asked_for_anew() -> None:
+def test_a_list_with_a_lost_event_is_not_believed_and_the_next_whole_one_is() -> None:
     story = Story()
     story.report(0, 0, (5049764, ALL_MODES, 3))
     story.event(SUMMARY, struct.pack("<BIIII", 0, 0, 0, ALL_MODES, ALL_MODES), 8)
     story.lose_an_event()
     story.event(END, b"", 8)
-    events, lost = story.received.check_events, story._sequence - 1
-    assert events.missing(story.now_s) == (lost, lost)
-    assert not events.incomplete, "it is requested first"
-    for _ in range(3):
-        assert events.missing(story.now_s + 0.1) is None, "not again at once"
-        story.now_s += 0.4
-        assert events.missing(story.now_s) == (lost, lost)
-    story.now_s += 0.4
-    assert events.missing(story.now_s) is None, "given up"
-    assert events.incomplete
+    events = story.received.check_events
+    assert events.lost
     assert "the battery is low" in story.sentences()[0], "the last whole list holds"
     story.report(ALL_MODES, ALL_MODES)
-    assert (story.sentences(), story.received.check_events.incomplete) == ([], False)
+    assert (story.sentences(), events.lost) == ([], False)
+    story._sequence -= 3  # what comes once more changes nothing
+    story.report(0, 0, (5049764, ALL_MODES, 3))
+    assert (story.sentences(), events.lost) == ([], False)
 
 
-def test_an_event_that_comes_when_it_is_requested_makes_the_list_whole() -> None:
+@pytest.mark.parametrize(
+    ("ahead", "reset", "lost"), [(0, 0, False), (-3, 0, False), (2, 0, True), (-3, 1, True), (-30, 0, True)]
+)
+def test_the_last_events_are_missed_by_the_number_that_the_autopilot_names(ahead: int, reset: int, lost: bool) -> None:
     story = Story()
     story.report(ALL_MODES, ALL_MODES)
-    story.event(SUMMARY, struct.pack("<BIIII", 0, 0, 0, 0, 0), 8)
-    story.lose_an_event()
-    story.event(END, b"", 8)
-    assert story.sentences() == [], "the old list holds until then"
-    story._sequence -= 2
-    story.event(event_number("check_battery_low"), struct.pack("<IB", ALL_MODES, 20), 3)
+    assert story._sequence == 0xFFFF, "numbers begin again after it"
+    newest = (story._sequence + ahead) & 0xFFFF
+    story.send("CURRENT_EVENT_SEQUENCE", sequence=newest, flags=reset)
+    assert story.received.check_events.lost is lost
+    story._sequence = newest if lost else story._sequence
+    story.report(0, 0, (5049764, ALL_MODES, 3))
     assert "the battery is low" in story.sentences()[0]
-    assert not story.received.check_events.incomplete
-
-
-def test_the_last_events_are_missed_by_the_number_that_the_autopilot_names() -> None:
-    story = Story()
-    story.report(ALL_MODES, ALL_MODES)
-    newest = story._sequence
-    assert newest == 0xFFFF, "numbers begin again after it"
-    story.send("CURRENT_EVENT_SEQUENCE", sequence=newest, flags=0)
-    assert story.received.check_events.missing(story.now_s) is None
-    story.send("CURRENT_EVENT_SEQUENCE", sequence=1, flags=0)
-    assert story.received.check_events.missing(story.now_s) == (0, 1)
-    story.send("CURRENT_EVENT_SEQUENCE", sequence=7, flags=1)
-    assert story.received.check_events.missing(story.now_s) is None, "it counts anew"
+    assert not story.received.check_events.lost
 
 
 def test_a_check_without_words_here_is_told_by_its_number() -> None:
