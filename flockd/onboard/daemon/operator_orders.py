@@ -8,7 +8,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple
 
 from flockd.core import services
 from flockd.core.config import DroneConfig
@@ -40,16 +40,6 @@ class OperatorRequests:
         self.resume = command == "resume"
 
 
-class Missions(Protocol):
-    """What takes an operator's orders to the mission."""
-
-    def fault(self, order: MissionOrder) -> str | None:
-        """Why it is refused; None: it is not. On any thread."""
-
-    def apply(self, order: MissionOrder) -> None:
-        """Has the pilot take it in its next step. On the event loop."""
-
-
 class OperatorCommands:
     """Accepts or refuses a command on any thread, and applies it on the event loop.
 
@@ -60,7 +50,7 @@ class OperatorCommands:
         self,
         allowed: Collection[str],
         requests: OperatorRequests,
-        missions: Missions,
+        missions: MissionOrders,
         loop: asyncio.AbstractEventLoop,
         log_event: Callable[[str], None],
         *,
@@ -93,9 +83,8 @@ class OperatorCommands:
         return AnswerMessage(accepted=True, sentence=f"{command} is being tried; the drone's state shows the result")
 
     def recent(self) -> list[TakenOrderMessage]:
-        """For telemetry: the last order of each operator of the last minute, the newest first."""
-        now_s = self._clock()
-        return [taken_message(order, now_s) for order in self._checks.recent()]
+        """See `OrderChecks.recent`."""
+        return self._checks.recent()
 
     def _apply(self, command: str, ask: AskMessage) -> None:
         """Raises ValueError with the reason for which it is refused."""
@@ -108,13 +97,6 @@ class OperatorCommands:
             self._loop.call_soon_threadsafe(self._missions.apply, order)
         else:
             self._loop.call_soon_threadsafe(self._requests.apply, command)
-
-
-def taken_message(order: TakenOrder, now_s: float) -> TakenOrderMessage:
-    """As telemetry has it; ``now_s``: on the clock by which it was taken."""
-    return TakenOrderMessage(
-        operator=order.operator, command=order.command, sequence=order.sequence, age_s=now_s - order.taken_s
-    )
 
 
 class _Limited:
@@ -151,10 +133,7 @@ SAFE = frozenset({"hold", "land"})
 RECENT_S, MOST_RECENT = 60.0, 8
 
 
-@dataclass(frozen=True)
-class TakenOrder:
-    """An order that was taken, and when on the drone's clock."""
-
+class _Taken(NamedTuple):
     operator: str
     command: str
     sequence: int
@@ -169,8 +148,8 @@ class OrderChecks:
         self._identity, self._clock = identity, clock
         self._lock = threading.Lock()
         self._sequences: OrderedDict[str, int] = OrderedDict()
-        self._newest: tuple[float, TakenOrder] | None = None
-        self._recent: dict[str, TakenOrder] = {}
+        self._newest: tuple[float, _Taken] | None = None
+        self._recent: dict[str, _Taken] = {}
 
     def fault(self, command: str, ask: AskMessage) -> str | None:
         """Why an order is refused, for its sender; None: it is not. Its number counts as used from now on."""
@@ -194,7 +173,7 @@ class OrderChecks:
 
     def take(self, command: str, ask: AskMessage) -> None:
         """An order is carried out."""
-        taken = TakenOrder(ask["operator"], command, ask["sequence"], self._clock())
+        taken = _Taken(ask["operator"], command, ask["sequence"], self._clock())
         with self._lock:
             if self._newest is None or ask["time_s"] >= self._newest[0]:
                 self._newest = ask["time_s"], taken
@@ -203,18 +182,23 @@ class OrderChecks:
             while len(self._recent) > MOST_RECENT:
                 self._recent.pop(next(iter(self._recent)))
 
-    def recent(self) -> tuple[TakenOrder, ...]:
-        """The last of each operator within `RECENT_S`, the newest first."""
+    def recent(self) -> list[TakenOrderMessage]:
+        """For telemetry: the last of each operator within `RECENT_S`, the newest first."""
         now_s = self._clock()
         with self._lock:
-            return tuple(one for one in reversed(self._recent.values()) if now_s - one.taken_s <= RECENT_S)
+            taken = [(*one[:3], now_s - one.taken_s) for one in reversed(self._recent.values())]
+        return [
+            TakenOrderMessage(operator=operator, command=command, sequence=sequence, age_s=age_s)
+            for operator, command, sequence, age_s in taken
+            if age_s <= RECENT_S
+        ]
 
 
 _TAKES_ORDERS = frozenset({State.NORMAL, State.DEGRADED, State.HOVER})
 
 
 class MissionOrders:
-    """See `flockd.onboard.daemon.operator_orders.Missions`."""
+    """Takes operators' orders to the mission."""
 
     def __init__(
         self,
@@ -227,12 +211,12 @@ class MissionOrders:
         self._config, self._pilot_loop, self._vehicle, self._state = config, pilot_loop, vehicle, state
 
     def fault(self, order: MissionOrder) -> str | None:
-        """Why it is refused, one sentence; None: it is not."""
+        """Why it is refused, one sentence; None: it is not. On any thread."""
         state = self._state()
         if state not in _TAKES_ORDERS:
             return f"flockd does not fly the drone now, as its state is {state}; its mission begins with the flight"
         return order_fault(self._config, order, self._vehicle())
 
     def apply(self, order: MissionOrder) -> None:
-        """Has the pilot take it in its next step."""
+        """Has the pilot take it in its next step. On the event loop."""
         self._pilot_loop.order = order

@@ -15,11 +15,10 @@ from typing import BinaryIO, Literal, Self
 
 import lz4.frame
 import zstandard
-from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
-from mcap.stream_reader import breakup_chunk
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from flockd.core.errors import FlockdError
@@ -28,6 +27,7 @@ CHUNK_BYTES = 100_000
 """What a killed writer loses at most, besides what it has not yet been given time to flush."""
 SYNC_EVERY_S = 1.0
 """How much a loss of power takes, where the disk keeps its word."""
+_KNOWN = {Opcode.CHUNK, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.METADATA, Opcode.ATTACHMENT}
 _MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")
 MAX_RECORD_BYTES = 256 << 20
@@ -220,33 +220,26 @@ class _Reader:
                 continue
             content = self._file.read(length)
             try:
-                found = list(self._parsed(opcode, content))
+                found = list(self._parsed(opcode, head + content))
             except _BROKEN as error:
                 yield Damage(offset, f"a {_name(opcode)} cannot be read ({error})", at_end=False)
             else:
                 yield from found
 
-    def _parsed(self, opcode: int, content: bytes) -> Iterator[Record]:
-        stream = ReadDataStream(io.BytesIO(content))
-        match opcode:
-            case Opcode.CHUNK:
-                for record in breakup_chunk(_uncompressed(Chunk.read(stream)), validate_crc=True):
-                    yield from self._unpacked(record)
-            case Opcode.SCHEMA:
-                yield from self._unpacked(Schema.read(stream))
-            case Opcode.CHANNEL:
-                yield from self._unpacked(Channel.read(stream))
-            case Opcode.MESSAGE:
-                yield from self._unpacked(Message.read(stream, len(content)))
-            case Opcode.METADATA:
-                metadata = Metadata.read(stream)
-                yield Note(metadata.name, metadata.metadata)
-            case Opcode.ATTACHMENT:
-                attachment = Attachment.read(stream)
-                yield Inclosure(attachment.name, attachment.media_type, attachment.data)
+    def _parsed(self, opcode: int, whole: bytes) -> Iterator[Record]:
+        if opcode in _KNOWN:
+            record = next(StreamReader(io.BytesIO(whole), skip_magic=True, emit_chunks=True).records)
+            if isinstance(record, Chunk):
+                for inner in breakup_chunk(_uncompressed(record), validate_crc=True):
+                    yield from self._unpacked(inner)
+            yield from self._unpacked(record)
 
-    def _unpacked(self, record: object) -> Iterator[Entry]:
+    def _unpacked(self, record: object) -> Iterator[Record]:
         match record:
+            case Metadata(name=name, metadata=facts):
+                yield Note(name, facts)
+            case Attachment(name=name, media_type=kind, data=data):
+                yield Inclosure(name, kind, data)
             case Schema():
                 self._schemas[record.id] = record
             case Channel():

@@ -10,6 +10,7 @@ import os
 import select
 from typing import Any, ClassVar
 
+
 def _words(names: str, kind: type[Any] = ctypes.c_uint32) -> list[tuple[str, type[Any]]]:
     return [(name, kind) for name in names.split()]
 

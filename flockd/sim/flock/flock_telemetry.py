@@ -15,7 +15,7 @@ from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, VehicleSta
 from flockd.flight.geometry import build_rig
 from flockd.flight.mission import order_fault
 from flockd.flight.safety import State
-from flockd.onboard.daemon.operator_orders import ORDERS, OrderChecks, taken_message
+from flockd.onboard.daemon.operator_orders import ORDERS, OrderChecks
 from flockd.onboard.telemetry import TelemetrySink, publish_step
 from flockd.onboard.telemetry.order_messages import parse_ask, parse_order
 from flockd.onboard.telemetry.preview import Previews
@@ -151,7 +151,6 @@ class FlockTelemetry:
 
     def show_flight(self, time_s: float, loop: ControlLoop) -> None:
         """Publishes who flies each drone, and why."""
-        now_s = time.monotonic()
         for i in self._there():
             (state, why), reasons = loop.status(i), self._reasons.get(i, ())
             held = state is State.ASKING
@@ -165,7 +164,7 @@ class FlockTelemetry:
                 height_m=self._states[i].height_m, velocity_trim=[0.0, 0.0],
                 velocity_error_m_s=loop.velocity_error_m_s(i),
                 silence="its autopilot holds position" if held else None, setpoints_sent=0, setpoints_missed=0,
-                orders=[taken_message(order, now_s) for order in self._checks[i].recent()],
+                orders=self._checks[i].recent(),
                 orders_refused=self._refused[i],
             )  # fmt: skip
             self._sink.publish(f"drone{i + 1}", "flight", {**message})
