@@ -46,14 +46,13 @@ RESULTS = (
     "refused because another station has control",
 )
 """By MAV_RESULT."""
-ENUMERATIONS: Mapping[tuple[str, str], int] = {
-    ("EXTENDED_SYS_STATE", "landed_state"): len(LANDED_STATES),
-    ("GPS_RAW_INT", "fix_type"): 9,  # GPS_FIX_TYPE
-    ("HEARTBEAT", "system_status"): 9,  # MAV_STATE
+VALUES: Mapping[str, tuple[str, range]] = {
+    "EXTENDED_SYS_STATE": ("landed_state", range(len(LANDED_STATES))),
+    "GPS_RAW_INT": ("fix_type", range(9)),  # GPS_FIX_TYPE
+    "HEARTBEAT": ("system_status", range(9)),  # MAV_STATE
+    "SYS_STATUS": ("battery_remaining", range(-1, 101)),  # -1 is MAVLink's own word for unknown
 }
-"""How many values each field's enumeration has, from 0, by message and field: of the MAVLink dialect `common`."""
-RANGES: Mapping[tuple[str, str], range] = {("SYS_STATUS", "battery_remaining"): range(-1, 101)}
-"""What other fields may be, likewise; -1 is MAVLink's own word for unknown."""
+"""What a field of these messages may be: of the MAVLink dialect `common`."""
 FACES_DOWN = 25
 """MAV_SENSOR_ROTATION_PITCH_270 of MAV_SENSOR_ORIENTATION."""
 RANGES_KEPT = 200
@@ -415,19 +414,15 @@ class ReceivedMessages:
         return {} if message is None else message.fields
 
     def _checked(self, name: str, fields: Fields) -> Fields:
-        """The same fields with None for values that their enumeration or range does not have."""
-        allowed = {**{field: range(count) for field, count in ENUMERATIONS.items()}, **RANGES}
-        unknown = [
-            field
-            for (message, field), values in allowed.items()
-            if message == name and fields.get(field) is not None and fields[field] not in values
-        ]
-        for field in unknown:
-            value = f"{name}.{field} = {fields[field]}"
-            if value not in self._unknown_values:
-                self._report(f"the autopilot sends {value}, which flockd does not know; it counts as unknown")
-            self._unknown_values[value] += 1
-        return {**fields, **dict.fromkeys(unknown)} if unknown else fields
+        """The same fields with None for a value that is none of `VALUES`."""
+        field, known = VALUES.get(name, ("", range(0)))
+        if fields.get(field) is None or fields[field] in known:
+            return fields
+        value = f"{name}.{field} = {fields[field]}"
+        if value not in self._unknown_values:
+            self._report(f"the autopilot sends {value}, which flockd does not know; it counts as unknown")
+        self._unknown_values[value] += 1
+        return {**fields, field: None}
 
 
 class StatusText:

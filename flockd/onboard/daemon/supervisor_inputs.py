@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -23,6 +22,8 @@ from flockd.onboard.sources import CameraStatus, Count, FrameSource
 from flockd.onboard.worker import LateError, Worker
 
 DROPS_WINDOW_S = 5.0
+_Tally = tuple[int, int, int, int]
+"""Frames: received, of these refused when they came; decoded, of these such that show nothing, or noise."""
 _BAD: tuple[Count, ...] = ("time_stamp", "flagged", "corrupt", "malformed")
 _REFUSED = (Objection.COMMAND_NOT_FINITE, Objection.COMMAND_TOO_LARGE, Objection.HEADING_NOT_FINITE)
 
@@ -165,9 +166,9 @@ class CameraMonitor:
         cameras = {name: self._health(name, camera, now) for name, camera in status.items()}
         while self._window and now - self._window[0][0] > DROPS_WINDOW_S:
             self._window.popleft()
-        tally = _Tally.of(status, noisy_images)
+        tally = _tally(status, noisy_images)
         self._window.append((now, tally))
-        return CameraSummary(cameras, tally.dropped_share(since=self._window[0][1]))
+        return CameraSummary(cameras, _dropped_share(self._window[0][1], tally))
 
     def _health(self, name: str, camera: CameraStatus, now: float) -> CameraHealth:
         """A fault with frozen images counted since the last good state means that the camera is frozen."""
@@ -181,35 +182,20 @@ class CameraMonitor:
         return CameraHealth(camera.age_s, period_s, unplugged=unplugged, frozen=is_frozen, noisy=noisy)
 
 
-class _Tally(NamedTuple):
-    """Frames of all cameras since the start. Few are decoded, so that these are a tally of their own."""
+def _tally(status: Mapping[str, CameraStatus], noisy_images: int) -> _Tally:
+    """Of all cameras since the start. Few frames are decoded, so that these are counted for themselves."""
+    counts = Counter[Count]()
+    for camera in status.values():
+        counts.update(camera.counts)
+    undecodable = counts["undecodable"]
+    refused = sum(counts[what] for what in _BAD) - undecodable
+    return counts["received"], refused, counts["used"] + undecodable, undecodable + noisy_images
 
-    received: int
-    refused: int
-    """When they came."""
-    decoded: int
-    useless: int
-    """How many of the decoded show nothing, or noise."""
 
-    @classmethod
-    def of(cls, status: Mapping[str, CameraStatus], noisy_images: int) -> Self:
-        """As of now."""
-
-        def count(*what: Count) -> int:
-            return sum(camera.counts.get(one, 0) for camera in status.values() for one in what)
-
-        undecodable = count("undecodable")
-        return cls(
-            received=count("received"),
-            refused=count(*_BAD) - undecodable,
-            decoded=count("used") + undecodable,
-            useless=undecodable + noisy_images,
-        )
-
-    def dropped_share(self, since: Self) -> float:
-        """The larger of the shares of those refused and of those useless, since another time."""
-        refused = (self.refused - since.refused) / max(self.received - since.received, 1)
-        return max(refused, (self.useless - since.useless) / max(self.decoded - since.decoded, 1))
+def _dropped_share(before: _Tally, now: _Tally) -> float:
+    """The larger of the shares of those refused and of those useless."""
+    received, refused, decoded, useless = (b - a for a, b in zip(before, now, strict=True))
+    return max(refused / max(received, 1), useless / max(decoded, 1))
 
 
 SAMPLE_S = 0.05
