@@ -23,7 +23,7 @@ from flockd.flight.geometry import (
 from flockd.ground.calibration.board import CalibrationError
 from flockd.ground.calibration.fragment import extrinsics_of, measured_today, write_rig
 from flockd.onboard.message_json import from_json, parsed
-from flockd.onboard.recording.mcap_file import Entry, RecordingError, read_records
+from flockd.onboard.recording.mcap_file import RecordingError, read_entries
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.streams import OUTPUT
 
@@ -35,13 +35,13 @@ of a focal length."""
 def found_rig(recording: Recording) -> tuple[CameraDeviation, ...]:
     """The last that the outputs of a recording say of its cameras; none: they say nothing. Raises RecordingError."""
     last: tuple[CameraDeviation, ...] = ()
-    for path in recording.contents.paths:
-        for record in read_records(path):
-            if isinstance(record, Entry) and record.stream.topic == OUTPUT.topic:
-                try:
-                    last = from_json(PilotOutput, parsed(record.data)).rig or last
-                except ValueError as error:
-                    raise RecordingError(f"{path}: the output of step {record.sequence} is damaged: {error}") from error
+    for entry in read_entries(*recording.contents.paths):
+        if entry.stream.topic == OUTPUT.topic:
+            try:
+                last = from_json(PilotOutput, parsed(entry.data)).rig or last
+            except ValueError as error:
+                damaged = f"the output of step {entry.sequence} is damaged: {error}"
+                raise RecordingError(f"{recording.path}: {damaged}") from error
     names = {camera.name for camera in recording.config.rig.cameras}
     for one in last:
         if one.camera not in names or not _is_possible(one):

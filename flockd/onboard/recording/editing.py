@@ -12,7 +12,7 @@ import numpy as np
 from flockd.core.messages import VehicleState
 from flockd.onboard.message_json import from_json, parsed
 from flockd.onboard.recording import foxglove
-from flockd.onboard.recording.mcap_file import Entry, McapFile, Note, RecordingError, read_records
+from flockd.onboard.recording.mcap_file import Entry, McapFile, Note, RecordingError, read_entries
 from flockd.onboard.recording.reader import (
     Contents,
     Recording,
@@ -86,7 +86,7 @@ def _copy(recording: Recording, target: Path, start_s: float, end_s: float, how:
 
 def _kept(contents: Contents, whole: set[int], in_time: Callable[[int], bool]) -> Iterator[Entry]:
     calibrated: set[str] = set()
-    for entry in _entries(contents):
+    for entry in read_entries(*contents.paths):
         topic = entry.stream.topic
         if is_calibration(topic):
             if topic not in calibrated:
@@ -101,7 +101,7 @@ def _whole_steps(contents: Contents, start_s: float, end_s: float, *, images: bo
     seen: dict[int, set[str]] = {}
     listed: dict[int, StepFrames] = {}
     damaged: set[int] = set()
-    for entry in _entries(contents):
+    for entry in read_entries(*contents.paths):
         if makes_steps(entry.stream.topic):
             seen.setdefault(entry.sequence, set()).add(entry.stream.topic)
         if entry.stream.topic == FRAMES.topic:
@@ -130,7 +130,3 @@ def _can_be_read(entry: Entry, images: bool) -> bool:
     except (ValueError, RecordingError):
         return False
     return True
-
-
-def _entries(contents: Contents) -> Iterator[Entry]:
-    return (record for path in contents.paths for record in read_records(path) if isinstance(record, Entry))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from flockd.onboard.message_json import Json, parsed
 from flockd.onboard.recording import foxglove
-from flockd.onboard.recording.mcap_file import Entry, RecordingError, read_records
+from flockd.onboard.recording.mcap_file import RecordingError, read_entries
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.streams import is_image
 
@@ -28,7 +28,7 @@ def export_tables(recording: Recording, folder: Path) -> tuple[Path, ...]:
     OSError.
     """
     tables: Tables = {}
-    for entry in _entries(recording):
+    for entry in read_entries(*recording.contents.paths):
         if entry.stream.encoding == "json":
             time = {"log_time_s": entry.time_ns * 1e-9}
             try:
@@ -45,7 +45,7 @@ def export_tables(recording: Recording, folder: Path) -> tuple[Path, ...]:
 def export_images(recording: Recording, folder: Path) -> int:
     """Writes each image as it is in the recording to `CAMERA/STEP_TIME.png` or `.jpeg`; gives their number."""
     count = 0
-    for entry in _entries(recording):
+    for entry in read_entries(*recording.contents.paths):
         if is_image(entry.stream.topic):
             data, kind = foxglove.image_data(entry.data)
             try:
@@ -64,11 +64,6 @@ def _file_name(name: str) -> str:
     if not _FILE_NAME.fullmatch(name):
         raise ValueError(f"it has the name {name[:60]!a}, which is none for a file")
     return name
-
-
-def _entries(recording: Recording) -> Iterator[Entry]:
-    paths = recording.contents.paths
-    return (record for path in paths for record in read_records(path) if isinstance(record, Entry))
 
 
 def _add(tables: Tables, table: str, fixed: Mapping[str, Any], message: Json) -> None:

@@ -187,6 +187,11 @@ def read_records(path: Path) -> Iterator[Record | Damage]:
         yield from _Reader(file).records()
 
 
+def read_entries(*paths: Path) -> Iterator[Entry]:
+    """The messages alone that can be read, of one file after the other."""
+    return (record for path in paths for record in read_records(path) if isinstance(record, Entry))
+
+
 class _Reader:
     """Walks from record to record by their lengths, so that one broken record does not hide the next."""
 

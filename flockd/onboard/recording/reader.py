@@ -20,7 +20,16 @@ from flockd.core.jpeg_header import cost_fault
 from flockd.core.messages import Frame, FrameSet, LearnedSize, MissionOrder, UInt8Array, VehicleState
 from flockd.onboard.message_json import from_json, parsed
 from flockd.onboard.recording import foxglove
-from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, Note, Record, RecordingError, read_records
+from flockd.onboard.recording.mcap_file import (
+    Damage,
+    Entry,
+    Inclosure,
+    Note,
+    Record,
+    RecordingError,
+    read_entries,
+    read_records,
+)
 from flockd.onboard.recording.streams import (
     CONFIGURATION,
     END_NOTE,
@@ -153,13 +162,12 @@ class Recording:
         Raises RecordingError where an image or a message is damaged.
         """
         number, messages = -1, dict[str, bytes]()
-        for path in self.contents.paths:
-            for record in read_records(path):
-                if isinstance(record, Entry) and makes_steps(record.stream.topic):
-                    if record.sequence != number:
-                        yield from self._built(number, messages, start_s, end_s)
-                        number, messages = record.sequence, {}
-                    messages[record.stream.topic] = record.data
+        for entry in read_entries(*self.contents.paths):
+            if makes_steps(entry.stream.topic):
+                if entry.sequence != number:
+                    yield from self._built(number, messages, start_s, end_s)
+                    number, messages = entry.sequence, {}
+                messages[entry.stream.topic] = entry.data
         yield from self._built(number, messages, start_s, end_s)
 
     def _built(

@@ -17,7 +17,7 @@ from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.flight.perception import load_networks
 from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.onboard.message_json import from_json
-from flockd.onboard.recording.mcap_file import Entry, read_records
+from flockd.onboard.recording.mcap_file import Entry, read_entries
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.streams import ORDER, OUTPUT
 from flockd.review.flight_log.builder import FlightLogBuilder
@@ -160,8 +160,7 @@ def _add_missions(
 
 
 def _entries(recordings: Path, drone: str, topic: str) -> Iterator[Entry]:
-    for path in sorted(recordings.glob(f"{drone}-*.mcap")):
-        yield from (one for one in read_records(path) if isinstance(one, Entry) and one.stream.topic == topic)
+    return (one for one in read_entries(*sorted(recordings.glob(f"{drone}-*.mcap"))) if one.stream.topic == topic)
 
 
 def were_ordered(recordings: Path, drone: str) -> bool:
