@@ -8,7 +8,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from flockd.core import services
 from flockd.core.config import DroneConfig
@@ -40,6 +40,16 @@ class OperatorRequests:
         self.resume = command == "resume"
 
 
+class Missions(Protocol):
+    """What takes an operator's orders to the mission."""
+
+    def fault(self, order: MissionOrder) -> str | None:
+        """Why it is refused; None: it is not. On any thread."""
+
+    def apply(self, order: MissionOrder) -> None:
+        """Has the pilot take it in its next step. On the event loop."""
+
+
 class OperatorCommands:
     """Accepts or refuses a command on any thread, and applies it on the event loop.
 
@@ -50,7 +60,7 @@ class OperatorCommands:
         self,
         allowed: Collection[str],
         requests: OperatorRequests,
-        missions: MissionOrders,
+        missions: Missions,
         loop: asyncio.AbstractEventLoop,
         log_event: Callable[[str], None],
         *,
@@ -198,7 +208,7 @@ _TAKES_ORDERS = frozenset({State.NORMAL, State.DEGRADED, State.HOVER})
 
 
 class MissionOrders:
-    """Takes operators' orders to the mission."""
+    """See `Missions`."""
 
     def __init__(
         self,
@@ -211,12 +221,12 @@ class MissionOrders:
         self._config, self._pilot_loop, self._vehicle, self._state = config, pilot_loop, vehicle, state
 
     def fault(self, order: MissionOrder) -> str | None:
-        """Why it is refused, one sentence; None: it is not. On any thread."""
+        """Why it is refused, one sentence; None: it is not."""
         state = self._state()
         if state not in _TAKES_ORDERS:
             return f"flockd does not fly the drone now, as its state is {state}; its mission begins with the flight"
         return order_fault(self._config, order, self._vehicle())
 
     def apply(self, order: MissionOrder) -> None:
-        """Has the pilot take it in its next step. On the event loop."""
+        """Has the pilot take it in its next step."""
         self._pilot_loop.order = order
