@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Literal
 
 import numpy as np
@@ -196,13 +197,13 @@ class RefusalWatch:
 
     def __init__(self, link: AutopilotLink, log_event: Callable[[str], None], clock: Callable[[], float]) -> None:
         self._link, self._log_event, self._clock = link, log_event, clock
-        self._asked_s = -math.inf
         self._seen_s: dict[str, float] = {}
         self.current: tuple[Refusal, ...] = ()
         """As of the last half second, the cause first."""
 
     async def run(self) -> None:
         """Watches until cancelled."""
+        asked_s = -math.inf
         while True:
             now = self._clock()
             self.current = self._link.refusals()
@@ -210,18 +211,10 @@ class RefusalWatch:
                 if now - self._seen_s.get(refusal.reason, -math.inf) >= LOG_AGAIN_S:
                     self._log_event(refusal.sentence)
                 self._seen_s[refusal.reason] = now
-            if self._must_ask(now):
-                self._asked_s = now
-                await self._ask()
+            # In flight nothing is asked: the list is for those who want to begin one.
+            if not self._link.knows_checks() and not self._link.status().armed and now - asked_s >= ASK_AGAIN_S:
+                asked_s = now
+                with suppress(AutopilotError, TimeoutError):  # of a firmware without one single messages tell reasons
+                    async with asyncio.timeout(ASK_AGAIN_S):
+                        await self._link.ask_for_checks()
             await asyncio.sleep(CHECKS_POLL_S)
-
-    def _must_ask(self, now_s: float) -> bool:
-        """In flight nothing is asked: the list is for those who want to begin one."""
-        return not self._link.knows_checks() and not self._link.status().armed and now_s - self._asked_s >= ASK_AGAIN_S
-
-    async def _ask(self) -> None:
-        try:
-            async with asyncio.timeout(ASK_AGAIN_S):
-                await self._link.ask_for_checks()
-        except (AutopilotError, TimeoutError):
-            return  # a firmware without such a list; single messages tell the reasons then
