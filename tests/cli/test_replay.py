@@ -6,7 +6,7 @@ import json
 from contextlib import ExitStack
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 import yaml
@@ -14,13 +14,17 @@ import yaml
 from flockd.cli import main
 from flockd.core.config import Overrides
 from flockd.core.data import data_path
-from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, VehicleState
+from flockd.core.messages import FrameSet, PilotOutput
+from flockd.flight.inference.hashes import model_hashes
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.reader import Recording
 from flockd.review.flight_log.from_recordings import flight_log, recordings_in
 from flockd.review.flight_log.log import FlightLog
 from flockd.sim.flock.start import with_drones
+from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import ScenarioConfig, load_scenario
+from tests.cli.conftest import Told
+from tests.make import changed
 from tests.onboard.recording.made_up import MODELS, MadeUpPilot, drone_config, record
 from tests.worlds import worlds_once
 
@@ -42,12 +46,10 @@ def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 class Nudged(MadeUpPilot):
     """Turns a little more from the fourth step on."""
 
-    nudge = 1e-9
-
-    def step(self, frames: FrameSet, vehicle: VehicleState, *, order: MissionOrder | None = None) -> PilotOutput:
-        output = super().step(frames, vehicle, order=order)
+    def step(self, frames: FrameSet, *more: Any, **order: Any) -> PilotOutput:
+        output = super().step(frames, *more, **order)
         if frames.time_s > 1000.25:
-            output.command.velocity[1] += self.nudge
+            output.command.velocity[1] += 1e-9
         return output
 
 
@@ -57,15 +59,11 @@ def nudged(path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def test_a_replay_equals_the_flight(path: Path, capsys: Capture) -> None:
-    assert main(["replay", str(path), "--diff"]) == 0
-    captured = capsys.readouterr()
-    assert captured.err == ""
-    first, second = captured.out.splitlines()
+def test_a_replay_equals_the_flight(path: Path, told: Told) -> None:
+    first, second = told(0, "replay", path, "--diff").splitlines()
     assert first.startswith("drone1: 10 steps, 0.9 s, ")
     assert second.startswith("equal in all ")
-    assert main(["replay", str(path), "--diff", "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    result = json.loads(told(0, "replay", path, "--diff", "--json"))
     assert (result["steps"], result["diff"]["equal"], result["warnings"]) == (10, True, [])
 
 
@@ -129,31 +127,26 @@ def test_a_new_recording_is_a_flight_too(nudged: Path, capsys: Capture) -> None:
     assert capsys.readouterr().err.splitlines()[-1].startswith(f"{out}: exists; ")
 
 
-def test_a_replay_that_breaks_off_leaves_no_recording(
-    path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
-) -> None:
+def test_a_replay_that_breaks_off_leaves_no_recording(path: Path, monkeypatch: pytest.MonkeyPatch, told: Told) -> None:
     class Broken(MadeUpPilot):
-        def step(self, frames: FrameSet, vehicle: VehicleState, *, order: MissionOrder | None = None) -> PilotOutput:
+        def step(self, *_: object, **__: object) -> PilotOutput:
             raise KeyboardInterrupt
 
     monkeypatch.setattr("flockd.review.replay.recorded_flight.FlockPilot", Broken)
-    assert main(["replay", str(path), "--out", str(path.with_name("again.mcap"))]) == 130
+    assert told(130, "replay", path, "--out", path.with_name("again.mcap")) == "interrupted\n"
     assert [file.name for file in path.parent.iterdir()] == ["drone1.mcap"]
-    assert capsys.readouterr().err == "interrupted\n"
 
 
-def test_other_settings_can_be_tried(path: Path, capsys: Capture) -> None:
-    config = drone_config()
-    values = config.model_dump(mode="json")
+def test_other_settings_can_be_tried(path: Path, told: Told) -> None:
+    values = drone_config().model_dump(mode="json")
     values["flocking"]["cohesion"] = 0.2
     file = path.with_name("other.yaml")
     file.write_text(yaml.safe_dump(values), encoding="utf-8")
     assert main(["replay", str(path), "--config", str(file), "--diff"]) == 1
     values["rig"]["cameras"][1]["size_px"] = [320, 240]
     file.write_text(yaml.safe_dump(values), encoding="utf-8")
-    capsys.readouterr()
-    assert main(["replay", str(path), "--config", str(file)]) == 2
-    assert capsys.readouterr().err.startswith(f"{file}: rig.cameras: camera 'left' has 320 x 240 pixels, but {path} ")
+    error = told(2, "replay", path, "--config", file)
+    assert error.startswith(f"{file}: rig.cameras: camera 'left' has 320 x 240 pixels, but {path} ")
 
 
 def test_what_keeps_a_replay_from_being_the_flight_is_told(
@@ -169,7 +162,7 @@ def test_what_keeps_a_replay_from_being_the_flight_is_told(
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "says"),
     [
         (["--update-reference"], "--update-reference needs"),
         (["--reference", "x"], "--reference alone"),
@@ -179,9 +172,8 @@ def test_what_keeps_a_replay_from_being_the_flight_is_told(
         (["--depth", "recorded"], "--depth is for datasets"),
     ],
 )
-def test_options_that_make_no_sense_together(path: Path, options: list[str], told: str, capsys: Capture) -> None:
-    assert main(["replay", str(path), *options]) == 2
-    assert capsys.readouterr().err.startswith(told)
+def test_options_that_make_no_sense_together(path: Path, options: list[str], says: str, told: Told) -> None:
+    assert told(2, "replay", path, *options).startswith(says)
 
 
 # From pixels: two drones through the simulator, with the shipped networks and small cameras.
@@ -190,17 +182,9 @@ DRONES = ("drone1", "drone2")
 
 def scenario(overrides: Overrides) -> ScenarioConfig:
     flight = with_drones(load_scenario(data_path("config") / "paper_flight.yaml", {"duration_s": 2.5, **overrides}), 2)
-    cameras = tuple(
-        camera.model_copy(
-            update={
-                "size_px": (240, 320),
-                "intrinsics": camera.intrinsics.model_copy(update={"fx": 111.0, "fy": 111.0, "cx": 120.0, "cy": 160.0}),
-            }
-        )
-        for camera in flight.drone.rig.cameras[:2]
-    )
-    drone = flight.drone.model_copy(update={"rig": flight.drone.rig.model_copy(update={"cameras": cameras})})
-    return flight.model_copy(update={"drone": drone})
+    small = {"size_px": (240, 320), "intrinsics__fx": 111.0, "intrinsics__fy": 111.0, "intrinsics__cx": 120.0}
+    cameras = [changed(one, intrinsics__cy=160.0, **small) for one in flight.drone.rig.cameras[:2]]
+    return changed(flight, drone__rig__cameras=tuple(cameras))
 
 
 class Flight(NamedTuple):
@@ -213,9 +197,6 @@ class Flight(NamedTuple):
     scope="module", params=["dis", pytest.param("flow", marks=[pytest.mark.slow, pytest.mark.whole_flight])]
 )
 def flight(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Flight:
-    from flockd.flight.inference.hashes import model_hashes
-    from flockd.sim.flock.swarm import fly
-
     flown, folder = scenario({"drone.perception.flow": request.param}), tmp_path_factory.mktemp("flight")
     models = model_hashes(flown.drone.perception)
     with ExitStack() as stack:
@@ -226,11 +207,10 @@ def flight(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         return Flight(folder, fly(flown, recorders=recorders, processes=1).log)
 
 
-def test_a_replay_of_a_simulated_flight_equals_it_bit_for_bit(flight: Flight, capsys: Capture) -> None:
+def test_a_replay_of_a_simulated_flight_equals_it_bit_for_bit(flight: Flight, told: Told) -> None:
     for index, drone in enumerate(DRONES):
         path = flight.folder / f"{drone}.mcap"
-        assert main(["replay", str(path), "--diff", "--json"]) == 0
-        result = json.loads(capsys.readouterr().out)
+        result = json.loads(told(0, "replay", path, "--diff", "--json"))
         assert (result["steps"], result["diff"]["equal"], result["warnings"]) == (5, True, [])
         assert result["diff"]["values"] > 5 * 20, "own motion, velocity and command alone are as many"
         for step in Recording(path).steps():
@@ -249,25 +229,22 @@ def test_the_recordings_make_the_flights_own_log(flight: Flight) -> None:
     assert again.metadata.model_dump(include=set(facts)) == flight.log.metadata.model_dump(include=set(facts))
 
 
-def test_where_time_goes_and_which_step_to_configure(
-    path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
-) -> None:
+def test_where_time_goes_and_which_step_to_configure(path: Path, monkeypatch: pytest.MonkeyPatch, told: Told) -> None:
     """Ten steps of a made-up flight: the first, which warms up, takes 9 s, the others 120 to 160 ms."""
     took_s = iter([9.0, 0.12, 0.12, 0.12, 0.12, 0.14, 0.14, 0.14, 0.16, 0.16])
 
     class Timed(MadeUpPilot):
-        def step(self, frames: FrameSet, vehicle: VehicleState, *, order: MissionOrder | None = None) -> PilotOutput:
+        def step(self, *frames: Any, **order: Any) -> PilotOutput:
             whole_s = next(took_s)
             clock[0] += whole_s
-            output = super().step(frames, vehicle, order=order)
+            output = super().step(*frames, **order)
             return replace(output, stages_ms={"flow": 750.0 * whole_s, "detection": 250.0 * whole_s})
 
     clock = [0.0]
     monkeypatch.setattr("flockd.review.replay.recorded_flight.FlockPilot", Timed)
     monkeypatch.setattr("flockd.review.replay.recorded_flight.time.perf_counter", lambda: clock[0])
     monkeypatch.setattr("flockd.review.replay.recorded_flight.time.process_time", lambda: 1.5 * clock[0])
-    assert main(["replay", str(path), "--profile", "--json"]) == 0
-    profile = json.loads(capsys.readouterr().out)["profile"]
+    profile = json.loads(told(0, "replay", path, "--profile", "--json"))["profile"]
     assert list(profile["stages"]) == ["flow", "detection", "step"]
     step, flow = profile["stages"]["step"], profile["stages"]["flow"]
     assert (step["p50_ms"], step["p95_ms"]) == pytest.approx((140.0, 160.0))
@@ -279,10 +256,8 @@ def test_where_time_goes_and_which_step_to_configure(
     assert profile["cameras"] == {"front": [160, 120], "left": [160, 120]}
 
 
-def test_the_table_of_where_time_goes(path: Path, capsys: Capture) -> None:
-    assert main(["replay", str(path), "--profile"]) == 0
-    out = capsys.readouterr().out
+def test_the_table_of_where_time_goes(path: Path, told: Told) -> None:
+    table = told(0, "replay", path, "--profile")
     for part in ("stage ", "p50 ms", "step  ", "computer:", "memory_mb: ", "step_s 0.5 is configured"):
-        assert part in out
-    assert main(["replay", str(path), "--profile", "--end", "0.2"]) == 2
-    assert "--profile" in capsys.readouterr().err
+        assert part in table
+    assert "--profile" in told(2, "replay", path, "--profile", "--end", "0.2")

@@ -1,4 +1,4 @@
-"""What the page shows of a drone follows from what was heard of it."""
+"""What the page and `flockd status` show of a drone follows from what was heard of it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from typing import Any
 
 import pytest
 
-from flockd.fleet.drone_rows import HISTORY_COLUMNS, MAX_CAMERAS, Known, drone_rows, history_row
-from flockd.fleet.watcher import Heard, Watched
+from flockd.cli.output import tables_console
+from flockd.cli.status import _table
+from flockd.fleet.drone_rows import HISTORY_COLUMNS, MAX_CAMERAS, Known, drone_rows, history_row, status_rows
+from flockd.fleet.watcher import Heard, Watched, _heard
 from flockd.onboard.telemetry.topics import AboutMessage
 from tests.make import flight_message
 
@@ -97,3 +99,66 @@ def test_the_fence_comes_from_the_drones_configuration_and_nonsense_draws_none()
     nonsense: tuple[dict[str, object], ...] = ({}, {"safety": 3}, {"safety": {"gate": []}})
     assert [fence_of(one) for one in nonsense] == [None] * 3
     assert fence_of({"safety": {"gate": {"fence_radius_m": float("inf")}}}) == {"radius_m": None, "corners_m": []}
+
+
+def stating(name: str, state: str, *, alive: bool = True, **flight: Any) -> Watched:
+    drone = watched(name, alive=alive, flight=flight_message(state=state, **flight))
+    return replace(drone, announced=True, seen=False)
+
+
+def test_the_worst_stands_first_and_drones_in_one_state_in_the_order_of_their_numbers() -> None:
+    states = "normal", "degraded", "idle", "hover", "normal", "ready", "asking", "silent", "of a later version"
+    names = ("drone10", "b", "c", "d", "drone2", "g", "h", "i", "k")
+    late = replace(stating("e", "normal"), topics={"flight": Heard(98.0, flight_message(state="normal"))})
+    fleet = [*map(stating, names, states), late, stating("f", "normal", alive=False)]
+    assert [(row["drone"], row["state"]) for row in status_rows(fleet, 100.3)] == [
+        ("f", "gone"), ("e", "quiet"), ("k", "quiet"), ("h", "asking"), ("d", "hover"), ("i", "silent"),
+        ("b", "degraded"), ("c", "idle"), ("g", "ready"), ("drone2", "normal"), ("drone10", "normal"),
+    ]  # fmt: skip
+
+
+def test_a_drone_that_has_published_nothing_yet_is_said_to_start() -> None:
+    new, broken = Watched("f", "a", True), Watched("f", "b", True, malformed={"flight": "no JSON"})
+    first, second = status_rows([new, broken], 100.3)
+    assert first["state"] == "quiet"
+    assert "it starts, or loads its networks" in first["matters"][0]
+    assert second["matters"] == ["its message `flight` is malformed: no JSON"]
+
+
+def test_a_row_tells_what_is_the_matter() -> None:
+    cameras = {
+        "front": {"age_s": 0.1, "fault": None, "counts": {}},
+        "back": {"age_s": None, "fault": "back: no such device", "counts": {}},
+    }
+    neighbours = {"time_s": 5.0, "neighbours": [{"confirmed": True}, {"confirmed": False}, {"confirmed": True}]}
+    computer = {"time_s": 5.0, "cameras": cameras, "load": 0.8}
+    (row,) = status_rows([watched("a", flight=FLIGHT, computer=computer, neighbours=neighbours)], 100.0)
+    assert row["matters"] == ["the battery is low", "back: no such device"]
+    assert (row["neighbours"], row["load"], row["battery_share"], row["height_m"]) == (2, 0.8, 0.4, 5.1)
+
+
+def test_a_drone_whose_time_passes_slowly_is_not_quiet() -> None:
+    """At a speed factor of 0.25 two messages a second come every 2 s, above the 1.5 s after which they are stale."""
+
+    def state(*heard: tuple[float, float], now_s: float) -> str:
+        flight = None
+        for watcher_s, own_s in heard:
+            flight = _heard(flight, watcher_s, flight_message(state="normal", time_s=own_s))
+        assert flight is not None
+        (row,) = status_rows([Watched("f", "a", alive=True, topics={"flight": flight})], now_s)
+        return str(row["state"])
+
+    assert state((0.0, 10.0), (2.0, 10.5), now_s=3.9) == "normal"
+    assert state((0.0, 10.0), (2.0, 10.5), now_s=8.5) == "quiet", "1.5 s of its own time are 6 s here"
+    assert state((0.0, 10.0), (0.5, 10.5), now_s=2.1) == "quiet", "in real time"
+
+
+def test_a_table_is_printed_for_people_and_not_cut_at_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    sentence = "no heartbeat from the autopilot for 12.5 s, and more words than a line of 80 columns has room for"
+    late = stating("a", "normal", reasons=[{"event": "link_lost", "sentence": sentence}])
+    tables_console().print(_table(status_rows([late, stating("b", "x", alive=False)], 100.3)))
+    heading, first, second, matter = capsys.readouterr().out.splitlines()
+    assert heading.split()[:5] == ["drone", "state", "mode", "height", "battery"]
+    assert first.split()[:2] == ["f/b", "gone"]
+    assert second.split() == ["f/a", "normal", "offboard", "4.0", "m", "50%"]
+    assert matter.endswith(sentence), "no padding to the width of a terminal that is not there"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from collections.abc import Mapping
 
 import numpy as np
 import pytest
@@ -84,3 +86,21 @@ def test_a_drone_is_held_where_it_would_stop_and_flies_on_when_it_is_resumed(mon
     assert np.linalg.norm(log.position[40, 0] - log.position[20, 0]) < 1.0, "at 1 m/s, braking with 3 m/s^2 or less"
     assert speed_m_s[-1] > 0.8
     assert {one["state"] for one in watching.flights["drone2"]} == {"normal"}
+
+
+def test_newest_messages_are_sent_again_while_the_simulation_computes() -> None:
+    sent: list[tuple[str, str, object]] = []
+    again = threading.Event()
+
+    class Sink:
+        def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
+            sent.append((drone, topic, message["time_s"]))
+            if sent.count(("drone1", "state", 2)) == 3:
+                again.set()
+
+    with Repeater(Sink(), every_s=0.01) as repeater:
+        repeater.publish("drone1", "state", {"time_s": 1})
+        repeater.publish("drone1", "state", {"time_s": 2})
+        assert again.wait(30.0)
+    assert sent[0] == ("drone1", "state", 1)
+    assert sent[1:].count(("drone1", "state", 1)) <= len(sent) - 4
