@@ -154,13 +154,15 @@ def test_it_leans_into_the_air_that_comes_against_it() -> None:
 
 
 def test_gusts_add_the_velocity_they_are_configured_for() -> None:
+    """Ten fields, with ten vehicles in each so far apart that they are pushed by themselves."""
+    apart = [START.model_copy(update={"position_m": (float(north_m), 0.0, -5.0)}) for north_m in range(0, 5000, 500)]
     spread = []
-    for seed in range(100):
-        vehicles = Vehicles([START], VehicleConfig(gust_m_s=0.3), seed=seed)
+    for seed in range(10):
+        vehicles = Vehicles(apart, VehicleConfig(gust_m_s=0.3), seed=seed)
         for k in range(12):
-            vehicles.step(np.ones((1, 2)), np.zeros(1), 1.0)
+            vehicles.step(np.ones((10, 2)), np.zeros(10), 1.0)
             if k >= 4:
-                spread.append(vehicles.velocity[0, :2] - 1.0)
+                spread.append(vehicles.velocity[:, :2] - 1.0)
     assert np.std(spread) == pytest.approx(0.3, rel=0.06)
     assert abs(np.mean(spread)) < 0.03
 
