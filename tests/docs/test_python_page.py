@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import math
 import re
+import runpy
 import shlex
 import shutil
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import pytest
 from flockd.cli import main
 from tests.ground.pictures.photographs import DRONE_SIZE_M, RENDERED, truth
 
+Printed = Callable[[str], list[str]]
 ROOT = Path(__file__).parents[2]
 REPLAY = ROOT / "tests" / "review" / "replay"
 DETECT, TRACK, LAW, PILOT, SEE, FIGURES = (
@@ -43,14 +44,20 @@ def program(heading: str) -> str:
     return text
 
 
-def printed(heading: str, folder: Path) -> list[str]:
-    """The lines that a section's program prints, run as a file in this folder."""
-    (folder / "program.py").write_text(program(heading), encoding="utf-8")
-    command = [sys.executable, "program.py"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    return done.stdout.splitlines()
+@pytest.fixture
+def printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Printed:
+    """The lines that a section's program prints, run as a file in the test's folder."""
+
+    def run(heading: str) -> list[str]:
+        (tmp_path / "program.py").write_text(program(heading), encoding="utf-8")
+        monkeypatch.chdir(tmp_path)
+        capfd.readouterr()
+        runpy.run_path("program.py", run_name="__main__")
+        out, err = capfd.readouterr()
+        assert err == ""
+        return out.splitlines()
+
+    return run
 
 
 def numbers(line: str) -> list[float]:
@@ -80,11 +87,11 @@ def test_the_readmes_program_is_one_of_the_pages() -> None:
     assert text == program(PILOT)
 
 
-def test_detect_drones_in_a_photograph(tmp_path: Path) -> None:
+def test_detect_drones_in_a_photograph(tmp_path: Path, printed: Printed) -> None:
     name = "4_m_3.jpg"
     distances, boxes = truth()
     shutil.copy(RENDERED / name, tmp_path / "photograph.jpg")
-    where, how_far, count = printed(DETECT, tmp_path)
+    where, how_far, count = printed(DETECT)
     left, right, top, bottom, probability = numbers(where)
     assert (left, top, right - left, bottom - top) == pytest.approx(boxes[name], abs=8)
     assert probability > 0.9
@@ -93,9 +100,9 @@ def test_detect_drones_in_a_photograph(tmp_path: Path) -> None:
     assert numbers(count) == [1]
 
 
-def test_track_your_own_detections(tmp_path: Path) -> None:
+def test_track_your_own_detections(printed: Printed) -> None:
     """The neighbour starts 6 m to the north and flies to the east at 0.8 m/s; the false detection is at 2 s."""
-    *steps, end = printed(TRACK, tmp_path)
+    *steps, end = printed(TRACK)
     confirmed = [numbers(line) for line in steps if line.endswith(", confirmed")]
     assert {track for _, track, *_ in confirmed} == {1}
     assert [time_s for time_s, *_ in confirmed] == [0.5 + 0.5 * step for step in range(9)]
@@ -105,15 +112,15 @@ def test_track_your_own_detections(tmp_path: Path) -> None:
     assert numbers(end) == pytest.approx([0.0, 0.8, 0.0], abs=0.1)
 
 
-def test_fly_your_own_states_by_the_flocking_law(tmp_path: Path) -> None:
+def test_fly_your_own_states_by_the_flocking_law(printed: Printed) -> None:
     """Three drones are at rest in Eq. 38 where they are the desired distance apart and fly the desired velocity."""
-    *_, last = printed(LAW, tmp_path)
+    *_, last = printed(LAW)
     assert numbers(last) == pytest.approx([30, 3.0, 3.0, 3.0, 1.0, 0.0], abs=0.05)
 
 
-def test_run_the_pilot_over_a_recording(tmp_path: Path) -> None:
+def test_run_the_pilot_over_a_recording(tmp_path: Path, printed: Printed) -> None:
     recorded(tmp_path)
-    lines = printed(PILOT, tmp_path)
+    lines = printed(PILOT)
     for line, expected in zip(lines, expected_steps(), strict=True):
         time_s, tracked, north, east = numbers(line)
         assert time_s == expected["time_s"]
@@ -121,10 +128,10 @@ def test_run_the_pilot_over_a_recording(tmp_path: Path) -> None:
         assert (north, east) == pytest.approx(expected["command"]["velocity"], abs=0.1)
 
 
-def test_see_what_the_networks_see(tmp_path: Path) -> None:
+def test_see_what_the_networks_see(tmp_path: Path, printed: Printed) -> None:
     """The one neighbour flies ahead; a range's standard deviation is 5 cm. As the page says, one image may miss it."""
     recorded(tmp_path)
-    steps = list(zip(printed(SEE, tmp_path), expected_steps(), strict=True))
+    steps = list(zip(printed(SEE), expected_steps(), strict=True))
     seen = [(line, expected) for line, expected in steps if not line.endswith("[]")]
     assert len(seen) >= 0.7 * len(steps)
     for line, expected in seen:
@@ -136,13 +143,14 @@ def test_see_what_the_networks_see(tmp_path: Path) -> None:
         assert line.endswith("m by front']")
 
 
-def test_read_a_flights_figures_into_pandas(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_a_flights_figures_into_pandas(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, printed: Printed) -> None:
     recorded(tmp_path)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("flockd.review.report.flight_folder.write_report", lambda folder, *_: folder)
     (commands,) = blocks(sections()[FIGURES], "sh")
     for command in commands.splitlines():
         assert main(shlex.split(command)[1:]) == 0
-    lines = printed(FIGURES, tmp_path)
+    lines = printed(FIGURES)
     flights = {words[0]: words[1:] for words in map(str.split, lines)}
     for name, drones in (("three", 3), ("six", 6)):
         summary = json.loads((tmp_path / "out" / name / "summary.json").read_text(encoding="utf-8"))
