@@ -171,6 +171,15 @@ def scenario(overrides: Mapping[str, Any] | None = None, name: str = "paper_flig
     return load_scenario(data_path("config") / f"{name}.yaml", dict(overrides or {}))
 
 
+def small_eyes(flight: ScenarioConfig) -> ScenarioConfig:
+    """The same with two cameras of half the width and height, front and back: what is compared need not be sharp."""
+    eyes = []
+    for one in flight.drone.rig.cameras[::2]:
+        halves = {f"intrinsics__{key}": getattr(one.intrinsics, key) / 2 for key in ("fx", "fy", "cx", "cy")}
+        eyes.append(changed(one, size_px=(one.size_px[0] // 2, one.size_px[1] // 2), **halves))
+    return changed(flight, drone__rig__cameras=tuple(eyes))
+
+
 def changed(section: Section, **keys: Any) -> Section:
     """A copy of a configuration with other values, by dotted path with `__`: ``safety__gate__max_speed_m_s=1.0``."""
     for path, value in keys.items():

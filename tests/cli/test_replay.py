@@ -24,7 +24,7 @@ from flockd.sim.flock.start import with_drones
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 from tests.cli.conftest import Told
-from tests.make import changed
+from tests.make import small_eyes
 from tests.onboard.recording.made_up import MODELS, MadeUpPilot, drone_config, record
 from tests.worlds import worlds_once
 
@@ -181,10 +181,8 @@ DRONES = ("drone1", "drone2")
 
 
 def scenario(overrides: Overrides) -> ScenarioConfig:
-    flight = with_drones(load_scenario(data_path("config") / "paper_flight.yaml", {"duration_s": 2.5, **overrides}), 2)
-    small = {"size_px": (240, 320), "intrinsics__fx": 111.0, "intrinsics__fy": 111.0, "intrinsics__cx": 120.0}
-    cameras = [changed(one, intrinsics__cy=160.0, **small) for one in flight.drone.rig.cameras[:2]]
-    return changed(flight, drone__rig__cameras=tuple(cameras))
+    paper = load_scenario(data_path("config") / "paper_flight.yaml", {"duration_s": 2.5, **overrides})
+    return small_eyes(with_drones(paper, 2))
 
 
 class Flight(NamedTuple):
