@@ -22,21 +22,22 @@ ONBOARD = ("autopilot", "telemetry", "ros", "sources", "recording", "daemon")
 PURE_ROOMS = ("flight", "core/messages.py", "core/choices.py")
 """No clock, no socket, no thread, no environment: what is tested is what flies."""
 IMPURE_MODULES = {
-    "asyncio",
-    "threading",
-    "multiprocessing",
-    "concurrent",
-    "time",
-    "datetime",
-    "socket",
-    "zenoh",
-    "random",
+    "asyncio", "threading", "multiprocessing", "concurrent", "time", "datetime", "socket", "zenoh", "random"
+}  # fmt: skip
+SIMULATION = ("sim", "campaign", "review/report")
+"""Only the simulator, campaigns and reports may need the libraries of the extra `sim`."""
+LIBRARIES = {
+    "onnxruntime openvino": ("flight/inference",),
+    "mavsdk": ("onboard/autopilot/mavsdk_link.py",),
+    "pymavlink": ("sim/autopilot", "sim/sitl/ground_station.py"),
+    "joblib ray": ("campaign/engine.py",),
+    "rosbags": ("onboard/recording/ros_bag.py",),
+    "rclpy": ("onboard/ros/ros_node.py", "onboard/sources/camera_child.py"),
+    "numba": SIMULATION,
+    "matplotlib": SIMULATION,
+    "jinja2 markupsafe": SIMULATION,
 }
-
-NETWORK_LIBRARIES = {"onnxruntime", "openvino"}
-"""Only inference runs networks."""
-SIMULATOR_LIBRARIES = {"numba", "matplotlib", "jinja2", "markupsafe"}
-"""Libraries of the extra `sim`: only the simulator, campaigns and reports may need them."""
+"""Where outside libraries sit behind their adapters."""
 TOOL_LIBRARIES = {"torch", "onnx", "trimesh", "embreex", "pytest"}
 """For training and tests: nothing in the package may need them."""
 
@@ -131,18 +132,6 @@ def test_only_the_gate_makes_a_setpoint() -> None:
         assert makes == (_place(path) == ("flight", "safety", "gate")), path
 
 
-def test_only_inference_runs_networks() -> None:
-    for path in set(MODULES) - set(_of("flight/inference")):
-        assert not _libraries(path) & NETWORK_LIBRARIES, path
-
-
-def test_what_flies_needs_none_of_the_simulators_libraries() -> None:
-    for path in MODULES:
-        if _room(path) not in {"sim", "campaign"} and _place(path)[:2] != ("review", "report"):
-            assert not _libraries(path) & SIMULATOR_LIBRARIES, path
-        assert not _libraries(path) & TOOL_LIBRARIES, path
-
-
 ZENOH_SESSION = PACKAGE / "onboard" / "telemetry" / "zenoh_session.py"
 """Opens and closes sessions, whatever goes through them."""
 FRAMES_OVER_ZENOH = PACKAGE / "onboard" / "sources" / "shared_memory.py"
@@ -155,21 +144,16 @@ ZENOH_READERS = {
 """Replies to queries; what an operator may ask says nothing of where another drone is."""
 
 
-@pytest.mark.parametrize(
-    ("library", "adapters"),
-    [
-        ("mavsdk", {"onboard/autopilot/mavsdk_link.py"}),
-        ("pymavlink", {"sim/autopilot", "sim/sitl/ground_station.py"}),
-        ("joblib", {"campaign/engine.py"}),
-        ("ray", {"campaign/engine.py"}),
-        ("rosbags", {"onboard/recording/ros_bag.py"}),
-        ("rclpy", {"onboard/ros/ros_node.py", "onboard/sources/camera_child.py"}),
-    ],
-)
-def test_an_outside_library_sits_behind_its_adapters(library: str, adapters: set[str]) -> None:
-    users = {path for path in MODULES if library in _libraries(path)}
+@pytest.mark.parametrize("libraries", LIBRARIES)
+def test_an_outside_library_sits_behind_its_adapters(libraries: str) -> None:
+    users = {path for path in MODULES if {*libraries.split()} & _libraries(path)}
     assert users
-    assert users <= set(_of(*adapters))
+    assert users <= set(_of(*LIBRARIES[libraries]))
+
+
+def test_no_module_needs_what_is_for_training_and_tests() -> None:
+    for path in MODULES:
+        assert not _libraries(path) & TOOL_LIBRARIES, path
 
 
 def test_no_drone_reads_telemetry_to_fly() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import getpass
 import json
@@ -23,6 +24,8 @@ from flockd.core.config import DroneConfig
 from flockd.core.data import data_path
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.sitl.ports import free_endpoint, free_port
+from tests.calm import until
+from tests.cli.conftest import Told
 from tests.faults.stories import Reacted
 from tests.onboard.autopilot.conftest import HEARTBEAT_S
 from tests.onboard.daemon.aboard import Cameras, config_for
@@ -38,35 +41,26 @@ class Manager:
     """Listens as a service manager does."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
         self.told: list[str] = []
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(str(path))
         self._socket.settimeout(0.1)
 
     def until(self, condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
-        begun_s = time.monotonic()
-        while not condition():
+        def heard() -> bool:
             assert process.poll() is None, process.communicate()
-            assert time.monotonic() - begun_s < SECONDS_TO_FAIL, "\n".join(self.told)
-            try:
+            with contextlib.suppress(TimeoutError):
                 self.told += self._socket.recv(4096).decode().splitlines()
-            except TimeoutError:
-                continue
+            return condition()
 
-    @property
-    def last_status(self) -> str:
-        return next((line.removeprefix("STATUS=") for line in reversed(self.told) if line.startswith("STATUS=")), "")
-
-    def close(self) -> None:
-        self._socket.close()
+        until(heard, SECONDS_TO_FAIL)
 
 
 @pytest.fixture
 def manager(tmp_path: Path) -> Iterator[Manager]:
     manager = Manager(tmp_path / "notify")
-    yield manager
-    manager.close()
+    with contextlib.closing(manager._socket):
+        yield manager
 
 
 def _written(
@@ -130,14 +124,14 @@ def test_it_gets_ready_alone_goes_on_after_sighup_and_ends_when_told(
 
 def _status(telemetry: str, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     """`flockd status` of the one drone, asked until it has heard the whole: on a busy computer that takes longer."""
-    until_s = time.monotonic() + SECONDS_TO_FAIL
-    while True:
+
+    def whole() -> Any:
         code = main(["status", "--connect", telemetry, "--seconds", "2.5", "--json"])
         rows = json.loads(capsys.readouterr().out or "[]")
-        if code == 0 and rows[0]["flight_mode"] is not None:
-            (row,) = rows
-            return dict(row)
-        assert time.monotonic() < until_s, rows
+        return rows if code == 0 and rows[0]["flight_mode"] is not None else None
+
+    (row,) = until(whole, SECONDS_TO_FAIL)
+    return dict(row)
 
 
 def test_a_changed_model_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -204,17 +198,16 @@ def test_it_flies_in_its_layer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert (drone.mission.height_m, drone.flocking.max_speed_m_s) == (7.0, 1.0)
 
 
-def test_a_file_where_the_recordings_folder_would_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_where_the_recordings_folder_would_be(tmp_path: Path, told: Told) -> None:
     config = _written(tmp_path)
     for name in (config, config / "recordings"):
-        assert main(["run", "--config", str(config), "--record", str(name)]) == 2
-        assert capsys.readouterr().err.startswith(f"{name}: is no folder; ")
+        assert told(2, "run", "--config", config, "--record", name).startswith(f"{name}: is no folder; ")
 
 
-def test_a_fleet_that_is_not_there_is_unavailable(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_fleet_that_is_not_there_is_unavailable(told: Told) -> None:
     endpoint = free_endpoint()
-    assert main(["status", "--connect", endpoint, "--seconds", "0.2"]) == 69
-    assert capsys.readouterr().err.startswith(f"no drone was found at {endpoint} within 0.2 s; ")
+    missing = told(69, "status", "--connect", endpoint, "--seconds", "0.2")
+    assert missing.startswith(f"no drone was found at {endpoint} within 0.2 s; ")
 
 
 def test_without_an_autopilot_it_is_unavailable_and_not_aborted(tmp_path: Path) -> None:
@@ -241,33 +234,25 @@ def test_a_network_that_never_ends_is_bad_configuration_within_ten_seconds(tmp_p
 
 @pytest.mark.fault("nothing-left-at-start")
 @pytest.mark.parametrize(
-    ("limit", "value", "told"),
+    ("limit", "values", "changes", "code", "says"),
     [
-        ("RLIMIT_NOFILE", 20, "this process may open 20 files, and a flight needs 128; "),
-        ("RLIMIT_AS", 700 << 20, "this process may use 700 MiB of addresses, and a flight needs 3072; "),
-        ("RLIMIT_AS", 200 << 20, "this process may use 200 MiB of addresses, and a flight needs 3072; "),
+        ("NOFILE", (20, 20), {}, 69, "this process may open 20 files, and a flight needs 128; "),
+        ("AS", (700 << 20,) * 2, {}, 69, "this process may use 700 MiB of addresses, and a flight needs 3072; "),
+        ("AS", (200 << 20,) * 2, {}, 69, "this process may use 200 MiB of addresses, and a flight needs 3072; "),
+        ("NOFILE", (20, 256), {"source": None}, 78, "source: is missing"),
     ],
+    ids=["files", "memory", "hardly any memory", "files that may be raised"],
 )
 def test_without_files_or_memory_it_is_unavailable_and_not_aborted(
-    limit: str, value: int, told: str, tmp_path: Path
+    limit: str, values: tuple[int, int], changes: dict[str, None], code: int, says: str, tmp_path: Path
 ) -> None:
     """Unchecked, the second is ended by glibc (127), the third by an ImportError; 24 files make a model look bad."""
-    config = _written(tmp_path)
-    limited = f"import resource; resource.setrlimit(resource.{limit}, ({value}, {value})); {RUN}"
-    command = [sys.executable, "-c", limited, "run", "--config", str(config)]
+    limited = f"import resource; resource.setrlimit(resource.RLIMIT_{limit}, {values}); {RUN}"
+    command = [sys.executable, "-c", limited, "run", "--config", str(_written(tmp_path, **changes))]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=SECONDS_TO_FAIL, check=False)
-    assert done.returncode == 69, done.stderr
-    assert done.stderr.startswith(told)
+    assert done.returncode == code, done.stderr
+    assert says in done.stderr
     assert len(done.stderr.splitlines()) == 1
-
-
-def test_a_low_limit_that_may_be_raised_is_raised(tmp_path: Path) -> None:
-    config = _written(tmp_path, source=None)
-    limited = f"import resource as r; r.setrlimit(r.RLIMIT_NOFILE, (20, 256)); {RUN}"
-    command = [sys.executable, "-c", limited, "run", "--config", str(config)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=SECONDS_TO_FAIL, check=False)
-    assert done.returncode == 78, done.stderr
-    assert "source: is missing" in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -9,12 +9,15 @@ from abc import ABC, abstractmethod
 from contextlib import ExitStack
 from typing import Self
 
+import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
 from flockd.core.errors import UnavailableError
 from flockd.core.messages import FloatArray
 from flockd.sim.sitl.autopilots import px4_folder
 from flockd.sim.sitl.ground_station import GroundStation
+
+PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
 
 
 class SitlRun(ABC):

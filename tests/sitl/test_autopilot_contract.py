@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
-
 import pytest
 
+from tests.sitl.sitl_run import PX4
 from tests.sitl.stories import seen
 
-PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
 NO_SETPOINTS = (
     "it receives no setpoints, as flockd sends none yet; fly in Hold or Position until flockd's state is ready, then "
     "switch to offboard"

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import os
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
@@ -19,7 +18,7 @@ from flockd.core import services
 from flockd.core.messages import SECTORS, ObstacleRanges
 from flockd.flight.obstacles import free_ahead, nearest_points
 from flockd.onboard.autopilot.mavsdk_link import Severity
-from tests.sitl.sitl_run import Meddler
+from tests.sitl.sitl_run import PX4, Meddler
 from tests.sitl.stories import Row, World, landing, seen, take_off
 
 GROUND_STATION_PORT = 14550
@@ -128,7 +127,6 @@ def _north_m(world: World) -> float:
     return float(world.station.poses().position[0, 0])
 
 
-PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
 STEPS = (
     ("arm", "accepted"),
     ("take off", "accepted"),
@@ -149,7 +147,7 @@ STEPS = (
 )
 
 
-@pytest.mark.parametrize(("autopilot", "speed_factor"), [("fake", 3.0), pytest.param("px4", 1.0, marks=PX4)])
+@pytest.mark.parametrize(("autopilot", "speed_factor"), [("fake", 4.0), pytest.param("px4", 1.0, marks=PX4)])
 def test_a_pilot_is_stopped_before_the_wall_and_where_nothing_is_known(autopilot: str, speed_factor: float) -> None:
     rows = seen(autopilot, (ready, take_off, text, blind, wall, landing), speed_factor, remote_control=True)
     assert [(row.story, row.what) for row in rows] == list(STEPS)

@@ -20,9 +20,9 @@ from flockd.review.flight_log.log import FlightLog
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.sitl.ground_station import FULL_STICK_M_S, GroundStation, home_deg
 from flockd.sim.sitl.ports import free_port
+from tests.sitl.sitl_run import PX4
 
 SECONDS_TO_START = 120.0
-PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
 
 
 def _scenario(folder: Path, drones: int, **drone: object) -> Path:

@@ -5,7 +5,6 @@ A flock that is sent elsewhere; one that a person leads, who flies one drone in 
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -16,9 +15,8 @@ import pytest
 from flockd.cli.sim import DEFAULT_SPEED_FACTOR
 from flockd.core.data import data_path
 from flockd.sim.scenario import load_scenario
+from tests.sitl.sitl_run import PX4
 from tools.checks.px4_rows import MISSIONS, Flight, Row, fly, goals_reached, main
-
-PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
 
 
 @PX4

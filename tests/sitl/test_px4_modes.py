@@ -1,7 +1,7 @@
 """The mode that PX4 itself ends in after faults, beside what its parameters promise; `pytest -rP` prints it.
 
 Each fault has a PX4 of its own, which hovers or flies in offboard at setpoints that flockd's autopilot link sends, from
-a process of its own; for `daemon_killed` a whole `flockd run` flies by rendered images.
+a process of its own. What PX4 makes of a killed `flockd run` is what it makes of that process.
 """
 
 from __future__ import annotations
@@ -18,23 +18,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flockd.core.config import DroneConfig
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.onboard.simulated_time import clock_at
-from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.start import with_drones
-from flockd.sim.scenario import ScenarioConfig, load, load_scenario
+from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.sitl.autopilots import Autopilots, Ports, Px4s, SimulatedAutopilots
-from flockd.sim.sitl.daemons import Daemons, fleet_configs
-from flockd.sim.sitl.frame_server import FrameServer
-from flockd.sim.sitl.ports import free_endpoint
 from flockd.sim.sitl.processes import Program, Programs
 from tests.sitl.companion import HEIGHT_M
-from tests.sitl.sitl_run import Meddler, SitlRun
-from tools.checks.soak import small
+from tests.sitl.sitl_run import PX4, Meddler, SitlRun
 
-FRAMES_HZ = 2.0
 SHELL_PORT = 14580
 """Port of this computer, where PX4's instance 0 listens to its companion computer."""
 START_S = 120.0
@@ -60,8 +53,6 @@ class Fault:
     parameters: Mapping[str, str] = field(default_factory=dict)
     north_m_s: float = 0.0
     """The commanded velocity."""
-    by_daemon: bool = False
-    """A whole daemon flies, and not a process that sends setpoints alone."""
 
 
 def _shell(*command: str) -> Callable[[Px4Flight], None]:
@@ -96,9 +87,6 @@ FAULTS = (
     Fault(
         "geofence_return", "RTL", "GF_ACTION 3: Return outside GF_MAX_HOR_DIST",
         lambda flight: None, {"GF_ACTION": "3", "GF_MAX_HOR_DIST": "15"}, north_m_s=1.5,
-    ),
-    Fault(
-        "daemon_killed", "LOITER", "COM_OBL_RC_ACT 5: Hold", lambda flight: flight.kill_companion(), by_daemon=True
     ),
     Fault("sender_killed", "LOITER", "COM_OBL_RC_ACT 5: Hold", lambda flight: flight.kill_companion()),
     Fault(
@@ -155,8 +143,7 @@ class Px4Flight(SitlRun):
         self.station = self._stack.enter_context(Meddler([port.truth], self._clock))
         self._until(lambda: self.station.is_connected(0), START_S * self._speed_factor, "PX4 sends nothing")
         self.station.request_messages()
-        start = self._start_daemon if self._fault.by_daemon else self._start_sender
-        self._companion = start(scenario, port, folder)
+        self._companion = self._start_sender(port, folder)
         station = self.station
         self._request(lambda: station.is_armed(0), lambda: station.arm(0), "was not armed")
         self._request(self._is_up, self._climb, "did not climb")
@@ -164,7 +151,7 @@ class Px4Flight(SitlRun):
             lambda: station.mode(0) == "OFFBOARD", lambda: station.select(0, "OFFBOARD"), "did not go into offboard"
         )
 
-    def _start_sender(self, scenario: ScenarioConfig, port: Ports, folder: Path) -> Program:
+    def _start_sender(self, port: Ports, folder: Path) -> Program:
         """A process that sends setpoints."""
         companions = self._stack.enter_context(Programs())
         options = [*map(str, (port.offboard, self._speed_factor, self._fault.north_m_s))]
@@ -173,31 +160,6 @@ class Px4Flight(SitlRun):
         companion = companions.start("companion", command, os.environ, Path(__file__).parents[2], log)
         self._until(lambda: "streaming" in log.read_text(), START_S * self._speed_factor, "no setpoints")
         return companion
-
-    def _start_daemon(self, scenario: ScenarioConfig, port: Ports, folder: Path) -> Program:
-        """A whole `flockd run`, with small images of the scenario's world and nobody else in it."""
-        sitl = load(data_path("config") / "px4_sitl.yaml")
-        assert isinstance(sitl, DroneConfig)
-        endpoint, speed_factor = free_endpoint(), self._speed_factor
-        scenario = scenario.model_copy(update={"drone": small(scenario.drone)})
-        (config,) = fleet_configs(scenario, sitl, ports=[port], endpoint=endpoint, speed_factor=speed_factor)
-        config = config.model_copy(update={"safety": config.safety.model_copy(update={"alone_s": None})})
-        server = self._stack.enter_context(
-            FrameServer(
-                CameraSimulator(scenario),
-                [config.name],
-                endpoint=endpoint,
-                rate_hz=FRAMES_HZ,
-                poses=self.station.poses,
-                clock=self._clock,
-                speed_factor=speed_factor,
-            )
-        )
-        daemons = self._stack.enter_context(Daemons([config], folder=folder, recordings=folder, environment=os.environ))
-        server.start()
-        daemons.start()
-        self._until(lambda: daemons.is_ready(0), START_S * speed_factor, "the daemon did not become ready")
-        return daemons.programs()[0]
 
     def trial(self) -> Result:
         """Injects the fault and watches what comes."""
@@ -286,9 +248,6 @@ class Px4Flight(SitlRun):
             self.wait(POLL_S * self._speed_factor)
 
 
-PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
-
-
 @pytest.mark.fault("link-lost")
 @pytest.mark.fault("pilot-takes-over")
 @pytest.mark.fault("battery-or-estimate")
@@ -306,13 +265,10 @@ def test_px4_ends_in_the_mode_that_its_parameters_promise(fault: Fault) -> None:
         assert result.drift_m_s < 0.5
 
 
-@pytest.mark.parametrize(
-    ("name", "speed_factor"), [("sender_killed", 2.0), pytest.param("daemon_killed", 1.0, marks=pytest.mark.slow)]
-)
-def test_a_killed_companion_ends_a_fake_autopilots_offboard_flight_in_hold(name: str, speed_factor: float) -> None:
+def test_a_killed_companion_ends_a_fake_autopilots_offboard_flight_in_hold() -> None:
     """The whole of a trial, with a fake autopilot in PX4's place: it goes from offboard to Hold afterwards."""
-    (killed,) = [fault for fault in FAULTS if fault.name == name]
-    with Px4Flight(killed, speed_factor, make=_Fake) as flight:
+    (killed,) = [fault for fault in FAULTS if fault.name == "sender_killed"]
+    with Px4Flight(killed, 3.0, make=_Fake) as flight:
         result = flight.trial()
     assert result.modes == ("OFFBOARD", "LOITER"), result
     assert result.reaction_s is not None

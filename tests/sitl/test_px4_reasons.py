@@ -29,7 +29,7 @@ from flockd.sim.scenario import load, load_scenario
 from flockd.sim.sitl.autopilots import Px4s
 from flockd.sim.sitl.daemons import Daemons
 from flockd.sim.sitl.ports import free_endpoint
-from tests.sitl.sitl_run import SitlRun
+from tests.sitl.sitl_run import PX4, SitlRun
 
 FLEET = "reasons"
 START_S, SHOWN_S, GONE_S = 300.0, 60.0, 60.0
@@ -252,9 +252,6 @@ def _config(port: int, endpoint: str) -> DroneConfig:
             "telemetry": config.telemetry.model_copy(update={"fleet": FLEET, "listen": (endpoint,), "connect": ()}),
         }
     )
-
-
-PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
 
 
 @PX4

@@ -18,8 +18,8 @@ from flockd.ground.doctor.autopilot_checks import check_autopilot
 from flockd.sim.flock.start import with_drones
 from flockd.sim.scenario import load, load_scenario
 from flockd.sim.sitl.autopilots import Px4s
+from tests.sitl.sitl_run import PX4
 
-PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
 SPEED_FACTOR, START_S, TIMES, PAUSE_S = 0.5, 120.0, 5, 0.5
 KEY, NO_KEY = bytes(range(1, 33)), bytes(32)
 EPOCH_2015_S, TICKS_A_S = 1420070400, 1e5
