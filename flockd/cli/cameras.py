@@ -15,7 +15,7 @@ from flockd.cli.parser import Commands, flag, option, positive_number, size
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
-    from flockd.ground.cameras.listing import Computer, FoundCamera, Mode
+    from flockd.ground.cameras.listing import FoundCamera, Mode
     from flockd.ground.cameras.watching import Watched
 
 SECONDS = 4.0
@@ -53,16 +53,10 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.ground.cameras.listing import Computer
-
-    return run(args, Computer())
-
-
-def run(args: argparse.Namespace, computer: Computer) -> int:
-    """The command on a computer."""
-    from flockd.ground.cameras.listing import list_cameras
+    from flockd.ground.cameras.listing import Computer, list_cameras
 
     refuse_overwriting(args, args.write)
+    computer = Computer()
     found = list_cameras(computer)
     if not found:
         raise UnavailableError(NONE_FOUND)

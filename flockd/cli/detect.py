@@ -18,6 +18,7 @@ from flockd.core.errors import ExitCode, UsageError
 if TYPE_CHECKING:
     from flockd.core.config import DroneConfig
     from flockd.core.config.perception import PerceptionConfig
+    from flockd.core.messages import UInt8Array
     from flockd.flight.geometry import Camera
     from flockd.ground.pictures.copies import Copies
     from flockd.ground.pictures.picture_files import PictureFile, PictureLabels
@@ -66,6 +67,9 @@ def add(commands: Commands) -> None:
     option(camera, "--camera NAME", "which of --config's cameras, where it has several")
 
 
+_FIGURES = ("probability", "range_m", "range_sigma_m", "size_m")
+
+
 @dataclass(frozen=True)
 class _Detected:
     """One picture with what was found in it."""
@@ -86,13 +90,13 @@ def _run(args: argparse.Namespace) -> int:
     if args.force and args.out is None:
         raise UsageError("--force has no meaning without --out; add it")
     drone = loaded(args.config)
-    cameras = _Cameras(args, drone)
+    camera = _camera_of_config(args, drone)
     pictures = find_pictures(args.pictures, but_not=args.out)
     labels = None if args.labels is None else read_labels(args.labels, pictures)
     config = _perception(drone, args.drone_size)
     copies = None if args.out is None else Copies(args.out, pictures, overwrite=args.force)
     left_out: list[str] = []
-    detected = list(_detected(args, pictures, labels, PictureDetector(config), cameras, copies, left_out))
+    detected = list(_detected(args, pictures, labels, PictureDetector(config), camera, copies, left_out))
     if left_out and not detected:
         raise DatasetError("\n".join(left_out))
     result = {**_result(detected, measure=labels is not None), "left_out": left_out}
@@ -111,46 +115,26 @@ def _run(args: argparse.Namespace) -> int:
     return ExitCode.CHECK_FAILED if left_out else ExitCode.DONE
 
 
-class _Cameras:
-    """The camera of each picture, by its size."""
+def _camera_of_config(args: argparse.Namespace, drone: DroneConfig | None) -> Camera | None:
+    """That of --config; None for one of --fov. Raises UsageError where the options do not give one."""
+    from flockd.flight.geometry import build_rig
 
-    def __init__(self, args: argparse.Namespace, drone: DroneConfig | None) -> None:
-        """Raises UsageError where the options do not give one."""
-        if drone is None and args.fov is None:
-            raise UsageError(
-                "the pictures' camera is not known; give its field of view with --fov (a phone's main camera has 65 to "
-                "75 degrees, its data sheet says), or a drone with --config"
-            )
-        if args.camera is not None and (drone is None or args.fov is not None):
-            raise UsageError("--camera is one of --config's, in place of --fov; name the drone's file alone")
-        self._file, self._fov = args.config, args.fov
-        self._mine = None if drone is None or args.fov is not None else self._of_rig(args, drone)
-
-    @staticmethod
-    def _of_rig(args: argparse.Namespace, drone: DroneConfig) -> Camera:
-        from flockd.flight.geometry import build_rig
-
-        cameras = build_rig(drone.rig).cameras
-        if args.camera is None and len(cameras) > 1:
-            raise UsageError(f"{args.config}: has cameras {', '.join(cameras)}; choose one with --camera")
-        name = args.camera or next(iter(cameras))
-        if name not in cameras:
-            raise UsageError(f"{args.config}: has no camera {name!r}; choose --camera from {', '.join(cameras)}")
-        return cameras[name].camera
-
-    def of(self, name: str, size: tuple[int, int]) -> Camera:
-        """The camera of a picture of this width and height. Raises UsageError where --config's has another size."""
-        if self._mine is not None:
-            if self._mine.size != size:
-                wanted = " x ".join(map(str, self._mine.size))
-                raise UsageError(
-                    f"{name}: is {size[0]} x {size[1]} pixels, and the camera of {self._file} {wanted}; give pictures "
-                    "of that camera, or --fov too"
-                )
-            return self._mine
-        from flockd.ground.pictures.single_frame import camera_with_fov
-
-        return camera_with_fov(size, self._fov)
+    if drone is None and args.fov is None:
+        raise UsageError(
+            "the pictures' camera is not known; give its field of view with --fov (a phone's main camera has 65 to "
+            "75 degrees, its data sheet says), or a drone with --config"
+        )
+    if args.camera is not None and (drone is None or args.fov is not None):
+        raise UsageError("--camera is one of --config's, in place of --fov; name the drone's file alone")
+    if drone is None or args.fov is not None:
+        return None
+    cameras = build_rig(drone.rig).cameras
+    if args.camera is None and len(cameras) > 1:
+        raise UsageError(f"{args.config}: has cameras {', '.join(cameras)}; choose one with --camera")
+    name = args.camera or next(iter(cameras))
+    if name not in cameras:
+        raise UsageError(f"{args.config}: has no camera {name!r}; choose --camera from {', '.join(cameras)}")
+    return cameras[name].camera
 
 
 def _perception(drone: DroneConfig | None, drone_size_m: float | None) -> PerceptionConfig:
@@ -174,12 +158,11 @@ def _detected(
     pictures: Sequence[PictureFile],
     labels: Mapping[PictureFile, PictureLabels] | None,
     detector: PictureDetector,
-    cameras: _Cameras,
+    camera: Camera | None,
     copies: Copies | None,
     left_out: list[str],
 ) -> Iterator[_Detected]:
     """In order; what cannot be read is skipped, and why appended to ``left_out``."""
-    from flockd.ground.datasets.image_files import DatasetError
     from flockd.ground.pictures.copies import annotated
     from flockd.ground.pictures.picture_files import check_size
 
@@ -188,27 +171,32 @@ def _detected(
         done = 0
         for picture in pictures:
             known = None if labels is None else labels.get(picture)
-            images = picture.images(args.every)
-            while True:
-                try:
-                    name, image = next(images)
-                except StopIteration:
-                    break
-                except DatasetError as error:
-                    left_out.append(str(error))
-                    break
+            for name, image in _readable(picture, args.every, left_out):
                 size = (image.shape[1], image.shape[0])
                 if known is not None:
                     check_size(args.labels, name, known, size)
-                camera = cameras.of(name, size)
+                if camera is not None and camera.size != size:
+                    raise UsageError(
+                        f"{name}: is {size[0]} x {size[1]} pixels, and the camera of {args.config} {camera.size[0]} x "
+                        f"{camera.size[1]}; give pictures of that camera, or --fov too"
+                    )
                 begin = time.perf_counter()
-                result = detector.detect(image, camera).at_least(args.min_probability)
+                result = detector.detect(image, camera, fov_deg=args.fov).at_least(args.min_probability)
                 seconds = time.perf_counter() - begin
                 if copies is not None:
                     copies.write(picture, name, annotated(image, result, known.boxes if known else ()))
                 yield _Detected(name, result.detections, result.proposals, known, seconds)
                 done += 1
                 tell(done, max(done, count))
+
+
+def _readable(picture: PictureFile, every: int, left_out: list[str]) -> Iterator[tuple[str, UInt8Array]]:
+    from flockd.ground.datasets.image_files import DatasetError
+
+    try:
+        yield from picture.images(every)
+    except DatasetError as error:
+        left_out.append(str(error))
 
 
 def _result(detected: Sequence[_Detected], *, measure: bool) -> dict[str, Any]:
@@ -221,13 +209,8 @@ def _result(detected: Sequence[_Detected], *, measure: bool) -> dict[str, Any]:
             {
                 "file": one.name,
                 "detections": [
-                    {
-                        "box": [round(value, 2) for value in found.box],
-                        "probability": round(found.probability, 4),
-                        "range_m": round(found.range_m, 4),
-                        "range_sigma_m": round(found.range_sigma_m, 4),
-                        "size_m": round(found.size_m, 4),
-                    }
+                    {"box": [round(value, 2) for value in found.box]}
+                    | {key: round(getattr(found, key), 4) for key in _FIGURES}
                     for found in one.detections
                 ],
             }

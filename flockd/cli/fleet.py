@@ -24,7 +24,6 @@ from flockd.core.errors import ExitCode, UnavailableError, UsageError
 if TYPE_CHECKING:
     from flockd.core.messages import MissionOrder
     from flockd.fleet.live_fleet import LiveFleet
-    from flockd.fleet.page.page_access import PageConnections
     from flockd.fleet.page.page_server import PageServer
     from flockd.fleet.watcher import FleetWatcher
 
@@ -271,20 +270,15 @@ async def serve_page(page: PageServer, address: str, port: int, served: Callable
     try:
         assert runner.server is not None
         connections = PageConnections(runner.server, page.trusted)
-        served(await _listen(connections, address, port))
+        try:
+            server = await asyncio.get_running_loop().create_server(connections, address, port)
+        except OSError as error:
+            told = f"the page cannot use {address} port {port} ({error.strerror}); name others"
+            raise UnavailableError(told) from error
+        served(server.sockets[0].getsockname()[1])
         await connections.run()
     finally:
         await runner.cleanup()
-
-
-async def _listen(connections: PageConnections, address: str, port: int) -> int:
-    """The port on which it listens."""
-    try:
-        server = await asyncio.get_running_loop().create_server(connections, address, port)
-    except OSError as error:
-        raise UnavailableError(f"the page cannot use {address} port {port} ({error.strerror}); name others") from error
-    bound: int = server.sockets[0].getsockname()[1]
-    return bound
 
 
 def announce(args: argparse.Namespace, port: int, key: str) -> None:

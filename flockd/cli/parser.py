@@ -55,13 +55,9 @@ class Parser(argparse.ArgumentParser):
         return parsed, unknown
 
     def error(self, message: str) -> NoReturn:
-        """Reports what is wrong with the command line, with a suggestion for a misspelt command or one that is gone."""
+        """Reports what is wrong with the command line, with a suggestion for a misspelt command."""
         unknown = re.match("argument COMMAND: invalid choice: '(.*?)' ", message)
-        named = unknown or re.match("unknown argument (--[^=]+)", message)
-        gone = None if named is None else COMMANDS.get(f"{self.prog} {named[1]}")
-        if named is not None and gone is not None:
-            message = f"{named[1]} is gone; {gone}"
-        elif unknown is not None:
+        if unknown is not None:
             close = difflib.get_close_matches(unknown[1], self.commands, n=1)
             hint = f"; did you mean `{self.prog} {close[0]}`?" if close else f", of {', '.join(self.commands)}"
             message = f"{unknown[1]!r} is not a command{hint}"

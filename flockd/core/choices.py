@@ -17,7 +17,6 @@ there is a drone."""
 
 Provider = Literal["cpu", "cuda", "tensorrt", "openvino"]
 """What computes the networks: execution providers of ONNX Runtime, or OpenVINO."""
-PROVIDERS: tuple[Provider, ...] = get_args(Provider)
 
 FlowRefinement = Literal["lucas_kanade", "dis", "none"]
 """What sharpens a network's flow."""

@@ -5,89 +5,70 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 _CAMERAS = "change them in the file; `flockd cameras --write FILE` writes the sections for what is plugged in"
-
-COMMANDS: Mapping[str, str] = {
-    **{
-        f"flockd config new {kind} --{option}": instead
-        for kind, options in {
-            "drone": {
-                "name": "write `--set name=NAME`",
-                "number": "write `--set safety.first_flight_layer=N`",
-                **dict.fromkeys(("cameras", "size", "field-of-view", "source"), _CAMERAS),
-                "autopilot": "write `--set autopilot.address=ADDRESS`",
-                "fleet": "write `--set telemetry.fleet=NAME`",
-                "mission": "write `--set 'mission={kind: KIND}'`",
-                "defaults": "leave it out: nothing is asked",
-            },
-            "scenario": {
-                "name": "write `--set scenario=NAME`",
-                "drones": "leave it out, and say it to `flockd sim FILE --drones N`",
-                "duration": "write `--set duration_s=S`",
-                "mission": "write `--set 'mission={kind: KIND}'`",
-                "obstacles": "write `--set world.obstacles.kind=KIND --set obstacles.enabled=true`",
-                "drone": "write `--set drone=FILE`",
-                "defaults": "leave it out: nothing is asked",
-            },
-        }.items()
-        for option, instead in options.items()
-    },
-    **dict.fromkeys(
-        ("flockd doctor --bench", "flockd doctor --minutes"),
-        "run `flockd run` with propellers off, and watch `flockd status`",
-    ),
-    "flockd doctor --unit": "`systemd-analyze security flockd` judges the unit",
-    "flockd fleet --recordings": "`flockd report FOLDER` writes a report of the recordings that plays them",
-    "flockd foxglove": "watch live with `flockd fleet`, or in ROS 2 with `flockd ros`; Foxglove opens recordings",
-    "flockd record export --ros2": "Foxglove opens the recording itself; record a flight's topics of `flockd ros`",
-    "flockd record export --format": "tables are CSV, which pandas, Polars and DuckDB read too; leave it out",
-    "flockd models bench": "`flockd replay RECORDING --profile` times the stages with the networks of --config",
-    "flockd replay --trajectory": "`--json` gives the motion of each pair, to be put together",
-    "flockd replay --calibration": "write the camera's matrix into the dataset's K.txt",
-    "flockd replay --speed": "leave it out: a replay shows nothing while it runs",
-    "flockd report --ulog": "open PX4's log in Flight Review or PlotJuggler",
-    "flockd cameras --measure": "`flockd cameras --picture FOLDER` measures",
-    **dict.fromkeys(
-        (
-            f"flockd calibrate rig --{option}"
-            for option in ("by", "reference", "config", "every", "squares", "square-mm")
-        ),
+_MISSION, _DEFAULTS = "write `--set 'mission={kind: KIND}'`", "leave it out: nothing is asked"
+_TABLES = "tables are CSV, which pandas, Polars and DuckDB read too; leave it out"
+_OPTIONS = (
+    ("config new drone", "name", "write `--set name=NAME`"),
+    ("config new drone", "number", "write `--set safety.first_flight_layer=N`"),
+    ("config new drone", "cameras size field-of-view source", _CAMERAS),
+    ("config new drone", "autopilot", "write `--set autopilot.address=ADDRESS`"),
+    ("config new drone", "fleet", "write `--set telemetry.fleet=NAME`"),
+    ("config new drone", "mission", _MISSION),
+    ("config new drone", "defaults", _DEFAULTS),
+    ("config new scenario", "name", "write `--set scenario=NAME`"),
+    ("config new scenario", "drones", "leave it out, and say it to `flockd sim FILE --drones N`"),
+    ("config new scenario", "duration", "write `--set duration_s=S`"),
+    ("config new scenario", "mission", _MISSION),
+    ("config new scenario", "obstacles", "write `--set world.obstacles.kind=KIND --set obstacles.enabled=true`"),
+    ("config new scenario", "drone", "write `--set drone=FILE`"),
+    ("config new scenario", "defaults", _DEFAULTS),
+    ("doctor", "bench minutes", "run `flockd run` with propellers off, and watch `flockd status`"),
+    ("doctor", "unit", "`systemd-analyze security flockd` judges the unit"),
+    ("fleet", "recordings", "`flockd report FOLDER` writes a report of the recordings that plays them"),
+    ("record export", "ros2", "Foxglove opens the recording itself; record a flight's topics of `flockd ros`"),
+    ("record export", "format", _TABLES),
+    ("replay", "trajectory", "`--json` gives the motion of each pair, to be put together"),
+    ("replay", "calibration", "write the camera's matrix into the dataset's K.txt"),
+    ("replay", "speed", "leave it out: a replay shows nothing while it runs"),
+    ("report", "ulog", "open PX4's log in Flight Review or PlotJuggler"),
+    ("cameras", "measure", "`flockd cameras --picture FOLDER` measures"),
+    (
+        "calibrate rig",
+        "by reference config every squares square-mm",
         "measure with a tape, fly, and take over what the flight found with `--from-flight RECORDING`",
     ),
-    "flockd calibrate rig --max-offset": "a flight finds the time offset: `--from-flight RECORDING`",
-    **{
-        f"flockd sim --{option}": f"write `--set {key}=VALUE`"
-        for option, key in {
-            "flow": "drone.perception.flow",
-            "scale": "drone.perception.scale",
-            "height": "drone.perception.height",
-            "wind": "vehicle.wind_m_s",
-            "speed": "drone.mission.speed_m_s",
-            "radius": "drone.mission.radius_m",
-            "cameras": "cameras.preset",
-        }.items()
-    },
-    "flockd sim --verbose": "the report says what was flown, and `flockd config show SCENARIO` what a file stands for",
-    **dict.fromkeys(
-        (f"flockd calibrate camera --{option}" for option in ("size", "pixel-format", "turn-deg")),
+    ("calibrate rig", "max-offset", "a flight finds the time offset: `--from-flight RECORDING`"),
+    ("sim", "flow", "write `--set drone.perception.flow=VALUE`"),
+    ("sim", "scale", "write `--set drone.perception.scale=VALUE`"),
+    ("sim", "height", "write `--set drone.perception.height=VALUE`"),
+    ("sim", "wind", "write `--set vehicle.wind_m_s=VALUE`"),
+    ("sim", "speed", "write `--set drone.mission.speed_m_s=VALUE`"),
+    ("sim", "radius", "write `--set drone.mission.radius_m=VALUE`"),
+    ("sim", "cameras", "write `--set cameras.preset=VALUE`"),
+    ("sim", "verbose", "the report says what was flown, and `flockd config show SCENARIO` what a file stands for"),
+    (
+        "calibrate camera",
+        "size pixel-format turn-deg",
         "`flockd cameras --write FILE` writes the cameras that are plugged in; name that with --config",
     ),
-    **dict.fromkeys(
-        (
-            f"flockd detect --{option}"
-            for option in ("models", "first-stage", "detector", "second-stage", "verification", "threads")
-        ),
+    (
+        "detect",
+        "models first-stage detector second-stage verification threads",
         "write it in the section `perception` of a drone's file, and name that with --config",
     ),
-    **dict.fromkeys(
-        (f"flockd calibrate camera --{option}" for option in ("dictionary", "marker-mm")),
+    (
+        "calibrate camera",
+        "dictionary marker-mm",
         "print flockd's own board with `flockd calibrate camera --print-board`",
     ),
-    **dict.fromkeys(
-        (f"flockd calibrate camera --{option}" for option in ("views", "max-blur", "serial", "seconds")),
-        "leave it out",
-    ),
+    ("calibrate camera", "views max-blur serial seconds", "leave it out"),
+    ("calibrate camera", "picture", "the command prints the coverage and each view's residual"),
+)
+COMMANDS: Mapping[str, str] = {
+    **{f"flockd {of} --{option}": instead for of, options, instead in _OPTIONS for option in options.split()},
+    "flockd foxglove": "watch live with `flockd fleet`, or in ROS 2 with `flockd ros`; Foxglove opens recordings",
+    "flockd models bench": "`flockd replay RECORDING --profile` times the stages with the networks of --config",
     "flockd calibrate drone": "measure from tip to tip, with propellers, and write `perception.drone_size_m`",
-    "flockd calibrate camera --picture": "the command prints the coverage and each view's residual",
     "flockd view": "open the recording in Foxglove, or in Rerun after `rerun mcap convert RECORDING.mcap -o X.rrd`",
 }
 """By a command, or a command and its option, as they were written on the command line."""

@@ -7,6 +7,7 @@ gives one.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -46,23 +47,6 @@ class DroneConfig(Section):
     own_velocity: OwnVelocitySource = "vision"
     yaw: Literal["hold", "course"] = "course"
     """Heading: kept as it is, or along the desired velocity."""
-
-    @model_validator(mode="after")
-    def _the_mission_can_be_flown(self) -> Self:
-        faults = mission_faults(self.mission, self.safety.gate, self.flocking.max_speed_m_s)
-        refuse(self, {("mission", *key): text for key, text in faults.items()})
-        return self
-
-    @model_validator(mode="after")
-    def _the_gate_lets_the_law_through(self) -> Self:
-        if self.flocking.max_speed_m_s > self.safety.gate.max_speed_m_s:
-            fault = (
-                f"{self.flocking.max_speed_m_s:g} is above safety.gate.max_speed_m_s, which would refuse it; write "
-                f"{self.safety.gate.max_speed_m_s:g} or less"
-            )
-            refuse(self, {("flocking", "max_speed_m_s"): fault})
-        return self
-
     recording: RecordingConfig = RecordingConfig()
     autopilot: AutopilotParameters | None = None
     """None: this drone's commands go nowhere but to the simulator."""
@@ -74,49 +58,44 @@ class DroneConfig(Section):
         return 1.0 if self.source is None else self.source.shared_memory.speed_factor
 
     @model_validator(mode="after")
-    def _the_gate_lets_the_trim_through(self) -> Self:
+    def _sections_agree(self) -> Self:
         gate_m_s, law_m_s = self.safety.gate.max_speed_m_s, self.flocking.max_speed_m_s
+        faults: dict[tuple[str | int, ...], str] = {
+            ("mission", *key): text for key, text in mission_faults(self.mission, self.safety.gate, law_m_s).items()
+        }
         trim_m_s = 0.0 if self.autopilot is None else self.autopilot.max_velocity_trim_m_s
-        if law_m_s + trim_m_s > gate_m_s and not math.isclose(law_m_s + trim_m_s, gate_m_s):
-            fault = (
+        if law_m_s > gate_m_s:
+            faults["flocking", "max_speed_m_s"] = (
+                f"{law_m_s:g} is above safety.gate.max_speed_m_s, which would refuse it; write {gate_m_s:g} or less"
+            )
+        elif law_m_s + trim_m_s > gate_m_s and not math.isclose(law_m_s + trim_m_s, gate_m_s):
+            faults["autopilot", "max_velocity_trim_m_s"] = (
                 f"{trim_m_s:g} and flocking.max_speed_m_s {law_m_s:g} are together above safety.gate.max_speed_m_s, "
                 f"which would refuse them; write {gate_m_s - law_m_s:g} or less"
             )
-            refuse(self, {("autopilot", "max_velocity_trim_m_s"): fault})
-        return self
-
-    @model_validator(mode="after")
-    def _what_is_sent_of_obstacles_is_looked_for(self) -> Self:
         if self.autopilot is not None and self.autopilot.obstacle_distance and not self.obstacles.enabled:
             fault = "needs the map of obstacles; write `enabled: true` in `obstacles`, or false here"
-            refuse(self, {("autopilot", "obstacle_distance"): fault})
-        return self
-
-    @model_validator(mode="after")
-    def _only_simulated_time_is_slow(self) -> Self:
+            faults["autopilot", "obstacle_distance"] = fault
         if self.speed_factor != 1.0 and self.autopilot is not None and self.autopilot.address.startswith("serial:"):
             fault = "is for simulations, and an autopilot on a cable is none; delete it"
-            refuse(self, {("source", "shared_memory", "speed_factor"): fault})
+            faults["source", "shared_memory", "speed_factor"] = fault
+        if self.source is not None and self.source.kind != "shared_memory":
+            faults |= self._device_faults([camera.name for camera in self.source.cameras])
+        refuse(self, faults)
         return self
 
-    @model_validator(mode="after")
-    def _every_camera_has_its_device(self) -> Self:
-        if self.source is None or self.source.kind == "shared_memory":
-            return self
+    def _device_faults(self, devices: Sequence[str]) -> dict[tuple[str | int, ...], str]:
+        """Where the cameras of the rig and the names of their devices do not match."""
         rig = [camera.name for camera in self.rig.cameras]
-        devices = [camera.name for camera in self.source.cameras]
         faults: dict[tuple[str | int, ...], str] = {}
         for number, name in enumerate(devices):
             if name not in rig:
-                faults["source", "cameras", number, "name"] = (
-                    f"{name} is no camera of the rig; write one of {', '.join(rig)}"
-                )
+                told = f"{name} is no camera of the rig; write one of {', '.join(rig)}"
+                faults["source", "cameras", number, "name"] = told
             elif name in devices[:number]:
                 faults["source", "cameras", number, "name"] = f"{name} has an entry already; keep one"
         missing = [name for name in rig if name not in devices]
         if missing and not faults:
-            faults["source", "cameras"] = (
-                f"has no entry of the name {missing[0]}, which is a camera of the rig; add one"
-            )
-        refuse(self, faults)
-        return self
+            told = f"has no entry of the name {missing[0]}, which is a camera of the rig; add one"
+            faults["source", "cameras"] = told
+        return faults

@@ -143,14 +143,9 @@ class SafetyParameters(Section):
 
     @model_validator(mode="after")
     def _worse_comes_later(self) -> Self:
-        for mild, grave in (
-            ("degraded_ego_motion_s", "max_ego_motion_s"),
-            ("degraded_load", "max_load"),
-            ("degraded_temperature_c", "max_temperature_c"),
-            ("degraded_velocity_error_m_s", "max_velocity_error_m_s"),
-        ):
-            if getattr(self, mild) > getattr(self, grave):
-                raise ValueError(f"{mild} is above {grave}; write a smaller one")
+        for limit in ("ego_motion_s", "load", "temperature_c", "velocity_error_m_s"):
+            if getattr(self, f"degraded_{limit}") > getattr(self, f"max_{limit}"):
+                raise ValueError(f"degraded_{limit} is above max_{limit}; write a smaller one")
         return self
 
     @model_validator(mode="after")

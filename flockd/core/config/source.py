@@ -99,18 +99,15 @@ class SourceParameters(Section):
             raise ValueError("real cameras know real time only; delete `shared_memory.speed_factor`")
         for number, camera in enumerate(self.cameras):
             refuse(self, {("cameras", number, *key): text for key, text in _misplaced(camera, self.kind).items()})
-            if self.set_tolerance_s * camera.rate_hz < 0.5:
-                fault = (
-                    f"{self.set_tolerance_s:g} is less than half a frame period of camera {camera.name!r}; write "
-                    f"{0.5 / camera.rate_hz:.3f} or more"
-                )
-                refuse(self, {("set_tolerance_s",): fault})
-            if self.silence_s * camera.rate_hz < 2.0:
-                fault = (
-                    f"{self.silence_s:g} is less than two frame periods of camera {camera.name!r}; write "
-                    f"{2.0 / camera.rate_hz:.3f} or more"
-                )
-                refuse(self, {("silence_s",): fault})
+            for key, periods, words in (
+                ("set_tolerance_s", 0.5, "half a frame period"),
+                ("silence_s", 2.0, "two frame periods"),
+            ):
+                if getattr(self, key) * camera.rate_hz < periods:
+                    told = (
+                        f"is less than {words} of camera {camera.name!r}; write {periods / camera.rate_hz:.3f} or more"
+                    )
+                    refuse(self, {(key,): f"{getattr(self, key):g} {told}"})
         refuse(
             self,
             {

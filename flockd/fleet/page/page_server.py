@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from aiohttp import WSMsgType, web
 
@@ -20,7 +20,7 @@ from flockd.fleet.drone_rows import HISTORY_COLUMNS, Known, Row
 from flockd.fleet.live_fleet import Event, LiveFleet
 from flockd.fleet.page.page_access import HEADERS, PageAccess, is_own_host, is_own_origin
 from flockd.fleet.page.page_pictures import PagePictures
-from flockd.fleet.simulation import SimulationMessage, checked_control
+from flockd.fleet.simulation import SimulationLink, checked_control
 from flockd.fleet.watcher import MAX_DRONES
 from flockd.onboard.telemetry.order_messages import parse_order
 from flockd.onboard.telemetry.topics import AnswerMessage
@@ -40,16 +40,6 @@ _TOKEN = "@TOKEN@"
 """In the page, for the session's."""
 
 
-class Simulation(Protocol):
-    """A simulation that the page controls: `flockd.fleet.simulation.SimulationLink`."""
-
-    def state(self) -> SimulationMessage | None:
-        """How it is doing; None: there is nothing to control."""
-
-    def ask(self, control: str, value: Mapping[str, object], operator: str) -> AnswerMessage:
-        """The answer to a control. Waits; called on a thread of its own."""
-
-
 class PageServer:
     """The application of one fleet. `application` gives what aiohttp serves."""
 
@@ -60,7 +50,7 @@ class PageServer:
         *,
         may_command: bool,
         operator: str = "page",
-        simulation: Simulation | None = None,
+        simulation: SimulationLink | None = None,
     ) -> None:
         """For one event loop.
 
@@ -249,7 +239,7 @@ class PageServer:
 class _Feed:
     """What one page is sent: each time only what has changed for it."""
 
-    def __init__(self, source: LiveFleet, socket: web.WebSocketResponse, simulation: Simulation | None) -> None:
+    def __init__(self, source: LiveFleet, socket: web.WebSocketResponse, simulation: SimulationLink | None) -> None:
         self._source, self._socket, self._simulation = source, socket, simulation
         self._sent: dict[str, Row] = {}
         self._event: Event | None = None

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from flockd.core.errors import FlockdError
 from flockd.core.messages import BoolArray, FloatArray, IntArray, UInt8Array
@@ -201,7 +202,7 @@ def first_pose(camera: Camera, seen: BoardDetection) -> tuple[float, RigidTransf
     if not usable.any():
         return math.inf, None
     # Through a pinhole whose axis points straight at the board: so a lens may see the board beside or behind itself.
-    R_virtual_camera = _turn_to_axis(rays[usable].mean(axis=0))
+    R_virtual_camera = Rotation.align_vectors([[0.0, 0.0, 1.0]], [rays[usable].mean(axis=0)])[0].as_matrix()
     turned = rays @ R_virtual_camera.T
     usable &= turned[:, 2] > _NEAREST_ANGLE
     if usable.sum() < 4:
@@ -223,13 +224,3 @@ def first_pose(camera: Camera, seen: BoardDetection) -> tuple[float, RigidTransf
             if error < best[0]:
                 best = error, pose
     return best
-
-
-def _turn_to_axis(direction: FloatArray) -> FloatArray:
-    """(3, 3) the shortest rotation that takes a direction to the optical axis."""
-    unit = direction / max(float(np.linalg.norm(direction)), 1e-12)
-    across = np.cross(unit, (0.0, 0.0, 1.0))
-    sine = float(np.linalg.norm(across))
-    if sine < 1e-9:
-        return np.eye(3) if unit[2] > 0.0 else np.diag([1.0, -1.0, -1.0])
-    return rotation_from_vector(across / sine * np.arctan2(sine, unit[2]))

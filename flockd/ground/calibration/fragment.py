@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ import yaml
 
 from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, MeasurementConfig
 from flockd.flight.geometry import RigidTransform, euler_from_rotation
-from flockd.onboard.recording.editing import written_whole
 
 _R_FRD_RDF = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """``R_body_camera`` of a camera that is mounted without any turn."""
@@ -28,13 +26,8 @@ def extrinsics_of(T_body_camera: RigidTransform, measured: MeasurementConfig) ->
     """A mounting as configuration: ten thousandths of a degree, hundredths of a millimetre."""
     roll, pitch, yaw = euler_from_rotation(T_body_camera.rotation @ _R_FRD_RDF.T)
     x, y, z = (round(float(value), 5) + 0.0 for value in T_body_camera.translation)
-    return ExtrinsicsConfig(
-        position_m=(x, y, z),
-        yaw_deg=round(math.degrees(yaw), 4) + 0.0,
-        pitch_deg=round(math.degrees(pitch), 4) + 0.0,
-        roll_deg=round(math.degrees(roll), 4) + 0.0,
-        measured=measured,
-    )
+    roll, pitch, yaw = (round(math.degrees(angle), 4) + 0.0 for angle in (roll, pitch, yaw))
+    return ExtrinsicsConfig(position_m=(x, y, z), yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll, measured=measured)
 
 
 def rig_text(cameras: Sequence[CameraConfig], comment: Sequence[str], time_offset_s: float = 0.0) -> str:
@@ -43,22 +36,9 @@ def rig_text(cameras: Sequence[CameraConfig], comment: Sequence[str], time_offse
     rig["cameras"] = []
     for camera in cameras:
         values = camera.model_dump(mode="json", exclude_defaults=True)
-        values["intrinsics"] = {
-            "model": camera.intrinsics.model,
-            **values["intrinsics"],
-        }  # worth saying, if the default
+        values["intrinsics"] = {"model": camera.intrinsics.model} | values["intrinsics"]  # said even if the default
         rig["cameras"].append(values)
     text: str = yaml.safe_dump(
         {"rig": rig}, default_flow_style=None, sort_keys=False, width=math.inf, allow_unicode=True
     )
     return "".join(f"# {line}".rstrip() + "\n" for line in comment) + text
-
-
-def write_rig(out: Path, cameras: Sequence[CameraConfig], time_offset_s: float) -> None:
-    """A file with a rig section, in place of any that was there."""
-    comment = (
-        "The cameras of a drone, written by `flockd calibrate rig`. Put this in place of `rig` in your drone's file,",
-        "then run `flockd config check` on that.",
-    )
-    with written_whole(out) as draft:
-        draft.write_text(rig_text(cameras, comment, time_offset_s), encoding="utf-8")

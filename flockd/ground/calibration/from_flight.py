@@ -21,8 +21,9 @@ from flockd.flight.geometry import (
     rotation_from_vector,
 )
 from flockd.ground.calibration.board import CalibrationError
-from flockd.ground.calibration.fragment import extrinsics_of, measured_today, write_rig
+from flockd.ground.calibration.fragment import extrinsics_of, measured_today, rig_text
 from flockd.onboard.message_json import from_json, parsed
+from flockd.onboard.recording.editing import written_whole
 from flockd.onboard.recording.mcap_file import RecordingError, read_entries
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.streams import OUTPUT
@@ -102,13 +103,13 @@ def corrected_rig(recording: Recording, source: str, out: Path) -> dict[str, Any
         told = "; ".join([*notes, "what is known agrees with the configuration"])
         raise CalibrationError(f"{source}: nothing of the rig is to be corrected: {told}")
     total_s = round(config.time_offset_s + (offset_s or 0.0), 4)
-    write_rig(out, cameras, total_s)
-    return {
-        "cameras": results,
-        "time_offset_s": total_s,
-        "notes": notes,
-        "out": str(out),
-    }
+    comment = (
+        "The cameras of a drone, written by `flockd calibrate rig`. Put this in place of `rig` in your drone's file,",
+        "then run `flockd config check` on that.",
+    )
+    with written_whole(out) as draft:
+        draft.write_text(rig_text(cameras, comment, total_s), encoding="utf-8")
+    return {"cameras": results, "time_offset_s": total_s, "notes": notes, "out": str(out)}
 
 
 def _offset_s(found: Sequence[CameraDeviation]) -> tuple[float | None, str | None]:

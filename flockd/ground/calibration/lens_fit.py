@@ -317,17 +317,16 @@ def fit_lenses(collector: Collector, model: LensModel | None, source: str) -> li
     return found
 
 
-def intrinsics_of(lens: Lens, measured: MeasurementConfig) -> IntrinsicsConfig:
-    """A lens as configuration: ten thousandths of a pixel, and what of the distortion makes as much."""
-    m = lens.camera.matrix
-    fx, fy, cx, cy = (round(float(m[place]), 4) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    distortion = tuple(round(k, 8) for k in lens.camera.distortion)
-    return IntrinsicsConfig(model=lens.model, fx=fx, fy=fy, cx=cx, cy=cy, distortion=distortion, measured=measured)
-
-
 def write_lens(camera: str, lens: Lens, measured: MeasurementConfig, out: Path) -> IntrinsicsConfig:
-    """Writes a drone with this one camera as YAML, and gives the lens as configuration."""
-    intrinsics = intrinsics_of(lens, measured)
+    """Writes a drone with this one camera as YAML, and gives the lens as configuration.
+
+    To ten thousandths of a pixel, and what of the distortion makes as much.
+    """
+    fx, fy, cx, cy = (round(float(value), 4) for value in lens.camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]])
+    distortion = tuple(round(k, 8) for k in lens.camera.distortion)
+    intrinsics = IntrinsicsConfig(
+        model=lens.model, fx=fx, fy=fy, cx=cx, cy=cy, distortion=distortion, measured=measured
+    )
     comment = (
         f"The lens of camera {camera}, written by `flockd calibrate camera`. Copy `intrinsics` to the camera of this",
         "name in your drone's file, then run `flockd config check` on that; this file too is a drone with one camera.",

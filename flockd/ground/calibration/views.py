@@ -152,9 +152,9 @@ class Collector:
         if seen is None:
             return self._refuse(Refused(name, "no board"))
         edge_px = edge_width_px(grey, seen, self._finder.spec)
-        if edge_px > sharp_px(image.shape[1]):
+        if edge_px > max(_SHARP_PX, _SHARP_SHARE * image.shape[1]):
             return self._refuse(Refused(name, "blurred", edge_px))
-        if moving and (before is None or not is_still(before, seen, image.shape[1])):
+        if moving and (before is None or _apart(before, seen, image.shape[1]) >= _STILL):
             return self._refuse(Refused(name, "moving"))
         if any(_apart(view.seen, seen, image.shape[1]) < _ALIKE for view in self.views):
             return self._refuse(Refused(name, "like another"))
@@ -188,16 +188,6 @@ class Collector:
             apart[i, j] = _apart(self.views[i].seen, self.views[j].seen, self.size[0])
         gone = self.views.pop(int(np.unravel_index(np.argmin(apart), apart.shape)[1]))
         self._refuse(Refused(gone.name, "like another"))
-
-
-def sharp_px(width: int) -> float:
-    """The widest edge of a sharp view in an image of this width."""
-    return max(_SHARP_PX, _SHARP_SHARE * width)
-
-
-def is_still(before: BoardDetection, now: BoardDetection, width: int) -> bool:
-    """Whether a board was held still from one frame to the next, in images of this width."""
-    return _apart(before, now, width) < _STILL
 
 
 def _apart(first: BoardDetection, second: BoardDetection, width: int) -> float:

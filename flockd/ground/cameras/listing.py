@@ -19,7 +19,6 @@ from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsCon
 from flockd.core.config.source import CameraDeviceParameters
 from flockd.core.errors import UsageError
 from flockd.ground.calibration.fragment import rig_text
-from flockd.onboard.sources.gstreamer_device import FORMATS
 from flockd.onboard.sources.v4l2_device import CAN_CAPTURE, CAPTURE, FOURCC, camera_flags, controls_of
 from flockd.onboard.sources.v4l2_kernel import (
     VIDIOC_ENUM_FMT,
@@ -35,7 +34,7 @@ from flockd.onboard.sources.v4l2_kernel import (
 
 USUAL_SIZE, USUAL_RATE_HZ = (640, 480), 30.0
 """What is chosen where a camera offers it."""
-_PREFERENCE = ("mjpeg", "NV12", "I420", "yuyv")
+_PREFERENCE = ("mjpeg", "NV12", "yuyv")
 """Formats in order of preference, first those that take the least of a bus."""
 
 
@@ -44,7 +43,7 @@ class Mode:
     """One format and size of a camera."""
 
     pixel_format: str
-    """`mjpeg` or `yuyv`; of a pipeline also GStreamer's name of a raw format."""
+    """`mjpeg` or `yuyv`; of an element of GStreamer `NV12`."""
     size: tuple[int, int]
     """Width, height."""
     rates_hz: tuple[float, ...]
@@ -86,10 +85,8 @@ class FoundCamera:
         """The mode nearest to a size, in the format that takes the least of a bus, at the usual rate if there is."""
 
         def cost(mode: Mode) -> tuple[int, int]:
-            width, height = mode.size
-            off = abs(width - size[0]) + abs(height - size[1])
-            rank = _PREFERENCE.index(mode.pixel_format) if mode.pixel_format in _PREFERENCE else len(_PREFERENCE)
-            return off, rank
+            off = abs(mode.size[0] - size[0]) + abs(mode.size[1] - size[1])
+            return off, _PREFERENCE.index(mode.pixel_format)
 
         if not self.modes:
             return None
@@ -101,7 +98,7 @@ class FoundCamera:
         """How flockd runs it in a mode, under a name of the rig; ``as_pipeline``: through GStreamer in any case."""
         rate_hz = mode.rates_hz[0]
         if self.element or as_pipeline:
-            kind = _PIPELINE_CAPS.get(mode.pixel_format, f"video/x-raw,format={mode.pixel_format}")
+            kind = _PIPELINE_CAPS[mode.pixel_format]
             fraction = f"{rate_hz:.0f}/1" if rate_hz == round(rate_hz) else f"{round(rate_hz * 1000)}/1000"
             limits = f"width={mode.size[0]},height={mode.size[1]},framerate={fraction}"
             element = self.element or f"v4l2src device={self.device}"
@@ -118,8 +115,10 @@ BY_PATH = Path("/dev/v4l/by-path")
 """udev's links by the socket that a camera is plugged into: they stay the same whatever is plugged in elsewhere."""
 RUN_S = 20.0
 _ARGUS = "nvarguscamerasrc"
-_ARGUS_MODES = tuple(Mode("NV12", size, (30.0,)) for size in ((640, 480), (1280, 720), (1920, 1080)))
-"""It scales to whatever it is asked for."""
+_SIZES_OF_RANGE = ((640, 480), (1280, 720), (1920, 1080))
+"""What is listed of a camera that scales to any size."""
+_SCALED = tuple(Mode("NV12", size, (30.0,)) for size in _SIZES_OF_RANGE)
+"""Modes of an element of GStreamer: those of libcamera and of NVIDIA scale to whatever they are asked for."""
 
 
 def run_program(command: Sequence[str]) -> str | None:
@@ -144,7 +143,7 @@ class Computer:
 def list_cameras(computer: Computer) -> list[FoundCamera]:
     """All of them, in a stable order; one that cannot be used says why."""
     found = list(_of_kernel(computer))
-    monitored = cameras_of_monitor(computer.run(MONITOR) or "")
+    monitored = list(_of_monitor(computer.run(MONITOR) or ""))
     if any(camera.fault == SENSOR_ONLY for camera in found) and computer.run(("gst-inspect-1.0", "--exists", _ARGUS)):
         found = list(_by_argus(found))
     elif monitored:  # they are the sensors among the kernel's devices
@@ -171,7 +170,7 @@ def _by_argus(found: Sequence[FoundCamera]) -> Iterator[FoundCamera]:
     for camera in found:
         if camera.fault == SENSOR_ONLY:
             element = f"{_ARGUS} sensor-id={number}"
-            yield replace(camera, device="", element=element, modes=_ARGUS_MODES, fault=None)
+            yield replace(camera, device="", element=element, modes=_SCALED, fault=None)
             number += 1
         else:
             yield camera
@@ -182,51 +181,21 @@ _OTHERS = ("v4l2src", "pipewiresrc", "ximagesrc")
 """Elements that are left out: what flockd finds by itself, and what is a view of it or no camera."""
 _LAUNCH = re.compile(r"^\s*gst-launch-1\.0 (\S.*?)(?: ! \.\.\.)?\s*$", re.MULTILINE)
 _NAME = re.compile(r"^\s*name\s*: (.*)$", re.MULTILINE)
-_CAPS = re.compile(r"(image/jpeg|video/x-raw),([^;\n]*)")
-_NUMBER = {key: re.compile(rf"\b{key}=(?:\(int\))?(\d+)") for key in ("width", "height")}
-_FORMAT = re.compile(r"\bformat=(?:\(string\))?(\w+)")
-_RATES = re.compile(r"\bframerate=(?:\(fraction\))?(?:\{([^}]*)\}|(\d+/\d+))")
 
 
-def cameras_of_monitor(text: str) -> list[FoundCamera]:
+def _of_monitor(text: str) -> Iterator[FoundCamera]:
     """A camera for each device that flockd does not find by itself; ``text`` is the monitor's whole output."""
-    found = []
     for part in text.split("Device found:")[1:]:
         launch, name = _LAUNCH.search(part), _NAME.search(part)
-        if launch is None or launch[1].startswith(_OTHERS):
-            continue
-        called = name[1].strip() if name else launch[1]
-        found.append(FoundCamera(called, node="", element=launch[1], modes=tuple(_modes(part)) or _ANY))
-    return found
-
-
-_ANY = (Mode("NV12", (640, 480), (30.0,)),)
-"""Modes assumed for an element that does not say what it offers."""
-
-
-def _modes(text: str) -> Iterator[Mode]:
-    for kind, fields in _CAPS.findall(text):
-        width, height = (_NUMBER[key].search(fields) for key in ("width", "height"))
-        name = _FORMAT.search(fields)
-        pixel_format = "mjpeg" if kind == "image/jpeg" else name[1] if name else ""
-        if width is None or height is None or (pixel_format != "mjpeg" and pixel_format not in FORMATS):
-            continue
-        pixel_format = "yuyv" if pixel_format == "YUY2" else pixel_format
-        yield Mode(pixel_format, (int(width[1]), int(height[1])), _rates(fields))
-
-
-def _rates(fields: str) -> tuple[float, ...]:
-    rates = _RATES.search(fields)
-    pairs = re.findall(r"(\d+)/(\d+)", rates[0]) if rates else []
-    return tuple(sorted({round(int(a) / int(b), 3) for a, b in pairs if int(b)}, reverse=True))
+        if launch is not None and not launch[1].startswith(_OTHERS):
+            called = name[1].strip() if name else launch[1]
+            yield FoundCamera(called, node="", element=launch[1], modes=_SCALED)
 
 
 SENSOR_ONLY = "sends a sensor's raw values only; read it by a pipeline of libcamerasrc, or nvarguscamerasrc on a Jetson"
 _DISCRETE = 1
 _MOST = 100
 """Entries of a list; a driver that never ends its own is not followed further."""
-_SIZES_OF_RANGE = ((640, 480), (1280, 720), (1920, 1080))
-"""What is listed of a camera that scales to any size."""
 _NAMES = {number: name for name, number in FOURCC.items()}
 _WORTH_SETTING = ("exposure", "gain", "white_balance", "focus")
 _Entry = TypeVar("_Entry", FormatDescription, FrameSize, FrameInterval)
@@ -294,7 +263,9 @@ def _entries(kernel: Kernel, descriptor: int, request: int, entry: Callable[...,
         yield asked
 
 
-_PIPELINE_CAPS = {"mjpeg": "image/jpeg", "yuyv": "video/x-raw,format=YUY2"}
+_PIPELINE_CAPS = {
+    "mjpeg": "image/jpeg", "yuyv": "video/x-raw,format=YUY2", "NV12": "video/x-raw,format=NV12",
+}  # fmt: skip
 
 
 FIELD_OF_VIEW_DEG = 130.0
@@ -329,23 +300,13 @@ def sections_text(cameras: Mapping[str, tuple[FoundCamera, Mode]], turn_deg: int
     for name, (camera, mode) in cameras.items():
         parameters = camera.parameters(name, mode, as_pipeline=as_pipelines)
         where = f", {camera.node} now" if camera.node else ""
+        keys = ("pipeline", "rate_hz") if parameters.pipeline else ("device", "pixel_format", "rate_hz")
+        values = {key: getattr(parameters, key) for key in keys} | ({"turn_deg": turn_deg} if turn_deg else {})
         lines.append(f"    - name: {name}    # {' '.join(camera.name.split())}{where}")
-        if parameters.pipeline:
-            lines.append(f"      pipeline: {json.dumps(parameters.pipeline, ensure_ascii=False)}")
-        else:
-            lines.append(f"      device: {json.dumps(parameters.device)}")
-            lines.append(f"      pixel_format: {parameters.pixel_format}")
-        lines.append(f"      rate_hz: {parameters.rate_hz:g}")
-        if turn_deg:
-            lines.append(f"      turn_deg: {turn_deg}")
-        if not as_pipelines:
-            lines += _controls(camera)
-    tolerance_s = max(0.02, 0.6 / slowest_hz)
-    silence_s = max(0.5, 3.0 / slowest_hz)
-    lines += [
-        f"  set_tolerance_s: {tolerance_s:.3g}    # half a frame period or more",
-        f"  silence_s: {silence_s:.3g}",
-    ]
+        lines += [f"      {key}: {json.dumps(value, ensure_ascii=False)}" for key, value in values.items()]
+        lines += [] if as_pipelines else _controls(camera)
+    lines.append(f"  set_tolerance_s: {max(0.02, 0.6 / slowest_hz):.3g}    # half a frame period or more")
+    lines.append(f"  silence_s: {max(0.5, 3.0 / slowest_hz):.3g}")
     return "\n".join(lines) + "\n"
 
 

@@ -53,11 +53,13 @@ def with_line(line: str) -> str:
     return DRONE + line + "\n"
 
 
-def test_whole_numbers_stand_for_floats_and_lists_for_tuples(tmp_path: Path) -> None:
+def test_a_file_is_read_as_a_person_means_it(tmp_path: Path) -> None:
+    """Whole numbers stand for floats and lists for tuples, old truth values are words, and it may be a Windows file."""
     path = tmp_path / "drone.yaml"
-    path.write_text(DRONE, encoding="utf-8")
+    path.write_bytes(b"\xef\xbb\xbf" + DRONE.replace("name: front", "name: on").replace("\n", "\r\n").encode())
     (camera,) = load_drone(path).rig.cameras
     assert (camera.intrinsics.fx, type(camera.intrinsics.fx), camera.size_px) == (320.0, float, (640, 480))
+    assert camera.name == "on"
 
 
 @pytest.mark.parametrize(
@@ -96,13 +98,8 @@ def test_scalars_follow_the_core_schema(text: str, value: object) -> None:
     assert type(read) is type(value)
 
 
-def test_words_that_old_yaml_takes_for_truth_values_stay_words(tmp_path: Path) -> None:
-    path = tmp_path / "drone.yaml"
-    path.write_text(DRONE.replace("name: front", "name: on"), encoding="utf-8")
-    assert load_drone(path).rig.cameras[0].name == "on"
-
-
 CAMERA, SLOW = "{name: front, device: /dev/video0}", "shared_memory: {speed_factor: 0.5}"
+CABLE = "autopilot: {address: 'serial:///dev/ttyS1:921600'}"
 SLIPS = (
     ("step_s: -0.5", "step_s: -0.5 is not greater than 0; write a number of seconds above 0 and up to 60"),
     ("step_s: '0.5'", "step_s: '0.5' is not a number of seconds above 0 and up to 60; write 0.5"),
@@ -130,14 +127,8 @@ SLIPS = (
     ("autopilot: {address: /dev/ttyAMA0}", "autopilot.address: /dev/ttyAMA0 is not an address; write an address, as"),
     ("telemetry: {listen: ['0.0.0.0:7447']}", "telemetry.listen[0]: '0.0.0.0:7447' is not a zenoh endpoint; write a"),
     (f"source: {{kind: v4l2, cameras: [{CAMERA}], {SLOW}}}", "source: real cameras know real time only; delete"),
-    (
-        f"source: {{kind: shared_memory, {SLOW.replace('0.5', '0.01')}}}",
-        "source.shared_memory.speed_factor: 0.01 is not",
-    ),
-    (
-        f"source: {{kind: shared_memory, {SLOW}}}\nautopilot: {{address: 'serial:///dev/ttyS1:921600'}}",
-        "source.shared_memory.speed_factor: is for simulations, and an autopilot on a cable is none; delete it",
-    ),
+    (f"source: {{kind: shared_memory, {SLOW.replace('0.5', '0.01')}}}", "source.shared_memory.speed_factor: 0.01 is"),
+    (f"source: {{kind: shared_memory, {SLOW}}}\n{CABLE}", "source.shared_memory.speed_factor: is for simulations, and"),
     ("autopilot: {obstacle_distance: true}", "autopilot.obstacle_distance: needs the map of obstacles"),
 )
 
@@ -149,27 +140,32 @@ def test_a_slip_in_line_six_is_reported_with_what_to_do(tmp_path: Path, line: st
     assert str(problem).startswith(f"drone.yaml:6: {told}")
 
 
-def test_a_key_given_twice_is_refused(tmp_path: Path) -> None:
-    (problem,) = _drone_problems(tmp_path, with_line("step_s: 0.5\nyaw: hold\nstep_s: 0.1"))
-    assert (problem.line, problem.key) == (8, "step_s")
-    assert "first in line 6" in problem.message
+GSTREAMER = 'source:\n  kind: gstreamer\n  cameras:\n    - {name: front, pipeline: "videotestsrc%s ! x"}'
+PIPELINE = "source.cameras[0].pipeline"
 
 
-@pytest.mark.parametrize(("escape", "shown"), [("\\0", "0x0000"), ("\\ud800", "0xd800")])
-def test_a_text_that_no_program_takes_is_refused(escape: str, shown: str, tmp_path: Path) -> None:
-    """In a pipeline it killed the camera's thread, after the check had passed it."""
-    source = f"""\
-source:
-  kind: gstreamer
-  cameras:
-    - {{name: front, pipeline: "videotestsrc{escape} ! videoconvert"}}"""
-    (problem,) = _drone_problems(tmp_path, with_line(source))
-    assert str(problem).startswith(f"drone.yaml:9: source.cameras[0].pipeline: holds the character {shown}, ")
-
-
-def test_a_rig_without_cameras_is_refused(tmp_path: Path) -> None:
-    assert places_of(_drone_problems(tmp_path, "rig:\n  cameras: []\n")) == ["drone.yaml:2: rig.cameras"]
-    assert places_of(_drone_problems(tmp_path, "step_s: 1\n")) == ["drone.yaml:1: rig"]
+@pytest.mark.parametrize(
+    ("text", "places", "told"),
+    [
+        (with_line("step_s: 0.5\nyaw: hold\nstep_s: 0.1"), ["8: step_s"], "first in line 6"),
+        # In a pipeline these killed the camera's thread, after the check had passed them.
+        (with_line(GSTREAMER % "\\0"), [f"9: {PIPELINE}"], "holds the character 0x0000"),
+        (with_line(GSTREAMER % "\\ud800"), [f"9: {PIPELINE}"], "holds the character 0xd800"),
+        ("rig:\n  cameras: []\n", ["2: rig.cameras"], "at least 1"),
+        ("step_s: 1\n", ["1: rig"], "is missing"),
+        (DRONE + DRONE.split("cameras:\n")[1], ["6: rig.cameras[1].name"], "share the name"),
+        (
+            DRONE.replace("cx: 320", "cx: 3200").replace("cy: 240", "cy: 480"),
+            [f"5: rig.cameras[0].intrinsics.{key}" for key in ("cx", "cy")],
+            "outside the image",
+        ),
+    ],
+    ids=["twice", "zero", "surrogate", "no cameras", "no rig", "one name", "principal point"],
+)
+def test_a_slip_is_told_at_its_line(text: str, places: list[str], told: str, tmp_path: Path) -> None:
+    problems = _drone_problems(tmp_path, text)
+    assert places_of(problems) == [f"drone.yaml:{place}" for place in places]
+    assert told in problems[0].message
 
 
 def test_faults_inside_a_camera_name_the_camera(tmp_path: Path) -> None:
@@ -181,11 +177,6 @@ def test_faults_inside_a_camera_name_the_camera(tmp_path: Path) -> None:
         *(f"drone.yaml:5: {camera}.intrinsics.{key}" for key in ("cy", "fx", "fx:320")),
     ]
     assert problems[-1].message.endswith("put a space after the colon: `fx: 320`")
-
-
-def test_two_cameras_of_one_name_are_refused(tmp_path: Path) -> None:
-    twice = DRONE + DRONE.split("cameras:\n")[1]
-    assert places_of(_drone_problems(tmp_path, twice)) == ["drone.yaml:6: rig.cameras[1].name"]
 
 
 @pytest.mark.parametrize(
@@ -214,12 +205,18 @@ def test_a_file_that_cannot_be_read_gets_one_sentence(tmp_path: Path, content: b
     assert str(problem).startswith(f"drone.yaml{told}")
 
 
-def test_paths_that_are_no_files_get_one_sentence(tmp_path: Path) -> None:
-    (tmp_path / "folder").mkdir()
+def test_what_is_no_file_or_has_more_values_than_any_gets_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before it is read through: the rest took 48 s to complain about."""
+    monkeypatch.setattr("flockd.core.config.document.MAX_VALUES", 300)
+    many = tmp_path / "many.yaml"
+    many.write_text("rig:\n  cameras:\n" + "  - {a: 1, b: 2}\n" * 500, encoding="utf-8")
     for path, told in (
         (tmp_path / "none.yaml", "does not exist"),
-        (tmp_path / "folder", "is a folder"),
+        (tmp_path, "is a folder"),
         (Path("/dev/zero"), "is not an ordinary file"),
+        (many, "holds more than 300 values"),
     ):
         (problem,) = problems_in(path)
         assert problem.message.startswith(told)
@@ -227,30 +224,27 @@ def test_paths_that_are_no_files_get_one_sentence(tmp_path: Path) -> None:
 
 def test_of_very_many_problems_the_first_are_told_and_the_others_counted(tmp_path: Path) -> None:
     path = tmp_path / "drone.yaml"
-    path.write_text("rig:\n  cameras:\n" + "  - {lens: wide, colour: red}\n" * 300, encoding="utf-8")
+    path.write_text("rig:\n  cameras:\n" + "  - {lens: wide, colour: red}\n" * 30, encoding="utf-8")
     with pytest.raises(ConfigError) as refused:
         load_drone(path)
     *told, last = str(refused.value).splitlines()
     assert len(told) == 20
-    assert all("is not a known key" in line or "is missing; add it" in line for line in told)
     assert told[0].startswith(f"{path}:3: rig.cameras[0]")
     found = len(refused.value.problems)
-    assert found >= 300 * 4, "two unknown keys and two missing ones each"
-    assert last == f"and {found - 20} more problems; correct these first"
+    assert found >= 30 * 4, "two unknown keys and two missing ones each"
+    assert last.startswith(f"and {found - 20} more problems")
 
 
-def test_a_file_of_a_hundred_thousand_values_is_refused_before_it_is_read_through(tmp_path: Path) -> None:
-    """The first of them are enough: the rest took 48 s to complain about."""
-    path = tmp_path / "drone.yaml"
-    path.write_text("rig:\n  cameras:\n" + "  - {a: 1, b: 2}\n" * 50_000, encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"holds more than 30000 values, which no configuration does"):
-        load_drone(path)
-
-
-def test_a_windows_file_is_read_as_any_other(tmp_path: Path) -> None:
-    path = tmp_path / "drone.yaml"
-    path.write_bytes(b"\xef\xbb\xbf" + DRONE.replace("\n", "\r\n").encode())
-    assert load_drone(path).rig.cameras[0].size_px == (640, 480)
+def test_models_that_are_not_there_are_reported_with_where_they_were_searched_for(tmp_path: Path) -> None:
+    (tmp_path / "models").mkdir()
+    for keys, told in (
+        ("models_dir: modles", rf"^perception\.models_dir: {tmp_path}/modles is no folder"),
+        ("models_dir: models", rf"^perception\.flow: there is no model 'flow_int8' \({tmp_path}/models/flow_int8"),
+        ("flow: my/flow.yaml", rf"\({tmp_path}/my/flow\.yaml is missing\)"),
+    ):
+        (tmp_path / "drone.yaml").write_text(with_line(f"perception: {{{keys}}}"), encoding="utf-8")
+        with pytest.raises(ModelError, match=told):
+            load_networks(load_drone(tmp_path / "drone.yaml").perception)
 
 
 def test_a_relative_path_counts_from_the_folder_of_the_file_it_stands_in(
@@ -272,26 +266,6 @@ def test_a_relative_path_counts_from_the_folder_of_the_file_it_stands_in(
     assert drone.perception.segmentation == "neighbours_int8", "a name is not a path"
     overridden = load_drone("../drones/drone.yaml", {"perception.models_dir": "here"})
     assert overridden.perception.models_dir == "here", "who overrides it stands elsewhere"
-
-
-def test_models_that_are_not_there_are_reported_with_where_they_were_searched_for(tmp_path: Path) -> None:
-    (tmp_path / "models").mkdir()
-    (tmp_path / "drone.yaml").write_text(with_line("perception: {models_dir: modles}"), encoding="utf-8")
-    with pytest.raises(ModelError, match=rf"^perception\.models_dir: {tmp_path}/modles is no folder; name the one "):
-        load_networks(load_drone(tmp_path / "drone.yaml").perception)
-    (tmp_path / "drone.yaml").write_text(with_line("perception: {models_dir: models}"), encoding="utf-8")
-    with pytest.raises(
-        ModelError, match=rf"^perception\.flow: there is no model 'flow_int8' \({tmp_path}/models/flow_int8\.yaml "
-    ):
-        load_networks(load_drone(tmp_path / "drone.yaml").perception)
-    (tmp_path / "drone.yaml").write_text(with_line("perception: {flow: my/flow.yaml}"), encoding="utf-8")
-    with pytest.raises(ModelError, match=rf"\({tmp_path}/my/flow\.yaml is missing\)"):
-        load_networks(load_drone(tmp_path / "drone.yaml").perception)
-
-
-def test_a_principal_point_outside_the_image_is_refused_at_its_line(tmp_path: Path) -> None:
-    outside = _drone_problems(tmp_path, DRONE.replace("cx: 320", "cx: 3200").replace("cy: 240", "cy: 480"))
-    assert places_of(outside) == [f"drone.yaml:5: rig.cameras[0].intrinsics.{key}" for key in ("cx", "cy")]
 
 
 def test_the_trim_that_an_error_recommends_is_taken_though_rounding_adds_up(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from flockd.cli import main
 from flockd.core.config import DroneConfig, load_drone, load_real_drone
 from flockd.core.config.real_drone import PROVEN_M_S
 from flockd.core.errors import ConfigError
+from flockd.ground.doctor.setup_checks import check_limits
 
 CONFIG = Path(__file__).parents[3] / "config"
 RIG = """\
@@ -84,15 +85,12 @@ def test_the_envelope_ends_where_the_encounters_did(law: float, gate: float, ref
     assert len(load_real_drone(file)[1]) == refused
 
 
-def test_the_laws_default_is_outside_so_that_the_speed_has_to_be_written(file: Path) -> None:
+def test_shipped_drones_are_inside_the_laws_default_is_not_and_studies_may_go_beyond(file: Path) -> None:
+    for inside in (CONFIG / "quadrotor.yaml", CONFIG / "px4_sitl.yaml", CONFIG / "simulator.yaml"):
+        assert load_real_drone(inside)[1] == []
     file.write_text(RIG + AUTOPILOT, encoding="utf-8")
     (problem,) = load_real_drone(file)[1]
     assert str(problem).startswith(f"{file}: flocking.max_speed_m_s: is not given, and its default of 3 m/s is above ")
-
-
-def test_shipped_drones_are_inside_and_studies_may_go_beyond(file: Path) -> None:
-    for inside in (CONFIG / "quadrotor.yaml", CONFIG / "px4_sitl.yaml", CONFIG / "simulator.yaml"):
-        assert load_real_drone(inside)[1] == []
     assert main(["config", "check", _write(file, law=9.0, gate=9.0, more="")]) == 0, "it has no autopilot to fly"
 
 
@@ -148,16 +146,18 @@ def test_a_layer_that_cannot_be_flown_is_refused(safety: str, told: str, file: P
     assert told in problem.message
 
 
-def test_doctor_says_whether_it_is_a_first_flight(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for text, told in (
-        ("safety: {first_flight_layer: 3}\n", "on: layer 3, 11 m above the ground at home, 1 m/s at most"),
-        ("flocking: {max_speed_m_s: 2.0}\n", "off: 2 m/s at most"),
-    ):
-        file.write_text(RIG + AUTOPILOT + text, encoding="utf-8")
-        assert main(["doctor", "--config", str(file), "--only", "limits"]) == 0
-        assert f"PASS  first flight  {told}" in capsys.readouterr().out
-    assert main(["doctor", "--config", _write(file, law=3.5), "--only", "limits", "--force"]) == 0
-    assert "WARNING  flocking.max_speed_m_s  3.5 m/s is above the 2 m/s" in capsys.readouterr().out
+@pytest.mark.parametrize(
+    ("text", "about", "level"),
+    [
+        ("safety: {first_flight_layer: 3}\n", "on: layer 3, 11 m above the ground at home, 1 m/s", "PASS"),
+        ("flocking: {max_speed_m_s: 2.0}\n", "off: 2 m/s at most", "PASS"),
+        ("flocking: {max_speed_m_s: 3.5}\n", "3.5 m/s is above the 2 m/s", "WARNING"),
+    ],
+)
+def test_doctor_says_whether_it_is_a_first_flight(text: str, about: str, level: str, file: Path) -> None:
+    file.write_text(RIG + AUTOPILOT + text, encoding="utf-8")
+    found = [finding for finding in check_limits(load_real_drone(file)[0]) if about in finding.measured]
+    assert [finding.level.value for finding in found] == [level]
 
 
 @pytest.mark.parametrize("name", ["quadrotor.yaml", "templates/drone.yaml"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from aiohttp import WSMsgType, web
 from aiohttp.test_utils import TestClient, TestServer
@@ -42,7 +43,7 @@ class Simulated:
 
 
 def client_of(
-    simulation: Simulated | None, access: PageAccess, *, may_command: bool = True
+    simulation: Any, access: PageAccess, *, may_command: bool = True
 ) -> TestClient[web.Request, web.Application]:
     page = PageServer(Asked(), access, may_command=may_command, operator="anna", simulation=simulation)
     return TestClient(TestServer(page.application(), host="127.0.0.1"))

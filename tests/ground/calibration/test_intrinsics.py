@@ -73,21 +73,18 @@ def test_a_more_complicated_lens_has_to_fit_clearly_better(wide_px: float, chose
 def test_a_wide_lens_does_not_pass_for_a_pinhole() -> None:
     with pytest.raises(CalibrationError, match=r"with a residual of 1\.\d+ px; show the board .* another model$"):
         calibrate(collected(WIDE).views, WIDE.size, "pinhole")
+    with pytest.raises(CalibrationError, match=r"^5 usable views of the board are too few; show it at least 6 times$"):
+        calibrate(collected(PINHOLE).views[:5], PINHOLE.size, "pinhole")
 
 
 @pytest.mark.parametrize("lens", [PINHOLE, WIDE], ids=lambda lens: lens.model)
 def test_boards_that_are_all_parallel_to_the_image_give_no_focal_length(lens: Lens) -> None:
     collector = Collector(BoardFinder(SPEC))
-    for number, place in enumerate(darkroom.sight(lens, 14, seed=3, tilt_deg=0.0)):
+    for number, place in enumerate(darkroom.sight(lens, 8, seed=3, tilt_deg=0.0)):
         collector.offer(f"{number}", photograph(lens, place, seed=number))
     assert len(collector.views) >= 6
     with pytest.raises(CalibrationError, match=r"tilted by 30 to 45 degrees"):
         calibrate(collector.views, lens.size, lens.model)
-
-
-def test_too_few_views_are_refused() -> None:
-    with pytest.raises(CalibrationError, match=r"^5 usable views of the board are too few; show it at least 6 times$"):
-        calibrate(collected(PINHOLE).views[:5], PINHOLE.size, "pinhole")
 
 
 def test_a_view_that_does_not_fit_is_dropped_and_named() -> None:
@@ -117,22 +114,14 @@ def test_views_are_refused_with_the_reason() -> None:
     # An edge out of focus by a deviation s rises from 10 to 90 % within 2.56 s; one swung over n pixels within n.
     assert widths["soft"] == pytest.approx(2.56 * 2.0, rel=0.25)
     assert widths["swung"] == pytest.approx(8.0, rel=0.25)
-
-
-def test_a_board_in_motion_is_no_view_and_one_held_still_is() -> None:
-    collector = Collector(BoardFinder(SPEC))
-    here, there = (photograph(PINHOLE, facing((x, 0.0, 0.4), 12.0)) for x in (0.0, 0.02))
-    assert [collector.offer("", image, moving=True) for image in (here, there, there)] == ["moving", "moving", None]
-
-
-def test_images_of_two_sizes_are_refused() -> None:
-    collector = Collector(BoardFinder(SPEC))
-    collector.offer("a.png", np.zeros((360, 480, 3), np.uint8))
-    with pytest.raises(CalibrationError, match=r"^b\.png: is 640 x 480 pixels and a\.png is 480 x 360; calibrate"):
+    with pytest.raises(CalibrationError, match=r"^b\.png: is 640 x 480 pixels and wall is 480 x 360; calibrate"):
         collector.offer("b.png", np.zeros((480, 640, 3), np.uint8))
 
 
-def test_of_many_views_those_that_differ_most_are_kept() -> None:
+def test_a_board_in_motion_is_no_view_and_of_many_those_that_differ_most_are_kept() -> None:
+    collector = Collector(BoardFinder(SPEC))
+    here, there = (photograph(PINHOLE, facing((x, 0.0, 0.4), 12.0)) for x in (0.0, 0.02))
+    assert [collector.offer("", image, moving=True) for image in (here, there, there)] == ["moving", "moving", None]
     collector = Collector(BoardFinder(SPEC), most=3)
     for x in (-0.06, -0.045, 0.0, 0.06):
         collector.offer(f"{x}", photograph(PINHOLE, facing((x, 0.0, 0.4), 12.0)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from types import SimpleNamespace
 from typing import Any
 
 from flockd.core.config import DroneConfig
@@ -10,16 +11,6 @@ from flockd.core.config.source import SourceParameters
 from flockd.core.messages import FrameSet, VehicleState
 from flockd.onboard.daemon.pilot_loop import PilotLoop
 from tests.onboard.recording.made_up import drone_config
-
-
-class OneSet:
-    """A source that has one set of frames and then no more."""
-
-    def __init__(self) -> None:
-        self._sets = [FrameSet(100.0, {})]
-
-    def newest(self, timeout_s: float = 0.0) -> FrameSet | None:
-        return self._sets.pop() if self._sets else None
 
 
 def test_frames_get_the_attitude_of_their_own_moment() -> None:
@@ -33,7 +24,8 @@ def test_frames_get_the_attitude_of_their_own_moment() -> None:
         return None
 
     anything: Any = None
-    source: Any = OneSet()
+    sets = [FrameSet(100.0, {})]
+    source: Any = SimpleNamespace(newest=lambda timeout_s=0.0: sets.pop() if sets else None)
 
     async def look() -> None:
         sight = PilotLoop(config, source, anything, vehicle_at, anything, anything, asyncio.get_running_loop().time)

@@ -14,7 +14,7 @@ import yaml
 
 from flockd.cli import main
 from flockd.core.config import load_drone
-from flockd.ground.cameras.listing import Computer, cameras_of_monitor
+from flockd.ground.cameras.listing import Computer
 from flockd.ground.cameras.watching import edge_width_px
 from flockd.ground.datasets.image_files import read_image
 from tests.ground.filming import filming
@@ -32,8 +32,6 @@ Device found:
 \tname  : /base/soc/i2c0mux/i2c@1/imx219@10
 \tclass : Source/Video
 \tcaps  : video/x-raw, format=NV12, width=1640, height=1232
-\t        video/x-raw, format=NV12, width=640, height=480, framerate={ (fraction)30/1, (fraction)60/1 }
-\t        video/x-raw, format=(string)YV12, width=320, height=240
 \tgst-launch-1.0 libcamerasrc camera-name="/base/soc/i2c0mux/i2c\\@1/imx219\\@10" ! ...
 
 
@@ -191,16 +189,6 @@ def test_a_camera_that_cannot_be_used_says_why(computer: Shelf, capsys: Capture)
     told = "".join(camera["fault"] for camera in yaml.safe_load(capsys.readouterr().out))
     for fault in ("sends a sensor's raw values only; read it by", "offers H264, and flockd reads", "cannot be opened"):
         assert fault in told
-
-
-def test_modes_of_the_monitor_are_those_that_can_be_decoded() -> None:
-    (camera,) = cameras_of_monitor(MONITOR)
-    assert camera.name == "/base/soc/i2c0mux/i2c@1/imx219@10"
-    assert [(mode.pixel_format, mode.size, mode.rates_hz) for mode in camera.modes] == [
-        ("NV12", (1640, 1232), ()),
-        ("NV12", (640, 480), (60.0, 30.0)),
-    ]
-    assert cameras_of_monitor("Probing devices...\n") == []
 
 
 @pytest.mark.parametrize("blur_px", [2.0, 3.0, 4.0])

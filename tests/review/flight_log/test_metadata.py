@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from flockd.core.data import data_path
 from flockd.review.flight_log.metadata import FleetMetadata, FlightMetadata
@@ -30,11 +29,3 @@ def test_metadata_of_a_fleet_comes_back(tmp_path: Path) -> None:
     assert np.isnan(again.fleet.order_last_20s)
     assert again.fleet.handed_over == {"drone1": "it landed"}
     assert again.separation_distance_m == drone.flocking.separation_distance_m
-
-
-def test_facts_that_no_flight_has_are_refused() -> None:
-    drone = load_scenario(data_path("config") / "paper_flight.yaml").drone
-    with pytest.raises(ValueError, match="duratoin_s"):
-        FlightMetadata.of_configuration(
-            drone, scenario="two", perception="learned", drones=2, duration_s=2.0, duratoin_s=2.0
-        )

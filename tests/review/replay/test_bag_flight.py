@@ -84,7 +84,10 @@ def imu(time_ns: int) -> Any:
     )  # fmt: skip
 
 
-def bag(folder: Path, states: str = "nav_msgs/msg/Odometry", topics: tuple[str, ...] = ("/odom",)) -> Path:
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
+def bag(folder: Path, states: str = ODOMETRY, topics: tuple[str, ...] = ("/odom",)) -> Path:
     """A second of two cameras at 10 Hz, the second one 20 ms late, and states at 50 Hz."""
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connections: dict[str, Any] = {}
@@ -149,35 +152,20 @@ def test_the_command_flies_the_bag_and_writes_a_recording(
     assert main(["replay", str(theirs), "--config", str(file), "--out", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["steps"] == 5
     assert main(["replay", str(out), "--diff"]) == 0, "and that is a recording like any other"
+    theirs = bag(tmp_path / "of_imu", "sensor_msgs/msg/Imu", ("/imu",))
+    file = config_file(tmp_path, perception={"scale": "network"})
+    assert main(["replay", str(theirs), "--config", str(file)]) == 0, "an IMU is enough where scale is the networks'"
 
 
 @pytest.mark.parametrize(
     ("states", "topics", "options", "changes", "sentence"),
     [
-        ("nav_msgs/msg/Odometry", ("/odom",), [], None, "is a bag of ROS 2; name a drone with --config"),
-        (
-            "nav_msgs/msg/Odometry",
-            ("/a", "/b"),
-            [],
-            {},
-            "has several topics of nav_msgs/msg/Odometry; name one with --vehicle",
-        ),
-        (
-            "nav_msgs/msg/Odometry",
-            ("/a",),
-            ["--vehicle", "/b"],
-            {},
-            "/b is not in it; name one of nav_msgs/msg/Odometry",
-        ),
-        ("nav_msgs/msg/Odometry", (), [], {}, "has no odometry, pose or IMU"),
+        (ODOMETRY, ("/odom",), [], None, "is a bag of ROS 2; name a drone with --config"),
+        (ODOMETRY, ("/a", "/b"), [], {}, "has several topics of nav_msgs/msg/Odometry; name one with --vehicle"),
+        (ODOMETRY, ("/a",), ["--vehicle", "/b"], {}, "/b is not in it; name one of nav_msgs/msg/Odometry"),
+        (ODOMETRY, (), [], {}, "has no odometry, pose or IMU"),
         ("sensor_msgs/msg/Imu", ("/imu",), [], {}, "/imu has an attitude and no height; set perception.scale"),
-        (
-            "nav_msgs/msg/Odometry",
-            ("/odom",),
-            [],
-            {"source": {"kind": "shared_memory"}},
-            "is a bag of ROS 2; replay it",
-        ),
+        (ODOMETRY, ("/odom",), [], {"source": {"kind": "shared_memory"}}, "is a bag of ROS 2; replay it"),
     ],
 )
 def test_what_cannot_be_is_said_in_one_sentence(
@@ -188,13 +176,3 @@ def test_what_cannot_be_is_said_in_one_sentence(
     given = [] if changes is None else ["--config", str(config_file(tmp_path, **changes))]
     assert main(["replay", str(theirs), *given, *options]) != 0
     assert sentence in capsys.readouterr().err
-
-
-def test_an_imu_is_enough_where_scale_is_the_networks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("flockd.review.replay.recorded_flight.FlockPilot", MadeUpPilot)
-    theirs = bag(tmp_path / "bag", "sensor_msgs/msg/Imu", ("/imu",))
-    file = config_file(tmp_path, perception={"scale": "network"})
-    assert main(["replay", str(theirs), "--config", str(file), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["steps"] == 5

@@ -394,23 +394,16 @@ def test_what_happens_once_flockd_does_not_fly_any_more_counts_apart() -> None:
     assert (of_none["drones"], of_none["first_s"], of_none["collisions_flown"]) == (0, None, None)
 
 
-def test_what_gates_slowed_drones_down_for_is_told_apart() -> None:
+def test_what_gates_slowed_drones_down_for_and_what_they_learned_of_sizes_is_told() -> None:
     log, by_cause = _hand_made(), {"neighbour": 0.011, "wind": 0.0009}
-    facts = {"gated": True, "slowed_share": 0.03, "slowed_by": by_cause}
+    sizes = {0: LearnedSize(since_s=12.0, size_m=0.43, sigma=0.07, used=True)}
+    facts = {"gated": True, "slowed_share": 0.03, "slowed_by": by_cause, "sizes": sizes}
     summary = summarise(replace(log, metadata=log.metadata.model_copy(update=facts)))
     assert causes_text(summary) == "neighbours 1.1 %, wind 0.1 %"
-    (slowed,) = [fact for fact in page_texts(summary, log)["facts"] if fact["name"] == "Slowed"]
-    assert slowed["remark"] == "of the time, by safety gates: neighbours 1.1 %, wind 0.1 %"
-
-
-def test_what_drones_learned_of_the_others_size_is_told() -> None:
-    log = _hand_made()
-    assert "Size learned" not in [fact["name"] for fact in page_texts(summarise(log), log)["facts"]]
-    sizes = {0: LearnedSize(since_s=12.0, size_m=0.43, sigma=0.07, used=True)}
-    summary = summarise(replace(log, metadata=log.metadata.model_copy(update={"sizes": sizes})))
-    assert sizes_text(summary) == f"0.43 to 0.43 m, by 1 of {summary['drones']} drones; 1 go by it"
-    (learned,) = [fact for fact in page_texts(summary, log)["facts"] if fact["name"] == "Size learned"]
-    assert (learned["value"], learned["unit"]) == ("0.43 to 0.43", "m")
+    assert sizes_text(summary) == "0.43 to 0.43 m, by 1 of 2 drones; 1 go by it"
+    told, before = ({one["name"]: one for one in page_texts(of, log)["facts"]} for of in (summary, summarise(log)))
+    assert told.keys() - before.keys() == {"Slowed", "Size learned"}
+    assert (told["Size learned"]["value"], told["Size learned"]["unit"]) == ("0.43 to 0.43", "m")
 
 
 def test_the_log_keeps_what_was_learned_last_and_since_when() -> None:
