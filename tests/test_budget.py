@@ -20,16 +20,16 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_190,
+    "flockd/core": 3_140,
     "flockd/flight": 14_780,
     "flockd/onboard": 10_510,
-    "flockd/fleet": 2_250,
-    "flockd/ground": 4_040,
-    "flockd/review": 3_380,
+    "flockd/fleet": 2_240,
+    "flockd/ground": 3_960,
+    "flockd/review": 3_370,
     "flockd/sim": 10_920,
     "flockd/campaign": 1_750,
-    "flockd/cli": 3_730,
-    "tests": 41_210,
+    "flockd/cli": 3_700,
+    "tests": 41_100,
     "tools/checks": 2_320,
     "tools/docs": 940,
     "tools/measure": 1_340,
