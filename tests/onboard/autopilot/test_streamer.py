@@ -96,16 +96,13 @@ def test_setpoints_flow_before_the_pilot_switches_to_offboard_whatever_the_mode_
     assert not story.streamer.report().offboard
 
 
-def test_a_dead_control_loop_is_silence_within_its_time_limit(in_offboard: Story) -> None:
-    died_s = in_offboard.now
-    in_offboard.go_on(3.0, beating=False)
-    assert in_offboard.sent[-1][0] - died_s <= 0.3
-
-
-def test_a_beating_loop_that_decides_nothing_any_more_is_silence_too(in_offboard: Story) -> None:
+@pytest.mark.parametrize(("lacks", "within_s"), [("beating", 0.3), ("deciding", 1.0)])
+def test_a_control_loop_that_is_dead_or_decides_nothing_any_more_is_silence(
+    in_offboard: Story, lacks: str, within_s: float
+) -> None:
     stopped_s = in_offboard.now
-    in_offboard.go_on(3.0, deciding=False)
-    assert in_offboard.sent[-1][0] - stopped_s <= 1.0
+    in_offboard.go_on(3.0, **{lacks: False})
+    assert in_offboard.sent[-1][0] - stopped_s <= within_s
 
 
 def test_a_setpoint_from_the_future_or_with_no_date_is_not_sent(story: Story) -> None:
@@ -153,6 +150,7 @@ def test_when_the_pilot_takes_over_it_is_silent_at_once_and_for_good(in_offboard
     in_offboard.autopilot(flight_mode=mode)
     assert in_offboard.go_on(1.0) == 0
     assert in_offboard.silence == f"the autopilot left offboard for {mode}"
+    assert in_offboard.streamer.report().fault is None
     in_offboard.autopilot(flight_mode="offboard")
     assert in_offboard.go_on(1.0) == 0
     in_offboard.streamer.begin()
@@ -167,10 +165,8 @@ def test_a_lost_link_is_silence_for_good(in_offboard: Story) -> None:
     in_offboard.autopilot(heartbeat_age_s=0.1)
     assert in_offboard.go_on(1.0) == 0
     assert in_offboard.silence == in_offboard.streamer.report().fault == "no heartbeat from the autopilot for 3.6 s"
-
-
-def test_a_link_without_any_message_is_lost_sooner(in_offboard: Story) -> None:
-    in_offboard.autopilot(message_age_s=2.1)
+    in_offboard.streamer.begin()
+    in_offboard.autopilot(message_age_s=2.1)  # without any message it is lost sooner
     assert in_offboard.go_on(1.0) == 0
     assert in_offboard.silence == "no message from the autopilot for 2.1 s"
 
@@ -185,12 +181,6 @@ def test_a_stall_stays_the_cause_though_the_autopilot_has_left_offboard_meanwhil
     assert in_offboard.silence == stalled
     in_offboard.streamer.end("the supervisor is silent")
     assert (in_offboard.silence, in_offboard.streamer.report().fault) == (stalled, None)
-
-
-def test_a_pilot_who_takes_over_is_no_fault(in_offboard: Story) -> None:
-    in_offboard.autopilot(flight_mode="position")
-    in_offboard.go_on(1.0)
-    assert in_offboard.streamer.report().fault is None
 
 
 def test_a_vehicle_in_its_failsafe_is_left_alone(story: Story) -> None:
@@ -211,18 +201,14 @@ def test_what_the_gate_makes_of_a_setpoint_is_what_is_sent(story: Story) -> None
     assert story.sent[-1][1] is tamed
 
 
-def test_what_the_gate_refuses_is_counted_and_not_sent(story: Story) -> None:
-    story.gate_says = None
+@pytest.mark.parametrize(
+    ("change", "told"), [({"gate_says": None}, "the gate refused"), ({"cable_is_in": False}, "the cable is out")]
+)
+def test_what_is_not_sent_is_counted_by_its_reason(story: Story, change: dict[str, object], told: str) -> None:
+    vars(story).update(change)
     story.streamer.begin()
     assert story.go_on(1.0) == 0
-    assert story.streamer.report().refused == {"the gate refused": 20}
-
-
-def test_a_cable_that_comes_out_is_told(story: Story) -> None:
-    story.streamer.begin()
-    story.cable_is_in = False
-    story.go_on(0.5)
-    assert story.streamer.report().refused == {"the cable is out": 10}
+    assert story.streamer.report().refused == {told: 20}
 
 
 def test_the_first_reason_for_an_end_is_kept(in_offboard: Story) -> None:

@@ -2,11 +2,10 @@
 
 fake_pipeline.py CAPS    # and over standard input the length of the words, four bytes, and the words
 
-`caps:WxH` and `caps:text` say what the images are; `N` sends N different images of 64x48 in RGB, 20 ms apart, `same:N`
-N equal ones. `short` sends one that lacks a byte, `flagged` one the driver calls damaged, `old` one of an hour ago,
-`untimed` one without a time. `stall` waits until the other side goes, `fail:text` and `end` say so, `print` prints a
-line, `crash` ends by a signal, `once:FILE` skips the word after it if FILE exists, and makes it. Underscores in texts
-are spaces.
+`caps:WxH` and `caps:text` say what the images are; `N` sends N different images of 64x48 in RGB, 20 ms apart.
+`short` sends one that lacks a byte, `flagged` one the driver calls damaged, `untimed` one without a time. `stall` waits
+until the other side goes, `fail:text` and `end` say so, `print` prints a line, `crash` ends by a signal, `once:FILE`
+skips the word after it if FILE exists, and makes it. Underscores in texts are spaces.
 """
 
 from __future__ import annotations
@@ -36,10 +35,10 @@ def picture(number: int) -> bytes:
     return bytes([number % 256]) * 3 + row[3:] + row * (HEIGHT - 1)
 
 
-def images(count: int, *, same: bool = False) -> None:
+def images(count: int) -> None:
     """Stamped as they are sent."""
     for number in range(count):
-        send(b"imag", picture(0 if same else number), time_ns=time.monotonic_ns())
+        send(b"imag", picture(number), time_ns=time.monotonic_ns())
         time.sleep(PERIOD_S)
 
 
@@ -52,10 +51,8 @@ def say_caps(text: str) -> None:
 
 WORDS: dict[str, Callable[[str], object]] = {
     "caps": say_caps,
-    "same": lambda text: images(int(text), same=True),
     "short": lambda _: send(b"imag", picture(0)[:-1], time_ns=time.monotonic_ns()),
     "flagged": lambda _: send(b"imag", picture(0), flags=1, time_ns=time.monotonic_ns()),
-    "old": lambda _: send(b"imag", picture(0), time_ns=time.monotonic_ns() - 3600 * 10**9),
     "untimed": lambda _: send(b"imag", picture(0), time_ns=-1),
     "stall": lambda _: sys.stdin.read(),
     "fail": lambda text: send(b"fail", text.replace("_", " ").encode()),

@@ -27,6 +27,7 @@ from flockd.onboard.telemetry import TOPICS, publish_step
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.sim.sitl.ports import free_endpoint
 from tests.make import neighbour, output, vehicle, wanted
+from tests.onboard.daemon.aboard import client
 
 Received = queue.Queue[tuple[str, dict[str, object]]]
 
@@ -40,12 +41,7 @@ def endpoint() -> str:
 def watched(endpoint: str) -> Iterator[tuple[ZenohTelemetry, Received]]:
     """A publishing peer and, in the queue, what a second peer of this process receives from it."""
     received: Received = queue.Queue()
-    config = zenoh.Config()
-    config.insert_json5("mode", '"peer"')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("listen/endpoints", "[]")
-    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-    with ZenohTelemetry("meadow", listen=[endpoint]) as telemetry, zenoh.open(config) as watcher:
+    with ZenohTelemetry("meadow", listen=[endpoint]) as telemetry, zenoh.open(client(endpoint)) as watcher:
         watcher.declare_subscriber(
             "flockd/v1/meadow/**",
             lambda sample: received.put((str(sample.key_expr), json.loads(sample.payload.to_bytes()))),
