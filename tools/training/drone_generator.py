@@ -15,11 +15,10 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from flockd.sim.renderer.airframe import Airframe, DroneModel, outline, oval
+from flockd.sim.renderer.airframe import BLACK, Airframe, DroneModel, outline, oval
 
 Array = NDArray[Any]
 Place = tuple[float, float, float]
-_BLACK = np.full(3, 0.02)
 FIRST_GENERATED = 1000
 """Family numbers of generated shapes begin here."""
 SIZES_M = (0.15, 1.2)
@@ -269,7 +268,7 @@ def add_ducts(c: Airframe, hubs: Array, radius: float) -> None:
     """Around every rotor."""
     for x, y, z in hubs:
         accent = c.front if x > 0 else c.rear
-        c.ring(x, y, z - 0.1 * radius, 1.07 * radius, 1.16 * radius, 0.24 * radius, accent, c.body)
+        c.ring((x, y, z - 0.1 * radius), (1.07 * radius, 1.16 * radius), 0.24 * radius, accent, c.body)
         c.beam((x - 1.1 * radius, y, z), (x + 1.1 * radius, y, z), (0.05 * radius, 0.04 * radius), [c.frame])
 
 
@@ -309,7 +308,7 @@ def _gimbal(c: Airframe, reach: float, body: tuple[float, float, float], rng: Ge
     for y in (-1.15 * ball, 1.15 * ball):
         c.rod((x, y, 0.4 * tall), (x, y, z), 0.2 * ball, [c.metal], 6)
     c.ball((x, 0, z), ball, c.frame)
-    c.rod((x + 0.8 * ball, 0, z), (x + 1.3 * ball, 0, z), 0.5 * ball, [_BLACK], 8)
+    c.rod((x + 0.8 * ball, 0, z), (x + 1.3 * ball, 0, z), 0.5 * ball, [BLACK], 8)
 
 
 def _parcel(c: Airframe, reach: float, body: tuple[float, float, float], rng: Generator) -> None:
@@ -331,7 +330,7 @@ def _battery(c: Airframe, reach: float, body: tuple[float, float, float], rng: G
     half, wide, tall = body
     z = -1.5 * tall
     c.box((-0.1 * half, 0, z), (0.7 * half, 0.45 * wide, 0.45 * tall), c.rear * 0.6)
-    c.box((-0.1 * half, 0, z), (0.08 * half, 0.47 * wide, 0.47 * tall), _BLACK)
+    c.box((-0.1 * half, 0, z), (0.08 * half, 0.47 * wide, 0.47 * tall), BLACK)
 
 
 _PAYLOADS = (_gimbal, _gimbal, _parcel, _antennas, _battery)

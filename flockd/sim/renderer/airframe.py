@@ -47,14 +47,17 @@ class DroneModel(Solid):
     """(2, 3) least and greatest corner, propellers at any angle; a family's own."""
 
 
+MACHINE_TEXTURES = 3
+BLACK = np.full(3, 0.02)
+Point = tuple[float, float, float]
+"""Metres, x, y and z of the builder's axes."""
+
+
 @functools.cache
 def machine_texels() -> PackedArray:
     """The packed pyramids of the machine textures, one after another; the same for all worlds."""
     rng = np.random.default_rng(7)
     return np.concatenate([textures.pack_pyramid(textures.speckle(rng)) for _ in range(MACHINE_TEXTURES)])
-
-
-MACHINE_TEXTURES = 3
 
 
 class Airframe:
@@ -77,108 +80,72 @@ class Airframe:
         self.prop = np.full(3, rng.uniform(0.03, 0.5)) if rng.random() < 0.7 else _vivid(rng) * 0.7
         self.skin = rng.integers(0, MACHINE_TEXTURES, 2)
 
-    def box(
-        self,
-        centre: tuple[float, float, float],
-        half: tuple[float, float, float],
-        colour: FloatArray,
-        heading: float = 0.0,
-    ) -> None:
+    def corners(self, x: float, y: float) -> list[tuple[float, float, FloatArray]]:
+        """Front right, rear right, rear left, front left, each with the colour of its end."""
+        return [(x, y, self.front), (-x, y, self.rear), (-x, -y, self.rear), (x, -y, self.front)]
+
+    def box(self, centre: Point, half: Point, colour: FloatArray, heading: float = 0.0) -> None:
         """A level box of these half sizes, turned by ``heading`` in rad."""
         self.mesh.box(np.array(centre), half, heading, int(self.skin[0]), colour, (0.3, 0.3))
 
-    def rod(
-        self,
-        a: tuple[float, float, float],
-        b: tuple[float, float, float],
-        radius: float,
-        colours: list[FloatArray],
-        sides: int = 6,
-    ) -> None:
+    def rod(self, a: Point, b: Point, radius: float, colours: list[FloatArray], sides: int = 6) -> None:
         """A tube in equal lengths of the given colours."""
-        self.mesh.frustum(
-            np.array(a), np.array(b), (radius, radius), sides, int(self.skin[1]), np.array(colours), (0.2, 0.2)
-        )
+        radii, tints = (radius, radius), np.array(colours)
+        self.mesh.frustum(np.array(a), np.array(b), radii, sides, int(self.skin[1]), tints, (0.2, 0.2))
 
-    def beam(
-        self,
-        a: tuple[float, float, float],
-        b: tuple[float, float, float],
-        half: tuple[float, float],
-        colours: list[FloatArray],
-    ) -> None:
+    def beam(self, a: Point, b: Point, half: tuple[float, float], colours: list[FloatArray]) -> None:
         """A level box beam in equal lengths of the given colours; half width and half height."""
         start, end = np.array(a), np.array(b)
         step = (end - start) / len(colours)
-        heading = math.atan2(step[1], step[0])
+        heading, length = math.atan2(step[1], step[0]), float(np.hypot(step[0], step[1]))
         for k, colour in enumerate(colours):
-            middle = start + step * (k + 0.5)
-            self.box(
-                (middle[0], middle[1], middle[2]),
-                (float(np.hypot(step[0], step[1])) / 2, half[0], half[1]),
-                colour,
-                heading,
-            )
+            x, y, z = start + step * (k + 0.5)
+            self.box((x, y, z), (length / 2, *half), colour, heading)
 
     def loft(self, rings: list[FloatArray], colours: list[FloatArray]) -> None:
         """A closed skin over rings (n, 3), the first on top, each clockwise seen from above; see ``Mesh.loft``."""
         self.mesh.loft(rings, int(self.skin[0]), np.array(colours), (0.3, 0.3))
 
-    def ball(self, centre: tuple[float, float, float], radius: float, colour: FloatArray) -> None:
+    def ball(self, centre: Point, radius: float, colour: FloatArray) -> None:
         """A sphere of four bands, open at both poles."""
         slope = np.radians([-70, -35, 0, 35, 70])
         rings = [oval(r, r, z) + centre for r, z in zip(radius * np.cos(slope), radius * np.sin(slope), strict=True)]
         self.loft(rings, [colour] * (len(rings) - 1))
 
     def ring(
-        self,
-        x: float,
-        y: float,
-        z: float,
-        inner: float,
-        outer: float,
-        half_height: float,
-        first: FloatArray,
-        second: FloatArray,
+        self, at: Point, radii: tuple[float, float], half_height: float, first: FloatArray, second: FloatArray
     ) -> None:
-        """A short upright tube with a wall, every third segment in the first colour."""
-        sides = 12
+        """A short upright tube with a wall, every third segment in the first colour; inner and outer radius."""
+        sides, (inner, outer) = 12, radii
         angle = np.arange(sides) * 2 * math.pi / sides
         ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         profile = ((outer, half_height), (outer, -half_height), (inner, -half_height), (inner, half_height))
-        vertices = np.vstack([np.column_stack([ring * r + (x, y), np.full(sides, z + up)]) for r, up in profile])
-        faces, tint = [], []
-        for k in range(sides):
-            j = (k + 1) % sides
-            for side in range(4):
-                a, b = side * sides, (side + 1) % 4 * sides
-                faces += [(a + k, b + j, a + j), (a + k, b + k, b + j)]
-                tint += [first if k % 3 == 0 else second] * 2
-        self.mesh.add(vertices, np.array(faces), int(self.skin[0]), np.array(tint), (0.3, 0.3))
+        vertices = np.vstack([np.column_stack([ring * r + at[:2], np.full(sides, at[2] + up)]) for r, up in profile])
+        faces = [
+            (a + k, *corners)
+            for k in range(sides)
+            for a, b in ((0, 12), (12, 24), (24, 36), (36, 0))
+            for corners in ((b + (k + 1) % sides, a + (k + 1) % sides), (b + k, b + (k + 1) % sides))
+        ]
+        tint = np.repeat([first if k % 3 == 0 else second for k in range(sides)], 8, axis=0)
+        self.mesh.add(vertices, np.array(faces), int(self.skin[0]), tint, (0.3, 0.3))
 
     def rotor(self, x: float, y: float, z: float, radius: float, motor: tuple[float, float], *, accent: bool) -> None:
         """A motor standing on (x, y, z), with its propeller. ``motor``: radius and height."""
         top = z - motor[1]
-        self.rod(
-            (x, y, z),
-            (x, y, top),
-            motor[0],
-            [self.metal, (self.front if x > 0 else self.rear) if accent else self.metal],
-            8,
-        )
+        end = (self.front if x > 0 else self.rear) if accent else self.metal
+        self.rod((x, y, z), (x, y, top), motor[0], [self.metal, end], 8)
         hub = np.array([x, y, top])
         self.hubs.append(hub)
         self.radii.append(radius)
-        angle = self.rng.uniform(0, math.pi)
-        lift = np.array([0, 0, 0.004 + 0.01 * radius])
+        angle, skin = self.rng.uniform(0, math.pi), int(self.skin[1])
+        foot = hub - np.array([0, 0, 0.004 + 0.01 * radius])
         if self.disc:
-            self.mesh.frustum(
-                hub - lift, hub - lift - [0, 0, 0.004], (radius, radius), 16, int(self.skin[1]), self.prop, (0.25, 0.25)
-            )
+            self.mesh.frustum(foot, foot - [0, 0, 0.004], (radius, radius), 16, skin, self.prop, (0.25, 0.25))
         else:
             width = 0.075 * radius + 0.004
-            half = math.sqrt(radius**2 - width**2)
-            self.mesh.box(hub - lift, (half, width, 0.002), angle, int(self.skin[1]), self.prop, (0.25, 0.25))
+            half = math.sqrt(radius**2 - width**2), width, 0.002
+            self.mesh.box(foot, half, angle, skin, self.prop, (0.25, 0.25))
 
     def model(self, family: int, seed: int) -> DroneModel:
         """The mesh, moved to the centre of its bounding box."""

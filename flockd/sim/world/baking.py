@@ -1,10 +1,11 @@
 """What is baked into a world once: its shadow map, and the ground's map of colours with sunlight."""
 # Compiled loops are long: a call for each few lines would cost more than it explains.
-# ruff: noqa: PLR0912, PLR0915
+# ruff: noqa: PLR0915
 
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from typing import Any
 
 import numpy as np
@@ -21,13 +22,18 @@ GROUND_MAP_BITS = 11
 SHADOW_MAP_SIZE = 2048
 
 
+Baked = namedtuple(
+    "Baked", "noise extent zone_scale variation ground openness heights slopes sun shadow_map shadow_frame"
+)
+"""What the ground's map is made of: `ground` is `Scenery.ground`, `slopes` are those of `heights`, north and east."""
+
+
 def ground_map(
     rng: Generator, scenery: Scenery, sun: FloatArray, shadow: Float32Array, frame: FloatArray
 ) -> tuple[Float32Array, UInt8Array]:
-    """Colour with baked sunlight (size, size, 4), and the kind of ground, per texel."""
+    """Colour with baked sunlight (size, size, 4), and the kind of ground, per texel: rows run north, columns east."""
     size = 1 << GROUND_MAP_BITS
-    colour = np.empty((size, size, 4), dtype=np.float32)
-    kinds = np.empty((size, size), dtype=np.uint8)
+    colour, kinds = np.empty((size, size, 4), dtype=np.float32), np.empty((size, size), dtype=np.uint8)
     noise = np.stack([
         textures.fractal_noise(rng, slope=rng.uniform(2.0, 2.6), coarsest=0.5),
         textures.fractal_noise(rng, slope=rng.uniform(0.8, 1.3), coarsest=0.4),
@@ -36,11 +42,12 @@ def ground_map(
     ])  # fmt: skip
     cell = 2 * scenery.extent / (scenery.heights.shape[0] - 1)
     slopes = np.stack([np.gradient(scenery.heights, cell, axis=k) for k in (0, 1)])
+    zone_scale = rng.uniform(0.7, 2.5)
+    variation = np.array([rng.uniform(0.12, 0.38), rng.uniform(0.1, 0.35), rng.uniform(0.0, 0.1)])
     compose_ground(
-        noise, scenery.extent, rng.uniform(0.7, 2.5), scenery.zone_limits, scenery.zone_colours, scenery.zone_kinds,
-        np.array([rng.uniform(0.12, 0.38), rng.uniform(0.1, 0.35), rng.uniform(0.0, 0.1)]),
-        scenery.roads, scenery.road_colours, scenery.patches, scenery.patch_colours, _openness(scenery), slopes, sun,
-        shadow, frame, scenery.heights, colour, kinds,
+        Baked(noise, scenery.extent, zone_scale, variation, scenery.ground, _openness(scenery), scenery.heights, slopes,
+              sun, shadow, frame),
+        colour, kinds,
     )  # fmt: skip
     return colour, kinds
 
@@ -74,15 +81,11 @@ def shadow_map(
     across = unit(np.array([-sun[1], sun[0], 0.0]))
     reach = extent * math.sqrt(2.0)
     half = reach * abs(sun[2]) + 25.0  # nothing is taller
-    frame = np.zeros((3, 4))
-    frame[0, :3], frame[1, :3], frame[2, :3] = (
-        across * size / (2 * reach),
-        np.cross(sun, across) * size / (2 * half),
-        sun,
-    )
-    frame[:2, 3] = size / 2
+    towards = across * size / (2 * reach), np.cross(sun, across) * size / (2 * half), sun
+    frame = np.column_stack([np.stack(towards), [size / 2, size / 2, 0.0]])
     shadow = np.full((size, size), -1e9, dtype=np.float32)
-    fill_shadow(vertices, triangles, frame, shadow)
+    n, e, d = vertices.T[..., None]
+    fill_shadow(frame[:, 0] * n + frame[:, 1] * e + frame[:, 2] * d + frame[:, 3], triangles, shadow)
     frame[2, 3] += 0.06  # a surface does not shade itself
     return shadow, frame
 
@@ -100,68 +103,44 @@ def sun_reaches(shadow: Any, frame: Any, n: float, e: float, d: float) -> float:
     if s < 0.0 or t < 0.0 or s >= size - 1.0 or t >= size - 1.0:
         return 1.0
     here = frame[2, 0] * n + frame[2, 1] * e + frame[2, 2] * d + frame[2, 3]
-    i = int(s)
-    j = int(t)
-    ws = s - i
-    wt = t - j
-    lit = 0.0
-    if here >= shadow[j, i]:
-        lit += (1.0 - ws) * (1.0 - wt)
-    if here >= shadow[j, i + 1]:
-        lit += ws * (1.0 - wt)
-    if here >= shadow[j + 1, i]:
-        lit += (1.0 - ws) * wt
-    if here >= shadow[j + 1, i + 1]:
-        lit += ws * wt
-    return lit
+    i, j = int(s), int(t)
+    ws, wt = s - i, t - j
+    lit = (1.0 - ws) * (1.0 - wt) if here >= shadow[j, i] else 0.0
+    lit += ws * (1.0 - wt) if here >= shadow[j, i + 1] else 0.0
+    lit += (1.0 - ws) * wt if here >= shadow[j + 1, i] else 0.0
+    return lit + (ws * wt if here >= shadow[j + 1, i + 1] else 0.0)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def fill_shadow(vertices: Any, triangles: Any, frame: Any, shadow: Any) -> None:
-    """Greatest height towards the sun in each cell of the shadow map (parallel projection)."""
+def fill_shadow(points: Any, triangles: Any, shadow: Any) -> None:
+    """Greatest height in each cell of the shadow map, of triangles of points: column, row, height towards the sun."""
     size = shadow.shape[0]
     for t in range(triangles.shape[0]):
-        s = np.empty(3)
-        r = np.empty(3)
-        h = np.empty(3)
-        for k in range(3):
-            p = vertices[triangles[t, k]]
-            s[k] = frame[0, 0] * p[0] + frame[0, 1] * p[1] + frame[0, 2] * p[2] + frame[0, 3]
-            r[k] = frame[1, 0] * p[0] + frame[1, 1] * p[1] + frame[1, 2] * p[2] + frame[1, 3]
-            h[k] = frame[2, 0] * p[0] + frame[2, 1] * p[1] + frame[2, 2] * p[2] + frame[2, 3]
-        area = (s[1] - s[0]) * (r[2] - r[0]) - (s[2] - s[0]) * (r[1] - r[0])
+        a, b, c = points[triangles[t, 0]], points[triangles[t, 1]], points[triangles[t, 2]]
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
         if abs(area) < 1e-9:
             continue
-        x0 = max(0, math.ceil(s.min() - 0.5))
-        x1 = min(size - 1, math.floor(s.max() - 0.5))
-        y0 = max(0, math.ceil(r.min() - 0.5))
-        y1 = min(size - 1, math.floor(r.max() - 0.5))
+        x0 = max(0, math.ceil(min(a[0], b[0], c[0]) - 0.5))
+        x1 = min(size - 1, math.floor(max(a[0], b[0], c[0]) - 0.5))
+        y0 = max(0, math.ceil(min(a[1], b[1], c[1]) - 0.5))
+        y1 = min(size - 1, math.floor(max(a[1], b[1], c[1]) - 0.5))
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
-                ds = x + 0.5 - s[0]
-                dr = y + 0.5 - r[0]
-                b1 = (ds * (r[2] - r[0]) - (s[2] - s[0]) * dr) / area
-                b2 = ((s[1] - s[0]) * dr - ds * (r[1] - r[0])) / area
+                ds, dr = x + 0.5 - a[0], y + 0.5 - a[1]
+                b1 = (ds * (c[1] - a[1]) - (c[0] - a[0]) * dr) / area
+                b2 = ((b[0] - a[0]) * dr - ds * (b[1] - a[1])) / area
                 if b1 >= 0.0 and b2 >= 0.0 and b1 + b2 <= 1.0:
-                    here = h[0] + b1 * (h[1] - h[0]) + b2 * (h[2] - h[0])
-                    shadow[y, x] = max(shadow[y, x], here)
+                    shadow[y, x] = max(shadow[y, x], a[2] + b1 * (b[2] - a[2]) + b2 * (c[2] - a[2]))
 
 
 @njit(cache=True, error_model="numpy")
 def _noise(maps: Any, k: int, u: float, v: float) -> float:
     """Bilinear value of the k-th tileable noise map at (u, v) in tiles."""
-    size = maps.shape[1]
-    mask = size - 1
-    fu = u * size
-    fv = v * size
-    x = math.floor(fu)
-    y = math.floor(fv)
-    wx = fu - x
-    wy = fv - y
-    x0 = x & mask
-    x1 = (x + 1) & mask
-    y0 = y & mask
-    y1 = (y + 1) & mask
+    mask = maps.shape[1] - 1
+    fu, fv = u * maps.shape[1], v * maps.shape[1]
+    x, y = math.floor(fu), math.floor(fv)
+    wx, wy = fu - x, fv - y
+    x0, x1, y0, y1 = x & mask, (x + 1) & mask, y & mask, (y + 1) & mask
     above = maps[k, y0, x0] * (1.0 - wx) + maps[k, y0, x1] * wx
     below = maps[k, y1, x0] * (1.0 - wx) + maps[k, y1, x1] * wx
     return float(above * (1.0 - wy) + below * wy)
@@ -176,114 +155,64 @@ def _between(grid: Any, i: int, j: int, a: float, b: float) -> float:
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def compose_ground(
-    noise: Any,
-    extent: float,
-    zone_scale: float,
-    zone_limits: Any,
-    zone_colours: Any,
-    zone_kinds: Any,
-    variation: Any,
-    roads: Any,
-    road_colours: Any,
-    patches: Any,
-    patch_colours: Any,
-    openness: Any,
-    slopes: Any,
-    sun: Any,
-    shadow: Any,
-    shadow_frame: Any,
-    heights: Any,
-    colour: Any,
-    kinds: Any,
-) -> None:
-    """The ground's map: colour and baked sunlight per texel (rows run north, columns east), and which detail covers it.
-
-    Zones from noise, then roads (straight with a sway), then rectangles: their rows are ``Scenery``'s.
-    """
-    size = kinds.shape[0]
-    cells = heights.shape[0] - 1
-    coarse = openness.shape[0]
+def compose_ground(baked: Any, colour: Any, kinds: Any) -> None:
+    """The ground's map. Zones from noise, then roads (straight with a sway), then rectangles."""
+    noise, extent, variation, sun = baked.noise, baked.extent, baked.variation, baked.sun
+    ground, heights, slopes = baked.ground, baked.heights, baked.slopes
+    roads, patches = ground.roads, ground.patches
+    size, cells, coarse = kinds.shape[0], heights.shape[0] - 1, baked.openness.shape[0]
+    marking, kerb = np.full(3, 0.55), np.full(3, 0.3)
     for row in range(size):
         n = ((row + 0.5) / size * 2.0 - 1.0) * extent
         for column in range(size):
             e = ((column + 0.5) / size * 2.0 - 1.0) * extent
-            gu = (n / extent + 1.0) * 0.5
-            gv = (e / extent + 1.0) * 0.5
-            broad = _noise(noise, 0, gv * zone_scale, gu * zone_scale)
-            tone = _noise(noise, 1, gv, gu)
-            fine = _noise(noise, 2, e / 19.0, n / 19.0)
-            value = broad + 0.03 * fine
+            gu, gv = (n / extent + 1.0) * 0.5, (e / extent + 1.0) * 0.5
+            tone, fine = _noise(noise, 1, gv, gu), _noise(noise, 2, e / 19.0, n / 19.0)
+            value = _noise(noise, 0, gv * baked.zone_scale, gu * baked.zone_scale) + 0.03 * fine
             zone = 0
-            while zone < zone_limits.shape[0] and value > zone_limits[zone]:
+            while zone < ground.zone_limits.shape[0] and value > ground.zone_limits[zone]:
                 zone += 1
-            kind = zone_kinds[zone]
-            red = zone_colours[zone, 0]
-            green = zone_colours[zone, 1]
-            blue = zone_colours[zone, 2]
-            worn = 1.0
+            kind, paint, worn = ground.zone_kinds[zone], ground.zone_colours[zone], 1.0
             for k in range(roads.shape[0]):
-                dn = n - roads[k, 0]
-                de = e - roads[k, 1]
+                dn, de = n - roads[k, 0], e - roads[k, 1]
                 along = dn * roads[k, 2] + de * roads[k, 3]
                 across = -dn * roads[k, 3] + de * roads[k, 2]
                 across += roads[k, 5] * math.sin(along * roads[k, 6] + roads[k, 7])
                 off = abs(across) - roads[k, 4]
                 ragged = 0.12 * fine if roads[k, 9] < 0.5 else 0.02 * fine
                 if off + ragged < 0.0:
-                    kind = int(roads[k, 8])
-                    red = road_colours[k, 0]
-                    green = road_colours[k, 1]
-                    blue = road_colours[k, 2]
-                    worn = 1.0
+                    kind, paint, worn = int(roads[k, 8]), ground.road_colours[k], 1.0
                     if roads[k, 9] > 1.5:
                         stripe = abs(across) < 0.07 and (along * 0.2 - math.floor(along * 0.2)) < 0.5
                         if stripe or abs(off + 0.25) < 0.06:
-                            red = green = blue = 0.55
-                            worn = 0.9
+                            paint, worn = marking, 0.9
                     elif roads[k, 9] < 0.5:  # two wheel tracks
                         worn = 1.0 - 0.25 * math.exp(-(((abs(across) - 0.5 * roads[k, 4]) / 0.25) ** 2))
                 elif off + ragged < 0.22 and roads[k, 9] > 0.5:
-                    red = green = blue = 0.3
-                    worn = 1.0
+                    paint, worn = kerb, 1.0
             for k in range(patches.shape[0]):
-                dn = n - patches[k, 0]
-                de = e - patches[k, 1]
+                dn, de = n - patches[k, 0], e - patches[k, 1]
                 a = abs(dn * patches[k, 2] + de * patches[k, 3])
                 b = abs(-dn * patches[k, 3] + de * patches[k, 2])
                 if a + 0.03 * fine < patches[k, 4] and b + 0.03 * fine < patches[k, 5]:
-                    kind = int(patches[k, 6])
-                    red = patch_colours[k, 0]
-                    green = patch_colours[k, 1]
-                    blue = patch_colours[k, 2]
-                    worn = 1.0
-                    if patches[k, 4] - a < 0.15 or patches[k, 5] - b < 0.15:
-                        worn = 0.7
+                    kind, paint = int(patches[k, 6]), ground.patch_colours[k]
+                    worn = 0.7 if patches[k, 4] - a < 0.15 or patches[k, 5] - b < 0.15 else 1.0
             shade = worn * math.exp(variation[0] * tone + variation[1] * fine)
             hue = variation[2] * _noise(noise, 3, gv, gu)
-            i = min(coarse - 1, row * coarse // size)
-            j = min(coarse - 1, column * coarse // size)
-            shade *= openness[i, j]
+            shade *= baked.openness[min(coarse - 1, row * coarse // size), min(coarse - 1, column * coarse // size)]
             # Sunlight: the grid's slopes, smoothed, with what stands in the way.
-            fn = gu * cells
-            fe = gv * cells
-            ci = min(cells - 1, int(fn))
-            cj = min(cells - 1, int(fe))
-            a = fn - ci
-            b = fe - cj
-            height = _between(heights, ci, cj, a, b)
-            slope_n = _between(slopes[0], ci, cj, a, b)
-            slope_e = _between(slopes[1], ci, cj, a, b)
+            i, j = min(cells - 1, int(gu * cells)), min(cells - 1, int(gv * cells))
+            a, b = gu * cells - i, gv * cells - j
+            height, north, east = (_between(heights, i, j, a, b), _between(slopes[0], i, j, a, b),
+                                   _between(slopes[1], i, j, a, b))  # fmt: skip
             lit = 0.0
             for k in range(5):
                 dx = 0.06 * ((k & 1) * 2 - 1) if k < 4 else 0.0
                 dy = 0.06 * ((k & 2) - 1) if k < 4 else 0.0
-                lit += 0.2 * sun_reaches(shadow, shadow_frame, n + dx, e + dy, -height)
-            cosine = max(
-                0.0, (-slope_n * sun[0] - slope_e * sun[1] - sun[2]) / math.sqrt(1.0 + slope_n**2 + slope_e**2)
-            )
-            colour[row, column, 0] = red * shade * (1.0 + hue)
-            colour[row, column, 1] = green * shade
-            colour[row, column, 2] = blue * shade * (1.0 - hue)
+                lit += 0.2 * sun_reaches(baked.shadow_map, baked.shadow_frame, n + dx, e + dy, -height)
+            cosine = max(0.0, (-north * sun[0] - east * sun[1] - sun[2]) / math.sqrt(1.0 + north**2 + east**2))
+            colour[row, column, 0] = paint[0] * shade * (1.0 + hue)
+            colour[row, column, 1] = paint[1] * shade
+            colour[row, column, 2] = paint[2] * shade * (1.0 - hue)
             colour[row, column, 3] = lit * cosine
             kinds[row, column] = kind

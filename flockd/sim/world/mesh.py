@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from flockd.core.messages import FloatArray, IntArray
 
+Tile = tuple[float, float]
+"""Width and height of a texture, m."""
+
 
 def unit(v: FloatArray) -> FloatArray:
     """Vectors (..., 3) at length 1."""
@@ -66,14 +69,9 @@ class Mesh:
         self.count = first_vertex
 
     def add(
-        self,
-        vertices: FloatArray,
-        triangles: IntArray,
-        texture: int,
-        tint: FloatArray,
-        tile: tuple[float, float],
+        self, vertices: FloatArray, triangles: IntArray, texture: int, tint: FloatArray, tile: Tile,
         origin: FloatArray | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Triangles of one texture, ``tile`` metres wide and high; columns level, rows downhill from ``origin``."""
         normal = face_normals(vertices, triangles)
         level = np.abs(normal[:, 2]) > 0.98
@@ -95,28 +93,17 @@ class Mesh:
         self.tint.append(np.broadcast_to(tint, (len(triangles), 3)))
 
     def box(
-        self,
-        centre: FloatArray,
-        half: tuple[float, float, float],
-        heading: float,
-        texture: int,
-        tint: FloatArray,
-        tile: tuple[float, float] = (2.0, 2.0),
-    ) -> None:
+        self, centre: FloatArray, half: tuple[float, float, float], heading: float, texture: int, tint: FloatArray,
+        tile: Tile = (2.0, 2.0),
+    ) -> None:  # fmt: skip
         """A closed box; ``half`` along the heading, across it, and vertically."""
         signs = np.array([(x, y, z) for z in (1, -1) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))], float)
         self.add(turn(signs * half, heading) + centre, _BOX, texture, tint, tile)
 
     def frustum(
-        self,
-        base: FloatArray,
-        tip: FloatArray,
-        radius: tuple[float, float],
-        sides: int,
-        texture: int,
-        tint: FloatArray,
-        tile: tuple[float, float] = (1.0, 2.0),
-    ) -> None:
+        self, base: FloatArray, tip: FloatArray, radius: tuple[float, float], sides: int, texture: int,
+        tint: FloatArray, tile: Tile = (1.0, 2.0),
+    ) -> None:  # fmt: skip
         """A closed cylinder or cone (tip radius 0) between two points; ``tint`` (3,), or (n, 3) in n equal bands."""
         axis = unit(tip - base)
         side = unit(np.cross(axis, np.array([0.3, 0.9, 0.1])))
@@ -128,14 +115,9 @@ class Mesh:
         self.loft(list(rings), texture, bands, tile, ends=np.stack([base, tip]))
 
     def loft(
-        self,
-        rings: list[FloatArray],
-        texture: int,
-        tint: FloatArray,
-        tile: tuple[float, float] = (1.0, 1.0),
-        *,
+        self, rings: list[FloatArray], texture: int, tint: FloatArray, tile: Tile = (1.0, 1.0), *,
         ends: FloatArray | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """A closed skin over rings (n, 3) of equally many points, right-handed about the way from first to last.
 
         ``tint`` (len(rings) - 1, 3): of the bands between the rings. ``ends`` (2, 3): middles of the first and the last
@@ -146,9 +128,8 @@ class Mesh:
         following = (k + 1) % sides
         faces = []
         for low in range(0, (len(rings) - 1) * sides, sides):
-            high = low + sides
-            faces.append(np.stack([k + low, following + low, k + high], 1))
-            faces.append(np.stack([following + low, following + high, k + high], 1))
+            faces.append(np.stack([k, following, k + sides], 1) + low)
+            faces.append(np.stack([following, following + sides, k + sides], 1) + low)
         last, middle = (len(rings) - 1) * sides, len(rings) * sides
         faces.append(np.stack([following, k, np.full(sides, middle)], 1))
         faces.append(np.stack([k + last, following + last, np.full(sides, middle + 1)], 1))
@@ -161,17 +142,9 @@ class Mesh:
         self.add(vertices, triangles, texture, colours, tile)
 
     def blob(
-        self,
-        centre: FloatArray,
-        radii: FloatArray,
-        rough: float,
-        rng: Generator,
-        texture: int,
-        tint: FloatArray,
-        tile: float,
-        *,
-        half_height: float = 0.0,
-    ) -> None:
+        self, centre: FloatArray, radii: FloatArray, rough: float, rng: Generator, texture: int, tint: FloatArray,
+        tile: float, *, half_height: float = 0.0,
+    ) -> None:  # fmt: skip
         """A lumpy ellipsoid, its halves drawn apart upright; each facet a slightly different shade."""
         sphere, faces = _SPHERE
         lumpy = sphere * (1.0 + rough * rng.uniform(-1, 1, (len(sphere), 1)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,131 +11,71 @@ from numpy.random import Generator
 
 from flockd.core.messages import Float32Array, FloatArray
 from flockd.sim.world import textures
-from flockd.sim.world.mesh import Mesh
+from flockd.sim.world.mesh import Mesh, Tile
 from flockd.sim.world.terrain import grid_height
 
 Spot = tuple[float, float, float]
 """Along a place's heading, across it, and down."""
+Ground = namedtuple("Ground", "zone_limits zone_kinds zone_colours roads road_colours patches patch_colours")
+"""``zone_limits`` part the noise into zones. Rows of ``roads``: a point (n, e), a direction, half width, sway, sway per
+metre, phase, kind, style (0 track, 1 path, 2 marked); of ``patches``: a centre, a direction, half sizes, kind."""
 
 
 class Scenery:
     """One world's things, in a fixed order of draws. Read its attributes, change none.
 
-    ``textures``: the ground's kinds first. ``obstacles`` as in ``World``. Each row of ``roads`` is a point (n, e), a
-    direction, half width, sway, sway per metre, phase, kind, style (0 track, 1 path, 2 marked); of ``patches`` a
-    centre, a direction, half sizes, kind. ``zone_limits`` part the noise into zones.
+    ``textures``: the ground's kinds first. ``obstacles`` as in ``World``.
     """
 
     def __init__(
-        self,
-        rng: Generator,
-        heights: FloatArray,
-        extent: float,
-        keep_out: FloatArray | None,
-        clearance: float,
+        self, rng: Generator, heights: FloatArray, extent: float, keep_out: FloatArray | None, clearance: float,
         first_vertex: int,
-    ) -> None:
-        self.rng = rng
-        self.heights = heights
-        self.extent = extent
-        self.keep_out = keep_out
-        self.clearance = clearance
+    ) -> None:  # fmt: skip
+        self.rng, self.heights, self.extent = rng, heights, extent
+        self.keep_out, self.clearance = keep_out, clearance
         self.mesh = Mesh(first_vertex)
         self.obstacles: list[tuple[float, float, float, float, float, float]] = []
-        self.textures: list[Float32Array] = []
+        kinds = [textures.GROUNDS[i] for i in rng.permutation(len(textures.GROUNDS))[: int(rng.integers(3, 5))]]
+        self.ground_kinds = len(kinds)
+        self.textures = [draw(rng) for draw in kinds]
         self._choose_textures()
-        self._choose_ground()
-        self._populate()
+        self.ground = _ground(rng, extent, [draw.__name__ for draw in kinds])
+        self.tree_styles = [_TreeStyle.draw(rng, self.leaves) for _ in range(int(rng.integers(1, 4)))]
+        # How much of each thing is drawn first, so that worlds differ in kind.
+        for draw, most, chance in (
+            (self._building, 30, 0.75), (self._container, 14, 0.45), (self._fence, 16, 0.6), (self._car, 24, 0.4),
+            (self._pole, 24, 0.55), (self._tree, 130, 0.85), (self._bush, 90, 0.65), (self._rock, 50, 0.5),
+            (self._pebble, 120, 0.5),
+        ):  # fmt: skip
+            for _ in range(int(most * rng.random() ** 1.5) + 1 if rng.random() < chance else 0):
+                draw()
         self._horizon()
 
     def _choose_textures(self) -> None:
-        rng = self.rng
-        names = rng.permutation(len(textures.GROUNDS))[: int(rng.integers(3, 5))]
-        self.ground_names = [textures.GROUNDS[i].__name__ for i in names]
-        self.ground_kinds = len(names)
-        self.textures = [textures.GROUNDS[i](rng) for i in names]
-        self.leaves = [self.add_texture(textures.leaves(rng)) for _ in range(2)]
-        self.bark = self.add_texture(textures.bark(rng))
+        rng, add = self.rng, self.add_texture
+        self.leaves = [add(textures.leaves(rng)) for _ in range(2)]
+        self.bark = add(textures.bark(rng))
         walls = [textures.WALLS[i](rng) for i in rng.permutation(len(textures.WALLS))[:3]]
-        self.walls = [self.add_texture(w) for w in walls]
-        self.roofs = [self.add_texture(textures.ROOFS[i](rng)) for i in rng.permutation(len(textures.ROOFS))[:2]]
-        self.facades = [
-            self.add_texture(textures.facade(rng, walls[int(rng.integers(0, 3))], paint_colour(rng))) for _ in range(4)
-        ]
-        self.planks = self.add_texture(textures.planks(rng))
-        self.rock = self.add_texture(textures.soil(rng))
+        self.walls = [add(wall) for wall in walls]
+        self.roofs = [add(textures.ROOFS[i](rng)) for i in rng.permutation(len(textures.ROOFS))[:2]]
+        facades = [textures.facade(rng, walls[int(rng.integers(0, 3))], paint_colour(rng)) for _ in range(4)]
+        self.facades = [add(facade) for facade in facades]
+        self.planks = add(textures.planks(rng))
+        self.rock = add(textures.soil(rng))
 
     def add_texture(self, texture: Float32Array) -> int:
         """Its number."""
         self.textures.append(texture)
         return len(self.textures) - 1
 
-    def _choose_ground(self) -> None:
-        """Zones, roads and paved rectangles, and their colours."""
-        rng = self.rng
-        count = int(rng.integers(1, 5))
-        self.zone_limits = np.sort(rng.uniform(-0.9, 0.9, count - 1))
-        self.zone_kinds = rng.integers(0, self.ground_kinds, count)
-        self.zone_colours = np.array([_ground_colour(rng, self.ground_names[k]) for k in self.zone_kinds])
-        roads = []
-        for _ in range(int(rng.choice([0, 1, 1, 2, 2, 3]))):
-            heading = rng.uniform(0, math.pi)
-            style = float(rng.integers(0, 3))  # track, path, marked road
-            half_width = {0.0: rng.uniform(0.8, 1.8), 1.0: rng.uniform(0.6, 2.0), 2.0: rng.uniform(2.2, 4.5)}[style]
-            n, e = rng.uniform(-0.6, 0.6, 2) * self.extent
-            sway = rng.uniform(0.0, 4.0) if rng.random() < 0.6 else 0.0
-            wave, phase, kind = (
-                2 * math.pi / rng.uniform(25, 90),
-                rng.uniform(0, 6.28),
-                rng.integers(0, self.ground_kinds),
-            )
-            roads.append((n, e, math.cos(heading), math.sin(heading), half_width, sway, wave, phase, kind, style))
-        self.roads = np.array(roads, dtype=float).reshape(-1, 10)
-        self.road_colours = np.array([_ground_colour(rng, self.ground_names[int(r[8])]) for r in roads]).reshape(-1, 3)
-        patches = []
-        for _ in range(int(rng.choice([0, 0, 1, 3, 8, 20]))):
-            heading = rng.uniform(0, math.pi)
-            n, e = rng.uniform(-0.9, 0.9, 2) * self.extent
-            a, b = np.exp(rng.uniform(math.log(0.6), math.log(12.0), 2))
-            patches.append((n, e, math.cos(heading), math.sin(heading), a, b, rng.integers(0, self.ground_kinds)))
-        self.patches = np.array(patches, dtype=float).reshape(-1, 7)
-        self.patch_colours = np.array([_ground_colour(rng, self.ground_names[int(p[6])]) for p in patches]).reshape(
-            -1, 3
-        )
-
-    def _populate(self) -> None:
-        """Fill the world: how much of each thing is drawn first, so that worlds differ in kind."""
-        rng = self.rng
-
-        def some(most: int, chance: float) -> int:
-            return int(most * rng.random() ** 1.5) + 1 if rng.random() < chance else 0
-
-        self.tree_styles = [_TreeStyle.draw(rng, self.leaves) for _ in range(int(rng.integers(1, 4)))]
-        for _ in range(some(30, 0.75)):
-            self._building()
-        for _ in range(some(14, 0.45)):
-            self._container()
-        for _ in range(some(16, 0.6)):
-            self._fence()
-        for _ in range(some(24, 0.4)):
-            self._car()
-        for _ in range(some(24, 0.55)):
-            self._pole()
-        for _ in range(some(130, 0.85)):
-            self._tree()
-        for _ in range(some(90, 0.65)):
-            self._bush()
-        for _ in range(some(50, 0.5)):
-            self._rock()
-        for _ in range(some(120, 0.5)):
-            self._pebble()
-
     def _place(
         self, half_length: float, half_width: float, top: float, *, off_road: bool = False, gap: float = 0.5
     ) -> _Place | None:
         """A spot for a footprint that keeps clear of the path and of what stands already; None if none was found."""
-        rng = self.rng
-        reach = math.hypot(half_length, half_width)
+        rng, narrow = self.rng, min(half_length, half_width)
+        reach, standing = math.hypot(half_length, half_width), np.array(self.obstacles).reshape(-1, 6)
+        sizes = standing[:, 2:4]
+        bound = np.minimum(np.hypot(*sizes.T), 1.3 * sizes.min(axis=1) + 0.5)
         for _ in range(12):
             n, e = rng.uniform(-1, 1, 2) * (self.extent - 4.0 - reach)
             heading = rng.uniform(0, math.pi)
@@ -142,20 +83,13 @@ class Scenery:
             if self.keep_out is not None and footprint_distance(footprint, self.keep_out).min() < self.clearance + 0.05:
                 continue
             if off_road and any(
-                abs(-(n - r[0]) * r[3] + (e - r[1]) * r[2]) < r[4] + r[5] + min(half_length, half_width)
-                for r in self.roads
+                abs(-(n - r[0]) * r[3] + (e - r[1]) * r[2]) < r[4] + r[5] + narrow for r in self.ground.roads
             ):
                 continue
-            if self.obstacles:
-                standing = np.array(self.obstacles)
-                if (footprint_distance(standing, np.array([[n, e]])) < min(half_length, half_width) + gap).any():
-                    continue
-                distance = np.hypot(standing[:, 0] - n, standing[:, 1] - e)
-                bound = np.minimum(
-                    np.hypot(standing[:, 2], standing[:, 3]), 1.3 * np.minimum(standing[:, 2], standing[:, 3]) + 0.5
-                )
-                if (distance < bound + reach).any():
-                    continue
+            if (footprint_distance(standing, np.array([[n, e]])) < narrow + gap).any():
+                continue
+            if (np.hypot(standing[:, 0] - n, standing[:, 1] - e) < bound + reach).any():
+                continue
             self.obstacles.append((n, e, half_length, half_width, heading, top))
             return _Place(n, e, heading)
         return None
@@ -164,13 +98,7 @@ class Scenery:
         return -float(grid_height(self.heights, self.extent, np.array([place.north]), np.array([place.east]))[0])
 
     def _box(
-        self,
-        place: _Place,
-        at: Spot,
-        half: Spot,
-        texture: int,
-        tint: FloatArray,
-        tile: tuple[float, float] = (2.0, 2.0),
+        self, place: _Place, at: Spot, half: Spot, texture: int, tint: FloatArray, tile: Tile = (2.0, 2.0)
     ) -> None:
         """A box with its middle at ``at`` in the place's axes, turned as the place is."""
         self.mesh.box(place.at(*at), half, place.heading, texture, tint, tile)
@@ -199,22 +127,14 @@ class Scenery:
         tint = np.full(3, 0.5) * rng.uniform(0.75, 1.2) if windows else paint
         bay_m = rng.uniform(2.2, 4.0)
         foundation = 0.6
-        for side, (length, turn, out) in enumerate(
-            ((a, 0.0, b), (b, math.pi / 2, a), (a, math.pi, b), (b, -math.pi / 2, a))
-        ):
+        for length, turn, out in ((a, 0.0, b), (b, math.pi / 2, a), (a, math.pi, b), (b, -math.pi / 2, a)):
             wall = _Place(place.north, place.east, place.heading + turn)
-            corners = np.array(
-                [
-                    wall.at(x, out, z + d)
-                    for x, d in ((-length, foundation), (length, foundation), (length, -wall_m), (-length, -wall_m))
-                ]
-            )
+            ends = (-length, foundation), (length, foundation), (length, -wall_m), (-length, -wall_m)
+            corners = np.array([wall.at(x, out, z + d) for x, d in ends])
             bays = max(1, round(2 * length / bay_m))
             tile = (4 * length / bays, 2 * floor_m) if windows else (3.0, 3.0)
-            self.mesh.add(
-                corners, np.array([(0, 1, 2), (0, 2, 3)]), facade, tint, tile, wall.at(length, out, z - wall_m)
-            )
-            if side == 0 and rng.random() < 0.7:
+            self.mesh.add(corners, _QUAD, facade, tint, tile, wall.at(length, out, z - wall_m))
+            if turn == 0.0 and rng.random() < 0.7:
                 entrance = rng.uniform(-0.6, 0.6) * length, out, z - 1.0
                 self._box(wall, entrance, (0.5, 0.04, 1.05), self.planks, paint_colour(rng), (1.0, 2.0))
         roof_tint = roof_colour(rng)
@@ -233,23 +153,15 @@ class Scenery:
         eave = top + overhang * roof_m / lb * 0.5
         eaves = [place.at(x * la, y * lb, eave) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
         v = np.array([*eaves, place.at(-ridge, 0, top - roof_m), place.at(ridge, 0, top - roof_m)])
-        tile_m = rng.uniform(1.5, 3.0)
-        tile = (tile_m, tile_m)
+        tile = (rng.uniform(1.5, 3.0),) * 2
+        gable = (roof, roof_tint) if ridge < la else (self.walls[1], paint)
         self.mesh.add(v, np.array([(0, 5, 1), (0, 4, 5), (2, 4, 3), (2, 5, 4)]), roof, roof_tint, tile, v[4])
-        self.mesh.add(
-            v,
-            np.array([(1, 5, 2), (3, 4, 0)]),
-            roof if ridge < la else self.walls[1],
-            roof_tint if ridge < la else paint,
-            tile,
-            v[4],
-        )
-        self.mesh.add(v, np.array([(0, 1, 2), (0, 2, 3)]), self.planks, paint * 0.6, (2.0, 2.0))
+        self.mesh.add(v, np.array([(1, 5, 2), (3, 4, 0)]), *gable, tile, v[4])
+        self.mesh.add(v, _QUAD, self.planks, paint * 0.6, (2.0, 2.0))
         if rng.random() < 0.6:
             wide = rng.uniform(0.2, 0.45)
             spot = rng.uniform(-0.5, 0.5) * ridge, rng.uniform(-0.4, 0.4) * b, top - roof_m
-            half = wide, wide, rng.uniform(0.7, 1.3)
-            self._box(place, spot, half, self.walls[0], paint_colour(rng), (1.5, 1.5))
+            self._box(place, spot, (wide, wide, rng.uniform(0.7, 1.3)), self.walls[0], paint_colour(rng), (1.5, 1.5))
 
     def _container(self) -> None:
         rng = self.rng
@@ -270,10 +182,8 @@ class Scenery:
         sections = max(2, int(a))
         for k in range(sections):
             x = (2 * (k + 0.5) / sections - 1) * a
-            middle = place.at(x, 0, 0)
-            piece = _Place(middle[0], middle[1], place.heading)
-            z = self._ground_z(piece)
-            half = a / sections
+            piece = _Place(*place.at(x, 0, 0)[:2], place.heading)
+            z, half = self._ground_z(piece), a / sections
             if style < 0.35:  # wall
                 self._box(piece, (0, 0, z - h + 0.2), (half, 0.12, h + 0.2), self.walls[1], tint)
             elif style < 0.55:  # hedge
@@ -281,8 +191,7 @@ class Scenery:
                 self._box(piece, inside, (half, 0.24, h + 0.2), self.leaves[0], leaf_colour(rng), (1.2, 1.2))
             else:
                 self._box(piece, (half, 0, z - h + 0.2), (0.06, 0.06, h + 0.25), self.planks, tint, (1.0, 1.0))
-                rails = (0.35, 1.0, 1.65) if style < 0.8 else (0.95,)
-                thick = 0.08 if style < 0.8 else 0.75 * h
+                rails, thick = ((0.35, 1.0, 1.65), 0.08) if style < 0.8 else ((0.95,), 0.75 * h)
                 for level in rails:
                     rail = 0, 0, z - level * h - 0.05
                     self._box(piece, rail, (half, 0.025, thick), self.planks, tint, (1.0, 1.0))
@@ -331,8 +240,7 @@ class Scenery:
         place = self._place(crown, crown, height, off_road=rng.random() < 0.9, gap=-0.4 * crown)
         if place is None:
             return
-        z = self._ground_z(place)
-        mesh = self.mesh
+        z, mesh = self._ground_z(place), self.mesh
         tint = style.colour * rng.uniform(0.75, 1.25)
         trunk_tint = np.array([0.22, 0.15, 0.1]) * rng.uniform(0.6, 1.8)
         r = 0.02 * height + 0.06
@@ -340,12 +248,11 @@ class Scenery:
         top = place.at(0, 0, z - max(bare + 0.3, 0.75 * height))
         mesh.frustum(place.at(0, 0, z + 0.3), top, (r, 0.5 * r), 7, self.bark, trunk_tint)
         if style.shape == "cone":
-            layers = style.layers
-            for k in range(layers):
-                low = bare + (height - bare) * k / layers * 0.85
-                high = low + (height - low) * (0.75 if k < layers - 1 else 1.0)
+            for k in range(style.layers):
+                low = bare + (height - bare) * k / style.layers * 0.85
+                high = low + (height - low) * (0.75 if k < style.layers - 1 else 1.0)
                 foot, tip = place.at(0, 0, z - low), place.at(0, 0, z - high)
-                radii = (crown * (1 - 0.75 * k / layers), 0.0)
+                radii = (crown * (1 - 0.75 * k / style.layers), 0.0)
                 mesh.frustum(foot, tip, radii, 9, style.texture, tint * (1 + 0.1 * k), (1.5, 1.5))
         elif style.shape in ("column", "round"):
             share, rough, tile = (0.45, 0.12, 1.6) if style.shape == "column" else (0.9, 0.14, 2.0)
@@ -389,8 +296,8 @@ class Scenery:
         size = rng.uniform(0.05, 0.2)
         middle = 0, 0, self._ground_z(place)
         if rng.random() < 0.6:
-            stone = np.full(3, rng.uniform(0.1, 0.6))
-            self._blob(place, middle, (size, size, 0.7 * size), 0.2, self.rock, stone, 0.8)
+            tint = np.full(3, rng.uniform(0.1, 0.6))
+            self._blob(place, middle, (size, size, 0.7 * size), 0.2, self.rock, tint, 0.8)
         else:
             self._blob(place, middle, (size, size, 0.8 * size), 0.25, self.leaves[1], leaf_colour(rng), 0.8)
 
@@ -406,8 +313,6 @@ class Scenery:
 
 def footprint_distance(obstacles: FloatArray, points: FloatArray) -> FloatArray:
     """Horizontal metres (n,) from points (n, 2) to the nearest of the rectangles; 0 inside."""
-    if len(obstacles) == 0:
-        return np.full(len(points), np.inf)
     nearest = np.full(len(points), np.inf)
     for north, east, half_length, half_width, heading, _ in obstacles:
         dn, de = points[:, 0] - north, points[:, 1] - east
@@ -415,6 +320,9 @@ def footprint_distance(obstacles: FloatArray, points: FloatArray) -> FloatArray:
         across = np.abs(-dn * math.sin(heading) + de * math.cos(heading)) - half_width
         nearest = np.minimum(nearest, np.hypot(np.maximum(along, 0.0), np.maximum(across, 0.0)))
     return nearest
+
+
+_QUAD = np.array([(0, 1, 2), (0, 2, 3)])
 
 
 @dataclass(frozen=True)
@@ -467,20 +375,48 @@ def paint_colour(rng: Generator) -> FloatArray:
 
 def roof_colour(rng: Generator) -> FloatArray:
     """Red, grey, brown or green."""
-    base = np.array([(0.4, 0.14, 0.08), (0.2, 0.2, 0.22), (0.3, 0.22, 0.15), (0.15, 0.22, 0.2)])[
-        int(rng.integers(0, 4))
-    ]
+    bases = np.array([(0.4, 0.14, 0.08), (0.2, 0.2, 0.22), (0.3, 0.22, 0.15), (0.15, 0.22, 0.2)])
+    base = bases[int(rng.integers(0, 4))]
     return np.asarray(np.clip(base * rng.uniform(0.6, 1.6) * rng.uniform(0.85, 1.15, 3), 0.03, 0.7))
 
 
-def _ground_colour(rng: Generator, kind: str) -> FloatArray:
-    base = {
-        "grass": (0.16, 0.22, 0.06),
-        "soil": (0.27, 0.19, 0.12),
-        "gravel": (0.32, 0.3, 0.27),
-        "asphalt": (0.14, 0.14, 0.15),
-        "paving": (0.34, 0.32, 0.3),
-        "bricks": (0.3, 0.18, 0.14),
-        "stone_cells": (0.33, 0.3, 0.25),
-    }[kind]
-    return np.asarray(np.clip(np.array(base) * rng.uniform(0.55, 1.4) * rng.uniform(0.85, 1.15, 3), 0.02, 0.7))
+_GROUND_COLOURS = {
+    "grass": (0.16, 0.22, 0.06), "soil": (0.27, 0.19, 0.12), "gravel": (0.32, 0.3, 0.27), "asphalt": (0.14, 0.14, 0.15),
+    "paving": (0.34, 0.32, 0.3), "bricks": (0.3, 0.18, 0.14), "stone_cells": (0.33, 0.3, 0.25),
+}  # fmt: skip
+
+
+def _ground(rng: Generator, extent: float, names: list[str]) -> Ground:
+    """Zones, roads and paved rectangles, and their colours; ``names`` of the kinds."""
+
+    def colours(kinds: list[int]) -> FloatArray:
+        drawn = [
+            np.array(_GROUND_COLOURS[names[kind]]) * rng.uniform(0.55, 1.4) * rng.uniform(0.85, 1.15, 3)
+            for kind in kinds
+        ]
+        return np.clip(np.array(drawn).reshape(-1, 3), 0.02, 0.7)
+
+    count = int(rng.integers(1, 5))
+    zone_limits = np.sort(rng.uniform(-0.9, 0.9, count - 1))
+    zone_kinds = rng.integers(0, len(names), count)
+    zone_colours = colours(zone_kinds.tolist())
+    roads, patches = [], []
+    for _ in range(int(rng.choice([0, 1, 1, 2, 2, 3]))):
+        heading = rng.uniform(0, math.pi)
+        style = int(rng.integers(0, 3))
+        half_width = (rng.uniform(0.8, 1.8), rng.uniform(0.6, 2.0), rng.uniform(2.2, 4.5))[style]
+        n, e = rng.uniform(-0.6, 0.6, 2) * extent
+        sway = rng.uniform(0.0, 4.0) if rng.random() < 0.6 else 0.0
+        wave, phase = 2 * math.pi / rng.uniform(25, 90), rng.uniform(0, 6.28)
+        kind = int(rng.integers(0, len(names)))
+        roads.append((n, e, math.cos(heading), math.sin(heading), half_width, sway, wave, phase, kind, style))
+    road_colours = colours([road[8] for road in roads])
+    for _ in range(int(rng.choice([0, 0, 1, 3, 8, 20]))):
+        heading = rng.uniform(0, math.pi)
+        n, e = rng.uniform(-0.9, 0.9, 2) * extent
+        a, b = np.exp(rng.uniform(math.log(0.6), math.log(12.0), 2))
+        patches.append((n, e, math.cos(heading), math.sin(heading), a, b, int(rng.integers(0, len(names)))))
+    return Ground(
+        zone_limits, zone_kinds, zone_colours, np.array(roads, dtype=float).reshape(-1, 10), road_colours,
+        np.array(patches, dtype=float).reshape(-1, 7), colours([patch[6] for patch in patches]),
+    )  # fmt: skip

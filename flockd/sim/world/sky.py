@@ -17,9 +17,8 @@ SKY_BITS = 9
 def draw_sky(rng: Generator) -> tuple[FloatArray, float, PackedArray]:
     """Sun, skylight, haze and the sky's map. Scaled so that level ground receives about 1."""
     elevation, azimuth = math.radians(rng.uniform(25, 70)), rng.uniform(0, 2 * math.pi)
-    sun = np.array(
-        [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), -math.sin(elevation)]
-    )
+    level = math.cos(elevation)
+    sun = np.array([level * math.cos(azimuth), level * math.sin(azimuth), -math.sin(elevation)])
     overcast = float(rng.choice([0.0, 0.0, rng.uniform(0, 0.6), rng.uniform(0.7, 1.0)]))
     warm = (math.radians(70) - elevation) / math.radians(45) * rng.uniform(0.3, 1.0)
     sun_colour = np.array([1.0, 1.0 - 0.14 * warm, 1.0 - 0.38 * warm]) * (1.0 - 0.92 * overcast)
@@ -30,16 +29,10 @@ def draw_sky(rng: Generator) -> tuple[FloatArray, float, PackedArray]:
     exposure = 2.0 ** rng.uniform(-0.55, 0.35) / irradiance
     sun_colour, skylight = sun_colour * exposure, skylight * exposure
     bounce = rng.uniform(0.15, 0.3) * (sun_colour * math.sin(elevation) + skylight) * rng.uniform(0.8, 1.0, 3)
-    zenith = (
-        (np.array([0.1, 0.24, 0.62]) * (1 - overcast) + 0.42 * overcast)
-        * rng.uniform(0.75, 1.2)
-        * rng.uniform(0.93, 1.07, 3)
-    )
-    horizon = (
-        (np.array([0.55, 0.68, 0.85]) * (1 - overcast) + 0.62 * overcast)
-        * rng.uniform(0.7, 1.15)
-        * rng.uniform(0.95, 1.05, 3)
-    )
+    zenith = np.array([0.1, 0.24, 0.62]) * (1 - overcast) + 0.42 * overcast
+    zenith = zenith * rng.uniform(0.75, 1.2) * rng.uniform(0.93, 1.07, 3)
+    horizon = np.array([0.55, 0.68, 0.85]) * (1 - overcast) + 0.62 * overcast
+    horizon = horizon * rng.uniform(0.7, 1.15) * rng.uniform(0.95, 1.05, 3)
     fog = math.exp(rng.uniform(math.log(0.0006), math.log(0.007)))
 
     size = 1 << SKY_BITS
@@ -55,15 +48,17 @@ def draw_sky(rng: Generator) -> tuple[FloatArray, float, PackedArray]:
     sky = sky + sun_colour * (0.25 * toward**8 + 0.8 * toward**120) * (1 - overcast)
     clouds = textures.fractal_noise(rng, size, slope=rng.uniform(1.3, 1.8), coarsest=0.3)
     drop = rng.uniform(2.5, 6.0) * (up + 0.12)
-    column = (north / drop * size).astype(np.int64) % size
-    row = (east / drop * size).astype(np.int64) % size
+    row, column = ((way / drop * size).astype(np.int64) % size for way in (east, north))
     density = clouds[row, column]
     cover = rng.uniform(-1.3, 0.6) + 1.5 * overcast
     amount = np.clip((density + cover) * rng.uniform(0.5, 1.5), 0, 1)[..., None] * np.clip(up * 5, 0, 1)[..., None]
     white = (0.95 * (1 - overcast) + 0.8 * overcast) * (1.15 - 0.25 * np.clip(density, 0, 2)[..., None])
     sky = sky * (1 - amount) + white * amount
-    light = np.stack([sun, sun_colour, skylight, bounce, horizon])
-    return light, fog, textures.pack_pyramid((sky / 4.0).astype(np.float32))
+    return (
+        np.stack([sun, sun_colour, skylight, bounce, horizon]),
+        fog,
+        textures.pack_pyramid((sky / 4.0).astype(np.float32)),
+    )
 
 
 def tone_curve(rng: Generator) -> UInt8Array:

@@ -91,39 +91,22 @@ def hills(rng: Generator, extent: float, hills_m: float, slope: float) -> FloatA
     """Heights (cells + 1, cells + 1) as `terrain.relief` has them, up positive, rows north; 0 at the origin.
 
     ``hills_m`` lie between the lowest and the highest point, or less where the ground would rise by more than ``slope``
-    for each metre somewhere.
+    for each metre somewhere on the triangles that `ground_mesh` makes of it.
     """
-    cells = max(2, round(2 * extent / CELL_M))
-    axis = np.linspace(-extent, extent, cells + 1)
-    drawn = [_drawn(rng, axis, extent) for _ in range(DRAWS)]
-    scaled = [_scaled(heights, hills_m, slope, float(axis[1] - axis[0])) for heights in drawn]
-    return max(scaled, key=_relief_m)
-
-
-def steepest(heights: FloatArray, cell_m: float) -> float:
-    """The largest slope of the triangles that `terrain.ground_mesh` makes of heights."""
-    north, east = np.diff(heights, axis=0) / cell_m, np.diff(heights, axis=1) / cell_m
-    halves = (np.hypot(north[:, :-1], east[1:]), np.hypot(north[:, 1:], east[:-1]))
-    return float(max(half.max() for half in halves))
-
-
-def _drawn(rng: Generator, axis: FloatArray, extent: float) -> FloatArray:
-    north, east = axis[:, None], axis[None, :]
-    heights, at_origin = _waves(rng, axis, WAVES, WAVELENGTHS_M)
+    axis = np.linspace(-extent, extent, max(2, round(2 * extent / CELL_M)) + 1)
     border = _smooth((extent - np.abs(axis)) / BORDER_M)
-    inner = _smooth((np.hypot(north, east) - LEVEL_M) / (FULL_M - LEVEL_M))
-    return np.asarray((heights - at_origin) * border[:, None] * border[None, :] * inner)
+    inner = _smooth((np.hypot(axis[:, None], axis) - LEVEL_M) / (FULL_M - LEVEL_M))
+    drawn = []
+    for _ in range(DRAWS):
+        heights, at_origin = _waves(rng, axis, WAVES, WAVELENGTHS_M)
+        heights = (heights - at_origin) * border[:, None] * border * inner
+        north, east = (np.diff(heights, axis=k) / float(axis[1] - axis[0]) for k in (0, 1))
+        steepest = max(np.hypot(north[:, :-1], east[1:]).max(), np.hypot(north[:, 1:], east[:-1]).max())
+        drawn.append(heights * min(hills_m / float(np.ptp(heights)), slope / float(steepest)))
+    return max(drawn, key=lambda heights: float(np.ptp(heights)))
 
 
 def _smooth(share: FloatArray) -> FloatArray:
     """0 below 0, 1 above 1, and between them a rise that begins and ends level."""
     share = np.clip(share, 0.0, 1.0)
     return np.asarray(share**2 * (3.0 - 2.0 * share))
-
-
-def _scaled(heights: FloatArray, hills_m: float, slope: float, cell_m: float) -> FloatArray:
-    return heights * min(hills_m / _relief_m(heights), slope / steepest(heights, cell_m))
-
-
-def _relief_m(heights: FloatArray) -> float:
-    return float(heights.max() - heights.min())

@@ -6,6 +6,7 @@ without a seam. Its width is one tile, whatever that is in metres.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -39,14 +40,9 @@ def pack_pyramid(texture: Float32Array) -> PackedArray:
 
 
 def fractal_noise(
-    rng: Generator,
-    size: int = SIZE,
-    *,
-    slope: float = 1.0,
-    finest: float = 2.0,
-    coarsest: float = 0.5,
+    rng: Generator, size: int = SIZE, *, slope: float = 1.0, finest: float = 2.0, coarsest: float = 0.5,
     stretch: float = 1.0,
-) -> Float32Array:
+) -> Float32Array:  # fmt: skip
     """Tileable noise (size, size), mean 0, standard deviation 1.
 
     ``slope``: amplitude falls as frequency^-slope (0 white, 1 natural, 2 smooth). Wavelengths from ``finest`` pixels to
@@ -72,34 +68,31 @@ def _grid() -> tuple[Float32Array, Float32Array]:
 
 def _coloured(value: Float32Array, tint: Float32Array | None = None, amount: float = 0.0) -> Float32Array:
     """Grey (size, size) as colour, its hue moved by a second noise."""
+    value = value.astype(np.float32)
     rgb = np.repeat(value[..., None], 3, axis=2)
     if tint is not None:
         rgb *= 1.0 + amount * tint[..., None] * np.array([1.0, 0.1, -1.0], dtype=np.float32)
     return np.asarray(np.clip(rgb * (0.5 / max(1e-3, float(value.mean()))), 0.02, 1.0), dtype=np.float32)
 
 
-def _cells(rng: Generator, count: int) -> tuple[Float32Array, NDArray[np.int64]]:
-    """Tileable Worley cells on a jittered ``count`` x ``count`` grid: 0 at their borders, and cell numbers."""
+def _cells(rng: Generator, least: int, most: int, darkest: float) -> tuple[Float32Array, Float32Array]:
+    """Tileable Worley cells on a jittered square grid: 0 at their borders, and a shade of each from `darkest` to 1."""
+    count = int(rng.integers(least, most))
     jitter = rng.random((count, count, 2), dtype=np.float32)
     rows, columns = _grid()
     nearest = np.full((SIZE, SIZE), 9.0, dtype=np.float32)
     second = nearest.copy()
     cell = np.zeros((SIZE, SIZE), dtype=np.int64)
-    base_row = np.floor(rows * count).astype(np.int64)
-    base_column = np.floor(columns * count).astype(np.int64)
-    for dr in (-1, 0, 1):
-        for dc in (-1, 0, 1):
-            r = (base_row + dr) % count
-            c = (base_column + dc) % count
-            point = jitter[r, c]
-            distance = np.hypot(
-                rows * count - (base_row + dr) - point[..., 0], columns * count - (base_column + dc) - point[..., 1]
-            )
-            closer = distance < nearest
-            second = np.where(closer, nearest, np.minimum(second, distance)).astype(np.float32)
-            nearest = np.where(closer, distance, nearest).astype(np.float32)
-            cell = np.where(closer, r * count + c, cell)
-    return second - nearest, cell
+    base_row, base_column = (np.floor(axis * count).astype(np.int64) for axis in (rows, columns))
+    for dr, dc in itertools.product((-1, 0, 1), repeat=2):
+        row, column = base_row + dr, base_column + dc
+        point = jitter[row % count, column % count]
+        distance = np.hypot(rows * count - row - point[..., 0], columns * count - column - point[..., 1])
+        closer = distance < nearest
+        second = np.where(closer, nearest, np.minimum(second, distance)).astype(np.float32)
+        nearest = np.where(closer, distance, nearest).astype(np.float32)
+        cell = np.where(closer, row % count * count + column % count, cell)
+    return second - nearest, rng.uniform(darkest, 1.0, cell.max() + 1).astype(np.float32)[cell]
 
 
 def grass(rng: Generator) -> Float32Array:
@@ -118,9 +111,8 @@ def soil(rng: Generator) -> Float32Array:
 
 def gravel(rng: Generator) -> Float32Array:
     """Pebbles of many greys."""
-    edge, cell = _cells(rng, int(rng.integers(24, 60)))
-    shade = rng.uniform(0.45, 1.0, cell.max() + 1).astype(np.float32)
-    value = shade[cell] * (0.35 + 0.65 * np.minimum(1.0, 3.0 * edge))
+    edge, shade = _cells(rng, 24, 60, 0.45)
+    value = shade * (0.35 + 0.65 * np.minimum(1.0, 3.0 * edge))
     return _coloured(value * np.exp(0.08 * fractal_noise(rng)), fractal_noise(rng, slope=0.3), 0.06)
 
 
@@ -131,15 +123,14 @@ def asphalt(rng: Generator) -> Float32Array:
     value = np.exp(0.26 * grain + 0.22 * wear)
     cracks = np.abs(fractal_noise(rng, slope=1.3, finest=3.0))
     value *= np.where(cracks < rng.uniform(0.005, 0.04), 0.55, 1.0)
-    return _coloured(value.astype(np.float32))
+    return _coloured(value)
 
 
 def stone_cells(rng: Generator) -> Float32Array:
     """Irregular flagstones or dried mud."""
-    edge, cell = _cells(rng, int(rng.integers(4, 9)))
-    shade = rng.uniform(0.5, 1.0, cell.max() + 1).astype(np.float32)
-    value = shade[cell] * np.where(edge < 0.06, 0.45, 1.0) * np.exp(0.2 * fractal_noise(rng, slope=0.8))
-    return _coloured(value.astype(np.float32), fractal_noise(rng, slope=1.4), 0.1)
+    edge, shade = _cells(rng, 4, 9, 0.5)
+    value = shade * np.where(edge < 0.06, 0.45, 1.0) * np.exp(0.2 * fractal_noise(rng, slope=0.8))
+    return _coloured(value, fractal_noise(rng, slope=1.4), 0.1)
 
 
 def _courses(rng: Generator, rows: int, columns: int, *, offset: float, joint: float) -> Float32Array:
@@ -194,19 +185,15 @@ def corrugated(rng: Generator) -> Float32Array:
     """Ribbed sheet with streaks."""
     _, c = _grid()
     ribs = 0.8 + 0.25 * np.sin(2 * np.pi * c * int(rng.integers(8, 24)))
-    return _coloured(
-        (ribs * np.exp(0.12 * fractal_noise(rng, slope=1.2, stretch=0.4))).astype(np.float32),
-        np.maximum(0.0, fractal_noise(rng, slope=1.3, stretch=0.5)),
-        0.12,
-    )
+    value = ribs * np.exp(0.12 * fractal_noise(rng, slope=1.2, stretch=0.4))
+    return _coloured(value, np.maximum(0.0, fractal_noise(rng, slope=1.3, stretch=0.5)), 0.12)
 
 
 def leaves(rng: Generator) -> Float32Array:
     """Foliage with deep gaps."""
-    edge, cell = _cells(rng, int(rng.integers(18, 44)))
-    shade = rng.uniform(0.3, 1.0, cell.max() + 1).astype(np.float32)
-    value = shade[cell] * np.minimum(1.0, 0.25 + 2.5 * edge) * np.exp(0.35 * fractal_noise(rng, slope=1.0))
-    return _coloured(value.astype(np.float32), fractal_noise(rng, slope=0.9), 0.15)
+    edge, shade = _cells(rng, 18, 44, 0.3)
+    value = shade * np.minimum(1.0, 0.25 + 2.5 * edge) * np.exp(0.35 * fractal_noise(rng, slope=1.0))
+    return _coloured(value, fractal_noise(rng, slope=0.9), 0.15)
 
 
 def bark(rng: Generator) -> Float32Array:
@@ -224,10 +211,8 @@ def speckle(rng: Generator) -> Float32Array:
         inside = (np.abs((r - y + 0.5) % 1.0 - 0.5) < high) & (np.abs((c - x + 0.5) % 1.0 - 0.5) < wide)
         value = np.where(inside, value * np.float32(rng.choice([0.5, 0.75, 1.3, 1.6])), value)
     for count in rng.integers(2, 5, 2):
-        line = (
-            np.abs((r * count) % 1.0 - 0.5) < 0.012 if rng.random() < 0.5 else np.abs((c * count) % 1.0 - 0.5) < 0.012
-        )
-        value = np.where(line, value * np.float32(0.6), value)
+        axis = r if rng.random() < 0.5 else c
+        value = np.where(np.abs((axis * count) % 1.0 - 0.5) < 0.012, value * np.float32(0.6), value)
     return _coloured(value)
 
 
@@ -243,25 +228,19 @@ def facade(rng: Generator, wall: Float32Array, colour: FloatArray) -> Float32Arr
     y0, y1 = int(bay * (0.5 - high / 2)), int(bay * (0.5 + high / 2))
     x0, x1 = int(bay * (0.5 - wide / 2)), int(bay * (0.5 + wide / 2))
     edge = max(2, int(bay * rng.uniform(0.012, 0.03)))
-    for row in range(2):
-        for column in range(2):
-            window = image[row * bay + y0 : row * bay + y1, column * bay + x0 : column * bay + x1]
-            h, w = window.shape[:2]
-            reflection = np.linspace(1.6, 0.7, h, dtype=np.float32)[:, None, None]
-            window[:] = np.clip(glass * rng.uniform(0.6, 1.7) * reflection, 0.0, 1.0)
-            if rng.random() < 0.4:  # a blind or curtain
-                window[: int(h * rng.uniform(0.2, 1.0))] = rng.uniform(0.2, 0.6) * rng.uniform(0.8, 1.0, 3)
-            for k in range(panes_x + 1):
-                x = min(w - edge, k * (w - edge) // panes_x)
-                window[:, x : x + edge] = frame_colour
-            for k in range(panes_y + 1):
-                y = min(h - edge, k * (h - edge) // panes_y)
-                window[y : y + edge] = frame_colour
-            if sill:
-                below = row * bay + y1
-                image[below : below + 2 * edge, column * bay + x0 - edge : column * bay + x1 + edge] = (
-                    frame_colour * 0.7
-                )
+    for top, left in itertools.product((0, bay), repeat=2):
+        window = image[top + y0 : top + y1, left + x0 : left + x1]
+        h, w = window.shape[:2]
+        reflection = np.linspace(1.6, 0.7, h, dtype=np.float32)[:, None, None]
+        window[:] = np.clip(glass * rng.uniform(0.6, 1.7) * reflection, 0.0, 1.0)
+        if rng.random() < 0.4:  # a blind or curtain
+            window[: int(h * rng.uniform(0.2, 1.0))] = rng.uniform(0.2, 0.6) * rng.uniform(0.8, 1.0, 3)
+        for k in range(panes_x + 1):
+            window[:, k * (w - edge) // panes_x :][:, :edge] = frame_colour
+        for k in range(panes_y + 1):
+            window[k * (h - edge) // panes_y :][:edge] = frame_colour
+        if sill:
+            image[top + y1 : top + y1 + 2 * edge, left + x0 - edge : left + x1 + edge] = frame_colour * 0.7
     if rng.random() < 0.5:  # a band between floors
         image[bay - 2 * edge : bay] *= rng.uniform(0.5, 1.5)
         image[-2 * edge :] *= rng.uniform(0.5, 1.5)

@@ -101,7 +101,7 @@ class World:
         uv = np.concatenate([np.zeros((ground_count, 2, 4)), *mesh.uv])
         shadow, frame = baking.shadow_map(vertices, triangles[ground_count:], light[0], extent_m)
         ground_map, kinds = baking.ground_map(rng, scenery, light[0], shadow, frame)
-        kind_count = len(scenery.ground_names)
+        kind_count = scenery.ground_kinds
         tiles_per_m = 1.0 / rng.uniform(2.2, 4.5, kind_count)
         return World(
             seed=seed,
