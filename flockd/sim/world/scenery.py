@@ -182,7 +182,8 @@ class Scenery:
         sections = max(2, int(a))
         for k in range(sections):
             x = (2 * (k + 0.5) / sections - 1) * a
-            piece = _Place(*place.at(x, 0, 0)[:2], place.heading)
+            north, east, _ = place.at(x, 0, 0)
+            piece = _Place(north, east, place.heading)
             z, half = self._ground_z(piece), a / sections
             if style < 0.35:  # wall
                 self._box(piece, (0, 0, z - h + 0.2), (half, 0.12, h + 0.2), self.walls[1], tint)
