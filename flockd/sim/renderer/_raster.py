@@ -5,7 +5,6 @@ that calls it and releases the GIL, so that several images are drawn side by sid
 three times as long to compile, and half as much processor time again to run.
 """
 # Compiled loops are long: a call for each few lines would cost more than it explains.
-# ruff: noqa: PLR0912, PLR0915
 
 from __future__ import annotations
 
@@ -20,6 +19,8 @@ from flockd.sim.world.baking import GROUND_MAP_BITS, sun_reaches
 from flockd.sim.world.sky import SKY_BITS
 from flockd.sim.world.textures import TEXTURE_BITS
 
+_TEXTURE_AREA = ((4 << (2 * TEXTURE_BITS)) - 1) // 3
+"""Texels of a texture's pyramid."""
 SUBSAMPLES = 3
 """Drone colours are sampled 3x3 per pixel; the middle sample is the pixel's centre."""
 Eye = namedtuple("Eye", ["K", "inverse_K", "R", "origin", "focal"])
@@ -45,14 +46,9 @@ def set_up_triangles(q: Any, triangles: Any, width: int, height: int, rows: Any,
     homogeneous (cross products of the corners), so a triangle that reaches behind the camera needs no clipping.
     """
     for t in range(triangles.shape[0]):
-        rows[t, 0] = 0
-        rows[t, 1] = -1
-        a = triangles[t, 0]
-        b = triangles[t, 1]
-        c = triangles[t, 2]
-        ax, ay, az = q[a, 0], q[a, 1], q[a, 2]
-        bx, by, bz = q[b, 0], q[b, 1], q[b, 2]
-        cx, cy, cz = q[c, 0], q[c, 1], q[c, 2]
+        rows[t, 0], rows[t, 1] = 0, -1
+        a, b, c = q[triangles[t, 0]], q[triangles[t, 1]], q[triangles[t, 2]]
+        (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (a[0], a[1], a[2]), (b[0], b[1], b[2]), (c[0], c[1], c[2])
         if az <= 0.0 and bz <= 0.0 and cz <= 0.0:
             continue
         if (ax < 0.0 and bx < 0.0 and cx < 0.0) or (ay < 0.0 and by < 0.0 and cy < 0.0):
@@ -61,59 +57,51 @@ def set_up_triangles(q: Any, triangles: Any, width: int, height: int, rows: Any,
             continue
         if ay > height * az and by > height * bz and cy > height * cz:
             continue
-        e0x = by * cz - bz * cy
-        e0y = bz * cx - bx * cz
-        e0z = bx * cy - by * cx
-        determinant = ax * e0x + ay * e0y + az * e0z
+        first = _cross(b, c)
+        determinant = ax * first[0] + ay * first[1] + az * first[2]
         if determinant > -1e-9:  # seen from behind, or edge on
             continue
-        top = 0
-        bottom = height - 1
+        top, bottom = 0, height - 1
         if az > 1e-6 and bz > 1e-6 and cz > 1e-6:
-            va = ay / az
-            vb = by / bz
-            vc = cy / cz
+            va, vb, vc = ay / az, by / bz, cy / cz
             top = max(top, math.ceil(max(-1.0, min(va, vb, vc)) - 0.5))
             bottom = min(bottom, math.floor(min(height + 1.0, max(va, vb, vc)) - 0.5))
-            ua = ax / az
-            ub = bx / bz
-            uc = cx / cz
+            ua, ub, uc = ax / az, bx / bz, cx / cz
             if math.ceil(min(ua, ub, uc) - 0.5) > math.floor(max(ua, ub, uc) - 0.5):  # between pixel centres
                 continue
         if top > bottom:
             continue
-        e1x = cy * az - cz * ay
-        e1y = cz * ax - cx * az
-        e1z = cx * ay - cy * ax
-        e2x = ay * bz - az * by
-        e2y = az * bx - ax * bz
-        e2z = ax * by - ay * bx
-        rows[t, 0] = top
-        rows[t, 1] = bottom
-        p = planes[t]
-        p[0], p[1], p[2] = -e0x, -e0y, -e0z
-        p[3], p[4], p[5] = -e1x, -e1y, -e1z
-        p[6], p[7], p[8] = -e2x, -e2y, -e2z
-        p[9] = (e0x + e1x + e2x) / determinant
-        p[10] = (e0y + e1y + e2y) / determinant
-        p[11] = (e0z + e1z + e2z) / determinant
+        rows[t, 0], rows[t, 1] = top, bottom
+        second, third, p = _cross(c, a), _cross(a, b), planes[t]
+        p[0], p[1], p[2] = -first[0], -first[1], -first[2]
+        p[3], p[4], p[5] = -second[0], -second[1], -second[2]
+        p[6], p[7], p[8] = -third[0], -third[1], -third[2]
+        p[9] = (first[0] + second[0] + third[0]) / determinant
+        p[10] = (first[1] + second[1] + third[1]) / determinant
+        p[11] = (first[2] + second[2] + third[2]) / determinant
+
+
+@njit(cache=True, error_model="numpy")
+def _cross(a: Any, b: Any) -> Any:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@njit(cache=True, error_model="numpy")
+def _at(plane: Any, begin: int, x: float, y: float) -> float:
+    """A plane's edge function or 1/z, the one whose coefficients begin there."""
+    return float(plane[begin] * x + plane[begin + 1] * y + plane[begin + 2])
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def fill(visible: Any, rows: Any, planes: Any, inverse_depth: Any, hit: Any) -> None:
     """Nearest triangle of each pixel: 1/z and its index (-1 for none), row spans from the edges' crossings."""
-    height, width = hit.shape
-    for y in range(height):
-        for x in range(width):
-            inverse_depth[y, x] = 0.0
-            hit[y, x] = -1
-    for k in range(visible.shape[0]):
-        t = visible[k]
+    width = hit.shape[1]
+    inverse_depth[:], hit[:] = 0.0, -1
+    for t in visible:
         p = planes[t]
         for y in range(rows[t, 0], rows[t, 1] + 1):
             v = y + 0.5
-            low = 0.0
-            high = width - 1.0
+            low, high = 0.0, width - 1.0
             for e in range(0, 9, 3):
                 slope = p[e]
                 rest = p[e + 1] * v + p[e + 2]
@@ -126,14 +114,11 @@ def fill(visible: Any, rows: Any, planes: Any, inverse_depth: Any, hit: Any) -> 
             if low > high:
                 continue
             x0 = math.ceil(low)
-            x1 = math.floor(high)
-            step = np.float32(p[9])
-            start = np.float32(p[9] * (x0 + 0.5) + p[10] * v + p[11])
-            for x in range(x0, x1 + 1):
+            step, start = np.float32(p[9]), np.float32(_at(p, 9, x0 + 0.5, v))
+            for x in range(x0, math.floor(high) + 1):
                 value = start + step * np.float32(x - x0)
                 if value > inverse_depth[y, x]:
-                    inverse_depth[y, x] = value
-                    hit[y, x] = t
+                    inverse_depth[y, x], hit[y, x] = value, t
 
 
 @njit(cache=True, error_model="numpy")
@@ -153,23 +138,16 @@ def _blend(a: Any, b: Any, weight: Any) -> Any:
 @njit(cache=True, error_model="numpy")
 def _bilinear(texels: Any, base: int, bits: int, u: float, v: float) -> Any:
     """Spread colour of one level at (u, v) in tiles, repeating."""
-    size = 1 << bits
-    mask = size - 1
-    fu = u * (size * 256.0) - 128.0
-    fv = v * (size * 256.0) - 128.0
-    iu = math.floor(fu)
-    iv = math.floor(fv)
-    wu = np.uint64(iu & 255)
-    wv = np.uint64(iv & 255)
-    x0 = (iu >> 8) & mask
-    y0 = (iv >> 8) & mask
-    x1 = (x0 + 1) & mask
-    row0 = base + (y0 << bits)
-    row1 = base + (((y0 + 1) & mask) << bits)
+    mask = (1 << bits) - 1
+    fu, fv = u * ((1 << bits) * 256.0) - 128.0, v * ((1 << bits) * 256.0) - 128.0
+    iu, iv = math.floor(fu), math.floor(fv)
+    x0, y0 = (iu >> 8) & mask, (iv >> 8) & mask
+    x1, row0, row1 = (x0 + 1) & mask, base + (y0 << bits), base + (((y0 + 1) & mask) << bits)
     # Unsigned indices spare the check for negative ones.
-    a = _blend(_spread(texels[np.uint64(row0 + x0)]), _spread(texels[np.uint64(row0 + x1)]), wu)
-    b = _blend(_spread(texels[np.uint64(row1 + x0)]), _spread(texels[np.uint64(row1 + x1)]), wu)
-    return _blend(a, b, wv)
+    wide, high = np.uint64(iu & 255), np.uint64(iv & 255)
+    a = _blend(_spread(texels[np.uint64(row0 + x0)]), _spread(texels[np.uint64(row0 + x1)]), wide)
+    b = _blend(_spread(texels[np.uint64(row1 + x0)]), _spread(texels[np.uint64(row1 + x1)]), wide)
+    return _blend(a, b, high)
 
 
 @njit(cache=True, error_model="numpy")
@@ -196,29 +174,40 @@ def _byte(spread: Any, shift: int) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _light(light: Any, normal_d: float, cosine: float) -> Any:
-    """Irradiance (r, g, b) of a surface: sun times ``cosine`` (shadow included) plus sky above and ground below."""
-    up = 0.5 - 0.5 * normal_d
+def _seen(scene: Any, colour: Any, fine: Any, normal_d: float, lit: float, away: float) -> Any:
+    """Linear light (r, g, b) of a surface's colour and texel, in the sun's share ``lit``, through so much haze.
+
+    On it falls sun, sky from above and light from the ground.
+    """
+    light, up, clear = scene.light, 0.5 - 0.5 * normal_d, math.exp(-scene.fog_per_m * away)
+    red = light[1, 0] * lit + light[2, 0] * up + light[3, 0] * (1.0 - up)
+    green = light[1, 1] * lit + light[2, 1] * up + light[3, 1] * (1.0 - up)
+    blue = light[1, 2] * lit + light[2, 2] * up + light[3, 2] * (1.0 - up)
     return (
-        light[1, 0] * cosine + light[2, 0] * up + light[3, 0] * (1.0 - up),
-        light[1, 1] * cosine + light[2, 1] * up + light[3, 1] * (1.0 - up),
-        light[1, 2] * cosine + light[2, 2] * up + light[3, 2] * (1.0 - up),
+        2.0 * colour[0] * _byte(fine, 0) * red * clear + light[4, 0] * (1.0 - clear),
+        2.0 * colour[1] * _byte(fine, 32) * green * clear + light[4, 1] * (1.0 - clear),
+        2.0 * colour[2] * _byte(fine, 16) * blue * clear + light[4, 2] * (1.0 - clear),
     )
 
 
 @njit(cache=True, error_model="numpy")
-def _encode(tone: Any, value: float) -> Any:
-    """Linear light to a display byte through the tone curve, which is tabulated over the square root."""
-    index = int(math.sqrt(max(0.0, value)) * 1024.0)
-    return tone[min(index, tone.shape[0] - 1)]
+def _ray(eye: Any, u: float, v: float) -> Any:
+    """Through a pixel: right and down of 1 m ahead of the camera, and the ray north, east and down."""
+    inverse_K, R = eye.inverse_K, eye.R
+    cx = inverse_K[0, 0] * u + inverse_K[0, 1] * v + inverse_K[0, 2]
+    cy = inverse_K[1, 1] * v + inverse_K[1, 2]
+    return (
+        cx, cy, R[0, 0] * cx + R[0, 1] * cy + R[0, 2], R[1, 0] * cx + R[1, 1] * cy + R[1, 2],
+        R[2, 0] * cx + R[2, 1] * cy + R[2, 2],
+    )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")
-def _put(rgb: Any, y: int, x: int, tone: Any, red: float, green: float, blue: float) -> None:
-    """Linear light into a pixel of the image."""
-    rgb[y, x, 0] = _encode(tone, red)
-    rgb[y, x, 1] = _encode(tone, green)
-    rgb[y, x, 2] = _encode(tone, blue)
+def _put(rgb: Any, y: int, x: int, tone: Any, linear: Any) -> None:
+    """Linear light (r, g, b) into a pixel, through the tone curve, which is tabulated over the square root."""
+    for channel in range(3):
+        index = int(math.sqrt(max(0.0, linear[channel])) * 1024.0)
+        rgb[y, x, channel] = tone[min(index, tone.shape[0] - 1)]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -227,27 +216,22 @@ def shade_scene(hit: Any, planes: Any, eye: Any, scene: Any, blobs: Any, rgb: An
 
     ``blobs`` (k, 9): a drone's place, radius and darkness; left, top, right and bottom of where its shadow may be.
     """
-    inverse_K, R, origin = eye.inverse_K, eye.R, eye.origin
-    light, tone, texture_area = scene.light, scene.tone, ((4 << (2 * TEXTURE_BITS)) - 1) // 3
-    sun, size, limit = light[0], 1 << GROUND_MAP_BITS, 0.5 - 0.51 / (1 << SKY_BITS)  # off the opposite border
+    origin, tone, sun, size = eye.origin, scene.tone, scene.light[0], 1 << GROUND_MAP_BITS
+    limit = 0.5 - 0.51 / (1 << SKY_BITS)  # off the opposite border
     sharper, of_map = math.log2(eye.focal) + 0.4, GROUND_MAP_BITS - math.log2(2.0 * scene.extent_m)
     for y in range(hit.shape[0]):
         for x in range(hit.shape[1]):
             t = hit[y, x]
-            cx = inverse_K[0, 0] * (x + 0.5) + inverse_K[0, 1] * (y + 0.5) + inverse_K[0, 2]
-            cy = inverse_K[1, 1] * (y + 0.5) + inverse_K[1, 2]
-            rn = R[0, 0] * cx + R[0, 1] * cy + R[0, 2]
-            re = R[1, 0] * cx + R[1, 1] * cy + R[1, 2]
-            rd = R[2, 0] * cx + R[2, 1] * cy + R[2, 2]
+            cx, cy, rn, re, rd = _ray(eye, x + 0.5, y + 0.5)
             if t < 0:  # on the sky's map: an octahedral one of the upper half
                 depth[y, x] = np.inf
                 scale = 0.5 / max(1e-9, abs(rn) + abs(re) + max(0.0, -rd))
                 u = max(-limit, min(limit, (rn + re) * scale)) + 0.5
                 v = max(-limit, min(limit, (rn - re) * scale)) + 0.5
                 found = sample(scene.sky, 0, SKY_BITS, u, v, 0.0)
-                _put(rgb, y, x, tone, 4.0 * _byte(found, 0), 4.0 * _byte(found, 32), 4.0 * _byte(found, 16))
+                _put(rgb, y, x, tone, (4.0 * _byte(found, 0), 4.0 * _byte(found, 32), 4.0 * _byte(found, 16)))
                 continue
-            z = 1.0 / (planes[t, 9] * (x + 0.5) + planes[t, 10] * (y + 0.5) + planes[t, 11])
+            z = 1.0 / _at(planes[t], 9, x + 0.5, y + 0.5)
             depth[y, x] = z
             n, e, d = origin[0] + rn * z, origin[1] + re * z, origin[2] + rd * z
             nn, ne, nd = scene.normals[t, 0], scene.normals[t, 1], scene.normals[t, 2]
@@ -264,14 +248,14 @@ def shade_scene(hit: Any, planes: Any, eye: Any, scene: Any, blobs: Any, rgb: An
             if kind < 0:
                 u, v = _mirrored(0.5 * e / scene.extent_m + 0.5), _mirrored(0.5 * n / scene.extent_m + 0.5)
                 mapped = sample(scene.ground_map, 0, GROUND_MAP_BITS, u, v, level + of_map)
-                red, green, blue, baked = _byte(mapped, 0), _byte(mapped, 32), _byte(mapped, 16), _byte(mapped, 48)
+                colour = _byte(mapped, 0), _byte(mapped, 32), _byte(mapped, 16)
                 # The ground's sunlight is baked into its map, and beyond that there is no shade.
-                lit *= -sun[2] if max(abs(n), abs(e)) > scene.extent_m else baked
+                lit *= -sun[2] if max(abs(n), abs(e)) > scene.extent_m else _byte(mapped, 48)
                 ground = scene.ground_kind[min(int(v * size), size - 1), min(int(u * size), size - 1)]
                 kind, tiles = int(scene.ground_detail[ground, 0]), scene.ground_detail[ground, 1]
                 u, v, level, nd = e * tiles, n * tiles, level + scene.ground_detail[ground, 2], -1.0
             else:
-                red, green, blue, of = scene.tint[t, 0], scene.tint[t, 1], scene.tint[t, 2], scene.uv[t]
+                colour, of = (scene.tint[t, 0], scene.tint[t, 1], scene.tint[t, 2]), scene.uv[t]
                 u = of[0, 0] * n + of[0, 1] * e + of[0, 2] * d + of[0, 3]
                 v = of[1, 0] * n + of[1, 1] * e + of[1, 2] * d + of[1, 3]
                 level += scene.level[t]
@@ -280,13 +264,8 @@ def shade_scene(hit: Any, planes: Any, eye: Any, scene: Any, blobs: Any, rgb: An
                     at = n + 0.08 * nn, e + 0.08 * ne, d + 0.08 * nd
                     cosine *= sun_reaches(scene.shadow_map, scene.shadow_frame, at[0], at[1], at[2])
                 lit *= cosine
-            fine = sample(scene.texels, kind * texture_area, TEXTURE_BITS, u, v, level)
-            of_red, of_green, of_blue = _light(light, nd, lit)
-            clear = math.exp(-scene.fog_per_m * z * length)
-            red = 2.0 * red * _byte(fine, 0) * of_red * clear + light[4, 0] * (1.0 - clear)
-            green = 2.0 * green * _byte(fine, 32) * of_green * clear + light[4, 1] * (1.0 - clear)
-            blue = 2.0 * blue * _byte(fine, 16) * of_blue * clear + light[4, 2] * (1.0 - clear)
-            _put(rgb, y, x, tone, red, green, blue)
+            fine = sample(scene.texels, kind * _TEXTURE_AREA, TEXTURE_BITS, u, v, level)
+            _put(rgb, y, x, tone, _seen(scene, colour, fine, nd, lit, z * length))
 
 
 @njit(cache=True, error_model="numpy")
@@ -315,22 +294,11 @@ def smooth_edges(hit: Any, texture: Any, planes: Any, linear: Any, tone: Any, sh
     copy of ``sharp``.
     """
     height, width = hit.shape
-    seen = np.empty(9, dtype=np.int64)
-    at = np.empty((9, 2), dtype=np.int64)
     for y in range(height):
         for x in range(width):
-            t = hit[y, x]
-            if (
-                (x == 0 or hit[y, x - 1] == t)
-                and (x + 1 == width or hit[y, x + 1] == t)
-                and (y == 0 or hit[y - 1, x] == t)
-                and (y + 1 == height or hit[y + 1, x] == t)
-            ):
-                continue
-            edge = False
+            t, edge = hit[y, x], False
             for k in range(4):
-                i = x + (k == 0) - (k == 1)
-                j = y + (k == 2) - (k == 3)
+                i, j = x + (k == 0) - (k == 1), y + (k == 2) - (k == 3)
                 if i < 0 or j < 0 or i >= width or j >= height or hit[j, i] == t:
                     continue
                 if t >= 0 and hit[j, i] >= 0 and texture[t] < 0 and texture[hit[j, i]] < 0:
@@ -341,151 +309,87 @@ def smooth_edges(hit: Any, texture: Any, planes: Any, linear: Any, tone: Any, sh
                 edge = edge or change > 24.0
             if not edge:
                 continue
-            count = 1
-            seen[0] = t
-            at[0, 0] = y
-            at[0, 1] = x
-            for j in range(max(0, y - 1), min(height, y + 2)):
-                for i in range(max(0, x - 1), min(width, x + 2)):
-                    known = False
-                    for k in range(count):
-                        known = known or seen[k] == hit[j, i]
-                    if not known:
-                        seen[count] = hit[j, i]
-                        at[count, 0] = j
-                        at[count, 1] = i
-                        count += 1
-            red = 0.0
-            green = 0.0
-            blue = 0.0
-            for sample_number in range(4):
-                u = x + 0.125 + 0.25 * sample_number
-                v = y + 0.125 + 0.25 * ((2 * sample_number + 1) % 5)
-                best = -1
-                nearest = 0.0
-                for k in range(count):
-                    if seen[k] < 0:
-                        if best < 0:
-                            best = k
-                        continue
-                    p = planes[seen[k]]
-                    if (
-                        p[0] * u + p[1] * v + p[2] >= 0.0
-                        and p[3] * u + p[4] * v + p[5] >= 0.0
-                        and p[6] * u + p[7] * v + p[8] >= 0.0
-                    ):
-                        inverse = p[9] * u + p[10] * v + p[11]
-                        if inverse > nearest:
-                            nearest = inverse
-                            best = k
-                best = max(0, best)  # covered by something that no pixel shows: as the pixel itself
-                j = at[best, 0]
-                i = at[best, 1]
+            red, green, blue = 0.0, 0.0, 0.0
+            for k in range(4):
+                u, v = x + 0.125 + 0.25 * k, y + 0.125 + 0.25 * ((2 * k + 1) % 5)
+                # The own triangle first; where none covers the sample, the sky if it is near, or as the pixel.
+                best, nearest = (y, x), _covering(planes, t, u, v)
+                for j in range(max(0, y - 1), min(height, y + 2)):
+                    for i in range(max(0, x - 1), min(width, x + 2)):
+                        inverse = _covering(planes, hit[j, i], u, v)
+                        if inverse > nearest or (nearest == 0.0 and hit[j, i] < 0 <= hit[best[0], best[1]]):
+                            best, nearest = (j, i), inverse
+                j, i = best
                 red += 0.25 * linear[sharp[j, i, 0]]
                 green += 0.25 * linear[sharp[j, i, 1]]
                 blue += 0.25 * linear[sharp[j, i, 2]]
-            _put(rgb, y, x, tone, red, green, blue)
+            _put(rgb, y, x, tone, (red, green, blue))
+
+
+@njit(cache=True, error_model="numpy")
+def _covering(planes: Any, t: int, u: float, v: float) -> float:
+    """1/z of a triangle there; 0 beside it, and of the sky."""
+    if t < 0 or _at(planes[t], 0, u, v) < 0.0 or _at(planes[t], 3, u, v) < 0.0 or _at(planes[t], 6, u, v) < 0.0:
+        return 0.0
+    return max(0.0, _at(planes[t], 9, u, v))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def lay_over(
-    hit: Any,
-    inverse_depth: Any,
-    planes: Any,
-    left: int,
-    top: int,
-    eye: Any,
-    thing: Any,
-    scene: Any,
-    linear: Any,
-    rgb: Any,
-    depth: Any,
-    ids: Any,
-) -> None:
+    hit: Any, inverse_depth: Any, planes: Any, left: int, top: int, eye: Any, thing: Any, scene: Any, linear: Any,
+    rgb: Any, depth: Any, ids: Any,
+) -> None:  # fmt: skip
     """Lay one drone over the image by coverage, from its 3x3 supersampled triangle indices within a rectangle.
 
     Depth and identity come from the middle sample, the pixel's centre.
     """
-    s = SUBSAMPLES
-    inverse_K, R, origin, texture_bits = eye.inverse_K, eye.R, eye.origin, TEXTURE_BITS
-    R_ned_body, position, normals, uv, colours = thing.rotation, thing.position, thing.normals, thing.uv, thing.colours
-    light, tone = scene.light, scene.tone
-    count = hit.shape[0] // s
-    sun = light[0]
-    texture_area = ((4 << (2 * texture_bits)) - 1) // 3
-    texture_size = float(1 << texture_bits)
-    for row in range(count):
+    s, origin, R, position, uv = SUBSAMPLES, eye.origin, thing.rotation, thing.position, thing.uv
+    sun, share = scene.light[0], 1.0 / (s * s)
+    for row in range(hit.shape[0] // s):
         y = top + row
         for column in range(hit.shape[1] // s):
             x = left + column
-            limit = 0.0
-            if depth[y, x] < np.inf:
-                limit = 1.0 / depth[y, x]
-            covered = 0
-            sum_red = 0.0
-            sum_green = 0.0
-            sum_blue = 0.0
-            last = -1
-            red = 0.0
-            green = 0.0
-            blue = 0.0
-            for j in range(s):
-                for i in range(s):
-                    t = hit[row * s + j, column * s + i]
-                    if t < 0 or inverse_depth[row * s + j, column * s + i] <= limit:
+            limit = 1.0 / depth[y, x] if depth[y, x] < np.inf else 0.0
+            covered, last, colour = 0, -1, (0.0, 0.0, 0.0)
+            red, green, blue = 0.0, 0.0, 0.0
+            for j in range(row * s, row * s + s):
+                for i in range(column * s, column * s + s):
+                    t = hit[j, i]
+                    if t < 0 or inverse_depth[j, i] <= limit:
                         continue
                     covered += 1
                     if t != last:
-                        last = t
-                        a = column * s + i + 0.5
-                        b = row * s + j + 0.5
-                        z = 1.0 / (planes[t, 9] * a + planes[t, 10] * b + planes[t, 11])
-                        u = left + a / s
-                        v = top + b / s
-                        cx = inverse_K[0, 0] * u + inverse_K[0, 1] * v + inverse_K[0, 2]
-                        cy = inverse_K[1, 1] * v + inverse_K[1, 2]
-                        rn = (R[0, 0] * cx + R[0, 1] * cy + R[0, 2]) * z
-                        re = (R[1, 0] * cx + R[1, 1] * cy + R[1, 2]) * z
-                        rd = (R[2, 0] * cx + R[2, 1] * cy + R[2, 2]) * z
+                        last, z = t, 1.0 / _at(planes[t], 9, i + 0.5, j + 0.5)
+                        _, _, rn, re, rd = _ray(eye, left + (i + 0.5) / s, top + (j + 0.5) / s)
+                        rn, re, rd = rn * z, re * z, rd * z
                         away = math.sqrt(rn * rn + re * re + rd * rd)
-                        nn, ne, nd = normals[t, 0], normals[t, 1], normals[t, 2]
-                        n = origin[0] + rn - position[0]
-                        e = origin[1] + re - position[1]
+                        nn, ne, nd = thing.normals[t, 0], thing.normals[t, 1], thing.normals[t, 2]
+                        n, e = origin[0] + rn - position[0], origin[1] + re - position[1]
                         d = origin[2] + rd - position[2]
-                        bx = R_ned_body[0, 0] * n + R_ned_body[1, 0] * e + R_ned_body[2, 0] * d
-                        by = R_ned_body[0, 1] * n + R_ned_body[1, 1] * e + R_ned_body[2, 1] * d
-                        bz = R_ned_body[0, 2] * n + R_ned_body[1, 2] * e + R_ned_body[2, 2] * d
+                        bx = R[0, 0] * n + R[1, 0] * e + R[2, 0] * d
+                        by = R[0, 1] * n + R[1, 1] * e + R[2, 1] * d
+                        bz = R[0, 2] * n + R[1, 2] * e + R[2, 2] * d
                         tu = uv[t, 0, 0] * bx + uv[t, 0, 1] * by + uv[t, 0, 2] * bz + uv[t, 0, 3]
                         tv = uv[t, 1, 0] * bx + uv[t, 1, 1] * by + uv[t, 1, 2] * bz + uv[t, 1, 3]
                         facing = max(0.05, -(rn * nn + re * ne + rd * nd) / away)
                         # Tiles per metre are the same both ways on a drone.
                         tile = abs(uv[t, 0, 0]) + abs(uv[t, 0, 1]) + abs(uv[t, 0, 2])
-                        fineness = math.log2(z / eye.focal / math.sqrt(facing) * texture_size * tile)
-                        fine = sample(thing.texels, thing.texture[t] * texture_area, texture_bits, tu, tv, fineness)
-                        cosine = nn * sun[0] + ne * sun[1] + nd * sun[2]
-                        if cosine > 0.0:
-                            cosine *= sun_reaches(
-                                scene.shadow_map, scene.shadow_frame, n + position[0], e + position[1], d + position[2]
-                            )
-                        red, green, blue = _light(light, nd, max(0.0, cosine))
-                        clear = math.exp(-scene.fog_per_m * away)
-                        red = red * 2.0 * colours[t, 0] * _byte(fine, 0) * clear + light[4, 0] * (1.0 - clear)
-                        green = green * 2.0 * colours[t, 1] * _byte(fine, 32) * clear + light[4, 1] * (1.0 - clear)
-                        blue = blue * 2.0 * colours[t, 2] * _byte(fine, 16) * clear + light[4, 2] * (1.0 - clear)
-                    sum_red += red
-                    sum_green += green
-                    sum_blue += blue
+                        level = math.log2(z / eye.focal / math.sqrt(facing) * float(1 << TEXTURE_BITS) * tile)
+                        fine = sample(thing.texels, thing.texture[t] * _TEXTURE_AREA, TEXTURE_BITS, tu, tv, level)
+                        lit = max(0.0, nn * sun[0] + ne * sun[1] + nd * sun[2])
+                        if lit > 0.0:
+                            at = n + position[0], e + position[1], d + position[2]
+                            lit *= sun_reaches(scene.shadow_map, scene.shadow_frame, at[0], at[1], at[2])
+                        colour = _seen(scene, thing.colours[t], fine, nd, lit, away)
+                    red, green, blue = red + colour[0], green + colour[1], blue + colour[2]
             if covered == 0:
                 continue
-            share = 1.0 / (s * s)
             rest = 1.0 - covered * share
-            red = linear[rgb[y, x, 0]] * rest + sum_red * share
-            green = linear[rgb[y, x, 1]] * rest + sum_green * share
-            blue = linear[rgb[y, x, 2]] * rest + sum_blue * share
-            _put(rgb, y, x, tone, red, green, blue)
-            middle_y = row * s + s // 2
-            middle_x = column * s + s // 2
-            t = hit[middle_y, middle_x]
-            if t >= 0 and inverse_depth[middle_y, middle_x] > limit:
-                depth[y, x] = 1.0 / (planes[t, 9] * (middle_x + 0.5) + planes[t, 10] * (middle_y + 0.5) + planes[t, 11])
+            red = linear[rgb[y, x, 0]] * rest + red * share
+            green = linear[rgb[y, x, 1]] * rest + green * share
+            blue = linear[rgb[y, x, 2]] * rest + blue * share
+            _put(rgb, y, x, scene.tone, (red, green, blue))
+            j, i = row * s + s // 2, column * s + s // 2
+            if hit[j, i] >= 0 and inverse_depth[j, i] > limit:
+                depth[y, x] = 1.0 / _at(planes[hit[j, i]], 9, i + 0.5, j + 0.5)
                 ids[y, x] = thing.identity

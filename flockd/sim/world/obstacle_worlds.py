@@ -28,7 +28,6 @@ _STREET_M = 6.0
 _POLE_SPACING_M = 25.0
 _SPAN_PARTS = 6
 """Straight parts of a sagging wire."""
-_WIRE_RADIUS_M = 0.012
 
 
 def obstacles_of(scenario: ScenarioConfig) -> Obstacles:
@@ -71,24 +70,20 @@ class _Site:
 
     def take(self, place: FloatArray, reach: float, gap: float) -> bool:
         """Whether a circle at `place` (2,) is within the area and off all others by `gap`; then it is taken."""
-        if (np.abs(place) > self.extent - reach).any() or not self.is_open(place, reach):
+        if (np.abs(place) > self.extent - reach).any():
             return False
-        apart = np.hypot(self._taken[:, 0] - place[0], self._taken[:, 1] - place[1])
-        if (apart < self._taken[:, 2] + reach + gap).any():
-            return False
+        for circles, apart in ((self._free, 0.0), (self._taken, gap)):
+            if (np.hypot(*(circles[:, :2] - place).T) < circles[:, 2] + reach + apart).any():
+                return False
         self._taken = np.vstack([self._taken, (*place, reach)])
         return True
 
-    def is_open(self, place: FloatArray, reach: float) -> bool:
-        """Whether it leaves free what is to be kept free."""
-        apart = np.hypot(self._free[:, 0] - place[0], self._free[:, 1] - place[1])
-        return bool((apart >= self._free[:, 2] + reach).all())
-
-    def anywhere(self, tries: int, reach: float, gap: float) -> FloatArray | None:
-        """(2,) a free circle's middle."""
+    def anywhere(self, tries: int, reach: float, gap: float, street: float | None = None) -> FloatArray | None:
+        """(2,) a free circle's middle, off the street to the north at its easting."""
         for _ in range(tries):
             place = self.rng.uniform(-self.extent, self.extent, 2)
-            if self.take(place, reach, gap):
+            on_street = street is not None and abs(place[1] - street) < _STREET_M / 2 + reach
+            if not on_street and self.take(place, reach, gap):
                 return place
         return None
 
@@ -127,12 +122,9 @@ def _old_tree(rng: Generator, place: FloatArray, trunk: float, *, conifer: bool)
     crown = float(rng.uniform(1.0, 2.2))
     solids: list[Solid] = [Frustum(north, east, trunk, 0.5 * trunk, -DEPTH_M, bare + 0.6 * (height - bare), "bark")]
     if conifer:
-        middle = bare + 0.4 * (height - bare)
-        solids += [
-            Frustum(north, east, crown, 0.3 * crown, bare, bare + 0.6 * (height - bare), "needles"),
-            Frustum(north, east, 0.75 * crown, 0.0, middle, height, "needles"),
-        ]
-        return solids
+        middle, upper = bare + 0.4 * (height - bare), bare + 0.6 * (height - bare)
+        solids.append(Frustum(north, east, crown, 0.3 * crown, bare, upper, "needles"))
+        return [*solids, Frustum(north, east, 0.75 * crown, 0.0, middle, height, "needles")]
     solids.append(Capsule(north, east, bare + crown, north, east, max(bare + crown, height - crown), crown, "leaves"))
     for _ in range(int(rng.integers(1, 4))):
         radius = float(rng.uniform(0.5, 0.8)) * crown
@@ -154,29 +146,26 @@ def _village(site: _Site, config: ObstaclesConfig) -> list[Solid]:
     for number in range(count):
         half = rng.uniform(3.5, 6.5), rng.uniform(2.8, 4.5)
         reach = math.hypot(*half)
-        place = _beside(site, street, reach, config.min_gap_m)
+        place = site.anywhere(_LOT_TRIES, reach, config.min_gap_m, street)
         if place is None:
             raise _crowded(config, f"{number} of {count} houses", "houses_per_hectare")
         turn = float(along_street + rng.normal(0.0, 0.08) + (math.pi / 2 if rng.random() < 0.5 else 0.0))
         houses.append(_house(rng, place, half, turn, solids))
     for _ in range(round(0.8 * count)):
-        _wall(site, street, config.min_gap_m, solids)
+        length, heading = float(rng.uniform(3.0, 10.0)), float(rng.uniform(0, math.pi))
+        place = site.anywhere(_LOT_TRIES, length / 2, config.min_gap_m, street)
+        if place is not None:
+            material: Material = "stone" if rng.random() < 0.5 else "bricks"
+            top, thick = float(rng.uniform(2.0, 5.5)), float(rng.uniform(0.1, 0.25))
+            north, east = place.tolist()
+            solids.append(Box(north, east, length / 2, thick, heading, -DEPTH_M, top, material))
     for _ in range(round(1.2 * count)):
         crown = float(rng.uniform(0.8, 1.6))
-        spot = _beside(site, street, crown, config.min_gap_m)
+        spot = site.anywhere(_LOT_TRIES, crown, config.min_gap_m, street)
         if spot is not None:
             solids += _garden_tree(rng, spot, crown)
     _service_wires(rng, solids, houses)
     return solids
-
-
-def _beside(site: _Site, street: float, reach: float, gap: float) -> FloatArray | None:
-    """(2,) a free circle's middle off the street."""
-    for _ in range(_LOT_TRIES):
-        place = site.rng.uniform(-site.extent, site.extent, 2)
-        if abs(place[1] - street) >= _STREET_M / 2 + reach and site.take(place, reach, gap):
-            return place
-    return None
 
 
 def _house(rng: Generator, place: FloatArray, half: tuple[float, float], heading: float, solids: list[Solid]) -> Box:
@@ -190,19 +179,6 @@ def _house(rng: Generator, place: FloatArray, half: tuple[float, float], heading
     at = north + along * math.cos(heading), east + along * math.sin(heading)
     solids.append(Box(*at, 0.4, 0.4, heading, top, top + roof_m + float(rng.uniform(0.8, 1.6)), "bricks"))
     return house
-
-
-def _wall(site: _Site, street: float, gap: float, solids: list[Solid]) -> None:
-    """A straight one: a row of circles that are free."""
-    rng = site.rng
-    length, heading = float(rng.uniform(3.0, 10.0)), float(rng.uniform(0, math.pi))
-    middle = _beside(site, street, length / 2, gap)
-    if middle is None:
-        return
-    material: Material = "stone" if rng.random() < 0.5 else "bricks"
-    top = float(rng.uniform(2.0, 5.5))
-    north, east = middle.tolist()
-    solids.append(Box(north, east, length / 2, float(rng.uniform(0.1, 0.25)), heading, -DEPTH_M, top, material))
 
 
 def _garden_tree(rng: Generator, place: FloatArray, crown: float) -> list[Solid]:
@@ -249,7 +225,7 @@ def _wire(one: FloatArray, other: FloatArray, *, sag: float) -> list[Solid]:
     points = one + share * (other - one)
     points[:, 2] -= sag * 4 * (share * (1 - share))[:, 0]
     ends = itertools.pairwise(points.tolist())
-    return [Capsule(a[0], a[1], a[2], b[0], b[1], b[2], _WIRE_RADIUS_M, "metal") for a, b in ends]
+    return [Capsule(a[0], a[1], a[2], b[0], b[1], b[2], 0.012, "metal") for a, b in ends]
 
 
 def with_obstacles(log: FlightLog, scenario: ScenarioConfig) -> FlightLog:
@@ -274,11 +250,7 @@ def clearances(obstacles: Obstacles, times: FloatArray, position: FloatArray, ve
     share = np.arange(POINTS_A_STEP)[:, None, None, None] / POINTS_A_STEP
     a, b = position[:-1], position[1:]
     run, end_run = interval * velocity[:-1], interval * velocity[1:]
-    path = (
-        (2 * share**3 - 3 * share**2 + 1) * a
-        + (share**3 - 2 * share**2 + share) * run
-        + (3 * share**2 - 2 * share**3) * b
-        + (share**3 - share**2) * end_run
-    )
+    path = (2 * share**3 - 3 * share**2 + 1) * a + (share**3 - 2 * share**2 + share) * run
+    path = path + (3 * share**2 - 2 * share**3) * b + (share**3 - share**2) * end_run
     nearest = np.minimum(obstacles.clearance(path).min(axis=0), obstacles.clearance(b))
     return np.vstack([nearest, obstacles.clearance(position[-1:])])

@@ -18,10 +18,7 @@ from flockd.core.messages import SECTORS, FloatArray, ObstacleRanges
 FRUSTUM, BOX, CAPSULE = 0.0, 1.0, 2.0
 KIND, NORTH, EAST, REACH_M, LOW_M, HIGH_M, OWN = range(7)
 """Columns of a solid's row (13,): the upright cylinder around it, and from `OWN` on its own seven figures."""
-_LEAST_SLOPE = 1e-9
-_LEAST_DIRECTION = 1e-12
 _LEAST_SQUARE = 1e-18
-_ROUNDING_RAD = 1e-6
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -34,14 +31,10 @@ def level_ranges(
     `solids` (k, 13) rows.
     """
     out[:] = math.inf
-    looks = np.empty((azimuths.size, 3))
-    for k in range(azimuths.size):
-        looks[k, 0], looks[k, 1], looks[k, 2] = azimuths[k], math.cos(azimuths[k]), math.sin(azimuths[k])
+    looks = np.column_stack((azimuths, np.cos(azimuths), np.sin(azimuths)))
     for k in range(solids.shape[0]):
-        if solids[k, LOW_M] > high or solids[k, HIGH_M] < low:
-            continue
-        reach = solids[k, REACH_M] + limit_m
-        if (solids[k, NORTH] - x) ** 2 + (solids[k, EAST] - y) ** 2 > reach * reach:
+        away_2 = (solids[k, NORTH] - x) ** 2 + (solids[k, EAST] - y) ** 2
+        if solids[k, LOW_M] > high or solids[k, HIGH_M] < low or away_2 > (solids[k, REACH_M] + limit_m) ** 2:
             continue
         own = solids[k, OWN:]
         if solids[k, KIND] == FRUSTUM:
@@ -72,7 +65,7 @@ def _capsule_ranges(
     """
     rise = own[5] - own[2]
     begin, end = 0.0, 1.0
-    if abs(rise) > _LEAST_SLOPE:
+    if abs(rise) > 1e-9:
         one, other = (low - own[6] - own[2]) / rise, (high + own[6] - own[2]) / rise
         begin, end = min(max(min(one, other), 0.0), 1.0), min(max(one, other, 0.0), 1.0)
     beyond = max(low - max(own[2], own[5]), min(own[2], own[5]) - high, 0.0)
@@ -97,7 +90,7 @@ def _disc_ranges(dn: float, de: float, radius: float, looks: Any, half_width: fl
         out[:] = 0.0
         return
     towards = math.atan2(de, dn)
-    meets = away * math.cos(min(math.asin(radius / away) + half_width + _ROUNDING_RAD, math.pi))
+    meets = away * math.cos(min(math.asin(radius / away) + half_width + 1e-6, math.pi))
     for k in range(out.size):
         if dn * looks[k, 1] + de * looks[k, 2] < meets:
             continue
@@ -133,7 +126,7 @@ def _rectangle_ranges(
 @njit(nogil=True, cache=True, error_model="numpy")
 def _slab(place: float, direction: float, half: float) -> Any:
     """How far along a line it enters and leaves what is within `half` of 0."""
-    along = _LEAST_DIRECTION if abs(direction) < _LEAST_DIRECTION else direction
+    along = 1e-12 if abs(direction) < 1e-12 else direction
     reach = math.copysign(half, along)
     return (-reach - place) / along, (reach - place) / along
 
@@ -163,7 +156,15 @@ def point_clearances(points: Any, solids: Any, out: Any) -> None:
 def _clearance(kind: float, own: Any, x: float, y: float, height: float) -> float:
     """From a point to a solid's surface, m; negative inside."""
     if kind == FRUSTUM:
-        return _to_frustum(own, math.sqrt((x - own[0]) ** 2 + (y - own[1]) ** 2), height)
+        # A polygon in distance from the axis and height.
+        wide, narrow, foot, top = own[2], own[3], own[4], own[5]
+        away = math.sqrt((x - own[0]) ** 2 + (y - own[1]) ** 2)
+        surface = min(
+            _to_segment(away, height, 0.0, foot, wide, foot),
+            _to_segment(away, height, wide, foot, narrow, top),
+            _to_segment(away, height, 0.0, top, narrow, top),
+        )
+        return -surface if foot <= height <= top and away <= _radius_at(own, height) else surface
     if kind == BOX:
         cosine, sine = math.cos(own[4]), math.sin(own[4])
         north, east = x - own[0], y - own[1]
@@ -177,18 +178,6 @@ def _clearance(kind: float, own: Any, x: float, y: float, height: float) -> floa
     share = min(max(along / max(ln * ln + le * le + lu * lu, _LEAST_SQUARE), 0.0), 1.0)
     a, b, c = x - own[0] - share * ln, y - own[1] - share * le, height - own[2] - share * lu
     return math.sqrt(a * a + b * b + c * c) - float(own[6])
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _to_frustum(own: Any, away: float, height: float) -> float:
-    """A polygon in distance from the axis and height."""
-    wide, narrow, foot, top = own[2], own[3], own[4], own[5]
-    surface = min(
-        _to_segment(away, height, 0.0, foot, wide, foot),
-        _to_segment(away, height, wide, foot, narrow, top),
-        _to_segment(away, height, 0.0, top, narrow, top),
-    )
-    return -surface if foot <= height <= top and away <= _radius_at(own, height) else surface
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -261,14 +250,9 @@ class Obstacles:
         self._solids = np.array([_row(solid) for solid in self.solids]).reshape(-1, 13)
 
     def ranges(
-        self,
-        position: FloatArray,
-        azimuths: FloatArray,
-        height_band: tuple[float, float] = HEIGHT_BAND_M,
-        *,
-        half_width: float = 0.0,
-        limit_m: float = math.inf,
-    ) -> FloatArray:
+        self, position: FloatArray, azimuths: FloatArray, height_band: tuple[float, float] = HEIGHT_BAND_M, *,
+        half_width: float = 0.0, limit_m: float = math.inf,
+    ) -> FloatArray:  # fmt: skip
         """(n,) level metres from `position` (3,) NED to the nearest solid at each of the azimuths; inf without one.
 
         Azimuths (n,) are rad clockwise from north. Of each solid the part counts whose height above the drone lies in
@@ -300,18 +284,12 @@ class Obstacles:
         return np.vstack([np.column_stack(of_frusta), boxes[:, OWN:], np.column_stack(of_lines)])
 
 
-def true_ranges(
-    obstacles: Obstacles, time_s: float, position: FloatArray, *, limit_m: float = RANGE_LIMIT_M
-) -> ObstacleRanges:
-    """What a drone at `position` (3,) NED would measure without errors: all around, up to `limit_m`."""
+def true_ranges(obstacles: Obstacles, time_s: float, position: FloatArray) -> ObstacleRanges:
+    """What a drone at `position` (3,) NED would measure without errors: all around, up to `RANGE_LIMIT_M`."""
     azimuths = np.arange(SECTORS, dtype=float) * (2 * math.pi / SECTORS)
-    range_m = obstacles.ranges(position, azimuths, half_width=math.pi / SECTORS, limit_m=limit_m)
-    return ObstacleRanges(
-        time_s=time_s,
-        range_m=range_m,
-        sigma_m=np.where(np.isfinite(range_m), EXACT_SIGMA_M, 0.0),
-        seen_m=np.minimum(range_m, limit_m),
-    )
+    range_m = obstacles.ranges(position, azimuths, half_width=math.pi / SECTORS, limit_m=RANGE_LIMIT_M)
+    sigma_m = np.where(np.isfinite(range_m), EXACT_SIGMA_M, 0.0)
+    return ObstacleRanges(time_s=time_s, range_m=range_m, sigma_m=sigma_m, seen_m=np.minimum(range_m, RANGE_LIMIT_M))
 
 
 def _row(solid: Solid) -> list[float]:
