@@ -284,12 +284,14 @@ class Obstacles:
         return np.vstack([np.column_stack(of_frusta), boxes[:, OWN:], np.column_stack(of_lines)])
 
 
-def true_ranges(obstacles: Obstacles, time_s: float, position: FloatArray) -> ObstacleRanges:
-    """What a drone at `position` (3,) NED would measure without errors: all around, up to `RANGE_LIMIT_M`."""
+def true_ranges(
+    obstacles: Obstacles, time_s: float, position: FloatArray, *, limit_m: float = RANGE_LIMIT_M
+) -> ObstacleRanges:
+    """What a drone at `position` (3,) NED would measure without errors: all around, up to `limit_m`."""
     azimuths = np.arange(SECTORS, dtype=float) * (2 * math.pi / SECTORS)
-    range_m = obstacles.ranges(position, azimuths, half_width=math.pi / SECTORS, limit_m=RANGE_LIMIT_M)
+    range_m = obstacles.ranges(position, azimuths, half_width=math.pi / SECTORS, limit_m=limit_m)
     sigma_m = np.where(np.isfinite(range_m), EXACT_SIGMA_M, 0.0)
-    return ObstacleRanges(time_s=time_s, range_m=range_m, sigma_m=sigma_m, seen_m=np.minimum(range_m, RANGE_LIMIT_M))
+    return ObstacleRanges(time_s=time_s, range_m=range_m, sigma_m=sigma_m, seen_m=np.minimum(range_m, limit_m))
 
 
 def _row(solid: Solid) -> list[float]:
