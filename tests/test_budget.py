@@ -26,7 +26,7 @@ LINES = {
     "flockd/fleet": 2_240,
     "flockd/ground": 3_960,
     "flockd/review": 3_370,
-    "flockd/sim": 10_920,
+    "flockd/sim": 10_500,
     "flockd/campaign": 1_750,
     "flockd/cli": 3_700,
     "tests": 41_040,
