@@ -16,7 +16,8 @@ import pytest
 from flockd import __version__
 from flockd.cli import _parser, installing, main
 from flockd.cli.sim import _scenario
-from flockd.core.errors import ModelError
+from flockd.core.config import DroneConfig
+from flockd.core.errors import ModelError, UnavailableError
 from flockd.review.flight_log.log import FlightLog
 from flockd.sim.vehicles.vehicles import Vehicles
 from tests.cli.conftest import Told
@@ -327,6 +328,22 @@ def test_an_interrupted_flight_leaves_its_report_and_can_be_flown_again(
     assert f"{moved}" in capsys.readouterr().err
     assert FlightLog.load(moved / "flight.npz").metadata.interrupted
     assert not FlightLog.load(folder / "flight.npz").metadata.interrupted
+
+
+def test_the_daemons_of_a_simulation_connect_where_they_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    connected: list[tuple[str, ...]] = []
+
+    def fly_fleet(scenario: object, sitl: DroneConfig, **_: object) -> None:
+        connected.append(sitl.telemetry.connect)
+        raise UnavailableError("no autopilot for this test; end here")
+
+    monkeypatch.setattr("flockd.sim.sitl.fleet.fly_fleet", fly_fleet)
+    flight = ["sim", "--autopilot", "fake", "--drones", "2", "--out"]
+    assert main([*flight, str(tmp_path / "one")]) == 69
+    assert main([*flight, str(tmp_path / "two"), "--telemetry-at", "tcp/127.0.0.1:7999"]) == 69
+    assert connected == [("tcp/127.0.0.1:7447",), ("tcp/127.0.0.1:7999",)]
 
 
 def test_what_is_set_is_what_is_flown() -> None:

@@ -1,19 +1,22 @@
-"""`flockd fleet` without any drone, and with drones of which some are lost; it is flown in tests/onboard/daemon."""
+"""`flockd fleet`: requests to drones of which some are lost, and the page's address; flown in tests/onboard/daemon."""
 
 from __future__ import annotations
 
+import socket
 import subprocess
 import sys
+from argparse import Namespace
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Self
+from unittest.mock import Mock
 
 import pytest
 
-from flockd.cli import main
-from flockd.cli.fleet import _found
+from flockd.cli.fleet import _found, announce
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.sim.sitl.ports import free_endpoint
+from tests.cli.conftest import Told
 
 ROOT = Path(__file__).parents[2]
 DRONE = """
@@ -33,34 +36,17 @@ with ZenohTelemetry("meadow", listen=[endpoint]) as telemetry:
 HOLD = "from flockd.cli import program; program()"
 
 
-class _Silence:
-    """No drone is heard."""
-
-    def __init__(self, *_: object, **__: object) -> None:
-        pass
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def drones(self) -> tuple[str, ...]:
-        return ()
-
-
 @pytest.mark.parametrize(
-    ("drones", "told"),
+    ("drones", "says"),
     [("all", "no drone was"), ("drone1", "drone1 was not"), ("drone1,drone2", "drone1 and drone2 were not")],
 )
 def test_a_drone_that_is_not_heard_gets_no_request(
-    drones: str, told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    drones: str, says: str, monkeypatch: pytest.MonkeyPatch, told: Told
 ) -> None:
-    monkeypatch.setattr("flockd.fleet.watcher.FleetWatcher", _Silence)
+    monkeypatch.setattr("flockd.fleet.watcher.FleetWatcher", lambda *_, **__: nullcontext(Mock(drones=tuple)))
     monkeypatch.setattr("flockd.cli.fleet.FIND_S", 0.0)
-    assert main(["fleet", "hold", drones, "--connect", "tcp/127.0.0.1:1"]) == 69
-    sentence = f"{told} found at tcp/127.0.0.1:1; no request was sent; check `flockd status`\n"
-    assert capsys.readouterr().err == sentence
+    error = told(69, "fleet", "hold", drones, "--connect", "tcp/127.0.0.1:1")
+    assert error.startswith(f"{says} found at tcp/127.0.0.1:1; no request was sent; ")
 
 
 def _drone(name: str, endpoint: str, *, lost: bool) -> subprocess.Popen[str]:
@@ -105,3 +91,31 @@ def test_a_drone_is_asked_when_it_is_found_and_not_after_a_while(monkeypatch: py
             assert next(found) == "meadow/drone1"
             telemetry.show_alive("drone2")
             assert next(found) == "meadow/drone2"
+
+
+def test_a_taken_port_is_reported_in_one_sentence(told: Told) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        error = told(69, "fleet", "--connect", "tcp/127.0.0.1:1", "--port", port)
+    assert error.startswith(f"the page cannot use 127.0.0.1 port {port} (")
+
+
+@pytest.mark.parametrize(
+    ("address", "shown", "warns"),
+    [
+        ("127.0.0.1", "127.0.0.1", False),
+        ("::1", "[::1]", False),
+        ("0.0.0.0", "127.0.0.1", True),
+        ("10.0.0.7", "10.0.0.7", True),
+    ],
+)
+def test_an_address_that_others_reach_comes_with_a_warning(
+    address: str, shown: str, warns: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    args = Namespace(server_address=address, connect=["tcp/127.0.0.1:1"], drones_at=None)
+    announce(args, 80, "k")
+    out, err = capsys.readouterr()
+    assert out.splitlines()[0] == f"the fleet page is at http://{shown}:80/?key=k"
+    assert ("travels unencrypted" in err) == ("on other computers" in out) == warns

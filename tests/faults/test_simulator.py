@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.calm import until
 from tests.faults.stories import Reacted
-from tests.sitl.test_fleet import _left_behind, _processes, _scenario
+from tests.sitl.test_fleet import _processes, _scenario
 
 pytestmark = [pytest.mark.slow, pytest.mark.whole_flight]
 SECONDS_TO_START = 180.0
@@ -29,18 +30,13 @@ def test_the_simulator_is_killed_in_flight(tmp_path: Path, reacted: Reacted) -> 
         [sys.executable, "-c", run, "sim", str(scenario), *options], env={**os.environ, "TMPDIR": str(tmp_path)},
         stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2],
     ) as simulator:  # fmt: skip
-        until_s = time.monotonic() + SECONDS_TO_START
-        recordings = tmp_path / "out" / "recordings"
-        while len(list(recordings.glob("*.mcap"))) < 2:  # each begins with its flight
-            assert simulator.poll() is None, simulator.communicate()
-            assert time.monotonic() < until_s
-            time.sleep(0.1)
+        flights = tmp_path / "out" / "recordings"
+        until(lambda: simulator.poll() is not None or len([*flights.glob("*.mcap")]) == 2, SECONDS_TO_START)
+        assert simulator.poll() is None, simulator.communicate()
         daemons = [command for command in _processes(str(tmp_path)).values() if " run --config " in command]
         assert len(daemons) == 2
         killed_s = time.monotonic()
         simulator.send_signal(signal.SIGKILL)
         simulator.wait()
-    while (left := _left_behind(str(tmp_path))) and time.monotonic() < killed_s + 60.0:
-        time.sleep(0.05)
-    assert left == []
+    until(lambda: not _processes(str(tmp_path)))
     reacted("simulator-killed", time.monotonic() - killed_s)

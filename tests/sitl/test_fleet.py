@@ -16,10 +16,13 @@ import pytest
 
 from flockd.cli import main
 from flockd.core.data import data_path
+from flockd.core.errors import UnavailableError
 from flockd.review.flight_log.log import FlightLog
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from flockd.sim.sitl.autopilots import px4_folder
 from flockd.sim.sitl.ground_station import FULL_STICK_M_S, GroundStation, home_deg
 from flockd.sim.sitl.ports import free_port
+from tests.calm import until
 from tests.sitl.sitl_run import PX4
 
 SECONDS_TO_START = 120.0
@@ -39,11 +42,6 @@ def _scenario(folder: Path, drones: int, **drone: object) -> Path:
     path = folder / "flight.yaml"
     path.write_text(json.dumps(flight), encoding="utf-8")
     return path
-
-
-def _left_behind(mark: str) -> list[str]:
-    """Command lines of processes that know of a folder."""
-    return list(_processes(mark).values())
 
 
 def _processes(mark: str) -> dict[int, str]:
@@ -92,7 +90,7 @@ def test_two_daemons_fly_from_rendered_frames_and_the_report_is_the_simulators(
         f"drone{i}.{suffix}" for i in (1, 2) for suffix in ("log", "yaml")
     }
     assert not (out / "recordings").exists()
-    assert _left_behind(str(tmp_path)) == []
+    assert _processes(str(tmp_path)) == {}
 
 
 def test_nobody_is_left_behind_when_it_is_told_to_end(tmp_path: Path) -> None:
@@ -103,16 +101,13 @@ def test_nobody_is_left_behind_when_it_is_told_to_end(tmp_path: Path) -> None:
         [sys.executable, "-c", run, "sim", str(_scenario(tmp_path, drones=1)), *options],
         cwd=data_path("config").parent, env=environment, stderr=subprocess.PIPE, text=True,
     ) as simulator:  # fmt: skip
-        until_s = time.monotonic() + SECONDS_TO_START
-        while not list(tmp_path.glob("flockd-*/drone1.log")):
-            assert simulator.poll() is None, simulator.communicate()
-            assert time.monotonic() < until_s
-            time.sleep(0.05)
+        until(lambda: simulator.poll() is not None or [*tmp_path.glob("flockd-*/drone1.log")], SECONDS_TO_START)
+        assert simulator.poll() is None, simulator.communicate()
         simulator.send_signal(signal.SIGTERM)
         _, told = simulator.communicate(timeout=60.0)
     assert simulator.returncode == 130
     assert told.splitlines()[-1] == "interrupted"
-    assert _left_behind(str(tmp_path)) == []
+    assert _processes(str(tmp_path)) == {}
     assert (tmp_path / "out/logs/drone1.yaml").is_file()
 
 
@@ -146,7 +141,7 @@ def test_an_interrupted_fleet_lands_and_leaves_a_report_of_what_was_flown(tmp_pa
     assert 2.0 <= log.metadata.duration_s < 300.0
     np.testing.assert_allclose(log.position[0, :, 2], -1.5, atol=0.3)
     assert "interrupted" in (out / "report.html").read_text(encoding="utf-8")
-    assert _left_behind(str(tmp_path)) == []
+    assert _processes(str(tmp_path)) == {}
 
 
 def test_a_daemon_that_does_not_come_up_ends_the_flight_with_its_own_words(
@@ -159,17 +154,13 @@ def test_a_daemon_that_does_not_come_up_ends_the_flight_with_its_own_words(
     assert "nothing" in last
 
 
-def test_without_px4_it_says_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = ["sim", str(_scenario(tmp_path, drones=1)), "--autopilot", "px4", "--out", str(tmp_path / "out")]
-    wanted = "set it to PX4's SITL build folder, which holds bin/px4 and etc/\n"
-    monkeypatch.delenv("FLOCKD_PX4", raising=False)
-    assert main(command) == 69
-    assert capsys.readouterr().err.endswith(f"\nthere is no PX4: FLOCKD_PX4 is not set; {wanted}")
-    monkeypatch.setenv("FLOCKD_PX4", str(tmp_path))
-    assert main(command) == 69
-    assert capsys.readouterr().err.endswith(f"\nthere is no PX4 in {tmp_path}, which FLOCKD_PX4 names; {wanted}")
+@pytest.mark.parametrize(
+    ("environment", "says"),
+    [({}, "FLOCKD_PX4 is not set"), ({"FLOCKD_PX4": "/nowhere"}, "in /nowhere, which FLOCKD_PX4 names")],
+)
+def test_without_px4_it_says_what_to_do(environment: dict[str, str], says: str) -> None:
+    with pytest.raises(UnavailableError, match=f"there is no PX4.* {says}; set it to"):
+        px4_folder(environment)
 
 
 def test_the_ground_station_knows_where_everybody_truly_is() -> None:
@@ -181,18 +172,13 @@ def test_the_ground_station_knows_where_everybody_truly_is() -> None:
             free_port(), height_m=2.0, yaw_rad=np.pi / 2, home_deg=home_deg(np.array([3.0, 4.0])), truth_port=port
         ) as fake_autopilot,
     ):
-        until_s = time.monotonic() + 60.0
-        while not (station.is_connected(0) and station.is_armed(0)):
-            assert time.monotonic() < until_s
-            time.sleep(0.01)
+        until(lambda: station.is_connected(0) and station.is_armed(0))
         poses = station.poses()
         np.testing.assert_allclose(poses.position, [[3.0, 4.0, -2.0]], atol=0.01)
         np.testing.assert_allclose(poses.R_ned_body[0], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-6)
         assert station.mode_is(0, "LOITER")
         station.select(0, "LAND")
-        while not station.mode_is(0, "LAND"):
-            assert time.monotonic() < until_s
-            time.sleep(0.01)
+        until(lambda: station.mode_is(0, "LAND"))
         assert fake_autopilot.mode == "LAND"
 
 
@@ -203,19 +189,16 @@ def test_a_person_flies_one_drone_by_its_sticks_in_position_mode() -> None:
         FakeAutopilot(free_port(), height_m=2.0, yaw_rad=0.7, truth_port=port) as fake_autopilot,
     ):
         fake_autopilot.parameters |= {"MPC_VEL_MANUAL": FULL_STICK_M_S, "MAN_DEADZONE": 0.0}
-        until_s = time.monotonic() + 60.0
-        while not station.is_connected(0):
-            assert time.monotonic() < until_s
-            time.sleep(0.01)
+        until(lambda: station.is_connected(0))
         station.select(0, "POSCTL")
         east = np.array([0.0, 1.0])
-        while np.linalg.norm(fake_autopilot.state.velocity[:2] - east) > 0.05:
-            assert time.monotonic() < until_s
+
+        def flies_east() -> bool:
             station.steer(0, east)
-            time.sleep(0.02)
-        while np.linalg.norm(fake_autopilot.state.velocity) > 0.05:  # nobody moves the sticks any more
-            assert time.monotonic() < until_s
-            time.sleep(0.02)
+            return bool(np.linalg.norm(fake_autopilot.state.velocity[:2] - east) < 0.05)
+
+        until(flies_east)
+        until(lambda: np.linalg.norm(fake_autopilot.state.velocity) < 0.05)  # nobody moves the sticks any more
         assert fake_autopilot.state.position[2] == pytest.approx(-2.0, abs=0.05)
 
 

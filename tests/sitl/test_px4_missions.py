@@ -16,7 +16,7 @@ from flockd.cli.sim import DEFAULT_SPEED_FACTOR
 from flockd.core.data import data_path
 from flockd.sim.scenario import load_scenario
 from tests.sitl.sitl_run import PX4
-from tools.checks.px4_rows import MISSIONS, Flight, Row, fly, goals_reached, main
+from tools.checks.px4_rows import MISSIONS, Flight, Row, fly, goals_reached
 
 
 @PX4
@@ -71,11 +71,3 @@ def test_what_a_flight_has_to_keep(changes: dict[str, Any], kept: bool) -> None:
         "longest_step_s": 0.5, "modes": "drone1 OFFBOARD", "ended": "", "most_off_m_s": 0.15, "goals": "20, 0: 9.0 s",
     }  # fmt: skip
     assert Row(**{**row, **changes}).kept is kept
-
-
-def test_without_px4_the_program_of_rows_says_what_to_do(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("FLOCKD_PX4", str(tmp_path))
-    assert main([]) == 69
-    assert f"there is no PX4 in {tmp_path}, which FLOCKD_PX4 names; set it to" in capsys.readouterr().err
