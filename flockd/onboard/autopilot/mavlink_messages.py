@@ -113,8 +113,7 @@ class ReceivedMessages:
         """In the air, or seen there and not disarmed since: a landed state alone does not end a flight."""
         self._home_moved = False
         self._landed = False
-        self._text, self._text_s = StatusText(), -math.inf
-        self._begun_fields: Fields = {}
+        self._text = StatusText()
         self._texts: deque[tuple[float, str]] = deque(maxlen=TEXTS_KEPT)
         """Warnings and worse, with their times."""
         self._ground_range: RangeReading | None = None
@@ -139,12 +138,11 @@ class ReceivedMessages:
     def add(self, name: str, fields: Fields, time_s: float) -> None:
         """Takes a message by its name and fields, NaN as null, as MAVSDK decodes them to JSON, and when it came."""
         self._heard_s = time_s
-        if self._text.begun is not None and name != "STATUSTEXT" and time_s - self._text_s > CHUNKS_S:
-            self.add("STATUSTEXT", {**self._begun_fields, "chunk_seq": 1, "text": ""}, time_s)  # it does not go on
+        begun = self._text.begun
+        if begun is not None and name != "STATUSTEXT" and time_s - begun.time_s > CHUNKS_S:
+            self.add("STATUSTEXT", {**begun.fields, "chunk_seq": 1, "text": ""}, time_s)  # it does not go on
         if name == "STATUSTEXT":
-            self._begun_fields = fields
-            self._text_s = time_s
-            whole = self._text.joined(fields)
+            whole = self._text.joined(fields, time_s)
             if whole is None:
                 return
             fields = {**fields, "text": whole}
@@ -433,14 +431,15 @@ class StatusText:
 
     def __init__(self) -> None:
         self._id, self._chunks = 0, [""]
-        self.begun: str | None = None
+        self.begun: ReceivedMessage | None = None
         """A text of id 0 that may go on."""
 
-    def joined(self, fields: Fields) -> str | None:
+    def joined(self, fields: Fields, time_s: float) -> str | None:
         """The whole text with its last chunk, None before; where a chunk was lost, dots stand for it."""
         text = str(fields.get("text") or "").partition("\0")[0]
         number, chunk = fields.get("id") or 0, fields.get("chunk_seq") or 0
-        self.begun = text if number == chunk == 0 and len(text) >= TEXT_CHUNK else None
+        may_go_on = number == chunk == 0 and len(text) >= TEXT_CHUNK
+        self.begun = ReceivedMessage(time_s, fields) if may_go_on else None
         if number == chunk == 0 and self.begun is None:
             return text
         if number != self._id or chunk == 0:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from flockd.core.messages import Neighbour, PilotOutput, VehicleState
+from flockd.flight.geometry import euler_from_rotation
 from flockd.onboard.telemetry.topics import (
     CommandMessage,
     HealthMessage,
@@ -28,16 +29,15 @@ class TelemetrySink(Protocol):
 
 def publish_step(sink: TelemetrySink, drone: str, vehicle: VehicleState, output: PilotOutput) -> None:
     """Publishes all that one step of one drone's pilot has to tell."""
-    time_s, R, command, mission, obstacles = (
-        output.time_s, vehicle.R_ned_body, output.command, output.mission, output.obstacles
-    )  # fmt: skip
+    time_s, command, mission, obstacles = output.time_s, output.command, output.mission, output.obstacles
+    roll_deg, pitch_deg, yaw_deg = map(math.degrees, euler_from_rotation(vehicle.R_ned_body))
     position_ne = None if vehicle.position is None else vehicle.position.tolist()
     state = StateMessage(
         time_s=time_s,
         height_m=vehicle.height_m,
-        roll_deg=math.degrees(math.atan2(R[2, 1], R[2, 2])),
-        pitch_deg=math.degrees(math.asin(max(-1.0, min(1.0, -R[2, 0])))),
-        yaw_deg=math.degrees(math.atan2(R[1, 0], R[0, 0])),
+        roll_deg=roll_deg,
+        pitch_deg=pitch_deg,
+        yaw_deg=yaw_deg,
         velocity_ned=None if output.velocity is None else output.velocity.tolist(),
         position_ne=position_ne,
         home_deg=None if vehicle.home_deg is None else vehicle.home_deg.tolist(),

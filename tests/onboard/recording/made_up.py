@@ -25,7 +25,7 @@ from flockd.core.messages import (
     Wanted,
 )
 from flockd.onboard.recording import Recorder
-from flockd.onboard.recording.mcap_file import Damage, McapFile, Record, read_records
+from flockd.onboard.recording.mcap_file import Damage, McapFile, Note, Record, read_records
 from tests.make import filled
 
 WIDTH, HEIGHT = 160, 120
@@ -102,6 +102,13 @@ def rewritten(source: Path, target: Path, change: Callable[[Record], Record]) ->
             assert not isinstance(found, Damage)
             file.write(change(found))
     return target
+
+
+def with_facts(source: Path, target: Path, **facts: str) -> Path:
+    """A copy of a recording all of whose notes say this too."""
+    return rewritten(
+        source, target, lambda one: replace(one, facts={**one.facts, **facts}) if isinstance(one, Note) else one
+    )
 
 
 def record(

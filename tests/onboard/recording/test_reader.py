@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import re
 import struct
 import time
 import tracemalloc
@@ -23,11 +22,11 @@ from flockd.onboard.message_json import to_json
 from flockd.onboard.recording import Recorder, RecordingError
 from flockd.onboard.recording.editing import cut, recover
 from flockd.onboard.recording.export import export_images, export_tables
-from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, McapFile, Note, Record, read_records
+from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, McapFile, Record, read_records
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.recorder import FLUSH_EVERY_S
 from flockd.onboard.recording.streams import is_image
-from tests.onboard.recording.made_up import LEARNED, MadeUpPilot, drone_config, inputs, record, rewritten
+from tests.onboard.recording.made_up import LEARNED, MadeUpPilot, drone_config, inputs, record, rewritten, with_facts
 
 ROOT = Path(__file__).parents[3]
 
@@ -83,12 +82,8 @@ def test_what_the_pilot_began_with_of_the_others_size_comes_back_to_the_last_bit
     ],
 )
 def test_a_size_that_is_none_is_refused(text: str, fault: str, tmp_path: Path, whole: Path) -> None:
-    def change(one: Record) -> Record:
-        if isinstance(one, Note) and one.name == "flockd":
-            return replace(one, facts={**one.facts, "learned_size": text})
-        return one
-
-    assert refusal(rewritten(whole, tmp_path / "x.mcap", change)).startswith(f"its learned_size {fault}")
+    path = with_facts(whole, tmp_path / "x.mcap", learned_size=text)
+    assert refusal(path).startswith(f"its learned_size {fault}")
 
 
 def test_a_configuration_of_another_version_is_refused_with_the_version_that_reads_it(
@@ -97,14 +92,11 @@ def test_a_configuration_of_another_version_is_refused_with_the_version_that_rea
     def later(entry: Record) -> Record:
         if isinstance(entry, Inclosure):
             return replace(entry, data=json.dumps({**json.loads(entry.data), "colour": "red"}).encode())
-        if isinstance(entry, Note) and "version" in entry.facts:
-            return replace(entry, facts={**entry.facts, "version": "9.1"})
         return entry
 
-    assert re.fullmatch(
-        r"the configuration in it is not one of this flockd \(colour: .*\); use the flockd that wrote it, 9\.1",
-        refusal(rewritten(whole, tmp_path / "later.mcap", later)),
-    )
+    told = refusal(with_facts(rewritten(whole, tmp_path / "later.mcap", later), tmp_path / "x.mcap", version="9.1"))
+    assert told.startswith("the configuration in it is not one of this flockd (colour: ")
+    assert told.endswith("); use the flockd that wrote it, 9.1")
 
 
 def test_a_file_cut_off_anywhere_is_refused_or_played_as_far_as_it_goes(tmp_path: Path, whole: Path) -> None:
@@ -210,12 +202,7 @@ def test_an_image_that_claims_to_be_huge_is_not_decoded(tmp_path: Path, whole: P
 
 @pytest.mark.parametrize("number", ["NaN", "-1", "1e9", "9" * 5000, ""])
 def test_a_number_of_lost_steps_that_is_none_is_refused(tmp_path: Path, whole: Path, number: str) -> None:
-    def miscounted(entry: Record) -> Record:
-        if isinstance(entry, Note) and "lost" in entry.facts:
-            return replace(entry, facts={**entry.facts, "lost": number})
-        return entry
-
-    assert "which is no number" in refusal(rewritten(whole, tmp_path / "x.mcap", miscounted))
+    assert "which is no number" in refusal(with_facts(whole, tmp_path / "x.mcap", lost=number))
 
 
 def test_a_step_without_its_vehicle_is_the_last_of_a_killed_one_or_an_error(tmp_path: Path, whole: Path) -> None:
