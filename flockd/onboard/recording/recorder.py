@@ -124,24 +124,16 @@ class Recorder:
         self._lock = threading.Condition()
         self._held_bytes = 0
         self._steps = 0
-        self._lost = 0
+        self.lost = 0
+        """Steps and messages that were dropped."""
         self._told_full = False
         self._closed = False
-        self._failure: str | None = None
+        self.failure: str | None = None
+        """Why the recording ended before the flight; None while all is well."""
         self._time_s: float | None = None
         self._early: list[tuple[str, Mapping[str, object]]] = []
         self._thread = threading.Thread(target=self._write_all, name=f"recorder {drone}", daemon=True)
         self._thread.start()
-
-    @property
-    def lost(self) -> int:
-        """Steps and messages that were dropped."""
-        return self._lost
-
-    @property
-    def failure(self) -> str | None:
-        """Why the recording ended before the flight; None while all is well."""
-        return self._failure
 
     def step(
         self,
@@ -171,7 +163,7 @@ class Recorder:
     def drain(self) -> None:
         """Waits until all is written: only for those whose time stands still meanwhile, such as a simulator."""
         with self._lock:
-            self._lock.wait_for(lambda: self._held_bytes == 0 or self._failure is not None)
+            self._lock.wait_for(lambda: self._held_bytes == 0 or self.failure is not None)
 
     def close(self, timeout_s: float = 30.0) -> None:
         """Writes what is left and ends the file. What is not written by then is lost, and reported."""
@@ -194,8 +186,8 @@ class Recorder:
     def _put(self, size: int, write: Callable[[], None]) -> None:
         with self._lock:
             fits = self._held_bytes == 0 or self._held_bytes + size <= self._settings.queue_mb * _MB
-            if self._closed or self._failure is not None or not fits:
-                self._lost += 1
+            if self._closed or self.failure is not None or not fits:
+                self.lost += 1
                 news = not fits and not self._told_full
                 self._told_full = self._told_full or not fits
             else:
@@ -216,7 +208,7 @@ class Recorder:
         """The thread."""
         try:
             self._write_queue()
-            self._parts.finish({"steps": str(self._steps), "lost": str(self._lost)})
+            self._parts.finish({"steps": str(self._steps), "lost": str(self.lost)})
         except OSError as error:
             self._fail((error.strerror or str(error)).lower())
         except Exception as error:  # noqa: BLE001 - no fault of the recorder may end a flight, or hide
@@ -225,10 +217,10 @@ class Recorder:
     def _fail(self, reason: str) -> None:
         sentence = f"recording {self._parts.path}: {reason}; the recording ends here and the flight goes on"
         with self._lock:
-            self._failure = sentence
+            self.failure = sentence
             self._held_bytes = 0
             while not self._queue.empty():  # the thread that takes these has failed
-                self._lost += self._queue.get() is not None
+                self.lost += self._queue.get() is not None
             self._lock.notify_all()
         self._parts.abandon()
         self._on_event(sentence)

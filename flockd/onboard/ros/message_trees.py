@@ -1,8 +1,8 @@
 """ROS 2's standard messages as trees of plain values, built from flockd's. Pure: neither a clock nor ROS is needed.
 
-A tree is a mapping from a message's fields to numbers, text, bytes, arrays, trees and lists of trees. Adapters make of
-it a message of `rclpy` for the air (`ros_node.py`), or one of `rosbags` for a bag. Arguments are in flockd's axes, and
-what comes out is in those of REP 103.
+A tree is a mapping from a message's fields to numbers, text, bytes, arrays, trees and lists of trees; a field that it
+lacks is 0, as `rclpy` makes messages (`ros_node.py`). Arguments are in flockd's axes, and what comes out is in those of
+REP 103.
 """
 
 from __future__ import annotations
@@ -98,37 +98,29 @@ def turn(R: FloatArray) -> Tree:
     return dict(zip("xyzw", quaternion_of(R).tolist(), strict=True))
 
 
-def odometry(
-    time_ns: int, names: Names, position_ned: FloatArray, R_ned_frd: FloatArray, velocity_ned: FloatArray | None
-) -> Tree:
-    """Where the body is from home, and its velocity in its own axes, as the message's definition asks for.
+def state_odometry(time_ns: int, names: Names, state: StateMessage) -> Tree | None:
+    """Of telemetry's `state`: where the body is from home, and its velocity in its own axes, as the message's
+    definition asks for. None where the drone does not know its position.
 
     Covariances are zero, which says that they are not known; so is a velocity that is not known, with a variance of -1
     to tell it from a standstill.
     """
-    known = velocity_ned is not None
+    place, velocity_ned = _known(state["position_ne"], 2), _known(state["velocity_ned"], 3)
+    if place is None or not _finite(state["height_m"]):
+        return None
+    position_ned, R_ned_frd = np.array([*place, -state["height_m"]]), attitude_of_state(state)
     body = R_ned_frd.T @ velocity_ned if velocity_ned is not None else np.zeros(3)
     return {
         "header": header(time_ns, names.odom),
         "child_frame_id": names.base_link,
         "pose": {
             "pose": {"position": vector(enu_of_ned(position_ned)), "orientation": turn(attitude_in_ros(R_ned_frd))},
-            "covariance": np.zeros(36),
         },
         "twist": {
-            "twist": {"linear": vector(flu_of_frd(body)), "angular": vector((0.0, 0.0, 0.0))},
-            "covariance": np.zeros(36) if known else np.concatenate([[-1.0], np.zeros(35)]),
+            "twist": {"linear": vector(flu_of_frd(body))},
+            "covariance": np.array([0.0 if velocity_ned is not None else -1.0, *np.zeros(35)]),
         },
     }
-
-
-def state_odometry(time_ns: int, names: Names, state: StateMessage) -> Tree | None:
-    """Of telemetry's `state`; None where the drone does not know its position."""
-    place, velocity = _known(state["position_ne"], 2), _known(state["velocity_ned"], 3)
-    if place is None or not _finite(state["height_m"]):
-        return None
-    position_ned = np.array([*place, -state["height_m"]])
-    return odometry(time_ns, names, position_ned, attitude_of_state(state), velocity)
 
 
 def attitude_of_state(state: StateMessage) -> FloatArray:
@@ -176,7 +168,6 @@ def tracks(time_ns: int, names: Names, neighbours: Sequence[NeighbourMessage]) -
         "height": 1,
         "width": len(used),
         "fields": fields,
-        "is_bigendian": False,
         "point_step": _POINT.itemsize,
         "row_step": _POINT.itemsize * len(used),
         "data": points.tobytes(),
@@ -220,9 +211,6 @@ def scan(time_ns: int, names: Names, obstacles: ObstaclesMessage) -> Tree | None
         "angle_min": -math.pi,
         "angle_max": -math.pi + (count - 1) * step,
         "angle_increment": step,
-        "time_increment": 0.0,
-        "scan_time": 0.0,
-        "range_min": 0.0,
         "range_max": farthest,
         "ranges": np.where(measured, ranges, free).astype(np.float32),
         "intensities": seen.astype(np.float32),
@@ -249,9 +237,6 @@ def camera_info(time_ns: int, frame: str, camera: CameraConfig, size_px: tuple[i
         "k": np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
         "r": np.eye(3).ravel(),
         "p": np.array([fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
-        "binning_x": 0,
-        "binning_y": 0,
-        "roi": {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False},
     }
 
 

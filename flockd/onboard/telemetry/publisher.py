@@ -54,7 +54,8 @@ class ZenohTelemetry(SessionOwner):
         self._publishers: dict[tuple[str, str], zenoh.Publisher] = {}
         self._kept: dict[str, list[Declared]] = {}
         """What is declared of each drone."""
-        self._lost = 0
+        self.lost = 0
+        """Messages that zenoh refused to take; congestion on the way is not known here."""
         self.identity = secrets.token_hex(4)
         """Of this process's drones, beside their names, which two drones may share by mistake."""
         # Memory that another process shares counts as the drone's, and has no limit of its own.
@@ -68,11 +69,6 @@ class ZenohTelemetry(SessionOwner):
             max_peers=MAX_PEERS,
         )
 
-    @property
-    def lost(self) -> int:
-        """Messages that zenoh refused to take; congestion on the way is not known here."""
-        return self._lost
-
     def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
         """Publishes one message; a number that is not finite becomes null.
 
@@ -82,7 +78,7 @@ class ZenohTelemetry(SessionOwner):
         try:
             self._publisher(drone, topic).put(payload)
         except zenoh.ZError:  # telemetry never ends a flight
-            self._lost += 1
+            self.lost += 1
 
     def show_alive(self, drone: str) -> None:
         """Publishes that a drone is alive for as long as this session is, and tells its clocks; no daemon to ask."""
