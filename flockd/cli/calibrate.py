@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.options import loaded, opened, refuse_overwriting
+from flockd.cli.options import camera_of, loaded, opened, refuse_overwriting
 from flockd.cli.output import complain, progress, say_facts, say_result
 from flockd.cli.parser import Commands, Parser, commands_of, flag, option, positive_count, positive_number, size
 from flockd.core.choices import LENS_MODELS
 from flockd.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from flockd.core.config import DroneConfig
     from flockd.ground.calibration.board import BoardSpec
     from flockd.ground.calibration.image_sources import ImageStream
 
@@ -34,7 +32,6 @@ def add(commands: Commands) -> None:
 
 
 def _add_shared(parser: Parser) -> None:
-    """Adds what both commands have."""
     option(parser, "--out FILE", "where the result goes (CAMERA.yaml or rig.yaml)", Path)
     flag(parser, "--force", "overwrite what is there")
     flag(parser, "--json", "print the result as JSON")
@@ -49,16 +46,6 @@ def _board_of(args: argparse.Namespace) -> BoardSpec:
         return BoardSpec(columns, rows, args.square_mm / 1000.0)
     except CalibrationError as error:
         raise UsageError(str(error)) from None
-
-
-@contextmanager
-def _ended_by_ctrl_c(live: bool) -> Iterator[None]:
-    """What was seen until then is enough."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        if not live:
-            raise
 
 
 def _source_name(args: argparse.Namespace) -> str:
@@ -109,8 +96,12 @@ def _camera(args: argparse.Namespace) -> int:
     name, images = _images(args, lambda: is_enough(collector))
     out = args.out or Path(f"{name}.yaml")
     refuse_overwriting(args, out)
-    with progress("detecting the board", "images") as on_image, _ended_by_ctrl_c(images.live):
-        collect_views(images, collector, on_image, complain)
+    with progress("detecting the board", "images") as on_image:
+        try:
+            collect_views(images, collector, on_image, complain)
+        except KeyboardInterrupt:
+            if not images.live:  # else what was seen until then is enough
+                raise
     lenses = fit_lenses(collector, args.model, _source_name(args))
     lens = simplest_that_fits(lenses)
     measured = measured_today(
@@ -160,13 +151,13 @@ def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, 
     if path is None:
         if config is None:
             raise UsageError("no SOURCE was given; name images, a recording or a device, or --config for its camera")
-        name = _name_in(config, args, str(args.config))
+        name = camera_of(config, args.camera, args.config)
         return name, image_sources.from_camera(config, str(args.config), name, enough)
     if path.suffix.lower() == ".mcap":
         recording = opened(path)
-        name = _name_in(recording.config, args, str(path))
+        name = camera_of(recording.config, args.camera, path)
         return name, image_sources.from_recording(recording, name, args.every)
-    name = args.camera or "camera" if config is None else _name_in(config, args, str(args.config))
+    name = args.camera or "camera" if config is None else camera_of(config, args.camera, args.config)
     if not re.fullmatch("[a-z0-9_-]+", name):
         raise UsageError(f"--camera {name}: a camera's name has small letters, digits, _ and - only")
     if path.is_dir():
@@ -175,15 +166,6 @@ def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, 
     if path.exists():
         fault = "is no folder or recording; name one, or for a live camera the drone with --config"
     raise UsageError(f"{path}: {fault}")
-
-
-def _name_in(config: DroneConfig, args: argparse.Namespace, where: str) -> str:
-    names = [camera.name for camera in config.rig.cameras]
-    name: str | None = args.camera or (names[0] if len(names) == 1 else None)
-    if name is None or name not in names:
-        said = "has several cameras" if name is None else f"has no camera {name!r}"
-        raise UsageError(f"{where}: {said}; choose with --camera from {', '.join(names)}")
-    return name
 
 
 def _add_rig(commands: Commands) -> None:

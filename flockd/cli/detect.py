@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.options import loaded
+from flockd.cli.options import camera_of, loaded
 from flockd.cli.output import complain, progress, say_facts, say_table
 from flockd.cli.parser import Commands, flag, number, option, positive_count, positive_number
 from flockd.core.errors import ExitCode, UsageError
@@ -128,13 +128,7 @@ def _camera_of_config(args: argparse.Namespace, drone: DroneConfig | None) -> Ca
         raise UsageError("--camera is one of --config's, in place of --fov; name the drone's file alone")
     if drone is None or args.fov is not None:
         return None
-    cameras = build_rig(drone.rig).cameras
-    if args.camera is None and len(cameras) > 1:
-        raise UsageError(f"{args.config}: has cameras {', '.join(cameras)}; choose one with --camera")
-    name = args.camera or next(iter(cameras))
-    if name not in cameras:
-        raise UsageError(f"{args.config}: has no camera {name!r}; choose --camera from {', '.join(cameras)}")
-    return cameras[name].camera
+    return build_rig(drone.rig).cameras[camera_of(drone, args.camera, args.config)].camera
 
 
 def _perception(drone: DroneConfig | None, drone_size_m: float | None) -> PerceptionConfig:

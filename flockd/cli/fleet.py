@@ -23,7 +23,6 @@ from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
     from flockd.core.messages import MissionOrder
-    from flockd.fleet.live_fleet import LiveFleet
     from flockd.fleet.page.page_server import PageServer
     from flockd.fleet.watcher import FleetWatcher
 
@@ -234,6 +233,8 @@ def _show_page(args: argparse.Namespace) -> int:
     import aiohttp.web  # noqa: F401 - before anything is opened: it is of an extra
 
     from flockd.fleet.live_fleet import LiveFleet
+    from flockd.fleet.page.page_access import PageAccess, lasting_key
+    from flockd.fleet.page.page_server import PageServer
     from flockd.fleet.watcher import FleetWatcher
 
     listen, connect = endpoints(args)
@@ -242,18 +243,11 @@ def _show_page(args: argparse.Namespace) -> int:
         LiveFleet(watcher) as source,
         suppress(KeyboardInterrupt),
     ):
-        asyncio.run(_serve(args, source))
+        access = PageAccess(None if args.key_file is None else lasting_key(args.key_file))
+        page = PageServer(source, access, may_command=not args.watch_only, operator=args.operator)
+        announced = functools.partial(announce, args, access.key)
+        asyncio.run(serve_page(page, args.server_address, args.port, announced))
     return ExitCode.DONE
-
-
-async def _serve(args: argparse.Namespace, source: LiveFleet) -> None:
-    from flockd.fleet.page.page_access import PageAccess, lasting_key
-    from flockd.fleet.page.page_server import PageServer
-
-    access = PageAccess(None if args.key_file is None else lasting_key(args.key_file))
-    page = PageServer(source, access, may_command=not args.watch_only, operator=args.operator)
-
-    await serve_page(page, args.server_address, args.port, lambda port: announce(args, port, access.key))
 
 
 async def serve_page(page: PageServer, address: str, port: int, served: Callable[[int], None]) -> None:
@@ -281,7 +275,7 @@ async def serve_page(page: PageServer, address: str, port: int, served: Callable
         await runner.cleanup()
 
 
-def announce(args: argparse.Namespace, port: int, key: str) -> None:
+def announce(args: argparse.Namespace, key: str, port: int) -> None:
     """Says where it is served, once it is, and where other computers reach it, what they may do."""
     where = ipaddress.ip_address(args.server_address)
     # For all addresses of this computer, the one at which it reaches itself.

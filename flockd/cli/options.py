@@ -149,6 +149,16 @@ def loaded(file: Path | None) -> DroneConfig | None:
     return config.drone if isinstance(config, ScenarioConfig) else config
 
 
+def camera_of(config: DroneConfig, wanted: str | None, where: object) -> str:
+    """The camera that is named, or the only one there is. Raises UsageError, which names ``where``."""
+    names = [camera.name for camera in config.rig.cameras]
+    name = wanted or (names[0] if len(names) == 1 else None)
+    if name is None or name not in names:
+        said = "has several cameras" if name is None else f"has no camera {name!r}"
+        raise UsageError(f"{where}: {said}; choose with --camera from {', '.join(names)}")
+    return name
+
+
 def refuse(args: argparse.Namespace, options: Sequence[str], why: str) -> None:
     """Raises UsageError where one of these options is given."""
     for name in options:

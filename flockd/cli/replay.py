@@ -260,7 +260,10 @@ def _run_dataset(args: argparse.Namespace) -> int:
     if given is not None and (scale := given.perception.scale) != "network":
         complain(f"{args.config}: perception.scale: {scale} needs an autopilot; of a dataset it is the network's")
     with progress("replaying", "pairs") as show_progress:
-        pairs = replay_dataset(dataset, config, stride, depth, show_progress)
+        pairs = []
+        for pair in replay_dataset(dataset, config, stride, depth):
+            pairs.append(pair)
+            show_progress(len(pairs), len(dataset) - stride)
     result = {**dataset_result(pairs), "stride": stride, "depth": depth, "flow": config.perception.flow}
     lines = [f"not estimated: {p['from']} to {p['to']}: {p['reason']}" for p in result["pairs"] if not p["estimated"]]
     say_facts(args, result if args.json else {**result, "pairs": len(pairs)}, *lines)

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -125,23 +126,17 @@ class FleetWatcher(SessionOwner):
         self.forgotten = 0
         """Names that made room for others."""
         self._events: deque[HeardEvent] = deque(maxlen=MAX_EVENTS)
-        self._session = open_session("telemetry", listen, connect, settings=settings, max_message_bytes=MAX_LINK_BYTES)
+        connected = partial(open_session, settings=settings, max_message_bytes=MAX_LINK_BYTES)
+        self._session = connected("telemetry", listen, connect)
         # Drones that connect here have one connection; to those that this computer connects to, orders have their own.
-        own = bool(connect) and not listen
-        self._orders = (
-            open_session("orders", [], connect, settings=settings, max_message_bytes=MAX_LINK_BYTES)
-            if own
-            else self._session
-        )
+        self._orders = connected("orders", [], connect) if connect and not listen else self._session
         self.queries = DroneQueries(self._session, self._orders)
         """To the same drones."""
         drones = f"{PREFIX}/{'*' if fleet is None else checked_name(fleet)}/*"
-        self._subscribers = [
-            self._session.declare_subscriber(f"{drones}/{topic}", self._take_message) for topic in TOPICS
-        ]
-        self._tokens = self._session.liveliness().declare_subscriber(
-            f"{drones}/alive/**", self._take_token, history=True
-        )
+        heard = self._session.declare_subscriber
+        self._subscribers = [heard(f"{drones}/{topic}", self._take_message) for topic in TOPICS]
+        tokens = self._session.liveliness()
+        self._tokens = tokens.declare_subscriber(f"{drones}/alive/**", self._take_token, history=True)
 
     def queries_under(self, prefix: str) -> DroneQueries:
         """To what replies as drones do, under other keys."""

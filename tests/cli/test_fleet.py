@@ -115,7 +115,7 @@ def test_an_address_that_others_reach_comes_with_a_warning(
     address: str, shown: str, warns: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     args = Namespace(server_address=address, connect=["tcp/127.0.0.1:1"], drones_at=None)
-    announce(args, 80, "k")
+    announce(args, "k", 80)
     out, err = capsys.readouterr()
     assert out.splitlines()[0] == f"the fleet page is at http://{shown}:80/?key=k"
     assert ("travels unencrypted" in err) == ("on other computers" in out) == warns

@@ -19,7 +19,7 @@ import numpy as np
 
 from flockd import __version__
 from flockd.core.config import load_drone
-from flockd.core.config.telemetry import OperatorCommand
+from flockd.core.config.drone import OperatorCommand
 from flockd.core.data import data_path
 from flockd.core.messages import (
     SECTORS,

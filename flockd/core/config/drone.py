@@ -12,20 +12,58 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from flockd.core.choices import OwnVelocitySource
+from flockd.core.choices import ImageFormat, OwnVelocitySource
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.avoidance import ObstacleParameters
-from flockd.core.config.base import Name, Section, refuse
+from flockd.core.config.base import Endpoint, Name, Positive, Section, refuse
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.config.geometry import GeometryParameters
 from flockd.core.config.mission import MissionParameters, mission_faults
 from flockd.core.config.perception import PerceptionConfig
-from flockd.core.config.recording import RecordingConfig
 from flockd.core.config.rig import RigConfig
 from flockd.core.config.safety import SafetyParameters
 from flockd.core.config.source import SourceParameters
-from flockd.core.config.telemetry import TelemetryParameters
 from flockd.core.config.tracking import TrackingParameters
+
+
+class RecordingConfig(Section):
+    """How a flight is written down, where it is."""
+
+    images: ImageFormat = "png"
+    """`png` loses nothing: only then does a replay equal the flight."""
+    jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 90
+    queue_mb: Positive = 64.0
+    """What waits for the disk; beyond it steps are dropped."""
+    file_mb: Positive = 2000.0
+    """Then the recording goes on in a new file."""
+    quota_mb: Positive = 20000.0
+    """Limit for all recordings of the drone in one folder together: the oldest are deleted to make room. Those of the
+    flight before stay, and do not count."""
+
+    @model_validator(mode="after")
+    def _a_file_fits(self) -> Self:
+        if self.file_mb > self.quota_mb:
+            raise ValueError(f"a file of {self.file_mb:g} MB does not fit into {self.quota_mb:g} MB; raise quota_mb")
+        return self
+
+
+OperatorCommand = Literal["hold", "land", "resume", "goto", "velocity"]
+
+
+class TelemetryParameters(Section):
+    """Who may watch this drone, and what they may ask of it."""
+
+    fleet: Name = "fleet"
+    listen: tuple[Endpoint, ...] = ("tcp/127.0.0.1:7447",)
+    """zenoh endpoints at which watchers find this drone, as in `tcp/0.0.0.0:7447`."""
+    connect: tuple[Endpoint, ...] = ()
+    """zenoh endpoints, of a router or of `flockd status --listen`, that this drone tries to reach for ever."""
+    zenoh_config: str | None = None
+    """A file of zenoh's own settings to begin with, for TLS and access control; see `config/zenoh_tls.json5`. A
+    relative path counts from the folder of the configuration file."""
+    commands: tuple[OperatorCommand, ...] = ()
+    """What operators may ask over telemetry; by default nothing. `goto` and `velocity` change the drone's mission until
+    the flight ends."""
 
 
 class DroneConfig(Section):

@@ -21,7 +21,7 @@ import numpy as np
 
 from flockd import __version__
 from flockd.core.config import DroneConfig
-from flockd.core.config.recording import RecordingConfig
+from flockd.core.config.drone import RecordingConfig
 from flockd.core.config.rig import RigConfig
 from flockd.core.messages import Frame, FrameSet, LearnedSize, MissionOrder, PilotOutput, VehicleState
 from flockd.core.secrets import masked

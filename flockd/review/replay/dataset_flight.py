@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -59,18 +59,6 @@ def dataset_config(dataset: Dataset, config: DroneConfig | None, depth: Depth, f
     changes = {"scale": "network", "flow": flow or config.perception.flow}
     update = {"rig": rig, "source": None, "perception": config.perception.model_copy(update=changes)}
     return config.model_copy(update=update)
-
-
-def replay_dataset(
-    dataset: Dataset, config: DroneConfig, stride: int, depth: Depth, progress: Callable[[int, int], None]
-) -> list[Pair]:
-    """The motion from each frame ``i`` to frame ``i + stride``. Raises DatasetError, ModelError."""
-    pairs: list[Pair] = []
-    learned = load_networks(config.perception)
-    for pair in fly_pairs(dataset, config, learned, stride=stride, recorded_depth=depth == "recorded"):
-        pairs.append(pair)
-        progress(len(pairs), len(dataset) - stride)
-    return pairs
 
 
 def dataset_result(pairs: Sequence[Pair]) -> dict[str, Any]:
@@ -165,22 +153,20 @@ class RecordedDepth(OneByOne):
         return self._learned.ranges(crops)
 
 
-def fly_pairs(
-    dataset: Dataset, config: DroneConfig, learned: ImageNetworks, *, stride: int, recorded_depth: bool
-) -> Iterator[Pair]:
+def replay_dataset(dataset: Dataset, config: DroneConfig, stride: int, depth: Depth) -> Iterator[Pair]:
     """Each frame i with frame i + ``stride``, in order, as a pilot with this configuration sees them.
 
     ``config`` has the dataset's camera as its only one. As many pilots as the stride take the frames in turns, so that
     each flies with every frame once. Nobody knows the autopilot's attitude and height: with `perception.scale: network`
-    the own motion needs none. Raises DatasetError at a frame that is missing or damaged.
+    the own motion needs none. Raises DatasetError at a frame that is missing or damaged, ModelError.
     """
     camera = build_rig(config.rig).cameras[dataset.camera.name]
     mount = camera.T_body_camera
-    perceiver = RecordedDepth(learned)
+    perceiver = RecordedDepth(load_networks(config.perception))
     pilots = [FlockPilot(config, perceiver) for _ in range(stride)]
     past: deque[tuple[DatasetFrame, PilotOutput]] = deque(maxlen=stride)
-    for moment, image, depth in dataset.frames(with_depth=recorded_depth):
-        perceiver.show(depth)
+    for moment, image, seen in dataset.frames(with_depth=depth == "recorded"):
+        perceiver.show(seen)
         frames = {camera.name: Frame(camera.name, image, moment.time_s, moment.index)}
         if float(image.std(axis=(0, 1)).max()) < _FLAT_DEVIATION:
             frames = {}  # as cameras' images of one colour are left out in flight

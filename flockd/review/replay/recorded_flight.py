@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from flockd.core.config import DroneConfig
-from flockd.core.config.recording import RecordingConfig
+from flockd.core.config.drone import RecordingConfig
 from flockd.flight.inference.hashes import model_hashes
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon import load_side_by_side

@@ -81,14 +81,9 @@ def colour_of(number: int, count: int) -> str:
     return to_hex(colormaps["viridis"](0.2 + 0.65 * number / (count - 1)))
 
 
-def drone_name(number: int) -> str:
-    """Drones count from 0 in the log and from 1 in the report, as in the paper."""
-    return f"drone {number + 1}"
-
-
 def drone_handles(drones: int) -> list[Line2D]:
-    """Of a legend: each drone's line."""
-    return [Line2D([], [], color=colour_of(i, drones), label=drone_name(i)) for i in range(drones)]
+    """Of a legend: each drone's line. Drones count from 0 in the log and from 1 in the report, as in the paper."""
+    return [Line2D([], [], color=colour_of(i, drones), label=f"drone {i + 1}") for i in range(drones)]
 
 
 RIG_ORDER = ("left", "front", "right", "back")

@@ -12,8 +12,8 @@ from typing import Self
 import yaml
 
 from flockd.core.config import DroneConfig
+from flockd.core.config.drone import RecordingConfig
 from flockd.core.config.mission import MissionParameters
-from flockd.core.config.recording import RecordingConfig
 from flockd.core.errors import ConfigError, ConfigProblem
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.sitl.autopilots import Ports

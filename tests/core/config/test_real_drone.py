@@ -14,15 +14,9 @@ from flockd.core.config import DroneConfig, load_drone, load_real_drone
 from flockd.core.config.real_drone import PROVEN_M_S
 from flockd.core.errors import ConfigError
 from flockd.ground.doctor.setup_checks import check_limits
+from tests.core.config.test_loader import CONFIG
+from tests.core.config.test_loader import DRONE as RIG
 
-CONFIG = Path(__file__).parents[3] / "config"
-RIG = """\
-rig:
-  cameras:
-    - name: front
-      size_px: [640, 480]
-      intrinsics: {fx: 320, fy: 320.0, cx: 320, cy: 240}
-"""
 AUTOPILOT = "autopilot: {max_velocity_trim_m_s: 0.5}\n"
 FLOCK = range(1, 6)
 SEPARATION_M = 3.0

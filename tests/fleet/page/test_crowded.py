@@ -11,8 +11,7 @@ from aiohttp import web
 
 from flockd.fleet.drone_rows import Row
 from flockd.fleet.page.page_access import MAX_STRANGERS, STRANGER_S, PageAccess, PageConnections
-from flockd.fleet.page.page_pictures import EVERY_S, SILENT_S, PagePictures
-from flockd.fleet.page.page_server import PageServer
+from flockd.fleet.page.page_server import EVERY_S, SILENT_S, PagePictures, PageServer
 from flockd.onboard.telemetry.topics import AnswerMessage
 from tests.fleet.page.test_access import Asked, opened, served
 

@@ -10,7 +10,6 @@ import pytest
 from flockd.core.choices import HeightSource
 from flockd.core.config import DroneConfig, load_drone
 from flockd.core.config.autopilot import AutopilotParameters
-from flockd.core.config.safety import GateParameters, SafetyParameters
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.core.messages import RangeReading
@@ -31,6 +30,7 @@ from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.sim.scenario import RangeFinderConfig
 from flockd.sim.sitl.ports import free_port
+from tests import make
 from tests.onboard.autopilot.conftest import HEARTBEAT_S
 
 GOOD: dict[str, float | int] = {
@@ -49,7 +49,7 @@ QUESTIONS = {511, 512, 401}
 
 def _config(port: int) -> DroneConfig:
     quadrotor = load_drone(data_path("config") / "quadrotor.yaml")
-    return quadrotor.model_copy(update={"autopilot": AutopilotParameters(address=f"udpin://127.0.0.1:{port}")})
+    return make.changed(quadrotor, autopilot=AutopilotParameters(address=f"udpin://127.0.0.1:{port}"))
 
 
 def _examined(port: int) -> list[Finding]:
@@ -154,17 +154,14 @@ def test_what_is_made_of_each_value(name: str, value: float, level: Level) -> No
 
 
 def test_a_fence_with_corners_reaches_as_far_as_the_farthest_inside_the_circle() -> None:
-    gate = GateParameters(fence_radius_m=None, fence_corners_m=((30.0, 40.0), (0.0, 10.0), (-10.0, 0.0)))
-    config = _config(14540).model_copy(update={"safety": SafetyParameters(gate=gate)})
-    assert "50 m" in judge_parameter("GF_MAX_HOR_DIST", 49.0, config).measured
-    free = SafetyParameters(gate=GateParameters(fence_radius_m=None))
-    endless = judge_parameter("GF_MAX_HOR_DIST", 0.0, config.model_copy(update={"safety": free}))
+    free = make.changed(_config(14540), safety__gate__fence_radius_m=None)
+    corners = make.changed(free, safety__gate__fence_corners_m=((30.0, 40.0), (0.0, 10.0), (-10.0, 0.0)))
+    assert "50 m" in judge_parameter("GF_MAX_HOR_DIST", 49.0, corners).measured
+    endless = judge_parameter("GF_MAX_HOR_DIST", 0.0, free)
     assert endless.fix == "set GF_MAX_HOR_DIST to where it must never fly"
 
 
-SENDS = _config(14540).model_copy(
-    update={"autopilot": AutopilotParameters(address="udpin://127.0.0.1:14540", obstacle_distance=True)}
-)
+SENDS = make.changed(_config(14540), autopilot__obstacle_distance=True)
 AT_30_HZ = {25: tuple(k / 30.0 for k in range(46))}
 GOOD_RANGE = RangeReading(1.5, 0.12, min_m=0.15, max_m=20.0, quality=1.0)
 
@@ -172,9 +169,7 @@ GOOD_RANGE = RangeReading(1.5, 0.12, min_m=0.15, max_m=20.0, quality=1.0)
 def _ranges(
     reading: RangeReading | None, arrivals: dict[int, tuple[float, ...]] | None = None, height: HeightSource = "best"
 ) -> list[Finding]:
-    drone = _config(14540)
-    perception = drone.perception.model_copy(update={"height": height})
-    return judge_range_finder(reading, arrivals or {}, drone.model_copy(update={"perception": perception}))
+    return judge_range_finder(reading, arrivals or {}, make.changed(_config(14540), perception__height=height))
 
 
 @pytest.mark.parametrize(

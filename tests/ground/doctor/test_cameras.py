@@ -27,6 +27,7 @@ from flockd.ground.doctor.camera_checks import check_cameras, coverage, lens_pro
 from flockd.onboard.sources import FramePublisher
 from flockd.onboard.sources.device_source import Devices
 from flockd.sim.sitl.ports import free_endpoint
+from tests import make
 from tests.ground.filming import JPEGS, RATE_HZ, filming
 from tests.onboard.sources.camera_images import SIZE, jpeg, scene
 from tests.onboard.sources.fake_kernel import FLAG_CLOCK_UNKNOWN, FLAG_ERROR, FakeCamera, FakeKernel
@@ -40,13 +41,12 @@ BY_HAND = (
 
 
 def _config(*names: str, controls: Sequence[ControlParameters] = BY_HAND) -> DroneConfig:
-    lens = IntrinsicsConfig(fx=300.0, fy=300.0, cx=320.0, cy=240.0)
-    rig = RigConfig(cameras=tuple(CameraConfig(name=name, size_px=SIZE, intrinsics=lens) for name in names))
+    rig = [make.camera(name, SIZE, 300.0) for name in names]
     devices = tuple(
         CameraDeviceParameters(name=name, device=f"/dev/{name}", rate_hz=RATE_HZ, controls=tuple(controls))
         for name in names
     )
-    return DroneConfig(rig=rig, source=SourceParameters(kind="v4l2", cameras=devices))
+    return make.drone(*rig, source=SourceParameters(kind="v4l2", cameras=devices))
 
 
 def _examined(
@@ -162,11 +162,10 @@ def test_a_driver_that_hangs_is_reported_and_the_other_camera_is_seen() -> None:
 
 def test_a_pipeline_is_watched_as_a_device_is() -> None:
     fake = (sys.executable, "-IS", str(Path(__file__).parents[2] / "onboard" / "sources" / "fake_pipeline.py"))
-    lens = IntrinsicsConfig(model="wide_angle", fx=30.0, fy=30.0, cx=32.0, cy=24.0)
     names = {"front": "caps:64x48 500 stall", "back": "fail:has_failed_(no_such_sensor)"}
-    rig = RigConfig(cameras=tuple(CameraConfig(name=name, size_px=(64, 48), intrinsics=lens) for name in names))
     cameras = tuple(CameraDeviceParameters(name=n, pipeline=text, rate_hz=40.0) for n, text in names.items())
-    config = DroneConfig(rig=rig, source=SourceParameters(kind="gstreamer", cameras=cameras))
+    source = SourceParameters(kind="gstreamer", cameras=cameras)
+    config = make.drone(*(make.camera(name) for name in names), source=source)
     found = _examined(config, Devices(command=fake), 10.0)
     told = " ".join(finding.measured for finding in found["camera front"])
     assert "images a second" in told
@@ -177,10 +176,8 @@ def test_a_pipeline_is_watched_as_a_device_is() -> None:
 def test_frames_of_another_program() -> None:
     """Those that fit, those of another size, and none at all."""
     endpoint, ended, width = free_endpoint(), threading.Event(), 64
-    lens = IntrinsicsConfig(fx=32.0, fy=32.0, cx=32.0, cy=24.0)
-    rig = RigConfig(cameras=(CameraConfig(name="front", size_px=(64, 48), intrinsics=lens),))
     where = SharedMemoryParameters(drone="tiny", connect=(endpoint,), rate_hz=20.0)
-    config = DroneConfig(rig=rig, source=SourceParameters(kind="shared_memory", shared_memory=where))
+    config = make.drone(source=SourceParameters(kind="shared_memory", shared_memory=where))
     publisher = FramePublisher(listen=[endpoint])
 
     def publish() -> None:

@@ -8,17 +8,16 @@ import pytest
 
 from flockd.core.config.drone import DroneConfig
 from flockd.core.config.perception import PerceptionConfig
-from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.messages import PilotOutput
 from flockd.ground.doctor import Level
 from flockd.ground.doctor.model_checks import STEPS, check_models, judge_steps, meadow, time_steps
+from tests import make
 from tests.flight.inference.conftest import copies
 from tests.onboard.daemon.aboard import TinyPerceiver
 
 __all__ = ["copies"]
 
-LENS = IntrinsicsConfig(fx=32.0, fy=32.0, cx=32.0, cy=24.0)
-TINY = DroneConfig(rig=RigConfig(cameras=(CameraConfig(name="front", size_px=(64, 48), intrinsics=LENS),)))
+TINY = make.drone()
 
 
 def _with(**perception: object) -> DroneConfig:

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from flockd.core.config import DroneConfig, load_drone
+from flockd.core.config.drone import TelemetryParameters
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
-from flockd.core.config.telemetry import TelemetryParameters
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.ground.doctor import Finding, Level
@@ -16,7 +16,7 @@ from flockd.ground.doctor.setup_checks import check_fleet, check_instance, check
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.sim.sitl.ports import free_endpoint
-from tests.onboard.daemon.aboard import config_for
+from tests import make
 
 QUADROTOR = load_drone(data_path("config") / "quadrotor.yaml")
 
@@ -25,7 +25,7 @@ def _fleet(listen_s: float, **endpoints: str) -> Finding:
     """Of a drone that listens and connects there."""
     listen, connect = ((endpoints[key],) if key in endpoints else () for key in ("listen", "connect"))
     telemetry = TelemetryParameters(fleet="meadow", listen=listen, connect=connect)
-    (finding,) = check_fleet(QUADROTOR.model_copy(update={"telemetry": telemetry}), listen_s)
+    (finding,) = check_fleet(make.changed(QUADROTOR, telemetry=telemetry), listen_s)
     return finding
 
 
@@ -64,11 +64,8 @@ OPEN, CLOSED = "rtspsrc location=rtsp://10.0.0.7/s", "rtspsrc location=rtsp://an
 
 
 def _with_pipeline(pipeline: str, settings: Path | None = None) -> DroneConfig:
-    config = config_for(1, "tcp/127.0.0.1:1", "tcp/127.0.0.1:2")
-    camera = CameraDeviceParameters(name="front", pipeline=pipeline)
-    telemetry = config.telemetry.model_copy(update={"zenoh_config": None if settings is None else str(settings)})
-    source = SourceParameters(kind="gstreamer", cameras=(camera,))
-    return config.model_copy(update={"source": source, "telemetry": telemetry})
+    source = SourceParameters(kind="gstreamer", cameras=(CameraDeviceParameters(name="front", pipeline=pipeline),))
+    return make.changed(make.drone(source=source), telemetry__zenoh_config=None if settings is None else str(settings))
 
 
 def _levels(config: DroneConfig, file: Path) -> list[Level]:

@@ -19,13 +19,13 @@ import zenoh
 from flockd.cli import main
 from flockd.core.config import DroneConfig
 from flockd.core.config.autopilot import AutopilotParameters
+from flockd.core.config.drone import OperatorCommand, TelemetryParameters
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.config.geometry import GeometryParameters
 from flockd.core.config.mission import MissionParameters
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.config.safety import SafetyParameters
 from flockd.core.config.source import SharedMemoryParameters, SourceParameters
-from flockd.core.config.telemetry import OperatorCommand, TelemetryParameters
 from flockd.core.messages import Float32Array, Frame, UInt8Array
 from flockd.fleet.watcher import FleetWatcher, Heard
 from flockd.flight.geometry import RigCamera, ZMap

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from flockd.core.config import DroneConfig
-from flockd.core.config.recording import RecordingConfig
+from flockd.core.config.drone import RecordingConfig
 from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
 from flockd.core.messages import (
     EgoMotion,

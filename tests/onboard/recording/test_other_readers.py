@@ -18,7 +18,7 @@ from google.protobuf.message_factory import GetMessageClass
 from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.records import Channel, Message, Schema
 
-from flockd.core.config.recording import RecordingConfig
+from flockd.core.config.drone import RecordingConfig
 from flockd.onboard.recording.editing import cut, recover
 from flockd.onboard.recording.reader import Recording
 from tests.onboard.recording.made_up import record

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from flockd.core.config.recording import RecordingConfig
+from flockd.core.config.drone import RecordingConfig
 from flockd.onboard.recording import Recorder
 from tests.make import output
 from tests.onboard.recording.made_up import MODELS, drone_config, inputs, record

@@ -20,7 +20,7 @@ from mcap.reader import NonSeekingReader, make_reader
 from scipy.spatial.transform import Rotation
 
 from flockd.core.config import DroneConfig
-from flockd.core.config.recording import RecordingConfig
+from flockd.core.config.drone import RecordingConfig
 from flockd.flight.geometry import build_rig
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.editing import cut

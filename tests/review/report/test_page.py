@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from flockd.review.flight_log.key_frames import KeyFrame
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.flight_log.metadata import FlightMetadata, MissionMetadata
 from flockd.review.report.curves import error_curves, flight_curves
 from flockd.review.report.filmstrip import filmstrip, load_plates, save_plates
 from flockd.review.report.flight_folder import save_flight, write_report_files
 from flockd.review.report.trajectories import gabriel_edges, obstacle_figure, trajectories
+from tests.review.report.test_summary import flight_metadata
 
 Array = NDArray[np.float64]
 RADIUS_M = 2.1
@@ -73,21 +73,15 @@ def _flight(*, drones: int = 5, duration_s: float = 110.0, perception: str = "le
         truth_position=position,
         truth_velocity=velocity,
         stages_ms={} if perception == "truth" else {"flow": np.array([40.0, 60.0]), "ego_motion": np.array([5.0])},
-        metadata=FlightMetadata(
+        metadata=flight_metadata(
             scenario="polygon",
-            mission=MissionMetadata(kind="circle_then_tangent", reached_m=1.0),
             perception=perception,
             flow="flow",
-            scale="height",
             drones=drones,
             duration_s=duration_s,
-            step_s=STEP_S,
             seed=7,
             wall_s=duration_s * 4,
             circle_until_s=66.0,
-            desired_distance_m=3.5,
-            observation_distance_m=20.0,
-            separation_distance_m=1.5,
         ),
     )
 

@@ -15,7 +15,9 @@ import pytest
 from markupsafe import Markup
 from py_mini_racer import MiniRacer
 
-from tests.review.report.test_page import Page, _flight, _moment, _report
+from tests.review.report.test_page import Page, _flight, _moment, _report, undrawn
+
+__all__ = ["undrawn"]
 
 SIDE_M = 2.1 * 3**0.5
 """Side of a triangle whose corners are 2.1 m from its middle."""
@@ -110,11 +112,9 @@ def test_drones_are_drawn_with_north_up_and_true_to_scale(html: str) -> None:
     assert followed[1][0] - followed[2][0] > side_px
 
 
-def test_labels_of_drones_that_are_close_do_not_lie_on_each_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("undrawn")
+def test_labels_of_drones_that_are_close_do_not_lie_on_each_other(tmp_path: Path) -> None:
     """Three within a few pixels of each other: a line of text is 12 px high."""
-    monkeypatch.setattr("flockd.review.report.page._embed", lambda *_, **__: Markup(""))
     log = _flight(drones=3, duration_s=10.0)
     position = log.position.copy()
     position[:, :, :2] = np.array([[0.0, 0.0], [0.1, 0.2], [-0.1, 0.3]])
@@ -126,8 +126,8 @@ def test_labels_of_drones_that_are_close_do_not_lie_on_each_other(
     assert min(np.diff(heights)) >= 12
 
 
-def test_a_round_obstacle_is_drawn_where_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flockd.review.report.page._embed", lambda *_, **__: Markup(""))
+@pytest.mark.usefixtures("undrawn")
+def test_a_round_obstacle_is_drawn_where_it_stands(tmp_path: Path) -> None:
     log = _flight(drones=3, duration_s=10.0)
     under_the_second = [*log.position[0, 1, :2], 0.3, 0.0, 0.0, 0.0, 8.0]
     page = _Browser(_report(tmp_path, replace(log, obstacles=np.array([under_the_second]))))

@@ -14,19 +14,8 @@ import pytest
 
 from flockd.cli import main
 from flockd.core.config import DroneConfig
-from flockd.core.messages import (
-    Detection,
-    EgoMotion,
-    Frame,
-    FrameSet,
-    LearnedSize,
-    MissionOrder,
-    Neighbour,
-    PilotOutput,
-    VehicleState,
-    Wanted,
-)
-from flockd.flight.geometry import RangeMap, log_polar, log_polar_covariance
+from flockd.core.messages import EgoMotion, FrameSet, LearnedSize, MissionOrder, PilotOutput, VehicleState
+from flockd.flight.geometry import RangeMap
 from flockd.flight.perception import CameraObservation, Observation
 from flockd.flight.pilot import StepTrace
 from flockd.onboard.recording import Recorder
@@ -37,6 +26,7 @@ from flockd.onboard.recording.truth import TrueDrone, Truth
 from flockd.review.flight_log.from_recordings import flight_log, key_frames, recordings_in
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.summary import summarise
+from tests import make
 from tests.onboard.recording.made_up import HEIGHT, MODELS, WIDTH, MadeUpPilot, drone_config, rewritten
 
 NAMES = ("drone1", "drone2")
@@ -72,27 +62,18 @@ def truth_at(time_s: float) -> Truth:
 
 def output_of(drone: int, step: int, time_s: float) -> PilotOutput:
     east_m = 1.01 * APART_M * (1 if drone == 0 else -1)
-    known = Neighbour(
-        track=7, position=np.array([0.0, east_m, 0.0]), velocity=np.array([1.0, 0.0, 0.0]), position_sigma_m=0.1,
-        velocity_sigma_m_s=0.1, age_s=1.0, unseen_s=0.0, hits=4, confirmed=True,
-    )  # fmt: skip
+    known = make.neighbour((0.0, east_m, 0.0), (1.0, 0.0, 0.0), track=7)
     false = replace(known, track=9, position=np.array([-20.0, 0.0, 0.0]))
     neighbours = [known] * (step >= UNKNOWN_STEPS) + [false] * (drone == 0 and step == 5)
-    bearing, log_range = log_polar(np.array([0.0, east_m, 0.0]))
-    detection = Detection(
-        bearing=bearing, log_range=log_range, covariance=log_polar_covariance(bearing, 0.1, 0.01),
-        drone_probability=0.9, size_m=0.6, cameras=("left",), label=1,
-    )  # fmt: skip
     moved = EgoMotion(np.eye(3), np.array([STEP_S + LONG_M, 0.0, 0.0]), STEP_S, 100, 80, 0.1)
-    return PilotOutput(
-        time_s=time_s,
+    return make.output(
+        time_s,
         ego_motion=moved if step else None,
         velocity=np.array([1.04, 0.0, 0.0]) if step else None,
-        detections=(detection,),
+        detections=(make.detection((0.0, east_m, 0.0), cameras=("left",)),),
         detection_tracks=(7,),
-        neighbour_motions={},
         neighbours=tuple(neighbours),
-        command=Wanted(np.array([1.0, 0.1]), np.array([0.0, 0.2]), 0.0),
+        command=make.wanted((1.0, 0.1)),
         stages_ms={"scene": 10.0 + step},
     )
 
@@ -100,8 +81,7 @@ def output_of(drone: int, step: int, time_s: float) -> PilotOutput:
 def inputs_at(step: int, time_s: float) -> tuple[FrameSet, VehicleState]:
     image = np.random.default_rng(step).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)  # fills the file step by step
     image[0, 0] = 10 * step
-    frames = {name: Frame(name, image, time_s, step) for name in ("front", "left")}
-    return FrameSet(time_s, frames), VehicleState(time_s, np.eye(3), 5.0)
+    return make.frames(time_s, dict.fromkeys(("front", "left"), image), step), make.vehicle(time_s)
 
 
 def record_flight(

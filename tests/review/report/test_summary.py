@@ -14,13 +14,14 @@ import pytest
 from numpy.typing import NDArray
 
 from flockd.core.data import data_path
-from flockd.core.messages import PilotOutput, SizeStatus, Wanted
+from flockd.core.messages import SizeStatus
 from flockd.review.flight_log.builder import FlightLogBuilder, match_neighbours
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FlightMetadata, HandedOver, LearnedSize, MissionMetadata
 from flockd.review.report.page_texts import page_texts
 from flockd.review.report.summary import causes_text, sizes_text, summarise
 from flockd.sim.scenario import load_scenario
+from tests import make
 
 Array = NDArray[np.float64]
 STEPS, DRONES = 30, 2
@@ -36,6 +37,16 @@ def _turn(axis: str, degrees: float) -> Array:
         "roll": [[1, 0, 0], [0, c, -s], [0, s, c]],
     }
     return np.array(turns[axis])
+
+
+def flight_metadata(**changes: Any) -> FlightMetadata:
+    """Of the hand-made flight, but for the changes."""
+    drone = load_scenario(data_path("config") / "paper_flight.yaml").drone
+    facts = {
+        "scenario": "side_by_side", "perception": "learned", "flow": "dis", "drones": DRONES, "duration_s": 15.0,
+        "seed": 3, "wall_s": 60.0, "circle_until_s": 2.0,
+    }  # fmt: skip
+    return FlightMetadata.of_configuration(drone, **{**facts, **changes})
 
 
 def _hand_made() -> FlightLog:
@@ -90,22 +101,7 @@ def _hand_made() -> FlightLog:
         truth_position=truth_position,
         truth_velocity=truth_velocity,
         stages_ms={"flow": np.arange(1.0, 102.0), "never run": np.empty(0)},
-        metadata=FlightMetadata(
-            scenario="side_by_side",
-            mission=MissionMetadata(kind="circle_then_tangent", reached_m=1.0),
-            perception="learned",
-            flow="dis",
-            scale="height",
-            drones=DRONES,
-            duration_s=15.0,
-            step_s=0.5,
-            seed=3,
-            wall_s=60.0,
-            circle_until_s=2.0,
-            desired_distance_m=3.5,
-            observation_distance_m=20.0,
-            separation_distance_m=1.5,
-        ),
+        metadata=flight_metadata(),
     )
 
 
@@ -410,8 +406,6 @@ def test_the_log_keeps_what_was_learned_last_and_since_when() -> None:
     builder = FlightLogBuilder(np.array([0.0, 0.5, 1.0]), 1)
     sizes = (SizeStatus(weaves=True), SizeStatus(True, 0.46, 0.09), SizeStatus(False, 0.43, 0.07, used=True))
     for step, size in enumerate(sizes):
-        command = Wanted(np.zeros(2), np.zeros(2), 0.0)
-        output = PilotOutput(0.5 * step, None, None, (), (), {}, (), command, size=size)
-        builder.add_output(step, 0, output, {})
+        builder.add_output(step, 0, make.output(0.5 * step, size=size), {})
     kept = builder.build(_hand_made().metadata, None).metadata.sizes
     assert kept == {0: LearnedSize(since_s=0.5, size_m=0.43, sigma=0.07, used=True)}
