@@ -20,16 +20,16 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_140,
+    "flockd/core": 3_120,
     "flockd/flight": 14_780,
     "flockd/onboard": 10_480,
-    "flockd/fleet": 2_240,
+    "flockd/fleet": 2_230,
     "flockd/ground": 3_960,
-    "flockd/review": 3_370,
+    "flockd/review": 3_350,
     "flockd/sim": 10_500,
     "flockd/campaign": 1_750,
-    "flockd/cli": 3_700,
-    "tests": 40_900,
+    "flockd/cli": 3_680,
+    "tests": 40_830,
     "tools/checks": 2_320,
     "tools/docs": 940,
     "tools/measure": 1_340,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_690,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 372}
+FILES = {"flockd": 369}
 NUMBERS_OF_FLIGHT = 528
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
