@@ -6,12 +6,10 @@ import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Protocol
 
 import cv2
 import numpy as np
 
-from flockd.core.config.mission import MissionParameters
 from flockd.core.messages import FloatArray, Frame, FrameSet, UInt8Array
 from flockd.flight.geometry import Rig, RigCamera, RigidTransform, build_rig, rotation_from_vector
 from flockd.flight.geometry.camera_motion import scaled_focal
@@ -25,7 +23,7 @@ from flockd.sim.renderer.renderer import Renderer, View
 from flockd.sim.scenario import CameraFaultConfig, ScenarioConfig
 from flockd.sim.scenario.imperfect_cameras import RigErrorsConfig
 from flockd.sim.vehicles.pose_trail import FlockPose, PoseTrail
-from flockd.sim.vehicles.vehicles import REFERENCE_DEG, UNDISTURBED, Disturbances
+from flockd.sim.vehicles.vehicles import REFERENCE_DEG, UNDISTURBED, Disturbances, Vehicles
 from flockd.sim.world.obstacle_worlds import obstacles_of
 from flockd.sim.world.world import World
 
@@ -76,18 +74,6 @@ def _direction(rng: np.random.Generator) -> FloatArray:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
-class FlockPoses(Protocol):
-    """Poses of all drones."""
-
-    @property
-    def position(self) -> FloatArray:
-        """(n, 3) metres NED."""
-
-    @property
-    def R_ned_body(self) -> FloatArray:  # noqa: N802 - the field's own notation
-        """(n, 3, 3)"""
-
-
 class CameraSimulator:
     """The world of a scenario, the models of its drones, and their cameras."""
 
@@ -106,13 +92,11 @@ class CameraSimulator:
             hills_m=scenario.world.hills_m,
             hills_slope=scenario.world.hills_slope,
         )
-        rng = np.random.default_rng([scenario.seed, 1])
+        rng, self._count = np.random.default_rng([scenario.seed, 1]), len(scenario.vehicles)
         drawn, wanted = int(rng.integers(FAMILIES)), scenario.world.drone_family
         family = drawn if wanted == "any" else wanted
-        self._count = len(scenario.vehicles)
         models = [drone_model(family, int(rng.integers(1 << 31))) for _ in range(self._count)]
-        self._world = world
-        self._renderer = Renderer(world, models)
+        self._world, self._renderer = world, Renderer(world, models)
         by_gain = scenario.camera_faults is not None and scenario.camera_faults.noise.gain > 0
         self._scenario, self._image_noise = scenario, 0.0 if by_gain else scenario.sensors.image_noise
         self.begin_again()
@@ -134,14 +118,9 @@ class CameraSimulator:
         return self._world.height_at(north, east)
 
     def capture(
-        self,
-        drone: int,
-        step: int,
-        time_s: float,
-        vehicles: FlockPoses,
-        trail: PoseTrail | None = None,
+        self, drone: int, step: int, time_s: float, vehicles: FlockPose | Vehicles, trail: PoseTrail | None = None,
         disturbed: Disturbances = UNDISTURBED,
-    ) -> tuple[FrameSet, RenderTruth]:
+    ) -> tuple[FrameSet, RenderTruth]:  # fmt: skip
         """The frame set of one drone, and the truth behind it.
 
         ``trail`` holds where the flock was until then, for what is late and for motion; None: what was captured before
@@ -152,7 +131,8 @@ class CameraSimulator:
             trail.add(FlockPose(time_s, vehicles.position, vehicles.R_ned_body))
         others = [i for i in range(self._count) if i != drone and i not in disturbed.removed]
         off = disturbed.cameras_off_of(drone)
-        cameras, flock = self._rigs[drone].cameras, dict.fromkeys(self.rig.cameras, vehicles)
+        cameras = self._rigs[drone].cameras
+        flock: dict[str, FlockPose | Vehicles] = dict.fromkeys(self.rig.cameras, vehicles)
         shots = {name: Shot(time_s, time_s, comes=True) for name in cameras}
         if self._real is not None:
             shots = {name: self._real[drone, name].clock.shot(time_s) for name in cameras}
@@ -188,21 +168,13 @@ class CameraSimulator:
             image = self._faults.applied(drone, name, time_s, image)
             if shots[name].comes and name not in off:
                 frames[name] = Frame(name, image, shots[name].stamp_s, step)
-        R_ned_body, position = vehicles.R_ned_body[drone], vehicles.position[drone]
         truth = RenderTruth(
-            self._rigs[drone],
-            views,
-            turns,
-            places,
-            R_ned_body,
-            position,
-            vehicles.R_ned_body,
-            vehicles.position,
-            others,
-        )
+            self._rigs[drone], views, turns, places, vehicles.R_ned_body[drone], vehicles.position[drone],
+            vehicles.R_ned_body, vehicles.position, others,
+        )  # fmt: skip
         return FrameSet(time_s, frames), truth
 
-    def _turn(self, drone: int, name: str, shot: Shot, flock: FlockPoses) -> FloatArray:
+    def _turn(self, drone: int, name: str, shot: Shot, flock: FlockPose | Vehicles) -> FloatArray:
         """(3, 3) from a camera's axes to NED, shaken."""
         R_ned_camera: FloatArray = flock.R_ned_body[drone] @ self._rigs[drone].cameras[name].T_body_camera.rotation
         if self._real is None:
@@ -217,12 +189,13 @@ class CameraSimulator:
         """How a camera moves around the time of its image."""
         assert self._real is not None
         flock, mounted = trail.motion_at(shown_s), self._rigs[drone].cameras[name].T_body_camera
+        shaking = self._real[drone, name].shaking
         R_ned_body = trail.at(shown_s).R_ned_body[drone]
         lever = R_ned_body @ np.cross(flock.turn[drone], mounted.translation)
         return CameraMotion(
             velocity=(flock.velocity[drone] + lever) @ R_ned_camera,
             turn=flock.turn[drone] @ mounted.rotation,
-            shake=self._real[drone, name].shaking.around(shown_s),
+            shake=lambda since_s: shaking.at(shown_s + since_s),
             drones={i + 1: flock.velocity[i] @ R_ned_camera for i in range(self._count) if i != drone},
         )
 
@@ -255,20 +228,14 @@ class ImageNoise:
 def planned_path(scenario: ScenarioConfig) -> FloatArray:
     """(n, 2) north and east of the flock's middle if it flies exactly as each of its missions wants, one after the
     other, and on for a few metres."""
-    missions = {vehicle.mission or scenario.drone.mission for vehicle in scenario.vehicles}
-    ordered = sorted(missions, key=lambda mission: mission.model_dump_json())
-    return np.concatenate([_path_of(scenario, mission) for mission in ordered])
-
-
-def _path_of(scenario: ScenarioConfig, mission: MissionParameters) -> FloatArray:
-    """The same of one mission."""
-    navigator = Navigator(mission, scenario.drone.safety.gate)
     start = np.mean([vehicle.position_m[:2] for vehicle in scenario.vehicles], axis=0)
-    flown, path = np.zeros(2), []
-    for time_s in np.arange(0.0, scenario.duration_s + 5.0, 0.5):
-        moment = Moment(float(time_s), start + flown, home_deg=np.array(REFERENCE_DEG))
-        flown = flown + navigator.step(moment).velocity * 0.5
-        path.append(start + flown)
+    missions, path = {vehicle.mission or scenario.drone.mission for vehicle in scenario.vehicles}, []
+    for mission in sorted(missions, key=lambda mission: mission.model_dump_json()):
+        navigator, flown = Navigator(mission, scenario.drone.safety.gate), np.zeros(2)
+        for time_s in np.arange(0.0, scenario.duration_s + 5.0, 0.5):
+            moment = Moment(float(time_s), start + flown, home_deg=np.array(REFERENCE_DEG))
+            flown = flown + navigator.step(moment).velocity * 0.5
+            path.append(start + flown)
     return np.array(path)
 
 

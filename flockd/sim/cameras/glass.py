@@ -41,13 +41,9 @@ class Glass:
         return cls(config.flare, dirt, _spots(config.drops, size, _DROP_SHARE, rng, (1.0, 1.0)))
 
     def passed(self, light: Float32Array, lens: LensField, sky: BoolArray, sun: FloatArray) -> Float32Array:
-        """What is left of light (h, w, 3).
+        """What is left of light (h, w, 3) as it falls on the lens.
 
-        Args:
-            light: as it falls on the lens.
-            lens: of the image.
-            sky: (h, w) where nothing hides the sky.
-            sun: (3,) unit vector towards it, in the camera's axes.
+        ``sky`` (h, w): where nothing hides it; ``sun`` (3,): unit vector towards it, in the camera's axes.
         """
         mean = light[lens.imaged].mean(axis=0)
         if self.wet.any():

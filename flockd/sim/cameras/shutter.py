@@ -43,10 +43,6 @@ class Shaking:
         tones = np.sin(times_s[:, None, None] * self._rad_s + self._phases)
         return np.asarray(tones @ self._amplitudes, np.float64)
 
-    def around(self, time_s: float) -> Callable[[FloatArray], FloatArray]:
-        """The same, of times (n,) s that count from `time_s`."""
-        return lambda since_s: self.at(time_s + since_s)
-
 
 _MOST_SAMPLES = 16
 """Instants of an exposure, one for each pixel of the longest way."""

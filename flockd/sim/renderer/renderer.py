@@ -20,6 +20,7 @@ from flockd.sim.world.mesh import face_normals
 from flockd.sim.world.world import World
 
 Indices = NDArray[np.int32]
+Pair = tuple[FloatArray, FloatArray]
 _MOST_DRONES = 254
 """Their ids are bytes."""
 
@@ -47,23 +48,14 @@ class Renderer:
         self._machine = machine_texels()
         self._normals = [face_normals(one.vertices.astype(np.float64), one.triangles) for one in self._drones]
         self._scene = scene_of(world)
-        codes = world.tone.astype(np.float64)
         # The middle of the linear values that show as each byte.
-        self._linear = np.interp(
-            np.arange(256), codes[: 1 + int(codes.argmax())], (np.arange(1 + int(codes.argmax())) / 1024.0) ** 2
-        )
+        codes = world.tone[: 1 + int(world.tone.argmax())].astype(np.float64)
+        self._linear = np.interp(np.arange(256), codes, (np.arange(len(codes)) / 1024.0) ** 2)
 
     def render(
-        self,
-        matrix: FloatArray,
-        size: tuple[int, int],
-        R_ned_camera: FloatArray,
-        position_ned: FloatArray,
-        *,
-        drone_rotations: FloatArray,
-        drone_positions: FloatArray,
-        shown: BoolArray | Sequence[int] | IntArray,
-    ) -> View:
+        self, matrix: FloatArray, size: tuple[int, int], R_ned_camera: FloatArray, position_ned: FloatArray, *,
+        drone_rotations: FloatArray, drone_positions: FloatArray, shown: BoolArray | Sequence[int] | IntArray,
+    ) -> View:  # fmt: skip
         """One image.
 
         ``matrix`` (3, 3) is the pinhole K for pixel centres at +0.5, ``size`` (width, height), ``R_ned_camera`` (3, 3)
@@ -167,15 +159,9 @@ def _bounds(q: FloatArray, width: int, height: int) -> tuple[int, int, int, int]
 
 
 def true_flow(
-    first: View,
-    second: View,
-    matrix: FloatArray,
-    *,
-    R_ned_camera: tuple[FloatArray, FloatArray],
-    position_ned: tuple[FloatArray, FloatArray],
-    drone_rotations: tuple[FloatArray, FloatArray],
-    drone_positions: tuple[FloatArray, FloatArray],
-) -> tuple[Float32Array, BoolArray]:
+    first: View, second: View, matrix: FloatArray, *, R_ned_camera: Pair, position_ned: Pair, drone_rotations: Pair,
+    drone_positions: Pair,
+) -> tuple[Float32Array, BoolArray]:  # fmt: skip
     """Where every pixel of the first image went in the second: flow (h, w, 2) in pixels, valid (h, w).
 
     Poses come in pairs (first, second), shaped as for ``Renderer.render``. Sky moves as a point at infinity. Valid: in

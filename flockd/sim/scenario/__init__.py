@@ -1,7 +1,6 @@
 """The typed configuration of a simulated flight, and its loader."""
 
 from flockd.sim.scenario.scenario_config import (
-    DRONE_FAMILIES,
     MAX_DRONES,
     MIN_START_DISTANCE_M,
     CameraFaultConfig,
@@ -18,7 +17,6 @@ from flockd.sim.scenario.scenario_config import (
 from flockd.sim.scenario.scenario_file import load, load_scenario, load_with_places, scenario_schema
 
 __all__ = [
-    "DRONE_FAMILIES",
     "MAX_DRONES",
     "MIN_START_DISTANCE_M",
     "CameraFaultConfig",

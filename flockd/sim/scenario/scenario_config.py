@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 from math import dist
 from typing import Annotated, Any, Literal, Self
@@ -13,13 +13,12 @@ from pydantic import Field, model_validator
 from flockd.core.config.base import NonNegative, Positive, Section, Share, Vector3, refuse
 from flockd.core.config.drone import DroneConfig
 from flockd.core.config.mission import MissionParameters, mission_faults
+from flockd.sim.renderer.drone_models import FAMILIES
 from flockd.sim.scenario.imperfect_cameras import CamerasConfig, CameraTimingConfig
 
 MAX_DRONES = 100
 """More would take days and all memory."""
 MAX_DURATION_S = 86400.0
-DRONE_FAMILIES = 14
-"""Meshes that the simulator can build, counted from 0."""
 _LOWEST_M = 0.5
 """A drone that begins lower touches the uneven ground."""
 _HIGHEST_M = 1000.0
@@ -144,14 +143,11 @@ class ObstaclesConfig(Section):
 
     @model_validator(mode="after")
     def _keys_fit_the_kind(self) -> Self:
-        refuse(
-            self,
-            {
-                (key,): f"has no meaning with kind `{self.kind}`, only with `{kind}`; delete it"
-                for key, kind in _ONLY_FOR.items()
-                if self.kind != kind and key in self.model_fields_set
-            },
-        )
+        foreign = {
+            (key,): kind for key, kind in _ONLY_FOR.items() if self.kind != kind and key in self.model_fields_set
+        }
+        told = f"has no meaning with kind `{self.kind}`, only with"
+        refuse(self, {key: f"{told} `{kind}`; delete it" for key, kind in foreign.items()})
         return self
 
 
@@ -167,7 +163,7 @@ class WorldConfig(Section):
     """Rise for each metre where they are steepest."""
     clearance_m: NonNegative = 9.0
     """Free of obstacles on both sides of the planned path."""
-    drone_family: Annotated[int, Field(ge=0, le=DRONE_FAMILIES - 1)] | Literal["any"] = "any"
+    drone_family: Annotated[int, Field(ge=0, le=FAMILIES - 1)] | Literal["any"] = "any"
     """Which mesh the drones wear; `any`: drawn from the seed, the same for the whole flock."""
     obstacles: ObstaclesConfig | None = None
     """Trees, or houses, walls, poles and wires, for the flock to fly between, on level ground; null: none within
@@ -323,74 +319,52 @@ class ScenarioConfig(Section):
         return [(self.drone_of(i).mission, vehicle.by_hand) for i, vehicle in enumerate(self.vehicles)]
 
     @model_validator(mode="after")
-    def _the_missions_can_be_flown(self) -> Self:
+    def _can_be_flown(self) -> Self:
         faults: dict[tuple[str | int, ...], str] = {}
-        for number, vehicle in enumerate(self.vehicles):
-            if vehicle.by_hand and all(other.by_hand for other in self.vehicles):
-                faults["vehicles", number, "by_hand"] = "flies the last drone by hand too; leave one to flockd"
-            if vehicle.mission is not None:
-                limits = self.drone.safety.gate, self.drone.flocking.max_speed_m_s
-                of_mission = mission_faults(vehicle.mission, *limits)
-                faults |= {("vehicles", number, "mission", *key): text for key, text in of_mission.items()}
-        refuse(self, faults)
-        return self
-
-    @model_validator(mode="after")
-    def _lasts_a_step(self) -> Self:
+        for key, text in (*self._faults_of_vehicles(), *self._faults_of_what_goes_wrong()):
+            faults.setdefault(key, text)
         step_s = self.drone.step_s
         if round(self.duration_s / step_s) < 1:
-            text = f"{self.duration_s:g} s is shorter than a step of {step_s:g} s; write {step_s:g} or more"
-            refuse(self, {("duration_s",): text})
-        return self
-
-    @model_validator(mode="after")
-    def _faults_have_their_drones_and_cameras(self) -> Self:
-        cameras = [camera.name for camera in self.drone.rig.cameras]
-        faults: dict[tuple[str | int, ...], str] = {}
-        named = {
-            **{("faults", number, "drone"): fault.drone for number, fault in enumerate(self.faults)},
-            **{("takeovers", number, "drone"): takeover.drone for number, takeover in enumerate(self.takeovers)},
-        }
-        for key, drone in named.items():
-            if drone > len(self.vehicles):
-                faults[key] = f"is {drone}, but there are {len(self.vehicles)} vehicles; write one of theirs"
-        for number, fault in enumerate(self.faults):
-            if fault.camera not in cameras:
-                faults["faults", number, "camera"] = f"is not in the rig; write one of {', '.join(cameras)}"
-            if fault.end_s <= fault.begin_s:
-                faults["faults", number, "end_s"] = f"is not after begin_s {fault.begin_s:g}; write a larger one"
+            faults["duration_s",] = (
+                f"{self.duration_s:g} s is shorter than a step of {step_s:g} s; write {step_s:g} or more"
+            )
         refuse(self, faults)
         return self
 
-    @model_validator(mode="after")
-    def _begins_in_the_air_and_apart(self) -> Self:
-        faults: dict[tuple[str | int, ...], str] = {}
+    def _faults_of_vehicles(self) -> Iterator[tuple[tuple[str | int, ...], str]]:
         for number, vehicle in enumerate(self.vehicles):
-            fault = _fault_of_height(vehicle.position_m[2])
-            if fault is not None:
-                faults["vehicles", number, "position_m"] = fault
+            if vehicle.by_hand and all(other.by_hand for other in self.vehicles):
+                yield ("vehicles", number, "by_hand"), "flies the last drone by hand too; leave one to flockd"
+            if vehicle.mission is not None:
+                limits = self.drone.safety.gate, self.drone.flocking.max_speed_m_s
+                for key, text in mission_faults(vehicle.mission, *limits).items():
+                    yield ("vehicles", number, "mission", *key), text
+            down_m, place = vehicle.position_m[2], ("vehicles", number, "position_m")
+            above = f"begins {abs(down_m):g} m above the ground; write "
+            if down_m > 0:
+                below = f"the third number points down, so that {down_m:g} is {down_m:g} m below the ground; "
+                yield place, f"{below}write {-max(down_m, _LOWEST_M):g}"
+            elif down_m > -_LOWEST_M:
+                yield place, f"{above}-{_LOWEST_M:g} or less as the third number"
+            elif down_m < -_HIGHEST_M:
+                yield place, f"{above}-{_HIGHEST_M:g} or more as the third number"
         for one, other in combinations(range(len(self.vehicles)), 2):
             apart_m = dist(self.vehicles[one].position_m, self.vehicles[other].position_m)
             if apart_m < MIN_START_DISTANCE_M:
-                faults.setdefault(
-                    ("vehicles", other, "position_m"),
-                    f"is {apart_m:.2g} m from vehicles[{one}], and drones touch below {MIN_START_DISTANCE_M:g} m; "
-                    "move one of them",
-                )
-        refuse(self, faults)
-        return self
+                near = f"is {apart_m:.2g} m from vehicles[{one}], and drones touch below {MIN_START_DISTANCE_M:g} m; "
+                yield ("vehicles", other, "position_m"), f"{near}move one of them"
 
-
-def _fault_of_height(down_m: float) -> str | None:
-    """What is wrong with the third number of a start position."""
-    if down_m > 0:
-        return (
-            f"the third number points down, so that {down_m:g} is {down_m:g} m below the ground; "
-            f"write {-max(down_m, _LOWEST_M):g}"
-        )
-    if down_m > -_LOWEST_M:
-        height_m = abs(down_m)
-        return f"begins {height_m:g} m above the ground; write -{_LOWEST_M:g} or less as the third number"
-    if down_m < -_HIGHEST_M:
-        return f"begins {-down_m:g} m above the ground; write -{_HIGHEST_M:g} or more as the third number"
-    return None
+    def _faults_of_what_goes_wrong(self) -> Iterator[tuple[tuple[str | int, ...], str]]:
+        cameras, count = [camera.name for camera in self.drone.rig.cameras], len(self.vehicles)
+        ordered: Mapping[str, Sequence[CameraFaultConfig | TakeoverConfig]]
+        ordered = {"faults": self.faults, "takeovers": self.takeovers}
+        for section, entries in ordered.items():
+            for number, entry in enumerate(entries):
+                if entry.drone > count:
+                    text = f"is {entry.drone}, but there are {count} vehicles; write one of theirs"
+                    yield (section, number, "drone"), text
+        for number, fault in enumerate(self.faults):
+            if fault.camera not in cameras:
+                yield ("faults", number, "camera"), f"is not in the rig; write one of {', '.join(cameras)}"
+            if fault.end_s <= fault.begin_s:
+                yield ("faults", number, "end_s"), f"is not after begin_s {fault.begin_s:g}; write a larger one"

@@ -10,6 +10,7 @@ from flockd.onboard.sources import FramePublisher
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.sitl.fleet_log import FleetFrame
 from flockd.sim.sitl.ground_station import Poses
+from flockd.sim.vehicles.pose_trail import FlockPose
 
 
 class FrameServer:
@@ -69,10 +70,11 @@ class FrameServer:
 
     def _publish(self, number: int) -> None:
         poses, time_s = self._poses(), self._clock()
+        flock = FlockPose(time_s, poses.position, poses.R_ned_body)
         for i, drone in enumerate(self._drones):
             if drone is None:
                 continue
-            frames, _ = self._cameras.capture(i, number, time_s, poses)
+            frames, _ = self._cameras.capture(i, number, time_s, flock)
             for frame in frames.frames.values():
                 self._publisher.publish(drone, frame)
         self._frames.append(FleetFrame(time_s, poses.position, poses.velocity, poses.R_ned_body))

@@ -65,16 +65,9 @@ class World:
 
     @staticmethod
     def generate(
-        seed: int,
-        *,
-        ground_relief_m: float = 0.15,
-        keep_out: FloatArray | None = None,
-        clearance_m: float = 9.0,
-        extent_m: float = 80.0,
-        obstacles: Obstacles | None = None,
-        hills_m: float = 0.0,
-        hills_slope: float = 0.15,
-    ) -> World:
+        seed: int, *, ground_relief_m: float = 0.15, keep_out: FloatArray | None = None, clearance_m: float = 9.0,
+        extent_m: float = 80.0, obstacles: Obstacles | None = None, hills_m: float = 0.0, hills_slope: float = 0.15,
+    ) -> World:  # fmt: skip
         """A world drawn from ``seed``: the same arguments give the same bytes.
 
         ``ground_relief_m``: standard deviation of the ground's height (0: exactly flat). Nothing taller than 0.3 m
@@ -82,10 +75,6 @@ class World:
         stand where they stand, on level ground. ``hills_m`` and ``hills_slope``: see `flockd.sim.world.terrain`; their
         ground is added to the relief.
         """
-        if extent_m < 20.0:
-            raise ValueError(f"extent_m must be at least 20 m, not {extent_m}")
-        if keep_out is not None and (keep_out.ndim != 2 or keep_out.shape[1] != 2):
-            raise ValueError(f"keep_out must be (n, 2), not {keep_out.shape}")
         rng = np.random.default_rng(seed)
         light, fog, sky_map = sky.draw_sky(rng)
         heights = terrain.relief(rng, extent_m, ground_relief_m)
@@ -129,9 +118,7 @@ class World:
 
     def height_at(self, north: FloatArray, east: FloatArray) -> FloatArray:
         """(n,) metres of ground above z = 0 (z = -height), on the very triangles drawn; 0 beyond the extent."""
-        return terrain.grid_height(
-            self.ground_heights, self.extent_m, np.asarray(north, float), np.asarray(east, float)
-        )
+        return terrain.grid_height(self.ground_heights, self.extent_m, north, east)
 
     def obstacle_distance(self, points: FloatArray) -> FloatArray:
         """(n,) horizontal metres from points (n, 2) to the nearest obstacle's footprint; 0 inside one."""

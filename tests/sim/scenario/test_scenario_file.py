@@ -13,8 +13,7 @@ from flockd.campaign.campaign_file import load_campaign
 from flockd.core.config import DroneConfig, Overrides, load_drone
 from flockd.core.errors import ConfigError
 from flockd.flight.geometry import build_rig
-from flockd.sim.renderer.drone_models import FAMILIES
-from flockd.sim.scenario import DRONE_FAMILIES, load_scenario, load_with_places, scenario_schema
+from flockd.sim.scenario import load_scenario, load_with_places, scenario_schema
 from tests.core.config.test_loader import CONFIG, DRONE, places_of, problems_in, with_line
 from tests.hostile import CORPUS, hostile, own_errors, put, text_of
 
@@ -159,10 +158,6 @@ def test_a_scenario_may_hold_its_drone(tmp_path: Path) -> None:
     file.write_text(SCENARIO.replace("drone: drone.yaml\n", inline.replace("cx: 320", "cx: -1")), encoding="utf-8")
     (place,) = places_of(problems_in(file, load_scenario))
     assert place == "scenario.yaml:7: drone.rig.cameras[0].intrinsics.cx"
-
-
-def test_the_configuration_knows_how_many_families_the_simulator_has() -> None:
-    assert DRONE_FAMILIES == FAMILIES
 
 
 def test_a_changed_configuration_is_read_or_refused(tmp_path: Path) -> None:
