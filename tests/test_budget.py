@@ -26,7 +26,7 @@ LINES = {
     "flockd/fleet": 2_230,
     "flockd/ground": 3_960,
     "flockd/review": 3_350,
-    "flockd/sim": 10_500,
+    "flockd/sim": 10_400,
     "flockd/campaign": 1_750,
     "flockd/cli": 3_680,
     "tests": 40_830,
