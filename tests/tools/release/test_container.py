@@ -1,4 +1,4 @@
-"""The container's recipe: it installs the lock, from files that the tree has and its ignore list lets through."""
+"""The containers' recipes: they install the lock, from files that the tree has and the ignore list lets through."""
 
 from __future__ import annotations
 
@@ -8,32 +8,20 @@ import pytest
 
 from tools.release.wheels import ROOT, SOURCES
 
-RECIPE = (ROOT / "Containerfile").read_text(encoding="utf-8")
-ROS_RECIPE = (ROOT / "packaging" / "ros" / "Containerfile").read_text(encoding="utf-8")
 
-
-def test_it_installs_the_lock_by_its_hashes_and_flockd_without_anything_else() -> None:
-    installs = re.findall(r"/pip install (.*?)(?: \\)?$", RECIPE, re.MULTILINE)
-    assert installs == [
-        "--no-cache-dir --require-hashes -r /tmp/service.txt",
-        "--no-cache-dir --no-deps --no-build-isolation /tmp/flockd",
-    ]
-    assert "COPY requirements/service.txt /tmp/service.txt\n" in RECIPE
-
-
-def test_that_of_ros_installs_the_lock_too_and_then_the_extra() -> None:
-    installs = re.findall(r"/pip install (.*?)(?: \\)?$", ROS_RECIPE, re.MULTILINE)
-    assert installs == [
-        "--no-cache-dir --require-hashes -r /tmp/service.txt",
-        "--no-cache-dir '/tmp/flockd[ros]'",
-    ]
-    assert "debian:12-slim" in ROS_RECIPE, "whose Python is the wheels' 3.11"
-
-
-@pytest.mark.parametrize("recipe", [RECIPE, ROS_RECIPE])
-def test_it_flies_as_nobody_special(recipe: str) -> None:
-    assert re.findall(r"^USER (.*)$", recipe, re.MULTILINE) == ["flockd"]
-    assert recipe.index("USER flockd") < recipe.index("ENTRYPOINT")
+@pytest.mark.parametrize(
+    ("recipe", "flockd"),
+    [
+        ("Containerfile", "--no-cache-dir --no-deps --no-build-isolation /tmp/flockd"),
+        ("packaging/ros/Containerfile", "--no-cache-dir '/tmp/flockd[ros]'"),
+    ],
+)
+def test_it_installs_the_lock_by_its_hashes_then_flockd_and_flies_as_nobody_special(recipe: str, flockd: str) -> None:
+    text = (ROOT / recipe).read_text(encoding="utf-8")
+    installs = re.findall(r"/pip install (.*?)(?: \\)?$", text, re.MULTILINE)
+    assert installs == ["--no-cache-dir --require-hashes -r /tmp/service.txt", flockd]
+    assert re.findall(r"^USER (.*)$", text, re.MULTILINE) == ["flockd"]
+    assert text.index("USER flockd") < text.index("ENTRYPOINT")
 
 
 def test_the_ignore_list_lets_through_what_building_needs() -> None:
