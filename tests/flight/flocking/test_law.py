@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from flockd.flight.flocking import FlockingLaw, FlockingParameters, WeightParameters, level_offsets
 from flockd.flight.flocking.metrics import connectivity, min_distance, obj1, obj2, order, pair_distances, safety, union
-from flockd.flight.geometry.level import limit_norm
 from flockd.flight.mission import MissionParameters
 from flockd.flight.mission.circle_then_tangent import course, desired_velocity
 
@@ -158,12 +157,6 @@ def test_two_drones_at_one_level_spot_part_each_to_its_own_right(noise_m: float)
     assert np.linalg.norm(places[0, :2] - places[1, :2]) > 1.5
 
 
-def test_neighbours_that_are_not_above_or_below_are_where_they_are_seen() -> None:
-    offsets = np.array([[0.1, 0.0, 1.0], [-2.0, 3.0, 0.5]])
-    np.testing.assert_array_equal(level_offsets(offsets), offsets[:, :2])
-    assert level_offsets(np.empty((0, 3))).shape == (0, 2)
-
-
 @pytest.mark.parametrize(
     ("own", "desired", "velocity", "acceleration"),
     [
@@ -177,11 +170,6 @@ def test_the_command_limits_first_the_acceleration_and_then_the_speed(
 ) -> None:
     law = FlockingLaw(FlockingParameters(max_acceleration_m_s2=2.0, max_speed_m_s=3.0))
     np.testing.assert_allclose(law.command(own, NOBODY, NOBODY, desired, 0.5), (velocity, acceleration))
-
-
-def test_a_limit_keeps_the_direction() -> None:
-    np.testing.assert_allclose(limit_norm(np.array([3.0, -4.0]), 1.0), [0.6, -0.8])
-    np.testing.assert_array_equal(limit_norm(np.zeros(2), 1.0), [0.0, 0.0])
 
 
 @pytest.mark.parametrize(

@@ -23,14 +23,13 @@ from flockd.flight.geometry import (
     rotation_from_vector,
     vector_from_rotation,
 )
-from flockd.flight.geometry.camera_motion import camera_motion, scaled_focal
+from flockd.flight.geometry.camera_motion import scaled_focal
 from tests.flight.geometry.synthetic_world import EXACT, Flaws, World, boxes_around, four_camera_rig, seen_twice
 
 pytestmark = pytest.mark.fault("rig-off")
 
 STEP_S = 0.5
 FLAWS = Flaws(flow_sigma_px=0.3, depth_sigma=0.1, object_bias=0.1, outliers=0.03)
-TIGHT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -184,9 +183,8 @@ def off_deg(found: CameraDeviation, turn: FloatArray) -> float:
     return math.degrees(float(np.linalg.norm(vector_from_rotation(off))))
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_two_degrees_thirty_milliseconds_and_two_percent_are_known_after_a_minute(seed: int) -> None:
-    random = np.random.default_rng(seed)
+def test_two_degrees_thirty_milliseconds_and_two_percent_are_known_after_a_minute() -> None:
+    random = np.random.default_rng(0)
     wrong = Wrong.by(2.0, 0.02, 0.03, random)
     for found in flown(lively(random), wrong, random).deviations():
         sigma = np.sqrt(np.diag(found.covariance))
@@ -215,7 +213,7 @@ def test_what_the_attitude_jitters_is_learnt_and_tells_no_mountings() -> None:
     circle = Way(lambda t: rotation_from_euler(0.0, 0.0, 0.1 * t), lively(np.random.default_rng(0)).position)
     yaw_sigmas_deg = []
     for jitter_deg in (0.0, 0.3):
-        found = flown(circle, AS_CONFIGURED, np.random.default_rng(1), 120, jitter_deg).deviations()
+        found = flown(circle, AS_CONFIGURED, np.random.default_rng(1), 60, jitter_deg).deviations()
         assert not [text for one in found for text in rig_faults(one)]
         yaw_sigmas_deg.append(min(math.degrees(math.sqrt(one.covariance[2, 2])) for one in found))
     assert yaw_sigmas_deg[1] > 0.9 * yaw_sigmas_deg[0] > 0.7
@@ -256,43 +254,6 @@ def test_a_flight_that_never_turns_leaves_open_what_it_does_not_show() -> None:
         assert time > 0.05
         assert focal > 0.02
         assert rig_faults(found) == ()
-
-
-def seen_by_right(turn: FloatArray, shift: FloatArray) -> tuple[PointPairs, RigidTransform]:
-    """Exact pairs of the right camera, and its true motion, of a body that moves so."""
-    poses, mount = (STRAIGHT.pose(0.0), STRAIGHT.pose(0.0) @ RigidTransform(turn, shift)), RIGHT.T_body_camera
-    random = np.random.default_rng(5)
-    pairs = seen_twice(boxes_around(random), CONFIGURED, poses, EXACT, random)
-    true = (poses[0] @ mount).inverse() @ (poses[1] @ mount)
-    return pairs.select(np.flatnonzero(pairs.camera_names == "right")), true
-
-
-RIGHT = CONFIGURED.cameras["right"]
-
-
-def test_exact_matches_give_a_cameras_motion_and_how_a_focal_length_spoils_it() -> None:
-    pairs, true = seen_by_right(rotation_from_euler(0.02, -0.03, 0.05), np.array([0.5, 0.1, 0.1]))
-    found = camera_motion(RIGHT, pairs, RigidTransform(np.eye(3), true.translation), 0.0)
-    assert found is not None
-    assert found.motion.rotation == pytest.approx(true.rotation, abs=TIGHT)
-    assert found.motion.translation == pytest.approx(true.translation, abs=TIGHT)
-    # With a focal length that is 1 % too short all directions are 1 % too far from the axis, and turns 1 % too large.
-    short = camera_motion(RIGHT, pairs, true, math.log(0.99))
-    assert short is not None
-    seemed = vector_from_rotation(true.rotation.T @ short.motion.rotation)
-    assert seemed == pytest.approx(found.by_focal(true)[:3] * math.log(0.99), abs=2e-4)
-    assert np.linalg.norm(seemed) > 0.003 * np.linalg.norm(vector_from_rotation(true.rotation))
-
-
-def test_twice_the_matches_tell_twice_as_much_also_where_half_are_left_out() -> None:
-    pairs, true = seen_by_right(np.eye(3), np.array([0.5, 0.0, 0.0]))
-    assert len(pairs) >= 600
-    told = []
-    for count in (300, 600):
-        found = camera_motion(RIGHT, pairs.select(np.linspace(0, len(pairs) - 1, count).astype(np.int64)), true, 0.0)
-        assert found is not None
-        told.append(float(np.trace(found.information[:3, :3])))
-    assert told[1] / told[0] == pytest.approx(2.0, rel=0.1)
 
 
 def test_what_says_nothing_changes_nothing() -> None:

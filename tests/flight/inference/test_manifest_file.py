@@ -11,7 +11,6 @@ from random import Random
 
 import pytest
 
-from flockd.core.data import data_path
 from flockd.core.errors import ModelError
 from flockd.flight.inference import load_manifest, read_manifest
 from flockd.flight.perception.requirements import check_roles
@@ -56,37 +55,6 @@ def test_a_model_file_larger_than_any_onnx_file_is_refused_unread_and_a_missing_
     path.with_suffix(".onnx").unlink()
     with refused(rf"^{path}:4: file: .*someones_depth\.onnx \(No such file"):
         load_manifest(path)
-
-
-@pytest.mark.parametrize(
-    ("content", "complaint"),
-    [
-        (None, "yaml: does not exist"),
-        (b"", "yaml: is empty"),
-        (b"inputs: " + b"[" * 100_000, "yaml:1: .* 32 levels"),
-        (b"name: a\n" * 200_000, "yaml: .* 1024 KiB"),
-        (b"- flow\n", "yaml:1: .* list"),
-    ],
-    ids=["nothing", "empty", "deep", "large", "list"],
-)
-def test_a_file_that_is_no_manifest_is_refused_in_one_sentence(
-    tmp_path: Path, content: bytes | None, complaint: str
-) -> None:
-    """As the configuration's files, which have the same reader."""
-    path = tmp_path / "model.yaml"
-    if content is not None:
-        path.write_bytes(content)
-    with refused(complaint):
-        read_manifest(path)
-    with refused("folder"):
-        read_manifest(tmp_path)
-
-
-def test_words_that_older_yaml_takes_for_booleans_are_words(tmp_path: Path) -> None:
-    """`n` is the free size of a batch, in shipped manifests without quotes."""
-    path = tmp_path / "model.yaml"
-    path.write_text((data_path("models") / "distance.yaml").read_text().replace("- n\n", "- y\n"))
-    assert read_manifest(path).manifest.inputs["picture"].shape == ("y", 96, 96, 3)
 
 
 def test_a_hostile_manifest_is_read_or_refused(tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ from flockd.core.errors import ConfigError
 from flockd.core.messages import FloatArray, MissionOrder, Setpoint
 from flockd.flight.geometry import euler_from_rotation
 from flockd.flight.mission import Guidance, MissionParameters, Moment, Navigator, order_fault
-from flockd.flight.mission.navigator import middle_of
 from flockd.flight.safety import Gate, outside_fence
 from flockd.onboard.telemetry.order_messages import order_message, parse_order
 from flockd.sim.autopilot.fake_vehicle import Demand, PointMass
@@ -101,27 +100,6 @@ def test_a_drone_that_has_not_come_near_has_not_been_there(stops_at_m: float) ->
     assert guidance.sentence.endswith("to waypoint 1 of 2")
 
 
-def test_a_position_that_jumps_near_a_waypoint_for_one_step_has_not_been_there() -> None:
-    """30 m away for the autopilot's estimate, 3 m for one step, and then 30 m again."""
-    point = Point(to((40.0, 0.0), (40.0, 40.0)))
-    point.fly(10.0)
-    before, point.position = point.position, np.array([37.0, 0.0])
-    point.step()
-    point.position = before
-    for _ in range(40):
-        guidance = point.step()
-        point.position = before
-    assert guidance.sentence == "30 m to waypoint 1 of 2"
-
-
-def test_the_middle_of_the_flock_is_led_not_the_drone() -> None:
-    neighbours = np.array([[3.0, 0.0], [3.0, 3.0]])
-    np.testing.assert_allclose(middle_of(neighbours), [2.0, 1.0])
-    navigator = Navigator(to((20.0, 1.0)), GATE)
-    guidance = navigator.step(Moment(0.0, ORIGIN, middle_of(neighbours)))
-    np.testing.assert_allclose(guidance.velocity, [1.0, 0.0])
-
-
 @pytest.mark.parametrize("end", ["land", "return"])
 def test_at_its_end_a_mission_has_the_autopilot_take_over(end: str) -> None:
     point = Point(to((2.0, 0.0), at_end=end))
@@ -156,14 +134,6 @@ def test_heights_have_the_drones_offset_and_stay_until_another() -> None:
     assert Point(mission(kind="hover")).step().height_m is None
 
 
-def test_the_heading_turns_no_faster_than_cameras_stand() -> None:
-    point = Point(to((10.0, 0.0), (10.0, 30.0), speed_m_s=2.0))
-    courses = [point.step().course_rad for _ in range(40)]
-    turned = np.diff([course for course in courses if course is not None])
-    assert turned.max() == pytest.approx(0.1)  # 0.2 rad/s
-    assert courses[-1] == pytest.approx(math.atan2(30.0, 1.0))  # from where the first waypoint was reached
-
-
 def test_hover_and_follow_want_no_velocity_and_a_velocity_is_kept() -> None:
     for kind in ("hover", "follow"):
         np.testing.assert_allclose(Point(mission(kind=kind)).step().velocity, ORIGIN)
@@ -194,15 +164,6 @@ def test_a_goal_takes_the_place_of_any_other_mission_for_good() -> None:
     np.testing.assert_allclose(point.position, [0.0, 20.0], atol=1.0)
 
 
-def test_a_goal_ordered_after_a_velocity_is_for_good_too() -> None:
-    point = Point(mission(kind="hover"))
-    point.step(MissionOrder(velocity=np.array([0.0, 0.5])))
-    point.fly(4.0)
-    point.step(MissionOrder(place=np.array([20.0, 0.0])))
-    assert point.fly(60.0).arrived
-    np.testing.assert_allclose(point.position, [20.0, 0.0], atol=0.1)
-
-
 PLACE, VELOCITY = MissionOrder(place=np.array([40.0, 0.0])), MissionOrder(velocity=np.array([0.5, 0.0]))
 
 
@@ -218,27 +179,6 @@ def test_an_order_without_a_height_keeps_the_last_one_ordered(
     assert point.step(replace(first, height_m=8.0)).height_m == 9.0
     assert point.step(second).height_m == 9.0
     assert {point.step().height_m for _ in range(10)} == {9.0}
-
-
-@pytest.mark.parametrize("loses", ["position", "fence"])
-def test_a_drone_that_stops_on_its_way_stays_at_the_height_of_that_way(loses: str) -> None:
-    """At 4 m it reached its first waypoint; at 8 m, on its way to the next, the autopilot's position is lost.
-
-    Or the next one but one, in degrees, turns out to be outside the fence.
-    """
-    waypoints: tuple[dict[str, float], ...] = (
-        {"north_m": 2.0, "east_m": 0.0, "height_m": 4.0},
-        {"north_m": 9.0, "east_m": 0.0, "height_m": 8.0},
-        {"latitude_deg": 48.0, "longitude_deg": 8.5},
-    )
-    navigator = Navigator(mission(kind="waypoints", waypoints=waypoints), GATE)
-    home_deg = np.array([47.4, 8.5])
-    assert navigator.step(Moment(0.0, np.array([0.0, 0.0]), home_deg=home_deg)).height_m == 4.0
-    assert navigator.step(Moment(0.5, np.array([2.0, 0.0]), home_deg=home_deg)).height_m == 8.0
-    stopped = Moment(1.0, None) if loses == "position" else Moment(1.0, np.array([9.0, 0.0]), home_deg=home_deg)
-    guidance = navigator.step(stopped)
-    np.testing.assert_array_equal(guidance.velocity, ORIGIN)
-    assert guidance.height_m == 8.0
 
 
 @pytest.fixture
@@ -368,7 +308,7 @@ def test_the_configuration_and_the_gate_agree_on_what_is_outside() -> None:
 
 
 def test_one_of_five_knows_the_goal_and_all_arrive_within_ten_metres() -> None:
-    _, position, _ = fly_exact_states(load_scenario(CONFIG / "one_knows.yaml", {"duration_s": 60.0}))
+    _, position, _ = fly_exact_states(load_scenario(CONFIG / "one_knows.yaml", {"duration_s": 45.0}))
     plan = position[-1, :, :2]
     assert np.linalg.norm(plan[:, None] - plan, axis=-1).max() < 10.0
     assert np.linalg.norm(plan - [25.0, 10.0], axis=1).max() < 10.0
@@ -380,20 +320,6 @@ def test_those_who_see_a_drone_that_is_flown_by_hand_go_with_it() -> None:
     assert np.linalg.norm(position[-1, :, :2] - [20.0, 10.0], axis=1).max() < 10.0
     # A person's drone goes as the person wants, wherever the others are: 0.5 m/s straight to the north at first.
     np.testing.assert_allclose(velocity[20, 0], [0.5, 0.0, 0.0], atol=0.01)
-
-
-def test_a_mission_changes_the_height_and_lands_at_its_end() -> None:
-    scenario = load_scenario(CONFIG / "led_by_hand.yaml", {"duration_s": 30.0})
-    lands = MissionParameters.model_validate(
-        {"kind": "waypoints", "at_end": "land", "waypoints": ({"north_m": 6.0, "east_m": 0.0, "height_m": 6.0},)}
-    )
-    start = scenario.vehicles[0].model_copy(update={"mission": lands, "by_hand": False})
-    alone = scenario.model_copy(update={"vehicles": (start,)})
-    _, position, _ = fly_exact_states(alone)
-    heights = -position[:, 0, 2]
-    assert heights.max() == pytest.approx(6.0, abs=0.15)
-    assert heights[-1] == pytest.approx(0.0, abs=0.01)
-    assert np.diff(heights).max() / 0.5 < 1.6  # MAX_CLIMB_M_S
 
 
 # Laps: mission, gate and vehicle in closed loop, turning to one side all the time.

@@ -5,13 +5,19 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from flockd.core.data import data_path
 from flockd.core.messages import FloatArray, UInt8Array
 from flockd.flight.geometry import RigidTransform
+from flockd.flight.inference import load_manifest
 from flockd.flight.perception import Crop
+from flockd.flight.perception.detection.second_stage import SecondStage
 from flockd.sim.renderer.drone_models import drone_model
 from flockd.sim.renderer.renderer import Renderer, View
 from flockd.sim.world.world import World
 from tests.make import pinhole
+
+SECOND_STAGE = SecondStage.of(load_manifest(data_path("models") / "distance_int8.yaml")[0])
+"""The interface of the shipped second stage, for fakes that stand in its place."""
 
 
 def crop_of(image: UInt8Array, focal_px: float, *, mirrored: bool = False) -> Crop:

@@ -26,16 +26,18 @@ def seen(image: UInt8Array) -> PictureResult:
 
 
 def answering(monkeypatch: pytest.MonkeyPatch, probability: float, width_px: float) -> None:
-    """Every cell of the detector's maps says so of a drone."""
+    """Every cell of the detector's maps says so of a drone; not a number: it fails."""
     infer = OnnxModel.infer
 
     def lie(model: OnnxModel, contents: dict[str, object]) -> dict[str, Float32Array]:
         outputs = infer(model, contents)  # type: ignore[arg-type]
-        if model.manifest.name == "detector":
-            boxes = outputs["boxes"].copy()
-            boxes[..., 2:5] = (width_px, width_px / 2, probability)
-            outputs = {**outputs, "boxes": boxes}
-        return outputs
+        if model.manifest.name != "detector":
+            return outputs
+        if np.isnan(probability):
+            raise FloatingPointError("model detector: output boxes is not finite")
+        boxes = outputs["boxes"].copy()
+        boxes[..., 2:5] = (width_px, width_px / 2, probability)
+        return {**outputs, "boxes": boxes}
 
     monkeypatch.setattr(OnnxModel, "infer", lie)
 
@@ -50,24 +52,13 @@ def test_a_detector_that_sees_drones_everywhere_is_contradicted_and_costs_no_mor
     assert result.detections == ()
 
 
-def test_a_detector_that_sees_none_leaves_the_drone_to_the_segmentation(monkeypatch: pytest.MonkeyPatch) -> None:
-    answering(monkeypatch, 0.0, 20.0)
-    assert len(seen(rendered(240.0, SIZE, (3.0, 0.3, -4.4)).rgb).detections) == 1
-
-
-def test_a_detector_that_gives_no_finite_numbers_costs_the_image_and_nothing_else(
+def test_one_that_sees_none_leaves_the_drone_to_the_segmentation_and_one_that_fails_costs_the_image(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    infer = OnnxModel.infer
-
-    def fail(model: OnnxModel, contents: dict[str, object]) -> dict[str, Float32Array]:
-        if model.manifest.name == "detector":
-            raise FloatingPointError("model detector: output boxes is not finite")
-        return infer(model, contents)  # type: ignore[arg-type]
-
     image = rendered(240.0, SIZE, (3.0, 0.3, -4.4)).rgb
+    answering(monkeypatch, 0.0, 20.0)
     assert len(seen(image).detections) == 1
-    monkeypatch.setattr(OnnxModel, "infer", fail)
+    answering(monkeypatch, np.nan, 20.0)
     result = seen(image)
     assert (result.detections, result.proposals) == ((), 0)
     assert not np.any(result.mask)

@@ -1,4 +1,4 @@
-"""Images that are noise are told from images of scenes, and camera by camera from what it showed before."""
+"""Images that are noise are told from those of scenes and from what the camera and its neighbours showed before."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ import pytest
 
 from flockd.core.config.perception import NoiseParameters
 from flockd.core.messages import UInt8Array
+from flockd.flight.geometry.rotations import rotation_from_euler
+from flockd.flight.perception.continuity import ContinuityMonitor
 from flockd.flight.perception.image_noise import NoiseMonitor, noise_shares
+
+pytestmark = pytest.mark.fault("noisy-camera")
 
 SIZE = (480, 640)
 PARAMETERS = NoiseParameters()
@@ -55,12 +59,6 @@ def test_noise_of_a_good_camera_is_none_and_so_are_images_of_one_colour_or_too_s
     assert white_share(noisy(scene(1.0, 30.0), 8.0)) < 0.02
     assert white_share(np.full((*SIZE, 3), 70, np.uint8)) == 0.0
     assert white_share(noisy(scene(1.0, 10.0, size=(24, 640)), 80.0)) == 0.0
-
-
-def test_noise_is_found_in_what_jpeg_leaves_of_it() -> None:
-    done, data = cv2.imencode(".jpg", noisy(scene(1.0, 20.0), 50.0), [cv2.IMWRITE_JPEG_QUALITY, 70])
-    assert done
-    assert white_share(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)) > 0.85
 
 
 def test_the_share_is_that_of_the_noisy_part() -> None:
@@ -133,3 +131,87 @@ def test_a_turn_from_the_sky_to_the_finest_texture_is_no_noise() -> None:
     columns = [round(SIZE[1] * share) for share in (0.0, 1 / 3, 2 / 3, 1.0, 1.0)]
     turned = [np.concatenate([gravel[:, :count], sky[:, count:]], axis=1) for count in columns]
     assert Camera().shows(*turned) == [False] * 5
+
+
+# Images that do not follow from the ones before them are told by comparison with the other cameras'.
+
+
+CAMERAS = ("front", "right", "left")
+WORLD = scene(1.2, 40.0, size=(SIZE[0], 2 * SIZE[1]))
+
+
+def view(number: int, pixels_a_step: int = 12) -> UInt8Array:
+    """The world, from a camera that moves along it."""
+    left = number * pixels_a_step
+    return WORLD[:, left : left + SIZE[1]]
+
+
+def blocks(side: int, share: float, number: int) -> UInt8Array:
+    """The view with squares of one colour each; a share of all, at other places in each image."""
+    rng = np.random.default_rng(number)
+    cells = (SIZE[0] // side, SIZE[1] // side)
+    colours = cv2.resize(rng.integers(0, 256, (*cells, 3), dtype=np.uint8), SIZE[::-1], interpolation=cv2.INTER_NEAREST)
+    hit = cv2.resize((rng.random(cells) < share).astype(np.uint8), SIZE[::-1], interpolation=cv2.INTER_NEAREST)
+    return np.where(hit[..., None] > 0, np.asarray(colours, np.uint8), view(number))
+
+
+class Rig:
+    """Cameras that all see the world; one of them may show something else."""
+
+    def __init__(self) -> None:
+        self._monitor = ContinuityMonitor(NoiseParameters())
+        self._number = 0
+
+    def left_shows(self, *images: UInt8Array | None, after_s: float = STEP_S) -> list[bool]:
+        """Whether the left camera is broken, for each image in turn; None: what it should show."""
+        found = []
+        for image in images:
+            self._number += 1
+            shown = {name: view(self._number) for name in CAMERAS}
+            shown["left"] = shown["left"] if image is None else image
+            broken = self._monitor.broken(shown, 100.0 + after_s * self._number, np.eye(3))
+            assert set(broken) <= {"left"}
+            found.append(bool(broken))
+        return found
+
+
+@pytest.mark.parametrize("side", [8, 16, 32])
+def test_blocks_are_damage_from_their_first_image_on_until_two_good_ones_followed(side: int) -> None:
+    damaged = [blocks(side, 1.0, number) for number in (2, 3, 4)]
+    shown = [None, *damaged, None, None, None]
+    # The first good image does not follow from the damage, the second is the first good one, the third is used.
+    assert Rig().left_shows(*shown) == [False, True, True, True, True, True, False]
+
+
+def test_few_blocks_are_not_enough_and_many_are() -> None:
+    assert Rig().left_shows(None, blocks(16, 0.03, 2), None) == [False] * 3
+    assert Rig().left_shows(None, blocks(16, 0.5, 2), blocks(16, 0.5, 3)) == [False, True, True]
+
+
+def test_light_that_changes_and_a_black_image_are_no_damage() -> None:
+    brighter = np.clip(1.3 * view(2).astype(float) + 15.0, 0, 255).astype(np.uint8)
+    assert Rig().left_shows(None, brighter, None) == [False] * 3
+    assert Rig().left_shows(None, np.zeros((*SIZE, 3), np.uint8), None) == [False] * 3
+
+
+def test_after_a_pause_a_camera_may_see_something_else() -> None:
+    assert Rig().left_shows(None, scene(1.2, 40.0, seed=9), after_s=5.0) == [False, False]
+
+
+def test_all_cameras_at_once_is_a_motion_and_no_damage_and_one_alone_is_not_judged() -> None:
+    monitor = ContinuityMonitor(NoiseParameters())
+    for number in range(4):
+        turned = scene(1.2, 40.0, seed=number)
+        assert monitor.broken(dict.fromkeys(CAMERAS, turned), STEP_S * number, np.eye(3)) == []
+    alone = ContinuityMonitor(NoiseParameters())
+    found = [alone.broken({"front": scene(1.2, 40.0, seed=n)}, STEP_S * n, np.eye(3)) for n in range(3)]
+    assert found == [[]] * 3
+
+
+@pytest.mark.parametrize(("turn_deg", "judged"), [(5.0, True), (15.0, False)])
+def test_while_the_drone_turns_fast_no_camera_is_judged(turn_deg: float, judged: bool) -> None:
+    monitor = ContinuityMonitor(NoiseParameters())
+    for number in range(2):
+        shown = {name: view(number) for name in CAMERAS} | {"left": blocks(16, 1.0, number)}
+        broken = monitor.broken(shown, STEP_S * number, rotation_from_euler(0.0, 0.0, number * np.deg2rad(turn_deg)))
+    assert broken == (["left"] if judged else [])

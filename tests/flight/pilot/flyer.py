@@ -17,7 +17,7 @@ from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.truth_perception import TruthPerception
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.vehicles.vehicles import Vehicles
-from tests.flight.perception.shipped import SECOND_STAGE
+from tests.flight.perception.cameras import SECOND_STAGE
 
 STEP_S = 0.5
 BAROMETER = {"drone.perception.height": "barometer"}

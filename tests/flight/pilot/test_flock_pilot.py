@@ -62,16 +62,6 @@ def test_true_maps_give_true_motions_and_a_repeated_time_stamp_restarts_the_pair
     assert any(reason.kind is ReasonKind.PAIR for reason in again.reasons)
 
 
-def test_the_others_of_the_rig_fly_on_without_one_camera(flyer: Flyer) -> None:
-    flyer.step()
-    flyer.move()
-    frames, state = flyer.take_frames()
-    output = flyer.pilot.step(without(frames, "left"), state)
-    assert output.counts["camera left: no frame"] == 1
-    assert output.ego_motion is not None
-    assert len(output.detections) == 1
-
-
 def test_a_camera_that_is_elsewhere_is_flown_without(flyer: Flyer, monkeypatch: pytest.MonkeyPatch) -> None:
     assert flyer.step().noisy_cameras == ()
     flyer.move()
@@ -105,7 +95,7 @@ def test_a_neighbour_before_a_camera_that_is_gone_is_as_probable_as_before(
 def test_a_neighbour_pulls_by_how_long_it_has_been_seen() -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (8.0, 0.0, -3.6)))
     other = FlockPilot(changed(flyer.scenario.drone, flocking__cohesion_time_s=None), flyer.truth)
-    for step in range(5):
+    for step in range(4):
         frames, state = flyer.take_frames()
         ours, papers = flyer.pilot.step(frames, state), other.step(frames, state)
         flyer.move()
@@ -289,13 +279,6 @@ def test_a_detection_that_the_tracker_refuses_costs_that_neighbour_only() -> Non
     assert [reason.kind for reason in output.reasons] == [ReasonKind.NEIGHBOUR]
     assert output.detections == (sound,)
     assert output.detection_tracks == tuple(neighbour.track for neighbour in output.neighbours)
-
-
-def test_a_time_before_the_first_step_is_no_error() -> None:
-    flyer = Flyer(ALONE)
-    flyer.step()
-    flyer.time_s -= 5.0
-    assert np.isfinite(flyer.step().command.velocity).all()
 
 
 def test_an_impossible_ego_motion_is_refused_but_not_for_ever() -> None:

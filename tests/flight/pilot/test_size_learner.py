@@ -54,15 +54,11 @@ class Flight:
         scatter: float = 0.0,
         doubt: float = 0.0,
         sizes_m: Sequence[float] = (SIZE_M,) * len(PLACES),
-        weaver: int | None = None,
         learned: LearnedSize | None = None,
         flies: bool = True,
     ) -> None:
-        """`scatter`: standard deviation of the logarithm of the judged size; `doubt`: what the network says of it.
-
-        `weaver`: one of the others that weaves, from 6 s on.
-        """
-        self._weaver, self._lift_m, self._sizes_m, self._doubt = weaver, 0.0, sizes_m, doubt
+        """`scatter`: standard deviation of the logarithm of the judged size; `doubt`: what the network says of it."""
+        self._sizes_m, self._doubt = sizes_m, doubt
         self._judged_m, self._random, self._scatter = judged_m, np.random.default_rng(3), scatter
         networks: Any = object()  # never asked for anything
         self._pilot = FlockPilot(config, networks, observer=self, learned=learned, flies=flies)
@@ -76,10 +72,7 @@ class Flight:
     ) -> Observation:  # fmt: skip
         """Four drones, at the range at which one of the size that it goes by has their apparent size."""
         self.told.append(learned_size)
-        places = PLACES.copy()
-        if self._weaver is not None:
-            places[self._weaver, 2] -= self._lift_m
-        found = tuple(self._detection(place, learned_size, k + 1) for k, place in enumerate(places))
+        found = tuple(self._detection(place, learned_size, k + 1) for k, place in enumerate(PLACES))
         self._last = Observation(frames.time_s, vehicle, {}, found, self._last)
         return self._last
 
@@ -108,9 +101,6 @@ class Flight:
             self.below_m -= climb_m_s * STEP_S
             if asked_m is not None:
                 self.below_m -= (asked_m - height_m) * (1 - math.exp(-STEP_S))  # 1 m/s for each metre
-            wove_s = self.time_s - 6.0
-            wanted_m = 0.43 * math.sin(2 * math.pi * wove_s / 6.0) if 0.0 <= wove_s < 12.0 else 0.0
-            self._lift_m += (wanted_m - self._lift_m) * (1 - math.exp(-STEP_S))
             self.time_s += STEP_S
         return outputs
 
@@ -142,12 +132,6 @@ def size_of(output: PilotOutput) -> SizeStatus:
     return output.size
 
 
-@pytest.fixture
-def no_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For an own weave."""
-    monkeypatch.setattr(Weave, "_may_begin", lambda self, *rest: False)
-
-
 def flight_shows(monkeypatch: pytest.MonkeyPatch, of_looks: SizeEstimate | None, of_track: Any = None) -> None:
     """The flight shows these sizes; `of_track` is called with a track's number."""
     monkeypatch.setattr(FlockSize, "of_looks", lambda self, size_m: of_looks)
@@ -158,7 +142,7 @@ def flight_shows(monkeypatch: pytest.MonkeyPatch, of_looks: SizeEstimate | None,
 def test_a_size_that_the_networks_judge_wrong_is_learned_and_used() -> None:
     """0.56 m instead of 0.4: ranges were 40 % too long. The gate reckons with what the learned size may be off."""
     flight = Flight(drone())
-    outputs = flight.fly(60.0)
+    outputs = flight.fly(25.0)
     assert outputs[5].size is None or not outputs[5].size.used
     assert np.linalg.norm(outputs[5].neighbours[0].position) == pytest.approx(1.4 * 3.19, rel=0.1)
     assert size_of(outputs[-1]).used
@@ -207,25 +191,11 @@ def test_nobody_weaves_before_the_flight_and_in_it_only_the_weave_tells_of_the_s
     assert flight.learned is None
 
 
-def test_ten_steps_a_second_judge_no_more_views_than_two(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else a few seconds of one view stand for a minute of many."""
-    counts = []
-    for step_s in (0.5, 0.1):
-        monkeypatch.setattr("tests.flight.pilot.test_size_learner.STEP_S", step_s)
-        flight = Flight(drone("auto"))
-        flight.fly(12.0)
-        learner = flight._pilot._size
-        assert learner is not None
-        counts.append(len(learner._judged))
-    assert counts[0] > 60
-    assert counts[1] == pytest.approx(counts[0], rel=0.1)
-
-
 def test_each_of_two_types_that_look_alike_has_its_own_size() -> None:
     """All are judged to be 0.56 m large; two are 0.4 and two 0.76 m."""
     flight = Flight(drone(), sizes_m=(0.4, 0.76, 0.4, 0.76))
     before = flight.fly(5.0)[-1]
-    last = flight.fly(60.0)[-1]
+    last = flight.fly(25.0)[-1]
     first, final = (_range_errors(output, flight.below_m) for output in (before, last))
     assert min(map(abs, first)) > 0.09, "0.56 / 0.4 and 0.56 / 0.76"
     assert max(map(abs, final)) < 0.1
@@ -233,23 +203,9 @@ def test_each_of_two_types_that_look_alike_has_its_own_size() -> None:
     assert (min(sizes_m), max(sizes_m)) == pytest.approx((0.4, 0.76), rel=0.1)
 
 
-@pytest.mark.usefixtures("no_room")
-def test_whoever_sees_another_weave_learns_the_size() -> None:
-    outputs = Flight(drone(), weaver=0).fly(22.0)
-    assert not any(weaves(outputs))
-    assert size_of(outputs[-1]).used
-    assert size_of(outputs[-1]).size_m == pytest.approx(SIZE_M, rel=0.15)
-
-
-@pytest.mark.usefixtures("no_room")
-def test_a_neighbours_own_size_is_used_without_an_own_weave(monkeypatch: pytest.MonkeyPatch) -> None:
-    flight_shows(monkeypatch, None, lambda number: SizeEstimate(SIZE_M, 0.05) if number == 1 else None)
-    assert "0.40 m large" in Flight(drone()).fly(10.0)[-1].mission.sentence
-
-
 def test_a_drone_that_knows_the_size_weaves_once_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     flight_shows(monkeypatch, SizeEstimate(SIZE_M, 0.05))
-    woven = weaves(Flight(drone()).fly(60.0))
+    woven = weaves(Flight(drone()).fly(45.0))
     assert sum(now and not before for before, now in itertools.pairwise([False, *woven])) == 1
 
 
@@ -270,16 +226,6 @@ def test_a_size_that_is_not_plausible_is_not_used(judged_m: float, monkeypatch: 
     flight_shows(monkeypatch, SizeEstimate(SIZE_M, 0.05))
     size = size_of(Flight(drone(), judged_m=judged_m).fly(10.0)[-1])
     assert (size.size_m, size.used) == (SIZE_M, False)
-
-
-def test_an_own_size_that_is_not_plausible_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nor one that becomes so: the track of a drone that begins to rise with the own one."""
-    said = iter([SizeEstimate(SIZE_M, 0.05)] * 40)
-    flight_shows(monkeypatch, None, lambda number: next(said, SizeEstimate(3.0, 0.05)))
-    outputs = Flight(drone()).fly(60.0)
-    assert any("0.40 m large" in one.mission.sentence for one in outputs)
-    assert not any("3.00" in one.mission.sentence for one in outputs)
-    assert max(float(np.linalg.norm(one.position)) for one in outputs[-1].neighbours) < 6.0
 
 
 @pytest.mark.parametrize(("size_m", "judged_m", "range_m"), [(0.4, 0.56, 4.2), (0.7, 0.7, 3.0)])
@@ -305,14 +251,14 @@ def test_a_size_that_is_in_use_is_undone_before_it_is_judged_again(
     ],
 )
 def test_a_size_that_the_networks_judge_well_stays_theirs(judged_m: float, doubt: float, used: bool) -> None:
-    outputs = Flight(drone("weave"), judged_m=judged_m, doubt=doubt).fly(60.0)
+    outputs = Flight(drone("weave"), judged_m=judged_m, doubt=doubt).fly(25.0)
     assert size_of(outputs[-1]).size_m == pytest.approx(SIZE_M, rel=0.1)
     assert size_of(outputs[-1]).used is used
     assert used or not any(one.size.used for one in outputs if one.size)
 
 
 def test_a_size_that_was_said_and_is_wrong_is_a_warning_with_both() -> None:
-    outputs = Flight(drone(drone_size_m=JUDGED_M, drone_size_sigma_m=0.01)).fly(60.0)
+    outputs = Flight(drone(drone_size_m=JUDGED_M, drone_size_sigma_m=0.01)).fly(25.0)
     first, last = (
         [reason.text for reason in one.reasons if reason.kind is ReasonKind.SIZE] for one in (outputs[5], outputs[-1])
     )
@@ -322,7 +268,7 @@ def test_a_size_that_was_said_and_is_wrong_is_a_warning_with_both() -> None:
 
 
 def test_it_is_off_where_it_is_not_asked_for() -> None:
-    outputs = Flight(drone("off"), scatter=0.1).fly(60.0)
+    outputs = Flight(drone("off"), scatter=0.1).fly(25.0)
     assert all(one.size is None and one.command.height_m is None for one in outputs)
 
 
@@ -339,15 +285,9 @@ def test_by_itself_it_weaves_where_the_judged_sizes_are_uncertain(
     scatter: float, doubt: float, said: dict[str, float], *, needed: bool
 ) -> None:
     """As of drones that the networks do not know, and whose size nobody said."""
-    outputs = Flight(drone("auto", **said), scatter=scatter, doubt=doubt).fly(60.0)
+    outputs = Flight(drone("auto", **said), scatter=scatter, doubt=doubt).fly(25.0)
     assert any(weaves(outputs)) is needed
     assert not needed or size_of(outputs[-1]).size_m == pytest.approx(SIZE_M, rel=0.1)
-
-
-def test_two_drones_draw_other_times() -> None:
-    named = (drone().model_copy(update={"name": name}) for name in ("alder", "birch"))
-    begins = [weaves(Flight(config).fly(45.0)).index(True) for config in named]
-    assert begins[0] != begins[1]
 
 
 @dataclass
@@ -435,12 +375,3 @@ def test_an_autopilot_that_follows_heights_otherwise_weaves_twice_in_vain(gain_p
     else:
         assert len(began) >= 4
         assert weaving.weave.given_up is None
-
-
-@pytest.mark.parametrize(("wanted_m", "needed", "lift_m"), [(HEIGHT_M + 1.0, True, 1.0), (HEIGHT_M, False, 0.0)])
-def test_it_ends_at_once_with_another_height_or_no_need(wanted_m: float, needed: bool, lift_m: float) -> None:
-    weaving = Weaving()
-    while not weaving.asked(STEP_S)[0]:
-        pass
-    weaving.wanted_m = wanted_m
-    assert (weaving.asked(12.0, needed=needed) == lift_m).all()

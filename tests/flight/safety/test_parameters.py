@@ -56,14 +56,3 @@ def test_a_law_faster_than_the_gate_is_reported_with_both_keys() -> None:
             load_drone(path, {"flocking.max_speed_m_s": speed_m_s})
     both = load_drone(SIMULATOR, {"flocking.max_speed_m_s": 6.0, "safety.gate.max_speed_m_s": 6.0})
     assert both.safety.gate.max_speed_m_s == 6.0
-
-
-def test_a_file_may_draw_a_fence(tmp_path: Path) -> None:
-    fence = (
-        "safety:\n  gate:\n    fence_radius_m: null\n    fence_corners_m: [[0, -20], [40, -20], [40, 20], [0, 20]]\n"
-    )
-    path = tmp_path / "drone.yaml"
-    path.write_text(SIMULATOR.read_text(encoding="utf-8") + fence, encoding="utf-8")
-    gate = load_drone(path).safety.gate
-    assert gate.fence_radius_m is None
-    assert gate.fence_corners_m == ((0.0, -20.0), (40.0, -20.0), (40.0, 20.0), (0.0, 20.0))

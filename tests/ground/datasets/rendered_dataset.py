@@ -15,7 +15,7 @@ from flockd.flight.geometry import RigCamera, ZMap
 from flockd.flight.perception import Crop, DisFlow, OneByOne, RangeEstimate, SceneMaps
 from flockd.sim.renderer.renderer import Renderer
 from flockd.sim.world.world import World
-from tests.flight.perception.shipped import SECOND_STAGE
+from tests.flight.perception.cameras import SECOND_STAGE
 
 WIDTH, HEIGHT = 320, 240
 FOCAL = 200.0

@@ -37,7 +37,7 @@ from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.sitl.ports import free_endpoint
 from tests import make
 from tests.calm import clock
-from tests.flight.perception.shipped import SECOND_STAGE
+from tests.flight.perception.cameras import SECOND_STAGE
 from tests.onboard.autopilot.flight import until
 
 WIDTH, HEIGHT = 64, 48

@@ -10,12 +10,9 @@ import pytest
 
 from flockd.core.config.perception import DetectionParameters
 from flockd.core.messages import UNCLASSED, BoolArray, Detection, UInt8Array
-from flockd.flight.geometry import ZMap
-from flockd.flight.perception import Crop, Instance, RangeEstimate, SceneMaps
+from flockd.flight.perception import Crop, RangeEstimate
 from flockd.flight.perception.detection.detector import DetectionTrace, Detector
-from flockd.flight.perception.detection.masks import DroneLogits, DroneMasks, first_stage_labels, without_borders
-from flockd.flight.perception.detection.proposals import propose_residuals
-from tests.flight.perception.shipped import SECOND_STAGE
+from flockd.flight.perception.detection.masks import without_borders
 from tests.flight.pilot.flyer import Flyer, SpoilableTruth, scenario_with
 
 PARAMETERS = DetectionParameters()
@@ -107,34 +104,6 @@ def test_masks_are_drawn_as_colours_say() -> None:
     found = drawn(np.where((disc & ~sliver)[:, :, None], np.array([200, 30, 30], np.uint8), meadow))
     assert found[disc & ~sliver].mean() > 0.95
     assert found[sliver].mean() < 0.05, "what has the meadow's colour is the meadow"
-
-
-def test_a_drone_painted_like_the_one_before_it_is_still_proposed() -> None:
-    """By colours, its pixels are the other one's; by the networks alone they are a residual."""
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0), (6.0, -0.6, -4.0)))
-    scene, rig = Scene(flyer), flyer.cameras.rig
-    near, far = (scene.maps.labels == instance.label for instance in scene.maps.instances)
-    image = np.where((near | far)[:, :, None], np.array([200, 30, 30], np.uint8), np.array([90, 120, 160], np.uint8))
-    logit = np.where(near, np.float32(3.0), np.where(far, np.float32(-3.0), np.float32(-7.0)))
-    first = np.where(near | far, np.uint8(UNCLASSED), np.uint8(0))
-    masks = DroneMasks(first, (DroneLogits(1, (slice(None), slice(None)), logit),))
-    by_colours = masks.by_colours(image, COLOUR_WEIGHT)
-    assert (by_colours == np.where(near | far, 1, 0)).mean() > 0.99
-    scenes = {scene.camera: replace(scene.maps, uncertain=~(near | far))}
-    (proposal,) = propose_residuals(rig, scenes, {scene.camera: masks.by_networks()}, SECOND_STAGE.rules, PARAMETERS)
-    place = flyer.vehicles.R_ned_body[0].T @ (flyer.vehicles.position[2] - flyer.vehicles.position[0])
-    assert proposal.roi.direction @ place / np.linalg.norm(place) > np.cos(0.02)
-    assert not propose_residuals(rig, scenes, {scene.camera: by_colours}, SECOND_STAGE.rules, PARAMETERS)
-
-
-def test_instances_get_the_labels_of_their_detections() -> None:
-    """Detected, rejected, and neither."""
-    instances = tuple(Instance(k, np.zeros(2), np.zeros(4), 1.0) for k in (1, 2, 3))
-    labels = np.array([[0, 1, 2, 3, 1]], np.uint8)
-    uncertain = np.array([[False, False, False, False, True]])
-    scene = SceneMaps(ZMap(np.ones((1, 5), np.float32)), labels, instances, uncertain=uncertain)
-    relabelled = first_stage_labels(scene, {1: 7}, rejected=[instances[1]])
-    assert relabelled.tolist() == [[0, 7, 0, UNCLASSED, UNCLASSED]]
 
 
 def test_background_beside_a_drone_is_not_used() -> None:

@@ -16,8 +16,8 @@ from flockd.flight.inference import OnnxModel
 from flockd.flight.perception import Instance, SceneMaps, group_instances
 from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes, with_boxes
 from flockd.flight.perception.detection.proposals import largest_blobs, propose_instances, propose_residuals
-from flockd.flight.perception.detection.roi import Roi, angle_between, roi_of_instance, take_crop
-from tests.flight.perception.shipped import SECOND_STAGE
+from flockd.flight.perception.detection.roi import Roi, roi_of_instance
+from tests.flight.perception.cameras import SECOND_STAGE
 from tests.make import rig_camera
 
 RULES = SECOND_STAGE.rules
@@ -76,27 +76,6 @@ def test_the_crop_of_a_small_drone_shows_the_same_pixels_whatever_the_lens_is_sa
     roi = roi_of((316.0, 237.0, 324.0, 243.0), camera)
     assert roi is not None
     assert math.tan(roi.half_angle) * camera.camera.focal_px == pytest.approx(0.95 * math.hypot(4, 3), rel=0.001)
-
-
-@pytest.mark.parametrize(
-    ("moved", "factor", "alike"), [(0.0, 1.0, True), (0.004, 1.0, False), (0.002, 1.04, True), (0.0, 1.06, False)]
-)
-def test_a_crop_would_repeat_when_it_is_hardly_moved_or_resized(moved: float, factor: float, alike: bool) -> None:
-    ahead = Roi(np.array([0.0, 0.0, 1.0]), 0.1)
-    further = Roi(np.array([math.sin(moved), 0.0, math.cos(moved)]), 0.1 * factor)
-    assert ahead.resembles(further, shift=0.03, resize=1.05) is alike
-
-
-def test_a_crop_shows_what_lies_in_its_direction() -> None:
-    image = np.zeros((480, 640, 3), np.uint8)
-    image[230:250, 470:490] = 255  # 160 px right of the centre: half a focal length
-    direction = np.array([0.5, 0.0, 1.0]) / math.hypot(0.5, 1.0)
-    crop, view = take_crop(Rig({"front": CAMERA}), {"front": image}, Roi(direction, 0.1), 96)
-    assert crop.image.shape == (96, 96, 3)
-    assert angle_between(view.T_body_virtual.rotation[:, 2], direction) < 1e-9
-    assert crop.image[48, 48].min() == 255
-    assert crop.image[5, 5].max() == 0
-    assert crop.camera.focal_px == pytest.approx(48 / math.tan(0.1))
 
 
 # How many.

@@ -8,7 +8,6 @@ import pytest
 
 from flockd.core.messages import Float32Array, UInt8Array
 from flockd.flight.perception import DisFlow
-from flockd.flight.perception.flow.cross_correlation import flow_correlation, global_translation
 from flockd.flight.perception.flow.features import feature_flow
 from tests.flight.perception.conftest import WrongFlow, grey
 
@@ -106,21 +105,6 @@ def windows(right: int, down: int) -> tuple[UInt8Array, UInt8Array]:
     first = large[top : top + 360, left : left + 540]
     second = large[top - down : top - down + 360, left - right : left - right + 540]
     return np.ascontiguousarray(first), np.ascontiguousarray(second)
-
-
-@pytest.mark.parametrize("true", [(0, 0), (232, -40), (-248, 64), (16, 160)])
-def test_the_shift_of_a_whole_image_is_found_to_a_small_pixel(true: tuple[int, int]) -> None:
-    first, second = windows(*true)
-    found = global_translation(grey(first), grey(second))
-    assert np.abs(np.array(found) - true).max() <= 8.0
-
-
-def test_a_flow_is_likely_where_it_leads_to_the_same() -> None:
-    first, second = (grey(image) for image in windows(64, -32))
-    right = np.full((360, 540, 2), (64.0, -32.0), np.float32)
-    assert flow_correlation(first, second, right) > 0.98
-    assert flow_correlation(first, second, -right) < 0.3
-    assert flow_correlation(first, second, np.full_like(right, 2000.0)) == 0.0
 
 
 def test_dis_finds_a_large_turn_although_the_network_went_astray() -> None:

@@ -153,14 +153,6 @@ def test_what_is_suddenly_in_the_beam_is_not_the_ground(range_m: float) -> None:
     assert all(isinstance(told[0], GroundEstimate) and told[0].height_m == 4.0 for told in others)
 
 
-def test_alone_it_gives_no_scale() -> None:
-    drone = Drone("range_finder")
-    drone.hovers(3.0)
-    ground, why = drone.hovers(2.0, 0.3)[-1]
-    assert ground is None
-    assert why is not None and why.kind is ReasonKind.HEIGHT and "contradicts" in why.text and "no scale" in why.text
-
-
 def test_what_is_in_the_beam_from_the_start_contradicts_home() -> None:
     """Where the height is zero the ground was, when the drone was armed there."""
     drone = Drone()
@@ -198,20 +190,10 @@ def test_a_step_in_the_ground_is_believed_once_the_range_follows_the_height() ->
     assert told[0].height_m == pytest.approx(8.0)
 
 
-def test_one_that_jumps_to_and_fro_is_not_believed() -> None:
-    drone = Drone()
-    drone.hovers(3.0)
-    sources = {source(drone.step(1.0 if k // 3 % 2 else 7.0)) for k in range(60)}
-    last = [source(drone.step(1.0 if k // 3 % 2 else 7.0)) for k in range(12)]
-    assert set(last) == {"barometer"}
-    assert sources == {"range_finder", "barometer"}, "the first is bridged"
-
-
 def test_the_barometers_drift_is_no_lie() -> None:
     """2 cm a second, as in a storm: over the time that is compared it stays within the tolerance."""
-    drone, true_m = Drone(), 4.0
-    for _ in range(600):
-        assert source(drone.step(true_m, climb_m_s=0.02)) == "range_finder"
+    drone = Drone()
+    assert {source(drone.step(4.0, climb_m_s=0.02)) for _ in range(600)} == {"range_finder"}
 
 
 @pytest.mark.parametrize("speed_m_s", [0.0, 1.0, 3.0])
@@ -251,10 +233,3 @@ def test_hills_of_fifteen_per_cent_never_contradict_the_barometer(seed: int) -> 
         rises_m.append(float(ground(position[:1], position[1:2])[0]))
     assert told == {None}
     assert np.ptp(rises_m) > 1.0, "there were hills"
-
-
-def test_over_level_ground_a_lie_of_less_than_the_tolerance_is_not_noticed() -> None:
-    """That is the limit of the check, as the documentation says."""
-    drone = Drone(tolerance_m=1.0)
-    drone.hovers(3.0)
-    assert source(drone.hovers(5.0, 3.1)[-1]) == "range_finder"

@@ -75,23 +75,6 @@ def test_successive_ranges_over_a_hillside_tell_its_slope() -> None:
     assert ground.height_m == pytest.approx(7.0 - 0.12 * 14.5, rel=0.02)
 
 
-def test_the_own_climb_is_no_change_of_the_ground() -> None:
-    below = follower()
-    for k in range(10):
-        ground = known(below.update(state(STEP_S * k, 3.0 + 0.2 * k, height_m=3.1 + 0.2 * k)))
-        assert ground.height_m == pytest.approx(3.0 + 0.2 * k)
-
-
-def test_ranges_are_smoothed() -> None:
-    """Over level ground, the error of the height is less than half of a reading's."""
-    below, rng, errors = follower(), np.random.default_rng(1), []
-    for k in range(200):
-        reading_m = 4.0 + 0.06 * float(rng.standard_normal())
-        ground = known(below.update(state(STEP_S * k, reading_m, north_m=0.1 * k)))
-        errors.append(ground.height_m - 4.0)
-    assert np.std(errors[20:]) < 0.03
-
-
 FAULTS: dict[str, Callable[[float], VehicleState]] = {
     "no range finder is heard": lambda t: state(t, None),
     "the range is not a number": lambda t: state(t, math.nan),
