@@ -364,6 +364,12 @@ def test_resume_does_not_help_while_the_link_is_lost_nor_in_flight() -> None:
     flying().step(cameras=NONE_SEE).step(resume_asked=True).then(State.HOVER)
 
 
+def test_a_glimpse_lost_for_half_a_second_is_a_hover_and_a_slow_while() -> None:
+    flight = flying().run(0.5, cameras=NONE_SEE).then(State.HOVER).step(cameras=ALL_SEE).then(State.DEGRADED)
+    assert not flight.events
+    flight.run(2.0 - 2 * STEP_S).then(State.DEGRADED).step().then(State.NORMAL)
+
+
 def test_cameras_unplugged_hover_at_most_a_second_then_hold_then_silence() -> None:
     flight = flying().run(1.0, cameras=NONE_SEE).then(State.HOVER).step().then(Action.ASK_HOLD)
     flight.run(0.5).then(Action.ASK_HOLD).step(flight_mode="hold").then(State.SILENT)
@@ -413,6 +419,11 @@ def test_a_worse_event_while_asking_asks_for_more_and_has_its_own_two_seconds() 
     flight = flying().run(1.5, hold_asked=True).step(land_asked=True).then(Action.ASK_LAND)
     assert flight.events[:2] == [Event.HOLD_ASKED, Event.LAND_ASKED]
     flight.run(2.0 - STEP_S, land_asked=False).then(Action.ASK_LAND).step().then(State.SILENT)
+
+
+def test_when_stopped_it_stands_still_until_hold_is_confirmed() -> None:
+    flight = flying().step(shutdown_asked=True).then(Action.ASK_HOLD).run(0.5).step(flight_mode="hold")
+    assert flight.then(State.SILENT).events[0] is Event.SHUTDOWN_ASKED
 
 
 @pytest.mark.parametrize(
