@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import is_dataclass, replace
 from types import UnionType
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 import numpy as np
 from pydantic import BaseModel
@@ -193,6 +193,12 @@ def filled(kind: Any, number: float) -> Any:
     origin, parts = get_origin(kind), get_args(kind)
     if kind is Reason:
         return Reason(ReasonKind.RECORDED, "front")
+    if is_typeddict(kind):
+        return {name: filled(hint, number) for name, hint in get_type_hints(kind).items()}
+    if origin is Literal:
+        return parts[0]
+    if origin is list:
+        return [filled(parts[0], number)] * 3
     if is_dataclass(kind) and isinstance(kind, type):
         hints = get_type_hints(kind, include_extras=True)
         return kind(**{field: filled(hint, number) for field, hint in hints.items()})

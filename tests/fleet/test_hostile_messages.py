@@ -8,7 +8,7 @@ import json
 import time
 from random import Random
 from types import SimpleNamespace
-from typing import Any, get_args, get_origin, get_type_hints, is_typeddict
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -25,23 +25,10 @@ from flockd.onboard.telemetry.topics import TOPICS
 from flockd.sim.flock.live_flight import LiveControls
 from flockd.sim.scenario import load_scenario
 from tests.hostile import ABSURD_TEXTS, absurd, assert_readable, hostile, mutated_bytes, mutated_json, nested
+from tests.make import filled
 
 COMMANDS = ("hold", "land", "goto", "velocity", "resume", "HOLD", "hold ", "hold/land", "__init__")
 NAMES = ("drone1", "front", "\x1b[2J", "é", " ", "a" * 300)
-
-
-def _example(kind: Any) -> Any:
-    """A message of a topic's type."""
-    origin, parts = get_origin(kind), get_args(kind)
-    if is_typeddict(kind):
-        return {name: _example(hint) for name, hint in get_type_hints(kind).items()}
-    if origin is list:
-        return [_example(parts[0])] * 3
-    if origin is dict:
-        return {"front": _example(parts[1])}
-    if parts:
-        return _example(next((part for part in parts if part is not type(None)), float))
-    return {float: 1.0, int: 3, bool: True, str: "normal"}.get(kind, "normal")
 
 
 def _sample(key: str, payload: bytes, attachment: bytes | None = None) -> Any:
@@ -54,7 +41,7 @@ def _sample(key: str, payload: bytes, attachment: bytes | None = None) -> Any:
 
 
 def test_whatever_is_published_is_shown_or_left() -> None:
-    examples = {name: _example(topic.type) for name, topic in TOPICS.items()}
+    examples = {name: filled(topic.type, 1.0) for name, topic in TOPICS.items()}
     now_s = [1000.0]
 
     @hostile(50)

@@ -80,7 +80,7 @@ async def opened(client: Client, access: PageAccess) -> dict[str, str]:
 
 async def test_without_the_key_nothing_is_shown() -> None:
     async with served() as (client, access, fleet):
-        paths = (
+        paths = [
             "/",
             "/fleet_page.js",
             "/plotly.js",
@@ -89,12 +89,12 @@ async def test_without_the_key_nothing_is_shown() -> None:
             "/live",
             "/?key=wrong",
             "/?key=",
-        )
+        ]
         for path in paths:
             assert (await client.get(path)).status == 403, path
         assert (await client.post("/ask", json=HOLD)).status == 403
         await opened(client, access)
-        for path in paths[:-3]:
+        for path in shown:
             assert (await client.get(path)).status == 200, path
         assert fleet.commands == []
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import pytest
 from aiohttp import WSMsgType, web
 from aiohttp.test_utils import TestClient, TestServer
 
@@ -67,10 +68,7 @@ async def test_a_page_of_drones_that_are_not_simulated_here_shows_no_control_and
         headers = await opened(client, access)
         assert await shown_by(client, headers) is None
         reply = await client.post("/simulate", json=PAUSE, headers=headers)
-        assert (reply.status, await reply.text()) == (
-            403,
-            "these drones are not simulated here: there is nothing to control beside them",
-        )
+        assert (reply.status, "not simulated here" in await reply.text()) == (403, True)
         reply = await client.post("/ask", json={"drones": ["f/one"], "command": "pause"}, headers=headers)
         assert reply.status == 400, "a control is no command to a drone"
 
@@ -137,10 +135,5 @@ def test_as_soon_as_a_drone_is_heard_that_is_not_of_the_simulation_there_is_noth
 
 def test_the_simulators_key_is_none_of_a_drones() -> None:
     assert not key_of("f").startswith(f"{PREFIX.split('/')[0]}/")
-    with ZenohTelemetry("f", listen=[free_endpoint()]) as simulator:
-        try:
-            simulator.reply_to(f"{PREFIX}/f/drone1/ask/*", lambda last, payload: {})
-        except ValueError as error:
-            assert "is a drone's" in str(error)
-        else:
-            raise AssertionError("it would answer for a drone")
+    with ZenohTelemetry("f", listen=[free_endpoint()]) as simulator, pytest.raises(ValueError, match="is a drone's"):
+        simulator.reply_to(f"{PREFIX}/f/drone1/ask/*", lambda last, payload: {})
