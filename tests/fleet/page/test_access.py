@@ -80,17 +80,8 @@ async def opened(client: Client, access: PageAccess) -> dict[str, str]:
 
 async def test_without_the_key_nothing_is_shown() -> None:
     async with served() as (client, access, fleet):
-        paths = [
-            "/",
-            "/fleet_page.js",
-            "/plotly.js",
-            "/history",
-            "/image/f/one/front",
-            "/live",
-            "/?key=wrong",
-            "/?key=",
-        ]
-        for path in paths:
+        shown = "/", "/fleet_page.js", "/plotly.js", "/history", "/image/f/one/front"
+        for path in (*shown, "/live", "/?key=wrong", "/?key="):
             assert (await client.get(path)).status == 403, path
         assert (await client.post("/ask", json=HOLD)).status == 403
         await opened(client, access)
