@@ -34,7 +34,7 @@ lint: $(VENV)/test.installed ### ruff and mypy
 	$(BIN)/mypy
 
 test: lint ## lint and all tests but the slow ones, on two cores in about 10 minutes
-	$(BIN)/python -m pytest -n 2 -m "not slow and not browser and not ros and not ray and not training" --durations=10 --durations-min=1
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow and not browser and not ros and not ray and not training" --durations=10 --durations-min=1
 
 test-all: lint ### lint and all tests, those too that take minutes each
 	$(BIN)/python -m pytest -n 2
