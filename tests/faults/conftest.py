@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
 
@@ -11,29 +11,18 @@ import pytest
 
 from flockd.core.config import DroneConfig
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from flockd.sim.sitl.ports import free_port
 from tests import calm
 from tests.make import changed
-from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
+from tests.onboard.autopilot.conftest import fake_autopilot, port
 from tests.onboard.daemon.aboard import Aboard, aboard
 
+__all__ = ["fake_autopilot", "port"]
 InTheAir = Callable[..., AbstractAsyncContextManager[Aboard]]
 
 
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     """See `tests.calm`; by its fixtures a test says where its drone flies."""
     return calm.run_coroutine_test(pyfuncitem, calm.run) if "port" in pyfuncitem.fixturenames else None
-
-
-@pytest.fixture
-def port() -> int:
-    return free_port()
-
-
-@pytest.fixture
-def fake_autopilot(port: int) -> Iterator[FakeAutopilot]:
-    with FakeAutopilot(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=calm.clock) as fake_autopilot:
-        yield fake_autopilot
 
 
 @pytest.fixture

@@ -12,12 +12,22 @@ from typing import Self
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
+from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.core.messages import FloatArray
+from flockd.sim.flock.start import with_drones
+from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.sitl.autopilots import px4_folder
 from flockd.sim.sitl.ground_station import GroundStation
 
 PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
+
+
+def one_drone(height_m: float) -> ScenarioConfig:
+    """PX4's flight with one drone, which begins this high."""
+    scenario = with_drones(load_scenario(data_path("config") / "px4_flight.yaml"), 1)
+    place = scenario.vehicles[0].model_copy(update={"position_m": (0.0, 0.0, -height_m)})
+    return scenario.model_copy(update={"vehicles": (place,)})
 
 
 class SitlRun(ABC):

@@ -20,7 +20,6 @@ import numpy as np
 
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.safety import SafetyParameters
-from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.core.messages import FloatArray, Setpoint, Wanted
 from flockd.flight.safety import Action, Permission, Request, Surroundings, Verdict
@@ -28,12 +27,10 @@ from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.onboard.simulated_time import clock_at
-from flockd.sim.flock.start import with_drones
-from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.sitl.autopilots import BY_HAND, Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.sitl.ports import free_port
 from tests.onboard.autopilot.pilots_link import PilotsLink
-from tests.sitl.sitl_run import Meddler
+from tests.sitl.sitl_run import Meddler, one_drone
 
 HEIGHT_M = 4.0
 NORTH_M_S = 1.0
@@ -379,25 +376,19 @@ async def _ask(link: AutopilotLink) -> None:
         await asyncio.sleep(1.0)
 
 
-def _scenario() -> ScenarioConfig:
-    scenario = with_drones(load_scenario(data_path("config") / "px4_flight.yaml"), 1)
-    place = scenario.vehicles[0].model_copy(update={"position_m": (0.0, 0.0, -HEIGHT_M)})
-    return scenario.model_copy(update={"vehicles": (place,)})
-
-
 Make = Callable[[float, Mapping[str, str], ExitStack], tuple[Autopilots, Callable[[], None]]]
 """An autopilot at a speed factor with PX4's parameters, and what starts it anew."""
 
 
 def _fake(speed_factor: float, _: Mapping[str, str], stack: ExitStack) -> tuple[Autopilots, Callable[[], None]]:
-    fakes = SimulatedAutopilots(_scenario(), speed_factor, lambda north, _: np.zeros_like(north))
+    fakes = SimulatedAutopilots(one_drone(HEIGHT_M), speed_factor, lambda north, _: np.zeros_like(north))
     return stack.enter_context(fakes), lambda: fakes.fakes[0].restart()  # noqa: PLW0108 - there is none before it starts
 
 
 def _px4(speed_factor: float, parameters: Mapping[str, str], stack: ExitStack) -> tuple[Autopilots, Callable[[], None]]:
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="contract-")))
     first, again = (
-        stack.enter_context(Px4s(_scenario(), speed_factor, os.environ, folder / name, parameters))
+        stack.enter_context(Px4s(one_drone(HEIGHT_M), speed_factor, os.environ, folder / name, parameters))
         for name in ("first", "again")
     )
 

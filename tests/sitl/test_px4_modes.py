@@ -18,15 +18,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.onboard.simulated_time import clock_at
-from flockd.sim.flock.start import with_drones
-from flockd.sim.scenario import ScenarioConfig, load_scenario
+from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.sitl.autopilots import Autopilots, Ports, Px4s, SimulatedAutopilots
 from flockd.sim.sitl.processes import Program, Programs
 from tests.sitl.companion import HEIGHT_M
-from tests.sitl.sitl_run import PX4, Meddler, SitlRun
+from tests.sitl.sitl_run import PX4, Meddler, SitlRun, one_drone
 
 SHELL_PORT = 14580
 """Port of this computer, where PX4's instance 0 listens to its companion computer."""
@@ -133,10 +131,7 @@ class Px4Flight(SitlRun):
 
     def _come_up(self) -> None:
         folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="px4-modes-")))
-        scenario = with_drones(load_scenario(data_path("config") / "px4_flight.yaml"), 1)
-        place = scenario.vehicles[0].model_copy(update={"position_m": (0.0, 0.0, -HEIGHT_M)})
-        scenario = scenario.model_copy(update={"vehicles": (place,)})
-        px4s = self._make(scenario, self._speed_factor, os.environ, folder, self._fault.parameters)
+        px4s = self._make(one_drone(HEIGHT_M), self._speed_factor, os.environ, folder, self._fault.parameters)
         self._px4 = self._stack.enter_context(px4s)
         self._px4.start()
         port = self._px4.ports[0]

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from pymavlink import mavutil
 
-from flockd.core.config import DroneConfig
+from flockd.core.config import DroneConfig, load_drone
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
@@ -25,10 +25,11 @@ from flockd.fleet.drone_rows import status_rows
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.autopilot.refusal_reasons import NOT_STREAMING, REASONS, SEVERAL_SENDERS
 from flockd.sim.flock.start import with_drones
-from flockd.sim.scenario import load, load_scenario
+from flockd.sim.scenario import load_scenario
 from flockd.sim.sitl.autopilots import Px4s
 from flockd.sim.sitl.daemons import Daemons
 from flockd.sim.sitl.ports import free_endpoint
+from tests.make import changed
 from tests.sitl.sitl_run import PX4, SitlRun
 
 FLEET = "reasons"
@@ -102,9 +103,7 @@ PROVOCATIONS = (
     _mode("auto:land", "check_modes_cannot_takeoff", "land_mode"),
     _mode("posctl", "check_modes_manual_control", "no_sticks"),
     _mode("offboard", NOT_STREAMING, "no_setpoints"),
-    Provocation(
-        "too_early", NOT_STREAMING, _switch_too_early, _land
-    ),
+    Provocation("too_early", NOT_STREAMING, _switch_too_early, _land),
     Provocation(
         "several_senders", SEVERAL_SENDERS,
         lambda bench: bench.begin_other_computer(), lambda bench: bench.end_other_computer(),
@@ -130,9 +129,7 @@ PROVOCATIONS = (
         "geofence_without_home", "check_gf_no_home",
         parameters={"COM_HOME_EN": "0", "GF_ACTION": "3"}, lasting=True,
     ),
-    Provocation(
-        "no_satellites", "check_modes_local_pos", parameters={"SIM_GPS_USED": "0"}, lasting=True
-    ),
+    Provocation("no_satellites", "check_modes_local_pos", parameters={"SIM_GPS_USED": "0"}, lasting=True),
 )  # fmt: skip
 
 
@@ -170,11 +167,8 @@ class Bench(SitlRun):
         rows = status_rows(self._watcher.drones(), time.monotonic())
         shown = {sentence for row in rows for sentence in row["matters"]}
         reasons = self._flight().get("reasons", ())
-        return {
-            str(reason["event"]): str(reason["sentence"])
-            for reason in reasons
-            if reason["event"] in REASONS and reason["sentence"] in shown
-        }  # fmt: skip
+        refused = {str(one["event"]): str(one["sentence"]) for one in reasons if one["event"] in REASONS}
+        return {event: sentence for event, sentence in refused.items() if sentence in shown}
 
     def armed(self) -> bool:
         """Motors on."""
@@ -217,9 +211,7 @@ class Bench(SitlRun):
             time.sleep(POLL_S)
 
     def _flight(self) -> Mapping[str, Any]:
-        return next(
-            (drone.message("flight", time.monotonic()) or {} for drone in self._watcher.drones()), {}
-        )  # fmt: skip
+        return next((drone.message("flight", time.monotonic()) or {} for drone in self._watcher.drones()), {})
 
     def trial(self, provocation: Provocation) -> str:
         """Provokes a reason, waits until it is shown and how, and takes it back. Raises UnavailableError."""
@@ -241,16 +233,13 @@ class Bench(SitlRun):
 
 def _config(port: int, endpoint: str) -> DroneConfig:
     """The SITL's drone, whose frames never come: what flockd itself lacks is not what this is about."""
-    config = load(data_path("config") / "px4_sitl.yaml")
-    assert isinstance(config, DroneConfig)
-    assert config.source is not None
-    frames = config.source.shared_memory.model_copy(update={"connect": (free_endpoint(),)})
-    return config.model_copy(
-        update={
-            "autopilot": AutopilotParameters(address=f"udpin://127.0.0.1:{port}"),
-            "source": config.source.model_copy(update={"shared_memory": frames}),
-            "telemetry": config.telemetry.model_copy(update={"fleet": FLEET, "listen": (endpoint,), "connect": ()}),
-        }
+    return changed(
+        load_drone(data_path("config") / "px4_sitl.yaml"),
+        autopilot=AutopilotParameters(address=f"udpin://127.0.0.1:{port}"),
+        source__shared_memory__connect=(free_endpoint(),),
+        telemetry__fleet=FLEET,
+        telemetry__listen=(endpoint,),
+        telemetry__connect=(),
     )
 
 

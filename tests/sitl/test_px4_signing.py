@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 from pymavlink import mavutil
 
-from flockd.core.config import DroneConfig
+from flockd.core.config import DroneConfig, load_drone
 from flockd.core.data import data_path
 from flockd.ground.doctor import Level
 from flockd.ground.doctor.autopilot_checks import check_autopilot
 from flockd.sim.flock.start import with_drones
-from flockd.sim.scenario import load, load_scenario
+from flockd.sim.scenario import load_scenario
 from flockd.sim.sitl.autopilots import Px4s
 from tests.sitl.sitl_run import PX4
 
@@ -45,8 +45,7 @@ def test_with_a_key_px4_hears_nobody_who_does_not_sign_until_the_key_is_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MAVLINK20", "1")
-    config = load(data_path("config") / "px4_sitl.yaml")
-    assert isinstance(config, DroneConfig)
+    config = load_drone(data_path("config") / "px4_sitl.yaml")
     scenario = with_drones(load_scenario(data_path("config") / "px4_flight.yaml"), 1)
     with Px4s(scenario, SPEED_FACTOR, os.environ, tmp_path, {}) as px4:
         px4.start()
