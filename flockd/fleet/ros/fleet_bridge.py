@@ -59,7 +59,8 @@ class FleetBridge:
         name of which ``operator``."""
         self._source, self._node, self._may_command, self._operator = source, node, may_command, operator
         self._names = DroneNames()
-        self._has_transforms = has_type(trees.TRANSFORMS)
+        self.has_transforms = has_type(trees.TRANSFORMS)
+        """Whether this ROS 2 has `tf2_msgs`; without it there is no `/tf`."""
         self._sent: dict[tuple[str, str], float] = {}
         self._told: dict[str, tuple[float, Tree]] = {}
         self._drawn: dict[str, Row] = {}
@@ -69,11 +70,6 @@ class FleetBridge:
         self._order_threads = ThreadPoolExecutor(_THREADS, "ROS 2 orders")
         self._over = threading.Event()
         self._thread = ThreadPoolExecutor(1, "fleet in ROS 2")
-
-    @property
-    def has_transforms(self) -> bool:
-        """Whether this ROS 2 has `tf2_msgs`; without it there is no `/tf`."""
-        return self._has_transforms
 
     def __enter__(self) -> FleetBridge:
         self._publishing = self._thread.submit(self._publish)
@@ -135,7 +131,7 @@ class FleetBridge:
                 ]
             case "obstacles":
                 return [(f"{space}/obstacles", trees.LASER_SCAN, trees.scan(time_ns, names, message))]
-        frames = _transforms(time_ns, names, message, row, about) if self._has_transforms else None
+        frames = _transforms(time_ns, names, message, row, about) if self.has_transforms else None
         return [
             (f"{space}/odometry", trees.ODOMETRY, trees.state_odometry(time_ns, names, message)),
             ("/tf", trees.TRANSFORMS, frames),
@@ -259,15 +255,16 @@ def _transforms(time_ns: int, names: Names, state: StateMessage, row: Row, about
         return None
     place = np.array(list(odometry["pose"]["pose"]["position"].values()))
     R = attitude_in_ros(trees.attitude_of_state(state))
+    mounted = {name: camera.T_body_camera for name, (_, camera) in cameras_of(about).items()}
     cameras = [
         trees.transform(
             time_ns,
             names.base_link,
             names.optical(ros_name(name)),
-            flu_of_frd(camera.T_body_camera.translation),
-            camera_in_ros(camera.T_body_camera.rotation),
+            flu_of_frd(T.translation),
+            camera_in_ros(T.rotation),
         )
-        for name, (_, camera) in cameras_of(about).items()
+        for name, T in mounted.items()
     ]
     return {
         "transforms": [
@@ -292,9 +289,5 @@ def cameras_of(about: AboutMessage | None) -> dict[str, tuple[CameraConfig, RigC
 def _status(name: str, row: Row) -> Tree:
     """Level, state and reasons; the camera's faults are among the reasons."""
     sentence = ": ".join([row["state"], *filter(None, ["; ".join(row["why"])])])
-    return trees.diagnostic(
-        f"{name}: flockd",
-        _LEVELS[row["state"]],
-        sentence,
-        {"state": row["state"], **{one: row[one] for one in _VALUES}},
-    )
+    values = {"state": row["state"], **{one: row[one] for one in _VALUES}}
+    return trees.diagnostic(f"{name}: flockd", _LEVELS[row["state"]], sentence, values)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,16 @@ _MAY_BE_EMPTY = (*_LEFT_AWAY, "truth_position", "truth_velocity")
 def shape_of(name: str, steps: int, drones: int) -> tuple[int, ...]:
     """Of an array of `SHAPES` in the log of so many."""
     return tuple({_S: steps, _N: drones}.get(side, side) for side in SHAPES[name])
+
+
+def spread(samples: FloatArray | Sequence[float], *wanted: str) -> dict[str, float | None]:
+    """Of samples of any shape those of mean, median, p95 and max that are ``wanted``; None where none is finite."""
+    known = np.asarray(samples, float)
+    known = known[np.isfinite(known)]
+    of: dict[str, Callable[[FloatArray], Any]] = {
+        "mean": np.mean, "median": np.median, "p95": lambda values: np.percentile(values, 95), "max": np.max,
+    }  # fmt: skip
+    return {name: float(of[name](known)) if len(known) else None for name in wanted}
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,6 +32,7 @@ from flockd.flight.geometry import (
 from flockd.flight.perception import Crop, ImageNetworks, OneByOne, RangeEstimate, SceneMaps, load_networks
 from flockd.flight.pilot import FlockPilot
 from flockd.ground.datasets.image_folder import Dataset, DatasetFrame
+from flockd.review.flight_log.log import spread
 
 Depth = Literal["recorded", "network"]
 
@@ -66,8 +67,8 @@ def dataset_result(pairs: Sequence[Pair]) -> dict[str, Any]:
     errors = [pair.error for pair in pairs if pair.error]
     return {
         "pairs": [_pair_result(pair) for pair in pairs],
-        "rotation_error_deg": _spread([rotation for rotation, _ in errors]),
-        "translation_error_m": _spread([translation for _, translation in errors]),
+        "rotation_error_deg": spread([rotation for rotation, _ in errors], "median", "p95", "max"),
+        "translation_error_m": spread([translation for _, translation in errors], "median", "p95", "max"),
         "estimated_ratio": sum(pair.found is not None for pair in pairs) / len(pairs),
     }
 
@@ -85,14 +86,6 @@ def _pair_result(pair: Pair) -> dict[str, Any]:
         "estimated": pair.found is not None,
         "reason": pair.reason,
     }
-
-
-def _spread(samples: Sequence[float]) -> dict[str, float | None]:
-    """None without samples."""
-    if not samples:
-        return {"median": None, "p95": None, "max": None}
-    median, p95, largest = np.percentile(samples, (50, 95, 100))
-    return {"median": float(median), "p95": float(p95), "max": float(largest)}
 
 
 _FLAT_DEVIATION = 1.0

@@ -20,6 +20,7 @@ from flockd.onboard.recording.difference import Comparison, compare
 from flockd.onboard.recording.editing import written_whole
 from flockd.onboard.recording.reader import RecordedStep, Recording
 from flockd.onboard.recording.streams import REPLAYED
+from flockd.review.flight_log.log import spread
 
 Outputs = Mapping[int, Mapping[str, Any]]
 """The pilot's outputs as JSON, by step number."""
@@ -113,15 +114,10 @@ def replay_result(
         "duration_s": duration_s,
         "realtime_factor": duration_s / spent_s,
         "reading_share": replay.reading_s / spent_s,
-        "stages_ms": {stage: _spread(samples) for stage, samples in replay.stages_ms.items()},
+        "stages_ms": {stage: spread(samples, "median", "p95") for stage, samples in replay.stages_ms.items()},
         "warnings": list(warnings),
         "diff": None if comparison is None else _diff(comparison),
     }
-
-
-def _spread(samples: Sequence[float]) -> dict[str, float]:
-    ordered = sorted(samples)
-    return {"median": ordered[len(ordered) // 2], "p95": ordered[int(0.95 * (len(ordered) - 1))]}
 
 
 def _diff(comparison: Comparison) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.flocking.metrics import closest_distances, connectivity, obj1, obj2, order, safety, union
 from flockd.review.flight_log.builder import match_neighbours
-from flockd.review.flight_log.log import FlightLog
+from flockd.review.flight_log.log import FlightLog, spread
 
 TAIL_S = 10.0
 """The end of a flight, over which the flock counts as converged."""
@@ -54,7 +54,10 @@ def summarise(log: FlightLog) -> Json:
         "has_truth": log.has_truth,
         "realtime_factor": metadata.duration_s / metadata.wall_s if metadata.wall_s else None,
         "table2": {
-            window: {column: _spread(np.abs(values[steps & metadata.by_sight])) for column, values in errors.items()}
+            window: {
+                column: spread(np.abs(values[steps & metadata.by_sight]), *_STATISTICS)
+                for column, values in errors.items()
+            }
             for window, steps in (("before", circling), ("after", ~circling))
         },
         "table3": _table_3(log),
@@ -72,6 +75,7 @@ def summarise(log: FlightLog) -> Json:
     }
 
 
+_STATISTICS = ("mean", "median", "p95", "max")
 _FROM_METADATA = (
     "scenario", "perception", "flow", "scale", "drones", "duration_s", "step_s", "seed", "wall_s", "circle_until_s",
     "desired_distance_m", "gated", "slowed_share", "slowed_by", "sizes",
@@ -205,18 +209,6 @@ def _handed_over(log: FlightLog) -> Json:
     }
 
 
-def _spread(values: FloatArray) -> Json:
-    known = values[np.isfinite(values)]
-    if not len(known):
-        return dict.fromkeys(("mean", "median", "p95", "max"))
-    return {
-        "mean": float(known.mean()),
-        "median": float(np.median(known)),
-        "p95": float(np.percentile(known, 95)),
-        "max": float(known.max()),
-    }
-
-
 def _table_3(log: FlightLog) -> Json:
     totals: dict[str, dict[str, FloatArray]] = {}
     tail = _tail(log)  # all of it has to follow the circle's end, where Eq. 44 changes its branch
@@ -285,7 +277,7 @@ def _neighbours(log: FlightLog) -> Json:
     return {
         "recall_within_10m": _mean(seen[near]),
         "false_share": _mean(has_false[log.recorded]),
-        "associated_error_m": _spread(np.abs(errors_m)),
+        "associated_error_m": spread(np.abs(errors_m), *_STATISTICS),
         "false_per_drone_minute": float(log.false_tracks.sum() / drone_minutes) if drone_minutes else None,
     }
 
