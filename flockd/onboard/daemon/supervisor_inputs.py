@@ -231,8 +231,7 @@ class LoopLag:
 class Thermometer:
     """Reads the hottest thermal zone once a second, on a worker: some drivers take their time."""
 
-    def __init__(self, folder: Path = THERMAL_ZONES) -> None:
-        self._folder = folder
+    def __init__(self) -> None:
         self._worker = Worker("thermometer")
         self.hottest_c: float | None = None
         """None on a computer that has no thermal zone, and while the reading hangs."""
@@ -241,7 +240,7 @@ class Thermometer:
         """Reads until cancelled."""
         while True:
             try:
-                self.hottest_c = await self._worker.do(READ_DEADLINE_S, hottest_zone_c, self._folder)
+                self.hottest_c = await self._worker.do(READ_DEADLINE_S, hottest_zone_c, THERMAL_ZONES)
             except LateError:
                 self.hottest_c = None
                 self._worker.leave()

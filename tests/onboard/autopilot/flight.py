@@ -105,18 +105,15 @@ class Foreigner:
 
 
 @asynccontextmanager
-async def flying(
-    address: str, wanted: Wanted = NORTH, clock: Callable[[], float] = calm.clock, system_id: int = 1
-) -> AsyncIterator[Flight]:
-    async with attended(address, clock, system_id) as link:
-        streamer = SetpointStreamer(
-            link.send_setpoint, link.status, let_pass, AutopilotParameters(), SafetyParameters(), clock=clock
-        )
+async def flying(address: str, wanted: Wanted = NORTH) -> AsyncIterator[Flight]:
+    async with attended(address) as link:
+        parameters = AutopilotParameters(), SafetyParameters()
+        streamer = SetpointStreamer(link.send_setpoint, link.status, let_pass, *parameters, clock=calm.clock)
         streamer.start()
 
         async def control() -> None:
             while True:
-                streamer.offer(request_of(wanted, clock()))
+                streamer.offer(request_of(wanted, calm.clock()))
                 streamer.beat()
                 await asyncio.sleep(CONTROL_S)
 

@@ -13,9 +13,9 @@ pytestmark = pytest.mark.fault("setpoints-clipped")
 TURN_RAD_S = 1.0
 
 
-def _asked(time_s: float, m_s: float = 2.0) -> tuple[float, float]:
+def _asked(time_s: float) -> tuple[float, float]:
     """A circle, so that an old setpoint is none of the new ones."""
-    return m_s * math.cos(TURN_RAD_S * time_s), m_s * math.sin(TURN_RAD_S * time_s)
+    return 2.0 * math.cos(TURN_RAD_S * time_s), 2.0 * math.sin(TURN_RAD_S * time_s)
 
 
 def _watched(

@@ -77,13 +77,11 @@ class MadeUpPilot:
         )
 
 
-def inputs(
-    steps: int, period_s: float = 0.1, seed: int = 0, levels: int = 256
-) -> Iterator[tuple[FrameSet, VehicleState]]:
+def inputs(steps: int, levels: int = 256) -> Iterator[tuple[FrameSet, VehicleState]]:
     """Frame sets and vehicle states at times that no decimal fraction hits; pictures of few levels compress well."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     for step in range(steps):
-        time_s = 1000.0 + period_s * step + 1 / 3e6
+        time_s = 1000.0 + 0.1 * step + 1 / 3e6
         frames = {
             name: Frame(name, rng.integers(0, levels, (HEIGHT, WIDTH, 3), dtype=np.uint8), time_s - 1e-3 / 7, 10 + step)
             for name in ("front", "left")
@@ -115,7 +113,6 @@ def record(
     path: Path,
     steps: int = 10,
     settings: RecordingConfig | None = None,
-    period_s: float = 0.1,
     learned: LearnedSize | None = LEARNED,
 ) -> list[PilotOutput]:
     """Records a made-up flight, and gives what its pilot said."""
@@ -123,7 +120,7 @@ def record(
     pilot = MadeUpPilot(config, learned=learned)
     outputs = []
     with Recorder(path, drone="drone1", config=config, settings=settings, models=MODELS, learned=learned) as recorder:
-        for frames, vehicle in inputs(steps, period_s):
+        for frames, vehicle in inputs(steps):
             outputs.append(pilot.step(frames, vehicle))
             recorder.drain()
             recorder.step(frames, vehicle, outputs[-1])
