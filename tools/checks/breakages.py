@@ -86,7 +86,7 @@ def fixed(entries: Sequence[Mapping[str, Any]]) -> list[Breakage]:
     found, stale = [], []
     for entry in entries:
         try:
-            file, source = _changed(entry["in"], entry["old"], entry["new"])
+            file, source = changed(entry["in"], entry["old"], entry["new"])
             tests = tuple(_test(name) for name in entry["tests"])
             found.append(Breakage(entry["name"], file, source, tests))
         except StaleError as error:
@@ -109,16 +109,19 @@ def small_changes(count: int, tests: Mapping[str, Sequence[str]]) -> list[Breaka
     ]  # fmt: skip
 
 
-def _changed(where: str, old: str, new: str) -> tuple[Path, str]:
-    """The one file under a folder that holds the text, and its source with the other one."""
-    place = ROOT / where
+def changed(where: str, old: str, new: str, root: Path = ROOT) -> tuple[Path, str]:
+    """The one file under a folder that holds the text, from `root` on, and its source with the other one.
+
+    Raises StaleError where the text is not there once.
+    """
+    place = root / where
     files = [place] if place.is_file() else sorted(place.rglob("*.py"))
     holding = [(path, text) for path in files if old in (text := path.read_text(encoding="utf-8"))]
     times = sum(text.count(old) for _, text in holding)
     if times != 1:
         raise StaleError(f"its text is {times} times in {where}, and has to be there once: {old!r}")
     ((path, text),) = holding
-    return path.relative_to(ROOT), text.replace(old, new)
+    return path.relative_to(root), text.replace(old, new)
 
 
 def _test(name: str) -> str:
