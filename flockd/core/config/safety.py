@@ -61,16 +61,12 @@ class GateParameters(Section):
 
     @model_validator(mode="after")
     def _limits_agree(self) -> Self:
-        if self.command_fresh_s >= self.command_timeout_s:
-            raise ValueError(
-                f"command_fresh_s {self.command_fresh_s:g} is not below command_timeout_s; write a smaller one"
-            )
+        for small, large in (("command_fresh_s", "command_timeout_s"), ("min_height_m", "max_height_m")):
+            if getattr(self, small) >= getattr(self, large):
+                raise ValueError(f"{small} {getattr(self, small):g} is not below {large}; write a smaller one")
         if self.neighbour_reaction_s < self.reaction_s:
-            raise ValueError(
-                f"neighbour_reaction_s is below reaction_s {self.reaction_s:g}, a part of it; write a larger one"
-            )
-        if self.min_height_m >= self.max_height_m:
-            raise ValueError(f"min_height_m {self.min_height_m:g} is not below max_height_m; write a smaller one")
+            told = f"neighbour_reaction_s is below reaction_s {self.reaction_s:g}, a part of it"
+            raise ValueError(f"{told}; write a larger one")
         if self.degraded_speed_m_s > self.max_speed_m_s:
             raise ValueError("degraded_speed_m_s is above max_speed_m_s; write a smaller one")
         if self.degraded_separation_m < self.min_separation_m:

@@ -133,18 +133,17 @@ class PictureDetector:
             boxes = [boxed.box]
         else:
             boxes = [i.box for i in instances if (i.box[2:] - i.box[:2]).max() <= _MAX_INSTANCE * size_px]
-            masked = _box_of(mask == one.label)
-            if masked is not None:
-                boxes.append(masked)
+            left, top, wide, high = cv2.boundingRect((mask == one.label).astype(np.uint8))
+            boxes += [np.array([left, top, left + wide, top + high], np.float64)] if wide else []
         if not boxes:  # no mask, or a nearer drone's covers it
             boxes.append(np.clip([*(centre - size_px / 2), *(centre + size_px / 2)], 0, np.tile(camera.size, 2)))
         box = np.concatenate([np.min(boxes, axis=0)[:2], np.max(boxes, axis=0)[2:]])
-        left, top, right, bottom = (float(value) for value in box / np.tile(scale, 2))
+        x0, y0, x1, y1 = (float(value) for value in box / np.tile(scale, 2))
         u, v = (float(value) for value in centre / scale)
         sigma = one.range_sigma_m
         known = self._config.drone_size_m is not None
         return DetectedDrone(
-            box=(left, top, right, bottom),
+            box=(x0, y0, x1, y1),
             centre_px=(u, v),
             probability=one.drone_probability,
             range_m=one.range_m,
@@ -173,11 +172,3 @@ def camera_with_fov(size: tuple[int, int], fov_deg: float) -> Camera:
     focal = max(size) / 2 / (math.tan(half_rad) if is_pinhole else half_rad)
     matrix = np.array([[focal, 0.0, size[0] / 2], [0.0, focal, size[1] / 2], [0.0, 0.0, 1.0]])
     return PinholeCamera(matrix, size) if is_pinhole else WideAngleCamera(matrix, size)
-
-
-def _box_of(mask: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> FloatArray | None:
-    """(4,) left, top, right, bottom of the pixels of a mask (h, w); None for an empty one."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if not rows.size:
-        return None
-    return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.float64)
