@@ -24,7 +24,7 @@ LINES = {
     "flockd/flight": 14_780,
     "flockd/onboard": 10_480,
     "flockd/fleet": 2_230,
-    "flockd/ground": 3_960,
+    "flockd/ground": 3_950,
     "flockd/review": 3_350,
     "flockd/sim": 10_400,
     "flockd/campaign": 1_750,
