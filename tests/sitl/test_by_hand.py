@@ -147,7 +147,7 @@ STEPS = (
 )
 
 
-@pytest.mark.parametrize(("autopilot", "speed_factor"), [("fake", 4.0), pytest.param("px4", 1.0, marks=PX4)])
+@pytest.mark.parametrize(("autopilot", "speed_factor"), [("fake", 3.0), pytest.param("px4", 1.0, marks=PX4)])
 def test_a_pilot_is_stopped_before_the_wall_and_where_nothing_is_known(autopilot: str, speed_factor: float) -> None:
     rows = seen(autopilot, (ready, take_off, text, blind, wall, landing), speed_factor, remote_control=True)
     assert [(row.story, row.what) for row in rows] == list(STEPS)

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from playwright.sync_api import Browser, Page, ViewportSize, expect, sync_playwright
+from playwright.sync_api import Browser, Page, ViewportSize, sync_playwright
 
 _RUN = "from flockd.cli import program; program()"
 _ARGUMENTS = ("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking")
@@ -32,28 +32,10 @@ HOLD = """async card => {
   return performance.now() - began;
 }"""
 PATIENCE_MS = 120_000
-BROWSERS, CAMERAS = 4, 12
 HELD = "article[data-key='made-up/drone1']"
 """The card of the drone that answers."""
 WIDE = ViewportSize(width=1440, height=900)
 NARROW = ViewportSize(width=390, height=844)
-
-
-def open_page(page: Page, address: str, drones: int) -> None:
-    """Until the first drone may be commanded."""
-    page.set_default_timeout(PATIENCE_MS)
-    page.goto(address)
-    expect(page.locator("article")).to_have_count(drones, timeout=PATIENCE_MS)
-    expect(page.locator(f"{HELD} [data-command=hold]")).to_be_enabled(timeout=PATIENCE_MS)
-    expect(page.locator(".plot .js-line").first).to_be_attached(timeout=PATIENCE_MS)  # the last that it loads
-
-
-def look_at_silent(page: Page, silent: int) -> None:
-    """Shows the cameras of all drones that answer nothing, until it is told so."""
-    for number in range(silent):
-        page.locator(f"article[data-key='made-up/drone{2 + number}'] .look").dispatch_event("click")
-    none = page.locator(".pictures figcaption", has_text="no picture")
-    expect(none.first).to_be_visible(timeout=PATIENCE_MS)
 
 
 def hold_s(page: Page) -> float:
