@@ -9,10 +9,10 @@ import pytest
 
 from flockd.core.messages import Float32Array, VehicleState
 from flockd.flight.geometry import PinholeCamera, rotation_from_euler
-from flockd.sim.cameras.glass import Glass
 from flockd.sim.cameras.real_camera import (
     Automatic,
     CameraClock,
+    Glass,
     NoiseTile,
     RealCamera,
     grey_levels,

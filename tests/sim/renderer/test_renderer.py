@@ -48,17 +48,24 @@ class Scene:
 
     def render(self, **changes: FloatArray) -> View:
         pose = {"R": self.R, "position": self.position, "rotations": self.rotations, "positions": self.positions}
-        return self._rendered(MATRIX, SIZE, **(pose | changes))
+        return self.rendered(MATRIX, SIZE, **(pose | changes))
 
     def through(self, camera: Camera) -> View:
         """What a lens sees from there."""
 
         def draw(matrix: FloatArray, size: tuple[int, int], turn: FloatArray) -> View:
-            return self._rendered(matrix, size, self.R @ turn, self.position, self.rotations, self.positions)
+            return self.rendered(matrix, size, self.R @ turn, self.position, self.rotations, self.positions)
 
         return lens_view(camera, draw)
 
-    def _rendered(
+    def rays(self, u: NDArray[np.int64], v: NDArray[np.int64]) -> FloatArray:
+        """(n, 3) NED through the middles of pixels, 1 m ahead."""
+        return np.column_stack([u + 0.5, v + 0.5, np.ones(len(u))]) @ np.linalg.inv(MATRIX).T @ self.R.T
+
+    def cast(self, rays: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+        return _cast(self.world, self.drones, self.rotations, self.positions, self.position, rays)
+
+    def rendered(
         self, matrix: FloatArray, size: tuple[int, int], R: FloatArray, position: FloatArray, rotations: FloatArray,
         positions: FloatArray,
     ) -> View:  # fmt: skip
@@ -74,30 +81,23 @@ def _attitude(rng: np.random.Generator, tilt: float) -> FloatArray:
 
 
 def _cast(
-    world: World,
-    drones: list[DroneModel],
-    rotations: FloatArray,
-    positions: FloatArray,
-    origin: FloatArray,
+    world: World, drones: list[DroneModel], rotations: FloatArray, positions: FloatArray, origin: FloatArray,
     rays: FloatArray,
-) -> tuple[FloatArray, NDArray[np.int64]]:
+) -> tuple[FloatArray, NDArray[np.int64]]:  # fmt: skip
     """Distance in units of each ray's length (inf: nothing) and id of what it hits, by embree."""
-    vertices, ids = [world.vertices], [np.zeros(len(world.triangles), dtype=np.int64)]
-    triangles: list[NDArray[np.int32]] = [world.triangles]
-    count = len(world.vertices)
-    for k, (drone, R, p) in enumerate(zip(drones, rotations, positions, strict=True)):
-        vertices.append(drone.vertices @ R.T + p)
-        triangles.append(drone.triangles + count)
-        ids.append(np.full(len(drone.triangles), k + 1))
-        count += len(drone.vertices)
-    mesh = trimesh.Trimesh(np.vstack(vertices) - origin, np.vstack(triangles), process=False)
+    flying = [(one.vertices @ R.T + p, one.triangles) for one, R, p in zip(drones, rotations, positions, strict=True)]
+    parts = [(world.vertices, world.triangles), *flying]
+    ids = np.repeat(np.arange(len(parts)), [len(triangles) for _, triangles in parts])
+    first = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    faces = np.vstack([triangles + begin for (_, triangles), begin in zip(parts, first, strict=False)])
+    mesh = trimesh.Trimesh(np.vstack([vertices for vertices, _ in parts]) - origin, faces, process=False)
     caster = RayMeshIntersector(mesh)
     hits = caster.intersects_first(np.zeros_like(rays), rays)
     plane = mesh.triangles[hits]
     normal = np.cross(plane[:, 1] - plane[:, 0], plane[:, 2] - plane[:, 0])
     with np.errstate(invalid="ignore", divide="ignore"):
         along = (normal * plane[:, 0]).sum(1) / (normal * rays).sum(1)
-    return np.where(hits >= 0, along, np.inf), np.where(hits >= 0, np.concatenate(ids)[hits], 0)
+    return np.where(hits >= 0, along, np.inf), np.where(hits >= 0, ids[hits], 0)
 
 
 @pytest.fixture(scope="module")
@@ -111,8 +111,7 @@ def test_depth_and_ids_agree_with_a_ray_caster(scenes: list[Scene]) -> None:
         view = scene.render()
         index = rng.choice(view.ids.size, 20_000, replace=False)
         v, u = np.divmod(index, SIZE[0])
-        rays = np.column_stack([u + 0.5, v + 0.5, np.ones(len(u))]) @ np.linalg.inv(MATRIX).T @ scene.R.T
-        depth, ids = _cast(scene.world, scene.drones, scene.rotations, scene.positions, scene.position, rays)
+        depth, ids = scene.cast(scene.rays(u, v))
         seen = view.depth[v, u]
         with np.errstate(invalid="ignore"):
             same = (np.isinf(depth) & np.isinf(seen)) | (np.abs(seen - depth) <= 1e-3 * depth)
@@ -145,9 +144,7 @@ def test_what_any_lens_sees_agrees_with_a_ray_caster(scenes: list[Scene], lens: 
         imaged = np.isfinite(rays[:, 0])
         assert (view.rgb[v[~imaged], u[~imaged]] == 0).all()
         v, u, rays = v[imaged], u[imaged], rays[imaged]
-        range_m, ids = _cast(
-            scene.world, scene.drones, scene.rotations, scene.positions, scene.position, rays @ scene.R.T
-        )
+        range_m, ids = scene.cast(rays @ scene.R.T)
         # The nearest ray that was drawn is up to half a pixel off: what is slanted or thin differs there.
         assert (ids == view.ids[v, u]).mean() > 0.996
         ahead = (rays[:, 2] > 0.05) & np.isfinite(range_m) & (range_m < 30.0) & (ids == view.ids[v, u])
@@ -174,8 +171,7 @@ def test_a_drone_within_reach_has_no_holes(scenes: list[Scene]) -> None:
         MATRIX, SIZE, scene.R, scene.position, drone_rotations=rotation[None], drone_positions=position[None], shown=[0]
     )
     v, u = np.divmod(np.arange(view.ids.size), SIZE[0])
-    rays = np.column_stack([u + 0.5, v + 0.5, np.ones(len(u))]) @ np.linalg.inv(MATRIX).T @ scene.R.T
-    depth, ids = _cast(scene.world, [drone], rotation[None], position[None], scene.position, rays)
+    depth, ids = _cast(scene.world, [drone], rotation[None], position[None], scene.position, scene.rays(u, v))
     depth, ids = depth.reshape(view.ids.shape), ids.reshape(view.ids.shape)
     assert (ids == 1).mean() > 0.2
     assert (ids == view.ids).mean() > 0.998
@@ -274,15 +270,7 @@ def test_any_image_size_is_a_crop_of_the_same_image(scenes: list[Scene], size: t
     whole = scene.render()
     shifted = MATRIX.copy()
     shifted[:2, 2] -= (100, 120)
-    part = scene.renderer.render(
-        shifted,
-        size,
-        scene.R,
-        scene.position,
-        drone_rotations=scene.rotations,
-        drone_positions=scene.positions,
-        shown=range(5),
-    )
+    part = scene.rendered(shifted, size, scene.R, scene.position, scene.rotations, scene.positions)
     high, wide = min(size[1], SIZE[1] - 120), min(size[0], SIZE[0] - 100)
     a, b = part.rgb[:high, :wide].astype(int), whole.rgb[120 : 120 + high, 100 : 100 + wide].astype(int)
     assert part.rgb.shape == (size[1], size[0], 3)
@@ -300,18 +288,13 @@ def test_flow_is_where_the_points_went(scenes: list[Scene]) -> None:
     first = scene.render()
     second = scene.render(R=R2, position=position2, rotations=rotations2, positions=positions2)
     flow, valid = true_flow(
-        first,
-        second,
-        MATRIX,
-        R_ned_camera=(scene.R, R2),
-        position_ned=(scene.position, position2),
-        drone_rotations=(scene.rotations, rotations2),
-        drone_positions=(scene.positions, positions2),
-    )
+        first, second, MATRIX, R_ned_camera=(scene.R, R2), position_ned=(scene.position, position2),
+        drone_rotations=(scene.rotations, rotations2), drone_positions=(scene.positions, positions2),
+    )  # fmt: skip
     assert valid[first.ids == 0].mean() > 0.7
     v, u = np.nonzero(valid & (rng.random(valid.shape) < 0.2))
-    rays = np.column_stack([u + 0.5, v + 0.5, np.ones(len(u))]) @ np.linalg.inv(MATRIX).T @ scene.R.T
-    depth, ids = _cast(scene.world, scene.drones, scene.rotations, scene.positions, scene.position, rays)
+    rays = scene.rays(u, v)
+    depth, ids = scene.cast(rays)
     agree = (ids == first.ids[v, u]) & np.isclose(depth, first.depth[v, u], rtol=1e-3)
     points = scene.position + rays * np.where(np.isinf(depth), 1e9, depth)[:, None]
     for k in range(len(scene.drones)):
