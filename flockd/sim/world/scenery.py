@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import namedtuple
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -326,8 +326,7 @@ def footprint_distance(obstacles: FloatArray, points: FloatArray) -> FloatArray:
 _QUAD = np.array([(0, 1, 2), (0, 2, 3)])
 
 
-@dataclass(frozen=True)
-class _Place:
+class _Place(NamedTuple):
     north: float
     east: float
     heading: float
@@ -337,8 +336,7 @@ class _Place:
         return np.array([self.north + along * c - across * s, self.east + along * s + across * c, down])
 
 
-@dataclass(frozen=True, eq=False)
-class _TreeStyle:
+class _TreeStyle(NamedTuple):
     shape: str
     height: float
     crown: float
@@ -349,15 +347,10 @@ class _TreeStyle:
 
     @staticmethod
     def draw(rng: Generator, leaves: list[int]) -> _TreeStyle:
-        return _TreeStyle(
-            shape=str(rng.choice(["cone", "round", "cloud", "cloud", "column", "bare"])),
-            height=float(rng.uniform(2.5, 10.0)),
-            crown=float(rng.uniform(0.2, 0.45)),
-            bare=float(rng.uniform(0.08, 0.4)),
-            layers=int(rng.integers(2, 5)),
-            texture=int(rng.choice(leaves)),
-            colour=leaf_colour(rng),
-        )
+        shape = str(rng.choice(["cone", "round", "cloud", "cloud", "column", "bare"]))
+        height, crown, bare = rng.uniform(2.5, 10.0), rng.uniform(0.2, 0.45), rng.uniform(0.08, 0.4)
+        layers, texture = int(rng.integers(2, 5)), int(rng.choice(leaves))
+        return _TreeStyle(shape, height, crown, bare, layers, texture, leaf_colour(rng))
 
 
 def leaf_colour(rng: Generator) -> FloatArray:

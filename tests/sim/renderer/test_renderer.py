@@ -60,7 +60,8 @@ class Scene:
 
     def rays(self, u: NDArray[np.int64], v: NDArray[np.int64]) -> FloatArray:
         """(n, 3) NED through the middles of pixels, 1 m ahead."""
-        return np.column_stack([u + 0.5, v + 0.5, np.ones(len(u))]) @ np.linalg.inv(MATRIX).T @ self.R.T
+        middles = np.column_stack([u + 0.5, v + 0.5, np.ones(len(u))])
+        return np.asarray(middles @ np.linalg.inv(MATRIX).T @ self.R.T)
 
     def cast(self, rays: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
         return _cast(self.world, self.drones, self.rotations, self.positions, self.position, rays)
