@@ -26,10 +26,10 @@ LINES = {
     "flockd/fleet": 2_230,
     "flockd/ground": 3_950,
     "flockd/review": 3_350,
-    "flockd/sim": 10_400,
+    "flockd/sim": 10_390,
     "flockd/campaign": 1_750,
     "flockd/cli": 3_680,
-    "tests": 39_660,
+    "tests": 39_640,
     "tools/checks": 2_320,
     "tools/docs": 940,
     "tools/measure": 1_530,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_690,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 369}
+FILES = {"flockd": 368}
 NUMBERS_OF_FLIGHT = 528
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
