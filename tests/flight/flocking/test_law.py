@@ -157,6 +157,12 @@ def test_two_drones_at_one_level_spot_part_each_to_its_own_right(noise_m: float)
     assert np.linalg.norm(places[0, :2] - places[1, :2]) > 1.5
 
 
+def test_neighbours_that_are_not_above_or_below_are_where_they_are_seen() -> None:
+    offsets = np.array([[0.1, 0.0, 1.0], [-2.0, 3.0, 0.5]])
+    np.testing.assert_array_equal(level_offsets(offsets), offsets[:, :2])
+    assert level_offsets(np.empty((0, 3))).shape == (0, 2)
+
+
 @pytest.mark.parametrize(
     ("own", "desired", "velocity", "acceleration"),
     [

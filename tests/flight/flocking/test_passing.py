@@ -122,6 +122,14 @@ def test_nearer_than_the_separation_it_comes_no_nearer() -> None:
     np.testing.assert_allclose(passed([1.2, 0.0, 0.0], [0.5, 0.0], np.array([0.2, 0.3])), [0.2, 0.3])
 
 
+def test_between_two_that_come_it_flies_as_clear_of_both_as_can_be() -> None:
+    """From the left and the right, so fast that there is no way out: within the highest speed, and away from none."""
+    offsets, theirs = np.array([[0.0, 2.0, 0.0], [0.0, -2.0, 0.0]]), np.array([[2.0, -3.0], [2.0, 3.0]])
+    velocity = clear_of(NORTH, NORTH, offsets, theirs, PARAMETERS, 3.0)
+    assert math.hypot(*velocity) <= PARAMETERS.max_speed_m_s
+    assert velocity[0] > NORTH[0]  # through before they meet
+
+
 @pytest.mark.parametrize("avoids", [True, False])
 @pytest.mark.parametrize("angle_deg", [180.0, 135.0, 90.0, 45.0])
 def test_two_on_a_course_to_meet_pass_at_the_separation(angle_deg: float, *, avoids: bool) -> None:

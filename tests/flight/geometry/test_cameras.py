@@ -98,6 +98,13 @@ def test_wide_angle_sees_behind_its_own_plane() -> None:
     assert np.allclose(camera.unproject(pixel, np.array([7.0])), point)
 
 
+def test_wide_angle_is_smooth_on_its_axis() -> None:
+    camera = WIDE_ANGLES[1]
+    assert np.allclose(camera.project(np.array([[0.0, 0.0, 4.0]])), [[322.5, 236.5]])
+    assert np.allclose(camera.rays(np.array([[322.5, 236.5]])), [[0.0, 0.0, 1.0]])
+    assert np.allclose(camera.jacobian(np.array([[0.0, 0.0, 4.0]]))[0], [[75.0, 0, 0], [0, 77.5, 0]], atol=1e-6)
+
+
 def test_what_lies_behind_a_pinhole_has_no_pixel_and_image_borders_are_half_open() -> None:
     camera = PINHOLES[0]
     pixels = camera.project(np.array([[0.0, 0.0, 5.0], [0.0, 0.0, -5.0], [1.0, 1.0, 0.0], [np.nan, 0.0, 1.0]]))

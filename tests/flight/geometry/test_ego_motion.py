@@ -19,6 +19,7 @@ from flockd.flight.geometry import (
     rotation_angle_deg,
     rotation_from_euler,
 )
+from flockd.flight.geometry.robust.kernels import Cauchy
 
 from .synthetic_world import EXACT, Flaws, boxes_around, four_camera_rig, seen_twice
 
@@ -95,6 +96,14 @@ def test_a_hopeless_start_is_refused_and_not_walked_away_from() -> None:
     assert refine_ego_motion(pairs, RIG, backwards) is None
 
 
+@pytest.mark.parametrize("rises", [True, False])
+def test_a_polish_that_costs_more_than_its_start_is_refused(monkeypatch: pytest.MonkeyPatch, rises: bool) -> None:
+    pairs, truth = flight(2, Flaws())
+    costs = iter([1.0, 2.0] if rises else [2.0, 1.0])  # of the start, then of the polished motion
+    monkeypatch.setattr(Cauchy, "loss", lambda *_: np.array([next(costs)]))
+    assert (refine_ego_motion(pairs, RIG, truth) is None) == rises
+
+
 @pytest.mark.parametrize("polished", ["refused", "leaves the matches behind"])
 def test_a_polish_that_is_no_better_leaves_algorithm_1s_result(monkeypatch: pytest.MonkeyPatch, polished: str) -> None:
     """Its robust cost falls where most matches are false, and it explains the others."""
@@ -132,6 +141,16 @@ def test_one_true_match_in_three_is_enough(parameters: GeometryParameters) -> No
     pairs, truth = flight(6, EXACT)
     degrees, metres = errors(estimate_ego_motion(with_false_matches(pairs, 0.66), RIG, 0.5, parameters), truth)
     assert degrees < 0.1
+    assert metres < 0.01
+
+
+def test_a_start_some_degrees_and_decimetres_off_converges() -> None:
+    pairs, truth = flight(4, Flaws())
+    off = RigidTransform(rotation_from_euler(0.02, -0.03, 0.03), np.array([0.1, -0.1, 0.1])) @ truth
+    found = refine_ego_motion(pairs, RIG, off)
+    assert found is not None
+    degrees, metres = errors(found, truth)
+    assert degrees < 0.03
     assert metres < 0.01
 
 

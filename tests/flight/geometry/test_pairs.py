@@ -123,6 +123,12 @@ def test_between_two_surfaces_the_nearer_pixel_decides() -> None:
         assert np.linalg.norm(in_camera) == pytest.approx(expected)
 
 
+def test_nothing_left_is_an_empty_set_and_not_an_error() -> None:
+    pairs = lift(np.array([[48.5, 64.5]]), wall_maps(), max_depth_m=1.0)
+    assert len(pairs) == 0
+    assert pairs.previous.shape == (0, 3)
+
+
 def test_a_map_of_another_size_is_refused() -> None:
     flow, before, _ = wall_maps()
     with pytest.raises(ValueError, match="'right' is 96x128, but its depth map is 48x64"):

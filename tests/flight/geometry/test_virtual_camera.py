@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flockd.core.messages import BoolArray, FloatArray, UInt8Array
-from flockd.flight.geometry import RigCamera, VirtualCrop, grid_pixels, virtual_crop
+from flockd.flight.geometry import Rig, RigCamera, VirtualCrop, grid_pixels, virtual_crop
 
 from .synthetic_world import four_camera_rig
 
@@ -53,6 +53,13 @@ def test_it_sits_in_the_best_camera_and_faces_level_along_the_direction() -> Non
     # The image's border is half_angle off the axis.
     assert np.allclose(crop.camera.project(np.array([[np.tan(0.2), 0.0, 1.0]])), [[96.0, 48.0]])
     assert virtual_crop(RIG, np.array([-0.1, -2.0, 0.0]), 0.2, 96).main == "left"
+
+
+def test_straight_down_has_a_level_axis_too() -> None:
+    down = RIG.cameras["front"].T_body_camera.rotation[:, [0, 2, 1]] * [1.0, -1.0, 1.0]  # optical axis down
+    camera = RigCamera("down", RIG.cameras["front"].camera, type(RIG.cameras["front"].T_body_camera)(down, np.zeros(3)))
+    crop = virtual_crop(Rig({"down": camera}), np.array([0.0, 0.0, 1.0]), 0.2, 32)
+    assert crop.T_body_virtual.rotation[:, 0].tolist() == [0.0, 1.0, 0.0]
 
 
 def test_every_pixel_takes_the_colour_of_its_own_ray_to_a_fraction_of_a_pixel() -> None:

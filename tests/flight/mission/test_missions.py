@@ -18,6 +18,7 @@ from flockd.core.errors import ConfigError
 from flockd.core.messages import FloatArray, MissionOrder, Setpoint
 from flockd.flight.geometry import euler_from_rotation
 from flockd.flight.mission import Guidance, MissionParameters, Moment, Navigator, order_fault
+from flockd.flight.mission.navigator import middle_of
 from flockd.flight.safety import Gate, outside_fence
 from flockd.onboard.telemetry.order_messages import order_message, parse_order
 from flockd.sim.autopilot.fake_vehicle import Demand, PointMass
@@ -100,6 +101,27 @@ def test_a_drone_that_has_not_come_near_has_not_been_there(stops_at_m: float) ->
     assert guidance.sentence.endswith("to waypoint 1 of 2")
 
 
+def test_a_position_that_jumps_near_a_waypoint_for_one_step_has_not_been_there() -> None:
+    """30 m away for the autopilot's estimate, 3 m for one step, and then 30 m again."""
+    point = Point(to((40.0, 0.0), (40.0, 40.0)))
+    point.fly(10.0)
+    before, point.position = point.position, np.array([37.0, 0.0])
+    point.step()
+    point.position = before
+    for _ in range(40):
+        guidance = point.step()
+        point.position = before
+    assert guidance.sentence == "30 m to waypoint 1 of 2"
+
+
+def test_the_middle_of_the_flock_is_led_not_the_drone() -> None:
+    neighbours = np.array([[3.0, 0.0], [3.0, 3.0]])
+    np.testing.assert_allclose(middle_of(neighbours), [2.0, 1.0])
+    navigator = Navigator(to((20.0, 1.0)), GATE)
+    guidance = navigator.step(Moment(0.0, ORIGIN, middle_of(neighbours)))
+    np.testing.assert_allclose(guidance.velocity, [1.0, 0.0])
+
+
 @pytest.mark.parametrize("end", ["land", "return"])
 def test_at_its_end_a_mission_has_the_autopilot_take_over(end: str) -> None:
     point = Point(to((2.0, 0.0), at_end=end))
@@ -130,6 +152,7 @@ def test_heights_have_the_drones_offset_and_stay_until_another() -> None:
     point = Point(mission(kind="waypoints", waypoints=waypoints, height_offset_m=-1.0))
     assert point.step().height_m == 5.0
     assert point.fly(10.0).height_m == 5.0
+    assert point.navigator.step(Moment(point.time_s, None)).height_m == 5.0, "without a position it stays there"
     assert Point(mission(kind="hover", height_m=4.0)).step().height_m == 4.0
     assert Point(mission(kind="hover")).step().height_m is None
 
@@ -162,6 +185,15 @@ def test_a_goal_takes_the_place_of_any_other_mission_for_good() -> None:
     status = point.navigator.status(point.fly(60.0))
     assert (status.kind, status.arrived) == ("waypoints", True)
     np.testing.assert_allclose(point.position, [0.0, 20.0], atol=1.0)
+
+
+def test_a_goal_ordered_after_a_velocity_is_for_good_too() -> None:
+    point = Point(mission(kind="hover"))
+    point.step(MissionOrder(velocity=np.array([0.0, 0.5])))
+    point.fly(4.0)
+    point.step(MissionOrder(place=np.array([20.0, 0.0])))
+    assert point.fly(60.0).arrived
+    np.testing.assert_allclose(point.position, [20.0, 0.0], atol=0.1)
 
 
 PLACE, VELOCITY = MissionOrder(place=np.array([40.0, 0.0])), MissionOrder(velocity=np.array([0.5, 0.0]))

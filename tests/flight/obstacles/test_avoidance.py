@@ -100,6 +100,11 @@ def test_the_side_is_kept_though_the_other_has_become_a_little_nearer() -> None:
     assert (first[1] > 0, then[1] > 0, fresh[1] > 0) == (True, True, False)
 
 
+def test_of_two_ways_alike_the_flocks_is_taken() -> None:
+    left = steered((1.5, 0.0), around(trunk(4.0, 0.0)), np.array([0.5, -1.0]))
+    assert left[1] < 0
+
+
 def test_before_a_wall_it_slides_along() -> None:
     ahead = around(wall(1.5, 0.0, 0.2, 30.0))
     north, east = steered((1.5, 0.0), ahead)
@@ -115,6 +120,17 @@ def test_a_way_that_leads_back_is_flown_at_less_than_a_third_of_the_speed_and_mo
     north, east = steered((2.4, 0.0), court)
     assert north < 0.0
     assert 0.25 * 2.4 < math.hypot(north, east) <= 0.3 * 2.4
+
+
+def test_an_obstacle_that_may_be_nearer_is_met_more_slowly() -> None:
+    dead_end = around(
+        wall(3.0, 0.0, 0.2, 5.0), wall(0.0, 1.8, 5.0, 0.2),
+        wall(0.0, -1.8, 5.0, 0.2), wall(-3.0, 0.0, 0.2, 5.0),
+    )  # fmt: skip
+    sure = np.linalg.norm(steered((1.5, 0.0), dead_end))
+    found = np.isfinite(dead_end.range_m)
+    blurred = ObstacleRanges(0.0, dead_end.range_m, np.where(found, 0.3, 0.0), dead_end.seen_m)
+    assert 0.0 < np.linalg.norm(steered((1.5, 0.0), blurred)) < sure < 1.5
 
 
 def test_into_what_was_not_looked_at_it_does_not_fly() -> None:

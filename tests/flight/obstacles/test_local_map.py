@@ -96,6 +96,12 @@ def test_an_obstacle_counts_as_nearer_than_measured(sector: int, place: list[flo
     np.testing.assert_allclose(points, [place], atol=1e-12)
 
 
+def test_an_obstacle_that_may_be_anywhere_near_still_has_a_direction() -> None:
+    points = nearest_points(ranges(0.0, {EAST: 0.5}, sigma_m=1.0), 2.0)
+    assert points.shape == (1, 2)
+    assert points[0, 1] > 0.0
+
+
 # In sectors from the nose: none is said to be free that is not, whatever the heading.
 
 SEEN_M = np.full(SECTORS, 15.0)
@@ -129,6 +135,12 @@ def test_what_was_not_looked_at_is_unknown_and_so_is_what_only_touches_it() -> N
     turned = free_ahead(NO_POINTS, seen_m, 0.0, math.radians(2.0), 15.0)
     assert np.flatnonzero(np.isnan(turned)).tolist() == [EAST - 1, EAST]
     assert np.isnan(free_ahead(NO_POINTS, np.zeros(SECTORS), 0.0, 0.0, 15.0)).all()
+
+
+def test_an_obstacle_counts_where_nothing_else_is_known() -> None:
+    free_m = free_ahead(np.array([[4.0, 0.0]]), np.zeros(SECTORS), 0.0, 0.0, 15.0)
+    assert free_m[0] == 4.0
+    assert np.isnan(free_m[1:]).all()
 
 
 @pytest.mark.parametrize(("seen_m", "free_m"), [(15.0, np.inf), (12.0, 11.4), (7.5, 6.9), (7.4, np.nan)])

@@ -128,6 +128,16 @@ def test_a_stump_whose_top_no_camera_shows_stands_in_the_way() -> None:
     assert found(seen((3.0, 0.0, 0.15), down_m=(-3.0, -1.0))) == {}
 
 
+def test_the_band_upwards_holds_downwards_too_where_it_is_wider() -> None:
+    wide, narrow = (ObstacleParameters(range_m=12.0, height_band_m=band_m, below_m=0.5) for band_m in (1.2, 0.6))
+    assert 0 in found(seen((3.0, 0.0, 0.15), down_m=(1.0, 3.0), parameters=wide))
+    assert found(seen((3.0, 0.0, 0.15), down_m=(1.0, 3.0), parameters=narrow)) == {}
+
+
+def test_of_two_trunks_in_a_line_the_nearer_one_counts() -> None:
+    assert seen((0.0, 4.0, 0.1), (0.0, 7.0, 0.6)).range_m[EAST] == pytest.approx(3.9, rel=0.06)
+
+
 @pytest.mark.parametrize("label", [1, UNCLASSED])
 def test_a_neighbour_is_no_obstacle(label: int) -> None:
     ranges = seen(of_label=(0.0, 4.0, 0.4), labels=label)

@@ -101,6 +101,26 @@ def test_flow_finds_a_known_shift_at_any_image_size(size: tuple[int, int]) -> No
     assert np.abs(np.median(network[ground], axis=(0, 1)) - [9.0, -5.0]).max() < 2.5
 
 
+class Roughly:
+    """A flow that is off by 3 px."""
+
+    name = "roughly"
+
+    def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
+        return np.full((*first.shape[:2], 2), [-57.0, 0.0], np.float32)
+
+
+def test_dis_loses_what_moves_far_unless_it_begins_near() -> None:
+    coarse = np.random.default_rng(0).integers(0, 255, (80, 120, 3), dtype=np.uint8)
+    large = cv2.resize(coarse, (720, 480), interpolation=cv2.INTER_CUBIC)
+    first, second = (np.ascontiguousarray(large[:, left : left + 560], dtype=np.uint8) for left in (0, 60))
+    inside = np.s_[40:-40, 100:-40]
+    assert np.abs(np.median(DisFlow().flow(first, second)[inside], axis=(0, 1)) - [-60.0, 0.0]).max() > 10.0
+    refined = DisFlow(Roughly())
+    assert refined.name == "roughly+dis"
+    assert np.abs(np.median(refined.flow(first, second)[inside], axis=(0, 1)) - [-60.0, 0.0]).max() < 0.1
+
+
 def test_the_twins_in_8_bits_say_what_the_float_networks_say() -> None:
     view = rendered(222.0, (320, 320), (1.5, -0.5, -4.2), (1.5, 0.5, -3.8))
     image = np.ascontiguousarray(view.rgb)

@@ -228,6 +228,16 @@ def test_a_size_that_is_not_plausible_is_not_used(judged_m: float, monkeypatch: 
     assert (size.size_m, size.used) == (SIZE_M, False)
 
 
+def test_an_own_size_that_is_not_plausible_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor one that becomes so: the track of a drone that begins to rise with the own one."""
+    said = iter([SizeEstimate(SIZE_M, 0.05)] * 40)
+    flight_shows(monkeypatch, None, lambda number: next(said, SizeEstimate(3.0, 0.05)))
+    outputs = Flight(drone()).fly(25.0)
+    assert any("0.40 m large" in one.mission.sentence for one in outputs)
+    assert not any("3.00" in one.mission.sentence for one in outputs)
+    assert max(float(np.linalg.norm(one.position)) for one in outputs[-1].neighbours) < 6.0
+
+
 @pytest.mark.parametrize(("size_m", "judged_m", "range_m"), [(0.4, 0.56, 4.2), (0.7, 0.7, 3.0)])
 def test_a_size_that_is_in_use_is_undone_before_it_is_judged_again(
     size_m: float, judged_m: float, range_m: float, monkeypatch: pytest.MonkeyPatch

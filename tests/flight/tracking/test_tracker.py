@@ -326,6 +326,14 @@ def test_a_stranger_that_hides_a_known_neighbour_is_believed_in_time(comes_m_s: 
     assert stranger_m > 1.0 + 0.5 * (1.0 + comes_m_s)
 
 
+def test_a_track_follows_a_jump_that_stays() -> None:
+    """One bad frame moves nothing, but a lasting 0.45 m, many sigmas off, is believed within 3 s."""
+    flock, jumped = _settled(), AHEAD + 0.45 * EAST
+    errors_m = [np.linalg.norm(flock.steps(1, jumped).one.position - jumped) for _ in range(8)]
+    assert errors_m[0] > 0.2
+    assert max(errors_m[6:]) < 0.1
+
+
 def test_the_first_update_is_the_textbook_kalman_filter() -> None:
     """By hand: 0.1 m at first sight, velocity +-0.7 m/s, 1 s on: 0.01 + 0.49 + 0.4^2 * 0.5 / 3 = 0.526667 m^2."""
     tracker = Follower(

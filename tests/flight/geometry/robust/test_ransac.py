@@ -102,6 +102,18 @@ def test_of_two_motions_the_one_with_more_pairs_is_found() -> None:
         assert result.inliers[other].mean() < 0.05
 
 
+def test_near_pairs_count_more_where_errors_grow_with_the_range() -> None:
+    """As those of stereo, with its square: fitted with equal weights the far ones spoil the translation."""
+    better = []
+    for seed in range(10):
+        random = np.random.default_rng(seed)
+        source = around(random, 3000, 2.0, 30.0)
+        noise = 0.002 * np.linalg.norm(source, axis=1, keepdims=True) ** 2
+        target = MOTION.apply(source) + random.normal(size=source.shape) * noise
+        better.append(error(ransac_rigid(source, target, seed=seed))[1] / error(paper(source, target, seed=seed))[1])
+    assert np.median(better) < 0.5
+
+
 @pytest.mark.parametrize(("count", "outliers"), [(60, 0.0), (300, 0.3), (2000, 0.6)])
 def test_the_covariance_is_honest(count: int, outliers: float) -> None:
     """The squared error in units of its covariance has the mean of a chi-square of six: 6, with 200 draws +-0.25."""
@@ -139,6 +151,17 @@ def test_unrelated_points_get_no_motion_rather_than_a_junk_one(method: Method) -
         source, target = np.random.default_rng(seed).uniform(-20.0, 20.0, (2, 400, 3))
         with pytest.raises(ValueError, match="no motion"):
             ransac_rigid(source, target, method=method)
+
+
+def test_a_small_cloud_of_few_pairs_is_enough() -> None:
+    """A neighbour of half a metre, matched in a dozen places."""
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        source = np.array([6.0, 1.0, 0.0]) + random.uniform(-0.25, 0.25, (12, 3))
+        target = MOTION.apply(source) + random.normal(0.0, 0.02, source.shape)
+        found = ransac_rigid(source, target, seed=seed).transform
+        middle = source.mean(axis=0)[None]
+        assert np.linalg.norm(found.apply(middle) - MOTION.apply(middle)) < 0.03
 
 
 LINE = np.outer(np.arange(40.0), [1.0, 1.0, 1.0])
@@ -259,6 +282,13 @@ def test_reweighted_steps_minimise_the_kernels_loss() -> None:
     assert found.state == pytest.approx(theirs.x, abs=1e-5)
     loss = Cauchy(0.1).loss(problem.residuals(found.state) ** 2).sum()
     assert 0.5 * 0.1**2 * loss == pytest.approx(theirs.cost, rel=1e-8)
+
+
+def test_before_its_least_number_of_steps_nothing_has_converged() -> None:
+    problem = Decay(T, NOISY)
+    best = GaussNewton(max_steps=20, tolerance=1e-9).minimise(problem, np.array([3.0, 0.7])).state
+    assert GaussNewton(max_steps=3, tolerance=1e-3).minimise(problem, best).converged
+    assert not GaussNewton(max_steps=3, tolerance=1e-3, min_steps=4).minimise(problem, best).converged
 
 
 def test_what_is_no_solution_is_distinguished() -> None:

@@ -56,6 +56,14 @@ def test_it_makes_a_flow_exact_that_is_some_pixels_off() -> None:
     assert off(grid_flow(rough, first, second, NO_DRONES), GROUND) < 0.1
 
 
+def test_a_point_that_goes_astray_takes_what_those_around_it_add() -> None:
+    """A piece of the second image shows something else."""
+    first, second = images()
+    second[200:240, 160:200] = np.random.default_rng(3).integers(0, 256, (40, 40, 3))
+    exact = grid_flow(told(MOVED), first, second, NO_DRONES)
+    assert np.linalg.norm(exact[GROUND] - MOVED, axis=-1).max() < 1.0
+
+
 def test_what_is_seen_well_keeps_its_own_flow_although_all_else_moves_otherwise() -> None:
     first, second = images()
     part = np.s_[200:260, 100:180]  # a thing before the ground, on its own way

@@ -76,6 +76,13 @@ def test_a_drone_that_has_grown_brighter_is_followed_too() -> None:
     assert np.median(scene.off(object_flow(scene.flow, scene.first, brighter, scene.mask))) < 0.2
 
 
+def test_a_drone_that_half_leaves_the_image_is_followed() -> None:
+    scene = Scene(motion((-36.0, 0.0), 0.0, 1.0, (40, 160)), (40, 160))
+    found = object_flow(scene.flow, scene.first, scene.second, scene.mask)
+    stays = scene.true[:, 0] + np.nonzero(scene.mask)[1] > 2
+    assert np.median(scene.off(found)[stays]) < 0.6
+
+
 def test_two_drones_are_separated() -> None:
     near = Scene(motion((18.0, 5.0), 0.0, 1.0, (120, 160)), (120, 160))
     far = Scene(motion((-14.0, 9.0), 0.0, 1.0, (290, 150)), (290, 150))

@@ -190,6 +190,15 @@ def test_a_step_in_the_ground_is_believed_once_the_range_follows_the_height() ->
     assert told[0].height_m == pytest.approx(8.0)
 
 
+def test_one_that_jumps_to_and_fro_is_not_believed() -> None:
+    drone = Drone()
+    drone.hovers(3.0)
+    sources = {source(drone.step(1.0 if k // 3 % 2 else 7.0)) for k in range(60)}
+    last = [source(drone.step(1.0 if k // 3 % 2 else 7.0)) for k in range(12)]
+    assert set(last) == {"barometer"}
+    assert sources == {"range_finder", "barometer"}, "the first is bridged"
+
+
 def test_the_barometers_drift_is_no_lie() -> None:
     """2 cm a second, as in a storm: over the time that is compared it stays within the tolerance."""
     drone = Drone()
