@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -20,30 +19,20 @@ from flockd.review.report.style import BAND, DRONE_COLOURS, MUTED, STYLE, inline
 
 MOST_ROWS = 200
 """The most rows of a table; `flights.csv` has all."""
+REASON, AGAIN = "reason", "fly it again"
+"""Columns of text, not of figures."""
 NEAREST = 5
 """Flights with the smallest distances are named."""
 
 
-@dataclass(frozen=True)
-class TableCell:
-    """One cell of a table's row."""
-
-    text: str = ""
-    kind: str = ""
-    """Class in the style sheet."""
-    code: str = ""
-    """A command instead of a text."""
-
-
-@dataclass(frozen=True)
-class Part:
+class Part(NamedTuple):
     """A section of a page."""
 
     title: str
     note: str = ""
     drawings: Sequence[Markup] = ()
     columns: Sequence[str] = ()
-    rows: Sequence[Sequence[str | TableCell]] = ()
+    rows: Sequence[Sequence[str]] = ()
 
 
 def write_campaign_page(results: Results, path: Path) -> None:
@@ -57,29 +46,26 @@ def write_campaign_page(results: Results, path: Path) -> None:
         headline=f"{_count(len(results.rows), 'flight')} of {results.plan.base['scenario']} in {cells}",
         lead=_lead(results),
         facts=[
-            _fact("Flights", f"{flown}", "", f"of {results.plan.flights}"),
-            _fact("Failed", f"{len(results.failures)}", "", "see below" if results.failures else "none"),
-            _fact("Flown in", f"{results.core_s / 3600:.2g}", "hours", "on one core, all flights together"),
+            ("Flights", flown, "", f"of {results.plan.flights}"),
+            ("Failed", len(results.failures), "", "see below" if results.failures else "none"),
+            ("Flown in", f"{results.core_s / 3600:.2g}", "hours", "on one core, all flights together"),
         ],
         sections=_parts(results),
+        text_columns=(REASON, AGAIN),
     )
     path.write_text(page, encoding="utf-8")
 
 
 def _lead(results: Results) -> str:
-    config = results.plan.config
-    varied = ", ".join(results.parameters)
+    config, varied = results.plan.config, results.parameters
+    base = {**results.plan.base, **config.fixed}
+    lasts = "as long as its cell says" if "duration_s" in varied else f"{base.get('duration_s', 110.0):g} s"
     how = {"truth": "on exact states", "sight": "by sight", "control": "at control level"}[config.perception]
-    how += "" if config.gated and config.perception != "control" else ", without safety gates"
-    unheld = "" if config.perception != "control" else "No supervisor flies along: wind slows and holds nobody. "
-    return f"Each flight lasts {_durations(results)} {how}. {unheld}" + (f"What varies: {varied}." if varied else "")
-
-
-def _durations(results: Results) -> str:
-    base = {**results.plan.base, **results.plan.config.fixed}
-    return (
-        f"{base.get('duration_s', 110.0):g} s" if "duration_s" not in results.parameters else "as long as its cell says"
-    )
+    if config.perception == "control":
+        how += ". No supervisor flies along: wind slows and holds nobody"
+    elif not config.gated:
+        how += ", without safety gates"
+    return f"Each flight lasts {lasts} {how}. " + (f"What varies: {', '.join(varied)}." if varied else "")
 
 
 _CURVES = (
@@ -103,48 +89,35 @@ def _parts(results: Results) -> list[Part]:
 
 
 def _cells(results: Results) -> Part:
-    names = results.parameters
-    rows: list[list[str | TableCell]] = []
+    names, rows = results.parameters, []
     for cell in results.plan.cells[:MOST_ROWS]:
         count = sum(row["cell"] == cell.number and row["status"] == "flown" for row in results.rows)
-        of_cell = [TableCell(_interval(results.interval(f, [cell.number]))) for f in results.figures]
-        rows.append(
-            [f"c{cell.number}", *(TableCell(shown(cell.parameters[n])) for n in names), TableCell(f"{count}"), *of_cell]
-        )
+        figures = (_interval(results.interval(figure, [cell.number])) for figure in results.figures)
+        rows.append([f"c{cell.number}", *(shown(cell.parameters[name]) for name in names), f"{count}", *figures])
     left_out = len(results.plan.cells) - MOST_ROWS
     note = f"{_CELLS} {left_out} more cells are in flights.csv." if left_out > 0 else _CELLS
-    return Part("All cells", note, (), ["cell", *names, "flights", *(label_of(f) for f in results.figures)], rows)
+    return Part("All cells", note, (), ["cell", *names, "flights", *map(label_of, results.figures)], rows)
 
 
 def _nearest(results: Results) -> Part:
     """The flights that were most dangerous."""
     measured = [row for row in results.rows if row.get("min_distance_m") is not None]
-    near = sorted(measured, key=lambda row: float(row["min_distance_m"]))
-    rows = [
-        [row["run"], TableCell(f"{row['min_distance_m']:.2f} m"), TableCell(kind="text", code=_rerun(results, row))]
-        for row in near[:NEAREST]
-    ]
-    return Part("Nearest flights", _NEAREST, (), ["flight", "nearest distance", "fly it again"], rows)
+    near = sorted(measured, key=lambda row: float(row["min_distance_m"]))[:NEAREST]
+    rows = [[row["run"], f"{row['min_distance_m']:.2f} m", _rerun(results, row)] for row in near]
+    return Part("Nearest flights", _NEAREST, (), ["flight", "nearest distance", AGAIN], rows)
 
 
 def _failures(results: Results) -> Part:
-    rows = [
-        [row["run"], TableCell(row["reason"], kind="text"), TableCell(kind="text", code=_rerun(results, row))]
-        for row in results.failures[:MOST_ROWS]
-    ]
-    return Part("Flights that failed", "", (), ["flight", "reason", "fly it again"], rows)
+    rows = [[row["run"], row["reason"], _rerun(results, row)] for row in results.failures[:MOST_ROWS]]
+    return Part("Flights that failed", "", (), ["flight", REASON, AGAIN], rows)
 
 
-def _rerun(results: Results, row: Row) -> str:
-    return f"flockd campaign rerun {results.path / row['run']}"
+def _rerun(results: Results, row: Row) -> Markup:
+    return Markup("<code>flockd campaign rerun {}</code>").format(results.path / row["run"])
 
 
 def _interval(interval: Interval | None) -> str:
     return "" if interval is None else f"{interval.mean:.4g} ± {interval.half_width:.2g}"
-
-
-def _fact(name: str, value: str, unit: str, remark: str) -> dict[str, str]:
-    return {"name": name, "value": value, "unit": unit, "remark": remark}
 
 
 def _count(number: int, thing: str) -> str:

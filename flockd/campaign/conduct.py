@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from flockd.campaign.engine import Engine
 from flockd.campaign.flight_kinds import FLIGHT_KINDS, Task
 from flockd.campaign.flight_plan import Plan, Run
-from flockd.campaign.folder import CampaignFolder
+from flockd.campaign.folder import CampaignFolder, flown_in
 
 Progress = Callable[[int, int], None]
 
@@ -30,7 +30,7 @@ def conduct(plan: Plan, folder: CampaignFolder, engine: Engine, progress: Progre
 
     The table is written at the end, and when this is interrupted.
     """
-    done_before = {one.run for one in folder.finished()}
+    done_before = {one.run for one in flown_in(folder.path, plan)}
     tasks = _tasks(plan, done_before)
     total = plan.flights - len(done_before)
     waiting = next(tasks, None)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import getitem
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -18,7 +20,7 @@ from flockd.review.report.summary import TAIL_S, estimation_errors, objective_su
 
 
 class Interval(NamedTuple):
-    """A mean, and between which values the true one lies with the asked confidence."""
+    """A mean, and between which values the true one lies with 95 % confidence."""
 
     mean: float
     low: float
@@ -30,7 +32,11 @@ class Interval(NamedTuple):
         return max(self.high - self.mean, self.mean - self.low)
 
 
-def mean_interval(values: Sequence[float], confidence: float = 0.95, *, is_share: bool = False) -> Interval | None:
+_UPPER_END = 0.975
+"""The upper end of an interval that leaves out as much above as below."""
+
+
+def mean_interval(values: Sequence[float], *, is_share: bool = False) -> Interval | None:
     """By Student's t; of values that are 0 or 1 (``is_share``) by Wilson's score. None where there is none.
 
     One value tells nothing of how much they differ. E. B. Wilson, "Probable inference, the law of succession, and
@@ -41,11 +47,11 @@ def mean_interval(values: Sequence[float], confidence: float = 0.95, *, is_share
         return None
     mean = float(np.mean(values))
     if is_share:
-        z = float(ndtri((1 + confidence) / 2))
+        z = float(ndtri(_UPPER_END))
         middle = (mean + z * z / (2 * n)) / (1 + z * z / n)
         reach = z / (1 + z * z / n) * math.sqrt(mean * (1 - mean) / n + z * z / (4 * n * n))
         return Interval(mean, max(middle - reach, 0.0), min(middle + reach, 1.0))
-    reach = float(stdtrit(n - 1, (1 + confidence) / 2)) * float(np.std(values, ddof=1)) / math.sqrt(n)
+    reach = float(stdtrit(n - 1, _UPPER_END)) * float(np.std(values, ddof=1)) / math.sqrt(n)
     return Interval(mean, mean - reach, mean + reach)
 
 
@@ -59,20 +65,10 @@ class Measure:
     name: str
     unit: str
     better: Literal["higher", "lower"]
-    of: Callable[[FlightLog, dict[str, Any]], Any]
-    """From a flight's log and its summary."""
+    of: str | Callable[[FlightLog, dict[str, Any]], Any] | None
+    """Its keys in a flight's summary, or from the log and the summary; None: of flights at control level alone."""
     is_share: bool = False
     """The figure is 0 or 1 for one flight, so that its mean is a share of flights."""
-
-
-def _in(*keys: str) -> Callable[[FlightLog, dict[str, Any]], Any]:
-    def found(_: FlightLog, summary: dict[str, Any]) -> Any:
-        value: Any = summary
-        for key in keys:
-            value = value[key]
-        return value
-
-    return found
 
 
 def _tail_mean(name: str) -> Callable[[FlightLog, dict[str, Any]], float]:
@@ -102,51 +98,45 @@ def _convergence_time(log: FlightLog, summary: dict[str, Any]) -> float | None:
     return time_s
 
 
-def _of_control_level(_: FlightLog, __: dict[str, Any]) -> None:
-    """Nothing: only `flockd.sim.control_level` has this figure."""
-
-
 MEASURES: dict[str, Measure] = {
-    "min_distance_m": Measure("nearest distance", "m", "higher", _in("flock", "min_distance_m")),
-    "min_distance_after_10s_m": Measure(
-        "nearest distance after 10 s", "m", "higher", _in("flock", "min_distance_after_10s_m")
-    ),
-    "order_tail": Measure("order at the end", "", "higher", _in("flock", "order_tail")),
-    "union_tail": Measure("union at the end", "", "higher", _in("flock", "union_tail")),
-    "safety": Measure("safety", "", "higher", _in("flock", "safety")),
+    "min_distance_m": Measure("nearest distance", "m", "higher", "flock.min_distance_m"),
+    "min_distance_after_10s_m": Measure("nearest distance after 10 s", "m", "higher", "flock.min_distance_after_10s_m"),
+    "order_tail": Measure("order at the end", "", "higher", "flock.order_tail"),
+    "union_tail": Measure("union at the end", "", "higher", "flock.union_tail"),
+    "safety": Measure("safety", "", "higher", "flock.safety"),
     "velocity_deviation_tail": Measure("velocity deviation at the end, Σ obj1", "", "lower", _tail_mean("obj1")),
     "shape_deviation_tail": Measure("shape deviation at the end, Σ obj2", "", "lower", _tail_mean("obj2")),
-    "arrived": Measure("arrived", "of the flights", "higher", _in("mission", "arrived"), is_share=True),
-    "arrival_time_s": Measure("time of arrival", "s", "lower", _in("mission", "time_s")),
-    "final_error_m": Measure("distance from the goal at the end", "m", "lower", _in("mission", "final_error_m")),
-    "collisions": Measure("collisions with obstacles", "", "lower", _in("obstacles", "collisions")),
-    "min_clearance_m": Measure("least clearance", "m", "higher", _in("obstacles", "min_clearance_m")),
-    "time_within_1m_s": Measure("time within 1 m of obstacles", "s", "lower", _in("obstacles", "time_within_1m_s")),
-    "recall_within_10m": Measure("neighbours known within 10 m", "", "higher", _in("neighbours", "recall_within_10m")),
+    "arrived": Measure("arrived", "of the flights", "higher", "mission.arrived", is_share=True),
+    "arrival_time_s": Measure("time of arrival", "s", "lower", "mission.time_s"),
+    "final_error_m": Measure("distance from the goal at the end", "m", "lower", "mission.final_error_m"),
+    "collisions": Measure("collisions with obstacles", "", "lower", "obstacles.collisions"),
+    "min_clearance_m": Measure("least clearance", "m", "higher", "obstacles.min_clearance_m"),
+    "time_within_1m_s": Measure("time within 1 m of obstacles", "s", "lower", "obstacles.time_within_1m_s"),
+    "recall_within_10m": Measure("neighbours known within 10 m", "", "higher", "neighbours.recall_within_10m"),
     "false_per_drone_minute": Measure(
-        "false neighbours a drone and minute", "", "lower", _in("neighbours", "false_per_drone_minute")
+        "false neighbours a drone and minute", "", "lower", "neighbours.false_per_drone_minute"
     ),
     "distance_error_median_m": Measure("distance error, median", "m", "lower", _distance_error(50.0)),
     "distance_error_p95_m": Measure("distance error, 95th percentile", "m", "lower", _distance_error(95.0)),
-    "false_share": Measure("time with a false neighbour", "of 1", "lower", _in("neighbours", "false_share")),
+    "false_share": Measure("time with a false neighbour", "of 1", "lower", "neighbours.false_share"),
     "associated_error_median_m": Measure("error of all tracks, median", "m", "lower", _of_tracks("median")),
     "associated_error_p95_m": Measure("error of all tracks, 95th percentile", "m", "lower", _of_tracks("p95")),
     "associated_error_max_m": Measure("error of all tracks, largest", "m", "lower", _of_tracks("max")),
     "convergence_time_s": Measure("time from which the shape stays", "s", "lower", _convergence_time),
-    "min_distance_tail_m": Measure("nearest distance at the end", "m", "higher", _of_control_level),
-    "min_level_distance_m": Measure("nearest level distance", "m", "higher", _of_control_level),
-    "drone_collisions": Measure("collisions of drones", "", "lower", _of_control_level),
-    "mean_nearest_tail_m": Measure("mean distance to the nearest at the end", "m", "higher", _of_control_level),
-    "rms_radius_tail_m": Measure("radius of the flock at the end, RMS", "m", "lower", _of_control_level),
-    "drones_held": Measure("drones in Hold", "", "lower", _in("handed_over", "drones")),
-    "first_hold_s": Measure("time of the first Hold", "s", "higher", _in("handed_over", "first_s")),
+    "min_distance_tail_m": Measure("nearest distance at the end", "m", "higher", None),
+    "min_level_distance_m": Measure("nearest level distance", "m", "higher", None),
+    "drone_collisions": Measure("collisions of drones", "", "lower", None),
+    "mean_nearest_tail_m": Measure("mean distance to the nearest at the end", "m", "higher", None),
+    "rms_radius_tail_m": Measure("radius of the flock at the end, RMS", "m", "lower", None),
+    "drones_held": Measure("drones in Hold", "", "lower", "handed_over.drones"),
+    "first_hold_s": Measure("time of the first Hold", "s", "higher", "handed_over.first_s"),
     "min_distance_flown_m": Measure(
-        "nearest distance while flockd flew", "m", "higher", _in("handed_over", "min_distance_flown_m")
+        "nearest distance while flockd flew", "m", "higher", "handed_over.min_distance_flown_m"
     ),
     "collisions_flown": Measure(
-        "collisions with obstacles while flockd flew", "", "lower", _in("handed_over", "collisions_flown")
+        "collisions with obstacles while flockd flew", "", "lower", "handed_over.collisions_flown"
     ),
-    "slowed_share": Measure("time slowed by gates", "of 1", "lower", _in("slowed_share")),
+    "slowed_share": Measure("time slowed by gates", "of 1", "lower", "slowed_share"),
 }
 
 
@@ -163,8 +153,9 @@ Figure = Annotated[str, AfterValidator(_known), Field(json_schema_extra={"enum":
 def figures_of(log: FlightLog, wanted: Iterable[Figure]) -> Figures:
     """The wanted figures of a flight; None where a flight of its kind has none, or it is not finite."""
     summary = summarise(log)
-    return {figure: _number(MEASURES[figure].of(log, summary)) for figure in wanted}
+    return {figure: _value(MEASURES[figure].of, log, summary) for figure in wanted}
 
 
-def _number(value: Any) -> float | None:
+def _value(of: str | Callable[[FlightLog, dict[str, Any]], Any] | None, log: FlightLog, summary: Any) -> float | None:
+    value = reduce(getitem, of.split("."), summary) if isinstance(of, str) else of and of(log, summary)
     return None if value is None or not math.isfinite(value) else float(value)

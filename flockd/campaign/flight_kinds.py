@@ -88,6 +88,7 @@ class FlownRun:
     reason: str | None = None
     """Why it failed."""
     scenario_sha256: str = ""
+    """Of all its values, those that no file gives too."""
     networks: str = ""
     """SHA-256 of each network, as `name=hash`."""
     wall_s: float = 0.0
@@ -113,13 +114,11 @@ def fly_task(task: Task) -> list[FlownRun]:
         return [_failed(task.runs[0], error, began, time.perf_counter() - wall_s)]
     wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
     share = len(task.runs)
+    hashes = (hashlib.sha256(scenario.model_dump_json().encode()).hexdigest() for scenario in scenarios)
     return [
-        FlownRun(
-            run, found, None, _sha256(scenario), networks, wall_s / share, cpu_s / share, began, platform.node(),
-            os.getpid(),
-        )
-        for run, scenario, found in zip(task.runs, scenarios, figures, strict=True)
-    ]  # fmt: skip
+        FlownRun(run, found, None, sha256, networks, wall_s / share, cpu_s / share, began, platform.node(), os.getpid())
+        for run, sha256, found in zip(task.runs, hashes, figures, strict=True)
+    ]
 
 
 def _single_threaded(scenario: ScenarioConfig) -> ScenarioConfig:
@@ -135,11 +134,6 @@ def _failed(run: Run, error: Exception, began: str, wall_s: float) -> FlownRun:
         places = traceback.extract_tb(error.__traceback__)
         reason += f" ({os.path.basename(places[-1].filename)}:{places[-1].lineno})"  # noqa: PTH119 - no file is meant
     return FlownRun(run, reason=reason, began=began, wall_s=wall_s, host=platform.node(), process=os.getpid())
-
-
-def _sha256(scenario: ScenarioConfig) -> str:
-    """The hash of all values of a scenario, those that no file gives too."""
-    return hashlib.sha256(scenario.model_dump_json().encode()).hexdigest()
 
 
 @lru_cache(maxsize=64)

@@ -6,7 +6,7 @@ import hashlib
 import itertools
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -71,7 +71,6 @@ def merged(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> Values:
 CASE = "case"
 """The parameter whose values are the names of `cases`."""
 MAX_CELLS = 10_000
-WIND = "vehicle.wind_m_s"
 Places = Mapping[KeyPath, Place]
 
 
@@ -121,12 +120,11 @@ class Plan:
             fault = f"names {config.scenario}, which is a drone's own file; name a scenario"
             raise ConfigError([places["scenario",].problem(fault)])
         config = _anchored(config, path.parent)
-        check = _Check(places, of_scenario)
-        check.keys(config)
+        _check_keys(config, places)
         errors = None if config.errors is None else load_perceived_errors(path.parent / config.errors)
         plan = cls(config, scenario.model_dump(exclude_unset=True), errors)
-        check.cells(plan)
-        check.wind(config)
+        _Check(places, of_scenario).cells(plan)
+        _check_wind(config, places)
         if idle := _idle_seeds(plan):
             raise ConfigError([places["seeds",].problem(idle)])
         if config.perception == "sight":
@@ -239,41 +237,44 @@ def _with_tuples(value: Any) -> Any:
     return tuple(_with_tuples(inner) for inner in value) if isinstance(value, list) else value
 
 
+def _check_keys(config: CampaignConfig, places: Places) -> None:
+    """Raises ConfigError for what needs no scenario: sizes of flocks, and how many cells there are."""
+    most = MAX_CONTROL_DRONES if config.perception == "control" else MAX_DRONES
+    wrong = [
+        places[path].problem(f"must be whole numbers from 1 to {most}, as in `values: [5, 10]`")
+        for path, values in _given(config, DRONES).items()
+        if not all(isinstance(n, int) and not isinstance(n, bool) and 1 <= n <= most for n in values)
+    ]
+    if (cells := _count_of_cells(config)) > MAX_CELLS:
+        section = places.get(("vary",), places[()])
+        wrong.append(section.problem(f"makes {cells} cells; write fewer values, for at most {MAX_CELLS}"))
+    if wrong:
+        raise ConfigError(wrong)
+
+
+def _check_wind(config: CampaignConfig, places: Places) -> None:
+    """Raises ConfigError for a wind that no flight would notice."""
+    fault = (
+        "changes nothing without images: a steady wind only tilts the drone, whose autopilot holds the velocity "
+        "over ground; write `perception: sight`, or `vehicle.gust_m_s` for wind that carries it off, or delete it"
+    )
+    wrong = [places[path].problem(fault) for path in _given(config, "vehicle.wind_m_s")]
+    if wrong and config.perception != "sight":
+        raise ConfigError(wrong)
+
+
+def _given(config: CampaignConfig, key: str) -> dict[KeyPath, Sequence[Any]]:
+    """The values that a campaign sets for a key, each with its path in the campaign's file."""
+    found: dict[KeyPath, Sequence[Any]] = {("fixed", key): [config.fixed[key]]} if key in config.fixed else {}
+    found |= {("cases", case, key): [values[key]] for case, values in config.cases.items() if key in values}
+    return found | ({("vary", key): config.vary[key].values} if key in config.vary else {})
+
+
 class _Check:
     """Finds what is wrong with the values that a campaign sets, each with its place in the campaign's file."""
 
     def __init__(self, places: Places, of_scenario: Places) -> None:
         self._places, self._of_scenario = places, of_scenario
-
-    def keys(self, config: CampaignConfig) -> None:
-        """Raises ConfigError for what needs no scenario: sizes of flocks, and how many cells there are."""
-        counts: dict[KeyPath, list[Any]] = {("fixed", DRONES): [config.fixed.get(DRONES, 1)]}
-        counts |= {("cases", case, DRONES): [values.get(DRONES, 1)] for case, values in config.cases.items()}
-        if (sizes := config.vary.get(DRONES)) is not None:
-            counts["vary", DRONES] = list(sizes.values)
-        most = MAX_CONTROL_DRONES if config.perception == "control" else MAX_DRONES
-        wrong = [
-            self._places[path].problem(f"must be whole numbers from 1 to {most}, as in `values: [5, 10]`")
-            for path, values in counts.items()
-            if not all(isinstance(n, int) and not isinstance(n, bool) and 1 <= n <= most for n in values)
-        ]
-        if (cells := _count_of_cells(config)) > MAX_CELLS:
-            section = self._places.get(("vary",), self._places[()])
-            wrong.append(section.problem(f"makes {cells} cells; write fewer values, for at most {MAX_CELLS}"))
-        if wrong:
-            raise ConfigError(wrong)
-
-    def wind(self, config: CampaignConfig) -> None:
-        """Raises ConfigError for a wind that no flight would notice."""
-        sections: dict[KeyPath, Mapping[str, Any]] = {("fixed",): config.fixed, ("vary",): config.vary}
-        sections |= {("cases", case): values for case, values in config.cases.items()}
-        fault = (
-            "changes nothing without images: a steady wind only tilts the drone, whose autopilot holds the velocity "
-            "over ground; write `perception: sight`, or `vehicle.gust_m_s` for wind that carries it off, or delete it"
-        )
-        wrong = [self._places[*path, WIND].problem(fault) for path, values in sections.items() if WIND in values]
-        if wrong and config.perception != "sight":
-            raise ConfigError(wrong)
 
     def cells(self, plan: Plan) -> None:
         """Raises ConfigError with each problem of any cell."""
@@ -309,9 +310,7 @@ class _Check:
             path = tuple(key.split("."))
             place = self._places[origin]
             places |= {path[:length]: places.get(path[:length], place) for length in range(1, len(path))}
-            inside = {place_of: None for place_of in places if place_of[: len(path)] == path}
-            for old in inside:
-                del places[old]
+            places = {at: one for at, one in places.items() if at[: len(path)] != path}
             places[path] = place
             depth = len(origin)
             places |= {

@@ -72,10 +72,6 @@ class CampaignFolder:
         self._lines.flush()
         os.fsync(self._lines.fileno())
 
-    def finished(self) -> Iterator[FlownRun]:
-        """The flights that are done. Raises UnavailableError where a line cannot be read."""
-        return iter(flown_in(self.path, self._plan))
-
     def write_table(self) -> None:
         """Writes the table anew. Raises UnavailableError where a line cannot be read."""
         rows = flight_rows(self._plan, flown_in(self.path, self._plan))

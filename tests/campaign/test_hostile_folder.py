@@ -9,7 +9,7 @@ from random import Random
 
 from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_plan import Plan, Run
-from flockd.campaign.folder import LINES_NAME, PLAN_NAME, CampaignFolder
+from flockd.campaign.folder import LINES_NAME, PLAN_NAME, CampaignFolder, flown_in
 from flockd.campaign.results import Results
 from tests.hostile import ROOT, hostile, mutated_bytes, mutated_json, own_errors, put
 
@@ -45,7 +45,7 @@ def test_a_changed_campaign_is_read_or_refused(tmp_path: Path) -> None:
             for cell in results.plan.cells[:20]:
                 results.interval("order_tail", [cell.number])
         with own_errors(), CampaignFolder(path, plan) as campaign:
-            list(campaign.finished())
+            flown_in(path, plan)
             campaign.write_table()
 
     check()
