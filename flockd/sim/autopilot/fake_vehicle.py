@@ -79,7 +79,7 @@ class Drift:
 class PointMass:
     """Follows a demand as PX4's vehicle in software does, but always level: the simulator's, without its lean."""
 
-    CLIMB_RESPONSE_S = 0.25
+    TURN_S = 0.25
     MAX_CLIMB_M_S = 3.0
     SUBSTEP_S = 0.02
 
@@ -90,20 +90,12 @@ class PointMass:
 
     def __call__(self, demand: Demand, interval_s: float) -> MotionState:
         """Advances it by ``interval_s`` seconds."""
-        substeps = math.ceil(interval_s / self.SUBSTEP_S)
+        place, velocity, substeps = self._place, self._velocity, math.ceil(interval_s / self.SUBSTEP_S)
         for _ in range(substeps):
-            self._step(demand, interval_s / substeps)
-        R_ned_body = rotation_from_euler(0.0, 0.0, self._yaw_rad)
-        return MotionState(self._place[0].copy(), self._velocity[0].copy(), R_ned_body)
-
-    def _step(self, demand: Demand, dt: float) -> None:
-        self._level.step(self._now_s, dt, self._place, self._velocity, demand.velocity[None])
-        self._now_s += dt
-        place, velocity = self._place[0], self._velocity[0]
-        climb = np.clip(demand.down_m - place[2], -self.MAX_CLIMB_M_S, self.MAX_CLIMB_M_S)
-        velocity[2] += (climb - velocity[2]) / self.CLIMB_RESPONSE_S * dt
-        place[2] += velocity[2] * dt
-        if place[2] >= 0.0:
-            place[2], velocity[2] = 0.0, min(0.0, velocity[2])
-        turn = wrapped(demand.yaw_rad - self._yaw_rad)
-        self._yaw_rad = wrapped(self._yaw_rad + turn * min(1.0, dt / self.CLIMB_RESPONSE_S))
+            dt_s = interval_s / substeps
+            self._level.step(self._now_s, dt_s, place, velocity, demand.velocity[None])
+            vehicles.climb(dt_s, place[:, 2], velocity[:, 2], -np.array([demand.down_m]), self.MAX_CLIMB_M_S)
+            self._now_s += dt_s
+            turn = wrapped(demand.yaw_rad - self._yaw_rad)
+            self._yaw_rad = wrapped(self._yaw_rad + turn * min(1.0, dt_s / self.TURN_S))
+        return MotionState(place[0].copy(), velocity[0].copy(), rotation_from_euler(0.0, 0.0, self._yaw_rad))

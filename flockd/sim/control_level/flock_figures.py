@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -46,7 +46,7 @@ def nearest_distances(near: Near, before: FloatArray, now: FloatArray) -> Neares
     now_m = np.hypot(level_m, places[closest, 2] - places[who, 2])
     # One that was nearer since than the nearest is now has gone both drones' ways from there at most.
     reach_m = np.maximum(now_m, SAFE_M) + (flown_m + flown_m.max(axis=1, keepdims=True)).ravel()
-    owners, others = near.pairs(who, reach_m)
+    owners, others = near.pairs(reach_m)
     end = places[others] - places[owners]
     begin = end - (ways[others] - ways[owners])
     apart_m = np.linalg.norm(end, axis=1)
@@ -66,9 +66,8 @@ def nearest_distances(near: Near, before: FloatArray, now: FloatArray) -> Neares
 def unions(near: Near, shape: tuple[int, int], reach_m: float) -> FloatArray:
     """`flockd.flight.flocking.metrics.union` of each of (flights, n), within `reach_m` of each other."""
     flights, n = shape
-    who = np.arange(flights * n)
-    pairs = near.pairs(who, np.full(len(who), reach_m))
-    graph = coo_array((np.ones(len(pairs[0]), dtype=bool), pairs), shape=(len(who), len(who)))
+    pairs = near.pairs(reach_m)
+    graph = coo_array((np.ones(len(pairs[0]), dtype=bool), pairs), shape=(flights * n, flights * n))
     firsts = np.unique(connected_components(graph, directed=False)[1], return_index=True)[1]
     return (n - np.bincount(firsts // n, minlength=flights)) / (n - 1) if n > 1 else np.ones(flights)
 
@@ -119,18 +118,14 @@ class FlightFigures:
 
     def of_flights(self) -> list[Figures]:
         """The figures of each flight; None where there is nothing to say."""
-        return [self._of_flock(k) for k in range(len(self._touching))]
+        found = {name: np.array([one[name] for one in self._steps if name in one]).T for name in self._steps[-1]}
+        return [self._of_flock({name: of[k] for name, of in found.items()}) for k in range(len(self._touching))]
 
-    def _values(self, name: str, flight: int) -> FloatArray:
-        """One flight's, of each step that has them."""
-        return np.array([of_step[name][flight] for of_step in self._steps if name in of_step])
-
-    def _of_flock(self, flight: int) -> Figures:
-        def values(name: str) -> FloatArray:
-            return self._values(name, flight)
+    def _of_flock(self, values: Mapping[str, FloatArray]) -> Figures:
+        """By a flight's values of each step that has them."""
 
         def tail_mean(name: str) -> float:
-            of_tail: list[float] = values(name)[-int(self._tail.sum()) :].tolist()
+            of_tail: list[float] = values[name][-int(self._tail.sum()) :].tolist()
             return sum(of_tail) / len(of_tail)
 
         def least_in(window: BoolArray) -> float | None:
@@ -138,19 +133,19 @@ class FlightFigures:
             begins = np.flatnonzero(window)[:1]
             within = window.copy()
             within[begins] = False
-            return _least([*values("since")[within], *values("now")[begins]])
+            return _least([*values["since"][within], *values["now"][begins]])
 
         n = self._touching.shape[1]
         pairs = n * (n - 1) / 2
         return {
-            "min_distance_m": _least(values("since")),
+            "min_distance_m": _least(values["since"]),
             "min_distance_after_10s_m": least_in(self._times >= TAIL_S),
             "min_distance_tail_m": least_in(self._tail),
-            "min_level_distance_m": _least(values("level_since")),
+            "min_level_distance_m": _least(values["level_since"]),
             "order_tail": tail_mean("order"),
             "union_tail": tail_mean("union"),
-            "safety": 1.0 - sum(values("unsafe")) / 2 / pairs / len(self._steps) if pairs else 1.0,
-            "drone_collisions": int(values("contacts").sum()),
+            "safety": 1.0 - sum(values["unsafe"]) / 2 / pairs / len(self._steps) if pairs else 1.0,
+            "drone_collisions": int(values["contacts"].sum()),
             "mean_nearest_tail_m": tail_mean("level_now") if pairs else None,
             "rms_radius_tail_m": tail_mean("extent"),
         }

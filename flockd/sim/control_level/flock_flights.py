@@ -93,18 +93,18 @@ class FlockFlights:
     def perceive(self, step: int) -> Near:
         """Who is near whom now; what the law makes of what each drone sees of the others is in `sums`."""
         near, states, p = Near(self.states), _rows(self.states), self._drone.flocking
-        who, reach_m = np.arange(len(states)), np.full(len(states), self._reach_m)
+        reach_m: float | FloatArray = self._reach_m
         if self._perception is None:
             if p.weight.kind == "nearest":  # no one else counts
                 counts_m = np.maximum(near.nearest(p.weight.nearest)[0], p.separation_distance_m)
                 reach_m = np.minimum(reach_m, counts_m)
-            owners, others = near.pairs(who, reach_m)
+            owners, others = near.pairs(reach_m)
             places, velocities = states[others, :3] - states[owners, :3], states[others, 3:]
             self._own, ages_s = states[:, 3:5], np.full(len(owners), math.inf)
             seen, offsets = Seen(owners, places, velocities, ages_s), places[:, :2]
         else:
             self._own = self._perception.own_velocities(states[:, 3:5], step)
-            seen = self._perception.perceive(who, reach_m, near, states, step)
+            seen = self._perception.perceive(self._reach_m, near, states, step)
             offsets = level_offsets(seen.offsets)
         still = np.zeros_like(self._own)
         u = self._law.accelerations(self._own, seen.owners, offsets, seen.velocities[:, :2], still, seen.ages_s)

@@ -49,16 +49,16 @@ class Near:
         numbers = np.arange(len(self._places))
         return found_m[:, 0], np.where(np.isinf(found_m[:, 0]), numbers, found[:, 0])
 
-    def pairs(self, who: IntArray, reach_m: FloatArray) -> tuple[IntArray, IntArray]:
-        """Of the drones `who` (m,), (p,) of `who`, in order, and the number (p,) of another within its `reach_m` (m,).
+    def pairs(self, reach_m: float | FloatArray) -> tuple[IntArray, IntArray]:
+        """(p,) drones, in order, and the number (p,) of another within the drone's `reach_m`, of all or (drones,).
 
         A drone's others are in ascending order; there may be some that are farther by a rounding error.
         """
         reach = np.minimum(reach_m * (1.0 + 1e-9), _APART_M / 2)
-        found = self._tree.query_ball_point(self._places[who], reach, return_sorted=True)
-        counts = np.fromiter(map(len, found), np.int64, len(who))
+        found = self._tree.query_ball_point(self._places, reach, return_sorted=True)
+        counts = np.fromiter(map(len, found), np.int64, len(found))
         others = np.fromiter(itertools.chain.from_iterable(found), np.int64, counts.sum())
-        owners = np.repeat(who, counts)
+        owners = np.repeat(np.arange(len(found)), counts)
         return owners[owners != others], others[owners != others]
 
 
@@ -95,20 +95,18 @@ class Perception:
         z = self._normals(drones, drones % self._drones, 0, step, self._errors.own_velocity_time_s)
         return np.asarray(velocities + slope * z + cubed * z**3, dtype=float)
 
-    def perceive(self, who: IntArray, reach_m: FloatArray, near: Near, states: FloatArray, step: int) -> Seen:
-        """The neighbours that the drones `who` (m,) perceive within `reach_m` (m,), of `states` (drones, 6).
+    def perceive(self, reach_m: float, near: Near, states: FloatArray, step: int) -> Seen:
+        """The neighbours that all drones perceive within `reach_m`, at `states` (drones, 6).
 
         Places are the level ones of the measurement, heights and sinking are without errors. Those that are there have
         been seen as if always.
         """
         errors, n, table = self._errors, self._drones, self._table
-        owners, others = near.pairs(who, reach_m)
+        owners, others = near.pairs(reach_m)
         offsets = states[others, :3] - states[owners, :3]
         ranges = np.linalg.norm(offsets, axis=1)
-        looked = np.zeros(len(states))
-        looked[who] = reach_m
         steepest = math.sin(math.radians(errors.elevation_limit_deg))
-        in_view = (ranges <= looked[owners]) & (np.abs(offsets[:, 2]) <= steepest * ranges)
+        in_view = (ranges <= reach_m) & (np.abs(offsets[:, 2]) <= steepest * ranges)
         by_range = np.flatnonzero(in_view)[np.lexsort((ranges[in_view], owners[in_view]))]
         owners, others, offsets = owners[by_range], others[by_range], offsets[by_range]
         ranges = np.maximum(ranges[by_range], _LEAST_RANGE_M)
@@ -128,25 +126,26 @@ class Perception:
         velocities[:, :2] += _error(table, ranges[:, None], VELOCITY, z)
         offsets = np.column_stack([north * cos - east * sin, north * sin + east * cos, down])
         true = Seen(owners, offsets, velocities, np.full(len(owners), math.inf))
-        false = self._false(who, reach_m, states, step)
+        false = self._false(reach_m, states, step)
         seen = Seen._make(np.concatenate(parts) for parts in zip(true, false, strict=True))
         return seen.of(np.argsort(seen.owners, kind="stable"))
 
-    def _false(self, who: IntArray, reach_m: FloatArray, states: FloatArray, step: int) -> Seen:
+    def _false(self, reach_m: float, states: FloatArray, step: int) -> Seen:
         """Neighbours that are none, which fly as the drone itself does."""
         false = self._errors.false_neighbours
         lifetime = false.lifetime_s / self._step_s
-        numbers, seeds, drones = np.arange(_MOST_FALSE), self._seeds[who, None], who[:, None] % self._drones
+        numbers, seeds = np.arange(_MOST_FALSE), self._seeds[:, None]
+        drones = np.arange(len(states))[:, None] % self._drones
         at = step / lifetime + _uniform(_mixed(seeds, drones, 4 + numbers, -1))
         there = _uniform(_mixed(seeds, drones, 4 + numbers, np.floor(at))) <= min(false.at_once / _MOST_FALSE, 1.0)
         bits = _mixed(seeds, drones, 8 + numbers, np.floor(at))
         bearing = 2.0 * math.pi * _uniform(bits)
         range_m = np.interp(2.0 * _uniform(bits << np.uint64(32)), [0.0, 1.0, 2.0], false.distances_m)
-        which, number = np.nonzero(there & (range_m <= reach_m[:, None]))
+        which, number = np.nonzero(there & (range_m <= reach_m))
         range_m, bearing, at = range_m[which, number], bearing[which, number], at[which, number]
         offsets = np.column_stack([range_m * np.cos(bearing), range_m * np.sin(bearing), np.zeros(len(which))])
         ages_s = (at - np.floor(at)) * false.lifetime_s
-        return Seen(who[which], offsets, states[who[which], 3:], ages_s)
+        return Seen(which, offsets, states[which, 3:], ages_s)
 
     def _visible(self, owners: IntArray, rays: FloatArray, widths: FloatArray) -> BoolArray:
         """Who is not hidden, (p,), of pairs from near to far.

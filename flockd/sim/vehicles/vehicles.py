@@ -118,11 +118,10 @@ class Motion:
         """
         count = substeps(interval_s)
         wanted, place, velocity = (part.reshape(len(part), -1).T for part in (setpoints, states[:3], states[3:]))
-        climbs, dt_s = bool(np.isfinite(heights).any()), interval_s / count
+        dt_s = interval_s / count
         for substep in range(count):
             self.step(begin_s + substep * dt_s, dt_s, place, velocity, wanted)
-            if climbs:
-                climb(dt_s, place[:, 2], velocity[:, 2], heights.reshape(-1))
+            climb(dt_s, place[:, 2], velocity[:, 2], heights.reshape(-1))
 
 
 def substeps(interval_s: float) -> int:
@@ -130,9 +129,11 @@ def substeps(interval_s: float) -> int:
     return math.ceil(interval_s / _MAX_SUBSTEP_S - 1e-9)
 
 
-def climb(dt_s: float, down: FloatArray, sink: FloatArray, heights: FloatArray) -> None:
+def climb(
+    dt_s: float, down: FloatArray, sink: FloatArray, heights: FloatArray, most_m_s: float = MAX_CLIMB_M_S
+) -> None:
     """Moves (n,) m and m/s in place towards heights (n,) m, up positive; NaN: as high as now."""
-    wanted = np.clip(np.nan_to_num((-heights - down) / CLIMB_TIME_S), -MAX_CLIMB_M_S, MAX_CLIMB_M_S)
+    wanted = np.clip(np.nan_to_num((-heights - down) / CLIMB_TIME_S), -most_m_s, most_m_s)
     sink += (wanted - sink) * min(1.0, 4.0 * dt_s / CLIMB_TIME_S)
     down += sink * dt_s
     landed = down >= 0.0
@@ -197,6 +198,7 @@ class Vehicles:
 
         `heights` (n,) m, up positive, are flown to; NaN, or None for all: as high as now.
         """
+        heights = np.full(len(setpoints), np.nan) if heights is None else heights
         for errors in self.errors:
             errors.advance(self._time_s)
         if self._by_estimate:
@@ -204,15 +206,13 @@ class Vehicles:
             setpoints, yaw_setpoints = setpoints.copy(), yaw_setpoints.copy()
             setpoints[some] -= [of.velocity[:2] for of in wrong]
             yaw_setpoints[some] -= [of.attitude[2] for of in wrong]
-            if heights is not None:
-                heights = heights.copy()
-                heights[some] -= [of.height_m for of in wrong]
+            heights = heights.copy()
+            heights[some] -= [of.height_m for of in wrong]
         count = substeps(interval_s)
-        climbs = heights is not None and not (np.isnan(heights).all() and self._is_level)
         for _ in range(count):
-            self._substep(setpoints, yaw_setpoints, interval_s / count, heights if climbs else None)
+            self._substep(setpoints, yaw_setpoints, interval_s / count, heights)
 
-    def _substep(self, setpoints: FloatArray, yaw_setpoints: FloatArray, dt: float, heights: FloatArray | None) -> None:
+    def _substep(self, setpoints: FloatArray, yaw_setpoints: FloatArray, dt: float, heights: FloatArray) -> None:
         config = self._config
         self.position, self.velocity = self.position.copy(), self.velocity.copy()
         steered = self._motion.step(self._time_s, dt, self.position, self.velocity, setpoints)
@@ -222,8 +222,7 @@ class Vehicles:
         error = (yaw_setpoints - self._yaw + math.pi) % (2 * math.pi) - math.pi
         limit = math.radians(config.max_yaw_rate_deg_s) * dt
         self._yaw = self._yaw + np.clip(-math.expm1(-dt / config.yaw_time_constant_s) * error, -limit, limit)
-        if heights is not None:
-            climb(dt, self.position[:, 2], self.velocity[:, 2], heights)
+        climb(dt, self.position[:, 2], self.velocity[:, 2], heights)
         self.R_ned_body = attitude(self._thrust, self._yaw)
         self.trail.add(FlockPose(self._time_s, self.position, self.R_ned_body))
 
@@ -243,11 +242,6 @@ class Vehicles:
         off: FloatArray = np.array([of.velocity for of in self.errors])
         return self.velocity + off
 
-    @property
-    def _is_level(self) -> bool:
-        """Whether all fly level, off the ground."""
-        return bool((self.velocity[:, 2] == 0.0).all() and (self.position[:, 2] < 0.0).all())
-
     def _drag(self, velocity: FloatArray) -> FloatArray:
         """(n, 2) m/s^2 of thrust that the air takes up, with wind."""
         return np.asarray(_DRAG_PER_S * (velocity - self._wind), dtype=float)
@@ -265,17 +259,13 @@ class EstimateErrors:
         self._time_s: float | None = None
         self.height_m = 0.0
         """The barometer is set to zero at take-off."""
-        self._tilt = math.radians(config.attitude_error_deg) * self._random.normal(size=2)
-        self._heading = math.radians(config.heading_error_deg) * self._random.normal(size=1)
+        self._attitude_sigma = np.radians([config.attitude_error_deg] * 2 + [config.heading_error_deg])
+        self.attitude = self._attitude_sigma * self._random.normal(size=3)
+        """(3,) rad: roll, pitch, yaw."""
         self.velocity = config.velocity_error_m_s * self._random.normal(size=3)
         """(3,) m/s NED."""
         self.position = config.position_error_m * self._random.normal(size=2)
         """(2,) m north and east."""
-
-    @property
-    def attitude(self) -> FloatArray:
-        """(3,) rad: roll, pitch, yaw."""
-        return np.concatenate([self._tilt, self._heading])
 
     def advance(self, time_s: float) -> None:
         """To `time_s`; never back."""
@@ -283,21 +273,17 @@ class EstimateErrors:
         elapsed_s, self._time_s = time_s - before_s, max(time_s, before_s)
         if elapsed_s <= 0.0:
             return
-        height = self._drift(
-            np.array([self.height_m]), config.barometer_drift_m, config.barometer_drift_time_s, elapsed_s
-        )
-        self.height_m = float(height[0])
-        self._tilt = self._drift(self._tilt, math.radians(config.attitude_error_deg), _ATTITUDE_ERROR_TIME_S, elapsed_s)
-        self._heading = self._drift(
-            self._heading, math.radians(config.heading_error_deg), _ATTITUDE_ERROR_TIME_S, elapsed_s
-        )
-        self.velocity = self._drift(self.velocity, config.velocity_error_m_s, config.velocity_error_time_s, elapsed_s)
-        self.position = self._drift(self.position, config.position_error_m, config.position_error_time_s, elapsed_s)
 
-    def _drift(self, error: FloatArray, sigma: float, time_constant_s: float, elapsed_s: float) -> FloatArray:
-        """A Gauss-Markov process after `elapsed_s`."""
-        keep = math.exp(-elapsed_s / time_constant_s)
-        return keep * error + math.sqrt(1 - keep**2) * sigma * self._random.normal(size=error.shape)
+        def drifted(error: FloatArray, sigma: float | FloatArray, time_constant_s: float) -> FloatArray:
+            """A Gauss-Markov process after `elapsed_s`."""
+            keep = math.exp(-elapsed_s / time_constant_s)
+            return np.asarray(keep * error + math.sqrt(1 - keep**2) * sigma * self._random.normal(size=error.shape))
+
+        height_m = np.array(self.height_m)
+        self.height_m = float(drifted(height_m, config.barometer_drift_m, config.barometer_drift_time_s))
+        self.attitude = drifted(self.attitude, self._attitude_sigma, _ATTITUDE_ERROR_TIME_S)
+        self.velocity = drifted(self.velocity, config.velocity_error_m_s, config.velocity_error_time_s)
+        self.position = drifted(self.position, config.position_error_m, config.position_error_time_s)
 
 
 class SimulatedAutopilot:

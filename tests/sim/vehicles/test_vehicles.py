@@ -9,34 +9,19 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from flockd.core.config.drone import DroneConfig
 from flockd.core.config.flocking import FlockingParameters
-from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.flight.flocking.metrics import min_distance, obj2, pair_distances
 from flockd.flight.geometry import rotation_from_euler
 from flockd.sim.flock.exact_states import fly_exact_states
-from flockd.sim.scenario import ScenarioConfig, SensorConfig, StartConfig, VehicleConfig
+from flockd.sim.scenario import SensorConfig, StartConfig, VehicleConfig
 from flockd.sim.vehicles.vehicles import SimulatedAutopilot, Vehicles, attitude
+from tests import make
 
 Array = NDArray[np.float64]
 START = StartConfig(position_m=(1.0, 2.0, -4.0))
 NO_YAW = np.zeros(1)
 
-TABLE_1 = tuple(
-    StartConfig(position_m=position, velocity_m_s=(1.0, 0.0))
-    for position in (
-        (-0.5, 0.9, -4.5),
-        (0.5, -2.8, -4.0),
-        (1.2, 4.5, -5.0),
-        (3.9, 0.5, -3.5),
-        (4.5, 1.4, -3.0),
-    )
-)
-CAMERA = CameraConfig(name="front", size_px=(64, 64), intrinsics=IntrinsicsConfig(fx=50.0, fy=50.0, cx=32.0, cy=32.0))
 AT_ONCE = VehicleConfig(dead_time_s=0.0, velocity_time_constant_s=0.25, max_acceleration_m_s2=4.0, max_jerk_m_s3=1e9)
-FIVE = ScenarioConfig(
-    scenario="five", ideal=True, vehicles=TABLE_1, drone=DroneConfig(rig=RigConfig(cameras=(CAMERA,)))
-)
 
 
 def _yaw_pitch_roll_deg(R_ned_body: Array) -> Array:
@@ -231,10 +216,11 @@ def test_an_autopilots_errors_depend_on_seed_and_drone_alone() -> None:
 
 def test_five_with_exact_states_become_the_pentagon() -> None:
     """Sides 2.47 m, diagonals 4.00 m, and the paper's convergence error of obj2 for its ground-truth run, 0.0206."""
-    times, positions, velocities = fly_exact_states(FIVE, gated=False)
+    five = make.scenario({"ideal": True})
+    times, positions, velocities = fly_exact_states(five, gated=False)
     assert positions.shape == velocities.shape == (220, 5, 3)
     np.testing.assert_allclose(times[[0, 1, -1]], [0.0, 0.5, 109.5])
-    np.testing.assert_array_equal(positions[0], [start.position_m for start in TABLE_1])
+    np.testing.assert_array_equal(positions[0], [start.position_m for start in five.vehicles])
     distances = np.sort(pair_distances(positions[-1, :, :2])[np.triu_indices(5, 1)])
     np.testing.assert_allclose(distances[:5], 2.47, atol=0.03)
     np.testing.assert_allclose(distances[5:], 4.00, atol=0.03)
