@@ -361,13 +361,13 @@ def _fly_live(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) ->
     from flockd.fleet.watcher import FleetWatcher
     from flockd.onboard.telemetry.publisher import ZenohTelemetry
     from flockd.sim.flock.flock_telemetry import FlockTelemetry, Repeater
-    from flockd.sim.flock.live_flight import LiveControls, answered, fly_live
+    from flockd.sim.flock.live_flight import LiveControls, fly_live
 
     endpoint = args.telemetry_at or ENDPOINT
     with suppress(KeyboardInterrupt), ExitStack() as stack:
         zenoh = stack.enter_context(ZenohTelemetry(fleet, listen=[endpoint]))
         controls = LiveControls(scenario, zenoh.identity, by_sight=args.perception != "truth")
-        zenoh.reply_to(f"{key_of(fleet)}/**", answered(controls))
+        zenoh.reply_to(f"{key_of(fleet)}/**", controls.reply)
         shown = FlockTelemetry(scenario, zenoh, stack.enter_context(Repeater(zenoh)))
         watcher = stack.enter_context(FleetWatcher(fleet, listen=[], connect=[endpoint]))
         source = stack.enter_context(LiveFleet(watcher))

@@ -128,7 +128,8 @@ def scenario() -> ScenarioConfig:
 def follower(place: FloatArray, velocity: FloatArray, rotation: FloatArray) -> Poses:
     """The drone, and a neighbour north of it that does as it does."""
     beside = np.array([NEIGHBOUR_M, 0.0, 0.0])
-    return Poses(np.stack([place, place + beside]), np.stack([velocity, velocity]), np.stack([rotation, rotation]))
+    flown = ([place, place + beside], [velocity, velocity], [rotation, rotation])
+    return Poses(time.monotonic(), *map(np.array, flown))
 
 
 def _add(samples: dict[str, array[float]], facts: Mapping[str, float]) -> None:

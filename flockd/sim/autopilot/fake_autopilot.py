@@ -3,13 +3,10 @@
 It speaks real MAVLink over UDP and keeps PX4's rules where flockd depends on them. These are: who may enter offboard,
 when it is lost and what follows; PX4 returns to offboard by itself when setpoints come back; the heartbeat comes once a
 second only. Where PX4 does more (climbing before a return, position control in Hold, estimators) it does not try.
-
-    python -m flockd.sim.autopilot.fake_autopilot --port 14540 --height 2.5
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import socket
 import struct
@@ -18,6 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -103,12 +101,10 @@ class FakeAutopilot:
         """False: its position and velocity do not come any more, and all else does."""
         self.frame_off, self.heading_off_rad = np.zeros(3), 0.0
         """By what its positions (3,) in NED and its heading are off the truth, in metres and clockwise."""
-        self.drifts, self._drift = True, Drift(system_id)
+        self.drifts, self.drift = True, Drift(system_id)
         # `drifts`, False: its estimate is the truth.
         self.failing: set[str] = set()
         """PX4's names of further checks that fail; each refuses to arm."""
-        self.wordless = False
-        """True: it refuses without a text or an event."""
         self.silent = False
         """True: as if the cable were cut, in both directions."""
         self.parameters: dict[str, float | int] = {
@@ -141,12 +137,15 @@ class FakeAutopilot:
         self.checks = FakeChecks(self._mav)
         truth = mavlink.MAVLink(Outlet(self._socket, self._ground), srcSystem=system_id, srcComponent=1)
         self._motion = motion or PointMass(np.array([0.0, 0.0, -height_m]), yaw_rad)
-        self._state = self._motion(Demand(np.zeros(2), -height_m, yaw_rad), 0.0)
-        self._armed = height_m > 0.0
-        self._intended: Mode = "LOITER"
-        self._mode: Mode = "LOITER"
-        self._hold_down_m = -height_m
-        self._hold_yaw_rad = yaw_rad
+        self.state: MotionState = self._motion(Demand(np.zeros(2), -height_m, yaw_rad), 0.0)
+        """The truth."""
+        self.armed = height_m > 0.0
+        """Motors on."""
+        self.intended_mode: Mode = "LOITER"
+        """The one that it was asked for."""
+        self.mode: Mode = "LOITER"
+        """The mode it really flies, which is not the one it was asked for while its failsafe is active."""
+        self._hold_down_m, self._hold_yaw_rad = -height_m, yaw_rad
         self._landed_s: float | None = None
         self._sticks = -math.inf, np.zeros(2)
         """When a person last moved them, and forward and right from -1 to 1."""
@@ -155,11 +154,16 @@ class FakeAutopilot:
         self.clock_offset_s = clock_ahead_s - self._clock()
         """Its own clock, of its stamps and of TIMESYNC, less ``clock`` times the speed factor."""
 
-        def streams() -> TelemetryStreams:
-            return TelemetryStreams(self, self._mav, truth, -self.clock_offset_s, heartbeat_s, home_deg, range_finder)
-
-        self._new_streams = streams
-        self._streams = streams()
+        self._new_streams = partial(
+            TelemetryStreams,
+            self,
+            self._mav,
+            truth,
+            heartbeat_s=heartbeat_s,
+            home_deg=home_deg,
+            range_finder=range_finder,
+        )
+        self._streams = self._new_streams(started_s=-self.clock_offset_s)
         self._heard_s = -math.inf
         """When no packet waited any more: what is taken later came later, whatever the wall clock says."""
         self._lock = threading.RLock()
@@ -184,34 +188,14 @@ class FakeAutopilot:
         self.close()
 
     @property
-    def mode(self) -> Mode:
-        """The mode it really flies, which is not the one it was asked for while its failsafe is active."""
-        return self._mode
-
-    @property
-    def armed(self) -> bool:
-        """Motors on."""
-        return self._armed
-
-    @property
-    def intended_mode(self) -> Mode:
-        """The one that it was asked for."""
-        return self._intended
-
-    @property
     def failsafe(self) -> bool:
         """It is in another mode than it was asked for."""
-        return self._mode != self._intended
+        return self.mode != self.intended_mode
 
     @property
     def has_ground_station(self) -> bool:
         """It hears one on its link, and sends its texts there."""
         return self.checks.has_ground_station(self._clock())
-
-    @property
-    def state(self) -> MotionState:
-        """The truth."""
-        return self._state
 
     def pilot_arms(self) -> None:
         """The pilot starts the motors."""
@@ -221,7 +205,7 @@ class FakeAutopilot:
     def pilot_selects(self, mode: Mode) -> None:
         """The pilot turns the switch."""
         with self._lock:
-            self._intended = mode
+            self.intended_mode = mode
             self._update_mode()
 
     @property
@@ -239,7 +223,7 @@ class FakeAutopilot:
             self._disarm()
             self.clock_offset_s = -self._clock()
             self.checks = FakeChecks(self._mav)
-            self._streams = self._new_streams()
+            self._streams = self._new_streams(started_s=-self.clock_offset_s)
 
     def send_from_elsewhere(self, data: bytes) -> None:
         """It receives a packet of another program, as one on another of its links."""
@@ -255,19 +239,9 @@ class FakeAutopilot:
             self._socket.sendto(data, self._ground)
 
     @property
-    def position_off(self) -> FloatArray:
-        """(3,) m by which its local positions are off the truth, in NED."""
-        return np.asarray(self.frame_off + np.append(self._drift.position, 0.0))
-
-    @property
-    def velocity_off(self) -> FloatArray:
-        """(2,) m/s likewise of its velocity, north and east."""
-        return self._drift.velocity
-
-    @property
     def followed_velocity(self) -> FloatArray | None:
         """(2,) m/s, north and east, that it follows in offboard; None in other modes."""
-        return self._followed().velocity if self._mode == "OFFBOARD" and self.setpoints else None
+        return self._followed().velocity if self.mode == "OFFBOARD" and self.setpoints else None
 
     def _clock(self) -> float:
         return self._speed_factor * self._real()
@@ -280,8 +254,7 @@ class FakeAutopilot:
                 now = self._clock()
                 self._fly(min(now - flown_s, MAX_STEP_S))
                 self._streams.send_due(now)
-                if not self.wordless:
-                    self.checks.tell_changes(self._failing())
+                self.checks.tell_changes(self._failing())
                 self.checks.announce(now)
             flown_s = now
 
@@ -312,20 +285,20 @@ class FakeAutopilot:
 
     def _update_mode(self) -> None:
         """The intended mode, or what PX4's failsafe puts in its place while offboard cannot run."""
-        lost = self._armed and self._intended == "OFFBOARD" and not self._signal()
-        mode = OFFBOARD_LOSS_MODES[int(self.parameters["COM_OBL_RC_ACT"])] if lost else self._intended
-        if mode == self._mode:
+        lost = self.armed and self.intended_mode == "OFFBOARD" and not self._signal()
+        mode = OFFBOARD_LOSS_MODES[int(self.parameters["COM_OBL_RC_ACT"])] if lost else self.intended_mode
+        if mode == self.mode:
             return
         if lost:
             self.checks.say("Failsafe activated", self._clock())
-        self._mode = mode
-        self._hold_down_m = float(self._state.position[2])
-        R = self._state.R_ned_body
+        self.mode = mode
+        self._hold_down_m = float(self.state.position[2])
+        R = self.state.R_ned_body
         self._hold_yaw_rad = math.atan2(R[1, 0], R[0, 0])
 
     def _select(self, mode: Mode, component: int) -> bool:
         """A mode requested over MAVLink: while armed, only one that can run. It tells ground stations alone of that."""
-        if self._armed and (mode == "ACRO" or (mode == "OFFBOARD" and not self._signal())):
+        if self.armed and (mode == "ACRO" or (mode == "OFFBOARD" and not self._signal())):
             if component == mavlink.MAV_COMP_ID_MISSIONPLANNER:
                 self.checks.say(f"Switching to {mode.title()} is currently not available", self._clock())
                 self.checks.deny("commander_modeswitch_not_avail", custom_mode(mode))
@@ -334,52 +307,51 @@ class FakeAutopilot:
         return True
 
     def _arm(self) -> bool:
-        if self._intended == "OFFBOARD" and not self._signal():
+        if self.intended_mode == "OFFBOARD" and not self._signal():
             self.checks.say("Arming denied: no offboard signal", self._clock())
             return False
         if self._failing() - {NO_SETPOINTS}:
-            if not self.wordless:
-                self.checks.say("Arming denied: Resolve system health failures first", self._clock())
-                self.checks.deny(CHECKS_FAIL)
+            self.checks.say("Arming denied: Resolve system health failures first", self._clock())
+            self.checks.deny(CHECKS_FAIL)
             return False
-        self._armed, self._landed_s = True, None
+        self.armed, self._landed_s = True, None
         return True
 
     def _failing(self) -> set[str]:
         """The checks that fail now."""
         missing = set() if self._signal() else {NO_SETPOINTS}
-        if not self._armed:
-            missing |= {NOT_ARMED_IN[self._intended]} if self._intended in NOT_ARMED_IN else set()
+        if not self.armed:
+            missing |= {NOT_ARMED_IN[self.intended_mode]} if self.intended_mode in NOT_ARMED_IN else set()
         return missing | self.failing | (set() if self.estimate_ok else {"check_estimator_hor_pos_not_stable"})
 
     def _disarm(self) -> None:
-        self._armed = False
-        self._intended = self._mode = "LOITER"
+        self.armed = False
+        self.intended_mode = self.mode = "LOITER"
 
     # Flight
 
     def _fly(self, interval_s: float) -> None:
         self._update_mode()
-        if not self._armed:
+        if not self.armed:
             return
         if self.drifts:
-            self._drift.step(interval_s)
+            self.drift.step(interval_s)
         demand = self._demand()
-        self._state = self._motion(replace(demand, velocity=demand.velocity - self._drift.velocity), interval_s)
-        height_m = -float(self._state.position[2])
+        self.state = self._motion(replace(demand, velocity=demand.velocity - self.drift.velocity), interval_s)
+        height_m = -float(self.state.position[2])
         blind = self.parameters["CP_DIST"] > 0 and self.collision_prevention.without_data_s(self._clock()) > HOLD_S
         risen = height_m > self.parameters["MIS_TAKEOFF_ALT"] - 0.1
-        if (self._mode == "POSCTL" and blind) or (self._mode == "TAKEOFF" and risen):
+        if (self.mode == "POSCTL" and blind) or (self.mode == "TAKEOFF" and risen):
             self.pilot_selects("LOITER")
-        elif self._mode == "RTL" and float(np.linalg.norm(self._state.position[:2])) < ARRIVED_M:
+        elif self.mode == "RTL" and float(np.linalg.norm(self.state.position[:2])) < ARRIVED_M:
             self.pilot_selects("LAND")
-        elif self._mode == "LAND" and height_m < ON_GROUND_M:
+        elif self.mode == "LAND" and height_m < ON_GROUND_M:
             self._landed_s = self._landed_s or self._clock()
             if self._clock() - self._landed_s > DISARM_AFTER_LANDING_S:
                 self._disarm()
 
     def _demand(self) -> Demand:
-        match self._mode:
+        match self.mode:
             case "OFFBOARD" if self.setpoints:
                 return self._followed()
             case "POSCTL":
@@ -389,7 +361,7 @@ class FakeAutopilot:
             case "LAND":
                 return Demand(np.zeros(2), 0.5, self._hold_yaw_rad)
             case "RTL":
-                home = -self._state.position[:2]
+                home = -self.state.position[:2]
                 return Demand(
                     home * min(1.0, 3.0 / max(float(np.linalg.norm(home)), 1e-9)), self._hold_down_m, self._hold_yaw_rad
                 )
@@ -400,7 +372,7 @@ class FakeAutopilot:
         """The newest setpoint, no faster than may be flown."""
         asked = self.setpoints[-1][1]
         speed_m_s, most_m_s = float(np.linalg.norm(asked.velocity)), self.parameters["MPC_XY_VEL_MAX"]
-        down_m = float(self._state.position[2]) + asked.sink_m_s  # the vehicle flies a metre that is missing at 1 m/s
+        down_m = float(self.state.position[2]) + asked.sink_m_s  # the vehicle flies a metre that is missing at 1 m/s
         return Demand(asked.velocity * (most_m_s / max(speed_m_s, most_m_s)), down_m, asked.yaw_rad)
 
     def _by_hand(self) -> FloatArray:
@@ -419,7 +391,7 @@ class FakeAutopilot:
         """Sticks moved fast take over from every mode but Position, and not from a failsafe, where PX4 asks more."""
         self._sticks = moved_s, sticks
         fast = self._override.moved(moved_s, sticks, self.parameters["MAN_OVERRIDE_SPD"])
-        if fast and self._armed and not self.failsafe and self._mode not in {"POSCTL", "ACRO"}:
+        if fast and self.armed and not self.failsafe and self.mode not in {"POSCTL", "ACRO"}:
             self.checks.say("Pilot took over using sticks", self._clock())
             self.pilot_selects("POSCTL")
 
@@ -480,7 +452,7 @@ class FakeAutopilot:
                 if done:
                     self._streams.intervals_s[int(message.param1)] = message.param2 * 1e-6
             case mavlink.MAV_CMD_RUN_PREARM_CHECKS:
-                self.checks.tell(() if self.wordless else self._failing())
+                self.checks.tell(self._failing())
                 done = True
             case mavlink.MAV_CMD_REQUEST_MESSAGE if message.param1 == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
                 self._streams.send_version()
@@ -512,18 +484,3 @@ def _age(ancillary: list[tuple[int, int, bytes]]) -> float:
     (stamp,) = (data for level, kind, data in ancillary if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS))
     seconds, nanoseconds = struct.unpack("@ll", stamp)
     return time.time() - float(seconds + nanoseconds * 1e-9)
-
-
-def main() -> None:
-    """Runs until it is interrupted."""
-    parser = argparse.ArgumentParser(description="A fake autopilot that speaks MAVLink over UDP. It is not PX4.")
-    parser.add_argument("--port", type=int, required=True, help="the UDP port on this computer to send to")
-    parser.add_argument("--system-id", type=int, default=1, help="its MAV_SYS_ID (1)")
-    parser.add_argument("--height", type=float, default=0.0, help="begin in the air, armed and in Hold, metres (0)")
-    options = parser.parse_args()
-    with FakeAutopilot(options.port, system_id=options.system_id, height_m=options.height):
-        threading.Event().wait()
-
-
-if __name__ == "__main__":
-    main()

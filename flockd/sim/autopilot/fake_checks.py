@@ -48,7 +48,8 @@ class FakeChecks:
         """Names the newest event's number, once a second."""
         if now_s - self._announced_s >= SEQUENCE_S:
             self._announced_s = now_s
-            self._mav.send(_EventSequence(self._sequence, reset=self._told is None))
+            data = struct.pack("<HB", self._sequence, int(self._told is None))
+            self._mav.send(_Raw(411, "CURRENT_EVENT_SEQUENCE", 106, data))
 
     def tell_changes(self, failing: Iterable[str]) -> None:
         """Sends the list if it is not the one sent last."""
@@ -81,10 +82,12 @@ class FakeChecks:
 
     def _send(self, number: int, level: int, arguments: bytes) -> None:
         self._sequence = (self._sequence + 1) & 0xFFFF
+        levels = level << 4 | level
+        data = struct.pack("<IIHBBB40s", number, BOOT_MS, self._sequence, 0, 0, levels, arguments)
         if self.events_to_lose > 0:
             self.events_to_lose -= 1
         else:
-            self._mav.send(_Event(number, self._sequence, level << 4 | level, arguments))
+            self._mav.send(_Raw(410, "EVENT", 160, data))
 
 
 class _Raw:
@@ -97,19 +100,3 @@ class _Raw:
         """The whole message as it goes over the link."""
         message = mavlink.MAVLink_message(self._number, self._name)
         return bytes(message._pack(mav, self._crc_extra, self._data, force_mavlink1=force_mavlink1))
-
-
-class _Event(_Raw):
-    """MAVLink's EVENT."""
-
-    def __init__(self, number: int, sequence: int, log_levels: int, arguments: bytes) -> None:
-        super().__init__(
-            410, "EVENT", 160, struct.pack("<IIHBBB40s", number, BOOT_MS, sequence, 0, 0, log_levels, arguments)
-        )
-
-
-class _EventSequence(_Raw):
-    """MAVLink's CURRENT_EVENT_SEQUENCE."""
-
-    def __init__(self, sequence: int, *, reset: bool) -> None:
-        super().__init__(411, "CURRENT_EVENT_SEQUENCE", 106, struct.pack("<HB", sequence, int(reset)))

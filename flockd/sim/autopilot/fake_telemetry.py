@@ -48,7 +48,7 @@ class TelemetryStreams:
     """Sends each message at its interval, to the link and, of the true pose, to a simulator."""
 
     def __init__(
-        self, vehicle: FakeAutopilot, link: mavlink.MAVLink, truth: mavlink.MAVLink, started_s: float,
+        self, vehicle: FakeAutopilot, link: mavlink.MAVLink, truth: mavlink.MAVLink, *, started_s: float,
         heartbeat_s: float, home_deg: tuple[float, float], range_finder: FakeRangeFinder | None,
     ) -> None:  # fmt: skip
         self._vehicle, self._mav, self._truth, self._range_finder = vehicle, link, truth, range_finder
@@ -128,8 +128,8 @@ class TelemetryStreams:
         if self._vehicle.estimate_ok and self._vehicle.sends_motion:
             self._mav.local_position_ned_send(
                 self._boot_ms(),
-                *(motion.position + self._vehicle.position_off),
-                *(motion.velocity[:2] + self._vehicle.velocity_off),
+                *(motion.position + self._vehicle.frame_off + np.append(self._vehicle.drift.position, 0.0)),
+                *(motion.velocity[:2] + self._vehicle.drift.velocity),
                 motion.velocity[2],
             )
 

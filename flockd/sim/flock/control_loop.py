@@ -49,27 +49,20 @@ class Commands:
     """(n,)"""
     height_m: FloatArray
     """(n,), up positive; NaN: as high as now."""
-    missions: tuple[MissionStatus, ...]
+    missions: list[MissionStatus]
     """See `PilotOutput.mission`."""
     desired: FloatArray
     """(n, 2) m/s: what each mission wants, times its pull."""
-    obstacles: tuple[ObstacleRanges | None, ...]
+    obstacles: list[ObstacleRanges | None]
     """What each drone saw of them; None where it does not look for any."""
-    neighbours: tuple[tuple[Neighbour, ...], ...]
+    neighbours: list[tuple[Neighbour, ...]]
     """What each drone knows of the others."""
 
     @classmethod
     def of(cls, n: int) -> Self:
         """Standstill of n drones, to be filled."""
         still = (np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.full(n, np.nan))
-        return cls(
-            *still, missions=(NO_STATUS,) * n, desired=np.zeros((n, 2)), obstacles=(None,) * n, neighbours=((),) * n
-        )
-
-    @property
-    def takeovers(self) -> list[str | None]:
-        """Which autopilots take over, and how."""
-        return [mission.takeover for mission in self.missions]
+        return cls(*still, [NO_STATUS] * n, np.zeros((n, 2)), [None] * n, [()] * n)
 
 
 RETURN_M_S = 2.0
@@ -86,24 +79,20 @@ class Handover:
     def __init__(self, scenario: ScenarioConfig) -> None:
         self._starts = np.array([vehicle.position_m[:2] for vehicle in scenario.vehicles])
         self._response_s = scenario.vehicle.dead_time_s + scenario.vehicle.velocity_time_constant_s
-        self._taken: dict[int, str] = {}
+        self.taken: dict[int, str] = {}
+        """How an autopilot has taken over, by its drone's number."""
         self._held: dict[int, FloatArray] = {}
         """Where, (3,) m NED."""
 
-    @property
-    def taken(self) -> frozenset[int]:
-        """Whose autopilot has taken over, by its number."""
-        return frozenset(self._taken)
-
     def hold(self, drone: int, position: FloatArray, velocity: FloatArray) -> None:
         """The autopilot of a drone at `position` (3,) m NED, with (3,) m/s, goes into Hold and stays there."""
-        self._taken[drone] = "hold"
+        self.taken[drone] = "hold"
         stops_s = self._response_s + math.hypot(*velocity[:2]) / (2 * _HOLD_BRAKING_M_S2)
         self._held[drone] = position + velocity * [stops_s, stops_s, 0.0]
 
     def resume(self, drone: int) -> None:
         """Its pilot flies it again."""
-        self._taken.pop(drone, None)
+        self.taken.pop(drone, None)
         self._held.pop(drone, None)
 
     def holding(self, positions: FloatArray) -> dict[int, tuple[FloatArray, float]]:
@@ -120,8 +109,8 @@ class Handover:
         velocity, height_m = velocity.copy(), height_m.copy()
         for i, takeover in enumerate(takeovers):
             if takeover is not None:
-                self._taken.setdefault(i, takeover)
-        for i, takeover in self._taken.items():
+                self.taken.setdefault(i, takeover)
+        for i, takeover in self.taken.items():
             if takeover == "hold":
                 continue
             way = self._starts[i] - positions[i, :2]
@@ -129,7 +118,7 @@ class Handover:
             if takeover == "return" and away_m > _THERE_M:
                 velocity[i] = way * (min(RETURN_M_S, away_m) / away_m)
             else:
-                self._taken[i] = "land"
+                self.taken[i] = "land"
                 velocity[i], height_m[i] = 0.0, 0.0
         return velocity, height_m
 
@@ -296,7 +285,7 @@ class ControlLoop:
     def fly(self, time_s: float, vehicles: Vehicles, commands: Commands, disturbed: Disturbances = UNDISTURBED) -> None:
         """From `time_s` one step on."""
         self._disturbed = disturbed
-        takeovers = commands.takeovers
+        takeovers: list[str | None] = [mission.takeover for mission in commands.missions]
         for takeover in self._scenario.takeovers:
             if time_s - self._step_s < takeover.time_s <= time_s:
                 if takeover.to == "hold":
@@ -315,7 +304,7 @@ class ControlLoop:
                 self._orders.popleft()
             order = self._orders[0]
             setpoints, heights = order.velocity.copy(), order.height_m.copy()
-            for i in self._drones.keys() - self._handover.taken - disturbed.removed:
+            for i in self._drones.keys() - self._handover.taken.keys() - disturbed.removed:
                 setpoint = self._setpoint(i, now_s, period_s, vehicles, order)
                 setpoints[i] = setpoint.velocity
                 if math.isfinite(order.height_m[i]):

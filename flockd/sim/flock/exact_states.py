@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
@@ -36,10 +34,8 @@ class ExactFlock:
         """``passes``: drones keep clear of those that would come too near, as pilots ask for; else the law alone."""
         drone, self._passes = scenario.drone, passes
         self._law, self._step_s = FlockingLaw(drone.flocking), drone.step_s
-        self._pilots = [
-            HandPilot(scenario, i) if vehicle.by_hand else Navigator(scenario.drone_of(i).mission, drone.safety.gate)
-            for i, vehicle in enumerate(scenario.vehicles)
-        ]
+        self._by_hand = [vehicle.by_hand for vehicle in scenario.vehicles]
+        self._pilots = [navigator_of(scenario, i) for i in range(len(self._by_hand))]
         self._yaw_rad = np.full(len(self._pilots), start_yaw(scenario))
         self._rig = build_rig(drone.rig)
         made_up, n = scenario.detections, len(self._pilots)
@@ -69,16 +65,14 @@ class ExactFlock:
         own, orders = velocities if own is None else own, orders or {}
         commands = Commands.of(len(positions))
         commands.yaw_rad[:] = self._yaw_rad
-        missions, ranges, known = list(commands.missions), list(commands.obstacles), list(commands.neighbours)
+        missions, ranges, known = commands.missions, commands.obstacles, commands.neighbours
         for i, pilot in enumerate(self._pilots):
             here, moving = positions[i, :2], own[i, :2]
             known[i] = self._neighbours(i, time_s, positions, velocities, disturbed.cameras_off_of(i))
             if self._obstacles.solids:
                 ranges[i] = true_ranges(self._obstacles, time_s, positions[i])
-            if isinstance(pilot, HandPilot):
-                flown = pilot.step(time_s, here)
-                commands.velocity[i] = commands.desired[i] = flown.velocity
-                commands.height_m[i], missions[i] = flown.height_m, flown.status
+            if self._by_hand[i]:
+                missions[i] = fly_by_hand(pilot, i, time_s, here, commands)
                 continue
             seen = [one for one in known[i] if one.confirmed]
             places = np.reshape([one.position for one in seen], (len(seen), 3))
@@ -103,7 +97,7 @@ class ExactFlock:
             if guidance.height_m is not None:
                 commands.height_m[i] = guidance.height_m
         self._yaw_rad = commands.yaw_rad
-        return replace(commands, missions=tuple(missions), obstacles=tuple(ranges), neighbours=tuple(known))
+        return commands
 
     def _neighbours(
         self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray, cameras_off: frozenset[str]
@@ -186,36 +180,33 @@ class TrackedNeighbours:
         return Measurement(bearing, log_range, covariance, 0.6, 0.95)
 
 
-class FlownByHand(NamedTuple):
-    """What a person wants of a drone."""
-
-    velocity: FloatArray
-    """(2,) m/s, north and east."""
-    height_m: float
-    """Up positive; NaN: as high as now."""
-    status: MissionStatus
+def navigator_of(scenario: ScenarioConfig, vehicle: int) -> Navigator:
+    """Along a vehicle's mission, for its pilot or for a person who flies it without flockd."""
+    drone = scenario.drone_of(vehicle)
+    return Navigator(drone.mission, drone.safety.gate)
 
 
-class HandPilot:
-    """A person who flies one drone along its mission in Position mode, without flockd; sees nothing of the flock."""
+def at_home(time_s: float, place: FloatArray) -> Moment:
+    """What a navigator is told that knows nothing of the flock, at `place` (2,) m from the world's origin."""
+    return Moment(time_s, place, home_deg=np.array(REFERENCE_DEG))
 
-    def __init__(self, scenario: ScenarioConfig, vehicle: int) -> None:
-        drone = scenario.drone_of(vehicle)
-        self._navigator = Navigator(drone.mission, drone.safety.gate)
 
-    def step(self, time_s: float, position: FloatArray) -> FlownByHand:
-        """At `position` (2,) m from the world's origin; called in order of time."""
-        guidance = self._navigator.step(Moment(time_s, position, home_deg=np.array(REFERENCE_DEG)))
-        height_m = np.nan if guidance.height_m is None else guidance.height_m
-        return FlownByHand(guidance.velocity, height_m, self._navigator.status(guidance))
+def fly_by_hand(person: Navigator, i: int, time_s: float, place: FloatArray, commands: Commands) -> MissionStatus:
+    """Puts what a person who flies one drone in Position mode wants of it into the commands; called in order of time.
+
+    The person sees nothing of the flock.
+    """
+    guidance = person.step(at_home(time_s, place))
+    commands.velocity[i] = commands.desired[i] = guidance.velocity
+    commands.height_m[i] = np.nan if guidance.height_m is None else guidance.height_m
+    return person.status(guidance)
 
 
 def start_yaw(scenario: ScenarioConfig) -> float:
     """The heading with which all begin: the course of the scenario's own mission; else north."""
-    mission = scenario.drone.mission
     start = np.mean([vehicle.position_m[:2] for vehicle in scenario.vehicles], axis=0)
-    moment = Moment(0.0, start, home_deg=np.array(REFERENCE_DEG))
-    return Navigator(mission, scenario.drone.safety.gate).step(moment).course_rad or 0.0
+    navigator = Navigator(scenario.drone.mission, scenario.drone.safety.gate)
+    return navigator.step(at_home(0.0, start)).course_rad or 0.0
 
 
 def vehicles_of(scenario: ScenarioConfig) -> Vehicles:
@@ -249,10 +240,11 @@ def fly_exact_states(scenario: ScenarioConfig, *, gated: bool = True) -> tuple[F
 def exact_states_at(times: FloatArray, scenario: ScenarioConfig) -> tuple[FloatArray, FloatArray]:
     """Positions (S, N, 3) m and velocities (S, N, 3) m/s of `fly_exact_states`, interpolated at ``times`` (S,) s."""
     steps_s, position, velocity = fly_exact_states(scenario)
-    flat = [values.reshape(len(steps_s), -1) for values in (position, velocity)]
-    at = [np.stack([np.interp(times, steps_s, column) for column in values.T], axis=1) for values in flat]
-    shape = (len(times), *position.shape[1:])
-    return at[0].reshape(shape), at[1].reshape(shape)
+
+    def at_times(column: FloatArray) -> FloatArray:
+        return np.interp(times, steps_s, column)
+
+    return np.apply_along_axis(at_times, 0, position), np.apply_along_axis(at_times, 0, velocity)
 
 
 def step_times(scenario: ScenarioConfig) -> FloatArray:

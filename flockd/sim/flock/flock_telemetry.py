@@ -101,11 +101,10 @@ class FlockTelemetry:
         self._orders: dict[int, MissionOrder] = {}
         self._requests: dict[int, str] = {}
         self._refused = dict.fromkeys(self._drones, 0)
-        self._reasons: dict[int, tuple[str, ...]] = {}
         self._disturbed = UNDISTURBED
         self._checks = {i: OrderChecks(announcer.identity, time.monotonic) for i in self._drones}
-        self._states: dict[int, VehicleState] = {}
-        self._stepped: dict[int, tuple[FrameSet, PilotOutput]] = {}
+        self._stepped: dict[int, tuple[FrameSet | None, VehicleState, PilotOutput]] = {}
+        """The newest step of each; without frames on exact states."""
         self._drawn: _DrawnOnRequest | None = None
         self._rig = build_rig(scenario.drone.rig)
         for i in self._drones:
@@ -123,7 +122,7 @@ class FlockTelemetry:
     def begin_again(self) -> None:
         """Another flight begins, with all drones."""
         with self._lock:
-            self._orders, self._requests, self._states, self._stepped, self._reasons = {}, {}, {}, {}, {}
+            self._orders, self._requests, self._stepped = {}, {}, {}
         if self._drawn is not None:
             self._drawn.begin_again()
         self.disturb(UNDISTURBED)
@@ -152,7 +151,8 @@ class FlockTelemetry:
     def show_flight(self, time_s: float, loop: ControlLoop) -> None:
         """Publishes who flies each drone, and why."""
         for i in self._there():
-            (state, why), reasons = loop.status(i), self._reasons.get(i, ())
+            _, vehicle, output = self._stepped[i]
+            (state, why), reasons = loop.status(i), [reason.text for reason in output.reasons]
             held = state is State.ASKING
             state = State.DEGRADED if state is State.NORMAL and reasons else state
             message = FlightMessage(
@@ -161,7 +161,7 @@ class FlockTelemetry:
                 reasons=[ReasonMessage(event="simulated", sentence=one) for one in (*why, *reasons)],
                 flight_mode="hold" if held else "simulated",
                 armed=True, in_air=True, heartbeat_age_s=None, heartbeats_lost=0, battery_share=None,
-                height_m=self._states[i].height_m, velocity_trim=[0.0, 0.0],
+                height_m=vehicle.height_m, velocity_trim=[0.0, 0.0],
                 velocity_error_m_s=loop.velocity_error_m_s(i),
                 silence="its autopilot holds position" if held else None, setpoints_sent=0, setpoints_missed=0,
                 orders=self._checks[i].recent(),
@@ -172,16 +172,15 @@ class FlockTelemetry:
     def _there(self) -> list[int]:
         return [i for i in self._drones if i not in self._disturbed.removed]
 
-    def take_order(self, drone: int) -> MissionOrder | None:
-        """An operator's that no step has taken yet; it is taken now."""
+    def take_orders(self, drones: Sequence[int]) -> dict[int, MissionOrder]:
+        """Operators', by drone, that no step has taken yet; they are taken now."""
         with self._lock:
-            return self._orders.pop(drone, None)
+            return {i: self._orders.pop(i) for i in drones if i in self._orders}
 
-    def show(self, drone: int, frames: FrameSet, vehicle: VehicleState, output: PilotOutput) -> None:
-        """Publishes a step of a pilot that sees."""
+    def show(self, drone: int, frames: FrameSet | None, vehicle: VehicleState, output: PilotOutput) -> None:
+        """Publishes a step of a pilot, with the frames that it saw."""
         with self._lock:
-            self._states[drone], self._stepped[drone] = vehicle, (frames, output)
-            self._reasons[drone] = tuple(reason.text for reason in output.reasons)
+            self._stepped[drone] = frames, vehicle, output
         publish_step(self._sink, f"drone{drone + 1}", vehicle, output)
 
     def show_exact(self, step: int, time_s: float, vehicles: Vehicles, commands: Commands) -> None:
@@ -199,16 +198,14 @@ class FlockTelemetry:
                 time_s, None, velocity, (), (), {}, commands.neighbours[i], wanted,
                 mission=commands.missions[i], obstacles=commands.obstacles[i],
             )  # fmt: skip
-            with self._lock:
-                self._states[i] = state
-            publish_step(self._sink, f"drone{i + 1}", state, output)
+            self.show(i, None, state, output)
 
     def _newest(self, drone: int) -> tuple[FrameSet | None, tuple[FrameSet, PilotOutput] | None]:
         if self._drawn is not None:
             return self._drawn.frames(drone), None
         with self._lock:
-            stepped = self._stepped.get(drone)
-        return (None, None) if stepped is None else (stepped[0], stepped)
+            frames, _, output = self._stepped.get(drone, (None, None, None))
+        return frames, None if frames is None or output is None else (frames, output)
 
     def _ask(self, drone: int, command: str, payload: bytes) -> AnswerMessage:
         try:
@@ -225,11 +222,11 @@ class FlockTelemetry:
         ask = parse_ask(payload)
         order = parse_order(command, ask["order"]) if command in ORDERS else None
         with self._lock:
-            state = self._states.get(drone)
+            stepped = self._stepped.get(drone)
         checks = self._checks[drone]
         fault = checks.fault(command, ask)
         if fault is None and order is not None:
-            fault = order_fault(self._scenario.drone_of(drone), order, state)
+            fault = order_fault(self._scenario.drone_of(drone), order, stepped and stepped[1])
         if fault is not None:
             raise ValueError(fault)
         checks.take(command, ask)
@@ -291,9 +288,3 @@ class _DrawnOnRequest:
 
     def _build(self) -> None:
         self._cameras = CameraSimulator(self._scenario, threads=1)
-
-
-def orders_of(shown: FlockTelemetry | None, drones: Sequence[int]) -> dict[int, MissionOrder]:
-    """What operators have ordered since the last step, by drone."""
-    taken = {} if shown is None else {i: shown.take_order(i) for i in drones}
-    return {i: order for i, order in taken.items() if order is not None}

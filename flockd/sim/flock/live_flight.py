@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import threading
 import time
 from collections import deque
@@ -19,7 +18,7 @@ from flockd.sim.flock.control_loop import ControlLoop
 from flockd.sim.flock.exact_states import vehicles_of
 from flockd.sim.flock.flock_telemetry import FlockTelemetry
 from flockd.sim.flock.pilot_pool import PilotPool
-from flockd.sim.flock.swarm import ExactStatePilots, VisionPilots
+from flockd.sim.flock.swarm import ExactStatePilots, VisionPilots, fly_commands
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances
 
@@ -82,6 +81,15 @@ class LiveControls:
                 self._wait_on(self._changed, min(left_s, _LONGEST_WAIT_S))
             return False
 
+    def reply(self, last: str, payload: bytes) -> Mapping[str, object]:
+        """To a query under the simulator's key: `state`, `time`, or a control's name."""
+        match last:
+            case "state":
+                return {**self.state()}
+            case "time":
+                return {"time_s": time.monotonic(), "wall_s": time.time(), "identity": self._identity}
+        return {**self.ask(last, payload)}
+
     def ask(self, control: str, payload: bytes) -> AnswerMessage:
         """The answer to a control."""
         try:
@@ -90,7 +98,9 @@ class LiveControls:
             fault = self._checks.fault(control, ask)
             if fault is not None:
                 return AnswerMessage(accepted=False, sentence=fault)
-            sentence = self._apply(control, given)
+            with self._changed:
+                sentence = self._done(control, given)
+                self._changed.notify_all()
         except ValueError as error:
             return AnswerMessage(accepted=False, sentence=str(error))
         return AnswerMessage(accepted=True, sentence=sentence)
@@ -115,14 +125,8 @@ class LiveControls:
                 removed=[_name(drone) for drone in sorted(self._disturbed.removed)],
             )
 
-    def _apply(self, control: str, given: Mapping[str, object]) -> str:
-        """What was done; raises ValueError where it cannot be."""
-        with self._changed:
-            sentence = self._done(control, given)
-            self._changed.notify_all()
-            return sentence
-
     def _done(self, control: str, given: Mapping[str, object]) -> str:
+        """What was done; raises ValueError where it cannot be."""
         match control, given:
             case "pause", _:
                 self._paused = True
@@ -204,20 +208,6 @@ def _name(drone: int) -> str:
     return f"drone{drone + 1}"
 
 
-def answered(controls: LiveControls) -> Callable[[str, bytes], Mapping[str, object]]:
-    """What replies to queries under the simulator's key: `state`, or a control's name."""
-
-    def reply(last: str, payload: bytes) -> Mapping[str, object]:
-        match last:
-            case "state":
-                return {**controls.state()}
-            case "time":
-                return {"time_s": time.monotonic(), "wall_s": time.time(), "identity": controls.state()["identity"]}
-        return {**controls.ask(last, payload)}
-
-    return reply
-
-
 def fly_live(
     scenario: ScenarioConfig,
     shown: FlockTelemetry,
@@ -243,28 +233,12 @@ def fly_live(
             controls.begin()
             shown.begin_again()
             pilots.begin_again()
-            _fly_once(scenario, pilots, shown, controls, gated=gated)
-
-
-def _fly_once(
-    scenario: ScenarioConfig,
-    pilots: ExactStatePilots | VisionPilots,
-    shown: FlockTelemetry,
-    controls: LiveControls,
-    *,
-    gated: bool,
-) -> None:
-    """Until another flight is to begin."""
-    loop = ControlLoop(scenario, gated=gated)
-    vehicles = vehicles_of(scenario)
-    for step in itertools.count():
-        time_s = step * scenario.drone.step_s
-        if not controls.wait(time_s):
-            return
-        disturbed = controls.disturbed
-        vehicles.disturb(disturbed)
-        shown.disturb(disturbed)
-        commands = pilots.step(step, time_s, vehicles, None, pictured=False, disturbed=disturbed)
-        shown.take_requests(time_s, loop, vehicles)
-        loop.fly(time_s, vehicles, commands, disturbed)
-        shown.show_flight(time_s, loop)
+            loop, vehicles = ControlLoop(scenario, gated=gated), vehicles_of(scenario)
+            step = 0
+            while controls.wait(time_s := step * scenario.drone.step_s):
+                disturbed = controls.disturbed
+                vehicles.disturb(disturbed)
+                shown.disturb(disturbed)
+                commands = pilots.step(step, time_s, vehicles, None, pictured=False, disturbed=disturbed)
+                fly_commands(commands, time_s, loop, vehicles, shown, disturbed)
+                step += 1

@@ -6,7 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -107,11 +107,10 @@ class PilotPool:
     def __init__(self, scenario: ScenarioConfig, swap: frozenset[str], processes: int | None) -> None:
         """In as many ``processes``; None: as many as there are processors. Never more than drones.
 
-        1: in this one, beside the caller; 0: on the caller's thread.
+        1 and 0: in this one.
         """
         self.drones = tuple(i for i, vehicle in enumerate(scenario.vehicles) if not vehicle.by_hand)
         """Counted from 0."""
-        self.on_this_thread = processes == 0
         count = min(len(self.drones), (os.cpu_count() or 1) if processes is None else max(processes, 1))
         self._shares = [self.drones[first::count] for first in range(count)]
         self._scenario = scenario
@@ -120,16 +119,13 @@ class PilotPool:
             from flockd.sim.flock.truth_perception import TruthPerception  # noqa: PLC0415 - see above
 
             self._swap = partial(TruthPerception, swap=swap)
-        self._executors: list[Executor] = []
+        self._executors: list[ProcessPoolExecutor] = []
         self._loaded: list[Future[None]] = []
         self._here: Pilots | None = None
 
     def __enter__(self) -> Self:
         """Starts the processes, which load their networks while the caller goes on. For the main thread."""
-        if len(self._shares) == 1:
-            self._executors.append(ThreadPoolExecutor(1, thread_name_prefix="pilots"))
-            return self
-        for share in self._shares:
+        for share in self._shares if len(self._shares) > 1 else ():
             executor = ProcessPoolExecutor(1, get_context("spawn"), initializer=bind, initargs=(os.getpid(),))
             self._executors.append(executor)
             with _deaf_children():
@@ -161,13 +157,12 @@ class PilotPool:
     ) -> Future[Stepped]:
         """Steps a drone's pilot, see `Pilots`; `stepped` waits until the drone's process has come to it."""
         inputs = (drone, frames, vehicle, truth if self._swap else None, pictured, order, begins)
-        if self._here is not None and self.on_this_thread:
+        if self._here is not None:
             done: Future[Stepped] = Future()
             done.set_result(self._here(*inputs))
             return done
-        pilots: Callable[..., Stepped] = self._here or _step
         with self._named(drone):
-            return self._executors[self._place(drone)].submit(pilots, *inputs)
+            return self._executors[self._place(drone)].submit(_step, *inputs)
 
     def stepped(self, drone: int, stepping: Future[Stepped]) -> Stepped:
         """What its pilot did. Raises UnavailableError when its process has ended."""

@@ -5,15 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
 
 from flockd import __version__
-from flockd.core.choices import TRUTH_ROLES, SimulatedPerception
-from flockd.core.errors import UsageError
-from flockd.core.messages import NO_STATUS, FloatArray
+from flockd.core.choices import SimulatedPerception
+from flockd.core.messages import FloatArray
 from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.truth import TrueDrone, Truth
@@ -25,13 +24,14 @@ from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.control_loop import Commands, ControlLoop
 from flockd.sim.flock.exact_states import (
     ExactFlock,
-    HandPilot,
+    fly_by_hand,
     fly_exact_states,
+    navigator_of,
     start_yaw,
     step_times,
     vehicles_of,
 )
-from flockd.sim.flock.flock_telemetry import FlockTelemetry, RealTime, orders_of
+from flockd.sim.flock.flock_telemetry import FlockTelemetry, RealTime
 from flockd.sim.flock.pilot_pool import PilotPool, Stepped
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.pose_trail import LateAttitude
@@ -72,23 +72,18 @@ def fly(
     Args:
         scenario: what to fly.
         perception: `learned` flies from rendered images; `truth` from exact relative states.
-        swap: roles of perception that take the truth instead of a network's estimate.
+        swap: of `TRUTH_ROLES`, those that take the truth instead of a network's estimate.
         gated: whether each drone's gate turns what its pilot asks for into setpoints, as in the daemon.
         shown: where every drone's output is published; operators' orders come from there. A flight on exact states
             then takes as long as it takes in the air.
         recorders: one a drone, or none; nothing comes back from there.
-        processes: for pilots that see, beside this one, which draws the images; 1: they step in this one; 0: they step,
-            and the images are drawn, on the calling thread; None: as many as there are processors, and no more than
+        processes: for pilots that see, beside this one, which draws the images; 1: they step in this one; 0: likewise,
+            and the images are drawn on the calling thread; None: as many as there are processors, and no more than
             drones.
         pictured: keep key frames for the report.
         progress: called with (steps done, steps in all).
         preparing: the same, of what is done before the first step: the companion, the networks, the world.
     """
-    unknown = swap - set(TRUTH_ROLES)
-    if unknown:
-        raise UsageError(
-            f"there is no role {sorted(unknown)[0]!r} to swap for truth; choose from {', '.join(TRUTH_ROLES)}"
-        )
     begin, began = time.perf_counter(), datetime.now(UTC)
     times = step_times(scenario)
     builder = FlightLogBuilder(times, len(scenario.vehicles))
@@ -104,7 +99,8 @@ def fly(
         pilots: ExactStatePilots | VisionPilots = ExactStatePilots(scenario, shown, gated=gated)
         if pool is not None:
             companion = fly_exact_states(scenario, gated=gated)[1:]
-            pilots = VisionPilots(scenario, pool, shown, recorders, companion, preparing)
+            threads = 0 if processes == 0 else None
+            pilots = VisionPilots(scenario, pool, shown, recorders, companion, preparing, threads)
         preparing(_PREPARATIONS, _PREPARATIONS)
         try:
             for step, time_s in enumerate(times):
@@ -113,12 +109,8 @@ def fly(
                 builder.add_truth(step, vehicles.position, vehicles.velocity, vehicles.R_ned_body)
                 commands = pilots.step(step, float(time_s), vehicles, builder, pictured=step in chosen)
                 builder.add_missions(step, commands.desired, commands.missions)
-                key_frames += pilots.key_frames()
-                if shown is not None:
-                    shown.take_requests(float(time_s), loop, vehicles)
-                loop.fly(float(time_s), vehicles, commands)
-                if shown is not None:
-                    shown.show_flight(float(time_s), loop)
+                key_frames += pilots.key_frames
+                fly_commands(commands, float(time_s), loop, vehicles, shown)
                 flown = step + 1
                 progress(flown, len(times))
         except KeyboardInterrupt:
@@ -148,6 +140,22 @@ def fly(
     return Flight(with_obstacles(builder.build(metadata, companion or builder.true_path), scenario), tuple(key_frames))
 
 
+def fly_commands(
+    commands: Commands,
+    time_s: float,
+    loop: ControlLoop,
+    vehicles: Vehicles,
+    shown: FlockTelemetry | None,
+    disturbed: Disturbances = UNDISTURBED,
+) -> None:
+    """One step on, as operators have asked since the last one, who see what comes of it."""
+    if shown is not None:
+        shown.take_requests(time_s, loop, vehicles)
+    loop.fly(time_s, vehicles, commands, disturbed)
+    if shown is not None:
+        shown.show_flight(time_s, loop)
+
+
 _PREPARATIONS = 4
 """The companion on exact states, the world, the networks, the pilots."""
 
@@ -155,10 +163,11 @@ _PREPARATIONS = 4
 class ExactStatePilots:
     """The flocking law on the exact states of all drones."""
 
+    key_frames: Sequence[KeyFrame] = ()
+
     def __init__(self, scenario: ScenarioConfig, shown: FlockTelemetry | None, *, gated: bool) -> None:
         self._scenario, self._gated, self._shown = scenario, gated, shown
         self.begin_again()
-        self._by_hand = [vehicle.by_hand for vehicle in scenario.vehicles]
 
     def begin_again(self) -> None:
         """For another flight from the beginning."""
@@ -176,22 +185,17 @@ class ExactStatePilots:
     ) -> Commands:
         """Commands for all drones; there are no images. ``builder``: None where nothing is kept."""
         positions, velocities = vehicles.position, vehicles.velocity
-        orders = orders_of(self._shown, range(len(positions)))
+        orders = {} if self._shown is None else self._shown.take_orders(range(len(positions)))
         own = None if self._scenario.detections is None else vehicles.known_velocity
         commands = self._flock.step(time_s, positions, velocities, orders, disturbed, own)
         if self._shown is not None:
             self._shown.show_exact(step, time_s, vehicles, commands)
-        if builder is None:
-            return commands
-        for i in (i for i, by_hand in enumerate(self._by_hand) if not by_hand):
-            others = np.arange(len(positions)) != i
-            relative = positions[others] - positions[i]
-            builder.add_exact_states(step, i, others, relative, velocities, commands.velocity[i])
+        for i, vehicle in enumerate(self._scenario.vehicles):
+            if builder is not None and not vehicle.by_hand:
+                others = np.arange(len(positions)) != i
+                relative = positions[others] - positions[i]
+                builder.add_exact_states(step, i, others, relative, velocities, commands.velocity[i])
         return commands
-
-    def key_frames(self) -> list[KeyFrame]:
-        """None."""
-        return []
 
 
 class VisionPilots:
@@ -205,12 +209,13 @@ class VisionPilots:
         recorders: Sequence[Recorder],
         companion: tuple[FloatArray, FloatArray] | None,
         preparing: Callable[[int, int], None],
+        threads: int | None = None,
     ) -> None:
-        """``companion``: for what is recorded; None where nothing is."""
+        """``companion``: for what is recorded; None where nothing is. ``threads``: see `CameraSimulator`."""
         self._companion = companion
         preparing(1, _PREPARATIONS)
         self._shown, self._recorders = shown, recorders
-        self._cameras = CameraSimulator(scenario, threads=0 if pool.on_this_thread else None)
+        self._cameras = CameraSimulator(scenario, threads=threads)
         preparing(2, _PREPARATIONS)
         pool.wait_until_ready()
         preparing(3, _PREPARATIONS)
@@ -225,7 +230,7 @@ class VisionPilots:
 
     def _begin(self) -> None:
         scenario = self._scenario
-        self._hands = {i: HandPilot(scenario, i) for i in range(len(scenario.vehicles)) if i not in self._drones}
+        self._hands = {i: navigator_of(scenario, i) for i in range(len(scenario.vehicles)) if i not in self._drones}
         ground = self._cameras.ground_height
         self._autopilots = {
             i: SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=i, ground=ground) for i in self._drones
@@ -233,6 +238,8 @@ class VisionPilots:
         late = None if scenario.camera_faults is None else scenario.camera_faults.attitude
         self._attitudes = {} if late is None else {i: LateAttitude(late, scenario.seed, i) for i in self._drones}
         self._stepped: dict[int, Stepped] = {}
+        self.key_frames: Sequence[KeyFrame] = ()
+        """What the pilots worked with in the last step, where that was asked for."""
         self._begins = set(self._drones)
 
     def step(
@@ -249,7 +256,7 @@ class VisionPilots:
         steps = {}
         render_ms = {}
         flying = [i for i in self._drones if i not in disturbed.removed]
-        orders = orders_of(self._shown, flying)
+        orders = {} if self._shown is None else self._shown.take_orders(flying)
         turn_rates = vehicles.trail.motion_at(time_s).turn
         for i in flying:
             begin = time.perf_counter()
@@ -271,6 +278,7 @@ class VisionPilots:
             )
         self._begins = set()
         self._stepped = {i: self._pool.stepped(i, stepping) for i, (_, _, stepping) in steps.items()}
+        self.key_frames = [frame for stepped in self._stepped.values() for frame in stepped.key_frames]
         truth = None if self._companion is None else self._truth(step, time_s, vehicles, self._companion)
         for i, stepped in self._stepped.items():
             frames, state, _ = steps[i]
@@ -287,23 +295,19 @@ class VisionPilots:
 
     def _commands(self, time_s: float, vehicles: Vehicles) -> Commands:
         """Commands of the pilots, and of the people who fly drones by hand."""
-        count = len(self._scenario.vehicles)
-        commands = Commands.of(count)
-        missions = [NO_STATUS] * count
-        obstacles, neighbours = list(commands.obstacles), list(commands.neighbours)
+        commands = Commands.of(len(self._scenario.vehicles))
         for i, stepped in self._stepped.items():
             output, command = stepped.output, stepped.output.command
             commands.velocity[i], commands.acceleration[i] = command.velocity, command.acceleration
             commands.yaw_rad[i] = self._yaw_rad if command.yaw_rad is None else command.yaw_rad
             commands.height_m[i] = np.nan if command.height_m is None else command.height_m
-            missions[i], obstacles[i], neighbours[i] = output.mission, output.obstacles, output.neighbours
+            commands.missions[i], commands.obstacles[i] = output.mission, output.obstacles
+            commands.neighbours[i] = output.neighbours
             commands.desired[i] = desired_of(self._scenario.drone_of(i).mission, time_s, output.mission)
         for i, hand in self._hands.items():
-            flown = hand.step(time_s, vehicles.position[i, :2])
-            commands.velocity[i] = commands.desired[i] = flown.velocity
-            commands.height_m[i], missions[i] = flown.height_m, flown.status
+            commands.missions[i] = fly_by_hand(hand, i, time_s, vehicles.position[i, :2], commands)
             commands.yaw_rad[i] = self._yaw_rad
-        return replace(commands, missions=tuple(missions), obstacles=tuple(obstacles), neighbours=tuple(neighbours))
+        return commands
 
     def _truth(self, step: int, time_s: float, vehicles: Vehicles, companion: tuple[FloatArray, FloatArray]) -> Truth:
         """For recordings only: no pilot gets it."""
@@ -319,7 +323,3 @@ class VisionPilots:
             for i in range(len(vehicles.position))
         )
         return Truth(time_s, tuple(drones))
-
-    def key_frames(self) -> list[KeyFrame]:
-        """What the pilots worked with in the last step, where that was asked for."""
-        return [frame for stepped in self._stepped.values() for frame in stepped.key_frames]

@@ -14,7 +14,6 @@ import yaml
 from flockd.core.config import DroneConfig
 from flockd.core.config.drone import RecordingConfig
 from flockd.core.config.mission import MissionParameters
-from flockd.core.errors import ConfigError, ConfigProblem
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.sitl.autopilots import Ports
 from flockd.sim.sitl.processes import Program, Programs
@@ -34,14 +33,10 @@ def fleet_configs(
     """What each drone of a scenario that is not flown by hand flies with.
 
     The pilot is the scenario's, with the mission's places counted from the drone's own home, which is below its start;
-    source, autopilot, safety and telemetry are those of ``sitl``. Raises ConfigError where ``sitl`` lacks one of them.
+    source, autopilot, safety and telemetry are those of ``sitl``, which has frames come by shared memory.
     """
-    if sitl.source is None or sitl.source.kind != "shared_memory":
-        raise ConfigError(
-            [ConfigProblem("px4_sitl.yaml", 0, "source", "has to be of kind `shared_memory`; write it so")]
-        )
-    if sitl.autopilot is None:
-        raise ConfigError([ConfigProblem("px4_sitl.yaml", 0, "autopilot", "is missing; add it")])
+    assert sitl.source is not None
+    assert sitl.autopilot is not None
     configs = []
     for i, port in enumerate(ports):
         if scenario.vehicles[i].by_hand:

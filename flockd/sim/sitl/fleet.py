@@ -18,14 +18,14 @@ from flockd.core.errors import UnavailableError
 from flockd.onboard.simulated_time import clock_at
 from flockd.sim.autopilot.fake_telemetry import Mode
 from flockd.sim.cameras.camera_simulator import CameraSimulator
-from flockd.sim.flock.exact_states import HandPilot, exact_states_at
+from flockd.sim.flock.exact_states import at_home, exact_states_at, navigator_of
 from flockd.sim.flock.swarm import Flight
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.sitl.autopilots import Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.sitl.daemons import Daemons, fleet_configs
-from flockd.sim.sitl.fleet_log import FleetFrame, FleetRun, fleet_key_frames, fleet_log, were_ordered
+from flockd.sim.sitl.fleet_log import FleetRun, fleet_key_frames, fleet_log, were_ordered
 from flockd.sim.sitl.frame_server import FrameServer
-from flockd.sim.sitl.ground_station import GroundStation
+from flockd.sim.sitl.ground_station import GroundStation, Poses
 from flockd.sim.sitl.ports import free_endpoint
 from flockd.sim.sitl.processes import Program
 from flockd.sim.world.obstacle_worlds import with_obstacles
@@ -120,7 +120,7 @@ class _Fleet:
         self._scenario, self._speed_factor, self._clock = scenario, speed_factor, clock
         self._autopilots, self._station, self._server, self._daemons = autopilots, station, server, daemons
         self._all = range(len(scenario.vehicles))
-        self._hands = {i: HandPilot(scenario, i) for i in self._all if scenario.vehicles[i].by_hand}
+        self._hands = {i: navigator_of(scenario, i) for i in self._all if scenario.vehicles[i].by_hand}
         self.drones = [i for i in self._all if i not in self._hands]
         """Those with a daemon, in the order of the daemons."""
         self._needed: Sequence[Program] = ()
@@ -186,7 +186,7 @@ class _Fleet:
         run.frames = self._frames_of(run, run.ended_s)
         return run
 
-    def _frames_of(self, run: FleetRun, until_s: float) -> tuple[FleetFrame, ...]:
+    def _frames_of(self, run: FleetRun, until_s: float) -> tuple[Poses, ...]:
         return tuple(s for s in self._server.frames() if run.began_s <= s.time_s < until_s)
 
     def land(self, run: FleetRun) -> None:
@@ -212,7 +212,7 @@ class _Fleet:
         for i, hand in self._hands.items():
             velocity = np.zeros(2)
             if flying_s is not None:
-                velocity = hand.step(flying_s, self._station.poses().position[i, :2]).velocity
+                velocity = hand.step(at_home(flying_s, self._station.poses().position[i, :2])).velocity
             self._station.steer(i, velocity)
 
     def _autopilot_ended(self, i: int) -> bool:

@@ -25,24 +25,11 @@ from flockd.review.flight_log.key_frames import KeyFrame, capture, key_frame_ste
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FleetMetadata, FlightMetadata, MissionMetadata
 from flockd.sim.scenario import ScenarioConfig
+from flockd.sim.sitl.ground_station import Poses
 
 END_OF_FLIGHT_S = 20.0
 """Over which order at the end is averaged."""
 KEY_FRAME_DRONE = 0
-
-
-@dataclass(frozen=True, eq=False)
-class FleetFrame:
-    """One frame set of every drone, rendered at one time, and the true state of the flock of n drones then."""
-
-    time_s: float
-    """On the simulated clock: the time stamp of all its frames."""
-    position: FloatArray
-    """(n, 3) m NED."""
-    velocity: FloatArray
-    """(n, 3) m/s NED."""
-    R_ned_body: FloatArray
-    """(n, 3, 3)"""
 
 
 @dataclass
@@ -55,7 +42,8 @@ class FleetRun:
     interrupted: bool = False
     ended_s: float = 0.0
     wall_s: float = 0.0
-    frames: tuple[FleetFrame, ...] = ()
+    frames: tuple[Poses, ...] = ()
+    """Where the flock was at each frame set, by its frames' time stamp on the simulated clock."""
     handed_over: dict[str, str] = field(default_factory=dict)
     """Why a drone did not fly to the end, by its name; also where its mission ends so."""
     modes: dict[str, list[str]] = field(default_factory=dict)
@@ -135,7 +123,7 @@ def fleet_log(
 
 
 def _add_missions(
-    builder: FlightLogBuilder, scenario: ScenarioConfig, frames: Sequence[FleetFrame], times: FloatArray,
+    builder: FlightLogBuilder, scenario: ScenarioConfig, frames: Sequence[Poses], times: FloatArray,
     statuses: Sequence[Mapping[int, MissionStatus]],
 ) -> None:  # fmt: skip
     """What each drone wanted at each frame; where its pilot left one out, what it wanted before.

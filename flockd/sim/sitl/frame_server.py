@@ -8,7 +8,6 @@ from typing import Self
 
 from flockd.onboard.sources import FramePublisher
 from flockd.sim.cameras.camera_simulator import CameraSimulator
-from flockd.sim.sitl.fleet_log import FleetFrame
 from flockd.sim.sitl.ground_station import Poses
 from flockd.sim.vehicles.pose_trail import FlockPose
 
@@ -35,7 +34,7 @@ class FrameServer:
         self._publisher = FramePublisher(listen=[endpoint])
         self._drones, self._period_s = tuple(drones), 1.0 / rate_hz
         self._poses, self._clock, self._speed_factor = poses, clock, speed_factor
-        self._frames: list[FleetFrame] = []
+        self._frames: list[Poses] = []
         self._failure: BaseException | None = None
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="frame server", daemon=True)
@@ -53,7 +52,7 @@ class FrameServer:
         """Begins to render and publish."""
         self._thread.start()
 
-    def frames(self) -> tuple[FleetFrame, ...]:
+    def frames(self) -> tuple[Poses, ...]:
         """All so far. Raises the exception that ended the thread."""
         if self._failure is not None:
             raise self._failure
@@ -69,12 +68,12 @@ class FrameServer:
             self._failure = error
 
     def _publish(self, number: int) -> None:
-        poses, time_s = self._poses(), self._clock()
-        flock = FlockPose(time_s, poses.position, poses.R_ned_body)
+        poses = self._poses()
+        flock = FlockPose(poses.time_s, poses.position, poses.R_ned_body)
         for i, drone in enumerate(self._drones):
             if drone is None:
                 continue
-            frames, _ = self._cameras.capture(i, number, time_s, flock)
+            frames, _ = self._cameras.capture(i, number, poses.time_s, flock)
             for frame in frames.frames.values():
                 self._publisher.publish(drone, frame)
-        self._frames.append(FleetFrame(time_s, poses.position, poses.velocity, poses.R_ned_body))
+        self._frames.append(poses)

@@ -51,21 +51,13 @@ _RECEIVED = {
 class Poses:
     """Where a flock of n drones is, NED metres from the world's origin."""
 
+    time_s: float
     position: FloatArray
     """(n, 3)"""
     velocity: FloatArray
     """(n, 3) m/s."""
     R_ned_body: FloatArray
     """(n, 3, 3)"""
-
-
-@dataclass(frozen=True, eq=False)
-class _Pose:
-    time_s: float
-    position: FloatArray
-    velocity: FloatArray
-    R_ned_body: FloatArray
-    turn_rad_s: FloatArray
 
 
 @dataclass
@@ -76,7 +68,8 @@ class _Vehicle:
     socket: socket.socket
     mav: Any = None
     address: tuple[str, int] | None = None
-    pose: _Pose | None = None
+    pose: tuple[float, Any] | None = None
+    """When its newest message with its pose came, and that."""
     mode: int | None = None
     armed: bool = False
     version: str | None = None
@@ -132,13 +125,8 @@ class GroundStation:
         with self._lock:
             poses = [vehicle.pose for vehicle in self._vehicles if vehicle.pose is not None]
         assert len(poses) == len(self._vehicles), "wait until all are connected"
-        ages_s = [min(max(now - pose.time_s, 0.0), MAX_FORWARD_S) for pose in poses]
-        since = list(zip(poses, ages_s, strict=True))
-        return Poses(  # as if neither velocity nor turn had changed
-            np.array([pose.position + age_s * pose.velocity for pose, age_s in since]),
-            np.array([pose.velocity for pose in poses]),
-            np.array([pose.R_ned_body @ rotation_from_euler(*(age_s * pose.turn_rad_s)) for pose, age_s in since]),
-        )
+        of_each = [_extrapolated(message, min(max(now - since_s, 0.0), MAX_FORWARD_S)) for since_s, message in poses]
+        return Poses(now, *map(np.array, zip(*of_each, strict=True)))
 
     def mode_is(self, number: int, mode: Mode) -> bool:
         """It flies in this mode."""
@@ -178,7 +166,7 @@ class GroundStation:
         It stops half a second after the last call.
         """
         vehicle = self._vehicles[number]
-        R = np.eye(3) if vehicle.pose is None else vehicle.pose.R_ned_body
+        R = np.eye(3) if vehicle.pose is None else _extrapolated(vehicle.pose[1], 0.0)[2]
         yaw_rad = math.atan2(R[1, 0], R[0, 0])
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
         ahead = np.array([cos * velocity[0] + sin * velocity[1], -sin * velocity[0] + cos * velocity[1]])
@@ -226,7 +214,7 @@ def home_deg(position: FloatArray) -> tuple[float, float]:
 def _update(vehicle: _Vehicle, message: Any, now: float) -> None:
     match message.get_type():
         case "HIL_STATE_QUATERNION":
-            vehicle.pose = _pose(message, now)
+            vehicle.pose = now, message
         case "HEARTBEAT":
             vehicle.mode = int(message.custom_mode)
             vehicle.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
@@ -242,17 +230,15 @@ def _update(vehicle: _Vehicle, message: Any, now: float) -> None:
             pass
 
 
-def _pose(message: Any, now: float) -> _Pose:
+def _extrapolated(message: Any, age_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Position (3,), velocity (3,) and R_ned_body after `age_s`, as if neither velocity nor turn had changed."""
     north_m, east_m = metres_a_degree(REFERENCE_DEG[0])
     north = (message.lat * 1e-7 - REFERENCE_DEG[0]) * north_m
     east = (message.lon * 1e-7 - REFERENCE_DEG[1]) * east_m
-    return _Pose(
-        time_s=now,
-        position=np.array([north, east, -message.alt * 1e-3]),
-        velocity=np.array([message.vx, message.vy, message.vz]) * 1e-2,
-        R_ned_body=rotation_from_quaternion(np.roll(message.attitude_quaternion, -1)),
-        turn_rad_s=np.array([message.rollspeed, message.pitchspeed, message.yawspeed]),
-    )
+    velocity = np.array([message.vx, message.vy, message.vz]) * 1e-2
+    R_ned_body = rotation_from_quaternion(np.roll(message.attitude_quaternion, -1))
+    turned = rotation_from_euler(age_s * message.rollspeed, age_s * message.pitchspeed, age_s * message.yawspeed)
+    return np.array([north, east, -message.alt * 1e-3]) + age_s * velocity, velocity, R_ned_body @ turned
 
 
 def _packets(data: bytes) -> Iterator[bytes]:

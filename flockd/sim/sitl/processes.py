@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Self
+from typing import Self
 
 from flockd.sim.sitl.bound_to_parent import bound, with_package
 
@@ -59,15 +59,12 @@ class Programs:
 
     def __init__(self) -> None:
         self._programs: list[Program] = []
-        self._files: list[IO[bytes]] = []
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.end()
-        for file in self._files:
-            file.close()
 
     def __iter__(self) -> Iterator[Program]:
         return iter(self._programs)
@@ -76,9 +73,7 @@ class Programs:
         self, name: str, command: Sequence[str], environment: Mapping[str, str], folder: Path, log: Path
     ) -> Program:
         """Starts one in ``folder``; all it writes goes to the file ``log``. For the main thread, as `end`."""
-        with _uninterrupted():
-            file = log.open("wb")
-            self._files.append(file)
+        with _uninterrupted(), log.open("wb") as file:
             process = subprocess.Popen(
                 bound(list(command)),
                 cwd=folder,

@@ -147,15 +147,9 @@ def test_a_drone_that_is_taken_over_holds_or_lands_and_its_mates_keep_apart() ->
     assert still.tolist() == [True, False, False, True, False]
     assert log.position[-1, 3, 2] > -0.1 > log.position[-1, 0, 2]
     assert log.metadata.handed_over[0].time_s == 10.0
+    assert log.metadata.slowed_share
+    assert log.metadata.slowed_by.keys() <= {"neighbour", "wind", "other"}
     assert min(map(min_distance, log.position)) > 0.7
-
-
-def test_a_log_says_who_was_held_when_and_why() -> None:
-    scenario = _scenario(duration_s=40.0, vehicle__gust_m_s=0.8, seed=2)
-    metadata = fly(scenario, perception="truth", pictured=False).log.metadata
-    assert metadata.handed_over
-    assert all("off the setpoints" in held.reason for held in metadata.handed_over.values())
-    assert metadata.slowed_by["wind"] > 0.1
 
 
 def test_gates_know_what_the_autopilots_estimate_and_not_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -67,17 +67,6 @@ def test_nobody_is_detected_in_the_view_of_a_camera_that_has_a_fault() -> None:
         assert max(unseen_s[:4]) == max(unseen_s[8:]) == 0.0
 
 
-def test_a_drone_that_lost_a_camera_flies_degraded() -> None:
-    fault = CameraFaultConfig(drone=1, camera="back", begin_s=0.5, end_s=9.0)
-    scenario = IDEAL.model_copy(update={"faults": (fault,)})
-    loop, vehicles = ControlLoop(scenario), Vehicles(scenario.vehicles, scenario.vehicle)
-    speeds_m_s = []
-    for time_s in np.arange(0.0, 3.0, 0.5):
-        loop.fly(time_s, vehicles, replace(Commands.of(2), velocity=np.array([[2.0, 0.0], [-2.0, 0.0]])))
-        speeds_m_s.append(np.abs(vehicles.velocity[:, 0]))
-    np.testing.assert_allclose(speeds_m_s[-1], [scenario.drone.safety.gate.degraded_speed_m_s, 2.0], atol=0.05)
-
-
 def test_the_same_seed_gives_the_same_and_each_drone_its_own() -> None:
     np.testing.assert_array_equal(known(3), known(3))
     assert not np.array_equal(known(3), known(4))

@@ -101,7 +101,7 @@ def _is_taken_over(flight: _Flight, one: int) -> None:
 
 
 def _lands(flight: _Flight, one: int) -> None:
-    flight.loop._handover._taken[one] = "land"
+    flight.loop._handover.taken[one] = "land"
 
 
 def _dies(flight: _Flight, one: int) -> None:

@@ -15,6 +15,7 @@ from flockd.core.messages import FrameSet, VehicleState
 from flockd.onboard.telemetry import TelemetrySink
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.review.flight_log.log import FlightLog
+from flockd.review.report.summary import summarise
 from flockd.sim.flock.flock_telemetry import FlockTelemetry, Repeater
 from flockd.sim.flock.pilot_pool import PilotPool
 from flockd.sim.flock.start import with_drones
@@ -139,8 +140,6 @@ def test_each_drone_decides_from_its_own_images_alone() -> None:
 @pytest.mark.slow
 def test_twenty_seconds_from_pixels() -> None:
     """Seed 0: 2.25 m, 0.9996, 0.968 (confirmation takes time). Of a flock that sees nobody, two come within 1.2 m."""
-    from flockd.review.report.summary import summarise
-
     summary = summarise(fly(load_scenario(data_path("config") / "paper_flight.yaml", {"duration_s": 20.0})).log)
     assert summary["flock"]["min_distance_after_10s_m"] >= 1.8
     assert summary["flock"]["order_tail"] >= 0.99
@@ -153,8 +152,6 @@ def test_twenty_seconds_from_pixels() -> None:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_papers_flight_from_pixels(seed: int) -> None:
     """Nobody closer than 1 m, order 0.98, union 1, recall 0.97, under one false neighbour a drone and minute."""
-    from flockd.review.report.summary import summarise
-
     paper = load_scenario(data_path("config") / "paper_flight.yaml", {"seed": seed})
     summary = summarise(fly(paper).log)
     assert summary["flock"]["min_distance_m"] >= 1.0
@@ -169,8 +166,6 @@ def test_the_papers_flight_from_pixels(seed: int) -> None:
 def test_a_forest_from_pixels(seed: int) -> None:
     """Nobody touches a tree or comes within 1 m of another, nobody is lost, recall 0.9; in the second one a drone once
     ran away around trees faster and faster."""
-    from flockd.review.report.summary import summarise
-
     log = fly(load_scenario(data_path("config") / "forest.yaml", {"seed": seed})).log
     summary = summarise(log)
     assert summary["obstacles"]["collisions"] == 0

@@ -11,7 +11,8 @@ from flockd.core.data import data_path
 from flockd.core.messages import MissionOrder
 from flockd.onboard.recording import Recorder
 from flockd.sim.scenario import load_scenario
-from flockd.sim.sitl.fleet_log import FleetFrame, FleetRun, fleet_log, were_ordered
+from flockd.sim.sitl.fleet_log import FleetRun, fleet_log, were_ordered
+from flockd.sim.sitl.ground_station import Poses
 from tests.onboard.recording.made_up import MODELS, MadeUpPilot, drone_config, inputs, record
 
 
@@ -21,8 +22,7 @@ def test_a_motion_over_a_skipped_frame_set_is_not_in_the_log(tmp_path: Path) -> 
     outputs = record(tmp_path / f"{config.name}-1.mcap", steps=4)
     times = [outputs[0].time_s, outputs[1].time_s, outputs[1].time_s + 0.05, outputs[2].time_s, outputs[3].time_s]
     frames = tuple(
-        FleetFrame(time_s, np.full((1, 3), float(row)), np.ones((1, 3)), np.eye(3)[None])
-        for row, time_s in enumerate(times)
+        Poses(time_s, np.full((1, 3), float(row)), np.ones((1, 3)), np.eye(3)[None]) for row, time_s in enumerate(times)
     )
     run = FleetRun(began_s=times[0], wall_s=9.0, frames=frames, autopilot="PX4 1.18.0")
     assert outputs[-1].mission.takeover is not None
