@@ -6,7 +6,7 @@ import hashlib
 import itertools
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -169,7 +169,10 @@ class Plan:
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
         """All combinations, in order."""
-        return tuple(Cell(number, values) for number, values in enumerate(self._combinations()))
+        axes = {CASE: tuple(self.config.cases)} if self.config.cases else {}
+        axes |= {key: variation.values for key, variation in self.config.vary.items()}
+        combinations = enumerate(itertools.product(*axes.values()))
+        return tuple(Cell(number, dict(zip(axes, values, strict=True))) for number, values in combinations)
 
     @property
     def wanted(self) -> tuple[Figure, ...]:
@@ -187,12 +190,6 @@ class Plan:
         of_case = self.config.cases[cell.parameters[CASE]] if CASE in cell.parameters else {}
         overrides = {**self.config.fixed, **of_case, **varied}
         return Recipe(self.base, overrides, self.config.seed + number, self.config.scatter_m)
-
-    def _combinations(self) -> Iterator[Values]:
-        axes = {CASE: tuple(self.config.cases)} if self.config.cases else {}
-        axes |= {key: variation.values for key, variation in self.config.vary.items()}
-        for values in itertools.product(*axes.values()):
-            yield dict(zip(axes, values, strict=True))
 
 
 def _count_of_cells(config: CampaignConfig) -> int:
