@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Protocol, Self
+from typing import Self
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from flockd.onboard.daemon.operator_orders import ORDERS, OrderChecks
 from flockd.onboard.telemetry import TelemetrySink, publish_step
 from flockd.onboard.telemetry.order_messages import parse_ask, parse_order
 from flockd.onboard.telemetry.preview import Previews
-from flockd.onboard.telemetry.publisher import Ask, NewestImage
+from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage, FlightMessage, ReasonMessage
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.control_loop import Commands, ControlLoop
@@ -70,20 +70,6 @@ class Repeater:
                     self._sink.publish(drone, topic, message)
 
 
-class Announcer(Protocol):
-    """Where the flock is announced: `flockd.onboard.telemetry.publisher.ZenohTelemetry`."""
-
-    @property
-    def identity(self) -> str:
-        """Of all drones that are announced there."""
-
-    def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
-        """A drone is alive, and replies to queries."""
-
-    def withdraw(self, drone: str) -> None:
-        """A drone is there no more."""
-
-
 REQUESTS = frozenset({"hold", "resume"})
 """Of an operator, beside orders: to the drone's autopilot, and back."""
 
@@ -94,7 +80,8 @@ class FlockTelemetry:
     Of what an autopilot does it has Hold alone. Queries come on threads of zenoh's.
     """
 
-    def __init__(self, scenario: ScenarioConfig, announcer: Announcer, sink: Repeater) -> None:
+    def __init__(self, scenario: ScenarioConfig, announcer: ZenohTelemetry, sink: Repeater) -> None:
+        """`announcer`: where the flock is announced; `sink`: where it is published."""
         self._scenario, self._announcer, self._sink = scenario, announcer, sink
         self._drones = [i for i, vehicle in enumerate(scenario.vehicles) if not vehicle.by_hand]
         self._lock = threading.Lock()

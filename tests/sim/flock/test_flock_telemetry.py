@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flockd.core.data import data_path
-from flockd.sim.flock.flock_telemetry import FlockTelemetry, RealTime, Repeater
+from flockd.sim.flock.flock_telemetry import RealTime
 from flockd.sim.flock.start import with_drones
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import ScenarioConfig, load_scenario
@@ -28,7 +28,7 @@ def test_a_flock_on_exact_states_is_seen_and_goes_where_it_is_sent(monkeypatch: 
     monkeypatch.setattr(RealTime, "wait", lambda self, time_s: None)
     watching = Watching()
     flown = scenario(60.0)
-    shown = FlockTelemetry(flown, watching, Repeater(watching))
+    shown = watching.shown(flown)
     assert not watching.goto("drone1", 1.0, 2.0)[0], "not before it knows where it is"
 
     def order_when_due(done: int, total: int) -> None:
@@ -73,9 +73,7 @@ def test_a_drone_is_held_where_it_would_stop_and_flies_on_when_it_is_resumed(mon
         if done in {20, 40}:
             assert watching.command("drone1", "hold" if done == 20 else "resume")[0]
 
-    log = fly(
-        flown, perception="truth", shown=FlockTelemetry(flown, watching, Repeater(watching)), progress=ask_when_due
-    ).log
+    log = fly(flown, perception="truth", shown=watching.shown(flown), progress=ask_when_due).log
     told = [(one["state"], one["flight_mode"]) for one in watching.flights["drone1"]]
     assert told == [("normal", "simulated")] * 20 + [("asking", "hold")] * 20 + [("normal", "simulated")] * 20
     (why,) = watching.flights["drone1"][30]["reasons"]

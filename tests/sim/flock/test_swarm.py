@@ -16,7 +16,6 @@ from flockd.onboard.telemetry import TelemetrySink
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.summary import summarise
-from flockd.sim.flock.flock_telemetry import FlockTelemetry, Repeater
 from flockd.sim.flock.pilot_pool import PilotPool
 from flockd.sim.flock.start import with_drones
 from flockd.sim.flock.swarm import Flight, fly
@@ -37,7 +36,7 @@ def scenario(duration_s: float = 0.5 * STEPS, height: str = "best", *, ideal: bo
 
 def flown(telemetry: TelemetrySink) -> FlightLog:
     announced = Watching()
-    log = fly(scenario(), shown=FlockTelemetry(scenario(), announced, Repeater(telemetry)), processes=1).log
+    log = fly(scenario(), shown=announced.shown(scenario(), telemetry), processes=1).log
     pictures = [newest("front") for newest in announced.image.values()]
     assert [picture[:2] for picture in pictures if picture is not None] == [b"\xff\xd8"] * 2, "JPEGs of both"
     return log

@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
-from flockd.onboard.telemetry.publisher import Ask, NewestImage
+from flockd.onboard.telemetry import TelemetrySink
+from flockd.onboard.telemetry.publisher import Ask, NewestImage, ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage
+from flockd.sim.flock.flock_telemetry import FlockTelemetry, Repeater
+from flockd.sim.scenario import ScenarioConfig
 
 
 class Watching:
@@ -50,3 +53,7 @@ class Watching:
         }  # fmt: skip
         answer = self.ask[drone](command, json.dumps(asked).encode())
         return answer["accepted"], answer["sentence"]
+
+    def shown(self, scenario: ScenarioConfig, telemetry: TelemetrySink | None = None) -> FlockTelemetry:
+        """A flock that is announced here, and published here too or elsewhere."""
+        return FlockTelemetry(scenario, cast("ZenohTelemetry", self), Repeater(telemetry or self))
