@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flockd.core.data import data_path
-from flockd.sim.flock.flock_telemetry import RealTime
+from flockd.sim.flock.flock_telemetry import RealTime, Repeater
 from flockd.sim.flock.start import with_drones
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import ScenarioConfig, load_scenario
