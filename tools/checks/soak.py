@@ -128,8 +128,9 @@ def scenario() -> ScenarioConfig:
 def follower(place: FloatArray, velocity: FloatArray, rotation: FloatArray) -> Poses:
     """The drone, and a neighbour north of it that does as it does."""
     beside = np.array([NEIGHBOUR_M, 0.0, 0.0])
-    flown = ([place, place + beside], [velocity, velocity], [rotation, rotation])
-    return Poses(time.monotonic(), *map(np.array, flown))
+    return Poses(
+        time.monotonic(), np.array([place, place + beside]), np.array([velocity] * 2), np.array([rotation] * 2)
+    )
 
 
 def _add(samples: dict[str, array[float]], facts: Mapping[str, float]) -> None:
