@@ -127,10 +127,8 @@ def scenario() -> ScenarioConfig:
 
 def follower(place: FloatArray, velocity: FloatArray, rotation: FloatArray) -> Poses:
     """The drone, and a neighbour north of it that does as it does."""
-    beside = np.array([NEIGHBOUR_M, 0.0, 0.0])
-    return Poses(
-        time.monotonic(), np.array([place, place + beside]), np.array([velocity] * 2), np.array([rotation] * 2)
-    )
+    places = np.stack([place, place + np.array([NEIGHBOUR_M, 0.0, 0.0])])
+    return Poses(time.monotonic(), places, np.array([velocity, velocity]), np.array([rotation, rotation]))
 
 
 def _add(samples: dict[str, array[float]], facts: Mapping[str, float]) -> None:
