@@ -97,6 +97,8 @@ def run(mechanism: Mechanism, plans: Sequence[Plan], commit: str, results: Path)
         environment = {**os.environ, "PYTHONPATH": name}
         with subprocess.Popen(command, cwd=name, env=environment, stdout=subprocess.PIPE, text=True) as child:
             for text in child.stdout or ():
+                if not text.startswith("{"):  # of a library
+                    continue
                 line = who | json.loads(text)
                 with results.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(line) + "\n")
