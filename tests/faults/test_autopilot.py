@@ -208,6 +208,7 @@ async def test_what_it_must_not_fly_with_is_told_once_and_ends_in_hold(
             await ship.until_matters(matter)
         assert not fake_autopilot.failsafe or matter == "position_lost"
         await ship.until_state("silent")
+        await asyncio.sleep(0.2)  # what was sent before has arrived
         async with ship.sends_nothing():
             for beginning in told[1:]:
                 await ship.until_event(beginning)
