@@ -193,7 +193,8 @@ def test_the_report_says_where_no_supervisor_flew(perception: str, says: bool, t
     flown(Plan.load(campaign_file(tmp_path, text)), tmp_path / "out", Shuffled(1))
     write_campaign_page(Results.load(tmp_path / "out"), tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert ("No supervisor flies along: wind slows and holds nobody." in page) is says
+    told = "at control level, without safety gates. No supervisor flies along: wind slows and holds nobody."
+    assert (told in page) is says
 
 
 def test_figures_stand_under_the_case_and_the_value_that_were_flown(tmp_path: Path) -> None:
