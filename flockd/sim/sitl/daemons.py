@@ -14,6 +14,7 @@ import yaml
 from flockd.core.config import DroneConfig
 from flockd.core.config.drone import RecordingConfig
 from flockd.core.config.mission import MissionParameters
+from flockd.core.errors import ConfigError, ConfigProblem
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.sitl.autopilots import Ports
 from flockd.sim.sitl.processes import Program, Programs
@@ -33,11 +34,14 @@ def fleet_configs(
     """What each drone of a scenario that is not flown by hand flies with.
 
     The pilot is the scenario's, with the mission's places counted from the drone's own home, which is below its start;
-    source, autopilot, safety and telemetry are those of ``sitl``, which has frames come by shared memory.
+    source, autopilot, safety and telemetry are those of ``sitl``. Raises ConfigError where ``sitl`` lacks one of them.
     """
-    assert sitl.source is not None
-    assert sitl.autopilot is not None
-    configs = []
+    if sitl.source is None or sitl.source.kind != "shared_memory":
+        fault = "has to be of kind `shared_memory`; write it so"
+        raise ConfigError([ConfigProblem("px4_sitl.yaml", 0, "source", fault)])
+    if sitl.autopilot is None:
+        raise ConfigError([ConfigProblem("px4_sitl.yaml", 0, "autopilot", "is missing; add it")])
+    configs, fleet = [], re.sub(r"[^A-Za-z0-9_.-]+", "-", scenario.scenario)
     for i, port in enumerate(ports):
         if scenario.vehicles[i].by_hand:
             continue
@@ -51,9 +55,7 @@ def fleet_configs(
             "autopilot": sitl.autopilot.model_copy(update=address),
             "mission": _from_home(scenario, i),
             "safety": sitl.safety,
-            "telemetry": sitl.telemetry.model_copy(
-                update={"fleet": re.sub(r"[^A-Za-z0-9_.-]+", "-", scenario.scenario)}
-            ),
+            "telemetry": sitl.telemetry.model_copy(update={"fleet": fleet}),
             "recording": RECORDING,
         }
         configs.append(scenario.drone.model_copy(update=parts))

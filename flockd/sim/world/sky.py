@@ -54,11 +54,8 @@ def draw_sky(rng: Generator) -> tuple[FloatArray, float, PackedArray]:
     amount = np.clip((density + cover) * rng.uniform(0.5, 1.5), 0, 1)[..., None] * np.clip(up * 5, 0, 1)[..., None]
     white = (0.95 * (1 - overcast) + 0.8 * overcast) * (1.15 - 0.25 * np.clip(density, 0, 2)[..., None])
     sky = sky * (1 - amount) + white * amount
-    return (
-        np.stack([sun, sun_colour, skylight, bounce, horizon]),
-        fog,
-        textures.pack_pyramid((sky / 4.0).astype(np.float32)),
-    )
+    light = np.stack([sun, sun_colour, skylight, bounce, horizon])
+    return light, fog, textures.pack_pyramid((sky / 4.0).astype(np.float32))
 
 
 def tone_curve(rng: Generator) -> UInt8Array:
