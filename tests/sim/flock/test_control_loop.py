@@ -146,9 +146,10 @@ def test_a_drone_that_is_taken_over_holds_or_lands_and_its_mates_keep_apart() ->
     still = np.linalg.norm(log.velocity[-10:], axis=2).max(axis=0) < 0.4  # what the estimates wander by
     assert still.tolist() == [True, False, False, True, False]
     assert log.position[-1, 3, 2] > -0.1 > log.position[-1, 0, 2]
-    assert log.metadata.handed_over[0].time_s == 10.0
+    held = log.metadata.handed_over[0]
+    assert (held.time_s, "operator" in held.reason) == (10.0, True)
     assert log.metadata.slowed_share
-    assert log.metadata.slowed_by.keys() <= {"neighbour", "wind", "other"}
+    assert "neighbour" in log.metadata.slowed_by
     assert min(map(min_distance, log.position)) > 0.7
 
 
