@@ -47,7 +47,7 @@ class Engine(Protocol):
 class ProcessEngine:
     """Between ``__enter__`` and ``__exit__``. Its processes end with this one, however that ends.
 
-    Each has an executor of its own, which so tells whose flight it was that ended a process.
+    Each process has an executor of its own, which tells whose flight ended it.
     """
 
     def __init__(self, workers: int) -> None:
@@ -99,7 +99,7 @@ class ProcessEngine:
 
 
 def _executor() -> ProcessPoolExecutor:
-    """Of one process."""
+    """It has one process."""
     environment = {**with_package(os.environ), **ONE_THREAD}
     return ProcessPoolExecutor(1, env=environment, initializer=_begin, initargs=(os.getpid(),))
 

@@ -33,7 +33,7 @@ class Interval(NamedTuple):
 
 
 _UPPER_END = 0.975
-"""The upper end of an interval that leaves out as much above as below."""
+"""The quantile at the upper end of a 95 % interval, which leaves out 2.5 % on each side."""
 
 
 def mean_interval(values: Sequence[float], *, is_share: bool = False) -> Interval | None:
@@ -66,7 +66,7 @@ class Measure:
     unit: str
     better: Literal["higher", "lower"]
     of: str | Callable[[FlightLog, dict[str, Any]], Any] | None
-    """Its keys in a flight's summary, or from the log and the summary; None: of flights at control level alone."""
+    """Its keys in a flight's summary, or a function of log and summary; None: only control level has this figure."""
     is_share: bool = False
     """The figure is 0 or 1 for one flight, so that its mean is a share of flights."""
 

@@ -88,7 +88,7 @@ class FlownRun:
     reason: str | None = None
     """Why it failed."""
     scenario_sha256: str = ""
-    """Of all its values, those that no file gives too."""
+    """Of all values of its scenario, defaults included."""
     networks: str = ""
     """SHA-256 of each network, as `name=hash`."""
     wall_s: float = 0.0

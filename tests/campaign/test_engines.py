@@ -87,7 +87,7 @@ def workers_of(parent: int) -> set[int]:
 
 @pytest.mark.slow
 def test_a_flight_that_ends_its_process_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One flight always ends its process; the others, some in a process that died while it had none, are flown."""
+    """One flight always ends its process. The others are flown, one after its process was killed while idle."""
     monkeypatch.setattr("flockd.campaign.engine.fly_task", _flown_but_one)
     plan = few(tmp_path)
     with ENGINES["processes"](2, None) as engine:

@@ -122,7 +122,7 @@ class FlightFigures:
         return [self._of_flock({name: of[k] for name, of in found.items()}) for k in range(len(self._touching))]
 
     def _of_flock(self, values: Mapping[str, FloatArray]) -> Figures:
-        """By a flight's values of each step that has them."""
+        """Of one flight. `values`: by name, one for each step that has it."""
 
         def tail_mean(name: str) -> float:
             of_tail: list[float] = values[name][-int(self._tail.sum()) :].tolist()

@@ -50,7 +50,7 @@ class Near:
         return found_m[:, 0], np.where(np.isinf(found_m[:, 0]), numbers, found[:, 0])
 
     def pairs(self, reach_m: float | FloatArray) -> tuple[IntArray, IntArray]:
-        """(p,) drones, in order, and the number (p,) of another within the drone's `reach_m`, of all or (drones,).
+        """(p,) drones, in order, and the number (p,) of another within `reach_m`, one for all drones or (drones,).
 
         A drone's others are in ascending order; there may be some that are farther by a rounding error.
         """

@@ -187,14 +187,14 @@ def navigator_of(scenario: ScenarioConfig, vehicle: int) -> Navigator:
 
 
 def at_home(time_s: float, place: FloatArray) -> Moment:
-    """What a navigator is told that knows nothing of the flock, at `place` (2,) m from the world's origin."""
+    """Without a flock, at `place` (2,) m from the world's origin: for a navigator that knows nothing of the others."""
     return Moment(time_s, place, home_deg=np.array(REFERENCE_DEG))
 
 
 def fly_by_hand(person: Navigator, i: int, time_s: float, place: FloatArray, commands: Commands) -> MissionStatus:
-    """Puts what a person who flies one drone in Position mode wants of it into the commands; called in order of time.
+    """Fills in the commands of drone `i`, which a person flies in Position mode, and returns how the mission goes.
 
-    The person sees nothing of the flock.
+    The person sees nothing of the flock. Called in order of time.
     """
     guidance = person.step(at_home(time_s, place))
     commands.velocity[i] = commands.desired[i] = guidance.velocity

@@ -160,7 +160,7 @@ class FlockTelemetry:
         return [i for i in self._drones if i not in self._disturbed.removed]
 
     def take_orders(self, drones: Sequence[int]) -> dict[int, MissionOrder]:
-        """Operators', by drone, that no step has taken yet; they are taken now."""
+        """Operators' orders, by drone, that no step has taken yet; they are taken now."""
         with self._lock:
             return {i: self._orders.pop(i) for i in drones if i in self._orders}
 

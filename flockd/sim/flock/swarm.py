@@ -148,7 +148,7 @@ def fly_commands(
     shown: FlockTelemetry | None,
     disturbed: Disturbances = UNDISTURBED,
 ) -> None:
-    """One step on, as operators have asked since the last one, who see what comes of it."""
+    """Takes what operators asked of the autopilots, flies one step, and publishes who flies each drone."""
     if shown is not None:
         shown.take_requests(time_s, loop, vehicles)
     loop.fly(time_s, vehicles, commands, disturbed)

@@ -312,7 +312,7 @@ def smooth_edges(hit: Any, texture: Any, planes: Any, linear: Any, tone: Any, sh
             red, green, blue = 0.0, 0.0, 0.0
             for k in range(4):
                 u, v = x + 0.125 + 0.25 * k, y + 0.125 + 0.25 * ((2 * k + 1) % 5)
-                # The own triangle first; where none covers the sample, the sky if it is near, or as the pixel.
+                # The pixel's own triangle first. Where none covers the sample: a neighbour's sky, else the pixel.
                 best, nearest = (y, x), _covering(planes, t, u, v)
                 for j in range(max(0, y - 1), min(height, y + 2)):
                     for i in range(max(0, x - 1), min(width, x + 2)):

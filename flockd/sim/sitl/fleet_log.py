@@ -43,7 +43,7 @@ class FleetRun:
     ended_s: float = 0.0
     wall_s: float = 0.0
     frames: tuple[Poses, ...] = ()
-    """Where the flock was at each frame set, by its frames' time stamp on the simulated clock."""
+    """The true poses at each frame set; `time_s` is the time stamp of its frames, on the simulated clock."""
     handed_over: dict[str, str] = field(default_factory=dict)
     """Why a drone did not fly to the end, by its name; also where its mission ends so."""
     modes: dict[str, list[str]] = field(default_factory=dict)

@@ -69,7 +69,7 @@ class _Vehicle:
     mav: Any = None
     address: tuple[str, int] | None = None
     pose: tuple[float, Any] | None = None
-    """When its newest message with its pose came, and that."""
+    """When the newest message with its pose came, and the message."""
     mode: int | None = None
     armed: bool = False
     version: str | None = None

@@ -79,7 +79,7 @@ class _Site:
         return True
 
     def anywhere(self, tries: int, reach: float, gap: float, street: float | None = None) -> FloatArray | None:
-        """(2,) a free circle's middle, off the street to the north at its easting."""
+        """(2,) a free circle's middle; off the street that runs north, where ``street`` is its easting."""
         for _ in range(tries):
             place = self.rng.uniform(-self.extent, self.extent, 2)
             on_street = street is not None and abs(place[1] - street) < _STREET_M / 2 + reach
