@@ -138,8 +138,8 @@ def test_each_drone_decides_from_its_own_images_alone() -> None:
 
 @pytest.mark.slow
 def test_twenty_seconds_from_pixels() -> None:
-    """Seed 0: 1.80 m, 0.978, 0.929 (confirmation takes time), no false one. Of a flock that sees nobody, two come within
-    0.53 m."""
+    """Seed 0: 1.80 m, 0.978, 0.929 (confirmation takes time), no false one. Of a flock that sees nobody, two come
+    within 0.53 m."""
     summary = summarise(fly(load_scenario(data_path("config") / "paper_flight.yaml", {"duration_s": 20.0})).log)
     assert summary["flock"]["min_distance_after_10s_m"] >= 1.5
     assert summary["flock"]["order_tail"] >= 0.95
