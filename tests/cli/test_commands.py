@@ -18,7 +18,9 @@ from flockd.cli import _parser, installing, main
 from flockd.cli.sim import _scenario
 from flockd.core.config import DroneConfig
 from flockd.core.errors import ModelError, UnavailableError
+from flockd.fleet.watcher import FleetWatcher
 from flockd.review.flight_log.log import FlightLog
+from flockd.sim.sitl.ports import free_endpoint
 from flockd.sim.vehicles.vehicles import Vehicles
 from tests.cli.conftest import Told
 
@@ -301,6 +303,14 @@ def test_each_flight_has_its_own_folder(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.usefixtures("unreported")
+def test_a_flight_is_watched_where_it_is_told_to_be(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    flight = ["sim", "--perception", "truth", "--telemetry", "--telemetry-at", endpoint, "--drones", "2"]
+    with FleetWatcher(None, listen=[], connect=[endpoint]) as watcher:
+        assert main([*flight, "--duration", "4", "--out", str(tmp_path / "out")]) == 0
+        assert {one.drone for one in watcher.drones()} == {"drone1", "drone2"}
+
+
 def test_an_interrupted_flight_leaves_its_report_and_can_be_flown_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:

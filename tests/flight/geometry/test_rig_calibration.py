@@ -23,7 +23,7 @@ from flockd.flight.geometry import (
     rotation_from_vector,
     vector_from_rotation,
 )
-from flockd.flight.geometry.camera_motion import scaled_focal
+from flockd.flight.geometry.camera_motion import camera_motion, scaled_focal
 from tests.flight.geometry.synthetic_world import EXACT, Flaws, World, boxes_around, four_camera_rig, seen_twice
 
 pytestmark = pytest.mark.fault("rig-off")
@@ -254,6 +254,19 @@ def test_a_flight_that_never_turns_leaves_open_what_it_does_not_show() -> None:
         assert time > 0.05
         assert focal > 0.02
         assert rig_faults(found) == ()
+
+
+def test_twice_the_matches_tell_twice_as_much_also_where_half_are_left_out() -> None:
+    random, right = np.random.default_rng(5), CONFIGURED.cameras["right"]
+    pairs = seen_twice(boxes_around(random), CONFIGURED, (STRAIGHT.pose(0.0), STRAIGHT.pose(0.5)), EXACT, random)
+    mine = np.flatnonzero(pairs.camera_names == "right")
+    motion, told = RigidTransform(np.eye(3), right.T_body_camera.rotation.T @ np.array([0.5, 0.0, 0.0])), []
+    for count in (300, 600):
+        some = pairs.select(mine[np.linspace(0, len(mine) - 1, count).astype(np.int64)])
+        found = camera_motion(right, some, motion, 0.0)
+        assert found is not None
+        told.append(float(np.trace(found.information[:3, :3])))
+    assert told[1] / told[0] == pytest.approx(2.0, rel=0.1)
 
 
 def test_what_says_nothing_changes_nothing() -> None:

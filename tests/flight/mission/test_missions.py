@@ -354,6 +354,16 @@ def test_those_who_see_a_drone_that_is_flown_by_hand_go_with_it() -> None:
     np.testing.assert_allclose(velocity[20, 0], [0.5, 0.0, 0.0], atol=0.01)
 
 
+def test_a_mission_changes_the_height_and_lands_at_its_end() -> None:
+    flight = load_scenario(CONFIG / "led_by_hand.yaml", {"duration_s": 30.0})
+    waypoints = ({"north_m": 6.0, "east_m": 0.0, "height_m": 6.0},)
+    lands = mission(kind="waypoints", at_end="land", waypoints=waypoints)
+    alone = changed(flight, vehicles=(changed(flight.vehicles[0], mission=lands, by_hand=False),))
+    heights = -fly_exact_states(alone)[1][:, 0, 2]
+    assert heights.max() == pytest.approx(6.0, abs=0.15)
+    assert heights[-1] == pytest.approx(0.0, abs=0.01)
+
+
 # Laps: mission, gate and vehicle in closed loop, turning to one side all the time.
 
 

@@ -188,6 +188,16 @@ def test_few_blocks_are_not_enough_and_many_are() -> None:
     assert Rig().left_shows(None, blocks(16, 0.5, 2), blocks(16, 0.5, 3)) == [False, True, True]
 
 
+def test_soft_noise_that_grows_slowly_does_not_follow_from_the_image_before() -> None:
+    """By 10 grey levels an image, up to 60: never is there much more than in the last."""
+    rng, shown = np.random.default_rng(1), [view(1)]
+    for number in range(2, 9):
+        soft = cv2.GaussianBlur(rng.standard_normal((*SIZE, 3)), (0, 0), 1.5)
+        added = min(10.0 * (number - 1), 60.0) / soft.std() * soft
+        shown.append(np.clip(view(number) + added, 0, 255).astype(np.uint8))
+    assert Rig().left_shows(*shown)[-2:] == [True, True]
+
+
 def test_light_that_changes_and_a_black_image_are_no_damage() -> None:
     brighter = np.clip(1.3 * view(2).astype(float) + 15.0, 0, 255).astype(np.uint8)
     assert Rig().left_shows(None, brighter, None) == [False] * 3

@@ -251,6 +251,16 @@ def test_a_size_that_is_in_use_is_undone_before_it_is_judged_again(
     assert (judged[0].size_m, judged[0].range_m) == pytest.approx((judged_m, range_m))
 
 
+@pytest.mark.parametrize("step_s", [0.5, 0.1])
+def test_ten_steps_a_second_judge_no_more_views_than_two(step_s: float) -> None:
+    """Else a few seconds of one view stand for a minute of many."""
+    learner = SizeLearner(drone())
+    one = Measurement(np.array([1.0, 0.0, 0.0]), math.log(3.0), 1e-4 * np.eye(3), JUDGED_M)
+    for _ in range(round(6.0 / step_s)):
+        learner.see(step_s, np.zeros(3), {1: one}, [at(3.0)])
+    assert len(learner._judged) == 12
+
+
 @pytest.mark.parametrize(
     ("judged_m", "doubt", "used"),
     [
@@ -298,6 +308,11 @@ def test_by_itself_it_weaves_where_the_judged_sizes_are_uncertain(
     outputs = Flight(drone("auto", **said), scatter=scatter, doubt=doubt).fly(25.0)
     assert any(weaves(outputs)) is needed
     assert not needed or size_of(outputs[-1]).size_m == pytest.approx(SIZE_M, rel=0.1)
+
+
+def test_two_drones_draw_other_times() -> None:
+    begins = [weaves(Flight(changed(drone(), name=name)).fly(25.0)).index(True) for name in ("alder", "birch")]
+    assert begins[0] != begins[1]
 
 
 @dataclass

@@ -154,6 +154,15 @@ def test_a_tree_and_outliers_do_not_move_it() -> None:
     assert np.abs(errors(found, SIZE_M)).max() < 3.0
 
 
+def test_of_two_types_each_has_its_own_size() -> None:
+    learned = flown(np.random.default_rng(0), sizes_m=(0.4, 0.4, 0.64, 0.64))
+    for number, size_m in ((0, 0.4), (2, 0.64)):
+        for found in (learned.of_track(number), learned.of_looks(1.35 * size_m)):
+            assert found is not None
+            assert found.deviations(size_m) < 3.0
+            assert found.size_m == pytest.approx(size_m, rel=0.2)
+
+
 def test_what_a_track_told_outlives_it() -> None:
     learned = flown(np.random.default_rng(0))
     before = learned.of_looks(1.35 * SIZE_M)
@@ -163,3 +172,10 @@ def test_what_a_track_told_outlives_it() -> None:
     assert after is not None
     assert (after.size_m, after.sigma) == pytest.approx((before.size_m, before.sigma))
     assert learned.of_track(0) is None
+
+
+def test_a_long_gap_begins_no_more_weaves_than_one_takes() -> None:
+    """A step after an hour takes as long as any."""
+    learned = flown(np.random.default_rng(0))
+    learned.step(3600.0, np.zeros(3), {})
+    assert max(len(track._elapsed_s) for track in learned._tracks.values()) < 100

@@ -136,6 +136,16 @@ def test_each_drone_decides_from_its_own_images_alone() -> None:
     assert np.array_equal(right.command_velocity[0], wrong.command_velocity[0])
 
 
+def test_pilots_that_see_take_an_operators_order() -> None:
+    watching, flight = Watching(), scenario(1.0)
+
+    def order(done: int, total: int) -> None:
+        assert done == total or all(watching.goto(drone, -4.5, -4.0)[0] for drone in ("drone1", "drone2"))
+
+    log = fly(flight, shown=watching.shown(flight), processes=2, progress=order).log
+    np.testing.assert_array_equal(log.goal, [[np.nan, np.nan], [-4.5, -4.0]])
+
+
 @pytest.mark.slow
 def test_twenty_seconds_from_pixels() -> None:
     """Seed 0: 1.80 m, 0.978, 0.929 (confirmation takes time), no false one. Of a flock that sees nobody, two come

@@ -20,10 +20,10 @@ from flockd.core.data import data_path
 from flockd.flight.inference import OnnxModel, load_manifest
 from tools.training.dataset import create_part
 from tools.training.detector import Boxes, DroneDetector, detection_loss
-from tools.training.export import export
+from tools.training.export import draw_back, export
 from tools.training.networks import DistanceNet, FlowNet, NeighboursNet, VerificationNet
-from tools.training.picture_tasks import CROPS, KINDS, VerificationTask, crop_of
-from tools.training.pictures import CLASSES, NOT_JUDGED, Proposals
+from tools.training.picture_tasks import CROPS, KINDS, VerificationTask, crop_of, visibility
+from tools.training.pictures import CLASSES, NO_BOX, NOT_JUDGED, Proposals
 from tools.training.quantise import quantise
 from tools.training.samples import Sample
 from tools.training.tasks import DistanceTask, FlowTask, NeighboursTask, SigmaTask, Task
@@ -280,6 +280,14 @@ def test_a_crop_shows_what_is_around_its_middle_at_one_scale() -> None:
         assert [rows.mean() + 0.5, columns.mean() + 0.5] == pytest.approx([48.0, 48.0], abs=1.0)
 
 
+def test_what_cannot_be_seen_hardly_counts() -> None:
+    grey = np.full((96, 96, 3), 200, np.uint8)
+    dark, faint = grey.copy(), grey.copy()
+    dark[36:60, 14:82], faint[36:60, 14:82] = 40, 199
+    assert visibility(dark, grey, 0.3) == 1.0
+    assert visibility(faint, grey, 0.3) < 0.15
+
+
 def test_pictures_that_were_not_looked_through_are_refused_with_the_command(data: Path) -> None:
     (data / "photographs" / "proposals.jsonl").unlink()
     with pytest.raises(FileNotFoundError, match=r"make it with `python -m tools\.training\.mine`"):
@@ -316,6 +324,20 @@ def test_the_class_of_the_box_is_learnt_and_no_other() -> None:
     detection_loss(given, torch.tensor([[[28.0, 20.0, 16.0, 8.0]]]), torch.tensor([[2]]))[0].backward()
     gradient = torch.cat([one.grad.flatten(2) for one in given if one.grad is not None], 2)[0, 5:].sum(1)
     assert (gradient < 0).tolist() == [False, False, True, False]
+
+
+def test_pictures_of_a_batch_are_learnt_from_apart() -> None:
+    torch.manual_seed(3)
+    given = [torch.randn(2, 5 + len(CLASSES), *cells) for cells in CELLS]
+    boxes = torch.tensor([[[28.0, 20.0, 16.0, 8.0], [30.0, 22.0, 14.0, 8.0]], [[40.0, 40.0, 30.0, 20.0], [0.0] * 4]])
+    classes = torch.tensor([[0, 1], [2, NO_BOX]])
+
+    def gradient(which: list[int]) -> torch.Tensor:
+        own = [one[which].clone().requires_grad_() for one in given]
+        detection_loss(own, boxes[which], classes[which])[0].backward()
+        return torch.cat([one.grad[0].flatten() for one in own if one.grad is not None])
+
+    assert torch.cosine_similarity(gradient([0, 1]), gradient([0]), 0) == pytest.approx(1.0, abs=1e-5)
 
 
 def test_nothing_is_learnt_of_objects_in_a_box_that_is_not_judged() -> None:
@@ -392,6 +414,13 @@ def test_a_detector_goes_on_from_the_shipped_one_and_not_from_another_network() 
             begin_with_onnx(other, MODELS / f"{name}.onnx", lambda: None)
 
 
+def test_normalisations_that_were_settled_go_on_learning() -> None:
+    net, feeds = DistanceNet(), torch.from_numpy(NETWORKS["distance"][1]["picture"])
+    begin_with_onnx(net, MODELS / "distance.onnx", lambda: net(feeds))
+    momenta = {layer.momentum for layer in net.modules() if isinstance(layer, nn.BatchNorm2d)}
+    assert momenta == {nn.BatchNorm2d(1).momentum}
+
+
 def test_a_network_is_exported_as_the_shipped_one_is_used_and_in_16_bits_says_the_same(tmp_path: Path) -> None:
     torch.manual_seed(0)
     shipped, _ = load_manifest(data_path("models") / "flow.yaml")
@@ -408,6 +437,17 @@ def test_a_network_is_exported_as_the_shipped_one_is_used_and_in_16_bits_says_th
     images = np.random.default_rng(0).integers(0, 255, (2, 1, 64, 64, 3), dtype=np.uint8)
     was, now = (model.run(dict(zip(("first", "second"), images, strict=True)))["flow"] for model in (whole, half))
     assert 0.0 < np.abs(now - was).mean() < 0.01 * was.std()
+
+
+def test_weights_are_drawn_back_a_third_of_the_way_to_what_the_run_began_with() -> None:
+    net = nn.Sequential(nn.Linear(2, 1), nn.Linear(1, 1))
+    nn.init.constant_(net[0].weight, 1.0)
+    later = net[1].weight.item()
+    draw_back(net, {"0.weight": torch.tensor([[3.0, 0.0]])})
+    assert net[0].weight.tolist() == [pytest.approx([1.7, 0.65])]
+    assert net[1].weight.item() == later, "a layer that the start did not have"
+    with pytest.raises(SystemExit, match=r"--begun-with: its 0\.weight is not the run's"):
+        draw_back(net, {"0.weight": torch.zeros(1, 3)})
 
 
 class Numbers(Task):

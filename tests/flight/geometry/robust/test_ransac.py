@@ -131,6 +131,15 @@ def test_the_covariance_is_honest(count: int, outliers: float) -> None:
     assert 0.5 < np.mean(squares) / 6.0 < 2.0
 
 
+def test_a_plane_of_points_that_is_turned_over_is_turned_and_not_mirrored() -> None:
+    random = np.random.default_rng(5)
+    motion = RigidTransform(Rotation.from_rotvec([np.pi, 0.0, 0.0]).as_matrix(), SHIFT)
+    source = random.uniform(-10.0, 10.0, (1000, 3)) * [1.0, 1.0, 0.0]
+    found = ransac_rigid(source, motion.apply(source) + random.normal(0.0, 0.02, source.shape)).transform
+    assert rotation_angle_deg(found.rotation @ motion.rotation.T) < 0.1
+    assert np.linalg.det(found.rotation) == pytest.approx(1.0)
+
+
 @BOTH
 def test_one_seed_gives_one_result_and_leaves_its_input_alone(method: Method) -> None:
     random = np.random.default_rng(7)
@@ -282,6 +291,14 @@ def test_reweighted_steps_minimise_the_kernels_loss() -> None:
     assert found.state == pytest.approx(theirs.x, abs=1e-5)
     loss = Cauchy(0.1).loss(problem.residuals(found.state) ** 2).sum()
     assert 0.5 * 0.1**2 * loss == pytest.approx(theirs.cost, rel=1e-8)
+
+
+def test_a_step_is_no_longer_than_it_may_be_and_a_damped_parameter_moves_less() -> None:
+    begin = np.array([2.0, 0.5])
+    limited = GaussNewton(max_steps=1, tolerance=0.0).minimise(Decay(T, NOISY, longest=0.01), begin)
+    assert np.abs(limited.state - begin).max() == pytest.approx(0.01)
+    equations = Decay(T, NOISY).linearise(begin)
+    assert abs(equations.damped(np.array([0.0, 1e9])).step()[1]) < 1e-6 < abs(equations.step()[1])
 
 
 def test_before_its_least_number_of_steps_nothing_has_converged() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from flockd.core.messages import UNCLASSED, BoolArray, Detection, Float32Array, FloatArray, UInt8Array
 from flockd.flight.geometry import RangeMap, Rig, RigCamera, build_rig, virtual_crop
+from flockd.flight.perception.detection.colour_model import reweight_by_colour
 from flockd.flight.perception.detection.masks import CropMask, DroneMasks, MaskRenderer, depth_of_drones
 from tests import make
 
@@ -148,3 +149,20 @@ def test_what_both_stages_surely_deny_is_no_drones_whatever_its_colour() -> None
     found = drawn((detection(1, AHEAD), [mask_of(AHEAD, 0.2, height=8.0)])).by_colours(image, COLOUR_WEIGHT)
     assert overlap(found == 1, disc(AHEAD)) > 0.95
     assert not (found[disc(far)] == 1).any()
+
+
+def test_what_has_about_the_drones_colours_becomes_the_drones_and_what_has_those_around_it_does_not() -> None:
+    """Among 50 pixels of the drone and 50 around it."""
+    own, around = (100, 100, 100), (200, 200, 200)
+    logits = np.array([[-1.0, 0.0, 0.0, 0.0, 1.0, *[5.0] * 50, *[-5.0] * 50]], np.float32)
+    colours = [own, (112, 100, 100), (100, 112, 100), (100, 100, 112), around, *[own] * 50, *[around] * 50]
+    found = reweight_by_colour(logits, np.array([colours], np.uint8), COLOUR_WEIGHT)[0]
+    assert found[:4].min() > 3.0, "a little more red, green or blue is still its colour"
+    assert found[2:4] == pytest.approx(found[1], rel=0.05)
+    assert found[4] < -3.0
+
+
+@pytest.mark.parametrize("logit", [60.0, -60.0])
+def test_numbers_stay_finite_however_sure_the_networks_are(logit: float) -> None:
+    black = np.zeros((4, 4, 3), np.uint8)
+    assert np.isfinite(reweight_by_colour(np.full((4, 4), logit, np.float32), black, COLOUR_WEIGHT)).all()

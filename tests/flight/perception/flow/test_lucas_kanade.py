@@ -100,6 +100,18 @@ def test_beside_a_drone_the_background_does_not_move_with_it() -> None:
     assert (settled[labels == 1] == flow[labels == 1]).all()
 
 
+def test_points_on_a_drone_say_nothing_of_the_background_beside_it() -> None:
+    """They follow the drone, which goes its own way."""
+    first, second = images()
+    drone = np.s_[200:232, 160:208]
+    second[210:242, 175:223] = first[drone]
+    flow, labels = told(MOVED), NO_DRONES.copy()
+    labels[drone], flow[drone] = 1, (15.0, 10.0)
+    beside = np.s_[194:238, 154:214]
+    off_px = np.linalg.norm(grid_flow(flow, first, second, labels)[beside] - MOVED, axis=2)
+    assert off_px[labels[beside] == 0].max() < 1.0
+
+
 @pytest.mark.parametrize("size", [(480, 640), (120, 161), (37, 50), (12, 9), (1, 2)])
 def test_images_of_any_size_have_a_flow_of_theirs(size: tuple[int, int]) -> None:
     image = np.random.default_rng(4).integers(0, 256, (*size, 3), np.uint8)

@@ -75,6 +75,13 @@ def test_successive_ranges_over_a_hillside_tell_its_slope() -> None:
     assert ground.height_m == pytest.approx(7.0 - 0.12 * 14.5, rel=0.02)
 
 
+def test_ranges_are_smoothed() -> None:
+    """Over level ground, the error of the height is less than half of a reading's."""
+    below, errors = follower(), 0.06 * np.random.default_rng(1).standard_normal(200)
+    found = [known(below.update(state(STEP_S * k, 4.0 + e, north_m=0.1 * k))).height_m for k, e in enumerate(errors)]
+    assert np.std(found[20:]) < 0.03
+
+
 FAULTS: dict[str, Callable[[float], VehicleState]] = {
     "no range finder is heard": lambda t: state(t, None),
     "the range is not a number": lambda t: state(t, math.nan),
