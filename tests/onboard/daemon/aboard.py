@@ -280,20 +280,24 @@ class Watched:
         assert (await self.ask("ask/resume"))["accepted"] is True
         await self.until_state("ready")
 
-    async def flies(self) -> None:
+    async def flies(self, tries: int = 3) -> None:
         """The pilot selects offboard; and again, where a busy computer let go of it before the drone had its speed."""
+
+        def let_go() -> bool:
+            return tries > 1 and self.fake_autopilot.mode != "OFFBOARD"
+
         await until(lambda: len(self.fake_autopilot.setpoints) > 5, SECONDS_TO_FAIL)
         self.fake_autopilot.pilot_selects("OFFBOARD")
         await asyncio.sleep(0.5)
-        await until(lambda: self.speed() > 0.8 * SPEED_M_S or self.fake_autopilot.mode != "OFFBOARD", SECONDS_TO_FAIL)
-        if self.fake_autopilot.mode != "OFFBOARD":
+        await until(lambda: self.speed() > 0.8 * SPEED_M_S or let_go(), SECONDS_TO_FAIL)
+        if let_go():
             self.fake_autopilot.pilot_selects("LOITER")
             async with asyncio.timeout(SECONDS_TO_FAIL):
                 while self.state() != "ready":
                     await self.ask("ask/resume")
                     await asyncio.sleep(0.5)
             self.events.clear()
-            await self.flies()
+            await self.flies(tries - 1)
 
     def last_setpoint_s(self) -> float:
         """When the newest came, on the autopilot's clock."""
