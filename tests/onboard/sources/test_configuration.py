@@ -123,6 +123,9 @@ SWAPPED = PIPELINES.replace("back, pipeline", "back, device").replace("lib", "/d
     ("source", "problem"),
     [
         ("v4l2\n", "5: source: has no entry of the name front, which is a camera of the rig; add one"),
+        ("v4l2\n" + TWO.replace("back", "rear"), "9: source.cameras[1].name: rear is no camera of the rig; write one"),
+        ("v4l2\n" + TWO.replace("back", "front"), "9: source.cameras[1].name: front has an entry already; keep one"),
+        ("v4l2\n" + TWO.replace("video2", "video0"), "9: source.cameras[1].device: two cameras share /dev/video0"),
         ("shared_memory\n" + TWO, "5: source: a source of kind `shared_memory` has no devices; delete `cameras`"),
         ("v4l2\n" + TWO.replace("device: /dev/video2", "rate_hz: 20"), "9: source.cameras[1]: has no `device`; write"),
         ("v4l2\n" + SWAPPED, "8: source.cameras[0].pipeline: is of a source of kind `gstreamer`; delete it, or write "),
