@@ -303,7 +303,9 @@ def sections_text(cameras: Mapping[str, tuple[FoundCamera, Mode]], turn_deg: int
         keys = ("pipeline", "rate_hz") if parameters.pipeline else ("device", "pixel_format", "rate_hz")
         values = {key: getattr(parameters, key) for key in keys} | ({"turn_deg": turn_deg} if turn_deg else {})
         lines.append(f"    - name: {name}    # {' '.join(camera.name.split())}{where}")
-        lines += [f"      {key}: {json.dumps(value, ensure_ascii=False)}" for key, value in values.items()]
+        for key, value in values.items():
+            told = f"{value:g}" if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
+            lines.append(f"      {key}: {told}")
         lines += [] if as_pipelines else _controls(camera)
     lines.append(f"  set_tolerance_s: {max(0.02, 0.6 / slowest_hz):.3g}    # half a frame period or more")
     lines.append(f"  silence_s: {max(0.5, 3.0 / slowest_hz):.3g}")

@@ -125,14 +125,19 @@ def flock_lines(axes: Axes, time_s: FloatArray, values: FloatArray) -> None:
     axes.plot(time_s[some], middle, color=BAND)
 
 
-def _legend(figure: Figure, log: FlightLog, *more: Line2D) -> None:
-    drones = log.position.shape[1]
-    of_flock: list[Line2D | Patch] = [
+def flock_handles(drones: int) -> list[Line2D | Patch]:
+    """Of a legend: what `flock_lines` draws."""
+    if drones <= FEW:
+        return [*drone_handles(drones)]
+    return [
         Line2D([], [], color=BAND, label="median drone"),
         Patch(color=BAND, alpha=0.5, linewidth=0, label="10th to 90th percentile"),
         Patch(color=BAND, alpha=0.18, linewidth=0, label="all drones"),
     ]
-    handles = [*(drone_handles(drones) if drones <= FEW else of_flock), *more]
+
+
+def _legend(figure: Figure, log: FlightLog, *more: Line2D) -> None:
+    handles = [*flock_handles(log.position.shape[1]), *more]
     if _circle_ends(log):
         handles.append(Line2D([], [], color=MUTED, linewidth=0.8, label="circle ends"))
     figure.legend(handles=handles, loc="outside upper left", ncols=len(handles), handlelength=1.8, columnspacing=1.4)

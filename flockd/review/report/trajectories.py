@@ -18,7 +18,7 @@ from matplotlib.transforms import Affine2D
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.flocking.metrics import pair_distances
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.report.curves import flock_lines
+from flockd.review.report.curves import flock_handles, flock_lines
 from flockd.review.report.style import (
     FEW,
     GRID,
@@ -195,8 +195,7 @@ def obstacle_figure(log: FlightLog) -> Figure | None:
         axes.axhline(0.0, color=INK, linewidth=1.0, linestyle=(0, (4, 3)))
         axes.set(xlabel="time, s", ylabel="clearance, m", title="Distance to the nearest obstacle")
         axes.set_ylim(min(-0.2, float(free_m.min()) - 0.2), min(10.0, float(free_m.max()) + 0.5))
-        if drones <= FEW:
-            axes.legend(handles=drone_handles(drones), loc="upper right", ncols=2)
+        axes.legend(handles=flock_handles(drones), loc="upper right", ncols=2)
     return figure
 
 
