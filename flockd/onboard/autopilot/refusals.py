@@ -44,7 +44,7 @@ MOST_CHECKS = 300
 """That a report may name as failed: PX4 has fewer."""
 NUMBERS = 1 << 16
 MOST_LATE = 20
-"""A number that is farther back is none of a message that came late: the autopilot counts anew."""
+"""An announced number that is farther back does not come late: the autopilot counts anew."""
 SEQUENCE_RESET = 1
 """MAV_EVENT_CURRENT_SEQUENCE_FLAGS."""
 PREARM_CHECK = 1 << 28
@@ -141,7 +141,7 @@ class CheckEvents:
                 self._lose()
 
     def _ahead(self, number: int) -> int:
-        """Of the newest; numbers begin again after the last. 1 for the first of all."""
+        """How far a number is ahead of the newest, where 0 follows 65535; 1 for the first of all."""
         half = NUMBERS // 2
         return 1 if self._last is None else (number - self._last + half) % NUMBERS - half
 

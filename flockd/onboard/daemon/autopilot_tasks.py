@@ -211,7 +211,7 @@ class RefusalWatch:
                 if now - self._seen_s.get(refusal.reason, -math.inf) >= LOG_AGAIN_S:
                     self._log_event(refusal.sentence)
                 self._seen_s[refusal.reason] = now
-            # In flight nothing is asked: the list is for those who want to begin one.
+            # On the ground alone. Where events were lost, `AutopilotLink.attend` asks too, and in flight.
             if not self._link.knows_checks() and not self._link.status().armed and now - asked_s >= ASK_AGAIN_S:
                 asked_s = now
                 with suppress(AutopilotError, TimeoutError):  # of a firmware without one single messages tell reasons

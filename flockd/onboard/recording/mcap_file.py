@@ -223,9 +223,9 @@ class _Reader:
                 yield Damage(offset, f"a {_name(opcode)} is {length:,} bytes long", at_end=False)
                 self._file.seek(length, io.SEEK_CUR)
                 continue
-            content = self._file.read(length)
+            whole = head + self._file.read(length)
             try:
-                found = list(self._parsed(opcode, head + content))
+                found = list(self._parsed(opcode, whole))
             except _BROKEN as error:
                 yield Damage(offset, f"a {_name(opcode)} cannot be read ({error})", at_end=False)
             else:
