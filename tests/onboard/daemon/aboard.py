@@ -282,16 +282,13 @@ class Watched:
 
     async def flies(self, tries: int = 3) -> None:
         """The pilot selects offboard; and again, where a busy computer let go of it before the drone had its speed."""
-
-        def let_go() -> bool:
-            return tries > 1 and self.fake_autopilot.mode != "OFFBOARD"
-
-        await until(lambda: len(self.fake_autopilot.setpoints) > 5, SECONDS_TO_FAIL)
-        self.fake_autopilot.pilot_selects("OFFBOARD")
+        px4 = self.fake_autopilot
+        await until(lambda: len(px4.setpoints) > 5, SECONDS_TO_FAIL)
+        px4.pilot_selects("OFFBOARD")
         await asyncio.sleep(0.5)
-        await until(lambda: self.speed() > 0.8 * SPEED_M_S or let_go(), SECONDS_TO_FAIL)
-        if let_go():
-            self.fake_autopilot.pilot_selects("LOITER")
+        await until(lambda: self.speed() > 0.8 * SPEED_M_S or (tries > 1 and px4.mode != "OFFBOARD"), SECONDS_TO_FAIL)
+        if tries > 1 and px4.mode != "OFFBOARD":
+            px4.pilot_selects("LOITER")
             async with asyncio.timeout(SECONDS_TO_FAIL):
                 while self.state() != "ready":
                     await self.ask("ask/resume")
