@@ -41,6 +41,8 @@ FIGURES: dict[Figure, str] = {
     "associated_error_max_m": "max", "slowed_share": "slowed",
 }  # fmt: skip
 """What is compared, and its column."""
+MEANS_NOTHING = {("head-on", "order_tail")}
+"""There, drones are to fly opposite ways."""
 
 Mechanism = Mapping[str, Any]
 """`name`, `lines`, `changes` (`in`, `old`, `new`) and perhaps `note`, as in the list."""
@@ -116,7 +118,7 @@ def fly_here() -> None:
         print(json.dumps({**line, "plan": [scenario, seed, seconds]}), flush=True)
 
 
-def compared(as_it_is: Iterable[Line], left_out: Iterable[Line]) -> dict[str, Any]:
+def compared(scenario: str, as_it_is: Iterable[Line], left_out: Iterable[Line]) -> dict[str, Any]:
     """Of flights of one scenario, by seed: how many pairs, whether all are the same, and by figure the mean difference,
     half of its interval, and whether that shows a "gain" or a "loss"."""
     before = {line["seed"]: line["figures"] for line in as_it_is}
@@ -125,7 +127,7 @@ def compared(as_it_is: Iterable[Line], left_out: Iterable[Line]) -> dict[str, An
     for figure in FIGURES:
         known = [(a[figure], b[figure]) for a, b in pairs if a.get(figure) is not None and b.get(figure) is not None]
         interval = mean_interval([b - a for a, b in known])
-        if interval is not None:
+        if interval is not None and (scenario, figure) not in MEANS_NOTHING:
             better = (interval.mean > 0.0) == (MEASURES[figure].better == "higher")
             shown = abs(interval.mean) > interval.half_width
             shows = "" if not shown else "gain" if better else "loss"
@@ -138,7 +140,9 @@ def row_of(mechanism: Mechanism, lines: Iterable[Line]) -> dict[str, Any]:
     by: dict[str, dict[str, list[Line]]] = {}
     for line in lines:
         by.setdefault(line["scenario"], {}).setdefault(line["mechanism"], []).append(line)
-    scenarios = {name: compared(of.get(key_of(AS_IT_IS), ()), of.get(key_of(mechanism), ())) for name, of in by.items()}
+    scenarios = {
+        name: compared(name, of.get(key_of(AS_IT_IS), ()), of.get(key_of(mechanism), ())) for name, of in by.items()
+    }
     flown_in = {name: one for name, one in scenarios.items() if one["pairs"]}
     found: dict[str, list[str]] = {"loss": [], "gain": [], "": []}
     for name, one in flown_in.items():
