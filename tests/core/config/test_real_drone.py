@@ -14,10 +14,11 @@ from flockd.core.config import DroneConfig, load_drone, load_real_drone
 from flockd.core.config.real_drone import PROVEN_M_S
 from flockd.core.errors import ConfigError
 from flockd.ground.doctor.setup_checks import check_limits
+from flockd.sim.sitl.ports import free_port
 from tests.core.config.test_loader import CONFIG
 from tests.core.config.test_loader import DRONE as RIG
 
-AUTOPILOT = "autopilot: {max_velocity_trim_m_s: 0.5}\n"
+AUTOPILOT = f"autopilot: {{address: udpin://127.0.0.1:{free_port()}, max_velocity_trim_m_s: 0.5}}\n"
 FLOCK = range(1, 6)
 SEPARATION_M = 3.0
 """Nearer above or below than this counts as at one height: the lower is in the other's downwash."""

@@ -18,7 +18,7 @@ from mavsdk.system import System
 from pymavlink.dialects.v20 import common as mavlink
 
 from flockd.core.config.autopilot import AutopilotParameters
-from flockd.core.messages import Setpoint, Wanted
+from flockd.core.messages import Setpoint, VehicleState, Wanted
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, Firmware
 from flockd.onboard.autopilot.mavsdk_link import (
     RECEIVED,
@@ -177,15 +177,19 @@ async def test_the_vehicle_follows_the_velocity_and_holds_its_own_height(
     address: str, fake_autopilot: FakeAutopilot
 ) -> None:
     wanted = Wanted(np.array([0.6, -0.8]), np.zeros(2), yaw_rad=-0.5, height_m=3.0)
+
+    def flies_as_asked(state: VehicleState | None) -> bool:
+        assert state is not None
+        assert state.velocity_ned is not None
+        off = np.abs(state.velocity_ned - [0.6, -0.8, 0.0]).max()
+        return bool(off < 0.15 and abs(state.height_m - 3.0) < 0.15)
+
     async with flying(address, wanted) as flight:
         await flight.enter_offboard()
         assert fake_autopilot.mode == "OFFBOARD"
-        await asyncio.sleep(1.5)
+        await until(lambda: flies_as_asked(flight.link.vehicle_state()))
         state = flight.link.vehicle_state()
         assert state is not None
-        assert state.velocity_ned is not None
-        np.testing.assert_allclose(state.velocity_ned, np.array([0.6, -0.8, 0.0]), atol=0.15)
-        assert state.height_m == pytest.approx(3.0, abs=0.15)
         assert math.atan2(state.R_ned_body[1, 0], state.R_ned_body[0, 0]) == pytest.approx(-0.5, abs=0.05)
         assert fake_autopilot.refused_setpoints == 0
 
