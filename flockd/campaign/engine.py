@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -47,61 +47,75 @@ class Engine(Protocol):
 class ProcessEngine:
     """Between ``__enter__`` and ``__exit__``. Its processes end with this one, however that ends.
 
-    Each process has an executor of its own, which tells whose flight ended it.
+    When a process dies, the executor cannot say which task it flew, and all that it had begun are lost. Each of them is
+    then flown by itself, which shows whose flight it was; the processes are new.
     """
 
     def __init__(self, workers: int) -> None:
-        self._free = [_executor() for _ in range(workers)]
-        self._flying: dict[Future[Flown], tuple[Task, ProcessPoolExecutor]] = {}
+        self._workers = workers
+        self._executor = self._started()
+        self._flying: dict[Future[Flown], Task] = {}
+        self._suspects: deque[Task] = deque()
+        """Were in an executor that broke."""
         self._tries: Counter[tuple[Run, ...]] = Counter()
-        """How often a task's flights have ended their process."""
+        """How often a task's flights were the only ones in an executor that broke."""
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for executor in (*self._free, *(executor for _, executor in self._flying.values())):
-            executor.shutdown(wait=True, kill_workers=True)
+        self._executor.shutdown(wait=True, kill_workers=True)
 
     @property
     def room(self) -> int:
-        """Processes that fly nothing."""
-        return len(self._free)
+        """For each process one that it flies and one that it goes on with; none while suspects fly by themselves."""
+        return 0 if self._suspects else 2 * self._workers - len(self._flying)
 
     def submit(self, task: Task) -> None:
         """Takes a task."""
-        executor = self._free.pop()
         try:
-            flying = executor.submit(fly_task, task)
-        except BrokenProcessPool:  # its process died while it had nothing to fly
-            executor = _executor()
-            flying = executor.submit(fly_task, task)
-        self._flying[flying] = task, executor
+            self._flying[self._executor.submit(fly_task, task)] = task
+        except BrokenProcessPool:  # a process died a moment ago
+            self._suspects.append(task)
+            if not self._flying:
+                self._restarted()
 
     def wait(self) -> list[Flown]:
         """What is finished; waits for one at least."""
         finished: list[Flown] = []
-        while not finished and self._flying:
-            for future in wait(self._flying, return_when=FIRST_COMPLETED)[0]:
-                task, executor = self._flying.pop(future)
+        while not finished and (self._flying or self._suspects):
+            if not self._flying:
+                self.submit(self._suspects.popleft())
+            done, _ = wait(self._flying, return_when=FIRST_COMPLETED)
+            broken = False
+            for future in done:
                 try:
                     finished.append(future.result())
-                    self._free.append(executor)
+                    del self._flying[future]
                 except BrokenProcessPool:
-                    executor.shutdown(wait=True, kill_workers=True)
-                    self._free.append(_executor())
-                    self._tries[task.runs] += 1
-                    if self._tries[task.runs] >= MAX_TRIES:
-                        finished.append(_ended(task))
-                    else:
-                        self.submit(task)
+                    broken = True
+            if broken:
+                finished += self._restarted()
         return finished
 
+    def _restarted(self) -> list[Flown]:
+        """With a new executor. Gives the results of tasks that have ended too many processes."""
+        wait(self._flying)  # all of them break
+        lost = [task for future, task in self._flying.items() if future.exception() is not None]
+        finished = [future.result() for future in self._flying if future.exception() is None]
+        self._flying.clear()
+        self._executor.shutdown(wait=True, kill_workers=True)
+        self._executor = self._started()
+        if len(lost) == 1:
+            self._tries[lost[0].runs] += 1
+            if self._tries[lost[0].runs] >= MAX_TRIES:
+                return [*finished, _ended(lost[0])]
+        self._suspects.extend(lost)
+        return finished
 
-def _executor() -> ProcessPoolExecutor:
-    """It has one process."""
-    environment = {**with_package(os.environ), **ONE_THREAD}
-    return ProcessPoolExecutor(1, env=environment, initializer=_begin, initargs=(os.getpid(),))
+    def _started(self) -> ProcessPoolExecutor:
+        environment = {**with_package(os.environ), **ONE_THREAD}
+        return ProcessPoolExecutor(self._workers, env=environment, initializer=_begin, initargs=(os.getpid(),))
 
 
 class RayEngine:

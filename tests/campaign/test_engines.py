@@ -10,17 +10,18 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from flockd.campaign.conduct import conduct, task_of
 from flockd.campaign.engine import ENGINES, Engine
-from flockd.campaign.flight_kinds import FlownRun, Task, fly_task
+from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_plan import Plan, Run
-from flockd.campaign.folder import LINES_NAME, CampaignFolder, flown_in
+from flockd.campaign.folder import LINES_NAME, CampaignFolder
 from flockd.sim.sitl.bound_to_parent import with_package
 from tests.campaign.flights import PAPER, Shuffled, campaign_file, flown
 
@@ -86,27 +87,37 @@ def workers_of(parent: int) -> set[int]:
 
 
 @pytest.mark.slow
-def test_a_flight_that_ends_its_process_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One flight always ends its process. The others are flown, one after its process was killed while idle."""
-    monkeypatch.setattr("flockd.campaign.engine.fly_task", _flown_but_one)
+def test_a_flight_that_ends_its_process_is_a_row(tmp_path: Path) -> None:
+    """One flight always ends its process; the others, which were lost with it, are flown."""
     plan = few(tmp_path)
     with ENGINES["processes"](2, None) as engine:
-        with CampaignFolder(tmp_path / "out", plan) as campaign:
-            conduct(plan, campaign, engine, lambda done, total: None)
-        for pid in workers_of(os.getpid()):
-            os.kill(pid, signal.SIGKILL)
-        time.sleep(1.0)
-        engine.submit(task_of(plan, (Run(0, 2),)))
-        again = engine.wait()
-    reasons = {one.run: one.reason for one in (*flown_in(tmp_path / "out", plan), *again[0])}
+        submit = engine._executor.submit  # type: ignore[attr-defined]
+
+        def submitted(work: Callable[..., Any], task: Any) -> Any:
+            return submit(_end if task.runs == (Run(0, 1),) else work, task)
+
+        engine._executor.submit = submitted  # type: ignore[attr-defined]
+        started = engine._started  # type: ignore[attr-defined]
+
+        def again() -> Any:
+            nonlocal submit
+            executor = started()
+            submit, executor.submit = executor.submit, submitted
+            return executor
+
+        engine._started = again  # type: ignore[attr-defined]
+        results: list[FlownRun] = []
+        for number in range(3):
+            engine.submit(task_of(plan, (Run(0, number),)))
+        while len(results) < 3:
+            results += [one for flown_task in engine.wait() for one in flown_task]
+    reasons = {one.run: one.reason for one in results}
     assert reasons[Run(0, 0)] is reasons[Run(0, 2)] is None
     assert "the process that flew it ended, 3 times" in (reasons[Run(0, 1)] or "")
 
 
-def _flown_but_one(task: Task) -> list[FlownRun]:
-    if task.runs == (Run(0, 1),):
-        os.kill(os.getpid(), signal.SIGKILL)
-    return fly_task(task)
+def _end(_: object) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 @contextmanager
