@@ -13,13 +13,11 @@ from flockd.core.config.base import Name, NonNegative, Section, refuse
 from flockd.core.config.document import KeyPath, Place, read_document
 from flockd.core.config.loader import require, validated
 
-FlightKindName = Literal["truth", "sight", "control"]
+FlightKindName = Literal["truth", "sight"]
 """How the flights of a campaign are flown."""
 
 DRONES = "drones"
 """Instead of a key: the size of the flock."""
-MAX_CONTROL_DRONES = 10_000
-"""The most drones in a flight at control level."""
 MAX_VALUES = 1000
 MAX_SEEDS = 1_000_000
 _Name = Annotated[Name, Field(max_length=60)]
@@ -47,14 +45,10 @@ class CampaignConfig(Section):
     scenario: str
     """The path of the scenario's file, relative to this one."""
     perception: FlightKindName = "truth"
-    """`truth`: on exact relative states, without images; `sight`: on networks, from rendered images; `control`: at
-    control level, with flocks of any size, many flights at once, by the law alone, on exact states or with `errors`."""
-    errors: str | None = None
-    """For `control`: the path of a file of perception's errors, relative to this one, as
-    `tools.training.fit_perception` writes it. none: exact states."""
+    """`truth`: without images, on exact relative states or, with the scenario's `detections`, on what drones track of
+    made-up ones; `sight`: on networks, from rendered images."""
     gated: bool = True
-    """Whether each drone flies through its safety gate, as in the daemon; false: to study the flocking law alone,
-    as at control level in any case."""
+    """Whether each drone flies through its safety gate, as in the daemon; false: to study the flocking law alone."""
     seed: Annotated[int, Field(ge=0, le=2**53)] = 0
     """Flight n of each cell, from 0, flies with the scenario's seed `seed` + n, in all cells alike: so differences
     between cells and between campaigns are of flights with the same gusts and worlds."""
@@ -73,12 +67,6 @@ class CampaignConfig(Section):
     measure: Annotated[tuple[Figure, ...], Field(min_length=1)] | None = None
     """Figures to keep; none: all."""
 
-    @model_validator(mode="before")
-    @classmethod
-    def _at_control_level_the_law_flies_alone(cls, values: Any) -> Any:
-        alone = isinstance(values, Mapping) and values.get("perception") == "control"
-        return {"gated": False, **values} if alone else values
-
     @model_validator(mode="after")
     def _says_nothing_twice(self) -> Self:
         faults: dict[tuple[str | int, ...], str] = {}
@@ -94,10 +82,6 @@ class CampaignConfig(Section):
         for case, values in self.cases.items():
             if "seed" in values:
                 faults["cases", case, "seed"] = "is set for each flight; write `seed` and `seeds` at the top level"
-        if self.errors is not None and self.perception != "control":
-            faults["errors",] = "is for `perception: control`; delete one of them"
-        if self.perception == "control" and self.gated:
-            faults["gated",] = "is not for `perception: control`, by the law alone; delete it, or write `truth` there"
         refuse(self, faults)
         return self
 

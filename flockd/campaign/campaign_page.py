@@ -60,10 +60,8 @@ def _lead(results: Results) -> str:
     config, varied = results.plan.config, results.parameters
     base = {**results.plan.base, **config.fixed}
     lasts = "as long as its cell says" if "duration_s" in varied else f"{base.get('duration_s', 110.0):g} s"
-    how = {"truth": "on exact states", "sight": "by sight", "control": "at control level"}[config.perception]
-    if config.perception == "control":
-        how += ", without safety gates. No supervisor flies along: wind slows and holds nobody"
-    elif not config.gated:
+    how = {"truth": "on exact states", "sight": "by sight"}[config.perception]
+    if not config.gated:
         how += ", without safety gates"
     return f"Each flight lasts {lasts} {how}. " + (f"What varies: {', '.join(varied)}." if varied else "")
 

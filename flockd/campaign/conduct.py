@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
@@ -42,30 +41,26 @@ def conduct(plan: Plan, folder: CampaignFolder, engine: Engine, progress: Progre
                 engine.submit(waiting)
                 flying += 1
                 waiting = next(tasks, None)
-            for results in engine.wait():
-                flying -= 1
-                folder.add(results)
-                flown += len(results)
-                failed += sum(one.reason is not None for one in results)
-                progress(flown, total)
+            results = engine.wait()
+            folder.add(results)
+            flying, flown = flying - len(results), flown + len(results)
+            failed += sum(one.reason is not None for one in results)
+            progress(flown, total)
     finally:
         folder.write_table()
     return Conducted(flown, failed, len(done_before))
 
 
 def _tasks(plan: Plan, done: Collection[Run]) -> Iterator[Task]:
-    """Of the flights that are not done; those of one cell together, as many as fly at once."""
-    at_once = FLIGHT_KINDS[plan.config.perception].at_once
-    for cell in plan.cells:
-        missing = (run for number in range(plan.config.seeds) if (run := Run(cell.number, number)) not in done)
-        while runs := tuple(itertools.islice(missing, at_once)):
-            yield task_of(plan, runs)
+    """Of the flights that are not done."""
+    runs = (Run(cell.number, number) for cell in plan.cells for number in range(plan.config.seeds))
+    return (task_of(plan, run) for run in runs if run not in done)
 
 
-def task_of(plan: Plan, runs: tuple[Run, ...]) -> Task:
-    """The task that flies these flights of one cell."""
-    recipes = tuple(plan.recipe(plan.cells[run.cell], run.number) for run in runs)
-    return Task(plan.config.perception, plan.wanted, runs, recipes, plan.config.gated, plan.errors)
+def task_of(plan: Plan, run: Run) -> Task:
+    """The task that flies a flight."""
+    recipe = plan.recipe(plan.cells[run.cell], run.number)
+    return Task(plan.config.perception, plan.wanted, run, recipe, plan.config.gated)
 
 
 SHORT_STEPS = 3
@@ -106,10 +101,9 @@ def _whole_flight(plan: Plan, cell: int) -> float:
 
 def _trial(plan: Plan, cell: int, steps: int) -> float:
     """Seconds of processor time of a flight of so many steps."""
-    kind = FLIGHT_KINDS[plan.config.perception]
-    task = task_of(plan, tuple(Run(cell, number) for number in range(min(kind.at_once, plan.config.seeds))))
-    scenarios = [recipe.scenario() for recipe in task.recipes]
-    scenarios = [one.model_copy(update={"duration_s": steps * one.drone.step_s}) for one in scenarios]
+    task = task_of(plan, Run(cell, 0))
+    scenario = task.recipe.scenario()
+    scenario = scenario.model_copy(update={"duration_s": steps * scenario.drone.step_s})
     begin_s = time.process_time()
-    kind.fly(scenarios, task)
-    return (time.process_time() - begin_s) / len(scenarios)
+    FLIGHT_KINDS[task.kind].fly(scenario, task)
+    return time.process_time() - begin_s

@@ -24,7 +24,6 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 """Environment of a process that flies: a library that starts threads of its own takes the others' processors."""
 MAX_TRIES = 3
 """How often a flight may end the process that flies it."""
-Flown = list[FlownRun]
 
 
 class Engine(Protocol):
@@ -39,7 +38,7 @@ class Engine(Protocol):
         """Takes a task."""
         ...
 
-    def wait(self) -> Sequence[Flown]:
+    def wait(self) -> Sequence[FlownRun]:
         """What of the submitted is finished since the last call; waits for one at least, if there is one."""
         ...
 
@@ -54,11 +53,11 @@ class ProcessEngine:
     def __init__(self, workers: int) -> None:
         self._workers = workers
         self._executor = self._started()
-        self._flying: dict[Future[Flown], Task] = {}
+        self._flying: dict[Future[FlownRun], Task] = {}
         self._suspects: deque[Task] = deque()
         """Were in an executor that broke."""
-        self._tries: Counter[tuple[Run, ...]] = Counter()
-        """How often a task's flights were the only ones in an executor that broke."""
+        self._tries: Counter[Run] = Counter()
+        """How often a flight was the only one in an executor that broke."""
 
     def __enter__(self) -> Self:
         return self
@@ -80,9 +79,9 @@ class ProcessEngine:
             if not self._flying:
                 self._restarted()
 
-    def wait(self) -> list[Flown]:
+    def wait(self) -> list[FlownRun]:
         """What is finished; waits for one at least."""
-        finished: list[Flown] = []
+        finished: list[FlownRun] = []
         while not finished and (self._flying or self._suspects):
             if not self._flying:
                 self.submit(self._suspects.popleft())
@@ -98,7 +97,7 @@ class ProcessEngine:
                 finished += self._restarted()
         return finished
 
-    def _restarted(self) -> list[Flown]:
+    def _restarted(self) -> list[FlownRun]:
         """With a new executor. Gives the results of tasks that have ended too many processes."""
         wait(self._flying)  # all of them break
         lost = [task for future, task in self._flying.items() if future.exception() is not None]
@@ -107,8 +106,8 @@ class ProcessEngine:
         self._executor.shutdown(wait=True, kill_workers=True)
         self._executor = self._started()
         if len(lost) == 1:
-            self._tries[lost[0].runs] += 1
-            if self._tries[lost[0].runs] >= MAX_TRIES:
+            self._tries[lost[0].run] += 1
+            if self._tries[lost[0].run] >= MAX_TRIES:
                 return [*finished, _ended(lost[0])]
         self._suspects.extend(lost)
         return finished
@@ -161,9 +160,9 @@ class RayEngine:
         """Takes a task."""
         self._flying[self._fly.remote(task)] = task
 
-    def wait(self) -> list[Flown]:
+    def wait(self) -> list[FlownRun]:
         """What is finished; waits for one at least."""
-        finished: list[Flown] = []
+        finished: list[FlownRun] = []
         for reference in self._ray.wait(list(self._flying), num_returns=1)[0] if self._flying else ():
             task = self._flying.pop(reference)
             try:
@@ -180,10 +179,10 @@ ENGINES: dict[EngineName, Callable[[int, str | None], AbstractContextManager[Eng
 """From the number of workers, and the address of a cluster. Each raises ModuleNotFoundError without its extra."""
 
 
-def _ended(task: Task) -> Flown:
+def _ended(task: Task) -> FlownRun:
     """The result of a task whose process did not live to its end."""
     reason = f"the process that flew it ended, {MAX_TRIES} times; run it by itself to see why, and watch the memory"
-    return [FlownRun(run, reason=reason) for run in task.runs]
+    return FlownRun(task.run, reason=reason)
 
 
 def _begin(parent: int) -> None:

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 from scipy.special import ndtri, stdtrit
 
-from flockd.core.messages import FloatArray
+from flockd.core.messages import BoolArray, FloatArray
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.summary import TAIL_S, estimation_errors, objective_sums, summarise
 
@@ -65,16 +65,26 @@ class Measure:
     name: str
     unit: str
     better: Literal["higher", "lower"]
-    of: str | Callable[[FlightLog, dict[str, Any]], Any] | None
-    """Its keys in a flight's summary, or a function of log and summary; None: only control level has this figure."""
+    of: str | Callable[[FlightLog, dict[str, Any]], Any]
+    """Its keys in a flight's summary, or a function of log and summary."""
     is_share: bool = False
     """The figure is 0 or 1 for one flight, so that its mean is a share of flights."""
+
+
+def _nearest_at_the_end(log: FlightLog, _: dict[str, Any]) -> float:
+    places = log.position[_tail(log)][:, :, None, :2]
+    apart = np.linalg.norm(places - places.swapaxes(1, 2), axis=-1)
+    return float(np.where(apart > 0, apart, np.inf).min(axis=2).mean())
+
+
+def _tail(log: FlightLog) -> BoolArray:
+    return log.time_s > log.time_s[-1] + log.metadata.step_s - TAIL_S - 1e-6
 
 
 def _tail_mean(name: str) -> Callable[[FlightLog, dict[str, Any]], float]:
     def mean(log: FlightLog, _: dict[str, Any]) -> float:
         sums = objective_sums(log, log.position, log.velocity)[name]
-        return float(np.mean(sums[log.time_s > log.time_s[-1] + log.metadata.step_s - TAIL_S - 1e-6]))
+        return float(np.mean(sums[_tail(log)]))
 
     return mean
 
@@ -123,11 +133,7 @@ MEASURES: dict[str, Measure] = {
     "associated_error_p95_m": Measure("error of all tracks, 95th percentile", "m", "lower", _of_tracks("p95")),
     "associated_error_max_m": Measure("error of all tracks, largest", "m", "lower", _of_tracks("max")),
     "convergence_time_s": Measure("time from which the shape stays", "s", "lower", _convergence_time),
-    "min_distance_tail_m": Measure("nearest distance at the end", "m", "higher", None),
-    "min_level_distance_m": Measure("nearest level distance", "m", "higher", None),
-    "drone_collisions": Measure("collisions of drones", "", "lower", None),
-    "mean_nearest_tail_m": Measure("mean distance to the nearest at the end", "m", "higher", None),
-    "rms_radius_tail_m": Measure("radius of the flock at the end, RMS", "m", "lower", None),
+    "mean_nearest_tail_m": Measure("mean level distance to the nearest at the end", "m", "higher", _nearest_at_the_end),
     "drones_held": Measure("drones in Hold", "", "lower", "handed_over.drones"),
     "first_hold_s": Measure("time of the first Hold", "s", "higher", "handed_over.first_s"),
     "min_distance_flown_m": Measure(
@@ -156,6 +162,6 @@ def figures_of(log: FlightLog, wanted: Iterable[Figure]) -> Figures:
     return {figure: _value(MEASURES[figure].of, log, summary) for figure in wanted}
 
 
-def _value(of: str | Callable[[FlightLog, dict[str, Any]], Any] | None, log: FlightLog, summary: Any) -> float | None:
-    value = reduce(getitem, of.split("."), summary) if isinstance(of, str) else of and of(log, summary)
+def _value(of: str | Callable[[FlightLog, dict[str, Any]], Any], log: FlightLog, summary: Any) -> float | None:
+    value = reduce(getitem, of.split("."), summary) if isinstance(of, str) else of(log, summary)
     return None if value is None or not math.isfinite(value) else float(value)

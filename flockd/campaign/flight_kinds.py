@@ -7,8 +7,8 @@ import os
 import platform
 import time
 import traceback
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
 
@@ -19,64 +19,43 @@ from flockd.core.choices import SimulatedPerception
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.errors import FlockdError
 from flockd.flight.inference.hashes import model_hashes
-from flockd.sim.control_level import fly_flocks
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import ScenarioConfig
-from flockd.sim.scenario.perceived import PerceivedErrors
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is sent to where it is flown: flights of one cell."""
+    """What is sent to where it is flown: one flight."""
 
     kind: FlightKindName
     wanted: tuple[Figure, ...]
-    runs: tuple[Run, ...]
-    recipes: tuple[Recipe, ...]
-    """As many."""
+    run: Run
+    recipe: Recipe
     gated: bool = True
     """See `CampaignConfig.gated`."""
-    errors: PerceivedErrors | None = None
-    """Perception's, at control level; None: exact states."""
-
-
-Fly = Callable[[Sequence[ScenarioConfig], Task], Sequence[Figures]]
-"""Flies a task's scenarios, and gives the wanted figures of each."""
 
 
 @dataclass(frozen=True)
 class FlightKind:
     """A way to fly."""
 
-    fly: Fly
+    fly: Callable[[ScenarioConfig, Task], Figures]
+    """Flies a task's scenario, and gives the wanted figures."""
     perception: SimulatedPerception
     """With which `flockd sim` flies such a flight, for its full report."""
-    at_once: int = 1
-    """Flights of one task."""
 
 
-def _alone(perception: SimulatedPerception) -> Fly:
-    """Flies one after the other, each on this thread alone, without key frames."""
+def _alone(perception: SimulatedPerception) -> FlightKind:
+    """On this thread alone, without key frames."""
 
-    def flown(scenarios: Sequence[ScenarioConfig], task: Task) -> list[Figures]:
-        logs = (fly(one, perception=perception, gated=task.gated, processes=0, pictured=False).log for one in scenarios)
-        return [figures_of(log, task.wanted) for log in logs]
+    def flown(scenario: ScenarioConfig, task: Task) -> Figures:
+        log = fly(scenario, perception=perception, gated=task.gated, processes=0, pictured=False).log
+        return figures_of(log, task.wanted)
 
-    return flown
-
-
-def _at_control_level(scenarios: Sequence[ScenarioConfig], task: Task) -> list[Figures]:
-    """All at once, on this thread."""
-    flown = fly_flocks(scenarios, errors=task.errors)
-    found = ({figure: one.get(figure) for figure in task.wanted} for one in flown)
-    return [{figure: None if value is None else float(value) for figure, value in one.items()} for one in found]
+    return FlightKind(flown, perception)
 
 
-FLIGHT_KINDS: dict[FlightKindName, FlightKind] = {
-    "truth": FlightKind(_alone("truth"), "truth"),
-    "sight": FlightKind(_alone("learned"), "learned"),
-    "control": FlightKind(_at_control_level, "truth", at_once=16),
-}
+FLIGHT_KINDS: dict[FlightKindName, FlightKind] = {"truth": _alone("truth"), "sight": _alone("learned")}
 
 
 @dataclass(frozen=True)
@@ -92,33 +71,24 @@ class FlownRun:
     networks: str = ""
     """SHA-256 of each network, as `name=hash`."""
     wall_s: float = 0.0
-    """Its share of its task's time."""
     cpu_s: float = 0.0
     began: str = ""
     host: str = ""
     process: int = 0
 
 
-def fly_task(task: Task) -> list[FlownRun]:
-    """Flies them. A flight that cannot be flown has its reason; of several, each is then tried by itself."""
+def fly_task(task: Task) -> FlownRun:
+    """Flies it. A flight that cannot be flown has its reason."""
     wall_s, cpu_s, began = time.perf_counter(), time.process_time(), datetime.now(UTC).isoformat(timespec="seconds")
     try:
-        scenarios = [_single_threaded(recipe.scenario()) for recipe in task.recipes]
-        figures = FLIGHT_KINDS[task.kind].fly(scenarios, task)
-        networks = _networks(scenarios[0].drone.perception) if task.kind == "sight" else ""
+        scenario = _single_threaded(task.recipe.scenario())
+        figures = FLIGHT_KINDS[task.kind].fly(scenario, task)
+        networks = _networks(scenario.drone.perception) if task.kind == "sight" else ""
     except Exception as error:  # noqa: BLE001 - whatever it is, it is one flight's result
-        if len(task.runs) > 1:
-            singles = zip(task.runs, task.recipes, strict=True)
-            alone = [replace(task, runs=(run,), recipes=(recipe,)) for run, recipe in singles]
-            return [flown for one in alone for flown in fly_task(one)]
-        return [_failed(task.runs[0], error, began, time.perf_counter() - wall_s)]
+        return _failed(task.run, error, began, time.perf_counter() - wall_s)
     wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
-    share = len(task.runs)
-    hashes = (hashlib.sha256(scenario.model_dump_json().encode()).hexdigest() for scenario in scenarios)
-    return [
-        FlownRun(run, found, None, sha256, networks, wall_s / share, cpu_s / share, began, platform.node(), os.getpid())
-        for run, sha256, found in zip(task.runs, hashes, figures, strict=True)
-    ]
+    sha256 = hashlib.sha256(scenario.model_dump_json().encode()).hexdigest()
+    return FlownRun(task.run, figures, None, sha256, networks, wall_s, cpu_s, began, platform.node(), os.getpid())
 
 
 def _single_threaded(scenario: ScenarioConfig) -> ScenarioConfig:

@@ -15,7 +15,7 @@ from typing import Any, Self
 from pydantic import ValidationError
 
 from flockd import __version__
-from flockd.campaign.campaign_file import DRONES, MAX_CONTROL_DRONES, CampaignConfig, Variation, load_campaign
+from flockd.campaign.campaign_file import DRONES, CampaignConfig, Variation, load_campaign
 from flockd.campaign.figures import MEASURES, Figure
 from flockd.core.choices import ROLES
 from flockd.core.config.document import KeyPath, Place, key_text
@@ -25,7 +25,6 @@ from flockd.core.errors import ConfigError, ConfigProblem, UsageError
 from flockd.flight.inference.hashes import model_hashes
 from flockd.sim.flock.start import scattered, with_drones
 from flockd.sim.scenario import MAX_DRONES, ScenarioConfig, load_with_places
-from flockd.sim.scenario.perceived import PerceivedErrors, load_perceived_errors
 
 Values = dict[str, Any]
 
@@ -104,8 +103,6 @@ class Plan:
     config: CampaignConfig
     base: Mapping[str, Any]
     """The scenario's own values, its drone's within."""
-    errors: PerceivedErrors | None = None
-    """Perception's errors, at control level."""
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -121,8 +118,7 @@ class Plan:
             raise ConfigError([places["scenario",].problem(fault)])
         config = _anchored(config, path.parent)
         _check_keys(config, places)
-        errors = None if config.errors is None else load_perceived_errors(path.parent / config.errors)
-        plan = cls(config, scenario.model_dump(exclude_unset=True), errors)
+        plan = cls(config, scenario.model_dump(exclude_unset=True))
         _Check(places, of_scenario).cells(plan)
         _check_wind(config, places)
         if idle := _idle_seeds(plan):
@@ -137,19 +133,18 @@ class Plan:
         """The plan whose `to_json` these values were read from. Raises ValueError with the reason in a few words."""
         try:
             values = _with_tuples(values)
-            errors = values["errors"] and PerceivedErrors.model_validate(values["errors"])
             config = CampaignConfig.model_validate(values["campaign"])
             ScenarioConfig.model_validate(base := values["scenario"])
         except ValidationError as error:
             first = error.errors()[0]
-            raise ValueError(f"{key_text(first['loc'])}: {first['msg']}") from error
+            raise ValueError(f"{key_text(first['loc']) or 'campaign'}: {first['msg']}") from error
         except KeyError as error:
             raise ValueError(f"it has no {error}") from error
         except (TypeError, AttributeError) as error:
             raise ValueError("it holds something else") from error
         if (cells := _count_of_cells(config)) > MAX_CELLS:
             raise ValueError(f"it has {cells} cells")
-        return cls(config, base, errors)
+        return cls(config, base)
 
     def to_json(self) -> str:
         """All of it, and the version of flockd: what has the same text has the same flights.
@@ -157,8 +152,7 @@ class Plan:
         In the order of the file, by which the cells are numbered.
         """
         config = self.config.model_dump(mode="json")
-        errors = self.errors and self.errors.model_dump(mode="json")
-        values = {"flockd": __version__, "campaign": config, "scenario": self.base, "errors": errors}
+        values = {"flockd": __version__, "campaign": config, "scenario": self.base}
         return json.dumps(values, indent=1) + "\n"
 
     @property
@@ -199,7 +193,7 @@ def _count_of_cells(config: CampaignConfig) -> int:
 def _idle_seeds(plan: Plan) -> str | None:
     """What is wrong where all seeds of a cell fly the very same flight."""
     config = plan.config
-    if config.seeds == 1 or config.perception == "sight" or config.scatter_m or plan.errors:
+    if config.seeds == 1 or config.perception == "sight" or config.scatter_m:
         return None
     for cell in plan.cells:
         scenario = plan.recipe(cell, 0).scenario()
@@ -236,11 +230,10 @@ def _with_tuples(value: Any) -> Any:
 
 def _check_keys(config: CampaignConfig, places: Places) -> None:
     """Raises ConfigError for what needs no scenario: sizes of flocks, and how many cells there are."""
-    most = MAX_CONTROL_DRONES if config.perception == "control" else MAX_DRONES
     wrong = [
-        places[path].problem(f"must be whole numbers from 1 to {most}, as in `values: [5, 10]`")
+        places[path].problem(f"must be whole numbers from 1 to {MAX_DRONES}, as in `values: [5, 10]`")
         for path, values in _given(config, DRONES).items()
-        if not all(isinstance(n, int) and not isinstance(n, bool) and 1 <= n <= most for n in values)
+        if not all(isinstance(n, int) and not isinstance(n, bool) and 1 <= n <= MAX_DRONES for n in values)
     ]
     if (cells := _count_of_cells(config)) > MAX_CELLS:
         section = places.get(("vary",), places[()])

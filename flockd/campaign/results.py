@@ -219,7 +219,6 @@ def _values(results: Results) -> Mapping[str, Any]:
     scenario = ScenarioConfig.model_validate(merged(results.plan.base, fixed)).model_dump(mode="json")
     own: dict[str, Any] = {"perception": config.perception, "gated": config.gated, "scatter_m": config.scatter_m}
     own[DRONES] = config.fixed.get(DRONES)
-    own["errors"] = None if results.plan.errors is None else results.plan.errors.perception
     return {"campaign": own, **scenario}
 
 

@@ -128,7 +128,6 @@ def _rerun(args: argparse.Namespace) -> int:
     from flockd.cli.flight_summary import report_flight
     from flockd.review.report.flight_folder import prepare_folder
     from flockd.sim.flock.swarm import fly
-    from flockd.sim.scenario import MAX_DRONES
 
     folder, name = args.flight.parent, args.flight.name
     plan = load_plan(folder)
@@ -140,18 +139,14 @@ def _rerun(args: argparse.Namespace) -> int:
         last = Run(len(plan.cells) - 1, plan.config.seeds - 1)
         raise UsageError(f"{folder}: has no flight {name}; the last one is {last.name}")
     scenario = plan.recipe(plan.cells[run.cell], run.number).scenario()
-    if len(scenario.vehicles) > MAX_DRONES:
-        raise UsageError(f"{folder}: {name} has {len(scenario.vehicles)} drones; reports are of up to {MAX_DRONES}")
     directory = args.out or folder / RERUNS / name
     prepare_folder(directory, force=args.force)
-    if plan.errors is not None:
-        complain(f"{name} is flown again by exact states; the campaign has others at control level")
     with Phases() as phases:
         perception = FLIGHT_KINDS[plan.config.perception].perception
         flight = fly(
             scenario,
             perception=perception,
-            gated=plan.config.gated and plan.config.perception != "control",
+            gated=plan.config.gated,
             progress=phases.of("flying", "steps"),
             preparing=phases.of("loading networks and building the world", "parts"),
         )

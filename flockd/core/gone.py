@@ -79,6 +79,7 @@ KEYS: Mapping[str, str] = {
     "cameras.compression.h264_mbit_s": "write `jpeg_quality`; streams are no longer simulated",
     "detections.latency_s": "write `latency_s` beside `detections`",
     "desired": "write the section `mission`, with `kind: circle_then_tangent` for the same flight",
+    "errors": "delete it, and write the section `detections` in the scenario, for `perception: truth`",
     "faults.kind": "delete it: a camera that fails sends nothing but noise",
     "faults.sigma": "delete it: a camera that fails sends nothing but noise",
     "stop": "delete it: all `seeds` are flown",

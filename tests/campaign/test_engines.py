@@ -94,7 +94,7 @@ def test_a_flight_that_ends_its_process_is_a_row(tmp_path: Path) -> None:
         submit = engine._executor.submit  # type: ignore[attr-defined]
 
         def submitted(work: Callable[..., Any], task: Any) -> Any:
-            return submit(_end if task.runs == (Run(0, 1),) else work, task)
+            return submit(_end if task.run == Run(0, 1) else work, task)
 
         engine._executor.submit = submitted  # type: ignore[attr-defined]
         started = engine._started  # type: ignore[attr-defined]
@@ -108,9 +108,9 @@ def test_a_flight_that_ends_its_process_is_a_row(tmp_path: Path) -> None:
         engine._started = again  # type: ignore[attr-defined]
         results: list[FlownRun] = []
         for number in range(3):
-            engine.submit(task_of(plan, (Run(0, number),)))
+            engine.submit(task_of(plan, Run(0, number)))
         while len(results) < 3:
-            results += [one for flown_task in engine.wait() for one in flown_task]
+            results += engine.wait()
     reasons = {one.run: one.reason for one in results}
     assert reasons[Run(0, 0)] is reasons[Run(0, 2)] is None
     assert "the process that flew it ended, 3 times" in (reasons[Run(0, 1)] or "")

@@ -105,11 +105,11 @@ def test_another_campaign_is_refused(plan: Plan, tmp_path: Path) -> None:
     [
         (b"{garbled", "Expecting property name"),
         (b"[" * 100_000, "it is nested too deep"),
-        (b'{"campaign": ' + b"[" * 200 + b"]" * 200 + b"}", "it has no 'errors'"),
+        (b'{"campaign": ' + b"[" * 200 + b"]" * 200 + b"}", "campaign: "),
         (b"\xff{}", "can't decode byte"),
         (b"[]", "it holds something else"),
-        (b"{}", "it has no 'errors'"),
-        (b'{"errors": null, "campaign": {"campaign": "x"}, "scenario": {}}', "scenario: Field required"),
+        (b"{}", "it has no 'campaign'"),
+        (b'{"campaign": {"campaign": "x"}, "scenario": {}}', "scenario: Field required"),
         (None, "it is not an ordinary file"),
     ],
 )
@@ -182,19 +182,6 @@ def test_the_report_says_what_was_flown(plan: Plan, tmp_path: Path) -> None:
     mean = results.interval("min_distance_m", [1])
     assert mean is not None
     assert sorted(results.by_seed("min_distance_m", [0, 1])) == [0, 1, 2, 4, 5]
-
-
-@pytest.mark.parametrize(("perception", "says"), [("truth", False), ("control", True)])
-def test_the_report_says_where_no_supervisor_flew(perception: str, says: bool, tmp_path: Path) -> None:
-    text = (
-        f"perception: {perception}\nfixed: {{duration_s: 4.0}}\n"
-        "vary: {vehicle.gust_m_s: {values: [0.5]}}\nmeasure: [order_tail]\n"
-    )
-    flown(Plan.load(campaign_file(tmp_path, text)), tmp_path / "out", Shuffled(1))
-    write_campaign_page(Results.load(tmp_path / "out"), tmp_path / "page.html")
-    page = (tmp_path / "page.html").read_text(encoding="utf-8")
-    told = "at control level, without safety gates. No supervisor flies along: wind slows and holds nobody."
-    assert (told in page) is says
 
 
 def test_figures_stand_under_the_case_and_the_value_that_were_flown(tmp_path: Path) -> None:

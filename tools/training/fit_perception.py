@@ -1,4 +1,4 @@
-"""Fits the errors of perception, by distance, to flights by sight, for flights at control level.
+"""Fits the errors of perception, by distance, to flights by sight.
 
     python -m tools.training.fit_perception FLIGHT [FLIGHT ...] --out config/perceived/shipped_networks.yaml
 
@@ -22,7 +22,6 @@ from flockd.core.messages import BoolArray, FloatArray
 from flockd.review.flight_log.builder import match_neighbours
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.flight_folder import LOG_NAME
-from flockd.sim.scenario.perceived import load_perceived_errors
 
 EDGES_M = (0.0, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 9.5, 13.0, 17.0, 20.0)
 LEAST_SAMPLES = 30
@@ -87,7 +86,6 @@ def main() -> None:
     text = yaml.safe_dump(named, sort_keys=False, width=120)
     text += yaml.dump(fitted, Dumper=_Plain, sort_keys=False, width=120, default_flow_style=None)
     args.out.write_text(head + text, encoding="utf-8")
-    load_perceived_errors(args.out)
     print(f"{args.out}: {sum(int(s.counts.sum()) for s in samples)} neighbours in steps of {len(logs)} flights")
     print(text)
 
@@ -132,7 +130,7 @@ def _false_distances(log: FlightLog, step: int) -> FloatArray:
 
 
 def _hidden_shares(relative: FloatArray, distance: FloatArray) -> FloatArray:
-    """(S, N, N): of drone j as drone i sees it, about, as flights at control level take it."""
+    """(S, N, N): of drone j as drone i sees it, about: discs hide each other by how deep they reach into each other."""
     n = distance.shape[1]
     apart = np.where(distance > 0, distance, np.inf)
     rays, radius = relative / apart[..., None], DRONE_RADIUS_M / apart
