@@ -26,10 +26,10 @@ LINES = {
     "flockd/fleet": 2_230,
     "flockd/ground": 3_950,
     "flockd/review": 3_350,
-    "flockd/sim": 10_190,
-    "flockd/campaign": 1_700,
+    "flockd/sim": 9_530,
+    "flockd/campaign": 1_650,
     "flockd/cli": 3_680,
-    "tests": 40_060,
+    "tests": 39_610,
     "tools/checks": 2_320,
     "tools/docs": 940,
     "tools/measure": 1_540,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_690,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 368}
+FILES = {"flockd": 363}
 NUMBERS_OF_FLIGHT = 528
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02

@@ -78,7 +78,7 @@ def _nearest_at_the_end(log: FlightLog, _: dict[str, Any]) -> float:
 
 
 def _tail(log: FlightLog) -> BoolArray:
-    return log.time_s > log.time_s[-1] + log.metadata.step_s - TAIL_S - 1e-6
+    return np.asarray(log.time_s > log.time_s[-1] + log.metadata.step_s - TAIL_S - 1e-6)
 
 
 def _tail_mean(name: str) -> Callable[[FlightLog, dict[str, Any]], float]:

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flockd.campaign.conduct import Conducted, conduct
-from flockd.campaign.engine import FlownRun
 from flockd.campaign.figures import Figures
-from flockd.campaign.flight_kinds import Task, fly_task
+from flockd.campaign.flight_kinds import FlownRun, Task, fly_task
 from flockd.campaign.flight_plan import Plan
 from flockd.campaign.folder import CampaignFolder
 from flockd.core.data import data_path
