@@ -121,8 +121,8 @@ def _camera(args: argparse.Namespace) -> int:
 
 
 def _print_board(args: argparse.Namespace, board: BoardSpec) -> int:
+    from flockd.core.data import written_whole
     from flockd.ground.calibration.board import CalibrationError, board_pdf, page_mm
-    from flockd.onboard.recording.editing import written_whole
 
     file: Path = args.print_board
     refuse_overwriting(args, file)

@@ -1,7 +1,10 @@
-"""Finds the files that come with flockd: ready-made configurations, model files and systemd units."""
+"""Files: those that come with flockd, and how one is written."""
 
 from __future__ import annotations
 
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
@@ -18,3 +21,14 @@ def data_path(folder: Literal["config", "models", "systemd"]) -> Path:
         if candidate.is_dir():
             return candidate
     raise UnavailableError(f"the folder {folder} that comes with flockd is not there; install flockd again")
+
+
+@contextmanager
+def written_whole(target: Path) -> Iterator[Path]:
+    """A place to write to, which becomes the target when all is written and vanishes otherwise."""
+    draft = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
+    try:
+        yield draft
+        draft.replace(target)
+    finally:
+        draft.unlink(missing_ok=True)

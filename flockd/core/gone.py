@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 _CAMERAS = "change them in the file; `flockd cameras --write FILE` writes the sections for what is plugged in"
 _MISSION, _DEFAULTS = "write `--set 'mission={kind: KIND}'`", "leave it out: nothing is asked"
-_TABLES = "tables are CSV, which pandas, Polars and DuckDB read too; leave it out"
 _OPTIONS = (
     ("config new drone", "name", "write `--set name=NAME`"),
     ("config new drone", "number", "write `--set safety.first_flight_layer=N`"),
@@ -25,8 +24,6 @@ _OPTIONS = (
     ("doctor", "bench minutes", "run `flockd run` with propellers off, and watch `flockd status`"),
     ("doctor", "unit", "`systemd-analyze security flockd` judges the unit"),
     ("fleet", "recordings", "`flockd report FOLDER` writes a report of the recordings that plays them"),
-    ("record export", "ros2", "Foxglove opens the recording itself; record a flight's topics of `flockd ros`"),
-    ("record export", "format", _TABLES),
     ("replay", "trajectory", "`--json` gives the motion of each pair, to be put together"),
     ("replay", "calibration", "write the camera's matrix into the dataset's K.txt"),
     ("replay", "speed", "leave it out: a replay shows nothing while it runs"),
@@ -69,6 +66,9 @@ COMMANDS: Mapping[str, str] = {
     "flockd foxglove": "watch live with `flockd fleet`, or in ROS 2 with `flockd ros`; Foxglove opens recordings",
     "flockd models bench": "`flockd replay RECORDING --profile` times the stages with the networks of --config",
     "flockd calibrate drone": "measure from tip to tip, with propellers, and write `perception.drone_size_m`",
+    "flockd record cut": "`flockd replay RECORDING --start S --end S --out FILE` flies the stretch again",
+    "flockd record export": "read it in Python: docs/python.md has a program",
+    "flockd record recover": "leave it out: what is whole of a recording is read",
     "flockd view": "open the recording in Foxglove, or in Rerun after `rerun mcap convert RECORDING.mcap -o X.rrd`",
 }
 """By a command, or a command and its option, as they were written on the command line."""
@@ -82,6 +82,7 @@ KEYS: Mapping[str, str] = {
     "errors": "delete it, and write the section `detections` in the scenario, for `perception: truth`",
     "faults.kind": "delete it: a camera that fails sends nothing but noise",
     "faults.sigma": "delete it: a camera that fails sends nothing but noise",
+    "recording.file_mb": "delete it: a flight is one file",
     "stop": "delete it: all `seeds` are flown",
     "safety.degraded_gusts_m_s": "write `degraded_velocity_error_m_s`",
     "safety.gate.max_drift_m_s": "delete it: wind is left to the autopilot",

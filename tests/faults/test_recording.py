@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from flockd.cli import main
 from flockd.onboard.recording.reader import Recording
 from tests.faults.process import Process, flying
 from tests.faults.stories import Reacted
@@ -47,9 +46,7 @@ async def test_sigterm_in_flight(tmp_path: Path, reacted: Reacted) -> None:
 
 
 @pytest.mark.fault("killed-while-recording", within_s=2.0)
-async def test_it_is_killed_while_it_records(
-    tmp_path: Path, reacted: Reacted, capsys: pytest.CaptureFixture[str]
-) -> None:
+async def test_it_is_killed_while_it_records(tmp_path: Path, reacted: Reacted) -> None:
     """As for a loss of power: the autopilot's failsafe acts, and what was written can be read."""
     found: list[Path] = []
     async with flying(tmp_path) as process:
@@ -58,10 +55,8 @@ async def test_it_is_killed_while_it_records(
         await process.until_mode()
         reacted("killed-while-recording", time.monotonic() - killed_s)
         assert process.fake_autopilot.failsafe, "nobody was there to ask for Hold"
-    whole = tmp_path / "whole.mcap"
-    assert main(["record", "recover", str(found[0]), "--out", str(whole)]) == 0, capsys.readouterr()
-    recording = Recording(whole)
-    assert recording.contents.finished
+    recording = Recording(found[0])
+    assert not recording.contents.finished
     assert len(list(recording.steps())) > 3
 
 

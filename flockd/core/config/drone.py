@@ -34,17 +34,9 @@ class RecordingConfig(Section):
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 90
     queue_mb: Positive = 64.0
     """What waits for the disk; beyond it steps are dropped."""
-    file_mb: Positive = 2000.0
-    """Then the recording goes on in a new file."""
     quota_mb: Positive = 20000.0
-    """Limit for all recordings of the drone in one folder together: the oldest are deleted to make room. Those of the
-    flight before stay, and do not count."""
-
-    @model_validator(mode="after")
-    def _a_file_fits(self) -> Self:
-        if self.file_mb > self.quota_mb:
-            raise ValueError(f"a file of {self.file_mb:g} MB does not fit into {self.quota_mb:g} MB; raise quota_mb")
-        return self
+    """Limit for all recordings of the drone in one folder together: the oldest are deleted to make room. That of the
+    flight before stays, and does not count. A flight that alone is larger is recorded that far."""
 
 
 OperatorCommand = Literal["hold", "land", "resume", "goto", "velocity"]

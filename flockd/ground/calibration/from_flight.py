@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from flockd.core.config.rig import RigConfig
+from flockd.core.data import written_whole
 from flockd.core.messages import CameraDeviation, PilotOutput
 from flockd.flight.geometry import (
     RigidTransform,
@@ -23,7 +24,6 @@ from flockd.flight.geometry import (
 from flockd.ground.calibration.board import CalibrationError
 from flockd.ground.calibration.fragment import extrinsics_of, measured_today, rig_text
 from flockd.onboard.message_json import from_json, parsed
-from flockd.onboard.recording.editing import written_whole
 from flockd.onboard.recording.mcap_file import RecordingError, read_entries
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.streams import OUTPUT
@@ -36,7 +36,7 @@ of a focal length."""
 def found_rig(recording: Recording) -> tuple[CameraDeviation, ...]:
     """The last that the outputs of a recording say of its cameras; none: they say nothing. Raises RecordingError."""
     last: tuple[CameraDeviation, ...] = ()
-    for entry in read_entries(*recording.contents.paths):
+    for entry in read_entries(recording.path):
         if entry.stream.topic == OUTPUT.topic:
             try:
                 last = from_json(PilotOutput, parsed(entry.data)).rig or last

@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 
 from flockd.core.choices import LENS_MODELS, LensModel
 from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, MeasurementConfig
+from flockd.core.data import written_whole
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry import Camera, PinholeCamera, RigidTransform, WideAngleCamera, rotation_from_vector
 from flockd.ground.calibration.board import (
@@ -27,7 +28,6 @@ from flockd.ground.calibration.board import (
 from flockd.ground.calibration.fragment import rig_text
 from flockd.ground.calibration.image_sources import ImageStream
 from flockd.ground.calibration.views import Collector, View
-from flockd.onboard.recording.editing import written_whole
 
 MIN_VIEWS = 6
 _COEFFICIENTS = {"pinhole": 5, "wide_angle": 4}

@@ -177,8 +177,7 @@ def _gaps(blind: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> list[str]:
 def check_rig(config: DroneConfig, folder: Path | None, state_folder: Path = STATE_FOLDER) -> Iterator[Finding]:
     """Of this drone's newest recording in the folder, named as for `check_disk`."""
     files = [path for path in (folder or state_folder).glob(f"{config.name}-*.mcap") if not path.is_symlink()]
-    first_parts = [path for path in files if path.is_file() and path.name.count(".") == 1]
-    newest = max(first_parts, key=lambda path: path.stat().st_mtime, default=None)
+    newest = max(filter(Path.is_file, files), key=lambda path: path.stat().st_mtime, default=None)
     if newest is None:
         yield passed("rig", "no flight of this drone is recorded yet that its cameras could be compared with")
         return
@@ -186,7 +185,7 @@ def check_rig(config: DroneConfig, folder: Path | None, state_folder: Path = STA
         recording = Recording(newest)
         found = found_rig(recording)
     except (FlockdError, OSError) as error:
-        yield warned("rig", f"its last flight could not be read: {error}", "delete it, or recover it: flockd record")
+        yield warned("rig", f"its last flight could not be read: {error}", "delete it")
         return
     if recording.config.rig != config.rig:
         yield passed("rig", f"is another than in the last flight, {newest.name}, which says nothing of it")

@@ -18,6 +18,8 @@ STATE_FOLDER = Path("/var/lib/flockd")
 MB = 1e6
 NEEDS_MB = 350.0
 """Resident, with the shipped networks and four cameras, beside what waits for the disk."""
+LEAST_MB = 2000.0
+"""For one flight: five minutes of four cameras as PNG."""
 SPARE_MB = 200.0
 SPARE_K = 10.0
 THERMAL = Path("/sys/class/thermal")
@@ -52,11 +54,10 @@ def check_disk(config: DroneConfig, folder: Path | None, state_folder: Path = ST
 
 def judge_room(config: DroneConfig, folder: Path, free_mb: float, own_mb: float) -> Finding:
     """The quota counts what this drone has recorded there before, and deletes the oldest of it."""
-    file_mb, quota_mb, room_mb = config.recording.file_mb, config.recording.quota_mb, free_mb + own_mb
+    quota_mb, room_mb = config.recording.quota_mb, free_mb + own_mb
     measured = f"{free_mb / 1e3:.1f} GB free in {folder}, {own_mb / 1e3:.1f} GB are this drone's recordings"
-    if room_mb < file_mb:
-        fix = f"make room, or write recording.file_mb and quota_mb: {0.8 * room_mb:.0f}"
-        return failed("disk", f"{measured}: not enough for a file of {file_mb / 1e3:g} GB (file_mb)", fix)
+    if room_mb < LEAST_MB:
+        return failed("disk", f"{measured}: not enough for a flight of {LEAST_MB / 1e3:g} GB", "make room")
     if room_mb < quota_mb:
         fix = f"make room, or write recording.quota_mb: {0.9 * room_mb:.0f}"
         return warned("disk", f"{measured}: not enough for the quota of {quota_mb / 1e3:g} GB", fix)

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from flockd.core.data import written_whole
 from flockd.onboard.message_json import Json
-from flockd.onboard.recording.editing import written_whole
 from flockd.onboard.recording.mcap_file import RecordingError
 
 Outputs = Mapping[int, Mapping[str, Any]]

@@ -187,9 +187,9 @@ def read_records(path: Path) -> Iterator[Record | Damage]:
         yield from _Reader(file).records()
 
 
-def read_entries(*paths: Path) -> Iterator[Entry]:
-    """The messages alone that can be read, of one file after the other."""
-    return (record for path in paths for record in read_records(path) if isinstance(record, Entry))
+def read_entries(path: Path) -> Iterator[Entry]:
+    """The messages alone that can be read."""
+    return (record for record in read_records(path) if isinstance(record, Entry))
 
 
 class _Reader:

@@ -40,17 +40,12 @@ from flockd.onboard.recording.streams import (
     MODELS_NOTE,
     ORDER,
     OUTPUT,
-    PILOT_BEGAN,
     TRUTH,
     VEHICLE,
     StepFrames,
     is_image,
-    part_path,
 )
 from flockd.onboard.recording.truth import Truth
-
-_WHAT_TO_DO = "`flockd record recover` makes a recording without it"
-_CALIBRATION_SUFFIX = "/calibration"
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,23 +84,22 @@ class StreamFacts:
 
 @dataclass
 class Contents:
-    """What one pass over all of a recording's files found."""
+    """What one pass over a recording found."""
 
     flight: Mapping[str, str]
     models: Mapping[str, str]
     configuration: bytes
-    paths: tuple[Path, ...] = ()
     streams: dict[str, StreamFacts] = field(default_factory=dict)
     steps: list[tuple[int, float]] = field(default_factory=list)
     """Number and time of each step."""
     lost: int = 0
     """Steps and messages that the recorder dropped, by its own count."""
-    damages: list[tuple[Path, Damage]] = field(default_factory=list)
+    damages: list[Damage] = field(default_factory=list)
 
     @property
     def finished(self) -> bool:
         """Whether its writer came to the end of it."""
-        return not any(damage.at_end for _, damage in self.damages)
+        return not any(damage.at_end for damage in self.damages)
 
     @property
     def gaps(self) -> tuple[tuple[int, int], ...]:
@@ -115,10 +109,10 @@ class Contents:
 
 
 class Recording:
-    """One drone's recording with all its files, checked as a whole when it is opened."""
+    """One drone's recording, checked as a whole when it is opened."""
 
     def __init__(self, path: Path | str, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
-        """Opens the file and those that go on where it ends.
+        """Opens the file.
 
         Raises RecordingError for what is not a recording of flockd, or too damaged to replay, and OSError.
         `progress` is called with (bytes checked, bytes in all).
@@ -153,16 +147,16 @@ class Recording:
     def pilot_began_s(self) -> float | None:
         """When the pilot took its first step, from which it counts its time; None where that is not known."""
         number, time_s = self.contents.steps[0]
-        known = self.contents.flight.get(PILOT_BEGAN)
-        return time_s if number == 0 else None if known is None else float(known)
+        return time_s if number == 0 else None
 
     def steps(self, start_s: float = -np.inf, end_s: float = np.inf) -> Iterator[RecordedStep]:
         """The steps at these times (of the recording's clock) in the order in which they were flown.
 
-        Raises RecordingError where an image or a message is damaged.
+        Without those that lost a message where the file is damaged (`Contents.damages`) or ends. Raises RecordingError
+        for a message that cannot be read though its checksum is right.
         """
         number, messages = -1, dict[str, bytes]()
-        for entry in read_entries(*self.contents.paths):
+        for entry in read_entries(self.path):
             if makes_steps(entry.stream.topic):
                 if entry.sequence != number:
                     yield from self._built(number, messages, start_s, end_s)
@@ -175,8 +169,6 @@ class Recording:
     ) -> Iterator[RecordedStep]:
         if FRAMES.topic not in messages:
             return
-        if VEHICLE.topic not in messages and not self.contents.finished and number == self.contents.steps[-1][0]:
-            return  # killed within this step
         try:
             listed: StepFrames = from_json(StepFrames, parsed(messages[FRAMES.topic]))
             if not start_s <= listed.time_s <= end_s:
@@ -190,9 +182,11 @@ class Recording:
                 image = decoded_image(messages[foxglove.image_stream(entry.camera).topic])
                 frames[entry.camera] = Frame(entry.camera, image, entry.time_s, entry.sequence)
         except KeyError as error:
-            raise RecordingError(f"{self.path}: step {number} lost its message {error}; {_WHAT_TO_DO}") from error
+            if self.contents.damages:
+                return
+            raise RecordingError(f"{self.path}: step {number} lost its message {error}; use another copy") from error
         except (ValueError, RecordingError) as error:
-            raise RecordingError(f"{self.path}: step {number} cannot be read ({error}); {_WHAT_TO_DO}") from error
+            raise RecordingError(f"{self.path}: step {number} cannot be read ({error}); use another copy") from error
         yield RecordedStep(number, FrameSet(listed.time_s, frames), vehicle, output, truth, order)
 
 
@@ -231,37 +225,19 @@ def check(path: Path) -> None:
         raise RecordingError(f"{path}: {fault}")
 
 
-def _survey(first: Path, progress: Callable[[int, int], None]) -> Contents:
-    check(first)
-    flight, models, configuration = head_of(first)
+def _survey(path: Path, progress: Callable[[int, int], None]) -> Contents:
+    check(path)
+    flight, models, configuration = head_of(path)
     found = Contents(flight.facts, models.facts, configuration.data)
-    found.paths = tuple(_all_parts(first, flight))
-    total, done = sum(path.stat().st_size for path in found.paths), 0
-    for path in found.paths:
-        for record in read_records(path):
-            if isinstance(record, Entry):
-                done += len(record.data)
-                progress(done, total)
-            _note(found, path, record)
+    total, done = path.stat().st_size, 0
+    for record in read_records(path):
+        if isinstance(record, Entry):
+            done += len(record.data)
+            progress(done, total)
+        _note(found, path, record)
     if not found.steps:
-        raise RecordingError(f"{first}: holds no step of a flight; record one that flies")
+        raise RecordingError(f"{path}: holds no step of a flight; record one that flies")
     return found
-
-
-def _all_parts(first: Path, flight: Note) -> Iterator[Path]:
-    """The file, and those after it that say they are of the same recording."""
-    yield first
-    number = _count(first, flight.facts, "part")
-    start = first if number == 0 else first.with_name(first.name.replace(f".{number}.mcap", ".mcap"))
-    while (path := part_path(start, number + 1)).is_file() and path != first:
-        number += 1
-        try:
-            head = head_of(path)[0]
-        except RecordingError:  # killed in the moment in which it was begun, or left over from another flight
-            return
-        if head.facts.get("recording") != flight.facts.get("recording"):
-            return
-        yield path
 
 
 def _note(found: Contents, path: Path, record: Record | Damage) -> None:
@@ -275,15 +251,14 @@ def _note(found: Contents, path: Path, record: Record | Damage) -> None:
             if stream.topic == FRAMES.topic:
                 found.steps.append((sequence, _time_of(path, data)))
         case Note(name, facts_of_end) if name == END_NOTE:
-            found.lost = _count(path, facts_of_end, "lost")
+            found.lost = _count(path, facts_of_end.get("lost", "0"))
         case Damage():
-            found.damages.append((path, record))
+            found.damages.append(record)
 
 
-def _count(path: Path, facts: Mapping[str, str], name: str) -> int:
-    text = facts.get(name, "0")
+def _count(path: Path, text: str) -> int:
     if not (text.isascii() and text.isdecimal() and len(text) < 10):
-        raise RecordingError(f"{path}: says {name} {text[:20]!r}, which is no number; use another copy")
+        raise RecordingError(f"{path}: says lost {text[:20]!r}, which is no number; use another copy")
     return int(text)
 
 
@@ -299,9 +274,7 @@ def _time_of(path: Path, data: bytes) -> float:
 
 def _config(path: Path, contents: Contents) -> DroneConfig:
     try:
-        return DroneConfig.model_validate_json(json.dumps(_without_gone(json.loads(contents.configuration))))
-    except json.JSONDecodeError as error:
-        raise RecordingError(f"{path}: the configuration in it is no JSON ({error}); use another copy") from error
+        return DroneConfig.model_validate_json(json.dumps(_without_gone(parsed(contents.configuration))))
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "the whole"
@@ -310,6 +283,8 @@ def _config(path: Path, contents: Contents) -> DroneConfig:
             f"{path}: the configuration in it is not one of this flockd ({key}: {first['msg']}); "
             f"use the flockd that wrote it, {version}"
         ) from error
+    except ValueError as error:
+        raise RecordingError(f"{path}: the configuration in it is no JSON ({error}); use another copy") from error
 
 
 def _without_gone(values: Any, at: str = "") -> Any:
@@ -329,11 +304,6 @@ def _learned(path: Path, flight: Mapping[str, str]) -> LearnedSize | None:
     if not all(0 < number < math.inf for number in (learned.size_m, learned.sigma, learned.looks_m)):
         raise RecordingError(f"{path}: its {LEARNED_SIZE} is no size; use another copy")
     return learned
-
-
-def is_calibration(topic: str) -> bool:
-    """Whether this stream says once what a camera is."""
-    return topic.endswith(_CALIBRATION_SUFFIX)
 
 
 def makes_steps(topic: str) -> bool:
@@ -360,8 +330,7 @@ def recording_info(recording: Recording) -> dict[str, Any]:
     contents = recording.contents
     return {
         **contents.flight,
-        "files": [str(path) for path in contents.paths],
-        "bytes": sum(path.stat().st_size for path in contents.paths),
+        "bytes": recording.path.stat().st_size,
         "finished": contents.finished,
         "steps": len(contents.steps),
         "start_s": recording.start_s,
@@ -369,9 +338,7 @@ def recording_info(recording: Recording) -> dict[str, Any]:
         "lost": contents.lost,
         "models": dict(contents.models),
         "gaps": [{"first_step": first, "last_step": last} for first, last in contents.gaps],
-        "damages": [
-            {"file": str(path), "byte": damage.offset, "reason": damage.reason} for path, damage in contents.damages
-        ],
+        "damages": [{"byte": damage.offset, "reason": damage.reason} for damage in contents.damages],
         "streams": [
             {
                 "topic": stream.topic,

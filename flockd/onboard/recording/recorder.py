@@ -47,7 +47,6 @@ from flockd.onboard.recording.streams import (
     FrameEntry,
     StepFrames,
     nanoseconds,
-    part_path,
 )
 from flockd.onboard.recording.truth import Truth
 
@@ -75,7 +74,7 @@ class _Step:
 
 
 class Recorder:
-    """Writes `PATH`, and when that is full `PATH` with a number before its suffix, each file complete in itself.
+    """Writes the file of one flight.
 
     `step` and `publish` return at once, whatever the disk does. What does not fit into the queue is dropped, counted
     and reported once; a disk that fails or is full ends the recording alone. Times are those of the messages.
@@ -96,7 +95,7 @@ class Recorder:
         """Begins a new recording over whatever `path` held.
 
         Args:
-            path: of the first file; its folder must exist.
+            path: of the file; its folder must exist.
             drone: whose flight.
             config: what its pilot flies with; goes into each file.
             settings: how to record; by default the configuration's own.
@@ -117,7 +116,7 @@ class Recorder:
             Note(MODELS_NOTE, models or {}),
             Inclosure(CONFIGURATION, "application/json", json.dumps(shown, indent=1, ensure_ascii=False).encode()),
         )
-        self._parts = _Parts(path, flight, head, config.rig, self._settings, self._tell)
+        self._file = _File(path, flight, head, config.rig, self._settings, self._tell)
         self._track = _Track(config.rig)
         self._queue: queue.SimpleQueue[tuple[int, Callable[[], None]] | None] = queue.SimpleQueue()
         """Bytes held, and what writes them; None at the end."""
@@ -173,9 +172,7 @@ class Recorder:
         self._queue.put(None)
         self._thread.join(timeout_s)
         if self._thread.is_alive():
-            self._on_event(
-                f"recording {self._parts.path}: the disk was too slow to end it; `flockd record recover` repairs it"
-            )
+            self._on_event(f"recording {self._file.path}: the disk was too slow to end it; it can be read up to there")
 
     def __enter__(self) -> Self:
         return self
@@ -208,25 +205,25 @@ class Recorder:
         """The thread."""
         try:
             self._write_queue()
-            self._parts.finish({"steps": str(self._steps), "lost": str(self.lost)})
+            self._file.finish({"steps": str(self._steps), "lost": str(self.lost)})
         except OSError as error:
             self._fail((error.strerror or str(error)).lower())
         except Exception as error:  # noqa: BLE001 - no fault of the recorder may end a flight, or hide
             self._fail(repr(error))
 
     def _fail(self, reason: str) -> None:
-        sentence = f"recording {self._parts.path}: {reason}; the recording ends here and the flight goes on"
+        sentence = f"recording {self._file.path}: {reason}; the recording ends here and the flight goes on"
         with self._lock:
             self.failure = sentence
             self._held_bytes = 0
             while not self._queue.empty():  # the thread that takes these has failed
                 self.lost += self._queue.get() is not None
             self._lock.notify_all()
-        self._parts.abandon()
+        self._file.abandon()
         self._on_event(sentence)
 
     def _write_queue(self) -> None:
-        self._parts.begin()
+        self._file.begin()
         flushed_s = time.monotonic()
         closing = unflushed = False
         while not (closing and self._queue.empty()):  # events of closing belong into the file too
@@ -240,10 +237,8 @@ class Recorder:
                     unflushed = True
                     del item, write  # or the last frames would stay in memory until the next
             if unflushed and (size == 0 or time.monotonic() - flushed_s >= FLUSH_EVERY_S):
-                self._parts.flush()
+                self._file.flush()
                 flushed_s, unflushed = time.monotonic(), False
-            if size:
-                self._parts.turn_page()
             with self._lock:
                 self._held_bytes -= size
                 if self._held_bytes == 0:
@@ -252,9 +247,9 @@ class Recorder:
     def _write_step(self, step: _Step) -> None:
         self._time_s = step.frames.time_s
         for entry in _step_entries(step, self._settings, self._track, self._tell):
-            self._parts.write(entry)
+            self._file.write(entry)
         for reason in step.output.reasons:
-            self._parts.write(_log_entry(step.frames.time_s, "WARNING", reason.text))
+            self._file.write(_log_entry(step.frames.time_s, "WARNING", reason.text))
         early, self._early = self._early, []
         for topic, message in early:  # from before there was a time
             self._write_message(topic, message)
@@ -265,9 +260,9 @@ class Recorder:
             self._early.append((topic, message))
             return
         time_s = float(stamp)
-        self._parts.write(_json_entry(TABLE[topic], time_s, 0, {"time_s": time_s, **message}))
+        self._file.write(_json_entry(TABLE[topic], time_s, 0, {"time_s": time_s, **message}))
         if topic == "events":
-            self._parts.write(_log_entry(time_s, "INFO", str(message.get("event", ""))))
+            self._file.write(_log_entry(time_s, "INFO", str(message.get("event", ""))))
 
 
 class _Track:
@@ -291,8 +286,8 @@ class _Track:
             yield Entry(foxglove.ODOMETRY, stamp, step.number, path)
 
 
-class _Parts:
-    """The files of one recording: each begins with all that is needed to understand it alone."""
+class _File:
+    """The file of one recording: it begins with all that is needed to understand it alone."""
 
     def __init__(
         self,
@@ -303,28 +298,21 @@ class _Parts:
         settings: RecordingConfig,
         tell: Callable[[str], None],
     ) -> None:
-        self._first = path
-        self._flight = {"format": FORMAT, "recording": uuid.uuid4().hex, **flight}
-        self._head, self._rig, self._settings, self._tell = head, rig, settings, tell
-        self._number = 0
-        self._skipped: set[Path] = set()
+        self.path, self._flight, self._head, self._rig, self._tell = path, flight, head, rig, tell
+        self._quota_mb = settings.quota_mb
         self._file: McapFile | None = None
+        self._earlier: dict[Path, int] = {}
+        """Bytes of what may be deleted, the oldest first."""
         self._calibrated = False
-
-    @property
-    def path(self) -> Path:
-        """Path of the file that is being written."""
-        return part_path(self._first, self._number)
 
     def begin(self) -> None:
-        """Starts the next file."""
-        self._make_room()
+        """Starts the file."""
+        self._earlier = self._deletable()
         self._file = McapFile(self.path)
-        self._calibrated = False
-        self._file.write(Note(FLIGHT_NOTE, {**self._flight, "part": str(self._number)}))
+        self._file.write(Note(FLIGHT_NOTE, {"format": FORMAT, "recording": uuid.uuid4().hex, **self._flight}))
         for record in self._head:
             self._file.write(record)
-        self._file.flush()
+        self.flush()
 
     def write(self, entry: Entry) -> None:
         """Adds a message, before the first one what is known of the cameras."""
@@ -337,64 +325,46 @@ class _Parts:
         self._file.write(entry)
 
     def flush(self) -> None:
-        """Makes safe what was written."""
+        """Makes safe what was written, within the quota: as the file grows, earlier ones go. Raises OSError."""
         assert self._file is not None
         self._file.flush()
-
-    def turn_page(self) -> None:
-        """Goes on in the next file where this one is full."""
-        assert self._file is not None
-        if self._file.size >= self._settings.file_mb * _MB:
-            self._file.finish()
-            self._number += 1
-            self.begin()
+        while self._file.size + sum(self._earlier.values()) > self._quota_mb * _MB:
+            if not self._earlier:
+                raise OSError("recording.quota_mb is reached")
+            path = next(iter(self._earlier))
+            del self._earlier[path]
+            path.unlink(missing_ok=True)
+            self._tell(f"recording: {path} was deleted, as all recordings may take {self._quota_mb:g} MB")
 
     def finish(self, end: Mapping[str, str]) -> None:
-        """Ends the last file."""
+        """Ends the file."""
         assert self._file is not None
         self._file.write(Note(END_NOTE, end))
         self._file.finish()
 
     def abandon(self) -> None:
-        """Leaves the last file as it is."""
+        """Leaves the file as it is."""
         if self._file is not None:
             self._file.abandon()
 
-    def _make_room(self) -> None:
-        """Deletes this drone's oldest recordings in the folder until a whole file more stays within the quota.
+    def _deletable(self) -> dict[Path, int]:
+        """Only what a recorder wrote: what someone replayed stays and does not count. So does the flight before this
+        one: somebody may want to know how it ended."""
+        others = [path for path in self.path.parent.glob("*.mcap") if path != self.path and self._is_ours(path)]
+        sizes = sorted((path.stat().st_mtime, path, path.stat().st_size) for path in others)
+        return {path: size for _, path, size in sizes[:-1]}
 
-        Only what a recorder wrote: what someone cut or recovered from it stays and does not count. So does the flight
-        before this one: somebody may want to know how it ended.
-        """
-        flights = {
-            path: facts.get("recording")
-            for path in self._first.parent.glob("*.mcap")
-            if path != self.path and (facts := self._written_by_a_recorder(path))
-        }
-        others = sorted(flights, key=lambda path: path.stat().st_mtime)
-        earlier = [flights[path] for path in others if flights[path] != self._flight["recording"]]
-        others = [path for path in others if flights[path] not in earlier[-1:]]
-        room = (self._settings.quota_mb - self._settings.file_mb) * _MB - sum(path.stat().st_size for path in others)
-        for path in others:
-            if room >= 0:
-                return
-            room += path.stat().st_size
-            path.unlink()
-            self._tell(f"recording: {path} was deleted, as all recordings may take {self._settings.quota_mb:g} MB")
-
-    def _written_by_a_recorder(self, path: Path) -> Mapping[str, str] | None:
-        """What is known of a file that a recorder of this drone wrote; what is no readable file is reported once."""
+    def _is_ours(self, path: Path) -> bool:
+        """Whether a recorder of this drone wrote the file; what is no readable file is reported."""
         try:
             facts = head_of(path)[0].facts if path.is_file() else None  # a pipe would wait for ever to be opened
             why = "is not a file"
         except (RecordingError, OSError) as error:
             facts, why = None, str(error).removeprefix(f"{path}: ")
         if facts is None:
-            if path not in self._skipped:
-                self._skipped.add(path)
-                self._tell(f"recording: {path} was skipped and does not count for the quota: it {why}")
-            return None
-        return facts if facts.get("drone") == self._flight["drone"] and not facts.keys() & EDITED else None
+            self._tell(f"recording: {path} was skipped and does not count for the quota: it {why}")
+            return False
+        return facts.get("drone") == self._flight["drone"] and not facts.keys() & EDITED
 
 
 def _step_entries(

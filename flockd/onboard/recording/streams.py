@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from flockd.core.messages import MissionOrder, PilotOutput, VehicleState
@@ -18,10 +17,9 @@ FORMAT = "1"
 FLIGHT_NOTE = "flockd"
 MODELS_NOTE = "models"
 END_NOTE = "end"
-RECOVERED, CUT, REPLAYED = EDITED = ("recovered_from", "cut_from", "replayed_from")
-"""Facts of a recording that was made of another."""
-PILOT_BEGAN = "pilot_began_s"
-"""A fact of what was cut or recovered: when the pilot took its first step, from which it counts its time."""
+REPLAYED = "replayed_from"
+EDITED = (REPLAYED, "recovered_from", "cut_from")
+"""Facts of a recording that was made of another; the last two of earlier versions."""
 LEARNED_SIZE = "learned_size"
 """A fact of a flight: what its pilot began with of the others' size, as JSON."""
 CONFIGURATION = "configuration.json"
@@ -65,11 +63,6 @@ TABLE = {key: _json_stream(f"/{key}", topic.type) for key, topic in TOPICS.items
 def is_image(topic: str) -> bool:
     """Whether this stream holds a camera's images."""
     return topic.endswith("/image")
-
-
-def part_path(first: Path, number: int) -> Path:
-    """Path of the recording's file with this number; the first is number 0."""
-    return first.with_name(f"{first.stem}.{number}{first.suffix}") if number else first
 
 
 def nanoseconds(time_s: float) -> int:

@@ -11,13 +11,13 @@ from typing import Any
 
 from flockd.core.config import DroneConfig
 from flockd.core.config.drone import RecordingConfig
+from flockd.core.data import written_whole
 from flockd.flight.inference.hashes import model_hashes
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon import load_side_by_side
 from flockd.onboard.message_json import to_json
 from flockd.onboard.recording import Recorder, RecordingError
 from flockd.onboard.recording.difference import Comparison, compare
-from flockd.onboard.recording.editing import written_whole
 from flockd.onboard.recording.reader import RecordedStep, Recording
 from flockd.onboard.recording.streams import REPLAYED
 from flockd.review.flight_log.log import spread
@@ -136,7 +136,7 @@ def _diff(comparison: Comparison) -> dict[str, Any]:
 @contextmanager
 def _recording_to(out: Path, recording: Recording, config: DroneConfig) -> Iterator[Recorder]:
     """A recorder whose file exists once all is written, and not otherwise: one file, without loss or quota."""
-    settings = RecordingConfig(images="png", file_mb=1e9, quota_mb=1e12)
+    settings = RecordingConfig(images="png", quota_mb=1e12)
     flown = recording.contents.flight
     facts = {**{name: flown[name] for name in ("scenario", "seed") if name in flown}, REPLAYED: recording.path.name}
     models = model_hashes(config.perception)
@@ -166,9 +166,9 @@ def _timed(steps: Iterator[RecordedStep]) -> Iterator[tuple[RecordedStep, float]
 def damage_warnings(recording: Recording) -> Iterator[str]:
     """One sentence for each damaged place and each gap of a recording."""
     contents = recording.contents
-    for path, damage in contents.damages:
+    for damage in contents.damages:
         where = "ends early" if damage.at_end else "is damaged"
-        yield f"{path}: {where} at byte {damage.offset}: {damage.reason}"
+        yield f"{recording.path}: {where} at byte {damage.offset}: {damage.reason}"
     for first, last in contents.gaps:
         yield f"{recording.path}: steps {first} to {last} are missing, so that later outputs may differ"
 

@@ -23,7 +23,7 @@ READY, STATUS = "READY=1", "STATUS="
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 SMALL = {"MALLOC_ARENA_MAX": "2"}
 """As systemd's unit sets it: fewer, fuller pools of memory."""
-RECORDING = RecordingConfig(images="jpeg", jpeg_quality=80, file_mb=20000.0, quota_mb=100000.0)
+RECORDING = RecordingConfig(images="jpeg", jpeg_quality=80, quota_mb=100000.0)
 """One file for a flight, which costs the daemon little."""
 _RUN = "from flockd.cli import program; program()"
 

@@ -148,7 +148,8 @@ def _add_missions(
 
 
 def _entries(recordings: Path, drone: str, topic: str) -> Iterator[Entry]:
-    return (one for one in read_entries(*sorted(recordings.glob(f"{drone}-*.mcap"))) if one.stream.topic == topic)
+    files = sorted(recordings.glob(f"{drone}-*.mcap"))
+    return (one for file in files for one in read_entries(file) if one.stream.topic == topic)
 
 
 def were_ordered(recordings: Path, drone: str) -> bool:

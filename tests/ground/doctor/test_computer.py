@@ -25,7 +25,7 @@ QUADROTOR = load_drone(data_path("config") / "quadrotor.yaml")
 
 
 def test_a_folder_for_recordings_is_written_and_left_as_it_was(tmp_path: Path) -> None:
-    (finding,) = check_disk(make.changed(QUADROTOR, recording__file_mb=1.0, recording__quota_mb=1.0), tmp_path)
+    (finding,) = check_disk(make.changed(QUADROTOR, recording__quota_mb=1.0), tmp_path)
     assert (finding.level, list(tmp_path.iterdir())) == (Level.PASS, [])
     (finding,) = check_disk(QUADROTOR, tmp_path / "none")
     assert (finding.level, finding.about) == (Level.FAILURE, "disk")
@@ -43,11 +43,11 @@ def test_a_folder_for_recordings_is_written_and_left_as_it_was(tmp_path: Path) -
         (21_000.0, 0.0, Level.PASS),
         (5_000.0, 16_000.0, Level.PASS),  # what it has recorded makes room for what it will
         (19_000.0, 0.0, Level.WARNING),
-        (1_500.0, 400.0, Level.FAILURE),  # less than one file
+        (1_500.0, 400.0, Level.FAILURE),  # less than a flight
     ],
 )
 def test_room_for_the_quota(free_mb: float, own_mb: float, level: Level) -> None:
-    assert (QUADROTOR.recording.file_mb, QUADROTOR.recording.quota_mb) == (2000.0, 20000.0)
+    assert QUADROTOR.recording.quota_mb == 20000.0
     assert judge_room(QUADROTOR, Path("/r"), free_mb, own_mb).level is level
 
 

@@ -8,18 +8,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from random import Random
 
-from flockd.onboard.recording.editing import recover
-from flockd.onboard.recording.export import export_images, export_tables
 from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, McapFile, Note, Record, read_records
 from flockd.onboard.recording.reader import Recording, recording_info
 from tests.hostile import CORPUS, hostile, mutated_bytes, mutated_json, nested, odd_file, own_errors, removed
 
 
-def test_a_changed_recording_is_read_or_refused_and_writes_nowhere_else(tmp_path: Path) -> None:
+def test_a_changed_recording_is_read_or_refused(tmp_path: Path) -> None:
     whole = (CORPUS / "recording.mcap").read_bytes()
     records = [record for record in read_records(CORPUS / "recording.mcap") if not isinstance(record, Damage)]
-    file, copied, tables = tmp_path / "mutated.mcap", tmp_path / "copied.mcap", tmp_path / "tables"
-    (tables / "csv").mkdir(parents=True)
+    file = tmp_path / "mutated.mcap"
 
     @hostile(25)
     def check(random: Random) -> None:
@@ -37,12 +34,6 @@ def test_a_changed_recording_is_read_or_refused_and_writes_nowhere_else(tmp_path
             json.dumps(recording_info(recording), allow_nan=False)
             for _ in recording.steps():
                 pass
-        with own_errors():
-            recover(Recording(file), copied)
-            export_tables(Recording(copied), tables / "csv")
-            export_images(Recording(copied), tables / "images")
-        assert {path.name for path in tables.iterdir()} <= {"csv", "images"}, "written outside of its tmp_path"
-        assert {path.name for path in tmp_path.iterdir()} <= {file.name, copied.name, tables.name}, "written outside"
 
     check()
 

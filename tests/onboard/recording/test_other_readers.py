@@ -18,9 +18,6 @@ from google.protobuf.message_factory import GetMessageClass
 from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.records import Channel, Message, Schema
 
-from flockd.core.config.drone import RecordingConfig
-from flockd.onboard.recording.editing import cut, recover
-from flockd.onboard.recording.reader import Recording
 from tests.onboard.recording.made_up import record
 from tests.review.report.test_recordings import record_flight
 
@@ -33,16 +30,10 @@ REPLAYED = sorted((Path(__file__).parents[2] / "review" / "replay").glob("*.mcap
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """What a recorder writes in one file and in several, with truth, cut, recovered after a kill; and older ones."""
+    """What a recorder writes, also with truth; and older ones."""
     folder = tmp_path_factory.mktemp("files")
     record(folder / "one.mcap")
-    record(folder / "several.mcap", settings=RecordingConfig(file_mb=1.0))
-    assert len(list(folder.glob("several*.mcap"))) > 1
     record_flight(folder / "simulated.mcap")
-    one = Recording(folder / "one.mcap")
-    cut(one, folder / "cut.mcap", one.start_s + 0.2, one.start_s + 0.6)
-    (folder / "killed").write_bytes((folder / "one.mcap").read_bytes()[:-400_000])
-    recover(Recording(folder / "killed"), folder / "recovered.mcap")
     return sorted(folder.glob("*.mcap")) + REPLAYED
 
 

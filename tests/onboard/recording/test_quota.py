@@ -9,16 +9,17 @@ import pytest
 
 from flockd.core.config.drone import RecordingConfig
 from flockd.onboard.recording import Recorder
+from flockd.onboard.recording.reader import Recording
 from tests.make import output
 from tests.onboard.recording.made_up import MODELS, drone_config, inputs, record
 
-SETTINGS = RecordingConfig(file_mb=0.5, quota_mb=1.0)
+SETTINGS = RecordingConfig(quota_mb=1.0)
 
 
-def _recorded(folder: Path, name: str, size_bytes: int, number: int, drone: str = "drone1") -> Path:
+def _recorded(folder: Path, name: str, size_bytes: int, number: int, *, drone: str = "drone1", **facts: str) -> Path:
     """A flight's file of this size, the higher its number the newer."""
     path = folder / f"{name}.mcap"
-    with Recorder(path, drone=drone, config=drone_config(), settings=None, models=MODELS) as recorder:
+    with Recorder(path, drone=drone, config=drone_config(), models=MODELS, facts=facts) as recorder:
         for frames, vehicle in inputs(1):
             recorder.drain()
             recorder.step(frames, vehicle, output(frames.time_s))
@@ -28,22 +29,31 @@ def _recorded(folder: Path, name: str, size_bytes: int, number: int, drone: str 
     return path
 
 
-@pytest.mark.parametrize(("size_bytes", "stays"), [(500_000, True), (500_001, False)])
-def test_what_leaves_room_for_one_whole_file_stays(size_bytes: int, stays: bool, tmp_path: Path) -> None:
-    """1 MB, of which the file being written may take half; the flight before this one does not count."""
-    older, last = _recorded(tmp_path, "older", size_bytes, 1), _recorded(tmp_path, "last", 900_000, 2)
-    record(tmp_path / "now.mcap", steps=1, settings=SETTINGS)
-    assert (older.exists(), last.exists()) == (stays, True)
-
-
-def test_only_as_many_go_as_have_to_and_the_oldest_first(tmp_path: Path) -> None:
+def test_as_a_flight_grows_the_oldest_go_and_no_more_than_have_to(tmp_path: Path) -> None:
+    """1 MB in all; the flight before this one neither counts nor goes."""
     files = [_recorded(tmp_path, f"flight{k}", 300_000, k) for k in (3, 1, 2, 4)]
     record(tmp_path / "now.mcap", steps=1, settings=SETTINGS)
-    assert [file.exists() for file in files] == [True, False, False, True]
+    assert [file.exists() for file in files] == [True, False, True, True]
+    record(tmp_path / "now.mcap", steps=6, settings=SETTINGS)
+    assert [file.exists() for file in files] == [False, False, False, True]
 
 
-def test_another_drones_recordings_neither_count_nor_go(tmp_path: Path) -> None:
+@pytest.mark.parametrize("made_of_another", ["replayed_from", "cut_from"])
+def test_what_is_not_this_drones_flight_neither_counts_nor_goes(tmp_path: Path, made_of_another: str) -> None:
     others = [_recorded(tmp_path, f"other{k}", 900_000, k, drone="drone2") for k in (1, 2)]
-    own = _recorded(tmp_path, "own", 500_000, 3)
+    replayed = _recorded(tmp_path, "replayed", 900_000, 3, **{made_of_another: "x.mcap"})
+    own = _recorded(tmp_path, "own", 500_000, 4)
     record(tmp_path / "now.mcap", steps=1, settings=SETTINGS)
-    assert all(file.exists() for file in (*others, own))
+    assert all(file.exists() for file in (*others, replayed, own))
+
+
+def test_a_flight_that_fills_the_quota_alone_is_recorded_so_far(tmp_path: Path) -> None:
+    told: list[str] = []
+    path, config = tmp_path / "now.mcap", drone_config()
+    with Recorder(path, drone="drone1", config=config, settings=SETTINGS, on_event=told.append) as recorder:
+        for frames, vehicle in inputs(40):
+            recorder.drain()
+            recorder.step(frames, vehicle, output(frames.time_s))
+    assert told == [f"recording {path}: recording.quota_mb is reached; the recording ends here and the flight goes on"]
+    assert 1e6 < path.stat().st_size < 5e6
+    assert not Recording(path).contents.finished

@@ -23,7 +23,6 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.drone import RecordingConfig
 from flockd.flight.geometry import build_rig
 from flockd.onboard.recording import Recorder
-from flockd.onboard.recording.editing import cut
 from flockd.onboard.recording.mcap_file import Entry, read_records
 from flockd.onboard.recording.reader import Recording
 from tests.onboard.recording.made_up import MODELS, MadeUpPilot, drone_config, inputs, record
@@ -124,34 +123,6 @@ def test_a_frame_that_is_no_image_is_left_out_and_reported(tmp_path: Path) -> No
     assert set(step.frames.frames) == {"front"}
     assert told == ["recording: an image of camera left has no pixels or not three channels and is left out"]
     assert len(messages(tmp_path / "drone1.mcap", "/events")) == 1
-
-
-def test_files_turn_over_and_stay_within_the_quota(tmp_path: Path) -> None:
-    others = tmp_path / "drone10.mcap"
-    others.write_bytes(b"another drone's")
-    record(tmp_path / "yesterday.mcap", steps=5)
-    os.utime(tmp_path / "yesterday.mcap", (1.0, 1.0))
-    record(tmp_path / "crash.mcap", steps=5)
-    os.utime(tmp_path / "crash.mcap", (2.0, 2.0))
-    cut(Recording(tmp_path / "yesterday.mcap"), tmp_path / "kept.mcap", 0.0, 2000.0)
-    settings = RecordingConfig(file_mb=0.4, quota_mb=1.2)
-    record(tmp_path / "drone1.mcap", steps=15, settings=settings)
-    files = sorted(tmp_path.glob("drone1.*mcap"))
-    assert 2 <= len(files) < 6
-    assert sum(file.stat().st_size for file in files) < 1.2e6 + 2.5e5, "within the quota, but for one step too many"
-    assert others.exists()
-    assert (tmp_path / "kept.mcap").exists(), "what someone cut out is not the recorder's to delete"
-    assert not (tmp_path / "yesterday.mcap").exists(), "the oldest goes first"
-    assert (tmp_path / "crash.mcap").exists(), "the flight before this one stays"
-    assert not (tmp_path / "drone1.mcap").exists(), "then its own beginning"
-    first = Recording(min(files, key=lambda file: int(file.suffixes[0][1:])))
-    assert set(first.contents.paths) == set(files)
-    told = [message for file in files for _, message in messages(file, "/events")]
-    assert told
-    assert all(message.log_time >= 1000e9 for message in told), "told before the first step, but not at time 0"
-    numbers = [step.number for step in first.steps()]
-    assert numbers == list(range(numbers[0], 15))
-    assert Recording(files[-1]).config == drone_config(), "each file is complete in itself"
 
 
 @pytest.mark.fault("foreign-recordings")

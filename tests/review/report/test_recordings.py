@@ -19,7 +19,6 @@ from flockd.flight.geometry import RangeMap
 from flockd.flight.perception import CameraObservation, Observation
 from flockd.flight.pilot import StepTrace
 from flockd.onboard.recording import Recorder
-from flockd.onboard.recording.editing import cut
 from flockd.onboard.recording.mcap_file import Note, Record
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.truth import TrueDrone, Truth
@@ -188,15 +187,6 @@ def test_the_report_of_a_folder_lies_beside_it_and_stays_unless_it_is_forced(
     assert page.read_text(encoding="utf-8") == "as it was"
     told(capsys, 0, page.parent, "--force")
     assert "Two drones flew 6 s by sight" in text_of(page)
-
-
-def test_a_cut_keeps_the_time_since_the_pilots_first_step(flight: Path, tmp_path: Path) -> None:
-    piece = tmp_path / "cut.mcap"
-    cut(Recording(flight / "drone1.mcap"), piece, 2.0, 4.0)
-    log = log_of(piece)
-    np.testing.assert_allclose(log.time_s, [2.0, 2.5, 3.0, 3.5, 4.0])
-    assert log.has_truth
-    np.testing.assert_allclose(np.arctan2(log.desired[:, 1], log.desired[:, 0]), log.time_s / 10)
 
 
 def test_a_step_in_which_the_recorder_was_killed_does_not_count(flight: Path, tmp_path: Path, capsys: Capture) -> None:
