@@ -22,14 +22,14 @@ ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_120,
     "flockd/flight": 14_780,
-    "flockd/onboard": 10_480,
+    "flockd/onboard": 10_170,
     "flockd/fleet": 2_230,
     "flockd/ground": 3_950,
     "flockd/review": 3_350,
     "flockd/sim": 9_530,
     "flockd/campaign": 1_650,
-    "flockd/cli": 3_680,
-    "tests": 39_610,
+    "flockd/cli": 3_620,
+    "tests": 39_430,
     "tools/checks": 2_320,
     "tools/docs": 940,
     "tools/measure": 1_540,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_690,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 363}
+FILES = {"flockd": 361}
 NUMBERS_OF_FLIGHT = 528
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
