@@ -22,25 +22,20 @@ _FLU_FRD = np.diag([1.0, -1.0, -1.0])
 
 
 def enu_of_ned(ned: FloatArray) -> FloatArray:
-    """(..., 3) in ENU of (..., 3) in NED. It is its own inverse."""
+    """(..., 3) in ENU of (..., 3) in NED."""
     enu: FloatArray = np.asarray(ned, np.float64) @ _ENU_NED.T
     return enu
 
-
-def ned_of_enu(enu: FloatArray) -> FloatArray:
-    """(..., 3) in NED of (..., 3) in ENU."""
-    return enu_of_ned(enu)
+ned_of_enu = enu_of_ned
+"""It is its own inverse."""
 
 
 def flu_of_frd(frd: FloatArray) -> FloatArray:
-    """(..., 3) in FLU of (..., 3) in FRD. It is its own inverse."""
+    """(..., 3) in FLU of (..., 3) in FRD."""
     flu: FloatArray = np.asarray(frd, np.float64) @ _FLU_FRD.T
     return flu
 
-
-def frd_of_flu(flu: FloatArray) -> FloatArray:
-    """(..., 3) in FRD of (..., 3) in FLU."""
-    return flu_of_frd(flu)
+frd_of_flu = flu_of_frd
 
 
 def attitude_in_ros(R_ned_frd: FloatArray) -> FloatArray:
