@@ -26,6 +26,7 @@ def enu_of_ned(ned: FloatArray) -> FloatArray:
     enu: FloatArray = np.asarray(ned, np.float64) @ _ENU_NED.T
     return enu
 
+
 ned_of_enu = enu_of_ned
 """It is its own inverse."""
 
@@ -34,6 +35,7 @@ def flu_of_frd(frd: FloatArray) -> FloatArray:
     """(..., 3) in FLU of (..., 3) in FRD."""
     flu: FloatArray = np.asarray(frd, np.float64) @ _FLU_FRD.T
     return flu
+
 
 frd_of_flu = flu_of_frd
 
