@@ -87,8 +87,7 @@ def main() -> int:
     """Builds, boots, listens, and prints."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, metavar="DIR", help="keep the machine's files here, and use those there")
-    only = "of capture, sandbox and service"
-    parser.add_argument("--only", nargs="+", default=[], choices=("capture", "sandbox", "service"), help=only)
+    parser.add_argument("--only", nargs="+", default=[], choices=("capture", "service"))
     parser.add_argument("--debian", choices=tuple(SUITES), default="12", help="what boots; default: %(default)s")
     arguments = parser.parse_args()
     try:

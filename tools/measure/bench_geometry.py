@@ -1,7 +1,6 @@
 """Rigid motions between paired points: ours, the paper's, and OpenCV's, on the same pairs and one thread.
 
 OMP_NUM_THREADS=1 python -m tools.measure.bench_geometry        # all cases, 30 draws each: some minutes
-OMP_NUM_THREADS=1 python -m tools.measure.bench_geometry --draws 1000 --only "5000, 90 % outliers" --methods consensus
 
 Milliseconds are the median of the best of three runs of each draw; degrees and centimetres the median and the 99th
 percentile; a failure is an answer off by more than 1 degree or 5 cm (for the cases with large errors, 3 degrees or 20
@@ -15,6 +14,7 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -66,13 +66,8 @@ CASES = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Draw:
-    """Pairs, and the motion between them."""
-
-    source: FloatArray
-    target: FloatArray
-    motion: RigidTransform
+Draw = tuple[FloatArray, FloatArray, RigidTransform]
+"""Pairs, source and target (n, 3), and the motion between them."""
 
 
 def draw(case: Case, seed: int) -> Draw:
@@ -92,7 +87,7 @@ def draw(case: Case, seed: int) -> Draw:
     wrong = random.random(case.pairs) < case.outliers
     reach_m = case.extent_m or 3.0
     target[wrong] += random.uniform(-reach_m, reach_m, (int(wrong.sum()), 3))
-    return Draw(source, target, motion)
+    return source, target, motion
 
 
 def _points(case: Case, random: np.random.Generator) -> FloatArray:
@@ -109,112 +104,72 @@ def _points(case: Case, random: np.random.Generator) -> FloatArray:
     return points
 
 
-Solve = Callable[[Draw, float], FloatArray]
-"""From pairs and the size of their errors, m, to a motion (4, 4)."""
+def _ours(source: FloatArray, target: FloatArray, method: str) -> RigidTransform:
+    return ransac_rigid(source, target, method=method, min_inlier_ratio=0.05).transform  # type: ignore[arg-type]
 
 
-def _ours(method: str) -> Solve:
-    def solve(pairs: Draw, _: float) -> FloatArray:
-        found = ransac_rigid(pairs.source, pairs.target, method=method, min_inlier_ratio=0.05)  # type: ignore[arg-type]
-        return _matrix(found.transform.rotation, found.transform.translation)
-
-    return solve
-
-
-def _opencv(pairs: Draw, noise_m: float) -> FloatArray:
-    found, affine, _ = cv2.estimateAffine3D(pairs.source, pairs.target, ransacThreshold=3.0 * noise_m)
+def _opencv(source: FloatArray, target: FloatArray, noise_m: float) -> RigidTransform:
+    found, affine, _ = cv2.estimateAffine3D(source, target, ransacThreshold=3.0 * noise_m)
     if not found:
-        return np.full((4, 4), np.nan)
+        raise ValueError("no affine motion")
     u, _, vt = np.linalg.svd(affine[:, :3])
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    middle = pairs.source.mean(axis=0)
-    return _matrix(rotation, affine[:, :3] @ middle + affine[:, 3] - rotation @ middle)
+    middle = source.mean(axis=0)
+    return RigidTransform(rotation, affine[:, :3] @ middle + affine[:, 3] - rotation @ middle)
 
 
-METHODS: dict[str, Solve] = {"consensus": _ours("consensus"), "paper": _ours("paper"), "OpenCV affine": _opencv}
+METHODS: dict[str, Callable[[FloatArray, FloatArray, float], RigidTransform]] = {
+    "consensus": lambda source, target, _: _ours(source, target, "consensus"),
+    "paper": lambda source, target, _: _ours(source, target, "paper"),
+    "OpenCV affine": _opencv,
+}
+"""From pairs and the size of their errors, m, to a motion."""
 
 
-def _matrix(rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, translation
-    return matrix
-
-
-@dataclass(frozen=True)
-class Row:
-    """Of one method in one case."""
-
-    ms: float
-    degrees: tuple[float, float]
-    """Median and 99th percentile."""
-    cm: tuple[float, float]
-    failures: int
-
-
-def measured(case: Case, solve: Solve, draws: int) -> Row:
-    """One method on the draws of a case."""
+def measured(case: Case, method: str, draws: int) -> dict[str, Any]:
+    """One method on the draws of a case: `ms`, `degrees` and `cm` (median and 99th percentile), `failures`."""
     ms, degrees, cm, failures = [], [], [], 0
     noise_m = 0.02 if case.extent_m else 0.2 if case.stereo else NOISE_M
     for seed in range(draws):
-        pairs = draw(case, seed)
+        source, target, motion = draw(case, seed)
+        middle = source.mean(axis=0)[None]
         best_s, off_deg, off_m = np.inf, np.inf, np.inf
         for _ in range(3):
             start = time.perf_counter()
             try:
-                found = solve(pairs, noise_m)
+                found = METHODS[method](source, target, noise_m)
             except ValueError:
-                found = np.full((4, 4), np.nan)
+                best_s = min(best_s, time.perf_counter() - start)
+                continue
             best_s = min(best_s, time.perf_counter() - start)
-        if np.isfinite(found).all():
-            left = found[:3, :3] @ pairs.motion.rotation.T
-            off_deg = float(np.degrees(np.arccos(np.clip((np.trace(left) - 1.0) / 2.0, -1.0, 1.0))))
-            middle = pairs.source.mean(axis=0)
-            off_m = float(np.linalg.norm(found[:3, :3] @ middle + found[:3, 3] - pairs.motion.apply(middle[None])[0]))
+            off_deg = float(np.degrees(Rotation.from_matrix(found.rotation @ motion.rotation.T).magnitude()))
+            off_m = float(np.linalg.norm(found.apply(middle) - motion.apply(middle)))
         ms.append(1e3 * best_s)
         degrees.append(off_deg)
         cm.append(100.0 * off_m)
         failures += not (off_deg < case.allowed * FAILED_DEG and off_m < case.allowed * FAILED_M)
-    return Row(
-        float(np.median(ms)),
-        (float(np.median(degrees)), float(np.percentile(degrees, 99, method="lower"))),
-        (float(np.median(cm)), float(np.percentile(cm, 99, method="lower"))),
-        failures,
-    )
+    known = {"degrees": degrees, "cm": cm}
+    off = {name: (np.median(of), np.percentile(of, 99, method="lower")) for name, of in known.items()}
+    return {"case": case.name, "method": method, "ms": np.median(ms), **off, "failures": failures}
 
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=30)
-    parser.add_argument("--only", nargs="+", metavar="CASE", choices=[case.name for case in CASES])
-    parser.add_argument("--methods", nargs="+", choices=METHODS)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    chosen = {name: METHODS[name] for name in options.methods or METHODS}
-    rows = []
-    if not options.json:
-        print(
-            f"{'case':36} {'method':27} {'ms':>8} {'deg':>7} {'99 %':>7} {'cm':>7} {'99 %':>7} "
-            f"failures of {options.draws}"
-        )
-    for case in CASES:
-        if options.only and case.name not in options.only:
-            continue
-        for name, solve in chosen.items():
-            row = measured(case, solve, options.draws)
-            rows.append({"case": case.name, "method": name, **vars(row)})
-            if not options.json:
-                print(
-                    f"{case.name:36} {name:27} {row.ms:8.2f} {row.degrees[0]:7.3f} {row.degrees[1]:7.3f} "
-                    f"{row.cm[0]:7.2f} {row.cm[1]:7.2f} {row.failures}",
-                    flush=True,
-                )
+    rows = [measured(case, method, options.draws) for case in CASES for method in METHODS]
     if options.json:
         print(json.dumps(rows, indent=1))
+        return
+    print(
+        f"{'case':36} {'method':14} {'ms':>8} {'deg':>7} {'99 %':>7} {'cm':>7} {'99 %':>7} failures of {options.draws}"
+    )
+    for row in rows:
+        off = (f"{one:7.3f}" for one in (*row["degrees"], *row["cm"]))
+        print(f"{row['case']:36} {row['method']:14} {row['ms']:8.2f}", *off, row["failures"])
 
 
 if __name__ == "__main__":

@@ -44,6 +44,7 @@ from flockd.core.config.document import Value
 from flockd.core.config.loader import Overrides
 from flockd.core.data import data_path
 from flockd.flight.inference.hashes import model_hashes
+from flockd.ground.pictures.scoring import summary
 from flockd.review.replay.profile import ComputerFiles
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import MIN_START_DISTANCE_M, load_scenario
@@ -290,6 +291,19 @@ def encounters(results: Results) -> list[dict[str, Any]]:
     return found
 
 
+def _pictures(labelled: Sequence[str], without_drones: Sequence[str]) -> dict[str, Any]:
+    """What `flockd detect` finds in each set, NAME=FOLDER, of cameras of 90 degrees."""
+    found: dict[str, Any] = {}
+    for given in (*labelled, *without_drones):
+        name, _, folder = given.partition("=")
+        labels = ["--labels", f"{folder}/labels.json"] if given in labelled else []
+        one = json.loads(_flockd("detect", folder, "--fov", "90", "--json", *labels))
+        pictures = one.pop("pictures")
+        false = sum(len(picture["detections"]) for picture in pictures)
+        found[name] = one if labels else {**summary([]), **one, "measured": len(pictures), "false": false}
+    return found
+
+
 def _campaign(name: str, seeds: int | None, folder: Path, workers: int) -> Results:
     """Fly a campaign of config/campaigns with so many seeds, None: the file's; what is there already is kept."""
     path = data_path("config") / "campaigns" / f"{name}.yaml"
@@ -344,10 +358,7 @@ def _part(part: str, commit: str, arguments: argparse.Namespace) -> dict[str, An
     elif part == "encounters":
         found = encounters(_campaign("encounters", 1 if quick else None, results / f"encounters-{size}", workers))
     elif part == "pictures":
-        sets = [("--labelled", one) for one in arguments.labelled] + [
-            ("--without-drones", one) for one in arguments.without_drones
-        ]
-        found = json.loads(_output("-m", "tools.measure.evaluate_real", "--json", *itertools.chain(*sets)))
+        found = _pictures(arguments.labelled, arguments.without_drones)
     elif part == "px4":
         found = json.loads(_output("-m", "tools.checks.px4_rows", "--json"))["flights"]
     elif part == "geometry":

@@ -9,8 +9,6 @@ Counted are whole drones in the middle of a crop that they fill, as the cascade'
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,64 +24,39 @@ RANGES_M = ((1.5, 5.0), (5.0, 10.0))
 _BATCH = 64
 
 
-@dataclass(frozen=True, eq=False)
-class HeldOut:
-    """Crops that no network has learnt from."""
-
-    picture: Array
-    """(n, 96, 96, 3) with the drone in the middle, as the cascade's last crop has it."""
-    log_range: Array
-    """(n,) true log(range / focal length)."""
-    range_m: Array
-    """(n,)"""
-    none: Array
-    """(m, 96, 96, 3) without a drone."""
-    log_size: Array
-    """(n,) logarithm of the drone's size in metres."""
-
-    @classmethod
-    def of(cls, folder: Path) -> HeldOut:
-        """Held-out crops from the files of ``render_drone_crops`` in ``folder``: whole drones, aimed at as the
-        cascade's last crop is.
-
-        Raises ValueError where the files are not such.
-        """
-        rows: list[dict[str, Array]] = []
-        for path in sorted(folder.glob("*.npz")):
-            with np.load(path) as arrays:
-                rows.append(dict(arrays))
-        if not rows or "whole" not in rows[0]:
-            raise ValueError(f"{folder}: holds no crops with ranges; make them with `render_drone_crops --held-out`")
-        joined = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
-        shown = joined["whole"] & is_aimed(joined)
-        return cls(
-            joined["picture"][shown],
-            joined["target"][shown, 0],
-            joined["range_m"][shown],
-            joined["picture"][joined["drone"] < 0.5],
-            (joined["apparent"] + joined["target"][:, 0])[shown],
-        )
+def held_out(folder: Path) -> tuple[dict[str, Array], Array]:
+    """Crops of ``render_drone_crops --held-out``: arrays (n, ...) of whole drones aimed at as the cascade's last crop
+    is; pictures (m, 96, 96, 3) without a drone. Raises ValueError where the files are not such.
+    """
+    rows: list[dict[str, Array]] = []
+    for path in sorted(folder.glob("*.npz")):
+        with np.load(path) as arrays:
+            rows.append(dict(arrays))
+    if not rows or "whole" not in rows[0]:
+        raise ValueError(f"{folder}: holds no crops with ranges; make them with `render_drone_crops --held-out`")
+    joined = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+    shown = joined["whole"] & is_aimed(joined)
+    return {name: values[shown] for name, values in joined.items()}, joined["picture"][joined["drone"] < 0.5]
 
 
-def measured(manifest: Path, crops: HeldOut) -> dict[str, str]:
+def measured(manifest: Path, crops: dict[str, Array], none: Array) -> dict[str, str]:
     """Figures of a network by what they are; relative errors of range are of one crop, without the cascade's mean."""
     model = OnnxModel(manifest, threads=1, check=check_roles)
-    out = _columns(model, crops.picture)
-    no = _columns(model, crops.none)
-    error = np.expm1(out["log_range_per_focal"] - crops.log_range)
-    by_size = np.expm1(crops.log_size - out["log_apparent_size"] - crops.log_range)
+    out, no = _columns(model, crops["picture"]), _columns(model, none)
+    log_range, range_m = crops["target"][:, 0], crops["range_m"]
+    error = np.expm1(out["log_range_per_focal"] - log_range)
+    by_size = np.expm1(crops["apparent"] - out["log_apparent_size"])
     figures: dict[str, str] = {}
     for name, errors in (("range", error), ("range by the known size", by_size)):
         for low, high in RANGES_M:
-            at = (low <= crops.range_m) & (crops.range_m < high)
+            at = (low <= range_m) & (range_m < high)
             if at.any():
                 off = np.abs(errors[at])
                 figures[f"error of {name}, {low:g}-{high:g} m, median / p95 / bias"] = (
                     f"{np.median(off):.2%} / {np.quantile(off, 0.95):.2%} / {np.median(errors[at]):+.2%}"
                 )
     of_size = np.exp(out["log_size_sigma"]) if "log_size_sigma" in out else 0.0
-    sigma = np.hypot(np.exp(out["log_relative_sigma"]), of_size)
-    sigmas = np.abs(out["log_range_per_focal"] - crops.log_range) / sigma
+    sigmas = np.abs(out["log_range_per_focal"] - log_range) / np.hypot(np.exp(out["log_relative_sigma"]), of_size)
     figures["errors inside 1 and 2 sigma"] = f"{np.mean(sigmas < 1):.0%}, {np.mean(sigmas < 2):.0%}"
     least = np.log(1 / (1 / model.manifest.threshold("drone_probability") - 1))
     figures["drones called a drone"] = f"{np.mean(out['drone_logit'] > least):.1%}"
@@ -107,19 +80,14 @@ def main() -> None:
     parser.add_argument("manifests", type=Path, nargs="+", help="of distance networks")
     arguments = parser.parse_args()
     try:
-        crops = HeldOut.of(arguments.crops)
+        crops, none = held_out(arguments.crops)
     except ValueError as error:
         parser.error(str(error))
-    print(f"{len(crops.picture)} crops with a drone, {len(crops.none)} without")
-    print(_table({str(manifest): measured(manifest, crops) for manifest in arguments.manifests}))
-
-
-def _table(figures: Mapping[str, Mapping[str, str]]) -> str:
-    """One row a figure, one column a network."""
-    names = list(next(iter(figures.values())))
-    rows = [["", *figures], *[[name, *(column[name] for column in figures.values())] for name in names]]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    return "\n".join("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows)
+    print(f"{len(crops['picture'])} crops with a drone, {len(none)} without")
+    figures = [measured(manifest, crops, none) for manifest in arguments.manifests]
+    print(" " * 56, *arguments.manifests, sep="  ")
+    for name in figures[0]:
+        print(f"{name:56}", *(f"{one[name]:24}" for one in figures), sep="  ")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -98,50 +98,42 @@ def main() -> None:
 def rows_of_pairs(found: Findings) -> Iterator[Row]:
     """Of drones, depth, masks and flow."""
     yield from _distances(found, "")
-    whole = sum(drone.found and drone.whole for drone in found.drones)
+    whole = [drone for drone in found.drones if drone.found and drone.whole]
     for sigmas in (1, 2):
-        yield Row(f"distance errors inside {sigmas} sigma", 100 * found.inside(sigmas), "%", whole)
+        inside = float(np.mean([abs(drone.error) < sigmas * drone.sigma for drone in whole]))
+        yield Row(f"distance errors inside {sigmas} sigma", 100 * inside, "%", len(whole))
     for given, name in WITH.items():
-        depth = found.depth[given]
-        yield Row(f"background depth, relative error, {name}, median", 100 * float(np.median(depth)), "%", len(depth))
         of_pixels = np.concatenate(found.depth_pixels[given])
-        what = f"background depth of a pixel, relative error, {name}, median"
-        yield Row(what, 100 * float(np.median(of_pixels)), "%", len(of_pixels))
+        for what, off in (("", np.array(found.depth[given])), (" of a pixel", of_pixels)):
+            name_of = f"background depth{what}, relative error, {name}, median"
+            yield Row(name_of, 100 * float(np.median(off)), "%", len(off))
     yield Row(f"mask IoU, drones within {MASK_WITHIN_M:g} m, mean", float(np.mean(found.iou)), "", len(found.iou))
     for low, high, name in ((12, np.inf, "at least 12"), (6, 12, "6 to 12")):
-        count = sum(low <= drone.width_px < high for drone in found.drones)
-        yield Row(f"drones whose box is {name} px wide, found", 100 * found.found(low, high), "%", count)
-        yield Row(f"drones whose box is {name} px wide, proposed", 100 * found.proposed(low, high), "%", count)
+        wide = [drone for drone in found.drones if low <= drone.width_px < high]
+        counts = {"found": sum(d.found for d in wide), "proposed": sum(d.found or d.proposed for d in wide)}
+        for what, count in counts.items():
+            yield Row(f"drones whose box is {name} px wide, {what}", 100 * count / max(len(wide), 1), "%", len(wide))
     yield Row("false drones in 500 images", 500 * found.false / found.images, "", found.images)
+    errors = {key: np.concatenate(parts) for key, parts in found.flow.items()}
     for on_drones, where in ((False, "background"), (True, "drones")):
         for network, name in (("network", "flow"), ("dis", "OpenCV DIS medium")):
-            errors = found.flow_errors(network, on_drones=on_drones)
+            off = errors[network, on_drones]
             for kind, figure in (("median", np.median), ("mean", np.mean)):
-                yield Row(f"{name} on {where}, end-point error, {kind}", float(figure(errors)), "px", len(errors))
-    ours, of_dis = (
-        np.concatenate([found.flow_errors(n, on_drones=d) for d in (False, True)]) for n in ("network", "dis")
-    )
-    yield Row(
-        "flow, mean end-point error as a share of OpenCV DIS medium's",
-        float(ours.mean() / of_dis.mean()),
-        "",
-        ours.size,
-    )
+                yield Row(f"{name} on {where}, end-point error, {kind}", float(figure(off)), "px", len(off))
+    ours, of_dis = (np.concatenate([errors[network, d] for d in (False, True)]) for network in ("network", "dis"))
+    what = "flow, mean end-point error as a share of OpenCV DIS medium's"
+    yield Row(what, float(ours.mean() / of_dis.mean()), "", ours.size)
 
 
 def _distances(found: Findings, note: str) -> Iterator[Row]:
-    parts = [(low, high, True) for low, high in RANGES_M] + [(0.0, 10.0, False)]
-    figures: dict[str, Callable[..., float]] = {
-        "median": lambda errors: np.median(np.abs(errors)),
-        "p95": lambda errors: np.quantile(np.abs(errors), 0.95),
-        "bias": np.median,
-    }
-    for low, high, whole in parts:
-        errors = found.errors(low, high, whole=whole)
+    for low, high, whole in [(low, high, True) for low, high in RANGES_M] + [(0.0, 10.0, False)]:
+        mine = [d.error for d in found.drones if d.found and d.whole is whole and low <= d.range_m < high]
         what = f"whole, {low:g}-{high:g} m" if whole else f"cut or hidden, within {high:g} m"
-        if len(errors):
+        if mine:
+            off = np.abs(mine)
+            figures = {"median": np.median(off), "p95": np.quantile(off, 0.95), "bias": np.median(mine)}
             for name, figure in figures.items():
-                yield Row(f"distance{note}, {what}, {name}", 100 * float(figure(errors)), "%", len(errors))
+                yield Row(f"distance{note}, {what}, {name}", 100 * float(figure), "%", len(mine))
 
 
 @dataclass(frozen=True)
@@ -175,26 +167,6 @@ class Findings:
         """The same of every sixteenth pixel."""
         self.flow: dict[tuple[str, bool], list[Array]] = {}
         """End-point errors, px, of ("network" or "dis", on drones)."""
-
-    def errors(self, low_m: float, high_m: float, *, whole: bool) -> Array:
-        """Relative range errors of the drones that were found."""
-        return np.array([d.error for d in self.drones if d.found and d.whole is whole and low_m <= d.range_m < high_m])
-
-    def inside(self, sigmas: float) -> float:
-        """Share of the whole drones' range errors that are within so many of their own standard deviations."""
-        return float(np.mean([abs(d.error) < sigmas * d.sigma for d in self.drones if d.found and d.whole]))
-
-    def found(self, low_px: float, high_px: float) -> float:
-        """Share of the drones whose box is so wide."""
-        return float(np.mean([d.found for d in self.drones if low_px <= d.width_px < high_px]))
-
-    def proposed(self, low_px: float, high_px: float) -> float:
-        """The same of those that the first stage proposed, or that were found."""
-        return float(np.mean([d.found or d.proposed for d in self.drones if low_px <= d.width_px < high_px]))
-
-    def flow_errors(self, name: str, *, on_drones: bool) -> Array:
-        """All of them."""
-        return np.concatenate(self.flow[name, on_drones])
 
 
 def look_at_pairs(pairs: PairSet, networks: OnnxNetworks, indices: Iterable[int]) -> Findings:

@@ -48,16 +48,8 @@ def bird(rng: Generator) -> Distractor:
     base = base * rng.uniform(0.7, 1.2)
     tips, head, belly = (base * rng.uniform(0.15, 1.0), base * rng.uniform(0.3, 1.3), base * rng.uniform(0.7, 1.5))
     mesh = Mesh()
-    profile = (
-        (-0.5, 0.3),
-        (-0.25, 0.8),
-        (0.0, 1.0),
-        (0.25, 0.85),
-        (0.35, 0.55),
-        (0.42, 0.6),
-        (0.47, 0.4),
-        (0.52, 0.05),
-    )
+    along = (-0.5, -0.25, 0.0, 0.25, 0.35, 0.42, 0.47, 0.52)
+    profile = zip(along, (0.3, 0.8, 1.0, 0.85, 0.55, 0.6, 0.4, 0.05), strict=True)
     mesh.loft(
         [_across(x * length, r * thick, r * thick) for x, r in profile],
         _SKIN,
@@ -67,11 +59,7 @@ def bird(rng: Generator) -> Distractor:
     tail = rng.uniform(0.6, 0.9) * length
     mesh.loft([_across(-tail, fan, 0.006 * span), _across(-0.4 * length, 0.3 * thick, 0.01 * span)], _SKIN, tips[None])
     body = mesh.count
-    chord, sweep, droop = (
-        span * rng.uniform(0.09, 0.16),
-        span * rng.uniform(-0.02, 0.16),
-        span * rng.uniform(-0.06, 0.1),
-    )
+    chord, sweep, droop = span * rng.uniform((0.09, -0.02, -0.06), (0.16, 0.16, 0.1))
     elbow = rng.uniform(0.35, 0.55)
     rings = []
     for share, width in ((0.0, 1.0), (elbow, 0.95), (0.8, 0.6), (1.0, 0.12)):

@@ -22,6 +22,7 @@ from flockd.core.messages import BoolArray, FloatArray
 from flockd.review.flight_log.builder import match_neighbours
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.flight_folder import LOG_NAME
+from tools.training.manifests import WithoutAliases
 
 EDGES_M = (0.0, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 9.5, 13.0, 17.0, 20.0)
 LEAST_SAMPLES = 30
@@ -36,14 +37,6 @@ HIDDEN_EDGES = (0.02, 0.2, 0.4, 0.6, 0.8, 1.01)
 DRONE_RADIUS_M, ELEVATION_DEG = 0.35, 45.0
 HIDDEN_LIMIT = 0.5
 """Where flights have too few hidden neighbours to tell."""
-
-
-class _Plain(yaml.SafeDumper):
-    """Writes what several entries share in each of them."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        """Always."""
-        return True
 
 
 class Samples(NamedTuple):
@@ -84,7 +77,7 @@ def main() -> None:
     head = "# Written by `python -m tools.training.fit_perception`; do not edit.\n"
     named = {"perception": args.name, "provenance": provenance}
     text = yaml.safe_dump(named, sort_keys=False, width=120)
-    text += yaml.dump(fitted, Dumper=_Plain, sort_keys=False, width=120, default_flow_style=None)
+    text += yaml.dump(fitted, Dumper=WithoutAliases, sort_keys=False, width=120, default_flow_style=None)
     args.out.write_text(head + text, encoding="utf-8")
     print(f"{args.out}: {sum(int(s.counts.sum()) for s in samples)} neighbours in steps of {len(logs)} flights")
     print(text)

@@ -20,12 +20,12 @@ def write_manifest(document: dict[str, Any], file: Path, golden: Mapping[str, ND
     for name, value in golden.items():
         document["outputs"][name] |= {"golden_mean": float(value.mean()), "golden_deviation": float(value.std())}
     path = file.with_suffix(".yaml")
-    path.write_text(yaml.dump(document, Dumper=_WithoutAliases, sort_keys=False, width=110), encoding="utf-8")
+    path.write_text(yaml.dump(document, Dumper=WithoutAliases, sort_keys=False, width=110), encoding="utf-8")
     OnnxModel(path, threads=1, check=check_roles)
     return path
 
 
-class _WithoutAliases(yaml.SafeDumper):
+class WithoutAliases(yaml.SafeDumper):
     """Lists that two keys share are written twice: a manifest may have no anchors."""
 
     def ignore_aliases(self, data: Any) -> bool:

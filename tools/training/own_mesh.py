@@ -26,9 +26,6 @@ missing."""
 FLAT = 0.7
 """A mesh stands upright where no level side is less than this share of its height."""
 MOST_TRIANGLES = 40_000
-CELLS = (320, 160, 80)
-"""A mesh of too many triangles is simplified to so many cells from tip to tip, in turn: at first a fifth of a
-crop's pixel each."""
 
 
 def read_meshes(paths: Sequence[Path], size_m: float) -> list[DroneModel]:
@@ -54,14 +51,10 @@ def _surface(path: Path, size_m: float) -> tuple[Array, Array, Array]:
     triangles = np.vstack([one + k for one, k in zip(faces, firsts, strict=True)])
     vertices = vertices[:, [0, 2, 1]] * (1.0, 1.0, -1.0)  # right-handed, y up -> right-handed, z down
     _check_size(path, vertices, size_m)
-    for cells in CELLS:
-        if len(triangles) > MOST_TRIANGLES:
-            vertices, triangles, kept = _in_cells(vertices, triangles, size_m / cells)
-            colours = colours[kept]
     if len(triangles) > MOST_TRIANGLES:
         raise ValueError(
-            f"{path}: has {len(triangles)} triangles without small details, and at most {MOST_TRIANGLES} are drawn; "
-            "simplify it where it was modelled"
+            f"{path}: has {len(triangles)} triangles, and at most {MOST_TRIANGLES} are drawn; simplify it where it was "
+            "modelled, as with Blender's Decimate"
         )
     return vertices, triangles, colours
 
@@ -121,18 +114,6 @@ def _widest(points: Array) -> float:
     angles = np.linspace(0, np.pi, 90, endpoint=False)
     along = points @ np.stack([np.cos(angles), np.sin(angles)])
     return float(np.ptp(along, axis=0).max())
-
-
-def _in_cells(vertices: Array, triangles: Array, cell_m: float) -> tuple[Array, Array, Array]:
-    """Corners of one cell become one; and the rows of the triangles that remain."""
-    cells = np.round(vertices / cell_m).astype(np.int64)
-    _, which, inverse = np.unique(cells @ [1 << 40, 1 << 20, 1], return_index=True, return_inverse=True)
-    coarse = inverse[triangles]
-    real = (coarse[:, 0] != coarse[:, 1]) & (coarse[:, 1] != coarse[:, 2]) & (coarse[:, 2] != coarse[:, 0])
-    corners = np.sort(coarse, axis=1)
-    _, first = np.unique((corners[:, 0] * len(which) + corners[:, 1]) * len(which) + corners[:, 2], return_index=True)
-    kept = np.intersect1d(np.flatnonzero(real), first)
-    return vertices[which], coarse[kept], kept
 
 
 def _colours(piece: Any) -> Array:

@@ -59,7 +59,7 @@ class Scene:
 
 
 class Cutouts:
-    """Rendered drones with transparent surroundings (tools.training.render_cutouts)."""
+    """Rendered drones with transparent surroundings (`render_drone_crops --cut-out`)."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

@@ -2,21 +2,26 @@
 
     python -m tools.training.render_drone_crops OUT --worlds 300 --scenes 300
     python -m tools.training.render_drone_crops OUT --mesh MY.glb --size-m 0.55 --worlds 40
+    python -m tools.training.render_drone_crops OUT --cut-out --worlds 100 --scenes 60
 
 Only the window of the camera's image that the crops show is drawn. Every drone stands in another place. One file a
 world. With --mesh (glTF) that drone alone flies. With --held-out, in test worlds and with ranges, that
-drone, or the families that no network learns from.
+drone, or the families that no network learns from. With --cut-out OUT receives drones to be put onto photographs, for
+`detector` and `verification`: PNGs, 320 px wide and high with straight alpha, and `index.jsonl`, whose lines name them
+as `file`. The shipped networks learnt from a folder of the same form that Blender's Cycles had rendered.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,13 +44,18 @@ HIDDEN_SHARE = 0.02
 """Hidden share of its outline below which a drone is whole."""
 WITH_DISTRACTORS, DISTRACTOR_ALONE = 0.3, 0.1
 """Shares of the scenes: a bird or the like before or behind the drone, and in its place, where half are too far."""
+CUT_PX, FINER = 320, 3
+"""A cut-out is rendered so many times as large, for soft edges."""
+CUT_FILL, CUT_RANGES_M, CUT_HEIGHTS_M = (0.75, 0.95), (1.2, 12.0), (15.0, 40.0)
+"""Of a cut-out: share of its width that the drone's size takes; from how far it is seen, and how high it flies."""
 
 
 @dataclass(frozen=True, eq=False)
 class CropJob:
-    """One file of crops."""
+    """One file of crops, or the cut-outs of one world."""
 
     file: Path
+    """Of cut-outs the last one."""
     seed: int
     """Seed of the world."""
     scenes: int
@@ -61,31 +71,32 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--worlds", type=int, default=300)
     parser.add_argument("--scenes", type=int, default=400, help="drones a world")
-    add_mesh(parser)
-    parser.add_argument("--held-out", action="store_true", help="to measure on, of drones and worlds never learnt from")
+    parser.add_argument("--mesh", type=Path, nargs="+", help="of a drone, with propellers and colours; several: any")
+    parser.add_argument("--size-m", type=float, help="of --mesh: widest horizontal distance, propeller tip to tip, m")
+    kind = parser.add_mutually_exclusive_group()
+    kind.add_argument("--held-out", action="store_true", help="to measure on, of drones and worlds never learnt from")
+    kind.add_argument("--cut-out", action="store_true", help="drones with transparent surroundings")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     arguments = parser.parse_args()
     own = own_drone(parser, arguments)
     arguments.out.mkdir(parents=True, exist_ok=True)
     # From the far end of the training worlds: other places than those of whole images.
     split = worlds.TEST if arguments.held_out else worlds.TRAINING
-    files = {seed: arguments.out / f"{seed}.npz" for seed in split[::-1][: arguments.worlds]}
+    ending = f"_{arguments.scenes - 1:04d}.png" if arguments.cut_out else ".npz"
+    files = {seed: arguments.out / f"{seed}{ending}" for seed in split[::-1][: arguments.worlds]}
     jobs = [
         CropJob(file, seed, arguments.scenes, own, measures=arguments.held_out)
         for seed, file in files.items()
         if not file.is_file()
     ]
-    worlds.in_processes(_render_world, jobs, arguments.processes)
-
-
-def add_mesh(parser: argparse.ArgumentParser) -> None:
-    """What says which drone flies."""
-    parser.add_argument("--mesh", type=Path, nargs="+", help="of a drone, with propellers and colours; several: any")
-    parser.add_argument("--size-m", type=float, help="of --mesh: widest horizontal distance, propeller tip to tip, m")
+    worlds.in_processes(_cut_world if arguments.cut_out else _render_world, jobs, arguments.processes)
+    if arguments.cut_out:
+        names = sorted(file.name for file in arguments.out.glob("*.png"))
+        (arguments.out / "index.jsonl").write_text("".join(json.dumps({"file": name}) + "\n" for name in names))
 
 
 def own_drone(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> list[DroneModel]:
-    """The drone that `add_mesh` names; none where it names none."""
+    """The drone that ``--mesh`` names; none where it names none."""
     if not arguments.mesh:
         return []
     if arguments.size_m is None:
@@ -100,7 +111,7 @@ def own_drone(parser: argparse.ArgumentParser, arguments: argparse.Namespace) ->
     return drones
 
 
-def drawn_models(
+def _drawn_models(
     own: Sequence[DroneModel], rng: np.random.Generator, *, measures: bool = False
 ) -> list[list[DroneModel]]:
     """Shapes, each painted in several ways: of ``own``, of the unseen families to measure on, or of the training's
@@ -124,7 +135,7 @@ def _render_world(job: CropJob) -> None:
     rng = np.random.Generator(np.random.PCG64([job.seed, 1]))
     world = World.generate(job.seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
     places = world.free_points(job.scenes, rng, 2.0)
-    models = drawn_models(job.own, rng, measures=job.measures)
+    models = _drawn_models(job.own, rng, measures=job.measures)
     samples = [sample for place in places for sample in _scene(world, place, models, rng, measures=job.measures)]
     joined = {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
     draft = job.file.with_suffix(".part")
@@ -228,6 +239,39 @@ def _window(crops: list[Any]) -> tuple[int, int, int, int]:
     low = np.clip(np.floor(np.nanmin(pixels, 0)) - 3, 0, (WIDTH - 8, HEIGHT - 8)).astype(int)
     high = np.clip(np.ceil(np.nanmax(pixels, 0)) + 3, low + 8, (WIDTH, HEIGHT)).astype(int)
     return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+def _cut_world(job: CropJob) -> None:
+    from flockd.sim.world.world import World  # noqa: PLC0415 - numba starts in the worker
+
+    rng = np.random.Generator(np.random.PCG64([job.seed, 2]))
+    world = World.generate(job.seed, ground_relief_m=0.0, keep_out=None)
+    models = _drawn_models(job.own, rng)
+    for number in range(job.scenes):
+        shape = models[int(rng.integers(len(models)))]
+        image = cut_out(world, shape[int(rng.integers(len(shape)))], rng)
+        cv2.imwrite(str(job.file.with_name(f"{job.seed}_{number:04d}.png")), image[..., [2, 1, 0, 3]])
+
+
+def cut_out(world: Any, drone: DroneModel, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """(320, 320, 4) RGBA of a drone from anywhere, alpha straight."""
+    from flockd.sim.renderer.renderer import Renderer  # noqa: PLC0415
+
+    side = FINER * CUT_PX
+    range_m = float(np.exp(rng.uniform(*np.log(CUT_RANGES_M))))
+    focal = side * rng.uniform(*CUT_FILL) * range_m / drone.size_m
+    matrix = np.array([[focal, 0.0, side / 2], [0.0, focal, side / 2], [0.0, 0.0, 1.0]])
+    pitch = np.arcsin(rng.uniform(-1.0, 1.0)) if rng.random() < 0.2 else rng.uniform(-0.9, 0.9)
+    R_ned_camera = worlds.attitude(rng.uniform(-np.pi, np.pi), np.array([rng.normal(0, 0.15), pitch])) @ R_BODY_CAMERA
+    place = np.array([0.0, 0.0, -rng.uniform(*CUT_HEIGHTS_M)])
+    view = Renderer(world, [drone]).render(
+        matrix, (side, side), R_ned_camera, place - range_m * R_ned_camera[:, 2],
+        drone_rotations=worlds.drawn_attitude(rng)[None], drone_positions=place[None], shown=[0],
+    )  # fmt: skip
+    mine = (view.ids == 1).astype(np.float32)[:, :, None]
+    small = cv2.resize(np.dstack([view.rgb * mine, 255.0 * mine]), (CUT_PX, CUT_PX), interpolation=cv2.INTER_AREA)
+    small[..., :3] *= 255.0 / np.maximum(small[..., 3:], 1.0)
+    return np.clip(np.rint(small), 0, 255).astype(np.uint8)
 
 
 if __name__ == "__main__":

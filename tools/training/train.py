@@ -3,8 +3,8 @@
     python -m tools.training.train neighbours --data DATA --out RUNS/neighbours --minutes 40
     python -m tools.training.train sigma --data DATA --out RUNS/sigma --start RUNS/distance/checkpoint.pt
 
-All draw from one folder: DATA/worlds of tools.training.render_training_data, DATA/crops of render_drone_crops,
-DATA/cutouts of render_cutouts, DATA/photographs without drones and DATA/labelled/* with real ones (see
+All draw from one folder: DATA/worlds of tools.training.render_training_data, DATA/crops of render_drone_crops and
+DATA/cutouts of render_drone_crops --cut-out, DATA/photographs without drones and DATA/labelled/* with real ones (see
 docs/networks.md), and what tools.training.mine found in them. `sigma` is the last part of `distance`: how far it may
 misjudge a drone's size, also of one that it has not seen.
 

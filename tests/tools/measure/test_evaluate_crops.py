@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flockd.core.data import data_path
 from tools.measure import evaluate_crops
-from tools.measure.evaluate_crops import HeldOut, measured
+from tools.measure.evaluate_crops import held_out, measured
 
 COUNT = 40
 SIZES_M = np.where(np.arange(COUNT) < 20, 0.5, 1.0)
@@ -29,20 +29,20 @@ def _write(folder: Path, **more: NDArray[Any]) -> None:
 
 def test_ranges_that_are_a_fifth_too_long_are_said_to_be_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _write(tmp_path, whole=np.arange(COUNT) < 36, range_m=np.where(np.arange(COUNT) % 2 == 0, 3.0, 7.0))
-    crops = HeldOut.of(tmp_path)
-    assert (len(crops.picture), len(crops.none)) == (36, 4)
-    assert np.exp(crops.log_size) == pytest.approx(SIZES_M[:36])
+    crops, none = held_out(tmp_path)
+    assert (len(crops["picture"]), len(none)) == (36, 4)
+    assert np.exp(crops["apparent"] + crops["target"][:, 0]) == pytest.approx(SIZES_M[:36])
 
     def columns(_: object, pictures: NDArray[Any]) -> dict[str, NDArray[Any]]:
         """A network that says 1.2 times the range, 70 px, and 15 % of deviation; and of none that it is none."""
         n = len(pictures)
-        ours = crops.log_range + np.log(1.2) if n == len(crops.picture) else np.zeros(n)
+        ours = crops["target"][:, 0] + np.log(1.2) if n == 36 else np.zeros(n)
         values = {"log_range_per_focal": ours, "log_apparent_size": np.full(n, np.log(70.0))}
-        logit = np.full(n, 9.0 if n == len(crops.picture) else -9.0)
+        logit = np.full(n, 9.0 if n == 36 else -9.0)
         return values | {"log_relative_sigma": np.full(n, np.log(0.15)), "drone_logit": logit}
 
     monkeypatch.setattr(evaluate_crops, "_columns", columns)
-    figures = measured(data_path("models") / "distance_int8.yaml", crops)
+    figures = measured(data_path("models") / "distance_int8.yaml", crops, none)
     for metres in ("1.5-5", "5-10"):
         assert figures[f"error of range, {metres} m, median / p95 / bias"] == "20.00% / 20.00% / +20.00%"
         assert figures[f"error of range by the known size, {metres} m, median / p95 / bias"].startswith("0.00% / 0.00%")
@@ -54,4 +54,4 @@ def test_ranges_that_are_a_fifth_too_long_are_said_to_be_so(tmp_path: Path, monk
 def test_crops_without_ranges_are_refused(tmp_path: Path) -> None:
     _write(tmp_path)
     with pytest.raises(ValueError, match=r"holds no crops with ranges; make them with `render_drone_crops --held-out`"):
-        HeldOut.of(tmp_path)
+        held_out(tmp_path)

@@ -48,8 +48,7 @@ def test_a_drone_is_proposed_where_the_second_stage_was_asked_about_its_directio
     found = Findings()
     compare_drones((), pairs, 0, depth, ids, found, [np.array([1.0, 0.0, 0.0])])
     assert [drone.proposed for drone in found.drones] == [True, False]
-    assert found.proposed(12, np.inf) == 0.5
-    assert found.found(12, np.inf) == 0.0
+    assert [drone.found for drone in found.drones] == [False, False]
 
 
 def test_ranges_along_the_rays_are_compared_with_depths_along_the_optical_axis() -> None:

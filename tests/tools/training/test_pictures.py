@@ -18,7 +18,7 @@ from flockd.core.data import data_path
 from flockd.flight.inference import OnnxModel
 from flockd.sim.renderer.drone_models import drone_model
 from flockd.sim.scenario import ObstaclesConfig
-from tools.measure.evaluate_crops import HeldOut, measured
+from tools.measure.evaluate_crops import held_out, measured
 from tools.training import worlds
 from tools.training.camera_effects import UNTOUCHED, as_filmed
 from tools.training.dataset import FOCAL_PX, HEIGHT, WIDTH, open_pairs
@@ -26,7 +26,7 @@ from tools.training.distractors import bag, balloon, bird, kite, mast
 from tools.training.mine import proposed
 from tools.training.own_mesh import OWN_FAMILY
 from tools.training.pictures import CropFiles, Cutouts, Scene, part_of, with_drones
-from tools.training.render_drone_crops import CropJob, _render_world, add_mesh, own_drone
+from tools.training.render_drone_crops import CropJob, _render_world, own_drone
 from tools.training.render_training_data import PairJob, _standing, render_world
 from tools.training.samples import DroneInView, crop_around, sample_of, warped
 
@@ -120,15 +120,12 @@ def test_some_images_stay_clear_and_the_others_are_spoilt() -> None:
 
 
 def test_a_mesh_without_the_drones_size_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    parser = argparse.ArgumentParser()
-    add_mesh(parser)
     with pytest.raises(SystemExit):
-        own_drone(parser, parser.parse_args(["--mesh", "my.glb"]))
+        own_drone(argparse.ArgumentParser(), argparse.Namespace(mesh=[Path("my.glb")], size_m=None))
     assert "--mesh needs --size-m, the drone's size" in capsys.readouterr().err
-    assert own_drone(parser, parser.parse_args([])) == []
 
 
-@pytest.mark.slow
+@pytest.mark.training
 def test_a_drone_of_a_mesh_flies_alone_and_a_network_is_measured_on_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -136,9 +133,7 @@ def test_a_drone_of_a_mesh_flies_alone_and_a_network_is_measured_on_it(
     mesh = tmp_path / "drone.glb"
     whole: Any = trimesh.util.concatenate(bars)
     whole.export(mesh)
-    parser = argparse.ArgumentParser()
-    add_mesh(parser)
-    own = own_drone(parser, parser.parse_args(["--mesh", str(mesh), "--size-m", "0.62"]))
+    own = own_drone(argparse.ArgumentParser(), argparse.Namespace(mesh=[mesh], size_m=0.62))
     assert "has no colours for 100% of its triangles; they get a drawn one" in capsys.readouterr().out
     job = CropJob(tmp_path / "crops.npz", worlds.TEST[-1], 40, own, measures=True)
     _render_world(job)
@@ -146,12 +141,10 @@ def test_a_drone_of_a_mesh_flies_alone_and_a_network_is_measured_on_it(
         assert set(crops["family"][crops["drone"] > 0.5]) == {OWN_FAMILY}
         sizes_m = np.exp(crops["apparent"] + crops["target"][:, 0])[crops["drone"] > 0.5]
     assert sizes_m == pytest.approx(0.62, rel=1e-3)
-    crops = HeldOut.of(tmp_path)
-    assert crops.log_size == pytest.approx(np.log(0.62), abs=1e-3)
-    assert "drones called a drone" in measured(data_path("models") / "distance_int8.yaml", crops)
+    assert "drones called a drone" in measured(data_path("models") / "distance_int8.yaml", *held_out(tmp_path))
 
 
-@pytest.mark.slow
+@pytest.mark.training
 def test_the_second_image_of_a_pair_is_where_the_flow_says_and_drones_are_in_their_boxes(tmp_path: Path) -> None:
     render_world(PairJob(tmp_path / "part-0000", worlds.TRAINING[3], 3, worlds.FAMILIES, 0.5))
     pairs, off = open_pairs(tmp_path), []

@@ -23,9 +23,7 @@ from tools.checks.device_check.findings import Check, Finding, run, until
 SIZE, SMALL = (640, 480), (320, 180)
 RATE_HZ, FRAMES = 25.0, 100
 SILENCE_S, NOTICED_S = 0.5, 0.5
-DROPPED_PERCENT, FLAGS = 20, 5
 LOOK_S = 0.002
-_DROPPING = "percentage_of_dropped_buffers"
 _FAILURES = {
     "a fatal streaming error": "inject_fatal_streaming_error",
     "a queue that refuses": "inject_vidioc_qbuf_error",
@@ -80,41 +78,6 @@ def carries_bytes() -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def loses_frames() -> Iterator[Finding]:
-    """The driver drops some; flockd counts the gaps in the numbers, and the rest flows on."""
-    with _running(_camera(WEBCAM, "yuyv")) as source:
-        before, begun_s = _counts(source), control(_DROPPING, DROPPED_PERCENT)
-        time.sleep(6.0)
-        control(_DROPPING, 0)
-        time.sleep(0.2)
-        after, span_s = _counts(source), time.monotonic() - begun_s
-        time.sleep(2.0)
-        more = _grown(after, source, "lost")
-    lost, received = (after.get(what, 0) - before.get(what, 0) for what in ("lost", "received"))
-    taken = RATE_HZ * span_s
-    yield Finding(
-        "dropped buffers", lost > 0 and abs(lost + received - taken) <= 3 and more == 0,
-        f"{lost} lost and {received} received, of {taken:.0f} that were taken; {more} lost afterwards",
-        f"about {DROPPED_PERCENT} % lost and counted, then none",
-    )  # fmt: skip
-
-
-def flags_damage() -> Iterator[Finding]:
-    """The driver says of single frames that they are damaged."""
-    with _running(_camera(WEBCAM, "yuyv")) as source:
-        before = _counts(source)
-        for _ in range(FLAGS):
-            control("inject_v4l2_buf_flag_error")
-            time.sleep(0.2)
-        flagged, opened = _grown(before, source, "flagged"), _grown(before, source, "opened")
-        goes_on = source.newest(1.0) is not None
-    yield Finding(
-        "buffer error flags", (flagged, opened) == (FLAGS, 0) and goes_on,
-        f"{flagged} of {FLAGS} refused and counted, opened again {opened} times",
-        "all refused, and the stream goes on",
-    )  # fmt: skip
-
-
 def breaks() -> Iterator[Finding]:
     """The driver gives up, or the process of a pipeline crashes as a driver in it does; only opening it again helps."""
     with _running(_camera(WEBCAM, "yuyv")) as source:
@@ -142,7 +105,7 @@ def falls_silent() -> Iterator[Finding]:
     )  # fmt: skip
 
 
-CHECKS: tuple[Check, ...] = streams, carries_bytes, loses_frames, flags_damage, breaks, falls_silent
+CHECKS: tuple[Check, ...] = streams, carries_bytes, breaks, falls_silent
 
 
 def _fails_and_returns(source: DeviceSource, what: str, fail: Callable[[], float]) -> Finding:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from tools.checks.device_check import cameras, capture, sandbox
+from tools.checks.device_check import cameras, capture
 from tools.checks.device_check.findings import Check, run_checks
 from tools.checks.device_check.service import Service
 
@@ -18,11 +18,7 @@ def main() -> None:
     findings, start, *only = sys.argv[1:]
     cameras.load()
     service = Service(Path(start).read_text(encoding="utf-8"))
-    groups: dict[str, tuple[Check, ...]] = {
-        "capture": capture.CHECKS,
-        "sandbox": (sandbox.holds,),
-        "service": service.checks,
-    }
+    groups: dict[str, tuple[Check, ...]] = {"capture": capture.CHECKS, "service": service.checks}
     run_checks(Path(findings), [check for group in only or groups for check in groups[group]])
     service.close()
 
