@@ -270,8 +270,8 @@ def cut_out(world: Any, drone: DroneModel, rng: np.random.Generator) -> NDArray[
     )  # fmt: skip
     mine = (view.ids == 1).astype(np.float32)[:, :, None]
     small = cv2.resize(np.dstack([view.rgb * mine, 255.0 * mine]), (CUT_PX, CUT_PX), interpolation=cv2.INTER_AREA)
-    small[..., :3] *= 255.0 / np.maximum(small[..., 3:], 1.0)
-    return np.clip(np.rint(small), 0, 255).astype(np.uint8)
+    colour = 255.0 * small[..., :3] / np.maximum(small[..., 3:], 1.0)
+    return np.asarray(np.clip(np.rint(np.dstack([colour, small[..., 3:]])), 0, 255), np.uint8)
 
 
 if __name__ == "__main__":
