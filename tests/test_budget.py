@@ -29,12 +29,12 @@ LINES = {
     "flockd/sim": 9_530,
     "flockd/campaign": 1_650,
     "flockd/cli": 3_620,
-    "tests": 39_430,
-    "tools/checks": 2_320,
+    "tests": 39_410,
+    "tools/checks": 2_150,
     "tools/docs": 940,
-    "tools/measure": 1_540,
+    "tools/measure": 1_330,
     "tools/release": 620,
-    "tools/training": 4_690,
+    "tools/training": 4_580,
 }
 """Lines of Python below a folder."""
 FILES = {"flockd": 361}
