@@ -89,7 +89,7 @@ def _vector(rotation: FloatArray) -> FloatArray:
 def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
     """(3, 3) of a quaternion (4,) x y z w of any length. Raises ValueError for one of no length.
 
-    By Rodrigues' formula: an autopilot sends 50 a second, and scipy takes most of a link's time for them.
+    By Rodrigues' formula: an autopilot's is read 20 times a second, and scipy takes ten times as long.
     """
     cross, w, square = cross_matrix(quaternion[:3]), quaternion[3], float(quaternion @ quaternion)
     if not square > 0.0:

@@ -26,7 +26,7 @@ JUMPS = 3
 """So many round trips in a row that contradict the estimate by `JUMP_S` and half their duration begin a new one."""
 RECENT_S = 2.0
 COMPARED_S = 1.0
-"""Messages that are compared with the clock: at 50 Hz enough for one that nothing has held up, ..."""
+"""Messages that are compared with the clock: at 30 Hz enough for one that nothing has held up, ..."""
 LEAST_MESSAGES = 10
 """... and at any rate so many."""
 LIES_AFTER_S = 1.5

@@ -275,7 +275,7 @@ class ReceivedMessages:
     @property
     def height_m(self) -> float:
         """Above home as the newest position says; NaN before the first."""
-        place = _vector(self._fields("LOCAL_POSITION_NED"), "x", "y", "z")
+        place = _numbers(self._fields("LOCAL_POSITION_NED"), "x", "y", "z")
         return math.nan if place is None else float((self.home_down_m or 0.0) - place[2])
 
     def _without_jumps(self, name: str, fields: Fields) -> Fields:
@@ -283,16 +283,16 @@ class ReceivedMessages:
         jump: str | None = None
         stamp_s = 1e-3 * float(fields.get("time_boot_ms") or 0)
         if name == "LOCAL_POSITION_NED":
-            place, velocity = _vector(fields, "x", "y", "z"), _vector(fields, "vx", "vy", "vz")
+            place, velocity = _numbers(fields, "x", "y", "z"), _numbers(fields, "vx", "vy", "vz")
             if place is None or velocity is None:
                 return fields
             jump = self._frame.move(stamp_s, place, velocity)
             if self._flies:
                 fields = {**fields, **dict(zip("xyz", (place + self._frame.offset).tolist(), strict=True))}
         elif name == "ATTITUDE_QUATERNION":
-            R_ned_body, rate = _attitude(fields), _vector(fields, "rollspeed", "pitchspeed", "yawspeed")
-            if R_ned_body is not None and rate is not None:
-                jump = self._frame.turn(stamp_s, R_ned_body, rate)
+            attitude, rate = _attitude(fields), _numbers(fields, "rollspeed", "pitchspeed", "yawspeed")
+            if attitude is not None and rate is not None:
+                jump = self._frame.turn(stamp_s, attitude, rate)
         if jump is not None and self._flies:
             self._report(jump)
         elif jump is not None:
@@ -368,12 +368,12 @@ class ReceivedMessages:
             return None
         place = _vector(position.fields, "x", "y", "z")
         velocity = _vector(position.fields, "vx", "vy", "vz")
-        R_ned_body = _attitude(attitude.fields)
-        if place is None or velocity is None or R_ned_body is None:
+        quaternion = _attitude(attitude.fields)
+        if place is None or velocity is None or quaternion is None:
             return None
         return VehicleState(
             time_s=min(attitude.time_s, position.time_s),
-            R_ned_body=R_ned_body,
+            R_ned_body=rotation_from_quaternion(np.array([*quaternion[1:], quaternion[0]])),
             height_m=float((self.home_down_m or 0.0) - place[2]),
             velocity_ned=velocity,
             position=None if self._home is None else (place - self._home)[:2],
@@ -483,20 +483,23 @@ def _range_reading(fields: Fields, time_s: float) -> RangeReading:
     )
 
 
-def _vector(fields: Fields, *names: str) -> FloatArray | None:
+def _numbers(fields: Fields, *names: str) -> list[float] | None:
     """The named numbers, or None where one is missing, null, which is how NaN comes, or infinite."""
-    numbers = [fields.get(name) for name in names]
-    if any(number is None or not math.isfinite(number) for number in numbers):
-        return None
-    return np.array(numbers, dtype=float)
+    numbers: list[Any] = [fields.get(name) for name in names]
+    return None if any(number is None or not math.isfinite(number) for number in numbers) else numbers
 
 
-def _attitude(fields: Fields) -> FloatArray | None:
-    """(3, 3) from the body to NED."""
-    quaternion = _vector(fields, "q2", "q3", "q4", "q1")
-    if quaternion is None or abs(float(np.linalg.norm(quaternion)) - 1.0) > QUATERNION_TOLERANCE:
-        return None
-    return rotation_from_quaternion(quaternion)
+def _vector(fields: Fields, *names: str) -> FloatArray | None:
+    """The same as an array."""
+    numbers = _numbers(fields, *names)
+    return None if numbers is None else np.array(numbers, dtype=float)
+
+
+def _attitude(fields: Fields) -> list[float] | None:
+    """Quaternion w x y z from the body to NED, of about unit length."""
+    quaternion = _numbers(fields, "q1", "q2", "q3", "q4")
+    known = quaternion is not None and abs(math.hypot(*quaternion) - 1.0) <= QUATERNION_TOLERANCE
+    return quaternion if known else None
 
 
 def _estimate_ok(message: ReceivedMessage | None) -> bool | None:

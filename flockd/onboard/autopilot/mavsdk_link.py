@@ -89,7 +89,7 @@ MOST_OPEN = 20
 """Exchanges whose reply is waited for; older ones are lost."""
 REASON_S = 0.5
 """For how long a refusal waits for the autopilot's text, which comes after it."""
-ATTEND_S, ANNOUNCE_S, PARAMETER_S = 0.1, 1.0, 0.4
+ATTEND_S, ANNOUNCE_S, PARAMETER_S = 0.25, 1.0, 0.5
 """Between two looks at what is missing; two announcements; and two readings of a parameter."""
 CHECKS_AGAIN_S = 1.0
 """Between two requests for the list of failed checks, of which events were lost."""
@@ -103,6 +103,7 @@ MAX_TEXTS = 100
 GONE_S = 10.0
 """A serial port that is gone for longer is not waited for on the ground; an autopilot that starts anew takes 5."""
 
+_JSON = json.JSONEncoder(allow_nan=False)
 _log = logging.getLogger(__name__)
 _LOG_LEVELS = {
     LogLevel.DEBUG: logging.DEBUG,
@@ -498,7 +499,7 @@ class AutopilotLink:
 
     def _message(self, name: str, fields: Fields) -> MavlinkMessage:
         target = {"target_system": self._system_id, "target_component": AUTOPILOT_COMPONENT}
-        text = json.dumps(fields if name in UNTARGETED else {**target, **fields}, allow_nan=False)
+        text = _JSON.encode(fields if name in UNTARGETED else {**target, **fields})
         return MavlinkMessage(name, 0, 0, self._system_id, AUTOPILOT_COMPONENT, text)
 
     async def _wait_for(self, name: str, deadline: float) -> Fields:

@@ -93,17 +93,18 @@ class SerialPort:
 
     def _run(self) -> None:
         while True:
-            poll = select.poll()
+            poll, there = select.poll(), self._descriptor >= 0
             poll.register(self._closing, select.POLLIN)
-            if self._descriptor >= 0:
+            if there:
                 poll.register(self._descriptor, select.POLLIN)
-            ready = poll.poll(None if self._descriptor >= 0 else 1e3 * REOPEN_S)
-            if any(descriptor == self._closing for descriptor, _ in ready):
-                return
-            if self._descriptor < 0:
-                self._reopen()
-            elif ready:
-                self._read()
+            while there == (self._descriptor >= 0):
+                ready = poll.poll(None if there else 1e3 * REOPEN_S)
+                if any(descriptor == self._closing for descriptor, _ in ready):
+                    return
+                if there:
+                    self._read()
+                else:
+                    self._reopen()
 
     def _read(self) -> None:
         try:

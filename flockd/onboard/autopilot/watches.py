@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from flockd.core import services
-from flockd.core.messages import FloatArray
-from flockd.flight.geometry import rotation_from_vector
 
 LOSS_TIME, LOSS_ACTION, GROUND_STATION_LOSS = "COM_OF_LOSS_T", "COM_OBL_RC_ACT", "NAV_DLL_ACT"
 MOST_SPEED = "MPC_XY_VEL_MAX"
@@ -131,15 +129,17 @@ LARGEST_M = 1.0
 """A larger jump, or one of the heading, is not flown on with."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Sample:
+class _Sample(NamedTuple):
     stamp_s: float
-    value: FloatArray
-    rate: FloatArray
+    value: Sequence[float]
+    rate: Sequence[float]
 
 
 class LocalFrame:
-    """Notices jumps. `offset` may be read on any thread."""
+    """Notices jumps. `offset` may be read on any thread.
+
+    On numbers: an autopilot sends 80 such messages a second, of which arrays of three take most of a link's time.
+    """
 
     def __init__(self) -> None:
         self.offset = np.zeros(3)
@@ -153,36 +153,55 @@ class LocalFrame:
         """The autopilot's own frame counts from now on."""
         self.offset, self.large = np.zeros(3), False
 
-    def move(self, stamp_s: float, place: FloatArray, velocity: FloatArray) -> str | None:
+    def move(self, stamp_s: float, place: Sequence[float], velocity: Sequence[float]) -> str | None:
         """Takes a position and velocity (3,) of the autopilot's, by its own clock; one sentence on a jump."""
         before, self._place = self._place, _Sample(stamp_s, place, velocity)
         if before is None or stamp_s < before.stamp_s:
             return None
-        interval_s = stamp_s - before.stamp_s
-        jump = place - before.value - 0.5 * interval_s * (before.rate + velocity)
-        if not JUMP_M + _unseen(interval_s) < np.linalg.norm(jump) < math.inf:
+        half_s = 0.5 * (stamp_s - before.stamp_s)
+        pairs = zip(place, before.value, before.rate, velocity, strict=True)
+        jump = [now - was - half_s * (rate + rate_now) for now, was, rate, rate_now in pairs]
+        if not JUMP_M + _unseen(2.0 * half_s) < math.hypot(*jump) < math.inf:
             return None
         self.offset = self.offset - jump
-        self.large |= float(max(math.hypot(jump[0], jump[1]), abs(jump[2]))) > LARGEST_M
-        north, east, down = np.round(jump, 1) + 0.0
+        self.large |= bool(max(math.hypot(*jump[:2]), abs(jump[2])) > LARGEST_M)
+        north, east, down = (round(one, 1) + 0.0 for one in jump)
         return (
             f"the autopilot's local frame jumped by {north:.1f} m north, {east:.1f} m east and {down:.1f} m down; "
             "home, fence, height and goals move with it"
         )
 
-    def turn(self, stamp_s: float, R_ned_body: FloatArray, rate: FloatArray) -> str | None:
-        """The same of attitudes (3, 3) and rates (3,) in rad/s of the body: only the heading is looked at."""
-        before, self._attitude = self._attitude, _Sample(stamp_s, R_ned_body, rate)
+    def turn(self, stamp_s: float, attitude: Sequence[float], rate: Sequence[float]) -> str | None:
+        """The same of unit quaternions w x y z from the body to NED and rates (3,) in rad/s of the body.
+
+        Only the heading is looked at: of the rotation w x y z from the attitude that the rates lead to, to the one that
+        was sent, the turn about the vertical is 2 atan2(z, w).
+        """
+        before, self._attitude = self._attitude, _Sample(stamp_s, attitude, rate)
         if before is None or stamp_s < before.stamp_s:
             return None
         interval_s = stamp_s - before.stamp_s
-        reckoned = before.value @ rotation_from_vector(0.5 * interval_s * (before.rate + rate))
-        off = R_ned_body @ reckoned.T
-        jump_rad = math.atan2(off[1, 0] - off[0, 1], off[0, 0] + off[1, 1])
+        half = [0.25 * interval_s * (was + now) for was, now in zip(before.rate, rate, strict=True)]
+        angle = math.hypot(*half)
+        scale = math.sin(angle) / angle if angle > 0.0 else 1.0
+        reckoned = _product(before.value, (math.cos(angle), *(scale * one for one in half)))
+        w, _, _, z = _product(attitude, (reckoned[0], *(-one for one in reckoned[1:])))
+        jump_rad = math.remainder(2.0 * math.atan2(z, w), math.tau)
         if abs(jump_rad) <= JUMP_RAD + _unseen(interval_s):
             return None
         self.large = True
         return f"the autopilot's heading jumped by {math.degrees(jump_rad):.0f} degrees"
+
+
+def _product(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float, float]:
+    """Of quaternions w x y z."""
+    (aw, ax, ay, az), (bw, bx, by, bz) = a, b
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
 
 
 def _unseen(interval_s: float) -> float:

@@ -134,7 +134,7 @@ _PRESETS: Mapping[CameraPreset, Mapping[str, Mapping[str, Any]]] = {
         "compression": {"jpeg_quality": 80},
         # Free running at 30 Hz; what a calibration of the delay leaves; USB's share.
         "timing": {"apart_s": 0.0167, "delay_s": 0.005, "jitter_s": 0.003, "dropped": 0.01},
-        # ATTITUDE_QUATERNION at 50 Hz, read between two of them, and a serial port.
+        # ATTITUDE_QUATERNION at 30 Hz, read between two of them, and a serial port.
         "attitude": {"late_s": 0.02, "noise_deg": 0.1},
     },
 }  # fmt: skip

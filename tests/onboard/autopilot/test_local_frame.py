@@ -63,8 +63,9 @@ def test_a_heading_jumps_that_its_rate_does_not_explain(degrees: float, jumps: b
     )
 
     def attitude(yaw_rad: float) -> FloatArray:
+        """Unit quaternion w x y z."""
         banked = rotation_from_vector(np.array([math.radians(30.0), 0.0, 0.0]))
-        return rotation_from_vector(np.array([0.0, 0.0, yaw_rad])) @ banked
+        return np.roll(quaternion_from_rotation(rotation_from_vector(np.array([0.0, 0.0, yaw_rad])) @ banked), 1)
 
     for number in range(10):
         assert frame.turn(0.02 * number, attitude(0.01 * math.pi * number), rate) is None
