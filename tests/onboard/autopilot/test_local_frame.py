@@ -24,7 +24,7 @@ def _moves(frame: LocalFrame, place: FloatArray, hz: float) -> None:
         around = 3.0 * np.array([math.cos(angle) - 1.0, math.sin(angle), 0.0])
         velocity = 4.0 * np.array([-math.sin(angle), math.cos(angle), 0.0])
         corrected = place + around + rng.normal(0.0, 0.03, 3)
-        assert frame.move(round(100.0 + t, 3), corrected, velocity) is None
+        assert frame.move(round(100.0 + t, 3), corrected.tolist(), velocity.tolist()) is None
 
 
 @pytest.mark.parametrize("hz", [2.0, 10.0, 30.0, 50.0])
@@ -45,9 +45,9 @@ def test_a_tight_circle_and_an_estimators_corrections_are_no_jump(hz: float) -> 
     ],
 )
 def test_a_jump_is_said_and_taken_out(jump: tuple[float, float, float], large: bool) -> None:
-    frame, velocity = LocalFrame(), np.array([1.0, 0.0, 0.0])
-    frame.move(1.0, np.zeros(3), velocity)
-    told = frame.move(1.1, np.array([0.1, 0.0, 0.0]) + jump, velocity)
+    frame, velocity = LocalFrame(), (1.0, 0.0, 0.0)
+    frame.move(1.0, (0.0, 0.0, 0.0), velocity)
+    told = frame.move(1.1, (0.1 + jump[0], *jump[1:]), velocity)
     assert told is not None
     assert f"{jump[0]:.1f} m north, {jump[1]:.1f} m east and {jump[2]:.1f} m down" in told
     np.testing.assert_allclose(frame.offset, np.negative(jump), atol=1e-9)
@@ -57,15 +57,13 @@ def test_a_jump_is_said_and_taken_out(jump: tuple[float, float, float], large: b
 @pytest.mark.parametrize(("degrees", "jumps"), [(8.0, False), (20.0, True), (-150.0, True)])
 def test_a_heading_jumps_that_its_rate_does_not_explain(degrees: float, jumps: bool) -> None:
     """While the drone turns at 90 degrees a second, banked by 30."""
-    frame, rate = (
-        LocalFrame(),
-        rotation_from_vector(np.array([-math.radians(30.0), 0.0, 0.0])) @ [0.0, 0.0, math.pi / 2],
-    )
+    frame, banked = LocalFrame(), rotation_from_vector(np.array([math.radians(30.0), 0.0, 0.0]))
+    rate = (banked.T @ [0.0, 0.0, math.pi / 2]).tolist()
 
-    def attitude(yaw_rad: float) -> FloatArray:
+    def attitude(yaw_rad: float) -> Any:
         """Unit quaternion w x y z."""
-        banked = rotation_from_vector(np.array([math.radians(30.0), 0.0, 0.0]))
-        return np.roll(quaternion_from_rotation(rotation_from_vector(np.array([0.0, 0.0, yaw_rad])) @ banked), 1)
+        turned = rotation_from_vector(np.array([0.0, 0.0, yaw_rad])) @ banked
+        return np.roll(quaternion_from_rotation(turned), 1).tolist()
 
     for number in range(10):
         assert frame.turn(0.02 * number, attitude(0.01 * math.pi * number), rate) is None
