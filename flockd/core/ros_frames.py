@@ -1,7 +1,7 @@
 """Between flockd's axes and those of ROS, by its REP 103 and REP 105: the only place that converts them. Pure.
 
 flockd's world is north, east, down (NED), its body forward, right, down (FRD); those of ROS are east, north, up (ENU)
-and forward, left, up (FLU). A camera's axes are the same in both: right, down, forward, which REP 103 calls `_optical`.
+and forward, left, up (FLU).
 Yaw counts from east counter-clockwise in ROS, and from north clockwise in flockd; pixel centres lie at whole numbers in
 ROS, and half a pixel farther in flockd. ``R_a_b`` takes coordinates from b to a.
 """
@@ -48,11 +48,6 @@ def attitude_in_ros(R_ned_frd: FloatArray) -> FloatArray:
 def attitude_of_ros(R_enu_flu: FloatArray) -> FloatArray:
     """R_ned_frd (3, 3) of an attitude in ROS."""
     return _ENU_NED @ R_enu_flu @ _FLU_FRD
-
-
-def camera_in_ros(R_frd_camera: FloatArray) -> FloatArray:
-    """R_flu_optical (3, 3) of a camera's mounting."""
-    return _FLU_FRD @ R_frd_camera
 
 
 def attitude_of_angles(roll_deg: float, pitch_deg: float, yaw_deg: float) -> FloatArray:

@@ -61,13 +61,6 @@ def test_pitch_and_roll() -> None:
     near(rf.quaternion_of(rf.attitude_in_ros(rf.attitude_of_angles(90.0, 0.0, 0.0))), [0.5, 0.5, 0.5, 0.5])
 
 
-def test_an_optical_frame() -> None:
-    """REP 103: `_optical` is "z forward, x right, y down": of a camera that faces forward, x is -y of the body."""
-    forward = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # FRD of RDF
-    near(rf.camera_in_ros(forward), [[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
-    near(rf.quaternion_of(rf.camera_in_ros(forward)), [-0.5, 0.5, -0.5, 0.5])
-
-
 def test_a_quaternion_that_nobody_filled_in_is_refused() -> None:
     with pytest.raises(ValueError, match="no rotation: a quaternion of length 0; fill it in"):
         rf.rotation_of(np.zeros(4))

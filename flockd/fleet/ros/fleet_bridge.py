@@ -2,41 +2,30 @@
 
 from __future__ import annotations
 
-import json
 import threading
-from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
-from flockd.core.config.rig import CameraConfig, RigConfig
-from flockd.core.jpeg_header import jpeg_size
-from flockd.core.ros_frames import MAP, attitude_in_ros, camera_in_ros, flu_of_frd
-from flockd.fleet.drone_rows import GONE, QUIET, Known, Row, origin_of
+from flockd.core.ros_frames import MAP, attitude_in_ros
+from flockd.fleet.drone_rows import GONE, QUIET, Known, Row
 from flockd.fleet.live_fleet import LiveFleet
 from flockd.fleet.ros.fleet_markers import home_in_map, markers
-from flockd.fleet.ros.ros_orders import NewestOrder, Whereabouts, goal_of, velocity_of
+from flockd.fleet.ros.ros_orders import goal_of, velocity_of
 from flockd.fleet.watcher import Watched
-from flockd.flight.geometry import RigCamera, build_rig
 from flockd.onboard.ros import message_trees as trees
 from flockd.onboard.ros.message_trees import Names, Tree, ros_name
-from flockd.onboard.ros.ros_node import Answer, Delivery, RosNode, has_type, tree_of
-from flockd.onboard.telemetry.topics import (
-    AboutMessage,
-    OrderMessage,
-    StateMessage,
-)
+from flockd.onboard.ros.ros_node import Delivery, RosNode, has_type
+from flockd.onboard.telemetry.topics import OrderMessage, StateMessage
 
 UPDATE_EVERY_S = 0.05
-PICTURE_EVERY_S = 0.2
 STATE_EVERY_S = 1.0
 """A drone's state is sent when it changes, and so often where it does not."""
 PLAIN = ("hold", "land", "resume")
 """Orders without a place, each a service."""
-_THREADS = 16
-"""That wait for pictures, and as many that wait for answers to goals and velocities."""
 _LEVELS = {
     **dict.fromkeys(("normal", "ready", "idle"), trees.OK),
     **dict.fromkeys(("degraded", "hover", "silent"), trees.WARN),
@@ -65,9 +54,6 @@ class FleetBridge:
         self._told: dict[str, tuple[float, Tree]] = {}
         self._drawn: dict[str, Row] = {}
         self._served: set[str] = set()
-        self._pictures: dict[str, tuple[float, Future[None]]] = {}
-        self._threads = ThreadPoolExecutor(_THREADS, "ROS 2 pictures")
-        self._order_threads = ThreadPoolExecutor(_THREADS, "ROS 2 orders")
         self._over = threading.Event()
         self._thread = ThreadPoolExecutor(1, "fleet in ROS 2")
 
@@ -78,8 +64,6 @@ class FleetBridge:
     def __exit__(self, *_: object) -> None:
         self._over.set()
         self._thread.shutdown()
-        self._threads.shutdown(cancel_futures=True)
-        self._order_threads.shutdown(cancel_futures=True)
 
     def wait(self) -> None:
         """Until it is closed. Raises what ended it before."""
@@ -92,7 +76,7 @@ class FleetBridge:
     def update(self) -> None:
         """Publishes what is new."""
         now_s = self._source.now_s()
-        rows, known = self._source.rows(now_s), self._source.known()
+        rows = self._source.rows(now_s)
         for drone in self._source.drones():
             key = f"{drone.fleet}/{drone.drone}"
             name, row = self._names.of(key), rows.get(key)
@@ -101,12 +85,11 @@ class FleetBridge:
             if self._may_command and name not in self._served:
                 self._served.add(name)
                 self._serve(key, name)
-            self._publish_step(drone, name, row, known.get(key, Known()).about, now_s)
+            self._publish_step(drone, name, row, now_s)
             self._publish_state(name, row, now_s)
             self._publish_markers(name, row)
-            self._ask_for_pictures(key, name, row, known.get(key, Known()), now_s)
 
-    def _publish_step(self, drone: Watched, name: str, row: Row, about: AboutMessage | None, now_s: float) -> None:
+    def _publish_step(self, drone: Watched, name: str, row: Row, now_s: float) -> None:
         """What each step of the drone's pilot told, once."""
         for topic in ("state", "neighbours", "obstacles"):
             heard, message = drone.topics.get(topic), drone.message(topic, now_s)
@@ -114,12 +97,12 @@ class FleetBridge:
                 continue
             self._sent[name, topic] = heard.time_s
             time_ns = round(1e9 * self._source.wall_s(heard.time_s))
-            for place, kind, tree in self._of_step(topic, time_ns, Names(name), message, row, about):
+            for place, kind, tree in self._of_step(topic, time_ns, Names(name), message, row):
                 if tree is not None:
                     self._node.publish(place, kind, tree, Delivery.SENSOR if place != "/tf" else Delivery.EVENT)
 
     def _of_step(
-        self, topic: str, time_ns: int, names: Names, message: Any, row: Row, about: AboutMessage | None
+        self, topic: str, time_ns: int, names: Names, message: Any, row: Row
     ) -> list[tuple[str, str, Tree | None]]:
         space = f"/{names.drone}"
         match topic:
@@ -131,7 +114,7 @@ class FleetBridge:
                 ]
             case "obstacles":
                 return [(f"{space}/obstacles", trees.LASER_SCAN, trees.scan(time_ns, names, message))]
-        frames = _transforms(time_ns, names, message, row, about) if self.has_transforms else None
+        frames = _transforms(time_ns, names, message, row) if self.has_transforms else None
         return [
             (f"{space}/odometry", trees.ODOMETRY, trees.state_odometry(time_ns, names, message)),
             ("/tf", trees.TRANSFORMS, frames),
@@ -157,37 +140,6 @@ class FleetBridge:
             number = list(self._drawn).index(name)
             self._node.publish(topic, trees.MARKERS, markers(time_ns, name, number, row), Delivery.STATE)
 
-    def _ask_for_pictures(self, key: str, name: str, row: Row, known: Known, now_s: float) -> None:
-        """Of cameras that somebody reads; each waits on a thread of its own, as the drone may take seconds."""
-        for camera in row["cameras"]:
-            base = f"/{name}/camera/{ros_name(camera)}"
-            self._node.advertise(f"{base}/image/compressed", trees.COMPRESSED_IMAGE, Delivery.SENSOR)
-            self._node.advertise(f"{base}/camera_info", trees.CAMERA_INFO, Delivery.SENSOR)
-            asked_s, asked = self._pictures.get(base, (-PICTURE_EVERY_S, None))
-            if asked is not None and asked.done():
-                asked.result()  # raises what it met
-            if now_s - asked_s < PICTURE_EVERY_S or (asked is not None and not asked.done()):
-                continue
-            if self._node.is_read(f"{base}/image/compressed"):
-                job = self._threads.submit(self._publish_picture, key, name, camera, base, known)
-                # From when it was due, so that a late look does not slow the pictures down.
-                due_s = asked_s + PICTURE_EVERY_S
-                self._pictures[base] = due_s if now_s - due_s < PICTURE_EVERY_S else now_s, job
-
-    def _publish_picture(self, key: str, name: str, camera: str, base: str, known: Known) -> None:
-        now_s = self._source.now_s()
-        picture = self._source.image(key, camera)
-        size_px = None if picture is None else jpeg_size(picture)
-        if picture is None or size_px is None:
-            return
-        time_ns, frame = round(1e9 * self._source.wall_s(now_s)), Names(name).optical(ros_name(camera))
-        image = trees.compressed_image(time_ns, frame, picture, "jpeg")
-        self._node.publish(f"{base}/image/compressed", trees.COMPRESSED_IMAGE, image, Delivery.SENSOR)
-        mounted = cameras_of(known.about).get(camera)
-        if mounted is not None:
-            info = trees.camera_info(time_ns, frame, mounted[0], size_px)
-            self._node.publish(f"{base}/camera_info", trees.CAMERA_INFO, info, Delivery.SENSOR)
-
     def _serve(self, key: str, name: str) -> None:
         """Its services, and the topics of orders that carry something."""
         for command in PLAIN:
@@ -196,40 +148,27 @@ class FleetBridge:
             ("goal", trees.POSE, "goto", goal_of),
             ("cmd_vel", trees.TWIST, "velocity", velocity_of),
         ):
-            orders = NewestOrder(self._order_threads, partial(self._order, key, name, command, parse))
-            self._node.subscribe(f"/{name}/{topic}", kind, orders.offer, Delivery.EVENT)
+            take = partial(self._order, key, name, command, parse)
+            self._node.subscribe(f"/{name}/{topic}", kind, take, Delivery.ORDER)
         self._node.advertise(f"/{name}/order_answer", trees.DIAGNOSTIC, Delivery.EVENT)
 
-    def _order(
-        self, key: str, name: str, command: str, parse: Callable[[Tree, Whereabouts], OrderMessage], message: Any
-    ) -> None:
+    def _order(self, key: str, name: str, command: str, parse: Callable[..., OrderMessage], message: Any) -> None:
         """What became of it is published, as a topic has no reply."""
+        row, known = self._source.rows(self._source.now_s()).get(key), self._source.known().get(key, Known())
         try:
-            answer = self._ask(key, command, parse(tree_of(message), self._whereabouts(key, name)))
+            if row is None:
+                raise ValueError("the drone is not heard any more")  # noqa: TRY301 - told below
+            accepted, sentence = self._ask(key, command, parse(message, Names(name), row, known.about))
         except ValueError as error:
-            answer = Answer(accepted=False, sentence=str(error))
-        level = trees.OK if answer.accepted else trees.ERROR
-        told = trees.diagnostic(f"{name}: {command}", level, answer.sentence, {"accepted": answer.accepted})
+            accepted, sentence = False, str(error)
+        level = trees.OK if accepted else trees.ERROR
+        told = trees.diagnostic(f"{name}: {command}", level, sentence, {"accepted": accepted})
         self._node.publish(f"/{name}/order_answer", trees.DIAGNOSTIC, told, Delivery.EVENT)
 
-    def _ask(self, key: str, command: str, order: OrderMessage | None) -> Answer:
+    def _ask(self, key: str, command: str, order: OrderMessage | None) -> tuple[bool, str]:
         """Asks the drone itself, which decides."""
-        answer = self._source.ask(key, command, cast("Mapping[str, object] | None", order), self._operator)
-        return Answer(answer["accepted"], answer["sentence"])
-
-    def _whereabouts(self, key: str, name: str) -> Whereabouts:
-        now_s = self._source.now_s()
-        home = self._source.rows(now_s).get(key, {}).get("home_ne")
-        about = self._source.known().get(key, Known()).about
-        origin = None if about is None else origin_of(about["configuration"])
-        told = (one.message("state", now_s) for one in self._source.drones() if f"{one.fleet}/{one.drone}" == key)
-        state = cast("StateMessage | None", next(told, None))
-        return Whereabouts(
-            Names(name),
-            None if home is None else np.array(home),
-            None if origin is None else np.array(origin),
-            None if state is None else trees.attitude_of_state(state),
-        )
+        answer = self._source.ask(key, command, None if order is None else dict(order), self._operator)
+        return answer["accepted"], answer["sentence"]
 
 
 class DroneNames:
@@ -248,42 +187,21 @@ class DroneNames:
         return self._names[key]
 
 
-def _transforms(time_ns: int, names: Names, state: StateMessage, row: Row, about: AboutMessage | None) -> Tree | None:
-    """map, odom, level, body and cameras, of a drone that knows its position."""
+def _transforms(time_ns: int, names: Names, state: StateMessage, row: Row) -> Tree | None:
+    """map, odom, level and body, of a drone that knows its position."""
     odometry = trees.state_odometry(time_ns, names, state)
     if odometry is None:
         return None
     place = np.array(list(odometry["pose"]["pose"]["position"].values()))
-    R = attitude_in_ros(trees.attitude_of_state(state))
-    mounted = {name: camera.T_body_camera for name, (_, camera) in cameras_of(about).items()}
-    cameras = [
-        trees.transform(
-            time_ns,
-            names.base_link,
-            names.optical(ros_name(name)),
-            flu_of_frd(T.translation),
-            camera_in_ros(T.rotation),
-        )
-        for name, T in mounted.items()
-    ]
     return {
         "transforms": [
             trees.transform(time_ns, MAP, names.odom, home_in_map(row), np.eye(3)),
             trees.transform(time_ns, names.odom, names.level, place, np.eye(3)),
-            trees.transform(time_ns, names.odom, names.base_link, place, R),
-            *cameras,
+            trees.transform(
+                time_ns, names.odom, names.base_link, place, attitude_in_ros(trees.attitude_of_state(state))
+            ),
         ]
     }
-
-
-def cameras_of(about: AboutMessage | None) -> dict[str, tuple[CameraConfig, RigCamera]]:
-    """A drone's cameras by name; none where its configuration is not known or cannot be."""
-    try:
-        config = RigConfig.model_validate_json(json.dumps((about or {"configuration": {}})["configuration"].get("rig")))
-        mounted = build_rig(config).cameras
-    except (ValueError, ArithmeticError, RecursionError):  # of a peer of another version, or a hostile one
-        return {}
-    return {camera.name: (camera, mounted[camera.name]) for camera in config.cameras}
 
 
 def _status(name: str, row: Row) -> Tree:

@@ -23,8 +23,8 @@ COLOURS = (
     (0.8, 0.47, 0.65),
     (0.34, 0.7, 0.91),
 )
-_OBSTACLE, _FENCE, _LABEL = (0.45, 0.45, 0.45), (0.8, 0.2, 0.2), (1.0, 1.0, 1.0)
-_ARROW, _SPHERE, _CYLINDER, _LINE_STRIP, _LINE_LIST, _TEXT = 0, 2, 3, 4, 5, 9
+_FENCE, _LABEL = (0.8, 0.2, 0.2), (1.0, 1.0, 1.0)
+_ARROW, _SPHERE, _CYLINDER, _LINE_STRIP, _TEXT = 0, 2, 3, 4, 9
 _DELETE_ALL = 3
 _ABOVE = np.array([0.0, 0.0, 0.6])
 """From a drone to its name."""
@@ -40,7 +40,6 @@ def markers(time_ns: int, name: str, number: int, row: Row) -> Tree:
             *_body(name, row, place, colour),
             *_course(row, place, colour),
             *_neighbours(row, place, colour),
-            *_obstacles(row, place),
             *_fence(row),
         ]
         drawn += [{"header": header(time_ns, MAP), "ns": name, "id": i, **part} for i, part in enumerate(parts)]
@@ -77,7 +76,7 @@ def _course(row: Row, place: FloatArray, colour: tuple[float, ...]) -> Iterable[
     for velocity, alpha, thickness_m in ((row["velocity_ned"], 1.0, 0.08), (row["command_ne"], 0.5, 0.03)):
         if velocity is not None:
             end = place + COURSE_S * enu_of_ned(np.array([*velocity, 0.0][:3]))
-            yield _lines(_LINE_STRIP, [place, end], _tint(colour, alpha), thickness_m)
+            yield _lines([place, end], _tint(colour, alpha), thickness_m)
     if row["goal_ne"] is not None:
         goal = home_in_map(row) + enu_of_ned(np.array([*row["goal_ne"], 0.0]))
         goal[2] = place[2] if row["goal_height_m"] is None else row["goal_height_m"]
@@ -90,39 +89,24 @@ def _neighbours(row: Row, place: FloatArray, colour: tuple[float, ...]) -> Itera
         there = place + enu_of_ned(np.array(one["ned"]))
         tint = _tint(colour, 0.6 if one["confirmed"] else 0.25)
         yield _sphere(there, max(0.3, 2.0 * (one["sigma_m"] or 0.0)), tint)
-        yield _lines(_LINE_STRIP, [place, there], tint, 0.02)
-
-
-def _obstacles(row: Row, place: FloatArray) -> Iterable[Tree]:
-    """A piece of a circle in each direction in which something is near, at the drone's height."""
-    ranges = row["obstacles_m"] or ()
-    half = math.pi / max(len(ranges), 1)
-    points = [
-        place + range_m * np.array([math.sin(azimuth), math.cos(azimuth), 0.0])
-        for sector, range_m in enumerate(ranges)
-        if range_m is not None
-        for azimuth in ((2 * sector - 1) * half, (2 * sector + 1) * half)
-    ]
-    if points:
-        yield _lines(_LINE_LIST, points, _tint(_OBSTACLE), 0.15)
+        yield _lines([place, there], tint, 0.02)
 
 
 def _fence(row: Row) -> Iterable[Tree]:
     """On the ground."""
     fence, home = row["fence"] or {}, home_in_map(row)
-    if fence.get("radius_m"):
-        angles = np.linspace(0.0, 2 * math.pi, 73)
-        circle = [home + fence["radius_m"] * np.array([math.cos(angle), math.sin(angle), 0.0]) for angle in angles]
-        yield _lines(_LINE_STRIP, circle, _tint(_FENCE, 0.8), 0.1)
-    if fence.get("corners_m"):
-        corners = [home + enu_of_ned(np.array([*corner, 0.0])) for corner in fence["corners_m"]]
-        yield _lines(_LINE_STRIP, [*corners, corners[0]], _tint(_FENCE, 0.8), 0.1)
+    angles = np.linspace(0.0, 2 * math.pi, 73)
+    circle = (fence.get("radius_m") or 0.0) * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    corners = [enu_of_ned(np.array([*corner, 0.0])) for corner in fence.get("corners_m") or ()]
+    for points in (circle if circle.any() else [], [*corners, *corners[:1]]):
+        if len(points):
+            yield _lines([home + point for point in points], _tint(_FENCE, 0.8), 0.1)
 
 
-def _lines(kind: int, points: Iterable[FloatArray], tint: Tree, thickness_m: float) -> Tree:
+def _lines(points: Iterable[FloatArray], tint: Tree, thickness_m: float) -> Tree:
     pose: dict[str, Any] = {"position": vector((0.0, 0.0, 0.0)), "orientation": LEVEL_TURN}
     scale = vector((thickness_m, 0.0, 0.0))
-    return {"type": kind, "pose": pose, "scale": scale, "color": tint, "points": [vector(one) for one in points]}
+    return {"type": _LINE_STRIP, "pose": pose, "scale": scale, "color": tint, "points": [vector(one) for one in points]}
 
 
 def _sphere(place: FloatArray, diameter_m: float, tint: Tree) -> Tree:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -35,7 +35,7 @@ def check(config: DroneConfig, vehicle_topic: str | None) -> None:
 
 
 class PerceptionNode:
-    """Sees drones in the images of a source, and publishes them, until it is told to end.
+    """Sees drones in the images of a source, and publishes them.
 
     Without the vehicle's state it takes the drone for level, and its nose for north: y of `DRONE/level` is then ahead,
     and x to the right. `check` comes first.
@@ -46,56 +46,41 @@ class PerceptionNode:
         self._config, self._node, self._vehicle_topic = config, node, vehicle_topic
         self._names = Names(ros_name(config.name))
         self._pilot = FlockPilot(config, load_side_by_side(config), stopwatch=time.perf_counter)
-        self._states = NearestState()
-        self._kind: str | None = None
+        self._states: NearestState | None = None
         self._last_s, self._told_s = -np.inf, -np.inf
-        self._over = threading.Event()
-
-    def stop(self) -> None:
-        """From any thread."""
-        self._over.set()
 
     def run(self, source: FrameSource) -> None:
-        """Between the source's start and its end."""
+        """For ever."""
         # Frames that come a little before a step is due are those of the step.
         slack_s = 0.0 if self._config.source is None else self._config.source.set_tolerance_s
         source.start()
         try:
-            while not self._over.is_set():
-                self._listen()
+            while True:
                 frames = source.newest(_LOOK_S)
-                if frames is not None and frames.time_s >= self._last_s + self._config.step_s - slack_s:
-                    vehicle = self._vehicle(frames.time_s)
-                    if vehicle is None:
-                        self._tell(source, ["no state of the vehicle is near the images' time; check --vehicle"])
-                        continue
+                vehicle = None if frames is None else self._vehicle(frames.time_s)
+                if frames is None or frames.time_s < self._last_s + self._config.step_s - slack_s:
+                    self._tell(source, [] if frames else None)
+                elif vehicle is None:
+                    self._tell(source, ["no state of the vehicle is near the images' time; check --vehicle"])
+                else:
                     self._last_s = frames.time_s
                     output = self._pilot.step(frames, vehicle)
                     self._publish(output)
                     self._tell(source, [reason.text for reason in output.reasons])
-                else:
-                    self._tell(source, [] if frames else None)
         finally:
             source.stop()
 
-    def _listen(self) -> None:
-        """As soon as the topic of the vehicle's state is there, whose kind is known only then."""
-        if self._vehicle_topic is None or self._kind is not None:
-            return
-        kinds = [kind for kind in self._node.kinds(self._vehicle_topic) if kind in STATES]
-        if kinds:
-            self._kind = kind = kinds[0]
-            self._node.subscribe(self._vehicle_topic, kind, self._take_state, Delivery.SENSOR)
-
-    def _take_state(self, message: Any) -> None:
-        """On a thread of the node's."""
-        assert self._kind is not None
-        time_s = 1e-9 * (stamp_ns(message) + time.monotonic_ns() - time.time_ns())
-        self._states.add(vehicle_state(self._kind, message, time_s))
-
     def _vehicle(self, time_s: float) -> VehicleState | None:
+        """Of the topic, whose kind is known only when it is there."""
         if self._vehicle_topic is None:
             return VehicleState(time_s, np.eye(3), 0.0)
+        if self._states is None:
+            kind = next((kind for kind in self._node.kinds(self._vehicle_topic) if kind in STATES), None)
+            if kind is None:
+                return None
+            self._states = NearestState()
+            take = partial(_take_state, self._states, kind)
+            self._node.subscribe(self._vehicle_topic, kind, take, Delivery.SENSOR)
         return self._states.at(time_s + self._config.rig.time_offset_s)
 
     def _publish(self, output: PilotOutput) -> None:
@@ -118,3 +103,8 @@ class PerceptionNode:
         status = trees.diagnostic(f"{self._names.drone}: perception", level, "; ".join(matters) or "sees", {})
         tree = trees.diagnostics(time.time_ns(), [status])
         self._node.publish(f"/{self._names.drone}/diagnostics", trees.DIAGNOSTICS, tree, Delivery.STATE)
+
+
+def _take_state(states: NearestState, kind: str, message: Any) -> None:
+    time_s = 1e-9 * (stamp_ns(message) + time.monotonic_ns() - time.time_ns())
+    states.add(vehicle_state(kind, message, time_s))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any, Literal
 
+import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
@@ -20,12 +21,10 @@ from google.protobuf.message import DecodeError
 from flockd.core.choices import ImageFormat
 from flockd.core.config.rig import CameraConfig
 from flockd.core.messages import FloatArray
+from flockd.core.ros_frames import CENTRE_PX
 from flockd.flight.geometry import Rig
 from flockd.onboard.recording.mcap_file import RecordingError, Stream
-from flockd.onboard.ros.message_trees import Tree, camera_info, turn, vector
-
-_MODELS = {"equidistant": "kannala_brandt"}
-"""Foxglove's name of a lens's model, where it is not that of ROS."""
+from flockd.onboard.ros.message_trees import Tree, turn, vector
 
 
 def image(time_ns: int, camera: str, data: bytes, kind: ImageFormat) -> bytes:
@@ -44,12 +43,21 @@ def image_data(message: bytes) -> tuple[bytes, str]:
 
 
 def calibration(time_ns: int, camera: CameraConfig) -> bytes:
-    """A CameraCalibration: what ROS 2 is told too, whose pixel centres lie at whole numbers as well."""
-    told = camera_info(time_ns, camera.name, camera, camera.size_px)
-    told["distortion_model"] = _MODELS.get(told["distortion_model"], told["distortion_model"])
-    fields = {name: told[name] for name in ("width", "height", "distortion_model")}
+    """A CameraCalibration, whose pixel centres lie at whole numbers."""
+    lens, (width, height) = camera.intrinsics, camera.size_px
+    cx, cy = lens.cx - CENTRE_PX, lens.cy - CENTRE_PX
+    model, coefficients = ("plumb_bob", 5) if lens.model == "pinhole" else ("kannala_brandt", 4)
     return _packed(
-        CameraCalibration, time_ns, frame_id=camera.name, **fields, **{name.upper(): told[name] for name in "dkrp"}
+        CameraCalibration,
+        time_ns,
+        frame_id=camera.name,
+        width=width,
+        height=height,
+        distortion_model=model,
+        D=lens.distortion or (0.0,) * coefficients,
+        K=(lens.fx, 0.0, cx, 0.0, lens.fy, cy, 0.0, 0.0, 1.0),
+        R=np.eye(3).ravel(),
+        P=(lens.fx, 0.0, cx, 0.0, 0.0, lens.fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0),
     )
 
 

@@ -14,10 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockd.core.config.rig import CameraConfig
 from flockd.core.messages import FloatArray
 from flockd.core.ros_frames import (
-    CENTRE_PX,
     attitude_in_ros,
     attitude_of_angles,
     enu_of_ned,
@@ -35,7 +33,6 @@ POSE_ARRAY = "geometry_msgs/msg/PoseArray"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 LASER_SCAN = "sensor_msgs/msg/LaserScan"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 DIAGNOSTIC = "diagnostic_msgs/msg/DiagnosticStatus"
 MARKERS = "visualization_msgs/msg/MarkerArray"
@@ -76,10 +73,6 @@ class Names(NamedTuple):
     def level(self) -> str:
         """East, north and up from the drone: in it are neighbours and obstacles."""
         return f"{self.drone}/level"
-
-    def optical(self, camera: str) -> str:
-        """A camera: right, down, forward."""
-        return f"{self.drone}/{camera}_optical"
 
 
 def header(time_ns: int, frame: str) -> Tree:
@@ -214,29 +207,6 @@ def scan(time_ns: int, names: Names, obstacles: ObstaclesMessage) -> Tree | None
         "range_max": farthest,
         "ranges": np.where(measured, ranges, free).astype(np.float32),
         "intensities": seen.astype(np.float32),
-    }
-
-
-def compressed_image(time_ns: int, frame: str, data: bytes, kind: str) -> Tree:
-    """``kind``: `jpeg` or `png`."""
-    return {"header": header(time_ns, frame), "format": kind, "data": data}
-
-
-def camera_info(time_ns: int, frame: str, camera: CameraConfig, size_px: tuple[int, int]) -> Tree:
-    """Of an image of this width and height, which is the camera's or scaled from it."""
-    lens, scale = camera.intrinsics, size_px[0] / camera.size_px[0]
-    fx, fy = scale * lens.fx, scale * lens.fy
-    cx, cy = scale * lens.cx - CENTRE_PX, scale * lens.cy - CENTRE_PX
-    pinhole = lens.model == "pinhole"
-    return {
-        "header": header(time_ns, frame),
-        "height": size_px[1],
-        "width": size_px[0],
-        "distortion_model": "plumb_bob" if pinhole else "equidistant",
-        "d": np.array(lens.distortion or (0.0,) * (5 if pinhole else 4)),
-        "k": np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
-        "r": np.eye(3).ravel(),
-        "p": np.array([fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
     }
 
 

@@ -12,7 +12,7 @@ import threading
 from array import array
 from collections.abc import Callable, Mapping
 from enum import Enum, auto
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -22,7 +22,8 @@ from flockd.onboard.ros.message_trees import Tree
 HERE_ONLY = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 """Environment of a node that only this computer's find: ROS 2 has no rule of its own about who may publish."""
 NOT_INSTALLED = "there is no rclpy; source a ROS 2, or, with Python 3.11 on x86-64 Linux, pip install -e '.[ros]'"
-_THREADS = 8
+_THREADS = 64
+"""At once, as far as there is work: an order may wait some seconds for a drone that is silent."""
 _TRIGGER = "std_srvs/srv/Trigger"
 _ELEMENT = re.compile(r"(?:sequence<)?([a-z0-9_]+/\w+)(?:, \d+)?>?(?:\[\d*\])?")
 
@@ -36,13 +37,8 @@ class Delivery(Enum):
     """Reliable, and the newest is kept for whoever comes later (transient local)."""
     EVENT = auto()
     """Reliable, the newest ten."""
-
-
-class Answer(NamedTuple):
-    """To a Trigger service."""
-
-    accepted: bool
-    sentence: str
+    ORDER = auto()
+    """Reliable, the newest: of those that wait while one is taken the others are dropped."""
 
 
 class RosNode:
@@ -62,10 +58,8 @@ class RosNode:
             raise UnavailableError(
                 f"ROS 2 cannot start ({str(error).splitlines()[0]}); check its environment"
             ) from error
-        from rclpy.callback_groups import ReentrantCallbackGroup  # noqa: PLC0415 - of an extra
-        from rclpy.executors import MultiThreadedExecutor  # noqa: PLC0415
+        from rclpy.executors import MultiThreadedExecutor  # noqa: PLC0415 - of an extra
 
-        self._group = ReentrantCallbackGroup()
         self._executor = MultiThreadedExecutor(num_threads=_THREADS, context=self._context)
         self._executor.add_node(self._node)
         self._publishers: dict[str, Any] = {}
@@ -92,26 +86,22 @@ class RosNode:
         self.advertise(topic, kind, delivery)
         self._publishers[topic].publish(_message(_type(kind), tree))
 
-    def is_read(self, topic: str) -> bool:
-        """Whether an advertised topic has a subscriber."""
-        return bool(self._publishers[topic].get_subscription_count())
-
     def kinds(self, topic: str) -> list[str]:
         """Types of what is published there now."""
         return sorted({one.topic_type for one in self._node.get_publishers_info_by_topic(topic)})
 
     def subscribe(self, topic: str, kind: str, take: Callable[[Any], None], delivery: Delivery) -> None:
-        """Calls ``take`` with each message of rclpy, on a thread of the node's; `tree_of` makes a tree of it."""
-        self._node.create_subscription(_type(kind), topic, take, _profile(delivery), callback_group=self._group)
+        """Calls ``take`` with one message of rclpy after the other, on a thread of the node's. It may wait."""
+        self._node.create_subscription(_type(kind), topic, take, _profile(delivery), callback_group=_one_at_a_time())
 
-    def serve(self, name: str, answer: Callable[[], Answer]) -> None:
-        """A Trigger service. ``answer`` may wait; it runs on a thread of the node's."""
+    def serve(self, name: str, answer: Callable[[], tuple[bool, str]]) -> None:
+        """A Trigger service; ``answer``: whether it succeeded, and a sentence. It may wait."""
 
         def respond(_: Any, response: Any) -> Any:
             response.success, response.message = answer()
             return response
 
-        self._node.create_service(_type(_TRIGGER), name, respond, callback_group=self._group)
+        self._node.create_service(_type(_TRIGGER), name, respond, callback_group=_one_at_a_time())
 
     def _spin(self) -> None:
         from rclpy.executors import ExternalShutdownException  # noqa: PLC0415
@@ -151,18 +141,21 @@ def _no_signals() -> Any:
     return SignalHandlerOptions.NO
 
 
+def _one_at_a_time() -> Any:
+    """A new group: what has one of its own waits for no other."""
+    from rclpy.callback_groups import MutuallyExclusiveCallbackGroup  # noqa: PLC0415
+
+    return MutuallyExclusiveCallbackGroup()
+
+
 def _profile(delivery: Delivery) -> Any:
     from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: PLC0415
 
-    match delivery:
-        case Delivery.SENSOR:
-            return QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
-        case Delivery.STATE:
-            return QoSProfile(
-                depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-            )
-        case Delivery.EVENT:
-            return QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+    if delivery is Delivery.SENSOR:
+        return QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    kept = DurabilityPolicy.TRANSIENT_LOCAL if delivery is Delivery.STATE else DurabilityPolicy.VOLATILE
+    depth = 10 if delivery is Delivery.EVENT else 1
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=kept)
 
 
 def _type(kind: str) -> Any:
@@ -195,12 +188,3 @@ def _field(kind: str, value: Any) -> Any:
     if isinstance(value, list) and (element := _ELEMENT.fullmatch(kind)) is not None:
         return [_message(_type(element[1]), one) for one in value]
     return value
-
-
-def tree_of(message: Any) -> Tree:
-    """The tree of a message of rclpy with messages and single values only."""
-    values = {name: getattr(message, name) for name in message.get_fields_and_field_types()}
-    return {
-        name: tree_of(value) if hasattr(value, "get_fields_and_field_types") else value
-        for name, value in values.items()
-    }

@@ -81,17 +81,6 @@ def test_a_late_node_sees_all_five_and_their_state_at_once(fleet: Fleet) -> None
         told("odometry of drone1", (len(times) - 1) / (times[-1] - times[0]), "Hz, of 2")
 
 
-def test_pictures_come_while_somebody_looks(fleet: Fleet) -> None:
-    topic = "/drone2/camera/front/image/compressed"
-    fleet.node.listen(topic, "sensor_msgs/msg/CompressedImage")
-    fleet.node.listen("/drone2/camera/front/camera_info", "sensor_msgs/msg/CameraInfo")
-    until(lambda: len(fleet.node.heard(topic)) >= 25)
-    times = [one["at"] for one in fleet.node.heard(topic)]
-    told("pictures", (len(times) - 1) / (times[-1] - times[0]), "Hz, of 5")
-    message = fleet.node.heard(topic)[-1]["message"]
-    assert (message["format"], message["header"]["frame_id"]) == ("jpeg", "drone2/front_optical")
-
-
 def test_what_a_step_tells_is_in_the_drones_namespace(fleet: Fleet) -> None:
     fleet.node.listen("/drone3/neighbours", "geometry_msgs/msg/PoseArray")
     fleet.node.listen("/drone3/neighbours/tracks", "sensor_msgs/msg/PointCloud2")

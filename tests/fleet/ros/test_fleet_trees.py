@@ -17,13 +17,7 @@ from flockd.onboard.ros.message_trees import Names
 from flockd.onboard.telemetry.topics import AboutMessage, StateMessage
 from tests.make import flight_message
 
-CAMERA = {
-    "name": "right", "size_px": [640, 480], "intrinsics": {"fx": 300.0, "fy": 300.0, "cx": 320.0, "cy": 240.0},
-    "extrinsics": {"position_m": [0.1, 0.05, -0.02], "yaw_deg": 90.0},
-}  # fmt: skip
-ABOUT = AboutMessage(
-    version="1", configuration={"rig": {"cameras": [CAMERA]}, "mission": {"origin_m": [3.0, -4.0]}}, commands=[]
-)
+ABOUT = AboutMessage(version="1", configuration={"mission": {"origin_m": [3.0, -4.0]}}, commands=[])
 STATE = StateMessage(
     time_s=1.0, height_m=5.0, roll_deg=0.0, pitch_deg=0.0, yaw_deg=90.0, velocity_ned=[1.0, 0.0, 0.0],
     position_ne=[10.0, 20.0], home_deg=[47.0, 8.0],
@@ -47,23 +41,16 @@ def moved(transform: dict[str, Any], point: list[float]) -> FloatArray:
     return found
 
 
-def test_transforms_lead_from_the_map_to_each_camera() -> None:
-    """East 20, north 10, up 5, facing east. The camera is 10 cm ahead and 5 cm to the right, and looks right."""
-    tree = _transforms(0, Names("drone1"), STATE, row(), ABOUT)
+def test_transforms_lead_from_the_map_to_the_body() -> None:
+    """East 20, north 10, up 5, facing east."""
+    tree = _transforms(0, Names("drone1"), STATE, row())
     assert tree is not None
     by_child = {one["child_frame_id"]: one for one in tree["transforms"]}
     parents = {child: one["header"]["frame_id"] for child, one in by_child.items()}
-    assert parents == {
-        "drone1/odom": "map",
-        "drone1/level": "drone1/odom",
-        "drone1/base_link": "drone1/odom",
-        "drone1/right_optical": "drone1/base_link",
-    }
+    assert parents == {"drone1/odom": "map", "drone1/level": "drone1/odom", "drone1/base_link": "drone1/odom"}
     np.testing.assert_allclose(moved(by_child["drone1/base_link"], [1.0, 0.0, 0.0]), [21.0, 10.0, 5.0], atol=1e-9)
     np.testing.assert_allclose(moved(by_child["drone1/level"], [0.0, 1.0, 0.0]), [20.0, 11.0, 5.0], atol=1e-9)
-    # 1 m before the lens, along its z: to the right of the body, which is -y.
-    np.testing.assert_allclose(moved(by_child["drone1/right_optical"], [0.0, 0.0, 1.0]), [0.1, -1.05, 0.02], atol=1e-9)
-    assert _transforms(0, Names("drone1"), {**STATE, "position_ne": None}, row(), None) is None
+    assert _transforms(0, Names("drone1"), {**STATE, "position_ne": None}, row()) is None
 
 
 def test_a_state_comes_with_its_reasons_and_its_level() -> None:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.core.config.rig import CameraConfig, IntrinsicsConfig
 from flockd.onboard.ros import message_trees as trees
 from flockd.onboard.ros.message_trees import Names
 from flockd.onboard.telemetry.topics import NeighbourMessage, ObstaclesMessage, StateMessage
@@ -85,13 +84,3 @@ def test_a_scan_clears_nothing_that_was_not_seen() -> None:
     assert tree["range_max"] == 10.0
     assert tree["angle_max"] == pytest.approx(math.pi - 2 * math.pi / 72)
     assert trees.scan(0, NAMES, ObstaclesMessage(time_s=0.0, range_m=[], seen_m=[])) is None
-
-
-def test_a_calibration_counts_pixels_from_the_first_ones_centre() -> None:
-    """A picture of half the size: focal lengths and centres halve, then the centre moves by half a pixel."""
-    lens = IntrinsicsConfig(fx=300.0, fy=310.0, cx=320.0, cy=240.0, distortion=(0.1, 0.2, 0.3, 0.4))
-    camera = CameraConfig(name="front", size_px=(640, 480), intrinsics=lens)
-    tree = trees.camera_info(0, "f", camera, (320, 240))
-    np.testing.assert_allclose(tree["k"], [150.0, 0, 159.5, 0, 155.0, 119.5, 0, 0, 1], atol=1e-9)
-    assert (tree["width"], tree["height"], tree["distortion_model"]) == (320, 240, "plumb_bob")
-    assert list(tree["d"]) == [0.1, 0.2, 0.3, 0.4]

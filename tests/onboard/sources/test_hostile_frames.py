@@ -14,7 +14,7 @@ import pytest
 
 from flockd.core.config import load_drone
 from flockd.core.config.source import SourceParameters
-from flockd.fleet.ros.ros_orders import Whereabouts, goal_of, velocity_of
+from flockd.fleet.ros.ros_orders import goal_of, velocity_of
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.mcap_file import RecordingError
 from flockd.onboard.recording.reader import decoded_image
@@ -22,6 +22,7 @@ from flockd.onboard.ros.message_trees import Names
 from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat, PackedFormat
 from flockd.onboard.sources.shared_memory import SharedMemorySource
 from flockd.onboard.telemetry.order_messages import parse_order
+from flockd.onboard.telemetry.topics import AboutMessage
 from tests.hostile import ABSURD_NUMBERS, CORPUS, any_float, assert_readable, hostile, mutated_bytes
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numbers near the largest overflow
@@ -99,17 +100,24 @@ def _shared_memory(random: Random, config: Any, photo: Any) -> None:
 
 
 def test_an_order_of_ros_is_taken_or_refused() -> None:
-    drone = Whereabouts(Names("drone1"), np.zeros(2), np.zeros(2), np.eye(3))
+    names, row = Names("drone1"), {"home_ne": [0.0, 0.0], "yaw_deg": 30.0}
+    about = AboutMessage(version="1", configuration={"mission": {"origin_m": [0.0, 0.0]}}, commands=[])
 
     @hostile(150)
     def check(random: Random) -> None:
         x, y, z = (any_float(random) for _ in range(3))
         frame = random.choice(("map", "drone1/odom", "drone1/base_link", "", "\0"))
-        place = {"header": {"frame_id": frame}, "pose": {"position": {"x": x, "y": y, "z": z}}}
-        motion = {"linear": {"x": x, "y": y, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": random.choice((0.0, z))}}
-        for make, message in ((goal_of, place), (velocity_of, {"header": {"frame_id": frame}, "twist": motion})):
+        message = SimpleNamespace(
+            header=SimpleNamespace(frame_id=frame),
+            pose=SimpleNamespace(position=SimpleNamespace(x=x, y=y, z=z)),
+            twist=SimpleNamespace(
+                linear=SimpleNamespace(x=x, y=y, z=0.0),
+                angular=SimpleNamespace(x=0.0, y=0.0, z=random.choice((0.0, z))),
+            ),
+        )
+        for command, make in (("goto", goal_of), ("velocity", velocity_of)):
             try:
-                parse_order("goto" if make is goal_of else "velocity", {**make(message, drone)})
+                parse_order(command, {**make(message, names, row, about)})
             except ValueError as error:
                 assert_readable(str(error))
 
