@@ -38,12 +38,8 @@ def test_a_goal_counts_from_the_missions_origin() -> None:
     """11 m east and 7 m north of home; the origin is 3 m north and 4 m west of it."""
     expected = {"north_m": 4.0, "east_m": 15.0, "height_m": 2.5}
     assert goal_of(goal("drone1/odom", 11.0, 7.0, 2.5), NAMES, ROW, ABOUT) == expected
-    assert goal_of(goal("map", 61.0, 107.0, 2.5), NAMES, ROW, ABOUT) == expected, (
-        "from home, 100 m north and 50 m east"
-    )
-    assert "height_m" not in goal_of(goal("map", 61.0, 107.0, 0.0), NAMES, ROW, ABOUT), (
-        "as RViz sends it"
-    )
+    assert goal_of(goal("map", 61.0, 107.0, 2.5), NAMES, ROW, ABOUT) == expected, "from home, 100 m north and 50 m east"
+    assert "height_m" not in goal_of(goal("map", 61.0, 107.0, 0.0), NAMES, ROW, ABOUT), "as RViz sends it"
 
 
 @pytest.mark.parametrize(
