@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from flockd.campaign.figures import Figure
+from flockd.campaign.figures import MEASURES, Figure
 from flockd.core.config.base import Name, NonNegative, Section, refuse
 from flockd.core.config.document import KeyPath, Place, read_document
 from flockd.core.config.loader import require, validated
@@ -66,6 +66,11 @@ class CampaignConfig(Section):
     `new: {drone.perception.models_dir: new_models}`."""
     measure: Annotated[tuple[Figure, ...], Field(min_length=1)] | None = None
     """Figures to keep; none: all."""
+
+    @property
+    def wanted(self) -> tuple[Figure, ...]:
+        """What is measured."""
+        return self.measure or tuple(MEASURES)
 
     @model_validator(mode="after")
     def _says_nothing_twice(self) -> Self:

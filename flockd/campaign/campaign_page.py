@@ -76,10 +76,8 @@ _NEAREST = "The flights in which two drones came nearest; the command flies one 
 
 def _parts(results: Results) -> list[Part]:
     curves = [
-        Markup(
-            inline_svg(parameter_curves(results, figure), f"{figure}-curves", f"{label_of(figure)} over the parameters")
-        )
-        for figure in (results.figures if results.parameters else ())
+        Markup(inline_svg(parameter_curves(results, one), f"{one}-curves", f"{label_of(one)} over the parameters"))
+        for one in (results.figures if results.parameters else ())
     ]
     drawn = [Part("Figures over the parameters", _CURVES, curves)] if curves else []
     tables = [_nearest(results), _cells(results), _failures(results)]
@@ -122,8 +120,6 @@ def _count(number: int, thing: str) -> str:
     return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
-_DECADES: Final = 30.0
-"""A parameter whose largest value is so many times its smallest gets a logarithmic axis."""
 _COLUMNS: Final = 3
 _PANEL_IN: Final = (3.6, 2.5)
 Points = list[tuple[Any, Sequence[float]]]
@@ -154,7 +150,6 @@ def parameter_curves(results: Results, figure: Figure) -> Drawing:
                 ]
                 _band(axes, points, colour, case, is_share=MEASURES[figure].is_share)
             axes.set_xlabel(parameter)
-            _spread_out(axes, results.values_of(parameter))
         for axes in panels.flat[len(parameters) :]:
             axes.set_axis_off()
         for axes in panels[:, 0]:
@@ -195,18 +190,3 @@ def _band(axes: Axes, points: Points, colour: str, label: str | None, *, is_shar
     if not numeric:
         axes.set_xticks(places, [shown(value) for value in values])
         axes.set_xlim(-0.5, len(values) - 0.5)
-
-
-def _spread_out(axes: Axes, values: Sequence[Any]) -> None:
-    """Sets a logarithmic axis for numbers over decades, with a tick at every value that has room."""
-    if not all(isinstance(value, int | float) and not isinstance(value, bool) and value > 0 for value in values):
-        return
-    if max(values) < _DECADES * min(values):
-        return
-    ticks: list[Any] = []
-    for value in sorted(values):
-        if not ticks or value >= 1.9 * ticks[-1]:
-            ticks.append(value)
-    axes.set_xscale("log")
-    axes.set_xticks(ticks, [shown(value) for value in ticks])
-    axes.minorticks_off()

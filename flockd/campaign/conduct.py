@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from flockd.campaign.engine import Engine
-from flockd.campaign.flight_kinds import FLIGHT_KINDS, Task
+from flockd.campaign.flight_kinds import figures_flown
 from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.folder import CampaignFolder, flown_in
 
@@ -30,7 +30,8 @@ def conduct(plan: Plan, folder: CampaignFolder, engine: Engine, progress: Progre
     The table is written at the end, and when this is interrupted.
     """
     done_before = {one.run for one in flown_in(folder.path, plan)}
-    tasks = _tasks(plan, done_before)
+    runs = ((cell, number) for cell in plan.cells for number in range(plan.config.seeds))
+    tasks = (plan.task(cell, number) for cell, number in runs if Run(cell.number, number) not in done_before)
     total = plan.flights - len(done_before)
     waiting = next(tasks, None)
     flying = flown = failed = 0
@@ -51,23 +52,8 @@ def conduct(plan: Plan, folder: CampaignFolder, engine: Engine, progress: Progre
     return Conducted(flown, failed, len(done_before))
 
 
-def _tasks(plan: Plan, done: Collection[Run]) -> Iterator[Task]:
-    """Of the flights that are not done."""
-    runs = (Run(cell.number, number) for cell in plan.cells for number in range(plan.config.seeds))
-    return (task_of(plan, run) for run in runs if run not in done)
-
-
-def task_of(plan: Plan, run: Run) -> Task:
-    """The task that flies a flight."""
-    recipe = plan.recipe(plan.cells[run.cell], run.number)
-    return Task(plan.config.perception, plan.wanted, run, recipe, plan.config.gated)
-
-
-SHORT_STEPS = 3
-"""Steps of a cell's first trial flight. The second one is longer: the difference is what its steps take, the rest what
-a flight takes before its first."""
-LONG_S = 0.5
-"""The second flight is twice as long until it takes so much more time than the first, or is a whole flight."""
+SHORT_STEPS, LONG_STEPS = 3, {"truth": 60, "sight": 9}
+"""Of the two trial flights of a cell: the difference is what its steps take, the rest what a flight takes before."""
 
 
 def estimate(plan: Plan, progress: Callable[[int, int], None]) -> float:
@@ -78,32 +64,21 @@ def estimate(plan: Plan, progress: Callable[[int, int], None]) -> float:
     cells = sorted({0, len(plan.cells) // 2, len(plan.cells) - 1})
     progress(0, len(cells))
     _trial(plan, cells[0], SHORT_STEPS)  # compiles and loads what later flights find ready
-    times = []
+    total_s = 0.0
     for done, cell in enumerate(cells, 1):
-        times.append(_whole_flight(plan, cell))
+        scenario = plan.task(plan.cells[cell], 0).scenario()
+        steps, more = round(scenario.duration_s / scenario.drone.step_s), LONG_STEPS[plan.config.perception]
+        short_s, long_s = _trial(plan, cell, SHORT_STEPS), _trial(plan, cell, more)
+        total_s += max(long_s + (steps - more) * (long_s - short_s) / (more - SHORT_STEPS), 0.0)
         progress(done, len(cells))
-    return sum(times) / len(times)
-
-
-def _whole_flight(plan: Plan, cell: int) -> float:
-    """Seconds of processor time."""
-    scenario, steps = plan.recipe(plan.cells[cell], 0).scenario(), SHORT_STEPS
-    whole = round(scenario.duration_s / scenario.drone.step_s)
-    short_s = long_s = _trial(plan, cell, SHORT_STEPS)
-    while steps < whole and long_s - short_s < LONG_S:
-        steps = min(2 * steps, whole)
-        long_s = _trial(plan, cell, steps)
-    if steps == whole:
-        return long_s
-    step_s = (long_s - short_s) / (steps - SHORT_STEPS)
-    return max(short_s - SHORT_STEPS * step_s, 0.0) + whole * step_s
+    return total_s / len(cells)
 
 
 def _trial(plan: Plan, cell: int, steps: int) -> float:
     """Seconds of processor time of a flight of so many steps."""
-    task = task_of(plan, Run(cell, 0))
-    scenario = task.recipe.scenario()
+    task = plan.task(plan.cells[cell], 0)
+    scenario = task.scenario()
     scenario = scenario.model_copy(update={"duration_s": steps * scenario.drone.step_s})
     begin_s = time.process_time()
-    FLIGHT_KINDS[task.kind].fly(scenario, task)
+    figures_flown(scenario, task)
     return time.process_time() - begin_s

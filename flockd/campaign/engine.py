@@ -14,8 +14,8 @@ from typing import Any, Literal, Protocol, Self
 import cv2
 from joblib.externals.loky import ProcessPoolExecutor
 
-from flockd.campaign.flight_kinds import FlownRun, Task, fly_task
-from flockd.campaign.flight_plan import Run
+from flockd.campaign.flight_kinds import FlownRun, fly_task
+from flockd.campaign.flight_plan import Run, Task
 from flockd.core.errors import UnavailableError
 from flockd.sim.sitl.bound_to_parent import bind, with_package
 

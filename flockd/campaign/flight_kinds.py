@@ -1,4 +1,4 @@
-"""How the flights of a campaign are flown: one entry a kind, and one function for a task of any kind."""
+"""How the flight of a task is flown, and what is kept of it."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ import os
 import platform
 import time
 import traceback
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
 
 from flockd.campaign.campaign_file import FlightKindName
-from flockd.campaign.figures import Figure, Figures, figures_of
-from flockd.campaign.flight_plan import Recipe, Run
+from flockd.campaign.figures import Figures, figures_of
+from flockd.campaign.flight_plan import Run, Task
 from flockd.core.choices import SimulatedPerception
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.errors import FlockdError
@@ -22,40 +21,15 @@ from flockd.flight.inference.hashes import model_hashes
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import ScenarioConfig
 
-
-@dataclass(frozen=True)
-class Task:
-    """What is sent to where it is flown: one flight."""
-
-    kind: FlightKindName
-    wanted: tuple[Figure, ...]
-    run: Run
-    recipe: Recipe
-    gated: bool = True
-    """See `CampaignConfig.gated`."""
+PERCEPTIONS: dict[FlightKindName, SimulatedPerception] = {"truth": "truth", "sight": "learned"}
+"""With which `flockd sim` flies the flights of a kind."""
 
 
-@dataclass(frozen=True)
-class FlightKind:
-    """A way to fly."""
-
-    fly: Callable[[ScenarioConfig, Task], Figures]
-    """Flies a task's scenario, and gives the wanted figures."""
-    perception: SimulatedPerception
-    """With which `flockd sim` flies such a flight, for its full report."""
-
-
-def _alone(perception: SimulatedPerception) -> FlightKind:
-    """On this thread alone, without key frames."""
-
-    def flown(scenario: ScenarioConfig, task: Task) -> Figures:
-        log = fly(scenario, perception=perception, gated=task.gated, processes=0, pictured=False).log
-        return figures_of(log, task.wanted)
-
-    return FlightKind(flown, perception)
-
-
-FLIGHT_KINDS: dict[FlightKindName, FlightKind] = {"truth": _alone("truth"), "sight": _alone("learned")}
+def figures_flown(scenario: ScenarioConfig, task: Task) -> Figures:
+    """Flies a task's scenario, on this thread alone and without key frames, and gives the wanted figures."""
+    perception, gated = PERCEPTIONS[task.config.perception], task.config.gated
+    log = fly(scenario, perception=perception, gated=gated, processes=0, pictured=False).log
+    return figures_of(log, task.config.wanted)
 
 
 @dataclass(frozen=True)
@@ -81,9 +55,9 @@ def fly_task(task: Task) -> FlownRun:
     """Flies it. A flight that cannot be flown has its reason."""
     wall_s, cpu_s, began = time.perf_counter(), time.process_time(), datetime.now(UTC).isoformat(timespec="seconds")
     try:
-        scenario = _single_threaded(task.recipe.scenario())
-        figures = FLIGHT_KINDS[task.kind].fly(scenario, task)
-        networks = _networks(scenario.drone.perception) if task.kind == "sight" else ""
+        scenario = _single_threaded(task.scenario())
+        figures = figures_flown(scenario, task)
+        networks = _networks(scenario.drone.perception) if task.config.perception == "sight" else ""
     except Exception as error:  # noqa: BLE001 - whatever it is, it is one flight's result
         return _failed(task.run, error, began, time.perf_counter() - wall_s)
     wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s

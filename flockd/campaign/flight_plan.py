@@ -7,7 +7,7 @@ import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
@@ -16,7 +16,6 @@ from pydantic import ValidationError
 
 from flockd import __version__
 from flockd.campaign.campaign_file import DRONES, CampaignConfig, Variation, load_campaign
-from flockd.campaign.figures import MEASURES, Figure
 from flockd.core.choices import ROLES
 from flockd.core.config.document import KeyPath, Place, key_text
 from flockd.core.config.loader import PATHS
@@ -29,26 +28,37 @@ from flockd.sim.scenario import MAX_DRONES, ScenarioConfig, load_with_places
 Values = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """One flight: a scenario's own values, and those put over them."""
+@dataclass(frozen=True, order=True)
+class Run:
+    """One flight: a cell, and which of its seeds, both from 0."""
 
+    cell: int
+    number: int
+
+    @property
+    def name(self) -> str:
+        """By which it is known in results and commands."""
+        return f"c{self.cell}-s{self.number}"
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is sent to where it is flown: one flight, of a scenario's own values and those put over them."""
+
+    run: Run
+    config: CampaignConfig
     base: Mapping[str, Any]
     overrides: Mapping[str, Any]
     """By dotted key."""
-    seed: int
-    scatter_m: float
 
-    def scenario(self) -> ScenarioConfig:
+    def scenario(self, *, scatter: bool = True) -> ScenarioConfig:
         """Raises ValueError (pydantic's ValidationError) for values that cannot be flown, and UsageError for starts."""
-        values = merged(self.base, {**self.overrides, "seed": self.seed})
+        values = merged(self.base, {**self.overrides, "seed": self.config.seed + self.run.number})
         count = values.pop(DRONES, None)
         scenario = ScenarioConfig.model_validate(values)
         if count is not None:
             scenario = with_drones(scenario, count)
-        if self.scatter_m:
-            scenario = scattered(scenario, self.scatter_m)
-        return scenario
+        return scattered(scenario, self.config.scatter_m) if scatter and self.config.scatter_m else scenario
 
 
 def merged(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> Values:
@@ -83,19 +93,6 @@ class Cell:
     """The value of each key of the grid, and of `case`."""
 
 
-@dataclass(frozen=True, order=True)
-class Run:
-    """One flight: a cell, and which of its seeds, both from 0."""
-
-    cell: int
-    number: int
-
-    @property
-    def name(self) -> str:
-        """By which it is known in results and commands."""
-        return f"c{self.cell}-s{self.number}"
-
-
 @dataclass(frozen=True)
 class Plan:
     """All flights of a campaign, as values only: what it takes is no longer read from files."""
@@ -119,12 +116,12 @@ class Plan:
         config = _anchored(config, path.parent)
         _check_keys(config, places)
         plan = cls(config, scenario.model_dump(exclude_unset=True))
-        _Check(places, of_scenario).cells(plan)
-        _check_wind(config, places)
+        if problems := {one for cell in plan.cells for one in _problems(plan, cell, places, of_scenario)}:
+            raise ConfigError(sorted(problems))
         if idle := _idle_seeds(plan):
             raise ConfigError([places["seeds",].problem(idle)])
         if config.perception == "sight":
-            for perception in {plan.recipe(cell, 0).scenario().drone.perception for cell in plan.cells}:
+            for perception in {plan.task(cell, 0).scenario().drone.perception for cell in plan.cells}:
                 model_hashes(perception)
         return plan
 
@@ -169,21 +166,15 @@ class Plan:
         return tuple(Cell(number, dict(zip(axes, values, strict=True))) for number, values in combinations)
 
     @property
-    def wanted(self) -> tuple[Figure, ...]:
-        """What is measured."""
-        return self.config.measure or tuple(MEASURES)
-
-    @property
     def flights(self) -> int:
         """How many there are."""
         return len(self.cells) * self.config.seeds
 
-    def recipe(self, cell: Cell, number: int) -> Recipe:
+    def task(self, cell: Cell, number: int) -> Task:
         """What one flight is made of."""
         varied = {key: value for key, value in cell.parameters.items() if key != CASE}
         of_case = self.config.cases[cell.parameters[CASE]] if CASE in cell.parameters else {}
-        overrides = {**self.config.fixed, **of_case, **varied}
-        return Recipe(self.base, overrides, self.config.seed + number, self.config.scatter_m)
+        return Task(Run(cell.number, number), self.config, self.base, {**self.config.fixed, **of_case, **varied})
 
 
 def _count_of_cells(config: CampaignConfig) -> int:
@@ -196,7 +187,7 @@ def _idle_seeds(plan: Plan) -> str | None:
     if config.seeds == 1 or config.perception == "sight" or config.scatter_m:
         return None
     for cell in plan.cells:
-        scenario = plan.recipe(cell, 0).scenario()
+        scenario = plan.task(cell, 0).scenario()
         if scenario.vehicle.gust_m_s or scenario.world.obstacles is not None:
             return None
     return (
@@ -229,7 +220,7 @@ def _with_tuples(value: Any) -> Any:
 
 
 def _check_keys(config: CampaignConfig, places: Places) -> None:
-    """Raises ConfigError for what needs no scenario: sizes of flocks, and how many cells there are."""
+    """Raises ConfigError for what needs no scenario: sizes of flocks, how many cells, a wind that nobody notices."""
     wrong = [
         places[path].problem(f"must be whole numbers from 1 to {MAX_DRONES}, as in `values: [5, 10]`")
         for path, values in _given(config, DRONES).items()
@@ -238,18 +229,13 @@ def _check_keys(config: CampaignConfig, places: Places) -> None:
     if (cells := _count_of_cells(config)) > MAX_CELLS:
         section = places.get(("vary",), places[()])
         wrong.append(section.problem(f"makes {cells} cells; write fewer values, for at most {MAX_CELLS}"))
-    if wrong:
-        raise ConfigError(wrong)
-
-
-def _check_wind(config: CampaignConfig, places: Places) -> None:
-    """Raises ConfigError for a wind that no flight would notice."""
     fault = (
         "changes nothing without images: a steady wind only tilts the drone, whose autopilot holds the velocity "
         "over ground; write `perception: sight`, or `vehicle.gust_m_s` for wind that carries it off, or delete it"
     )
-    wrong = [places[path].problem(fault) for path in _given(config, "vehicle.wind_m_s")]
-    if wrong and config.perception != "sight":
+    winds = {} if config.perception == "sight" else _given(config, "vehicle.wind_m_s")
+    wrong += [places[path].problem(fault) for path in winds]
+    if wrong:
         raise ConfigError(wrong)
 
 
@@ -260,50 +246,34 @@ def _given(config: CampaignConfig, key: str) -> dict[KeyPath, Sequence[Any]]:
     return found | ({("vary", key): config.vary[key].values} if key in config.vary else {})
 
 
-class _Check:
-    """Finds what is wrong with the values that a campaign sets, each with its place in the campaign's file."""
-
-    def __init__(self, places: Places, of_scenario: Places) -> None:
-        self._places, self._of_scenario = places, of_scenario
-
-    def cells(self, plan: Plan) -> None:
-        """Raises ConfigError with each problem of any cell."""
-        problems = {problem for cell in plan.cells for problem in self._problems(plan, cell)}
-        if problems:
-            raise ConfigError(sorted(problems))
-
-    def _problems(self, plan: Plan, cell: Cell) -> list[ConfigProblem]:
-        recipe = replace(plan.recipe(cell, 0), scatter_m=0.0)
-        places = self._places_of(plan, cell)
-        for key, value in recipe.overrides.items():
-            try:
-                merged(plan.base, {key: value})
-            except ValueError as error:
-                return [places[tuple(key.split("."))].problem(str(error))]
+def _problems(plan: Plan, cell: Cell, given: Places, of_scenario: Places) -> list[ConfigProblem]:
+    """What is wrong with the values that a campaign sets, each with its place in the campaign's file."""
+    task, places = plan.task(cell, 0), _places_of(plan, cell, given, of_scenario)
+    for key, value in task.overrides.items():
         try:
-            recipe.scenario()
-        except ValidationError as error:
-            return problems_of(error.errors(), ScenarioConfig, places)
-        except UsageError as error:
-            return [places[()].problem(str(error))]
-        return []
+            merged(plan.base, {key: value})
+        except ValueError as error:
+            return [places[tuple(key.split("."))].problem(str(error))]
+    try:
+        task.scenario(scatter=False)
+    except ValidationError as error:
+        return problems_of(error.errors(), ScenarioConfig, places)
+    except UsageError as error:
+        return [places[()].problem(str(error))]
+    return []
 
-    def _places_of(self, plan: Plan, cell: Cell) -> Places:
-        """Where each value of the cell's scenario stands: in the campaign's file, or in the scenario's or drone's."""
-        config, places = plan.config, dict(self._of_scenario)
-        origins: dict[str, KeyPath] = {key: ("fixed", key) for key in config.fixed}
-        if (case := cell.parameters.get(CASE)) is not None:
-            origins |= {key: ("cases", case, key) for key in config.cases[case]}
-        for key, variation in config.vary.items():
-            origins[key] = ("vary", key, "values", variation.values.index(cell.parameters[key]))
-        for key, origin in origins.items():
-            path = tuple(key.split("."))
-            place = self._places[origin]
-            places |= {path[:length]: places.get(path[:length], place) for length in range(1, len(path))}
-            places = {at: one for at, one in places.items() if at[: len(path)] != path}
-            places[path] = place
-            depth = len(origin)
-            places |= {
-                (*path, *at[depth:]): p for at, p in self._places.items() if at[:depth] == origin and at != origin
-            }
-        return places
+
+def _places_of(plan: Plan, cell: Cell, given: Places, of_scenario: Places) -> Places:
+    """Where each value of the cell's scenario stands: in the campaign's file, or in the scenario's or drone's."""
+    config, places = plan.config, dict(of_scenario)
+    origins: dict[str, KeyPath] = {key: ("fixed", key) for key in config.fixed}
+    if (case := cell.parameters.get(CASE)) is not None:
+        origins |= {key: ("cases", case, key) for key in config.cases[case]}
+    for key, variation in config.vary.items():
+        origins[key] = ("vary", key, "values", variation.values.index(cell.parameters[key]))
+    for key, origin in origins.items():
+        path, depth = tuple(key.split(".")), len(origin)
+        places |= {path[:length]: places.get(path[:length], given[origin]) for length in range(1, len(path))}
+        places = {at: one for at, one in places.items() if at[: len(path)] != path}
+        places |= {(*path, *at[depth:]): one for at, one in given.items() if at[:depth] == origin}
+    return places

@@ -34,7 +34,6 @@ RERUNS = "reruns"
 _LOCK = ".lock"
 _OURS = {PLAN_NAME, LINES_NAME, FLIGHTS_NAME, REPORT_NAME, RERUNS, _LOCK}
 _FLOWN = TypeAdapter(FlownRun)
-MAX_PLAN_BYTES = 1 << 26
 
 
 class CampaignFolder:
@@ -109,12 +108,8 @@ def flown_in(path: Path, plan: Plan) -> list[FlownRun]:
 
 def flight_rows(plan: Plan, flown: Sequence[FlownRun]) -> list[dict[str, Any]]:
     """One row for each flight, of what is the same whatever flew it."""
-    origin = {
-        "perception": plan.config.perception,
-        "flockd_version": __version__,
-        "numpy_version": np.__version__,
-        "campaign_sha256": plan.sha256,
-    }
+    origin = {"perception": plan.config.perception, "flockd_version": __version__}
+    origin |= {"numpy_version": np.__version__, "campaign_sha256": plan.sha256}
     return [
         {
             "run": one.run.name,
@@ -124,7 +119,7 @@ def flight_rows(plan: Plan, flown: Sequence[FlownRun]) -> list[dict[str, Any]]:
             **plan.cells[one.run.cell].parameters,
             "status": "flown" if one.reason is None else "failed",
             "reason": one.reason,
-            **{figure: one.figures.get(figure) for figure in plan.wanted},
+            **{figure: one.figures.get(figure) for figure in plan.config.wanted},
             **origin,
             "scenario_sha256": one.scenario_sha256,
             "networks_sha256": one.networks,
@@ -161,8 +156,7 @@ def _plan_values(path: Path) -> Any:
     try:
         if not file.is_file():
             raise ValueError("it is not an ordinary file")  # noqa: TRY301 - wrapped below
-        with file.open("rb") as stream:
-            return parsed(stream.read(MAX_PLAN_BYTES))
+        return parsed(file.read_bytes())
     except (OSError, ValueError) as error:
         raise _no_plan(path, error) from error
 

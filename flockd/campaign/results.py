@@ -53,7 +53,7 @@ class Results:
     @property
     def figures(self) -> tuple[Figure, ...]:
         """Those that a flight has a value of."""
-        return tuple(figure for figure in self.plan.wanted if any(row[figure] is not None for row in self.rows))
+        return tuple(figure for figure in self.plan.config.wanted if any(row[figure] is not None for row in self.rows))
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -102,8 +102,6 @@ def _hashable(value: Any) -> Any:
 LEVEL = 0.05
 """Significance level for all figures together: at most this often, one is called different where none is."""
 _DRAWS = 9_999
-_NUMBERS_AT_ONCE = 500_000
-"""How many permutations are drawn at once, so that they need little memory."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +117,7 @@ class Verdict:
     pairs: int
     """Seeds that both flew."""
     p: float
-    """How often a difference so large would come up if there were none, adjusted for all figures (Holm, 1979)."""
+    """How often a difference so large would come up if there were none, times the number of figures (Bonferroni)."""
 
     @property
     def says(self) -> Literal["better", "worse", "no difference shown"]:
@@ -165,9 +163,8 @@ def compare(first: Results, second: Results) -> Comparison:
             f"{first.path} and {second.path} cannot be compared, without a cell and a figure that both have of two "
             "seeds alike; vary and measure the same in both, from the same `seed` on"
         )
-    return Comparison(
-        first, second, len(cells), _adjusted(verdicts), tuple(differences(_values(first), _values(second)))
-    )
+    adjusted = tuple(replace(verdict, p=min(verdict.p * len(verdicts), 1.0)) for verdict in verdicts)
+    return Comparison(first, second, len(cells), adjusted, tuple(differences(_values(first), _values(second))))
 
 
 def _verdict(first: Results, second: Results, figure: Figure, cells: list[tuple[int, int]]) -> Verdict | None:
@@ -191,21 +188,10 @@ def paired_p(differences: FloatArray) -> float:
     """
     from scipy.stats import permutation_test  # noqa: PLC0415 - heavy
 
-    at_once = max(_NUMBERS_AT_ONCE // len(differences), 1)
     found = permutation_test(
-        (differences,), np.mean, permutation_type="samples", n_resamples=_DRAWS, batch=at_once, rng=0, vectorized=True
+        (differences,), np.mean, permutation_type="samples", n_resamples=_DRAWS, batch=100, rng=0, vectorized=True
     )
     return float(found.pvalue)
-
-
-def _adjusted(verdicts: list[Verdict]) -> tuple[Verdict, ...]:
-    """With Holm's adjustment: the smallest p counts as many times as there are figures, the next one time less, ..."""
-    order = sorted(range(len(verdicts)), key=lambda i: verdicts[i].p)
-    adjusted, largest = list(verdicts), 0.0
-    for rank, i in enumerate(order):
-        largest = max(largest, min(verdicts[i].p * (len(verdicts) - rank), 1.0))
-        adjusted[i] = replace(verdicts[i], p=largest)
-    return tuple(adjusted)
 
 
 def _key(parameters: Mapping[str, Any]) -> str:

@@ -122,7 +122,7 @@ def _dry_run(args: argparse.Namespace, plan: Plan, workers: int) -> int:
 
 
 def _rerun(args: argparse.Namespace) -> int:
-    from flockd.campaign.flight_kinds import FLIGHT_KINDS
+    from flockd.campaign.flight_kinds import PERCEPTIONS
     from flockd.campaign.flight_plan import Run
     from flockd.campaign.folder import RERUNS, load_plan
     from flockd.cli.flight_summary import report_flight
@@ -138,14 +138,13 @@ def _rerun(args: argparse.Namespace) -> int:
     if run.cell >= len(plan.cells) or run.number >= plan.config.seeds:
         last = Run(len(plan.cells) - 1, plan.config.seeds - 1)
         raise UsageError(f"{folder}: has no flight {name}; the last one is {last.name}")
-    scenario = plan.recipe(plan.cells[run.cell], run.number).scenario()
+    scenario = plan.task(plan.cells[run.cell], run.number).scenario()
     directory = args.out or folder / RERUNS / name
     prepare_folder(directory, force=args.force)
     with Phases() as phases:
-        perception = FLIGHT_KINDS[plan.config.perception].perception
         flight = fly(
             scenario,
-            perception=perception,
+            perception=PERCEPTIONS[plan.config.perception],
             gated=plan.config.gated,
             progress=phases.of("flying", "steps"),
             preparing=phases.of("loading networks and building the world", "parts"),

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from flockd.campaign.conduct import Conducted, conduct
 from flockd.campaign.figures import Figures
-from flockd.campaign.flight_kinds import FlownRun, Task, fly_task
-from flockd.campaign.flight_plan import Plan
+from flockd.campaign.flight_kinds import FlownRun, fly_task
+from flockd.campaign.flight_plan import Plan, Task
 from flockd.campaign.folder import CampaignFolder
 from flockd.core.data import data_path
 from flockd.sim.scenario import ScenarioConfig
@@ -64,4 +64,4 @@ def made_up(scenario: ScenarioConfig, task: Task) -> Figures:
     if scenario.seed == 3:
         raise ArithmeticError("no flight today")
     law, north_m = scenario.drone.flocking, scenario.vehicles[0].position_m[0]
-    return dict.fromkeys(task.wanted, law.cohesion + north_m + 0.01 * scenario.seed + 0.1 * law.separation)
+    return dict.fromkeys(task.config.wanted, law.cohesion + north_m + 0.01 * scenario.seed + 0.1 * law.separation)

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from flockd.campaign.conduct import conduct, task_of
+from flockd.campaign.conduct import conduct
 from flockd.campaign.engine import ENGINES, Engine
 from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_plan import Plan, Run
@@ -53,6 +53,7 @@ def test_a_process_gives_the_same_flights(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.whole_flight
 def test_a_process_that_dies_is_replaced(tmp_path: Path) -> None:
     """Both processes are killed as soon as they fly, and one again; all flights are there once."""
     plan = few(tmp_path, seeds=12, duration_s=10.0)
@@ -87,6 +88,7 @@ def workers_of(parent: int) -> set[int]:
 
 
 @pytest.mark.slow
+@pytest.mark.whole_flight
 def test_a_flight_that_ends_its_process_is_a_row(tmp_path: Path) -> None:
     """One flight always ends its process; the others, which were lost with it, are flown."""
     plan = few(tmp_path)
@@ -108,7 +110,7 @@ def test_a_flight_that_ends_its_process_is_a_row(tmp_path: Path) -> None:
         engine._started = again  # type: ignore[attr-defined]
         results: list[FlownRun] = []
         for number in range(3):
-            engine.submit(task_of(plan, Run(0, number)))
+            engine.submit(plan.task(plan.cells[0], number))
         while len(results) < 3:
             results += engine.wait()
     reasons = {one.run: one.reason for one in results}
@@ -130,6 +132,7 @@ def command(path: Path, out: Path, *more: str) -> Iterator[subprocess.Popen[byte
 
 
 @pytest.mark.slow
+@pytest.mark.whole_flight
 def test_20_kills_lose_nothing_and_double_nothing(tmp_path: Path) -> None:
     """Each kill comes at a random moment after the campaign has flown some more; its processes end with it."""
     plan = few(tmp_path, seeds=400, duration_s=20.0)

@@ -34,7 +34,7 @@ def test_drones_that_are_to_avoid_each_other_begin_far_apart(name: str) -> None:
     """Else a flight shows where drones were put, not what they do: two groups once began a metre apart."""
     plan = Plan.load(next(path for path in EXAMPLES if path.stem == name))
     for cell in plan.cells:
-        starts = np.array([one.position_m for one in plan.recipe(cell, 0).scenario().vehicles])
+        starts = np.array([one.position_m for one in plan.task(cell, 0).scenario().vehicles])
         apart_m = np.linalg.norm(starts[:, None] - starts, axis=-1)[np.triu_indices(len(starts), 1)]
         assert apart_m.min() >= 2.0, cell.parameters
 
@@ -52,20 +52,20 @@ cases:
     assert [tuple(cell.parameters.values()) for cell in plan.cells] == [
         (case, cohesion, drones) for case in ("calm", "windy") for cohesion in (0.1, 0.2, 0.3) for drones in (2, 7)
     ]
-    last = plan.recipe(plan.cells[-1], 4).scenario()
+    last = plan.task(plan.cells[-1], 4).scenario()
     assert (last.drone.flocking.cohesion, len(last.vehicles), last.vehicle.gust_m_s) == (0.3, 7, 0.4)
     assert last.seed == 4
-    first = plan.recipe(plan.cells[0], 0).scenario()
+    first = plan.task(plan.cells[0], 0).scenario()
     assert (first.vehicle.gust_m_s, first.drone.flocking.separation) == (0.0, 10.0)
 
 
 def test_a_flight_moves_its_starts_by_its_seed_alone(tmp_path: Path) -> None:
     plan = Plan.load(campaign_file(tmp_path, ""))
-    starts = [plan.recipe(plan.cells[0], number).scenario().vehicles[1].position_m for number in range(6)]
+    starts = [plan.task(plan.cells[0], number).scenario().vehicles[1].position_m for number in range(6)]
     assert len(set(starts)) == 6
     assert all(abs(north - 0.5) <= 0.5 and abs(east + 2.8) <= 0.5 and down == -4.0 for north, east, down in starts)
     later = Plan.load(campaign_file(tmp_path, "seed: 2\n"))
-    assert later.recipe(later.cells[0], 0) == plan.recipe(plan.cells[0], 2)
+    assert later.task(later.cells[0], 0).scenario() == plan.task(plan.cells[0], 2).scenario()
 
 
 def test_a_plan_is_its_own_copy(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_a_plan_is_its_own_copy(tmp_path: Path) -> None:
     again = Plan.from_values(json.loads(plan.to_json()))
     assert again.to_json() == plan.to_json()
     assert again.cells == plan.cells  # neither cases nor keys are in the order of the alphabet
-    assert again.recipe(again.cells[1], 5).scenario() == plan.recipe(plan.cells[1], 5).scenario()
+    assert again.task(again.cells[1], 5).scenario() == plan.task(plan.cells[1], 5).scenario()
     assert Run(1, 5).name == "c1-s5"
 
 

@@ -133,7 +133,7 @@ def test_the_fisheye_flight_has_the_real_drones_lenses() -> None:
 def test_a_campaigns_preset_takes_the_place_of_its_scenarios() -> None:
     """Before, the scenario's realistic values stayed under a case's `preset: ideal`."""
     plan = Plan.load(CONFIG / "campaigns" / "cameras.yaml")
-    flown = {str(cell.parameters["case"]): plan.recipe(cell, 0).scenario().cameras for cell in plan.cells}
+    flown = {str(cell.parameters["case"]): plan.task(cell, 0).scenario().cameras for cell in plan.cells}
     assert flown["ideal"] == CamerasConfig.model_validate(AS_MOUNTED)
     assert flown["realistic"] == CamerasConfig.model_validate({"preset": "realistic", **AS_MOUNTED})
     assert flown["gain_8"] == CamerasConfig.model_validate({"noise": {"gain": 8.0}, **AS_MOUNTED})

@@ -77,11 +77,11 @@ def test_ranges_that_err_much_and_many_misses_bring_nobody_together(
 @pytest.mark.parametrize("cell", RECIPROCAL.cells[:11], ids=lambda cell: cell.parameters[CASE])
 def test_reciprocal_encounters(cell: Cell) -> None:
     """One flight of each way that two can meet, and some of five; `config/campaigns/reciprocal.yaml` has the others."""
-    assert nearest_m(RECIPROCAL.recipe(cell, 0).scenario()) >= 1.0
+    assert nearest_m(RECIPROCAL.task(cell, 0).scenario()) >= 1.0
 
 
 @pytest.mark.parametrize("number", [140, 87, 91])
 def test_among_mates_a_drone_steps_out_of_the_way_of_one_that_a_person_flies(number: int) -> None:
     """Three flights in which it came within 0.34, 0.70 and 0.75 m: it changed sides, or chose a closed one."""
     (cell,) = [cell for cell in RECIPROCAL.cells if cell.parameters[CASE] == "five_one_without_flockd"]
-    assert nearest_m(RECIPROCAL.recipe(cell, number).scenario()) >= 1.0
+    assert nearest_m(RECIPROCAL.task(cell, number).scenario()) >= 1.0
