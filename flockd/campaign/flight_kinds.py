@@ -28,7 +28,7 @@ PERCEPTIONS: dict[FlightKindName, SimulatedPerception] = {"truth": "truth", "sig
 def figures_flown(scenario: ScenarioConfig, task: Task) -> Figures:
     """Flies a task's scenario, on this thread alone and without key frames, and gives the wanted figures."""
     perception, gated = PERCEPTIONS[task.config.perception], task.config.gated
-    log = fly(scenario, perception=perception, gated=gated, processes=0, pictured=False).log
+    log = fly(scenario, perception=perception, gated=gated, threads=0, pictured=False).log
     return figures_of(log, task.config.wanted)
 
 

@@ -41,7 +41,7 @@ costs, with five drones on a processor without 8-bit instructions:
   time       12 s of processor time a simulated second, so 11 minutes on two free cores for the whole flight, and 10 s
              to begin; a flight of 10 s with three drones 66 s of processor time; with --perception truth a few
              seconds
-  memory     1.1 GB on two processors, and 0.3 GB more for each further one, up to one a drone
+  memory     1.4 GB
   disk       31 MB for the report and what it is made of
   --record   another 4.5 MB a drone and simulated second: 2.5 GB for the whole flight
 Try `--duration 10 --drones 3` first. Ctrl-C ends a flight early, with a report of what was flown and exit code 130."""

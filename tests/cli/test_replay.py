@@ -202,7 +202,7 @@ def flight(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
             stack.enter_context(Recorder(folder / f"{drone}.mcap", drone=drone, config=flown.drone, models=models))
             for drone in DRONES
         ]
-        return Flight(folder, fly(flown, recorders=recorders, processes=1).log)
+        return Flight(folder, fly(flown, recorders=recorders, threads=0).log)
 
 
 def test_a_replay_of_a_simulated_flight_equals_it_bit_for_bit(flight: Flight, told: Told) -> None:

@@ -68,7 +68,7 @@ def scenario(deg: float, late_s: float, focal: float) -> ScenarioConfig:
 def flown(flight: ScenarioConfig, path: Path) -> tuple[PilotOutput, ...]:
     """With true maps, so that nothing but the rig is wrong; recorded."""
     with Told(path, drone="drone1", config=flight.drone) as recorder:
-        fly(flight, swap=frozenset(TRUTH_ROLES), recorders=[recorder], processes=0, pictured=False)
+        fly(flight, swap=frozenset(TRUTH_ROLES), recorders=[recorder], threads=0, pictured=False)
     return recorder.outputs
 
 

@@ -158,7 +158,7 @@ def flown(flight: Flight, logs: Path | None = None) -> Line:
         overrides = {**overrides, "duration_s": flight.duration_s}
     try:
         scenario = load_scenario(data_path("config") / flight.file, overrides)
-        log = fly(scenario, perception=EYES[flight.eyes].perception, processes=0, pictured=False).log
+        log = fly(scenario, perception=EYES[flight.eyes].perception, threads=0, pictured=False).log
         figures = figures_of(log, FIGURES)
         if logs is not None and flight.eyes == "sight":
             log.save(logs / f"{flight.scenario.replace(' ', '_')}-{flight.seed}.npz")

@@ -6,7 +6,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from dataclasses import replace
 
 from flockd.core.choices import SimulatedPerception
@@ -17,7 +16,6 @@ from flockd.onboard.telemetry.topics import AnswerMessage
 from flockd.sim.flock.control_loop import ControlLoop
 from flockd.sim.flock.exact_states import vehicles_of
 from flockd.sim.flock.flock_telemetry import FlockTelemetry
-from flockd.sim.flock.pilot_pool import PilotPool
 from flockd.sim.flock.swarm import ExactStatePilots, VisionPilots, fly_commands
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances
@@ -222,23 +220,19 @@ def fly_live(
 
     Until KeyboardInterrupt. The arguments are those of `flockd.sim.flock.swarm.fly`; `controls` give the pace.
     """
-    with ExitStack() as stack:
-        pilots: ExactStatePilots | VisionPilots
-        if perception == "truth":
-            pilots = ExactStatePilots(scenario, shown, gated=gated)
-        else:
-            pool = stack.enter_context(PilotPool(scenario, swap, None))
-            pilots = VisionPilots(scenario, pool, shown, (), None, preparing)
-        while True:
-            controls.begin()
-            shown.begin_again()
-            pilots.begin_again()
-            loop, vehicles = ControlLoop(scenario, gated=gated), vehicles_of(scenario)
-            step = 0
-            while controls.wait(time_s := step * scenario.drone.step_s):
-                disturbed = controls.disturbed
-                vehicles.disturb(disturbed)
-                shown.disturb(disturbed)
-                commands = pilots.step(step, time_s, vehicles, None, pictured=False, disturbed=disturbed)
-                fly_commands(commands, time_s, loop, vehicles, shown, disturbed)
-                step += 1
+    pilots: ExactStatePilots | VisionPilots = ExactStatePilots(scenario, shown, gated=gated)
+    if perception == "learned":
+        pilots = VisionPilots(scenario, swap, shown, (), None, preparing)
+    while True:
+        controls.begin()
+        shown.begin_again()
+        pilots.begin_again()
+        loop, vehicles = ControlLoop(scenario, gated=gated), vehicles_of(scenario)
+        step = 0
+        while controls.wait(time_s := step * scenario.drone.step_s):
+            disturbed = controls.disturbed
+            vehicles.disturb(disturbed)
+            shown.disturb(disturbed)
+            commands = pilots.step(step, time_s, vehicles, None, pictured=False, disturbed=disturbed)
+            fly_commands(commands, time_s, loop, vehicles, shown, disturbed)
+            step += 1

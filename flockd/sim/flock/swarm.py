@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
@@ -32,7 +31,7 @@ from flockd.sim.flock.exact_states import (
     vehicles_of,
 )
 from flockd.sim.flock.flock_telemetry import FlockTelemetry, RealTime
-from flockd.sim.flock.pilot_pool import PilotPool, Stepped
+from flockd.sim.flock.pilots import Pilots, Stepped
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.pose_trail import LateAttitude
 from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances, SimulatedAutopilot, Vehicles
@@ -60,7 +59,7 @@ def fly(
     gated: bool = True,
     shown: FlockTelemetry | None = None,
     recorders: Sequence[Recorder] = (),
-    processes: int | None = None,
+    threads: int | None = None,
     pictured: bool = True,
     progress: Callable[[int, int], None] = lambda done, total: None,
     preparing: Callable[[int, int], None] = lambda done, total: None,
@@ -77,9 +76,8 @@ def fly(
         shown: where every drone's output is published; operators' orders come from there. A flight on exact states
             then takes as long as it takes in the air.
         recorders: one a drone, or none; nothing comes back from there.
-        processes: for pilots that see, beside this one, which draws the images; 1: they step in this one; 0: likewise,
-            and the images are drawn on the calling thread; None: as many as there are processors, and no more than
-            drones.
+        threads: for pilots that see, and as many for their images; 0: all on the calling one; None: as many as there
+            are processors.
         pictured: keep key frames for the report.
         progress: called with (steps done, steps in all).
         preparing: the same, of what is done before the first step: the companion, the networks, the world.
@@ -93,31 +91,28 @@ def fly(
     chosen = key_frame_steps(len(times)) if pictured else set()
     key_frames: list[KeyFrame] = []
     flown, pace = 0, RealTime()
-    with ExitStack() as stack:
-        pool = stack.enter_context(PilotPool(scenario, swap, processes)) if perception == "learned" else None
-        companion = None
-        pilots: ExactStatePilots | VisionPilots = ExactStatePilots(scenario, shown, gated=gated)
-        if pool is not None:
-            companion = fly_exact_states(scenario, gated=gated)[1:]
-            threads = 0 if processes == 0 else None
-            pilots = VisionPilots(scenario, pool, shown, recorders, companion, preparing, threads)
-        preparing(_PREPARATIONS, _PREPARATIONS)
-        try:
-            for step, time_s in enumerate(times):
-                if shown is not None and pool is None:
-                    pace.wait(float(time_s))
-                builder.add_truth(step, vehicles.position, vehicles.velocity, vehicles.R_ned_body)
-                commands = pilots.step(step, float(time_s), vehicles, builder, pictured=step in chosen)
-                builder.add_missions(step, commands.desired, commands.missions)
-                key_frames += pilots.key_frames
-                fly_commands(commands, float(time_s), loop, vehicles, shown)
-                flown = step + 1
-                progress(flown, len(times))
-        except KeyboardInterrupt:
-            if flown < _LEAST_STEPS:
-                raise
-            builder.cut(flown)
-            companion = companion and (companion[0][:flown], companion[1][:flown])
+    companion = None
+    pilots: ExactStatePilots | VisionPilots = ExactStatePilots(scenario, shown, gated=gated)
+    if perception == "learned":
+        companion = fly_exact_states(scenario, gated=gated)[1:]
+        pilots = VisionPilots(scenario, swap, shown, recorders, companion, preparing, threads)
+    preparing(_PREPARATIONS, _PREPARATIONS)
+    try:
+        for step, time_s in enumerate(times):
+            if shown is not None and companion is None:
+                pace.wait(float(time_s))
+            builder.add_truth(step, vehicles.position, vehicles.velocity, vehicles.R_ned_body)
+            commands = pilots.step(step, float(time_s), vehicles, builder, pictured=step in chosen)
+            builder.add_missions(step, commands.desired, commands.missions)
+            key_frames += pilots.key_frames
+            fly_commands(commands, float(time_s), loop, vehicles, shown)
+            flown = step + 1
+            progress(flown, len(times))
+    except KeyboardInterrupt:
+        if flown < _LEAST_STEPS:
+            raise
+        builder.cut(flown)
+        companion = companion and (companion[0][:flown], companion[1][:flown])
     metadata = FlightMetadata.of_configuration(
         scenario.drone,
         scenario=scenario.scenario,
@@ -204,28 +199,29 @@ class VisionPilots:
     def __init__(
         self,
         scenario: ScenarioConfig,
-        pool: PilotPool,
+        swap: frozenset[str],
         shown: FlockTelemetry | None,
         recorders: Sequence[Recorder],
         companion: tuple[FloatArray, FloatArray] | None,
         preparing: Callable[[int, int], None],
         threads: int | None = None,
     ) -> None:
-        """``companion``: for what is recorded; None where nothing is. ``threads``: see `CameraSimulator`."""
+        """``companion``: for what is recorded; None where nothing is. ``swap``, ``threads``: see `fly`."""
         self._companion = companion
         preparing(1, _PREPARATIONS)
         self._shown, self._recorders = shown, recorders
         self._cameras = CameraSimulator(scenario, threads=threads)
         preparing(2, _PREPARATIONS)
-        pool.wait_until_ready()
+        self._pilots = Pilots(scenario, swap, threads)
         preparing(3, _PREPARATIONS)
-        self._pool, self._drones = pool, pool.drones
+        self._drones = self._pilots.drones
         self._scenario, self._yaw_rad = scenario, start_yaw(scenario)
         self._begin()
 
     def begin_again(self) -> None:
         """For another flight from the beginning, in the same world and with the same networks."""
         self._cameras.begin_again()
+        self._pilots.begin_again()
         self._begin()
 
     def _begin(self) -> None:
@@ -240,7 +236,6 @@ class VisionPilots:
         self._stepped: dict[int, Stepped] = {}
         self.key_frames: Sequence[KeyFrame] = ()
         """What the pilots worked with in the last step, where that was asked for."""
-        self._begins = set(self._drones)
 
     def step(
         self,
@@ -269,15 +264,9 @@ class VisionPilots:
             if self._attitudes:
                 state = self._attitudes[i].heard(state, vehicles.trail)
             with_pictures = pictured and i in self._drones[:_KEY_FRAME_DRONES]
-            steps[i] = (
-                frames,
-                state,
-                self._pool.step(
-                    i, frames, state, seen, pictured=with_pictures, order=orders.get(i), begins=i in self._begins
-                ),
-            )
-        self._begins = set()
-        self._stepped = {i: self._pool.stepped(i, stepping) for i, (_, _, stepping) in steps.items()}
+            stepping = self._pilots.step(i, frames, state, seen, pictured=with_pictures, order=orders.get(i))
+            steps[i] = frames, state, stepping
+        self._stepped = {i: stepping.result() for i, (_, _, stepping) in steps.items()}
         self.key_frames = [frame for stepped in self._stepped.values() for frame in stepped.key_frames]
         truth = None if self._companion is None else self._truth(step, time_s, vehicles, self._companion)
         for i, stepped in self._stepped.items():
