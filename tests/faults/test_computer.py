@@ -94,7 +94,7 @@ async def test_steps_take_longer_than_they_may(in_flight: InTheAir, reacted: Rea
 @pytest.mark.fault("overrun", within_s=8.0)
 async def test_it_gets_too_hot(in_flight: InTheAir, reacted: Reacted, monkeypatch: pytest.MonkeyPatch) -> None:
     temperature_c = [50.0]
-    monkeypatch.setattr("flockd.onboard.daemon.supervisor_inputs.hottest_zone_c", lambda _: temperature_c[0])
+    monkeypatch.setattr("flockd.onboard.daemon.supervisor_inputs.thermal_zones", lambda: [("cpu", temperature_c[0])])
 
     async with in_flight() as ship:
         temperature_c[0] = 88.0

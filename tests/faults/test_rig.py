@@ -23,7 +23,7 @@ from flockd.flight.geometry import (
 )
 from flockd.ground.doctor import Level
 from flockd.ground.doctor.camera_checks import check_rig
-from flockd.onboard.daemon.pilot_loop import RigReports
+from flockd.onboard.daemon.pilot_loop import Reports
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.reader import Recording
 from flockd.sim.cameras import camera_simulator
@@ -77,7 +77,7 @@ def test_a_rig_is_not_as_configured(tmp_path: Path, reacted: Reacted, capsys: py
     """Two degrees, 2 cm, 30 ms and 2 %: said in flight with the correction, and flown on as configured."""
     flight = scenario(2.0, 0.03, 0.02)
     outputs = flown(flight, tmp_path / NAME)
-    reports, told = RigReports(), dict[str, float]()
+    reports, told = Reports(), dict[str, float]()
     for output in outputs:
         told |= dict.fromkeys(reports.update(output), output.time_s - outputs[0].time_s)
     assert len(told) == len(CAMERAS) * len(FAULTS)  # each once
@@ -133,7 +133,7 @@ def test_a_camera_is_upside_down_or_two_are_swapped(
         cameras[name] = RigCamera(name, cameras[name].camera, turned)
     monkeypatch.setattr(camera_simulator, "true_rigs", lambda scenario: [Rig(cameras)])
     outputs = flown(flight, tmp_path / NAME)
-    reports, told = RigReports(), dict[str, float]()
+    reports, told = Reports(), dict[str, float]()
     for output in outputs:
         told |= dict.fromkeys(reports.update(output), output.time_s - outputs[0].time_s)
     for name in axes:
@@ -151,7 +151,7 @@ def test_a_camera_is_upside_down_or_two_are_swapped(
 def test_a_rig_as_configured_is_flown_without_a_word(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     flight = scenario(0.0, 0.0, 0.0)
     outputs = flown(flight, tmp_path / NAME)
-    reports = RigReports()
+    reports = Reports()
     assert not [text for output in outputs for text in reports.update(output)]
     last = [output.rig for output in outputs if output.rig][-1]
     assert [one.camera for one in last] == list(CAMERAS)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from flockd.core.config import DroneConfig
 from flockd.ground.doctor import Finding, failed, graded, passed, warned
+from flockd.onboard.daemon.supervisor_inputs import THERMAL_ZONES, thermal_zones
 
 STATE_FOLDER = Path("/var/lib/flockd")
 """Where the systemd unit lets flockd record."""
@@ -22,7 +23,6 @@ LEAST_MB = 2000.0
 """For one flight: five minutes of four cameras as PNG."""
 SPARE_MB = 200.0
 SPARE_K = 10.0
-THERMAL = Path("/sys/class/thermal")
 MEMORY = Path("/proc/meminfo")
 YEARS = (2026, 2100)
 """A clock that says another year was never set."""
@@ -75,9 +75,9 @@ def check_memory(config: DroneConfig, meminfo: Path = MEMORY) -> Iterator[Findin
     yield graded("memory", f"{measured}{little}", fix, failure=free_mb < needs_mb, warning=bool(little))
 
 
-def check_temperature(config: DroneConfig, folder: Path = THERMAL) -> Iterator[Finding]:
+def check_temperature(config: DroneConfig, folder: Path = THERMAL_ZONES) -> Iterator[Finding]:
     """How hot it is now, at rest, and whether the processor is being slowed down for it."""
-    zones = dict(thermal_zones(folder))
+    zones = thermal_zones(folder)
     slowed = sorted(processors_slowed(folder))
     if slowed:
         measured = f"the processor is being slowed down ({', '.join(slowed)})"
@@ -86,22 +86,13 @@ def check_temperature(config: DroneConfig, folder: Path = THERMAL) -> Iterator[F
         measured = "this computer reports no temperature, so flockd will not notice when it gets too hot"
         yield warned("temperature", measured, "load the driver of its thermal sensor, if it has one")
         return
-    hottest = max(zones, key=zones.__getitem__)
+    hottest, celsius = max(zones, key=lambda zone: zone[1])
     limit_c = config.safety.degraded_temperature_c
-    measured = f"{zones[hottest]:.0f} °C ({hottest}); from {limit_c:g} on it flies slowly"
-    hot, warm = zones[hottest] >= limit_c, zones[hottest] > limit_c - SPARE_K
+    measured = f"{celsius:.0f} °C ({hottest}); from {limit_c:g} on it flies slowly"
+    hot, warm = celsius >= limit_c, celsius > limit_c - SPARE_K
     fix = f"{'let it cool down, and ' if hot else ''}improve its airflow, or add a heat sink"
     little = ": little is left" if warm and not hot else ""
     yield graded("temperature", f"{measured}{little}", fix, failure=hot, warning=warm)
-
-
-def thermal_zones(folder: Path) -> Iterator[tuple[str, float]]:
-    """Those that can be read; a zone that is switched off cannot."""
-    for zone in sorted(folder.glob("thermal_zone*")):
-        try:
-            yield (zone / "type").read_text("ascii").strip(), int((zone / "temp").read_text("ascii")) / 1000
-        except (OSError, ValueError):
-            continue
 
 
 def processors_slowed(folder: Path) -> Iterator[str]:

@@ -24,7 +24,6 @@ from flockd.core.messages import (
     Neighbour,
     PilotOutput,
     RangeReading,
-    Reason,
     ReasonKind,
     VehicleState,
 )
@@ -94,9 +93,7 @@ class PilotLoop:
         self._failure: str | None = None
         self._unexpected = 0
         """Errors in a row that nobody expects."""
-        self._height_reports = FaultReports(ReasonKind.HEIGHT, "the range finder works again", each=False)
-        self._lens_reports = FaultReports(ReasonKind.LENS, "its lens is clear again", each=True)
-        self._rig_reports, self._size_reports = RigReports(), SizeReports()
+        self._reports = Reports()
         self._took_s: deque[float] = deque(maxlen=STEPS_REMEMBERED)
         self.frames: FrameSet | None = None
         """The newest; None before the first."""
@@ -129,7 +126,7 @@ class PilotLoop:
     def _begin(self) -> None:
         self._begun += 1
         self._pilot = self.order = None
-        self._rig_reports, self._size_reports = RigReports(), SizeReports()
+        self._reports.begin()
 
     @property
     def ego_motion_age_s(self) -> float:
@@ -196,13 +193,7 @@ class PilotLoop:
         self.newest = StepResult(taken_s, output, self._flight, number)
         self.stepped = frames, output
         self._count(self.newest)
-        reports = (
-            *self._height_reports.update(output.reasons),
-            *self._lens_reports.update(output.reasons),
-            *self._rig_reports.update(output),
-            *self._size_reports.update(output),
-        )
-        for report in reports:
+        for report in self._reports.update(output):
             self._log_event(report)
         self._on_step(frames, vehicle, output, order)
 
@@ -245,54 +236,43 @@ def last_seen_s(time_s: float, neighbours: Sequence[Neighbour]) -> float:
     )
 
 
-class FaultReports:
-    """Reports when faults of one kind begin, and when they are over."""
-
-    def __init__(self, kind: ReasonKind, over: str, *, each: bool) -> None:
-        """``over``: said, after its subject, when a fault is over; ``each``: of each fault, else when none is left."""
-        self._kind, self._over, self._each = kind, over, each
-        self._faults: dict[str, None] = {}
-
-    def update(self, reasons: Sequence[Reason]) -> list[str]:
-        """The sentences that a step's reasons are worth."""
-        before, self._faults = self._faults, dict.fromkeys(one.text for one in reasons if one.kind is self._kind)
-        begun = [fault for fault in self._faults if fault not in before]
-        over = [fault for fault in before if fault not in self._faults] if self._each or not self._faults else []
-        return begun + [f"{fault.partition(':')[0]}: {self._over}" for fault in over]
-
-
-class RigReports:
-    """Reports, once a flight, what of a camera is not as configured, and by how much."""
+class Reports:
+    """The sentences that outputs are worth: what begins, what of it is over, and what is found of cameras and sizes."""
 
     def __init__(self) -> None:
-        self._said: set[str] = set()
+        self._faults: dict[str, ReasonKind] = {}
+        """Of the step before, by their texts."""
+        self.begin()
+
+    def begin(self) -> None:
+        """Another pilot begins, which finds all anew."""
+        self._said_of_rig: set[str] = set()
+        self._told_of_size: set[str] = set()
 
     def update(self, output: PilotOutput) -> list[str]:
         """The sentences that a step's output is worth."""
-        new = [one.text for one in output.reasons if one.kind is ReasonKind.RIG and one.text not in self._said]
-        self._said.update(new)
-        corrections = {text: self._done(one, output) for one in output.rig for text in rig_faults(one)}
+        return [*self._of_faults(output), *self._of_rig(output), *self._of_size(output)]
+
+    def _of_faults(self, output: PilotOutput) -> list[str]:
+        """When one begins, and when it is over; of heights, when none is left."""
+        before, self._faults = self._faults, {one.text: one.kind for one in output.reasons if one.kind in _OVER}
+        begun = [fault for fault in self._faults if fault not in before]
+        over = [
+            f"{fault.partition(':')[0]}: {_OVER[kind]}"
+            for fault, kind in before.items()
+            if fault not in self._faults and (kind is ReasonKind.LENS or kind not in self._faults.values())
+        ]
+        return begun + over
+
+    def _of_rig(self, output: PilotOutput) -> list[str]:
+        """Once a flight, what of a camera is not as configured, and by how much."""
+        new = [one.text for one in output.reasons if one.kind is ReasonKind.RIG and one.text not in self._said_of_rig]
+        self._said_of_rig.update(new)
+        corrections = {text: _done(one, output) for one in output.rig for text in rig_faults(one)}
         return [text + corrections[text] for text in new]
 
-    def _done(self, one: CameraDeviation, output: PilotOutput) -> str:
-        if one.camera in output.noisy_cameras:
-            return " The drone flies without it."
-        if one.elsewhere:
-            return " It is flown on as configured, as too few others agree with the autopilot."
-        return (
-            f": by what it saw, {described(one)}; it is flown on as configured, and "
-            "`flockd calibrate rig --from-flight` corrects it"
-        )
-
-
-class SizeReports:
-    """Reports when the drone begins to weave, when it has found how large the others are, and what contradicts it."""
-
-    def __init__(self) -> None:
-        self._told: set[str] = set()
-
-    def update(self, output: PilotOutput) -> list[str]:
-        """The sentences that a step's output is worth."""
+    def _of_size(self, output: PilotOutput) -> list[str]:
+        """That it weaves, how large the others are, and what contradicts it, when it is new."""
         size, told = output.size, dict[str, str]()
         if size is None:
             return []
@@ -302,9 +282,24 @@ class SizeReports:
             found = f"{size.size_m:.2f} m large, +-{size.sigma:.0%}"
             told["used"] = f"size: the others are {found}; ranges follow from it"
         told |= {one.kind: one.text for one in output.reasons if one.kind is ReasonKind.SIZE}
-        new = [text for what, text in told.items() if what not in self._told]
-        self._told = set(told)
+        new = [text for what, text in told.items() if what not in self._told_of_size]
+        self._told_of_size = set(told)
         return new
+
+
+_OVER = {ReasonKind.HEIGHT: "the range finder works again", ReasonKind.LENS: "its lens is clear again"}
+"""Said, after its subject, when a fault is over."""
+
+
+def _done(one: CameraDeviation, output: PilotOutput) -> str:
+    if one.camera in output.noisy_cameras:
+        return " The drone flies without it."
+    if one.elsewhere:
+        return " It is flown on as configured, as too few others agree with the autopilot."
+    return (
+        f": by what it saw, {described(one)}; it is flown on as configured, and "
+        "`flockd calibrate rig --from-flight` corrects it"
+    )
 
 
 HISTORY_S = services.VEHICLE_STATE.timeout

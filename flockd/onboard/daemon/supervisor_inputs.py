@@ -6,6 +6,7 @@ import asyncio
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -240,7 +241,8 @@ class Thermometer:
         """Reads until cancelled."""
         while True:
             try:
-                self.hottest_c = await self._worker.do(READ_DEADLINE_S, hottest_zone_c, THERMAL_ZONES)
+                zones = await self._worker.do(READ_DEADLINE_S, thermal_zones)
+                self.hottest_c = max((celsius for _, celsius in zones), default=None)
             except LateError:
                 self.hottest_c = None
                 self._worker.leave()
@@ -248,12 +250,10 @@ class Thermometer:
             await asyncio.sleep(1.0)
 
 
-def hottest_zone_c(folder: Path) -> float | None:
-    """Temperature of the hottest zone that can be read; a zone that is switched off cannot."""
-    readings = []
-    for zone in folder.glob("thermal_zone*/temp"):
-        try:
-            readings.append(int(zone.read_text(encoding="ascii")) / 1000)
-        except (OSError, ValueError):
-            continue
-    return max(readings, default=None)
+def thermal_zones(folder: Path = THERMAL_ZONES) -> list[tuple[str, float]]:
+    """Name and temperature in degrees Celsius of those that can be read; a zone that is switched off cannot."""
+    found = []
+    for zone in sorted(folder.glob("thermal_zone*")):
+        with suppress(OSError, ValueError):
+            found.append(((zone / "type").read_text("ascii").strip(), int((zone / "temp").read_text("ascii")) / 1000))
+    return found

@@ -92,7 +92,7 @@ class Damage:
     offset: int
     reason: str
     at_end: bool
-    """The file just stops: its writer was killed. Otherwise something within it is damaged."""
+    """The file just stops, or zeros follow: its writer was killed. Otherwise something within it is damaged."""
 
 
 class McapFile:
@@ -205,29 +205,22 @@ class _Reader:
         while True:
             offset = self._file.tell()
             head = self._file.read(_HEAD.size)
-            if len(head) < _HEAD.size:
+            opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
+            if opcode == Opcode.DATA_END:
+                return
+            if opcode == 0 or offset + _HEAD.size + length > self._size:
                 yield Damage(offset, "it stops without an end", at_end=True)
                 return
-            opcode, length = _HEAD.unpack(head)
-            if offset + _HEAD.size + length > self._size:
-                yield Damage(offset, "it stops within a record", at_end=True)
-                return
-            if opcode == Opcode.DATA_END:
-                if self._file.seek(-len(_MAGIC), io.SEEK_END) and self._file.read() != _MAGIC:
-                    yield Damage(offset, "it stops within its index", at_end=True)
-                return
-            if opcode == 0:
-                yield Damage(offset, "zeros stand where a record should begin", at_end=True)
-                return
             if length > MAX_RECORD_BYTES:
-                yield Damage(offset, f"a {_name(opcode)} is {length:,} bytes long", at_end=False)
+                yield Damage(offset, f"a record is {length:,} bytes long", at_end=False)
                 self._file.seek(length, io.SEEK_CUR)
                 continue
             whole = head + self._file.read(length)
             try:
                 found = list(self._parsed(opcode, whole))
             except _BROKEN as error:
-                yield Damage(offset, f"a {_name(opcode)} cannot be read ({error})", at_end=False)
+                name = Opcode(opcode).name.lower()
+                yield Damage(offset, f"a {name} cannot be read ({error})", at_end=False)
             else:
                 yield from found
 
@@ -271,10 +264,3 @@ def _uncompressed(chunk: Chunk) -> Chunk:
     if len(data) != size:
         raise ValueError("its uncompressed size is not what it says")
     return dataclasses.replace(chunk, compression="", data=data)
-
-
-def _name(opcode: int) -> str:
-    try:
-        return Opcode(opcode).name.lower()
-    except ValueError:
-        return f"record of the unknown kind {opcode}"

@@ -17,8 +17,9 @@ import numpy as np
 from flockd import __version__
 from flockd.core.config import DroneConfig
 from flockd.flight.inference import manifests_of
-from flockd.ground.doctor.computer_checks import MB, MEMORY, THERMAL, processors_slowed, thermal_zones
+from flockd.ground.doctor.computer_checks import MB, MEMORY, processors_slowed
 from flockd.ground.doctor.model_checks import FULL
+from flockd.onboard.daemon.supervisor_inputs import THERMAL_ZONES, thermal_zones
 from flockd.review.replay.recorded_flight import Replay
 
 LEAST_STEPS = 5
@@ -41,7 +42,7 @@ class ComputerFiles:
     cpuinfo: Path = Path("/proc/cpuinfo")
     board: Path = Path("/proc/device-tree/model")
     meminfo: Path = MEMORY
-    thermal: Path = THERMAL
+    thermal: Path = THERMAL_ZONES
 
     def computer(self) -> dict[str, Any]:
         """What it is: board or processor, cores for this process, instructions, memory (None: not told)."""

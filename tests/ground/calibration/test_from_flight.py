@@ -18,7 +18,7 @@ from flockd.ground.calibration.board import CalibrationError
 from flockd.ground.calibration.from_flight import corrected_rig, found_rig
 from flockd.ground.doctor import Level
 from flockd.ground.doctor.camera_checks import check_rig
-from flockd.onboard.daemon.pilot_loop import RigReports
+from flockd.onboard.daemon.pilot_loop import Reports
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.mcap_file import RecordingError
 from flockd.onboard.recording.reader import Recording
@@ -143,7 +143,7 @@ def test_times_of_cameras_that_do_not_agree_are_named(tmp_path: Path) -> None:
     assert "20 ms off the others'" in result["notes"][0]
     fault = Reason(ReasonKind.RIG, "camera left: it is not turned as configured")
     output: PilotOutput = replace(filled(PilotOutput, 0.5), reasons=(fault,), rig=(seen("front"), seen("left")))
-    reports = RigReports()
+    reports = Reports()
     (text,) = reports.update(output)
     assert text.startswith("camera left: it is not turned as configured: by what it saw, turned by roll +0.30")
     assert reports.update(output) == [], "each fault is said once a flight"

@@ -38,15 +38,14 @@ from flockd.flight.safety import Action, Decision, Gate, Inputs, Permission, Req
 from flockd.onboard.daemon.control import Control
 from flockd.onboard.daemon.operator_orders import OperatorRequests
 from flockd.onboard.daemon.pilot_loop import (
-    FaultReports,
     PilotLoop,
-    SizeReports,
+    Reports,
     StepResult,
     VehicleHistory,
     last_seen_s,
 )
 from flockd.onboard.daemon.status import ServiceManager
-from flockd.onboard.daemon.supervisor_inputs import CameraMonitor, InputCollector, LoopLag, hottest_zone_c
+from flockd.onboard.daemon.supervisor_inputs import CameraMonitor, InputCollector, LoopLag, thermal_zones
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
 from flockd.onboard.sources import CameraStatus, Count
 from flockd.onboard.worker import Worker
@@ -129,12 +128,13 @@ def test_without_a_service_manager_or_its_watchdog_nothing_is_said_and_nothing_f
             manager.recv(999)
 
 
-def test_the_hottest_zone_counts_and_one_that_cannot_be_read_does_not(tmp_path: Path) -> None:
-    assert hottest_zone_c(tmp_path) is None
+def test_a_thermal_zone_that_cannot_be_read_does_not_count(tmp_path: Path) -> None:
+    assert thermal_zones(tmp_path) == []
     for number, reading in enumerate(("41500", "67250", "", "off")):
         (tmp_path / f"thermal_zone{number}").mkdir()
         (tmp_path / f"thermal_zone{number}" / "temp").write_text(reading, encoding="ascii")
-    assert hottest_zone_c(tmp_path) == 67.25
+        (tmp_path / f"thermal_zone{number}" / "type").write_text("cpu\n", encoding="ascii")
+    assert thermal_zones(tmp_path) == [("cpu", 41.5), ("cpu", 67.25)]
 
 
 def test_a_blocked_event_loop_is_seen_while_it_is_and_after() -> None:
@@ -223,14 +223,14 @@ def test_frames_get_the_range_that_was_taken_nearest_to_them() -> None:
 
 
 def test_a_range_finder_that_fails_is_an_event_and_so_is_its_return() -> None:
-    reports = FaultReports(ReasonKind.HEIGHT, "the range finder works again", each=False)
+    reports = Reports()
     weak, old = (
         Reason(ReasonKind.HEIGHT, f"height: the range{fault}; the barometer's is used")
         for fault in (" finder's signal is too weak", " is too old")
     )
     left = Reason(ReasonKind.CAMERA, "camera left: no frame")
     steps: tuple[tuple[Reason, ...], ...] = ((), (left, weak), (weak,), (old,), (left,), ())
-    found = [reports.update(reasons) for reasons in steps]
+    found = [reports.update(output(reasons=reasons)) for reasons in steps]
     assert found == [[], [weak.text], [], [old.text], ["height: the range finder works again"], []]
 
 
@@ -250,7 +250,7 @@ def test_who_has_seen_another_twice_is_not_alone_though_it_is_not_confirmed_yet(
 
 
 def test_what_is_learned_of_the_others_size_is_an_event_each_time_that_it_is_new() -> None:
-    reports = SizeReports()
+    reports = Reports()
     said = Reason(ReasonKind.SIZE, "size: perception.drone_size_m says 0.56 m, and the flight shows 0.39 +-0.04 m")
     steps = (
         (None, ()),

@@ -106,8 +106,8 @@ def test_a_file_cut_off_anywhere_is_refused_or_played_as_far_as_it_goes(tmp_path
             assert "\n" not in str(error)
             outcomes.append(0)
         else:
-            assert not recording.contents.finished
             steps = list(recording.steps())
+            assert not recording.contents.finished or len(steps) == 10, "only its index is cut off"
             assert [step.number for step in steps] == list(range(len(steps)))
             outcomes.append(len(steps))
     assert outcomes == sorted(outcomes)
