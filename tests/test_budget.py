@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_120,
     "flockd/flight": 14_780,
-    "flockd/onboard": 10_150,
+    "flockd/onboard": 10_130,
     "flockd/fleet": 2_070,
     "flockd/ground": 3_950,
     "flockd/review": 3_350,
