@@ -12,7 +12,7 @@ from pathlib import Path
 
 from flockd.core.config import DroneConfig
 from flockd.ground.doctor import Finding, failed, graded, passed, warned
-from flockd.onboard.daemon.supervisor_inputs import THERMAL_ZONES, thermal_zones
+from flockd.onboard.daemon import THERMAL_ZONES, thermal_zones
 
 STATE_FOLDER = Path("/var/lib/flockd")
 """Where the systemd unit lets flockd record."""

@@ -19,7 +19,7 @@ from flockd.core.config import DroneConfig
 from flockd.flight.inference import manifests_of
 from flockd.ground.doctor.computer_checks import MB, MEMORY, processors_slowed
 from flockd.ground.doctor.model_checks import FULL
-from flockd.onboard.daemon.supervisor_inputs import THERMAL_ZONES, thermal_zones
+from flockd.onboard.daemon import THERMAL_ZONES, thermal_zones
 from flockd.review.replay.recorded_flight import Replay
 
 LEAST_STEPS = 5
