@@ -76,6 +76,7 @@ COMMANDS: Mapping[str, str] = {
 KEYS: Mapping[str, str] = {
     "autopilot.arm_and_take_off": "leave it out: a pilot or a ground station arms, takes off and selects offboard",
     "autopilot.max_heartbeat_age_s": "write `heartbeat_timeout_s` in the section `safety`",
+    "autopilot.obstacle_distance": "delete it, and set PX4's CP_DIST to -1: flockd stops no pilot who flies by hand",
     "cameras.compression.h264_mbit_s": "write `jpeg_quality`; streams are no longer simulated",
     "detections.latency_s": "write `latency_s` beside `detections`",
     "desired": "write the section `mission`, with `kind: circle_then_tangent` for the same flight",

@@ -57,9 +57,6 @@ VEHICLE_STATE = Service("the autopilot's state", 30.0, 2.0, "forgotten; frames o
 MOTION = Service("the autopilot's position and velocity", 30.0, 0.5, "motion_unknown")
 GROUND_RANGE = Service("range to the ground", 30.0, 0.3, "it gives no scale", ("perception.range_finder.max_age_s",))
 RANGE_FINDER = Service("range finder", 30.0, 0.5, "the autopilot's own distance to bottom takes its place")
-OBSTACLE_DISTANCE = Service(
-    "`OBSTACLE_DISTANCE`, to the autopilot", 10.0, 0.5, "PX4 stops in Position mode, and goes to Hold after 5 s"
-)
 TIME_SYNC = Service("reply to a clock exchange", 5.0, 1.0, "it is not used")
 STEP_TOPIC = Service("telemetry of a step", 2.0, 1.5, "watchers show nothing for it")
 PREVIEW = Service("picture with detections", 2.0, 2.0, "the newest picture is shown without them")

@@ -42,8 +42,5 @@ class AutopilotParameters(Section):
     autopilot`."""
     velocity_trim_memory: Share = 0.7
     """Share of a correction that is kept over half a second: noise of single steps goes, slow drifts stay."""
-    obstacle_distance: bool = False
-    """Whether the map of obstacles is sent to the autopilot (`OBSTACLE_DISTANCE`), so that PX4's Collision Prevention
-    stops a pilot who flies by hand in Position mode; CP_DIST switches it on there. Needs `obstacles.enabled`."""
     low_battery_share: Share = 0.2
     """The battery counts as low when the autopilot says that no more than this is left."""

@@ -103,9 +103,6 @@ class DroneConfig(Section):
                 f"{trim_m_s:g} and flocking.max_speed_m_s {law_m_s:g} are together above safety.gate.max_speed_m_s, "
                 f"which would refuse them; write {gate_m_s - law_m_s:g} or less"
             )
-        if self.autopilot is not None and self.autopilot.obstacle_distance and not self.obstacles.enabled:
-            fault = "needs the map of obstacles; write `enabled: true` in `obstacles`, or false here"
-            faults["autopilot", "obstacle_distance"] = fault
         if self.speed_factor != 1.0 and self.autopilot is not None and self.autopilot.address.startswith("serial:"):
             fault = "is for simulations, and an autopilot on a cable is none; delete it"
             faults["source", "shared_memory", "speed_factor"] = fault

@@ -245,7 +245,12 @@ def judge_parameter(name: str, value: float, config: DroneConfig) -> Finding:
         case "GF_MAX_VER_DIST":
             return _judge_limit(name, value, gate.max_height_m, "max_height_m")
         case "CP_DIST":
-            return _judge_collision_prevention(name, value, config)
+            told = (
+                ": PX4 lets nobody fly in Position mode where nothing sends it distances of obstacles"
+                if value > 0
+                else ""
+            )
+            return graded(name, f"{value:g}{told}", "set CP_DIST to -1, unless a sensor sends them", warning=value > 0)
     return _judge_action(name, ACTIONS[name], int(value), config)
 
 
@@ -270,24 +275,6 @@ def _judge_action(name: str, action: ParameterChoice, value: int, config: DroneC
     best, second, third = (f"{one} ({action.words[one]})" for one in action.good)
     fatal = action.poor is not None and value not in (*action.good, *action.poor)
     return graded(name, measured, f"set {name} to {best}, {second} or {third}", failure=fatal, warning=not good)
-
-
-def _judge_collision_prevention(name: str, value: float, config: DroneConfig) -> Finding:
-    """In metres."""
-    sends, on = config.autopilot is not None and config.autopilot.obstacle_distance, value > 0
-    measured, fix = {
-        (True, True): ("m: PX4 stops a pilot in Position mode by what flockd sees, and where it does not", ""),
-        (True, False): (
-            "m: PX4 lets nobody fly in Position mode where nothing sends it distances of obstacles",
-            "set CP_DIST to -1, or autopilot.obstacle_distance to true",
-        ),
-        (False, True): (
-            "PX4 ignores the distances that autopilot.obstacle_distance sends",
-            "set CP_DIST to the distance to keep, in metres",
-        ),
-        (False, False): ("PX4 stops no pilot before obstacles", ""),
-    }[on, sends]
-    return graded(name, f"{value:g}{' ' if on else ': '}{measured}", fix, warning=on != sends)
 
 
 def _judge_limit(name: str, value: float, own_m: float | None, what: str) -> Finding:

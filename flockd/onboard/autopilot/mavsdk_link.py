@@ -21,7 +21,6 @@ from functools import lru_cache
 from itertools import cycle
 from typing import Any, Self, TypeVar
 
-import numpy as np
 from mavsdk.component_type import ComponentType
 from mavsdk.connection_result import ConnectionResult
 from mavsdk.logging import LogLevel, log_subscribe
@@ -32,7 +31,7 @@ from mavsdk.system import System
 
 from flockd.core import services
 from flockd.core.config.autopilot import AutopilotParameters
-from flockd.core.messages import FloatArray, Setpoint, VehicleState
+from flockd.core.messages import Setpoint, VehicleState
 from flockd.flight.tracking.weave_path import HEIGHT_GAIN_PER_S
 from flockd.onboard.autopilot.autopilot_status import (
     MODES,
@@ -55,12 +54,6 @@ AUTOPILOT_COMPONENT = 1
 SETPOINT_TYPE_MASK = 2503
 """SET_POSITION_TARGET_LOCAL_NED: velocity and yaw; the rest is ignored."""
 MAV_FRAME_LOCAL_NED = 1
-MAV_FRAME_BODY_FRD = 12
-"""Of OBSTACLE_DISTANCE: PX4 1.18 lets the last of several sectors win that overlap one of its own, which are those of
-the body; sectors from north would hide a trunk behind the free sector beside it."""
-NEAREST_OBSTACLE_CM, UNKNOWN_CM = 30, 0xFFFF
-"""PX4 brakes before no obstacle that is as near as the sensor's least range: the nearest is sent 1 cm farther."""
-MAV_DISTANCE_SENSOR_UNKNOWN = 4
 MAV_AUTOPILOT_PX4 = 12
 COMMAND_SET_MODE = 176
 COMMAND_SET_MESSAGE_INTERVAL = 511
@@ -83,7 +76,7 @@ STREAMS_HZ = {
 most; its heartbeat comes once a second whatever one asks."""
 RECEIVED = (*STREAMS_HZ, "HEARTBEAT", "AUTOPILOT_VERSION", "STATUSTEXT", "EVENT", "CURRENT_EVENT_SEQUENCE")
 TIME_SYNC = "TIMESYNC"
-UNTARGETED = frozenset({"HEARTBEAT", "OBSTACLE_DISTANCE", "STATUSTEXT"})
+UNTARGETED = frozenset({"HEARTBEAT", "STATUSTEXT"})
 """Messages without a target: for all who hear them."""
 MOST_OPEN = 20
 """Exchanges whose reply is waited for; older ones are lost."""
@@ -360,27 +353,6 @@ class AutopilotLink:
             raise AutopilotError(f"MAVSDK could not send a setpoint ({error.result.name.lower()})") from error
         self._sent_s = self._clock()
         self.received.setpoints.sent(self._sent_s, north, east)
-
-    def send_obstacle_distances(self, free_m: FloatArray, range_m: float) -> None:
-        """Sends how far the drone sees that it is free, once: `free_m` (n,) as of `free_ahead`, up to `range_m`."""
-        most_cm = int(100 * range_m)
-        known_cm = np.floor(100 * np.nan_to_num(free_m, nan=0.0, posinf=range_m))
-        centimetres = np.clip(known_cm, NEAREST_OBSTACLE_CM + 1, most_cm).astype(int)
-        centimetres[np.isposinf(free_m)] = most_cm + 1
-        centimetres[np.isnan(free_m)] = UNKNOWN_CM
-        fields = {
-            "time_usec": int(1e6 * self._clock()),
-            "sensor_type": MAV_DISTANCE_SENSOR_UNKNOWN,
-            "distances": centimetres.tolist(),
-            "increment": 360 // len(free_m),
-            "min_distance": NEAREST_OBSTACLE_CM,
-            "max_distance": most_cm,
-            "increment_f": 0.0,
-            "angle_offset": 0.0,
-            "frame": MAV_FRAME_BODY_FRD,
-        }
-        with suppress(MavlinkDirectError):  # a link that cannot send says so where setpoints are sent
-            self._direct.send_message(self._message("OBSTACLE_DISTANCE", fields))
 
     def send_text(self, text: str, severity: Severity) -> None:
         """Sends a text once, for ground stations, to which PX4 forwards it, and for PX4's log; cut where too long."""

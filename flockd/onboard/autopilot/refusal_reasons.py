@@ -17,7 +17,6 @@ CHECKS_FAIL = "commander_arm_denied_resolve_failures"
 NOT_STREAMING = "no_setpoints_sent"
 SEVERAL_SENDERS = "several_senders"
 UNKNOWN_CHECK = "unknown_check"
-NOT_TOLD = "not_told"
 OF_STATE: Mapping[int, str] = {1: "boots", 2: "calibrates", 7: "powers_off", 8: "terminated"}
 """By the heartbeat's MAV_STATE."""
 
@@ -160,7 +159,6 @@ flockd flies multicopters: switch it to that mode
 read its checks in a ground station, or the messages before this one
   commander_arm_denied_resolve_failures: its checks before the flight fail
   unknown_check: a check fails that flockd has no words for
-  not_told: it gives no reason
 """
 """A remedy, and below it what is the matter, by name; names of PX4's without words say it themselves."""
 

@@ -10,14 +10,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from flockd.onboard.autopilot.autopilot_status import AutopilotStatus, FlightMode, mode_of
+from flockd.onboard.autopilot.autopilot_status import AutopilotStatus, mode_of
 from flockd.onboard.autopilot.refusal_reasons import (
     CHECKS_FAIL,
     NAMES,
     NAVIGATION_STATES,
     NO_SETPOINTS,
     NOT_STREAMING,
-    NOT_TOLD,
     OF_STATE,
     RANK,
     REASONS,
@@ -107,8 +106,6 @@ class CheckEvents:
         """Events were lost since."""
         self.denied: tuple[float, str] | None = None
         """When a request was last refused, and why: a switch to offboard, for want of setpoints."""
-        self.denied_mode: tuple[float, FlightMode] | None = None
-        """When a ground station was last refused another mode, and which; PX4 tells of no other request."""
         self._last: int | None = None
         """Number of the newest event that the autopilot has sent."""
         self._begun: tuple[int, int] | None = None
@@ -158,11 +155,8 @@ class CheckEvents:
         elif number in DENIALS:
             self.denied = time_s, NAMES[number]
         elif number == MODE_DENIED:
-            mode = mode_of(_word(arguments, 0))
-            if mode == "offboard":
+            if mode_of(_word(arguments, 0)) == "offboard":
                 self.denied = time_s, NO_SETPOINTS
-            else:
-                self.denied_mode = time_s, mode
         elif self._begun is not None and len(self._failed) < MOST_CHECKS:
             self._failed.append(FailedCheck(number, _word(arguments, 0), level))
 
@@ -199,7 +193,6 @@ def refusals(
         elif not status.armed and settled and _checks_fail(messages["SYS_STATUS"]):
             found.append(_refusal(CHECKS_FAIL, "to arm"))
         found += _of_denial(events, status, found)
-        found += _of_mode(events, status.time_s)
     return _few({refusal.reason: refusal for refusal in reversed(found)})
 
 
@@ -254,17 +247,6 @@ def _of_denial(events: CheckEvents, status: AutopilotStatus, found: Sequence[Ref
     name = events.denied[1]
     if name != NO_SETPOINTS and not (name == CHECKS_FAIL and (found or events.report is not None)):
         yield _refusal(name, "to arm")
-
-
-def _of_mode(events: CheckEvents, now_s: float) -> list[Refusal]:
-    """Why a ground station was refused a flight mode a moment ago."""
-    if events.denied_mode is None or now_s - events.denied_mode[0] >= REMEMBERED_S:
-        return []
-    mode = events.denied_mode[1]
-    state = NAVIGATION_STATES.get(mode)
-    failed = () if events.report is None or state is None else events.report.failed
-    told = [_named(c, mode, streams=True) for c in failed if c.modes >> (state or 0) & 1 and c.modes != ALL_MODES]
-    return told or [_refusal(NOT_TOLD, mode)]
 
 
 def _named(check: FailedCheck, refused: str, *, streams: bool) -> Refusal:

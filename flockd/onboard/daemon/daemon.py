@@ -21,7 +21,6 @@ from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.onboard.autopilot.watches import MOST_SPEED
 from flockd.onboard.daemon.autopilot_tasks import (
     AutopilotRequests,
-    ObstacleDistances,
     RefusalWatch,
     StateTexts,
     state_sentence,
@@ -171,7 +170,6 @@ class Daemon:
             link=link, gate=gate, streamer=streamer, source=self._source, pilot_loop=pilot_loop, networks=networks,
             control=control,
             requests=requests, refusals=RefusalWatch(link, sinks.event, clock), sinks=sinks,
-            distances=ObstacleDistances(config, link, pilot_loop, history, clock),
             texts=StateTexts(link.send_text, clock), telemetry=telemetry, commands=commands, lag=lag,
             thermometer=thermometer, dead_tasks=dead_tasks,
         )  # fmt: skip
@@ -214,8 +212,6 @@ class Daemon:
             "telemetry": lambda: publish_status(components, self._clock),
             "service": lambda: notify_service_manager(components, self._service),
         }
-        if self._config.autopilot.obstacle_distance:
-            concerns["obstacle distances"] = components.distances.run
         async with asyncio.TaskGroup() as group:
             tasks = [
                 group.create_task(self._supervised(name, run, components), name=name) for name, run in concerns.items()

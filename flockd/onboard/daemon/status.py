@@ -15,7 +15,6 @@ from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.onboard.daemon.autopilot_tasks import (
     AutopilotRequests,
-    ObstacleDistances,
     RefusalWatch,
     StateTexts,
     state_sentence,
@@ -57,7 +56,6 @@ class Components:
     control: Control
     requests: AutopilotRequests
     refusals: RefusalWatch
-    distances: ObstacleDistances
     texts: StateTexts
     sinks: MessageSinks
     telemetry: ZenohTelemetry

@@ -34,7 +34,7 @@ from flockd.sim.autopilot.fake_telemetry import (
     mode_by_number,
 )
 from flockd.sim.autopilot.fake_vehicle import Asked, Demand, Drift, Motion, MotionState, PointMass
-from flockd.sim.autopilot.sticks import HOLD_S, CollisionPrevention, StickOverride, stick_curve
+from flockd.sim.autopilot.sticks import StickOverride, stick_curve
 
 TICK_S = 0.02
 MAX_STEP_S = 0.2
@@ -150,7 +150,6 @@ class FakeAutopilot:
         self._sticks = -math.inf, np.zeros(2)
         """When a person last moved them, and forward and right from -1 to 1."""
         self._override = StickOverride()
-        self.collision_prevention = CollisionPrevention()
         self.clock_offset_s = clock_ahead_s - self._clock()
         """Its own clock, of its stamps and of TIMESYNC, less ``clock`` times the speed factor."""
 
@@ -339,9 +338,8 @@ class FakeAutopilot:
         demand = self._demand()
         self.state = self._motion(replace(demand, velocity=demand.velocity - self.drift.velocity), interval_s)
         height_m = -float(self.state.position[2])
-        blind = self.parameters["CP_DIST"] > 0 and self.collision_prevention.without_data_s(self._clock()) > HOLD_S
         risen = height_m > self.parameters["MIS_TAKEOFF_ALT"] - 0.1
-        if (self.mode == "POSCTL" and blind) or (self.mode == "TAKEOFF" and risen):
+        if self.mode == "TAKEOFF" and risen:
             self.pilot_selects("LOITER")
         elif self.mode == "RTL" and float(np.linalg.norm(self.state.position[:2])) < ARRIVED_M:
             self.pilot_selects("LAND")
@@ -381,8 +379,6 @@ class FakeAutopilot:
         wanted = self.parameters["MPC_VEL_MANUAL"] * stick_curve(sticks, self.parameters["MAN_DEADZONE"])
         if self._clock() - moved_s > STICKS_FRESH_S:
             return np.zeros(2)
-        if self.parameters["CP_DIST"] > 0:
-            wanted = self.collision_prevention.limited(wanted, self.parameters["CP_DIST"], self._clock())
         ahead, right = wanted
         cos, sin = math.cos(self._hold_yaw_rad), math.sin(self._hold_yaw_rad)
         return np.array([cos * ahead - sin * right, sin * ahead + cos * right])
@@ -415,8 +411,6 @@ class FakeAutopilot:
                 self._feel(arrived_s, np.clip([message.x, message.y], -1000, 1000) / 1000)
             case "STATUSTEXT" if self._ground is not None:  # forwarded, as PX4's links in software do
                 self._socket.sendto(bytes(message.get_msgbuf()), self._ground)
-            case "OBSTACLE_DISTANCE":
-                self.collision_prevention.take(message, arrived_s)
             case "TIMESYNC" if message.tc1 == 0:
                 own_ns = int(1e9 * (self._clock() + self.clock_offset_s))
                 self._mav.timesync_send(own_ns, message.ts1)

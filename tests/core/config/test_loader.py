@@ -129,7 +129,6 @@ SLIPS = (
     (f"source: {{kind: v4l2, cameras: [{CAMERA}], {SLOW}}}", "source: real cameras know real time only; delete"),
     (f"source: {{kind: shared_memory, {SLOW.replace('0.5', '0.01')}}}", "source.shared_memory.speed_factor: 0.01 is"),
     (f"source: {{kind: shared_memory, {SLOW}}}\n{CABLE}", "source.shared_memory.speed_factor: is for simulations, and"),
-    ("autopilot: {obstacle_distance: true}", "autopilot.obstacle_distance: needs the map of obstacles"),
 )
 
 

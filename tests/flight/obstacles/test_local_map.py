@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
 from flockd.core.config.avoidance import ObstacleParameters
 from flockd.core.messages import SECTORS, FloatArray, ObstacleRanges
-from flockd.flight.obstacles import LocalMap, free_ahead, nearest_points
+from flockd.flight.obstacles import LocalMap, nearest_points
 
 PARAMETERS = ObstacleParameters(enabled=True, range_m=15.0, memory_s=3.0, sigmas=2.0)
 STILL = np.zeros(2)
@@ -100,50 +98,3 @@ def test_an_obstacle_that_may_be_anywhere_near_still_has_a_direction() -> None:
     points = nearest_points(ranges(0.0, {EAST: 0.5}, sigma_m=1.0), 2.0)
     assert points.shape == (1, 2)
     assert points[0, 1] > 0.0
-
-
-# In sectors from the nose: none is said to be free that is not, whatever the heading.
-
-SEEN_M = np.full(SECTORS, 15.0)
-NO_POINTS = np.empty((0, 2))
-BEHIND, LEFT = SECTORS // 2, 3 * SECTORS // 4
-
-
-@pytest.mark.parametrize(
-    ("points", "heading_deg", "found"),
-    [
-        ([[0.0, 4.0]], 0.0, {EAST: 4.0}),
-        ([[0.0, 4.0]], 90.0, {NORTH: 4.0}),
-        ([[0.0, 4.0]], 180.0, {LEFT: 4.0}),
-        ([[0.0, 4.0]], -90.0, {BEHIND: 4.0}),
-        # The sector of 90 degrees spans 85.5 to 90.5 from the nose, so over those of 85 and 90.
-        ([[0.0, 4.0]], 2.0, {EAST - 1: 4.0, EAST: 4.0}),
-        ([[4.0, 0.0], [3.0, 0.0], [9.0, 0.0]], 0.0, {NORTH: 3.0}),  # the nearest counts
-    ],
-)
-def test_an_obstacle_is_where_it_is_from_the_nose(
-    points: list[list[float]], heading_deg: float, found: dict[int, float]
-) -> None:
-    free_m = free_ahead(np.array(points), SEEN_M, 0.0, math.radians(heading_deg), 15.0)
-    assert obstacles_in(free_m) == pytest.approx(found)
-
-
-def test_what_was_not_looked_at_is_unknown_and_so_is_what_only_touches_it() -> None:
-    seen_m = SEEN_M.copy()
-    seen_m[EAST] = 0.0
-    assert np.flatnonzero(np.isnan(free_ahead(NO_POINTS, seen_m, 0.0, 0.0, 15.0))).tolist() == [EAST]
-    turned = free_ahead(NO_POINTS, seen_m, 0.0, math.radians(2.0), 15.0)
-    assert np.flatnonzero(np.isnan(turned)).tolist() == [EAST - 1, EAST]
-    assert np.isnan(free_ahead(NO_POINTS, np.zeros(SECTORS), 0.0, 0.0, 15.0)).all()
-
-
-def test_an_obstacle_counts_where_nothing_else_is_known() -> None:
-    free_m = free_ahead(np.array([[4.0, 0.0]]), np.zeros(SECTORS), 0.0, 0.0, 15.0)
-    assert free_m[0] == 4.0
-    assert np.isnan(free_m[1:]).all()
-
-
-@pytest.mark.parametrize(("seen_m", "free_m"), [(15.0, np.inf), (12.0, 11.4), (7.5, 6.9), (7.4, np.nan)])
-def test_where_sight_ends_an_obstacle_may_be(seen_m: float, free_m: float) -> None:
-    """The drone has moved 0.6 m since. Less than half the range is as good as nothing."""
-    np.testing.assert_allclose(free_ahead(NO_POINTS, np.full(SECTORS, seen_m), 0.6, 0.0, 15.0), free_m)

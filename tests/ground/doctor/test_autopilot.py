@@ -161,7 +161,6 @@ def test_a_fence_with_corners_reaches_as_far_as_the_farthest_inside_the_circle()
     assert endless.fix == "set GF_MAX_HOR_DIST to where it must never fly"
 
 
-SENDS = make.changed(_config(14540), autopilot__obstacle_distance=True)
 AT_30_HZ = {25: tuple(k / 30.0 for k in range(46))}
 GOOD_RANGE = RangeReading(1.5, 0.12, min_m=0.15, max_m=20.0, quality=1.0)
 
@@ -188,8 +187,6 @@ def _ranges(
         (lambda: judge_signing(False, silent=True), Level.WARNING),  # a link that was cut says nothing of keys
         (lambda: judge_messages({}), None),
         (lambda: judge_messages({"EXTENDED_SYS_STATE.landed_state = 5": 3}), Level.WARNING),
-        (lambda: judge_parameter("CP_DIST", -1.0, SENDS), Level.WARNING),
-        (lambda: judge_parameter("CP_DIST", 2.0, SENDS), Level.PASS),
         (lambda: _ranges(GOOD_RANGE, AT_30_HZ), Level.PASS),
         (lambda: _ranges(None, height="range_finder"), Level.FAILURE),  # nothing else gives the scale
         (lambda: _ranges(None, {0: (1.0,)}, "range_finder"), Level.FAILURE),  # it faces forward

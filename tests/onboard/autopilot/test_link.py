@@ -284,20 +284,6 @@ async def test_a_text_reaches_a_ground_station_that_the_autopilot_forwards_to(po
         await link.close()
 
 
-async def test_the_autopilot_gets_distances_in_centimetres_from_the_nose(
-    address: str, fake_autopilot: FakeAutopilot
-) -> None:
-    """MAVLink: 65535 is unknown, one more than the largest distance is free; and no nearer than the sensor's least."""
-    free_m = np.full(72, np.inf)
-    free_m[[0, 1, 2, 3]] = 4.567, 0.1, np.nan, 14.999
-    link = await AutopilotLink.connect(_parameters(address), clock=clock)
-    assert fake_autopilot.collision_prevention.without_data_s(clock()) == math.inf
-    link.send_obstacle_distances(free_m, 15.0)
-    await until(lambda: fake_autopilot.collision_prevention.without_data_s(clock()) < 1.0)
-    assert fake_autopilot.collision_prevention.distances_cm[:5].tolist() == [456, 31, 65535, 1499, 1501]
-    await link.close()
-
-
 async def test_two_programs_cannot_command_one_drone(address: str, fake_autopilot: FakeAutopilot) -> None:
     link = await AutopilotLink.connect(_parameters(address), clock=clock)
     with pytest.raises(AutopilotError, match=r"is another program on it|in use by another program"):
