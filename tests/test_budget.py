@@ -20,16 +20,16 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_120,
-    "flockd/flight": 14_780,
-    "flockd/onboard": 10_130,
+    "flockd/core": 3_110,
+    "flockd/flight": 14_730,
+    "flockd/onboard": 10_020,
     "flockd/fleet": 2_070,
-    "flockd/ground": 3_950,
+    "flockd/ground": 3_930,
     "flockd/review": 3_350,
-    "flockd/sim": 9_410,
+    "flockd/sim": 9_360,
     "flockd/campaign": 1_530,
     "flockd/cli": 3_620,
-    "tests": 39_240,
+    "tests": 38_920,
     "tools/checks": 2_150,
     "tools/docs": 940,
     "tools/measure": 1_330,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_580,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 361}
+FILES = {"flockd": 360}
 NUMBERS_OF_FLIGHT = 528
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
