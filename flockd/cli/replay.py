@@ -34,7 +34,7 @@ def add(commands: Commands) -> None:
         "flockd replay drone1.mcap --config my_drone.yaml --out again.mcap",
         "flockd replay drone1.mcap --diff --reference drone1.expected --tolerance command=1e-6",
         "flockd replay drone1.mcap --reference drone1.expected --update-reference",
-        "flockd replay rgbd_dataset_freiburg1_xyz --depth recorded --stride 3",
+        "flockd replay office --depth recorded --stride 3",
         "flockd replay flight_bag --config my_drone.yaml --vehicle /mavros/local_position/odom",
     )
     description = "Run the pilot on a recorded flight again: the same frames and vehicle states, the same code."
@@ -255,8 +255,6 @@ def _run_dataset(args: argparse.Namespace) -> int:
         raise UsageError(f"{dataset.path}: has {len(dataset)} frames, and none {stride} after another; lower --stride")
     given = loaded(args.config)
     config = dataset_config(dataset, given, depth, args.flow)
-    for note in dataset.notes:
-        complain(note)
     if given is not None and (scale := given.perception.scale) != "network":
         complain(f"{args.config}: perception.scale: {scale} needs an autopilot; of a dataset it is the network's")
     with progress("replaying", "pairs") as show_progress:

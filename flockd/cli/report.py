@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
 from flockd.cli.flight_summary import show_summary
-from flockd.cli.options import opened, refuse, refuse_overwriting, require
-from flockd.cli.output import complain, progress, say_result
+from flockd.cli.options import opened, refuse, require
+from flockd.cli.output import complain, progress
 from flockd.cli.parser import Commands, flag, option
 from flockd.core.errors import UsageError
 
@@ -30,7 +30,6 @@ def add(commands: Commands) -> None:
         "flockd report recordings",
         "flockd report kestrel-20261120T101500Z.mcap --out reports/kestrel",
         "flockd report drone1.mcap --without-pictures --json",
-        "flockd report out/short/recordings --video short.webm --drone drone2",
     )
     description = "Write the summary and the report of a flight, from its folder or from recordings."
     parser = commands("report", description, examples, _run)
@@ -43,22 +42,11 @@ def add(commands: Commands) -> None:
     flag(parser, "--force", "overwrite an earlier report, or a flight in --out")
     option(parser, "--out DIR", f"of a recording's report; default: NAME{SUFFIX} beside it", Path)
     flag(parser, "--without-pictures", "do not run the networks again for the report's images")
-    option(
-        parser,
-        "--video FILE",
-        "write a video instead, .webm or .mp4: a recorded drone's images with its detections",
-        Path,
-    )
-    option(parser, "--drone NAME", "whose images the video shows; default: the first recorded")
     flag(parser, "--json", "print the summary as JSON")
 
 
 def _run(args: argparse.Namespace) -> int:
     require(args.flight)
-    if args.video is not None:
-        refuse(args, ("out", "without_pictures"), "has no meaning with --video; drop it")
-        return _video(args)
-    refuse(args, ("drone",), "is for --video; drop it")
     from flockd.review.flight_log.log import FlightLog
     from flockd.review.report.flight_folder import (
         LOG_NAME,
@@ -91,31 +79,6 @@ def _run(args: argparse.Namespace) -> int:
     with progress("writing the report", "figures") as tell_progress:
         summary = write_report_files(directory, log, tell_progress)
     return show_summary(directory, log, summary, as_json=args.json)
-
-
-def _video(args: argparse.Namespace) -> int:
-    """A video of one of the recordings."""
-    from flockd.review.flight_log.from_recordings import recordings_in
-    from flockd.review.report.flight_folder import RECORDINGS
-    from flockd.review.report.flight_video import CODECS, write_video
-
-    if args.video.suffix.lower() not in CODECS:
-        raise UsageError(f"{args.video}: a video's name ends in {' or '.join(CODECS)}; give it another")
-    refuse_overwriting(args, args.video)
-    paths = recordings_in(args.flight / RECORDINGS) if _is_flight(args.flight) else _recordings(args.flight)
-    if not paths:
-        raise UsageError(f"{args.flight}: has no recordings, of which a video is made; fly with --record")
-    recordings = [opened(path) for path in paths]
-    recording = next((one for one in recordings if args.drone in {None, one.drone}), None)
-    if recording is None:
-        raise UsageError(
-            f"--drone {args.drone}: has no recording; name one of {', '.join(r.drone for r in recordings)}"
-        )
-    with progress("writing the video", "steps") as tell_progress:
-        count = write_video(args.video, recording, tell_progress)
-    seconds = count * recording.config.step_s
-    facts = {"video": str(args.video), "frames": count, "seconds": seconds}
-    return say_result(args, facts, f"{args.video}: {count} frames, {seconds:g} s")
 
 
 def _is_flight(folder: Path) -> bool:

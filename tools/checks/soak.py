@@ -30,12 +30,11 @@ from flockd.core.messages import FloatArray
 from flockd.fleet.watcher import FleetWatcher
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.cameras.camera_simulator import CameraSimulator
-from flockd.sim.scenario import ScenarioConfig, load_scenario
+from flockd.sim.scenario import ScenarioConfig, load, load_scenario
 from flockd.sim.sitl.daemons import Daemons
 from flockd.sim.sitl.frame_server import FrameServer
 from flockd.sim.sitl.ground_station import Poses
 from flockd.sim.sitl.ports import free_endpoint, free_port
-from tools.measure.bench_daemon import at, of_the_unit, status_mb
 
 SHRINK = 4
 """Factor on the simulator's front camera, the only one: 120 x 160 pixels, so that much else fits beside it."""
@@ -94,6 +93,31 @@ def slope_of(name: str, values: Sequence[float]) -> Slope:
         high=high,
         grows=low > allowed,
     )
+
+
+def at(port: int, endpoint: str) -> DroneConfig:
+    """The configuration of PX4 SITL, with the ports that are free here."""
+    config = load(data_path("config") / "px4_sitl.yaml")
+    assert isinstance(config, DroneConfig)
+    assert config.source is not None
+    assert config.autopilot is not None
+    shared_memory = config.source.shared_memory.model_copy(update={"connect": (endpoint,)})
+    source = config.source.model_copy(update={"shared_memory": shared_memory})
+    autopilot = config.autopilot.model_copy(update={"address": f"udpin://127.0.0.1:{port}"})
+    return config.model_copy(update={"source": source, "autopilot": autopilot})
+
+
+def of_the_unit() -> dict[str, str]:
+    """The environment that systemd gives the daemon."""
+    lines = (data_path("systemd") / "flockd.service").read_text(encoding="utf-8").splitlines()
+    pairs = " ".join(line.removeprefix("Environment=") for line in lines if line.startswith("Environment="))
+    return dict(pair.split("=", 1) for pair in pairs.split())
+
+
+def status_mb(pid: int) -> dict[str, float]:
+    """What Linux says of a process's memory."""
+    lines = (line.split() for line in Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines())
+    return {words[0].rstrip(":"): int(words[1]) / 1024 for words in lines if words[-1] == "kB"}
 
 
 def process_facts(pid: int) -> dict[str, float]:

@@ -7,8 +7,8 @@ python -m tools.measure.card --parts px4 step   # these again; the others stay a
 `flights`: the published scenarios on seeds that follow from the commit's hash, so that nobody can have tuned to them.
 Beside each flight by sight stand, on the same seed, a blind one, whose drones detect nobody, and an exact one, on the
 true states of all: what the blind flock matches is no achievement. A run that was stopped goes on: RESULTS/COMMIT-*
-has a line for each flight, and the logs of those by sight. `errors`: what drones perceive wrongly in these flights,
-for config/perceived. `encounters`: two drones that meet on made-up detections with such errors. `pictures`: real ones,
+has a line for each flight, and the logs of those by sight. `encounters`: two drones that meet on made-up
+detections with the errors that flights by sight have. `pictures`: real ones,
 with --labelled and --without-drones. `px4`: where FLOCKD_PX4 names a build. `geometry`, `step`: on this computer.
 """
 
@@ -51,7 +51,6 @@ from flockd.sim.scenario import MIN_START_DISTANCE_M, load_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 FIGURES_FILE = ROOT / "docs" / "figures.json"
-PERCEIVED = ROOT / "config" / "perceived" / "shipped_networks.yaml"
 SEEDS = 1_000_000
 """Worlds of flights have seeds below this: `tools.training.worlds` keeps those of training apart."""
 CONFIDENCE = 0.95
@@ -351,11 +350,7 @@ def _part(part: str, commit: str, arguments: argparse.Namespace) -> dict[str, An
     if part == "flights":
         lines = run(flights_of(commit, quick=quick), results / f"{size}.jsonl", workers)
         return document(commit, lines, quick=quick)
-    if part == "errors":
-        logs = sorted(str(path) for path in results.glob("*.npz"))
-        _output("-m", "tools.training.fit_perception", *logs, "--out", str(PERCEIVED))
-        found = {"logs": [Path(log).name for log in logs]}
-    elif part == "encounters":
+    if part == "encounters":
         found = encounters(_campaign("encounters", 1 if quick else None, results / f"encounters-{size}", workers))
     elif part == "pictures":
         found = _pictures(arguments.labelled, arguments.without_drones)
@@ -369,7 +364,7 @@ def _part(part: str, commit: str, arguments: argparse.Namespace) -> dict[str, An
     return {**_measured_by(commit, f"python -m tools.measure.card{' --quick' * quick} --parts {part}"), "found": found}
 
 
-PARTS = ("flights", "errors", "encounters", "pictures", "px4", "geometry", "step")
+PARTS = ("flights", "encounters", "pictures", "px4", "geometry", "step")
 
 
 def main() -> None:

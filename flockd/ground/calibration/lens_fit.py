@@ -78,16 +78,6 @@ class Lens:
         return root_mean_square(np.concatenate(self.residuals()))
 
     @property
-    def rms_of_views_px(self) -> tuple[float, ...]:
-        """The same for each view."""
-        return tuple(root_mean_square(residuals) for residuals in self.residuals())
-
-    @property
-    def max_px(self) -> float:
-        """The largest distance of any corner."""
-        return float(np.linalg.norm(np.concatenate(self.residuals()), axis=1).max())
-
-    @property
     def tilts_deg(self) -> tuple[float, ...]:
         """How far the board's plane was turned away from the image's, in each view."""
         return tuple(tilt_deg(pose) for pose in self.poses)
@@ -343,12 +333,14 @@ def lens_result(lens: Lens, lenses: Sequence[Lens], collector: Collector) -> dic
     advice = list(collector.coverage.advice(lens.tilts_deg))
     if not lens.reaches_corners:
         advice.append("show the board in the corners of the image: the fitted lens does not reach them")
-    of_views = dict(zip((view.name for view in lens.views), lens.rms_of_views_px, strict=True))
+    residuals = lens.residuals()
+    of_views = {view.name: root_mean_square(own) for view, own in zip(lens.views, residuals, strict=True)}
+    max_px = float(np.linalg.norm(np.concatenate(residuals), axis=1).max())
     return {
         "size_px": list(lens.camera.size),
         "sigma_px": {key: float(value) for key, value in zip(("fx", "fy", "cx", "cy"), lens.sigma, strict=False)},
         "field_of_view_deg": [angle if math.isfinite(angle) else None for angle in lens.field_of_view_deg],
-        "residual_px": {"rms": lens.rms_px, "max": lens.max_px, "views": of_views},
+        "residual_px": {"rms": lens.rms_px, "max": max_px, "views": of_views},
         "models": {one.model: {"rms_px": one.rms_px} for one in lenses},
         "coverage": collector.coverage.share,
         "views": len(lens.views),

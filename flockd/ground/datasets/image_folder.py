@@ -1,8 +1,7 @@
-"""A folder of one camera's images, with their times, depth maps and poses where those are known.
+"""A folder of one camera's images, with their depth maps and poses where those are known.
 
-As TUM's RGB-D sets are published: `rgb.txt`, `depth.txt` and `groundtruth.txt` list files and poses by time, and
-`K.txt` is the camera's matrix. Or without lists: the files of `images/` and `depth/` in order of their names, a second
-apart, and in `poses.txt` a 4x4 camera-to-world matrix a line.
+The files of `images/` and of `depth/` in order of their names; in `poses.txt` a 4x4 camera-to-world matrix a line; and
+in `K.txt` the camera's matrix.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from pydantic import ValidationError
-from scipy.spatial.transform import Rotation, Slerp
 
 from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.errors import ConfigError
@@ -21,12 +19,8 @@ from flockd.core.messages import FloatArray, UInt8Array
 from flockd.flight.geometry import RigidTransform, ZMap, build_rig
 from flockd.ground.datasets.image_files import SUFFIXES, DatasetError, read_depth, read_image
 
-_TUM_UNITS_PER_M, _UNITS_PER_M = 5000.0, 1000.0
+_UNITS_PER_M = 1000.0
 """Of depth maps, 16 bits a pixel."""
-_MAX_OFFSET_S = 0.02
-"""An image and a depth map farther apart in time do not belong together."""
-_MAX_GAP_S = 0.1
-"""Between poses farther apart in time nothing is known."""
 _ROUNDING = 1e-2
 """How far from a rotation a matrix of rounded numbers may be."""
 
@@ -39,17 +33,13 @@ _CENTRAL = (1 / 3, 2 / 3)
 MAX_TABLE_BYTES = 1 << 28
 """Hours of poses at 200 Hz."""
 
-_Poses = Sequence[RigidTransform | None]
-
 
 @dataclass(frozen=True, eq=False)
 class DatasetFrame:
-    """When and where an image was taken, and the files of it."""
+    """Where an image was taken, and the files of it."""
 
     index: int
     """Counted from 0 at the dataset's first frame."""
-    name: str
-    time_s: float
     image: Path
     depth: Path | None
     T_world_camera: RigidTransform | None
@@ -64,9 +54,6 @@ class Dataset:
     camera: CameraConfig
     """The one that took it; pixel centres at +0.5."""
     moments: tuple[DatasetFrame, ...]
-    depth_units_per_m: float
-    notes: tuple[str, ...]
-    """What a person should know although nothing is wrong: each is one sentence."""
 
     @property
     def has_depth(self) -> bool:
@@ -81,118 +68,42 @@ class Dataset:
         none; None where they were not asked for. Raises DatasetError at a file that is missing or damaged."""
         size = self.camera.size_px
         for one in self.moments:
-            depth = ZMap(read_depth(one.depth, size, self.depth_units_per_m)) if with_depth and one.depth else None
+            depth = ZMap(read_depth(one.depth, size, _UNITS_PER_M)) if with_depth and one.depth else None
             yield one, read_image(one.image, size), depth
 
 
 def open_dataset(path: Path) -> Dataset:
-    """The images in a folder.
-
-    Where there is depth, images without a map of their time are left out. Raises DatasetError, and ConfigError for a
-    calibration that cannot be used.
-    """
-    listed = (path / "rgb.txt").is_file()
-    if not listed and not (path / "images").is_dir():
-        raise DatasetError(f"{path}: is no folder of images; it needs images/, or rgb.txt with their times and names")
-    times_s, images = _listed(path / "rgb.txt") if listed else _counted(path / "images")
+    """The images in a folder. Raises DatasetError, and ConfigError for a calibration that cannot be used."""
+    if not (path / "images").is_dir():
+        raise DatasetError(f"{path}: is no folder of images; it needs images/, and K.txt with the camera's matrix")
+    images = _files(path / "images")
     camera = read_calibration(path / "K.txt", read_image(images[0]).shape[1::-1])
-    if listed:
-        depth, units_per_m = _depth_by_time(path / "depth.txt", times_s), _TUM_UNITS_PER_M
-        poses = _poses_by_time(path / "groundtruth.txt", times_s)
-    else:
-        depth, units_per_m = _depth_by_name(path / "depth", images), _UNITS_PER_M
-        poses = _poses_in_order(path / "poses.txt", images)
-    kept = [index for index in range(len(images)) if not depth or index in depth]
-    moments = tuple(
-        DatasetFrame(number, images[k].name, float(times_s[k]), images[k], depth.get(k), poses[k])
-        for number, k in enumerate(kept)
-    )
-    for file in (file for one in moments for file in (one.image, one.depth) if file is not None):
-        if not file.is_file():  # better now than after an hour
-            raise DatasetError(f"{file}: is missing; restore it, or leave its frame out")
-    left_out = len(images) - len(kept)
-    note = f"{path}: {left_out} of {len(images)} images have no depth map within {_MAX_OFFSET_S:g} s, and are left out"
-    return Dataset(path, camera, moments, units_per_m, (note,) if left_out else ())
+    depth, poses = _depth(path / "depth", images), _poses(path / "poses.txt", images)
+    return Dataset(path, camera, tuple(map(DatasetFrame, range(len(images)), images, depth, poses)))
 
 
-def _listed(file: Path) -> tuple[FloatArray, list[Path]]:
-    """Times and files of a list."""
-    times, files = [], []
-    for number, line in read_lines(file):
-        time, _, name = line.partition(" ")
-        try:
-            times.append(float(time))
-        except ValueError:
-            name = ""
-        if not name.strip() or not np.isfinite(times[-1]):
-            raise DatasetError(f"{file}:{number}: does not fit; it needs a time in seconds and a file")
-        files.append(file.parent / name.strip())
-    if not files:
-        raise DatasetError(f"{file}: is empty; it needs a time in seconds and a file a line")
-    return _increasing(file, np.array(times)), files
-
-
-def _increasing(file: Path, times_s: FloatArray) -> FloatArray:
-    if np.any(np.diff(times_s) <= 0):
-        raise DatasetError(f"{file}: its times do not increase; sort it by time")
-    return times_s
-
-
-def _counted(folder: Path) -> tuple[FloatArray, list[Path]]:
+def _files(folder: Path) -> list[Path]:
     files = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
     if not files:
         raise DatasetError(f"{folder}: holds no images; put them there")
-    return np.arange(len(files), dtype=float), files
+    return files
 
 
-def _depth_by_time(file: Path, image_times_s: FloatArray) -> dict[int, Path]:
-    """By the image's index, the depth map nearest in time; none without a list."""
-    if not file.exists():
-        return {}
-    times_s, maps = _listed(file)
-    nearest = np.abs(times_s[None] - image_times_s[:, None]).argmin(axis=1)
-    close = np.abs(times_s[nearest] - image_times_s) <= _MAX_OFFSET_S
-    if not close.any():
-        raise DatasetError(f"{file}: has no depth map at the time of any image; it belongs to another rgb.txt")
-    return {int(index): maps[nearest[index]] for index in np.flatnonzero(close)}
-
-
-def _depth_by_name(folder: Path, images: Sequence[Path]) -> dict[int, Path]:
+def _depth(folder: Path, images: Sequence[Path]) -> Sequence[Path | None]:
     """Checked against the images both ways: a file too many may belong to an image that is gone."""
     if not folder.is_dir():
-        return {}
-    maps = {file.stem: file for file in _counted(folder)[1]}
+        return [None] * len(images)
+    maps = {file.stem: file for file in _files(folder)}
     stems = [image.stem for image in images]
     for stem in stems:
         if stem not in maps:
             raise DatasetError(f"{folder / stem}.png: is missing; each image needs its depth")
     for alone in sorted(maps.keys() - set(stems)):
         raise DatasetError(f"{maps[alone]}: its image is missing in {images[0].parent}; restore it, or delete both")
-    return {index: maps[stem] for index, stem in enumerate(stems)}
+    return [maps[stem] for stem in stems]
 
 
-def _poses_by_time(file: Path, image_times_s: FloatArray) -> _Poses:
-    """Between those of the file; None before, after and in its gaps."""
-    if not file.exists():
-        return [None] * len(image_times_s)
-    rows = read_rows(file, columns=8, what="time tx ty tz qx qy qz qw")
-    times_s = _increasing(file, rows[:, 0])
-    if np.any(np.linalg.norm(rows[:, 4:], axis=1) < 1e-6):
-        raise DatasetError(f"{file}: a quaternion is all zero; delete that line")
-    if len(times_s) < 2:
-        raise DatasetError(f"{file}: has one pose alone; it needs those of all images")
-    after = np.searchsorted(times_s, image_times_s).clip(1, len(times_s) - 1)
-    inside = (image_times_s >= times_s[0]) & (image_times_s <= times_s[-1])
-    known = inside & (times_s[after] - times_s[after - 1] <= _MAX_GAP_S) | np.isin(image_times_s, times_s)
-    if not known.any():
-        raise DatasetError(f"{file}: has no pose at the time of any image; it belongs to another")
-    at_s = image_times_s.clip(times_s[0], times_s[-1])
-    turns = Slerp(times_s, Rotation.from_quat(rows[:, 4:]))(at_s).as_matrix()
-    places = np.column_stack([np.interp(at_s, times_s, rows[:, axis]) for axis in (1, 2, 3)])
-    return [RigidTransform(*pose) if there else None for there, *pose in zip(known, turns, places, strict=True)]
-
-
-def _poses_in_order(file: Path, images: Sequence[Path]) -> _Poses:
+def _poses(file: Path, images: Sequence[Path]) -> Sequence[RigidTransform | None]:
     if not file.exists():
         return [None] * len(images)
     rows = read_rows(file, columns=16, what="one 4x4 camera-to-world matrix a line, 16 numbers")

@@ -160,11 +160,11 @@ def replay_dataset(dataset: Dataset, config: DroneConfig, stride: int, depth: De
     past: deque[tuple[DatasetFrame, PilotOutput]] = deque(maxlen=stride)
     for moment, image, seen in dataset.frames(with_depth=depth == "recorded"):
         perceiver.show(seen)
-        frames = {camera.name: Frame(camera.name, image, moment.time_s, moment.index)}
+        frames = {camera.name: Frame(camera.name, image, float(moment.index), moment.index)}
         if float(image.std(axis=(0, 1)).max()) < _FLAT_DEVIATION:
             frames = {}  # as cameras' images of one colour are left out in flight
-        vehicle = VehicleState(moment.time_s, np.eye(3), 0.0)
-        output = pilots[moment.index % stride].step(FrameSet(moment.time_s, frames), vehicle)
+        vehicle = VehicleState(float(moment.index), np.eye(3), 0.0)
+        output = pilots[moment.index % stride].step(FrameSet(float(moment.index), frames), vehicle)
         if len(past) == stride:
             before, output_before = past[0]
             ego = output.ego_motion

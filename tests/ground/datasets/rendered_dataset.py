@@ -20,8 +20,6 @@ from tests.flight.perception.cameras import SECOND_STAGE
 WIDTH, HEIGHT = 320, 240
 FOCAL = 200.0
 FRAMES = 6
-PERIOD_S = 0.1
-START_S = 1403636579.75
 MATRIX = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
 OTHERS_MATRIX = MATRIX - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
 """The matrix of the same camera for whoever counts pixel centres from 0."""
@@ -80,10 +78,6 @@ class Onlooker(OneByOne):
         return ()
 
 
-def times_s() -> list[float]:
-    return [START_S + PERIOD_S * k for k in range(FRAMES)]
-
-
 def write_rgbd_folder(scene: Scene, path: Path) -> Path:
     for folder in ("images", "depth"):
         (path / folder).mkdir(parents=True)
@@ -93,29 +87,6 @@ def write_rgbd_folder(scene: Scene, path: Path) -> Path:
         cv2.imwrite(str(path / "depth" / name), _units(depth, 1000.0))
     np.savetxt(path / "K.txt", OTHERS_MATRIX)
     np.savetxt(path / "poses.txt", scene.poses.reshape(-1, 16), fmt="%.6e")
-    return path
-
-
-def write_tum(scene: Scene, path: Path) -> Path:
-    """Depth 4 ms after its image; poses at other times than the images."""
-    for folder in ("rgb", "depth"):
-        (path / folder).mkdir(parents=True)
-    rgb, maps = ["# color images", "# timestamp filename"], ["# depth maps"]
-    for k, (image, depth) in enumerate(zip(scene.images, scene.depth, strict=True)):
-        time_s = times_s()[k]
-        rgb.append(f"{time_s:.6f} rgb/{time_s:.6f}.png")
-        _write(path / "rgb" / f"{time_s:.6f}.png", image)
-        maps.append(f"{time_s + 0.004:.6f} depth/{time_s + 0.004:.6f}.png")
-        cv2.imwrite(str(path / "depth" / f"{time_s + 0.004:.6f}.png"), _units(depth, 5000.0))
-    (path / "rgb.txt").write_text("\n".join(rgb) + "\n")
-    (path / "depth.txt").write_text("\n".join(maps) + "\n")
-    np.savetxt(path / "K.txt", OTHERS_MATRIX)
-    lines = ["# timestamp tx ty tz qx qy qz qw"]
-    for time_s, pose in zip(times_s(), scene.poses, strict=True):
-        for shift_s in (-0.01, 0.01):  # as if it stood still there: between the two lies the pose itself
-            numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
-            lines.append(f"{time_s + shift_s:.6f} {' '.join(f'{number:.9f}' for number in numbers)}")
-    (path / "groundtruth.txt").write_text("\n".join(lines) + "\n")
     return path
 
 

@@ -18,7 +18,7 @@ MOST_FRAMES = 50
 
 
 def test_a_changed_data_set_is_read_or_refused(tmp_path: Path) -> None:
-    root = _tum(tmp_path)
+    root = _folder(tmp_path)
     originals = {path: path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
     @hostile(80)
@@ -91,12 +91,10 @@ def _image(path: Path, *, depth: bool = False) -> None:
     cv2.imwrite(str(path), pixels.astype(np.uint16 if depth else np.uint8))
 
 
-def _tum(root: Path) -> Path:
+def _folder(root: Path) -> Path:
     for index in range(3):
-        _image(root / f"rgb/{index}.png")
+        _image(root / f"images/{index}.png")
         _image(root / f"depth/{index}.png", depth=True)
-    for kind in ("rgb", "depth"):
-        (root / f"{kind}.txt").write_text("# time file\n" + "".join(f"{i}.5 {kind}/{i}.png\n" for i in range(3)))
     (root / "K.txt").write_text("10 0 8\n0 10 6\n0 0 1\n")
-    (root / "groundtruth.txt").write_text("".join(f"{i / 20} {i} 0 1 0 0 0 1\n" for i in range(80)))
+    (root / "poses.txt").write_text("".join(f"1 0 0 {i} 0 1 0 0 0 0 1 0 0 0 0 1\n" for i in range(3)))
     return root
