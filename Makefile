@@ -11,7 +11,7 @@ LOCK := requirements/service.txt
 COMPILE = $(BIN)/uv pip compile --quiet --no-header --no-annotate --only-binary=:all: pyproject.toml -
 
 .DEFAULT_GOAL := help
-.PHONY: help demo live docs lint test test-all browser training ray coverage ros faults flights breakages mutants references wheel release deb container lock sbom clean
+.PHONY: help demo live docs lint test test-all browser training coverage ros faults flights breakages mutants references wheel release deb container lock sbom clean
 
 help:
 	@sed -n 's/^\([a-z-]*\):.* ## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -34,7 +34,7 @@ lint: $(VENV)/test.installed ### ruff and mypy
 	$(BIN)/mypy
 
 test: lint ## lint and all tests but the slow ones, on two cores in about 10 minutes
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow and not browser and not ros and not ray and not training" --durations=10 --durations-min=1
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow and not browser and not ros and not training" --durations=10 --durations-min=1
 
 test-all: lint ### lint and all tests, those too that take minutes each
 	$(BIN)/python -m pytest -n 2
@@ -51,9 +51,6 @@ flights: $(VENV)/test.installed ### flights of minutes: encounters, two daemons,
 
 training: $(VENV)/test.installed $(VENV)/train.installed ### the tests of the networks' training, with torch (0.9 GB; with CUDA several)
 	$(BIN)/python -m pytest -m training tests/tools/training
-
-ray: $(VENV)/test.installed $(VENV)/ray.installed ### a campaign on a Ray cluster of which one node is killed (0.3 GB)
-	$(BIN)/python -m pytest -m ray tests/campaign
 
 browser: $(VENV)/test.installed $(VENV)/browser.installed ### the fleet page in a headless Chromium: /usr/bin/chromium, or what CHROMIUM names
 	$(BIN)/python -m pytest -m browser -rP tests/fleet/page
@@ -99,7 +96,6 @@ sbom: $(VENV)/release.installed $(VENV)/test.installed ### check licences, and w
 	$(BIN)/uv pip install --quiet --python $(VENV)/service --require-hashes -r $(LOCK)
 	$(BIN)/python -m tools.release.licences $(VENV)/service/bin/python
 	$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible -o out/flockd.cdx.json $(VENV)/service
-	$(BIN)/python -m tools.release.sbom out/flockd.cdx.json
 
 clean: ### delete the virtual environment and what was built
 	rm -rf $(VENV) $(ROS_VENV) build dist *.egg-info

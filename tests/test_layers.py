@@ -30,7 +30,7 @@ LIBRARIES = {
     "onnxruntime openvino": ("flight/inference",),
     "mavsdk": ("onboard/autopilot/mavsdk_link.py",),
     "pymavlink": ("sim/autopilot", "sim/sitl/ground_station.py"),
-    "joblib ray": ("campaign/engine.py",),
+    "joblib": ("campaign/engine.py",),
     "rosbags": ("onboard/recording/ros_bag.py",),
     "rclpy": ("onboard/ros/ros_node.py", "onboard/sources/camera_child.py"),
     "numba": SIMULATION,

@@ -1,25 +1,22 @@
-"""Where flights are flown: in processes of this computer, with the executor that joblib brings along, or by Ray."""
+"""Where flights are flown: in processes of this computer, with the executor that joblib brings along."""
 
 from __future__ import annotations
 
 import os
 import signal
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager
-from typing import Any, Literal, Protocol, Self
+from typing import Protocol, Self
 
 import cv2
 from joblib.externals.loky import ProcessPoolExecutor
 
 from flockd.campaign.flight_kinds import FlownRun, fly_task
 from flockd.campaign.flight_plan import Run, Task
-from flockd.core.errors import UnavailableError
 from flockd.sim.sitl.bound_to_parent import bind, with_package
 
-EngineName = Literal["processes", "ray"]
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 """Environment of a process that flies: a library that starts threads of its own takes the others' processors."""
 MAX_TRIES = 3
@@ -115,68 +112,6 @@ class ProcessEngine:
     def _started(self) -> ProcessPoolExecutor:
         environment = {**with_package(os.environ), **ONE_THREAD}
         return ProcessPoolExecutor(self._workers, env=environment, initializer=_begin, initargs=(os.getpid(),))
-
-
-class RayEngine:
-    """Between ``__enter__`` and ``__exit__``. The nodes need the same flockd, installed.
-
-    Each task takes one processor. When its process or its node dies, Ray flies it again elsewhere. Nodes may join
-    and leave meanwhile.
-    """
-
-    def __init__(self, workers: int, address: str | None) -> None:
-        """A new cluster of this computer with so many ``workers``, or the one at ``address``.
-
-        Raises UnavailableError where there is none.
-        """
-        import ray  # noqa: PLC0415 - an extra
-
-        environment = {**ONE_THREAD, "PYTHONPATH": with_package(os.environ).get("PYTHONPATH", "")}
-        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-        where: dict[str, Any] = {"num_cpus": workers, "include_dashboard": False}
-        if address is not None:
-            where = {"address": address}
-        try:
-            ray.init(**where, runtime_env={"env_vars": environment}, log_to_driver=False, logging_level="ERROR")
-        except (ConnectionError, RuntimeError, ValueError) as error:
-            there = "here" if address is None else f"at {address}"
-            raise UnavailableError(f"no Ray cluster can be used {there} ({error}); see `ray status`") from error
-        self._ray = ray
-        self._fly = ray.remote(num_cpus=1, max_retries=MAX_TRIES - 1)(fly_task)
-        self._flying: dict[Any, Task] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._ray.shutdown()
-
-    @property
-    def room(self) -> int:
-        """By the processors that the cluster has now: for each a task that it flies, and one that it goes on with."""
-        return 2 * max(int(self._ray.cluster_resources().get("CPU", 1)), 1) - len(self._flying)
-
-    def submit(self, task: Task) -> None:
-        """Takes a task."""
-        self._flying[self._fly.remote(task)] = task
-
-    def wait(self) -> list[FlownRun]:
-        """What is finished; waits for one at least."""
-        finished: list[FlownRun] = []
-        for reference in self._ray.wait(list(self._flying), num_returns=1)[0] if self._flying else ():
-            task = self._flying.pop(reference)
-            try:
-                finished.append(self._ray.get(reference))
-            except self._ray.exceptions.RayError:  # of its process: what a flight raises is in its result
-                finished.append(_ended(task))
-        return finished
-
-
-ENGINES: dict[EngineName, Callable[[int, str | None], AbstractContextManager[Engine]]] = {
-    "processes": lambda workers, _: ProcessEngine(workers),
-    "ray": RayEngine,
-}
-"""From the number of workers, and the address of a cluster. Each raises ModuleNotFoundError without its extra."""
 
 
 def _ended(task: Task) -> FlownRun:

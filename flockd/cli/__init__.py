@@ -37,7 +37,6 @@ from flockd.core.jpeg_header import MAX_IMAGE_PIXELS
 EXTRAS = {
     **dict.fromkeys(("numba", "llvmlite", "matplotlib", "jinja2", "markupsafe"), "sim"),
     "joblib": "campaign",
-    "ray": "ray",
     "argcomplete": "completion",
     **dict.fromkeys(("aiohttp", "plotly"), "fleet"),
     "rosbags": "bags",

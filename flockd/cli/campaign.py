@@ -41,20 +41,11 @@ def add(commands: Commands) -> None:
     examples = (
         "flockd campaign config/campaigns/separation.yaml --dry-run",
         "flockd campaign config/campaigns/separation.yaml --workers 4 --out out/tonight",
-        "flockd campaign config/campaigns/separation.yaml --engine ray --address 10.0.0.5:6379",
     )
     parser = commands(RUN, "Fly what is missing of a campaign, and write its report.", examples, _run, notes=COSTS)
     option(parser, "FILE", "of the campaign", Path)
     option(parser, "--out FOLDER", "default: out/NAME, by the campaign's name", Path)
     option(parser, "--workers N", "flights at once (default: processors)", positive_count)
-    option(
-        parser,
-        "--engine",
-        "what flies them: processes of this computer, or a Ray cluster (default: processes)",
-        choices=("processes", "ray"),
-        default="processes",
-    )
-    option(parser, "--address HOST:PORT", "with --engine ray: a running cluster (default: a new one)")
     flag(parser, "--dry-run", "print how many flights and hours it is; keep nothing")
     flag(parser, "--json", "print what was flown as JSON")
     examples = (
@@ -78,13 +69,11 @@ def add(commands: Commands) -> None:
 def _run(args: argparse.Namespace) -> int:
     from flockd.campaign.campaign_page import write_campaign_page
     from flockd.campaign.conduct import conduct
-    from flockd.campaign.engine import ENGINES
+    from flockd.campaign.engine import ProcessEngine
     from flockd.campaign.flight_plan import Plan
     from flockd.campaign.folder import REPORT_NAME, CampaignFolder
     from flockd.campaign.results import Results
 
-    if args.address is not None and args.engine != "ray":
-        raise UsageError("--address is of a Ray cluster; add --engine ray, or drop it")
     workers = args.workers or os.cpu_count() or 1
     plan = Plan.load(args.file)
     if args.dry_run:
@@ -93,7 +82,7 @@ def _run(args: argparse.Namespace) -> int:
     try:
         with (
             CampaignFolder(path, plan) as folder,
-            ENGINES[args.engine](workers, args.address) as engine,
+            ProcessEngine(workers) as engine,
             Phases() as phases,
         ):
             conducted = conduct(plan, folder, engine, phases.of("flying", "flights"))

@@ -47,16 +47,6 @@ costs, with five drones on a processor without 8-bit instructions:
 Try `--duration 10 --drones 3` first. Ctrl-C ends a flight early, with a report of what was flown and exit code 130."""
 OPTIONS = {"duration": "duration_s", "seed": "seed"}
 """Which key of the scenario an option sets."""
-_NOT_LIVE = {
-    "telemetry": "--live has --telemetry in it; drop one of them",
-    "record": "--live keeps nothing; fly with --record and without --live",
-    "json": "--live has no summary; drop --json",
-    "out": "--live writes nothing; drop --out",
-    "force": "--live writes nothing; drop --force",
-    "autopilot": "--live flies with the simulator's own pilots; drop --autopilot",
-    "duration": "--live flies on until Ctrl-C; drop --duration",
-}
-"""Options that do not go with it, and what to do."""
 SITL = "px4_sitl.yaml"
 DEFAULT_SPEED_FACTOR = 0.25
 """Two cores then keep up with five drones."""
@@ -248,13 +238,37 @@ def _recorders(
 
 
 def _check_options(args: argparse.Namespace) -> None:
-    _check_live(args)
-    _check_fleet(args)
+    """Raises UsageError for options that do not go with each other."""
+    live, fleet, own = args.live, args.autopilot is not None, "which have their own; drop it"
+    slowest, fastest = SPEED_FACTORS
+    wrong = {
+        "--live has --telemetry in it; drop one of them": live and args.telemetry,
+        "--live keeps nothing; fly with --record and without --live": live and args.record,
+        "--live has no summary; drop --json": live and args.json,
+        "--live writes nothing; drop --out": live and args.out,
+        "--live writes nothing; drop --force": live and args.force,
+        "--live flies with the simulator's own pilots; drop --autopilot": live and fleet,
+        "--live flies on until Ctrl-C; drop --duration": live and args.duration,
+        "--port is for --live; add that, or drop it": args.port is not None and not live,
+        "--no-browser is for --live; add that, or drop it": not (args.browser or live),
+        "--speed-factor is for real daemons; drop it, or name their --autopilot": args.speed_factor and not fleet,
+        f"--speed-factor is not from {slowest:g} to {fastest:g}; choose another": (
+            args.speed_factor and not slowest <= args.speed_factor <= fastest
+        ),
+        "--telemetry-at is for --telemetry, --live and --autopilot; add one of them, or drop it": (
+            args.telemetry_at is not None and not (args.telemetry or live or fleet)
+        ),
+        f"--perception truth has no meaning with real daemons, {own}": fleet and args.perception == "truth",
+        f"--swap has no meaning with real daemons, {own}": fleet and args.swap,
+        f"--telemetry has no meaning with real daemons, {own}": fleet and args.telemetry,
+    }
     if args.perception == "truth":
         idle = [f"--set {key}" for key, _ in args.settings if key.startswith(("drone.perception.", "cameras."))]
         idle += [f"--{option}" for option in ("swap", "record") if getattr(args, option)]
-        if idle:
-            raise UsageError(f"{idle[0]} has no meaning without networks; drop it or --perception truth")
+        wrong |= {f"{one} has no meaning without networks; drop it or --perception truth": True for one in idle}
+    for sentence, is_so in wrong.items():
+        if is_so:
+            raise UsageError(sentence)
 
 
 def _scenario(args: argparse.Namespace) -> ScenarioConfig:
@@ -340,16 +354,6 @@ def _plain(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_]+", "-", name).strip("-") or "flight"
 
 
-def _check_live(args: argparse.Namespace) -> None:
-    """Raises UsageError for options that go without --live, or with it, only."""
-    if args.live:
-        for option, sentence in _NOT_LIVE.items():
-            if getattr(args, option):
-                raise UsageError(sentence)
-    elif args.port is not None or not args.browser:
-        raise UsageError(f"--{'no-browser' if not args.browser else 'port'} is for --live; add that, or drop it")
-
-
 def _fly_live(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) -> int:
     """Until Ctrl-C."""
     import aiohttp.web  # noqa: F401 - before anything is opened: it is of an extra
@@ -431,23 +435,6 @@ def _served(page: PageServer, port: int) -> Iterator[int]:
     finally:
         loop.call_soon_threadsafe(task.cancel)
         thread.join()
-
-
-def _check_fleet(args: argparse.Namespace) -> None:
-    """Raises UsageError for options that go with the simulator's own pilots, or with daemons, only."""
-    if args.autopilot is None:
-        if args.speed_factor is not None:
-            raise UsageError("--speed-factor is for real daemons; drop it, or name their --autopilot")
-        if args.telemetry_at is not None and not (args.telemetry or args.live):
-            raise UsageError("--telemetry-at is for --telemetry, --live and --autopilot; add one of them, or drop it")
-        return
-    slowest, fastest = SPEED_FACTORS
-    if args.speed_factor is not None and not slowest <= args.speed_factor <= fastest:
-        raise UsageError(f"--speed-factor {args.speed_factor:g} is not from {slowest:g} to {fastest:g}; choose another")
-    own = {"--perception truth": args.perception == "truth", "--swap": args.swap, "--telemetry": args.telemetry}
-    idle = [option for option, given in own.items() if given]
-    if idle:
-        raise UsageError(f"{idle[0]} has no meaning with real daemons, which have their own; drop it")
 
 
 def _fly_fleet(args: argparse.Namespace, scenario: ScenarioConfig, directory: Path) -> int:

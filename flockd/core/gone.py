@@ -27,6 +27,7 @@ _OPTIONS = (
     ("replay", "trajectory", "`--json` gives the motion of each pair, to be put together"),
     ("replay", "calibration", "write the camera's matrix into the dataset's K.txt"),
     ("replay", "speed", "leave it out: a replay shows nothing while it runs"),
+    ("campaign", "engine address", "each computer flies a part of the values, of a file of its own"),
     ("report", "video drone", "open the recording in Foxglove, which plays its images"),
     ("report", "ulog", "open PX4's log in Flight Review or PlotJuggler"),
     ("cameras", "measure", "`flockd cameras --picture FOLDER` measures"),

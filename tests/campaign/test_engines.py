@@ -1,4 +1,4 @@
-"""The engines give what flying in this process gives, also when processes, nodes or the campaign itself are killed."""
+"""The engines give what flying in this process gives, also when processes or the campaign itself are killed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from flockd.campaign.conduct import conduct
-from flockd.campaign.engine import ENGINES, Engine
+from flockd.campaign.engine import Engine, ProcessEngine
 from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.folder import LINES_NAME, CampaignFolder
@@ -46,7 +46,7 @@ def flown_on(plan: Plan, folder: Path, engine: Engine) -> bytes:
 
 def test_a_process_gives_the_same_flights(tmp_path: Path) -> None:
     plan = few(tmp_path)
-    with ENGINES["processes"](1, None) as engine:
+    with ProcessEngine(1) as engine:
         assert flown_on(plan, tmp_path / "out", engine) == expected(plan, tmp_path)
     lines = (tmp_path / "out" / LINES_NAME).read_text().splitlines()
     assert os.getpid() not in {json.loads(line)["process"] for line in lines}
@@ -67,7 +67,7 @@ def test_a_process_that_dies_is_replaced(tmp_path: Path) -> None:
                     os.kill(pid, signal.SIGKILL)
             time.sleep(0.2)
 
-    with ENGINES["processes"](2, None) as engine:
+    with ProcessEngine(2) as engine:
         threading.Thread(target=kill_some, daemon=True).start()
         assert flown_on(plan, tmp_path / "out", engine) == expected(plan, tmp_path)
     assert len(killed) == 3
@@ -92,14 +92,14 @@ def workers_of(parent: int) -> set[int]:
 def test_a_flight_that_ends_its_process_is_a_row(tmp_path: Path) -> None:
     """One flight always ends its process; the others, which were lost with it, are flown."""
     plan = few(tmp_path)
-    with ENGINES["processes"](2, None) as engine:
-        submit = engine._executor.submit  # type: ignore[attr-defined]
+    with ProcessEngine(2) as engine:
+        submit = engine._executor.submit
 
         def submitted(work: Callable[..., Any], task: Any) -> Any:
             return submit(_end if task.run == Run(0, 1) else work, task)
 
-        engine._executor.submit = submitted  # type: ignore[attr-defined]
-        started = engine._started  # type: ignore[attr-defined]
+        engine._executor.submit = submitted
+        started = engine._started
 
         def again() -> Any:
             nonlocal submit
@@ -107,7 +107,7 @@ def test_a_flight_that_ends_its_process_is_a_row(tmp_path: Path) -> None:
             submit, executor.submit = executor.submit, submitted
             return executor
 
-        engine._started = again  # type: ignore[attr-defined]
+        engine._started = again  # type: ignore[method-assign]
         results: list[FlownRun] = []
         for number in range(3):
             engine.submit(plan.task(plan.cells[0], number))
@@ -166,27 +166,3 @@ def names_in(out: Path) -> set[str]:
     lines = path.read_text().splitlines(keepends=True) if path.exists() else []
     runs = [json.loads(line)["run"] for line in lines if line.endswith("\n")]
     return {f"c{run['cell']}-s{run['number']}" for run in runs}
-
-
-@pytest.mark.ray
-def test_a_ray_cluster_of_two_nodes_of_which_one_is_killed(tmp_path: Path) -> None:
-    """The rest of its flights is flown on the other one; the results are those of this process."""
-    from ray.cluster_utils import Cluster
-
-    plan = few(tmp_path, seeds=30, duration_s=10.0)
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-    try:
-        second = cluster.add_node(num_cpus=1)
-        cluster.wait_for_nodes()
-
-        def kill_one() -> None:
-            while len(names_in(tmp_path / "out")) < 6:
-                time.sleep(0.2)
-            cluster.remove_node(second, allow_graceful=False)
-
-        threading.Thread(target=kill_one, daemon=True).start()
-        with ENGINES["ray"](2, cluster.address) as engine:
-            assert flown_on(plan, tmp_path / "out", engine) == expected(plan, tmp_path)
-        assert len(cluster.list_all_nodes()) == 1, "the other one was killed while they flew"
-    finally:
-        cluster.shutdown()

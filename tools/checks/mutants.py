@@ -109,16 +109,8 @@ OPERATORS: dict[type[ast.operator], ast.operator] = {
     ast.BitOr: ast.BitAnd(),
     ast.BitAnd: ast.BitOr(),
 }
-OPPOSITES = {
-    "min": "max",
-    "max": "min",
-    "any": "all",
-    "all": "any",
-    "argmin": "argmax",
-    "argmax": "argmin",
-    "minimum": "maximum",
-    "maximum": "minimum",
-}
+_OPPOSED = (("min", "max"), ("any", "all"), ("argmin", "argmax"), ("minimum", "maximum"))
+OPPOSITES = {one: other for pair in _OPPOSED for one, other in (pair, pair[::-1])}
 
 
 def _edits(tree: ast.Module) -> Iterator[list[Edit]]:

@@ -18,7 +18,6 @@ import tempfile
 import time
 from array import array
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -56,43 +55,24 @@ ALLOWED = {
 """Growth over the run, as a share of the mean, that is noise; of any other quantity, none is judged."""
 
 
-@dataclass(frozen=True)
-class Slope:
-    """How one quantity went."""
+def slope_of(name: str, values: Sequence[float]) -> dict[str, float]:
+    """How a quantity went, by samples evenly spread over a run, at least 40.
 
-    warm_up: float
-    """Growth in the first tenth, from its first samples to its last."""
-    first: float
-    """Mean of the second tenth."""
-    last: float
-    """Mean of the last tenth."""
-    slope: float
-    """Over the run without its first tenth, in the quantity's unit."""
-    low: float
-    high: float
-    """Upper end of the 95 % confidence interval of the slope."""
-    grows: bool
-
-
-def slope_of(name: str, values: Sequence[float]) -> Slope:
-    """The slope of samples evenly spread over a run; at least 40."""
+    `warm_up`: growth in the first tenth, from its first samples to its last; `first`, `last`: means of the second and
+    of the last tenth; `slope` over the run without its first tenth, in the quantity's unit, and the ends `low` and
+    `high` of its 95 % confidence interval; `grows`: 1 if it is more than allowed.
+    """
     samples = np.asarray(values, float)
     tenth = max(len(samples) // 10, 1)
     means = np.array([stretch.mean() for stretch in np.array_split(samples[tenth:], STRETCHES)])
-    line = stats.linregress(np.linspace(0.0, 1.0, STRETCHES), means)
+    line, edge = stats.linregress(np.linspace(0.0, 1.0, STRETCHES), means), max(tenth // 10, 1)
     margin = float(np.nan_to_num(stats.t.ppf(0.975, STRETCHES - 2) * line.stderr))  # NaN: the same all the time
-    low, high = float(line.slope) - margin, float(line.slope) + margin
     allowed = ALLOWED.get(name, np.inf) * abs(float(samples.mean()))
-    edge = max(tenth // 10, 1)
-    return Slope(
-        warm_up=float(samples[tenth - edge : tenth].mean() - samples[:edge].mean()),
-        first=float(samples[tenth : 2 * tenth].mean()),
-        last=float(samples[-tenth:].mean()),
-        slope=float(line.slope),
-        low=low,
-        high=high,
-        grows=low > allowed,
-    )
+    return {
+        "warm_up": samples[tenth - edge : tenth].mean() - samples[:edge].mean(),
+        "first": samples[tenth : 2 * tenth].mean(), "last": samples[-tenth:].mean(), "slope": line.slope,
+        "low": line.slope - margin, "high": line.slope + margin, "grows": float(line.slope - margin > allowed),
+    }  # fmt: skip
 
 
 def at(port: int, endpoint: str) -> DroneConfig:
@@ -181,7 +161,7 @@ def soak_daemon(minutes: float) -> dict[str, array[float]]:
                 poses=poses,
                 clock=time.monotonic,
                 speed_factor=1.0,
-            ) as server,
+            ) as server,  # fmt: skip
             Daemons([config], folder=folder, recordings=folder, environment={**os.environ, **of_the_unit()}) as daemons,
         ):
             server.start()
@@ -265,10 +245,10 @@ def main() -> int:
     print(f"{minutes:g} minutes of a daemon, {len(next(iter(samples.values())))} samples")
     print(f"{'':20}{'warm-up':>10}{'first':>10}{'last':>10}{'growth after the warm-up, 95 %':>34}")
     for name, one in slopes.items():
-        verdict = "  GROWS" if one.grows else ""
-        interval = f"{one.slope:+.3f} ({one.low:+.3f} to {one.high:+.3f})"
-        print(f"{name:20}{one.warm_up:+10.2f}{one.first:10.2f}{one.last:10.2f}{interval:>34}{verdict}")
-    return 1 if any(slope.grows for slope in slopes.values()) else 0
+        verdict = "  GROWS" if one["grows"] else ""
+        interval = f"{one['slope']:+.3f} ({one['low']:+.3f} to {one['high']:+.3f})"
+        print(f"{name:20}{one['warm_up']:+10.2f}{one['first']:10.2f}{one['last']:10.2f}{interval:>34}{verdict}")
+    return 1 if any(one["grows"] for one in slopes.values()) else 0
 
 
 def _filled(values: Sequence[float]) -> list[float]:

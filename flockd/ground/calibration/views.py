@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -200,34 +200,46 @@ def _apart(first: BoardDetection, second: BoardDetection, width: int) -> float:
 
 _SMALLEST_SQUARE_PX = 10.0
 """Across smaller squares there is no room to measure an edge."""
-_BESIDE = 0.35
-"""Where black and white are taken, in squares to both sides of an edge."""
+_REACH, _STEP_PX = 0.35, 0.25
+"""How far a profile goes to both sides, in squares, and how fine it is."""
+_ALONG = np.linspace(-0.2, 0.2, 7)
+"""Where along an edge its profile is taken, in squares from its middle; the average has less noise."""
 
 
 def edge_width_px(grey: UInt8Array, seen: BoardDetection, spec: BoardSpec) -> float:
-    """Pixels over which black becomes white, in the direction in which the view is blurred more: contrast over slope.
+    """Pixels over which black becomes white, in the direction in which the view is blurred more.
 
     Of a perfectly sharp image it is between 1 and 2; of one blurred with a deviation of s pixels about 2.5 s. NaN
     where the board is too small to tell.
     """
-    place, across = dict(zip(seen.ids.tolist(), seen.pixels, strict=True)), spec.columns - 1
-    slope = np.hypot(cv2.Scharr(grey, cv2.CV_32F, 1, 0), cv2.Scharr(grey, cv2.CV_32F, 0, 1)) / 32.0
-    steepest = cv2.dilate(slope, np.ones((3, 3), np.uint8))
+    place = {int(number): index for index, number in enumerate(seen.ids)}
+    across = spec.columns - 1
     widths = []
     for to_next, last_column in ((1, across - 1), (across, across)):
-        firsts = [one for one in place if one + to_next in place and one % across < last_column]
-        first, second = (np.array([place[one + step] for one in firsts]).reshape(-1, 2) for step in (0, to_next))
-        along = (second - first)[np.linalg.norm(second - first, axis=1) >= _SMALLEST_SQUARE_PX]
-        middle = ((first + second) / 2)[np.linalg.norm(second - first, axis=1) >= _SMALLEST_SQUARE_PX]
-        if len(along):
-            aside = _BESIDE * along[:, ::-1] * (-1.0, 1.0)
-            contrast = np.abs(_at(grey, middle + aside) - _at(grey, middle - aside))
-            widths.append(float(np.median(contrast / np.maximum(_at(steepest, middle), 1e-6))))
+        edges = [
+            (seen.pixels[place[number]], seen.pixels[place[number + to_next]])
+            for number in place
+            if number + to_next in place and number % across < last_column
+        ]
+        found = [_width(grey, first, second) for first, second in edges]
+        measured = [width for width in found if np.isfinite(width)]
+        if measured:
+            widths.append(float(np.median(measured)))
     return max(widths) if widths else float("nan")
 
 
-def _at(image: Any, places: FloatArray) -> FloatArray:
-    """(n,) values of a map at pixels (n, 2)."""
-    maps = (places - 0.5).astype(np.float32)[:, None]  # OpenCV has pixel centres at whole numbers
-    found = cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found, np.float64).ravel()
+def _width(grey: UInt8Array, first: FloatArray, second: FloatArray) -> float:
+    """Width of the edge between two neighbouring corners."""
+    along = second - first
+    square = float(np.linalg.norm(along))
+    if square < _SMALLEST_SQUARE_PX:
+        return float("nan")
+    normal = np.array([-along[1], along[0]]) / square
+    offsets = np.arange(-_REACH * square, _REACH * square, _STEP_PX)
+    middles = (first + second) / 2 + _ALONG[:, None] * along
+    samples = middles[:, None] + offsets[None, :, None] * normal - 0.5  # OpenCV has pixel centres at whole numbers
+    maps = samples.astype(np.float32)
+    profile = cv2.remap(grey, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    mean = np.asarray(profile, np.float64).mean(axis=0)
+    slope = float(np.abs(np.diff(mean)).max()) / _STEP_PX
+    return float(np.ptp(mean)) / slope if slope > 0.0 else float("nan")

@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from flockd.ground.pictures.single_frame import Box, DetectedDrone
 
 WIDTHS_PX = (0, 6, 12, 30, 80)
 """Where the classes of box width begin; the last one is open."""
 WIDTH_CLASSES = tuple(f"{a}-{b}" for a, b in zip(WIDTHS_PX, [*map(str, WIDTHS_PX[1:]), ""], strict=True))
-FOUND_IOU, AP_IOU = 0.3, 0.5
-"""Least intersection over union with a box of ``found_iou30`` and ``ap50``."""
+AP_IOU = 0.5
+"""Least intersection over union with a box of ``ap50``."""
 
 Fit = Callable[[DetectedDrone, Box], float | None]
 """How well a detection fits a box, the more the better; None: not at all."""
@@ -104,21 +103,18 @@ def summary(pictures: Sequence[Labelled]) -> dict[str, Any]:
     """The summary of one set of labelled pictures.
 
     ``boxes``; ``by_width``: by the box's width in pixels the boxes, those ``found`` (a detection's centre lies in the
-    box) and those ``found_iou30``; ``ap50``; ``measured``: how many pictures; ``false``: detections that found no box;
-    ``false_per_picture`` and its 95 % confidence interval ``false_per_picture_95``.
+    box); ``ap50``; ``measured``: how many pictures; ``false``: detections that found no box; ``false_per_picture``.
     """
-    counts = {name: {"boxes": 0, "found": 0, "found_iou30": 0} for name in WIDTH_CLASSES}
+    counts = {name: {"boxes": 0, "found": 0} for name in WIDTH_CLASSES}
     false, judged = 0, list[tuple[float, bool]]()
     for one in pictures:
         by_centre, by_each = match(one, centre_in_box)
-        by_overlap, _ = match(one, overlap(FOUND_IOU))
         false += sum(not is_true for _, is_true in by_each)
         judged += match(one, overlap(AP_IOU))[1]
-        for box, is_found, is_overlapped in zip(one.boxes, by_centre, by_overlap, strict=True):
+        for box, is_found in zip(one.boxes, by_centre, strict=True):
             of_width = counts[width_class(box)]
             of_width["boxes"] += 1
             of_width["found"] += is_found
-            of_width["found_iou30"] += is_overlapped
     boxes, measured = sum(len(picture.boxes) for picture in pictures), len(pictures)
     ap50 = average_precision(judged, boxes)
     return {
@@ -128,15 +124,4 @@ def summary(pictures: Sequence[Labelled]) -> dict[str, Any]:
         "measured": measured,
         "false": false,
         "false_per_picture": false / measured if measured else None,
-        "false_per_picture_95": [count / measured for count in count_interval(false)] if measured else None,
     }
-
-
-def count_interval(count: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Between which numbers the expected one lies, with this confidence, where ``count`` independent events were seen.
-
-    Exact for Poisson counts: F. Garwood, "Fiducial limits for the Poisson distribution", 1936. False detections of one
-    picture are not quite independent, so the true interval is somewhat wider.
-    """
-    beside = (1 - confidence) / 2
-    return float(gammaincinv(count, beside)) if count else 0.0, float(gammaincinv(count + 1, 1 - beside))
