@@ -24,20 +24,20 @@ LINES = {
     "flockd/flight": 14_730,
     "flockd/onboard": 10_020,
     "flockd/fleet": 2_070,
-    "flockd/ground": 3_930,
-    "flockd/review": 3_350,
+    "flockd/ground": 3_820,
+    "flockd/review": 3_170,
     "flockd/sim": 9_360,
-    "flockd/campaign": 1_530,
-    "flockd/cli": 3_620,
-    "tests": 38_920,
+    "flockd/campaign": 1_470,
+    "flockd/cli": 3_550,
+    "tests": 38_670,
     "tools/checks": 2_150,
-    "tools/docs": 940,
-    "tools/measure": 1_330,
-    "tools/release": 620,
-    "tools/training": 4_580,
+    "tools/docs": 860,
+    "tools/measure": 1_170,
+    "tools/release": 550,
+    "tools/training": 4_340,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 360}
+FILES = {"flockd": 359}
 NUMBERS_OF_FLIGHT = 528
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
