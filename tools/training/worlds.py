@@ -123,14 +123,15 @@ def drawn_distraction(position: Array, ray: Array, ground: float, rng: np.random
     velocity, beat = np.append(rng.normal(0, 0.7, 2), rng.normal(0, 0.3)), (0.0, 0.0, 0.0)
     kind = rng.choice(["bird", "balloon", "kite", "bag", "mast"], p=[0.6, 0.1, 0.1, 0.1, 0.1])
     if kind == "bird":
-        thing, tilt, turn = bird(rng), rng.normal(0, (0.45, 0.25)), rng.normal(0, 0.4, 3)
+        thing = bird(rng)
         velocity = rng.uniform(0, 9) * np.array([np.cos(heading), np.sin(heading), rng.normal(0, 0.15)])
         # Small birds beat fast, and now and then every bird glides.
         beat = (rng.choice([0.1, 0.8]) * rng.uniform(0.5, 1.0), rng.uniform(0, 2 * np.pi), 12.0 / thing.size_m**0.5)
+        tilt, turn = rng.normal(0, (0.45, 0.25)), rng.normal(0, 0.4, 3)
     elif kind == "balloon":
         thing, tilt, turn = balloon(rng), rng.normal(0, 0.15, 2), rng.normal(0, 0.3, 3)
     elif kind == "kite":
-        thing, tilt = kite(rng), np.array([rng.normal(0, 0.3), rng.uniform(0.3, 1.3)])
+        tilt, thing = np.array([rng.normal(0, 0.3), rng.uniform(0.3, 1.3)]), kite(rng)
         turn = rng.normal(0, 0.5, 3)
     elif kind == "bag":
         thing, tilt, turn, velocity = bag(rng), rng.normal(0, 0.8, 2), rng.normal(0, 1.5, 3), 2 * velocity
