@@ -30,12 +30,8 @@ def test_info_tells_what_is_in_it(path: Path, told: Told) -> None:
     assert (facts["drone"], facts["steps"], facts["finished"], facts["lost"]) == ("drone1", 10, True, 0)
     assert facts["duration_s"] == pytest.approx(0.9)
     assert (facts["gaps"], facts["damages"], facts["models"]) == ([], [], MODELS)
-    images = next(stream for stream in facts["streams"] if stream["topic"] == "/camera/front/image")
-    assert images["messages"] == 10
-    assert images["rate_hz"] == pytest.approx(10.0)
-    text = told(0, "record", "info", path)
-    assert "foxglove.CompressedImage" in text
-    assert "rate_hz: 10.0" in text
+    assert facts["messages"]["/camera/front/image"] == 10
+    assert "/camera/front/image: 10" in told(0, "record", "info", path)
 
 
 def test_info_tells_of_a_recording_that_was_cut_off(cut_off: Path, told: Told) -> None:

@@ -159,7 +159,7 @@ class McapFile:
             self.abandon()
 
     def _sync(self, descriptor: int) -> None:
-        """In a thread of its own: a slow disk takes long for this, and the next messages must not wait for it."""
+        """In a thread of its own: a slow disk takes long for this, and a simulator waits for the messages."""
         try:
             os.fsync(descriptor)
         except OSError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -19,7 +20,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.jpeg_header import cost_fault
 from flockd.core.messages import Frame, FrameSet, LearnedSize, MissionOrder, UInt8Array, VehicleState
 from flockd.onboard.message_json import from_json, parsed
-from flockd.onboard.recording import foxglove
+from flockd.onboard.recording import foxglove, streams
 from flockd.onboard.recording.mcap_file import (
     Damage,
     Entry,
@@ -29,21 +30,6 @@ from flockd.onboard.recording.mcap_file import (
     RecordingError,
     read_entries,
     read_records,
-)
-from flockd.onboard.recording.streams import (
-    CONFIGURATION,
-    END_NOTE,
-    FLIGHT_NOTE,
-    FORMAT,
-    FRAMES,
-    LEARNED_SIZE,
-    MODELS_NOTE,
-    ORDER,
-    OUTPUT,
-    TRUTH,
-    VEHICLE,
-    StepFrames,
-    is_image,
 )
 from flockd.onboard.recording.truth import Truth
 
@@ -65,31 +51,14 @@ class RecordedStep:
 
 
 @dataclass
-class StreamFacts:
-    """One topic of a recording."""
-
-    topic: str
-    schema: str
-    messages: int = 0
-    bytes: int = 0
-    first_ns: int = 0
-    last_ns: int = 0
-
-    @property
-    def rate_hz(self) -> float | None:
-        """Messages a second from the first to the last."""
-        span_s = (self.last_ns - self.first_ns) * 1e-9
-        return (self.messages - 1) / span_s if span_s > 0 else None
-
-
-@dataclass
 class Contents:
     """What one pass over a recording found."""
 
     flight: Mapping[str, str]
     models: Mapping[str, str]
     configuration: bytes
-    streams: dict[str, StreamFacts] = field(default_factory=dict)
+    messages: Counter[str] = field(default_factory=Counter)
+    """By topic."""
     steps: list[tuple[int, float]] = field(default_factory=list)
     """Number and time of each step."""
     lost: int = 0
@@ -141,7 +110,7 @@ class Recording:
     @property
     def has_truth(self) -> bool:
         """Whether a simulator recorded the true states of all drones."""
-        return TRUTH.topic in self.contents.streams
+        return streams.TRUTH.topic in self.contents.messages
 
     @property
     def pilot_began_s(self) -> float | None:
@@ -167,16 +136,20 @@ class Recording:
     def _built(
         self, number: int, messages: Mapping[str, bytes], start_s: float, end_s: float
     ) -> Iterator[RecordedStep]:
-        if FRAMES.topic not in messages:
+        if streams.FRAMES.topic not in messages:
             return
         try:
-            listed: StepFrames = from_json(StepFrames, parsed(messages[FRAMES.topic]))
+            listed: streams.StepFrames = from_json(streams.StepFrames, parsed(messages[streams.FRAMES.topic]))
             if not start_s <= listed.time_s <= end_s:
                 return
-            vehicle: VehicleState = from_json(VehicleState, parsed(messages[VEHICLE.topic]))
-            output = parsed(messages[OUTPUT.topic]) if OUTPUT.topic in messages else None
-            truth = from_json(Truth, parsed(messages[TRUTH.topic])) if TRUTH.topic in messages else None
-            order = from_json(MissionOrder, parsed(messages[ORDER.topic])) if ORDER.topic in messages else None
+            vehicle: VehicleState = from_json(VehicleState, parsed(messages[streams.VEHICLE.topic]))
+            output = parsed(messages[streams.OUTPUT.topic]) if streams.OUTPUT.topic in messages else None
+            truth = from_json(Truth, parsed(messages[streams.TRUTH.topic])) if streams.TRUTH.topic in messages else None
+            order = (
+                from_json(MissionOrder, parsed(messages[streams.ORDER.topic]))
+                if streams.ORDER.topic in messages
+                else None
+            )
             frames = {}
             for entry in listed.frames:
                 image = decoded_image(messages[foxglove.image_stream(entry.camera).topic])
@@ -198,11 +171,11 @@ def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
     flight, models, configuration = None, None, None
     for record in read_records(path):
         match record:
-            case Note(name) if name == FLIGHT_NOTE:
+            case Note(name) if name == streams.FLIGHT_NOTE:
                 flight = record
-            case Note(name) if name == MODELS_NOTE:
+            case Note(name) if name == streams.MODELS_NOTE:
                 models = record
-            case Inclosure(name) if name == CONFIGURATION:
+            case Inclosure(name) if name == streams.CONFIGURATION:
                 configuration = record
             case Damage():
                 if flight is None:
@@ -211,8 +184,8 @@ def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
             case Entry() if flight is None:
                 break
         if flight and models and configuration:
-            if flight.facts.get("format") != FORMAT:
-                known = f"format {flight.facts.get('format')!r}, and this flockd reads {FORMAT!r}"
+            if flight.facts.get("format") != streams.FORMAT:
+                known = f"format {flight.facts.get('format')!r}, and this flockd reads {streams.FORMAT!r}"
                 raise RecordingError(f"{path}: is of {known}; use the flockd that wrote it")
             return flight, models, configuration
     raise RecordingError(f"{path}: is an MCAP file, but not a recording of flockd; name one that flockd wrote")
@@ -242,15 +215,11 @@ def _survey(path: Path, progress: Callable[[int, int], None]) -> Contents:
 
 def _note(found: Contents, path: Path, record: Record | Damage) -> None:
     match record:
-        case Entry(stream, time_ns, sequence, data):
-            facts = found.streams.setdefault(stream.topic, StreamFacts(stream.topic, stream.schema_name))
-            facts.first_ns = time_ns if facts.messages == 0 else min(facts.first_ns, time_ns)
-            facts.last_ns = max(facts.last_ns, time_ns)
-            facts.messages += 1
-            facts.bytes += len(data)
-            if stream.topic == FRAMES.topic:
+        case Entry(stream, _, sequence, data):
+            found.messages[stream.topic] += 1
+            if stream.topic == streams.FRAMES.topic:
                 found.steps.append((sequence, _time_of(path, data)))
-        case Note(name, facts_of_end) if name == END_NOTE:
+        case Note(name, facts_of_end) if name == streams.END_NOTE:
             found.lost = _count(path, facts_of_end.get("lost", "0"))
         case Damage():
             found.damages.append(record)
@@ -295,20 +264,28 @@ def _without_gone(values: Any, at: str = "") -> Any:
 
 
 def _learned(path: Path, flight: Mapping[str, str]) -> LearnedSize | None:
-    if LEARNED_SIZE not in flight:
+    if streams.LEARNED_SIZE not in flight:
         return None
     try:
-        learned: LearnedSize = from_json(LearnedSize, parsed(flight[LEARNED_SIZE].encode()))
+        learned: LearnedSize = from_json(LearnedSize, parsed(flight[streams.LEARNED_SIZE].encode()))
     except ValueError as error:
-        raise RecordingError(f"{path}: its {LEARNED_SIZE} cannot be read ({error}); use another copy") from error
+        raise RecordingError(
+            f"{path}: its {streams.LEARNED_SIZE} cannot be read ({error}); use another copy"
+        ) from error
     if not all(0 < number < math.inf for number in (learned.size_m, learned.sigma, learned.looks_m)):
-        raise RecordingError(f"{path}: its {LEARNED_SIZE} is no size; use another copy")
+        raise RecordingError(f"{path}: its {streams.LEARNED_SIZE} is no size; use another copy")
     return learned
 
 
 def makes_steps(topic: str) -> bool:
     """Whether this stream's messages are parts of steps, numbered by their sequence."""
-    return topic in {FRAMES.topic, VEHICLE.topic, ORDER.topic, OUTPUT.topic, TRUTH.topic} or is_image(topic)
+    return topic in {
+        streams.FRAMES.topic,
+        streams.VEHICLE.topic,
+        streams.ORDER.topic,
+        streams.OUTPUT.topic,
+        streams.TRUTH.topic,
+    } or streams.is_image(topic)
 
 
 def decoded_image(message: bytes) -> UInt8Array:
@@ -326,7 +303,7 @@ def decoded_image(message: bytes) -> UInt8Array:
 
 
 def recording_info(recording: Recording) -> dict[str, Any]:
-    """What a recording contains, as JSON: flight, duration, models, gaps, damages and the rate of each stream."""
+    """What a recording contains, as JSON: flight, duration, models, gaps, damages and messages of each topic."""
     contents = recording.contents
     return {
         **contents.flight,
@@ -339,14 +316,5 @@ def recording_info(recording: Recording) -> dict[str, Any]:
         "models": dict(contents.models),
         "gaps": [{"first_step": first, "last_step": last} for first, last in contents.gaps],
         "damages": [{"byte": damage.offset, "reason": damage.reason} for damage in contents.damages],
-        "streams": [
-            {
-                "topic": stream.topic,
-                "schema": stream.schema,
-                "messages": stream.messages,
-                "rate_hz": stream.rate_hz,
-                "bytes": stream.bytes,
-            }
-            for stream in contents.streams.values()
-        ],
+        "messages": dict(contents.messages),
     }

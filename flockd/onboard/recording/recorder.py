@@ -27,27 +27,9 @@ from flockd.core.messages import Frame, FrameSet, LearnedSize, MissionOrder, Pil
 from flockd.core.secrets import masked
 from flockd.flight.geometry import build_rig
 from flockd.onboard.message_json import to_json
-from flockd.onboard.recording import foxglove
+from flockd.onboard.recording import foxglove, streams
 from flockd.onboard.recording.mcap_file import Entry, Inclosure, McapFile, Note, RecordingError
 from flockd.onboard.recording.reader import head_of
-from flockd.onboard.recording.streams import (
-    CONFIGURATION,
-    EDITED,
-    END_NOTE,
-    FLIGHT_NOTE,
-    FORMAT,
-    FRAMES,
-    LEARNED_SIZE,
-    MODELS_NOTE,
-    ORDER,
-    OUTPUT,
-    TABLE,
-    TRUTH,
-    VEHICLE,
-    FrameEntry,
-    StepFrames,
-    nanoseconds,
-)
 from flockd.onboard.recording.truth import Truth
 
 FLUSH_EVERY_S = 0.2
@@ -110,11 +92,13 @@ class Recorder:
         began = datetime.now(UTC).isoformat(timespec="seconds")
         flight = {"drone": drone, "began": began, "images": self._settings.images, **_VERSIONS, **(facts or {})}
         if learned is not None:
-            flight[LEARNED_SIZE] = json.dumps(to_json(learned))
+            flight[streams.LEARNED_SIZE] = json.dumps(to_json(learned))
         shown = masked(config.model_dump(mode="json"))  # it is passed on; nobody needs passwords to fly it
         head = (
-            Note(MODELS_NOTE, models or {}),
-            Inclosure(CONFIGURATION, "application/json", json.dumps(shown, indent=1, ensure_ascii=False).encode()),
+            Note(streams.MODELS_NOTE, models or {}),
+            Inclosure(
+                streams.CONFIGURATION, "application/json", json.dumps(shown, indent=1, ensure_ascii=False).encode()
+            ),
         )
         self._file = _File(path, flight, head, config.rig, self._settings, self._tell)
         self._track = _Track(config.rig)
@@ -156,7 +140,7 @@ class Recorder:
 
         For what does not follow from a step, such as events: all that does is written with the step.
         """
-        if drone == self._drone and topic in TABLE:
+        if drone == self._drone and topic in streams.TABLE:
             self._put(_SMALL_BYTES, lambda: self._write_message(topic, message))
 
     def drain(self) -> None:
@@ -260,7 +244,7 @@ class Recorder:
             self._early.append((topic, message))
             return
         time_s = float(stamp)
-        self._file.write(_json_entry(TABLE[topic], time_s, 0, {"time_s": time_s, **message}))
+        self._file.write(_json_entry(streams.TABLE[topic], time_s, 0, {"time_s": time_s, **message}))
         if topic == "events":
             self._file.write(_log_entry(time_s, "INFO", str(message.get("event", ""))))
 
@@ -278,7 +262,7 @@ class _Track:
         if velocity is not None and not math.isnan(self._time_s):
             self._north_east = self._north_east + velocity[:2] * (time_s - self._time_s)
         self._time_s = time_s
-        position, stamp = np.array([*self._north_east, -step.vehicle.height_m]), nanoseconds(time_s)
+        position, stamp = np.array([*self._north_east, -step.vehicle.height_m]), streams.nanoseconds(time_s)
         places = foxglove.transforms(stamp, position, R_ned_body, self._rig)
         yield Entry(foxglove.TRANSFORMS, stamp, step.number, places)
         if velocity is not None:
@@ -309,7 +293,9 @@ class _File:
         """Starts the file."""
         self._earlier = self._deletable()
         self._file = McapFile(self.path)
-        self._file.write(Note(FLIGHT_NOTE, {"format": FORMAT, "recording": uuid.uuid4().hex, **self._flight}))
+        self._file.write(
+            Note(streams.FLIGHT_NOTE, {"format": streams.FORMAT, "recording": uuid.uuid4().hex, **self._flight})
+        )
         for record in self._head:
             self._file.write(record)
         self.flush()
@@ -339,7 +325,7 @@ class _File:
     def finish(self, end: Mapping[str, str]) -> None:
         """Ends the file."""
         assert self._file is not None
-        self._file.write(Note(END_NOTE, end))
+        self._file.write(Note(streams.END_NOTE, end))
         self._file.finish()
 
     def abandon(self) -> None:
@@ -364,7 +350,7 @@ class _File:
         if facts is None:
             self._tell(f"recording: {path} was skipped and does not count for the quota: it {why}")
             return False
-        return facts.get("drone") == self._flight["drone"] and not facts.keys() & EDITED
+        return facts.get("drone") == self._flight["drone"] and not facts.keys() & streams.EDITED
 
 
 def _step_entries(
@@ -378,18 +364,18 @@ def _step_entries(
         if data is None:
             tell(f"recording: an image of camera {camera} has no pixels or not three channels and is left out")
             continue
-        kept.append(FrameEntry(camera, frame.time_s, frame.sequence))
-        stamp = nanoseconds(frame.time_s)
+        kept.append(streams.FrameEntry(camera, frame.time_s, frame.sequence))
+        stamp = streams.nanoseconds(frame.time_s)
         message = foxglove.image(stamp, camera, data, settings.images)
         yield Entry(foxglove.image_stream(camera), stamp, step.number, message)
-    yield _json_entry(FRAMES, time_s, step.number, StepFrames(step.number, time_s, tuple(kept)))
-    yield _json_entry(VEHICLE, time_s, step.number, step.vehicle)
+    yield _json_entry(streams.FRAMES, time_s, step.number, streams.StepFrames(step.number, time_s, tuple(kept)))
+    yield _json_entry(streams.VEHICLE, time_s, step.number, step.vehicle)
     if step.order is not None:
-        yield _json_entry(ORDER, time_s, step.number, step.order)
+        yield _json_entry(streams.ORDER, time_s, step.number, step.order)
     yield from track.entries(step)
     if step.truth is not None:
-        yield _json_entry(TRUTH, time_s, step.number, step.truth)
-    yield _json_entry(OUTPUT, time_s, step.number, step.output)
+        yield _json_entry(streams.TRUTH, time_s, step.number, step.truth)
+    yield _json_entry(streams.OUTPUT, time_s, step.number, step.output)
 
 
 def _compressed(frame: Frame, settings: RecordingConfig) -> bytes | None:
@@ -403,9 +389,9 @@ def _compressed(frame: Frame, settings: RecordingConfig) -> bytes | None:
 
 
 def _json_entry(stream: Any, time_s: float, sequence: int, message: object) -> Entry:
-    return Entry(stream, nanoseconds(time_s), sequence, json.dumps(to_json(message), allow_nan=False).encode())
+    return Entry(stream, streams.nanoseconds(time_s), sequence, json.dumps(to_json(message), allow_nan=False).encode())
 
 
 def _log_entry(time_s: float, level: Literal["INFO", "WARNING"], text: str) -> Entry:
-    stamp = nanoseconds(time_s)
+    stamp = streams.nanoseconds(time_s)
     return Entry(foxglove.LOG, stamp, 0, foxglove.log(stamp, level, text))

@@ -16,30 +16,10 @@ from fractions import Fraction
 
 from flockd.core.choices import PixelFormat
 from flockd.core.config.source import CameraDeviceParameters, ControlParameters
+from flockd.onboard.sources import v4l2_kernel as v4l2
 from flockd.onboard.sources.frames import CameraDevice, CameraError, CapturedBuffer
 from flockd.onboard.sources.image_formats import ImageFormat, MjpegFormat, PackedFormat, TurnedFormat
-from flockd.onboard.sources.v4l2_kernel import (
-    VIDIOC_DQBUF,
-    VIDIOC_G_CTRL,
-    VIDIOC_QBUF,
-    VIDIOC_QUERYBUF,
-    VIDIOC_QUERYCAP,
-    VIDIOC_QUERYCTRL,
-    VIDIOC_REQBUFS,
-    VIDIOC_S_CTRL,
-    VIDIOC_S_FMT,
-    VIDIOC_S_PARM,
-    VIDIOC_STREAMOFF,
-    VIDIOC_STREAMON,
-    Buffer,
-    Capability,
-    Control,
-    Format,
-    Kernel,
-    QueryControl,
-    RequestBuffers,
-    StreamParameters,
-)
+from flockd.onboard.sources.v4l2_kernel import Kernel
 
 CAPTURE = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
 _MAPPED = 1  # V4L2_MEMORY_MMAP
@@ -89,9 +69,9 @@ class V4l2Device(CameraDevice):
         with self._telling("has failed"):
             if not self._kernel.wait(self._descriptor, timeout_s):
                 return None
-        buffer = Buffer(type=CAPTURE, memory=_MAPPED)
+        buffer = v4l2.Buffer(type=CAPTURE, memory=_MAPPED)
         try:
-            self._kernel.ioctl(self._descriptor, VIDIOC_DQBUF, buffer)
+            self._kernel.ioctl(self._descriptor, v4l2.VIDIOC_DQBUF, buffer)
         except BlockingIOError:
             return None
         except OSError as error:
@@ -103,7 +83,7 @@ class V4l2Device(CameraDevice):
             flagged=bool(buffer.flags & _FLAG_ERROR),
         )
         with self._telling("has failed"):
-            self._kernel.ioctl(self._descriptor, VIDIOC_QBUF, buffer)
+            self._kernel.ioctl(self._descriptor, v4l2.VIDIOC_QBUF, buffer)
         return captured
 
     def image_format(self) -> ImageFormat:
@@ -116,15 +96,15 @@ class V4l2Device(CameraDevice):
     def close(self) -> None:
         """Stops the camera and gives it back."""
         with contextlib.suppress(OSError):  # an unplugged camera cannot be stopped any more
-            self._kernel.ioctl(self._descriptor, VIDIOC_STREAMOFF, ctypes.c_int(CAPTURE))
+            self._kernel.ioctl(self._descriptor, v4l2.VIDIOC_STREAMOFF, ctypes.c_int(CAPTURE))
         while self._maps:
             self._maps.pop().close()
         self._kernel.close(self._descriptor)
 
     def _check_capabilities(self) -> None:
-        capability = Capability()
+        capability = v4l2.Capability()
         with self._telling("is not a V4L2 camera"):
-            self._kernel.ioctl(self._descriptor, VIDIOC_QUERYCAP, capability)
+            self._kernel.ioctl(self._descriptor, v4l2.VIDIOC_QUERYCAP, capability)
         flags = camera_flags(capability)
         if not flags & CAN_CAPTURE or not flags & _CAN_STREAM:
             raise CameraError(
@@ -133,11 +113,11 @@ class V4l2Device(CameraDevice):
             )
 
     def _set_format(self, size: tuple[int, int], pixel_format: PixelFormat) -> None:
-        asked = Format(
+        asked = v4l2.Format(
             type=CAPTURE, width=size[0], height=size[1], pixelformat=FOURCC[pixel_format], field=_PROGRESSIVE
         )
         with self._telling("cannot be set up"):
-            self._kernel.ioctl(self._descriptor, VIDIOC_S_FMT, asked)
+            self._kernel.ioctl(self._descriptor, v4l2.VIDIOC_S_FMT, asked)
         if (asked.width, asked.height) != size or asked.pixelformat != FOURCC[pixel_format]:
             offered = int(asked.pixelformat).to_bytes(4, "little").decode("ascii", "replace")
             smaller = f", or write a smaller reduce than {self._reduce}" if self._reduce > 1 else ""
@@ -149,9 +129,9 @@ class V4l2Device(CameraDevice):
 
     def _set_rate(self, rate_hz: float) -> None:
         period = 1 / Fraction(rate_hz).limit_denominator(1001)
-        asked = StreamParameters(type=CAPTURE, numerator=period.numerator, denominator=period.denominator)
+        asked = v4l2.StreamParameters(type=CAPTURE, numerator=period.numerator, denominator=period.denominator)
         try:
-            self._kernel.ioctl(self._descriptor, VIDIOC_S_PARM, asked)
+            self._kernel.ioctl(self._descriptor, v4l2.VIDIOC_S_PARM, asked)
         except OSError as error:
             if error.errno == errno.ENOTTY:
                 return  # a driver without this call has one rate only
@@ -182,9 +162,9 @@ class V4l2Device(CameraDevice):
 
     def _set_control(self, wanted: ControlParameters, number: int) -> None:
         with self._telling(f"cannot set {wanted.name} to {wanted.value}"):
-            self._kernel.ioctl(self._descriptor, VIDIOC_S_CTRL, Control(id=number, value=wanted.value))
-            granted = Control(id=number)
-            self._kernel.ioctl(self._descriptor, VIDIOC_G_CTRL, granted)
+            self._kernel.ioctl(self._descriptor, v4l2.VIDIOC_S_CTRL, v4l2.Control(id=number, value=wanted.value))
+            granted = v4l2.Control(id=number)
+            self._kernel.ioctl(self._descriptor, v4l2.VIDIOC_G_CTRL, granted)
         if granted.value != wanted.value:
             raise CameraError(
                 f"{self._who} makes {granted.value} of {wanted.name} {wanted.value}; write a value it can keep"
@@ -192,14 +172,14 @@ class V4l2Device(CameraDevice):
 
     def _start(self) -> None:
         with self._telling("cannot be started"):
-            wanted = RequestBuffers(count=_BUFFERS, type=CAPTURE, memory=_MAPPED)
-            self._kernel.ioctl(self._descriptor, VIDIOC_REQBUFS, wanted)
+            wanted = v4l2.RequestBuffers(count=_BUFFERS, type=CAPTURE, memory=_MAPPED)
+            self._kernel.ioctl(self._descriptor, v4l2.VIDIOC_REQBUFS, wanted)
             for index in range(wanted.count):
-                buffer = Buffer(index=index, type=CAPTURE, memory=_MAPPED)
-                self._kernel.ioctl(self._descriptor, VIDIOC_QUERYBUF, buffer)
+                buffer = v4l2.Buffer(index=index, type=CAPTURE, memory=_MAPPED)
+                self._kernel.ioctl(self._descriptor, v4l2.VIDIOC_QUERYBUF, buffer)
                 self._maps.append(self._kernel.map(self._descriptor, buffer.length, buffer.offset & 0xFFFFFFFF))
-                self._kernel.ioctl(self._descriptor, VIDIOC_QBUF, buffer)
-            self._kernel.ioctl(self._descriptor, VIDIOC_STREAMON, ctypes.c_int(CAPTURE))
+                self._kernel.ioctl(self._descriptor, v4l2.VIDIOC_QBUF, buffer)
+            self._kernel.ioctl(self._descriptor, v4l2.VIDIOC_STREAMON, ctypes.c_int(CAPTURE))
 
     @contextlib.contextmanager
     def _telling(self, what: str) -> Iterator[None]:
@@ -220,20 +200,20 @@ class V4l2Device(CameraDevice):
                 return CameraError(f"{self._who} {what} ({os.strerror(error.errno or 0)})")
 
 
-def camera_flags(capability: Capability) -> int:
+def camera_flags(capability: v4l2.Capability) -> int:
     """What this device can do; not what the whole camera can, which may have several."""
     known = capability.capabilities & _HAS_DEVICE_CAPABILITIES
     return int(capability.device_caps if known else capability.capabilities)
 
 
-def controls_of(kernel: Kernel, descriptor: int) -> dict[str, QueryControl]:
+def controls_of(kernel: Kernel, descriptor: int) -> dict[str, v4l2.QueryControl]:
     """The controls of an open device, by the names that `v4l2-ctl` prints. Raises OSError."""
-    controls: dict[str, QueryControl] = {}
+    controls: dict[str, v4l2.QueryControl] = {}
     number = 0
     while True:
-        control = QueryControl(id=number | _NEXT_CONTROL)
+        control = v4l2.QueryControl(id=number | _NEXT_CONTROL)
         try:
-            kernel.ioctl(descriptor, VIDIOC_QUERYCTRL, control)
+            kernel.ioctl(descriptor, v4l2.VIDIOC_QUERYCTRL, control)
         except OSError as error:
             if error.errno in {errno.EINVAL, errno.ENOTTY}:
                 return controls  # that was the last

@@ -8,16 +8,7 @@ from typing import Protocol
 
 from flockd.core.messages import Neighbour, PilotOutput, VehicleState
 from flockd.flight.geometry import euler_from_rotation
-from flockd.onboard.telemetry.topics import (
-    CommandMessage,
-    HealthMessage,
-    MissionMessage,
-    NeighbourMessage,
-    NeighboursMessage,
-    ObstaclesMessage,
-    StateMessage,
-    TimingsMessage,
-)
+from flockd.onboard.telemetry import topics
 
 
 class TelemetrySink(Protocol):
@@ -32,7 +23,7 @@ def publish_step(sink: TelemetrySink, drone: str, vehicle: VehicleState, output:
     time_s, command, mission, obstacles = output.time_s, output.command, output.mission, output.obstacles
     roll_deg, pitch_deg, yaw_deg = map(math.degrees, euler_from_rotation(vehicle.R_ned_body))
     position_ne = None if vehicle.position is None else vehicle.position.tolist()
-    state = StateMessage(
+    state = topics.StateMessage(
         time_s=time_s,
         height_m=vehicle.height_m,
         roll_deg=roll_deg,
@@ -44,11 +35,13 @@ def publish_step(sink: TelemetrySink, drone: str, vehicle: VehicleState, output:
     )
     sink.publish(drone, "state", state)
     neighbours = [neighbour_message(neighbour) for neighbour in output.neighbours]
-    sink.publish(drone, "neighbours", NeighboursMessage(time_s=time_s, neighbours=neighbours))
+    sink.publish(drone, "neighbours", topics.NeighboursMessage(time_s=time_s, neighbours=neighbours))
     if obstacles is not None:  # to the centimetre
         range_m, seen_m = obstacles.range_m.round(2).tolist(), obstacles.seen_m.round(2).tolist()
-        sink.publish(drone, "obstacles", ObstaclesMessage(time_s=obstacles.time_s, range_m=range_m, seen_m=seen_m))
-    asked = CommandMessage(
+        sink.publish(
+            drone, "obstacles", topics.ObstaclesMessage(time_s=obstacles.time_s, range_m=range_m, seen_m=seen_m)
+        )
+    asked = topics.CommandMessage(
         time_s=time_s,
         velocity_ne=command.velocity.tolist(),
         acceleration_ne=command.acceleration.tolist(),
@@ -56,7 +49,7 @@ def publish_step(sink: TelemetrySink, drone: str, vehicle: VehicleState, output:
     )
     sink.publish(drone, "command", asked)
     if mission.known:
-        told = MissionMessage(
+        told = topics.MissionMessage(
             time_s=time_s,
             kind=mission.kind,
             sentence=mission.sentence,
@@ -67,14 +60,14 @@ def publish_step(sink: TelemetrySink, drone: str, vehicle: VehicleState, output:
         )
         sink.publish(drone, "mission", told)
     reasons = [reason.text for reason in output.reasons]
-    health = HealthMessage(time_s=time_s, ok=not reasons, reasons=reasons, refused=dict(output.counts))
+    health = topics.HealthMessage(time_s=time_s, ok=not reasons, reasons=reasons, refused=dict(output.counts))
     sink.publish(drone, "health", health)
-    sink.publish(drone, "timings", TimingsMessage(time_s=time_s, stages_ms=dict(output.stages_ms)))
+    sink.publish(drone, "timings", topics.TimingsMessage(time_s=time_s, stages_ms=dict(output.stages_ms)))
 
 
-def neighbour_message(neighbour: Neighbour) -> NeighbourMessage:
+def neighbour_message(neighbour: Neighbour) -> topics.NeighbourMessage:
     """One neighbour, as telemetry has it."""
-    return NeighbourMessage(
+    return topics.NeighbourMessage(
         track=neighbour.track,
         position_ned=neighbour.position.tolist(),
         velocity_ned=neighbour.velocity.tolist(),
