@@ -96,3 +96,6 @@ KEYS: Mapping[str, str] = {
     "safety.max_ego_motion_failures": "write `max_ego_motion_s`, in seconds instead of steps",
 }
 """By a drone's, scenario's or campaign's key, with dots, and without `drone` before those of a drone in a scenario."""
+
+VALUES = (("flocking.size", "auto"), ("flocking.size", "weave"))
+"""Keys and their values that recordings of earlier versions hold, and that this one takes for the default."""

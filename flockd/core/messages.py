@@ -57,8 +57,6 @@ class ReasonKind(StrEnum):
     """A neighbour, or its motion."""
     RIG = "rig"
     """Nothing, but that a camera is not as its configuration says."""
-    SIZE = "size"
-    """Nothing, but that the neighbours are not as large as the configuration says."""
     RECORDED = "recorded"
     """Unknown: recordings keep the text alone."""
 
@@ -411,11 +409,9 @@ class SizeStatus:
     weaves: bool
     """Whether it moves up and down now, to learn it."""
     size_m: float | None = None
-    """From tip to tip; None: not known well enough, or of several types."""
+    """From tip to tip, from which ranges follow; None: not known well enough."""
     sigma: float | None = None
     """Relative standard deviation of `size_m`."""
-    used: bool = False
-    """Whether ranges follow from this size, as the networks judge the drones to be of another."""
 
 
 @dataclass(frozen=True)
@@ -426,10 +422,6 @@ class LearnedSize:
     """From tip to tip."""
     sigma: float
     """Relative standard deviation of `size_m`."""
-    looks_m: float
-    """What the networks judge the size of such drones to be."""
-    doubted: bool
-    """Whether they say that they do not know it."""
 
 
 @dataclass(frozen=True, eq=False)

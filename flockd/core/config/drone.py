@@ -19,7 +19,7 @@ from flockd.core.config.base import Endpoint, Name, Positive, Section, refuse
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.config.geometry import GeometryParameters
 from flockd.core.config.mission import MissionParameters, mission_faults
-from flockd.core.config.perception import PerceptionConfig
+from flockd.core.config.perception import NO_MODEL, PerceptionConfig
 from flockd.core.config.rig import RigConfig
 from flockd.core.config.safety import SafetyParameters
 from flockd.core.config.source import SourceParameters
@@ -103,6 +103,10 @@ class DroneConfig(Section):
                 f"{trim_m_s:g} and flocking.max_speed_m_s {law_m_s:g} are together above safety.gate.max_speed_m_s, "
                 f"which would refuse them; write {gate_m_s - law_m_s:g} or less"
             )
+        if self.flocking.size == "learn" and self.perception.drone_size_m is not None:
+            faults["flocking", "size"] = "learns what perception.drone_size_m says; delete one of the two"
+        elif self.flocking.size == "learn" and self.perception.distance == NO_MODEL:
+            faults["flocking", "size"] = "needs the apparent size; name a second stage in perception.distance"
         if self.speed_factor != 1.0 and self.autopilot is not None and self.autopilot.address.startswith("serial:"):
             fault = "is for simulations, and an autopilot on a cable is none; delete it"
             faults["source", "shared_memory", "speed_factor"] = fault

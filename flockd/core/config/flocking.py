@@ -40,12 +40,10 @@ class FlockingParameters(Section):
     """After how long a neighbour may pull with `max_acceleration_m_s2`; until then with the square of the share of that
     time for which it has been seen. What is no drone is mostly seen for a few seconds, and far away, where Eq. 39 pulls
     most. null: no limit, as in the paper. docs/concepts/flocking_law.md says what it wins and costs."""
-    size: Literal["auto", "weave", "off"] = "auto"
-    """Whether the drone learns how large the others are. `weave`: twelve seconds at a time it moves up and down by
-    0.3 m, and the shift of the others' bearings tells their ranges without their size. Where the networks judge it
-    otherwise by more than two standard deviations, ranges follow from the size that was learned. `auto`: only where
-    `perception.drone_size_m` says none, and the sizes that the networks judge scatter, as of drones that they do not
-    know."""
+    size: Literal["off", "learn"] = "off"
+    """`learn`: the drone finds out how large the others are, all alike, where nobody knows and the networks do not. For
+    twelve seconds it moves up and down by 0.3 m, and the shift of the others' bearings tells their ranges without their
+    size; ranges follow from that size from then on. Who knows it writes `perception.drone_size_m` instead."""
     own_weight: NonNegative = 1.0
     """W_i of Eq. 42"""
     max_speed_m_s: Annotated[float, Field(gt=0, le=50)] = 3.0

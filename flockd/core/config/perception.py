@@ -145,7 +145,8 @@ class PerceptionConfig(Section):
     noise: NoiseParameters = NoiseParameters()
     drone_size_m: Annotated[float, Field(ge=MIN_DRONE_SIZE_M, le=MAX_DRONE_SIZE_M)] | None = None
     """Size of every drone of the fleet, from tip to tip with propellers, where it is known: a drone's range is then
-    this over its apparent size. By default the network judges each drone's size."""
+    this over its apparent size. By default the network judges each drone's size, which is often a quarter off where it
+    was not trained on that airframe."""
     drone_size_sigma_m: NonNegative = 0.01
     """Standard deviation of `drone_size_m`: by default of a tape measure. It adds to the deviation of every range."""
     scale: ScaleSource = "height"

@@ -11,7 +11,6 @@ import cv2
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, UInt8Array
 from flockd.flight.geometry import PinholeCamera, RigidTransform, ZMap
 from flockd.flight.perception.detection.instances import Instance
-from flockd.flight.tracking import looks_alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +64,6 @@ class KnownSize:
 
     size_m: float
     sigma_m: float
-    looks_m: float | None = None
-    """What the network judges such drones' size to be: those that look otherwise are none; None: all are."""
-
-    def is_of(self, judged_m: float) -> bool:
-        """Whether a drone whose size the network judges so has this size."""
-        return self.looks_m is None or looks_alike(judged_m, self.looks_m)
 
 
 @dataclass(frozen=True, eq=False)

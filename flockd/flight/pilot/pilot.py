@@ -111,8 +111,7 @@ class FlockPilot:
         """What the last step's pairs began at."""
         self._rig_said_s: float | None = None
         self._tracker = Tracker(config.tracking)
-        self._size = None if config.flocking.size == "off" else SizeLearner(config, learned, flies=flies)
-        self._flies = flies
+        self._size = SizeLearner(config, learned, flies=flies)
         self._law = FlockingLaw(config.flocking)
         self._passing = Passing(self._law, config.safety.gate.vertical_separation_m)
         self._map = LocalMap(config.obstacles) if config.obstacles.enabled else None
@@ -165,10 +164,9 @@ class FlockPilot:
         trace = trace or StepTrace()
         predictions = self._predictions(frames.time_s)
         ground, why_no_ground = (None, None) if self._ground is None else self._ground.update(vehicle)
-        learned_size = None if self._size is None else self._size.used
-        observation = self._perception.observe(
-            frames, vehicle, ground, predictions, trace.detection, laps.end, learned_size
-        )
+        learned = self._size.learned
+        known = None if learned is None else KnownSize(learned.size_m, learned.sigma * learned.size_m)
+        observation = self._perception.observe(frames, vehicle, ground, predictions, trace.detection, laps.end, known)
         trace.observation = observation
         if self._config.perception.height == "barometer":
             ground = None  # the height says as much
@@ -192,10 +190,7 @@ class FlockPilot:
         deviations = self._deviations(observation.time_s)
         faults = [text for one in deviations for text in rig_faults(one)]
         of_rig = [Reason(ReasonKind.RIG, text) for text in faults]
-        of_size = () if self._size is None else self._size.reasons
-        reasons = (
-            *of_height, *observation.reasons, *why_no_ego, *why_no_motion, *why_no_measurement, *of_rig, *of_size,
-        )  # fmt: skip
+        reasons = (*of_height, *observation.reasons, *why_no_ego, *why_no_motion, *why_no_measurement, *of_rig)
         return PilotOutput(
             time_s=observation.time_s,
             ego_motion=ego,
@@ -213,13 +208,13 @@ class FlockPilot:
             ground=ground,
             obstacles=obstacles,
             rig=deviations,
-            size=None if self._size is None else self._size.status,
+            size=self._size.status,
         )
 
     @property
     def learned(self) -> LearnedSize | None:
         """What the steps until now showed of the others' size, for the next flight's pilot."""
-        return None if self._size is None else self._size.learned
+        return self._size.learned
 
     def _refused(self, frames: FrameSet, reason: Reason) -> PilotOutput:
         """The output of a step that was not done."""
@@ -357,20 +352,16 @@ class FlockPilot:
         velocity: FloatArray | None,
     ) -> tuple[Neighbour, ...]:
         """The neighbours after what their measurements, by track, tell of their size."""
-        size = self._size
-        if size is None:
-            return self._tracker.neighbours()
-        interval_s, way = 0.0, np.zeros(3)
+        sunk_m = 0.0
         if observation.previous is not None:
-            before = observation.previous.vehicle
-            interval_s, way[2] = observation.interval_s, before.height_m - observation.vehicle.height_m
-            way = way if ego is None or not self._flies else _displacement(observation, ego)
-        if changed := size.see(interval_s, way, measured, self._tracker.neighbours()):
-            before_m, now_m = changed
-            self._tracker.resize(now_m, before_m, velocity)
-        for track, own_m in size.own_sizes(self._tracker.neighbours()).items():
-            self._tracker.resize_one(track, own_m, velocity)
-        return size.cautious(self._tracker.neighbours())
+            before_m = observation.previous.vehicle.height_m
+            sunk_m = before_m - observation.vehicle.height_m if ego is None else _displacement(observation, ego)[2]
+        neighbours = self._tracker.neighbours()
+        size_m = self._size.see(observation.time_s, sunk_m, measured, neighbours)
+        if size_m is not None:
+            self._tracker.resize(size_m, velocity)
+            neighbours = self._tracker.neighbours()
+        return self._size.cautious(neighbours)
 
     def _local_map(
         self,
@@ -435,11 +426,9 @@ class FlockPilot:
             )
         if self._config.yaw == "course" and guidance.course_rad is not None:
             self._yaw_rad = guidance.course_rad
-        height_m = guidance.height_m
-        if self._size is not None:
-            ends = guidance.takeover is not None
-            height_m = self._size.height(observation.time_s, vehicle, ground, height_m, neighbours, ends=ends)
-            self._mission = replace(self._mission, sentence=self._mission.sentence + self._size.sentence)
+        ends = guidance.takeover is not None
+        height_m = self._size.height(observation.time_s, vehicle, ground, guidance.height_m, neighbours, ends=ends)
+        self._mission = replace(self._mission, sentence=self._mission.sentence + self._size.sentence)
         trim = self._trim.velocity
         return Wanted(
             self._trim.corrected(command), acceleration, self._yaw_rad, trim if trim.any() else None, height_m

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from flockd.core.config.tracking import TrackingParameters
-from flockd.flight.tracking.measurement import Measurement, looks_alike
+from flockd.flight.tracking.measurement import Measurement
 from flockd.flight.tracking.tracker import Prediction, Shown, Tracker
 
-__all__ = ["Measurement", "Prediction", "Shown", "Tracker", "TrackingParameters", "looks_alike"]
+__all__ = ["Measurement", "Prediction", "Shown", "Tracker", "TrackingParameters"]

@@ -21,14 +21,12 @@ def assign(
     measurements: Sequence[Measurement],
     tracks: Sequence[Hypotheses],
     parameters: TrackingParameters,
-    sizes_m: Sequence[float | None],
 ) -> dict[int, tuple[int, Innovation]]:
     """One to one, the likeliest assignment of measurements to tracks: measurement -> (track, innovation), by index.
 
     The cost of a pair is its squared Mahalanobis distance plus the logarithm of the innovation covariance's determinant
     (twice its negative log likelihood but for a constant). A measurement without a track costs what the vaguest of its
-    pairs would cost at the gate, so that no pair within the gate is given up for nothing. To a track whose size is
-    known, of ``sizes_m``, a measurement is of a drone of that size.
+    pairs would cost at the gate, so that no pair within the gate is given up for nothing.
     """
     if not measurements or not tracks:
         return {}
@@ -39,9 +37,7 @@ def assign(
     unassigned = np.full((len(measurements), len(measurements)), _FORBIDDEN)
     np.fill_diagonal(unassigned, -_FORBIDDEN)
     for row, column in np.argwhere(_near(measurements, states, parameters.gate_sigma)).tolist():
-        measurement, size_m = measurements[row], sizes_m[column]
-        measurement = measurement if size_m is None else measurement.of_size(size_m)
-        pair = tracks[column].innovation(measurement, parameters)
+        pair = tracks[column].innovation(measurements[row], parameters)
         squared, log_determinant = pair.squared_distance, pair.log_determinant
         if squared <= gate:
             pairs[row, column] = pair

@@ -170,7 +170,7 @@ def _noise(measurement: Measurement, parameters: TrackingParameters) -> FloatArr
     A range is a size over an apparent size, so that the two err together: by as much, with `size_correlation`. What the
     judged size may be off (`Detection.log_size_sigma`) is no part of it: that lasts, and is no noise. A filter that
     took it for noise would find the range from how the neighbour moves, which in a flock tells nothing of it
-    (`flock_size`).
+    (`pilot.size_learner`).
     """
     variance = measurement.log_range_variance
     across = parameters.size_correlation * variance * measurement.bearing[:, None]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -94,10 +94,6 @@ class Measurement:
         covariance = log_polar_covariance(bearing, range_sigma_m / math.exp(log_range), bearing_sigma_rad)
         return cls(bearing, log_range, covariance, size_m, drone_probability)
 
-    def of_size(self, size_m: float) -> Self:
-        """As it is of a drone of this size, which appears as large."""
-        return replace(self, size_m=size_m, log_range=self.log_range + math.log(size_m / self.size_m))
-
     @property
     def range_m(self) -> float:
         """From the own drone."""
@@ -112,12 +108,3 @@ class Measurement:
     def position(self) -> FloatArray:
         """(3,) metres, NED, own drone at the origin."""
         return self.range_m * self.bearing
-
-
-_ALIKE = 1.5
-"""A drone that looks larger or smaller than another by more than this factor is of another type."""
-
-
-def looks_alike(size_m: float, other_m: float) -> bool:
-    """Whether two drones of judged sizes may be of one type; false for NaN."""
-    return 1 / _ALIKE < size_m / other_m < _ALIKE

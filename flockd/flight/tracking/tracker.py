@@ -15,7 +15,7 @@ from flockd.flight.tracking.association import assign
 from flockd.flight.tracking.filter import Innovation, State
 from flockd.flight.tracking.hypotheses import Hypotheses
 from flockd.flight.tracking.manoeuvres import Manoeuvres
-from flockd.flight.tracking.measurement import Measurement, looks_alike
+from flockd.flight.tracking.measurement import Measurement
 
 _OF_USUAL = 0.02
 """The share of one detection in what is usual: that of the last fifty."""
@@ -46,8 +46,6 @@ class Prediction:
     size_m: float
     """As of `Detection.size_m`."""
     existence_probability: float
-    size_known: bool = False
-    """The flight has shown the size, whatever the networks judge."""
 
 
 class Tracker:
@@ -102,8 +100,7 @@ class Tracker:
         interval_s = max(0.0, time_s - self._time_s)
         weight = min(1.0, interval_s / self.parameters.evidence_interval_s)
         self._time_s = time_s
-        known = [track.known_size_m for track in self._tracks]
-        pairs = assign(measurements, [track.hypotheses for track in self._tracks], self.parameters, known)
+        pairs = assign(measurements, [track.hypotheses for track in self._tracks], self.parameters)
         missed = self._without({column for column, _ in pairs.values()})
         self._miss(missed, interval_s, weight, shown)
         numbers = []
@@ -137,28 +134,19 @@ class Tracker:
                 position=state.position,
                 covariance=state.position_covariance,
                 size_m=state.size_m,
-                size_known=track.known_size_m is not None,
                 existence_probability=track.drone_probability
                 * existence.predicted(track.existence, interval_s, self.parameters),
             )
             for track, state in zip(known, states, strict=True)
         )
 
-    def resize(self, size_m: float, until_now_m: float, own_velocity: FloatArray | None) -> None:
-        """Neighbours that were about `until_now_m` large, from tip to tip, are `size_m`, and so much nearer or farther.
+    def resize(self, size_m: float, own_velocity: FloatArray | None) -> None:
+        """The neighbours are found to be `size_m` large, from tip to tip, and so much nearer or farther.
 
-        Those whose own size is known stay. `own_velocity` (3,) NED m/s; None: not known.
+        `own_velocity` (3,) NED m/s; None: not known.
         """
         for track in self._tracks:
-            if track.known_size_m is None and looks_alike(track.state.size_m, until_now_m):
-                track.hypotheses = track.hypotheses.changed(lambda state: filter.resized(state, size_m, own_velocity))
-
-    def resize_one(self, number: int, size_m: float, own_velocity: FloatArray | None) -> None:
-        """The neighbour of one track is `size_m` large, and so is what is measured of it from now on."""
-        for track in self._tracks:
-            if track.number == number:
-                track.known_size_m = size_m
-                track.hypotheses = track.hypotheses.changed(lambda state: filter.resized(state, size_m, own_velocity))
+            track.hypotheses = track.hypotheses.changed(lambda state: filter.resized(state, size_m, own_velocity))
 
     def neighbours(self) -> tuple[Neighbour, ...]:
         """All tracks as of the last `predict` and `update`, confirmed or not, by track number."""
@@ -190,8 +178,6 @@ class Tracker:
 
     def _detect(self, track: _Track, measurement: Measurement, innovation: Innovation, weight: float) -> None:
         interval_s = max(0.0, self._time_s - track.last_seen_s)
-        if track.known_size_m is not None:
-            measurement = measurement.of_size(track.known_size_m)
         track.hits += 1
         track.agrees = innovation.squared_distance <= self.parameters.confirm_sigma**2
         track.agreed += weight * track.agrees * self._share(measurement)
@@ -285,8 +271,6 @@ class _Track:
     """Whether the last one was."""
     confirmed: bool = False
     was_confirmed: bool = False
-    known_size_m: float | None = None
-    """Its own, as the flight has shown; None: as measured."""
 
     @property
     def state(self) -> State:

@@ -31,6 +31,10 @@ def check_limits(config: DroneConfig) -> Iterator[Finding]:
     for key, text in beyond_envelope(config).items():
         measured, _, fix = text.partition("; ")
         yield warned(key_text(key), measured, fix)
+    if config.perception.drone_size_m is None and config.flocking.size == "off":
+        measured = "nobody says it: ranges follow from what the networks judge, often a quarter off for new airframes"
+        fix = "measure the drones from tip to tip and write perception.drone_size_m, or flocking.size: learn"
+        yield warned("drone size", measured, fix)
 
 
 def check_instance(taken: UnavailableError | None) -> Iterator[Finding]:

@@ -32,7 +32,6 @@ from mavsdk.system import System
 from flockd.core import services
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.messages import Setpoint, VehicleState
-from flockd.flight.tracking.weave_path import HEIGHT_GAIN_PER_S
 from flockd.onboard.autopilot.autopilot_status import (
     MODES,
     AutopilotError,
@@ -59,6 +58,8 @@ COMMAND_SET_MODE = 176
 COMMAND_SET_MESSAGE_INTERVAL = 511
 COMMAND_REQUEST_MESSAGE = 512
 COMMAND_RUN_CHECKS = 401
+HEIGHT_GAIN_PER_S = 1.0
+"""A setpoint asks for so much climb for each metre that is missing."""
 STREAMS_HZ = {
     "ATTITUDE_QUATERNION": (31, services.VEHICLE_STATE.rate_hz),
     "LOCAL_POSITION_NED": (32, 30.0),

@@ -66,7 +66,6 @@ class Control:
         self._height_m = math.nan
         self._yaw_rad = math.nan
         self._flight = 0
-        self._armed = False
         self._request: Request | None = None
         """The last one offered; None in silence."""
         self.decision = Decision(State.IDLE, Action.SILENCE, ())
@@ -91,7 +90,7 @@ class Control:
         )
         before, now = self.decision, self._clock()
         self.decision = self._supervisor.step(now, inputs)
-        self._begin_or_end_flight(before, status, vehicle)
+        self._begin_or_end_flight(before, vehicle)
         self._stream(now, status, vehicle, before)
         self._requests.takeover = self._takeover()
         self._on_tick(before, self.decision)
@@ -109,15 +108,9 @@ class Control:
         takeover = result.output.mission.takeover
         return None if takeover is None else MissionEnd(takeover)
 
-    def _begin_or_end_flight(self, before: Decision, status: AutopilotStatus, vehicle: VehicleState | None) -> None:
-        """A flight begins with a new pilot, and holds the height and the heading that the drone has then.
-
-        From when it is armed a pilot watches the others whose size the climb shows.
-        """
+    def _begin_or_end_flight(self, before: Decision, vehicle: VehicleState | None) -> None:
+        """A flight begins with a new pilot, and holds the height and the heading that the drone has then."""
         flies = self.decision.state in FLYING
-        if status.armed and not self._armed and not flies:
-            self._pilot_loop.watch()
-        self._armed = status.armed
         if flies and before.state not in FLYING:
             self._flight += 1
             self._pilot_loop.begin_flight(self._flight)

@@ -86,7 +86,6 @@ class PilotLoop:
         self._pilot: FlockPilot | None = None
         self._flight = self._begun = 0
         """Number of the flight, and how often a pilot was begun."""
-        self._flies = False
         self._learned: LearnedSize | None = None
         self.learned_before: LearnedSize | None = None
         """Of the others' size, which the flight's pilot began with."""
@@ -114,16 +113,7 @@ class PilotLoop:
 
     def begin_flight(self, number: int) -> None:
         """Uses a new pilot from the next step on: its time begins there, so that a recording can be replayed."""
-        self._flight, self._flies, self.learned_before = number, True, self._learned
-        self._begin()
-
-    def watch(self) -> None:
-        """Uses a new pilot, which nobody flies, from the next step on: what was seen while people carried the drones
-        tells nothing of their size, and the climb that comes does."""
-        self._flies, self._learned, self.learned_before = False, None, None
-        self._begin()
-
-    def _begin(self) -> None:
+        self._flight, self.learned_before = number, self._learned
         self._begun += 1
         self._pilot = self.order = None
         self._reports.begin()
@@ -203,7 +193,7 @@ class PilotLoop:
             self._networks,
             stopwatch=time.perf_counter,
             learned=self.learned_before,
-            flies=self._flies,
+            flies=self._flight > 0,
         )
 
     def _note_failure(self, why: str) -> None:
@@ -272,16 +262,17 @@ class Reports:
         return [text + corrections[text] for text in new]
 
     def _of_size(self, output: PilotOutput) -> list[str]:
-        """That it weaves, how large the others are, and what contradicts it, when it is new."""
+        """That it weaves, and how large the others are, when it is new."""
         size, told = output.size, dict[str, str]()
         if size is None:
             return []
         if size.weaves:
             told["weaves"] = "size: moves up and down to learn how large the others are"
-        if size.used:
+        if size.size_m is not None:
             found = f"{size.size_m:.2f} m large, +-{size.sigma:.0%}"
-            told["used"] = f"size: the others are {found}; ranges follow from it"
-        told |= {one.kind: one.text for one in output.reasons if one.kind is ReasonKind.SIZE}
+            told["found"] = (
+                f"size: the others are {found}; ranges follow from it; measure them and write `perception.drone_size_m`"
+            )
         new = [text for what, text in told.items() if what not in self._told_of_size]
         self._told_of_size = set(told)
         return new

@@ -260,7 +260,11 @@ def _without_gone(values: Any, at: str = "") -> Any:
     """The values of an older configuration, without the keys that this version has not."""
     if not isinstance(values, dict):
         return values
-    return {key: _without_gone(value, f"{at}{key}.") for key, value in values.items() if f"{at}{key}" not in gone.KEYS}
+    return {
+        key: _without_gone(value, f"{at}{key}.")
+        for key, value in values.items()
+        if f"{at}{key}" not in gone.KEYS and (f"{at}{key}", value) not in gone.VALUES
+    }
 
 
 def _learned(path: Path, flight: Mapping[str, str]) -> LearnedSize | None:
@@ -272,7 +276,7 @@ def _learned(path: Path, flight: Mapping[str, str]) -> LearnedSize | None:
         raise RecordingError(
             f"{path}: its {streams.LEARNED_SIZE} cannot be read ({error}); use another copy"
         ) from error
-    if not all(0 < number < math.inf for number in (learned.size_m, learned.sigma, learned.looks_m)):
+    if not all(0 < number < math.inf for number in (learned.size_m, learned.sigma)):
         raise RecordingError(f"{path}: its {streams.LEARNED_SIZE} is no size; use another copy")
     return learned
 

@@ -89,7 +89,7 @@ class FlightLogBuilder:
         size = output.size
         if size is not None and size.size_m is not None and size.sigma is not None:
             since_s = self._sizes[i].since_s if i in self._sizes else float(self._rows["time_s"][step])
-            self._sizes[i] = LearnedSize(since_s=since_s, size_m=size.size_m, sigma=size.sigma, used=size.used)
+            self._sizes[i] = LearnedSize(since_s=since_s, size_m=size.size_m, sigma=size.sigma)
         for stage, ms in stages_ms.items():
             self._stages.setdefault(stage, []).append(ms)
 

@@ -59,8 +59,6 @@ class LearnedSize(BaseModel):
     """When it first knew one."""
     size_m: float
     sigma: float
-    used: bool
-    """As of `SizeStatus`."""
 
 
 class MissionMetadata(BaseModel):

@@ -99,8 +99,7 @@ def sizes_text(summary: Mapping[str, Any]) -> str:
     sizes = [one["size_m"] for one in summary["sizes"].values()]
     if not sizes:
         return ""
-    used = sum(one["used"] for one in summary["sizes"].values())
-    return f"{min(sizes):.2f} to {max(sizes):.2f} m, by {len(sizes)} of {summary['drones']} drones; {used} go by it"
+    return f"{min(sizes):.2f} to {max(sizes):.2f} m, by {len(sizes)} of {summary['drones']} drones"
 
 
 def estimation_errors(log: FlightLog) -> dict[str, FloatArray]:

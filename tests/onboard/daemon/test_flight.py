@@ -181,8 +181,8 @@ async def test_an_operator_sends_it_somewhere_and_the_recording_replays(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    """Also what its pilot began with of the others' size, which the one before the flight learned."""
-    learned = LearnedSize(0.43, 0.08, 0.31, doubted=True)
+    """Also what its pilot began with of the others' size, which the one before it learned."""
+    learned = LearnedSize(0.43, 0.08)
     monkeypatch.setattr(FlockPilot, "learned", learned)
     async with aboard(
         fake_autopilot,

@@ -30,7 +30,7 @@ from tests.make import filled
 
 WIDTH, HEIGHT = 160, 120
 MODELS = {"flow": "ab" * 32}
-LEARNED = LearnedSize(0.43, 1 / 11, 1 / 3, doubted=True)
+LEARNED = LearnedSize(0.43, 1 / 11)
 
 
 def drone_config() -> DroneConfig:
@@ -56,7 +56,7 @@ class MadeUpPilot:
         stopwatch: Callable[[], float] | None = None,
         learned: LearnedSize | None = None,
     ) -> None:
-        self._memory = 0.1 if learned is None else learned.size_m / learned.looks_m + learned.sigma
+        self._memory = 0.1 if learned is None else learned.size_m + learned.sigma
         self.gain = config.flocking.cohesion
 
     def step(self, frames: FrameSet, vehicle: VehicleState, *, order: MissionOrder | None = None) -> PilotOutput:

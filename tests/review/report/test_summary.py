@@ -392,11 +392,11 @@ def test_what_happens_once_flockd_does_not_fly_any_more_counts_apart() -> None:
 
 def test_what_gates_slowed_drones_down_for_and_what_they_learned_of_sizes_is_told() -> None:
     log, by_cause = _hand_made(), {"neighbour": 0.011, "wind": 0.0009}
-    sizes = {0: LearnedSize(since_s=12.0, size_m=0.43, sigma=0.07, used=True)}
+    sizes = {0: LearnedSize(since_s=12.0, size_m=0.43, sigma=0.07)}
     facts = {"gated": True, "slowed_share": 0.03, "slowed_by": by_cause, "sizes": sizes}
     summary = summarise(replace(log, metadata=log.metadata.model_copy(update=facts)))
     assert causes_text(summary) == "neighbours 1.1 %, wind 0.1 %"
-    assert sizes_text(summary) == "0.43 to 0.43 m, by 1 of 2 drones; 1 go by it"
+    assert sizes_text(summary) == "0.43 to 0.43 m, by 1 of 2 drones"
     told, before = ({one["name"]: one for one in page_texts(of, log)["facts"]} for of in (summary, summarise(log)))
     assert told.keys() - before.keys() == {"Slowed", "Size learned"}
     assert (told["Size learned"]["value"], told["Size learned"]["unit"]) == ("0.43 to 0.43", "m")
@@ -404,8 +404,8 @@ def test_what_gates_slowed_drones_down_for_and_what_they_learned_of_sizes_is_tol
 
 def test_the_log_keeps_what_was_learned_last_and_since_when() -> None:
     builder = FlightLogBuilder(np.array([0.0, 0.5, 1.0]), 1)
-    sizes = (SizeStatus(weaves=True), SizeStatus(True, 0.46, 0.09), SizeStatus(False, 0.43, 0.07, used=True))
+    sizes = (SizeStatus(weaves=True), SizeStatus(True, 0.46, 0.09), SizeStatus(False, 0.43, 0.07))
     for step, size in enumerate(sizes):
         builder.add_output(step, 0, make.output(0.5 * step, size=size), {})
     kept = builder.build(_hand_made().metadata, None).metadata.sizes
-    assert kept == {0: LearnedSize(since_s=0.5, size_m=0.43, sigma=0.07, used=True)}
+    assert kept == {0: LearnedSize(since_s=0.5, size_m=0.43, sigma=0.07)}

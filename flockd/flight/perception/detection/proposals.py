@@ -30,8 +30,6 @@ class Predicted:
     log_range: float
     covariance: FloatArray
     """(3, 3) as of `Detection.covariance`."""
-    size_m: float | None = None
-    """Its size, where the flight has shown it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +106,7 @@ def propose_predictions(
         roi = Roi(bearing, rules.half_angle(prediction.size_m, range_m, pixel_angle(rig, cameras, bearing)))
         found = any(angle_between(roi.direction, bearing) < roi.half_angle for bearing in detected)
         if not found:
-            size_m = prediction.size_m if prediction.size_known else None
-            proposals.append(Proposal(cameras, roi, predicted=Predicted(bearing, log_range, covariance, size_m)))
+            proposals.append(Proposal(cameras, roi, predicted=Predicted(bearing, log_range, covariance)))
     return proposals, reasons
 
 

@@ -190,10 +190,7 @@ class Cascade:
 
     def _candidate(self, stage: _Stage, view: VirtualCrop, estimate: RangeEstimate) -> Candidate:
         """The camera sits beside the body's origin, so that bearing and range change a little."""
-        track = stage.proposal.predicted
-        if track is not None and track.size_m is not None:
-            estimate = estimate.of_size(KnownSize(track.size_m, 0.0))
-        elif self._known_size is not None and self._known_size.is_of(estimate.size_m):
+        if self._known_size is not None:
             estimate = estimate.of_size(self._known_size)
         ray = view.camera.rays(estimate.centre[None])[0]
         bearing, log_range = ray, estimate.log_range

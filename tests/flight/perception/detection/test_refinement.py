@@ -20,8 +20,6 @@ from flockd.flight.perception.detection.proposals import Proposal
 from flockd.flight.perception.detection.refinement import Candidate
 from flockd.flight.perception.detection.roi import Roi
 from flockd.flight.perception.maps import KnownSize, SceneMaps
-from flockd.flight.tracking import Prediction
-from flockd.sim.flock.truth_perception import _SIZE_M
 from tests.flight.pilot.flyer import Flyer, scenario_with
 
 
@@ -139,27 +137,12 @@ def test_range_is_size_over_apparent_size() -> None:
         assert math.isnan(replace(ESTIMATE, size_m=size_m).of_size(KnownSize(0.5, 0.02)).log_range)
 
 
-def test_a_size_that_was_learned_is_that_of_drones_that_look_as_those_did(flyer: Flyer) -> None:
-    """Those looked 0.9 m large and were found to be 0.6 m; one that looks 1.4 m large is of another type."""
+def test_a_size_that_was_learned_is_that_of_all(flyer: Flyer) -> None:
     taken = flyer.take_frames()
     (true,) = flyer.perception().observe(*taken, None).detections
-    for looks, factor in ((1.0, 0.7), (1.4, 0.7), (1.6, 1.0), (0.6, 1.0)):
-        learned = KnownSize(0.7 * true.size_m, 0.01, looks_m=looks * true.size_m)
-        (known,) = flyer.perception().observe(*taken, None, learned_size=learned).detections
-        assert known.range_m == pytest.approx(factor * true.range_m, rel=0.02)
-
-
-@pytest.mark.parametrize("size_known", [True, False])
-def test_where_a_track_is_predicted_its_own_size_counts(
-    flyer: Flyer, monkeypatch: pytest.MonkeyPatch, size_known: bool
-) -> None:
-    """The first stage misses the drone; the track is 0.7 times as far as the size that is judged would have it."""
-    for proposes in ("propose_instances", "propose_residuals"):
-        monkeypatch.setattr(f"flockd.flight.perception.detection.detector.{proposes}", lambda *_: [])
-    place = np.array([0.7 * 3.0, 0.0, 0.0])
-    track = Prediction(place, 0.01 * np.eye(3), 0.7 * _SIZE_M, 0.99, size_known=size_known)
-    found = flyer.perception().observe(*flyer.take_frames(), None, [track]).detections
-    assert [one.range_m for one in found] == pytest.approx([0.7 * 3.0] * size_known, rel=0.05)
+    learned = KnownSize(0.7 * true.size_m, 0.01)
+    (known,) = flyer.perception().observe(*taken, None, learned_size=learned).detections
+    assert known.range_m == pytest.approx(0.7 * true.range_m, rel=0.02)
 
 
 def test_a_flights_detections_are_ranged_by_the_size_that_was_said(flyer: Flyer) -> None:

@@ -1,0 +1,40 @@
+"""Drones of families that no network was trained on find out how large the others are, by sight (`flocking.size`)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flockd.core.config.document import Value
+from flockd.core.data import data_path
+from flockd.core.messages import FloatArray
+from flockd.review.flight_log.log import FlightLog
+from flockd.sim.flock.swarm import fly
+from flockd.sim.scenario import load_scenario
+
+
+def range_errors(log: FlightLog, drone: int, since_s: float, until_s: float) -> FloatArray:
+    """Relative, of the neighbours that one drone knows, each by the true one nearest in bearing."""
+    errors = []
+    for step, i, _, *place in log.tracked:
+        if int(i) == drone and since_s < log.time_s[int(step)] <= until_s:
+            others = np.delete(log.position[int(step)] - log.position[int(step), drone], drone, axis=0)
+            ranges, range_m = np.linalg.norm(others, axis=1), float(np.linalg.norm(place))
+            errors.append(range_m / ranges[np.argmax(others @ np.array(place) / ranges)] - 1)
+    return np.array(errors)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", [12, 13])
+def test_a_size_that_no_network_knows_is_found_in_twenty_seconds(family: int) -> None:
+    """By the first that weaves; its ranges are right from then on."""
+    overrides: dict[str, Value] = {"duration_s": 24.0, "world.drone_family": family, "drone.flocking.size": "learn"}
+    log = fly(load_scenario(data_path("config") / "paper_flight.yaml", overrides), pictured=False).log
+    sizes = log.metadata.sizes
+    drone = min(sizes, key=lambda one: sizes[one].since_s)
+    since_s = sizes[drone].since_s
+    before = range_errors(log, drone, 2.0, since_s - 0.1)
+    after = range_errors(log, drone, since_s - 0.1, 24.0)
+    assert since_s <= 20.5
+    assert abs(np.median(before)) > 0.15
+    assert abs(np.median(after)) < 0.05
