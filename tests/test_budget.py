@@ -21,15 +21,15 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_110,
-    "flockd/flight": 14_730,
-    "flockd/onboard": 9_940,
+    "flockd/flight": 14_090,
+    "flockd/onboard": 9_930,
     "flockd/fleet": 2_070,
     "flockd/ground": 3_820,
     "flockd/review": 3_170,
     "flockd/sim": 9_360,
     "flockd/campaign": 1_470,
     "flockd/cli": 3_550,
-    "tests": 38_660,
+    "tests": 38_340,
     "tools/checks": 2_150,
     "tools/docs": 860,
     "tools/measure": 1_170,
