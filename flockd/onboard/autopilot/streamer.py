@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from flockd.core.config.autopilot import AutopilotParameters
@@ -31,8 +30,6 @@ CLOSE_TIMEOUT_S = 1.0
 class StreamReport:
     """What the streamer has done since it was made."""
 
-    streaming: bool
-    """Begun and not ended; it may be silent all the same."""
     offboard: bool
     """This stream has seen the autopilot in offboard."""
     silence: str | None
@@ -40,8 +37,6 @@ class StreamReport:
     fault: str | None
     """Why the stream ended by itself, unless it was because the autopilot left offboard; None after `end`."""
     sent: int
-    refused: Mapping[str, int]
-    """Deadlines at which nothing was sent, by reason."""
     missed: int
     """Deadlines that passed unused because the thread did not get to run."""
 
@@ -78,7 +73,6 @@ class SetpointStreamer:
         self._silence: str | None = "not begun"
         self._sent = 0
         self._missed = 0
-        self._refused: Counter[str] = Counter()
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -117,25 +111,20 @@ class SetpointStreamer:
         stream = self._stream
         self._end_after_a_gap(stream)
         return StreamReport(
-            streaming=stream.ended is None,
             offboard=stream.offboard,
             silence=stream.ended or self._silence,
             fault=stream.fault,
             sent=self._sent,
-            refused=dict(self._refused),
             missed=self._missed,
         )
 
     def step(self) -> None:
-        """One deadline: sends a setpoint, or counts why not. The thread calls this."""
+        """One deadline: sends a setpoint, or keeps why not. The thread calls this."""
         stream = self._stream
         if stream.ended is not None:
             return
         self._end_after_a_gap(stream)  # before looking at the autopilot, whose failsafe is what follows from the gap
-        silence = stream.ended or self._watch(stream) or self._send_one(stream)
-        self._silence = silence
-        if silence is not None:
-            self._refused[silence] += 1
+        self._silence = stream.ended or self._watch(stream) or self._send_one(stream)
 
     def _end_after_a_gap(self, stream: _Stream) -> None:
         """Ends a stream whose last setpoint in offboard flight was sent too long ago."""

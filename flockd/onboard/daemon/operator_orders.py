@@ -69,7 +69,8 @@ class OperatorCommands:
     ) -> None:
         """``identity`` and ``clock``: those that the drone tells its watchers."""
         self._allowed, self._requests, self._missions, self._loop = allowed, requests, missions, loop
-        self._checks, self._clock = OrderChecks(identity, clock), clock
+        self._checks = OrderChecks(identity, clock)
+        self.recent = self._checks.recent
         self._taken = _Limited(log_event, burst=60, refill_s=1.0, clock=clock)
         self._refusals = _Limited(log_event, burst=10, refill_s=60.0, clock=clock)
         self.refused = 0
@@ -91,10 +92,6 @@ class OperatorCommands:
             return AnswerMessage(accepted=False, sentence=str(error))
         self._taken.tell(f"an operator asked for {command}: {ask['operator']}, order {ask['sequence']}")
         return AnswerMessage(accepted=True, sentence=f"{command} is being tried; the drone's state shows the result")
-
-    def recent(self) -> list[TakenOrderMessage]:
-        """See `OrderChecks.recent`."""
-        return self._checks.recent()
 
     def _apply(self, command: str, ask: AskMessage) -> None:
         """Raises ValueError with the reason for which it is refused."""

@@ -26,15 +26,8 @@ from flockd.onboard.daemon.pilot_loop import PilotLoop
 from flockd.onboard.daemon.supervisor_inputs import LoopLag, Thermometer
 from flockd.onboard.daemon.watched_networks import WatchedNetworks
 from flockd.onboard.sources import FrameSource
-from flockd.onboard.telemetry import TOPICS
+from flockd.onboard.telemetry import TOPICS, topics
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
-from flockd.onboard.telemetry.topics import (
-    CameraMessage,
-    ClockMessage,
-    ComputerMessage,
-    FlightMessage,
-    ReasonMessage,
-)
 
 START_POLL_S = 0.1
 START_MORE_S = 10.0
@@ -110,17 +103,17 @@ def _matters(decision: Decision) -> tuple[State, tuple[Event, ...]]:
     return decision.state, tuple(reason.event for reason in decision.reasons)
 
 
-def _flight_message(components: Components, now: float) -> FlightMessage:
+def _flight_message(components: Components, now: float) -> topics.FlightMessage:
     decision, status, stream = components.control.decision, components.link.status(), components.streamer.report()
     vehicle, refusals = components.link.vehicle_state(), components.refusals.current
     newest = components.pilot_loop.newest
     trim = None if newest is None else newest.output.command.trim
-    return FlightMessage(
+    return topics.FlightMessage(
         time_s=now,
         state=decision.state.value,
         reasons=[
-            *(ReasonMessage(event=reason.event.value, sentence=reason.sentence) for reason in decision.reasons),
-            *(ReasonMessage(event=refusal.reason, sentence=refusal.sentence) for refusal in refusals),
+            *(topics.ReasonMessage(event=reason.event.value, sentence=reason.sentence) for reason in decision.reasons),
+            *(topics.ReasonMessage(event=refusal.reason, sentence=refusal.sentence) for refusal in refusals),
         ],
         flight_mode=status.flight_mode,
         armed=None if math.isinf(status.heartbeat_age_s) else status.armed,
@@ -139,24 +132,22 @@ def _flight_message(components: Components, now: float) -> FlightMessage:
     )
 
 
-def _clock_message(components: Components, now: float) -> ClockMessage:
+def _clock_message(components: Components, now: float) -> topics.ClockMessage:
     clock = components.link.received.trusted_clock()
-    if clock is None:
-        return ClockMessage(time_s=now, offset_s=None, error_s=None, jitter_s=None, round_trip_s=None, age_s=None)
-    return ClockMessage(
+    return topics.ClockMessage(
         time_s=now,
-        offset_s=clock.offset_s,
-        error_s=clock.error_s,
-        jitter_s=clock.jitter_s,
-        round_trip_s=clock.round_trip_s,
-        age_s=now - clock.time_s,
+        offset_s=None if clock is None else clock.offset_s,
+        error_s=None if clock is None else clock.error_s,
+        jitter_s=None if clock is None else clock.jitter_s,
+        round_trip_s=None if clock is None else clock.round_trip_s,
+        age_s=None if clock is None else now - clock.time_s,
     )
 
 
-def _computer_message(components: Components, now: float) -> ComputerMessage:
+def _computer_message(components: Components, now: float) -> topics.ComputerMessage:
     noisy = components.pilot_loop.noisy_images
     cameras = {
-        name: CameraMessage(
+        name: topics.CameraMessage(
             age_s=camera.age_s,
             fault=camera.fault,
             counts={str(what): n for what, n in camera.counts.items()}
@@ -164,7 +155,7 @@ def _computer_message(components: Components, now: float) -> ComputerMessage:
         )
         for name, camera in components.source.status().items()
     }
-    return ComputerMessage(
+    return topics.ComputerMessage(
         time_s=now,
         cameras=cameras,
         load=components.pilot_loop.load(),

@@ -14,15 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flockd.core import ros_frames as rf
 from flockd.core.messages import FloatArray
-from flockd.core.ros_frames import (
-    attitude_in_ros,
-    attitude_of_angles,
-    enu_of_ned,
-    flu_of_frd,
-    quaternion_of,
-    scan_order,
-)
 from flockd.onboard.telemetry.topics import NeighbourMessage, ObstaclesMessage, StateMessage
 
 Tree = dict[str, Any]
@@ -88,7 +81,7 @@ def vector(values: Iterable[float]) -> Tree:
 
 def turn(R: FloatArray) -> Tree:
     """A Quaternion."""
-    return dict(zip("xyzw", quaternion_of(R).tolist(), strict=True))
+    return dict(zip("xyzw", rf.quaternion_of(R).tolist(), strict=True))
 
 
 def state_odometry(time_ns: int, names: Names, state: StateMessage) -> Tree | None:
@@ -102,15 +95,16 @@ def state_odometry(time_ns: int, names: Names, state: StateMessage) -> Tree | No
     if place is None or not _finite(state["height_m"]):
         return None
     position_ned, R_ned_frd = np.array([*place, -state["height_m"]]), attitude_of_state(state)
+    R_enu_flu = rf.attitude_in_ros(R_ned_frd)
     body = R_ned_frd.T @ velocity_ned if velocity_ned is not None else np.zeros(3)
     return {
         "header": header(time_ns, names.odom),
         "child_frame_id": names.base_link,
         "pose": {
-            "pose": {"position": vector(enu_of_ned(position_ned)), "orientation": turn(attitude_in_ros(R_ned_frd))},
+            "pose": {"position": vector(rf.enu_of_ned(position_ned)), "orientation": turn(R_enu_flu)},
         },
         "twist": {
-            "twist": {"linear": vector(flu_of_frd(body))},
+            "twist": {"linear": vector(rf.flu_of_frd(body))},
             "covariance": np.array([0.0 if velocity_ned is not None else -1.0, *np.zeros(35)]),
         },
     }
@@ -118,7 +112,7 @@ def state_odometry(time_ns: int, names: Names, state: StateMessage) -> Tree | No
 
 def attitude_of_state(state: StateMessage) -> FloatArray:
     """R_ned_frd (3, 3); level and to the north where it is not known."""
-    return attitude_of_angles(*(state[key] or 0.0 for key in ("roll_deg", "pitch_deg", "yaw_deg")))
+    return rf.attitude_of_angles(*(state[key] or 0.0 for key in ("roll_deg", "pitch_deg", "yaw_deg")))
 
 
 TRACK_FIELDS = (
@@ -133,7 +127,7 @@ _POINT = np.dtype([(name, {_FLOAT64: "<f8", _UINT32: "<u4", _UINT8: "u1"}[kind])
 
 def neighbour_poses(time_ns: int, names: Names, neighbours: Sequence[NeighbourMessage]) -> Tree:
     """Where each neighbour is from the drone, in the order of `tracks`. Which way it faces is not known."""
-    positions = [enu_of_ned(np.array(one["position_ned"])) for one in usable(neighbours)]
+    positions = [rf.enu_of_ned(np.array(one["position_ned"])) for one in usable(neighbours)]
     return {
         "header": header(time_ns, names.level),
         "poses": [{"position": vector(position), "orientation": LEVEL_TURN} for position in positions],
@@ -145,7 +139,7 @@ def tracks(time_ns: int, names: Names, neighbours: Sequence[NeighbourMessage]) -
     used = usable(neighbours)
     points = np.zeros(len(used), _POINT)
     for point, one in zip(points, used, strict=True):
-        place, velocity = (enu_of_ned(np.array(one[key])) for key in ("position_ned", "velocity_ned"))
+        place, velocity = (rf.enu_of_ned(np.array(one[key])) for key in ("position_ned", "velocity_ned"))
         point["x"], point["y"], point["z"] = place
         point["vx"], point["vy"], point["vz"] = velocity
         point["position_variance"] = one["position_sigma_m"] ** 2
@@ -189,7 +183,7 @@ def scan(time_ns: int, names: Names, obstacles: ObstaclesMessage) -> Tree | None
     count = len(obstacles["range_m"])
     if count == 0 or count % 4 or len(obstacles["seen_m"]) != count:
         return None
-    order = scan_order(count)
+    order = rf.scan_order(count)
     ranges, seen = (
         np.array([math.nan if one is None else one for one in obstacles[key]], np.float64)[order]
         for key in ("range_m", "seen_m")

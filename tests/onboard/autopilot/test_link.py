@@ -220,7 +220,7 @@ async def test_arming_taking_off_and_landing_from_offboard(port: int, address: s
             await flight.enter_offboard()
             await flight.link.land()
             await until(lambda: fake_autopilot.mode == "LAND")
-            await until(lambda: not flight.streamer.report().streaming)
+            await until(lambda: "left offboard" in (flight.streamer.report().silence or ""))
 
 
 def test_nobody_there_is_told_with_what_to_check(address: str) -> None:
