@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_110,
     "flockd/flight": 14_090,
-    "flockd/onboard": 9_930,
+    "flockd/onboard": 9_900,
     "flockd/fleet": 2_070,
     "flockd/ground": 3_820,
     "flockd/review": 3_170,
