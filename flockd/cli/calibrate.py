@@ -48,11 +48,6 @@ def _board_of(args: argparse.Namespace) -> BoardSpec:
         raise UsageError(str(error)) from None
 
 
-def _source_name(args: argparse.Namespace) -> str:
-    """Where the images come from."""
-    return str(args.source or args.config)
-
-
 def _add_camera(commands: Commands) -> None:
     """Adds the command."""
     examples = (
@@ -93,6 +88,7 @@ def _camera(args: argparse.Namespace) -> int:
     from flockd.ground.calibration.views import Collector
 
     collector = Collector(BoardFinder(board))
+    source = str(args.source or args.config)
     name, images = _images(args, lambda: is_enough(collector))
     out = args.out or Path(f"{name}.yaml")
     refuse_overwriting(args, out)
@@ -102,13 +98,10 @@ def _camera(args: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             if not images.live:  # else what was seen until then is enough
                 raise
-    lenses = fit_lenses(collector, args.model, _source_name(args))
+    lenses = fit_lenses(collector, args.model, source)
     lens = simplest_that_fits(lenses)
     measured = measured_today(
-        camera=images.identity,
-        source=_source_name(args),
-        views=len(lens.views),
-        residual_px=round(lens.rms_px, 4),
+        camera=images.identity, source=source, views=len(lens.views), residual_px=round(lens.rms_px, 4)
     )
     intrinsics = write_lens(name, lens, measured, out).model_dump(mode="json")
     numbers = lens_result(lens, lenses, collector)

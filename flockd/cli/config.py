@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.options import add_force, add_settings, permit, refuse_overwriting
 from flockd.cli.output import say, say_json, say_result
-from flockd.cli.parser import Commands, Parser, commands_of, flag, option
+from flockd.cli.parser import Commands, commands_of, flag, option
 from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, ModelError, UsageError
 
 if TYPE_CHECKING:
@@ -48,21 +48,16 @@ def add(commands: Commands) -> None:
     examples = ("flockd config card my_drone.yaml", "flockd config card /etc/flockd/drone.yaml > card.md")
     description = "Print the card of a flight day, as Markdown: limits, heights, what each fault does, who does what."
     option(commands("card", description, examples, _card), "FILE", "of a drone", Path)
-    examples = ("flockd config new drone my_drone.yaml", "flockd config new scenario my_flight.yaml")
-    commands = commands_of(
-        commands("new", "Write a commented file of a drone or a scenario, to be filled in.", examples)
-    )
     examples = (
-        "flockd config new drone my_drone.yaml",
         "flockd config new drone my_drone.yaml --set name=kite2 --set safety.first_flight_layer=2",
-    )
-    _add_new_options(commands("drone", "Write the configuration of a real drone.", examples, _new), "drone")
-    examples = (
-        "flockd config new scenario my_flight.yaml",
         "flockd config new scenario woods.yaml --set world.obstacles.kind=forest --set obstacles.enabled=true",
     )
-    description = "Write the configuration of a simulated flight."
-    _add_new_options(commands("scenario", description, examples, _new), "scenario")
+    description = "Write a commented file of a real drone or a simulated flight, to be filled in."
+    parser = commands("new", description, examples, _new)
+    parser.add_argument("kind", choices=("drone", "scenario"), help="of the file")
+    option(parser, "FILE", "to write", Path)
+    flag(parser, "--force", "overwrite the file if it exists")
+    add_settings(parser, "write this value")
 
 
 def _card(args: argparse.Namespace) -> int:
@@ -174,13 +169,6 @@ def _schema(args: argparse.Namespace) -> int:
     kinds = {"drone": DroneConfig.model_json_schema, "campaign": CampaignConfig.model_json_schema}
     say_json(kinds.get(args.kind, scenario_schema)())
     return ExitCode.DONE
-
-
-def _add_new_options(parser: Parser, kind: str) -> None:
-    option(parser, "FILE", "to write", Path)
-    flag(parser, "--force", "overwrite the file if it exists")
-    add_settings(parser, "write this value")
-    parser.set_defaults(kind=kind)
 
 
 def _new(args: argparse.Namespace) -> int:

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-_CAMERAS = "change them in the file; `flockd cameras --write FILE` writes the sections for what is plugged in"
-_MISSION, _DEFAULTS = "write `--set 'mission={kind: KIND}'`", "leave it out: nothing is asked"
 _OPTIONS = (
-    ("config new drone", "name", "write `--set name=NAME`"),
-    ("config new drone", "number", "write `--set safety.first_flight_layer=N`"),
-    ("config new drone", "cameras size field-of-view source", _CAMERAS),
-    ("config new drone", "autopilot", "write `--set autopilot.address=ADDRESS`"),
-    ("config new drone", "fleet", "write `--set telemetry.fleet=NAME`"),
-    ("config new drone", "mission", _MISSION),
-    ("config new drone", "defaults", _DEFAULTS),
-    ("config new scenario", "name", "write `--set scenario=NAME`"),
-    ("config new scenario", "drones", "leave it out, and say it to `flockd sim FILE --drones N`"),
-    ("config new scenario", "duration", "write `--set duration_s=S`"),
-    ("config new scenario", "mission", _MISSION),
-    ("config new scenario", "obstacles", "write `--set world.obstacles.kind=KIND --set obstacles.enabled=true`"),
-    ("config new scenario", "drone", "write `--set drone=FILE`"),
-    ("config new scenario", "defaults", _DEFAULTS),
+    ("config new", "name", "write `--set name=NAME`, of a scenario `--set scenario=NAME`"),
+    ("config new", "number", "write `--set safety.first_flight_layer=N`"),
+    (
+        "config new",
+        "cameras size field-of-view source",
+        "`flockd cameras --write FILE` writes those that are plugged in",
+    ),
+    ("config new", "autopilot", "write `--set autopilot.address=ADDRESS`"),
+    ("config new", "fleet", "write `--set telemetry.fleet=NAME`"),
+    ("config new", "mission", "write `--set 'mission={kind: KIND}'`"),
+    ("config new", "defaults", "leave it out: nothing is asked"),
+    ("config new", "drones", "leave it out, and say it to `flockd sim FILE --drones N`"),
+    ("config new", "duration", "write `--set duration_s=S`"),
+    ("config new", "obstacles", "write `--set world.obstacles.kind=KIND --set obstacles.enabled=true`"),
+    ("config new", "drone", "write `--set drone=FILE`"),
     ("doctor", "bench minutes", "run `flockd run` with propellers off, and watch `flockd status`"),
     ("doctor", "unit", "`systemd-analyze security flockd` judges the unit"),
     ("fleet", "recordings", "`flockd report FOLDER` writes a report of the recordings that plays them"),

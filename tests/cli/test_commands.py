@@ -145,7 +145,7 @@ def test_without_a_command_the_help_is_shown(command: list[str], capsys: Capture
         (["--no-browser"], 2, "--no-browser is for --live"),
         (["--telemetry-at", "tcp/127.0.0.1:7999"], 2, "--telemetry-at is for --telemetry, --live and --autopilot"),
         (["--speed-factor", "0.5"], 2, "--speed-factor is for real daemons"),
-        (["--autopilot", "fake", "--speed-factor", "0.01"], 2, "--speed-factor is not from 0.02 to 10"),
+        (["--autopilot", "fake", "--speed-factor", "0.01"], 2, "'0.01' is not a number from 0.02 to 10"),
         (["--autopilot", "fake", "--perception", "truth"], 2, "--perception truth has no meaning with real daemons"),
     ],
 )

@@ -12,7 +12,7 @@ import inspect
 import math
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.safety import SafetyParameters
 from flockd.core.consistency import CHECKS
 from flockd.core.services import SERVICES
-from flockd.flight.safety.policy import Barrier, Reaction, rules
+from flockd.flight.safety.policy import Barrier, rules
 from flockd.onboard.autopilot.refusal_reasons import REASONS
 from flockd.onboard.telemetry import topics
 from flockd.sim.scenario import scenario_schema
@@ -66,38 +66,25 @@ def pages() -> dict[str, str]:
     }
 
 
-# ---------------------------------------------------------------------------------------------------------- refusals
-
-
 def refusals_page() -> str:
     """Every reason to refuse arming or offboard, with what to do."""
-    lines = [
-        "# Why the autopilot refuses",
-        "",
-        NOTICE,
-        "",
+    return _page(
+        "Why the autopilot refuses",
         "Every reason that flockd knows for which an autopilot refuses to arm or to fly offboard, and what to do, in",
         "the words of `flockd status`, `flockd doctor` and the log.",
         "[Why not offboard](../real_drone.md#why-not-offboard) shows how they are found.",
         "Names that begin with `check_` or `commander_` are those of PX4's events; the others are flockd's.",
         "",
-        "| what is the matter | what to do | name |",
-        "|---|---|---|",
-        *(f"| {reason.what} | {reason.remedy} | `{name}` |" for name, reason in REASONS.items()),
-    ]
-    return "\n".join(lines) + "\n"
-
-
-# ----------------------------------------------------------------------------------------------------- configuration
+        *_table("what is the matter | what to do | name", ((r.what, r.remedy, f"`{n}`") for n, r in REASONS.items())),
+    )
 
 
 def configuration_page() -> str:
     """Every key of drone and scenario files."""
-    lines = [
-        "# Configuration reference",
-        "",
-        NOTICE,
-        "",
+    drone, scenario = DroneConfig.model_json_schema(), scenario_schema()
+    campaign = CampaignConfig.model_json_schema()
+    return _page(
+        "Configuration reference",
         "Every key of the three kinds of file: its default, its type and limits, and what it means. Units are part of",
         "the names: `_m` metres, `_s` seconds, `_deg` degrees, `_px` pixels, `_hz` per second. Ranges and positions",
         "of a drone are in the body frame, of a scenario in the world frame:",
@@ -107,16 +94,10 @@ def configuration_page() -> str:
         "The [shipped files](files.md) are good to start from. `flockd config check FILE` reports everything that is",
         "wrong in a file, and `flockd config schema drone` prints the JSON schema that this page was made from.",
         "",
-        "## Drone files",
-        "",
-    ]
-    drone = DroneConfig.model_json_schema()
-    lines += _described(drone) + _section(drone, drone, "")
-    scenario = scenario_schema()
-    lines += ["## Scenario files", "", *_described(scenario), *_section(scenario, scenario, "", level=3)]
-    campaign = CampaignConfig.model_json_schema()
-    lines += ["## Campaign files", "", *_described(campaign), *_section(campaign, campaign, "", level=3)]
-    return "\n".join(lines).rstrip() + "\n"
+        *("## Drone files", "", *_described(drone), *_section(drone, drone, "")),
+        *("## Scenario files", "", *_described(scenario), *_section(scenario, scenario, "")),
+        *("## Campaign files", "", *_described(campaign), *_section(campaign, campaign, "")),
+    )
 
 
 def _described(schema: Mapping[str, Any]) -> list[str]:
@@ -132,16 +113,14 @@ def _section(root: Mapping[str, Any], schema: Mapping[str, Any], path: str, leve
         inner, many = _inner(root, value)
         dotted = f"{path}.{key}" if path else key
         if inner is None:
-            rows.append((key, _default(key, value, required), _meaning(value)))
+            rows.append((f"`{key}`", _default(key, value, required), _meaning(value)))
             continue
         shown = f"{dotted}{many}"
         kind = {"": "section", "[]": "list of sections", ".KEY": "section for each key"}[many]
-        rows.append((key, _default(key, value, required), f"{kind}, see [`{shown}`](#{_slug(shown)})"))
+        rows.append((f"`{key}`", _default(key, value, required), f"{kind}, see [`{shown}`](#{_slug(shown)})"))
         below += [f"{'#' * level} `{shown}`", "", *_described({**inner, **_own_description(value)})]
         below += _section(root, inner, shown, level + 1 if level < 5 else level)
-    table = ["| key | default | meaning |", "|---|---|---|"]
-    table += [f"| `{key}` | {default} | {meaning} |" for key, default, meaning in rows]
-    return [*table, "", *below]
+    return [*_table("key | default | meaning", rows), *below]
 
 
 def _own_description(value: Mapping[str, Any]) -> dict[str, Any]:
@@ -211,29 +190,18 @@ def _kind(value: Mapping[str, Any]) -> str:
     return " ".join([kind.get(value.get("type", ""), "value"), ", ".join(limits)]).strip()
 
 
-# ---------------------------------------------------------------------------------------------------------- commands
-
-
 def commands_page() -> str:
     """Every command with its options and examples."""
     codes = EXIT_CODES.splitlines()[1:]
-    lines = [
-        "# Command-line reference",
-        "",
-        NOTICE,
-        "",
+    return _page(
+        "Command-line reference",
         "Every command prints this with `--help`. `--json` prints for programs what is otherwise printed for people.",
         "",
-        "| exit code | meaning |",
-        "|---|---|",
-        *(f"| {code} | {meaning.strip()} |" for code, meaning in (line.split(maxsplit=1) for line in codes)),
-        "",
+        *_table("exit code | meaning", (map(str.strip, line.split(maxsplit=1)) for line in codes)),
         "No command overwrites a file or an earlier flight, unless `--force` is given.",
         "",
-    ]
-    for command in _leaves(_parser()):
-        lines += _command(command)
-    return "\n".join(lines).rstrip() + "\n"
+        *(line for command in _leaves(_parser()) for line in _command(command)),
+    )
 
 
 def _leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
@@ -257,9 +225,7 @@ def _command(parser: argparse.ArgumentParser) -> list[str]:
         words.append("[OPTIONS]")
     lines = [f"## {parser.prog}", "", parser.description or "", "", "```", " ".join(words), "```", ""]
     if shown:
-        lines += ["| option | meaning |", "|---|---|"]
-        lines += [f"| {_named(action)} | {_help(parser, action)} |" for action in shown]
-        lines.append("")
+        lines += _table("option | meaning", ((_named(action), _help(parser, action)) for action in shown))
     examples, _, notes = (parser.epilog or "").partition("\n\n")
     commands = [line.strip() for line in examples.splitlines()[1:]]
     if commands:
@@ -297,39 +263,31 @@ def _help(parser: argparse.ArgumentParser, action: argparse.Action) -> str:
     return text
 
 
-# --------------------------------------------------------------------------------------------------------- telemetry
-
-
 def messages_page() -> str:
     """Topics and the fields of their messages."""
-    lines = [
-        "# Telemetry messages",
-        "",
-        NOTICE,
-        "",
+    rows, types = [], []
+    for topic in topics.TOPICS.values():
+        name = topic.type.__name__
+        rate = "on events" if topic.rate_hz is None else f"{topic.rate_hz:g}"
+        stale = "never" if topic.stale_after_s is None else f"{topic.stale_after_s:g}"
+        rows.append((f"`{topic.key}`", f"[{name}](#{_slug(name)})", rate, stale, "yes" if topic.recorded else "no"))
+    for node in ast.parse(inspect.getsource(topics)).body:
+        if isinstance(node, ast.ClassDef) and any(isinstance(b, ast.Name) and b.id == "TypedDict" for b in node.bases):
+            types += [f"## {node.name}", "", _one_line(ast.get_docstring(node) or ""), ""]
+            fields = (
+                (f"`{name}`", f"`{kind.replace(' | None', ' or null')}`", text) for name, kind, text in _fields(node)
+            )
+            types += _table("field | type | meaning", fields)
+    return _page(
+        "Telemetry messages",
         "A key is `flockd/v1/<fleet>/<drone>/<topic>`; a message is a JSON object in UTF-8. Every number is finite or",
         "`null`. Vectors are lists in [NED](../concepts/pipeline.md#coordinate-frames).",
         "Times are seconds on the drone's monotonic clock.",
         "How to connect: [Telemetry](../fleet_page.md#telemetry).",
         "",
-        "| topic | message | expected rate, Hz | stale after, s | recorded |",
-        "|---|---|---|---|---|",
-    ]
-    for topic in topics.TOPICS.values():
-        name = topic.type.__name__
-        rate = "on events" if topic.rate_hz is None else f"{topic.rate_hz:g}"
-        stale = "never" if topic.stale_after_s is None else f"{topic.stale_after_s:g}"
-        recorded = "yes" if topic.recorded else "no"
-        lines.append(f"| `{topic.key}` | [{name}](#{_slug(name)}) | {rate} | {stale} | {recorded} |")
-    lines.append("")
-    for node in ast.parse(inspect.getsource(topics)).body:
-        if isinstance(node, ast.ClassDef) and any(isinstance(b, ast.Name) and b.id == "TypedDict" for b in node.bases):
-            lines += [f"## {node.name}", "", _one_line(ast.get_docstring(node) or ""), ""]
-            lines += ["| field | type | meaning |", "|---|---|---|"]
-            for name, kind, text in _fields(node):
-                lines.append(f"| `{name}` | `{kind.replace(' | None', ' or null')}` | {text} |")
-            lines.append("")
-    return "\n".join(lines).rstrip() + "\n"
+        *_table("topic | message | expected rate, Hz | stale after, s | recorded", rows),
+        *types,
+    )
 
 
 def _fields(node: ast.ClassDef) -> Iterator[tuple[str, str, str]]:
@@ -342,88 +300,83 @@ def _fields(node: ast.ClassDef) -> Iterator[tuple[str, str, str]]:
             yield here.target.id, ast.unparse(here.annotation), _one_line(text)
 
 
-# ------------------------------------------------------------------------------------------------------------ faults
-
-
 BEFORE = {Barrier.NONE: "may fly", Barrier.WAIT: "waits until it has passed", Barrier.LATCH: "waits for the ground"}
 
 
 def faults_page() -> str:
     """Every event that the supervisor knows, and its rule."""
-    lines = [
-        "# Faults and reactions",
-        "",
-        NOTICE,
-        "",
+    known = rules(SafetyParameters())
+    events = {event.value for event in known}
+
+    def told(reaction: str) -> str:
+        return f"`{reaction}`" if reaction in events else reaction
+
+    def keys(names: Sequence[str]) -> str:
+        return ", ".join(f"`{name}`" for name in names)
+
+    rows = []
+    for event, rule in known.items():
+        later = "" if math.isinf(rule.after_s) else f"{rule.later.name.lower()} after {rule.after_s:g} s"
+        rows.append((f"`{event.value}`", BEFORE[rule.barrier], rule.reaction.name.lower(), later))
+    return _page(
+        "Faults and reactions",
         "Every event that the supervisor notices, by its name in telemetry, with the defaults of",
         "[`safety`](configuration.md#safety). [Safety](../safety.md) explains the columns.",
         "",
-        "| event | before the flight | in flight | if it lasts |",
-        "|---|---|---|---|",
-    ]
-    for event, rule in rules(SafetyParameters()).items():
-        later = "" if math.isinf(rule.after_s) else f"{_reaction(rule.later)} after {rule.after_s:g} s"
-        lines.append(f"| `{event.value}` | {BEFORE[rule.barrier]} | {_reaction(rule.reaction)} | {later} |")
-    lines += [
-        "",
+        *_table("event | before the flight | in flight | if it lasts", rows),
         "## Time-outs",
         "",
         "How old each message may become, and what is done then. A reaction in code type is an event of the table",
         "above. The keys of the [configuration](configuration.md) change a time-out for one drone.",
         "",
-        "| message | rate, Hz | time-out | reaction | keys |",
-        "|---|---|---|---|---|",
-    ]
-    events = {event.value for event in rules(SafetyParameters())}
-    for one in SERVICES:
-        reaction = f"`{one.reaction}`" if one.reaction in events else one.reaction
-        keys = ", ".join(f"`{key}`" for key in one.keys)
-        lines.append(f"| {one.message} | {one.rate_hz:g} | {one.timeout:g} {one.unit} | {reaction} | {keys} |")
-    lines += [
-        "",
+        *_table(
+            "message | rate, Hz | time-out | reaction | keys",
+            (
+                (s.message, f"{s.rate_hz:g}", f"{s.timeout:g} {s.unit}", told(s.reaction), keys(s.keys))
+                for s in SERVICES
+            ),
+        ),
         "## Consistency of sensors",
         "",
         "What one source says is compared with what the others lead to expect, as an extended Kalman filter does with",
         "its innovations. SD: standard deviations of what is expected.",
         "",
-        "| compared | limit | beyond it | where the limit comes from | begins with this default |",
-        "|---|---|---|---|---|",
-    ]
-    for check in CHECKS:
-        reaction = f"`{check.reaction}`" if check.reaction in events else check.reaction
-        keys = ", ".join(f"`{key}`" for key in check.keys)
-        lines.append(f"| {check.compared} | {check.limit:g} {check.unit} | {reaction} | {check.source} | {keys} |")
-    return "\n".join([*lines, *_stories()]) + "\n"
+        *_table(
+            "compared | limit | beyond it | where the limit comes from | begins with this default",
+            ((c.compared, f"{c.limit:g} {c.unit}", told(c.reaction), c.source, keys(c.keys)) for c in CHECKS),
+        ),
+        *_stories(),
+    )
 
 
 def _stories() -> list[str]:
     """The list of faults, and the tests that their markers name."""
-    lines = [
-        "",
+    known, rows = stories(), []
+    for name, fault in faults().items():
+        told = [story for story in known if story.fault == name]
+        limits = [story.within_s for story in told if story.within_s is not None]
+        tests = ", ".join(f"`{story.test.removeprefix('tests/')}`" for story in told)
+        within, runs = f"{max(limits):g}" if limits else "", ", ".join(sorted({story.runs for story in told}))
+        rows.append((str(fault.row), f"`{name}`", fault.fault, fault.reaction, within, runs, tests))
+    return [
         "## Stories",
         "",
         "The faults that flockd has to survive, by the name that `pytest -m fault --fault NAME` takes, and the tests",
         "that inject each. s: the longest reaction that they allow. Run: by CI (`.ci/run`), by hand (`make flights`),",
         "or with PX4.",
         "",
-        "| | fault | what happens | what flockd does | s | run | shown by |",
-        "|---|---|---|---|---|---|---|",
+        *_table("| fault | what happens | what flockd does | s | run | shown by", rows),
     ]
-    known = stories()
-    for name, fault in faults().items():
-        told = [story for story in known if story.fault == name]
-        limits = [story.within_s for story in told if story.within_s is not None]
-        tests = ", ".join(f"`{story.test.removeprefix('tests/')}`" for story in told)
-        within, runs = f"{max(limits):g}" if limits else "", ", ".join(sorted({story.runs for story in told}))
-        lines.append(f"| {fault.row} | `{name}` | {fault.fault} | {fault.reaction} | {within} | {runs} | {tests} |")
-    return lines
 
 
-def _reaction(reaction: Reaction) -> str:
-    return reaction.name.lower()
+def _page(title: str, *lines: str) -> str:
+    return "\n".join([f"# {title}", "", NOTICE, "", *lines]).rstrip() + "\n"
 
 
-# -------------------------------------------------------------------------------------------------------------- text
+def _table(columns: str, rows: Iterable[Iterable[str]]) -> list[str]:
+    """With an empty line after it; ``columns``: their heads, with | between them."""
+    count = columns.count("|") + 1
+    return [f"| {columns} |", "|---" * count + "|", *(f"| {' | '.join(row)} |" for row in rows), ""]
 
 
 def _one_line(text: str) -> str:

@@ -53,12 +53,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--like", type=Path, help="manifest that says all that is not measured here")
     parser.add_argument("--half", action="store_true", help="store weights in 16 bits: half the file")
-    parser.add_argument(
-        "--begun-with",
-        type=Path,
-        metavar="CHECKPOINT",
-        help="what the run was started with, its start.pt: the mean of both weights is exported",
-    )
+    with_its_start = "the run's start.pt: the mean of both weights is exported"
+    parser.add_argument("--begun-with", type=Path, metavar="CHECKPOINT", help=with_its_start)
     parser.add_argument("--share", type=float, default=BEGUN_WITH_SHARE, help="of --begun-with in that mean")
     arguments = parser.parse_args()
     net = NETWORKS[arguments.network]()

@@ -41,12 +41,7 @@ def main() -> None:
     """Quantise one network."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("manifest", type=Path, help="of the float network")
-    parser.add_argument(
-        "--data",
-        type=Path,
-        required=True,
-        help="folder of tools.training.render_training_data, or tools.training.render_drone_crops",
-    )
+    parser.add_argument("--data", type=Path, required=True, help="of render_training_data or render_drone_crops")
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
     path, differences = quantise(arguments.manifest, arguments.data, arguments.out)
