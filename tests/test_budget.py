@@ -28,13 +28,13 @@ LINES = {
     "flockd/review": 3_170,
     "flockd/sim": 9_360,
     "flockd/campaign": 1_470,
-    "flockd/cli": 3_550,
+    "flockd/cli": 3_530,
     "tests": 38_340,
     "tools/checks": 2_150,
-    "tools/docs": 860,
+    "tools/docs": 810,
     "tools/measure": 1_170,
     "tools/release": 550,
-    "tools/training": 4_340,
+    "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
 FILES = {"flockd": 357}
