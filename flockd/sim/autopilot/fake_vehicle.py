@@ -86,7 +86,7 @@ class PointMass:
     def __init__(self, position: FloatArray, yaw_rad: float = 0.0) -> None:
         """At rest at `position`, (3,) metres NED."""
         self._place, self._velocity = position.astype(float)[None], np.zeros((1, 3))
-        self._level, self._now_s, self._yaw_rad = vehicles.Motion(VehicleConfig(), [0], 1), 0.0, yaw_rad
+        self._level, self._now_s, self._yaw_rad = vehicles.Motion(VehicleConfig(), 0, 1), 0.0, yaw_rad
 
     def __call__(self, demand: Demand, interval_s: float) -> MotionState:
         """Advances it by ``interval_s`` seconds."""

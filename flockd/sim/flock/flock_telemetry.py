@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Self
 
@@ -222,22 +222,6 @@ class FlockTelemetry:
                 self._requests[drone] = command
             else:
                 self._orders[drone] = order
-
-
-class RealTime:
-    """Waits until as much real time has passed as simulated time."""
-
-    def __init__(
-        self, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
-    ) -> None:
-        self._clock, self._sleep = clock, sleep
-        self._began_s: float | None = None
-
-    def wait(self, time_s: float) -> None:
-        """Until `time_s` of the flight."""
-        if self._began_s is None:
-            self._began_s = self._clock() - time_s
-        self._sleep(max(0.0, self._began_s + time_s - self._clock()))
 
 
 class _DrawnOnRequest:

@@ -30,7 +30,7 @@ from flockd.sim.flock.exact_states import (
     step_times,
     vehicles_of,
 )
-from flockd.sim.flock.flock_telemetry import FlockTelemetry, RealTime
+from flockd.sim.flock.flock_telemetry import FlockTelemetry
 from flockd.sim.flock.pilots import Pilots, Stepped
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.pose_trail import LateAttitude
@@ -90,17 +90,18 @@ def fly(
     vehicles = vehicles_of(scenario)
     chosen = key_frame_steps(len(times)) if pictured else set()
     key_frames: list[KeyFrame] = []
-    flown, pace = 0, RealTime()
+    flown = 0
     companion = None
     pilots: ExactStatePilots | VisionPilots = ExactStatePilots(scenario, shown, gated=gated)
     if perception == "learned":
         companion = fly_exact_states(scenario, gated=gated)[1:]
         pilots = VisionPilots(scenario, swap, shown, recorders, companion, preparing, threads)
     preparing(_PREPARATIONS, _PREPARATIONS)
+    first_s = time.perf_counter()
     try:
         for step, time_s in enumerate(times):
             if shown is not None and companion is None:
-                pace.wait(float(time_s))
+                time.sleep(max(0.0, first_s + float(time_s) - time.perf_counter()))
             builder.add_truth(step, vehicles.position, vehicles.velocity, vehicles.R_ned_body)
             commands = pilots.step(step, float(time_s), vehicles, builder, pictured=step in chosen)
             builder.add_missions(step, commands.desired, commands.missions)

@@ -55,7 +55,7 @@ REFERENCE_DEG = (1.0, 1.0)
 
 
 class Motion:
-    """How the vehicles of a batch of flights move; remembers what gusts added to their velocities.
+    """How vehicles move; remembers what gusts added to their velocities.
 
     Horizontal velocity follows a setpoint, after a dead time, as a first-order lag of limited acceleration and jerk.
     With the same time constant it comes back from what gusts add, as hard as the vehicle can lean: an autopilot limits
@@ -63,22 +63,21 @@ class Motion:
     damped controller of limited climb, down to the ground at z = 0.
     """
 
-    def __init__(self, config: VehicleConfig, seeds: Sequence[int], drones: int) -> None:
-        """`seeds` rule the gusts of the flights, of so many `drones` each."""
-        self._config, self._seeds, self._shape = config, seeds, (len(seeds), drones, 3)
-        self._blown = np.zeros((len(seeds) * drones, 2))
+    def __init__(self, config: VehicleConfig, seed: int, drones: int) -> None:
+        """`seed` rules the gusts."""
+        self._config, self._seed = config, seed
+        self._blown = np.zeros((drones, 2))
         """What of the velocity gusts added, m/s."""
         self._waiting: deque[tuple[float, FloatArray]] = deque()
         """Setpoints (n, 2) m/s that are not answered yet, and when they are."""
         self._answered: FloatArray | None = None
-        self._followed = np.zeros((len(seeds) * drones, 2))
+        self._followed = np.zeros((drones, 2))
         """Acceleration towards the setpoints, m/s^2."""
         self.blow(config.gust_m_s)
 
     def blow(self, gust_m_s: float) -> None:
         """From now on gusts are as strong as that."""
-        config = self._config.model_copy(update={"gust_m_s": gust_m_s})
-        self._gusts = GustField(np.stack([GustField.of(config, seed).waves for seed in self._seeds]))
+        self._gusts = GustField.of(self._config.model_copy(update={"gust_m_s": gust_m_s}), self._seed)
 
     def step(
         self, now_s: float, dt_s: float, place: FloatArray, velocity: FloatArray, setpoints: FloatArray
@@ -93,7 +92,7 @@ class Motion:
         wanted = limit_norms((setpoints - (velocity[:, :2] - self._blown)) * answer_per_s, config.max_acceleration_m_s2)
         followed = self._followed = self._followed + limit_norms(wanted - self._followed, config.max_jerk_m_s3 * dt_s)
         steered = limit_norms(followed - self._blown * answer_per_s, MAX_LEAN_M_S2)
-        push = self._gusts.push(now_s, place.reshape(self._shape)).reshape(-1, 2)
+        push = self._gusts.push(now_s, place)
         self._blown = self._blown + (steered - followed + push) * dt_s
         acceleration = steered + push
         place[:, :2] += velocity[:, :2] * dt_s + acceleration * (dt_s**2 / 2)
@@ -108,25 +107,6 @@ class Motion:
         while self._waiting and self._waiting[0][0] <= now_s + min(dt_s, self._config.dead_time_s) + _SAME_TIME_S:
             self._answered = self._waiting.popleft()[1]
         return self._answered
-
-    def fly(
-        self, begin_s: float, interval_s: float, states: FloatArray, setpoints: FloatArray, heights: FloatArray
-    ) -> None:
-        """Moves `states` (6, flights, n) in place for `interval_s`, towards `setpoints` (2, flights, n) m/s.
-
-        `heights` (flights, n) m, up positive; NaN: as high as now.
-        """
-        count = substeps(interval_s)
-        wanted, place, velocity = (part.reshape(len(part), -1).T for part in (setpoints, states[:3], states[3:]))
-        dt_s = interval_s / count
-        for substep in range(count):
-            self.step(begin_s + substep * dt_s, dt_s, place, velocity, wanted)
-            climb(dt_s, place[:, 2], velocity[:, 2], heights.reshape(-1))
-
-
-def substeps(interval_s: float) -> int:
-    """Into how many short steps an interval is cut."""
-    return math.ceil(interval_s / _MAX_SUBSTEP_S - 1e-9)
 
 
 def climb(
@@ -168,7 +148,7 @@ class Vehicles:
             self.errors = tuple(EstimateErrors(sensors, seed=seed, drone=i) for i in range(n))
         self._by_estimate = [i for i, start in enumerate(starts) if not start.by_hand and self.errors]
         self._config, self._gust_m_s, self._time_s = config, config.gust_m_s, 0.0
-        self._motion = Motion(config, [seed], n)
+        self._motion = Motion(config, seed, n)
         self._wind = np.array(config.wind_m_s)
         self._yaw = np.full(n, yaw_rad)
         self.position = np.array([start.position_m for start in starts])
@@ -208,7 +188,7 @@ class Vehicles:
             yaw_setpoints[some] -= [of.attitude[2] for of in wrong]
             heights = heights.copy()
             heights[some] -= [of.height_m for of in wrong]
-        count = substeps(interval_s)
+        count = math.ceil(interval_s / _MAX_SUBSTEP_S - 1e-9)
         for _ in range(count):
             self._substep(setpoints, yaw_setpoints, interval_s / count, heights)
 

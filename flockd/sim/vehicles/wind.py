@@ -26,7 +26,7 @@ class GustField(NamedTuple):
     """
 
     waves: FloatArray
-    """(..., m, 8) of each: the wave vector (1/m, NED), the angular frequency (1/s), and the pushes (m/s^2, north and
+    """(m, 8) of each: the wave vector (1/m, NED), the angular frequency (1/s), and the pushes (m/s^2, north and
     east) that go with its cosine and its sine. (0, 8): no gusts."""
 
     @classmethod
@@ -46,9 +46,9 @@ class GustField(NamedTuple):
         return cls(np.column_stack([k, k @ wind_m_s, across[0, :, :2], across[1, :, :2]]))
 
     def push(self, time_s: float, positions: FloatArray) -> FloatArray:
-        """(..., n, 2) m/s^2 north and east at places (..., n, 3) m NED."""
-        phase = positions @ self.waves[..., :3].mT - time_s * self.waves[..., None, :, 3]
-        pushes: FloatArray = np.cos(phase) @ self.waves[..., 4:6] + np.sin(phase) @ self.waves[..., 6:]
+        """(n, 2) m/s^2 north and east at places (n, 3) m NED."""
+        phase = positions @ self.waves[:, :3].T - time_s * self.waves[:, 3]
+        pushes: FloatArray = np.cos(phase) @ self.waves[:, 4:6] + np.sin(phase) @ self.waves[:, 6:]
         return pushes
 
 

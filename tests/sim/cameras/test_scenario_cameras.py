@@ -139,13 +139,6 @@ def test_a_campaigns_preset_takes_the_place_of_its_scenarios() -> None:
     assert flown["gain_8"] == CamerasConfig.model_validate({"noise": {"gain": 8.0}, **AS_MOUNTED})
 
 
-def test_campaigns_may_vary_a_single_fault() -> None:
-    changes: dict[str, str | float] = {"cameras.preset": "realistic", "cameras.noise.gain": 16.0}
-    cameras = load_scenario(CONFIG / "paper_flight.yaml", changes).cameras
-    assert cameras is not None
-    assert (cameras.noise.gain, cameras.noise.full_well_e) == (16.0, 4300.0)
-
-
 FAULTS: Mapping[str, tuple[Mapping[str, Mapping[str, Any]], float]] = {
     "exposure": ({"shutter": {"exposure_s": 0.03}}, 0.1),
     "readout": ({"shutter": {"readout_s": 0.05}}, 0.1),

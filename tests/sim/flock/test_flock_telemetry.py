@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flockd.core.data import data_path
-from flockd.sim.flock.flock_telemetry import RealTime, Repeater
+from flockd.sim.flock.flock_telemetry import Repeater
 from flockd.sim.flock.start import with_drones
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import ScenarioConfig, load_scenario
@@ -25,7 +25,7 @@ def scenario(duration_s: float) -> ScenarioConfig:
 
 
 def test_a_flock_on_exact_states_is_seen_and_goes_where_it_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(RealTime, "wait", lambda self, time_s: None)
+    monkeypatch.setattr("flockd.sim.flock.swarm.time.sleep", lambda seconds: None)
     watching = Watching()
     flown = scenario(60.0)
     shown = watching.shown(flown)
@@ -56,17 +56,8 @@ def test_a_flock_on_exact_states_is_seen_and_goes_where_it_is_sent(monkeypatch: 
     assert picture[:2] == b"\xff\xd8", "a JPEG"
 
 
-def test_real_time_is_waited_for_and_never_caught_up_with() -> None:
-    slept: list[float] = []
-    clock = iter((100.0, 100.0, 100.2, 101.7))
-    pace = RealTime(lambda: next(clock), slept.append)
-    for time_s in (0.0, 0.5, 1.0):
-        pace.wait(time_s)
-    assert slept == pytest.approx([0.0, 0.3, 0.0])
-
-
 def test_a_drone_is_held_where_it_would_stop_and_flies_on_when_it_is_resumed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(RealTime, "wait", lambda self, time_s: None)
+    monkeypatch.setattr("flockd.sim.flock.swarm.time.sleep", lambda seconds: None)
     watching, flown = Watching(), scenario(30.0)
 
     def ask_when_due(done: int, total: int) -> None:

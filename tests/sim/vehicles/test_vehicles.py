@@ -95,25 +95,6 @@ def test_yaw_turns_the_short_way_and_no_faster_than_allowed() -> None:
     assert _yaw_pitch_roll_deg(vehicles.R_ned_body[0])[0] == pytest.approx(-100.0, abs=0.01)
 
 
-def test_a_small_turn_is_a_first_order_lag() -> None:
-    vehicles = Vehicles([START], VehicleConfig(yaw_time_constant_s=0.4))
-    vehicles.step(np.zeros((1, 2)), np.array([0.1]), 0.4)
-    assert math.radians(_yaw_pitch_roll_deg(vehicles.R_ned_body[0])[0]) == pytest.approx(0.1 * (1 - math.exp(-1)))
-
-
-def test_nose_down_to_the_north_and_right_side_down_to_the_east() -> None:
-    config = AT_ONCE.model_copy(update={"tilt_time_constant_s": 0.0})
-    north, east = (Vehicles([START], config) for _ in range(2))
-    north.step(np.array([[1.0, 0.0]]), NO_YAW, 0.02)
-    east.step(np.array([[0.0, 1.0]]), NO_YAW, 0.02)
-    yaw, pitch, roll = _yaw_pitch_roll_deg(north.R_ned_body[0])
-    assert pitch < -15  # about 4 m/s^2 against 9.81
-    assert (yaw, roll) == pytest.approx((0, 0), abs=1e-9)
-    yaw, pitch, roll = _yaw_pitch_roll_deg(east.R_ned_body[0])
-    assert roll > 15
-    assert (yaw, pitch) == pytest.approx((0, 0), abs=1e-9)
-
-
 def test_thrust_carries_the_weight_and_accelerates() -> None:
     rng = np.random.default_rng(0)
     thrust, yaw = rng.uniform(-4, 4, (20, 2)), rng.uniform(-3, 3, 20)
@@ -150,16 +131,6 @@ def test_gusts_add_the_velocity_they_are_configured_for() -> None:
                 spread.append(vehicles.velocity[:, :2] - 1.0)
     assert np.std(spread) == pytest.approx(0.3, rel=0.06)
     assert abs(np.mean(spread)) < 0.03
-
-
-def test_gusts_depend_on_the_seed_alone() -> None:
-    flown = []
-    for seed in (1, 1, 2):
-        vehicles = Vehicles([START], VehicleConfig(gust_m_s=0.3), seed=seed)
-        vehicles.step(np.zeros((1, 2)), NO_YAW, 2.0)
-        flown.append(vehicles.position)
-    np.testing.assert_array_equal(flown[0], flown[1])
-    assert np.any(flown[0] != flown[2])
 
 
 def test_an_autopilot_without_errors_gives_true_values() -> None:

@@ -35,7 +35,6 @@ def test_hills_are_as_high_and_as_steep_as_they_may_be_and_level_where_drones_be
     np.testing.assert_array_equal(heights[0], 0.0)
 
 
-@pytest.mark.slow
 def test_the_range_is_that_of_the_ground_which_is_drawn(world: World) -> None:
     """A camera along the body's down axis: the depth of its middle pixel is the range."""
     renderer, random = Renderer(world, []), np.random.default_rng(0)
