@@ -176,6 +176,8 @@ class Gate:
                 target = limit_norm(slowed, request.fastest_m_s)
                 if (target != wanted.velocity).any():
                     objections.append(Objection.SLOWED)
+        if permission.action is Action.OFFER:  # whatever flies it: the takeover begins at the velocity that it has
+            self._last = None
         velocity = self._within_acceleration(target, now_s, around)
         sent = self._within_space(velocity, permission.action, around, objections)
         wanted_m = request.height_m if wanted.height_m is None else wanted.height_m
@@ -208,6 +210,10 @@ class Gate:
             (
                 Objection.NEIGHBOUR_UNKNOWN,
                 not (np.isfinite(around.neighbours).all() and np.isfinite(around.neighbour_velocities).all()),
+            ),
+            (
+                Objection.NEIGHBOUR_UNKNOWN,
+                around.neighbour_margins is not None and not (around.neighbour_margins > -math.inf).all(),
             ),
             (Objection.OBSTACLE_UNKNOWN, not np.isfinite(around.obstacles).all()),
         )

@@ -15,8 +15,10 @@ def nearest_within(velocity: FloatArray, directions: FloatArray, limits: FloatAr
     """The nearest velocity whose part along each direction, (n, 2) of length 1, is within its limit, (n,), 0 or more.
 
     In the plane that is the velocity itself, or its foot on the line where one limit is reached, or the point where
-    two such lines cross. Standstill always fits, so that the result is never longer than the velocity.
+    two such lines cross. Standstill always fits, so that the result is never longer than the velocity. A limit that is
+    not a number counts as 0.
     """
+    limits = np.nan_to_num(limits, nan=0.0, posinf=np.inf)
     over = directions @ velocity - limits
     if (over <= 0).all():
         return velocity

@@ -211,6 +211,9 @@ def test_a_heading_that_has_turned_on_and_on_is_the_same_heading(turns: int) -> 
         ({"neighbours": [[9.0, 0.0, 0.0], [math.nan, 5.0, 0.0]]}, Objection.NEIGHBOUR_UNKNOWN),
         ({"neighbours": [[9.0, 0.0, math.inf]]}, Objection.NEIGHBOUR_UNKNOWN),
         ({"neighbours": [[9.0, 0, 0]], "neighbour_velocities": [[0.0, math.nan]]}, Objection.NEIGHBOUR_UNKNOWN),
+        ({"neighbours": [[9.0, 0, 0]], "neighbour_margins": [[math.nan, 0.1]]}, Objection.NEIGHBOUR_UNKNOWN),
+        ({"neighbours": [[9.0, 0, 0]], "neighbour_margins": [[0.1, math.nan]]}, Objection.NEIGHBOUR_UNKNOWN),
+        ({"neighbours": [[9.0, 0, 0]], "neighbour_margins": [[-math.inf, 0.0]]}, Objection.NEIGHBOUR_UNKNOWN),
         ({"obstacles": [[5.0, 0.0], [math.nan, 1.0]]}, Objection.OBSTACLE_UNKNOWN),
         ({"obstacles": [[5.0, 0.0], [1.0, math.inf]]}, Objection.OBSTACLE_UNKNOWN),
     ],
@@ -521,3 +524,22 @@ def test_separation_wins_over_the_acceleration_limit() -> None:
     stream = Stream(max_acceleration_m_s2=2.0)
     stream.velocities(20, [1.0, 0.0])
     np.testing.assert_allclose(stream.velocities(1, [1.0, 0.0], neighbours=[[0.9, 0, 0]]), [[0, 0]], atol=1e-12)
+
+
+def test_a_takeover_in_motion_begins_at_the_velocity_that_the_drone_has() -> None:
+    """PX4 wants a stream before offboard: it carries what a person flies, 4 m/s, which then falls by 0.2 m/s a tick."""
+    gate, north_m_s = Gate(GateParameters()), []
+    for tick in range(24):
+        action = Action.OFFER if tick < 20 else Action.FLY
+        verdict = gate.step(0.05 * tick, request(0.05 * tick, STILL, action, around(velocity=[4.0, 0.0])))
+        north_m_s.append(sent(verdict).velocity[0])
+    most_m_s = GateParameters().max_speed_m_s
+    assert north_m_s[:20] == [min(4.0, most_m_s)] * 20
+    fall = 0.05 * GateParameters().max_acceleration_m_s2
+    assert north_m_s[20:] == pytest.approx([north_m_s[19] - k * fall for k in range(1, 5)])
+
+
+@pytest.mark.parametrize("action", [Action.HOVER, Action.ASK_HOLD, Action.FLY])
+def test_a_margin_that_is_not_a_number_stops_and_raises_nothing(action: Action) -> None:
+    near = around(neighbours=[[3.0, 0.0, 0.0]], neighbour_margins=[[0.1, math.nan]])
+    assert sent(Stream().second([1.0, 0.0], action, near)).velocity.tolist() == [0.0, 0.0]
