@@ -48,7 +48,7 @@ MAX_UNEXPECTED = 3
 
 @dataclass(frozen=True, eq=False)
 class StepResult:
-    """The output of one step, and when its frames were fetched, on the daemon's clock."""
+    """The output of one step, and when its images were taken, on the daemon's clock: all ages count from there."""
 
     time_s: float
     output: PilotOutput
@@ -142,9 +142,11 @@ class PilotLoop:
                 continue
             self.frames = frames
             taken_s = self._clock()
-            vehicle = self._vehicle_at(frames.time_s + self._config.rig.time_offset_s)
+            exposed_s = frames.time_s + self._config.rig.time_offset_s
+            vehicle = self._vehicle_at(exposed_s)
             if vehicle is not None:
-                await self._step(taken_s, frames, vehicle)
+                on_our_clock = 0.0 <= taken_s - exposed_s <= HISTORY_S
+                await self._step(taken_s, exposed_s if on_our_clock else taken_s, frames, vehicle)
             now = self._clock()
             due_s = max(due_s + self._config.step_s, now)
             await asyncio.sleep(due_s - frame_period_s - now)  # the next frame is the one that comes when a step is due
@@ -155,7 +157,7 @@ class PilotLoop:
         self._geometry.leave(LEAVE_S)
         self._decoding.leave(LEAVE_S)
 
-    async def _step(self, taken_s: float, frames: FrameSet, vehicle: VehicleState) -> None:
+    async def _step(self, taken_s: float, seen_s: float, frames: FrameSet, vehicle: VehicleState) -> None:
         begun, order = self._begun, self.order
         self.steps += 1
         try:
@@ -180,7 +182,7 @@ class PilotLoop:
         self._failure, self._unexpected = None, 0
         number = 1 if self._pilot is None or self.newest is None else self.newest.number + 1
         self._pilot, self._learned = pilot, pilot.learned
-        self.newest = StepResult(taken_s, output, self._flight, number)
+        self.newest = StepResult(seen_s, output, self._flight, number)
         self.stepped = frames, output
         self._count(self.newest)
         for report in self._reports.update(output):

@@ -294,11 +294,11 @@ def test_what_was_learned_goes_into_the_next_flight(monkeypatch: pytest.MonkeyPa
     async def tell() -> None:
         for begin in begun:
             begin()
-            await loop._step(0.0, FrameSet(0.0, {}), state)
+            await loop._step(0.0, 0.0, FrameSet(0.0, {}), state)
 
     asyncio.run(tell())
     newest, during = loop.newest, [lambda: loop.begin_flight(3)]
-    asyncio.run(loop._step(0.0, FrameSet(9.0, {}), state))
+    asyncio.run(loop._step(0.0, 0.0, FrameSet(9.0, {}), state))
     assert loop.newest is newest, "a flight began while the step was under way: its result is nobody's"
     loop.leave()
     sizes_m = [None if learned is None else round(learned.size_m, 3) for learned, _ in made]
