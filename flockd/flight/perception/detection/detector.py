@@ -82,7 +82,7 @@ class Detector:
         proposals = propose_instances(rig, scenes, rules, self._parameters)
         first = cascade.refine(rig, images, proposals)
         predicted, unpredicted = propose_predictions(
-            rig, vehicle, predictions, [c.bearing for c in first.candidates], rules
+            rig, vehicle, predictions, [(c.bearing, c.log_range) for c in first.candidates], rules
         )
         second = cascade.refine(rig, images, predicted)
         candidates = [*first.candidates, *second.candidates]

@@ -18,7 +18,7 @@ from flockd.flight.geometry import Rig, log_polar
 from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.detection.roi import CropRules, Roi, angle_between, pixel_angle, roi_of_instance
 from flockd.flight.perception.maps import SceneMaps
-from flockd.flight.tracking import Prediction
+from flockd.flight.tracking import Prediction, looks_alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ def propose_predictions(
     rig: Rig,
     vehicle: VehicleState,
     predictions: Iterable[Prediction],
-    detected: Sequence[FloatArray],
+    detected: Sequence[tuple[FloatArray, float]],
     rules: CropRules,
 ) -> tuple[list[Proposal], list[Reason]]:
     """Where a track is predicted and nothing was found, and why a prediction is none.
@@ -86,7 +86,8 @@ def propose_predictions(
         rig: the cameras that have an image.
         vehicle: for the attitude.
         predictions: of the confirmed tracks.
-        detected: bearings (3,), in the body, of what was found already.
+        detected: bearings (3,), in the body, of what was found already, and the logarithm of its range in metres: who
+            is at quite another range is not the one that is predicted.
         rules: for the crops.
     """
     proposals, reasons = [], []
@@ -104,7 +105,10 @@ def propose_predictions(
         if not cameras:
             continue
         roi = Roi(bearing, rules.half_angle(prediction.size_m, range_m, pixel_angle(rig, cameras, bearing)))
-        found = any(angle_between(roi.direction, bearing) < roi.half_angle for bearing in detected)
+        found = any(
+            angle_between(roi.direction, other) < roi.half_angle and looks_alike(range_m, math.exp(log_other))
+            for other, log_other in detected
+        )
         if not found:
             proposals.append(Proposal(cameras, roi, predicted=Predicted(bearing, log_range, covariance)))
     return proposals, reasons

@@ -15,10 +15,16 @@ from flockd.flight.geometry import Rig, RigCamera, WideAngleCamera, ZMap
 from flockd.flight.inference import OnnxModel
 from flockd.flight.perception import Instance, SceneMaps, group_instances
 from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes, with_boxes
-from flockd.flight.perception.detection.proposals import largest_blobs, propose_instances, propose_residuals
+from flockd.flight.perception.detection.proposals import (
+    largest_blobs,
+    propose_instances,
+    propose_predictions,
+    propose_residuals,
+)
 from flockd.flight.perception.detection.roi import Roi, roi_of_instance
+from flockd.flight.tracking import Prediction
 from tests.flight.perception.cameras import SECOND_STAGE
-from tests.make import rig_camera
+from tests.make import rig_camera, vehicle
 
 RULES = SECOND_STAGE.rules
 CAMERA = rig_camera(320.0, (640, 480))
@@ -76,6 +82,17 @@ def test_the_crop_of_a_small_drone_shows_the_same_pixels_whatever_the_lens_is_sa
     roi = roi_of((316.0, 237.0, 324.0, 243.0), camera)
     assert roi is not None
     assert math.tan(roi.half_angle) * camera.camera.focal_px == pytest.approx(0.95 * math.hypot(4, 3), rel=0.001)
+
+
+@pytest.mark.parametrize(("range_m", "searched"), [(3.2, 0), (9.0, 1), (1.0, 1)])
+def test_a_neighbour_is_searched_for_though_another_range_is_detected_there(range_m: float, searched: int) -> None:
+    """It is predicted 3 m ahead; what was detected two degrees beside it is it, or far behind it, or hides it."""
+    front = Rig({"front": CAMERA})
+    ahead = CAMERA.T_body_camera.rotation @ [0.0, 0.0, 1.0]
+    beside = CAMERA.T_body_camera.rotation @ [math.sin(math.radians(2.0)), 0.0, math.cos(math.radians(2.0))]
+    near = Prediction(3.0 * ahead, 0.01 * np.eye(3), 0.5, 0.99)
+    found, _ = propose_predictions(front, vehicle(), [near], [(beside, math.log(range_m))], RULES)
+    assert len(found) == searched
 
 
 # How many.
