@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -52,8 +53,11 @@ _ROTATION_TOLERANCE = 1e-3
 """How far an attitude's R R^T may be from the identity: beyond it is no attitude, and not only rounded."""
 _ROUNDING = 1e-6
 """The same: what is farther off is replaced by the nearest rotation, as measurements and transforms ask for one."""
-_BY_VELOCITY_SIGMA_M = 0.1
-"""Standard deviation of where the drone went in a step, each axis, by its velocity alone."""
+_LONGEST_S = 10.0
+"""Since the last step: what was known before a longer gap is forgotten anyway."""
+_DISAGREE = "ego-motion: images and autopilot disagree on the velocity; one, or the height above ground, is wrong"
+_VELOCITY_SIGMA_M_S = 0.2
+"""Of the velocity that is known where images show no own motion, each axis: PX4's estimate, or the last by images."""
 
 
 @dataclass
@@ -126,6 +130,9 @@ class FlockPilot:
         self._first_time_s: float | None = None
         self._last_time_s: float | None = None
         self._velocity: FloatArray | None = None
+        """(3,) m/s NED that images gave last."""
+        self._flew: FloatArray | None = None
+        """(3,) m/s NED in the last good step, by images or else by the autopilot."""
         self._yaw_rad: float | None = None
         """The heading asked for last; before the first, that of the first good attitude."""
         self._refused_in_a_row = 0
@@ -156,7 +163,7 @@ class FlockPilot:
             self._yaw_rad = math.atan2(vehicle.R_ned_body[1, 0], vehicle.R_ned_body[0, 0])
         refusal = _why_refused(frames, vehicle)
         if refusal is not None:
-            return self._refused(frames, refusal)
+            return self._refused(frames.time_s, refusal)
         vehicle = _with_rotation(vehicle)
         elsewhere = self._calibration.elsewhere()
         frames = replace(frames, frames={name: one for name, one in frames.frames.items() if name not in elsewhere})
@@ -176,12 +183,15 @@ class FlockPilot:
         motions, why_no_motion = self._neighbour_motions(observation, ego)
         laps.end("neighbour_motion")
         self._trim.update(vehicle, ego)
+        if self._trim.doubt_m_s:
+            why_no_ego = (*why_no_ego, Reason(ReasonKind.EGO_MOTION, _DISAGREE))
         velocity = self._own_velocity(observation, ego)
         detections, measurements, why_no_measurement = self._measurements(observation, motions)
-        tracks = self._track(observation, ego, measurements, velocity)
+        moved = self._moved(observation, ego)
+        tracks = self._track(observation, moved, measurements, velocity)
         neighbours = self._with_sizes(observation, ego, dict(zip(tracks, measurements, strict=True)), velocity)
         laps.end("tracking")
-        obstacles = self._local_map(observation, ego, ground, velocity)
+        obstacles = self._local_map(observation, ego, ground, moved)
         laps.end("obstacles")
         command = self._command(observation, neighbours, velocity, obstacles, ground)
         laps.end("flocking")
@@ -216,21 +226,31 @@ class FlockPilot:
         """What the steps until now showed of the others' size, for the next flight's pilot."""
         return self._size.learned
 
-    def _refused(self, frames: FrameSet, reason: Reason) -> PilotOutput:
-        """The output of a step that was not done."""
+    def _refused(self, time_s: float, reason: Reason) -> PilotOutput:
+        """The output of a step that was not done: neighbours and obstacles as of the last one, which went on since."""
         last_s = 0.0 if self._last_time_s is None else self._last_time_s
+        time_s = max(time_s, last_s) if math.isfinite(time_s) else last_s
+        interval_s = min(time_s - last_s, _LONGEST_S)
+        moved = None if self._flew is None else interval_s * self._flew
+        sigma_m = _VELOCITY_SIGMA_M_S * interval_s
+        tracker, local_map = copy.deepcopy((self._tracker, self._map))
+        if self._last_time_s is not None:
+            tracker.predict(interval_s, moved, sigma_m)
+            tracker.update(time_s, (), shown=lambda places, radius_m: np.zeros(len(places), np.bool_))
+        level = None if moved is None else moved[:2]
         return PilotOutput(
-            time_s=frames.time_s if math.isfinite(frames.time_s) else last_s,
+            time_s=time_s,
             ego_motion=None,
             velocity=self._velocity,
             detections=(),
             detection_tracks=(),
             neighbour_motions={},
-            neighbours=self._tracker.neighbours(),
+            neighbours=tracker.neighbours(),
             command=Wanted(np.zeros(2), np.zeros(2), self._yaw_rad),
             mission=self._mission,
             reasons=(reason,),
             counts={reason.text: 1},
+            obstacles=None if local_map is None else local_map.step(time_s, None, level, sigma_m),
         )
 
     def _predictions(self, time_s: float) -> tuple[Prediction, ...]:
@@ -333,15 +353,13 @@ class FlockPilot:
     def _track(
         self,
         observation: Observation,
-        ego: EgoMotion | None,
+        moved: tuple[FloatArray | None, float],
         measurements: Sequence[Measurement],
         velocity: FloatArray | None,
     ) -> tuple[int, ...]:
         """The track of each measurement."""
         if observation.previous is not None:
-            displacement = None if ego is None else _displacement(observation, ego)
-            sigma_m = self._config.geometry.own_displacement_sigma_m
-            self._tracker.predict(observation.interval_s, displacement, sigma_m)
+            self._tracker.predict(observation.interval_s, *moved)
         return self._tracker.update(observation.time_s, measurements, velocity, self._shown(observation))
 
     def _with_sizes(
@@ -368,18 +386,29 @@ class FlockPilot:
         observation: Observation,
         ego: EgoMotion | None,
         ground: GroundEstimate | None,
-        velocity: FloatArray | None,
+        moved: tuple[FloatArray | None, float],
     ) -> ObstacleRanges | None:
         """The local map at this time; None where obstacles are not looked for."""
         if self._map is None or self._ranging is None:
             return None
-        displacement, sigma_m = None, 0.0
-        if ego is not None:
-            displacement, sigma_m = _displacement(observation, ego)[:2], self._config.geometry.own_displacement_sigma_m
-        elif velocity is not None and self._last_time_s is not None:
-            displacement, sigma_m = velocity[:2] * (observation.time_s - self._last_time_s), _BY_VELOCITY_SIGMA_M
         ranges = observation.obstacles or self._ranging.ranges(observation, ego, ground)
-        return self._map.step(observation.time_s, ranges, displacement, sigma_m)
+        displacement, sigma_m = moved
+        return self._map.step(observation.time_s, ranges, None if displacement is None else displacement[:2], sigma_m)
+
+    def _moved(self, observation: Observation, ego: EgoMotion | None) -> tuple[FloatArray | None, float]:
+        """(3,) metres NED that the drone went in the step, and its standard deviation, each axis; None: not known.
+
+        By the images; where they show none, by the autopilot's velocity, or by the last one that images gave.
+        """
+        known = observation.vehicle.velocity_ned
+        self._flew = self._velocity if ego is not None or known is None else known
+        if ego is not None:
+            doubt_m = self._trim.doubt_m_s * ego.interval_s
+            return _displacement(observation, ego), self._config.geometry.own_displacement_sigma_m + doubt_m
+        if self._flew is None or self._last_time_s is None:
+            return None, 0.0
+        interval_s = min(observation.time_s - self._last_time_s, _LONGEST_S)
+        return interval_s * self._flew, _VELOCITY_SIGMA_M_S * interval_s
 
     def _shown(self, observation: Observation) -> Shown:
         """Tells who is wholly in view of a camera that gave an image in this step."""

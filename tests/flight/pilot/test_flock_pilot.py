@@ -295,3 +295,34 @@ def test_an_impossible_ego_motion_is_refused_but_not_for_ever() -> None:
         known.append(output.ego_motion is not None)
         assert (output.ego_motion is not None) != any("that fast" in reason.text for reason in output.reasons)
     assert known == [False, False, True, True]
+
+
+class Comes:
+    """Sees one that hovers 12 m north of where a drone begins, which flies at it at 2 m/s; no image shows a motion."""
+
+    def __init__(self) -> None:
+        self.last: Observation | None = None
+        self.sees = True
+
+    def observe(self, frames: FrameSet, vehicle: VehicleState, *_: object) -> Observation:
+        seen = (detection((12.0 - 2.0 * frames.time_s, 0.0, 0.0)),) if self.sees else ()
+        self.last = Observation(frames.time_s, vehicle, {}, seen, self.last and replace(self.last, previous=None))
+        return self.last
+
+
+@pytest.mark.parametrize("lost", ["own motion", "attitude"])
+def test_where_images_or_attitude_are_lost_neighbours_come_on_by_the_velocity_that_is_known(lost: str) -> None:
+    """Detected for two seconds, by the autopilot's velocity; then not for one: it is 6 m away, not 8."""
+    observer = Comes()
+    pilot = FlockPilot(changed(ALONE.drone, own_velocity="autopilot"), NEVER_ASKED, observer=observer)
+    for step in range(7):
+        time_s = STEP_S * step
+        state = vehicle(time_s, 4.0, velocity_ned=np.array([2.0, 0.0, 0.0]))
+        observer.sees = step < 5
+        if lost == "attitude" and step >= 5:
+            state = replace(state, R_ned_body=np.full((3, 3), math.nan))
+        output = pilot.step(frames(time_s), state)
+    (neighbour,) = output.neighbours
+    assert output.ego_motion is None and output.time_s == time_s
+    assert neighbour.unseen_s == pytest.approx(1.0)
+    assert neighbour.position[0] == pytest.approx(6.0, abs=0.3)

@@ -104,3 +104,17 @@ def test_short_steps_forget_as_much_in_half_a_second_as_one_long_step() -> None:
         trims.append(trim.velocity)
     assert trims[1] == pytest.approx(trims[0])
     assert trims[0] == pytest.approx((1.0 - 0.7**4) * np.array([0.2, -0.1]))
+
+
+@pytest.mark.parametrize(("scale", "speed_m_s", "doubted"), [(2.0, 1.0, True), (0.4, 2.0, True), (1.1, 2.0, False)])
+def test_images_that_show_another_speed_than_the_autopilot_are_doubted(
+    scale: float, speed_m_s: float, doubted: bool
+) -> None:
+    """As over ground that is not at the height of home, with PX4's own errors of 0.15 m/s beside it."""
+    trim, rng, north = VelocityTrim(0.0, 0.7, GATE_M_S), np.random.default_rng(0), np.array([speed_m_s, 0.0, 0.0])
+    doubts = []
+    for step in range(40):
+        trim.update(vehicle(step, north + rng.normal(0.0, 0.15, 3)), ego(scale * north if step else None))
+        doubts.append(trim.doubt_m_s)
+    assert (doubts[-1] == pytest.approx(abs(scale - 1.0) * speed_m_s, abs=0.15)) is doubted
+    assert any(doubts) is doubted
