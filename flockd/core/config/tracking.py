@@ -7,9 +7,10 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from flockd.core.config.base import Duration, Positive, Section
+from flockd.core.config.base import Duration, NonNegative, Positive, Section
 
-_ROUNDING = 1e-9
+JITTER_S = 0.05
+"""By how much the time between two frame sets may be shorter than a step: more than a frame of a camera of 30 Hz."""
 
 Probability = Annotated[float, Field(gt=0, lt=1)]
 
@@ -48,6 +49,11 @@ class TrackingParameters(Section):
     """Correlation of the errors of a detection's log range and log size, taken to be equally large: a range is the
     size, which the appearance tells, over the apparent size. Measured as 0.2 with drones of families that the shipped
     networks know and 0.9 with others; taken low, so that ranges count as uncertain as the networks say they are."""
+    range_error_time_s: Duration = 1.5
+    """How long errors of one neighbour's log ranges last. With the shipped networks' detections in the simulator the
+    correlation of errors that are 0.5, 1, 2 and 4 s apart is 0.53, 0.38, 0.21 and 0.09 ..."""
+    range_error_lasts: Probability = 0.75
+    """... so that this share of their variance lasts; the rest is new in each frame set."""
     size_drift: Positive = 0.05
     """How far the log size of one drone drifts, as the network sees it in changing views: standard deviation after one
     second, growing with the square root of the time."""
@@ -74,6 +80,9 @@ class TrackingParameters(Section):
     drone_probability_memory_s: Duration = 5.0
     """Time constant of the average of the network's drone probabilities over a track; its existence probability is
     multiplied by it."""
+    heading_sigma_rad: NonNegative = 0.035
+    """Error of the autopilot's heading, as PX4's magnetometer has it: it turns all neighbours alike about the drone,
+    and lasts, so that it counts where places are said and not in the filter."""
     confirm_hits: Annotated[int, Field(ge=1)] = 2
     """No track is confirmed with fewer detections that agree with it, after the first each by `evidence_interval_s`."""
     vague_factor: Annotated[float, Field(ge=1)] = 2.0
@@ -95,7 +104,7 @@ class TrackingParameters(Section):
 
     def confirm_steps(self, step_s: float) -> int:
         """With which step, at the earliest, a neighbour is confirmed that all steps of `step_s` show."""
-        return 1 + (self.confirm_hits - 1) * math.ceil(self.evidence_interval_s / step_s - _ROUNDING)
+        return 1 + math.ceil((self.confirm_hits - 1) * max((self.evidence_interval_s - JITTER_S) / step_s, 1.0))
 
     @model_validator(mode="after")
     def _ordered(self) -> TrackingParameters:

@@ -13,11 +13,6 @@ from flockd.core.config.tracking import TrackingParameters
 from flockd.flight.tracking.filter import Innovation
 
 
-def predicted(probability: float, interval_s: float, parameters: TrackingParameters) -> float:
-    """`interval_s` later: neighbours leave."""
-    return probability * math.exp(-interval_s / parameters.survival_time_s)
-
-
 def missed(probability: float, in_view: float, weight: float, parameters: TrackingParameters) -> float:
     """After a frame set without a detection of the track, which the cameras show with the probability `in_view`."""
     return _bayes(probability, weight * math.log(1.0 - in_view * parameters.detection_probability))

@@ -1,4 +1,10 @@
-"""The Kalman filter of one track: motion model, update in log-polar coordinates and size, update of the velocity."""
+"""The Kalman filter of one track: motion model, update in log-polar coordinates and size, update of the velocity.
+
+Errors of ranges last from frame to frame, so that many near in time tell little more than one. The state has the
+lasting error beside the motion (coloured measurement noise: A. Bryson, L. Henrikson, "Estimation using sampled data
+containing sequentially correlated noise", Journal of Spacecraft and Rockets 5(6), 1968), in standard deviations of the
+newest detection's log range: a first-order Gauss-Markov process with the time constant `range_error_time_s`.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +18,8 @@ from flockd.core.messages import FloatArray
 from flockd.flight.geometry import log_polar_residual
 from flockd.flight.tracking.measurement import Measurement
 
+SIZE = 8
+"""Of a state."""
 _LINEARISATIONS = 3
 """Linearisations of the iterated update (B. Bell, F. Cathey, IEEE Transactions on Automatic Control 38(2), 1993)."""
 MIN_RANGE_M = 0.01
@@ -20,12 +28,14 @@ MIN_RANGE_M = 0.01
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """A neighbour's position relative to the own drone and its velocity over ground, NED, and its size."""
+    """A neighbour's position relative to the own drone and its velocity over ground, NED, its size, and by how much its
+    ranges are wrong."""
 
     mean: FloatArray
-    """(7,) three in metres, three in m/s, and the natural logarithm of the size in metres."""
+    """(8,) three in metres, three in m/s, the natural logarithm of the size in metres, and the lasting error of log
+    ranges, in standard deviations."""
     covariance: FloatArray
-    """(7, 7)"""
+    """(8, 8)"""
 
     @property
     def position(self) -> FloatArray:
@@ -92,10 +102,17 @@ def initial(
     measurement: Measurement, velocity: FloatArray, covariance_m2_s2: FloatArray, parameters: TrackingParameters
 ) -> State:
     """The state after a first detection of a drone that flies at `velocity` (3,) m/s, uncertain by its covariance."""
-    of_place = np.vstack([measurement.range_m * np.eye(3, 4), np.zeros((3, 4)), [0.0, 0.0, 0.0, 1.0]])
-    covariance = of_place @ _noise(measurement, parameters) @ of_place.T
+    of_place = np.zeros((SIZE, 5))
+    of_place[:3, :3], of_place[6, 3], of_place[7, 4] = measurement.range_m * np.eye(3), 1.0, 1.0
+    lasting = _lasting_sigma(measurement, parameters)
+    of_place[:3, 4] = -measurement.range_m * measurement.bearing * lasting
+    of_place[6, 4] = -parameters.size_correlation * lasting
+    noise = np.eye(5)
+    noise[:4, :4] = _noise(measurement, parameters)
+    covariance = of_place @ noise @ of_place.T
     covariance[3:6, 3:6] = covariance_m2_s2
-    return _with_velocity(State(_at(measurement, velocity), covariance), measurement, parameters)
+    mean = np.concatenate([measurement.position, velocity, [math.log(measurement.size_m), 0.0]])
+    return _with_velocity(State(mean, covariance), measurement, parameters)
 
 
 def predict(
@@ -113,16 +130,18 @@ def predict(
     size drifts by `size_drift`.
     """
     dt = interval_s
-    transition, displacement, sigma_m = np.eye(7), np.zeros(3), parameters.relative_speed_sigma_m_s * dt
+    transition, displacement, sigma_m = np.eye(SIZE), np.zeros(3), parameters.relative_speed_sigma_m_s * math.sqrt(dt)
+    transition[7, 7] = math.exp(-dt / parameters.range_error_time_s)
     if own_displacement is not None:
         transition[:3, 3:6] = dt * np.eye(3)
         displacement, sigma_m = own_displacement, own_displacement_sigma_m
-    noise = np.zeros((7, 7))
+    noise = np.zeros((SIZE, SIZE))
     noise[:6, :6] = np.kron(np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), np.diag(density))
     noise[:3, :3] += sigma_m**2 * np.eye(3)
     noise[6, 6] = parameters.size_drift**2 * dt
+    noise[7, 7] = 1.0 - transition[7, 7] ** 2
     return State(
-        mean=transition @ state.mean - np.concatenate([displacement, np.zeros(4)]),
+        mean=transition @ state.mean - np.concatenate([displacement, np.zeros(SIZE - 3)]),
         covariance=transition @ state.covariance @ transition.T + noise,
     )
 
@@ -135,7 +154,7 @@ def resized(state: State, size_m: float, own_velocity: FloatArray | None) -> Sta
     factor = size_m / state.size_m
     of_velocity = 1.0 if own_velocity is None else factor
     own = np.zeros(3) if own_velocity is None else own_velocity
-    scale = np.array([factor] * 3 + [of_velocity] * 3 + [1.0])
+    scale = np.array([factor] * 3 + [of_velocity] * 3 + [1.0, 1.0])
     mean = scale * state.mean
     mean[3:6] += (1.0 - of_velocity) * own
     mean[6] = math.log(size_m)
@@ -144,7 +163,7 @@ def resized(state: State, size_m: float, own_velocity: FloatArray | None) -> Sta
 
 def innovation(state: State, measurement: Measurement, parameters: TrackingParameters) -> Innovation:
     """The innovation of a measurement against the predicted state."""
-    residual, derivative = _linearised(state.mean, measurement)
+    residual, derivative = _linearised(state.mean, measurement, parameters)
     return Innovation(residual, derivative @ state.covariance @ derivative.T + _noise(measurement, parameters))
 
 
@@ -157,15 +176,17 @@ def update(state: State, measurement: Measurement, parameters: TrackingParameter
     predicted = innovation(state, measurement, parameters)
     excess = _excess(predicted.squared_distance, parameters)
     covariance = _noise(measurement, parameters) + (excess - 1.0) * predicted.covariance
-    mean = _at(measurement, state.velocity)
+    mean = state.mean.copy()
+    mean[:3] = measurement.position * math.exp(-_lasting_sigma(measurement, parameters) * mean[7])
+    mean[6] = math.log(measurement.size_m)
     for _ in range(_LINEARISATIONS):
-        residual, derivative = _linearised(mean, measurement)
+        residual, derivative = _linearised(mean, measurement, parameters)
         mean, posterior = _kalman(state, derivative, residual - derivative @ (state.mean - mean), covariance)
     return _with_velocity(State(mean, posterior), measurement, parameters)
 
 
 def _noise(measurement: Measurement, parameters: TrackingParameters) -> FloatArray:
-    """(4, 4) covariance of a measurement's log-polar coordinates and log size.
+    """(4, 4) covariance of what is new in a measurement's log-polar coordinates and log size.
 
     A range is a size over an apparent size, so that the two err together: by as much, with `size_correlation`. What the
     judged size may be off (`Detection.log_size_sigma`) is no part of it: that lasts, and is no noise. A filter that
@@ -173,19 +194,23 @@ def _noise(measurement: Measurement, parameters: TrackingParameters) -> FloatArr
     (`pilot.size_learner`).
     """
     variance = measurement.log_range_variance
-    across = parameters.size_correlation * variance * measurement.bearing[:, None]
-    return np.block([[measurement.covariance, across], [across.T, np.array([[variance]])]])
+    lasting = _lasting_sigma(measurement, parameters) ** 2
+    bearing = measurement.bearing
+    across = parameters.size_correlation * (variance - lasting) * bearing[:, None]
+    place = measurement.covariance - lasting * np.outer(bearing, bearing)
+    of_size = variance - parameters.size_correlation**2 * lasting
+    return np.block([[place, across], [across.T, np.array([[of_size]])]])
 
 
-def _at(measurement: Measurement, velocity: FloatArray) -> FloatArray:
-    """The mean (7,) of a state where the measurement is, with this velocity (3,)."""
-    return np.concatenate([measurement.position, velocity, [math.log(measurement.size_m)]])
+def _lasting_sigma(measurement: Measurement, parameters: TrackingParameters) -> float:
+    """Standard deviation of what of a log range's error lasts."""
+    return math.sqrt(parameters.range_error_lasts * measurement.log_range_variance)
 
 
 def _with_velocity(state: State, measurement: Measurement, parameters: TrackingParameters) -> State:
     if measurement.velocity is None:
         return state
-    observation = np.eye(7)[3:6]
+    observation = np.eye(SIZE)[3:6]
     residual = measurement.velocity - state.velocity
     covariance = measurement.velocity_sigma_m_s**2 * np.eye(3)
     spread = state.velocity_covariance + covariance
@@ -202,23 +227,28 @@ def _excess(squared_distance: float, parameters: TrackingParameters) -> float:
     return max(1.0, squared_distance / parameters.robust_sigma**2)
 
 
-def _linearised(mean: FloatArray, measurement: Measurement) -> tuple[FloatArray, FloatArray]:
-    """The residual (4,) of a measurement from a state (7,), and the derivative (4, 7) of the predicted measurement."""
+def _linearised(
+    mean: FloatArray, measurement: Measurement, parameters: TrackingParameters
+) -> tuple[FloatArray, FloatArray]:
+    """The residual (4,) of a measurement from a state (8,), and the derivative (4, 8) of the predicted measurement."""
     distance_m = float(np.linalg.norm(mean[:3]))
     range_m = max(distance_m, MIN_RANGE_M)
     bearing = mean[:3] / range_m if distance_m >= MIN_RANGE_M else measurement.bearing
-    place = log_polar_residual(measurement.bearing, measurement.log_range, bearing, float(np.log(range_m)))
-    derivative = np.zeros((4, 7))
+    lasting = _lasting_sigma(measurement, parameters)
+    log_range = math.log(range_m) + lasting * float(mean[7])
+    place = log_polar_residual(measurement.bearing, measurement.log_range, bearing, log_range)
+    derivative = np.zeros((4, SIZE))
     derivative[:3, :3] = np.eye(3) / range_m
-    derivative[3, 6] = 1.0
-    return np.append(place, math.log(measurement.size_m) - mean[6]), derivative
+    derivative[:3, 7] = lasting * bearing
+    derivative[3, 6:] = 1.0, parameters.size_correlation * lasting
+    return np.append(place, math.log(measurement.size_m) - derivative[3, 6:] @ mean[6:]), derivative
 
 
 def _kalman(
     state: State, derivative: FloatArray, residual: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean (7,) and covariance (7, 7), in Joseph's form, after `residual` with noise of `covariance`."""
+    """Mean (8,) and covariance (8, 8), in Joseph's form, after `residual` with noise of `covariance`."""
     spread = derivative @ state.covariance @ derivative.T + covariance
     gain = np.linalg.solve(spread, derivative @ state.covariance).T
-    left = np.eye(7) - gain @ derivative
+    left = np.eye(SIZE) - gain @ derivative
     return state.mean + gain @ residual, left @ state.covariance @ left.T + gain @ covariance @ gain.T

@@ -79,8 +79,8 @@ class Hypotheses:
         """The mean and the covariance of all together; of one it is its state."""
         if len(self.each) == 1:
             return self.each[0].state
-        mean = sum((h.probability * h.state.mean for h in self.each), np.zeros(7))
-        covariance = np.zeros((7, 7))
+        mean = sum((h.probability * h.state.mean for h in self.each), np.zeros(filter.SIZE))
+        covariance = np.zeros((filter.SIZE, filter.SIZE))
         for h in self.each:
             off = h.state.mean - mean
             covariance += h.probability * (h.state.covariance + np.outer(off, off))

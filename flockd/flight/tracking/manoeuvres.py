@@ -58,7 +58,7 @@ class Manoeuvres:
             excess = ((velocity - before) ** 2 - variance - variance_before) / (_OF_MEANS * taken_s)
             level = excess[:2].mean()
             keep = math.exp(-taken_s / self._memory_s)
-            self._own = keep * self._own + (1 - keep) * np.array([level, level, excess[2]])
+            self._own = np.maximum(keep * self._own + (1 - keep) * np.array([level, level, excess[2]]), 0.0)
         self._last = velocity, variance
         self._begin_interval()
 

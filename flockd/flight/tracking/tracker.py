@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flockd.core.config.tracking import TrackingParameters
+from flockd.core.config.tracking import JITTER_S, TrackingParameters
 from flockd.core.messages import BoolArray, FloatArray, Neighbour
 from flockd.flight.tracking import existence, filter  # noqa: A004 - the field's word
 from flockd.flight.tracking.association import assign
@@ -19,7 +19,6 @@ from flockd.flight.tracking.measurement import Measurement
 
 _OF_USUAL = 0.02
 """The share of one detection in what is usual: that of the last fifty."""
-_ROUNDING_S = 1e-9
 _UNSEEN_SHARE = 0.1
 """Who was followed for long is looked for longer than `max_unseen_s`: for this share of that time, while it is likely
 to exist. Else its next detection, often a vague one, would be of a stranger."""
@@ -81,7 +80,7 @@ class Tracker:
                     state, interval_s, own_displacement, own_displacement_sigma_m, density, self.parameters
                 )
             )
-            track.existence = existence.predicted(track.existence, interval_s, self.parameters)
+            track.existence = self._survives(track, interval_s)
 
     def update(
         self,
@@ -98,7 +97,7 @@ class Tracker:
         should have come into view again.
         """
         interval_s = max(0.0, time_s - self._time_s)
-        weight = min(1.0, interval_s / self.parameters.evidence_interval_s)
+        weight = min(1.0, interval_s / (self.parameters.evidence_interval_s - JITTER_S))
         self._time_s = time_s
         pairs = assign(measurements, [track.hypotheses for track in self._tracks], self.parameters)
         missed = self._without({column for column, _ in pairs.values()})
@@ -134,8 +133,7 @@ class Tracker:
                 position=state.position,
                 covariance=state.position_covariance,
                 size_m=state.size_m,
-                existence_probability=track.drone_probability
-                * existence.predicted(track.existence, interval_s, self.parameters),
+                existence_probability=track.drone_probability * self._survives(track, interval_s),
             )
             for track, state in zip(known, states, strict=True)
         )
@@ -155,7 +153,7 @@ class Tracker:
                 track=track.number,
                 position=track.state.position,
                 velocity=track.state.velocity,
-                position_sigma_m=float(np.sqrt(np.trace(track.state.position_covariance) / 3)),
+                position_sigma_m=self._position_sigma_m(track.state),
                 velocity_sigma_m_s=float(np.sqrt(np.trace(track.state.velocity_covariance) / 3)),
                 age_s=self._time_s - track.first_seen_s,
                 unseen_s=self._time_s - track.last_seen_s,
@@ -167,12 +165,24 @@ class Tracker:
             for track in self._tracks
         )
 
+    def _survives(self, track: _Track, interval_s: float) -> float:
+        """Its existence, later: one that was never confirmed is soon forgotten where no camera looks."""
+        p = self.parameters
+        lasts_s = p.survival_time_s if track.was_confirmed else p.drone_probability_memory_s
+        return track.existence * math.exp(-interval_s / lasts_s)
+
+    def _position_sigma_m(self, state: State) -> float:
+        """An axis, with what the heading turns it by."""
+        level_m = math.hypot(*state.position[:2])
+        variance = np.trace(state.position_covariance) + (self.parameters.heading_sigma_rad * level_m) ** 2
+        return math.sqrt(variance / 3)
+
     def _without(self, assigned: set[int]) -> list[_Track]:
         return [track for index, track in enumerate(self._tracks) if index not in assigned]
 
     def _miss(self, tracks: Sequence[_Track], interval_s: float, weight: float, shown: Shown | None) -> None:
         for track in tracks:
-            in_view = 1.0 if shown is None or not track.was_confirmed else _probability_in_view(track.state, shown)
+            in_view = 1.0 if shown is None else _probability_in_view(track.state, shown)
             track.existence = existence.missed(track.existence, in_view, weight, self.parameters)
             track.missing_s += in_view * interval_s
 
@@ -235,7 +245,7 @@ class Tracker:
     def _is_kept(self, track: _Track) -> bool:
         known_s = track.last_seen_s - track.first_seen_s
         longest_s = max(self.parameters.max_unseen_s, _UNSEEN_SHARE * known_s)
-        return track.missing_s <= longest_s + _ROUNDING_S and track.existence >= self.parameters.drop_probability
+        return track.missing_s <= longest_s + JITTER_S and track.existence >= self.parameters.drop_probability
 
 
 def _probability_in_view(state: State, shown: Shown) -> float:
