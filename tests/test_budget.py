@@ -20,16 +20,16 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_110,
-    "flockd/flight": 14_090,
-    "flockd/onboard": 9_900,
+    "flockd/core": 3_120,
+    "flockd/flight": 14_190,
+    "flockd/onboard": 9_910,
     "flockd/fleet": 2_070,
     "flockd/ground": 3_820,
     "flockd/review": 3_170,
     "flockd/sim": 9_320,
     "flockd/campaign": 1_470,
     "flockd/cli": 3_530,
-    "tests": 38_270,
+    "tests": 38_400,
     "tools/checks": 2_150,
     "tools/docs": 810,
     "tools/measure": 1_170,
@@ -38,11 +38,11 @@ LINES = {
 }
 """Lines of Python below a folder."""
 FILES = {"flockd": 357}
-NUMBERS_OF_FLIGHT = 484
+NUMBERS_OF_FLIGHT = 487
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
 """A budget that is farther above what there is is to be lowered."""
-STEPS = {"crossing": (45_800, 20), "normal": (24_100, 15)}
+STEPS = {"crossing": (40_900, 20), "normal": (22_200, 15)}
 """Python calls and network runs of a step in a recorded flight of tests/review/replay."""
 
 

@@ -65,7 +65,9 @@ class VelocityTrim:
         wrong = (believed - before.R_ned_body @ ego.velocity)[:2]
         if not np.isfinite(wrong).all():
             return  # it would never leave the mean again
-        self._lasts = self._lasts - math.expm1(-ego.interval_s / _LASTS_S) * (limit_norm(wrong, _MOST_M_S) - self._lasts)
+        self._lasts = self._lasts - math.expm1(-ego.interval_s / _LASTS_S) * (
+            limit_norm(wrong, _MOST_M_S) - self._lasts
+        )
         self._usual_m_s = _USUAL_M_S + _USUAL_SHARE * math.hypot(*believed[:2])
         kept = self._memory ** (ego.interval_s / MEMORY_S)
         self._mean = kept * self._mean + (1 - kept) * limit_norm(wrong, 2 * self._limit_m_s)

@@ -121,7 +121,7 @@ def test_a_size_that_is_a_quarter_off_is_found_within_a_weave_and_errs_as_it_say
         off.append(math.log(flight.learned.size_m / SIZE_M) / flight.learned.sigma)
         found = next(k for k, one in enumerate(outputs) if one.size and one.size.size_m)
         shrunk = np.array(ranges(outputs[found])) / ranges(outputs[found - 1])
-        assert np.median(shrunk) == pytest.approx(flight.learned.size_m / JUDGED_M, abs=0.06)
+        assert np.median(shrunk) == pytest.approx(flight.learned.size_m / JUDGED_M, abs=0.08)
         assert flight.told[-1] == KnownSize(flight.learned.size_m, flight.learned.sigma * flight.learned.size_m)
         assert min(range_sigmas(outputs[-1])) >= flight.learned.sigma
         assert f"{flight.learned.size_m:.2f} m large" in outputs[-1].mission.sentence
