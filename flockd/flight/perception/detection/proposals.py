@@ -18,7 +18,10 @@ from flockd.flight.geometry import Rig, log_polar
 from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.detection.roi import CropRules, Roi, angle_between, pixel_angle, roi_of_instance
 from flockd.flight.perception.maps import SceneMaps
-from flockd.flight.tracking import Prediction, looks_alike
+from flockd.flight.tracking import Prediction
+
+_SAME_RANGE = math.log(1.5)
+"""By which a log range may be off where it is that of the neighbour that is predicted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +109,7 @@ def propose_predictions(
             continue
         roi = Roi(bearing, rules.half_angle(prediction.size_m, range_m, pixel_angle(rig, cameras, bearing)))
         found = any(
-            angle_between(roi.direction, other) < roi.half_angle and looks_alike(range_m, math.exp(log_other))
+            angle_between(roi.direction, other) < roi.half_angle and abs(log_range - log_other) < _SAME_RANGE
             for other, log_other in detected
         )
         if not found:
