@@ -130,10 +130,7 @@ class FlockTelemetry:
         with self._lock:
             requests, self._requests = self._requests, {}
         for i, command in requests.items():
-            if command == "hold":
-                loop.hold(i, time_s, vehicles)
-            else:
-                loop.resume(i)
+            loop.hold(i, time_s, vehicles) if command == "hold" else loop.resume(i)
 
     def show_flight(self, time_s: float, loop: ControlLoop) -> None:
         """Publishes who flies each drone, and why."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -146,7 +147,9 @@ class LiveControls:
             case "camera", {"drone": str(drone), "camera": str(camera), "works": bool(works)}:
                 return self._switch(drone, camera, works=works)
             case _:
-                return self._remove(str(given["drone"]))
+                number = self._number(drone := str(given["drone"]))
+                self._disturbed = replace(self._disturbed, removed=self._disturbed.removed | {number})
+                return f"{drone} is taken out of the world"
 
     def _switch(self, drone: str, camera: str, *, works: bool) -> str:
         cameras = [one.name for one in self._scenario.drone.rig.cameras]
@@ -156,11 +159,6 @@ class LiveControls:
         off = self._disturbed.cameras_off
         self._disturbed = replace(self._disturbed, cameras_off=off - one if works else off | one)
         return f"the camera {camera} of {drone} delivers {'images again' if works else 'no images any more'}"
-
-    def _remove(self, drone: str) -> str:
-        number = self._number(drone)
-        self._disturbed = replace(self._disturbed, removed=self._disturbed.removed | {number})
-        return f"{drone} is taken out of the world"
 
     def _number(self, drone: str) -> int:
         """Counted from 0, of one that is there and that flockd flies."""
@@ -172,20 +170,17 @@ class LiveControls:
 
     def _left_s(self, time_s: float) -> float:
         """Until a step is due, on the clock."""
-        if self._paused:
-            return _LONGEST_WAIT_S
-        if self._due is None:
-            return 0.0
-        before_s, due_s = self._due
-        return due_s + (time_s - before_s) / self._speed - self._clock()
+        return _LONGEST_WAIT_S if self._paused else self._due_s(time_s) - self._clock()
+
+    def _due_s(self, time_s: float) -> float:
+        """When a time of the flight is due on the clock; minus infinity: at once."""
+        return -math.inf if self._due is None else self._due[1] + (time_s - self._due[0]) / self._speed
 
     def _note(self, time_s: float) -> None:
         """A step begins."""
-        now_s, due_s = self._clock(), None
-        if self._due is not None:
-            due_s = self._due[1] + (time_s - self._due[0]) / self._speed
+        now_s, due_s = self._clock(), self._due_s(time_s)
         # A little late, as sleeping always is, does not move what follows.
-        self._due = time_s, now_s if due_s is None or now_s - due_s > _LONGEST_WAIT_S else due_s
+        self._due = time_s, now_s if now_s - due_s > _LONGEST_WAIT_S else due_s
         self._time_s = time_s
         self._steps.append((now_s, time_s))
         while len(self._steps) > 2 and self._steps[1][0] < now_s - _REACHED_OVER_S:
