@@ -26,7 +26,7 @@ LINES = {
     "flockd/fleet": 2_070,
     "flockd/ground": 3_820,
     "flockd/review": 3_170,
-    "flockd/sim": 9_320,
+    "flockd/sim": 9_310,
     "flockd/campaign": 1_470,
     "flockd/cli": 3_530,
     "tests": 38_400,
