@@ -20,16 +20,16 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_120,
-    "flockd/flight": 14_190,
-    "flockd/onboard": 9_910,
+    "flockd/core": 3_090,
+    "flockd/flight": 13_510,
+    "flockd/onboard": 9_890,
     "flockd/fleet": 2_070,
-    "flockd/ground": 3_820,
+    "flockd/ground": 4_590,
     "flockd/review": 3_170,
     "flockd/sim": 9_310,
     "flockd/campaign": 1_470,
     "flockd/cli": 3_530,
-    "tests": 38_400,
+    "tests": 38_560,
     "tools/checks": 2_150,
     "tools/docs": 810,
     "tools/measure": 1_170,
@@ -37,12 +37,12 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 357}
-NUMBERS_OF_FLIGHT = 487
+FILES = {"flockd": 358}
+NUMBERS_OF_FLIGHT = 423
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
 """A budget that is farther above what there is is to be lowered."""
-STEPS = {"crossing": (40_900, 20), "normal": (22_200, 15)}
+STEPS = {"crossing": (36_200, 20), "normal": (18_000, 15)}
 """Python calls and network runs of a step in a recorded flight of tests/review/replay."""
 
 

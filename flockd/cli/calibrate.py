@@ -170,10 +170,13 @@ def _add_rig(commands: Commands) -> None:
 
 
 def _rig(args: argparse.Namespace) -> int:
-    from flockd.ground.calibration.from_flight import corrected_rig
+    from flockd.ground.calibration.from_flight import corrected_rig, found_rig
 
     out = args.out or Path("rig.yaml")
     refuse_overwriting(args, out)
-    result = corrected_rig(opened(args.from_flight), str(args.from_flight), out)
+    recording = opened(args.from_flight)
+    with progress("replaying", "steps") as tell:
+        found = found_rig(recording, progress=tell)
+    result = corrected_rig(recording, found, str(args.from_flight), out)
     advice = "put it in place of rig in your drone's file, then run flockd config check on that"
     return say_facts(args, result, f"written: {out}; {advice}")

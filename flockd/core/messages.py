@@ -34,7 +34,6 @@ class Shape:
 Vector2 = Annotated[FloatArray, Shape((2,))]
 Vector3 = Annotated[FloatArray, Shape((3,))]
 Matrix3 = Annotated[FloatArray, Shape((3, 3))]
-Matrix5 = Annotated[FloatArray, Shape((5, 5))]
 
 
 class ReasonKind(StrEnum):
@@ -56,7 +55,7 @@ class ReasonKind(StrEnum):
     NEIGHBOUR = "neighbour"
     """A neighbour, or its motion."""
     RIG = "rig"
-    """Nothing, but that a camera is not as its configuration says."""
+    """A camera's image, as it moves otherwise than the drone."""
     RECORDED = "recorded"
     """Unknown: recordings keep the text alone."""
 
@@ -378,30 +377,6 @@ class Setpoint:
         object.__setattr__(self, "yaw_rad", wrapped(self.yaw_rad))
 
 
-@dataclass(frozen=True, eq=False)
-class CameraDeviation:
-    """How a camera differs from its configuration, estimated in flight; nothing is corrected by it."""
-
-    camera: str
-    turn: Vector3
-    """(3,) rotation vector in body axes, rad, by which it is turned from where the configuration has it:
-    ``R_body_camera = exp(turn) R_configured``."""
-    time_offset_s: float
-    """To be added to its time stamps, beside the rig's configured offset."""
-    focal_scale: float
-    """Its focal lengths over the configured ones."""
-    covariance: Matrix5
-    """(5, 5) of turn, time offset, and the focal scale's logarithm."""
-    elsewhere: bool = False
-    """It moves otherwise than the drone, as no mounting that is a little off explains: the other numbers say nothing.
-    Turned or upside down, swapped with another, or before something that moves along."""
-    readout_s: Vector2 | None = None
-    """(2,) seconds in which rows are read one after the other, over the image's width (from its right: negative) and
-    over its height; of all cameras together. Near 0: a global shutter."""
-    readout_sigma_s: Vector2 | None = None
-    """(2,) standard deviations."""
-
-
 @dataclass(frozen=True)
 class SizeStatus:
     """What the drone has learned in flight of how large its neighbours are."""
@@ -448,12 +423,10 @@ class PilotOutput:
     mission: MissionStatus = NO_STATUS
     """As of the last good step."""
     noisy_cameras: tuple[str, ...] = ()
-    """Whose images were not used: noise, damage, a lens that shows too little, a camera that is `elsewhere`."""
+    """Whose images were not used: noise, damage, a lens that shows too little, another motion than the drone's."""
     ground: GroundEstimate | None = None
     """From the range finder, or the barometer in its place; None: no range finder is wanted, or there is no scale."""
     obstacles: ObstacleRanges | None = None
     """The local map; None where obstacles are not looked for."""
-    rig: tuple[CameraDeviation, ...] = ()
-    """How each camera differs from its configuration, as far as this flight has shown it, once in some seconds."""
     size: SizeStatus | None = None
     """None while nothing is learned of the neighbours' size."""

@@ -3,7 +3,7 @@
 from flockd.flight.geometry.cameras import Camera, PinholeCamera, WideAngleCamera
 from flockd.flight.geometry.closest_approach import closest_approach, share_at_closest
 from flockd.flight.geometry.depth_maps import RangeMap, ZMap, blind_pixels, range_map, z_map
-from flockd.flight.geometry.ego_motion import estimate_ego_motion
+from flockd.flight.geometry.ego_motion import estimate_ego_motion, moved_pixels
 from flockd.flight.geometry.ego_motion_refinement import refine_ego_motion
 from flockd.flight.geometry.ground import ground_inverse_depth
 from flockd.flight.geometry.ground_fit import FittedGround, GroundSamples, fit_ground
@@ -12,7 +12,6 @@ from flockd.flight.geometry.neighbour_motion import estimate_neighbour_motion
 from flockd.flight.geometry.pairs import BACKGROUND_LABEL, PointPairs, grid_pixels, label_pixels, lift_matches
 from flockd.flight.geometry.polar import log_polar, log_polar_covariance, log_polar_residual
 from flockd.flight.geometry.rig import Rig, RigCamera, build_rig
-from flockd.flight.geometry.rig_calibration import RigCalibration, Seen, described, differs, rig_faults, rolling
 from flockd.flight.geometry.rigid_fit import fit_rigid
 from flockd.flight.geometry.robust.ransac import RansacResult, ransac_rigid
 from flockd.flight.geometry.rotations import (
@@ -38,18 +37,14 @@ __all__ = [
     "RangeMap",
     "RansacResult",
     "Rig",
-    "RigCalibration",
     "RigCamera",
     "RigidTransform",
-    "Seen",
     "VirtualCrop",
     "WideAngleCamera",
     "ZMap",
     "blind_pixels",
     "build_rig",
     "closest_approach",
-    "described",
-    "differs",
     "estimate_ego_motion",
     "estimate_neighbour_motion",
     "euler_from_rotation",
@@ -63,12 +58,11 @@ __all__ = [
     "log_polar",
     "log_polar_covariance",
     "log_polar_residual",
+    "moved_pixels",
     "quaternion_from_rotation",
     "range_map",
     "ransac_rigid",
     "refine_ego_motion",
-    "rig_faults",
-    "rolling",
     "rotation_angle_deg",
     "rotation_from_euler",
     "rotation_from_quaternion",

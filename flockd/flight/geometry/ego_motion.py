@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockd.core.config.geometry import GeometryParameters
-from flockd.core.messages import EgoMotion
+from flockd.core.messages import EgoMotion, FloatArray
 from flockd.flight.geometry.ego_motion_refinement import refine_ego_motion
 from flockd.flight.geometry.pairs import BACKGROUND_LABEL, PointPairs
 from flockd.flight.geometry.rig import Rig, RigCamera
@@ -77,10 +77,14 @@ def estimate_ego_motion(
 
 def _explained(by_camera: list[tuple[RigCamera, PointPairs]], motion: RigidTransform) -> int:
     """Of how many matches, by the camera that saw them, the point, seen first and moved, falls on its second pixel."""
-    near, back = 0, motion.inverse()
+    near = 0
     for camera, pairs in by_camera:
-        mount = camera.T_body_camera
-        pixels = camera.camera.project((back.apply(pairs.previous) - mount.translation) @ mount.rotation)
-        u, v = (pixels - pairs.pixels_current).T
+        u, v = (moved_pixels(camera, pairs.previous, motion) - pairs.pixels_current).T
         near += int(np.count_nonzero(u * u + v * v < ACCEPTANCE.explained_px**2))  # NaN behind a camera, and not near
     return near
+
+
+def moved_pixels(camera: RigCamera, points: FloatArray, motion: RigidTransform) -> FloatArray:
+    """(n, 2) where a camera of a body that moved, as in Eq. 7, sees points (n, 3) of C; NaN where it does not."""
+    mount = camera.T_body_camera
+    return camera.camera.project((motion.inverse().apply(points) - mount.translation) @ mount.rotation)

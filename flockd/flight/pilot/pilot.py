@@ -14,7 +14,6 @@ import numpy as np
 from flockd.core.config.drone import DroneConfig
 from flockd.core.messages import (
     NO_STATUS,
-    CameraDeviation,
     Detection,
     EgoMotion,
     FloatArray,
@@ -33,13 +32,14 @@ from flockd.core.messages import (
 )
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.flocking.passing import Passing
-from flockd.flight.geometry import RigCalibration, Seen, build_rig, estimate_ego_motion, rig_faults
+from flockd.flight.geometry import build_rig, estimate_ego_motion
 from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
 from flockd.flight.obstacles import Avoidance, LocalMap, ObstacleRanging
 from flockd.flight.perception import Networks, Observation, Perception, load_networks
 from flockd.flight.perception.detection.detector import DetectionTrace
 from flockd.flight.perception.maps import KnownSize
+from flockd.flight.pilot.camera_agreement import CameraAgreement, moves_otherwise
 from flockd.flight.pilot.ground import GroundFilter, scaled_by_ground
 from flockd.flight.pilot.motions import background_pairs, neighbour_motions
 from flockd.flight.pilot.size_learner import SizeLearner
@@ -47,8 +47,6 @@ from flockd.flight.pilot.trim import VelocityTrim
 from flockd.flight.safety.surroundings import limits_towards
 from flockd.flight.tracking import Measurement, Prediction, Shown, Tracker
 
-RIG_EVERY_S = 5.0
-"""An output in so many seconds says what is known of the rig: it changes slowly, and is long."""
 _ROTATION_TOLERANCE = 1e-3
 """How far an attitude's R R^T may be from the identity: beyond it is no attitude, and not only rounded."""
 _ROUNDING = 1e-6
@@ -110,10 +108,7 @@ class FlockPilot:
         )
         by_height = config.perception.scale == "height"
         self._ground = GroundFilter(config.perception.height, config.perception.range_finder) if by_height else None
-        self._calibration = RigCalibration(self._rig)
-        self._seen: Seen | None = None
-        """What the last step's pairs began at."""
-        self._rig_said_s: float | None = None
+        self._agreement = CameraAgreement(self._rig)
         self._tracker = Tracker(config.tracking)
         self._size = SizeLearner(config, learned, flies=flies)
         self._law = FlockingLaw(config.flocking)
@@ -165,7 +160,7 @@ class FlockPilot:
         if refusal is not None:
             return self._refused(frames.time_s, refusal)
         vehicle = _with_rotation(vehicle)
-        elsewhere = self._calibration.elsewhere()
+        elsewhere = self._agreement.elsewhere()
         frames = replace(frames, frames={name: one for name, one in frames.frames.items() if name not in elsewhere})
         laps = _Laps(self._stopwatch)
         trace = trace or StepTrace()
@@ -177,7 +172,7 @@ class FlockPilot:
         trace.observation = observation
         if self._config.perception.height == "barometer":
             ground = None  # the height says as much
-        ego, why_no_ego = self._ego_motion(observation, frames)
+        ego, why_no_ego = self._ego_motion(observation)
         ego = self._scaled(observation, ego, ground)
         laps.end("ego_motion")
         motions, why_no_motion = self._neighbour_motions(observation, ego)
@@ -197,9 +192,7 @@ class FlockPilot:
         laps.end("flocking")
         self._last_time_s = observation.time_s
         of_height = () if why_no_ground is None else (why_no_ground,)
-        deviations = self._deviations(observation.time_s)
-        faults = [text for one in deviations for text in rig_faults(one)]
-        of_rig = [Reason(ReasonKind.RIG, text) for text in faults]
+        of_rig = [Reason(ReasonKind.RIG, f"{moves_otherwise(name)} The drone flies without it.") for name in elsewhere]
         reasons = (*of_height, *observation.reasons, *why_no_ego, *why_no_motion, *why_no_measurement, *of_rig)
         return PilotOutput(
             time_s=observation.time_s,
@@ -217,7 +210,6 @@ class FlockPilot:
             noisy_cameras=(*observation.noisy_cameras, *elsewhere),
             ground=ground,
             obstacles=obstacles,
-            rig=deviations,
             size=self._size.status,
         )
 
@@ -259,10 +251,8 @@ class FlockPilot:
             return ()
         return self._tracker.predictions(time_s - self._last_time_s, self._velocity)
 
-    def _ego_motion(self, observation: Observation, frames: FrameSet) -> tuple[EgoMotion | None, Sequence[Reason]]:
+    def _ego_motion(self, observation: Observation) -> tuple[EgoMotion | None, Sequence[Reason]]:
         """The own motion in C (the body frame at the previous observation), or why there is none (Eq. 7-21)."""
-        times_s = {name: frame.time_s for name, frame in frames.frames.items()}
-        before, self._seen = self._seen, Seen(observation.vehicle, frames.time_s, times_s)
         if observation.previous is None:
             return None, ()
         parameters = self._config.geometry
@@ -270,8 +260,7 @@ class FlockPilot:
             pairs = background_pairs(self._rig, observation, parameters)
         except ValueError as error:
             return None, (Reason(ReasonKind.EGO_MOTION, f"ego-motion: {error}"),)
-        if before is not None and before.frames_s == observation.previous.time_s:
-            self._calibration.update(before, self._seen, pairs)
+        self._agreement.see(observation.previous.vehicle, observation.vehicle, observation.interval_s, pairs)
         try:
             ego = estimate_ego_motion(pairs, self._rig, observation.interval_s, parameters)
         except ValueError as error:
@@ -313,15 +302,6 @@ class FlockPilot:
             return True
         self._refused_in_a_row += 1
         return False
-
-    def _deviations(self, time_s: float) -> tuple[CameraDeviation, ...]:
-        """What is known of the rig, once in `RIG_EVERY_S`."""
-        if self._rig_said_s is None:
-            self._rig_said_s = time_s
-        if abs(time_s - self._rig_said_s) < RIG_EVERY_S:
-            return ()
-        self._rig_said_s = time_s
-        return self._calibration.deviations()
 
     def _neighbour_motions(
         self, observation: Observation, ego: EgoMotion | None

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,57 +13,82 @@ import numpy as np
 
 from flockd.core.config.rig import RigConfig
 from flockd.core.data import written_whole
-from flockd.core.messages import CameraDeviation, PilotOutput
-from flockd.flight.geometry import (
-    RigidTransform,
-    build_rig,
+from flockd.flight.geometry import RigidTransform, build_rig, rotation_from_vector
+from flockd.flight.pilot import FlockPilot, StepTrace
+from flockd.flight.pilot.camera_agreement import moves_otherwise
+from flockd.flight.pilot.motions import background_pairs
+from flockd.ground.calibration.board import CalibrationError
+from flockd.ground.calibration.fragment import extrinsics_of, measured_today, rig_text
+from flockd.ground.calibration.rig_calibration import (
+    CameraDeviation,
+    RigCalibration,
+    Seen,
     described,
     differs,
     rig_faults,
     rolling,
-    rotation_from_vector,
 )
-from flockd.ground.calibration.board import CalibrationError
-from flockd.ground.calibration.fragment import extrinsics_of, measured_today, rig_text
-from flockd.onboard.message_json import from_json, parsed
-from flockd.onboard.recording.mcap_file import RecordingError, read_entries
+from flockd.onboard.daemon import load_side_by_side
+from flockd.onboard.recording.mcap_file import RecordingError
 from flockd.onboard.recording.reader import Recording
-from flockd.onboard.recording.streams import OUTPUT
+from flockd.onboard.recording.streams import is_image
 
 MAX_TURN_RAD, MAX_OFFSET_S, MAX_FOCAL = math.radians(0.5), 0.01, 0.01
 """What is more uncertain than this is not known: the standard deviation of a mounting about its worst axis, of a time,
 of a focal length."""
+LEAST_S = 5.0
+"""Of looks: less says nothing."""
 
 
-def found_rig(recording: Recording) -> tuple[CameraDeviation, ...]:
-    """The last that the outputs of a recording say of its cameras; none: they say nothing. Raises RecordingError."""
-    last: tuple[CameraDeviation, ...] = ()
-    for entry in read_entries(recording.path):
-        if entry.stream.topic == OUTPUT.topic:
-            try:
-                last = from_json(PilotOutput, parsed(entry.data)).rig or last
-            except ValueError as error:
-                damaged = f"the output of step {entry.sequence} is damaged: {error}"
-                raise RecordingError(f"{recording.path}: {damaged}") from error
-    names = {camera.name for camera in recording.config.rig.cameras}
-    for one in last:
-        if one.camera not in names or not _is_possible(one):
-            raise RecordingError(f"{recording.path}: what it says of the rig, of camera {one.camera!r}, cannot be")
-    return last
+def found_rig(
+    recording: Recording, last_s: float = math.inf, progress: Callable[[int, int], None] = lambda done, total: None
+) -> tuple[CameraDeviation, ...]:
+    """How each camera was in the last seconds of a flight, whose steps are computed again; none: it is too short.
+
+    ``progress`` is called with the steps done and their total. Raises RecordingError where there are no images, and
+    ModelError.
+    """
+    if not any(map(is_image, recording.contents.messages)):
+        raise RecordingError(f"{recording.path}: holds no images, and without them nothing of its cameras can be told")
+    config, began_s = recording.config, recording.start_s + recording.duration_s - last_s
+    total = sum(began_s <= time_s for _, time_s in recording.contents.steps)
+    pilot = FlockPilot(config, load_side_by_side(config), learned=recording.learned)
+    rig = build_rig(config.rig)
+    calibration, looks_s, told = RigCalibration(rig), 0.0, set[str]()
+    before: Seen | None = None
+    for done, step in enumerate(recording.steps(began_s), start=1):
+        trace = StepTrace()
+        output = pilot.step(step.frames, step.vehicle, trace, step.order)
+        told |= {reason.text for reason in output.reasons} | set((step.output or {}).get("reasons", ()))
+        observation, after = trace.observation, None
+        if observation is not None:
+            times_s = {name: frame.time_s for name, frame in step.frames.frames.items()}
+            after = Seen(observation.vehicle, step.frames.time_s, times_s)
+            if before is not None and observation.previous and observation.previous.time_s == before.frames_s:
+                with contextlib.suppress(ValueError):  # no depth has a scale, or no camera both frames
+                    calibration.update(before, after, background_pairs(rig, observation, config.geometry))
+                    looks_s += observation.interval_s
+        before = after
+        progress(done, total)
+    if looks_s < LEAST_S:
+        return ()
+    return tuple(
+        replace(one, elsewhere=one.elsewhere or any(text.startswith(moves_otherwise(one.camera)) for text in told))
+        for one in calibration.deviations()
+    )
 
 
-def corrected_rig(recording: Recording, source: str, out: Path) -> dict[str, Any]:
-    """Writes the rig that the flight found to ``out`` and gives the result.
+def corrected_rig(
+    recording: Recording, deviations: Sequence[CameraDeviation], source: str, out: Path
+) -> dict[str, Any]:
+    """Writes the recording's rig, corrected by what `found_rig` found, to ``out`` and gives the result.
 
     What is not known well, and what differs by less than three standard deviations, stays as it was configured.
     Raises CalibrationError where nothing is to be taken over.
     """
-    found = {one.camera: one for one in found_rig(recording)}
+    found = {one.camera: one for one in deviations}
     if not found:
-        raise CalibrationError(
-            f"{source}: says nothing of the rig: it is shorter than some seconds, or was recorded by an older "
-            "flockd; fly again"
-        )
+        raise CalibrationError(f"{source}: says nothing of the rig: it is shorter than {LEAST_S:g} s; fly again")
     config = recording.config.rig
     offset_s, note = _offset_s(list(found.values()))
     cameras, results, notes = [], {}, [] if note is None else [note]
@@ -126,11 +153,3 @@ def _offset_s(found: Sequence[CameraDeviation]) -> tuple[float | None, str | Non
         worst = known[int(apart_s.argmax())].camera
         note = f"the time of camera {worst!r} is {1e3 * apart_s.max():.0f} ms off the others'; the offset is their mean"
     return (mean_s, note) if abs(mean_s) > 3.0 * sigma_s else (None, note)
-
-
-def _is_possible(one: CameraDeviation) -> bool:
-    readout = [of for of in (one.readout_s, one.readout_sigma_s) if of is not None]
-    numbers = np.concatenate([one.turn, [one.time_offset_s, one.focal_scale], one.covariance.ravel(), *readout])
-    if not (np.isfinite(numbers).all() and one.focal_scale > 0.0 and np.abs(numbers).max() < 100.0):
-        return False
-    return bool(np.allclose(one.covariance, one.covariance.T) and np.linalg.eigvalsh(one.covariance)[0] > 0.0)

@@ -72,7 +72,7 @@ def failed_from_error(about: str, sentence: str) -> Finding:
 
 _LIMITS_S = {
     "limits": 5.0,
-    "rig": 60.0,
+    "rig": 120.0,
     "instance": 5.0,
     "memory": 5.0,
     "disk": 20.0,

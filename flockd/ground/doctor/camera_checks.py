@@ -11,12 +11,13 @@ import numpy as np
 
 from flockd.core.config import DroneConfig
 from flockd.core.config.rig import CameraConfig, RigConfig
-from flockd.core.errors import FlockdError
-from flockd.flight.geometry import Rig, build_rig, described, rig_faults
+from flockd.flight.geometry import Rig, build_rig
 from flockd.ground.calibration.from_flight import found_rig
+from flockd.ground.calibration.rig_calibration import described, rig_faults
 from flockd.ground.cameras.watching import START_S, Watched, watch
 from flockd.ground.doctor import Finding, Level, failed, failed_from_error, graded, passed, warned
 from flockd.ground.doctor.computer_checks import STATE_FOLDER
+from flockd.onboard.recording.mcap_file import RecordingError
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.sources.device_source import Devices
 
@@ -35,6 +36,8 @@ ODD_CENTRE, WRONG_CENTRE = 0.08, 0.2
 """Shares of the width or height, between the principal point and the middle."""
 ODD_PIXELS, WRONG_PIXELS = 0.03, 0.15
 """How much fx and fy differ: pixels are square, unless images were squeezed from another aspect."""
+LAST_S = 30.0
+"""Of the last flight, that the rig is compared with: computed again, they take less time than they took in the air."""
 NARROW_DEG, MOST_PINHOLE_DEG, MOST_WIDE_DEG = 40.0, 130.0, 220.0
 
 
@@ -183,12 +186,12 @@ def check_rig(config: DroneConfig, folder: Path | None, state_folder: Path = STA
         return
     try:
         recording = Recording(newest)
-        found = found_rig(recording)
-    except (FlockdError, OSError) as error:
+        if recording.config.rig != config.rig:
+            yield passed("rig", f"is another than in the last flight, {newest.name}, which says nothing of it")
+            return
+        found = found_rig(recording, LAST_S)
+    except (RecordingError, OSError) as error:
         yield warned("rig", f"its last flight could not be read: {error}", "delete it")
-        return
-    if recording.config.rig != config.rig:
-        yield passed("rig", f"is another than in the last flight, {newest.name}, which says nothing of it")
         return
     if not found:
         yield passed("rig", f"the last flight, {newest.name}, was too short to say anything of it")

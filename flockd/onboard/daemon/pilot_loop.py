@@ -16,7 +16,6 @@ import numpy as np
 from flockd.core import services
 from flockd.core.config import DroneConfig
 from flockd.core.messages import (
-    CameraDeviation,
     FloatArray,
     FrameSet,
     LearnedSize,
@@ -27,7 +26,7 @@ from flockd.core.messages import (
     ReasonKind,
     VehicleState,
 )
-from flockd.flight.geometry import described, rig_faults, rotation_from_vector, vector_from_rotation
+from flockd.flight.geometry import rotation_from_vector, vector_from_rotation
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
 from flockd.onboard.sources import FrameSource
@@ -257,11 +256,10 @@ class Reports:
         return begun + over
 
     def _of_rig(self, output: PilotOutput) -> list[str]:
-        """Once a flight, what of a camera is not as configured, and by how much."""
+        """Once a flight, which cameras move otherwise than the drone."""
         new = [one.text for one in output.reasons if one.kind is ReasonKind.RIG and one.text not in self._said_of_rig]
         self._said_of_rig.update(new)
-        corrections = {text: _done(one, output) for one in output.rig for text in rig_faults(one)}
-        return [text + corrections[text] for text in new]
+        return new
 
     def _of_size(self, output: PilotOutput) -> list[str]:
         """That it weaves, and how large the others are, when it is new."""
@@ -282,17 +280,6 @@ class Reports:
 
 _OVER = {ReasonKind.HEIGHT: "the range finder works again", ReasonKind.LENS: "its lens is clear again"}
 """Said, after its subject, when a fault is over."""
-
-
-def _done(one: CameraDeviation, output: PilotOutput) -> str:
-    if one.camera in output.noisy_cameras:
-        return " The drone flies without it."
-    if one.elsewhere:
-        return " It is flown on as configured, as too few others agree with the autopilot."
-    return (
-        f": by what it saw, {described(one)}; it is flown on as configured, and "
-        "`flockd calibrate rig --from-flight` corrects it"
-    )
 
 
 HISTORY_S = services.VEHICLE_STATE.timeout

@@ -12,8 +12,8 @@ import numpy as np
 
 from flockd.core.messages import FloatArray, Frame, FrameSet, UInt8Array
 from flockd.flight.geometry import Rig, RigCamera, RigidTransform, build_rig, rotation_from_vector
-from flockd.flight.geometry.camera_motion import scaled_focal
 from flockd.flight.mission import Moment, Navigator
+from flockd.ground.calibration.camera_motion import scaled_focal
 from flockd.sim.cameras.lens_views import lens_view
 from flockd.sim.cameras.real_camera import NOISE_TILE, NoiseTile, Shot, real_cameras
 from flockd.sim.cameras.shutter import CameraMotion

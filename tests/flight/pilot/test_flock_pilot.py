@@ -12,9 +12,10 @@ import pytest
 
 from flockd.core.config.mission import MissionParameters
 from flockd.core.messages import Float32Array, Frame, FrameSet, Reason, ReasonKind, VehicleState
-from flockd.flight.geometry import RigCalibration, RigCamera, rotation_angle_deg, rotation_from_euler
+from flockd.flight.geometry import RigCamera, rotation_angle_deg, rotation_from_euler
 from flockd.flight.perception import Observation, SceneMaps
 from flockd.flight.pilot import FlockPilot
+from flockd.flight.pilot.camera_agreement import CameraAgreement
 from tests.flight.pilot.flyer import STEP_S, Flyer, SpoilableTruth, scenario_with
 from tests.make import changed, detection, frames, vehicle
 
@@ -65,10 +66,12 @@ def test_true_maps_give_true_motions_and_a_repeated_time_stamp_restarts_the_pair
 def test_a_camera_that_is_elsewhere_is_flown_without(flyer: Flyer, monkeypatch: pytest.MonkeyPatch) -> None:
     assert flyer.step().noisy_cameras == ()
     flyer.move()
-    monkeypatch.setattr(RigCalibration, "elsewhere", lambda calibration: ("front",))
+    monkeypatch.setattr(CameraAgreement, "elsewhere", lambda agreement: ("front",))
     output = flyer.step()
     assert output.noisy_cameras == ("front",)
     assert output.counts["camera front: no frame"] == 1
+    (told,) = (reason.text for reason in output.reasons if reason.kind is ReasonKind.RIG)
+    assert told.startswith("camera front: it moves otherwise") and told.endswith("The drone flies without it.")
     assert not output.detections, "the neighbour is ahead"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,13 +12,16 @@ import numpy as np
 import pytest
 
 from flockd.core.config import DroneConfig, load_drone
-from flockd.core.messages import CameraDeviation, FloatArray, PilotOutput, Reason, ReasonKind
-from flockd.flight.geometry import build_rig, rotation_from_vector
+from flockd.core.messages import FloatArray, FrameSet, PilotOutput, Reason, ReasonKind, VehicleState
+from flockd.flight.geometry import PointPairs, build_rig, rotation_from_vector
+from flockd.flight.perception import Observation
+from flockd.flight.pilot import StepTrace
+from flockd.flight.pilot.camera_agreement import moves_otherwise
+from flockd.ground.calibration import from_flight
 from flockd.ground.calibration.board import CalibrationError
 from flockd.ground.calibration.from_flight import corrected_rig, found_rig
-from flockd.ground.doctor import Level
-from flockd.ground.doctor.camera_checks import check_rig
-from flockd.onboard.daemon.pilot_loop import Reports
+from flockd.ground.calibration.rig_calibration import CameraDeviation
+from flockd.ground.doctor import Finding, Level, camera_checks
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.mcap_file import RecordingError
 from flockd.onboard.recording.reader import Recording
@@ -41,27 +44,27 @@ def seen(
     return CameraDeviation(camera, turn, time_s, focal, np.diag(np.array(sigmas) ** 2))
 
 
-def recorded(folder: Path, rigs: Sequence[Sequence[CameraDeviation]], name: str = NAME) -> Recording:
-    """A flight whose outputs say this, one after the other."""
-    config = drone_config()
-    with Recorder(folder / name, drone="drone1", config=config) as recorder:
-        for (frames, vehicle), rig in zip(inputs(len(rigs)), rigs, strict=True):
+def recorded(folder: Path, steps: int = 2, change: Callable[[PilotOutput], PilotOutput] = lambda one: one) -> Recording:
+    """A flight of two cameras."""
+    with Recorder(folder / NAME, drone="drone1", config=drone_config()) as recorder:
+        for frames, vehicle in inputs(steps):
             output: PilotOutput = filled(PilotOutput, 0.5)
-            recorder.step(frames, vehicle, replace(output, time_s=frames.time_s, rig=tuple(rig)))
+            recorder.step(frames, vehicle, change(replace(output, time_s=frames.time_s)))
             recorder.drain()
-    return Recording(folder / name)
+    return Recording(folder / NAME)
 
 
-def examined(config: DroneConfig, folder: Path) -> list[tuple[Level, str]]:
-    """What the doctor finds of drone1's last flight: its levels, and of what."""
-    return [(one.level, one.about) for one in check_rig(config.model_copy(update={"name": "drone1"}), folder)]
+def examined(
+    monkeypatch: pytest.MonkeyPatch, config: DroneConfig, folder: Path, *found: CameraDeviation
+) -> list[Finding]:
+    """What the doctor finds of drone1's last flight, in which this was found."""
+    monkeypatch.setattr(camera_checks, "found_rig", lambda recording, last_s: found)
+    return list(camera_checks.check_rig(config.model_copy(update={"name": "drone1"}), folder))
 
 
-def test_the_last_that_was_said_is_taken_over(tmp_path: Path) -> None:
-    worse = seen("front", -TURN), seen("left", -TURN)
-    recording = recorded(tmp_path, [worse, (seen("front"), seen("left")), ()])
-    out = tmp_path / "rig.yaml"
-    result = corrected_rig(recording, "flight", out)
+def test_what_was_found_is_taken_over(tmp_path: Path) -> None:
+    recording, out = recorded(tmp_path), tmp_path / "rig.yaml"
+    result = corrected_rig(recording, (seen("front"), seen("left")), "flight", out)
     assert result["cameras"]["front"]["taken"] == ["mounting", "focal length"]
     before, after = recording.config.rig, load_drone(out).rig
     assert after.time_offset_s == pytest.approx(before.time_offset_s - 0.03)
@@ -76,9 +79,8 @@ def test_the_last_that_was_said_is_taken_over(tmp_path: Path) -> None:
 
 def test_what_is_not_known_is_kept_and_named(tmp_path: Path) -> None:
     vague = (WELL[0], WELL[1], math.radians(1.2), 0.02, 0.02)
-    recording = recorded(tmp_path, [(seen("front", sigmas=vague), seen("left"))])
-    out = tmp_path / "rig.yaml"
-    result = corrected_rig(recording, "flight", out)
+    recording, out = recorded(tmp_path), tmp_path / "rig.yaml"
+    result = corrected_rig(recording, (seen("front", sigmas=vague), seen("left")), "flight", out)
     assert result["cameras"]["front"]["taken"] == []
     assert result["cameras"]["left"]["taken"] == ["mounting", "focal length"]
     assert result["notes"] == [
@@ -95,88 +97,115 @@ def test_a_rolling_shutter_is_said(tmp_path: Path) -> None:
 
     turned, as_configured = rolled(seen("front")), rolled(seen("front", np.zeros(3), 0.0, 1.0))
     said = "rows are read over the images' width in -17 +- 2 ms: a rolling shutter"
-    recording = recorded(tmp_path, [(turned, seen("left"))])
-    assert corrected_rig(recording, "flight", tmp_path / "rig.yaml")["notes"] == [said]
-    other = recorded(tmp_path, [(as_configured, replace(as_configured, camera="left"))], NAME.replace("12", "13"))
+    recording, found = recorded(tmp_path), (as_configured, replace(as_configured, camera="left"))
+    assert corrected_rig(recording, (turned, seen("left")), "flight", tmp_path / "rig.yaml")["notes"] == [said]
     with pytest.raises(CalibrationError, match=rf"to be corrected: {re.escape(said)}; what is known agrees"):
-        corrected_rig(other, "flight", tmp_path / "again.yaml")
+        corrected_rig(recording, found, "flight", tmp_path / "again.yaml")
 
 
-def test_of_a_camera_that_is_elsewhere_nothing_is_taken_and_the_doctor_names_it(tmp_path: Path) -> None:
-    lost = replace(seen("front", time_s=-0.3), elsewhere=True)
-    recording = recorded(tmp_path, [(lost, seen("left"))])
-    out = tmp_path / "rig.yaml"
-    result = corrected_rig(recording, "flight", out)
+def test_of_a_camera_that_is_elsewhere_nothing_is_taken_and_the_doctor_names_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = replace(seen("front", time_s=-0.3), elsewhere=True), seen("left")
+    recording, out = recorded(tmp_path), tmp_path / "rig.yaml"
+    result = corrected_rig(recording, found, "flight", out)
     assert result["cameras"]["front"]["taken"] == []
     assert result["notes"][0].startswith("camera front: it moves otherwise than the drone")
     assert load_drone(out).rig.cameras[0] == recording.config.rig.cameras[0]
     assert result["time_offset_s"] == pytest.approx(-0.03)
-    found = examined(recording.config, tmp_path)
-    assert found == [(Level.FAILURE, "camera front"), (Level.WARNING, "camera left")]
+    front, left = examined(monkeypatch, recording.config, tmp_path, *found)
+    assert (front.level, front.about) == (Level.FAILURE, "camera front")
+    assert (left.level, left.about) == (Level.WARNING, "camera left")
 
 
 LITTLE = (np.radians([0.1, -0.2, 0.1]), 0.002, 1.004)
 
 
 @pytest.mark.parametrize(
-    ("rigs", "told"),
+    ("found", "told"),
     [
-        ([(seen("front", *LITTLE), seen("left", *LITTLE))], "nothing of the rig is to be corrected"),
-        ([(), ()], "says nothing of the rig"),
+        ((seen("front", *LITTLE), seen("left", *LITTLE)), "nothing of the rig is to be corrected"),
+        ((), "says nothing of the rig"),
     ],
     ids=["agrees", "silent"],
 )
 def test_what_agrees_or_is_not_said_is_not_replaced(
-    rigs: Sequence[Sequence[CameraDeviation]], told: str, tmp_path: Path
+    found: tuple[CameraDeviation, ...], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recording = recorded(tmp_path, rigs)
+    recording = recorded(tmp_path)
     with pytest.raises(CalibrationError, match=told):
-        corrected_rig(recording, "flight", tmp_path / "rig.yaml")
+        corrected_rig(recording, found, "flight", tmp_path / "rig.yaml")
     assert not (tmp_path / "rig.yaml").exists()
-    assert examined(recording.config, tmp_path) == [(Level.PASS, "rig")]
+    (finding,) = examined(monkeypatch, recording.config, tmp_path, *found)
+    assert (finding.level, finding.about) == (Level.PASS, "rig")
 
 
 def test_times_of_cameras_that_do_not_agree_are_named(tmp_path: Path) -> None:
-    recording = recorded(tmp_path, [(seen("front", time_s=-0.01), seen("left", time_s=-0.05))])
-    result = corrected_rig(recording, "flight", tmp_path / "rig.yaml")
+    found = seen("front", time_s=-0.01), seen("left", time_s=-0.05)
+    result = corrected_rig(recorded(tmp_path), found, "flight", tmp_path / "rig.yaml")
     assert result["time_offset_s"] == pytest.approx(-0.03)
     assert "20 ms off the others'" in result["notes"][0]
-    fault = Reason(ReasonKind.RIG, "camera left: it is not turned as configured")
-    output: PilotOutput = replace(filled(PilotOutput, 0.5), reasons=(fault,), rig=(seen("front"), seen("left")))
-    reports = Reports()
-    (text,) = reports.update(output)
-    assert text.startswith("camera left: it is not turned as configured: by what it saw, turned by roll +0.30")
-    assert reports.update(output) == [], "each fault is said once a flight"
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        seen("top"),
-        seen("front", np.array([math.nan, 0.0, 0.0])),
-        seen("front", focal=0.0),
-        seen("front", focal=-1.0),
-        seen("front", sigmas=(0.0,) * 5),
-        replace(seen("front"), covariance=np.full((5, 5), 1e300)),
-        replace(seen("front"), covariance=-np.eye(5)),
-        replace(seen("front"), readout_s=np.array([math.nan, 0.0]), readout_sigma_s=np.full(2, 0.001)),
-    ],
-    ids=["stranger", "nan", "no focal length", "negative", "certain", "absurd", "negative variances", "nan readout"],
-)
-def test_what_cannot_be_is_refused_in_one_sentence(wrong: CameraDeviation, tmp_path: Path) -> None:
-    recording = recorded(tmp_path, [(wrong,)])
-    with pytest.raises(RecordingError, match="cannot be"):
+class StubPilot:
+    """Sees two cameras that show nothing."""
+
+    def __init__(self, *_: object, **__: object) -> None:
+        self._before: Observation | None = None
+
+    def step(self, frames: FrameSet, vehicle: VehicleState, trace: StepTrace, _: object) -> PilotOutput:
+        trace.observation = self._before = Observation(frames.time_s, vehicle, {}, (), self._before)
+        output: PilotOutput = filled(PilotOutput, 0.5)
+        return output
+
+
+@pytest.fixture
+def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(from_flight, "FlockPilot", StubPilot)
+    monkeypatch.setattr(from_flight, "load_side_by_side", lambda config: None)
+    points, pixels = np.zeros((0, 3)), np.zeros((0, 2))
+    nothing = PointPairs(points, points, np.zeros(0, np.int64), np.zeros(0, np.str_), pixels, pixels)
+    monkeypatch.setattr(from_flight, "background_pairs", lambda *_: nothing)
+
+
+@pytest.mark.usefixtures("stubbed")
+def test_a_camera_that_was_flown_without_is_elsewhere_and_a_short_flight_says_nothing(tmp_path: Path) -> None:
+    def told(output: PilotOutput) -> PilotOutput:
+        text = f"{moves_otherwise('left')} The drone flies without it."
+        return replace(output, reasons=(Reason(ReasonKind.RIG, text),) if output.time_s > 1005.9 else ())
+
+    recording, done = recorded(tmp_path, 61, told), list[tuple[int, int]]()
+    front, left = found_rig(recording, progress=lambda steps, total: done.append((steps, total)))
+    assert (front.camera, front.elsewhere) == ("front", False)
+    assert (left.camera, left.elsewhere) == ("left", True)
+    assert done[-1] == (61, 61)
+    assert found_rig(recording, last_s=4.0) == ()
+
+
+def test_a_recording_without_images_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Recorder(tmp_path / NAME, drone="drone1", config=drone_config()) as recorder:
+        for frames, vehicle in inputs(2):
+            recorder.step(replace(frames, frames={}), vehicle, filled(PilotOutput, 0.5))
+    recording = Recording(tmp_path / NAME)
+    with pytest.raises(RecordingError, match="holds no images"):
         found_rig(recording)
-    assert examined(recording.config, tmp_path) == [(Level.WARNING, "rig")]
+    config = recording.config.model_copy(update={"name": "drone1"})
+    (finding,) = camera_checks.check_rig(config, tmp_path)
+    assert (finding.level, finding.about) == (Level.WARNING, "rig")
 
 
-def test_the_doctor_compares_the_newest_recording_with_the_configuration(tmp_path: Path) -> None:
-    config = drone_config().model_copy(update={"name": "drone1"})
-    assert examined(config, tmp_path) == [(Level.PASS, "rig")], "there is no flight yet"
-    recorded(tmp_path, [(seen("front", np.zeros(3), 0.0, 1.0), seen("left"))])
-    (finding,) = check_rig(config, tmp_path)
+def test_the_doctor_compares_the_newest_recording_with_the_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = drone_config()
+    (finding,) = examined(monkeypatch, config, tmp_path)
+    assert (finding.level, finding.about) == (Level.PASS, "rig"), "there is no flight yet"
+    recorded(tmp_path)
+    found = seen("front", np.zeros(3), 0.0, 1.0), seen("left")
+    (finding,) = examined(monkeypatch, config, tmp_path, *found)
     assert (finding.level, finding.about) == (Level.WARNING, "camera left")
     assert "roll +0.30 +- 0.10, pitch -1.90 +- 0.10, yaw +0.50 +- 0.10 degrees, time -30 +- 1 ms" in finding.measured
     assert "flockd calibrate rig --from-flight" in finding.fix
     other = config.model_copy(update={"rig": config.rig.model_copy(update={"time_offset_s": 0.01})})
-    assert examined(other, tmp_path) == [(Level.PASS, "rig")], "another rig than in the last flight"
+    (finding,) = examined(monkeypatch, other, tmp_path, *found)
+    assert "is another than in the last flight" in finding.measured

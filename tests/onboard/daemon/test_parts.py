@@ -34,6 +34,7 @@ from flockd.core.messages import (
 )
 from flockd.flight.inference import OnnxModel
 from flockd.flight.perception import ImagePair
+from flockd.flight.pilot.camera_agreement import moves_otherwise
 from flockd.flight.safety import Action, Decision, Gate, Inputs, Permission, Request, State, Surroundings
 from flockd.onboard.daemon.control import Control
 from flockd.onboard.daemon.operator_orders import OperatorRequests
@@ -232,6 +233,14 @@ def test_a_range_finder_that_fails_is_an_event_and_so_is_its_return() -> None:
     steps: tuple[tuple[Reason, ...], ...] = ((), (left, weak), (weak,), (old,), (left,), ())
     found = [reports.update(output(reasons=reasons)) for reasons in steps]
     assert found == [[], [weak.text], [], [old.text], ["height: the range finder works again"], []]
+
+
+def test_a_camera_that_is_flown_without_is_said_once_a_flight() -> None:
+    reports, told = Reports(), Reason(ReasonKind.RIG, f"{moves_otherwise('left')} The drone flies without it.")
+    steps: tuple[tuple[Reason, ...], ...] = ((), (told,), (), (told,))
+    assert [reports.update(output(reasons=reasons)) for reasons in steps] == [[], [told.text], [], []]
+    reports.begin()
+    assert reports.update(output(reasons=(told,))) == [told.text]
 
 
 def test_who_has_seen_another_twice_is_not_alone_though_it_is_not_confirmed_yet() -> None:

@@ -1,4 +1,4 @@
-"""A rig calibrated in flight: how each camera is turned, when it takes its images, its focal length; with covariance.
+"""A rig calibrated by a flight: how each camera is turned, when it takes its images, its focal length; with covariance.
 
 An error-state Kalman filter. It compares how each camera moved between two images, by what it alone saw
 (`camera_motion`), with how the autopilot says that the body turned and went. The camera's turn is the body's seen from
@@ -19,12 +19,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flockd.core.messages import CameraDeviation, FloatArray, VehicleState
-from flockd.flight.geometry.camera_motion import CameraMotion, camera_motion
+from flockd.core.messages import FloatArray, VehicleState
 from flockd.flight.geometry.pairs import PointPairs
 from flockd.flight.geometry.rig import Rig, RigCamera
 from flockd.flight.geometry.rotations import cross_matrix, rotation_from_vector, vector_from_rotation
 from flockd.flight.geometry.transform import RigidTransform
+from flockd.flight.pilot.camera_agreement import moves_otherwise
+from flockd.ground.calibration.camera_motion import CameraMotion, camera_motion
 
 PRIOR_TURN_RAD, PRIOR_OFFSET_S, PRIOR_FOCAL = math.radians(4.0), 0.06, 0.04
 """Standard deviations before anything was seen: each axis of a mounting, a time, a focal length's logarithm."""
@@ -79,6 +80,30 @@ squares of 16 cameras in two worlds; with real cameras more is to be expected.""
 
 
 @dataclass(frozen=True, eq=False)
+class CameraDeviation:
+    """How a camera differs from its configuration, by what it saw in a flight."""
+
+    camera: str
+    turn: FloatArray
+    """(3,) rotation vector in body axes, rad, by which it is turned from where the configuration has it:
+    ``R_body_camera = exp(turn) R_configured``."""
+    time_offset_s: float
+    """To be added to its time stamps, beside the rig's configured offset."""
+    focal_scale: float
+    """Its focal lengths over the configured ones."""
+    covariance: FloatArray
+    """(5, 5) of turn, time offset, and the focal scale's logarithm."""
+    elsewhere: bool = False
+    """It moves otherwise than the drone, as no mounting that is a little off explains: the other numbers say nothing.
+    Turned or upside down, swapped with another, or before something that moves along."""
+    readout_s: FloatArray | None = None
+    """(2,) seconds in which rows are read one after the other, over the image's width (from its right: negative) and
+    over its height; of all cameras together. Near 0: a global shutter."""
+    readout_sigma_s: FloatArray | None = None
+    """(2,) standard deviations."""
+
+
+@dataclass(frozen=True, eq=False)
 class Seen:
     """What the autopilot said at a frame set's time, and each camera's own time."""
 
@@ -110,8 +135,7 @@ def differs(deviation: CameraDeviation) -> Differs:
 def rig_faults(deviation: CameraDeviation) -> tuple[str, ...]:
     """What of a camera differs, by more than is worth a warning, one sentence each; for people."""
     if deviation.elsewhere:
-        text = "it moves otherwise than the drone: is it the one of that name, turned as configured?"
-        return (f"camera {deviation.camera}: {text}",)
+        return (moves_otherwise(deviation.camera),)
     sure, found = differs(deviation), []
     if sure.turn and float(np.linalg.norm(deviation.turn)) > WORTH_TURN_RAD:
         found.append("it is not turned as configured")
@@ -236,7 +260,7 @@ class RigCalibration:
     def update(self, before: Seen, after: Seen, pairs: PointPairs) -> None:
         """Takes what stood still between two frame sets, which are at most some seconds apart.
 
-        What is farther apart is left out, and so is what makes no finite numbers: a step must not end of it.
+        What is farther apart is left out, and so is what makes no finite numbers.
         """
         interval_s = after.vehicle.time_s - before.vehicle.time_s
         if not 0.0 < interval_s <= _MAX_INTERVAL_S:
@@ -302,15 +326,6 @@ class RigCalibration:
                 )
             )
         return tuple(found)
-
-    def elsewhere(self) -> tuple[str, ...]:
-        """Cameras to fly without, as of `CameraDeviation.elsewhere`; none where more do so than agree with the drone.
-
-        Of one camera and the autopilot, or the attitude that is late to most, it is not known which is wrong.
-        """
-        agreements = {name: camera.agreement for name, camera in self._cameras.items()}
-        found = tuple(name for name, agreement in agreements.items() if agreement < -_AGREES)
-        return found if len(found) <= sum(agreement > _AGREES for agreement in agreements.values()) else ()
 
     def _wait(self, interval_s: float) -> None:
         """The state as uncertain as it becomes meanwhile."""
