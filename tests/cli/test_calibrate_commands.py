@@ -151,12 +151,12 @@ def test_before_a_live_camera_a_person_gets_instructions(
     assert (facts["views"], facts["refused"]) == (8, {"moving": 8})
     assert facts["intrinsics"]["fx"] == pytest.approx(PINHOLE.fx, rel=0.01)
     lines = captured.err.splitlines()
-    assert lines[0] == "0 views, 0 % covered: hold the board before the camera, and hold it still"
-    assert re.match(r"1 views, \d+ % covered: tilt the board by 30 to 45 degrees, .*: 0 of 1 views", lines[1])
+    assert lines[0].startswith("0 views, 0 % covered: ")
+    assert re.match(r"1 views, \d+ % covered: .* 30 to 45 degrees, ", lines[1])
     assert film.ended
     measured = load_drone(out).rig.cameras[0].intrinsics.measured
     assert measured is not None
-    assert measured.camera == "not known, /dev/video7"
+    assert measured.camera.endswith(", /dev/video7")
 
 
 def test_a_v4l2_camera_is_read(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -200,7 +200,7 @@ def test_a_usb_camera_is_known_by_its_serial_number(tmp_path: Path) -> None:
     entry.mkdir(parents=True)
     (entry / "device").symlink_to(usb / "1-1:1.0")
     assert identity(Path("/dev/video3"), tmp_path / "class") == "USB 046d:0825 serial 8A2B5C90"
-    assert identity(Path("/dev/video4"), tmp_path / "class") == "not known, /dev/video4"
+    assert identity(Path("/dev/video4"), tmp_path / "class").endswith(", /dev/video4")
 
 
 def test_the_board_is_printed_in_its_true_size(tmp_path: Path, told: Told) -> None:

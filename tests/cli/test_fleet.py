@@ -73,7 +73,7 @@ def test_a_hold_reaches_each_whatever_the_others_do(wanted: str) -> None:
             process.kill()
             process.communicate()
     first, *rest = hold.stdout.splitlines()
-    assert first == "meadow/drone3: it is tried", "before it is known that others do not answer"
+    assert first.startswith("meadow/drone3: "), "before it is known that others do not answer"
     assert sorted(rest[:2]) == [
         f"meadow/{name}: did not answer; this computer may not command it" for name in ("drone1", "drone2")
     ]
@@ -117,5 +117,5 @@ def test_an_address_that_others_reach_comes_with_a_warning(
     args = Namespace(server_address=address, connect=["tcp/127.0.0.1:1"], drones_at=None)
     announce(args, "k", 80)
     out, err = capsys.readouterr()
-    assert out.splitlines()[0] == f"the fleet page is at http://{shown}:80/?key=k"
+    assert f"http://{shown}:80/?key=k" in out.splitlines()[0]
     assert ("travels unencrypted" in err) == ("on other computers" in out) == warns

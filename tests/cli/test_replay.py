@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from contextlib import ExitStack
 from dataclasses import fields, replace
 from pathlib import Path
@@ -26,9 +27,6 @@ from flockd.sim.scenario import ScenarioConfig, load_scenario
 from tests.cli.conftest import Told
 from tests.make import small_eyes
 from tests.onboard.recording.made_up import MODELS, MadeUpPilot, drone_config, record
-from tests.worlds import worlds_once
-
-__all__ = ["worlds_once"]
 
 Capture = pytest.CaptureFixture[str]
 
@@ -73,10 +71,9 @@ def test_the_first_difference_is_told_with_time_drone_field_and_both_values(nudg
     recorded = next(step.output for step in Recording(nudged).steps() if step.number == 3)
     assert recorded is not None
     value = recorded["command"]["velocity"][1]
-    assert told[1] == (
-        f"drone1 differs at 1000.300 s (step 3) in command.velocity[1]: expected {value!r}, found {value + 1e-9!r}"
-    )
-    assert told[2] == "  command.velocity: in 7 of 10 steps, by at most 1e-09"
+    for part in ("1000.300 s (step 3)", "command.velocity[1]", f"{value!r}", f"{value + 1e-9!r}"):
+        assert part in told[1]
+    assert re.search(r"command\.velocity: .* 7 of 10 .* 1e-09$", told[2])
     assert main(["replay", str(nudged), "--diff", "--json"]) == 1
     first = json.loads(capsys.readouterr().out)["diff"]["first"]
     assert first["field"] == "command.velocity[1]"
@@ -106,7 +103,7 @@ def test_a_reference_is_written_compared_and_updated(
     capsys.readouterr()
     assert main(against) == 1
     last = capsys.readouterr().out.splitlines()[-1]
-    assert last == f"if this is meant: flockd replay {path} --reference {reference} --update-reference"
+    assert last.endswith(f" flockd replay {path} --reference {reference} --update-reference")
     assert main(update) == 0
     assert main(against) == 0
 

@@ -81,7 +81,7 @@ def test_the_schema_names_every_field_with_its_type_and_shape() -> None:
     properties = json_schema(VehicleState)["properties"]
     assert properties["velocity_ned"] == {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
     assert (properties["R_ned_body"]["minItems"], properties["R_ned_body"]["maxItems"]) == (9, 9)
-    assert properties["R_ned_body"]["description"] == "3 x 3 matrix, row by row"
+    assert "row by row" in properties["R_ned_body"]["description"]
 
 
 def test_an_array_of_another_shape_is_refused() -> None:

@@ -113,10 +113,7 @@ def test_a_hold_is_confirmed_and_a_drone_that_allows_none_refuses(fleet: Fleet) 
     told("and until its diagnostics show it", time.monotonic() - began_s, "s")
     assert fleet.node.call("/drone1/resume")["ok"]
     refused = fleet.node.call("/drone1/land")
-    assert (refused["ok"], refused["text"]) == (
-        False,
-        "'land' is not allowed here; telemetry.commands allows hold, resume",
-    )
+    assert not refused["ok"] and "telemetry.commands" in refused["text"]
     assert fleet.node.call("/drone4/hold")["ok"] is False, "it allows nothing"
 
 

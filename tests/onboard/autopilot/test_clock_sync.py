@@ -213,7 +213,7 @@ def test_an_autopilot_that_starts_again_does_not_lie() -> None:
         state = received.vehicle_state()
         assert state is not None
         assert abs(state.time_s - time_s) <= DELAY_S + 1e-9
-    assert said == ["the autopilot has started anew"]
+    assert len(said) == 1 and "anew" in said[0]
     assert received.trusted_clock() is not None
 
 
@@ -223,7 +223,7 @@ def test_a_clock_that_is_right_again_is_believed_after_ten_seconds() -> None:
     assert flight.received.trusted_clock() is None
     flight.worst_deg(5.0)
     assert flight.received.trusted_clock() is not None
-    assert flight.said[-1] == "the autopilot's clock agrees with its messages again; their stamps are used"
+    assert "agrees" in flight.said[-1]
 
 
 async def test_the_fake_autopilots_known_clock_is_found_through_mavsdk(port: int) -> None:

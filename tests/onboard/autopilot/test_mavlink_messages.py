@@ -59,7 +59,7 @@ def test_an_unknown_landed_state_is_unknown_counted_and_logged_once(landed_state
     assert (status.landed_state, status.in_air) == ("unknown", False)
     value = f"EXTENDED_SYS_STATE.landed_state = {landed_state}"
     assert received.unknown_values() == {value: 2}
-    assert log == [f"the autopilot sends {value}, which flockd does not know; it counts as unknown"]
+    assert len(log) == 1 and value in log[0]
     received.add(*("EXTENDED_SYS_STATE", {"landed_state": 1}), 3.0)
     assert received.status(now_s=4.0).landed_state == "ground", "a known value counts again"
 
@@ -112,7 +112,7 @@ def test_a_home_that_moves_counts_on_the_ground_only_and_with_an_unknown_landed_
 
 def test_an_unknown_result_of_a_command_has_words_too() -> None:
     assert result_text(4) == "failed"
-    assert result_text(200) == "answered with the unknown result 200"
+    assert "200" in result_text(200)
 
 
 ARMED, DISARMED = {"base_mode": 128, "custom_mode": 6 << 16}, {"base_mode": 0, "custom_mode": 6 << 16}
@@ -136,11 +136,8 @@ def test_home_stays_while_armed_whatever_landed_state_and_home_say_and_moves_aft
     assert status.home_ned is not None and vehicle is not None
     assert list(status.home_ned) == [1.0, 0.0, -0.2]
     assert vehicle.height_m == pytest.approx(3.8)  # -0.2 + 4.0
-    assert log == [
-        "the autopilot reports that the drone is on the ground, still armed",
-        "the autopilot's home moved by 53.0 m in flight; "  # sqrt(49^2 + 20.2^2)
-        "height band and fence stay where they were until it is disarmed",
-    ]
+    assert len(log) == 2 and "on the ground" in log[0]
+    assert "moved by 53.0 m" in log[1]  # sqrt(49^2 + 20.2^2)
     received.add("HEARTBEAT", DISARMED, 12.0)
     received.add(*_home(2.0, -0.1), 13.0)
     assert received.home_down_m == -0.1
@@ -169,8 +166,8 @@ def test_the_first_text_of_px4_has_the_id_of_texts_without_chunks_and_is_seen_wh
     """As PX4 SITL 1.18 sends it after a start: id 0, and a tab at the end."""
     first, second = "Arming denied: Resolve system health failures firs", "t\t"
     received, log = _received(_text(first, 0, 0), _text(second, 0, 1))
-    assert log == ["the autopilot says: Arming denied: Resolve system health failures first"]
-    assert received.recent_texts(2.0, 10.0) == ["Arming denied: Resolve system health failures first"]
+    assert received.recent_texts(2.0, 10.0) == [f"{first}t"]
+    assert len(log) == 1 and log[0].endswith(f": {first}t")
 
 
 def test_a_stamp_from_the_past_is_a_restart_on_the_ground_and_nothing_in_flight() -> None:
@@ -179,7 +176,7 @@ def test_a_stamp_from_the_past_is_a_restart_on_the_ground_and_nothing_in_flight(
     received, log = _received(armed, *attitude)
     assert (received.restarts, log) == (0, [])
     received, log = _received(disarmed, *attitude)
-    assert (received.restarts, log) == (1, ["the autopilot has started anew"])
+    assert (received.restarts, len(log)) == (1, 1)
 
 
 def test_a_text_of_just_one_chunk_is_seen_when_it_does_not_go_on() -> None:

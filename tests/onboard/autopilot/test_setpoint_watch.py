@@ -39,7 +39,7 @@ def test_what_the_autopilot_clips_is_said_once_and_nobody_is_accused(parameters:
     told: list[str] = []
     assert _watched(told, share=0.6, parameters=parameters).seen is None
     how = "is 1.2" if parameters else "may limit it"
-    assert told == [f"the autopilot flies slower than flockd asks, 1.2 instead of 2.0 m/s: its MPC_XY_VEL_MAX {how}"]
+    assert len(told) == 1 and f"1.2 instead of 2.0 m/s: its MPC_XY_VEL_MAX {how}" in told[0]
 
 
 def test_what_is_shorter_than_the_known_limit_is_somebody_elses() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 from dataclasses import replace
 
@@ -110,7 +111,7 @@ def test_a_setpoint_from_the_future_or_with_no_date_is_not_sent(story: Story) ->
     for date in (story.now + 60.0, math.nan):
         story.streamer.offer(request_of(NORTH, date))
         assert story.go_on(0.5, deciding=False) == 0
-        assert story.silence == "the setpoint is not fresh"
+        assert story.silence is not None and "not fresh" in story.silence
 
 
 def test_a_setpoint_from_before_the_beginning_is_not_sent(story: Story) -> None:
@@ -128,7 +129,7 @@ def test_a_short_stumble_of_the_loop_is_forgiven(in_offboard: Story) -> None:
 def test_after_a_long_one_nothing_brings_the_stream_back_but_a_new_beginning(in_offboard: Story) -> None:
     in_offboard.go_on(1.5, beating=False)
     assert in_offboard.go_on(5.0) == 0
-    assert in_offboard.silence == "the control loop is late, for more than 0.5 s in offboard flight"
+    assert in_offboard.silence is not None and "loop is late, for more than 0.5 s" in in_offboard.silence
     in_offboard.streamer.begin()
     assert in_offboard.go_on(1.0) == 20
 
@@ -136,7 +137,7 @@ def test_after_a_long_one_nothing_brings_the_stream_back_but_a_new_beginning(in_
 def test_a_process_that_was_stopped_between_two_deadlines_does_not_go_on_where_it_was(in_offboard: Story) -> None:
     in_offboard.now += 0.7
     assert in_offboard.go_on(1.0) == 0
-    assert in_offboard.silence == "the thread was stopped, for more than 0.5 s in offboard flight"
+    assert in_offboard.silence is not None and "stopped, for more than 0.5 s" in in_offboard.silence
 
 
 def test_a_gap_before_offboard_ends_nothing(story: Story) -> None:
@@ -149,7 +150,7 @@ def test_a_gap_before_offboard_ends_nothing(story: Story) -> None:
 def test_when_the_pilot_takes_over_it_is_silent_at_once_and_for_good(in_offboard: Story, mode: str) -> None:
     in_offboard.autopilot(flight_mode=mode)
     assert in_offboard.go_on(1.0) == 0
-    assert in_offboard.silence == f"the autopilot left offboard for {mode}"
+    assert in_offboard.silence is not None and in_offboard.silence.endswith(f"left offboard for {mode}")
     assert in_offboard.streamer.report().fault is None
     in_offboard.autopilot(flight_mode="offboard")
     assert in_offboard.go_on(1.0) == 0
@@ -164,11 +165,12 @@ def test_a_lost_link_is_silence_for_good(in_offboard: Story) -> None:
     assert in_offboard.go_on(1.0) == 0
     in_offboard.autopilot(heartbeat_age_s=0.1)
     assert in_offboard.go_on(1.0) == 0
-    assert in_offboard.silence == in_offboard.streamer.report().fault == "no heartbeat from the autopilot for 3.6 s"
+    assert in_offboard.silence is not None and re.search(r"heartbeat .* 3\.6 s", in_offboard.silence)
+    assert in_offboard.streamer.report().fault == in_offboard.silence
     in_offboard.streamer.begin()
     in_offboard.autopilot(message_age_s=2.1)  # without any message it is lost sooner
     assert in_offboard.go_on(1.0) == 0
-    assert in_offboard.silence == "no message from the autopilot for 2.1 s"
+    assert in_offboard.silence is not None and re.search(r"message .* 2\.1 s", in_offboard.silence)
 
 
 @pytest.mark.fault("own-stall")
@@ -188,7 +190,7 @@ def test_a_vehicle_in_its_failsafe_is_left_alone(story: Story) -> None:
     story.autopilot(failsafe=True)
     story.streamer.begin()
     assert story.go_on(1.0) == 0
-    assert story.silence == "the autopilot is in its failsafe"
+    assert story.silence is not None and "failsafe" in story.silence
     story.autopilot(failsafe=False)
     assert story.go_on(1.0) == 20
 
@@ -247,7 +249,7 @@ def test_the_thread_keeps_its_rate_and_ends_when_the_gate_breaks() -> None:
     while streamer.report().fault is None:
         offer()
     before = len(sent)
-    assert streamer.report().silence == "the streamer failed: ZeroDivisionError('a bug')"
+    assert "ZeroDivisionError('a bug')" in str(streamer.report().silence)
     time.sleep(0.2)
     assert len(sent) == before
     streamer.close()

@@ -54,10 +54,10 @@ def drone() -> Drone:
 def test_an_order_is_taken_once_and_says_who_gave_it(drone: Drone) -> None:
     assert drone.order("hold", 1)["accepted"]
     assert drone.requests.hold
-    assert drone.said == ["an operator asked for hold: anna, order 1"]
+    assert len(drone.said) == 1 and drone.said[0].endswith("hold: anna, order 1")
     drone.requests.hold = False
     answer = drone.order("hold", 1)
-    assert answer == {"accepted": False, "sentence": "order 1 or a later one of this sender has come before"}
+    assert not answer["accepted"] and answer["sentence"].startswith("order 1 ")
     assert not drone.requests.hold
     assert not drone.order("goto", 0)["accepted"], "an earlier one that came late"
     assert drone.order("goto", 2)["accepted"]
@@ -73,10 +73,7 @@ def test_an_order_counts_while_it_is_new(drone: Drone, age_s: float, taken: bool
 
 def test_an_order_for_another_drone_of_the_same_name_is_refused(drone: Drone) -> None:
     answer = drone.order("hold", 1, identity="2e")
-    assert answer == {
-        "accepted": False,
-        "sentence": "it is for another drone of this name, with the identity '2e'",
-    }
+    assert not answer["accepted"] and "'2e'" in answer["sentence"]
     assert not drone.requests.hold
 
 
@@ -87,7 +84,7 @@ def test_of_two_operators_the_later_one_wins_and_both_are_seen(drone: Drone) -> 
     assert drone.order("resume", 7, operator="bert", session="b")["accepted"]
     drone.now_s += 1.0
     late = drone.order("goto", 1, time_s=given_s)
-    assert late == {"accepted": False, "sentence": "bert gave a later order, resume, that has come before"}
+    assert not late["accepted"] and late["sentence"].startswith("bert gave a later order, resume")
     assert drone.goals == []
     assert drone.order("hold", 2, time_s=given_s)["accepted"]
     assert drone.commands.recent() == [

@@ -35,10 +35,10 @@ def test_a_dead_autopilot_is_asked_again_and_again_but_reported_once() -> None:
         requests.takeover = "hold"
         await asyncio.sleep(8.0)
         assert dead.asked == 7
-        assert events == [f"the autopilot was asked for hold and {SILENT}"]
+        assert len(events) == 1 and events[0].endswith(f"asked for hold and {SILENT}")
         requests.takeover = "land"
         await asyncio.sleep(8.0)
-        assert events[1:] == [f"the autopilot was asked for land and {SILENT}"]
+        assert len(events) == 2 and events[1].endswith(f"asked for land and {SILENT}")
         await asyncio.sleep(30.0)
         assert events[2:] == events[1:2], "now and then the same is said again"
         task.cancel()

@@ -43,21 +43,21 @@ def refusal(path: Path) -> str:
 
 def test_what_is_no_recording_is_refused_in_one_sentence(tmp_path: Path, whole: Path) -> None:
     path = tmp_path / "x.mcap"
-    assert refusal(path) == "does not exist; check the path"
-    assert refusal(tmp_path) == "is a folder; name a recording in it"
+    assert "does not exist; " in refusal(path)
+    assert "is a folder; " in refusal(tmp_path)
     for content in (b"", b"hello", b"\x89MCAP"):
         path.write_bytes(content)
-        assert refusal(path) == "is not a recording (it does not begin as MCAP files do); name another file"
+        assert "is not a recording (" in refusal(path)
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
         channel = writer.register_channel("/speed", "json", writer.register_schema("x", "jsonschema", b"{}"))
         writer.add_message(channel, 1, b"{}", 1)
         writer.finish()  # type: ignore[no-untyped-call]
-    assert refusal(path) == "is an MCAP file, but not a recording of flockd; name one that flockd wrote"
+    assert "is an MCAP file, but not a recording of flockd; " in refusal(path)
     content = whole.read_bytes()
     path.write_bytes(content.replace(b"\x01\x00\x00\x001", b"\x01\x00\x00\x002", 1))
-    assert refusal(path) == "is of format '2', and this flockd reads '1'; use the flockd that wrote it"
+    assert "is of format '2', and this flockd reads '1'; " in refusal(path)
 
 
 def test_what_the_pilot_began_with_of_the_others_size_comes_back_to_the_last_bit(tmp_path: Path, whole: Path) -> None:

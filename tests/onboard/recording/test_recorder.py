@@ -121,7 +121,7 @@ def test_a_frame_that_is_no_image_is_left_out_and_reported(tmp_path: Path) -> No
         recorder.step(frames, vehicle, output)
     (step,) = Recording(tmp_path / "drone1.mcap").steps()
     assert set(step.frames.frames) == {"front"}
-    assert told == ["recording: an image of camera left has no pixels or not three channels and is left out"]
+    assert len(told) == 1 and "camera left" in told[0]
     assert len(messages(tmp_path / "drone1.mcap", "/events")) == 1
 
 
@@ -157,9 +157,7 @@ def test_a_disk_that_never_answers_costs_steps_but_no_time(tmp_path: Path) -> No
         recorder.step(*step)
     fit = 1e6 // (2 * 160 * 120 * 3 + 4096)
     assert recorder.lost == 30 - fit
-    assert [event for event in told if "dropped" in event] == [
-        "recording: the disk is too slow, so that steps are dropped; record smaller or fewer images"
-    ]
+    assert sum("dropped" in event for event in told) == 1
     recorder.close(timeout_s=0.2)
     assert "too slow to end it" in told[-1]
     # None of these waited for the disk, which answers here for the first time and lets the thread go.
@@ -202,7 +200,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_flight(tmp_path: Path, kind:
                 recorder.drain()
                 recorder.step(frames, vehicle, output)
                 assert output.command.yaw_rad == free.step(frames, vehicle).command.yaw_rad
-        assert told == [f"recording {path}: {reason}; the recording ends here and the flight goes on"]
+        assert len(told) == 1 and told[0].startswith(f"recording {path}: {reason}; ")
         assert recorder.failure == told[0]
         assert recorder.lost > 15
         assert str(path) not in {f"{fd.readlink()}" for fd in Path("/proc/self/fd").iterdir() if fd.is_symlink()}
@@ -221,4 +219,4 @@ def test_nowhere_to_write_is_reported_once_and_does_not_raise(tmp_path: Path) ->
         for frames, vehicle in itertools.islice(inputs(3), 3):
             recorder.step(frames, vehicle, MadeUpPilot(config).step(frames, vehicle))
             recorder.drain()
-    assert told == [f"recording {path}: no such file or directory; the recording ends here and the flight goes on"]
+    assert len(told) == 1 and told[0].startswith(f"recording {path}: no such file or directory; ")

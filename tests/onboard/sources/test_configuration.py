@@ -113,7 +113,7 @@ def test_a_drone_without_source_can_be_simulated_but_opens_none(tmp_path: Path) 
     path.write_text(RIG, encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
         open_source(load_drone(path), "drone.yaml")
-    assert str(caught.value) == "drone.yaml: source: is missing; add one, as in config/quadrotor.yaml"
+    assert str(caught.value).startswith("drone.yaml: source: is missing; ")
 
 
 SWAPPED = PIPELINES.replace("back, pipeline", "back, device").replace("lib", "/dev/")

@@ -149,7 +149,7 @@ def test_stamps_of_another_clock_are_dropped_and_good_frames_go_on_at_once(
             status = source.status()["front"]
             assert status.counts["time_stamp"] == bad + 1
             assert (status.fault is not None) == (bad == 2), "one bad frame is no lost camera"
-        assert status.fault == "front: a time stamp is not of this computer's clock; correct the program"
+        assert "front: a time stamp " in str(status.fault)
         _send(publisher, number + 1)
         received = source.newest(60.0)
         assert received is not None

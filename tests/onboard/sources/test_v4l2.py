@@ -218,7 +218,7 @@ def test_an_unplugged_camera_is_reported_at_once_and_comes_back_when_plugged_in(
 
     kernel.unplug("front")
     fault = source.why()
-    assert fault == "front: /dev/front is not there; plug the camera in, or correct the path"
+    assert fault.startswith("front: /dev/front is not there; ")
 
     kernel.send("back", JPEGS[2])
     assert source.next().frames.keys() == {"back"}, "the others go on"
@@ -243,7 +243,7 @@ def test_a_silent_camera_is_noticed_and_opened_again(start: Watch) -> None:
     kernel.send("front", JPEGS[0])
     source.next()
     status = source.until(lambda status: status.fault is not None)
-    assert status.fault == "front: /dev/front gave no usable image for 0.2 s"
+    assert str(status.fault).startswith("front: /dev/front gave no usable image for 0.2 s")
     kernel.send("front", JPEGS[0])  # as v4l2loopback does: the last picture of before, stamped as of now
     source.received(front=2)
     assert source.newest(0.05) is None
@@ -264,8 +264,7 @@ def test_a_frozen_camera_counts_as_silent(start: Watch) -> None:
     assert used == 5, "the picture and four repetitions; the fifth is one too many"
     counts = source.status()["front"].counts
     assert counts["frozen"] == 4
-    source.until(lambda status: status.fault == "front: /dev/front gave no usable image for 0.2 s "
-           "(the last was refused: frozen)")  # fmt: skip
+    source.until(lambda status: "0.2 s (the last was refused: frozen)" in str(status.fault))
     kernel.send("front", JPEGS[0])
     kernel.send("front", JPEGS[1])
     source.next()
@@ -276,7 +275,7 @@ def test_a_camera_that_another_program_uses_is_reported_and_taken_when_it_is_fre
     kernel = FakeKernel(front=FakeCamera(owner=1))
     source = start(kernel, _camera())
     status = source.until(lambda status: status.fault is not None)
-    assert status.fault == "front: /dev/front is in use by another program; stop that one"
+    assert "/dev/front is in use" in str(status.fault)
     assert status.age_s == float("inf")
     kernel.cameras["/dev/front"].owner = None
     kernel.send("front", JPEGS[0])
@@ -291,7 +290,7 @@ def test_an_error_of_the_stream_closes_the_camera_and_opens_it_again(start: Watc
     source.next()
     kernel.fail("front", errno.EIO)
     status = source.until(lambda status: status.fault is not None)
-    assert status.fault == "front: /dev/front has failed (Input/output error)"
+    assert "/dev/front has failed (Input/output error)" in str(status.fault)
     kernel.fail("front", 0)
     kernel.send("front", JPEGS[0])
     kernel.send("front", JPEGS[1])

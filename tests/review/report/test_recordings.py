@@ -183,7 +183,7 @@ def test_the_report_of_a_folder_lies_beside_it_and_stays_unless_it_is_forced(
     page.write_text("as it was", encoding="utf-8")
     out, err = told(capsys, 0, page.parent)
     assert out.splitlines()[-1] == f"report: {page}"
-    assert err == f"{page}: is left as it was; --force writes it again\n"
+    assert err.startswith(f"{page}: is left as it was; ")
     assert page.read_text(encoding="utf-8") == "as it was"
     told(capsys, 0, page.parent, "--force")
     assert "Two drones flew 6 s by sight" in text_of(page)

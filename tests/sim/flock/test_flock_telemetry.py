@@ -33,10 +33,7 @@ def test_a_flock_on_exact_states_is_seen_and_goes_where_it_is_sent(monkeypatch: 
 
     def order_when_due(done: int, total: int) -> None:
         if done == 20:
-            assert watching.goto("drone1", -10.0, -12.0) == (
-                True,
-                "goto is being tried; the drone's state shows the result",
-            )
+            assert watching.goto("drone1", -10.0, -12.0)[0]
             assert watching.goto("drone2", -10.0, -12.0)[0]
             accepted, why = watching.goto("drone1", 100.0, 0.0)
             assert not accepted
@@ -47,7 +44,7 @@ def test_a_flock_on_exact_states_is_seen_and_goes_where_it_is_sent(monkeypatch: 
     assert watching.about["drone1"]["commands"] == ["goto", "hold", "resume", "velocity"]
     assert [state["position_ne"] for state in watching.states["drone2"]] == log.position[:, 1, :2].tolist()
     assert np.linalg.norm(log.position[-1, :, :2].mean(axis=0) - [-10.0, -12.0]) < 1.0
-    assert watching.command("drone1", "land") == (False, "land is an autopilot's, and simulated drones have Hold alone")
+    assert not watching.command("drone1", "land")[0]
     assert watching.flights["drone1"][-1]["orders_refused"] == 2, "before it knew where it was, and out of the fence"
     began_s = time.monotonic()
     while (picture := watching.image["drone1"]("front")) is None:
@@ -68,7 +65,7 @@ def test_a_drone_is_held_where_it_would_stop_and_flies_on_when_it_is_resumed(mon
     told = [(one["state"], one["flight_mode"]) for one in watching.flights["drone1"]]
     assert told == [("normal", "simulated")] * 20 + [("asking", "hold")] * 20 + [("normal", "simulated")] * 20
     (why,) = watching.flights["drone1"][30]["reasons"]
-    assert why["sentence"] == "an operator asked for Hold"
+    assert why["sentence"].endswith("asked for Hold")
     speed_m_s = np.linalg.norm(log.velocity[:, 0, :2], axis=1)
     assert speed_m_s[20] > 0.8
     assert speed_m_s[30:40].max() < 0.05

@@ -108,10 +108,7 @@ def test_cameras_are_switched_off_and_on_and_drones_removed() -> None:
     assert bench.ask("camera", {"drone": "drone1", "camera": "front", "works": True})[0]
     assert bench.controls.state()["cameras_off"] == {"drone3": ["left"]}
     assert bench.ask("remove", {"drone": "drone1"})[0]
-    assert bench.ask("camera", {"drone": "drone1", "camera": "front", "works": True}) == (
-        False,
-        "there is no drone 'drone1' in this simulation",
-    )
+    assert not bench.ask("camera", {"drone": "drone1", "camera": "front", "works": True})[0]
 
 
 @pytest.mark.parametrize(

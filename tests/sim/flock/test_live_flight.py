@@ -53,5 +53,5 @@ def test_a_flight_begun_again_is_the_same_and_a_camera_that_is_off_shows_nothing
     assert sorted(watching.image) == ["drone1"]
     assert (watching.image["drone1"]("front"), watching.image["drone1"]("back") is None) == (None, False)
     told = [reason["sentence"] for reason in watching.flights["drone1"][-1]["reasons"]]
-    assert told[0] == "a camera is lost: front unplugged"
+    assert told[0].endswith("front unplugged")
     assert "camera front: no frame" in told

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any, cast
@@ -95,7 +96,8 @@ def test_a_drone_that_leaves_at_the_very_end_is_noted_too() -> None:
     fleet._note_handovers(run, 19.9)
     assert run.handed_over == {}
     fleet._note_handovers(run, np.inf)
-    assert run.handed_over == {"drone2": "after 19.9 s its daemon ended with exit code 70 (last line of drone2)"}
+    assert run.handed_over.keys() == {"drone2"}
+    assert re.search(r"19\.9 s .* exit code 70 \(last line of drone2\)", run.handed_over["drone2"])
 
 
 def test_each_change_of_a_flight_mode_is_noted_once() -> None:
@@ -115,7 +117,7 @@ def test_drones_land_though_another_ones_autopilot_is_dead(monkeypatch: pytest.M
     world.fleet().land(run)
     assert world.armed == [True, False]
     assert (1, "LAND") in world.selected
-    assert run.notes == ["PX4 instance 0 had ended, so that its drone was not landed"]
+    assert len(run.notes) == 1 and "PX4 instance 0" in run.notes[0]
 
 
 def test_a_drone_that_still_climbs_is_not_at_its_height() -> None:
