@@ -14,6 +14,9 @@ from hypothesis import settings
 from tests.calm import run_coroutine_test
 from tests.faults.stories import REACTION, Reacted, limits
 from tests.permitted_skips import permitted
+from tests.worlds import generate_anew, share_worlds
+
+__all__ = ["generate_anew"]
 
 settings.register_profile("many", max_examples=10_000)
 """A hundred times as many inputs of `tests/hostile`, others each time: `--hypothesis-profile=many`."""
@@ -28,6 +31,10 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     place = collection_path.relative_to(tests).as_posix() if tests in collection_path.parents else ""
     marker = OWN_EXTRAS.get(place)
     return True if marker not in (None, config.option.markexpr) else None
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    share_worlds(config)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -7,9 +7,8 @@ import numpy as np
 
 from flockd.core.messages import Float32Array, UInt8Array
 from tests.flight.inference.conftest import copies
-from tests.worlds import worlds_once
 
-__all__ = ["copies", "worlds_once"]
+__all__ = ["copies"]
 
 
 def grey(image: UInt8Array) -> UInt8Array:
