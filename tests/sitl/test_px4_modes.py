@@ -20,8 +20,7 @@ import pytest
 
 from flockd.core.errors import UnavailableError
 from flockd.onboard.simulated_time import clock_at
-from flockd.sim.scenario import ScenarioConfig
-from flockd.sim.sitl.autopilots import Autopilots, Ports, Px4s, SimulatedAutopilots
+from flockd.sim.sitl.autopilots import Ports, Px4s
 from flockd.sim.sitl.processes import Program, Programs
 from tests.sitl.companion import HEIGHT_M
 from tests.sitl.sitl_run import PX4, Meddler, SitlRun, one_drone
@@ -122,16 +121,15 @@ class Result:
 class Px4Flight(SitlRun):
     """One PX4 in offboard flight."""
 
-    def __init__(self, fault: Fault, speed_factor: float, make: Callable[..., Autopilots] = Px4s) -> None:
+    def __init__(self, fault: Fault, speed_factor: float) -> None:
         super().__init__()
-        self._make = make
         self._fault, self._speed_factor = fault, speed_factor
         self._clock = clock_at(speed_factor)
         self._sticks = False
 
     def _come_up(self) -> None:
         folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="px4-modes-")))
-        px4s = self._make(one_drone(HEIGHT_M), self._speed_factor, os.environ, folder, self._fault.parameters)
+        px4s = Px4s(one_drone(HEIGHT_M), self._speed_factor, os.environ, folder, self._fault.parameters)
         self._px4 = self._stack.enter_context(px4s)
         self._px4.start()
         port = self._px4.ports[0]
@@ -258,20 +256,3 @@ def test_px4_ends_in_the_mode_that_its_parameters_promise(fault: Fault) -> None:
     assert result.ended_in == fault.promised, result
     if fault.name == "wind":
         assert result.drift_m_s < 0.5
-
-
-def test_a_killed_companion_ends_a_fake_autopilots_offboard_flight_in_hold() -> None:
-    """The whole of a trial, with a fake autopilot in PX4's place: it goes from offboard to Hold afterwards."""
-    (killed,) = [fault for fault in FAULTS if fault.name == "sender_killed"]
-    with Px4Flight(killed, 3.0, make=_Fake) as flight:
-        result = flight.trial()
-    assert result.modes == ("OFFBOARD", "LOITER"), result
-    assert result.reaction_s is not None
-    assert result.reaction_s > 0.0
-
-
-class _Fake(SimulatedAutopilots):
-    """Fake autopilots that are made as PX4s are."""
-
-    def __init__(self, scenario: ScenarioConfig, speed_factor: float, *_: object) -> None:
-        super().__init__(scenario, speed_factor, lambda north, _: np.zeros_like(north))
