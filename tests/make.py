@@ -171,10 +171,10 @@ def scenario(overrides: Mapping[str, Any] | None = None, name: str = "paper_flig
     return load_scenario(data_path("config") / f"{name}.yaml", dict(overrides or {}))
 
 
-def small_eyes(flight: ScenarioConfig) -> ScenarioConfig:
-    """The same with two cameras of half the width and height, front and back: what is compared need not be sharp."""
+def small_eyes(flight: ScenarioConfig, every: int = 2) -> ScenarioConfig:
+    """The same with cameras of half the size, front and back alone or all: what is seen need not be sharp."""
     eyes = []
-    for one in flight.drone.rig.cameras[::2]:
+    for one in flight.drone.rig.cameras[::every]:
         halves = {f"intrinsics__{key}": getattr(one.intrinsics, key) / 2 for key in ("fx", "fy", "cx", "cy")}
         eyes.append(changed(one, size_px=(one.size_px[0] // 2, one.size_px[1] // 2), **halves))
     return changed(flight, drone__rig__cameras=tuple(eyes))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import threading
 import time
@@ -23,6 +24,7 @@ MODELS = Path(__file__).parents[3] / "models"
 Outputs = Mapping[str, NDArray[Any]]
 
 
+@functools.cache
 def opened(name: str, provider: Any = "openvino") -> OnnxModel:
     return OnnxModel(MODELS / f"{name}.yaml", threads=1, provider=provider)
 

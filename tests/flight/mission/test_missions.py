@@ -179,21 +179,14 @@ def test_a_goal_takes_the_place_of_any_other_mission_for_good() -> None:
     circling = point.navigator.status(point.step())
     assert (circling.kind, circling.sentence, circling.goal) == ("circle_then_tangent", "on the circle", None)
     np.testing.assert_allclose(circling.desired, [1.5, 0.0])
+    point.step(MissionOrder(velocity=np.array([0.0, 0.5])))
+    point.fly(4.0)
     ordered = point.step(MissionOrder(place=np.array([0.0, 20.0]), height_m=7.0, speed_m_s=0.5))
     assert ordered.height_m == 7.0
     assert math.hypot(*ordered.velocity) == pytest.approx(0.5)
     status = point.navigator.status(point.fly(60.0))
     assert (status.kind, status.arrived) == ("waypoints", True)
     np.testing.assert_allclose(point.position, [0.0, 20.0], atol=1.0)
-
-
-def test_a_goal_ordered_after_a_velocity_is_for_good_too() -> None:
-    point = Point(mission(kind="hover"))
-    point.step(MissionOrder(velocity=np.array([0.0, 0.5])))
-    point.fly(4.0)
-    point.step(MissionOrder(place=np.array([20.0, 0.0])))
-    assert point.fly(60.0).arrived
-    np.testing.assert_allclose(point.position, [20.0, 0.0], atol=0.1)
 
 
 PLACE, VELOCITY = MissionOrder(place=np.array([40.0, 0.0])), MissionOrder(velocity=np.array([0.5, 0.0]))
@@ -368,15 +361,15 @@ def test_a_mission_changes_the_height_and_lands_at_its_end() -> None:
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0], ids=["to the right", "to the left"])
-def test_ten_squares_are_flown_without_standing_and_with_the_heading_along(side: float) -> None:
+def test_four_squares_are_flown_without_standing_and_with_the_heading_along(side: float) -> None:
     """Of 12 m at 1.5 m/s; the gate is stepped each 0.1 s, the mission each 0.5 s."""
-    corners = [(12.0, 0.0), (12.0, side * 12.0), (0.0, side * 12.0), (0.0, 0.0)] * 10
+    corners = [(12.0, 0.0), (12.0, side * 12.0), (0.0, side * 12.0), (0.0, 0.0)] * 4
     navigator, gate = Navigator(to(*corners, speed_m_s=1.5, reached_m=1.0), GATE), Gate(GATE)
     fly = PointMass(np.array([0.0, 0.0, -5.0]))
     state = fly(Demand(np.zeros(2), -5.0, 0.0), 0.0)
     setpoints: list[Setpoint] = []
     turned_rad, yaw_rad = 0.0, 0.0
-    for tick in range(6000):
+    for tick in range(3000):
         now_s = 0.1 * tick
         if tick % 5 == 0:
             guidance, wanted_s = navigator.step(Moment(now_s, state.position[:2])), now_s
@@ -391,8 +384,8 @@ def test_ten_squares_are_flown_without_standing_and_with_the_heading_along(side:
         state = fly(Demand(verdict.setpoint.velocity, -5.0, verdict.setpoint.yaw_rad), 0.1)
         before_rad, yaw_rad = yaw_rad, euler_from_rotation(state.R_ned_body)[2]
         turned_rad += math.remainder(yaw_rad - before_rad, math.tau)
-    assert guidance.sentence == "at waypoint 40 of 40"
-    assert turned_rad == pytest.approx(10 * side * math.tau, abs=2.0), "as often as it went around"
+    assert guidance.sentence == "at waypoint 16 of 16"
+    assert turned_rad == pytest.approx(4 * side * math.tau, abs=2.0), "as often as it went around"
     speeds = np.hypot(*np.array([setpoint.velocity for setpoint in setpoints[10:-40]]).T)
     assert speeds.min() > 0.75, "it never stands"
     headings = [setpoint.yaw_rad for setpoint in setpoints]

@@ -18,6 +18,7 @@ from flockd.sim.flock.truth_perception import TruthPerception
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.vehicles.vehicles import Vehicles
 from tests.flight.perception.cameras import SECOND_STAGE
+from tests.make import small_eyes
 
 STEP_S = 0.5
 BAROMETER = {"drone.perception.height": "barometer"}
@@ -42,8 +43,10 @@ class NoNetworks:
         raise AssertionError("asked for a learned range")
 
 
-def scenario_with(*places: tuple[float, float, float]) -> ScenarioConfig:
+def scenario_with(*places: tuple[float, float, float], sharp: bool = False) -> ScenarioConfig:
+    """Drones at these places; ``sharp``: in images of the full size, for one that is far."""
     scenario = load_scenario(data_path("config") / "paper_flight.yaml", {"seed": 4, "ideal": True, **BAROMETER})
+    scenario = scenario if sharp else small_eyes(scenario, every=1)
     start = scenario.vehicles[0]
     drones = tuple(start.model_copy(update={"position_m": place, "velocity_m_s": (1.0, 0.0)}) for place in places)
     return scenario.model_copy(update={"vehicles": drones})

@@ -96,7 +96,7 @@ def test_a_neighbour_before_a_camera_that_is_gone_is_as_probable_as_before(
 
 
 def test_a_neighbour_pulls_by_how_long_it_has_been_seen() -> None:
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (8.0, 0.0, -3.6)))
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (8.0, 0.0, -3.6), sharp=True))
     other = FlockPilot(changed(flyer.scenario.drone, flocking__cohesion_time_s=None), flyer.truth)
     for step in range(4):
         frames, state = flyer.take_frames()
@@ -165,13 +165,6 @@ def test_a_drone_that_segmentation_misses_is_found_where_it_is_predicted(flyer: 
     if still_there:
         place = flyer.vehicles.R_ned_body[0] @ output.detections[0].position
         assert np.allclose(place, flyer.vehicles.position[1] - flyer.vehicles.position[0], atol=0.02)
-
-
-def test_blind_cameras_still_give_a_finite_command() -> None:
-    output = FlockPilot(ALONE.drone, NEVER_ASKED).step(frames(0.0), vehicle(height_m=4.0))
-    assert output.ego_motion is None
-    assert len(output.reasons) == 4
-    assert np.isfinite([*output.command.velocity, output.command.yaw_rad]).all()
 
 
 @pytest.mark.parametrize(("height_m", "blind"), [(0.0, 2), (-0.5, 4), (-2.0, 4)], ids=["at", "below", "far below"])

@@ -113,7 +113,7 @@ def test_who_flies_at_a_fence_stops_before_it(corners: Corners, asked: tuple[flo
     setpoints = deque([np.zeros(2)] * 4)
     gate, position, velocity, nearest_m = Gate(limits), np.zeros(2), np.zeros(2), math.inf
     border = outline(corners) if corners else None
-    for now_s in np.arange(0.0, 30.0, 0.05):
+    for now_s in np.arange(0.0, 20.0, 0.05):
         setpoint = gate.step(now_s, request(now_s, asked, surroundings=around(position, velocity))).setpoint
         assert setpoint is not None
         setpoints.append(setpoint.velocity)

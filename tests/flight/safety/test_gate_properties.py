@@ -64,7 +64,7 @@ def test_whatever_is_asked_for_what_is_sent_is_safe(seed: int, odd: float) -> No
         return drawn
 
     gate, last, now_s, moving, climbing = Gate(PARAMETERS), None, 0.0, 0, 0
-    for _ in range(1000):
+    for _ in range(600):
         now_s += float(rng.choice([0.0, 0.05, 0.05, 0.05, 0.2]))
         action = Action(rng.choice([Action.FLY, Action.FLY, Action.FLY_DEGRADED, *Action]))
         many, height_m = int(rng.integers(0, 4)), 10.0 + number(3.0)

@@ -33,7 +33,7 @@ def flown(gate: Gate, asked: FloatArray, response_s: float, dead_s: float, near:
     return np.array(setpoints[late:])
 
 
-VEHICLES = list(itertools.product((0.15, 0.3, 0.45, 0.6, 0.8), (0.0, 0.1, 0.2, 0.3, 0.4)))
+VEHICLES = list(itertools.product((0.15, 0.45, 0.8), (0.0, 0.2, 0.4)))
 """Time constants and total dead times, s; PX4's in software answers with 0.45 and 0.21, and the link adds to it."""
 
 

@@ -611,7 +611,7 @@ _SEEN = ("stream_fault", "foreign_setpoints", "parameter_fault")
 def test_hostile_inputs_never_make_it_fly_without_the_pilot_a_link_and_an_estimate() -> None:
     parameters = SafetyParameters()
 
-    @hostile(80)
+    @hostile(40)
     def check(random: Random) -> None:
         supervisor, now_s, inputs = Supervisor(parameters), 1000.0, QUIET
         for _ in range(random.randrange(1, 40)):

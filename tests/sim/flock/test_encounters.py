@@ -43,7 +43,7 @@ def head_on(speed_m_s: float, seed: int, **detections: Any) -> ScenarioConfig:
     changes = {
         "vehicles": vehicles,
         "seed": seed,
-        "duration_s": 30.0 / speed_m_s + 6.0,
+        "duration_s": 15.0 / speed_m_s + 8.0,
         "detections": ENCOUNTER.detections.model_copy(update=detections),
     }
     return ENCOUNTER.model_copy(update=changes)
@@ -69,7 +69,7 @@ def test_ranges_that_err_much_and_many_misses_bring_nobody_together(
     range_error: float, missed: float, least_m: float
 ) -> None:
     """At the speed that is proven. With both, of which networks are far, drones do not touch."""
-    apart_m = [nearest_m(head_on(2.0, seed, range_error=range_error, missed=missed)) for seed in range(6)]
+    apart_m = [nearest_m(head_on(2.0, seed, range_error=range_error, missed=missed)) for seed in range(3)]
     assert min(apart_m) >= least_m
 
 

@@ -27,7 +27,7 @@ def scenario(duration_s: float) -> ScenarioConfig:
 def test_a_flock_on_exact_states_is_seen_and_goes_where_it_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("flockd.sim.flock.swarm.time.sleep", lambda seconds: None)
     watching = Watching()
-    flown = scenario(60.0)
+    flown = scenario(45.0)
     shown = watching.shown(flown)
     assert not watching.goto("drone1", 1.0, 2.0)[0], "not before it knows where it is"
 

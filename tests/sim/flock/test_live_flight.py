@@ -13,7 +13,7 @@ from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances
 from tests.make import small_eyes
 from tests.sim.flock.watching import Watching
 
-STEPS = 3
+STEPS = 2
 FRONT_OFF = Disturbances(cameras_off=frozenset({(0, "front")}), removed=frozenset({1}))
 
 

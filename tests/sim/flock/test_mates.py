@@ -123,7 +123,6 @@ STOPS: dict[str, tuple[int, Callable[[_Flight, int], None]]] = {
 @pytest.mark.parametrize(
     ("range_error", "seed"),
     [
-        (0.02, 0),
         (0.06, 1),
         *(pytest.param(*of, marks=pytest.mark.slow) for of in itertools.product((0.02, 0.06), (2, 3, 4, 5))),
     ],

@@ -118,12 +118,12 @@ def mirrored(share: float) -> float:
     return share if 0.0 <= share <= 1.0 else 1.0 - abs(1.0 - share % 2.0)
 
 
-@pytest.mark.parametrize(("seed", "down", "height_m"), [(11, 0.1, 4.0), (12, 0.7, 5.0), (11, -0.3, 3.0)])
+@pytest.mark.parametrize(("seed", "down", "height_m"), [(11, 0.1, 4.0), (12, 0.7, 5.0)])
 def test_colours_are_those_of_the_plain_formulas(seed: int, down: float, height_m: float) -> None:
     world = World.generate(seed)
     ground = world.height_at(np.zeros(1), np.zeros(1))[0]
     shot = Shot(world, tilted(down, 0.4), np.array([0.0, 0.0, -height_m - ground]), DRONES - (0, 0, ground, 0, 0))
-    pixels = np.random.default_rng(0).choice(shot.hit.size, 2000, replace=False)
+    pixels = np.random.default_rng(0).choice(shot.hit.size, 1200, replace=False)
     off, kinds = [], set()
     for y, x in zip(*np.divmod(pixels, SIZE[0]), strict=True):
         z, colour = shot.expected(y, x)

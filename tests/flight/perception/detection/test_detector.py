@@ -73,7 +73,7 @@ def with_discs(truth: SpoilableTruth, height: float) -> Callable[[Sequence[Crop]
 
 def test_two_drones_that_the_first_stage_takes_for_one_are_two() -> None:
     """The far one's pixels count for the near one's, until the second stage says which of them are the near one's."""
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0), (6.0, -0.6, -4.0)))
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0), (6.0, -0.6, -4.0), sharp=True))
     flyer.truth.instead["ranges"] = with_discs(flyer.truth, 9.0)
     scene = Scene(flyer)
     (near, far), true = scene.maps.instances, scene.maps.labels
