@@ -24,9 +24,10 @@ KEPT = 3
 def share_worlds(config: pytest.Config) -> None:
     """Makes the folder, for as long as the run takes."""
     if FOLDER not in os.environ:
-        folder = TemporaryDirectory(prefix="flockd-worlds-")
-        os.environ[FOLDER] = folder.name
-        config.add_cleanup(lambda: (os.environ.pop(FOLDER), folder.cleanup()))
+        folder, patch = TemporaryDirectory(prefix="flockd-worlds-"), pytest.MonkeyPatch()
+        patch.setenv(FOLDER, folder.name)
+        config.add_cleanup(patch.undo)
+        config.add_cleanup(folder.cleanup)
 
 
 @pytest.fixture(scope="session", autouse=True)
