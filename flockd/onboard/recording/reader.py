@@ -33,6 +33,9 @@ from flockd.onboard.recording.mcap_file import (
 )
 from flockd.onboard.recording.truth import Truth
 
+_OF_STEPS = {one.topic for one in (streams.FRAMES, streams.VEHICLE, streams.ORDER, streams.OUTPUT, streams.TRUTH)}
+"""Streams whose messages, beside images, are parts of steps, numbered by their sequence."""
+
 
 @dataclass(frozen=True, eq=False)
 class RecordedStep:
@@ -126,7 +129,7 @@ class Recording:
         """
         number, messages = -1, dict[str, bytes]()
         for entry in read_entries(self.path):
-            if makes_steps(entry.stream.topic):
+            if entry.stream.topic in _OF_STEPS or streams.is_image(entry.stream.topic):
                 if entry.sequence != number:
                     yield from self._built(number, messages, start_s, end_s)
                     number, messages = entry.sequence, {}
@@ -191,15 +194,10 @@ def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
     raise RecordingError(f"{path}: is an MCAP file, but not a recording of flockd; name one that flockd wrote")
 
 
-def check(path: Path) -> None:
-    """Raises RecordingError when there is no file to read at all."""
+def _survey(path: Path, progress: Callable[[int, int], None]) -> Contents:
     if not path.is_file():
         fault = "is a folder; name a recording in it" if path.is_dir() else "does not exist; check the path"
         raise RecordingError(f"{path}: {fault}")
-
-
-def _survey(path: Path, progress: Callable[[int, int], None]) -> Contents:
-    check(path)
     flight, models, configuration = head_of(path)
     found = Contents(flight.facts, models.facts, configuration.data)
     total, done = path.stat().st_size, 0
@@ -279,17 +277,6 @@ def _learned(path: Path, flight: Mapping[str, str]) -> LearnedSize | None:
     if not all(0 < number < math.inf for number in (learned.size_m, learned.sigma)):
         raise RecordingError(f"{path}: its {streams.LEARNED_SIZE} is no size; use another copy")
     return learned
-
-
-def makes_steps(topic: str) -> bool:
-    """Whether this stream's messages are parts of steps, numbered by their sequence."""
-    return topic in {
-        streams.FRAMES.topic,
-        streams.VEHICLE.topic,
-        streams.ORDER.topic,
-        streams.OUTPUT.topic,
-        streams.TRUTH.topic,
-    } or streams.is_image(topic)
 
 
 def decoded_image(message: bytes) -> UInt8Array:

@@ -70,7 +70,7 @@ def recording_of_bag(bag: Bag, config: DroneConfig, vehicle_topic: str | None, t
     states = _states(bag, _vehicle_topic(bag, vehicle_topic), config, began_ns)
     steps = 0
     with McapFile(target) as file:
-        facts = {"format": FORMAT, "drone": config.name, "images": "png", "recording": uuid.uuid4().hex, "part": "0"}
+        facts = {"format": FORMAT, "drone": config.name, "images": "png", "recording": uuid.uuid4().hex}
         file.write(Note(FLIGHT_NOTE, {**facts, "from_bag": bag.path.name}))
         file.write(Note(MODELS_NOTE, model_hashes(config.perception)))
         file.write(Inclosure(CONFIGURATION, "application/json", config.model_dump_json(indent=1).encode()))
