@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_090,
     "flockd/flight": 13_510,
-    "flockd/onboard": 9_890,
+    "flockd/onboard": 9_880,
     "flockd/fleet": 2_070,
     "flockd/ground": 4_590,
     "flockd/review": 3_170,
