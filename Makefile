@@ -33,7 +33,7 @@ lint: $(VENV)/test.installed ### ruff and mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: $(VENV)/test.installed ## lint and all tests but the slow ones, side by side, on two cores in about 7 minutes
+test: $(VENV)/test.installed ## lint and all tests but the slow ones, side by side, on two cores in under 10 minutes
 	$(MAKE) --jobs=2 lint quick
 
 quick: $(VENV)/test.installed
