@@ -51,9 +51,10 @@ class SizeLearner:
         """``learned``: before the flight. Without ``flies`` the autopilot or a person flies the drone, and it does not
         weave."""
         self._is_said = config.perception.drone_size_m is not None
-        self._weave = Weave(config.safety.gate, config.name) if config.flocking.size == "learn" else None
+        self._learns, self._gate, self._name = config.flocking.size == "learn", config.safety.gate, config.name
+        self._weave: Weave | None = None
         self._may_weave = flies and config.safety.first_flight_layer is None
-        self.learned = learned if self._weave else None
+        self.learned = learned if self._learns else None
         """What ranges follow from, and what goes into the next flight; None: from what the networks judge, or the
         configuration says."""
         self._known: tuple[float, float] | None = None
@@ -70,10 +71,10 @@ class SizeLearner:
     @property
     def status(self) -> SizeStatus | None:
         """As of now; None: nothing is learned."""
-        if self._weave is None or not (self._weave.moves or self.learned):
-            return None
-        size_m, sigma = (self.learned.size_m, self.learned.sigma) if self.learned else (None, None)
-        return SizeStatus(self._weave.moves, size_m, sigma)
+        weaves = self._weave is not None and self._weave.moves
+        if self.learned is not None:
+            return SizeStatus(weaves, self.learned.size_m, self.learned.sigma)
+        return SizeStatus(weaves) if weaves else None
 
     @property
     def sentence(self) -> str:
@@ -132,8 +133,11 @@ class SizeLearner:
         ends: bool,
     ) -> float | None:
         """The height to ask for, with the weave in it; as of `Wanted`. ``ends``: the mission is over."""
-        if self._weave is None:
+        if not self._learns:
             return wanted_m
+        if self._weave is None:  # simulated drones may have one name
+            begun = np.array([vehicle.height_m, *vehicle.R_ned_body.flat])
+            self._weave = Weave(self._gate, self._name.encode() + begun.tobytes())
         needed = self._may_weave and self.learned is None and not ends
         above_ground_m = vehicle.height_m if ground is None else ground.height_m
         return self._weave.height(time_s, vehicle.height_m, above_ground_m, wanted_m, neighbours, needed=needed)

@@ -39,10 +39,10 @@ _ABOVE_GROUND_M = 2.0
 class Weave:
     """When one drone moves up and down, and how."""
 
-    def __init__(self, gate: GateParameters, name: str) -> None:
-        """``name``: the drone's own, so that two draw other times."""
+    def __init__(self, gate: GateParameters, own: bytes) -> None:
+        """``own``: what no two drones have in common, so that they draw other times."""
         self._gate = gate
-        self._random = np.random.default_rng(zlib.crc32(name.encode()))
+        self._random = np.random.default_rng(zlib.crc32(own))
         self._next_s: float | None = None
         self._began_s: float | None = None
         self._base_m = 0.0
