@@ -97,9 +97,10 @@ def test_one_that_goes_may_have_braked_since_it_was_seen_last(unseen_s: float, l
     flies_on_m_s, brakes_m_s = limits_towards([one], GateParameters())[1]
     assert flies_on_m_s == pytest.approx(math.sqrt(1.5**2 + 2 * 1.5 * 3.0 + 2.0**2) - 1.5)
     assert brakes_m_s == pytest.approx(math.sqrt(0.75**2 + 2 * 1.5 * left_m) - 0.75)
-    faster = replace(one, velocity_sigma_m_s=0.25)
-    left_m = max(left_m - 2 * 0.25 * 1.0, 0.0)  # two standard deviations, for the reaction time
-    assert limits_towards([faster], GateParameters())[1][1] == pytest.approx(math.sqrt(0.75**2 + 3 * left_m) - 0.75)
+    # Two standard deviations of its place, and of its velocity for the reaction time of a second.
+    for unsure in (replace(one, position_sigma_m=0.25), replace(one, velocity_sigma_m_s=0.25)):
+        slower_m_s = limits_towards([unsure], GateParameters())[1][1]
+        assert slower_m_s == pytest.approx(math.sqrt(0.75**2 + 3 * max(left_m - 2 * 0.25, 0.0)) - 0.75)
     later = told(one).neighbour_unseen_s
     assert later is not None
     np.testing.assert_allclose(later, [unseen_s + 0.5])
