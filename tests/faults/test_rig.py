@@ -130,7 +130,7 @@ def test_a_rig_is_not_as_configured(
     # ... and who asks for it gets the corrected rig.
     out = tmp_path / "rig.yaml"
     assert main(["calibrate", "rig", "--from-flight", str(tmp_path / NAME), "--out", str(out)]) == 0
-    assert "taken over: mounting and focal length" in capsys.readouterr().out
+    assert "taken: [mounting, focal length]" in capsys.readouterr().out
     corrected = load_drone(out).rig
     assert corrected.time_offset_s == pytest.approx(-0.03, abs=0.005)
     for name, one in build_rig(corrected).cameras.items():
