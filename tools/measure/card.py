@@ -7,8 +7,8 @@ python -m tools.measure.card --parts px4 step   # these again; the others stay a
 `flights`: the published scenarios on seeds that follow from the commit's hash, so that nobody can have tuned to them.
 Beside each flight by sight stand, on the same seed, a blind one, whose drones detect nobody, and an exact one, on the
 true states of all: what the blind flock matches is no achievement. A run that was stopped goes on: RESULTS/COMMIT-*
-has a line for each flight, and the logs of those by sight. `encounters`: two drones that meet on made-up
-detections with the errors that flights by sight have. `pictures`: real ones,
+has a line for each flight, and the logs of those by sight. `errors`: what drones perceive wrongly in these flights,
+for config/perceived. `encounters`: two drones that meet on made-up detections with such errors. `pictures`: real ones,
 with --labelled and --without-drones. `px4`: where FLOCKD_PX4 names a build. `geometry`, `step`: on this computer.
 """
 
@@ -46,11 +46,14 @@ from flockd.core.data import data_path
 from flockd.flight.inference.hashes import model_hashes
 from flockd.ground.pictures.scoring import summary
 from flockd.review.replay.profile import ComputerFiles
+from flockd.sim.cameras.camera_simulator import family_of
 from flockd.sim.flock.swarm import fly
-from flockd.sim.scenario import MIN_START_DISTANCE_M, load_scenario
+from flockd.sim.scenario import MIN_START_DISTANCE_M, ScenarioConfig, load_scenario
+from tools.measure import perceived_errors
 
 ROOT = Path(__file__).resolve().parents[2]
 FIGURES_FILE = ROOT / "docs" / "figures.json"
+PERCEIVED = ROOT / "config" / "perceived" / "shipped_networks.yaml"
 SEEDS = 1_000_000
 """Worlds of flights have seeds below this: `tools.training.worlds` keeps those of training apart."""
 CONFIDENCE = 0.95
@@ -124,6 +127,18 @@ class Flight:
         """What tells it from the others of a run."""
         return self.scenario, self.eyes, self.seed
 
+    @property
+    def log_name(self) -> str:
+        """That of its log's file, of one by sight."""
+        return f"{self.scenario.replace(' ', '_')}-{self.seed}.npz"
+
+    def flown(self) -> ScenarioConfig:
+        """What is flown."""
+        overrides: Overrides = {**self.overrides, "seed": self.seed, "drone.perception.threads": 1}
+        if self.duration_s is not None:
+            overrides = {**overrides, "duration_s": self.duration_s}
+        return load_scenario(data_path("config") / self.file, overrides)
+
 
 Line = dict[str, Any]
 """Of one flight: `scenario`, `eyes`, `seed`, `figures` (null where there is none), `wall_s`, and `failed`, the reason
@@ -152,15 +167,11 @@ def seeds_of(commit: str, scenario: str, count: int) -> list[int]:
 def flown(flight: Flight, logs: Path | None = None) -> Line:
     """Fly it on this process alone; a flight that cannot be flown has its reason. One by sight leaves its log."""
     begin, reason, figures = time.monotonic(), None, dict[Figure, float | None]()
-    overrides: Overrides = {**flight.overrides, "seed": flight.seed, "drone.perception.threads": 1}
-    if flight.duration_s is not None:
-        overrides = {**overrides, "duration_s": flight.duration_s}
     try:
-        scenario = load_scenario(data_path("config") / flight.file, overrides)
-        log = fly(scenario, perception=EYES[flight.eyes].perception, threads=0, pictured=False).log
+        log = fly(flight.flown(), perception=EYES[flight.eyes].perception, threads=0, pictured=False).log
         figures = figures_of(log, FIGURES)
         if logs is not None and flight.eyes == "sight":
-            log.save(logs / f"{flight.scenario.replace(' ', '_')}-{flight.seed}.npz")
+            log.save(logs / flight.log_name)
     except Exception as error:  # noqa: BLE001 - whatever it is, it is one flight's result
         reason = f"{type(error).__name__}: {error}"
     who = dict(zip(("scenario", "eyes", "seed"), flight.key, strict=True))
@@ -350,7 +361,13 @@ def _part(part: str, commit: str, arguments: argparse.Namespace) -> dict[str, An
     if part == "flights":
         lines = run(flights_of(commit, quick=quick), results / f"{size}.jsonl", workers)
         return document(commit, lines, quick=quick)
-    if part == "encounters":
+    if part == "errors":
+        flown_by_sight = {one.log_name: one for one in flights_of(commit, quick=False) if one.eyes == "sight"}
+        logs = {path.stem: path for path in sorted(results.glob("*.npz"))}
+        families = {path.stem: family_of(flown_by_sight[path.name].flown()) for path in logs.values()}
+        perceived_errors.write(logs, families, commit, PERCEIVED)
+        found = {"logs": list(logs)}
+    elif part == "encounters":
         found = encounters(_campaign("encounters", 1 if quick else None, results / f"encounters-{size}", workers))
     elif part == "pictures":
         found = _pictures(arguments.labelled, arguments.without_drones)
@@ -364,7 +381,7 @@ def _part(part: str, commit: str, arguments: argparse.Namespace) -> dict[str, An
     return {**_measured_by(commit, f"python -m tools.measure.card{' --quick' * quick} --parts {part}"), "found": found}
 
 
-PARTS = ("flights", "encounters", "pictures", "px4", "geometry", "step")
+PARTS = ("flights", "errors", "encounters", "pictures", "px4", "geometry", "step")
 
 
 def main() -> None:

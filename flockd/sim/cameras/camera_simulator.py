@@ -74,6 +74,12 @@ def _direction(rng: np.random.Generator) -> FloatArray:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
+def family_of(scenario: ScenarioConfig) -> int:
+    """Which mesh the drones of a flight wear."""
+    wanted = scenario.world.drone_family
+    return int(np.random.default_rng([scenario.seed, 1]).integers(FAMILIES)) if wanted == "any" else wanted
+
+
 class CameraSimulator:
     """The world of a scenario, the models of its drones, and their cameras."""
 
@@ -93,9 +99,8 @@ class CameraSimulator:
             hills_slope=scenario.world.hills_slope,
         )
         rng, self._count = np.random.default_rng([scenario.seed, 1]), len(scenario.vehicles)
-        drawn, wanted = int(rng.integers(FAMILIES)), scenario.world.drone_family
-        family = drawn if wanted == "any" else wanted
-        models = [drone_model(family, int(rng.integers(1 << 31))) for _ in range(self._count)]
+        rng.integers(FAMILIES)  # drawn by `family_of`
+        models = [drone_model(family_of(scenario), int(rng.integers(1 << 31))) for _ in range(self._count)]
         self._world, self._renderer = world, Renderer(world, models)
         by_gain = scenario.camera_faults is not None and scenario.camera_faults.noise.gain > 0
         self._scenario, self._image_noise = scenario, 0.0 if by_gain else scenario.sensors.image_noise

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import ndtri
@@ -123,6 +124,9 @@ _OWN_MOTION_ERROR_M = 0.02
 """Standard deviation of a drone's motion in a step, each axis, of which the tracker is told. Where the scenario is
 `ideal` the motion is exact."""
 
+_FALSE_SPEED_M_S = 0.7
+"""Standard deviation of a false neighbour's velocity, of which two or three detections tell little."""
+
 
 class TrackedNeighbours:
     """What one drone knows of the others as its own tracker makes it of detections that are made up from the truth."""
@@ -136,6 +140,8 @@ class TrackedNeighbours:
         """Of each other drone, in standard deviations: of the range's logarithm and the bearing (3), and the normal
         number that decides whether it is missed."""
         self._position: FloatArray | None = None
+        self._by_chance = np.random.default_rng([scenario.seed, drone, 1])
+        self._false: Neighbour | None = None
 
     def step(
         self, time_s: float, positions: FloatArray, velocities: FloatArray, yaw_rad: float = 0.0,
@@ -165,7 +171,24 @@ class TrackedNeighbours:
 
         found = [one for one in found if shown(one.position[None], 0.0)[0]]
         self._tracker.update(time_s, found, velocities[self._drone], shown)
-        return self._tracker.neighbours()
+        self._false = self._false_neighbour(time_s, here)
+        false = [] if self._false is None else [replace(self._false, position=self._false.position - here)]
+        return *self._tracker.neighbours(), *false
+
+    def _false_neighbour(self, time_s: float, here: FloatArray) -> Neighbour | None:
+        """A confirmed track of what is no drone, which begins and ends by chance; its position is in the world."""
+        config, chance = self._config, self._by_chance.random()
+        if self._false is not None:
+            lasts = chance > self._step_s / config.false_time_s
+            return replace(self._false, age_s=self._false.age_s + self._step_s) if lasts else None
+        if chance > config.false_at_once * self._step_s / config.false_time_s:
+            return None
+        range_m = float(np.interp(self._by_chance.random(), (0.1, 0.5, 0.9), config.false_m))
+        ahead = rotation_from_euler(0.0, 0.0, self._by_chance.uniform(-math.pi, math.pi)) @ [range_m, 0.0, 0.0]
+        return Neighbour(
+            -1 - round(time_s / self._step_s), here + ahead, np.zeros(3), range_m * config.range_error,
+            _FALSE_SPEED_M_S, self._step_s, unseen_s=0.0, hits=2, confirmed=True,
+        )  # fmt: skip
 
     def _detection(self, offset: FloatArray, errors: FloatArray) -> Measurement | None:
         config = self._config

@@ -8,11 +8,13 @@ from itertools import combinations
 from math import dist
 from typing import Annotated, Any, Literal, Self
 
+import yaml
 from pydantic import Field, model_validator
 
 from flockd.core.config.base import NonNegative, Positive, Section, Share, Vector3, refuse
 from flockd.core.config.drone import DroneConfig
 from flockd.core.config.mission import MissionParameters, mission_faults
+from flockd.core.data import data_path
 from flockd.sim.renderer.drone_models import FAMILIES
 from flockd.sim.scenario.imperfect_cameras import CamerasConfig, CameraTimingConfig
 
@@ -176,24 +178,35 @@ class WorldConfig(Section):
         return self
 
 
+_PERCEIVED: dict[str, Any] = yaml.safe_load(
+    (data_path("config") / "perceived" / "shipped_networks.yaml").read_text(encoding="utf-8")
+)["detections"]
+
+
 class DetectionsConfig(Section):
     """Detections made up from the truth with errors that last, for flights without images through the drone's own
-    tracker, which is wrong about the drone's own way by 2 cm a step. In the view of a camera that has one of `faults`
+    tracker, which is wrong about the drone's own way by 2 cm a step. Errors are by default those that flights by sight
+    had (config/perceived/shipped_networks.yaml). In the view of a camera that has one of `faults`
     nobody is detected, and the drone flies degraded."""
 
     range_m: Positive = 20.0
     """Farther away nobody is detected."""
-    missed: Share = 0.05
+    missed: Share = _PERCEIVED["missed"]
     """Probability that a drone is not detected in a step."""
-    range_error: Annotated[float, Field(gt=0, le=1)] = 0.05
+    range_error: Annotated[float, Field(gt=0, le=1)] = _PERCEIVED["range_error"]
     """Standard deviation of the logarithm of a range."""
-    bearing_error_rad: Annotated[float, Field(gt=0, le=1)] = 0.005
+    bearing_error_rad: Annotated[float, Field(gt=0, le=1)] = _PERCEIVED["bearing_error_rad"]
     """Standard deviation of a bearing, each axis."""
-    error_time_s: NonNegative = 1.85
-    """How long errors stay about the same; 0: each step has its own. By default as of the shipped networks
-    (config/perceived/shipped_networks.yaml) ..."""
-    missed_time_s: NonNegative = 3.04
+    error_time_s: NonNegative = _PERCEIVED["error_time_s"]
+    """How long errors stay about the same; 0: each step has its own ..."""
+    missed_time_s: NonNegative = _PERCEIVED["missed_time_s"]
     """... and the same of what is missed."""
+    false_at_once: Share = _PERCEIVED["false_at_once"]
+    """How many false neighbours a drone has at once, mean, one at most: what is no drone, and stays where it is, ..."""
+    false_time_s: Positive = _PERCEIVED["false_time_s"]
+    """... for so long each, mean, from when it is confirmed ..."""
+    false_m: tuple[Positive, Positive, Positive] = _PERCEIVED["false_m"]
+    """... so far away: 10th, 50th and 90th percentile."""
 
 
 class CameraFaultConfig(Section):
@@ -230,7 +243,7 @@ _IDEAL: Mapping[str, Mapping[str, object]] = {
         "barometer_drift_m": 0.1, "heading_error_deg": 0.2, "turn_rate_noise_deg_s": 0.0,
         "velocity_error_time_s": 10.0, "position_error_m": 0.5, "position_error_time_s": 60.0,
     },
-    "detections": {"error_time_s": 0.0, "missed_time_s": 0.0},
+    "detections": {"error_time_s": 0.0, "missed_time_s": 0.0, "false_at_once": 0.0},
 }  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,9 +21,9 @@ IDEAL = load_scenario(CONFIG / "encounter.yaml", {"ideal": True})
 AHEAD = np.array([[0.0, 0.0, -5.0], [8.0, 6.0, -5.0]])
 
 
-def known(seed: int = 0, steps: int = 20, positions: np.ndarray = AHEAD, **changes: float) -> list[np.ndarray]:
+def known(seed: int = 0, steps: int = 20, positions: np.ndarray = AHEAD, **changes: Any) -> list[np.ndarray]:
     """Where the second drone, which hovers as the first does, is known to be after each step; NaN: nowhere."""
-    config = DetectionsConfig(**changes)
+    config = DetectionsConfig(**{"false_at_once": 0.0, **changes})
     tracked = TrackedNeighbours(ENCOUNTER.model_copy(update={"seed": seed}), config, 0)
     found = [tracked.step(0.5 * i, positions, np.zeros((2, 3))) for i in range(steps)]
     return [one[0].position if one else np.full(3, np.nan) for one in found]
@@ -30,7 +31,7 @@ def known(seed: int = 0, steps: int = 20, positions: np.ndarray = AHEAD, **chang
 
 def test_who_is_near_is_tracked_to_within_the_errors() -> None:
     finals = np.array(
-        [known(seed, range_error=0.1, bearing_error_rad=0.01, error_time_s=0.0)[-1] for seed in range(20)]
+        [known(seed, missed=0.05, range_error=0.1, bearing_error_rad=0.01, error_time_s=0.0)[-1] for seed in range(20)]
     )
     errors = finals - [8.0, 6.0, 0.0]
     assert 0.02 < np.sqrt(np.mean(errors**2)) < 0.5  # one detection: 1 m along, 0.1 m across
@@ -56,8 +57,8 @@ def test_nobody_is_detected_in_the_view_of_a_camera_that_has_a_fault() -> None:
     for camera, yaw_deg, seen in (("front", 0.0, False), ("back", 0.0, True), ("left", 90.0, False)):
         fault = CameraFaultConfig(drone=1, camera=camera, begin_s=2.0, end_s=4.0)
         scenario = ENCOUNTER.model_copy(update={"faults": (fault,)})
-        tracked = TrackedNeighbours(scenario, DetectionsConfig(missed=0.0), 0)
-        others = TrackedNeighbours(scenario, DetectionsConfig(missed=0.0), 1)
+        tracked = TrackedNeighbours(scenario, DetectionsConfig(missed=0.0, false_at_once=0.0), 0)
+        others = TrackedNeighbours(scenario, DetectionsConfig(missed=0.0, false_at_once=0.0), 1)
         unseen_s = []
         for i in range(12):
             found = tracked.step(0.5 * i, AHEAD, np.zeros((2, 3)), np.radians(yaw_deg))
@@ -114,10 +115,25 @@ def test_who_pulls_away_at_the_start_is_followed() -> None:
 
 def test_errors_last_as_long_as_they_are_said_to() -> None:
     """The range's error of one neighbour, step by step: a Gauss-Markov process, its correlation exp(-t / 1.85 s)."""
-    tracked = TrackedNeighbours(ENCOUNTER, DetectionsConfig(missed=1.0), 0)  # so that nobody is tracked
+    config = DetectionsConfig(missed=1.0, error_time_s=1.85)  # so that nobody is tracked
+    tracked = TrackedNeighbours(ENCOUNTER, config, 0)
     errors = []
     for i in range(4000):
         tracked.step(0.5 * i, AHEAD, np.zeros((2, 3)))
         errors.append(tracked._errors[0, 0])
     for lag in (1, 6):
         assert np.corrcoef(errors[:-lag], errors[lag:])[0, 1] == pytest.approx(np.exp(-0.5 * lag / 1.85), abs=0.08)
+
+
+def test_false_neighbours_are_there_as_often_and_as_long_as_they_are_said_to_be() -> None:
+    """Nobody is near; 10 % of the time there is one, for 2 s each, half of them nearer than 5 m: all within 10 %."""
+    config = DetectionsConfig(false_at_once=0.1, false_time_s=2.0, false_m=(3.0, 5.0, 9.0))
+    alone = np.array([[0.0, 0.0, -5.0], [100.0, 0.0, -5.0]])
+    found, steps = [], 20_000
+    tracked = TrackedNeighbours(ENCOUNTER, config, 0)
+    for i in range(steps):
+        found += [(one.track, float(np.hypot(*one.position[:2]))) for one in tracked.step(0.5 * i, alone, alone * 0.0)]
+    tracks = dict(found)
+    assert len(found) / steps == pytest.approx(0.1, abs=0.02)
+    assert 0.5 * len(found) / len(tracks) == pytest.approx(2.0, rel=0.1)
+    assert np.median(list(tracks.values())) == pytest.approx(5.0, rel=0.1)
