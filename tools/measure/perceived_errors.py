@@ -36,7 +36,8 @@ class Samples(NamedTuple):
     log_range: FloatArray
     """Errors; NaN where missed."""
     bearing_rad: FloatArray
-    """Likewise, level, clockwise."""
+    """Likewise, level, clockwise, off the mean of all that a drone sees in a step: what turns them alike is its heading,
+    by which it flies too. NaN where it sees one alone."""
     false_m: list[float]
     """Distances of tracks that are no drone's, once a step each, ..."""
     false_begun: int
@@ -65,9 +66,17 @@ def samples_of(log: FlightLog) -> Samples:
         matched = [track for track, _ in match_neighbours(tracks, others)]
         false_m += np.linalg.norm(np.delete(tracks, matched, axis=0), axis=1).tolist()
     return Samples(
-        distance, np.log(np.linalg.norm(seen, axis=-1) / distance), (turn + np.pi) % (2 * np.pi) - np.pi, false_m,
+        distance, np.log(np.linalg.norm(seen, axis=-1) / distance), _beside_heading(turn), false_m,
         int(log.false_tracks[later].sum()), log.metadata.step_s,
     )  # fmt: skip
+
+
+def _beside_heading(turn: FloatArray) -> FloatArray:
+    """(S, N, N) of directions that all of a drone's in a step are turned by alike; NaN in, NaN out."""
+    turn = (turn + np.pi) % (2 * np.pi) - np.pi
+    seen = np.isfinite(turn).sum(axis=2, keepdims=True)
+    mean = np.nansum(turn, axis=2, keepdims=True) / np.maximum(seen, 1)
+    return np.where(seen >= 2, (turn - mean) * np.sqrt(seen / np.maximum(seen - 1, 1)), np.nan)
 
 
 def fit(samples: Mapping[str, Samples], families: Mapping[str, int]) -> dict[str, Any]:

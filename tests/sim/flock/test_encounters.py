@@ -64,12 +64,11 @@ def test_drones_that_meet_head_on_stay_apart(speed_m_s: float, seeds: range) -> 
     assert min(nearest_m(head_on(speed_m_s, seed)) for seed in seeds) >= 1.0
 
 
-@pytest.mark.parametrize(("range_error", "missed", "least_m"), [(0.2, 0.05, 1.0), (0.05, 0.3, 1.0), (0.2, 0.3, 0.3)])
-def test_ranges_that_err_much_or_many_misses_bring_nobody_together(
+@pytest.mark.parametrize(("range_error", "missed", "least_m"), [(0.2, 0.05, 1.0), (0.05, 0.3, 1.0), (0.2, 0.3, 0.7)])
+def test_ranges_that_err_much_and_many_misses_bring_nobody_together(
     range_error: float, missed: float, least_m: float
 ) -> None:
-    """At the speed that is proven. With both, of which networks are far, one pair touches where bearings are wrong by 2
-    degrees for 1.9 s too: it stays 0.9 m apart if these are right."""
+    """At the speed that is proven. With both, of which networks are far, drones do not touch."""
     apart_m = [nearest_m(head_on(2.0, seed, range_error=range_error, missed=missed)) for seed in range(3)]
     assert min(apart_m) >= least_m
 
