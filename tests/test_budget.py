@@ -21,7 +21,7 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_090,
-    "flockd/flight": 13_510,
+    "flockd/flight": 13_530,
     "flockd/onboard": 9_880,
     "flockd/fleet": 2_070,
     "flockd/ground": 4_590,
@@ -29,16 +29,16 @@ LINES = {
     "flockd/sim": 9_360,
     "flockd/campaign": 1_470,
     "flockd/cli": 3_530,
-    "tests": 38_570,
+    "tests": 38_590,
     "tools/checks": 2_150,
     "tools/docs": 810,
-    "tools/measure": 1_330,
+    "tools/measure": 1_340,
     "tools/release": 550,
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
 FILES = {"flockd": 358}
-NUMBERS_OF_FLIGHT = 423
+NUMBERS_OF_FLIGHT = 425
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
 """A budget that is farther above what there is is to be lowered."""

@@ -36,8 +36,8 @@ class Samples(NamedTuple):
     log_range: FloatArray
     """Errors; NaN where missed."""
     bearing_rad: FloatArray
-    """Likewise, level, clockwise, off the mean of all that a drone sees in a step: what turns them alike is its heading,
-    by which it flies too. NaN where it sees one alone."""
+    """Likewise, level, clockwise, off the mean of all that a drone sees in a step: what turns them alike is its
+    heading, by which it flies too. NaN where it sees one alone."""
     false_m: list[float]
     """Distances of tracks that are no drone's, once a step each, ..."""
     false_begun: int

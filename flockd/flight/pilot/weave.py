@@ -20,10 +20,12 @@ _ASKED_M = 0.43
 """The drone asks for heights this much above and below its own, which moves it by about 0.34 m, ..."""
 PERIOD_S, DURATION_S = 6.0, 12.0
 """... in a sine of this period, for so long."""
+_SETTLES_S = 3.0
+"""So long afterwards it asks for the height where it began, to be there again."""
 _DRAWN_WITHIN_S = 8.0
 """It begins at a time drawn from so many seconds, for not all to weave at once."""
 _CLIMB_M_S = 0.2
-"""A neighbour that rises or sinks faster is weaving, and the drone waits."""
+"""A neighbour that rises or sinks faster, or did so in the last half period, is weaving, and the drone waits."""
 _AGAIN_S = (1.0, 4.0)
 """Where it may not begin it tries again after so long."""
 _STEADY_S = 6.0
@@ -44,19 +46,22 @@ class Weave:
         self._gate = gate
         self._random = np.random.default_rng(zlib.crc32(own))
         self._next_s: float | None = None
+        self._climbed_s = -math.inf
+        """When a neighbour last rose or sank."""
         self._began_s: float | None = None
+        self._ended_s: float | None = None
         self._base_m = 0.0
         self._wanted_m: float | None = None
         self._steady_since_s: float | None = None
 
     @property
     def moves(self) -> bool:
-        """Whether it moves the drone."""
-        return self._began_s is not None
+        """Whether it moves the drone up and down."""
+        return self._began_s is not None and self._ended_s is None
 
     def is_over(self, time_s: float) -> bool:
         """Whether it has moved the drone for as long as it should."""
-        return self._began_s is not None and time_s - self._began_s >= DURATION_S
+        return self._began_s is not None and self._ended_s is None and time_s - self._began_s >= DURATION_S
 
     def height(
         self,
@@ -72,6 +77,8 @@ class Weave:
 
         The drone is at `height_m` above home. `needed`: there is something to learn, and nothing that forbids it.
         """
+        if any(one.confirmed and abs(one.velocity[2]) > _CLIMB_M_S for one in neighbours):
+            self._climbed_s = time_s
         if self._steady_since_s is None:  # a flight begins at its height
             self._wanted_m, self._steady_since_s = wanted_m, time_s - _STEADY_S
         elif wanted_m != self._wanted_m:
@@ -80,11 +87,15 @@ class Weave:
             if not needed or not self._begins(time_s, height_m, above_ground_m, neighbours):
                 return wanted_m
             self._began_s, self._base_m = time_s, height_m
-        elif not needed or self._steady_since_s > self._began_s or self.is_over(time_s):
-            self._began_s = self._next_s = None
+        elif self._ended_s is None and (not needed or self._steady_since_s > self._began_s or self.is_over(time_s)):
+            self._ended_s = time_s
+        base_m = self._base_m if wanted_m is None else wanted_m
+        if self._ended_s is None:
+            return base_m + _ASKED_M * math.sin(2 * math.pi * (time_s - self._began_s) / PERIOD_S)
+        if time_s - self._ended_s >= _SETTLES_S:
+            self._began_s = self._ended_s = self._next_s = None
             return wanted_m
-        asked_m = _ASKED_M * math.sin(2 * math.pi * (time_s - self._began_s) / PERIOD_S)
-        return (self._base_m if wanted_m is None else wanted_m) + asked_m
+        return base_m
 
     def _begins(self, time_s: float, height_m: float, above_ground_m: float, neighbours: Sequence[Neighbour]) -> bool:
         if self._next_s is None:
@@ -106,6 +117,7 @@ class Weave:
             time_s - self._steady_since_s >= _STEADY_S
             and abs(height_m - base_m) <= _AT_HEIGHT_M
             and room_m >= _ASKED_M + _ABOVE_LOWEST_M
+            and time_s - self._climbed_s >= PERIOD_S / 2
             and bool(seen)
-            and all(math.hypot(*one.position[:2]) >= column_m and abs(one.velocity[2]) <= _CLIMB_M_S for one in seen)
+            and all(math.hypot(*one.position[:2]) >= column_m for one in seen)
         )

@@ -126,6 +126,8 @@ def test_a_size_that_is_a_quarter_off_is_found_within_a_weave_and_errs_as_it_say
         assert min(range_sigmas(outputs[-1])) >= flight.learned.sigma
         assert f"{flight.learned.size_m:.2f} m large" in outputs[-1].mission.sentence
         assert sum(now and not before for before, now in itertools.pairwise([False, *weaves(outputs)])) == 1
+        flight.fly(3.0)
+        assert abs(flight.below_m) < 0.05, "it is back at its height"
     sizes_m = np.exp(np.array(off) * 0.05)
     assert np.median(np.abs(sizes_m - 1)) < 0.05
     assert 0.1 < np.mean(np.square(off)) < 1.5
@@ -238,6 +240,16 @@ def test_it_ends_at_once(why: str) -> None:
     if why == "the mission's height changes":
         weaving.wanted_m = HEIGHT_M + 1.0
     assert (weaving.asked(5.0, needed=why != "the mission is over") == 0.0).all()
+
+
+def test_it_waits_while_another_is_at_the_turn_of_its_weave() -> None:
+    weaving, lifts = Weaving(), []
+    for step in range(60):
+        climb_m_s = 0.4 * math.cos(2 * math.pi * step * STEP_S / PERIOD_S) if step < 44 else 0.0
+        weaving.neighbours = (at(4.0, climb_m_s),)
+        lifts.append(weaving.asked(STEP_S)[0])
+    assert (np.array(lifts[:44]) == 0.0).all()
+    assert any(lifts[44:])
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,8 @@ def lasting(random: np.random.Generator, time_s: float) -> Any:
 
 
 def test_errors_misses_and_false_neighbours_are_measured_as_they_were_made_up() -> None:
-    """Three 6 m apart, whose headings are wrong by 2 degrees; ranges err by 5 % for 2 s, bearings by 0.03, a tenth is missed for 2 s and less, and one drone has
-    a false neighbour 4 m away in every tenth step, each time another."""
+    """Three 6 m apart, whose headings are wrong by 2 degrees; ranges err by 5 % for 2 s, bearings by 0.03, a tenth is
+    missed for 2 s and less, and one drone has a false neighbour 4 m away in every tenth step, each time another."""
     random = np.random.default_rng(0)
     position = np.zeros((STEPS, 3, 3))
     position[:, 1, 0] = 6.0
