@@ -339,7 +339,7 @@ class FlockPilot:
     ) -> tuple[int, ...]:
         """The track of each measurement."""
         if observation.previous is not None:
-            self._tracker.predict(observation.interval_s, *moved)
+            self._tracker.predict(min(observation.interval_s, _LONGEST_S), *moved)
         return self._tracker.update(observation.time_s, measurements, velocity, self._shown(observation))
 
     def _with_sizes(

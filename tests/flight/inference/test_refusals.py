@@ -76,11 +76,10 @@ def test_a_start_with_a_damaged_model_ends_with_one_sentence(
     shipped = (MODELS.parent / "config" / "px4_sitl.yaml").read_text()
     drone.write_text(shipped.replace("perception:\n", f"perception:\n  models_dir: {copies}\n"))
     room = tmp_path / "room"
-    room.mkdir()
+    (room / "images").mkdir(parents=True)
     for index in range(2):
         noise = np.random.default_rng(index).integers(0, 255, (96, 128, 3), np.uint8)
-        cv2.imwrite(str(room / f"{index}.png"), noise)
-    (room / "rgb.txt").write_text("0 0.png\n1 1.png\n")
+        cv2.imwrite(str(room / "images" / f"{index}.png"), noise)
     (room / "K.txt").write_text("100 0 64\n0 100 48\n0 0 1\n")
     assert main(["replay", str(room), "--config", str(drone)]) == 78
     sentences = capsys.readouterr().err.splitlines()

@@ -322,3 +322,13 @@ def test_where_images_or_attitude_are_lost_neighbours_come_on_by_the_velocity_th
     assert output.ego_motion is None and output.time_s == time_s
     assert neighbour.unseen_s == pytest.approx(1.0)
     assert neighbour.position[0] == pytest.approx(6.0, abs=0.3)
+
+
+def test_a_time_beyond_all_others_ends_no_step() -> None:
+    observer = Comes()
+    pilot = FlockPilot(changed(ALONE.drone, own_velocity="autopilot"), NEVER_ASKED, observer=observer)
+    for time_s in (0.0, 0.5, 1.0, 1e308):
+        observer.sees = time_s < 2.0
+        output = pilot.step(frames(time_s), vehicle(time_s, 4.0, velocity_ned=np.array([2.0, 0.0, 0.0])))
+    assert output.neighbours == ()
+    assert np.isfinite(output.command.velocity).all()
