@@ -52,7 +52,7 @@ _ROTATION_TOLERANCE = 1e-3
 _ROUNDING = 1e-6
 """The same: what is farther off is replaced by the nearest rotation, as measurements and transforms ask for one."""
 _LONGEST_S = 10.0
-"""Since the last step: what was known before a longer gap is forgotten anyway."""
+"""Since the last step: what was known before a longer gap is forgotten."""
 _DISAGREE = "ego-motion: images and autopilot disagree on the velocity; one, or the height above ground, is wrong"
 _VELOCITY_SIGMA_M_S = 0.2
 """Of the velocity that is known where images show no own motion, each axis: PX4's estimate, or the last by images."""
@@ -246,8 +246,8 @@ class FlockPilot:
         )
 
     def _predictions(self, time_s: float) -> tuple[Prediction, ...]:
-        """Predictions of the tracks at the frames' time; none where time does not go on."""
-        if self._last_time_s is None or time_s <= self._last_time_s:
+        """Predictions of the tracks at the frames' time; none where time does not go on, or too far."""
+        if self._last_time_s is None or not 0.0 < time_s - self._last_time_s <= _LONGEST_S:
             return ()
         return self._tracker.predictions(time_s - self._last_time_s, self._velocity)
 
@@ -339,6 +339,8 @@ class FlockPilot:
     ) -> tuple[int, ...]:
         """The track of each measurement."""
         if observation.previous is not None:
+            if observation.interval_s > _LONGEST_S:
+                self._tracker.forget()
             self._tracker.predict(min(observation.interval_s, _LONGEST_S), *moved)
         return self._tracker.update(observation.time_s, measurements, velocity, self._shown(observation))
 

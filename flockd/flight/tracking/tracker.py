@@ -146,6 +146,10 @@ class Tracker:
         for track in self._tracks:
             track.hypotheses = track.hypotheses.changed(lambda state: filter.resized(state, size_m, own_velocity))
 
+    def forget(self) -> None:
+        """Nothing is known of anybody any more."""
+        self._tracks = []
+
     def neighbours(self) -> tuple[Neighbour, ...]:
         """All tracks as of the last `predict` and `update`, confirmed or not, by track number."""
         return tuple(
