@@ -130,7 +130,9 @@ def test_a_size_that_is_a_quarter_off_is_found_within_a_weave_and_errs_as_it_say
         assert abs(flight.below_m) < 0.05, "it is back at its height"
     sizes_m = np.exp(np.array(off) * 0.05)
     assert np.median(np.abs(sizes_m - 1)) < 0.05
-    assert 0.1 < np.mean(np.square(off)) < 0.3, "it says 4 % at least, and errs by less; 0.43 if errors were independent"
+    assert 0.1 < np.mean(np.square(off)) < 0.3, (
+        "it says 4 % at least, and errs by less; 0.43 if errors were independent"
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
