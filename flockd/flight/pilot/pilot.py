@@ -237,7 +237,7 @@ class FlockPilot:
             detections=(),
             detection_tracks=(),
             neighbour_motions={},
-            neighbours=tracker.neighbours(),
+            neighbours=self._size.cautious(tracker.neighbours()),
             command=Wanted(np.zeros(2), np.zeros(2), self._yaw_rad),
             mission=self._mission,
             reasons=(reason,),

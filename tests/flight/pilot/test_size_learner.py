@@ -169,14 +169,18 @@ def test_it_weaves_only_where_it_is_asked_for_and_flown(flies: bool) -> None:
     assert not any(weaves(outputs))
 
 
+@pytest.mark.parametrize("refused", [False, True])
 @pytest.mark.parametrize(
     ("doubt", "said", "least", "most"), [(0.3, {}, 0.15, 0.2), (0.03, {}, 0, 0.1), (0.3, {"drone_size_m": 0.4}, 0, 0.1)]
 )
 def test_the_gate_reckons_with_what_a_judged_size_may_be_off(
-    doubt: float, said: dict[str, float], least: float, most: float
+    doubt: float, said: dict[str, float], least: float, most: float, refused: bool
 ) -> None:
     """Of drones that the networks do not know, and whose size nobody said. It lasts, and does not average out."""
-    sigmas = range_sigmas(Flight(drone("off", **said), doubt=doubt).fly(4.0)[-1])
+    flight = Flight(drone("off", **said), doubt=doubt)
+    flight.fly(4.0)
+    flight.below_m = math.nan if refused else 0.0
+    sigmas = range_sigmas(flight.fly(STEP_S)[-1])
     assert all(least <= sigma <= most for sigma in sigmas)
 
 
