@@ -11,6 +11,7 @@ import json
 import logging
 import math
 import socket
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -40,6 +41,7 @@ from flockd.onboard.autopilot.autopilot_status import (
     Firmware,
     FlightMode,
 )
+from flockd.onboard.autopilot.frequent_messages import FrequentMessages
 from flockd.onboard.autopilot.mavlink_messages import Fields, ReceivedMessages, result_text, text_chunks
 from flockd.onboard.autopilot.refusal_reasons import REMEDIES_OF_RESULTS
 from flockd.onboard.autopilot.refusals import Refusal
@@ -148,6 +150,10 @@ class AutopilotLink:
         self._time_syncs: deque[int] = deque(maxlen=MOST_OPEN)
         """This computer's times in nanoseconds of exchanges that were not answered yet."""
         self._text_ids = cycle(range(1, 0x10000))
+        self._receiving = threading.Lock()
+        if port is not None:
+            frequent = FrequentMessages(self._system_id, AUTOPILOT_COMPONENT, self._add)
+            port.hand_to(lambda data: (rest := frequent.without(data)) and mavsdk.pass_received_raw_bytes(rest))
         for name in (*RECEIVED, TIME_SYNC):
             self._direct.subscribe_message(name, self._receive)
 
@@ -403,7 +409,12 @@ class AutopilotLink:
         elif message.message_name == TIME_SYNC:
             self._take_time(json.loads(message.fields_json), now)
         else:
-            self.received.add(message.message_name, json.loads(message.fields_json), now)
+            self._add(message.message_name, json.loads(message.fields_json))
+
+    def _add(self, name: str, fields: Fields) -> None:
+        """Called on MAVSDK's thread and on the serial port's."""
+        with self._receiving:
+            self.received.add(name, fields, self._clock())
 
     def _take_time(self, fields: Fields, now: float) -> None:
         """Takes the reply to an exchange of ours; the autopilot asks in the same message, which is left to others."""
