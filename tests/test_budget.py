@@ -22,10 +22,10 @@ ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_090,
     "flockd/flight": 13_530,
-    "flockd/onboard": 9_980,
-    "flockd/fleet": 2_070,
+    "flockd/onboard": 9_220,
+    "flockd/fleet": 2_600,
     "flockd/ground": 4_590,
-    "flockd/review": 3_170,
+    "flockd/review": 3_390,
     "flockd/sim": 9_360,
     "flockd/campaign": 1_470,
     "flockd/cli": 3_530,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 359}
+FILES = {"flockd": 357}
 NUMBERS_OF_FLIGHT = 425
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02

@@ -16,7 +16,7 @@ ROOMS = ("core", "flight", "onboard", "fleet", "ground", "review", "sim", "campa
 """From the ground up: a room imports itself and rooms below it."""
 FLIGHT = ("geometry", "inference", "tracking", "perception", "flocking", "safety", "obstacles", "mission", "pilot")
 """The order inside `flight`. Mission and obstacles ask for the fence and the half planes of safety."""
-ONBOARD = ("autopilot", "telemetry", "ros", "sources", "recording", "daemon")
+ONBOARD = ("autopilot", "telemetry", "sources", "recording", "daemon")
 """The order inside `onboard`: frames may come over zenoh; recording asks telemetry for the table of topics."""
 
 PURE_ROOMS = ("flight", "core/messages.py", "core/choices.py")
@@ -31,8 +31,8 @@ LIBRARIES = {
     "mavsdk": ("onboard/autopilot/mavsdk_link.py",),
     "pymavlink": ("sim/autopilot", "sim/sitl/ground_station.py"),
     "joblib": ("campaign/engine.py",),
-    "rosbags": ("onboard/recording/ros_bag.py",),
-    "rclpy": ("onboard/ros/ros_node.py", "onboard/sources/camera_child.py"),
+    "rosbags": ("review/replay/bag_flight.py",),
+    "rclpy": ("fleet/ros/ros_node.py", "onboard/sources/camera_child.py"),
     "numba": SIMULATION,
     "matplotlib": SIMULATION,
     "jinja2 markupsafe": SIMULATION,

@@ -17,9 +17,9 @@ from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from flockd.core.config import DroneConfig
-    from flockd.onboard.recording.difference import Comparison
     from flockd.onboard.recording.reader import Recording
     from flockd.review.replay.dataset_flight import Depth
+    from flockd.review.replay.difference import Comparison
 
 _OF_RECORDINGS = ("start", "end", "out", "diff", "reference", "update_reference", "tolerance")
 _OF_DATASETS = ("depth", "stride", "flow")
@@ -73,7 +73,7 @@ def _tolerance(text: str) -> tuple[str, float]:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.onboard.recording.ros_bag import is_bag
+    from flockd.review.replay.bag_flight import is_bag
 
     if args.recording.is_dir() and not is_bag(args.recording):
         return _run_dataset(args)
@@ -86,7 +86,7 @@ def _run(args: argparse.Namespace) -> int:
 @contextmanager
 def _recording(args: argparse.Namespace) -> Iterator[Recording]:
     """What is replayed; of a bag of somebody else's a recording in a temporary folder."""
-    from flockd.onboard.recording.ros_bag import Bag, is_bag
+    from flockd.review.replay.bag_flight import Bag, is_bag, recording_of_bag
 
     if args.vehicle is not None and not is_bag(args.recording):
         raise UsageError("--vehicle is for bags of ROS 2, and this is none; leave it out")
@@ -94,8 +94,6 @@ def _recording(args: argparse.Namespace) -> Iterator[Recording]:
         yield opened(args.recording)
         return
     with Bag(args.recording) as bag, TemporaryDirectory(prefix="flockd-bag-") as folder:
-        from flockd.review.replay.bag_flight import recording_of_bag
-
         config = loaded(args.config)
         if config is None:
             raise UsageError(
@@ -135,7 +133,7 @@ def _replay(args: argparse.Namespace, recording: Recording) -> int:
 
         replay = replay_flight(recording, config, start_s, end_s, out=args.out, progress=after_step)
     if args.update_reference:
-        from flockd.onboard.recording.difference import save_reference
+        from flockd.review.replay.difference import save_reference
 
         save_reference(args.reference, recording.drone, replay.outputs)
     comparison = None
@@ -200,7 +198,7 @@ def _reference(args: argparse.Namespace) -> Mapping[int, Mapping[str, Any]] | No
         return None
     if not args.reference.is_file():
         raise UsageError(f"{args.reference}: does not exist; write it first with --update-reference")
-    from flockd.onboard.recording.difference import load_reference
+    from flockd.review.replay.difference import load_reference
 
     return load_reference(args.reference)
 

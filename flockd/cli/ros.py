@@ -61,7 +61,7 @@ def _perceive(args: argparse.Namespace) -> int:
     """Until Ctrl-C."""
     from flockd.core.config import load_drone
     from flockd.fleet.ros.perceive import PerceptionNode, check
-    from flockd.onboard.ros.ros_node import RosNode
+    from flockd.fleet.ros.ros_node import RosNode
     from flockd.onboard.sources import open_source
 
     config = load_drone(args.config)
@@ -80,8 +80,8 @@ def _run(args: argparse.Namespace) -> int:
     """Until Ctrl-C."""
     from flockd.fleet.live_fleet import LiveFleet
     from flockd.fleet.ros.fleet_bridge import FleetBridge
+    from flockd.fleet.ros.ros_node import RosNode
     from flockd.fleet.watcher import FleetWatcher
-    from flockd.onboard.ros.ros_node import RosNode
 
     listen, connect = endpoints(args)
     with ExitStack() as stack, suppress(KeyboardInterrupt):

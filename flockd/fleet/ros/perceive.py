@@ -12,12 +12,12 @@ import numpy as np
 from flockd.core.config import DroneConfig
 from flockd.core.errors import UsageError
 from flockd.core.messages import PilotOutput, VehicleState
+from flockd.fleet.ros import message_trees as trees
+from flockd.fleet.ros.message_trees import Names, ros_name
+from flockd.fleet.ros.ros_input import STATES, NearestState, stamp_ns, vehicle_state
+from flockd.fleet.ros.ros_node import Delivery, RosNode
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon import load_side_by_side
-from flockd.onboard.ros import message_trees as trees
-from flockd.onboard.ros.message_trees import Names, ros_name
-from flockd.onboard.ros.ros_input import STATES, NearestState, stamp_ns, vehicle_state
-from flockd.onboard.ros.ros_node import Delivery, RosNode
 from flockd.onboard.sources import FrameSource
 from flockd.onboard.telemetry.step_messages import neighbour_message
 

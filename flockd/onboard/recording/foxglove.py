@@ -21,10 +21,9 @@ from google.protobuf.message import DecodeError
 from flockd.core.choices import ImageFormat
 from flockd.core.config.rig import CameraConfig
 from flockd.core.messages import FloatArray
-from flockd.core.ros_frames import CENTRE_PX
+from flockd.core.ros_frames import CENTRE_PX, quaternion_of
 from flockd.flight.geometry import Rig
 from flockd.onboard.recording.mcap_file import RecordingError, Stream
-from flockd.onboard.ros.message_trees import Tree, turn, vector
 
 
 def image(time_ns: int, camera: str, data: bytes, kind: ImageFormat) -> bytes:
@@ -73,8 +72,8 @@ def transforms(time_ns: int, position: FloatArray, R_ned_body: FloatArray, rig: 
             "timestamp": _stamp(time_ns),
             "parent_frame_id": parent,
             "child_frame_id": child,
-            "translation": vector(place),
-            "rotation": turn(R),
+            "translation": _vector(place),
+            "rotation": _turn(R),
         }
         for parent, child, place, R in places
     ]
@@ -83,8 +82,8 @@ def transforms(time_ns: int, position: FloatArray, R_ned_body: FloatArray, rig: 
 
 def odometry(time_ns: int, position: FloatArray, R_ned_body: FloatArray, velocity_ned: FloatArray) -> bytes:
     """An Odometry: the path that adds up from the own velocity."""
-    pose = {"position": vector(position), "orientation": turn(R_ned_body)}
-    velocity = vector(R_ned_body.T @ velocity_ned)
+    pose = {"position": _vector(position), "orientation": _turn(R_ned_body)}
+    velocity = _vector(R_ned_body.T @ velocity_ned)
     frames = {"frame_id": "local", "body_frame_id": "body"}
     return _packed(Odometry, time_ns, **frames, pose=pose, linear_velocity=velocity)
 
@@ -98,7 +97,15 @@ def _packed(kind: Any, time_ns: int, **fields: Any) -> bytes:
     return bytes(kind(timestamp=_stamp(time_ns), **fields).SerializeToString())
 
 
-def _stamp(time_ns: int) -> Tree:
+def _vector(values: FloatArray) -> dict[str, float]:
+    return dict(zip("xyz", values.tolist(), strict=True))
+
+
+def _turn(R: FloatArray) -> dict[str, float]:
+    return dict(zip("xyzw", quaternion_of(R).tolist(), strict=True))
+
+
+def _stamp(time_ns: int) -> dict[str, int]:
     return {"seconds": time_ns // 10**9, "nanos": time_ns % 10**9}
 
 

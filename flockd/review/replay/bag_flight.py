@@ -1,11 +1,15 @@
-"""A bag of somebody else's stack becomes a recording that can be replayed: its images, with odometry or an IMU."""
+"""A bag of ROS 2, in MCAP or SQLite, becomes a recording that can be replayed: its images, with odometry or an IMU.
+
+The one adapter to `rosbags`, which reads it without ROS.
+"""
 
 from __future__ import annotations
 
 import json
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
+from typing import Any, NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -14,11 +18,20 @@ from flockd.core.choices import ImageFormat
 from flockd.core.config import DroneConfig
 from flockd.core.errors import UsageError
 from flockd.core.messages import UInt8Array, VehicleState
+from flockd.fleet.ros.message_trees import COMPRESSED_IMAGE, IMU
+from flockd.fleet.ros.ros_input import (
+    LONGEST_GAP_S,
+    STATES,
+    NearestState,
+    RosImage,
+    image_of,
+    stamp_ns,
+    vehicle_state,
+)
 from flockd.flight.inference.hashes import model_hashes
 from flockd.onboard.message_json import to_json
 from flockd.onboard.recording import RecordingError, foxglove
 from flockd.onboard.recording.mcap_file import Entry, Inclosure, McapFile, Note
-from flockd.onboard.recording.ros_bag import Bag, BagMessage
 from flockd.onboard.recording.streams import (
     CONFIGURATION,
     END_NOTE,
@@ -30,16 +43,6 @@ from flockd.onboard.recording.streams import (
     FrameEntry,
     StepFrames,
     nanoseconds,
-)
-from flockd.onboard.ros.message_trees import COMPRESSED_IMAGE, IMU
-from flockd.onboard.ros.ros_input import (
-    LONGEST_GAP_S,
-    STATES,
-    NearestState,
-    RosImage,
-    image_of,
-    stamp_ns,
-    vehicle_state,
 )
 from flockd.onboard.sources.assembler import Assembler, RawFrameSet
 from flockd.onboard.sources.frames import RawFrame
@@ -190,3 +193,72 @@ def _entries(step: int, frames: RawFrameSet, vehicle: VehicleState) -> Iterator[
     stamp = nanoseconds(frames.time_s)
     for stream, message in ((FRAMES, StepFrames(step, frames.time_s, tuple(kept))), (VEHICLE, vehicle)):
         yield Entry(stream, stamp, step, json.dumps(to_json(message), allow_nan=False).encode())
+
+
+METADATA = "metadata.yaml"
+
+
+def is_bag(path: Path) -> bool:
+    """Whether it is the folder of a bag."""
+    return (path / METADATA).is_file()
+
+
+class BagMessage(NamedTuple):
+    """One message of a bag."""
+
+    topic: str
+    kind: str
+    time_ns: int
+    data: bytes
+    """As it travels (CDR)."""
+
+
+class Bag:
+    """A bag that is read. Raises RecordingError for what is none, and ModuleNotFoundError without `rosbags`."""
+
+    def __init__(self, folder: Path) -> None:
+        from rosbags.rosbag2 import Reader, ReaderError  # noqa: PLC0415 - of an extra
+
+        self.path = folder
+        self._store = _store()
+        try:
+            self._reader = Reader(folder)
+            self._reader.open()
+        except (ReaderError, OSError, ValueError, KeyError) as error:
+            raise RecordingError(f"{folder}: is no bag that can be read ({error}); use another copy") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._reader.close()
+
+    def kinds(self) -> dict[str, str]:
+        """The type of each topic."""
+        return {one.topic: one.msgtype for one in self._reader.connections}
+
+    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
+        """Of these topics, in the order of their times. Raises RecordingError where it is damaged."""
+        wanted = [one for one in self._reader.connections if one.topic in topics]
+        if not wanted:
+            return
+        try:
+            for connection, time_ns, data in self._reader.messages(wanted):
+                yield BagMessage(connection.topic, connection.msgtype, time_ns, bytes(data))
+        except RecordingError:
+            raise
+        except Exception as error:  # of whatever library unpacks it
+            raise RecordingError(f"{self.path}: cannot be read to its end ({error}); use another copy") from error
+
+    def read(self, message: BagMessage) -> Any:
+        """A message's fields as attributes, of the standard types. Raises RecordingError."""
+        try:
+            return self._store.deserialize_cdr(message.data, message.kind)
+        except Exception as error:  # of generated code: struct.error, UnicodeDecodeError and others
+            raise RecordingError(f"{self.path}: a message of {message.topic} cannot be read ({error})") from error
+
+
+def _store() -> Any:
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 - of an extra
+
+    return get_typestore(Stores.ROS2_JAZZY)

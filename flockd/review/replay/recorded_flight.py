@@ -17,10 +17,10 @@ from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon import load_side_by_side
 from flockd.onboard.message_json import to_json
 from flockd.onboard.recording import Recorder, RecordingError
-from flockd.onboard.recording.difference import Comparison, compare
 from flockd.onboard.recording.reader import RecordedStep, Recording
 from flockd.onboard.recording.streams import REPLAYED
 from flockd.review.flight_log.log import spread
+from flockd.review.replay.difference import Comparison, compare
 
 Outputs = Mapping[int, Mapping[str, Any]]
 """The pilot's outputs as JSON, by step number."""

@@ -12,8 +12,8 @@ from flockd.core.ros_frames import rotation_of
 from flockd.fleet.drone_rows import WORST_FIRST, Known, drone_rows, origin_of
 from flockd.fleet.ros.fleet_bridge import _LEVELS, _status, _transforms
 from flockd.fleet.ros.fleet_markers import markers
+from flockd.fleet.ros.message_trees import Names
 from flockd.fleet.watcher import Heard, Watched
-from flockd.onboard.ros.message_trees import Names
 from flockd.onboard.telemetry.topics import AboutMessage, StateMessage
 from tests.make import flight_message
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from flockd.fleet.ros.fleet_bridge import DroneNames
+from flockd.fleet.ros.message_trees import Names
 from flockd.fleet.ros.ros_orders import goal_of, velocity_of
-from flockd.onboard.ros.message_trees import Names
 from flockd.onboard.telemetry.topics import AboutMessage
 
 NAMES = Names("drone1")

@@ -14,11 +14,11 @@ import pytest
 
 from flockd.core.config import load_drone
 from flockd.core.config.source import SourceParameters
+from flockd.fleet.ros.message_trees import Names
 from flockd.fleet.ros.ros_orders import goal_of, velocity_of
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.mcap_file import RecordingError
 from flockd.onboard.recording.reader import decoded_image
-from flockd.onboard.ros.message_trees import Names
 from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat, PackedFormat
 from flockd.onboard.sources.shared_memory import SharedMemorySource
 from flockd.onboard.telemetry.order_messages import parse_order

@@ -17,8 +17,7 @@ from flockd.cli import main
 from flockd.core.config import load_drone
 from flockd.core.messages import FloatArray, UInt8Array
 from flockd.onboard.recording.reader import Recording
-from flockd.onboard.recording.ros_bag import Bag
-from flockd.review.replay.bag_flight import recording_of_bag
+from flockd.review.replay.bag_flight import Bag, recording_of_bag
 from tests.onboard.recording.made_up import MadeUpPilot
 
 STORE = get_typestore(Stores.ROS2_JAZZY)

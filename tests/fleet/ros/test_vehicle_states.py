@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.onboard.ros.message_trees import IMU, ODOMETRY, POSE
-from flockd.onboard.ros.ros_input import LONGEST_GAP_S, NearestState, vehicle_state
+from flockd.fleet.ros.message_trees import IMU, ODOMETRY, POSE
+from flockd.fleet.ros.ros_input import LONGEST_GAP_S, NearestState, vehicle_state
 from tests.make import vehicle
 
 

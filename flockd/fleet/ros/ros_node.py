@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 
 from flockd.core.errors import UnavailableError
-from flockd.onboard.ros.message_trees import Tree
+from flockd.fleet.ros.message_trees import Tree
 
 HERE_ONLY = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 """Environment of a node that only this computer's find: ROS 2 has no rule of its own about who may publish."""

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.onboard.ros import message_trees as trees
-from flockd.onboard.ros.message_trees import Names
+from flockd.fleet.ros import message_trees as trees
+from flockd.fleet.ros.message_trees import Names
 from flockd.onboard.telemetry.topics import NeighbourMessage, ObstaclesMessage, StateMessage
 
 NAMES = Names("drone1")
