@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from flockd.flight.obstacles.avoidance import Avoidance
-from flockd.flight.obstacles.local_map import LocalMap, nearest_points
+from flockd.flight.obstacles.local_map import DIRECTIONS, LocalMap, nearest_points
 from flockd.flight.obstacles.ranging import ObstacleRanging
 
-__all__ = ["Avoidance", "LocalMap", "ObstacleRanging", "nearest_points"]
+__all__ = ["DIRECTIONS", "Avoidance", "LocalMap", "ObstacleRanging", "nearest_points"]

@@ -11,7 +11,7 @@ from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray, ObstacleRanges
 from flockd.flight.flocking import FlockingLaw, level_offsets, lookahead_s
 from flockd.flight.geometry.level import limit_norm
-from flockd.flight.obstacles.local_map import nearest_points
+from flockd.flight.obstacles.local_map import nearest_points, sector_of
 from flockd.flight.obstacles.steering import Steering
 from flockd.flight.safety.approach import stopping_speed, towards_neighbours, towards_obstacles
 from flockd.flight.safety.half_planes import nearest_within
@@ -78,6 +78,13 @@ class Avoidance:
         to_neighbours = towards_neighbours(gate, neighbours, velocities, gate.degraded_separation_m)
         directions, most_m_s = zip(to_obstacles, to_neighbours, strict=True)
         return nearest_within(velocity, np.concatenate(directions), np.concatenate(most_m_s))
+
+    def within_sight(self, velocity: FloatArray, ranges: ObstacleRanges) -> FloatArray:
+        """The velocity (2,) m/s; where no camera looks any more, no faster than the drone stops within what was seen."""
+        seen_m = ranges.seen_m[sector_of(velocity[None])[0]]
+        if seen_m >= self._parameters.range_m:
+            return velocity
+        return limit_norm(velocity, float(stopping_speed(seen_m, self._gate.braking_m_s2, self._reaction_s)))
 
     def _away(self, ranges: ObstacleRanges) -> FloatArray:
         """(2,) m/s from the nearest obstacle, where that is nearer than the clearance."""

@@ -107,7 +107,7 @@ class LocalMap:
         """The points that newer ranges neither show again nor have looked past often enough."""
         points = self._points
         away_m = np.hypot(*points.places.T)
-        around = (_sector_of(points.places)[:, None] + [-1, 0, 1]) % SECTORS
+        around = (sector_of(points.places)[:, None] + [-1, 0, 1]) % SECTORS
         own = around[:, 1]
         allowed_m = _CONSISTENT_SIGMAS * np.hypot(points.sigma_m[:, None], ranges.sigma_m[around])
         beyond = np.minimum(ranges.range_m, ranges.seen_m)[around] > away_m[:, None] + allowed_m
@@ -121,7 +121,7 @@ class LocalMap:
         """In each sector the point that may be nearest."""
         points = self._points
         away_m = np.hypot(*points.places.T)
-        sectors = _sector_of(points.places)
+        sectors = sector_of(points.places)
         farthest_first = np.argsort(-(away_m - self._parameters.sigmas * points.sigma_m), kind="stable")
         range_m, sigma_m = np.full(SECTORS, np.inf), np.zeros(SECTORS)
         range_m[sectors[farthest_first]] = away_m[farthest_first]  # the last one written stays
@@ -141,7 +141,7 @@ NEAREST_M = 0.01
 """No obstacle counts as nearer: it needs a direction."""
 
 
-def _sector_of(places: FloatArray) -> IntArray:
+def sector_of(places: FloatArray) -> IntArray:
     """(m,) of places (m, 2)."""
     azimuths = np.arctan2(places[:, 1], places[:, 0])
     sectors: IntArray = np.round(azimuths * SECTORS / (2 * math.pi)).astype(np.int64) % SECTORS

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -14,6 +14,7 @@ import numpy as np
 from flockd.core.config.drone import DroneConfig
 from flockd.core.messages import (
     NO_STATUS,
+    SECTORS,
     Detection,
     EgoMotion,
     FloatArray,
@@ -35,7 +36,7 @@ from flockd.flight.flocking.passing import Passing
 from flockd.flight.geometry import build_rig, estimate_ego_motion
 from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
-from flockd.flight.obstacles import Avoidance, LocalMap, ObstacleRanging
+from flockd.flight.obstacles import DIRECTIONS, Avoidance, LocalMap, ObstacleRanging
 from flockd.flight.perception import Networks, Observation, Perception, load_networks
 from flockd.flight.perception.detection.detector import DetectionTrace
 from flockd.flight.perception.maps import KnownSize
@@ -53,6 +54,8 @@ _ROUNDING = 1e-6
 """The same: what is farther off is replaced by the nearest rotation, as measurements and transforms ask for one."""
 _LONGEST_S = 10.0
 """Since the last step: what was known before a longer gap is forgotten."""
+_FAR_M = 1e3
+"""As far as the horizon, beside the way from one camera to the next."""
 _DISAGREE = "ego-motion: images and autopilot disagree on the velocity; one, or the height above ground, is wrong"
 _VELOCITY_SIGMA_M_S = 0.2
 """Of the velocity that is known where images show no own motion, each axis: PX4's estimate, or the last by images."""
@@ -113,7 +116,7 @@ class FlockPilot:
         self._size = SizeLearner(config, learned, flies=flies)
         self._law = FlockingLaw(config.flocking)
         self._passing = Passing(self._law, config.safety.gate.vertical_separation_m)
-        self._map = LocalMap(config.obstacles) if config.obstacles.enabled else None
+        self._map = LocalMap(config.obstacles)
         self._ranging = ObstacleRanging(self._rig, config.obstacles) if config.obstacles.enabled else None
         self._avoidance = Avoidance(config.obstacles, config.safety.gate, config.step_s)
         self._navigator = Navigator(config.mission, config.safety.gate)
@@ -186,9 +189,9 @@ class FlockPilot:
         tracks = self._track(observation, moved, measurements, velocity)
         neighbours = self._with_sizes(observation, ego, dict(zip(tracks, measurements, strict=True)), velocity)
         laps.end("tracking")
-        obstacles = self._local_map(observation, ego, ground, moved)
+        ranges = self._local_map(observation, ego, ground, moved)
         laps.end("obstacles")
-        command = self._command(observation, neighbours, velocity, obstacles, ground)
+        command = self._command(observation, neighbours, velocity, ranges, ground)
         laps.end("flocking")
         self._last_time_s = observation.time_s
         of_height = () if why_no_ground is None else (why_no_ground,)
@@ -209,7 +212,7 @@ class FlockPilot:
             mission=self._mission,
             noisy_cameras=(*observation.noisy_cameras, *elsewhere),
             ground=ground,
-            obstacles=obstacles,
+            obstacles=None if self._ranging is None else ranges,
             size=self._size.status,
         )
 
@@ -242,7 +245,7 @@ class FlockPilot:
             mission=self._mission,
             reasons=(reason,),
             counts={reason.text: 1},
-            obstacles=None if local_map is None else local_map.step(time_s, None, level, sigma_m),
+            obstacles=None if self._ranging is None else local_map.step(time_s, None, level, sigma_m),
         )
 
     def _predictions(self, time_s: float) -> tuple[Prediction, ...]:
@@ -369,13 +372,21 @@ class FlockPilot:
         ego: EgoMotion | None,
         ground: GroundEstimate | None,
         moved: tuple[FloatArray | None, float],
-    ) -> ObstacleRanges | None:
-        """The local map at this time; None where obstacles are not looked for."""
-        if self._map is None or self._ranging is None:
-            return None
-        ranges = observation.obstacles or self._ranging.ranges(observation, ego, ground)
+    ) -> ObstacleRanges:
+        """The local map at this time; where obstacles are not looked for, all is free that no lost camera would show."""
+        if self._ranging is None:
+            ranges = self._free(observation)
+        else:
+            ranges = observation.obstacles or self._ranging.ranges(observation, ego, ground)
         displacement, sigma_m = moved
         return self._map.step(observation.time_s, ranges, None if displacement is None else displacement[:2], sigma_m)
+
+    def _free(self, observation: Observation) -> ObstacleRanges:
+        gone = self._gone(observation)
+        far_m = _FAR_M * np.column_stack([DIRECTIONS, np.zeros(SECTORS)]) @ observation.vehicle.R_ned_body
+        seen = ~self._rig.hidden(far_m, gone) if gone else np.ones(SECTORS, np.bool_)
+        nothing, exact = np.full(SECTORS, np.inf), np.zeros(SECTORS)
+        return ObstacleRanges(observation.time_s, nothing, exact, np.where(seen, np.inf, 0.0))
 
     def _moved(self, observation: Observation, ego: EgoMotion | None) -> tuple[FloatArray | None, float]:
         """(3,) metres NED that the drone went in the step, and its standard deviation, each axis; None: not known.
@@ -392,10 +403,13 @@ class FlockPilot:
         interval_s = min(observation.time_s - self._last_time_s, _LONGEST_S)
         return interval_s * self._flew, _VELOCITY_SIGMA_M_S * interval_s
 
+    def _gone(self, observation: Observation) -> Set[str]:
+        """The cameras that gave no image that can be used."""
+        return self._rig.cameras.keys() - observation.cameras.keys()
+
     def _shown(self, observation: Observation) -> Shown:
         """Tells who is wholly in view of a camera that gave an image in this step."""
-        gone = self._rig.cameras.keys() - observation.cameras.keys()
-        R_ned_body = observation.vehicle.R_ned_body
+        gone, R_ned_body = self._gone(observation), observation.vehicle.R_ned_body
         return lambda places, radius_m: self._rig.shows(places @ R_ned_body, radius_m, gone)  # rows R^T p: in the body
 
     def _command(
@@ -403,7 +417,7 @@ class FlockPilot:
         observation: Observation,
         neighbours: Sequence[Neighbour],
         velocity: FloatArray | None,
-        obstacles: ObstacleRanges | None,
+        ranges: ObstacleRanges,
         ground: GroundEstimate | None,
     ) -> Wanted:
         if self._first_time_s is None:
@@ -426,15 +440,14 @@ class FlockPilot:
         self._mission = self._navigator.status(guidance)
         desired = self._mission.desired
         own = guidance.velocity if velocity is None else velocity[:2]  # before the first pair: as desired
-        if obstacles is None:
+        if self._ranging is None:
             tracks, limits = [n.track for n in seen], limits_towards(neighbours, self._config.safety.gate)
             command, acceleration = self._passing.command(
                 own, places, velocities, desired, self._config.step_s, tracks, limits, ages_s
             )
+            command = self._avoidance.within_sight(command, ranges)
         else:
-            command, acceleration = self._avoidance.command(
-                self._law, own, places, velocities, desired, obstacles, ages_s
-            )
+            command, acceleration = self._avoidance.command(self._law, own, places, velocities, desired, ranges, ages_s)
         if self._config.yaw == "course" and guidance.course_rad is not None:
             self._yaw_rad = guidance.course_rad
         ends = guidance.takeover is not None

@@ -11,6 +11,9 @@ from flockd.core.messages import FloatArray
 from flockd.core.polygon import is_inside
 from flockd.flight.safety.approach import NOTHING_NEAR, stopping_speed
 
+_ROUND = np.radians(np.arange(0, 360, 30))
+"""Directions from the one outward, in which the way to a round fence counts."""
+
 
 def outside_fence(parameters: GateParameters, position: FloatArray) -> bool:
     """Whether (2,) metres north and east of home are outside the fence; so is what is not finite, if there is one."""
@@ -28,15 +31,19 @@ def towards_fence(p: GateParameters, position: FloatArray) -> tuple[FloatArray, 
     """Directions (n, 2) to the fences, or outward where one was left, and how fast to fly there, (n,) m/s.
 
     A fence counts as a wall, to which the drone keeps `obstacle_clearance_m`: see `stopping_speed`. Beyond it, not at
-    all outward. For a `position` that is not finite there is no direction.
+    all outward. A round one limits the speed along it too: a vehicle that answers late leaves a circle at the tangent.
+    For a `position` that is not finite there is no direction.
     """
     offsets: list[FloatArray] = []
     left_m: list[float] = []
     if not np.isfinite(position).all():
         return NOTHING_NEAR
     if p.fence_radius_m is not None:
-        offsets.append(position)
-        left_m.append(p.fence_radius_m - math.hypot(*position))
+        out_m = math.hypot(*position)
+        out_rad = math.atan2(position[1], position[0])
+        offsets.extend(np.column_stack([np.cos(out_rad + _ROUND), np.sin(out_rad + _ROUND)]))
+        across = p.fence_radius_m**2 - (out_m * np.sin(_ROUND)) ** 2
+        left_m.extend((np.sqrt(np.maximum(across, 0.0)) - out_m * np.cos(_ROUND)).tolist())
     if p.fence_corners_m:
         to_sides = _nearest_of_sides(position, np.array(p.fence_corners_m)) - position
         ranges_m = np.linalg.norm(to_sides, axis=1)

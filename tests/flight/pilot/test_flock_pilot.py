@@ -95,6 +95,20 @@ def test_a_neighbour_before_a_camera_that_is_gone_is_as_probable_as_before(
     assert (left < 0.95) is less_probable
 
 
+@pytest.mark.parametrize(("gone", "stands"), [("front", True), ("back", False)])
+def test_no_drone_flies_for_long_where_only_a_lost_camera_would_look(flyer: Flyer, gone: str, stands: bool) -> None:
+    """The mission and the neighbour lead north, where the front camera looks."""
+    speeds_m_s = []
+    for step in range(9):
+        frames, state = flyer.take_frames()
+        output = flyer.pilot.step(without(frames, gone) if step >= 2 else frames, state)
+        speeds_m_s.append(float(np.linalg.norm(output.command.velocity)))
+        flyer.move()
+    assert output.obstacles is None, "none were looked for"
+    assert min(speeds_m_s[:4]) > 0.5, "what was seen a second ago is flown into"
+    assert (speeds_m_s[-1] < 0.01) is stands
+
+
 def test_a_neighbour_pulls_by_how_long_it_has_been_seen() -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (8.0, 0.0, -3.6), sharp=True))
     other = FlockPilot(changed(flyer.scenario.drone, flocking__cohesion_time_s=None), flyer.truth)

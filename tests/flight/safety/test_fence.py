@@ -49,9 +49,16 @@ def test_a_circle_around_home() -> None:
     assert outside_fence(circle, np.array([-30.0, -40.01]))
     for position, most_m_s in (([36.0, 48.0], 0.0), ([29.7, 39.6], 0.0), ([27.0, 36.0], stopping(5.0 - 0.6))):
         directions, limits = towards_fence(circle, np.array(position))
-        np.testing.assert_allclose(directions, [[0.6, 0.8]])
-        assert limits == pytest.approx([most_m_s])
-    assert len(towards_fence(circle, np.zeros(2))[1]) == 0  # home, from where no direction is the nearest
+        np.testing.assert_allclose(directions[0], [0.6, 0.8])
+        assert limits[0] == pytest.approx(most_m_s)
+    assert towards_fence(circle, np.zeros(2))[1] == pytest.approx(np.full(12, stopping(50.0 - 0.6)))
+
+
+def test_the_way_to_a_circle_counts_all_around() -> None:
+    place, ways_m = np.array([-20.0, 35.0]), np.arange(0.0, 100.0, 0.001)
+    for direction, most_m_s in zip(*towards_fence(fence(radius_m=50.0), place), strict=True):
+        inside = np.hypot(*(place[:, None] + ways_m * direction[:, None])) <= 50.0
+        assert most_m_s == pytest.approx(stopping(ways_m[inside].max() - 0.6), abs=0.01)
 
 
 def test_without_a_fence_nothing_is_outside_not_even_the_unknown() -> None:
@@ -98,11 +105,13 @@ def test_with_a_circle_and_corners_both_have_to_be_kept() -> None:
     assert not outside_fence(both, np.array([8.0, 8.0]))
     for position, outward in (
         ([11.0, 0.0], [[1.0, 0.0]]),
-        ([-14.0, 0.0], [[-1.0, 0.0], [-1.0, 0.0]]),
-        ([9.6, 9.6], [[math.sqrt(0.5), math.sqrt(0.5)], [0.0, 1.0], [1.0, 0.0]]),
+        ([-11.0, 0.0], [[-1.0, 0.0]]),
+        ([9.6, 9.6], [[0.0, 1.0], [1.0, 0.0]]),
     ):
         directions, limits = towards_fence(both, np.array(position))
-        np.testing.assert_allclose(directions[limits == 0.0], outward, atol=1e-12)
+        of_square = limits[12:] == 0.0
+        np.testing.assert_allclose(directions[12:][of_square], outward, atol=1e-12)
+        assert (limits[:12] == 0.0).any() == (np.hypot(*position) > 11.4)
 
 
 @pytest.mark.parametrize("asked", [(3.0, 0.0), (-2.0, 2.0), (1.0, -2.5)])
@@ -123,6 +132,23 @@ def test_who_flies_at_a_fence_stops_before_it(corners: Corners, asked: tuple[flo
         left_m = 12.0 - np.hypot(*position) if border is None else np.linalg.norm(border - position, axis=1).min()
         nearest_m = min(nearest_m, float(left_m))
     assert 0.3 < nearest_m < 1.0
+
+
+@pytest.mark.parametrize("radius_m", [10.0, 100.0])
+@pytest.mark.parametrize("outward_rad", [0.0, 0.8])
+def test_who_flies_along_a_circle_stays_within_it(radius_m: float, outward_rad: float) -> None:
+    """At 4 m/s, always at the same angle from it: a limit outward alone leads 25 m out of a circle of 10 m."""
+    setpoints = deque([np.zeros(2)] * 4)
+    gate, position, velocity = Gate(fence(radius_m=radius_m)), np.array([radius_m - 4.0, 0.0]), np.zeros(2)
+    for now_s in np.arange(0.0, 60.0, 0.05):
+        course = math.atan2(position[1], position[0]) + math.pi / 2 - outward_rad
+        asked = 4.0 * np.array([math.cos(course), math.sin(course)])
+        setpoint = gate.step(now_s, request(now_s, asked, surroundings=around(position, velocity))).setpoint
+        assert setpoint is not None
+        setpoints.append(setpoint.velocity)
+        velocity = velocity + 0.05 / 0.45 * (setpoints.popleft() - velocity)
+        position = position + 0.05 * velocity
+        assert np.hypot(*position) < radius_m - 0.3
 
 
 def test_the_heights_are_a_band_and_an_unknown_height_is_outside() -> None:

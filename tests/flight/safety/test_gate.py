@@ -378,15 +378,15 @@ GAP = [(0.1 * k, side) for k in range(-20, 21) for side in (-0.9, 0.9)]
 @pytest.mark.parametrize(
     ("asked", "near", "expected", "objections"),
     [
-        pytest.param([1.0, 0.5], BEYOND, [0.0, 0.5], FENCE, id="outside the fence outward"),
-        pytest.param([-1.0, 0.5], BEYOND, [-1.0, 0.5], (), id="outside the fence inward"),
+        pytest.param([1.0, 0.5], BEYOND, STILL, FENCE, id="outside the fence outward"),
+        pytest.param([-1.0, 0.5], BEYOND, [-1.0, 0.0], FENCE, id="outside the fence inward"),
         # 2 m before it, of which 0.6 m are kept: 0.5 v + v^2 / 3 = 1.4 m
         pytest.param([1.0, 0.5], {"position": [98.0, 0.0]}, [1.0, 0.5], (), id="slowly at the fence"),
         pytest.param(
             [2.0, 0.5], {"position": [98, 0]}, [math.sqrt(0.5625 + 4.2) - 0.75, 0.5], FENCE, id="fast at the fence"
         ),
         pytest.param(
-            [0.0, 1.0], BEYOND | {"neighbours": [[0.5, 0.0, 0.0]]}, [0.0, 1.0], (), id="along the fence, past one"
+            [-1.0, 1.0], BEYOND | {"neighbours": [[0.5, 0.0, 0.0]]}, [-1.0, 0.0], FENCE, id="back, away from one"
         ),
         pytest.param(
             [1.0, 1.0], BEYOND | {"neighbours": [[0.0, 0.5, 0.0]]}, STILL, FENCE + SEPARATION, id="fence and neighbour"
