@@ -80,7 +80,7 @@ class Avoidance:
         return nearest_within(velocity, np.concatenate(directions), np.concatenate(most_m_s))
 
     def within_sight(self, velocity: FloatArray, ranges: ObstacleRanges) -> FloatArray:
-        """The velocity (2,) m/s; where no camera looks any more, no faster than the drone stops within what was seen."""
+        """The velocity (2,) m/s; where no camera looks any more, one that stops within what was seen there."""
         seen_m = ranges.seen_m[sector_of(velocity[None])[0]]
         if seen_m >= self._parameters.range_m:
             return velocity

@@ -373,7 +373,7 @@ class FlockPilot:
         ground: GroundEstimate | None,
         moved: tuple[FloatArray | None, float],
     ) -> ObstacleRanges:
-        """The local map at this time; where obstacles are not looked for, all is free that no lost camera would show."""
+        """The local map now; where obstacles are not looked for, all is free but what lost cameras would show."""
         if self._ranging is None:
             ranges = self._free(observation)
         else:
