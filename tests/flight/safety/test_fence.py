@@ -111,7 +111,7 @@ def test_with_a_circle_and_corners_both_have_to_be_kept() -> None:
         directions, limits = towards_fence(both, np.array(position))
         of_square = limits[12:] == 0.0
         np.testing.assert_allclose(directions[12:][of_square], outward, atol=1e-12)
-        assert (limits[:12] == 0.0).any() == (np.hypot(*position) > 11.4)
+        assert (limits[:12] == 0.0).any() == (math.hypot(*position) > 11.4)
 
 
 @pytest.mark.parametrize("asked", [(3.0, 0.0), (-2.0, 2.0), (1.0, -2.5)])
