@@ -54,8 +54,6 @@ _ROUNDING = 1e-6
 """The same: what is farther off is replaced by the nearest rotation, as measurements and transforms ask for one."""
 _LONGEST_S = 10.0
 """Since the last step: what was known before a longer gap is forgotten."""
-_FAR_M = 1e3
-"""As far as the horizon, beside the way from one camera to the next."""
 _DISAGREE = "ego-motion: images and autopilot disagree on the velocity; one, or the height above ground, is wrong"
 _VELOCITY_SIGMA_M_S = 0.2
 """Of the velocity that is known where images show no own motion, each axis: PX4's estimate, or the last by images."""
@@ -383,7 +381,7 @@ class FlockPilot:
 
     def _free(self, observation: Observation) -> ObstacleRanges:
         gone = self._gone(observation)
-        far_m = _FAR_M * np.column_stack([DIRECTIONS, np.zeros(SECTORS)]) @ observation.vehicle.R_ned_body
+        far_m = self._config.obstacles.range_m * np.column_stack([DIRECTIONS, np.zeros(SECTORS)]) @ observation.vehicle.R_ned_body
         seen = ~self._rig.hidden(far_m, gone) if gone else np.ones(SECTORS, np.bool_)
         nothing, exact = np.full(SECTORS, np.inf), np.zeros(SECTORS)
         return ObstacleRanges(observation.time_s, nothing, exact, np.where(seen, np.inf, 0.0))

@@ -11,10 +11,6 @@ from flockd.core.messages import FloatArray
 from flockd.core.polygon import is_inside
 from flockd.flight.safety.approach import NOTHING_NEAR, stopping_speed
 
-_ROUND = np.radians(np.arange(0, 360, 30))
-"""Directions from the one outward, in which the way to a round fence counts."""
-
-
 def outside_fence(parameters: GateParameters, position: FloatArray) -> bool:
     """Whether (2,) metres north and east of home are outside the fence; so is what is not finite, if there is one."""
     radius_m, corners_m = parameters.fence_radius_m, parameters.fence_corners_m
@@ -40,10 +36,11 @@ def towards_fence(p: GateParameters, position: FloatArray) -> tuple[FloatArray, 
         return NOTHING_NEAR
     if p.fence_radius_m is not None:
         out_m = math.hypot(*position)
-        out_rad = math.atan2(position[1], position[0])
-        offsets.extend(np.column_stack([np.cos(out_rad + _ROUND), np.sin(out_rad + _ROUND)]))
-        across = p.fence_radius_m**2 - (out_m * np.sin(_ROUND)) ** 2
-        left_m.extend((np.sqrt(np.maximum(across, 0.0)) - out_m * np.cos(_ROUND)).tolist())
+        off = np.linspace(0.0, 2.0 * math.pi, 12, endpoint=False)  # from the direction outward
+        azimuths = math.atan2(position[1], position[0]) + off
+        offsets.extend(np.column_stack([np.cos(azimuths), np.sin(azimuths)]))
+        half_chord = np.sqrt(np.maximum(p.fence_radius_m**2 - (out_m * np.sin(off)) ** 2, 0.0))
+        left_m.extend((half_chord - out_m * np.cos(off)).tolist())
     if p.fence_corners_m:
         to_sides = _nearest_of_sides(position, np.array(p.fence_corners_m)) - position
         ranges_m = np.linalg.norm(to_sides, axis=1)
