@@ -381,7 +381,11 @@ class FlockPilot:
 
     def _free(self, observation: Observation) -> ObstacleRanges:
         gone = self._gone(observation)
-        far_m = self._config.obstacles.range_m * np.column_stack([DIRECTIONS, np.zeros(SECTORS)]) @ observation.vehicle.R_ned_body
+        far_m = (
+            self._config.obstacles.range_m
+            * np.column_stack([DIRECTIONS, np.zeros(SECTORS)])
+            @ observation.vehicle.R_ned_body
+        )
         seen = ~self._rig.hidden(far_m, gone) if gone else np.ones(SECTORS, np.bool_)
         nothing, exact = np.full(SECTORS, np.inf), np.zeros(SECTORS)
         return ObstacleRanges(observation.time_s, nothing, exact, np.where(seen, np.inf, 0.0))

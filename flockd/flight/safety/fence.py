@@ -11,6 +11,7 @@ from flockd.core.messages import FloatArray
 from flockd.core.polygon import is_inside
 from flockd.flight.safety.approach import NOTHING_NEAR, stopping_speed
 
+
 def outside_fence(parameters: GateParameters, position: FloatArray) -> bool:
     """Whether (2,) metres north and east of home are outside the fence; so is what is not finite, if there is one."""
     radius_m, corners_m = parameters.fence_radius_m, parameters.fence_corners_m
