@@ -113,7 +113,7 @@ def quiet(**changes: Any) -> Inputs:
 
 def output(time_s: float = 0.0, **fields: Any) -> PilotOutput:
     """Of a step in which nothing was seen and nothing is wanted."""
-    nothing = PilotOutput(time_s, None, None, (), (), {}, (), wanted())
+    nothing = PilotOutput(time_s, None, None, (), (), (), wanted())
     return replace(nothing, **fields)
 
 

@@ -20,8 +20,8 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_090,
-    "flockd/flight": 13_560,
+    "flockd/core": 3_070,
+    "flockd/flight": 12_590,
     "flockd/onboard": 9_220,
     "flockd/fleet": 2_600,
     "flockd/ground": 4_590,
@@ -29,7 +29,7 @@ LINES = {
     "flockd/sim": 9_360,
     "flockd/campaign": 1_470,
     "flockd/cli": 3_530,
-    "tests": 38_720,
+    "tests": 38_410,
     "tools/checks": 2_150,
     "tools/docs": 810,
     "tools/measure": 1_340,
@@ -37,12 +37,12 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 357}
-NUMBERS_OF_FLIGHT = 425
+FILES = {"flockd": 354}
+NUMBERS_OF_FLIGHT = 349
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
 """A budget that is farther above what there is is to be lowered."""
-STEPS = {"crossing": (36_300, 20), "normal": (18_100, 15)}
+STEPS = {"crossing": (26_200, 20), "normal": (16_000, 15)}
 """Python calls and network runs of a step in a recorded flight of tests/review/replay."""
 
 

@@ -214,22 +214,6 @@ class EgoMotion:
 
 
 @dataclass(frozen=True, eq=False)
-class NeighbourMotion:
-    """A neighbour's own motion over one interval, in C, free of the drone's own (Eq. 31-36)."""
-
-    rotation: Matrix3
-    translation: Vector3
-    """(3,) metres in C (Eq. 35)."""
-    velocity: Vector3
-    """(3,) m/s in C (Eq. 36)."""
-    interval_s: float
-    centre: Vector3
-    """(3,) metres in F: centre of the inliers' bounding box (Eq. 37)."""
-    pairs: int
-    inliers: int
-
-
-@dataclass(frozen=True, eq=False)
 class Detection:
     """One drone detected in one frame set, before tracking, in log-polar coordinates: a bearing and a log range.
 
@@ -410,8 +394,6 @@ class PilotOutput:
     detections: tuple[Detection, ...]
     detection_tracks: tuple[int, ...]
     """The track that each detection went to."""
-    neighbour_motions: Mapping[int, NeighbourMotion]
-    """By the label of the detection."""
     neighbours: tuple[Neighbour, ...]
     command: Wanted
     reasons: tuple[Reason, ...] = ()

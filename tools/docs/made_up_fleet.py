@@ -176,7 +176,7 @@ class MadeUpDrone:
         command = Wanted(velocity, np.zeros(2), yaw)
         mission = MissionStatus("circle_then_tangent", velocity, "circles", goal=np.zeros(2))
         output = PilotOutput(
-            time_s, None, moving, (), (), {}, neighbours, command, mission=mission, obstacles=_obstacles(time_s, place)
+            time_s, None, moving, (), (), neighbours, command, mission=mission, obstacles=_obstacles(time_s, place)
         )
         return vehicle, output
 

@@ -104,10 +104,6 @@ def _points(case: Case, random: np.random.Generator) -> FloatArray:
     return points
 
 
-def _ours(source: FloatArray, target: FloatArray, method: str) -> RigidTransform:
-    return ransac_rigid(source, target, method=method, min_inlier_ratio=0.05).transform  # type: ignore[arg-type]
-
-
 def _opencv(source: FloatArray, target: FloatArray, noise_m: float) -> RigidTransform:
     found, affine, _ = cv2.estimateAffine3D(source, target, ransacThreshold=3.0 * noise_m)
     if not found:
@@ -119,8 +115,7 @@ def _opencv(source: FloatArray, target: FloatArray, noise_m: float) -> RigidTran
 
 
 METHODS: dict[str, Callable[[FloatArray, FloatArray, float], RigidTransform]] = {
-    "consensus": lambda source, target, _: _ours(source, target, "consensus"),
-    "paper": lambda source, target, _: _ours(source, target, "paper"),
+    "Algorithm 1": lambda source, target, _: ransac_rigid(source, target, min_inlier_ratio=0.05).transform,
     "OpenCV affine": _opencv,
 }
 """From pairs and the size of their errors, m, to a motion."""

@@ -8,8 +8,7 @@ from flockd.flight.geometry.ego_motion_refinement import refine_ego_motion
 from flockd.flight.geometry.ground import ground_inverse_depth
 from flockd.flight.geometry.ground_fit import FittedGround, GroundSamples, fit_ground
 from flockd.flight.geometry.ground_track import scale_on_track
-from flockd.flight.geometry.neighbour_motion import estimate_neighbour_motion
-from flockd.flight.geometry.pairs import BACKGROUND_LABEL, PointPairs, grid_pixels, label_pixels, lift_matches
+from flockd.flight.geometry.pairs import BACKGROUND_LABEL, PointPairs, grid_pixels, lift_matches
 from flockd.flight.geometry.polar import log_polar, log_polar_covariance, log_polar_residual
 from flockd.flight.geometry.rig import Rig, RigCamera, build_rig
 from flockd.flight.geometry.rigid_fit import fit_rigid
@@ -46,14 +45,12 @@ __all__ = [
     "build_rig",
     "closest_approach",
     "estimate_ego_motion",
-    "estimate_neighbour_motion",
     "euler_from_rotation",
     "fit_ground",
     "fit_rigid",
     "grid_pixels",
     "ground_inverse_depth",
     "inverse_ranges_of_rays",
-    "label_pixels",
     "lift_matches",
     "log_polar",
     "log_polar_covariance",

@@ -45,7 +45,6 @@ def estimate_ego_motion(
     found = ransac_rigid(
         background.current,
         background.previous,
-        method=parameters.method,
         threshold=parameters.initial_threshold_m,
         min_inlier_ratio=parameters.min_inlier_ratio,
         hypotheses=parameters.hypotheses,

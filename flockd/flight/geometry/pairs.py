@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from flockd.core.messages import UNCLASSED, BoolArray, Float32Array, FloatArray, IntArray
+from flockd.core.messages import BoolArray, Float32Array, FloatArray, IntArray
 from flockd.flight.geometry.depth_maps import RangeMap
 from flockd.flight.geometry.rig import RigCamera
 
@@ -60,18 +60,6 @@ def grid_pixels(size: tuple[int, int], stride: int) -> FloatArray:
     pixels = np.empty((len(v), len(u), 2))
     pixels[..., 0], pixels[..., 1] = u, v[:, None]
     return pixels.reshape(-1, 2)
-
-
-def label_pixels(labels: NDArray[np.integer], limit: int) -> dict[int, FloatArray]:
-    """By each drone's label in ``labels`` (h, w), the (n, 2) centres of its pixels, at most ``limit``, evenly drawn."""
-    places = np.flatnonzero((labels != BACKGROUND_LABEL) & (labels != UNCLASSED))
-    found, pixels = labels.ravel().take(places), {}
-    for label in np.flatnonzero(np.bincount(found)).tolist():
-        mine = places[found == label]
-        if len(mine) > limit:
-            mine = mine[np.linspace(0, len(mine) - 1, limit).astype(np.int64)]
-        pixels[label] = np.stack([mine % labels.shape[1], mine // labels.shape[1]], axis=1) + 0.5
-    return pixels
 
 
 def lift_matches(

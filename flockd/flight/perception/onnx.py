@@ -24,7 +24,7 @@ from flockd.flight.inference.session import OnnxModel
 from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes, with_boxes
 from flockd.flight.perception.detection.instances import group_instances
 from flockd.flight.perception.detection.second_stage import SecondStage
-from flockd.flight.perception.flow import DisFlow, Flow, OnnxFlow, grid_flow, object_flow
+from flockd.flight.perception.flow import DisFlow, Flow, OnnxFlow, grid_flow
 from flockd.flight.perception.interface import OneByOne
 from flockd.flight.perception.maps import Crop, OpenDepth, RangeEstimate, SceneMaps
 from flockd.flight.perception.requirements import check_roles
@@ -79,12 +79,10 @@ class OnnxNetworks(OneByOne):
         self._models.terminate()
 
     def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
-        """See `Networks`. The flow of each drone is found by itself."""
+        """See `Networks`."""
         before, after = first.image, second.image
         flow = self._flow.flow(before, after)
-        if self._flow_refinement == "lucas_kanade":
-            flow = grid_flow(flow, before, after, labels)
-        return object_flow(flow, before, after, labels)
+        return grid_flow(flow, before, after, labels) if self._flow_refinement == "lucas_kanade" else flow
 
     def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
         """See `Networks`."""

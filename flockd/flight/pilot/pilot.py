@@ -23,7 +23,6 @@ from flockd.core.messages import (
     LearnedSize,
     MissionOrder,
     Neighbour,
-    NeighbourMotion,
     ObstacleRanges,
     PilotOutput,
     Reason,
@@ -42,7 +41,7 @@ from flockd.flight.perception.detection.detector import DetectionTrace
 from flockd.flight.perception.maps import KnownSize
 from flockd.flight.pilot.camera_agreement import CameraAgreement, moves_otherwise
 from flockd.flight.pilot.ground import GroundFilter, scaled_by_ground
-from flockd.flight.pilot.motions import background_pairs, neighbour_motions
+from flockd.flight.pilot.motions import background_pairs
 from flockd.flight.pilot.size_learner import SizeLearner
 from flockd.flight.pilot.trim import VelocityTrim
 from flockd.flight.safety.surroundings import limits_towards
@@ -176,13 +175,11 @@ class FlockPilot:
         ego, why_no_ego = self._ego_motion(observation)
         ego = self._scaled(observation, ego, ground)
         laps.end("ego_motion")
-        motions, why_no_motion = self._neighbour_motions(observation, ego)
-        laps.end("neighbour_motion")
         self._trim.update(vehicle, ego)
         if self._trim.doubt_m_s:
             why_no_ego = (*why_no_ego, Reason(ReasonKind.EGO_MOTION, _DISAGREE))
         velocity = self._own_velocity(observation, ego)
-        detections, measurements, why_no_measurement = self._measurements(observation, motions)
+        detections, measurements, why_no_measurement = self._measurements(observation)
         moved = self._moved(observation, ego)
         tracks = self._track(observation, moved, measurements, velocity)
         neighbours = self._with_sizes(observation, ego, dict(zip(tracks, measurements, strict=True)), velocity)
@@ -194,14 +191,13 @@ class FlockPilot:
         self._last_time_s = observation.time_s
         of_height = () if why_no_ground is None else (why_no_ground,)
         of_rig = [Reason(ReasonKind.RIG, f"{moves_otherwise(name)} The drone flies without it.") for name in elsewhere]
-        reasons = (*of_height, *observation.reasons, *why_no_ego, *why_no_motion, *why_no_measurement, *of_rig)
+        reasons = (*of_height, *observation.reasons, *why_no_ego, *why_no_measurement, *of_rig)
         return PilotOutput(
             time_s=observation.time_s,
             ego_motion=ego,
             velocity=velocity,
             detections=detections,
             detection_tracks=tracks,
-            neighbour_motions=motions,
             neighbours=neighbours,
             command=command,
             reasons=reasons,
@@ -237,7 +233,6 @@ class FlockPilot:
             velocity=self._velocity,
             detections=(),
             detection_tracks=(),
-            neighbour_motions={},
             neighbours=self._size.cautious(tracker.neighbours()),
             command=Wanted(np.zeros(2), np.zeros(2), self._yaw_rad),
             mission=self._mission,
@@ -304,28 +299,18 @@ class FlockPilot:
         self._refused_in_a_row += 1
         return False
 
-    def _neighbour_motions(
-        self, observation: Observation, ego: EgoMotion | None
-    ) -> tuple[Mapping[int, NeighbourMotion], Sequence[Reason]]:
-        if ego is None:
-            return {}, ()
-        return neighbour_motions(self._rig, observation, ego, self._config.geometry)
-
     def _own_velocity(self, observation: Observation, ego: EgoMotion | None) -> FloatArray | None:
         """(3,) NED m/s. Where vision fails, the last one that it gave."""
         if ego is not None:
             self._velocity = _displacement(observation, ego) / ego.interval_s  # Eq. 21
         return observation.vehicle.velocity_ned if self._config.own_velocity == "autopilot" else self._velocity
 
-    def _measurements(
-        self, observation: Observation, motions: Mapping[int, NeighbourMotion]
-    ) -> tuple[tuple[Detection, ...], list[Measurement], list[Reason]]:
+    def _measurements(self, observation: Observation) -> tuple[tuple[Detection, ...], list[Measurement], list[Reason]]:
         """The detections that the tracker takes, what it takes, and why it takes others not."""
-        caution = self._config.geometry.neighbour_velocity_caution
         taken, measurements, reasons = [], [], []
         for detection in observation.detections:
             try:
-                measurements.append(_measurement(observation, detection, motions.get(detection.label), caution))
+                measurements.append(Measurement.of(detection, observation.vehicle.R_ned_body))
                 taken.append(detection)
             except ValueError as error:
                 reasons.append(Reason(ReasonKind.NEIGHBOUR, f"neighbour: {error}"))
@@ -380,7 +365,7 @@ class FlockPilot:
         return self._map.step(observation.time_s, ranges, None if displacement is None else displacement[:2], sigma_m)
 
     def _free(self, observation: Observation) -> ObstacleRanges:
-        gone = self._gone(observation)
+        gone = self._gone(observation) if observation.cameras else frozenset()  # without eyes nothing is flown
         far_m = (
             self._config.obstacles.range_m
             * np.column_stack([DIRECTIONS, np.zeros(SECTORS)])
@@ -505,18 +490,6 @@ def _displacement(observation: Observation, ego: EgoMotion) -> FloatArray:
     before = observation.vehicle if observation.previous is None else observation.previous.vehicle
     displacement: FloatArray = before.R_ned_body @ ego.translation
     return displacement
-
-
-def _measurement(
-    observation: Observation, detection: Detection, motion: NeighbourMotion | None, caution: float
-) -> Measurement:
-    """A detection in NED axes, with the velocity of Eq. 36 where there is one."""
-    R_ned_body = observation.vehicle.R_ned_body
-    velocity, sigma_m_s = None, 1.0
-    if motion is not None and observation.previous is not None:
-        velocity = observation.previous.vehicle.R_ned_body @ motion.velocity
-        sigma_m_s = caution * math.sqrt(2) * detection.way_sigma_m / motion.interval_s
-    return Measurement.of(detection, R_ned_body, velocity, sigma_m_s)
 
 
 class _Laps:

@@ -1,4 +1,4 @@
-"""The Kalman filter of one track: motion model, update in log-polar coordinates and size, update of the velocity.
+"""The Kalman filter of one track: motion model, update in log-polar coordinates and size.
 
 Errors of ranges last from frame to frame, so that many near in time tell little more than one. The state has the
 lasting error beside the motion (coloured measurement noise: A. Bryson, L. Henrikson, "Estimation using sampled data
@@ -112,7 +112,7 @@ def initial(
     covariance = of_place @ noise @ of_place.T
     covariance[3:6, 3:6] = covariance_m2_s2
     mean = np.concatenate([measurement.position, velocity, [math.log(measurement.size_m), 0.0]])
-    return _with_velocity(State(mean, covariance), measurement, parameters)
+    return State(mean, covariance)
 
 
 def predict(
@@ -168,7 +168,7 @@ def innovation(state: State, measurement: Measurement, parameters: TrackingParam
 
 
 def update(state: State, measurement: Measurement, parameters: TrackingParameters) -> State:
-    """The state after a measurement: an iterated extended Kalman update in log-polar coordinates, then the velocity.
+    """The state after a measurement: an iterated extended Kalman update in log-polar coordinates.
 
     The first linearisation is at the measurement and not at the prediction: where the prediction is vague, e.g. of a
     new track, one at the prediction would overshoot.
@@ -182,7 +182,7 @@ def update(state: State, measurement: Measurement, parameters: TrackingParameter
     for _ in range(_LINEARISATIONS):
         residual, derivative = _linearised(mean, measurement, parameters)
         mean, posterior = _kalman(state, derivative, residual - derivative @ (state.mean - mean), covariance)
-    return _with_velocity(State(mean, posterior), measurement, parameters)
+    return State(mean, posterior)
 
 
 def _noise(measurement: Measurement, parameters: TrackingParameters) -> FloatArray:
@@ -205,17 +205,6 @@ def _noise(measurement: Measurement, parameters: TrackingParameters) -> FloatArr
 def _lasting_sigma(measurement: Measurement, parameters: TrackingParameters) -> float:
     """Standard deviation of what of a log range's error lasts."""
     return math.sqrt(parameters.range_error_lasts * measurement.log_range_variance)
-
-
-def _with_velocity(state: State, measurement: Measurement, parameters: TrackingParameters) -> State:
-    if measurement.velocity is None:
-        return state
-    observation = np.eye(SIZE)[3:6]
-    residual = measurement.velocity - state.velocity
-    covariance = measurement.velocity_sigma_m_s**2 * np.eye(3)
-    spread = state.velocity_covariance + covariance
-    excess = _excess(float(residual @ np.linalg.solve(spread, residual)), parameters)
-    return State(*_kalman(state, observation, residual, covariance + (excess - 1.0) * spread))
 
 
 def _excess(squared_distance: float, parameters: TrackingParameters) -> float:

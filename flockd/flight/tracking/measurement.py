@@ -32,10 +32,6 @@ class Measurement:
     """Probability that it is a drone at all, 0 to 1."""
     log_size_sigma: float = 0.0
     """As of `Detection`."""
-    velocity: FloatArray | None = None
-    """(3,) m/s over ground, where one was estimated (Eq. 36)."""
-    velocity_sigma_m_s: float = 1.0
-    """Standard deviation of `velocity`, each axis."""
 
     def __post_init__(self) -> None:
         if not abs(float(np.linalg.norm(self.bearing)) - 1.0) < 1e-6:  # a NaN fails too
@@ -50,20 +46,10 @@ class Measurement:
             raise ValueError(f"a probability lies between 0 and 1, not at {self.drone_probability}")
         if not (math.isfinite(self.log_size_sigma) and self.log_size_sigma >= 0):
             raise ValueError(f"a size's sigma must be finite and not negative, not {self.log_size_sigma}")
-        if self.velocity is not None and not np.isfinite(self.velocity).all():
-            raise ValueError("a measured velocity must be finite")
-        if not (math.isfinite(self.velocity_sigma_m_s) and self.velocity_sigma_m_s > 0):
-            raise ValueError(f"a velocity's sigma must be finite and positive, not {self.velocity_sigma_m_s} m/s")
 
     @classmethod
-    def of(
-        cls,
-        detection: Detection,
-        R_ned_body: FloatArray,
-        velocity: FloatArray | None = None,
-        velocity_sigma_m_s: float = 1.0,
-    ) -> Self:
-        """A detection, turned by the attitude (3, 3) from body into NED axes; `velocity` (3,) is NED already."""
+    def of(cls, detection: Detection, R_ned_body: FloatArray) -> Self:
+        """A detection, turned by the attitude (3, 3) from body into NED axes."""
         return cls(
             bearing=R_ned_body @ detection.bearing,
             log_range=detection.log_range,
@@ -71,8 +57,6 @@ class Measurement:
             size_m=detection.size_m,
             drone_probability=detection.drone_probability,
             log_size_sigma=detection.log_size_sigma,
-            velocity=velocity,
-            velocity_sigma_m_s=velocity_sigma_m_s,
         )
 
     @classmethod

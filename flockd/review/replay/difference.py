@@ -120,17 +120,13 @@ def _flat(value: Json, name: str = "") -> Iterator[tuple[str, Json]]:
     if isinstance(value, Mapping):
         for key, inner in value.items():
             if name or key not in NOT_COMPARED:
-                place = f"{name}[{key}]" if name in _BY_NAME else f"{name}.{key}".lstrip(".")
+                place = f"{name}[{key}]" if name == "counts" else f"{name}.{key}".lstrip(".")
                 yield from _flat(inner, place)
     elif isinstance(value, Sequence) and not isinstance(value, str):
         for index, inner in enumerate(value):
             yield from _flat(inner, f"{name}[{index}]")
     else:
         yield name, value
-
-
-_BY_NAME = ("neighbour_motions", "counts")
-"""Fields that are mappings: their keys are content, not names."""
 
 
 def _same(a: Json, b: Json, tolerance: float) -> bool:

@@ -179,7 +179,7 @@ class FlockTelemetry:
             )
             wanted = Wanted(commands.velocity[i], commands.acceleration[i], float(commands.yaw_rad[i]))
             output = PilotOutput(
-                time_s, None, velocity, (), (), {}, commands.neighbours[i], wanted,
+                time_s, None, velocity, (), (), commands.neighbours[i], wanted,
                 mission=commands.missions[i], obstacles=commands.obstacles[i],
             )  # fmt: skip
             self.show(i, None, state, output)

@@ -42,7 +42,6 @@ def test_true_maps_give_true_motions_and_a_repeated_time_stamp_restarts_the_pair
     assert first.ego_motion is None
     before = flyer.vehicles
     R_before, p_before = before.R_ned_body[0], before.position[0]
-    q_before = before.position[1]
     flyer.move()
     second = flyer.step()
     after = flyer.vehicles
@@ -54,8 +53,6 @@ def test_true_maps_give_true_motions_and_a_repeated_time_stamp_restarts_the_pair
     assert np.allclose(second.velocity, (after.position[0] - p_before) / STEP_S, atol=0.005)
     assert len(second.neighbours) == 1, "a neighbour that straddles two cameras is one neighbour"
     assert np.allclose(second.neighbours[0].position, after.position[1] - after.position[0], atol=0.02)
-    (motion,) = second.neighbour_motions.values()
-    assert np.allclose(R_before @ motion.velocity, (after.position[1] - q_before) / STEP_S, atol=0.1)
     (detection,) = second.detections
     assert set(detection.cameras) == {"front", "right"}
     again = flyer.step()

@@ -402,12 +402,6 @@ def test_a_track_whose_motions_agree_has_one() -> None:
     assert neighbour.possible[0].range_sigma_m < 3**0.5 * neighbour.position_sigma_m
 
 
-def test_a_measured_velocity_counts_by_its_variance() -> None:
-    measured = replace(_seen(AHEAD), velocity=np.array([1.0, 0.7, 0.0]), velocity_sigma_m_s=math.sqrt(0.49 / 3))
-    velocity = Follower(stranger_probability=1e-9).steps(1, measured).one.velocity
-    np.testing.assert_allclose(velocity, [1.0, 0.7 * 3 / 4, 0.0])  # prior variance 0.49, thrice as large
-
-
 def test_the_filter_knows_its_own_error() -> None:
     """Truth drawn from the filter's own model: the squared error over its variance averages to 1."""
     rng = np.random.default_rng(5)
@@ -569,8 +563,6 @@ def test_probabilities_that_do_not_increase_are_refused() -> None:
         ({"covariance": np.full((3, 3), np.inf)}, "covariance"),
         ({"size_m": 0.0}, "size"),
         ({"drone_probability": 1.2}, "probability"),
-        ({"velocity": np.array([np.nan, 0, 0])}, "velocity"),
-        ({"velocity_sigma_m_s": 0.0}, "sigma"),
         *(({"log_size_sigma": sigma}, "size's sigma") for sigma in (-0.1, math.nan, math.inf)),
     ],
 )

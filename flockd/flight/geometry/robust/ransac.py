@@ -1,15 +1,13 @@
-"""The rigid motion that most pairs agree on: by consensus, or by Algorithm 1, whose threshold finds its own size."""
+"""The rigid motion that most pairs agree on: Algorithm 1, whose threshold finds its own size."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from flockd.core.messages import BoolArray, FloatArray, IntArray
 from flockd.flight.geometry.rigid_fit import checked_pairs, fit_rigid
-from flockd.flight.geometry.robust.consensus import FEWEST_PAIRS, find_consensus
 from flockd.flight.geometry.rotations import crossed
 from flockd.flight.geometry.transform import RigidTransform
 
@@ -25,18 +23,12 @@ class RansacResult:
     transform: RigidTransform
     inliers: BoolArray
     threshold: float
-    covariance: FloatArray | None = None
-    """(6, 6) of a left increment (rotation vector in rad, translation in m) of the motion; None: by Algorithm 1."""
-
-
-Method = Literal["consensus", "paper"]
 
 
 def ransac_rigid(
     source: FloatArray,
     target: FloatArray,
     *,
-    method: Method = "consensus",
     threshold: float = 0.01,
     min_inlier_ratio: float = 0.2,
     seed: int = 0,
@@ -45,13 +37,11 @@ def ransac_rigid(
 ) -> RansacResult:
     """The motion ``target = R source + t`` of ``source`` and ``target`` (n, 3) metres, despite outliers.
 
-    ``consensus`` learns the size of the errors from the pairs, and whether it grows with the range: see
-    `find_consensus`; it has no use for ``threshold`` and ``hypotheses``. ``paper`` is Algorithm 1, which also stands in
-    where there are fewer than ten pairs. Its threshold doubles from ``threshold`` metres, at most to ``max_threshold``,
-    until some hypothesis, fitted to three random pairs, has more than ``min_inlier_ratio`` n pairs within it; the
-    hypothesis with the most wins and is fitted again to all its inliers. Every threshold sees ``hypotheses``
-    hypotheses, as when Algorithm 1's inner counter is reset; they are the same ones, so each is scored only once.
-    Beyond the paper: fitting and selecting alternate for as long as that finds more inliers.
+    Algorithm 1: the threshold doubles from ``threshold`` metres, at most to ``max_threshold``, until some hypothesis,
+    fitted to three random pairs, has more than ``min_inlier_ratio`` n pairs within it; the hypothesis with the most
+    wins and is fitted again to all its inliers. Every threshold sees ``hypotheses`` hypotheses, as when Algorithm 1's
+    inner counter is reset; they are the same ones, so each is scored only once. Beyond the paper: fitting and selecting
+    alternate for as long as that finds more inliers.
 
     Deterministic for a ``seed``. Raises ValueError with the reason for degenerate input (see `fit_rigid`), and where
     no motion has enough inliers.
@@ -59,11 +49,6 @@ def ransac_rigid(
     source, target = checked_pairs(source, target)
     if not 0.0 < threshold <= max_threshold:
         raise ValueError(f"the threshold {threshold} m must be positive and not above its maximum {max_threshold} m")
-    if method == "consensus" and len(source) >= FEWEST_PAIRS:
-        found = find_consensus(
-            source, target, min_inlier_ratio=min_inlier_ratio, max_threshold=max_threshold, seed=seed
-        )
-        return RansacResult(found.transform, found.inliers, found.threshold, found.covariance(target))
     rotations, translations = _hypotheses(source, target, hypotheses, np.random.default_rng(seed))
     ladder = [threshold]
     while ladder[-1] * 2.0 <= max_threshold:

@@ -3,7 +3,6 @@
 from flockd.flight.perception.flow.dis import DisFlow
 from flockd.flight.perception.flow.lucas_kanade import grid_flow
 from flockd.flight.perception.flow.network import OnnxFlow
-from flockd.flight.perception.flow.objects import object_flow
 from flockd.flight.perception.interface import Flow
 
-__all__ = ["DisFlow", "Flow", "OnnxFlow", "grid_flow", "object_flow"]
+__all__ = ["DisFlow", "Flow", "OnnxFlow", "grid_flow"]
