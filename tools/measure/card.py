@@ -364,6 +364,8 @@ def _part(part: str, commit: str, arguments: argparse.Namespace) -> dict[str, An
     if part == "errors":
         flown_by_sight = {one.log_name: one for one in flights_of(commit, quick=False) if one.eyes == "sight"}
         logs = {path.stem: path for path in sorted(results.glob("*.npz"))}
+        if not logs:
+            raise SystemExit(f"{results} has no log of a flight by sight; fly them first, with `--parts flights`")
         families = {path.stem: family_of(flown_by_sight[path.name].flown()) for path in logs.values()}
         perceived_errors.write(logs, families, commit, PERCEIVED)
         found = {"logs": list(logs)}
@@ -374,7 +376,7 @@ def _part(part: str, commit: str, arguments: argparse.Namespace) -> dict[str, An
     elif part == "px4":
         found = json.loads(_output("-m", "tools.checks.px4_rows", "--json"))["flights"]
     elif part == "geometry":
-        found = json.loads(_output("-m", "tools.measure.bench_geometry", "--json", "--draws", "30" if quick else "300"))
+        found = json.loads(_output("-m", "tools.measure.bench_geometry", "--draws", "30" if quick else "300"))
     elif part == "step":
         recording = "tests/review/replay/crossing.mcap"
         found = json.loads(_flockd("replay", recording, "--profile", "--json"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from argparse import Namespace
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from tools.measure.card import (
     SEEDS,
     Flight,
     Line,
+    _part,
     document,
     flights_of,
     flown,
@@ -103,6 +105,11 @@ def test_the_document_names_commit_networks_and_what_each_scenario_gave() -> Non
     assert paper["sight"]["figures"]["order_tail"]["count"] == 1
     assert "associated_error_p95_m" not in paper["blind"]["figures"]
     assert set(table_of(lines)) == set(SCENARIOS)
+
+
+def test_without_flights_by_sight_one_sentence_says_what_to_fly_before_their_errors(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match=r"no log of a flight by sight; .*`--parts flights`"):
+        _part("errors", COMMIT, Namespace(quick=False, workers=1, results=tmp_path))
 
 
 @pytest.mark.parametrize("eyes", ["blind", "exact"])
