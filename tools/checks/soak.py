@@ -23,13 +23,12 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from flockd.core.config import DroneConfig
+from flockd.core.config import DroneConfig, load_drone
 from flockd.core.data import data_path
-from flockd.core.messages import FloatArray
 from flockd.fleet.watcher import FleetWatcher
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.cameras.camera_simulator import CameraSimulator
-from flockd.sim.scenario import ScenarioConfig, load, load_scenario
+from flockd.sim.scenario import load_scenario
 from flockd.sim.sitl.daemons import Daemons
 from flockd.sim.sitl.frame_server import FrameServer
 from flockd.sim.sitl.ground_station import Poses
@@ -75,18 +74,6 @@ def slope_of(name: str, values: Sequence[float]) -> dict[str, float]:
     }  # fmt: skip
 
 
-def at(port: int, endpoint: str) -> DroneConfig:
-    """The configuration of PX4 SITL, with the ports that are free here."""
-    config = load(data_path("config") / "px4_sitl.yaml")
-    assert isinstance(config, DroneConfig)
-    assert config.source is not None
-    assert config.autopilot is not None
-    shared_memory = config.source.shared_memory.model_copy(update={"connect": (endpoint,)})
-    source = config.source.model_copy(update={"shared_memory": shared_memory})
-    autopilot = config.autopilot.model_copy(update={"address": f"udpin://127.0.0.1:{port}"})
-    return config.model_copy(update={"source": source, "autopilot": autopilot})
-
-
 def of_the_unit() -> dict[str, str]:
     """The environment that systemd gives the daemon."""
     lines = (data_path("systemd") / "flockd.service").read_text(encoding="utf-8").splitlines()
@@ -94,15 +81,11 @@ def of_the_unit() -> dict[str, str]:
     return dict(pair.split("=", 1) for pair in pairs.split())
 
 
-def status_mb(pid: int) -> dict[str, float]:
-    """What Linux says of a process's memory."""
-    lines = (line.split() for line in Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines())
-    return {words[0].rstrip(":"): int(words[1]) / 1024 for words in lines if words[-1] == "kB"}
-
-
 def process_facts(pid: int) -> dict[str, float]:
     """What Linux counts of a process. Raises OSError when it has ended."""
-    folder, known = Path(f"/proc/{pid}"), status_mb(pid)
+    folder = Path(f"/proc/{pid}")
+    lines = (line.split() for line in (folder / "status").read_text(encoding="ascii").splitlines())
+    known = {words[0].rstrip(":"): int(words[1]) / 1024 for words in lines if words[-1] == "kB"}
     return {
         "memory, MB": known["VmRSS"],
         "own memory, MB": known["RssAnon"],  # without files' pages, as of libraries first used late
@@ -123,18 +106,6 @@ def small(config: DroneConfig) -> DroneConfig:
     return config.model_copy(update={"rig": config.rig.model_copy(update={"cameras": tuple(cameras)})})
 
 
-def scenario() -> ScenarioConfig:
-    """The paper's world with two drones and small cameras."""
-    paper = load_scenario(data_path("config") / "paper_flight.yaml", {"seed": 5})
-    return paper.model_copy(update={"drone": small(paper.drone), "vehicles": paper.vehicles[:2]})
-
-
-def follower(place: FloatArray, velocity: FloatArray, rotation: FloatArray) -> Poses:
-    """The drone, and a neighbour north of it that does as it does."""
-    places = np.stack([place, place + np.array([NEIGHBOUR_M, 0.0, 0.0])])
-    return Poses(time.monotonic(), places, np.array([velocity, velocity]), np.array([rotation, rotation]))
-
-
 def _add(samples: dict[str, array[float]], facts: Mapping[str, float]) -> None:
     for name, value in facts.items():
         samples.setdefault(name, array("d")).append(value)  # small
@@ -144,26 +115,24 @@ def soak_daemon(minutes: float) -> dict[str, array[float]]:
     """Samples of each quantity, from the moment in which the daemon is ready and flies."""
     port, frames_at, telemetry_at = free_port(), free_endpoint(), free_endpoint()
     config = daemon_config(port, frames_at, telemetry_at)
-    world = scenario().model_copy(update={"drone": config})
+    paper = load_scenario(data_path("config") / "paper_flight.yaml", {"seed": 5})
+    world = paper.model_copy(update={"drone": config, "vehicles": paper.vehicles[:2]})
     with tempfile.TemporaryDirectory() as name, FakeAutopilot(port, height_m=HEIGHT_M) as autopilot:
 
         def poses() -> Poses:
+            """The drone, and a neighbour north of it that does as it does."""
             state = autopilot.state
-            return follower(state.position, state.velocity, state.R_ned_body)
+            places = np.stack([state.position, state.position + np.array([NEIGHBOUR_M, 0.0, 0.0])])
+            return Poses(time.monotonic(), places, np.array([state.velocity] * 2), np.array([state.R_ned_body] * 2))
 
         folder = Path(name)
         with (
             FrameServer(
-                CameraSimulator(world),
-                [config.name],
-                endpoint=frames_at,
-                rate_hz=2.0,
-                poses=poses,
-                clock=time.monotonic,
-                speed_factor=1.0,
-            ) as server,  # fmt: skip
+                CameraSimulator(world), [config.name], endpoint=frames_at, rate_hz=2.0, poses=poses,
+                clock=time.monotonic, speed_factor=1.0,
+            ) as server,
             Daemons([config], folder=folder, recordings=folder, environment={**os.environ, **of_the_unit()}) as daemons,
-        ):
+        ):  # fmt: skip
             server.start()
             daemons.start()
             _wait_for(daemons, server)
@@ -172,12 +141,20 @@ def soak_daemon(minutes: float) -> dict[str, array[float]]:
 
 
 def daemon_config(port: int, frames_at: str, telemetry_at: str) -> DroneConfig:
-    """One that flies its circle for ever."""
-    config = small(at(port, frames_at))
-    telemetry = config.telemetry.model_copy(update={"listen": (telemetry_at,), "connect": ()})
-    mission = config.mission.model_copy(update={"circle_until_s": 1e9})
-    safety = config.safety.model_copy(update={"alone_s": None})
-    return config.model_copy(update={"telemetry": telemetry, "mission": mission, "safety": safety})
+    """That of PX4 SITL with the ports that are free here and a small camera, which flies its circle for ever."""
+    config = small(load_drone(data_path("config") / "px4_sitl.yaml"))
+    assert config.source is not None
+    assert config.autopilot is not None
+    shared_memory = config.source.shared_memory.model_copy(update={"connect": (frames_at,)})
+    return config.model_copy(
+        update={
+            "source": config.source.model_copy(update={"shared_memory": shared_memory}),
+            "autopilot": config.autopilot.model_copy(update={"address": f"udpin://127.0.0.1:{port}"}),
+            "telemetry": config.telemetry.model_copy(update={"listen": (telemetry_at,), "connect": ()}),
+            "mission": config.mission.model_copy(update={"circle_until_s": 1e9}),
+            "safety": config.safety.model_copy(update={"alone_s": None}),
+        }
+    )
 
 
 def _wait_for(daemons: Daemons, server: FrameServer) -> None:

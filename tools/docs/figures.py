@@ -1,18 +1,15 @@
 """Writes the tables of figures in README and docs from docs/figures.json, which `tools.measure.card` measures.
 
-python -m tools.docs.figures            # writes the pages
-python -m tools.docs.figures --check    # exit code 1 when a page is not up to date
+python -m tools.docs.figures    # writes the pages
 
 A page has a table between `<!-- figures: NAME -->` and `<!-- end of figures -->`, NAME being one of `TABLES`.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import subprocess
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -149,23 +146,12 @@ TABLES: dict[str, Callable[[Mapping[str, Part]], str]] = {
 }
 
 
-def main() -> int:
-    """Reads the command line; writes or checks the pages."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="write nothing; exit code 1 when a page is out of date")
-    check = parser.parse_args().check
-    parts, old = json.loads(FIGURES_FILE.read_text(encoding="utf-8")), []
+def main() -> None:
+    """Writes the pages."""
+    parts = json.loads(FIGURES_FILE.read_text(encoding="utf-8"))
     for page in pages():
-        text = page.read_text(encoding="utf-8")
-        fresh = written(text, parts)
-        if AGE.sub("", fresh) != AGE.sub("", text):
-            old.append(page)
-        if fresh != text and not check:
-            page.write_text(fresh, encoding="utf-8")
-    for page in old if check else ():
-        print(f"{page.relative_to(ROOT)}: out of date; run python -m tools.docs.figures", file=sys.stderr)
-    return 1 if check and old else 0
+        page.write_text(written(page.read_text(encoding="utf-8"), parts), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

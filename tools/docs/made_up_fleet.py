@@ -10,7 +10,6 @@ import asyncio
 import itertools
 import math
 import os
-import threading
 from collections.abc import Sequence
 from typing import get_args
 
@@ -37,7 +36,6 @@ from flockd.onboard.telemetry import publish_step
 from flockd.onboard.telemetry.publisher import DEFAULT_ENDPOINT, ZenohTelemetry
 from flockd.onboard.telemetry.topics import (
     AboutMessage,
-    AnswerMessage,
     CameraMessage,
     ComputerMessage,
     FlightMessage,
@@ -45,6 +43,8 @@ from flockd.onboard.telemetry.topics import (
 )
 
 FLEET = "made-up"
+CAMERAS = ("front", "back")
+RATE_HZ = 2.0
 RADIUS_M, SPEED_M_S, HEIGHT_M, SPACING_M, SIGHT_M = 25.0, 1.5, 5.0, 3.5, 6.5
 HOME_DEG = np.array([47.3977, 8.5456])
 TREES = np.array([[12.0, 20.0], [-6.0, 33.0], [30.0, 2.0], [-15.0, -22.0], [8.0, -34.0], [35.0, 25.0]])
@@ -58,9 +58,7 @@ def main() -> int:
     parser.add_argument("--drones", type=int, default=5)
     parser.add_argument("--flock", type=int, help="drones in all, where other processes publish the others")
     parser.add_argument("--first", type=int, default=1, help="number of the first drone")
-    parser.add_argument("--rate", type=float, default=2.0, help="steps a second")
     parser.add_argument("--commands", default="", help=f"of {', '.join(get_args(OperatorCommand))}")
-    parser.add_argument("--mute", type=int, default=0, metavar="CAMERAS", help="answer nothing, with so many cameras")
     parser.add_argument("--listen", default=DEFAULT_ENDPOINT)
     parser.add_argument(
         "--connect", action="append", default=[], help="where a watcher listens, in the place of --listen"
@@ -72,24 +70,22 @@ def main() -> int:
         try:
             commands = [one for one in args.commands.split(",") if one]
             flock = args.flock or args.drones
-            asyncio.run(_publish(telemetry, numbers, flock, args.rate, commands, args.mute))
+            asyncio.run(_publish(telemetry, numbers, flock, commands))
         except KeyboardInterrupt:
             return 0
     return 0
 
 
-async def _publish(
-    telemetry: ZenohTelemetry, numbers: Sequence[int], flock: int, rate_hz: float, commands: list[str], mute: int
-) -> None:
+async def _publish(telemetry: ZenohTelemetry, numbers: Sequence[int], flock: int, commands: list[str]) -> None:
     loop = asyncio.get_running_loop()
-    drones = [MadeUpDrone(telemetry, number, flock, commands, loop, mute) for number in numbers]
+    drones = [MadeUpDrone(telemetry, number, flock, commands, loop) for number in numbers]
     began_s = loop.time()
     for step in itertools.count():
-        time_s = step / rate_hz
+        time_s = step / RATE_HZ
         places, velocity = flying(time_s, flock)
         for drone in drones:
             drone.step(time_s, places, velocity)
-        await asyncio.sleep(max(0.0, began_s + (step + 1) / rate_hz - loop.time()))
+        await asyncio.sleep(max(0.0, began_s + (step + 1) / RATE_HZ - loop.time()))
 
 
 def flying(time_s: float, drones: int) -> tuple[FloatArray, FloatArray]:
@@ -105,20 +101,10 @@ class MadeUpDrone:
     """Circles in a grid of drones; holds, lands and resumes when it is asked to."""
 
     def __init__(
-        self,
-        telemetry: ZenohTelemetry,
-        number: int,
-        flock: int,
-        commands: list[str],
-        loop: asyncio.AbstractEventLoop,
-        mute: int = 0,
+        self, telemetry: ZenohTelemetry, number: int, flock: int, commands: list[str], loop: asyncio.AbstractEventLoop
     ) -> None:
-        """``flock``: how many there are in all, of which it sees the nearest.
-
-        ``mute``: with so many cameras, it answers neither questions for their pictures nor commands; 0: it answers.
-        """
-        self._flock, self._mute = flock, mute
-        self._cameras = [f"camera{number}" for number in range(mute)] if mute else ["front", "back"]
+        """``flock``: how many there are in all, of which it sees the nearest."""
+        self._flock = flock
         self._telemetry, self._number, self.name = telemetry, number, f"drone{number}"
         self._requests = OperatorRequests()
         self._times = itertools.count()
@@ -130,7 +116,7 @@ class MadeUpDrone:
         self._commands = OperatorCommands(
             commands, self._requests, self, loop, self._event, identity=telemetry.identity
         )
-        telemetry.announce(self.name, about, self._command, self._image)
+        telemetry.announce(self.name, about, self._commands.handle, self._image)
 
     def fault(self, order: MissionOrder) -> str | None:
         """Takes every order, and flies none."""
@@ -195,7 +181,7 @@ class MadeUpDrone:
         )  # fmt: skip
 
     def _computer(self, time_s: float) -> ComputerMessage:
-        cameras = {name: CameraMessage(age_s=0.03, fault=None, counts={}) for name in self._cameras}
+        cameras = {name: CameraMessage(age_s=0.03, fault=None, counts={}) for name in CAMERAS}
         return ComputerMessage(
             time_s=time_s, cameras=cameras,
             load=0.5 + 0.1 * math.sin(0.2 * time_s + self._number), steps=self._steps, steps_failed=0, network_faults=0,
@@ -203,26 +189,17 @@ class MadeUpDrone:
             messages_lost=0, recording=None,
         )  # fmt: skip
 
-    def _command(self, command: str, payload: bytes) -> AnswerMessage:
-        self._wait_if_mute()
-        return self._commands.handle(command, payload)
-
-    def _wait_if_mute(self) -> None:
-        if self._mute:
-            threading.Event().wait()
-
     def _event(self, sentence: str) -> None:
         self._telemetry.publish(self.name, "events", {"time_s": self._steps / 2.0, "event": sentence})
 
     def _image(self, camera: str) -> bytes | None:
         """A picture that says whose it is."""
-        self._wait_if_mute()
         image = np.full((240, 320, 3), (140, 110, 70), np.uint8)
         image[150:] = (60, 110, 80)
         cv2.circle(image, (90 + 10 * (self._steps % 14), 120), 14, (0, 109, 255), 1, cv2.LINE_AA)
         text = f"{self.name} {camera} {os.getpid()}"
         cv2.putText(image, text, (8, 230), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
-        return bytes(cv2.imencode(".jpg", image)[1]) if camera in {"front", "back"} else None
+        return bytes(cv2.imencode(".jpg", image)[1]) if camera in CAMERAS else None
 
 
 def _obstacles(time_s: float, place: FloatArray) -> ObstacleRanges:

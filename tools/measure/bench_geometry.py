@@ -149,22 +149,12 @@ def measured(case: Case, method: str, draws: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Prints the table."""
+    """Prints JSON, a row for each case and method."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=30)
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
+    draws = parser.parse_args().draws
     cv2.setNumThreads(1)
-    rows = [measured(case, method, options.draws) for case in CASES for method in METHODS]
-    if options.json:
-        print(json.dumps(rows, indent=1))
-        return
-    print(
-        f"{'case':36} {'method':14} {'ms':>8} {'deg':>7} {'99 %':>7} {'cm':>7} {'99 %':>7} failures of {options.draws}"
-    )
-    for row in rows:
-        off = (f"{one:7.3f}" for one in (*row["degrees"], *row["cm"]))
-        print(f"{row['case']:36} {row['method']:14} {row['ms']:8.2f}", *off, row["failures"])
+    print(json.dumps([measured(case, method, draws) for case in CASES for method in METHODS], indent=1))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 python -m tools.training.render_training_data DATA/test   --split test --worlds 25 --pairs 12
 python -m tools.training.render_training_data DATA/unseen --split test --worlds 25 --pairs 12 --families unseen
-python -m tools.measure.evaluate_networks --data DATA/test --unseen DATA/unseen [--json]
+python -m tools.measure.evaluate_networks --data DATA/test --unseen DATA/unseen
 
 How long they take says `flockd replay RECORDING --profile`.
 """
@@ -10,9 +10,8 @@ How long they take says `flockd replay RECORDING --profile`.
 from __future__ import annotations
 
 import argparse
-import json
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -68,29 +67,19 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of render_training_data.py")
     parser.add_argument("--unseen", type=Path, help="another one, with families that no network was trained on")
     parser.add_argument("--models", type=Path, default=data_path("models"))
-    parser.add_argument("--pairs", type=int, default=10_000, help="of each folder at most this many")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--float", action="store_true", help="the float networks, not their 8-bit twins")
-    parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     config = PerceptionConfig(threads=arguments.threads)
     if arguments.float:
         config = config.model_copy(update={role: getattr(config, role).removesuffix("_int8") for role in ROLES})
     perception = OnnxNetworks(config, arguments.models)
 
-    def findings(folder: Path) -> Findings:
-        pairs = open_pairs(folder)
-        indices = range(min(pairs.count, arguments.pairs))
-        return look_at_pairs(pairs, perception, indices)
-
-    rows = list(rows_of_pairs(findings(arguments.data)))
+    rows = list(rows_of_pairs(look_at_pairs(open_pairs(arguments.data), perception)))
     if arguments.unseen is not None:
-        rows += list(_distances(findings(arguments.unseen), ", unseen families"))
+        rows += list(_distances(look_at_pairs(open_pairs(arguments.unseen), perception), ", unseen families"))
     files = list(arguments.models.glob("*.onnx"))
     rows.append(Row("all networks", sum(file.stat().st_size for file in files) / 1e6, "MB", len(files)))
-    if arguments.json:
-        print(json.dumps([asdict(row) for row in rows], indent=1))
-        return
     for row in rows:
         print(row)
 
@@ -103,10 +92,8 @@ def rows_of_pairs(found: Findings) -> Iterator[Row]:
         inside = float(np.mean([abs(drone.error) < sigmas * drone.sigma for drone in whole]))
         yield Row(f"distance errors inside {sigmas} sigma", 100 * inside, "%", len(whole))
     for given, name in WITH.items():
-        of_pixels = np.concatenate(found.depth_pixels[given])
-        for what, off in (("", np.array(found.depth[given])), (" of a pixel", of_pixels)):
-            name_of = f"background depth{what}, relative error, {name}, median"
-            yield Row(name_of, 100 * float(np.median(off)), "%", len(off))
+        off = found.depth[given]
+        yield Row(f"background depth, relative error, {name}, median", 100 * float(np.median(off)), "%", len(off))
     yield Row(f"mask IoU, drones within {MASK_WITHIN_M:g} m, mean", float(np.mean(found.iou)), "", len(found.iou))
     for low, high, name in ((12, np.inf, "at least 12"), (6, 12, "6 to 12")):
         wide = [drone for drone in found.drones if low <= drone.width_px < high]
@@ -163,20 +150,18 @@ class Findings:
         self.iou: list[float] = []
         self.depth: dict[str | None, list[float]] = {given: [] for given in (None, *HEIGHT_SIGMAS_M)}
         """Mean relative error of the background's depth in each image, by what measured the height, None: RGB alone."""
-        self.depth_pixels: dict[str | None, list[Array]] = {given: [] for given in self.depth}
-        """The same of every sixteenth pixel."""
         self.flow: dict[tuple[str, bool], list[Array]] = {}
         """End-point errors, px, of ("network" or "dis", on drones)."""
 
 
-def look_at_pairs(pairs: PairSet, networks: OnnxNetworks, indices: Iterable[int]) -> Findings:
+def look_at_pairs(pairs: PairSet, networks: OnnxNetworks) -> Findings:
     """The second stage and all, on each pair's first image; the flow on both. The autopilot's height errs.
 
     Drones are what they are with a barometer.
     """
     rng = np.random.Generator(np.random.PCG64(0))
     dis, found = DisFlow(), Findings()
-    for index in indices:
+    for index in range(pairs.count):
         rig = Rig({"camera": rig_camera(float(pairs["focal"][index]))})
         images = np.asarray(pairs["image"][index])
         R_ned_camera = np.asarray(pairs["R_ned_camera"][index, 0], np.float64)
@@ -194,7 +179,6 @@ def look_at_pairs(pairs: PairSet, networks: OnnxNetworks, indices: Iterable[int]
             assert ranges is not None
             off = depth_errors(RangeMap(ranges), rig.cameras["camera"], depth, ids)
             found.depth[given].append(float(off.mean()) if off.size else 0.0)
-            found.depth_pixels[given].append(off[::16])
         labels = view.cameras["camera"].labels
         _masks(((labels > 0) & (labels != UNCLASSED))[1::2, 1::2], ids, pairs, index, found)
         proposed = [proposal.roi.direction for proposal in trace.proposals]
