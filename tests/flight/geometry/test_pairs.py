@@ -72,12 +72,6 @@ def test_both_ends_lie_on_the_wall_and_are_one_step_apart() -> None:
     assert np.allclose(CAMERA.pixels_of_points(pairs.previous), pairs.pixels_previous, atol=1e-6)
 
 
-def test_ends_outside_either_image_are_dropped() -> None:
-    outward = lift(np.array([[0.5, 64.5], [95.5, 0.5], [-3.0, 5.0], [48.5, 64.5]]), wall_maps())
-    # Moving ahead, the border's pixels leave the image; the one in the middle stays.
-    assert outward.pixels_previous.tolist() == [[48.5, 64.5]]
-
-
 def test_a_match_keeps_its_class_only_where_both_ends_agree() -> None:
     labels, labels_after = no_labels(), no_labels()
     labels[:, 48:] = 2
@@ -115,18 +109,7 @@ def test_between_two_surfaces_the_nearer_pixel_decides() -> None:
         assert np.linalg.norm(in_camera) == pytest.approx(expected)
 
 
-def test_nothing_left_is_an_empty_set_and_not_an_error() -> None:
-    pairs = lift(np.array([[48.5, 64.5]]), wall_maps(), max_depth_m=1.0)
-    assert len(pairs) == 0
-    assert pairs.previous.shape == (0, 3)
-
-
 def test_a_map_of_another_size_is_refused() -> None:
     flow, before, _ = wall_maps()
     with pytest.raises(ValueError, match="'right' is 96x128, but its depth map is 48x64"):
         lift(grid_pixels(SIZE, 8), (flow, before, RangeMap(np.ones((64, 48), dtype=np.float32))))
-
-
-def test_the_grid_is_of_pixel_centres_inside_the_image() -> None:
-    assert grid_pixels((4, 3), 1)[:5].tolist() == [[0.5, 0.5], [1.5, 0.5], [2.5, 0.5], [3.5, 0.5], [0.5, 1.5]]
-    assert grid_pixels((10, 5), 4).tolist() == [[2.5, 2.5], [6.5, 2.5]]

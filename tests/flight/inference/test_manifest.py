@@ -17,13 +17,11 @@ from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
 from flockd.core.errors import ModelError
 from flockd.flight.inference import OnnxModel, manifests_of, read_manifest
-from flockd.flight.inference.feeds import feeds_for, golden_feeds
+from flockd.flight.inference.feeds import feeds_for
 from flockd.flight.inference.fitting import fit
-from flockd.flight.inference.manifest import Manifest
 from flockd.flight.perception.requirements import REQUIREMENTS, check_roles
 from tests.flight.inference.foreign import (
     SIZE,
-    constant_flow,
     image_input,
     map_output,
     one_channel_depth,
@@ -190,19 +188,6 @@ def test_crop_size_thresholds_and_a_batchs_size_come_from_the_manifest(tmp_path:
     assert (whole.map_stride, whole.crop, whole.thresholds) == (None, None, {})
     with pytest.raises(ModelError, match="crop"):
         _ = whole.crop_size_px
-
-
-def test_planes_enter_at_the_stride_of_the_manifest(tmp_path: Path) -> None:
-    manifest = Manifest.model_validate(yaml.safe_load(with_planes(tmp_path).read_text()), strict=False)
-    assert not list(manifest.faults())
-    assert golden_feeds(manifest)["rays"].shape == (1, 2, 8, 16)
-    assert feeds_for(manifest, (100, 40))["rays"].shape == (1, 2, 16, 32)  # padded to 128 x 64
-
-
-def test_sizes_that_the_file_leaves_free_the_manifest_may_fix(tmp_path: Path) -> None:
-    path = constant_flow(tmp_path, (1.0, 1.0), ("w", "h"))
-    changed(path, {f"inputs.{name}.shape": [1, HEIGHT, WIDTH, 1] for name in "ab"})
-    assert OnnxModel(path, threads=1).manifest.fixed_size == SIZE
 
 
 @pytest.mark.parametrize(

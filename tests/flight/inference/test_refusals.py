@@ -19,7 +19,7 @@ from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
 from flockd.core.errors import ModelError
 from flockd.flight.inference import OnnxModel
-from flockd.flight.inference.providers import Prepared, available
+from flockd.flight.inference.providers import available
 from flockd.flight.perception import OnnxNetworks
 from tests.flight.inference.foreign import SIZE, image_input, map_output, write_model
 
@@ -113,19 +113,6 @@ def test_a_provider_that_onnx_runtime_silently_replaces_is_an_error(monkeypatch:
 def test_tensorrt_never_builds_in_flight(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"flow\.yaml:4: file: .*tensorrt.*; run `flockd models prepare`"):
         OnnxModel(MODELS / "flow.yaml", threads=1, provider="tensorrt", engines=tmp_path)
-
-
-def test_what_was_prepared_covers_what_lies_between(tmp_path: Path) -> None:
-    shapes = [{"first": (1, 120, 160, 3)}, {"first": (1, 96, 216, 3)}, {"first": (16, 96, 160, 3)}]
-    Prepared.over(shapes).save(tmp_path)
-    prepared = Prepared.load(tmp_path)
-    assert prepared is not None
-    assert prepared.covers({"first": (4, 100, 200, 3)})
-    assert not prepared.covers({"first": (17, 100, 200, 3)})
-    assert not prepared.covers({"first": (1, 88, 200, 3)})
-    assert not prepared.covers({"first": (1, 100, 200)})
-    assert not prepared.covers({"second": (1, 100, 200, 3)})
-    assert Prepared.load(tmp_path / "elsewhere") is None
 
 
 def test_a_provider_that_cannot_run_a_model_is_an_error_of_one_sentence(tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ from flockd.core.errors import ConfigError
 from flockd.core.messages import FloatArray, MissionOrder, Setpoint
 from flockd.flight.geometry import euler_from_rotation
 from flockd.flight.mission import Guidance, MissionParameters, Moment, Navigator, order_fault
-from flockd.flight.mission.navigator import middle_of
 from flockd.flight.safety import Gate, outside_fence
 from flockd.onboard.telemetry.order_messages import order_message, parse_order
 from flockd.sim.autopilot.fake_vehicle import Demand, PointMass
@@ -101,27 +100,6 @@ def test_a_drone_that_has_not_come_near_has_not_been_there(stops_at_m: float) ->
     assert guidance.sentence.endswith("to waypoint 1 of 2")
 
 
-def test_a_position_that_jumps_near_a_waypoint_for_one_step_has_not_been_there() -> None:
-    """30 m away for the autopilot's estimate, 3 m for one step, and then 30 m again."""
-    point = Point(to((40.0, 0.0), (40.0, 40.0)))
-    point.fly(10.0)
-    before, point.position = point.position, np.array([37.0, 0.0])
-    point.step()
-    point.position = before
-    for _ in range(40):
-        guidance = point.step()
-        point.position = before
-    assert guidance.sentence == "30 m to waypoint 1 of 2"
-
-
-def test_the_middle_of_the_flock_is_led_not_the_drone() -> None:
-    neighbours = np.array([[3.0, 0.0], [3.0, 3.0]])
-    np.testing.assert_allclose(middle_of(neighbours), [2.0, 1.0])
-    navigator = Navigator(to((20.0, 1.0)), GATE)
-    guidance = navigator.step(Moment(0.0, ORIGIN, middle_of(neighbours)))
-    np.testing.assert_allclose(guidance.velocity, [1.0, 0.0])
-
-
 @pytest.mark.parametrize("end", ["land", "return"])
 def test_at_its_end_a_mission_has_the_autopilot_take_over(end: str) -> None:
     point = Point(to((2.0, 0.0), at_end=end))
@@ -155,15 +133,6 @@ def test_heights_have_the_drones_offset_and_stay_until_another() -> None:
     assert point.navigator.step(Moment(point.time_s, None)).height_m == 5.0, "without a position it stays there"
     assert Point(mission(kind="hover", height_m=4.0)).step().height_m == 4.0
     assert Point(mission(kind="hover")).step().height_m is None
-
-
-def test_hover_and_follow_want_no_velocity_and_a_velocity_is_kept() -> None:
-    for kind in ("hover", "follow"):
-        np.testing.assert_allclose(Point(mission(kind=kind)).step().velocity, ORIGIN)
-    navigator = Navigator(mission(kind="velocity", velocity_m_s=(0.0, -1.0), pull=2.0), GATE)
-    guidance = navigator.step(Moment(0.0))  # needs no position
-    np.testing.assert_allclose(navigator.pull(guidance), [0.0, -2.0])
-    assert guidance.course_rad == pytest.approx(-math.pi / 2)
 
 
 def test_an_operators_velocity_and_goal_hold_for_two_seconds() -> None:
@@ -261,17 +230,6 @@ def test_a_goal_that_no_mission_can_have_is_refused_without_a_fence_too(
     unfenced = changed(config, safety__gate__fence_radius_m=None)
     here = vehicle(home_deg=[47.4, 8.5])
     assert "farther" in str(order_fault(unfenced, parse_order("goto", message), here))
-
-
-@pytest.mark.parametrize(
-    "message",
-    [None, {}, {"north_m": 1}, {"north_m": 1, "east_m": "2"}, {"north_m": math.nan, "east_m": 0},
-     {"north_m": True, "east_m": 0}, {"north_m": 1, "east_m": 0, "latitude_deg": 1}, {"colour": 1},
-     {"velocity_ne": [1, 0]}, {"north_m": 1e300, "east_m": 0}, {"north_m": 1, "east_m": 0, "height_m": None}],
-)  # fmt: skip
-def test_what_is_no_order_is_refused_with_a_sentence(message: dict[str, object] | None) -> None:
-    with pytest.raises(ValueError, match=r"goto|order|_m is (no finite number|beyond)"):
-        parse_order("goto", message)
 
 
 @pytest.mark.parametrize(

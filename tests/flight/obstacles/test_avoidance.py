@@ -55,11 +55,6 @@ def test_a_disc_meets_a_point_where_geometry_says() -> None:
     np.testing.assert_array_equal(free_way(points, 5.0, np.array([math.pi])), [np.inf])
 
 
-def test_from_within_its_clearance_a_drone_may_only_fly_off() -> None:
-    points = np.array([[0.5, 0.0]])
-    np.testing.assert_array_equal(free_way(points, 0.9, np.array([0.0, math.pi, 0.5, 2.0])), [0.0, np.inf, 0.0, np.inf])
-
-
 # Steering.
 
 
@@ -100,37 +95,11 @@ def test_the_side_is_kept_though_the_other_has_become_a_little_nearer() -> None:
     assert (first[1] > 0, then[1] > 0, fresh[1] > 0) == (True, True, False)
 
 
-def test_of_two_ways_alike_the_flocks_is_taken() -> None:
-    left = steered((1.5, 0.0), around(trunk(4.0, 0.0)), np.array([0.5, -1.0]))
-    assert left[1] < 0
-
-
 def test_before_a_wall_it_slides_along() -> None:
     ahead = around(wall(1.5, 0.0, 0.2, 30.0))
     north, east = steered((1.5, 0.0), ahead)
     assert east > 0.5
     assert abs(north) < 0.3 * east
-
-
-def test_a_way_that_leads_back_is_flown_at_less_than_a_third_of_the_speed_and_more_than_none() -> None:
-    court = around(
-        wall(2.0, 0.0, 0.2, 8.0), wall(0.0, 2.0, 8.0, 0.2),
-        wall(0.0, -2.0, 8.0, 0.2),
-    )  # fmt: skip
-    north, east = steered((2.4, 0.0), court)
-    assert north < 0.0
-    assert 0.25 * 2.4 < math.hypot(north, east) <= 0.3 * 2.4
-
-
-def test_an_obstacle_that_may_be_nearer_is_met_more_slowly() -> None:
-    dead_end = around(
-        wall(3.0, 0.0, 0.2, 5.0), wall(0.0, 1.8, 5.0, 0.2),
-        wall(0.0, -1.8, 5.0, 0.2), wall(-3.0, 0.0, 0.2, 5.0),
-    )  # fmt: skip
-    sure = np.linalg.norm(steered((1.5, 0.0), dead_end))
-    found = np.isfinite(dead_end.range_m)
-    blurred = ObstacleRanges(0.0, dead_end.range_m, np.where(found, 0.3, 0.0), dead_end.seen_m)
-    assert 0.0 < np.linalg.norm(steered((1.5, 0.0), blurred)) < sure < 1.5
 
 
 def test_into_what_was_not_looked_at_it_does_not_fly() -> None:
@@ -158,17 +127,6 @@ def test_the_command_can_be_stopped_a_step_later() -> None:
         command, _ = avoidance.command(law, np.array([1.5, 0.0]), NOBODY, NOBODY[:, :2], np.array([3.0, 0.0]), ahead)
         speed = max(float(command[0]), 0.0)
         assert speed * 1.0 + speed**2 / 3.0 <= max(away_m - PARAMETERS.clearance_m, 0.0) + 1e-6
-
-
-def test_without_obstacles_the_command_is_the_laws() -> None:
-    avoidance, law = Avoidance(PARAMETERS, GATE, 0.5), FlockingLaw(FlockingParameters())
-    offsets = np.array([[3.0, 2.0, 1.0], [-4.0, 1.0, 0.5]])
-    velocities = np.array([[0.5, 0.1], [0.4, 0.0]])
-    own, desired = np.array([0.5, 0.2]), np.array([1.0, 0.0])
-    command, acceleration = avoidance.command(law, own, offsets, velocities, desired, FREE)
-    expected = law.command(own, offsets[:, :2], velocities, desired, 0.5)
-    np.testing.assert_allclose(command, expected[0])
-    np.testing.assert_allclose(acceleration, expected[1])
 
 
 # A flock on exact states.

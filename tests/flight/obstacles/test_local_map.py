@@ -60,14 +60,6 @@ def test_two_obstacles_in_a_sector_are_both_kept_and_the_nearer_one_counts() -> 
     assert obstacles_in(local.step(1.0, ranges(1.0, {NORTH: 9.0}), STILL, 0.0)) == {NORTH: 9.0}  # seen past it twice
 
 
-def test_what_newer_ranges_do_not_reach_stays() -> None:
-    local = LocalMap(PARAMETERS)
-    local.step(0.0, ranges(0.0, {NORTH: 8.0}), None, 0.0)
-    for time_s in (0.5, 1.0, 1.5, 2.0):
-        view = local.step(time_s, ranges(time_s, {}, seen_m=6.0), STILL, 0.0)
-    assert obstacles_in(view) == {NORTH: 8.0}
-
-
 def test_farther_than_its_range_nothing_counts() -> None:
     local = LocalMap(PARAMETERS)
     assert obstacles_in(local.step(0.0, ranges(0.0, {NORTH: 15.5, EAST: 14.5}), None, 0.0)) == {EAST: 14.5}
@@ -92,9 +84,3 @@ def test_where_time_runs_backwards_the_map_begins_anew() -> None:
 def test_an_obstacle_counts_as_nearer_than_measured(sector: int, place: list[float]) -> None:
     points: FloatArray = nearest_points(ranges(0.0, {sector: 3.0}, sigma_m=0.1), 2.0)
     np.testing.assert_allclose(points, [place], atol=1e-12)
-
-
-def test_an_obstacle_that_may_be_anywhere_near_still_has_a_direction() -> None:
-    points = nearest_points(ranges(0.0, {EAST: 0.5}, sigma_m=1.0), 2.0)
-    assert points.shape == (1, 2)
-    assert points[0, 1] > 0.0

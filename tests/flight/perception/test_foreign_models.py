@@ -70,15 +70,6 @@ def test_flow_of_a_network_of_fixed_size_comes_back_in_pixels_of_the_image(
     np.testing.assert_allclose(flow[..., 1], -2.0 * size[1] / inner[1], rtol=1e-5)
 
 
-def test_what_lies_right_in_the_image_lies_right_in_the_map_although_its_input_was_padded(tmp_path: Path) -> None:
-    image = plain((0, 0, 0), (64, 64))  # half as wide again is black border in an input of 48 x 32
-    image[:, 32:] = 255
-    depth = depth_of(one_channel_depth(tmp_path, output={}), image)
-    assert depth.shape == (64, 64)
-    np.testing.assert_allclose(depth[:, :30], 0.0, atol=1e-6)
-    np.testing.assert_allclose(depth[:, 34:], 1.0, atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("output", "focal_px", "red", "size", "expected"),
     [
@@ -156,14 +147,6 @@ def test_height_finds_the_ground_under_what_stands_on_it_and_drones_before_it_do
     fixed = metric_depth(opened(seen, shift=shift, labels=labels), ground, FRONT.camera)
     right = (labels == 0) & (bare | (scene < 20.0))
     np.testing.assert_allclose(fixed[right], (scene / AXIAL_SHARE)[right], rtol=0.02)
-
-
-def test_without_ground_in_view_height_says_nothing() -> None:
-    """Above the horizon, or where nothing in the picture looks like ground."""
-    wall = np.random.default_rng(0).uniform(1.0, 30.0, (HEIGHT, WIDTH))
-    for ground in (np.zeros((HEIGHT // 2, WIDTH // 2), np.float32), depth_of_ground(3.0)[1]):
-        with pytest.raises(ValueError, match="too little"):
-            metric_depth(opened(wall, shift=True), ground, FRONT.camera)
 
 
 def test_a_foreign_relative_network_sees_metres_by_height(tmp_path: Path) -> None:

@@ -110,12 +110,6 @@ def test_what_all_cameras_see_is_no_lens(spoil: Spoil) -> None:
     assert not any(drone.flies(20, spoil, others=spoil))
 
 
-def test_a_gust_of_leaves_in_three_images_is_none() -> None:
-    drone = Drone()
-    drone.flies(10)
-    assert not any(drone.flies(3, covered) + drone.flies(5) + drone.flies(3, covered) + drone.flies(5))
-
-
 def test_a_camera_that_looks_at_the_sky_is_not_judged() -> None:
     """The drone leans by 70 degrees: the first camera, which looks ahead, sees the sky alone."""
     drone = Drone()

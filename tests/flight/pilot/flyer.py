@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import numpy as np
+import pytest
 
 from flockd.core.choices import ROLES
 from flockd.core.data import data_path
@@ -13,7 +14,7 @@ from flockd.core.messages import Float32Array, Frame, FrameSet, PilotOutput, UIn
 from flockd.flight.geometry import RigCamera
 from flockd.flight.perception import Crop, Perception, RangeEstimate, SceneMaps
 from flockd.flight.pilot import FlockPilot
-from flockd.sim.cameras.camera_simulator import CameraSimulator
+from flockd.sim.cameras import camera_simulator
 from flockd.sim.flock.truth_perception import TruthPerception
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.vehicles.vehicles import Vehicles
@@ -79,7 +80,10 @@ class Flyer:
 
     def __init__(self, scenario: ScenarioConfig) -> None:
         self.scenario = scenario
-        self.cameras = CameraSimulator(scenario)
+        with pytest.MonkeyPatch.context() as patch:  # one world, wherever the drones begin
+            patch.setattr(camera_simulator, "planned_path", lambda _: np.zeros((1, 2)))
+            patch.setattr(camera_simulator, "_spread", lambda _: 12.0)
+            self.cameras = camera_simulator.CameraSimulator(scenario)
         self.truth = SpoilableTruth()
         self.pilot = FlockPilot(scenario.drone, self.truth)
         self.vehicles = Vehicles(scenario.vehicles, scenario.vehicle)

@@ -101,12 +101,3 @@ def test_who_walks_before_a_drone_that_stands_still_makes_no_camera_another_one(
     """All that its cameras see moves."""
     still = Way(lambda t: np.eye(3), lambda t: np.array([0.0, 0.0, -4.5]))
     assert flown_without(Wrong.turned({"front": UPSIDE_DOWN}), LIVELY, 12, said=still) == ()
-
-
-def test_without_a_velocity_nothing_is_told() -> None:
-    agreement = CameraAgreement(CONFIGURED)
-    for before, after, pairs in looks(
-        STRAIGHT, Wrong.turned(dict.fromkeys(("front",), OTHER_SIDE)), np.random.default_rng(3), 20
-    ):
-        agreement.see(replace(before, velocity_ned=None), after, STEP_S, pairs)
-    assert agreement.elsewhere() == ()

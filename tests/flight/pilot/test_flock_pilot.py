@@ -15,7 +15,6 @@ from flockd.core.messages import Float32Array, Frame, FrameSet, Reason, ReasonKi
 from flockd.flight.geometry import RigCamera, rotation_angle_deg, rotation_from_euler
 from flockd.flight.perception import Observation, SceneMaps
 from flockd.flight.pilot import FlockPilot
-from flockd.flight.pilot.camera_agreement import CameraAgreement
 from tests.flight.pilot.flyer import STEP_S, Flyer, SpoilableTruth, scenario_with
 from tests.make import changed, detection, frames, vehicle
 
@@ -58,18 +57,6 @@ def test_true_maps_give_true_motions_and_a_repeated_time_stamp_restarts_the_pair
     again = flyer.step()
     assert again.ego_motion is None
     assert any(reason.kind is ReasonKind.PAIR for reason in again.reasons)
-
-
-def test_a_camera_that_is_elsewhere_is_flown_without(flyer: Flyer, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert flyer.step().noisy_cameras == ()
-    flyer.move()
-    monkeypatch.setattr(CameraAgreement, "elsewhere", lambda agreement: ("front",))
-    output = flyer.step()
-    assert output.noisy_cameras == ("front",)
-    assert output.counts["camera front: no frame"] == 1
-    (told,) = (reason.text for reason in output.reasons if reason.kind is ReasonKind.RIG)
-    assert told.startswith("camera front: it moves otherwise") and told.endswith("The drone flies without it.")
-    assert not output.detections, "the neighbour is ahead"
 
 
 @pytest.mark.parametrize(("gone", "less_probable"), [("front", False), ("back", True)])
@@ -204,15 +191,6 @@ def blown_about(yaw: str, *headings_rad: float, height_m: float = 4.0) -> list[f
         state = vehicle(float(i), height_m, R_ned_body=rotation_from_euler(0.0, 0.0, heading_rad))
         asked.append(pilot.step(frames(float(i)), state).command.yaw_rad)
     return asked
-
-
-def test_a_mission_is_unknown_before_the_first_good_step_and_stays_known_in_refused_ones() -> None:
-    pilot = FlockPilot(ALONE.drone, NEVER_ASKED)
-    heights_m = (math.nan, 4.0, math.nan)  # refused, good, refused
-    statuses = [pilot.step(frames(0.5 * i), vehicle(0.5 * i, height_m)).mission for i, height_m in enumerate(heights_m)]
-    known = ("circle_then_tangent", True)
-    assert [(status.kind, status.known) for status in statuses] == [("unknown", False), known, known]
-    np.testing.assert_allclose(statuses[2].desired, [1.0, 0.0])  # where the paper's circle begins
 
 
 @pytest.mark.parametrize("yaw", ["hold", "course"])

@@ -145,13 +145,6 @@ def test_mates_that_move_as_the_drone_does_teach_nothing(seed: int) -> None:
     assert scale_of(level) is None
 
 
-def test_one_of_another_size_among_them_moves_it_little() -> None:
-    flight = Flight(drone(), mates="bush")
-    flight.fly(45.0)
-    assert flight.learned is not None
-    assert flight.learned.size_m == pytest.approx(SIZE_M, rel=0.15)
-
-
 def test_what_a_flight_learned_the_next_one_begins_with() -> None:
     learned = LearnedSize(SIZE_M, 0.05)
     flight = Flight(drone(), learned=learned)
@@ -188,13 +181,6 @@ def test_the_gate_reckons_with_what_a_judged_size_may_be_off(
 def test_what_cannot_be_learned_is_refused(perception: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match="size"):
         DroneConfig.model_validate({**drone().model_dump(), "perception": perception})
-
-
-def test_two_drones_draw_other_times() -> None:
-    """Simulated ones have one name, and begin elsewhere."""
-    flights = [Flight(changed(drone(), name=name)) for name in ("alder", "birch", "birch")]
-    flights[2].below_m = 0.1
-    assert len({weaves(flight.fly(25.0)).index(True) for flight in flights}) == 3
 
 
 def at(north_m: float, climb_m_s: float = 0.0) -> Neighbour:
@@ -246,16 +232,6 @@ def test_it_ends_at_once(why: str) -> None:
     if why == "the mission's height changes":
         weaving.wanted_m = HEIGHT_M + 1.0
     assert (weaving.asked(5.0, needed=why != "the mission is over") == 0.0).all()
-
-
-def test_it_waits_while_another_is_at_the_turn_of_its_weave() -> None:
-    weaving, lifts = Weaving(), []
-    for step in range(60):
-        climb_m_s = 0.4 * math.cos(2 * math.pi * step * STEP_S / PERIOD_S) if step < 44 else 0.0
-        weaving.neighbours = (at(4.0, climb_m_s),)
-        lifts.append(weaving.asked(STEP_S)[0])
-    assert (np.array(lifts[:44]) == 0.0).all()
-    assert any(lifts[44:])
 
 
 @pytest.mark.parametrize(

@@ -41,15 +41,6 @@ def test_a_drone_flies_as_commanded_although_its_autopilot_errs() -> None:
     assert moved[:2] == pytest.approx(wanted, abs=5e-3)
 
 
-def test_an_autopilot_that_is_right_is_left_alone() -> None:
-    trim = VelocityTrim(0.5, 0.7, GATE_M_S)
-    for step in range(10):
-        speeding_up = np.array([0.2 * step, -0.1 * step, 0.0])
-        mean = speeding_up - np.array([0.1, -0.05, 0.0])
-        trim.update(vehicle(step, speeding_up), ego(mean if step else None))
-    assert trim.velocity == pytest.approx([0, 0], abs=1e-12)
-
-
 @pytest.mark.parametrize("limit_m_s", [0.0, 0.3])
 def test_no_trim_is_larger_than_allowed_and_a_wild_measurement_is_soon_forgotten(limit_m_s: float) -> None:
     trim, still = VelocityTrim(limit_m_s, 0.7, GATE_M_S), np.zeros(3)

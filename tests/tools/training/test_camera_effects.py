@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from tools.training.camera_effects import (
     CameraEffects,
-    demosaiced,
-    drawn_effects,
     smear_kernel,
     through_camera,
 )
@@ -63,29 +61,9 @@ def test_a_point_that_moves_is_smeared_along_its_way_and_loses_no_light() -> Non
     assert np.allclose(upright, kernel.T, atol=1e-5)
 
 
-def test_a_mosaic_keeps_plain_colours_and_makes_fringes_at_an_edge() -> None:
-    plain = np.full((33, 47, 3), (200, 120, 40), np.uint8)
-    assert np.array_equal(demosaiced(plain), plain)
-    fringed = demosaiced(edge()).astype(int)
-    assert fringed.shape == (96, 96, 3)
-    assert np.abs(fringed[..., 0] - fringed[..., 2]).max() > 20  # the edge was grey
-    assert np.abs(fringed[:, :40] - 60).max() == 0
-
-
 def test_noise_has_the_strength_that_was_asked_for_and_denoising_lessens_it() -> None:
     grey = np.full((96, 96, 3), 128, np.uint8)
     noisy = through_camera(grey, replace(PERFECT, noise=6.0), np.random.default_rng(0))
     assert noisy.astype(float).std() == pytest.approx(6.0, rel=0.05)
     denoised = through_camera(grey, replace(PERFECT, noise=6.0, denoising=25.0), np.random.default_rng(0))
     assert denoised.astype(float).std() < 3.5
-
-
-def test_drawn_cameras_stay_within_what_was_measured_and_differ() -> None:
-    rng = np.random.default_rng(0)
-    drawn = [drawn_effects(0.3, rng) for _ in range(500)]
-    assert all(one.scale == 0.3 and 0 <= one.blur_px <= 1.0 and 0.5 <= one.resampling <= 1 for one in drawn)
-    assert all(one.quality is None or 30 <= one.quality <= 95 for one in drawn)
-    assert 0.17 < np.mean([one.quality is None for one in drawn]) < 0.33
-    image = edge()
-    for one in drawn[:40]:
-        assert through_camera(image, one, rng).shape == image.shape

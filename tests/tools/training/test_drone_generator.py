@@ -8,7 +8,6 @@ import pytest
 from flockd.sim.renderer.airframe import DroneModel
 from flockd.sim.renderer.drone_models import FAMILIES
 from tools.training.drone_generator import FIRST_GENERATED, SIZES_M, generated_drone
-from tools.training.samples import four_motors
 
 SHAPES = range(24)
 
@@ -47,15 +46,3 @@ def test_the_size_is_what_the_mesh_measures_from_tip_to_tip(drones: list[DroneMo
         # Propellers may stand across the arms, and guards reach a little beyond them.
         assert apart <= widest + 1e-6
         assert widest < 1.12 * drone.size_m
-
-
-def test_the_four_motors_of_a_large_drone_are_those_that_spread_evenly() -> None:
-    angles = np.arange(8) * np.pi / 4
-    ring = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(8)])
-    chosen = four_motors(ring)
-    assert np.cov(chosen[:, :2].T) == pytest.approx(np.eye(2) * 2 / 3, abs=1e-9), "every other one"
-    pairs = np.vstack([ring[::2], ring[::2] + np.array([0, 0, 0.1])])
-    assert {tuple(np.round(hub[:2], 6)) for hub in four_motors(pairs)} == {
-        tuple(np.round(hub[:2], 6)) for hub in ring[::2]
-    }
-    assert np.array_equal(four_motors(ring[1:5]), ring[1:5])

@@ -22,11 +22,11 @@ from tools.training.dataset import create_part
 from tools.training.detector import Boxes, DroneDetector, detection_loss
 from tools.training.export import draw_back, export
 from tools.training.networks import DistanceNet, FlowNet, NeighboursNet, VerificationNet
-from tools.training.picture_tasks import CROPS, KINDS, VerificationTask, crop_of, visibility
-from tools.training.pictures import CLASSES, NO_BOX, NOT_JUDGED, Proposals
+from tools.training.picture_tasks import CROPS, KINDS, VerificationTask
+from tools.training.pictures import CLASSES, NO_BOX, NOT_JUDGED
 from tools.training.quantise import quantise
 from tools.training.samples import Sample
-from tools.training.tasks import DistanceTask, FlowTask, NeighboursTask, SigmaTask, Task
+from tools.training.tasks import DistanceTask, FlowTask, SigmaTask, Task
 from tools.training.train import batches, start, train
 from tools.training.weights import begin_with_onnx
 
@@ -129,14 +129,6 @@ def task_of(folder: Path) -> DistanceTask:
     return task
 
 
-def test_what_a_run_begins_with_is_the_teacher(tmp_path: Path) -> None:
-    task, weights = task_of(tmp_path), answering(2.0).state_dict()
-    task.go_on_from(weights)
-    assert task.teacher is not None
-    assert torch.equal(task.teacher.get_parameter("head.bias"), weights["head.bias"])
-    assert torch.equal(task.net.get_parameter("head.bias"), weights["head.bias"])
-
-
 @pytest.mark.parametrize(
     ("sure", "forgotten", "pull"),
     [(-3.0, 3.0, 0.1), (-0.5, 0.5, 0.05), (5.0, 0.0, 0.0)],
@@ -154,24 +146,6 @@ def test_what_a_teacher_is_surer_of_is_no_drone_pulls_the_logit_down(
     # Half of the crops are drones, all with the logit 0: by the labels alone it is neither to rise nor to fall.
     assert float(task.net.get_parameter("head.bias").grad[4]) == pytest.approx(pull, abs=1e-6)
     assert all(value.grad is None for value in task.teacher.parameters()), "the teacher does not learn"
-
-
-def test_with_a_teacher_crops_without_a_drone_are_mixed_with_each_other_alone(tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    task = task_of(tmp_path)
-    seen: list[Tensor] = []
-    task.net.register_forward_pre_hook(lambda _net, given: seen.append(given[0]))
-    task.teacher = answering(0.0).eval()
-    given = batch()
-    # Grey levels that light and noise cannot carry from one kind to another.
-    given["picture"][:DRONES], given["picture"][DRONES:] = 30, 200
-    given["picture"][DRONES] = 110
-    task.loss(given)
-    drones, others = seen[0][:DRONES].float(), seen[0][DRONES:].float()
-    assert (drones.mean((1, 2, 3)) < 60).all()
-    assert (others.mean((1, 2, 3)) > 80).all()
-    kinds = (others.mean(3) < 155).float().mean((1, 2))
-    assert ((kinds > 0.01) & (kinds < 0.99)).any(), "one shows a part of the darker one, or it of another"
 
 
 def test_sigma_learns_how_far_sizes_are_off_and_changes_nothing_else(tmp_path: Path) -> None:
@@ -192,29 +166,6 @@ def test_sigma_learns_how_far_sizes_are_off_and_changes_nothing_else(tmp_path: P
     after = task.net(given["picture"])[0].detach()
     assert torch.equal(after[:, :6], before[:, :6])
     assert float(torch.exp(after[:, 6]).mean()) == pytest.approx(np.sqrt(2.0) * np.log(2.0), rel=0.1)
-
-
-def test_depth_mask_and_offsets_are_drawn_towards_the_truth(tmp_path: Path) -> None:
-    shape = (2, 1, 8, 8)
-    depth, logit = torch.full(shape, 4.0, requires_grad=True), torch.zeros(shape, requires_grad=True)
-    offset = torch.zeros((2, 2, 8, 8), requires_grad=True)
-    task = NeighboursTask(data_of(tmp_path, batch()))
-    answer = depth, logit, offset
-    task.net = lambda image, geometry: answer
-    drone = torch.zeros(shape)
-    drone[1, :, :, 4:] = 1.0
-    seen = {"image": torch.zeros(0), "geometry": torch.zeros(0), "depth": torch.full(shape, 5.0), "drone": drone}
-    loss, _ = task.loss(seen | {"offset": torch.full((2, 2, 8, 8), 3.0)})
-    loss.backward()
-    assert depth.grad is not None
-    assert logit.grad is not None
-    assert offset.grad is not None
-    assert (depth.grad < 0).all(), "5 m is more than 4 m"
-    assert (logit.grad[drone == 1] < 0).all()
-    assert (logit.grad[drone == 0] > 0).all()
-    beside = (drone == 0).expand_as(offset)
-    assert (offset.grad[~beside] < 0).all()
-    assert (offset.grad[beside] == 0).all(), "only a drone's pixels point to its centre"
 
 
 def write_lines(file: Path, *entries: object) -> None:
@@ -271,29 +222,6 @@ def test_every_kind_is_drawn_says_what_it_shows_and_has_the_same_parts(data: Pat
     assert np.mean(greens) > 0.7, "drones stand before the photographs"
 
 
-def test_a_crop_shows_what_is_around_its_middle_at_one_scale() -> None:
-    image = np.zeros((400, 600, 3), np.uint8)
-    image[180:220, 250:350] = 255
-    for half in (60.0, 200.0):
-        rows, columns = np.nonzero(crop_of(image, np.array([300.0, 200.0]), half)[:, :, 0] > 127)
-        assert np.ptp(columns) + 1 == pytest.approx(100 * 48 / half, abs=1.5)
-        assert [rows.mean() + 0.5, columns.mean() + 0.5] == pytest.approx([48.0, 48.0], abs=1.0)
-
-
-def test_what_cannot_be_seen_hardly_counts() -> None:
-    grey = np.full((96, 96, 3), 200, np.uint8)
-    dark, faint = grey.copy(), grey.copy()
-    dark[36:60, 14:82], faint[36:60, 14:82] = 40, 199
-    assert visibility(dark, grey, 0.3) == 1.0
-    assert visibility(faint, grey, 0.3) < 0.15
-
-
-def test_pictures_that_were_not_looked_through_are_refused_with_the_command(data: Path) -> None:
-    (data / "photographs" / "proposals.jsonl").unlink()
-    with pytest.raises(FileNotFoundError, match=r"make it with `python -m tools\.training\.mine`"):
-        Proposals([data / "photographs"])
-
-
 def maps(logit: float = -5.0) -> list[torch.Tensor]:
     """Small boxes that are nothing."""
     made = [torch.zeros(1, 5 + len(CLASSES), *cells) for cells in CELLS]
@@ -310,20 +238,6 @@ def test_the_right_answer_costs_less_than_another_box_and_than_nothing() -> None
         made[0][0, 4:6, 2, 3] = 5.0
     costs = [float(detection_loss(one, box, kind)[0]) for one in (right, beside, maps())]
     assert costs[0] < costs[1] < costs[2]
-
-
-def test_a_cell_answers_for_one_box_and_one_cell_for_a_box_that_none_overlaps() -> None:
-    """By hand: 83 of 84 cells are asked for no object, one for an object, all at a logit of -5."""
-    boxes = torch.tensor([[[28.0, 20.0, 40.0, 30.0], [28.0, 20.0, 30.0, 40.0]]])
-    _, figures = detection_loss(maps(), boxes, torch.tensor([[0, 1]]))
-    assert figures["object"] == pytest.approx(83 * np.log1p(np.exp(-5.0)) + np.log1p(np.exp(5.0)), rel=1e-4)
-
-
-def test_the_class_of_the_box_is_learnt_and_no_other() -> None:
-    given = [one.requires_grad_() for one in maps(0.0)]
-    detection_loss(given, torch.tensor([[[28.0, 20.0, 16.0, 8.0]]]), torch.tensor([[2]]))[0].backward()
-    gradient = torch.cat([one.grad.flatten(2) for one in given if one.grad is not None], 2)[0, 5:].sum(1)
-    assert (gradient < 0).tolist() == [False, False, True, False]
 
 
 def test_pictures_of_a_batch_are_learnt_from_apart() -> None:
@@ -350,21 +264,6 @@ def test_nothing_is_learnt_of_objects_in_a_box_that_is_not_judged() -> None:
     assert gradient is not None
     assert gradient[0, 4, 3:5, 3:5].abs().max() == 0
     assert gradient[0, 4, 0, 0] > 0
-
-
-def test_training_on_16_bit_numbers_reads_the_motors_places_to_a_fraction_of_a_pixel() -> None:
-    maps = torch.full((1, DistanceNet.maps, 48, 48), -60.0)
-    across = []
-    for motor, column in enumerate((8, 19, 30, 39)):
-        maps[0, motor, 24, column], maps[0, motor, 24, column + 1] = 0.0, np.log(9.0)
-        across.append(2 * column + 1 - 48 + 0.9 * 2)
-    net = DistanceNet().train()
-    net.look.register_forward_hook(lambda _layer, _given, _answer: maps.expand(2, -1, -1, -1))
-    net.head.weight.data.zero_()
-    net.head.bias.data.zero_()
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        apparent = net(torch.zeros(2, 96, 96, 3, dtype=torch.uint8))[0][:, 5]
-    assert apparent.tolist() == pytest.approx([np.log(np.std(across)) + 1.0] * 2, abs=1e-4)
 
 
 def picture_of_nothing(*shape: int) -> NDArray[np.uint8]:
@@ -412,13 +311,6 @@ def test_a_detector_goes_on_from_the_shipped_one_and_not_from_another_network() 
     for other, name in ((DroneDetector(), "flow"), (DistanceNet(), "neighbours")):
         with pytest.raises(ValueError, match=rf"{name}\.onnx: its "):
             begin_with_onnx(other, MODELS / f"{name}.onnx", lambda: None)
-
-
-def test_normalisations_that_were_settled_go_on_learning() -> None:
-    net, feeds = DistanceNet(), torch.from_numpy(NETWORKS["distance"][1]["picture"])
-    begin_with_onnx(net, MODELS / "distance.onnx", lambda: net(feeds))
-    momenta = {layer.momentum for layer in net.modules() if isinstance(layer, nn.BatchNorm2d)}
-    assert momenta == {nn.BatchNorm2d(1).momentum}
 
 
 def test_a_network_is_exported_as_the_shipped_one_is_used_and_in_16_bits_says_the_same(tmp_path: Path) -> None:

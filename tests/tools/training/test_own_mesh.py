@@ -44,15 +44,6 @@ def read(path: Path, size_m: float) -> DroneModel:
     return drone
 
 
-def test_files_of_one_drone_keep_their_common_origin(tmp_path: Path) -> None:
-    """With and without the post: the bars, whose middle is then another, stay where they are."""
-    whole = cross_of_boxes()
-    bars = trimesh.Trimesh(whole.vertices[:16], whole.faces[:24], process=False)
-    first, second = read_meshes([written(tmp_path, "a.glb", whole), written(tmp_path, "b.glb", bars)], 0.62)
-    assert first.extent[1].tolist() == pytest.approx(second.extent[1].tolist(), abs=1e-6), "their undersides"
-    assert second.extent[0, 2] - first.extent[0, 2] == pytest.approx(0.1, abs=1e-6), "the post, z down"
-
-
 def test_a_mesh_stands_upright_about_its_middle_and_is_not_mirrored(tmp_path: Path) -> None:
     mesh = cross_of_boxes()
     drone = read(written(tmp_path, "drone.glb", mesh), 0.62)
@@ -109,16 +100,6 @@ def test_materials_of_gltf_are_read_as_its_specification_says(
 ) -> None:
     drone = read(written(tmp_path, "drone.glb", of_material(cross_of_boxes(), **said)), 0.6)
     assert np.unique(drone.colours.round(4), axis=0) == pytest.approx(np.array([albedo]), abs=2e-4)
-
-
-def test_a_part_is_where_its_node_puts_it(tmp_path: Path) -> None:
-    """One bar in the file, twice in the scene: along, and turned and 0.1 m higher."""
-    turn = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.1], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-    scene: Any = trimesh.Scene()
-    scene.add_geometry(trimesh.creation.box((0.6, 0.05, 0.1)), geom_name="bar")
-    scene.graph.update("again", matrix=turn, geometry="bar")
-    drone = read(written(tmp_path, "drone.glb", scene), 0.62)
-    assert drone.extent[1] - drone.extent[0] == pytest.approx([0.6, 0.6, 0.15], abs=1e-6)
 
 
 def test_parts_of_different_materials_keep_theirs_and_one_without_is_painted(tmp_path: Path) -> None:

@@ -17,17 +17,15 @@ from numpy.typing import NDArray
 from flockd.core.data import data_path
 from flockd.flight.inference import OnnxModel
 from flockd.sim.renderer.drone_models import drone_model
-from flockd.sim.scenario import ObstaclesConfig
 from tools.measure.evaluate_crops import held_out, measured
 from tools.training import worlds
-from tools.training.camera_effects import UNTOUCHED, as_filmed
 from tools.training.dataset import FOCAL_PX, HEIGHT, WIDTH, open_pairs
 from tools.training.distractors import bag, balloon, bird, kite, mast
 from tools.training.mine import proposed
 from tools.training.own_mesh import OWN_FAMILY
 from tools.training.pictures import CropFiles, Cutouts, Scene, part_of, with_drones
 from tools.training.render_drone_crops import CropJob, _render_world, own_drone
-from tools.training.render_training_data import PairJob, _standing, render_world
+from tools.training.render_training_data import PairJob, render_world
 from tools.training.samples import DroneInView, crop_around, sample_of, warped
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -54,31 +52,6 @@ def test_a_family_of_few_images_is_drawn_as_often_as_one_of_many(tmp_path: Path)
     assert shares == pytest.approx([0.46, 0.46, 0.08], abs=0.04)
     lonely = [sample for sample in drawn if sample["family"] == 1 and sample["drone"] > 0.5]
     assert {float(sample["apparent"]) for sample in lonely} == {0.0} | {float(n) for n in range(90, 95)}
-
-
-def test_hundreds_of_shapes_do_not_crowd_out_the_families(tmp_path: Path) -> None:
-    _write(tmp_path / "a.npz", np.concatenate([np.arange(12), 1000 + np.arange(400)]))
-    files, rng = CropFiles(tmp_path), np.random.default_rng(0)
-    drawn = np.array([files.draw(rng)["family"] for _ in range(3000)])
-    assert np.mean(drawn < 12) == pytest.approx(0.5, abs=0.04)
-    assert np.bincount(drawn[drawn < 12], minlength=12).min() > 0.5 * 1500 / 12
-
-
-def test_images_like_the_last_crop_of_a_drone_are_drawn_more_often_than_others(tmp_path: Path) -> None:
-    target = np.zeros((100, 3))
-    target[:80, 1], target[80:90, 2] = 20.0, -9.0
-    values = np.full(100, np.log(70.0))
-    values[90] = np.log(120.0)
-    _write(tmp_path / "a.npz", np.zeros(100), apparent=values, target=target)
-    files, rng = CropFiles(tmp_path), np.random.default_rng(0)
-    drawn = [files.draw(rng) for _ in range(3000)]
-    like_it = [np.abs(sample["target"]).max() == 0.0 and sample["apparent"] < np.log(100.0) for sample in drawn]
-    assert np.mean(like_it) == pytest.approx(0.6 + 0.4 * 0.09, abs=0.03)
-
-
-def test_a_folder_without_images_says_how_to_make_them(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"make them with `python -m tools\.training\.render_drone_crops`"):
-        CropFiles(tmp_path)
 
 
 def test_the_mask_of_a_crop_is_the_drone_that_it_faces() -> None:
@@ -109,20 +82,6 @@ def test_a_warped_image_goes_where_its_flow_says() -> None:
         assert inner.mean() > 0.2
         assert np.median(away[inner]) <= 2.0
         assert np.median(np.abs(np.roll(smooth, 7, axis=1).astype(float) - smooth).max(axis=2)) > 5.0, "it has texture"
-
-
-def test_some_images_stay_clear_and_the_others_are_spoilt() -> None:
-    rng = np.random.default_rng(3)
-    image = rng.integers(60, 190, (96, 96, 3), dtype=np.uint8)
-    away = np.array([np.abs(as_filmed([image], rng)[0].astype(float) - image).mean() for _ in range(200)])
-    assert np.mean(away == 0.0) == pytest.approx(UNTOUCHED, abs=0.15)
-    assert 3.0 < np.median(away[away > 0.0]) < 60.0
-
-
-def test_a_mesh_without_the_drones_size_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        own_drone(argparse.ArgumentParser(), argparse.Namespace(mesh=[Path("my.glb")], size_m=None))
-    assert "--mesh needs --size-m, the drone's size" in capsys.readouterr().err
 
 
 @pytest.mark.training
@@ -166,14 +125,6 @@ def test_worlds_for_training_validation_test_and_flights_never_meet() -> None:
     parts = [worlds.FLIGHTS, worlds.TRAINING, worlds.VALIDATION, worlds.TEST]
     assert all(a.stop <= b.start for a, b in pairwise(parts))
     assert not set(worlds.FAMILIES) & set(worlds.UNSEEN_FAMILIES)
-
-
-def test_a_place_too_small_for_the_drawn_houses_gets_fewer() -> None:
-    drawn = ObstaclesConfig(kind="village", extent_m=28.0, min_gap_m=2.0, houses_per_hectare=16.0)
-    stands, obstacles = _standing(drawn, 3)
-    assert obstacles is not None
-    assert stands is not None
-    assert 2.0 < stands.houses_per_hectare < 16.0
 
 
 def test_a_part_of_a_picture_takes_its_boxes_along() -> None:

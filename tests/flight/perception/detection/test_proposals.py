@@ -6,17 +6,13 @@ import math
 
 import numpy as np
 import pytest
-import yaml
 
 from flockd.core.config.perception import DetectionParameters
-from flockd.core.data import data_path
 from flockd.core.messages import UNCLASSED, Float32Array, FloatArray, UInt8Array
 from flockd.flight.geometry import Rig, RigCamera, WideAngleCamera, ZMap
-from flockd.flight.inference import OnnxModel
 from flockd.flight.perception import Instance, SceneMaps, group_instances
 from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes, with_boxes
 from flockd.flight.perception.detection.proposals import (
-    largest_blobs,
     propose_instances,
     propose_predictions,
     propose_residuals,
@@ -75,15 +71,6 @@ def test_a_region_suits_a_drones_size_and_stays_near_the_last_one() -> None:
     assert RULES.half_angle(50.0, 1.0, 0.003) == pytest.approx(math.radians(35.0))
 
 
-@pytest.mark.parametrize("fov_deg", [25.0, 40.0, 60.0, 90.0])
-def test_the_crop_of_a_small_drone_shows_the_same_pixels_whatever_the_lens_is_said_to_be(fov_deg: float) -> None:
-    """A drone 8 px wide; before the crop was at least 2 degrees wide, 32 px of a lens of 40 degrees."""
-    camera = rig_camera(320.0 / math.tan(math.radians(fov_deg / 2)), (640, 480))
-    roi = roi_of((316.0, 237.0, 324.0, 243.0), camera)
-    assert roi is not None
-    assert math.tan(roi.half_angle) * camera.camera.focal_px == pytest.approx(0.95 * math.hypot(4, 3), rel=0.001)
-
-
 @pytest.mark.parametrize(("range_m", "searched"), [(3.2, 0), (9.0, 1), (1.0, 1)])
 def test_a_neighbour_is_searched_for_though_another_range_is_detected_there(range_m: float, searched: int) -> None:
     """It is predicted 3 m ahead; what was detected two degrees beside it is it, or far behind it, or hides it."""
@@ -124,20 +111,6 @@ def test_residuals_count_among_the_proposals_and_bring_nothing_back(most: int, c
     masks = {"front": np.where(scene.labels > 0, np.uint8(UNCLASSED), np.uint8(0))}
     parameters = DetectionParameters(max_proposals=most, max_residuals=6)
     assert len(propose_residuals(RIG, {"front": scene}, masks, RULES, parameters)) == count
-
-
-def test_an_image_full_of_false_ones_gives_only_the_largest_residuals() -> None:
-    """What the first stage is certain of in a hundred places; only the largest are proposed, and no mere specks."""
-    pixels = np.zeros((640, 480), np.bool_)
-    for k in range(100):
-        pixels[60 * (k // 10) : 60 * (k // 10) + 5 + k // 5, 45 * (k % 10) : 45 * (k % 10) + 20] = True
-    blobs = largest_blobs(pixels, max_blobs=6, min_px=24)
-    assert [blob.area_px for blob in blobs] == [20.0 * (5 + k // 5) for k in (95, 96, 97, 98, 99, 90)]
-    assert list(blobs[0].box) == [225.0, 540.0, 245.0, 564.0]
-    speck = np.zeros((640, 480), np.bool_)
-    assert not largest_blobs(speck, max_blobs=6, min_px=24)
-    speck[100:103, 200:207] = True
-    assert not largest_blobs(speck, max_blobs=6, min_px=24)
 
 
 # Two drones in one mask are told apart by the centres that their pixels vote for.
@@ -266,12 +239,6 @@ def test_the_parts_of_a_large_drone_are_one_with_it() -> None:
     assert (marked == drone.label).sum() == 4 * 7 + 4 * 8
 
 
-def test_a_smaller_drone_before_a_large_one_stays_where_it_has_a_box_of_its_own() -> None:
-    small = (102.0, 52.0, 116.0, 58.0)
-    _, seen = merged((instance(1, small),), [small, DRONE], [3.0, 2.0])
-    assert [one.box.tolist() for one in seen] == [list(small), list(DRONE)]
-
-
 @pytest.mark.parametrize(
     ("width_px", "added"),
     [(5, 3.0), (8, 3.0), (160**0.5, 1.5), (20, 0.0), (40, 0.0), (40 * 7.5**0.5, 2.0), (300, 4.0), (600, 4.0)],
@@ -281,13 +248,3 @@ def test_what_the_second_stage_says_against_a_small_or_a_large_box_counts_less(w
     assert BOXES.evidence(box, -4.0) == pytest.approx(0.5 * -4.0 + added)
     for odds in (2.0, math.log(19.0)):
         assert width_px > 8 or BOXES.evidence(box, odds) == pytest.approx(0.5 * math.log(19.0)), "no more than surest"
-
-
-def test_the_shipped_rules_are_those_of_its_manifest() -> None:
-    path = data_path("models") / "detector.yaml"
-    given = yaml.safe_load(path.read_text(encoding="utf-8"))["thresholds"]
-    rules = BoxRules.of(OnnxModel(path, threads=1).manifest)
-    found = (rules.gain, rules.large, rules.small, rules.no_box)
-    names = ("evidence_gain", "large_box_evidence", "small_box_evidence", "no_box_evidence")
-    assert found == tuple(given[name] for name in names)
-    assert len(set(found)) == 4

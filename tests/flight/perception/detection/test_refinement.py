@@ -19,7 +19,7 @@ from flockd.flight.perception.detection.nms import fuse, suppress, without_occlu
 from flockd.flight.perception.detection.proposals import Proposal
 from flockd.flight.perception.detection.refinement import Candidate
 from flockd.flight.perception.detection.roi import Roi
-from flockd.flight.perception.maps import KnownSize, SceneMaps
+from flockd.flight.perception.maps import KnownSize
 from tests.flight.pilot.flyer import Flyer, scenario_with
 
 
@@ -106,19 +106,6 @@ def test_nonsense_for_the_mirrored_crop_gives_no_detection(flyer: Flyer, wrong: 
     assert not flyer.step().detections
 
 
-def test_every_crop_of_a_proposal_carries_what_a_detector_said_of_it(flyer: Flyer) -> None:
-    scenes = flyer.truth.sound("scene")
-
-    def scene(*arguments: Any) -> SceneMaps:
-        maps: SceneMaps = scenes(*arguments)
-        return replace(maps, instances=tuple(replace(one, evidence=2.5) for one in maps.instances))
-
-    flyer.truth.instead["scene"] = scene
-    crops = answering(flyer, lambda _, __, one: one)
-    assert flyer.step().detections
-    assert [crop.evidence for crop in crops] == [2.5] * 3
-
-
 # A known size: the range is the size over the apparent size, and its deviation is the networks' and the size's.
 
 ESTIMATE = RangeEstimate(math.log(4.0), 0.03, np.array([48.0, 48.0]), size_m=0.8, drone_probability=0.9)
@@ -135,14 +122,6 @@ def test_range_is_size_over_apparent_size() -> None:
     assert (known.drone_probability, known.centre.tolist()) == (0.9, [48.0, 48.0])
     for size_m in (0.0, math.inf, math.nan):
         assert math.isnan(replace(ESTIMATE, size_m=size_m).of_size(KnownSize(0.5, 0.02)).log_range)
-
-
-def test_a_size_that_was_learned_is_that_of_all(flyer: Flyer) -> None:
-    taken = flyer.take_frames()
-    (true,) = flyer.perception().observe(*taken, None).detections
-    learned = KnownSize(0.7 * true.size_m, 0.01)
-    (known,) = flyer.perception().observe(*taken, None, learned_size=learned).detections
-    assert known.range_m == pytest.approx(0.7 * true.range_m, rel=0.02)
 
 
 def test_a_flights_detections_are_ranged_by_the_size_that_was_said(flyer: Flyer) -> None:
@@ -232,11 +211,3 @@ def test_a_fused_detection_is_the_weighted_mean_with_the_best_ones_variance() ->
     assert fused.range_sigma_m == pytest.approx(0.05 * fused.range_m)
     assert (fused.cameras, fused.label) == (("front", "left"), 3)
     assert np.trace(fused.covariance) == pytest.approx(0.05**2 + 2 * 0.004**2)
-
-
-def test_a_size_that_is_not_known_makes_the_range_uncertain_too() -> None:
-    """3 % by the apparent size and 40 % by the size are 40.1 %."""
-    fused = fuse([replace(candidate(4.0, 0.03), log_size_sigma=0.4)], 1)
-    assert fused.log_size_sigma == 0.4
-    assert fused.range_sigma_m / fused.range_m == pytest.approx(math.hypot(0.03, 0.4))
-    assert np.trace(fused.covariance) == pytest.approx(0.03**2 + 2 * 0.004**2), "all its views are off alike"

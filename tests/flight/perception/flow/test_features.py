@@ -83,14 +83,3 @@ def test_dis_finds_a_large_turn_about_the_optical_axis_although_the_network_went
     first = pattern(1)
     second, true = moved(first, turn(25, 1.3, 60, -30))
     assert np.median(errors(DisFlow(WrongFlow()).flow(first, second), true)) < 2.0  # as near as DIS gets at such a zoom
-
-
-def test_what_a_flow_says_does_not_hang_on_the_flows_before_it() -> None:
-    """DIS keeps its memory from call to call, also for images of another size."""
-    first = pattern(1)
-    second, _ = moved(first, turn(1.0, 1.0, 3.0, 2.0))
-    alone = DisFlow().flow(first, second)
-    used = DisFlow()
-    used.flow(second, pattern(2))
-    used.flow(pattern(3, 200, 150), pattern(4, 200, 150))
-    assert np.array_equal(used.flow(first, second), alone)

@@ -56,14 +56,6 @@ def test_it_makes_a_flow_exact_that_is_some_pixels_off() -> None:
     assert off(grid_flow(rough, first, second, NO_DRONES), GROUND) < 0.1
 
 
-def test_a_point_that_goes_astray_takes_what_those_around_it_add() -> None:
-    """A piece of the second image shows something else."""
-    first, second = images()
-    second[200:240, 160:200] = np.random.default_rng(3).integers(0, 256, (40, 40, 3))
-    exact = grid_flow(told(MOVED), first, second, NO_DRONES)
-    assert np.linalg.norm(exact[GROUND] - MOVED, axis=-1).max() < 1.0
-
-
 def test_what_is_seen_well_keeps_its_own_flow_although_all_else_moves_otherwise() -> None:
     first, second = images()
     part = np.s_[200:260, 100:180]  # a thing before the ground, on its own way
@@ -100,18 +92,6 @@ def test_beside_a_drone_the_background_does_not_move_with_it() -> None:
     assert (settled[labels == 1] == flow[labels == 1]).all()
 
 
-def test_points_on_a_drone_say_nothing_of_the_background_beside_it() -> None:
-    """They follow the drone, which goes its own way."""
-    first, second = images()
-    drone = np.s_[200:232, 160:208]
-    second[210:242, 175:223] = first[drone]
-    flow, labels = told(MOVED), NO_DRONES.copy()
-    labels[drone], flow[drone] = 1, (15.0, 10.0)
-    beside = np.s_[194:238, 154:214]
-    off_px = np.linalg.norm(grid_flow(flow, first, second, labels)[beside] - MOVED, axis=2)
-    assert off_px[labels[beside] == 0].max() < 1.0
-
-
 @pytest.mark.parametrize("size", [(480, 640), (120, 161), (37, 50), (12, 9), (1, 2)])
 def test_images_of_any_size_have_a_flow_of_theirs(size: tuple[int, int]) -> None:
     image = np.random.default_rng(4).integers(0, 256, (*size, 3), np.uint8)
@@ -125,11 +105,3 @@ def test_where_nothing_is_to_be_seen_the_flow_stays_about_the_same(of: tuple[flo
     empty = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
     flow = np.full((HEIGHT, WIDTH, 2), of, np.float32)
     np.testing.assert_allclose(grid_flow(flow, empty, empty, NO_DRONES), flow, atol=0.01)
-
-
-def test_a_flow_that_went_astray_stays_finite() -> None:
-    first, second = images()
-    rng = np.random.default_rng(1)
-    for scale in (1.0, 1e3, 1e6):
-        flow = (scale * rng.normal(size=(HEIGHT, WIDTH, 2))).astype(np.float32)
-        assert np.isfinite(grid_flow(flow, first, second, NO_DRONES)).all()

@@ -75,13 +75,6 @@ def test_successive_ranges_over_a_hillside_tell_its_slope() -> None:
     assert ground.height_m == pytest.approx(7.0 - 0.12 * 14.5, rel=0.02)
 
 
-def test_ranges_are_smoothed() -> None:
-    """Over level ground, the error of the height is less than half of a reading's."""
-    below, errors = follower(), 0.06 * np.random.default_rng(1).standard_normal(200)
-    found = [known(below.update(state(STEP_S * k, 4.0 + e, north_m=0.1 * k))).height_m for k, e in enumerate(errors)]
-    assert np.std(found[20:]) < 0.03
-
-
 FAULTS: dict[str, Callable[[float], VehicleState]] = {
     "no range finder is heard": lambda t: state(t, None),
     "the range is not a number": lambda t: state(t, math.nan),
@@ -125,22 +118,6 @@ def test_one_reading_of_something_else_is_not_the_ground_and_two_are() -> None:
     assert known(below.update(state(2.5, 4.0))).height_m == pytest.approx(4.0)
     below.update(state(3.0, 3.2))
     assert known(below.update(state(3.5, 3.2))).height_m == pytest.approx(3.2), "a terrace"
-
-
-def test_a_slope_that_images_show_counts_with_its_uncertainty() -> None:
-    below = follower()
-    below.update(state(0.0, 4.0))
-    for k in range(1, 20):
-        below.see_slope(np.array([0.0, 0.1]))
-        ground = known(below.update(state(STEP_S * k, 4.0)))
-    assert ground.slope == pytest.approx([0.0, 0.1], abs=0.01)
-
-
-def test_after_a_long_gap_the_ground_is_found_anew() -> None:
-    below = follower()
-    below.update(state(0.0, 4.0))
-    assert known(below.update(state(9.0, 4.9))).height_m == pytest.approx(4.9)
-    assert known(below.update(state(8.0, 3.0))).height_m == pytest.approx(3.0), "time ran backwards"
 
 
 # The own motion's scale from a range to the ground, on rendered frames with perception answered by the truth.
