@@ -40,7 +40,7 @@ class Scene:
 
 def scene() -> Scene:
     """Ahead, down and to the side, with all three turns, 4 m above ground."""
-    renderer = Renderer(World.generate(5), [])
+    renderer = Renderer(World.generate(11), [])
     images, depth, poses = [], [], []
     for k in range(FRAMES):
         R = Rotation.from_euler("ZYX", np.radians([1.5 * k, -12.0 + k, 0.7 * k])).as_matrix() @ R_FRD_RDF

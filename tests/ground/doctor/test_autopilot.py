@@ -47,13 +47,19 @@ QUESTIONS = {511, 512, 401}
 """MAV_CMD_SET_MESSAGE_INTERVAL, _REQUEST_MESSAGE and _RUN_PREARM_CHECKS."""
 
 
-def _config(port: int) -> DroneConfig:
+def _config(port: int, system_id: int | None = None) -> DroneConfig:
     quadrotor = load_drone(data_path("config") / "quadrotor.yaml")
-    return make.changed(quadrotor, autopilot=AutopilotParameters(address=f"udpin://127.0.0.1:{port}"))
+    autopilot = AutopilotParameters(address=f"udpin://127.0.0.1:{port}", system_id=system_id)
+    return make.changed(quadrotor, autopilot=autopilot)
 
 
 def _examined(port: int) -> list[Finding]:
     return list(check_autopilot(_config(port), 60.0))
+
+
+def _soon_examined(port: int) -> list[Finding]:
+    """Without waiting for other systems, nor for ranges."""
+    return list(check_autopilot(make.changed(_config(port, 1), perception__height="barometer"), 60.0))
 
 
 class _Noting(FakeAutopilot):
@@ -94,14 +100,14 @@ def test_what_is_wrong_with_one_is_told_in_the_order_in_which_it_was_asked() -> 
         fake_autopilot.parameters.update({**GOOD, "COM_OF_LOSS_T": 2.5})
         del fake_autopilot.parameters["GF_ACTION"]
         fake_autopilot.failing = {"check_gyro_not_calibrated"}
-        found = {finding.about: finding for finding in _examined(port)}
+        found = {finding.about: finding for finding in _soon_examined(port)}
         assert {about for about, one in found.items() if one.level is Level.FAILURE} == {"GF_ACTION", "arming"}
         assert "calibrate" in found["arming"].fix
         assert found["COM_OF_LOSS_T"].fix == "set COM_OF_LOSS_T to 1 s"
         fake_autopilot.cut_at = "COM_OBL_RC_ACT"
-        cut = _examined(port)
+        cut = _soon_examined(port)
     assert [finding.about for finding in cut] == [
-        "heartbeat", "system id", "firmware", "signing", "COM_OF_LOSS_T", "COM_OBL_RC_ACT", "heartbeat"
+        "heartbeat", "firmware", "signing", "COM_OF_LOSS_T", "COM_OBL_RC_ACT", "heartbeat"
     ]  # fmt: skip
     assert [finding.level for finding in cut[-2:]] == [Level.FAILURE, Level.FAILURE]
 

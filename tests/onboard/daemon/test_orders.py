@@ -121,16 +121,16 @@ def test_sessions_without_end_do_not_fill_the_memory(drone: Drone) -> None:
     assert len(drone.commands.recent()) == 8
 
 
-@pytest.mark.parametrize(("per_second", "accepted"), [(2000, False), (10, False), (2000, True)])
-def test_of_a_hundred_thousand_orders_a_few_hundred_fill_log_telemetry_and_recording(
+@pytest.mark.parametrize(("per_second", "accepted"), [(400, False), (2, False), (400, True)])
+def test_of_twenty_thousand_orders_a_few_hundred_fill_log_telemetry_and_recording(
     drone: Drone, per_second: int, accepted: bool
 ) -> None:
     ask = {"identity": "1f", "operator": "anna", "session": "a", "order": None}
-    for number in range(100_000):
+    for number in range(20_000):
         drone.now_s += 1.0 / per_second
         payload = json.dumps({**ask, "sequence": number, "time_s": drone.now_s}).encode() if accepted else b"{"
         assert drone.commands.handle("hold", payload)["accepted"] == accepted
     assert 1 < len(drone.said) < 500
     counted = any("more before, which were not logged" in said for said in drone.said)
-    assert counted == (accepted or per_second == 10), "a minute after a refusal that was not logged"
-    assert drone.commands.refused == (0 if accepted else 100_000)
+    assert counted == (accepted or per_second == 2), "a minute after a refusal that was not logged"
+    assert drone.commands.refused == (0 if accepted else 20_000)
