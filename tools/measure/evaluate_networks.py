@@ -92,8 +92,9 @@ def rows_of_pairs(found: Findings) -> Iterator[Row]:
         inside = float(np.mean([abs(drone.error) < sigmas * drone.sigma for drone in whole]))
         yield Row(f"distance errors inside {sigmas} sigma", 100 * inside, "%", len(whole))
     for given, name in WITH.items():
-        off = found.depth[given]
-        yield Row(f"background depth, relative error, {name}, median", 100 * float(np.median(off)), "%", len(off))
+        images = found.depth[given]
+        what = f"background depth, relative error, {name}, median"
+        yield Row(what, 100 * float(np.median(images)), "%", len(images))
     yield Row(f"mask IoU, drones within {MASK_WITHIN_M:g} m, mean", float(np.mean(found.iou)), "", len(found.iou))
     for low, high, name in ((12, np.inf, "at least 12"), (6, 12, "6 to 12")):
         wide = [drone for drone in found.drones if low <= drone.width_px < high]
