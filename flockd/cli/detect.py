@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,15 +21,13 @@ if TYPE_CHECKING:
     from flockd.core.messages import UInt8Array
     from flockd.flight.geometry import Camera
     from flockd.ground.pictures.copies import Copies
-    from flockd.ground.pictures.picture_files import PictureFile, PictureLabels
+    from flockd.ground.pictures.picture_files import PictureFile
     from flockd.ground.pictures.single_frame import DetectedDrone, PictureDetector
 
 MAX_FOV_DEG = 170.0
 NOTES = """\
 Larger pictures are resized to 1280 pixels for the networks; boxes are in pixels of the picture.
---labels: a drone is found when the centre of a detection lies in its box, each box once; any other detection is false.
-A picture that cannot be read is reported and left out, and the exit code is 1. A label file that cannot be read ends
-the command with exit code 1."""
+A picture that cannot be read is reported and left out, and the exit code is 1."""
 
 
 def add(commands: Commands) -> None:
@@ -38,14 +36,12 @@ def add(commands: Commands) -> None:
         "flockd detect photograph.jpg --fov 70 --out drawn",
         "flockd detect pictures/ clip.mp4 --every 10 --fov 70 --json",
         "flockd detect front/ --config my_drone.yaml --camera front",
-        "flockd detect pictures/ --fov 70 --labels drones.json",
         "flockd detect photograph.jpg --fov 70 --drone-size 0.35",
     )
     parser = commands("detect", "Detect drones in pictures, with the code that flies.", examples, _run, notes=NOTES)
     option(parser, "PICTURES", "images, folders of them, videos", Path, nargs="+")
     option(parser, "--out FOLDER", "write copies of the pictures with the detections drawn in", Path)
     flag(parser, "--force", "overwrite what is there")
-    option(parser, "--labels FILE", "COCO boxes of category `drone`: measures how many are found", Path)
     option(
         parser,
         "--min-probability P",
@@ -77,14 +73,13 @@ class _Detected:
     name: str
     detections: tuple[DetectedDrone, ...]
     proposals: int
-    labels: PictureLabels | None
     seconds: float
 
 
 def _run(args: argparse.Namespace) -> int:
     from flockd.ground.datasets.image_files import DatasetError
     from flockd.ground.pictures.copies import Copies
-    from flockd.ground.pictures.picture_files import find_pictures, read_labels
+    from flockd.ground.pictures.picture_files import find_pictures
     from flockd.ground.pictures.single_frame import PictureDetector
 
     if args.force and args.out is None:
@@ -92,22 +87,18 @@ def _run(args: argparse.Namespace) -> int:
     drone = loaded(args.config)
     camera = _camera_of_config(args, drone)
     pictures = find_pictures(args.pictures, but_not=args.out)
-    labels = None if args.labels is None else read_labels(args.labels, pictures)
     config = _perception(drone, args.drone_size)
     copies = None if args.out is None else Copies(args.out, pictures, overwrite=args.force)
     left_out: list[str] = []
-    detected = list(_detected(args, pictures, labels, PictureDetector(config), camera, copies, left_out))
+    detected = list(_detected(args, pictures, PictureDetector(config), camera, copies, left_out))
     if left_out and not detected:
         raise DatasetError("\n".join(left_out))
-    result = {**_result(detected, measure=labels is not None), "left_out": left_out}
+    result = {**_result(detected), "left_out": left_out}
     if not args.json:
         _say_detections(detected)
         found = {"detections": sum(len(one.detections) for one in detected)}
         result = found | {name: fact for name, fact in result.items() if name not in {"pictures", "left_out"}}
     say_facts(args, result)
-    unlabelled = 0 if labels is None else sum(one.labels is None for one in detected)
-    if unlabelled:
-        complain(f"{args.labels}: does not list {unlabelled} of the {len(detected)} pictures; they are not measured")
     if copies is not None:
         complain(f"written: {copies.written} {'copy' if copies.written == 1 else 'copies'} in {args.out}")
     for fault in left_out:
@@ -150,7 +141,6 @@ def _perception(drone: DroneConfig | None, drone_size_m: float | None) -> Percep
 def _detected(
     args: argparse.Namespace,
     pictures: Sequence[PictureFile],
-    labels: Mapping[PictureFile, PictureLabels] | None,
     detector: PictureDetector,
     camera: Camera | None,
     copies: Copies | None,
@@ -158,17 +148,13 @@ def _detected(
 ) -> Iterator[_Detected]:
     """In order; what cannot be read is skipped, and why appended to ``left_out``."""
     from flockd.ground.pictures.copies import annotated
-    from flockd.ground.pictures.picture_files import check_size
 
     count = sum(picture.count(args.every) for picture in pictures)
     with progress("detecting", "pictures") as tell:
         done = 0
         for picture in pictures:
-            known = None if labels is None else labels.get(picture)
             for name, image in _readable(picture, args.every, left_out):
                 size = (image.shape[1], image.shape[0])
-                if known is not None:
-                    check_size(args.labels, name, known, size)
                 if camera is not None and camera.size != size:
                     raise UsageError(
                         f"{name}: is {size[0]} x {size[1]} pixels, and the camera of {args.config} {camera.size[0]} x "
@@ -178,8 +164,8 @@ def _detected(
                 result = detector.detect(image, camera, fov_deg=args.fov).at_least(args.min_probability)
                 seconds = time.perf_counter() - begin
                 if copies is not None:
-                    copies.write(picture, name, annotated(image, result, known.boxes if known else ()))
-                yield _Detected(name, result.detections, result.proposals, known, seconds)
+                    copies.write(picture, name, annotated(image, result))
+                yield _Detected(name, result.detections, result.proposals, seconds)
                 done += 1
                 tell(done, max(done, count))
 
@@ -193,11 +179,9 @@ def _readable(picture: PictureFile, every: int, left_out: list[str]) -> Iterator
         left_out.append(str(error))
 
 
-def _result(detected: Sequence[_Detected], *, measure: bool) -> dict[str, Any]:
-    from flockd.ground.pictures.scoring import Labelled, summary
-
+def _result(detected: Sequence[_Detected]) -> dict[str, Any]:
     count = max(len(detected), 1)
-    result: dict[str, Any] = {
+    return {
         "images": len(detected),
         "pictures": [
             {
@@ -213,10 +197,6 @@ def _result(detected: Sequence[_Detected], *, measure: bool) -> dict[str, Any]:
         "proposals_per_image": round(sum(one.proposals for one in detected) / count, 2),
         "ms_per_image": round(1000 * sum(one.seconds for one in detected) / count, 2),
     }
-    if measure:
-        labelled = [Labelled(o.detections, o.labels.boxes) for o in detected if o.labels is not None]
-        result |= summary(labelled)
-    return result
 
 
 def _say_detections(detected: Sequence[_Detected]) -> None:

@@ -36,6 +36,7 @@ _OPTIONS = (
         "measure with a tape, fly, and take over what the flight found with `--from-flight RECORDING`",
     ),
     ("calibrate rig", "max-offset", "a flight finds the time offset: `--from-flight RECORDING`"),
+    ("detect", "labels", "`python -m tools.measure.labelled` measures what `--json` wrote"),
     ("sim", "flow", "write `--set drone.perception.flow=VALUE`"),
     ("sim", "scale", "write `--set drone.perception.scale=VALUE`"),
     ("sim", "height", "write `--set drone.perception.height=VALUE`"),

@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from flockd.ground.pictures.scoring import WIDTH_CLASSES
 from tools.measure.card import EYES, FIGURES_FILE, ROOT, git
+from tools.measure.labelled import WIDTH_CLASSES
 
 BLOCK = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
 AGE = re.compile(r" \d+ commits? of `flockd/flight` since\.")

@@ -44,12 +44,12 @@ from flockd.core.config.document import Value
 from flockd.core.config.loader import Overrides
 from flockd.core.data import data_path
 from flockd.flight.inference.hashes import model_hashes
-from flockd.ground.pictures.scoring import summary
 from flockd.review.replay.profile import ComputerFiles
 from flockd.sim.cameras.camera_simulator import family_of
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import MIN_START_DISTANCE_M, ScenarioConfig, load_scenario
 from tools.measure import perceived_errors
+from tools.measure.labelled import Box, read_labels, scored
 
 ROOT = Path(__file__).resolve().parents[2]
 FIGURES_FILE = ROOT / "docs" / "figures.json"
@@ -306,11 +306,11 @@ def _pictures(labelled: Sequence[str], without_drones: Sequence[str]) -> dict[st
     found: dict[str, Any] = {}
     for given in (*labelled, *without_drones):
         name, _, folder = given.partition("=")
-        labels = ["--labels", f"{folder}/labels.json"] if given in labelled else []
-        one = json.loads(_flockd("detect", folder, "--fov", "90", "--json", *labels))
+        one = json.loads(_flockd("detect", folder, "--fov", "90", "--json"))
         pictures = one.pop("pictures")
-        false = sum(len(picture["detections"]) for picture in pictures)
-        found[name] = one if labels else {**summary([]), **one, "measured": len(pictures), "false": false}
+        nowhere: dict[Path, list[Box]] = {Path(picture["file"]).resolve(): [] for picture in pictures}
+        labels = read_labels(Path(folder) / "labels.json") if given in labelled else nowhere
+        found[name] = one | scored(pictures, labels)
     return found
 
 

@@ -53,24 +53,18 @@ class Copies:
 
 _COLOURS = ((255, 109, 0), (0, 176, 255), (213, 0, 249), (0, 200, 83), (255, 214, 0), (255, 23, 68))
 """RGB, of one detection after the other."""
-_LABELLED = (255, 255, 255)
 _MASK_WEIGHT = 0.4
 _REFERENCE_PX = 900.0
 """Longer side of a picture that lines of one pixel suit."""
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
-def annotated(image: UInt8Array, result: PictureResult, labelled: Sequence[Box] = ()) -> UInt8Array:
-    """A copy of an image (h, w, 3), RGB, with each detection's box, mask, probability, range and size.
-
-    ``labelled``: boxes of the drones that are known to be there, drawn in white.
-    """
+def annotated(image: UInt8Array, result: PictureResult) -> UInt8Array:
+    """A copy of an image (h, w, 3), RGB, with each detection's box, mask, probability, range and size."""
     height, width = image.shape[:2]
     mask = cv2.resize(result.mask, (width, height), interpolation=cv2.INTER_NEAREST)
     drawn = image.copy()
     thick = max(round(max(width, height) / _REFERENCE_PX), 1)
-    for box in labelled:
-        _rectangle(drawn, box, _LABELLED, thick)
     for number, one in enumerate(result.detections):
         colour = _COLOURS[number % len(_COLOURS)]
         mine = mask == one.label

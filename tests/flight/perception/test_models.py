@@ -23,9 +23,9 @@ from flockd.flight.perception.flow import grid_flow
 from flockd.flight.perception.maps import RangeEstimate
 from flockd.flight.perception.onnx import CROPS_PER_RUN
 from flockd.flight.perception.requirements import check_roles
-from flockd.ground.pictures.scoring import intersection_over_union
 from tests.flight.perception.cameras import crop_of, rendered
 from tests.make import rig_camera
+from tools.measure.labelled import half_overlap
 
 MODELS = data_path("models")
 NETWORKS = ("distance", "flow", "neighbours", "verification")
@@ -53,7 +53,7 @@ def test_the_detector_finds_a_drone_in_the_whole_image_and_its_evidence_is_for_i
     (drone,) = [one for one in maps.instances if one.boxed]
     rows, columns = np.nonzero(view.ids == 1)
     seen = (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
-    assert intersection_over_union(tuple(drone.box.tolist()), seen) > 0.5
+    assert half_overlap(tuple(drone.box.tolist()), seen) > 0.5
     assert drone.evidence > 0
 
 

@@ -14,7 +14,6 @@ import pytest
 from flockd.core.jpeg_header import jpeg_size
 from flockd.ground.datasets.image_files import DatasetError, read_image
 from flockd.ground.datasets.image_folder import read_lines
-from flockd.ground.pictures.picture_files import read_labels
 from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat
 
 HUGE = 60_000
@@ -95,7 +94,7 @@ def test_a_jpeg_that_takes_long_for_its_many_scans_is_refused_before_it_is_decod
 def test_what_is_no_ordinary_file_is_refused_without_waiting_for_its_writer(tmp_path: Path) -> None:
     pipe, endless = tmp_path / "pipe.png", Path("/dev/zero")
     os.mkfifo(pipe)
-    for read in (read_image, read_lines, lambda path: read_labels(path, [])):
+    for read in (read_image, read_lines):
         for path in (pipe, endless):
             with pytest.raises(DatasetError, match="is not an ordinary file"):
                 read(path)

@@ -1,0 +1,61 @@
+"""How detections in labelled pictures are matched and measured: every figure by hand."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tools.measure.labelled import Box, average_precision, half_overlap, match, middle_inside, read_labels, scored
+
+BOX = (10.0, 10.0, 30.0, 20.0)
+
+
+def moved(right: float) -> Box:
+    return BOX[0] + right, BOX[1], BOX[2] + right, BOX[3]
+
+
+def test_of_two_boxes_a_detection_takes_the_one_that_it_fits_best_and_each_is_found_once() -> None:
+    wide = (0.0, 0.0, 60.0, 40.0)
+    assert match([BOX, (25.0, 15.0, 45.0, 35.0)], [wide, BOX], middle_inside) == [1, 0]
+    assert match([BOX, (25.0, 15.0, 45.0, 35.0)], [wide, BOX], half_overlap) == [1, None]
+    assert match([moved(2), BOX, moved(50)], [BOX, (100.0, 100.0, 110.0, 105.0)], middle_inside) == [0, None, None]
+
+
+def test_average_precision_by_hand() -> None:
+    """Three boxes: hit, miss, hit. Precision 1 at recall 1/3, 2/3 at 2/3: area 1/3 + 2/9. The third is not found."""
+    assert average_precision([(0.7, True), (0.9, True), (0.8, False)], 3) == pytest.approx(1 / 3 + 2 / 9)
+    assert average_precision([], 3) == 0.0
+    assert average_precision([(0.9, False)], 0) is None
+    # A miss before the hit costs it: precision is 1/2 at recall 1. Of equal probabilities none is before the other.
+    assert average_precision([(0.9, False), (0.8, True)], 1) == pytest.approx(0.5)
+    assert average_precision([(0.9, True), (0.9, False)], 1) == average_precision([(0.9, False), (0.9, True)], 1) == 0.5
+
+
+def test_pictures_with_and_without_drones_and_one_without_labels(tmp_path: Path) -> None:
+    """Boxes 20 px wide: hit well; hit with IoU 1/3, beside a false one; not found; and a false one where none is."""
+    ghost = (200.0, 200.0, 230.0, 220.0)
+    left, top, right, bottom = BOX
+    labels = {
+        "images": [{"id": number, "file_name": f"{number}.jpg"} for number in range(4)],
+        "categories": [{"id": 1, "name": "bird"}, {"id": 2, "name": "drone"}],
+        "annotations": [
+            {"image_id": number, "category_id": kind, "bbox": [left, top, right - left, bottom - top]}
+            for number, kind in ((0, 2), (1, 2), (2, 2), (3, 1))
+        ],
+    }
+    (tmp_path / "labels.json").write_text(json.dumps(labels))
+
+    def picture(name: str, *found: tuple[Box, float]) -> dict[str, Any]:
+        return {"file": str(tmp_path / name), "detections": [{"box": b, "probability": p} for b, p in found]}
+
+    pictures = [
+        picture("0.jpg", (BOX, 0.99)), picture("1.jpg", (moved(9.9), 0.9), (ghost, 0.95)), picture("2.jpg"),
+        picture("3.jpg", (ghost, 0.85)), picture("other.jpg", (BOX, 0.9)),
+    ]  # fmt: skip
+    found = scored(pictures, read_labels(tmp_path / "labels.json"))
+    assert found["by_width"].pop("12-30") == {"boxes": 3, "found": 2}
+    assert set(map(str, found.pop("by_width").values())) == {"{'boxes': 0, 'found': 0}"}
+    assert found == {"boxes": 3, "ap50": round(1 / 3, 4), "measured": 4, "false": 2, "false_per_picture": 0.5}

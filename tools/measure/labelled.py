@@ -1,0 +1,115 @@
+"""How well `flockd detect` finds the drones of labelled pictures, and how often it takes something else for one.
+
+flockd detect FOLDER --fov 90 --json > found.json
+python -m tools.measure.labelled found.json FOLDER/labels.json     # boxes in COCO's format, of the category `drone`
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+Box = tuple[float, float, float, float]
+"""Left, top, right, bottom in pixels."""
+Fit = Callable[[Box, Box], float]
+"""How well a detection's box fits a drone's, the more the better; below 0: not at all."""
+
+WIDTHS_PX = (0, 6, 12, 30, 80)
+"""Where the classes of box width begin; the last one is open."""
+WIDTH_CLASSES = tuple(f"{a}-{b}" for a, b in zip(WIDTHS_PX, [*map(str, WIDTHS_PX[1:]), ""], strict=True))
+
+
+def read_labels(path: Path) -> dict[Path, list[Box]]:
+    """The drones of each picture, by COCO's boxes of the category `drone`."""
+    coco = json.loads(path.read_text(encoding="utf-8"))
+    drones = {one["id"] for one in coco["categories"] if one["name"] == "drone"}
+    files = {one["id"]: (path.parent / one["file_name"]).resolve() for one in coco["images"]}
+    found: dict[Path, list[Box]] = {file: [] for file in files.values()}
+    for one in coco["annotations"]:
+        if one["category_id"] in drones:
+            left, top, width, height = one["bbox"]
+            found[files[one["image_id"]]].append((left, top, left + width, top + height))
+    return found
+
+
+def scored(pictures: Sequence[dict[str, Any]], labels: dict[Path, list[Box]]) -> dict[str, Any]:
+    """What the labelled ones of ``pictures``, as `flockd detect --json` tells them, come to.
+
+    By the box's width the ``boxes`` and those ``found``, in which a detection's middle lies; ``ap50``, the average
+    precision at an intersection over union of 0.5; ``measured`` pictures; ``false``: detections that found no box.
+    """
+    counts = {name: {"boxes": 0, "found": 0} for name in WIDTH_CLASSES}
+    measured, false, judged = 0, 0, list[tuple[float, bool]]()
+    for picture in pictures:
+        if (boxes := labels.get(Path(picture["file"]).resolve())) is None:
+            continue
+        measured += 1
+        detections = sorted(picture["detections"], key=lambda one: -one["probability"])
+        found = match([tuple(one["box"]) for one in detections], boxes, middle_inside)
+        false += found.count(None)
+        for number, box in enumerate(boxes):
+            of_width = counts[WIDTH_CLASSES[int(np.searchsorted(WIDTHS_PX, box[2] - box[0], side="right")) - 1]]
+            of_width["boxes"] += 1
+            of_width["found"] += number in found
+        overlapping = match([tuple(one["box"]) for one in detections], boxes, half_overlap)
+        judged += [(one["probability"], of is not None) for one, of in zip(detections, overlapping, strict=True)]
+    count = sum(of_width["boxes"] for of_width in counts.values())
+    ap50 = average_precision(judged, count)
+    per_picture = false / measured if measured else None
+    return {
+        "boxes": count, "by_width": counts, "ap50": None if ap50 is None else round(ap50, 4),
+        "measured": measured, "false": false, "false_per_picture": per_picture,
+    }  # fmt: skip
+
+
+def match(detections: Sequence[Box], boxes: Sequence[Box], fit: Fit) -> list[int | None]:
+    """The number of the box that each detection finds, the most probable first: of those left the one it fits best."""
+    left, found = set(range(len(boxes))), list[int | None]()
+    for one in detections:
+        best = max(left, key=lambda number: fit(one, boxes[number]), default=None)
+        if best is None or fit(one, boxes[best]) < 0:
+            found.append(None)
+        else:
+            found.append(best)
+            left.remove(best)
+    return found
+
+
+def middle_inside(one: Box, box: Box) -> float:
+    """The nearer the middles, the better, if the detection's lies in the box."""
+    u, v = (one[0] + one[2]) / 2, (one[1] + one[3]) / 2
+    if not (box[0] <= u <= box[2] and box[1] <= v <= box[3]):
+        return -1.0
+    return 1.0 / (1.0 + float(np.hypot(u - (box[0] + box[2]) / 2, v - (box[1] + box[3]) / 2)))
+
+
+def half_overlap(one: Box, box: Box) -> float:
+    """Intersection over union, if it is a half or more."""
+    width, height = min(one[2], box[2]) - max(one[0], box[0]), min(one[3], box[3]) - max(one[1], box[1])
+    both = max(width, 0.0) * max(height, 0.0)
+    area, other = ((of[2] - of[0]) * (of[3] - of[1]) for of in (one, box))
+    return share if (share := both / (area + other - both)) >= 0.5 else -1.0
+
+
+def average_precision(judged: Sequence[tuple[float, bool]], boxes: int) -> float | None:
+    """Area under the curve of the best precision at each recall or a higher one (PASCAL VOC since 2010, Everingham et
+    al. 2015); None without boxes. ``judged``: of all detections the probability, and whether it found a box."""
+    if not boxes:
+        return None
+    ordered = sorted(judged, key=lambda one: -one[0])
+    probabilities = np.array([probability for probability, _ in ordered])
+    hits = np.cumsum([is_true for _, is_true in ordered])
+    last = np.append(probabilities[1:] != probabilities[:-1], True)[: len(ordered)]  # equal ones count together
+    precision = (hits / np.arange(1, len(ordered) + 1))[last]
+    best = np.maximum.accumulate(precision[::-1])[::-1]
+    return float(np.sum(best * np.diff(hits[last] / boxes, prepend=0.0)))
+
+
+if __name__ == "__main__":
+    detected = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))["pictures"]
+    print(json.dumps(scored(detected, read_labels(Path(sys.argv[2]))), indent=1))
