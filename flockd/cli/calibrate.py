@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def add(commands: Commands) -> None:
     """Adds the command."""
     examples = (
-        "flockd calibrate camera --print-board board.pdf",
+        "flockd calibrate camera --print-board board.svg",
         "flockd calibrate camera pictures/ --camera front",
         "flockd calibrate rig --from-flight drone1.mcap",
     )
@@ -51,7 +51,7 @@ def _board_of(args: argparse.Namespace) -> BoardSpec:
 def _add_camera(commands: Commands) -> None:
     """Adds the command."""
     examples = (
-        "flockd calibrate camera --print-board board.pdf",
+        "flockd calibrate camera --print-board board.svg",
         "flockd calibrate camera pictures/ --camera front",
         "flockd calibrate camera drone1.mcap --camera left --every 5 --model wide_angle",
         "flockd calibrate camera --config my_drone.yaml --camera front",
@@ -62,7 +62,7 @@ def _add_camera(commands: Commands) -> None:
     option(parser, "SOURCE", help_of_source, nargs="?")
     option(parser, "--camera NAME", "the camera's name in the rig")
     option(parser, "--model", "default: pinhole, unless the other fits clearly better", choices=LENS_MODELS)
-    option(parser, "--print-board FILE", "write the board to print (.pdf)", Path)
+    option(parser, "--print-board FILE", "write the board to print (.svg)", Path)
     option(parser, "--config FILE", "the drone, for its camera's device and serial", Path)
     option(parser, "--every N", "take every Nth frame (1)", positive_count, default=1)
     _add_shared(parser)
@@ -115,18 +115,14 @@ def _camera(args: argparse.Namespace) -> int:
 
 def _print_board(args: argparse.Namespace, board: BoardSpec) -> int:
     from flockd.core.data import written_whole
-    from flockd.ground.calibration.board import CalibrationError, board_pdf, page_mm
+    from flockd.ground.calibration.board import board_svg, page_mm
 
     file: Path = args.print_board
     refuse_overwriting(args, file)
-    if file.suffix.lower() != ".pdf":
-        raise UsageError(f"{file}: a board is written as .pdf; give it such a name")
-    try:
-        data = board_pdf(board)
-    except CalibrationError as error:
-        raise UsageError(f"{file}: {error}") from None
+    if file.suffix.lower() != ".svg":
+        raise UsageError(f"{file}: a board is written as .svg, which browsers print; give it such a name")
     with written_whole(file) as draft:
-        draft.write_bytes(data)
+        draft.write_text(board_svg(board), encoding="utf-8")
     page = "{:.0f} x {:.0f} mm".format(*page_mm(board))
     told = (
         f"{file}: print it at 100 % on paper of {page} or more, glue it to something flat, and measure a square: "

@@ -6,10 +6,10 @@ import contextlib
 import json
 import re
 import threading
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -204,26 +204,22 @@ def test_a_usb_camera_is_known_by_its_serial_number(tmp_path: Path) -> None:
 
 
 def test_the_board_is_printed_in_its_true_size(tmp_path: Path, told: Told) -> None:
-    page = tmp_path / "board.pdf"
+    page = tmp_path / "board.svg"
     assert "print it at 100 % on paper of 276 x 204 mm" in told(0, "calibrate", "camera", "--print-board", page)
-    text = page.read_bytes()
-    box = re.search(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", text)
-    assert box is not None
-    assert [float(side) / 72 * 25.4 for side in box.groups()] == pytest.approx([276.0, 204.0], abs=0.01)
-    streams = [zlib.decompress(part.split(b"\nendstream")[0]) for part in text.split(b"stream\n")[1::2]]
-    across, down = (float(number) / 72 * 25.4 for number in (streams[0].split()[1], streams[0].split()[4]))
-    assert (across, down) == pytest.approx((252.0, 180.0), abs=0.01), "7 x 5 squares of 36 mm"
-    size = re.search(rb"/Width (\d+) /Height (\d+)", text)
-    assert size is not None
-    image = np.frombuffer(streams[1], np.uint8).reshape(int(size[2]), int(size[1]))
-    framed = cv2.copyMakeBorder(image, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
+    drawing = ElementTree.fromstring(page.read_text(encoding="utf-8"))
+    assert (drawing.attrib["width"], drawing.attrib["height"]) == ("276mm", "204mm")
+    assert drawing.attrib["viewBox"] == "0 0 276 204"
+    board = drawing[1].attrib
+    assert board["transform"] == "translate(12 12) scale(4.5)", "eight cells are 36 mm"
+    cells = np.full((40, 56), 255, np.uint8)
+    for x, y in re.findall(r"M(\d+) (\d+)h1v1h-1z", board["d"]):
+        cells[int(y), int(x)] = 0
+    framed = cv2.copyMakeBorder(np.kron(cells, np.ones((12, 12))), 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
     seen = BoardFinder(BoardSpec()).find(np.asarray(framed, np.uint8))
     assert seen is not None
     assert len(seen.ids) == 24
-    table = int(text.split(b"startxref\n")[1].split()[0])
-    for number, entry in enumerate(text[table:].split(b"\n")[3:8], start=1):
-        assert text[int(entry[:10]) :].startswith(b"%d 0 obj" % number)
-    assert "is written as .pdf" in told(2, "calibrate", "camera", "--print-board", tmp_path / "b.gif")
+    assert drawing[2].attrib["d"] == "M0 0h100"
+    assert "is written as .svg" in told(2, "calibrate", "camera", "--print-board", tmp_path / "b.gif")
     assert "exists" in told(2, "calibrate", "camera", "--print-board", page)
 
 

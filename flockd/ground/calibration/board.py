@@ -4,7 +4,6 @@ printed, found in images, and placed before a camera."""
 from __future__ import annotations
 
 import math
-import zlib
 from dataclasses import dataclass
 
 import cv2
@@ -24,7 +23,7 @@ _DICTIONARY, _MARKERS, _MARKER_SHARE = cv2.aruco.DICT_4X4_50, 50, 0.75
 """Markers of 4 by 4 cells, 50 of them, with so much of a square's side."""
 MIN_CORNERS = 8
 """Fewer say too little of where the board is."""
-_CENTRE_PX = 0.5
+CENTRE_PX = 0.5
 """OpenCV has pixel centres at whole numbers."""
 
 
@@ -92,7 +91,7 @@ class BoardFinder:
         points = np.asarray(points, np.float64).reshape(-1, 3)
         if min(len(np.unique(points[:, 0].round(9))), len(np.unique(points[:, 1].round(9)))) < 2:
             return None
-        pixels = np.asarray(pixels, np.float64).reshape(-1, 2) + _CENTRE_PX
+        pixels = np.asarray(pixels, np.float64).reshape(-1, 2) + CENTRE_PX
         return BoardDetection(np.asarray(ids, np.int64).reshape(-1), pixels, points)
 
 
@@ -101,57 +100,9 @@ def _opencv_board(spec: BoardSpec) -> cv2.aruco.CharucoBoard:
     return cv2.aruco.CharucoBoard((spec.columns, spec.rows), spec.square_m, _MARKER_SHARE * spec.square_m, dictionary)
 
 
-_PIXELS_PER_MM = 12
-"""About 300 to the inch."""
-_MARGIN_MM = 12.0
-_POINTS_PER_MM = 72.0 / 25.4
-_RULER_MM = 100.0
-_LARGEST_PIXELS = 20_000
-
-
-def board_pdf(spec: BoardSpec) -> bytes:
-    """One page (ISO 32000-1): the board, what it is, and a line to check the printer with.
-
-    Raises CalibrationError for a board that is too large to print.
-    """
-    pixels_per_square = round(spec.square_m * 1000.0 * _PIXELS_PER_MM)
-    if not 8 <= pixels_per_square <= _LARGEST_PIXELS // max(spec.columns, spec.rows):
-        raise CalibrationError(f"squares of {spec.square_m * 1000:g} mm cannot be printed; choose another size")
-    image = spec.image(pixels_per_square)
-    page_width, page_height = (side * _POINTS_PER_MM for side in page_mm(spec))
-    width, height = (1000.0 * spec.square_m * squares * _POINTS_PER_MM for squares in (spec.columns, spec.rows))
-    left, bottom = (page_width - width) / 2, (page_height - height) / 2
-    ruler, low = _RULER_MM * _POINTS_PER_MM, bottom / 2
-    text = (
-        f"{spec.columns}x{spec.rows} squares of {spec.square_m * 1000:g} mm. Print at 100 %; this line is "
-        f"{_RULER_MM:g} mm long:"
-    )
-    content = (
-        f"q {width:.4f} 0 0 {height:.4f} {left:.4f} {bottom:.4f} cm /Board Do Q\n"
-        f"BT /F 7 Tf {left:.4f} {low + 5:.4f} Td ({text}) Tj ET\n"
-        f"0.5 w {left:.4f} {low:.4f} m {left + ruler:.4f} {low:.4f} l S\n"
-    ).encode("ascii")
-    objects = (
-        b"<< /Type /Catalog /Pages 2 0 R >>",
-        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
-        f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {page_width:.4f} {page_height:.4f}] /Contents 4 0 R /Resources "
-        "<< /XObject << /Board 5 0 R >> /Font << /F << /Type /Font /Subtype /Type1 /BaseFont /Helvetica >> >> >> "
-        ">>".encode("ascii"),
-        _stream("", content),
-        _stream(
-            f"/Type /XObject /Subtype /Image /Width {image.shape[1]} /Height {image.shape[0]} "
-            "/ColorSpace /DeviceGray /BitsPerComponent 8 ",
-            image.tobytes(),
-        ),
-    )
-    data, places = b"%PDF-1.4\n", []
-    for number, body in enumerate(objects, start=1):
-        places.append(len(data))
-        data += b"%d 0 obj\n%s\nendobj\n" % (number, body)
-    table = b"".join(b"%010d 00000 n \n" % place for place in places)
-    head = b"xref\n0 %d\n0000000000 65535 f \n" % (len(objects) + 1)
-    tail = b"trailer\n<< /Size %d /Root 1 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (len(objects) + 1, len(data))
-    return data + head + table + tail
+_CELLS = 8
+"""Across a square: its marker's six, and one beside it on either side."""
+_MARGIN_MM, _RULER_MM = 12.0, 100.0
 
 
 def page_mm(spec: BoardSpec) -> tuple[float, float]:
@@ -160,10 +111,20 @@ def page_mm(spec: BoardSpec) -> tuple[float, float]:
     return width, height
 
 
-def _stream(entries: str, data: bytes) -> bytes:
-    packed = zlib.compress(data, 9)
-    head = f"<< {entries}/Filter /FlateDecode /Length {len(packed)} >>".encode("ascii")
-    return head + b"\nstream\n" + packed + b"\nendstream"
+def board_svg(spec: BoardSpec) -> str:
+    """One page: the board in its true size, what it is, and a line to check the printer with."""
+    width, height = page_mm(spec)
+    cell_mm = 1000.0 * spec.square_m / _CELLS
+    black = "".join(f"M{x} {y}h1v1h-1z" for y, x in np.argwhere(spec.image(_CELLS) == 0))
+    text = f"{spec.columns}x{spec.rows} squares of {1000.0 * spec.square_m:g} mm. Print at 100 %; this line is "
+    return f"""\
+<svg xmlns="http://www.w3.org/2000/svg" width="{width:g}mm" height="{height:g}mm" viewBox="0 0 {width:g} {height:g}">
+<rect width="100%" height="100%" fill="white"/>
+<path transform="translate({_MARGIN_MM:g} {_MARGIN_MM:g}) scale({cell_mm:g})" shape-rendering="crispEdges" d="{black}"/>
+<path transform="translate({_MARGIN_MM:g} {height - 4:g})" stroke="black" stroke-width="0.2" d="M0 0h{_RULER_MM:g}"/>
+<text x="{_MARGIN_MM:g}" y="{height - 5:g}" font-family="sans-serif" font-size="2.5">{text}{_RULER_MM:g} mm long:</text>
+</svg>
+"""
 
 
 _FACTOR = 2.5

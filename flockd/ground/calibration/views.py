@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from flockd.core.messages import BoolArray, FloatArray, IntArray, UInt8Array
-from flockd.ground.calibration.board import BoardDetection, BoardFinder, BoardSpec, CalibrationError
+from flockd.ground.calibration.board import CENTRE_PX, BoardDetection, BoardFinder, CalibrationError
 
 COLUMNS, ROWS = 8, 6
 _DARK = 16
@@ -151,7 +151,7 @@ class Collector:
         before, self._before = self._before, seen
         if seen is None:
             return self._refuse(Refused(name, "no board"))
-        edge_px = edge_width_px(grey, seen, self._finder.spec)
+        edge_px = edge_width_px(grey, seen, self._finder.spec.columns)
         if edge_px > max(_SHARP_PX, _SHARP_SHARE * image.shape[1]):
             return self._refuse(Refused(name, "blurred", edge_px))
         if moving and (before is None or _apart(before, seen, image.shape[1]) >= _STILL):
@@ -200,46 +200,33 @@ def _apart(first: BoardDetection, second: BoardDetection, width: int) -> float:
 
 _SMALLEST_SQUARE_PX = 10.0
 """Across smaller squares there is no room to measure an edge."""
-_REACH, _STEP_PX = 0.35, 0.25
+_ACROSS, _STEP_PX = 0.35, 0.25
 """How far a profile goes to both sides, in squares, and how fine it is."""
 _ALONG = np.linspace(-0.2, 0.2, 7)
 """Where along an edge its profile is taken, in squares from its middle; the average has less noise."""
 
 
-def edge_width_px(grey: UInt8Array, seen: BoardDetection, spec: BoardSpec) -> float:
+def edge_width_px(grey: UInt8Array, seen: BoardDetection, columns: int) -> float:
     """Pixels over which black becomes white, in the direction in which the view is blurred more.
 
     Of a perfectly sharp image it is between 1 and 2; of one blurred with a deviation of s pixels about 2.5 s. NaN
-    where the board is too small to tell.
+    where the board, of so many columns of squares, is too small to tell.
     """
-    place = {int(number): index for index, number in enumerate(seen.ids)}
-    across = spec.columns - 1
+    corners = columns - 1
+    places = dict(zip(seen.ids.tolist(), seen.pixels, strict=True))
     widths = []
-    for to_next, last_column in ((1, across - 1), (across, across)):
-        edges = [
-            (seen.pixels[place[number]], seen.pixels[place[number + to_next]])
-            for number in place
-            if number + to_next in place and number % across < last_column
-        ]
-        found = [_width(grey, first, second) for first, second in edges]
-        measured = [width for width in found if np.isfinite(width)]
-        if measured:
-            widths.append(float(np.median(measured)))
-    return max(widths) if widths else float("nan")
-
-
-def _width(grey: UInt8Array, first: FloatArray, second: FloatArray) -> float:
-    """Width of the edge between two neighbouring corners."""
-    along = second - first
-    square = float(np.linalg.norm(along))
-    if square < _SMALLEST_SQUARE_PX:
-        return float("nan")
-    normal = np.array([-along[1], along[0]]) / square
-    offsets = np.arange(-_REACH * square, _REACH * square, _STEP_PX)
-    middles = (first + second) / 2 + _ALONG[:, None] * along
-    samples = middles[:, None] + offsets[None, :, None] * normal - 0.5  # OpenCV has pixel centres at whole numbers
-    maps = samples.astype(np.float32)
-    profile = cv2.remap(grey, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    mean = np.asarray(profile, np.float64).mean(axis=0)
-    slope = float(np.abs(np.diff(mean)).max()) / _STEP_PX
-    return float(np.ptp(mean)) / slope if slope > 0.0 else float("nan")
+    for to_next, last in ((1, corners - 1), (corners, corners)):
+        found = []
+        for number, first in places.items():
+            second = places.get(number + to_next) if number % corners < last else None
+            if second is None or (square := float(np.linalg.norm(second - first))) < _SMALLEST_SQUARE_PX:
+                continue
+            along, offsets = second - first, np.arange(-_ACROSS * square, _ACROSS * square, _STEP_PX)
+            middles = (first + second) / 2 + _ALONG[:, None] * along - CENTRE_PX
+            at = middles[:, None] + offsets[:, None] / square * [-along[1], along[0]]
+            profile = cv2.remap(grey, *np.moveaxis(at.astype(np.float32), 2, 0), cv2.INTER_LINEAR)
+            mean = np.asarray(profile, np.float64).mean(axis=0)
+            if (slope := np.abs(np.diff(mean)).max() / _STEP_PX) > 0.0:
+                found.append(np.ptp(mean) / slope)
+        widths += [float(np.median(found))] if found else []
+    return max(widths, default=float("nan"))
