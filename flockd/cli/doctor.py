@@ -72,7 +72,7 @@ def _examine(config: DroneConfig, args: argparse.Namespace) -> Mapping[str, Sequ
             stack.enter_context(only_owner(config.autopilot))
         except UnavailableError as error:
             taken = error
-        drone = Examined(config, args.config, args.record, args.seconds, taken)
+        drone = Examined(config, args.record, args.seconds, taken)
         checks = plan(drone, args.only or CHECKS)
         return run_checks(checks, stack.enter_context(progress("examining", "checks")))
 

@@ -98,14 +98,12 @@ class FrameSet:
 
 @dataclass(frozen=True, eq=False)
 class RangeReading:
-    """How far a range finder that faces down says the ground is, or the autopilot in its place."""
+    """How far a range finder that faces down says the ground is."""
 
     time_s: float
     """When it was measured, on the clock of `VehicleState`."""
     range_m: float
-    """Slant range along the body's down axis; of the autopilot's own distance to bottom, straight down."""
-    vertical: bool = False
-    """It is the autopilot's own distance to bottom."""
+    """Along the body's down axis."""
     min_m: float | None = None
     """Nearer than this the sensor measures nothing; None: not known."""
     max_m: float | None = None

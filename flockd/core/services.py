@@ -56,7 +56,6 @@ OTHER_HEARTBEAT = Service("another computer's heartbeat", 1.0, 5.0, "it counts a
 VEHICLE_STATE = Service("the autopilot's state", 30.0, 2.0, "forgotten; frames of another time take the newest")
 MOTION = Service("the autopilot's position and velocity", 30.0, 0.5, "motion_unknown")
 GROUND_RANGE = Service("range to the ground", 30.0, 0.3, "it gives no scale", ("perception.range_finder.max_age_s",))
-RANGE_FINDER = Service("range finder", 30.0, 0.5, "the autopilot's own distance to bottom takes its place")
 TIME_SYNC = Service("reply to a clock exchange", 5.0, 1.0, "it is not used")
 STEP_TOPIC = Service("telemetry of a step", 2.0, 1.5, "watchers show nothing for it")
 PREVIEW = Service("picture with detections", 2.0, 2.0, "the newest picture is shown without them")

@@ -13,7 +13,6 @@ from pymavlink import mavutil
 
 from flockd.core.config import DroneConfig, load_drone
 from flockd.core.data import data_path
-from flockd.ground.doctor import Level
 from flockd.ground.doctor.autopilot_checks import check_autopilot
 from flockd.sim.flock.start import with_drones
 from flockd.sim.scenario import load_scenario
@@ -27,9 +26,8 @@ EPOCH_2015_S, TICKS_A_S = 1420070400, 1e5
 LATER = 10**8
 
 
-def _signing(config: DroneConfig) -> Level:
-    (found,) = [finding for finding in check_autopilot(config) if finding.about == "signing"]
-    return found.level
+def _is_deaf(config: DroneConfig) -> bool:
+    return any(finding.about == "signing" for finding in check_autopilot(config))
 
 
 def _again(send: Callable[[], None]) -> None:
@@ -52,12 +50,12 @@ def test_with_a_key_px4_hears_nobody_who_does_not_sign_until_the_key_is_removed(
         station: Any = mavutil.mavlink_connection(f"udpin:127.0.0.1:{px4.ports[0].truth}", source_system=255)
         try:
             assert station.wait_heartbeat(timeout=START_S) is not None
-            assert _signing(config) is Level.PASS, "it accepts unsigned messages"
+            assert not _is_deaf(config), "it accepts unsigned messages"
             stamp = int((time.time() - EPOCH_2015_S) * TICKS_A_S)
             _again(lambda: station.mav.setup_signing_send(1, 1, KEY, stamp))
-            assert _signing(config) is Level.FAILURE, "it is heard and does not respond"
+            assert _is_deaf(config), "it is heard and does not respond"
             station.setup_signing(KEY, sign_outgoing=True, initial_timestamp=stamp + LATER)
             _again(lambda: station.mav.setup_signing_send(1, 1, NO_KEY, 0))
-            assert _signing(config) is Level.PASS, "the old key signed its own removal"
+            assert not _is_deaf(config), "the old key signed its own removal"
         finally:
             station.close()

@@ -224,7 +224,8 @@ def edge_width_px(grey: UInt8Array, seen: BoardDetection, columns: int) -> float
             along, offsets = second - first, np.arange(-_ACROSS * square, _ACROSS * square, _STEP_PX)
             middles = (first + second) / 2 + _ALONG[:, None] * along - CENTRE_PX
             at = middles[:, None] + offsets[:, None] / square * [-along[1], along[0]]
-            profile = cv2.remap(grey, *np.moveaxis(at.astype(np.float32), 2, 0), cv2.INTER_LINEAR)
+            columns_at, rows_at = np.moveaxis(at.astype(np.float32), 2, 0)
+            profile = cv2.remap(grey, columns_at, rows_at, cv2.INTER_LINEAR)
             mean = np.asarray(profile, np.float64).mean(axis=0)
             if (slope := np.abs(np.diff(mean)).max() / _STEP_PX) > 0.0:
                 found.append(np.ptp(mean) / slope)

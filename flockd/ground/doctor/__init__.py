@@ -78,7 +78,6 @@ _LIMITS_S = {
     "disk": 20.0,
     "temperature": 10.0,
     "clock": 10.0,
-    "secrets": 5.0,
     "zenoh": 20.0,
     "autopilot": 60.0,
     "cameras": 20.0,
@@ -87,7 +86,7 @@ _LIMITS_S = {
 """How long each may take, the cameras beside what they are watched. Memory before the models are loaded, and those
 last, as they heat up the computer."""
 CHECKS = tuple(_LIMITS_S)
-BESIDE_A_FLIGHT = frozenset({"limits", "instance", "memory", "disk", "temperature", "clock", "secrets"})
+BESIDE_A_FLIGHT = frozenset({"limits", "instance", "memory", "disk", "temperature", "clock"})
 """They leave alone what a drone flies with: its autopilot, cameras and endpoints, and its computer's time."""
 
 
@@ -107,8 +106,6 @@ class Examined:
     """A drone, and what its checks need to know."""
 
     config: DroneConfig
-    file: Path
-    """Its configuration's."""
     recordings: Path | None
     """Where flights are recorded; None: in the service's folder, where there is one."""
     seconds: float
@@ -160,8 +157,6 @@ def _check(name: str, drone: Examined) -> Iterable[Finding]:
 
     if name == "limits":
         return setup.check_limits(config)
-    if name == "secrets":
-        return setup.check_secrets(config, drone.file)
     return setup.check_fleet(config) if name == "zenoh" else setup.check_instance(drone.taken)
 
 

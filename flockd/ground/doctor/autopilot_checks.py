@@ -12,10 +12,10 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.messages import RangeReading
 from flockd.flight.safety import link_lost
-from flockd.ground.doctor import Finding, Level, failed, failed_from_error, graded, passed, warned
+from flockd.ground.doctor import Finding, failed, failed_from_error, graded, passed, warned
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware
 from flockd.onboard.autopilot.clock_sync import ClockEstimate
-from flockd.onboard.autopilot.mavlink_messages import FACES_DOWN, MOST_ERROR_S
+from flockd.onboard.autopilot.mavlink_messages import MOST_ERROR_S
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.refusals import Refusal
 
@@ -34,7 +34,6 @@ WATCHED_S = 1.5
 LEAST_RATE_HZ = 10.0
 NEAREST_M = 0.5
 """A sensor that measures nothing nearer is blind at take-off and landing."""
-_FACES = {0: "forward", 2: "to the right", 4: "backward", 6: "to the left", 24: "up"}
 
 PARAMETERS: dict[str, type[int] | type[float]] = {
     "COM_OF_LOSS_T": float,
@@ -109,31 +108,35 @@ def check_autopilot(config: DroneConfig, heard_s: float = HEARD_S) -> Iterator[F
 async def _ask(config: DroneConfig, parameters: AutopilotParameters, heard_s: float) -> list[Finding]:
     link = await AutopilotLink.connect(parameters, timeout_s=heard_s)
     try:
-        heard = link.status()
-        found = [judge_heartbeat(link.system_id, heard, config), *judge_system_id(link.system_id, parameters)]
-        responds = True
+        found = [judge_heartbeat(link.system_id, link.status(), config)]
+        if parameters.system_id is None:
+            measured = f"autopilot.system_id is not given: what is heard alone is flown, now system {link.system_id}"
+            fix = "give each drone of the fleet another MAV_SYS_ID, and write this one's as autopilot.system_id"
+            found.append(warned("system id", measured, fix))
         try:
             found.append(judge_firmware(await link.firmware()))
         except AutopilotError as error:
-            responds = False
             found.append(failed_from_error("firmware", str(error)))
-        signing = judge_signing(responds, silent=_is_silent(link.status(), config))
-        found += [signing] if responds or signing.level is Level.FAILURE else []
-        found += [] if signing.level is Level.FAILURE else await _parameters(link, config)
-        if not _is_silent(link.status(), config):
-            with suppress(AutopilotError, TimeoutError):  # without the checks of now, what its messages say counts
-                async with asyncio.timeout(CHECKS_S):
-                    await link.ask_for_checks()
-                    while not link.knows_checks():
-                        await asyncio.sleep(0.02)
-            found += judge_refusals(link.refusals())
-            with suppress(TimeoutError):
-                async with asyncio.timeout(CLOCK_S):
-                    await link.synchronise()
-            found.append(judge_clock(link.received.trusted_clock()))
-            await asyncio.sleep(WATCHED_S if config.perception.height != "barometer" else 0.0)
-            found += judge_range_finder(link.received.ground_range(), link.received.range_finders(), config)
-        found += judge_messages(link.received.unknown_values())
+            if not _is_silent(link.status(), config):
+                measured = "it is heard and does not respond: nothing reaches it, or it accepts signed messages only"
+                fix = "check the cable's other direction; remove the signing key from its SD card"
+                return [*found, failed("signing", measured, fix)]
+        found += await _parameters(link, config)
+        if _is_silent(link.status(), config):
+            return found
+        with suppress(AutopilotError, TimeoutError):  # without the checks of now, what its messages say counts
+            async with asyncio.timeout(CHECKS_S):
+                await link.ask_for_checks()
+                while not link.knows_checks():
+                    await asyncio.sleep(0.02)
+        found += judge_refusals(link.refusals())
+        with suppress(TimeoutError):
+            async with asyncio.timeout(CLOCK_S):
+                await link.synchronise()
+        found.append(judge_clock(link.received.trusted_clock()))
+        if config.perception.scale == "height" and config.perception.height != "barometer":
+            await asyncio.sleep(WATCHED_S)
+            found.append(judge_range_finder(link.received.ground_range, tuple(link.received.ranges_s), config))
     finally:
         await link.close()
     return found
@@ -170,25 +173,6 @@ def judge_heartbeat(system_id: int, status: AutopilotStatus, config: DroneConfig
     return passed("heartbeat", f"{measured}, disarmed, in flight mode {status.flight_mode}")
 
 
-def judge_system_id(system_id: int, parameters: AutopilotParameters) -> list[Finding]:
-    """A warning where any autopilot would do."""
-    if parameters.system_id is not None:
-        return []
-    measured = f"autopilot.system_id is not given: the only autopilot that is heard is flown, now system {system_id}"
-    fix = "give each drone of the fleet another MAV_SYS_ID, and write this one's as autopilot.system_id"
-    return [warned("system id", measured, fix)]
-
-
-def judge_signing(responds: bool, *, silent: bool) -> Finding:
-    """Whether it accepts messages that are not signed (MAVLink 2): flockd's are not, and others' need not be either."""
-    if responds:
-        return passed("signing", "it accepts unsigned messages of any sender: keep all others off its link")
-    if silent:
-        return warned("signing", "not known: it is not heard any more", "repair the link first")
-    measured = "it is heard and does not respond: nothing reaches it, or it accepts signed messages only"
-    return failed("signing", measured, "check the cable's other direction; remove the signing key from its SD card")
-
-
 def judge_refusals(refusals: Sequence[Refusal]) -> list[Finding]:
     """Why it could not be armed or fly offboard now."""
     if not refusals:
@@ -202,22 +186,10 @@ def judge_clock(clock: ClockEstimate | None) -> Finding:
     if clock is None:
         measured = "it does not answer TIMESYNC, or its stamps contradict it: attitudes count from when they arrive"
         return warned("clock", measured, "update the firmware, and check whether the link loses messages")
-    measured = (
-        f"{clock.offset_s:+.4f} s against this computer's, known to {1e3 * clock.error_s:.2f} ms; "
-        f"single measurements {1e3 * clock.jitter_s:.2f} ms apart, "
-        f"shortest round trip {1e3 * clock.round_trip_s:.1f} ms"
-    )
+    measured = f"known to {1e3 * clock.error_s:.2f} ms; shortest round trip {1e3 * clock.round_trip_s:.1f} ms"
     fix = "raise the link's baud rate, send fewer streams over it, and take load off this computer"
     uncertain = ": so uncertain that attitudes count from when they arrive" if clock.error_s > MOST_ERROR_S else ""
     return graded("clock", f"{measured}{uncertain}", fix, warning=bool(uncertain))
-
-
-def judge_messages(unknown_values: Mapping[str, int]) -> list[Finding]:
-    """A warning where messages had values that flockd does not know."""
-    if not unknown_values:
-        return []
-    values = ", ".join(f"{value} ({count} times)" for value, count in sorted(unknown_values.items()))
-    return [warned("messages", f"values that flockd does not know: {values}", "update flockd, or the firmware")]
 
 
 def judge_firmware(firmware: Firmware) -> Finding:
@@ -245,12 +217,8 @@ def judge_parameter(name: str, value: float, config: DroneConfig) -> Finding:
         case "GF_MAX_VER_DIST":
             return _judge_limit(name, value, gate.max_height_m, "max_height_m")
         case "CP_DIST":
-            told = (
-                ": PX4 lets nobody fly in Position mode where nothing sends it distances of obstacles"
-                if value > 0
-                else ""
-            )
-            return graded(name, f"{value:g}{told}", "set CP_DIST to -1, unless a sensor sends them", warning=value > 0)
+            told = f"{value:g}; above 0 PX4 lets nobody fly in Position mode unless something sends it distances"
+            return graded(name, told, "set CP_DIST to -1, unless a sensor sends them", warning=value > 0)
     return _judge_action(name, ACTIONS[name], int(value), config)
 
 
@@ -289,47 +257,24 @@ def _judge_limit(name: str, value: float, own_m: float | None, what: str) -> Fin
     return passed(name, f"{value:g} m, {own}")
 
 
-def judge_range_finder(
-    reading: RangeReading | None, arrivals_s: Mapping[int, Sequence[float]], config: DroneConfig
-) -> list[Finding]:
-    """Findings of a drone that is on the ground; none where the configuration takes the height from elsewhere.
-
-    Args:
-        reading: the newest of the sensor that faces down, or the autopilot's own distance to bottom.
-        arrivals_s: when the last DISTANCE_SENSOR messages came, by MAV_SENSOR_ORIENTATION.
-        config: the drone's.
-    """
-    perception = config.perception
-    if perception.scale != "height" or perception.height == "barometer":
-        return []
-    blame = failed if perception.height == "range_finder" else warned
+def judge_range_finder(reading: RangeReading | None, arrivals_s: Sequence[float], config: DroneConfig) -> Finding:
+    """The newest of the sensor that faces down, of a drone on the ground; ``arrivals_s``: of its last readings."""
     if reading is None:
-        if arrivals_s:
-            others = ", ".join(_FACES.get(number, f"by MAV_SENSOR_ORIENTATION {number}") for number in arrivals_s)
-            fix = "mount it facing down, and set its orientation in PX4 (such as SENS_CM8JL65_R_0) to 25, downward"
-            return [blame(RANGE_FINDER, f"no range finder faces down; those that are heard face {others}", fix)]
-        fix = "see to the sensor and its driver in PX4, or write perception.height: barometer"
-        return [blame(RANGE_FINDER, "the autopilot sends no DISTANCE_SENSOR and no distance to bottom", fix)]
-    if reading.vertical:
-        measured = f"no DISTANCE_SENSOR; PX4's own distance to bottom is {reading.range_m:.2f} m"
-        return [
-            warned(RANGE_FINDER, measured, "let PX4 send DISTANCE_SENSOR on this link: it is newer, and has its limits")
-        ]
-    return [_judge_sensor(reading, arrivals_s.get(FACES_DOWN, ()), config)]
-
-
-def _judge_sensor(reading: RangeReading, arrivals_s: Sequence[float], config: DroneConfig) -> Finding:
-    least_m, most_m = reading.min_m or 0.0, reading.max_m
-    limits = f"from {least_m:.2f} m" if most_m is None else f"from {least_m:.2f} to {most_m:.1f} m"
+        blame = failed if config.perception.height == "range_finder" else warned
+        fix = "see to the sensor, its driver and orientation (downward) in PX4, or write perception.height: barometer"
+        return blame(RANGE_FINDER, "the autopilot sends no DISTANCE_SENSOR that faces down", fix)
+    least_m, most_m = reading.min_m or 0.0, math.inf if reading.max_m is None else reading.max_m
     span_s = arrivals_s[-1] - arrivals_s[0] if arrivals_s else 0.0
     rate_hz = (len(arrivals_s) - 1) / span_s if span_s > 0.0 else 0.0
-    measured = f"faces down, {reading.range_m:.2f} m now, measures {limits}, {rate_hz:.0f} times a second"
-    gate = config.safety.gate
-    if most_m is not None and most_m < gate.max_height_m:
-        fix = f"make safety.gate.max_height_m {most_m:.0f} m or less, or take a sensor that measures farther"
-        return warned(RANGE_FINDER, f"{measured}; the drone may fly at {gate.max_height_m:g} m", fix)
-    if least_m > NEAREST_M:
-        fix = "take a sensor that measures nearer, or fly higher than that from the start"
-        return warned(RANGE_FINDER, measured, fix)
+    measured = (
+        f"faces down, {reading.range_m:.2f} m now, measures from {least_m:.2f} to {most_m:.1f} m, {rate_hz:.0f} times "
+        f"a second; the drone may fly at {config.safety.gate.max_height_m:g} m"
+    )
     fix = f"let the sensor and this link give it at {LEAST_RATE_HZ:g} Hz or more"
-    return graded(RANGE_FINDER, measured, fix, warning=rate_hz < LEAST_RATE_HZ)
+    if most_m < config.safety.gate.max_height_m:
+        fix = f"make safety.gate.max_height_m {most_m:.0f} m or less, or take a sensor that measures farther"
+    elif least_m > NEAREST_M:
+        fix = "take a sensor that measures nearer, or fly higher than that from the start"
+    elif rate_hz >= LEAST_RATE_HZ:
+        return passed(RANGE_FINDER, measured)
+    return warned(RANGE_FINDER, measured, fix)

@@ -1,4 +1,4 @@
-"""Limits of the flight, which secrets others may read, and who else is there: on this computer, on the fleet."""
+"""Limits of the flight, and who else is there: on this computer, on the fleet."""
 
 from __future__ import annotations
 
@@ -10,14 +10,11 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.document import key_text
 from flockd.core.config.real_drone import beyond_envelope
 from flockd.core.errors import UnavailableError
-from flockd.core.secrets import masked
 from flockd.fleet.watcher import FleetWatcher
 from flockd.ground.doctor import Finding, failed, passed, warned
-from flockd.onboard.telemetry.zenoh_session import SessionError, private_keys
 
 LISTEN_S = 3.0
 """Others try again every second to reach this drone."""
-_READABLE, _WRITABLE = 0o004, 0o022
 
 
 def check_limits(config: DroneConfig) -> Iterator[Finding]:
@@ -44,46 +41,6 @@ def check_instance(taken: UnavailableError | None) -> Iterator[Finding]:
         return
     fix = "stop it while you examine (`systemctl stop flockd`), if the drone does not fly"
     yield failed("instance", str(taken).rpartition("; ")[0], fix)
-
-
-def check_secrets(config: DroneConfig, file: Path) -> Iterator[Finding]:
-    """``file``: the configuration's."""
-    values = config.model_dump(mode="json")
-    yield _judge_file(file, "holds a password" if masked(values) != values else "")
-    settings = config.telemetry.zenoh_config
-    if settings is None:
-        return
-    yield _judge_file(Path(settings), "holds a password" if _holds_password(Path(settings)) else "")
-    try:
-        keys = private_keys(Path(settings))
-    except SessionError as error:
-        yield failed("secrets", str(error).rpartition("; ")[0], "correct the file of zenoh's settings")
-        return
-    for key in keys:
-        yield _judge_file(key, "is a private key")
-
-
-def _holds_password(file: Path) -> bool:
-    try:
-        text = file.read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return False  # said by what follows
-    return '"' in text and ("password:" in text or "_base64:" in text)
-
-
-def _judge_file(file: Path, secret: str) -> Finding:
-    """``secret``: what others must not read in it; empty where they may."""
-    try:
-        mode = file.stat().st_mode
-    except OSError as error:
-        fix = "examine as the user that flies: `sudo -u flockd flockd doctor ...`, or correct the path"
-        return warned("secrets", f"{file} cannot be examined ({error.strerror})", fix)
-    close = f"`sudo chgrp flockd {file}`, `sudo chmod 640 {file}`: for its owner and the service alone"
-    if secret and mode & _READABLE:
-        return failed("secrets", f"{file} {secret}, and every user of this computer may read it", close)
-    if mode & _WRITABLE:
-        return failed("secrets", f"{file} may be changed by others than its owner", f"`sudo chmod go-w {file}`")
-    return passed("secrets", f"{file} {secret or 'holds no password'}, mode {mode & 0o777:o}")
 
 
 def check_fleet(config: DroneConfig, listen_s: float = LISTEN_S) -> Iterator[Finding]:

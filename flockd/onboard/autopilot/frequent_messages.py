@@ -35,7 +35,6 @@ LAYOUTS: Mapping[int, _Layout] = {
         "DISTANCE_SENSOR", 85, "I3HxxB25xB",
         "time_boot_ms min_distance max_distance current_distance orientation signal_quality",
     ),
-    141: _layout("ALTITUDE", 47, "28xf", "bottom_clearance"),
 }  # fmt: skip
 """By message number; of each the fields that `ReceivedMessages` reads."""
 BEGINS, HEADER, CHECKSUM, SIGNATURE, SIGNED = 0xFD, 10, 2, 13, 1

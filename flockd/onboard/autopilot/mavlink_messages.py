@@ -1,13 +1,13 @@
 """What the autopilot's MAVLink messages say: decoding, without MAVSDK and without I/O.
 
 Messages are kept as they come, the newest of each kind, so that no queue grows and the state is known at any time.
-Values of enumerations are checked where they enter: one that is not known here counts as unknown, and is counted.
+Values of enumerations are checked where they enter: one that is not known here counts as unknown.
 """
 
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -56,7 +56,7 @@ VALUES: Mapping[str, tuple[str, range]] = {
 FACES_DOWN = 25
 """MAV_SENSOR_ROTATION_PITCH_270 of MAV_SENSOR_ORIENTATION."""
 RANGES_KEPT = 200
-"""Arrivals of each range finder, to tell its rate."""
+"""Arrivals of its readings, to tell their rate."""
 FULL_SIGNAL, NO_SIGNAL = 100, 1
 """Values of DISTANCE_SENSOR's `signal_quality`, in percent; 0 is for sensors that do not say."""
 QUATERNION_TOLERANCE = 0.1
@@ -106,7 +106,7 @@ class ReceivedMessages:
         """
         self._report = report
         self._newest: dict[str, ReceivedMessage] = {}
-        self._unknown_values: Counter[str] = Counter()
+        self._unknown_values: set[str] = set()
         self._home: FloatArray | None = None
         self._home_deg: FloatArray | None = None
         self._flies = False
@@ -116,9 +116,10 @@ class ReceivedMessages:
         self._text = StatusText()
         self._texts: deque[tuple[float, str]] = deque(maxlen=TEXTS_KEPT)
         """Warnings and worse, with their times."""
-        self._ground_range: RangeReading | None = None
-        self._ranges_s: dict[int, deque[float]] = {}
-        """When the newest readings of range finders came, by their orientation."""
+        self.ground_range: RangeReading | None = None
+        """The newest of the range finder that faces down."""
+        self.ranges_s: deque[float] = deque(maxlen=RANGES_KEPT)
+        """When its last readings came."""
         self._other_computer_s = -math.inf
         self._first_s, self._heard_s = math.inf, -math.inf
         """When its first heartbeat came, and its newest message."""
@@ -161,11 +162,9 @@ class ReceivedMessages:
         fields = self._without_jumps(name, fields)
         if name in STAMPED:
             arrived_s, time_s = time_s, self._stamped_s(name, fields, time_s)
-            if name == DISTANCE_SENSOR:
-                orientation = int(fields.get("orientation") or 0)
-                self._ranges_s.setdefault(orientation, deque(maxlen=RANGES_KEPT)).append(arrived_s)
-                if orientation == FACES_DOWN:
-                    self._ground_range = _range_reading(fields, time_s)
+            if name == DISTANCE_SENSOR and fields.get("orientation") == FACES_DOWN:
+                self.ranges_s.append(arrived_s)
+                self.ground_range = _range_reading(fields, time_s)
         self._newest[name] = ReceivedMessage(time_s, self._checked(name, fields))
         self._follow(name, time_s)
 
@@ -329,10 +328,6 @@ class ReceivedMessages:
         """The newest of a kind; None before the first."""
         return self._newest.get(name)
 
-    def unknown_values(self) -> Mapping[str, int]:
-        """How often each unknown value has arrived, as in `EXTENDED_SYS_STATE.landed_state = 5`."""
-        return dict(self._unknown_values)
-
     def status(self, now_s: float) -> AutopilotStatus:
         """What they say of the autopilot."""
         heartbeat = self._newest.get("HEARTBEAT", ReceivedMessage(-math.inf, {}))
@@ -378,22 +373,8 @@ class ReceivedMessages:
             velocity_ned=velocity,
             position=None if self._home is None else (place - self._home)[:2],
             home_deg=self._home_deg,
-            ground_range=self.ground_range(),
+            ground_range=self.ground_range,
         )
-
-    def ground_range(self) -> RangeReading | None:
-        """The newest of the range finder that faces down, or PX4's distance to bottom where that is silent."""
-        sensor, altitude = self._ground_range, self._newest.get("ALTITUDE")
-        bottom = None if altitude is None else _vector(altitude.fields, "bottom_clearance")
-        if altitude is None or bottom is None or bottom[0] <= 0.0:
-            return sensor
-        if sensor is not None and altitude.time_s - sensor.time_s <= services.RANGE_FINDER.timeout:
-            return sensor
-        return RangeReading(altitude.time_s, float(bottom[0]), vertical=True)
-
-    def range_finders(self) -> Mapping[int, tuple[float, ...]]:
-        """When the last readings came, by the MAV_SENSOR_ORIENTATION of the sensor."""
-        return {orientation: tuple(times) for orientation, times in list(self._ranges_s.items())}
 
     def flight_mode(self) -> FlightMode:
         """By the newer of heartbeat and CURRENT_MODE; a mode that is not in `MODES` is `other`."""
@@ -419,7 +400,7 @@ class ReceivedMessages:
         value = f"{name}.{field} = {fields[field]}"
         if value not in self._unknown_values:
             self._report(f"the autopilot sends {value}, which flockd does not know; it counts as unknown")
-        self._unknown_values[value] += 1
+        self._unknown_values.add(value)
         return {**fields, field: None}
 
 

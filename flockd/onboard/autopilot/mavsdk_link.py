@@ -71,8 +71,7 @@ STREAMS_HZ = {
     "ESTIMATOR_STATUS": (230, 2.0),
     "HOME_POSITION": (242, 1.0),
     "CURRENT_MODE": (436, 20.0),
-    "DISTANCE_SENSOR": (132, services.RANGE_FINDER.rate_hz),
-    "ALTITUDE": (141, 10.0),
+    "DISTANCE_SENSOR": (132, services.GROUND_RANGE.rate_hz),
     "POSITION_TARGET_LOCAL_NED": (85, services.POSITION_TARGET.rate_hz),
 }
 """What is asked for, by message number and rate. PX4 sends CURRENT_MODE at once when the mode changes, at this rate at

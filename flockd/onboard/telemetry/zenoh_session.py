@@ -58,16 +58,6 @@ def open_session(
         raise SessionError(purpose, f"{endpoints}{with_settings}", reason) from error
 
 
-def private_keys(settings: Path) -> tuple[Path, ...]:
-    """The files of the private keys that zenoh's settings name. Raises SessionError where these cannot be read."""
-    try:
-        tls = json.loads(zenoh.Config.from_file(str(settings)).get_json("transport/link/tls"))
-    except zenoh.ZError as error:
-        raise SessionError("telemetry", f"the settings of {settings}", str(error).split(" at ")[0]) from error
-    names = [str(tls[name]) for name in tls if name.endswith("private_key") and tls[name]]
-    return tuple(Path(name) for name in dict.fromkeys(names))
-
-
 def close_session(session: zenoh.Session) -> None:
     """Ends a session and all that was declared in it."""
     with suppress(zenoh.ZError):  # after ten seconds, where a peer that is lost does not hear that it ends

@@ -53,7 +53,6 @@ class TelemetryStreams:
     ) -> None:  # fmt: skip
         self._vehicle, self._mav, self._truth, self._range_finder = vehicle, link, truth, range_finder
         self._home_deg, self._started_s, self._now_s = home_deg, started_s, started_s
-        self._clearance_m = math.nan
         self.heartbeats_to_lose = 0
         """So many of the next are lost on their way."""
         self._heartbeat_s = heartbeat_s
@@ -75,7 +74,6 @@ class TelemetryStreams:
             230: (1.0, self._send_estimator),
             242: (1.0, self._send_home),
             132: (0.1, self._send_range),
-            141: (0.1, self._send_altitude),
             85: (0.1, self._send_setpoint),
             115: (TRUTH_S, self._send_truth),
             436: (2.0, self._send_mode),
@@ -162,15 +160,12 @@ class TelemetryStreams:
 
     def _send_range(self) -> None:
         """Nothing in a dropout; of ground out of its limits a reading without a signal, as drivers do."""
-        self._clearance_m = math.nan
         if self._range_finder is None:
             return
         motion = self._vehicle.state
         reading = self._range_finder.read(self._now_s, motion.position, motion.velocity, motion.R_ned_body)
         if reading is None or reading.min_m is None or reading.max_m is None:
             return
-        if reading.quality:
-            self._clearance_m = reading.range_m * float(motion.R_ned_body[2, 2])
         self._mav.distance_sensor_send(
             self._boot_ms(),
             *(round(100.0 * metres) for metres in (reading.min_m, reading.max_m, reading.range_m)),
@@ -180,12 +175,6 @@ class TelemetryStreams:
             UNKNOWN_COVARIANCE,
             signal_quality=FULL_SIGNAL if reading.quality else NO_SIGNAL,
         )
-
-    def _send_altitude(self) -> None:
-        """With the distance to bottom, which PX4 has as long as it has ranges."""
-        height_m = -float(self._vehicle.state.position[2])
-        heights_m = [height_m] * 4
-        self._mav.altitude_send(self._boot_ms() * 1000, *heights_m, math.nan, self._clearance_m)
 
     def _send_truth(self) -> None:
         motion = self._vehicle.state

@@ -1,18 +1,15 @@
-"""Who else is there: on the fleet, on this computer; how open its unit is, and which secrets others may read."""
+"""Who else is there: on the fleet, on this computer."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
-from flockd.core.config import DroneConfig, load_drone
+from flockd.core.config import load_drone
 from flockd.core.config.drone import TelemetryParameters
-from flockd.core.config.source import CameraDeviceParameters, SourceParameters
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
 from flockd.ground.doctor import Finding, Level
-from flockd.ground.doctor.setup_checks import check_fleet, check_instance, check_secrets
+from flockd.ground.doctor.setup_checks import check_fleet, check_instance
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.sim.sitl.ports import free_endpoint
@@ -58,44 +55,3 @@ def test_a_second_instance() -> None:
     assert next(iter(check_instance(None))).level is Level.PASS
     (finding,) = check_instance(UnavailableError("autopilot.address: taken; stop it"))
     assert (finding.level, finding.measured) == (Level.FAILURE, "autopilot.address: taken")
-
-
-OPEN, CLOSED = "rtspsrc location=rtsp://10.0.0.7/s", "rtspsrc location=rtsp://anna:hunter2@10.0.0.7/s"
-
-
-def _with_pipeline(pipeline: str, settings: Path | None = None) -> DroneConfig:
-    source = SourceParameters(kind="gstreamer", cameras=(CameraDeviceParameters(name="front", pipeline=pipeline),))
-    return make.changed(make.drone(source=source), telemetry__zenoh_config=None if settings is None else str(settings))
-
-
-def _levels(config: DroneConfig, file: Path) -> list[Level]:
-    return [finding.level for finding in check_secrets(config, file)]
-
-
-def test_a_configuration_with_a_password_is_for_the_service_alone(tmp_path: Path) -> None:
-    file = tmp_path / "drone.yaml"
-    file.touch()
-    for mode, pipeline, level in (
-        (0o644, OPEN, Level.PASS),
-        (0o644, CLOSED, Level.FAILURE),  # every user may read it
-        (0o640, CLOSED, Level.PASS),
-        (0o666, OPEN, Level.FAILURE),  # others may change it
-    ):
-        file.chmod(mode)
-        assert _levels(_with_pipeline(pipeline), file) == [level]
-    assert _levels(_with_pipeline(OPEN), tmp_path / "none") == [Level.WARNING]
-
-
-def test_the_private_keys_of_tls_are_for_the_service_alone(tmp_path: Path) -> None:
-    file, settings, key = (tmp_path / name for name in ("drone.yaml", "tls.json5", "own.key"))
-    for one in (file, key):
-        one.touch()
-        one.chmod(0o600)
-    text = (data_path("config") / "zenoh_tls.json5").read_text(encoding="utf-8")
-    settings.write_text(text.replace("/etc/flockd/tls", str(tmp_path)), encoding="utf-8")
-    settings.chmod(0o644)
-    assert _levels(_with_pipeline(OPEN, settings), file) == [Level.PASS] * 3, "listens and connects"
-    key.chmod(0o644)
-    assert _levels(_with_pipeline(OPEN, settings), file)[-1] is Level.FAILURE
-    settings.write_text("{", encoding="utf-8")
-    assert _levels(_with_pipeline(OPEN, settings), file)[-1] is Level.FAILURE

@@ -17,11 +17,9 @@ MESSAGES = [
     mavlink.MAVLink_position_target_local_ned_message(7, 1, 0, NAN, NAN, NAN, 1.5, -0.5, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0),
     mavlink.MAVLink_distance_sensor_message(9, 20, 3000, 253, 0, 3, 25, 255, 0.1, 0.2, [1.0, 0, 0, 0], 87),
     mavlink.MAVLink_distance_sensor_message(9, 20, 3000, 250, 0, 3, 25, 0),
-    mavlink.MAVLink_altitude_message(10**15, 1.0, 2.0, 3.0, 4.0, 5.0, 6.25),
 ]
 OTHERS = [
     mavlink.MAVLink_heartbeat_message(2, 12, 81, 50593792, 4, 3),
-    mavlink.MAVLink_attitude_message(1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
 ]
 
 

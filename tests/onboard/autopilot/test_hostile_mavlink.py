@@ -45,7 +45,6 @@ def test_whatever_an_autopilot_sends_is_taken_or_left() -> None:
             R = state.R_ned_body
             assert np.allclose(R @ R.T, np.eye(3), atol=1e-6), "an attitude that is no rotation"
             assert math.isfinite(state.height_m)
-        assert all(isinstance(count, int) for count in received.unknown_values().values())
         for sentence in said:
             assert_readable(sentence)
 

@@ -112,8 +112,7 @@ class GroundFilter:
         fault = reading_fault(reading, vehicle.time_s, self._parameters)
         if reading is None or fault is not None:
             return fault
-        along = np.array([0.0, 0.0, 1.0]) if reading.vertical else vehicle.R_ned_body[:, 2]
-        point = reading.range_m * along
+        point = reading.range_m * vehicle.R_ned_body[:, 2]
         ground_m = _height_at(reading.time_s, vehicle) - float(point[2])
         place = GroundPoint(vehicle.time_s, self._flown + point[:2], ground_m, reading.range_m)
         home = None if vehicle.position is None else self._flown - vehicle.position

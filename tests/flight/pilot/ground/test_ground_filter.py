@@ -32,12 +32,11 @@ def state(
     R: FloatArray = LEVEL,
     age_s: float = 0.02,
     quality: float | None = 1.0,
-    vertical: bool = False,
 ) -> VehicleState:
     """The state of a drone whose sensor measures from 0.2 to 12 m."""
     reading = None
     if range_m is not None:
-        reading = RangeReading(time_s - age_s, range_m, vertical=vertical, min_m=0.2, max_m=12.0, quality=quality)
+        reading = RangeReading(time_s - age_s, range_m, min_m=0.2, max_m=12.0, quality=quality)
     return vehicle(time_s, height_m, R_ned_body=R, position=[north_m, 0.0], ground_range=reading)
 
 
@@ -56,8 +55,6 @@ def test_a_slant_range_is_turned_upright() -> None:
     ground = known(follower().update(state(0.0, 5.0, R=R)))
     assert ground.source == "range_finder"
     assert ground.height_m == pytest.approx(upright_m, abs=1e-9)
-    of_autopilot = known(follower().update(state(0.0, 5.0, R=R, vertical=True)))
-    assert of_autopilot.height_m == pytest.approx(5.0), "PX4's distance to bottom is straight down already"
 
 
 def test_successive_ranges_over_a_hillside_tell_its_slope() -> None:
