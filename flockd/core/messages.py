@@ -15,7 +15,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from flockd.core.angles import wrapped
+from flockd.core.navigation import wrapped
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]

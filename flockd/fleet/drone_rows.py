@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from flockd.core.earth import degrees_apart, metres_a_degree
+from flockd.core.navigation import degrees_apart, metres_a_degree
 from flockd.fleet.watcher import Heard, Watched, ambiguity
 from flockd.onboard.telemetry.topics import AboutMessage, is_name
 

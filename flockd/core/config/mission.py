@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from flockd.core.config.base import Distance, NonNegative, Section, Speed, refuse
 from flockd.core.config.safety import GateParameters
-from flockd.core.polygon import is_inside
+from flockd.core.navigation import is_inside
 
 MissionKind = Literal["circle_then_tangent", "hover", "velocity", "waypoints", "follow", "operator"]
 AtEnd = Literal["hold", "land", "return"]

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from flockd.core.ros_frames import MAP, attitude_in_ros
 from flockd.fleet.drone_rows import GONE, QUIET, Known, Row
 from flockd.fleet.live_fleet import LiveFleet
 from flockd.fleet.ros import message_trees as trees
 from flockd.fleet.ros.fleet_markers import home_in_map, markers
 from flockd.fleet.ros.message_trees import Names, Tree, ros_name
+from flockd.fleet.ros.ros_frames import MAP, attitude_in_ros
 from flockd.fleet.ros.ros_node import Delivery, RosNode, has_type
 from flockd.fleet.ros.ros_orders import goal_of, velocity_of
 from flockd.fleet.watcher import Watched

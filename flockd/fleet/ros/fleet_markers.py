@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from flockd.core.messages import FloatArray
-from flockd.core.ros_frames import MAP, attitude_in_ros, attitude_of_angles, enu_of_ned
 from flockd.fleet.drone_rows import GONE, QUIET, Row
 from flockd.fleet.ros.message_trees import LEVEL_TURN, Tree, header, turn, vector
+from flockd.fleet.ros.ros_frames import MAP, attitude_in_ros, attitude_of_angles, enu_of_ned
 
 COURSE_S = 2.0
 """A course leads to where the drone is then."""

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockd.core import ros_frames as rf
 from flockd.core.messages import FloatArray
+from flockd.fleet.ros import ros_frames as rf
 from flockd.onboard.telemetry.topics import NeighbourMessage, ObstaclesMessage, StateMessage
 
 Tree = dict[str, Any]

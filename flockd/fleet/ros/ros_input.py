@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from flockd.core.messages import FloatArray, VehicleState
-from flockd.core.ros_frames import attitude_of_ros, frd_of_flu, ned_of_enu, rotation_of
 from flockd.fleet.ros.message_trees import IMU, ODOMETRY, POSE
+from flockd.fleet.ros.ros_frames import attitude_of_ros, frd_of_flu, ned_of_enu, rotation_of
 
 _NS = 1_000_000_000
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from flockd.core.ros_frames import MAP, ned_of_enu
 from flockd.fleet.drone_rows import Row, origin_of
 from flockd.fleet.ros.message_trees import Names
+from flockd.fleet.ros.ros_frames import MAP, ned_of_enu
 from flockd.onboard.telemetry.topics import AboutMessage, OrderMessage
 
 

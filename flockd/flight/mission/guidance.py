@@ -8,8 +8,8 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from flockd.core.angles import wrapped
 from flockd.core.messages import FloatArray, MissionOrder
+from flockd.core.navigation import wrapped
 
 SLOW_DOWN_S = 2.0
 """The way to the last goal is flown no faster than the distance left over this."""

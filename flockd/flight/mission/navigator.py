@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from flockd.core.angles import wrapped
 from flockd.core.config.mission import MissionParameters, WaypointParameters
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray, MissionOrder, MissionStatus
+from flockd.core.navigation import wrapped
 from flockd.flight.mission.circle_then_tangent import CircleThenTangent
 from flockd.flight.mission.follow import Follow
 from flockd.flight.mission.guidance import Guidance, Mission, Moment

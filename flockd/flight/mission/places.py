@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from flockd.core.config.mission import WaypointParameters
-from flockd.core.earth import degrees_apart, metres_a_degree
 from flockd.core.messages import FloatArray, MissionOrder
+from flockd.core.navigation import degrees_apart, metres_a_degree
 
 
 def place_of_order(order: MissionOrder, origin: FloatArray, home_deg: FloatArray | None) -> FloatArray | None:

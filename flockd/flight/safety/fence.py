@@ -8,7 +8,7 @@ import numpy as np
 
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray
-from flockd.core.polygon import is_inside
+from flockd.core.navigation import is_inside
 from flockd.flight.safety.approach import NOTHING_NEAR, stopping_speed
 
 

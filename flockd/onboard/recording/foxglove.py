@@ -17,13 +17,14 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import DecodeError
+from scipy.spatial.transform import Rotation
 
 from flockd.core.choices import ImageFormat
 from flockd.core.config.rig import CameraConfig
 from flockd.core.messages import FloatArray
-from flockd.core.ros_frames import CENTRE_PX, quaternion_of
 from flockd.flight.geometry import Rig
 from flockd.onboard.recording.mcap_file import RecordingError, Stream
+from flockd.onboard.sources.ros_device import CENTRE_PX
 
 
 def image(time_ns: int, camera: str, data: bytes, kind: ImageFormat) -> bytes:
@@ -102,7 +103,7 @@ def _vector(values: FloatArray) -> dict[str, float]:
 
 
 def _turn(R: FloatArray) -> dict[str, float]:
-    return dict(zip("xyzw", quaternion_of(R).tolist(), strict=True))
+    return dict(zip("xyzw", Rotation.from_matrix(R).as_quat(canonical=True).tolist(), strict=True))
 
 
 def _stamp(time_ns: int) -> dict[str, int]:

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 
 from flockd.core.config.rig import IntrinsicsConfig
 from flockd.core.config.source import CameraDeviceParameters
-from flockd.core.ros_frames import CENTRE_PX
 from flockd.onboard.sources.camera_child import COMPRESSED, IMAGE, IMAGE_HEAD, INFO, INFO_BODY, NO_ROS
 from flockd.onboard.sources.child_device import ROS_CHILD, ChildDevice, ChildMessage
 from flockd.onboard.sources.frames import CameraError, CapturedBuffer
@@ -26,6 +25,8 @@ ENCODINGS: Mapping[str, str] = {
     "uyvy": "UYVY",
 }
 """What is read of `sensor_msgs/image_encodings`, by GStreamer's name."""
+CENTRE_PX = 0.5
+"""ROS and its tools have pixel centres at whole numbers, flockd at +0.5."""
 LENS_TOLERANCE = 0.03
 """By so much of the focal length a driver's CameraInfo and the rig may be apart: two calibrations of one camera are."""
 

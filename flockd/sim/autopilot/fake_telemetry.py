@@ -11,8 +11,8 @@ import numpy as np
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import development as mavlink
 
-from flockd.core.earth import metres_a_degree
 from flockd.core.messages import FloatArray
+from flockd.core.navigation import metres_a_degree
 from flockd.flight.geometry import quaternion_from_rotation, rotation_from_vector, vector_from_rotation
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flockd.core.angles import wrapped
 from flockd.core.messages import FloatArray
+from flockd.core.navigation import wrapped
 from flockd.flight.geometry import rotation_from_euler
 from flockd.sim.scenario import VehicleConfig
 from flockd.sim.vehicles import vehicles

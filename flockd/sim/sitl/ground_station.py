@@ -19,9 +19,9 @@ import numpy as np
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import development as mavlink
 
-from flockd.core.earth import metres_a_degree
 from flockd.core.errors import UnavailableError
 from flockd.core.messages import FloatArray
+from flockd.core.navigation import metres_a_degree
 from flockd.flight.geometry import rotation_from_euler, rotation_from_quaternion
 from flockd.onboard.autopilot.mavlink_messages import StatusText
 from flockd.sim.autopilot.fake_telemetry import Mode

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from flockd.core.messages import FloatArray
-from flockd.core.ros_frames import rotation_of
 from flockd.fleet.drone_rows import WORST_FIRST, Known, drone_rows, origin_of
 from flockd.fleet.ros.fleet_bridge import _LEVELS, _status, _transforms
 from flockd.fleet.ros.fleet_markers import markers
 from flockd.fleet.ros.message_trees import Names
+from flockd.fleet.ros.ros_frames import rotation_of
 from flockd.fleet.watcher import Heard, Watched
 from flockd.onboard.telemetry.topics import AboutMessage, StateMessage
 from tests.make import flight_message

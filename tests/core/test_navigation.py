@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from flockd.core.angles import wrapped
 from flockd.core.messages import Setpoint, Wanted
+from flockd.core.navigation import wrapped
 from flockd.flight.mission import Guidance
 
 DEGREES = [

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from flockd.core import ros_frames as rf
+from flockd.fleet.ros import ros_frames as rf
 
 TOLERANCE = 1e-9
 

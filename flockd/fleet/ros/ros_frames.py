@@ -2,8 +2,7 @@
 
 flockd's world is north, east, down (NED), its body forward, right, down (FRD); those of ROS are east, north, up (ENU)
 and forward, left, up (FLU).
-Yaw counts from east counter-clockwise in ROS, and from north clockwise in flockd; pixel centres lie at whole numbers in
-ROS, and half a pixel farther in flockd. ``R_a_b`` takes coordinates from b to a.
+Yaw counts from east counter-clockwise in ROS, and from north clockwise in flockd. ``R_a_b`` takes coordinates from b to a.
 """
 
 from __future__ import annotations
@@ -13,8 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from flockd.core.messages import FloatArray, IntArray
 
-CENTRE_PX = 0.5
-"""Coordinates of the first pixel's centre in flockd; 0 in ROS."""
 MAP = "map"
 """REP 105: the world of all drones, which does not drift; here with its origin at the home of one of them."""
 _ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])

@@ -1,0 +1,39 @@
+"""Angles modulo a turn, places within a polygon, and how many metres a degree of the WGS 84 ellipsoid is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+EQUATOR_M = 6_378_137.0
+SQUARED_ECCENTRICITY = 6.694379990e-3
+
+
+def wrapped(angle_rad: float) -> float:
+    """The same direction in (-pi, pi]; an angle in there stays as it is. NaN where it is not finite."""
+    if not math.isfinite(angle_rad):
+        return math.nan
+    turned_rad = math.remainder(angle_rad, math.tau)
+    return turned_rad if turned_rad > -math.pi else math.pi
+
+
+def is_inside(corners: Sequence[tuple[float, float]], north_m: float, east_m: float) -> bool:
+    """Whether a ray to the east crosses the outline through the corners, (north, east), an odd number of times."""
+    crossed = 0
+    for (n1, e1), (n2, e2) in zip(corners, (*corners[1:], corners[0]), strict=True):
+        crossed += (n1 > north_m) != (n2 > north_m) and east_m < e1 + (e2 - e1) * (north_m - n1) / (n2 - n1)
+    return crossed % 2 == 1
+
+
+def metres_a_degree(latitude_deg: float) -> tuple[float, float]:
+    """Metres in a degree of latitude and of longitude."""
+    latitude = math.radians(latitude_deg)
+    flattened = 1.0 - SQUARED_ECCENTRICITY * math.sin(latitude) ** 2
+    north = math.radians(EQUATOR_M * (1.0 - SQUARED_ECCENTRICITY) / flattened**1.5)
+    east = math.radians(EQUATOR_M * math.cos(latitude) / math.sqrt(flattened))
+    return north, east
+
+
+def degrees_apart(longitude_deg: float, other_deg: float) -> float:
+    """How far east one longitude is of another, the shorter way around the Earth: from -180 to 180."""
+    return (longitude_deg - other_deg + 180.0) % 360.0 - 180.0
