@@ -2,7 +2,8 @@
 
 flockd's world is north, east, down (NED), its body forward, right, down (FRD); those of ROS are east, north, up (ENU)
 and forward, left, up (FLU).
-Yaw counts from east counter-clockwise in ROS, and from north clockwise in flockd. ``R_a_b`` takes coordinates from b to a.
+Yaw counts from east counter-clockwise in ROS, and from north clockwise in flockd. ``R_a_b`` takes
+coordinates from b to a.
 """
 
 from __future__ import annotations
