@@ -20,24 +20,24 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_070,
+    "flockd/core": 2_970,
     "flockd/flight": 12_590,
-    "flockd/onboard": 9_220,
-    "flockd/fleet": 2_600,
-    "flockd/ground": 4_590,
+    "flockd/onboard": 9_190,
+    "flockd/fleet": 2_680,
+    "flockd/ground": 4_160,
     "flockd/review": 3_390,
-    "flockd/sim": 9_360,
+    "flockd/sim": 9_340,
     "flockd/campaign": 1_470,
-    "flockd/cli": 3_530,
-    "tests": 37_370,
+    "flockd/cli": 3_510,
+    "tests": 37_150,
     "tools/checks": 2_060,
     "tools/docs": 760,
-    "tools/measure": 1_310,
+    "tools/measure": 1_430,
     "tools/release": 550,
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 354}
+FILES = {"flockd": 351}
 NUMBERS_OF_FLIGHT = 349
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
