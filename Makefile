@@ -36,8 +36,9 @@ lint: $(VENV)/test.installed ### ruff and mypy
 test: $(VENV)/test.installed ## lint and all tests but the slow ones, side by side, on two cores in under 10 minutes
 	$(MAKE) --jobs=2 lint quick
 
+# Three on two cores: many wait for sleeps and sockets.
 quick: $(VENV)/test.installed
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow and not browser and not ros and not training" --durations=10 --durations-min=1
+	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not slow and not browser and not ros and not training" --durations=10 --durations-min=1
 
 test-all: lint ### lint and all tests, those too that take minutes each
 	$(BIN)/python -m pytest -n 2

@@ -126,21 +126,6 @@ def test_a_drone_that_allows_no_command_refuses(flock: Flock) -> None:
     assert answer == {"made-up/drone4": refusal}
 
 
-def test_a_stranger_in_the_same_browser_commands_nothing(flock: Flock) -> None:
-    """With the page's cookie in the browser, from a page of another origin."""
-    stranger = flock.page.context.new_page()
-    stranger.goto("about:blank")
-    sent = stranger.evaluate(
-        """async address => { try { const reply = await fetch(address + "ask", {method: "POST", mode: "no-cors",
-        credentials: "include", body: JSON.stringify({drones: ["made-up/drone1"], command: "hold"})});
-        return reply.status } catch { return "refused" } }""",
-        flock.address.split("?")[0],
-    )
-    assert sent in {0, "refused"}, "its reply cannot be read"
-    stranger.close()
-    expect(flock.page.locator(f"{card(flock.page, 'drone1')} .state")).to_have_text("normal")
-
-
 def opened_beside(flock: Flock) -> Page:
     """A page of a browser of its own."""
     browser = flock.page.context.browser

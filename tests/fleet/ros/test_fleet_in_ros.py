@@ -117,15 +117,6 @@ def test_a_hold_is_confirmed_and_a_drone_that_allows_none_refuses(fleet: Fleet) 
     assert fleet.node.call("/drone4/hold")["ok"] is False, "it allows nothing"
 
 
-def test_an_order_by_topic_is_answered_too(fleet: Fleet) -> None:
-    fleet.node.listen("/drone1/order_answer", STATUS, "event")
-    time.sleep(1.0)  # a topic has no wait_for: until the two have found each other
-    fields = {"header.frame_id": "base_link", "pose.position.x": 1.0}
-    fleet.node.do("publish", topic="/drone1/goal", type=GOAL, fields=fields)
-    answer = fleet.node.newest("/drone1/order_answer")
-    assert (answer["level"], answer["name"]) == (2, "drone1: goto")
-
-
 def test_without_orders_a_stranger_finds_no_service(fleet: Fleet) -> None:
     """A domain in which the same fleet is only watched."""
     endpoint, environment = free_endpoint(), own_domain()

@@ -102,14 +102,6 @@ def test_it_turns_to_the_side_to_which_the_gate_lets_it_fly() -> None:
         assert velocity[1] <= most_m_s
 
 
-def test_between_two_that_come_it_flies_as_clear_of_both_as_can_be() -> None:
-    """From the left and the right, so fast that there is no way out: within the highest speed, and away from none."""
-    offsets, theirs = np.array([[0.0, 2.0, 0.0], [0.0, -2.0, 0.0]]), np.array([[2.0, -3.0], [2.0, 3.0]])
-    velocity = clear_of(NORTH, NORTH, offsets, theirs, PARAMETERS, 3.0)
-    assert math.hypot(*velocity) <= PARAMETERS.max_speed_m_s
-    assert velocity[0] > NORTH[0]  # through before they meet
-
-
 @pytest.mark.parametrize("avoids", [True, False])
 @pytest.mark.parametrize("angle_deg", [180.0, 135.0, 90.0, 45.0])
 def test_two_on_a_course_to_meet_pass_at_the_separation(angle_deg: float, *, avoids: bool) -> None:

@@ -12,14 +12,12 @@ import pytest
 import yaml
 from onnx import helper
 
-from flockd.core.choices import ROLES
-from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
 from flockd.core.errors import ModelError
-from flockd.flight.inference import OnnxModel, manifests_of, read_manifest
+from flockd.flight.inference import OnnxModel, read_manifest
 from flockd.flight.inference.feeds import feeds_for
 from flockd.flight.inference.fitting import fit
-from flockd.flight.perception.requirements import REQUIREMENTS, check_roles
+from flockd.flight.perception.requirements import check_roles
 from tests.flight.inference.foreign import (
     SIZE,
     image_input,
@@ -152,15 +150,6 @@ def test_what_cannot_be_is_refused_in_one_sentence_with_file_line_and_key(
     line = path.read_text().splitlines()[int(found[1]) - 1].strip()
     names = re.split(r"[.\[]", key.removesuffix("]"))
     assert line.startswith(("- ", *(f"{name}:" for name in names[-2:]))) or (found[1] == "1" and len(names) == 1)
-
-
-def test_each_role_of_the_configuration_has_its_requirements() -> None:
-    assert tuple(REQUIREMENTS) == ROLES
-    config = PerceptionConfig()
-    assert config.networks == {role: getattr(config, role) for role in ROLES}
-    without = PerceptionConfig(flow="dis", distance="none")
-    assert list(without.networks) == ["depth", "segmentation"]
-    assert [path.stem for path in manifests_of(without)] == ["neighbours_int8"]
 
 
 def test_an_output_is_read_by_the_names_of_its_columns(tmp_path: Path) -> None:

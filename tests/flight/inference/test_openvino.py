@@ -44,26 +44,6 @@ def test_crops_stay_with_onnx_runtime(name: str) -> None:
     assert opened(name).provider == "CPUExecutionProvider"
 
 
-def test_two_threads_at_once_get_what_each_asked_for() -> None:
-    model = opened("flow_int8")
-    feeds = [feeds_for(model.manifest, size) for size in ((160, 120), (160, 120), (120, 160))]
-    feeds[1] = {name: 255 - value for name, value in feeds[1].items()}
-    alone = [model.run(each)["flow"] for each in feeds]
-    wrong: list[int] = []
-
-    def run(index: int) -> None:
-        together = [model.run(feeds[index])["flow"] for _ in range(8)]
-        wrong.extend(index for flow in together if not np.array_equal(flow, alone[index]))
-
-    threads = [threading.Thread(target=run, args=(index,)) for index in range(len(feeds))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert wrong == []
-    assert not np.array_equal(alone[0], alone[1])
-
-
 def test_a_run_can_be_ended_and_the_next_one_is_whole() -> None:
     model = opened("neighbours_int8")
     feeds = feeds_for(model.manifest, (640, 480))

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flockd.cli import main
 from flockd.core.config import DroneConfig, load_drone
 from flockd.core.config.mission import fault_of_place
 from flockd.core.config.safety import GateParameters
@@ -123,16 +122,6 @@ def test_degrees_are_metres_from_home() -> None:
     outside = far.step(Moment(0.0, ORIGIN, home_deg=np.array([47.5, 8.5])))
     assert "fence" in outside.sentence
     np.testing.assert_allclose(outside.velocity, ORIGIN)
-
-
-def test_heights_have_the_drones_offset_and_stay_until_another() -> None:
-    waypoints = ({"north_m": 2.0, "east_m": 0.0, "height_m": 6.0}, {"north_m": 9.0, "east_m": 0.0})
-    point = Point(mission(kind="waypoints", waypoints=waypoints, height_offset_m=-1.0))
-    assert point.step().height_m == 5.0
-    assert point.fly(10.0).height_m == 5.0
-    assert point.navigator.step(Moment(point.time_s, None)).height_m == 5.0, "without a position it stays there"
-    assert Point(mission(kind="hover", height_m=4.0)).step().height_m == 4.0
-    assert Point(mission(kind="hover")).step().height_m is None
 
 
 def test_an_operators_velocity_and_goal_hold_for_two_seconds() -> None:
@@ -271,15 +260,6 @@ def test_in_a_scenario_the_mission_is_of_all_and_one_drone_may_have_its_own(tmp_
         load_scenario(path)
 
 
-def test_one_drone_at_least_is_left_to_flockd(tmp_path: Path) -> None:
-    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
-    path = tmp_path / "scenario.yaml"
-    path.write_text(SCENARIO.replace("4]}", "4], by_hand: true}"), encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"scenario.yaml:4: vehicles\[0\].by_hand: "):
-        load_scenario(path)
-    assert main(["sim", str(CONFIG / "led_by_hand.yaml"), "--drones", "1", "--perception", "truth"]) == 2
-
-
 def test_the_configuration_and_the_gate_agree_on_what_is_outside() -> None:
     corners = ((-8.0, -10.0), (-8.0, 10.0), (10.0, 10.0), (10.0, 2.0), (2.0, 2.0), (2.0, -10.0))
     gate = GateParameters(fence_radius_m=12.0, fence_corners_m=corners)
@@ -318,10 +298,9 @@ def test_a_mission_changes_the_height_and_lands_at_its_end() -> None:
 # Laps: mission, gate and vehicle in closed loop, turning to one side all the time.
 
 
-@pytest.mark.parametrize("side", [1.0, -1.0], ids=["to the right", "to the left"])
-def test_four_squares_are_flown_without_standing_and_with_the_heading_along(side: float) -> None:
-    """Of 12 m at 1.5 m/s; the gate is stepped each 0.1 s, the mission each 0.5 s."""
-    corners = [(12.0, 0.0), (12.0, side * 12.0), (0.0, side * 12.0), (0.0, 0.0)] * 4
+def test_four_squares_are_flown_without_standing_and_with_the_heading_along() -> None:
+    """To the left, of 12 m at 1.5 m/s; the gate is stepped each 0.1 s, the mission each 0.5 s."""
+    corners = [(12.0, 0.0), (12.0, -12.0), (0.0, -12.0), (0.0, 0.0)] * 4
     navigator, gate = Navigator(to(*corners, speed_m_s=1.5, reached_m=1.0), GATE), Gate(GATE)
     fly = PointMass(np.array([0.0, 0.0, -5.0]))
     state = fly(Demand(np.zeros(2), -5.0, 0.0), 0.0)
@@ -343,7 +322,7 @@ def test_four_squares_are_flown_without_standing_and_with_the_heading_along(side
         before_rad, yaw_rad = yaw_rad, euler_from_rotation(state.R_ned_body)[2]
         turned_rad += math.remainder(yaw_rad - before_rad, math.tau)
     assert guidance.sentence == "at waypoint 16 of 16"
-    assert turned_rad == pytest.approx(4 * side * math.tau, abs=2.0), "as often as it went around"
+    assert turned_rad == pytest.approx(-4 * math.tau, abs=2.0), "as often as it went around"
     speeds = np.hypot(*np.array([setpoint.velocity for setpoint in setpoints[10:-40]]).T)
     assert speeds.min() > 0.75, "it never stands"
     headings = [setpoint.yaw_rad for setpoint in setpoints]

@@ -14,7 +14,7 @@ from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray, ObstacleRanges
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.obstacles import Avoidance
-from flockd.flight.obstacles.steering import Steering, free_way
+from flockd.flight.obstacles.steering import free_way
 from flockd.sim.flock.exact_states import ExactFlock
 from flockd.sim.vehicles.vehicles import Vehicles
 from flockd.sim.world.obstacles import Box, Frustum, Obstacles, Solid, true_ranges
@@ -85,21 +85,6 @@ def test_a_trunk_is_passed_on_the_nearer_side_and_in_the_middle_on_the_right(eas
     assert speed == pytest.approx(1.5 * math.cos(math.atan2(aside, north) / 2) ** 2)
     clearance_m = abs(4.0 * aside - east * north) / speed - 0.2  # of the straight way to the trunk
     assert clearance_m >= PARAMETERS.clearance_m
-
-
-def test_the_side_is_kept_though_the_other_has_become_a_little_nearer() -> None:
-    steering = Steering(PARAMETERS)
-    first, _ = steering.around(np.array([1.5, 0.0]), around(trunk(4.0, -0.1)), STILL)
-    then, _ = steering.around(np.array([1.5, 0.0]), around(trunk(3.5, 0.1)), STILL)
-    fresh, _ = Steering(PARAMETERS).around(np.array([1.5, 0.0]), around(trunk(3.5, 0.1)), STILL)
-    assert (first[1] > 0, then[1] > 0, fresh[1] > 0) == (True, True, False)
-
-
-def test_before_a_wall_it_slides_along() -> None:
-    ahead = around(wall(1.5, 0.0, 0.2, 30.0))
-    north, east = steered((1.5, 0.0), ahead)
-    assert east > 0.5
-    assert abs(north) < 0.3 * east
 
 
 def test_into_what_was_not_looked_at_it_does_not_fly() -> None:

@@ -53,13 +53,6 @@ def test_a_newer_range_of_the_same_obstacle_takes_the_older_ones_place() -> None
     assert view.sigma_m[NORTH] == 0.2
 
 
-def test_two_obstacles_in_a_sector_are_both_kept_and_the_nearer_one_counts() -> None:
-    local = LocalMap(PARAMETERS)
-    local.step(0.0, ranges(0.0, {NORTH: 3.0}), None, 0.0)
-    assert obstacles_in(local.step(0.5, ranges(0.5, {NORTH: 9.0}), STILL, 0.0)) == {NORTH: 3.0}
-    assert obstacles_in(local.step(1.0, ranges(1.0, {NORTH: 9.0}), STILL, 0.0)) == {NORTH: 9.0}  # seen past it twice
-
-
 def test_farther_than_its_range_nothing_counts() -> None:
     local = LocalMap(PARAMETERS)
     assert obstacles_in(local.step(0.0, ranges(0.0, {NORTH: 15.5, EAST: 14.5}), None, 0.0)) == {EAST: 14.5}

@@ -137,16 +137,6 @@ def test_what_no_camera_shows_is_not_seen() -> None:
     assert ranges.seen_m[5] == 12.0
 
 
-def test_depth_without_a_scale_and_a_few_wrong_pixels_show_nothing() -> None:
-    front, nothing = RIG.cameras["front"], np.full(640 * 480, np.nan)
-    few = np.full((640, 480), SKY_M)
-    few[318:330:4, 242] = 1.0  # three of those that are taken
-    for depth, most_m in ((nothing, 0.0), (few.ravel(), 12.0)):
-        ranges = RANGING.ranges(Observation(0.0, vehicle(), {"front": blank(front, depth)}, (), None))
-        assert found(ranges) == {}
-        assert ranges.seen_m.max() == most_m
-
-
 def flown(
     trunk: tuple[float, float, float],
     way: FloatArray,

@@ -90,17 +90,6 @@ def test_a_relative_network_is_refused_where_nothing_fixes_its_scale(tmp_path: P
         perception_with(one_channel_depth(tmp_path, output=RELATIVE), scale="network")
 
 
-@pytest.mark.parametrize(("output", "shift", "inverse"), [(RELATIVE, True, 0.2), ({}, False, 5.0)])
-def test_the_scale_is_left_to_height_where_that_is_asked_for(
-    tmp_path: Path, output: dict[str, Any], shift: bool, inverse: float
-) -> None:
-    """Also a metric network's: it takes no ground as an input, so height has to align what it says."""
-    depth = depth_of(one_channel_depth(tmp_path, output=output), plain((51, 0, 0)), scale="height")
-    assert isinstance(depth, OpenDepth)
-    assert depth.shift is shift
-    np.testing.assert_allclose(depth.inverse, inverse, rtol=1e-5)
-
-
 # Depth without metres: the height above ground says how far away things are.
 
 WIDTH, HEIGHT = 160, 120

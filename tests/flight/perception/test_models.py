@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -16,12 +14,11 @@ from flockd.core.choices import ROLES
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
 from flockd.core.errors import ModelError
-from flockd.core.messages import Float32Array, Frame, UInt8Array
+from flockd.core.messages import Frame, UInt8Array
 from flockd.flight.inference import OnnxModel, find_manifests, load_manifest, read_manifest
 from flockd.flight.perception import Crop, DisFlow, OnnxFlow, OnnxNetworks
 from flockd.flight.perception.flow import grid_flow
 from flockd.flight.perception.maps import RangeEstimate
-from flockd.flight.perception.onnx import CROPS_PER_RUN
 from flockd.flight.perception.requirements import check_roles
 from tests.flight.perception.cameras import crop_of, rendered
 from tests.make import rig_camera
@@ -129,24 +126,6 @@ def test_what_a_mirror_shows_is_estimated_as_if_there_were_none() -> None:
         assert math.exp(told.log_range) == pytest.approx(1.5, rel=0.25)
 
 
-def test_many_images_go_in_batches_no_larger_than_what_is_prepared(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(0)
-    images = rng.integers(0, 256, (31, 96, 96, 3), dtype=np.uint8)
-    pictures = [crop_of(image, 100.0) for image in images]
-    config = PerceptionConfig(verification="none")
-    perception, answer, batches = OnnxNetworks(config, MODELS), OnnxModel.infer, []
-
-    def noted(model: OnnxModel, contents: dict[Any, Any]) -> dict[Any, Float32Array]:
-        batches.append(len(contents["crop"]))
-        return answer(model, contents)
-
-    monkeypatch.setattr(OnnxModel, "infer", noted)
-    ranges = [estimate.log_range for estimate in perception.ranges(pictures)]
-    assert max(batches) == CROPS_PER_RUN
-    assert sum(batches) == 31
-    np.testing.assert_allclose(ranges, [perception.ranges([picture])[0].log_range for picture in pictures], atol=1e-3)
-
-
 def test_the_network_of_flow_is_made_exact_as_configured() -> None:
     first, second = shifted_pictures((9, -5), (320, 240))
     network = OnnxFlow(OnnxModel(MODELS / "flow_int8.yaml", threads=1))
@@ -215,12 +194,3 @@ def test_the_distance_networks_logit_is_added_up_to_the_limit(copies: Path, dete
         assert added == pytest.approx(np.clip(alone, -limit, limit), abs=1e-3)
     assert min(alone[:2]) > 1.0
     assert alone[2] < -1.0
-
-
-def test_what_is_known_of_a_crop_before_is_added_to_what_it_shows() -> None:
-    networks = OnnxNetworks(PerceptionConfig(flow="dis"), MODELS)
-    ground = crops()[2]
-    before, doubted, believed = networks.ranges([replace(ground, evidence=e) for e in (0.0, -1.5, 30.0)])
-    assert logit(doubted) == pytest.approx(logit(before) - 1.5, abs=1e-3)
-    assert math.isnan(before.log_range)
-    assert math.isfinite(believed.log_range), "what is believed is asked for its range"

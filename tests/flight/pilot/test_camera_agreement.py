@@ -95,9 +95,3 @@ def before_a_wall(pairs: PointPairs, random: np.random.Generator) -> PointPairs:
 )
 def test_what_shows_nothing_or_is_near_is_no_other_camera(seen: Seen, way: Way) -> None:
     assert flown_without(AS_CONFIGURED, way, 20, seen=of_front(seen)) == ()
-
-
-def test_who_walks_before_a_drone_that_stands_still_makes_no_camera_another_one() -> None:
-    """All that its cameras see moves."""
-    still = Way(lambda t: np.eye(3), lambda t: np.array([0.0, 0.0, -4.5]))
-    assert flown_without(Wrong.turned({"front": UPSIDE_DOWN}), LIVELY, 12, said=still) == ()

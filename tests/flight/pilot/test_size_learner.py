@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from flockd.core.config import DroneConfig
 from flockd.core.config.safety import GateParameters
@@ -177,12 +176,6 @@ def test_the_gate_reckons_with_what_a_judged_size_may_be_off(
     assert all(least <= sigma <= most for sigma in sigmas)
 
 
-@pytest.mark.parametrize("perception", [{"drone_size_m": 0.4}, {"distance": "none"}])
-def test_what_cannot_be_learned_is_refused(perception: dict[str, Any]) -> None:
-    with pytest.raises(ValidationError, match="size"):
-        DroneConfig.model_validate({**drone().model_dump(), "perception": perception})
-
-
 def at(north_m: float, climb_m_s: float = 0.0) -> Neighbour:
     return neighbour([north_m, 0.0, 0.0], [0.0, 0.0, -climb_m_s], position_sigma_m=0.1)
 
@@ -223,15 +216,6 @@ def test_it_goes_up_and_down_twice_and_ends_where_it_began() -> None:
     half = round(PERIOD_S / STEP_S)
     assert lifts[moved[0] : moved[0] + half] == pytest.approx(lifts[moved[0] + half : moved[0] + 2 * half], abs=1e-9)
     assert lifts[-1] == 0.0
-
-
-@pytest.mark.parametrize("why", ["the mission is over", "the mission's height changes"])
-def test_it_ends_at_once(why: str) -> None:
-    weaving = Weaving()
-    assert weaving.asked(10.0)[-1] != 0.0
-    if why == "the mission's height changes":
-        weaving.wanted_m = HEIGHT_M + 1.0
-    assert (weaving.asked(5.0, needed=why != "the mission is over") == 0.0).all()
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from tools.training.picture_tasks import CROPS, KINDS, VerificationTask
 from tools.training.pictures import CLASSES, NO_BOX, NOT_JUDGED
 from tools.training.quantise import quantise
 from tools.training.samples import Sample
-from tools.training.tasks import DistanceTask, FlowTask, SigmaTask, Task
+from tools.training.tasks import DistanceTask, FlowTask, Task
 from tools.training.train import batches, start, train
 from tools.training.weights import begin_with_onnx
 
@@ -146,26 +146,6 @@ def test_what_a_teacher_is_surer_of_is_no_drone_pulls_the_logit_down(
     # Half of the crops are drones, all with the logit 0: by the labels alone it is neither to rise nor to fall.
     assert float(task.net.get_parameter("head.bias").grad[4]) == pytest.approx(pull, abs=1e-6)
     assert all(value.grad is None for value in task.teacher.parameters()), "the teacher does not learn"
-
-
-def test_sigma_learns_how_far_sizes_are_off_and_changes_nothing_else(tmp_path: Path) -> None:
-    """All drones are judged half as large as they are. Of a Laplace distribution with that mean deviation, ln 2, the
-    standard deviation is root 2 times as much."""
-    torch.manual_seed(0)
-    given = {name: values[:4] for name, values in batch().items()}
-    task = SigmaTask(data_of(tmp_path, given))
-    task.begin()
-    torch.nn.init.constant_(task.net.get_parameter("doubt.2.bias"), 4.6)  # 67 %: few steps are to be enough
-    before = task.net(given["picture"])[0].detach()
-    given["target"][:, 0], given["apparent"] = before[:, 0], before[:, 5] + np.log(2.0)
-    optimiser = torch.optim.Adam([one for one in task.net.parameters() if one.requires_grad], 3e-3)
-    for _ in range(25):
-        optimiser.zero_grad()
-        task.loss(given)[0].backward()
-        optimiser.step()
-    after = task.net(given["picture"])[0].detach()
-    assert torch.equal(after[:, :6], before[:, :6])
-    assert float(torch.exp(after[:, 6]).mean()) == pytest.approx(np.sqrt(2.0) * np.log(2.0), rel=0.1)
 
 
 def write_lines(file: Path, *entries: object) -> None:

@@ -20,7 +20,6 @@ from flockd.sim.renderer.drone_models import drone_model
 from tools.measure.evaluate_crops import held_out, measured
 from tools.training import worlds
 from tools.training.dataset import FOCAL_PX, HEIGHT, WIDTH, open_pairs
-from tools.training.distractors import bag, balloon, bird, kite, mast
 from tools.training.mine import proposed
 from tools.training.own_mesh import OWN_FAMILY
 from tools.training.pictures import CropFiles, Cutouts, Scene, part_of, with_drones
@@ -166,24 +165,3 @@ def test_what_is_proposed_is_a_negative_but_beside_a_drone(network: str) -> None
     found = proposed(model, cut, [])
     assert found
     assert len(proposed(model, cut, found[:1])) < len(found)
-
-
-def test_distractors_have_their_sizes_and_closed_parts() -> None:
-    rng = np.random.default_rng(0)
-    for make in (bird, balloon, kite, bag, lambda rng: mast(rng, 5.0)):
-        for _ in range(8):
-            thing = make(rng)
-            mesh = trimesh.Trimesh(thing.vertices, thing.triangles)
-            mesh.merge_vertices(digits_vertex=5)
-            assert mesh.is_watertight
-            assert all(part.volume > 0 for part in mesh.split())
-            assert len(thing.triangles) <= 500
-            widest = np.ptp(thing.vertices[:, :2], axis=0).max()
-            assert 0.2 <= thing.size_m <= 1.2
-            if thing.wing.any():
-                np.testing.assert_allclose(np.ptp(thing.vertices[:, 1]), thing.size_m, rtol=1e-5)
-                up, down = thing.flapped(0.6), thing.flapped(-0.6)
-                tip = thing.vertices[:, 1].argmax()
-                assert up.vertices[tip, 2] < thing.vertices[tip, 2] < down.vertices[tip, 2]  # z is down
-            else:
-                assert widest < 2.5 * thing.size_m

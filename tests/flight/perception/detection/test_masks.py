@@ -91,18 +91,6 @@ def test_a_pixel_that_two_drones_claim_is_the_surer_ones() -> None:
         assert overlap(found == 1, disc(AHEAD) & ~disc(beside)) > 0.9
 
 
-def test_where_the_second_stage_does_not_tell_the_labels_stay() -> None:
-    """Without a mask, with one of another camera, and behind."""
-    labels, behind = NOTHING.copy(), np.array([-4.0, 0.0, 0.0])
-    labels[300:320, 200:240] = 1
-    for seen, masks in (
-        (detection(1, AHEAD), []),
-        (detection(1, AHEAD, "left"), [mask_of(AHEAD, 0.2)]),
-        (detection(1, behind), [mask_of(behind, 0.2)]),
-    ):
-        assert (drawn((seen, masks), labels=labels).by_networks() == labels).all()
-
-
 def test_a_detected_drone_stands_at_its_range_in_the_map_whichever_way_it_is() -> None:
     place = FRONT.T_body_camera.translation + 5.0 * np.array([math.cos(0.8), 0.0, math.sin(0.8)])
     column, row = FRONT.pixels_of_points(place[None])[0].astype(int)

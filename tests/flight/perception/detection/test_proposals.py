@@ -64,13 +64,6 @@ def test_where_a_lens_images_nothing_the_rest_of_a_box_counts() -> None:
     assert roi_of((600.0, 440.0, 640.0, 480.0), camera) is None
 
 
-def test_a_region_suits_a_drones_size_and_stays_near_the_last_one() -> None:
-    assert RULES.half_angle(0.5, 4.0, 0.003) == pytest.approx(math.atan(0.68 * 0.125))
-    assert RULES.half_angle(0.5, 4.0, 0.003, before=0.4) == pytest.approx(0.4 / 1.7)
-    assert RULES.half_angle(0.5, 400.0, 0.003) == pytest.approx(0.012), "4 px of the image"
-    assert RULES.half_angle(50.0, 1.0, 0.003) == pytest.approx(math.radians(35.0))
-
-
 @pytest.mark.parametrize(("range_m", "searched"), [(3.2, 0), (9.0, 1), (1.0, 1)])
 def test_a_neighbour_is_searched_for_though_another_range_is_detected_there(range_m: float, searched: int) -> None:
     """It is predicted 3 m ahead; what was detected two degrees beside it is it, or far behind it, or hides it."""
@@ -221,15 +214,6 @@ def test_an_instance_takes_the_box_that_is_the_same_drone_and_keeps_its_label() 
     assert drone.centre == pytest.approx([120, 60])
     assert drone.evidence == pytest.approx(0.5 * 2.0)
     assert set(np.unique(marked)) == {0, 1}
-
-
-def test_what_only_one_of_both_finds_is_kept_too() -> None:
-    """The detector's gets a label of its own and comes first; the segmentation's is less likely a drone."""
-    _, seen = merged((instance(1, (10, 10, 20, 20)),), [DRONE], [-1.0])
-    assert [one.label for one in sorted(seen, key=lambda one: -one.score)] == [2, 1]
-    assert [one.evidence for one in seen] == pytest.approx([-0.5, BOXES.no_box])
-    _, (alone,) = merged((instance(1, (10, 10, 20, 20)),), [], [])
-    assert alone.evidence == BOXES.no_box
 
 
 def test_the_parts_of_a_large_drone_are_one_with_it() -> None:

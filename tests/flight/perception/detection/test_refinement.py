@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -97,13 +96,6 @@ def test_a_low_probability_of_the_first_crop_does_not_outlive_the_next(
     """Only a very low one rejects at once; the first crop was not cut to this drone."""
     answering(flyer, lambda asked, _, one: replace(one, drone_probability=given[asked]))
     assert len(flyer.step().detections) == found
-
-
-@pytest.mark.filterwarnings("ignore:invalid value")
-@pytest.mark.parametrize("wrong", [{"log_range": math.inf}, {"log_range": math.nan}, {"log_range_sigma": 0.0}])
-def test_nonsense_for_the_mirrored_crop_gives_no_detection(flyer: Flyer, wrong: dict[str, Any]) -> None:
-    answering(flyer, lambda _, crop, one: replace(one, **wrong) if crop.mirrored else one)
-    assert not flyer.step().detections
 
 
 # A known size: the range is the size over the apparent size, and its deviation is the networks' and the size's.
