@@ -65,7 +65,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _table(rows: list[dict[str, Any]]) -> Text:
-    heads = ("drone", "state", "mode", "height", "battery", "sees", "load", "clock")
+    heads = ("drone", "state", "mode", "height", "battery", "sees", "load")
     return noted_table(heads, [(_cells(row), _notes(row)) for row in rows])
 
 
@@ -78,7 +78,6 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
         _number(row["battery_share"], ".0%", ""),
         _number(row["neighbours"], "d", ""),
         _number(row["load"], ".0%", ""),
-        _number(None if row["clock_error_s"] is None else 1e3 * row["clock_error_s"], ".1f", " ms"),
     )
 
 

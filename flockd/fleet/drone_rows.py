@@ -40,7 +40,6 @@ def _worst(row: Mapping[str, Any]) -> tuple[object, ...]:
 def _status_row(drone: Watched, now_s: float) -> dict[str, Any]:
     flight: Mapping[str, Any] = drone.message("flight", now_s) or {}
     computer: Mapping[str, Any] = drone.message("computer", now_s) or {}
-    clock: Mapping[str, Any] = drone.message("clock", now_s) or {}
     neighbours = drone.message("neighbours", now_s)
     state = flight.get("state", QUIET) if drone.alive else GONE
     starting = drone.alive and not drone.topics and not drone.malformed
@@ -59,9 +58,6 @@ def _status_row(drone: Watched, now_s: float) -> dict[str, Any]:
         if neighbours is None
         else sum(1 for neighbour in neighbours["neighbours"] if neighbour["confirmed"]),
         "load": computer.get("load"),
-        "clock_offset_s": clock.get("offset_s"),
-        "clock_error_s": clock.get("error_s"),
-        "clock_jitter_s": clock.get("jitter_s"),
         "mission": (drone.message("mission", now_s) or {}).get("sentence"),
         "orders": orders,
         "orders_refused": flight.get("orders_refused"),

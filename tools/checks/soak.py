@@ -49,7 +49,6 @@ ALLOWED = {
     "own memory, MB": 0.03,
     "descriptors": 0.02,
     "threads": 0.02,
-    "step, ms": 0.15,
 }
 """Growth over the run, as a share of the mean, that is noise; of any other quantity, none is judged."""
 
@@ -200,9 +199,8 @@ def _told(watcher: FleetWatcher) -> Mapping[str, float]:
     """What the daemon publishes of itself; NaN while it has not yet."""
     drones, now_s = watcher.drones(), time.monotonic()
     message = drones[0].message if drones else lambda topic, at_s: None
-    timings, computer, flight = (message(topic, now_s) or {} for topic in ("timings", "computer", "flight"))
+    computer, flight = (message(topic, now_s) or {} for topic in ("computer", "flight"))
     return {
-        "step, ms": float(sum(timings["stages_ms"].values())) if timings else np.nan,
         "load": float(computer.get("load", np.nan)),
         "loop lag, s": float(computer.get("loop_lag_s", np.nan)),
         "steps": float(computer.get("steps", np.nan)),

@@ -80,11 +80,10 @@ async def notify_service_manager(components: Components, service: ServiceManager
 
 
 async def publish_status(components: Components, clock: Callable[[], float]) -> None:
-    """Publishes `flight`, `computer` and `clock` at the rates of the table of topics, until cancelled."""
+    """Publishes `flight` and `computer` at the rates of the table of topics, until cancelled."""
     messages: dict[str, Callable[[float], Mapping[str, object]]] = {
         "flight": lambda now: _flight_message(components, now),
         "computer": lambda now: _computer_message(components, now),
-        "clock": lambda now: _clock_message(components, now),
     }
     due_s = dict.fromkeys(messages, clock())
     while True:
@@ -129,18 +128,6 @@ def _flight_message(components: Components, now: float) -> topics.FlightMessage:
         setpoints_missed=stream.missed,
         orders=components.commands.recent(),
         orders_refused=components.commands.refused,
-    )
-
-
-def _clock_message(components: Components, now: float) -> topics.ClockMessage:
-    clock = components.link.received.trusted_clock()
-    return topics.ClockMessage(
-        time_s=now,
-        offset_s=None if clock is None else clock.offset_s,
-        error_s=None if clock is None else clock.error_s,
-        jitter_s=None if clock is None else clock.jitter_s,
-        round_trip_s=None if clock is None else clock.round_trip_s,
-        age_s=None if clock is None else now - clock.time_s,
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import platform
 import queue
 import threading
@@ -11,7 +10,6 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -23,7 +21,7 @@ from flockd import __version__
 from flockd.core.config import DroneConfig
 from flockd.core.config.drone import RecordingConfig
 from flockd.core.config.rig import RigConfig
-from flockd.core.messages import Frame, FrameSet, LearnedSize, MissionOrder, PilotOutput, VehicleState
+from flockd.core.messages import FloatArray, Frame, FrameSet, LearnedSize, MissionOrder, PilotOutput, VehicleState
 from flockd.core.secrets import masked
 from flockd.flight.geometry import build_rig
 from flockd.onboard.message_json import to_json
@@ -43,16 +41,6 @@ _VERSIONS = {
 _MB = 1e6
 _SMALL_BYTES = 4096
 """What anything but an image counts for in the queue."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Step:
-    number: int
-    frames: FrameSet
-    vehicle: VehicleState
-    output: PilotOutput
-    truth: Truth | None
-    order: MissionOrder | None
 
 
 class Recorder:
@@ -101,7 +89,8 @@ class Recorder:
             ),
         )
         self._file = _File(path, flight, head, config.rig, self._settings, self._tell)
-        self._track = _Track(config.rig)
+        self._rig, self._north_east = build_rig(config.rig), np.zeros(2)
+        self._placed_s: float | None = None
         self._queue: queue.SimpleQueue[tuple[int, Callable[[], None]] | None] = queue.SimpleQueue()
         """Bytes held, and what writes them; None at the end."""
         self._lock = threading.Condition()
@@ -114,7 +103,6 @@ class Recorder:
         self.failure: str | None = None
         """Why the recording ended before the flight; None while all is well."""
         self._time_s: float | None = None
-        self._early: list[tuple[str, Mapping[str, object]]] = []
         self._thread = threading.Thread(target=self._write_all, name=f"recorder {drone}", daemon=True)
         self._thread.start()
 
@@ -132,8 +120,7 @@ class Recorder:
         """
         number, self._steps = self._steps, self._steps + 1
         size = sum(frame.image.nbytes for frame in frames.frames.values())
-        step = _Step(number, frames, vehicle, output, truth, order)
-        self._put(size + _SMALL_BYTES, lambda: self._write_step(step))
+        self._put(size + _SMALL_BYTES, lambda: self._write_step(number, frames, vehicle, output, truth, order))
 
     def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
         """Takes one telemetry message, if the table of topics marks it as recorded; a `TelemetrySink`.
@@ -179,7 +166,7 @@ class Recorder:
             self._tell("recording: the disk is too slow, so that steps are dropped; record smaller or fewer images")
 
     def _tell(self, event: str) -> None:
-        """Into the file and to the subscribers."""
+        """Into the file, where a step has told the time, and to the subscribers."""
         with self._lock:
             self._held_bytes += _SMALL_BYTES
             self._queue.put((_SMALL_BYTES, lambda: self._write_message("events", {"event": event})))
@@ -228,46 +215,63 @@ class Recorder:
                 if self._held_bytes == 0:
                     self._lock.notify_all()
 
-    def _write_step(self, step: _Step) -> None:
-        self._time_s = step.frames.time_s
-        for entry in _step_entries(step, self._settings, self._track, self._tell):
+    def _write_step(
+        self,
+        number: int,
+        frames: FrameSet,
+        vehicle: VehicleState,
+        output: PilotOutput,
+        truth: Truth | None,
+        order: MissionOrder | None,
+    ) -> None:
+        """All messages that a step becomes; its output comes late, so that a step with an output is whole."""
+        time_s = self._time_s = frames.time_s
+        kept = []
+        for camera, frame in frames.frames.items():
+            data = _compressed(frame, self._settings)
+            if data is None:
+                self._tell(
+                    f"recording: an image of camera {camera} has no pixels or not three channels and is left out"
+                )
+                continue
+            kept.append(streams.FrameEntry(camera, frame.time_s, frame.sequence))
+            stamp = streams.nanoseconds(frame.time_s)
+            message = foxglove.image(stamp, camera, data, self._settings.images)
+            self._file.write(Entry(foxglove.image_stream(camera), stamp, number, message))
+        written = {streams.FRAMES: streams.StepFrames(number, time_s, tuple(kept)), streams.VEHICLE: vehicle}
+        written |= {} if order is None else {streams.ORDER: order}
+        for stream, of_step in written.items():
+            self._file.write(_json_entry(stream, time_s, number, of_step))
+        for entry in self._places(number, time_s, vehicle, output.velocity):
             self._file.write(entry)
-        for reason in step.output.reasons:
-            self._file.write(_log_entry(step.frames.time_s, "WARNING", reason.text))
-        early, self._early = self._early, []
-        for topic, message in early:  # from before there was a time
-            self._write_message(topic, message)
+        if truth is not None:
+            self._file.write(_json_entry(streams.TRUTH, time_s, number, truth))
+        self._file.write(_json_entry(streams.OUTPUT, time_s, number, output))
+        for reason in output.reasons:
+            self._file.write(_log_entry(time_s, "WARNING", reason.text))
+
+    def _places(
+        self, number: int, time_s: float, vehicle: VehicleState, velocity: FloatArray | None
+    ) -> Iterator[Entry]:
+        """Of all frames, and the own path, for viewers: north and east from the first step, up by the autopilot."""
+        if velocity is not None and self._placed_s is not None:
+            self._north_east = self._north_east + velocity[:2] * (time_s - self._placed_s)
+        self._placed_s = time_s
+        position, stamp = np.array([*self._north_east, -vehicle.height_m]), streams.nanoseconds(time_s)
+        places = foxglove.transforms(stamp, position, vehicle.R_ned_body, self._rig)
+        yield Entry(foxglove.TRANSFORMS, stamp, number, places)
+        if velocity is not None:
+            path = foxglove.odometry(stamp, position, vehicle.R_ned_body, velocity)
+            yield Entry(foxglove.ODOMETRY, stamp, number, path)
 
     def _write_message(self, topic: str, message: Mapping[str, object]) -> None:
         stamp = message.get("time_s", self._time_s)  # without one: the recorder's own events
         if not isinstance(stamp, int | float):
-            self._early.append((topic, message))
             return
         time_s = float(stamp)
         self._file.write(_json_entry(streams.TABLE[topic], time_s, 0, {"time_s": time_s, **message}))
         if topic == "events":
             self._file.write(_log_entry(time_s, "INFO", str(message.get("event", ""))))
-
-
-class _Track:
-    """The frames' places and the own path, for viewers: north and east from the first step, up by the autopilot."""
-
-    def __init__(self, rig: RigConfig) -> None:
-        self._rig = build_rig(rig)
-        self._north_east, self._time_s = np.zeros(2), math.nan
-
-    def entries(self, step: _Step) -> Iterator[Entry]:
-        """Where everything is at this step."""
-        time_s, velocity, R_ned_body = step.frames.time_s, step.output.velocity, step.vehicle.R_ned_body
-        if velocity is not None and not math.isnan(self._time_s):
-            self._north_east = self._north_east + velocity[:2] * (time_s - self._time_s)
-        self._time_s = time_s
-        position, stamp = np.array([*self._north_east, -step.vehicle.height_m]), streams.nanoseconds(time_s)
-        places = foxglove.transforms(stamp, position, R_ned_body, self._rig)
-        yield Entry(foxglove.TRANSFORMS, stamp, step.number, places)
-        if velocity is not None:
-            path = foxglove.odometry(stamp, position, R_ned_body, velocity)
-            yield Entry(foxglove.ODOMETRY, stamp, step.number, path)
 
 
 class _File:
@@ -351,31 +355,6 @@ class _File:
             self._tell(f"recording: {path} was skipped and does not count for the quota: it {why}")
             return False
         return facts.get("drone") == self._flight["drone"] and not facts.keys() & streams.EDITED
-
-
-def _step_entries(
-    step: _Step, settings: RecordingConfig, track: _Track, tell: Callable[[str], None]
-) -> Iterator[Entry]:
-    """All messages that a step becomes; its output comes last, so that a step with an output is whole."""
-    time_s = step.frames.time_s
-    kept = []
-    for camera, frame in step.frames.frames.items():
-        data = _compressed(frame, settings)
-        if data is None:
-            tell(f"recording: an image of camera {camera} has no pixels or not three channels and is left out")
-            continue
-        kept.append(streams.FrameEntry(camera, frame.time_s, frame.sequence))
-        stamp = streams.nanoseconds(frame.time_s)
-        message = foxglove.image(stamp, camera, data, settings.images)
-        yield Entry(foxglove.image_stream(camera), stamp, step.number, message)
-    yield _json_entry(streams.FRAMES, time_s, step.number, streams.StepFrames(step.number, time_s, tuple(kept)))
-    yield _json_entry(streams.VEHICLE, time_s, step.number, step.vehicle)
-    if step.order is not None:
-        yield _json_entry(streams.ORDER, time_s, step.number, step.order)
-    yield from track.entries(step)
-    if step.truth is not None:
-        yield _json_entry(streams.TRUTH, time_s, step.number, step.truth)
-    yield _json_entry(streams.OUTPUT, time_s, step.number, step.output)
 
 
 def _compressed(frame: Frame, settings: RecordingConfig) -> bytes | None:

@@ -25,7 +25,6 @@ from flockd.onboard.sources.image_formats import (
     PackedFormat,
     check_length,
     plausible,
-    up_to,
 )
 
 PACKAGES = "libgstreamer1.0-0, gstreamer1.0-plugins-base and the plugins that its pipeline needs"
@@ -66,8 +65,6 @@ class GstreamerDevice(ChildDevice):
 
 
 _PLANAR: Mapping[str, int] = {"NV12": cv2.COLOR_YUV2RGB_NV12, "I420": cv2.COLOR_YUV2RGB_I420}
-FORMATS = (*_PLANAR, *PACKED)
-"""Cheapest first: a pipeline that can choose gives the first."""
 _FIELD = re.compile(r"(format|width|height)=\(\w+\)([^,;\s]+)")
 
 
@@ -77,36 +74,27 @@ class PlanarFormat:
 
     name: str
     size: tuple[int, int]
-    """Width, height."""
+    """Width, a multiple of eight, which GStreamer pads nowhere, and height, an even one."""
 
     def check(self, data: bytes) -> None:
         """See ``ImageFormat``: size."""
-        width, height = self._padded()
-        check_length(data, width * height + self._colour_line() * height // 2)
+        check_length(data, self.size[0] * self.size[1] * 3 // 2)
 
     def decode(self, data: bytes) -> UInt8Array:
         """See ``ImageFormat``."""
         self.check(data)
-        width, height = self._padded()
-        planes = np.frombuffer(data, np.uint8)
-        colours = planes[width * height :].reshape(-1, self._colour_line() // (1 if self.name == "NV12" else 2))
-        used = np.ascontiguousarray(colours[:, : width if self.name == "NV12" else width // 2])
-        joined = np.concatenate([planes[: width * height], used.reshape(-1)]).reshape(height * 3 // 2, width)
-        image = np.asarray(cv2.cvtColor(joined, _PLANAR[self.name]), np.uint8)
-        return plausible(np.ascontiguousarray(image[: self.size[1], : self.size[0]]))
+        planes = np.frombuffer(data, np.uint8).reshape(-1, self.size[0])
+        return plausible(np.asarray(cv2.cvtColor(planes, _PLANAR[self.name]), np.uint8))
 
-    def _padded(self) -> tuple[int, int]:
-        return up_to(4, self.size[0]), up_to(2, self.size[1])
 
-    def _colour_line(self) -> int:
-        """Bytes for the colours of two rows."""
-        width = self._padded()[0]
-        return width if self.name == "NV12" else 2 * up_to(4, up_to(2, self.size[0]) // 2)
+def _formats(size: tuple[int, int]) -> tuple[str, ...]:
+    """Cheapest first: a pipeline that can choose gives the first."""
+    return (*(_PLANAR if size[0] % 8 == size[1] % 2 == 0 else ()), *PACKED)
 
 
 def caps(size: tuple[int, int], rate_hz: float) -> str:
     """What a pipeline is asked for: all that can be decoded, in the rig's size and rate where it can choose."""
-    formats = f"format=(string){{{','.join(FORMATS)}}}"
+    formats = f"format=(string){{{','.join(_formats(size))}}}"
     kinds = ("image/jpeg", f"video/x-raw,{formats}")
     in_size = f",width={size[0]},height={size[1]}"
     at_rate = f",framerate={round(rate_hz * 1000)}/1000"
@@ -125,4 +113,4 @@ def format_of(text: str) -> tuple[ImageFormat, tuple[int, int]] | None:
     name = fields.get("format", "")
     if name in PACKED:
         return PackedFormat(name, size), size
-    return (PlanarFormat(name, size), size) if name in _PLANAR else None
+    return (PlanarFormat(name, size), size) if name in _formats(size) else None

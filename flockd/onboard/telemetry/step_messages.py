@@ -59,10 +59,6 @@ def publish_step(sink: TelemetrySink, drone: str, vehicle: VehicleState, output:
             arrived=mission.arrived,
         )
         sink.publish(drone, "mission", told)
-    reasons = [reason.text for reason in output.reasons]
-    health = topics.HealthMessage(time_s=time_s, ok=not reasons, reasons=reasons, refused=dict(output.counts))
-    sink.publish(drone, "health", health)
-    sink.publish(drone, "timings", topics.TimingsMessage(time_s=time_s, stages_ms=dict(output.stages_ms)))
 
 
 def neighbour_message(neighbour: Neighbour) -> topics.NeighbourMessage:

@@ -3,7 +3,7 @@
 A key is `flockd/v1/<fleet>/<drone>/<topic>`; a message is a JSON object in UTF-8. Every number is finite or null.
 Vectors are lists: NED is north, east, down. Times are seconds on the drone's monotonic clock.
 
-`state` to `timings` follow from each step of the pilot; `flight` to `clock` come from the daemon, at all times. Beside
+`state` to `mission` follow from each step of the pilot; the others come from the daemon, at all times. Beside
 the topics, a drone's daemon has a liveliness token `.../alive/<identity>`, whose identity no other process has. It
 replies to a query for `.../about` with an `AboutMessage`, for `.../time` with a `TimeMessage`, and for
 `.../image/<camera>` with a small JPEG of what that camera sees. A query for `.../ask/hold`, `land`, `resume`, `goto` or
@@ -112,29 +112,11 @@ class MissionMessage(TypedDict):
     """At the last goal."""
 
 
-class HealthMessage(TypedDict):
-    """Whether the step found all it should."""
-
-    time_s: float
-    ok: bool
-    reasons: list[str]
-    """Why something is missing; empty when ok."""
-    refused: dict[str, int]
-    """Estimates refused in this step, by reason."""
-
-
 class EventMessage(TypedDict):
     """Something that happened once."""
 
     time_s: float
     event: str
-
-
-class TimingsMessage(TypedDict):
-    """How long each stage of the step took."""
-
-    time_s: float
-    stages_ms: dict[str, float]
 
 
 class ReasonMessage(TypedDict):
@@ -189,22 +171,6 @@ class FlightMessage(TypedDict):
     """Of the last minute, one of each operator, the newest first."""
     orders_refused: int | None
     """Since the start."""
-
-
-class ClockMessage(TypedDict):
-    """The autopilot's clock against this computer's, measured by MAVLink's TIMESYNC."""
-
-    time_s: float
-    offset_s: float | None
-    """The autopilot's clock, since its start, less this computer's; null before it is known, as all that follows."""
-    error_s: float | None
-    """The offset is off by no more."""
-    jitter_s: float | None
-    """Standard deviation of single measurements."""
-    round_trip_s: float | None
-    """The shortest of the last seconds: there and back."""
-    age_s: float | None
-    """Since the last measurement."""
 
 
 class CameraMessage(TypedDict):
@@ -326,11 +292,8 @@ TOPICS = {
         Topic("obstacles", ObstaclesMessage, *_STEP, recorded=False),
         Topic("command", CommandMessage, *_STEP, recorded=False),
         Topic("mission", MissionMessage, *_STEP, recorded=False),
-        Topic("health", HealthMessage, *_STEP, recorded=False),
         Topic("events", EventMessage, rate_hz=None, stale_after_s=None, recorded=True),
-        Topic("timings", TimingsMessage, *_STEP, recorded=False),
         Topic("flight", FlightMessage, *_STEP, recorded=True),
         Topic("computer", ComputerMessage, *_COMPUTER, recorded=True),
-        Topic("clock", ClockMessage, *_COMPUTER, recorded=True),
     )
 }
