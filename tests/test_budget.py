@@ -22,8 +22,8 @@ ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 2_970,
     "flockd/flight": 12_590,
-    "flockd/onboard": 9_190,
-    "flockd/fleet": 2_680,
+    "flockd/onboard": 9_110,
+    "flockd/fleet": 2_670,
     "flockd/ground": 4_160,
     "flockd/review": 3_390,
     "flockd/sim": 9_340,
