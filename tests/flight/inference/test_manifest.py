@@ -15,7 +15,6 @@ from onnx import helper
 from flockd.core.data import data_path
 from flockd.core.errors import ModelError
 from flockd.flight.inference import OnnxModel, read_manifest
-from flockd.flight.inference.feeds import feeds_for
 from flockd.flight.inference.fitting import fit
 from flockd.flight.perception.requirements import check_roles
 from tests.flight.inference.foreign import (
@@ -162,21 +161,6 @@ def test_an_output_is_read_by_the_names_of_its_columns(tmp_path: Path) -> None:
         np.testing.assert_allclose(named[columns[1]], [0.8, 0.2], rtol=1e-5)
     with pytest.raises(ValueError, match="columns darkness, brightness"):
         model.manifest.outputs["numbers"].by_column(np.zeros((2, 3), np.float32))
-
-
-def test_crop_size_thresholds_and_a_batchs_size_come_from_the_manifest(tmp_path: Path) -> None:
-    manifest = read_manifest(crop_regressor(tmp_path, thresholds={"probability": 0.25})).manifest
-    assert manifest.crop_size_px == 24
-    assert manifest.crop is not None
-    assert (manifest.crop.fill, manifest.crop.max_crops) == (0.5, 3)
-    assert manifest.threshold("probability") == 0.25
-    assert feeds_for(manifest, (640, 480), 5)["patch"].shape == (5, 3, 24, 24)
-    with pytest.raises(ModelError, match=r"thresholds\.p;"):
-        manifest.threshold("p")
-    whole = read_manifest(depth(tmp_path), check_roles).manifest
-    assert (whole.map_stride, whole.crop, whole.thresholds) == (None, None, {})
-    with pytest.raises(ModelError, match="crop"):
-        _ = whole.crop_size_px
 
 
 @pytest.mark.parametrize(

@@ -112,20 +112,6 @@ def test_the_twins_in_8_bits_say_what_the_float_networks_say() -> None:
         np.testing.assert_allclose(mine.centre, other.centre, atol=1.5)
 
 
-def test_what_a_mirror_shows_is_estimated_as_if_there_were_none() -> None:
-    view = rendered(100.0, (96, 96), (1.5, -0.1, -4.1))
-    image = np.ascontiguousarray(view.rgb)
-    direct, mirrored = (crop_of(image, 100.0, mirrored=m) for m in (False, True))
-    shown_so = crop_of(image[:, ::-1], 100.0)
-    one, other, raw = OnnxNetworks(PerceptionConfig(), MODELS).ranges([direct, mirrored, shown_so])
-    assert other.log_range != pytest.approx(one.log_range, abs=1e-4), "the network errs on both apart"
-    assert other.log_range == pytest.approx(raw.log_range, abs=1e-3)
-    np.testing.assert_allclose(other.centre, [96 - raw.centre[0], raw.centre[1]], atol=0.05)
-    for told in (one, other):
-        assert told.centre[0] == pytest.approx(48 - 100 / 15, abs=3.0)
-        assert math.exp(told.log_range) == pytest.approx(1.5, rel=0.25)
-
-
 def test_the_network_of_flow_is_made_exact_as_configured() -> None:
     first, second = shifted_pictures((9, -5), (320, 240))
     network = OnnxFlow(OnnxModel(MODELS / "flow_int8.yaml", threads=1))

@@ -384,26 +384,6 @@ def test_a_detection_of_another_size_is_of_another_drone() -> None:
         assert flock.step(_seen(0.5 * AHEAD, 0.1, size_m)) == (number,)
 
 
-@pytest.mark.parametrize(
-    ("parameters", "sigma_m", "after_s", "expected_m"),
-    [
-        # Equally sure: the mean of the logarithms.
-        ({"size_drift": 1e-6}, 0.8, STEP_S, math.sqrt(0.5 * 0.7)),
-        # After 100 s the log size has drifted by 0.5, and is seen to 0.1: 26 parts of the new to one of the old.
-        ({"drone_probability_memory_s": 3600.0, "clutter_density": 1e-9}, 0.4, 100.0, 0.7 * (0.5 / 0.7) ** (1 / 27)),
-    ],
-    ids=["at once", "long ago"],
-)
-def test_the_size_predicted_is_averaged_over_the_detections(
-    parameters: dict[str, float], sigma_m: float, after_s: float, expected_m: float
-) -> None:
-    flock = Follower(confirm_hits=2, **parameters)
-    for size_m in (0.5, 0.7):
-        assert flock.step(_seen(AHEAD, sigma_m, size_m), after_s=after_s) == (1,)
-    (prediction,) = flock.tracker.predictions(STEP_S, CRUISE)
-    assert prediction.size_m == pytest.approx(expected_m, rel=0.01)
-
-
 @pytest.mark.parametrize(("size_m", "north_m"), [(0.72, 4.0), (0.6, 4.8)])
 def test_a_range_is_the_track_s_size_over_the_apparent_size(size_m: float, north_m: float) -> None:
     """Twenty looks tell 0.6 m. A last one takes the drone for one of 0.72 m at 1.2 times its range: it looks as large
@@ -455,20 +435,6 @@ def test_probabilities_that_do_not_increase_are_refused() -> None:
 def test_a_measurement_that_is_no_number_is_refused(bad: dict[str, Any], reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         replace(_seen(AHEAD), **bad)
-
-
-def test_a_drone_that_turns_out_larger_is_farther_and_faster_in_proportion() -> None:
-    """0.9 m instead of 0.6: half as far again, and so its velocity relative to the own one; the bearing stays."""
-    flock = Follower()
-    for step in range(20):
-        flock.step(AHEAD + 0.1 * step * EAST)
-    before = flock.one
-    flock.tracker.resize(0.9, CRUISE)
-    assert flock.one.position == pytest.approx(1.5 * before.position, rel=0.01)
-    assert flock.one.velocity - CRUISE == pytest.approx(1.5 * (before.velocity - CRUISE), abs=0.01)
-    assert flock.one.position_sigma_m == pytest.approx(1.5 * before.position_sigma_m, rel=0.05)
-    (prediction,) = flock.tracker.predictions(STEP_S, CRUISE)
-    assert prediction.size_m == pytest.approx(0.9)
 
 
 # Neighbours are taken to manoeuvre as hard as the own drone does, and are followed in gusts.

@@ -23,7 +23,7 @@ from tools.training.detector import Boxes, DroneDetector, detection_loss
 from tools.training.export import draw_back, export
 from tools.training.networks import DistanceNet, FlowNet, NeighboursNet, VerificationNet
 from tools.training.picture_tasks import CROPS, KINDS, VerificationTask
-from tools.training.pictures import CLASSES, NO_BOX, NOT_JUDGED
+from tools.training.pictures import CLASSES, NOT_JUDGED
 from tools.training.quantise import quantise
 from tools.training.samples import Sample
 from tools.training.tasks import DistanceTask, FlowTask, Task
@@ -218,20 +218,6 @@ def test_the_right_answer_costs_less_than_another_box_and_than_nothing() -> None
         made[0][0, 4:6, 2, 3] = 5.0
     costs = [float(detection_loss(one, box, kind)[0]) for one in (right, beside, maps())]
     assert costs[0] < costs[1] < costs[2]
-
-
-def test_pictures_of_a_batch_are_learnt_from_apart() -> None:
-    torch.manual_seed(3)
-    given = [torch.randn(2, 5 + len(CLASSES), *cells) for cells in CELLS]
-    boxes = torch.tensor([[[28.0, 20.0, 16.0, 8.0], [30.0, 22.0, 14.0, 8.0]], [[40.0, 40.0, 30.0, 20.0], [0.0] * 4]])
-    classes = torch.tensor([[0, 1], [2, NO_BOX]])
-
-    def gradient(which: list[int]) -> torch.Tensor:
-        own = [one[which].clone().requires_grad_() for one in given]
-        detection_loss(own, boxes[which], classes[which])[0].backward()
-        return torch.cat([one.grad[0].flatten() for one in own if one.grad is not None])
-
-    assert torch.cosine_similarity(gradient([0, 1]), gradient([0]), 0) == pytest.approx(1.0, abs=1e-5)
 
 
 def test_nothing_is_learnt_of_objects_in_a_box_that_is_not_judged() -> None:

@@ -102,21 +102,6 @@ def test_materials_of_gltf_are_read_as_its_specification_says(
     assert np.unique(drone.colours.round(4), axis=0) == pytest.approx(np.array([albedo]), abs=2e-4)
 
 
-def test_parts_of_different_materials_keep_theirs_and_one_without_is_painted(tmp_path: Path) -> None:
-    bars = [y_up(trimesh.creation.box(size)) for size in ((0.6, 0.1, 0.05), (0.1, 0.4, 0.05))]
-    bars[0] = of_material(bars[0], baseColorFactor=[*BROWN, 255])
-    drone = read(written(tmp_path, "drone.glb", trimesh.Scene(bars)), 0.6)
-    own = np.isfinite(drone.colours).all(axis=1)
-    assert own.mean() == 0.5
-    assert drone.colours[own] == pytest.approx(np.tile(BROWN_OF_LINEAR, (24, 1)), abs=1e-3)
-    looks = [painted(drone, seed).colours for seed in range(8)]
-    assert len({look[~own].tobytes() for look in looks}) > 1
-    assert all(len(np.unique(look[~own], axis=0)) == 1 for look in looks), "one part, one colour"
-    shades = np.array([look[own][0] / BROWN_OF_LINEAR for look in looks])
-    assert shades.min() > 0.5
-    assert shades.max() < 2.0, "the file's colour in another light"
-
-
 @pytest.mark.parametrize(
     ("name", "size_m", "said"),
     [

@@ -56,17 +56,6 @@ def test_it_makes_a_flow_exact_that_is_some_pixels_off() -> None:
     assert off(grid_flow(rough, first, second, NO_DRONES), GROUND) < 0.1
 
 
-def test_what_is_seen_well_keeps_its_own_flow_although_all_else_moves_otherwise() -> None:
-    first, second = images()
-    part = np.s_[200:260, 100:180]  # a thing before the ground, on its own way
-    second[np.s_[215:275, 130:210]] = first[part]
-    flow = told(MOVED)
-    flow[part] = (30.0, 15.0)
-    settled = grid_flow(flow, first, second, NO_DRONES)
-    inside = settled[210:250, 112:168]
-    assert np.abs(np.median(inside, axis=(0, 1)) - [30.0, 15.0]).max() < 0.3
-
-
 def test_a_thin_trunk_before_the_ground_keeps_its_own_flow_that_nothing_told() -> None:
     """One column of points has it, and all points around them move otherwise."""
     first, second = images()

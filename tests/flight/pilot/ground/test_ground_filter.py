@@ -107,16 +107,6 @@ def test_a_short_dropout_is_bridged_by_the_own_motion_and_a_long_one_is_not() ->
     assert known(below.update(state(3.0, 6.0, height_m=6.5))).source == "range_finder", "it works again"
 
 
-def test_one_reading_of_something_else_is_not_the_ground_and_two_are() -> None:
-    below = follower()
-    for k in range(4):
-        below.update(state(STEP_S * k, 4.0))
-    assert known(below.update(state(2.0, 2.5))).height_m == pytest.approx(4.0), "a crate, or a drone below"
-    assert known(below.update(state(2.5, 4.0))).height_m == pytest.approx(4.0)
-    below.update(state(3.0, 3.2))
-    assert known(below.update(state(3.5, 3.2))).height_m == pytest.approx(3.2), "a terrace"
-
-
 # The own motion's scale from a range to the ground, on rendered frames with perception answered by the truth.
 
 
