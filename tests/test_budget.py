@@ -21,7 +21,7 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 2_970,
-    "flockd/flight": 12_590,
+    "flockd/flight": 11_950,
     "flockd/onboard": 9_110,
     "flockd/fleet": 2_670,
     "flockd/ground": 4_160,
@@ -29,7 +29,7 @@ LINES = {
     "flockd/sim": 9_340,
     "flockd/campaign": 1_470,
     "flockd/cli": 3_510,
-    "tests": 36_530,
+    "tests": 36_230,
     "tools/checks": 2_060,
     "tools/docs": 760,
     "tools/measure": 1_430,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 351}
+FILES = {"flockd": 348}
 NUMBERS_OF_FLIGHT = 349
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02

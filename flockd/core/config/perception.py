@@ -30,30 +30,17 @@ class DetectionParameters(Section):
     """A further crop is not worth it when it would be moved by less than this share of half its width, ..."""
     crop_resize: Annotated[float, Field(ge=1)] = 1.05
     """... and resized by less than this factor."""
-    prediction_gate: Positive = 4.0
-    """What is found where a track was predicted lies within this Mahalanobis distance of it, in standard deviations."""
     suppression_gate: Positive = 3.4
     """Two detections are one when their Mahalanobis distance is less: 99 % of pairs of one drone are nearer (chi-square
     of three degrees of freedom)."""
     drone_extent: Share = 0.18
     """Share of its size by which a drone's centre may be misplaced between two of its detections, as a standard
     deviation: with the gate, two drones are never nearer to each other than 0.6 of their size."""
-    occlusion: Share = 0.25
-    """Nothing is seen of what lies behind a drone within this share of its angular size from its centre."""
     max_proposals: Annotated[int, Field(ge=1)] = 12
-    """Regions of one image that the first stage segments and the second stage is given, with the residuals: those of
-    the highest score, for a cluttered image not to cost the deadline. More than the drones that one camera sees."""
-    max_residuals: Annotated[int, Field(ge=0)] = 6
-    """Residuals of one image that are proposed, the largest: one full of false ones must not cost the deadline. They
-    count among `max_proposals`."""
-    residual_px: Annotated[int, Field(ge=1)] = 24
-    """Image pixels that a residual has at least."""
-    residual_distance_px: Annotated[int, Field(ge=0)] = 4
-    """How far it is from every drone's mask: nearer, it is the mask's own error."""
+    """Regions of one image that the first stage segments and the second stage is given: those of the highest score, for
+    a cluttered image not to cost the deadline. More than the drones that one camera sees."""
     mask_border_px: Annotated[int, Field(ge=0)] = 5
     """Background so near to a mask is not used: masks and depth maps are least certain there."""
-    colour_weight: NonNegative = 4.0
-    """Weight of a pixel's colour against the networks' logits, in a mask. 0: masks are the networks' alone."""
     depth_map_sigma: Positive = 0.08
     """Standard deviation of a drone's log range where the depth map alone gives it (`perception.distance: none`)."""
 

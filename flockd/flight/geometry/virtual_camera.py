@@ -17,8 +17,6 @@ from flockd.flight.geometry.rig import Rig, RigCamera
 from flockd.flight.geometry.transform import RigidTransform
 
 _GREY = 128
-_AT_A_TIME = 30_000
-"""OpenCV samples no more places in a row."""
 _NOT_IN_IT = -1.0
 _MINIFICATION = 1.5
 """Image pixels per crop pixel from which on single samples would alias."""
@@ -56,17 +54,6 @@ class VirtualCrop:
                 cv2.copyTo(drawn, seen.view(np.uint8), crop)
                 valid |= seen
         return crop, valid
-
-    def look_up(self, values: Float32Array, points_body: FloatArray) -> Float32Array:
-        """(n,) what a map (size, size) over the image says at points (n, 3) of the body; NaN where not in it."""
-        towards = self.T_body_virtual.rotation.T @ (points_body - self.T_body_virtual.translation).T
-        pixels = self.camera.project(towards.T)
-        u, v = (pixels.T - 0.5).astype(np.float32)[:, None]
-        found = np.empty(len(pixels), np.float32)
-        for start in range(0, len(pixels), _AT_A_TIME):
-            part = slice(start, start + _AT_A_TIME)
-            found[part] = cv2.remap(values, u[:, part], v[:, part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.where(self.camera.in_image(pixels), found, np.float32(np.nan))
 
     def _maps(self, images: Mapping[str, UInt8Array], range_m: float | None) -> dict[str, Float32Array]:
         """For each camera that is needed, u and v (2, size, size) of what it fills the crop with; NaN elsewhere.

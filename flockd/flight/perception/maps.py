@@ -8,7 +8,7 @@ from functools import cached_property
 
 import cv2
 
-from flockd.core.messages import BoolArray, Float32Array, FloatArray, UInt8Array
+from flockd.core.messages import Float32Array, FloatArray, UInt8Array
 from flockd.flight.geometry import PinholeCamera, RigidTransform, ZMap
 from flockd.flight.perception.detection.instances import Instance
 
@@ -32,10 +32,6 @@ class SceneMaps:
     labels: UInt8Array
     """(h, w) 0 for background, then one value a drone."""
     instances: tuple[Instance, ...]
-    uncertain: BoolArray | None = None
-    """(h, w) pixels of the drones that may just as well be background; None: no such."""
-    logit: Float32Array | None = None
-    """(h, w) / `Networks.map_stride`, of each pixel being any drone's; None: the labels are all that is known."""
 
     @cached_property
     def labelled(self) -> tuple[slice, slice]:
@@ -80,8 +76,6 @@ class RangeEstimate:
     """The drone's size from tip to tip; errs like the range does, but is the same in every crop of one drone."""
     drone_probability: float = 1.0
     """Probability that there is a drone at all."""
-    mask: Float32Array | None = None
-    """(size, size) logit of each pixel of the crop being that drone's; None: the model does not say."""
     log_size_sigma: float = 0.0
     """Standard deviation of the logarithm of `size_m`. `log_range` errs with it, by as much again."""
 

@@ -102,16 +102,13 @@ class OnnxNetworks(OneByOne):
         # A second stage weeds out false proposals, so that the first may propose more.
         threshold = self._segmentation.manifest.threshold
         alone = threshold("proposal_logit_alone")
-        proposal, certain = alone, alone
-        if self._distance is not None:
-            proposal, certain = threshold("proposal_logit"), threshold("mask_logit")
+        proposal = alone if self._distance is None else threshold("proposal_logit")
         labels, instances = group_instances(logit - np.float32(proposal), offset, scale=self.map_stride)
         labels = np.asarray(cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
         if self._detector is not None and self._box_rules is not None:
             boxes, odds = self._boxes(self._detector, self._box_rules, frame.image, camera)
             labels, instances = with_boxes(labels, instances, boxes, odds, self._box_rules)
-        low = cv2.resize((logit < certain).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
-        return SceneMaps(self._depth_of(depth, camera), labels, instances, uncertain=low & (labels > 0), logit=logit)
+        return SceneMaps(self._depth_of(depth, camera), labels, instances)
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         """See `Networks`."""
@@ -157,9 +154,8 @@ class OnnxNetworks(OneByOne):
         outputs = _in_batches(distance, images)
         columns = distance.manifest.results["range"].by_column(outputs["range"])
         evidence = logits + np.clip(columns["drone_logit"], -limit, limit)
-        masks = list(outputs["mask"][:, 0]) if "mask" in outputs else [None] * len(crops)
         return tuple(
-            _estimate({name: float(column[k]) for name, column in columns.items()}, float(evidence[k]), crop, masks[k])
+            _estimate({name: float(column[k]) for name, column in columns.items()}, float(evidence[k]), crop)
             for k, crop in enumerate(crops)
         )
 
@@ -242,10 +238,7 @@ class OnnxNetworks(OneByOne):
         if config.flow == "dis":
             return DisFlow()
         network = OnnxFlow(self._models.open(config.flow, "flow"))
-        if config.flow_refinement == "none":
-            return network
-        when_lost = config.flow_refinement == "lucas_kanade"
-        return DisFlow(network, config.flow_refinement_scale, when_lost=when_lost)
+        return DisFlow(network, config.flow_refinement_scale) if config.flow_refinement == "dis" else network
 
 
 _OF_CROPS = frozenset({"distance", "verification"})
@@ -322,20 +315,16 @@ _MOST_SIZE_SIGMA = 0.5
 """Twice that is a factor of 2.7 in size either way: a network that says more says that it knows nothing."""
 
 
-def _estimate(columns: Mapping[str, float], drone_logit: float, crop: Crop, mask: Float32Array | None) -> RangeEstimate:
+def _estimate(columns: Mapping[str, float], drone_logit: float, crop: Crop) -> RangeEstimate:
     """The estimate from one crop's output, with a mirror image's turned back."""
     size = crop.camera.size[0]
-    right = columns["right_px"]
-    if crop.mirrored:
-        right = -right
-        mask = None if mask is None else np.ascontiguousarray(mask[:, ::-1])
+    right = -columns["right_px"] if crop.mirrored else columns["right_px"]
     return RangeEstimate(
         log_range=columns["log_range_per_focal"] + float(np.log(crop.camera.focal_px)),
         log_range_sigma=float(np.exp(columns["log_relative_sigma"])),
         centre=np.array([size / 2 + right, size / 2 + columns["down_px"]]),
         size_m=float(np.exp(columns["log_range_per_focal"] + columns["log_apparent_size"])),
         drone_probability=float(_probability(np.array(drone_logit))),
-        mask=mask,
         log_size_sigma=min(float(np.exp(columns.get("log_size_sigma", -np.inf))), _MOST_SIZE_SIGMA),
     )
 

@@ -39,7 +39,7 @@ def test_what_shows_nothing_is_told_from_what_does_nothing(after: list[float], v
 
 
 def test_the_list_fits_the_sources_and_one_that_fits_no_more_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert len({one["name"] for one in ablate.listed()}) >= 60
+    assert len({one["name"] for one in ablate.listed()}) >= 50
     monkeypatch.setattr("yaml.safe_load", lambda _: [ONE])
     with pytest.raises(StaleError, match=r"^one: "):
         ablate.listed()

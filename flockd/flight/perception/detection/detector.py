@@ -10,14 +10,9 @@ from flockd.core.messages import Detection, Reason, UInt8Array, VehicleState
 from flockd.flight.geometry import RangeMap, Rig
 from flockd.flight.perception.detection.from_depth import candidates_from_depth
 from flockd.flight.perception.detection.instances import Instance
-from flockd.flight.perception.detection.masks import DroneMasks, MaskRenderer, first_stage_labels
-from flockd.flight.perception.detection.nms import Suppressed, separate, suppress
-from flockd.flight.perception.detection.proposals import (
-    Proposal,
-    propose_instances,
-    propose_predictions,
-    propose_residuals,
-)
+from flockd.flight.perception.detection.masks import first_stage_labels
+from flockd.flight.perception.detection.nms import Suppressed, suppress
+from flockd.flight.perception.detection.proposals import Proposal, propose_instances, propose_predictions
 from flockd.flight.perception.detection.refinement import Candidate, Cascade
 from flockd.flight.perception.interface import Networks
 from flockd.flight.perception.maps import KnownSize, SceneMaps
@@ -48,7 +43,6 @@ class Detector:
 
     def __init__(self, rig: Rig, networks: Networks, parameters: DetectionParameters) -> None:
         self._rig, self._networks, self._parameters = rig, networks, parameters
-        self._renderers = {name: MaskRenderer(c, networks.map_stride) for name, c in rig.cameras.items()}
 
     def detect(
         self,
@@ -77,7 +71,7 @@ class Detector:
         stage = self._networks.second_stage
         if stage is None:
             trace.candidates += candidates_from_depth(rig, scenes, depths, self._parameters)
-            return self._masked(suppress(trace.candidates, self._parameters), images, scenes, ())
+            return _masked(suppress(trace.candidates, self._parameters), scenes)
         rules, cascade = stage.rules, Cascade(self._networks, stage, self._parameters, known_size)
         proposals = propose_instances(rig, scenes, rules, self._parameters)
         first = cascade.refine(rig, images, proposals)
@@ -87,35 +81,17 @@ class Detector:
         second = cascade.refine(rig, images, predicted)
         candidates = [*first.candidates, *second.candidates]
         none = {proposal.instance for proposal in first.rejected if proposal.instance}
-        masks = {n: m.by_networks() for n, m in self._masks(separate(candidates), scenes, none).items()}
-        residuals = propose_residuals(rig, scenes, masks, rules, self._parameters)
-        third = cascade.refine(rig, images, residuals)
-        candidates += third.candidates
-        trace.proposals += [*proposals, *predicted, *residuals]
+        trace.proposals += [*proposals, *predicted]
         trace.candidates += candidates
-        reasons = (*first.reasons, *unpredicted, *second.reasons, *third.reasons)
-        return self._masked(suppress(candidates, self._parameters), images, scenes, none, reasons)
+        reasons = (*first.reasons, *unpredicted, *second.reasons)
+        return _masked(suppress(candidates, self._parameters), scenes, none, reasons)
 
-    def _masked(
-        self,
-        found: Suppressed,
-        images: Mapping[str, UInt8Array],
-        scenes: Mapping[str, SceneMaps],
-        rejected: Container[Instance],
-        reasons: tuple[Reason, ...] = (),
-    ) -> Detected:
-        masks = self._masks(found, scenes, rejected)
-        weight = self._parameters.colour_weight
-        by_colours = {name: mask.by_colours(images[name], weight) for name, mask in masks.items()}
-        return Detected(found.detections, by_colours, reasons)
 
-    def _masks(
-        self, found: Suppressed, scenes: Mapping[str, SceneMaps], rejected: Container[Instance]
-    ) -> dict[str, DroneMasks]:
-        masks = {}
-        for name, scene in scenes.items():
-            labels = first_stage_labels(scene, found.labels_of(name), rejected)
-            masks[name] = DroneMasks(labels)
-            if scene.logit is not None:
-                masks[name] = self._renderers[name].render(labels, scene.logit, found.detections, found.masks_of)
-        return masks
+def _masked(
+    found: Suppressed,
+    scenes: Mapping[str, SceneMaps],
+    rejected: Container[Instance] = (),
+    reasons: tuple[Reason, ...] = (),
+) -> Detected:
+    masks = {name: first_stage_labels(scene, found.labels_of(name), rejected) for name, scene in scenes.items()}
+    return Detected(found.detections, masks, reasons)

@@ -1,4 +1,4 @@
-"""Where a drone may be: what the first stage segments, where tracks are predicted, and residuals that no mask explains.
+"""Where a drone may be: what the first stage segments, and where tracks are predicted.
 
 A proposal costs a few crops of the second stage, which decides.
 """
@@ -9,11 +9,10 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from flockd.core.config.perception import DetectionParameters
-from flockd.core.messages import UNCLASSED, BoolArray, FloatArray, Reason, ReasonKind, UInt8Array, VehicleState
+from flockd.core.messages import FloatArray, Reason, ReasonKind, VehicleState
 from flockd.flight.geometry import Rig, log_polar
 from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.detection.roi import CropRules, Roi, angle_between, pixel_angle, roi_of_instance
@@ -115,56 +114,3 @@ def propose_predictions(
         if not found:
             proposals.append(Proposal(cameras, roi, predicted=Predicted(bearing, log_range, covariance)))
     return proposals, reasons
-
-
-def propose_residuals(
-    rig: Rig,
-    scenes: Mapping[str, SceneMaps],
-    masks: Mapping[str, UInt8Array],
-    rules: CropRules,
-    parameters: DetectionParameters,
-) -> list[Proposal]:
-    """Where the first stage is certain of a drone and no mask of the second explains it.
-
-    A drone that another hides in part, or passes close by, is often segmented as a part of it. Where the
-    instances are as many as may be proposed, there are none. ``masks`` are the networks' alone: by colours, one drone's
-    would take more of another that is painted alike.
-    """
-    proposals = []
-    for name, scene in scenes.items():
-        if scene.uncertain is None:
-            continue
-        mask, part = masks[name], scene.labelled
-        residual = np.zeros(mask.shape, np.bool_)
-        residual[part] = (mask[part] == UNCLASSED) & (scene.labels[part] > 0) & ~scene.uncertain[part]
-        if residual.any():
-            masked = ((mask > 0) & (mask != UNCLASSED)).astype(np.uint8)
-            width = 2 * parameters.residual_distance_px + 1
-            residual &= cv2.dilate(masked, np.ones((width, width), np.uint8)) == 0
-            camera = rig.cameras[name]
-            most = min(parameters.max_residuals, max(parameters.max_proposals - len(scene.instances), 0))
-            blobs = largest_blobs(residual, most, parameters.residual_px)
-            proposals += [
-                Proposal((name,), roi, blob)
-                for blob in blobs
-                if (roi := roi_of_instance(camera, blob, rules)) is not None
-            ]
-    return proposals
-
-
-def largest_blobs(pixels: BoolArray, max_blobs: int, min_px: int) -> list[Instance]:
-    """The largest groups (at most ``max_blobs``) of at least ``min_px`` pixels (h, w) that touch each other."""
-    mask = pixels.astype(np.uint8)
-    x, y, across, down = cv2.boundingRect(mask)  # they are few: the rest of the image takes most of the time
-    if not across:
-        return []
-    count, _, stats, centres = cv2.connectedComponentsWithStats(mask[y : y + down, x : x + across])
-    stats[:, [cv2.CC_STAT_LEFT, cv2.CC_STAT_TOP]] += (x, y)
-    centres += (x, y)
-    largest = sorted(range(1, count), key=lambda k: -stats[k, cv2.CC_STAT_AREA])[:max_blobs]
-    found = []
-    for k in largest:
-        left, top, width, height, area = (float(value) for value in stats[k])
-        if area >= min_px:
-            found.append(Instance(0, centres[k] + 0.5, np.array([left, top, left + width, top + height]), area))
-    return found

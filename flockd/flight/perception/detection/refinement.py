@@ -11,8 +11,7 @@ import numpy as np
 
 from flockd.core.config.perception import DetectionParameters
 from flockd.core.messages import FloatArray, Reason, ReasonKind, UInt8Array
-from flockd.flight.geometry import Rig, VirtualCrop, log_polar, log_polar_covariance, log_polar_residual
-from flockd.flight.perception.detection.masks import CropMask
+from flockd.flight.geometry import Rig, VirtualCrop, log_polar, log_polar_covariance
 from flockd.flight.perception.detection.proposals import Proposal
 from flockd.flight.perception.detection.roi import Roi, pixel_angle, take_crop
 from flockd.flight.perception.detection.second_stage import SecondStage
@@ -33,7 +32,6 @@ class Candidate:
     bearing_sigma_rad: float
     size_m: float
     drone_probability: float = 1.0
-    masks: tuple[CropMask, ...] = ()
     log_size_sigma: float = 0.0
     """As of `RangeEstimate`."""
 
@@ -147,7 +145,7 @@ class Cascade:
         for candidate in together:
             if candidate.drone_probability <= self._thresholds.another_crop:
                 rejected.append(candidate.proposal)
-            elif candidate.drone_probability > self._needed(candidate.proposal) and self._is_as_predicted(candidate):
+            elif candidate.drone_probability > self._needed(candidate.proposal):
                 candidates.append(candidate)
         return Refined(candidates, rejected, reasons)
 
@@ -197,10 +195,9 @@ class Cascade:
         if math.isfinite(log_range) and log_range < math.log(2 * self._parameters.max_range_m):
             place = view.T_body_virtual.apply(math.exp(log_range) * ray[None])[0]
             bearing, log_range = log_polar(place)
-        masks = () if estimate.mask is None else (CropMask(view, estimate.mask, stage.roi.half_angle),)
         return Candidate(
             stage.proposal, bearing, log_range, estimate.log_range_sigma, self._thresholds.bearing_sigma_rad,
-            estimate.size_m, estimate.drone_probability, masks, estimate.log_size_sigma,
+            estimate.size_m, estimate.drone_probability, estimate.log_size_sigma,
         )  # fmt: skip
 
     def _with_mirrored(
@@ -247,16 +244,6 @@ class Cascade:
     def _needed(self, proposal: Proposal) -> float:
         return self._thresholds.drone if proposal.predicted is None else self._thresholds.predicted_drone
 
-    def _is_as_predicted(self, candidate: Candidate) -> bool:
-        """Within a Mahalanobis distance of the track that it was proposed for."""
-        track = candidate.proposal.predicted
-        if track is None:
-            return True
-        residual = log_polar_residual(candidate.bearing, candidate.log_range, track.bearing, track.log_range)
-        extent = self._parameters.drone_extent * candidate.size_m / candidate.range_m
-        spread = track.covariance + candidate.covariance + extent**2 * np.eye(3)
-        return float(residual @ np.linalg.solve(spread, residual)) < self._parameters.prediction_gate**2
-
 
 def mean_candidate(one: Candidate, other: Candidate) -> Candidate:
     """The mean of log range, bearing, log size and sigmas, weighted by the variances; the lesser probability."""
@@ -273,7 +260,6 @@ def mean_candidate(one: Candidate, other: Candidate) -> Candidate:
         log_range_sigma=math.exp(mean(math.log(one.log_range_sigma), math.log(other.log_range_sigma))),
         size_m=math.exp(mean(math.log(one.size_m), math.log(other.size_m))),
         drone_probability=min(one.drone_probability, other.drone_probability),
-        masks=one.masks + other.masks,
         log_size_sigma=mean(one.log_size_sigma, other.log_size_sigma),
     )
 

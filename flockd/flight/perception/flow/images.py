@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from flockd.core.messages import Float32Array, UInt8Array
+from flockd.core.messages import UInt8Array
 
 
 def grey(image: UInt8Array) -> UInt8Array:
@@ -19,8 +19,3 @@ def shrunk(image: UInt8Array, size: tuple[int, int]) -> UInt8Array:
         half = image.shape[1] // 2, image.shape[0] // 2
         image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), np.uint8)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def smoothed(image: UInt8Array | Float32Array, sigma_px: float) -> Float32Array:
-    """The image after a Gaussian filter."""
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), dtype=np.float32)

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 from flockd.core.config.perception import DetectionParameters
-from flockd.core.messages import UNCLASSED, Float32Array, FloatArray, UInt8Array
+from flockd.core.messages import Float32Array, FloatArray, UInt8Array
 from flockd.flight.geometry import Rig, RigCamera, WideAngleCamera, ZMap
 from flockd.flight.perception import Instance, SceneMaps, group_instances
 from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes, with_boxes
 from flockd.flight.perception.detection.proposals import (
     propose_instances,
     propose_predictions,
-    propose_residuals,
 )
 from flockd.flight.perception.detection.roi import Roi, roi_of_instance
 from flockd.flight.tracking import Prediction
@@ -79,14 +78,13 @@ def test_a_neighbour_is_searched_for_though_another_range_is_detected_there(rang
 
 
 def scene_of(*scores: float) -> SceneMaps:
-    """Squares of 8 x 8 pixels in a row, one for each score, and certain of all."""
+    """Squares of 8 x 8 pixels in a row, one for each score."""
     labels, instances = np.zeros(SIZE[::-1], np.uint8), []
     for k, score in enumerate(scores):
         left, top = 4 + 14 * (k % 11), 10 + 30 * (k // 11)
         labels[top : top + 8, left : left + 8] = k + 1
         instances.append(instance(k + 1, (left, top, left + 8, top + 8), 64.0, score))
-    uncertain = np.zeros(labels.shape, np.bool_)
-    return SceneMaps(ZMap(np.full(labels.shape, 5.0, np.float32)), labels, tuple(instances), uncertain=uncertain)
+    return SceneMaps(ZMap(np.full(labels.shape, 5.0, np.float32)), labels, tuple(instances))
 
 
 @pytest.mark.parametrize(("most", "kept"), [(None, [1, 2, 3, 4, 5, 6]), (3, [1, 3, 4]), (1, [4])])
@@ -95,15 +93,6 @@ def test_of_too_many_the_best_are_proposed_in_their_order(most: int | None, kept
     scenes = {"front": scene_of(3.0, 0.5, 2.0, 4.0, 1.0, 2.0)}
     proposals = propose_instances(RIG, scenes, RULES, parameters)
     assert [one.instance.label for one in proposals if one.instance] == kept
-
-
-@pytest.mark.parametrize(("most", "count"), [(12, 4), (30, 6), (8, 0)])
-def test_residuals_count_among_the_proposals_and_bring_nothing_back(most: int, count: int) -> None:
-    """No mask explains any of eight certain instances, as where the second stage had no mask for them."""
-    scene = scene_of(*range(8, 0, -1))
-    masks = {"front": np.where(scene.labels > 0, np.uint8(UNCLASSED), np.uint8(0))}
-    parameters = DetectionParameters(max_proposals=most, max_residuals=6)
-    assert len(propose_residuals(RIG, {"front": scene}, masks, RULES, parameters)) == count
 
 
 # Two drones in one mask are told apart by the centres that their pixels vote for.

@@ -14,7 +14,7 @@ from flockd.core.config.perception import DetectionParameters, PerceptionConfig
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry import log_polar
 from flockd.flight.perception import Crop, Instance, Perception, RangeEstimate
-from flockd.flight.perception.detection.nms import fuse, suppress, without_occluded
+from flockd.flight.perception.detection.nms import fuse, suppress
 from flockd.flight.perception.detection.proposals import Proposal
 from flockd.flight.perception.detection.refinement import Candidate
 from flockd.flight.perception.detection.roi import Roi
@@ -147,7 +147,7 @@ def test_sizes_that_cannot_be_are_refused(values: dict[str, object]) -> None:
         PerceptionConfig.model_validate(values)
 
 
-# Non-maximum suppression: what is one drone, what hides another, and what the fused detection says.
+# Non-maximum suppression: what is one drone, and what the fused detection says.
 
 PARAMETERS = DetectionParameters()
 
@@ -178,22 +178,6 @@ def test_candidates_are_one_drone_by_their_mahalanobis_distance(
 ) -> None:
     both = [candidate(4.0, sigma), candidate(range_m, sigma, turned_deg=turned_deg, camera="left")]
     assert len(suppress(both, PARAMETERS).detections) == (1 if same else 2)
-
-
-@pytest.mark.parametrize(
-    ("range_m", "turned_deg", "kept_m"),
-    [
-        (12.0, 1.0, [3.0]),  # half of a drone at an image's border: nothing could be seen there, behind the whole one
-        (12.0, 6.0, [3.0, 12.0]),  # beside it
-        (1.0, 1.0, [1.0, 3.0]),  # near, however uncertain: that is never overlooked
-        (3.5, 1.0, [3.0, 3.5]),  # the two may be one
-    ],
-)
-def test_an_uncertain_one_behind_another_is_suppressed(range_m: float, turned_deg: float, kept_m: list[float]) -> None:
-    certain = candidate(3.0, 0.017, size_m=0.5)
-    uncertain = candidate(range_m, 0.2, turned_deg=turned_deg, size_m=0.5, camera="left")
-    kept = without_occluded([uncertain, certain], PARAMETERS)
-    assert sorted(one.range_m for one in kept) == pytest.approx(kept_m)
 
 
 def test_a_fused_detection_is_the_weighted_mean_with_the_best_ones_variance() -> None:
