@@ -160,7 +160,7 @@ class CameraSimulator:
                 return seen, seen.rgb
             motion = self._motion(drone, name, shots[name].shown_s, turns[name], trail)
             sun = self._world.light[0] @ turns[name]
-            return seen, self._real[drone, name].image(seen, motion, time_s, sun)
+            return seen, self._real[drone, name].image(seen, motion, sun)
 
         # Side by side; noise and faults are drawn in the cameras' order, so that the images do not depend on that.
         drawn = map(view, cameras) if self._executor is None else self._executor.map(view, cameras)

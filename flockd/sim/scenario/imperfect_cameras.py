@@ -49,27 +49,12 @@ class SensorNoiseConfig(Section):
     """Standard deviation, in electrons."""
 
 
-class AutomaticConfig(Section):
-    """Automatic exposure and white balance, of each camera by itself."""
-
-    exposure: Share = 0.0
-    """Share of the way to a mean of 18 % of white that brightness is corrected; above 1 by gain, with its noise."""
-    white_balance: Share = 0.0
-    """Share of the way to a grey mean that red and blue are corrected."""
-    time_s: Positive = 0.5
-    """Time constant of both."""
-
-
 class LensFaultsConfig(Section):
-    """What is on or in the glass. Dirt and drops stay where they are during a flight."""
+    """What is in the glass."""
 
     flare: Share = 0.0
     """Share of the light that is scattered over the image, the sun's included where the lens sees it (veiling glare
     index, ISO 9358): half of the sun's evenly, half around it."""
-    dirt: Share = 0.0
-    """Share of the image that specks darken, out of focus."""
-    drops: Share = 0.0
-    """Share of the image that drops of water blur."""
 
 
 class CompressionConfig(Section):
@@ -128,9 +113,8 @@ _PRESETS: Mapping[CameraPreset, Mapping[str, Mapping[str, Any]]] = {
         # OV5647, 1.4 um: 4.3 ke, 36 dB, 68 dB, so 4300 / 10^(68 / 20) = 1.7 e (user guide of the OptArc AF51, page 21).
         # 12 dB of gain: a cloudy day at 5 ms.
         "noise": {"gain": 4.0, "full_well_e": 4300.0, "read_noise_e": 1.7},
-        "automatic": {"exposure": 0.7, "white_balance": 0.5, "time_s": 0.5},
-        # Simple lenses measure 1 to 3 % (https://www.imatest.com/docs/veilingglare/). A little dust, no rain.
-        "lens": {"flare": 0.02, "dirt": 0.01, "drops": 0.0},
+        # Simple lenses measure 1 to 3 % (https://www.imatest.com/docs/veilingglare/).
+        "lens": {"flare": 0.02},
         "compression": {"jpeg_quality": 80},
         # Free running at 30 Hz; what a calibration of the delay leaves; USB's share.
         "timing": {"apart_s": 0.0167, "delay_s": 0.005, "jitter_s": 0.003, "dropped": 0.01},
@@ -153,7 +137,6 @@ class CamerasConfig(Section):
     shutter: ShutterConfig = ShutterConfig()
     shake: ShakeConfig = ShakeConfig()
     noise: SensorNoiseConfig = SensorNoiseConfig()
-    automatic: AutomaticConfig = AutomaticConfig()
     lens: LensFaultsConfig = LensFaultsConfig()
     compression: CompressionConfig = CompressionConfig()
     reduce: Literal[1, 2, 4] = 1

@@ -145,10 +145,7 @@ FAULTS: Mapping[str, tuple[Mapping[str, Mapping[str, Any]], float]] = {
     "shake": ({"shake": {"rms_deg": 2.0, "frequency_hz": 40.0}}, 1.0),
     "shake in the exposure": ({"shake": {"rms_deg": 2.0, "frequency_hz": 200.0}, "shutter": {"exposure_s": 0.01}}, 1.0),
     "noise": ({"noise": {"gain": 8.0}}, 1.0),
-    "automatics": ({"automatic": {"exposure": 1.0, "white_balance": 1.0}}, 1.0),
     "flare": ({"lens": {"flare": 0.2}}, 1.0),
-    "dirt": ({"lens": {"dirt": 0.2}}, 0.5),
-    "drops": ({"lens": {"drops": 0.2}}, 0.2),
     "JPEG": ({"compression": {"jpeg_quality": 30}}, 0.5),
 }
 """What is configured, and by how many grey levels an image then differs from an ideal camera's at least."""
