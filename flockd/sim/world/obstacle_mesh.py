@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple, assert_never
 
@@ -47,23 +48,20 @@ def draw_obstacles(scenery: Scenery, obstacles: Obstacles, seed: int) -> None:
                 base, tip = (np.array([solid.north, solid.east, -height]) for height in (solid.foot, solid.top))
                 radii, sides = (solid.foot_radius, solid.top_radius), 10 if wide < 0.4 else 16
                 scenery.mesh.frustum(base, tip, radii, sides, look.texture, look.tint * shade, look.tile_m)
-                stands, footprint = solid.foot < 1.0, (wide, wide, 0.0, solid.top)
             case Box():
                 if solid.material != "roof" and min(solid.half_length, solid.half_width) > _HOUSE_M:
                     look = houses[int(rng.integers(_LOOKS))]
                 half = solid.half_length, solid.half_width, (solid.top - solid.foot) / 2
                 centre = np.array([solid.north, solid.east, -(solid.top + solid.foot) / 2])
                 scenery.mesh.box(centre, half, solid.heading, look.texture, look.tint * shade, look.tile_m)
-                stands, footprint = solid.foot < 1.0, (*half[:2], solid.heading, solid.top)
             case Capsule():
-                lower, upper = sorted((solid.height, solid.other_height))
-                stands = solid.material != "metal" and lower - solid.radius < LOWEST_CROWN_M
-                footprint = solid.radius, solid.radius, 0.0, upper + solid.radius
                 _draw_capsule(scenery, solid, look, shade, rng)
             case never:
                 assert_never(never)
-        if stands:
-            scenery.obstacles.append((solid.north, solid.east, *footprint))
+        lowest, highest = solid.heights
+        if solid.material != "metal" and lowest < (LOWEST_CROWN_M if isinstance(solid, Capsule) else 1.0):
+            *place, length, width, heading, margin = solid.between(-math.inf, math.inf)
+            scenery.obstacles.append((place[0], place[1], length + margin, width + margin, heading, highest))
 
 
 def _draw_capsule(scenery: Scenery, solid: Capsule, look: _Look, shade: float, rng: Generator) -> None:
