@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
+import sys
 from collections import Counter, deque
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -15,10 +17,11 @@ from joblib.externals.loky import ProcessPoolExecutor
 
 from flockd.campaign.flight_kinds import FlownRun, fly_task
 from flockd.campaign.flight_plan import Run, Task
-from flockd.sim.sitl.bound_to_parent import bind, with_package
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 """Environment of a process that flies: a library that starts threads of its own takes the others' processors."""
+PR_SET_PDEATHSIG = 1
+"""Of prctl(2): Linux sends a signal when the parent ends."""
 MAX_TRIES = 3
 """How often a flight may end the process that flies it."""
 
@@ -110,8 +113,9 @@ class ProcessEngine:
         return finished
 
     def _started(self) -> ProcessPoolExecutor:
-        environment = {**with_package(os.environ), **ONE_THREAD}
-        return ProcessPoolExecutor(self._workers, env=environment, initializer=_begin, initargs=(os.getpid(),))
+        return ProcessPoolExecutor(
+            self._workers, env={**os.environ, **ONE_THREAD}, initializer=_begin, initargs=(os.getpid(),)
+        )
 
 
 def _ended(task: Task) -> FlownRun:
@@ -122,6 +126,8 @@ def _ended(task: Task) -> FlownRun:
 
 def _begin(parent: int) -> None:
     """In a new process: it ends with its parent, Ctrl-C is for the parent alone, and OpenCV starts no threads."""
-    bind(parent)
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGTERM), 0, 0, 0)
+    if os.getppid() != parent:
+        sys.exit(128 + signal.SIGTERM)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(0)

@@ -136,7 +136,6 @@ def _rerun(args: argparse.Namespace) -> int:
             perception=PERCEPTIONS[plan.config.perception],
             gated=plan.config.gated,
             progress=phases.of("flying", "steps"),
-            preparing=phases.of("loading networks and building the world", "parts"),
         )
     return report_flight(directory, flight, args)
 

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import html
 import os
 import re
 import signal
 import sys
-import tempfile
 import threading
-import webbrowser
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager, suppress
@@ -25,7 +22,7 @@ from flockd.cli.flight_summary import report_flight
 from flockd.cli.options import ENDPOINT, add_operator_option, add_settings
 from flockd.cli.output import Phases, complain, say
 from flockd.cli.parser import Commands, flag, number, option, port_number, positive_count, positive_number, whole_number
-from flockd.core.choices import TRUTH_ROLES, AutopilotKind, SimulatedPerception
+from flockd.core.choices import AutopilotKind, SimulatedPerception
 from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -98,13 +95,6 @@ def add(commands: Commands) -> None:
     option(parser, "--seed N", "of the world and of all noise", whole_number("a whole number, 0 or more"))
     option(
         parser,
-        "--swap ROLE,...",
-        f"use the exact values of these roles instead of a network's: {', '.join(TRUTH_ROLES)}",
-        _roles,
-        default=frozenset(),
-    )
-    option(
-        parser,
         "--out DIR",
         "a new folder; default: out/SCENARIO-PERCEPTION-seedN, or -AUTOPILOT-, with -2, -3, ... if there is one",
         Path,
@@ -123,9 +113,6 @@ def add(commands: Commands) -> None:
         "slow down, disturb, begin again; until Ctrl-C, without a report",
     )
     option(parser, "--port N", f"with --live: of the page (default: {PORT}; 0: any)", port_number)
-    parser.add_argument(
-        "--no-browser", dest="browser", action="store_false", help="with --live: print the address, and open no browser"
-    )
     add_operator_option(parser)
     flag(
         parser,
@@ -149,14 +136,6 @@ def _flock_size(text: str) -> int:
     if count > MAX_DRONES:
         raise argparse.ArgumentTypeError(f"{text!r} is more than the {MAX_DRONES} drones that can be simulated")
     return count
-
-
-def _roles(text: str) -> frozenset[str]:
-    roles = frozenset(text.split(","))
-    unknown = sorted(roles - set(TRUTH_ROLES))
-    if unknown:
-        raise argparse.ArgumentTypeError(f"{unknown[0]!r} is not a role; the roles are {', '.join(TRUTH_ROLES)}")
-    return roles
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -192,15 +171,15 @@ def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespac
             if not args.quiet:
                 complain(f"the flock is at {endpoint}: `flockd fleet` shows it in a browser and sends it places")
         phases = stack.enter_context(Phases(quiet=args.quiet))
+        if args.perception == "learned":
+            phases.say("loading networks and building the world")
         flight = fly(
             scenario,
             perception=args.perception,
-            swap=args.swap,
             gated=args.gated,
             shown=shown,
-            recorders=_recorders(scenario, args.swap, directory / RECORDINGS, stack) if args.record else (),
+            recorders=_recorders(scenario, directory / RECORDINGS, stack) if args.record else (),
             progress=phases.of("flying", "steps"),
-            preparing=phases.of("loading networks and building the world", "parts"),
         )
     code = report_flight(directory, flight, args)
     if flight.log.metadata.interrupted:
@@ -212,15 +191,13 @@ def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespac
     return code
 
 
-def _recorders(
-    scenario: ScenarioConfig, swap: frozenset[str], directory: Path, stack: ExitStack
-) -> tuple[Recorder, ...]:
+def _recorders(scenario: ScenarioConfig, directory: Path, stack: ExitStack) -> tuple[Recorder, ...]:
     """A recorder for each drone that flockd flies."""
     from flockd.flight.inference.hashes import model_hashes
     from flockd.onboard.recording import Recorder
 
     directory.mkdir(exist_ok=True)
-    facts = {"scenario": scenario.scenario, "seed": str(scenario.seed), "true_roles": ", ".join(sorted(swap))}
+    facts = {"scenario": scenario.scenario, "seed": str(scenario.seed)}
     return tuple(
         stack.enter_context(
             Recorder(
@@ -249,18 +226,16 @@ def _check_options(args: argparse.Namespace) -> None:
         "--live flies with the simulator's own pilots; drop --autopilot": live and fleet,
         "--live flies on until Ctrl-C; drop --duration": live and args.duration,
         "--port is for --live; add that, or drop it": args.port is not None and not live,
-        "--no-browser is for --live; add that, or drop it": not (args.browser or live),
         "--speed-factor is for real daemons; drop it, or name their --autopilot": args.speed_factor and not fleet,
         "--telemetry-at is for --telemetry, --live and --autopilot; add one of them, or drop it": (
             args.telemetry_at is not None and not (args.telemetry or live or fleet)
         ),
         f"--perception truth has no meaning with real daemons, {own}": fleet and args.perception == "truth",
-        f"--swap has no meaning with real daemons, {own}": fleet and args.swap,
         f"--telemetry has no meaning with real daemons, {own}": fleet and args.telemetry,
     }
     if args.perception == "truth":
         idle = [f"--set {key}" for key, _ in args.settings if key.startswith(("drone.perception.", "cameras."))]
-        idle += [f"--{option}" for option in ("swap", "record") if getattr(args, option)]
+        idle += ["--record"] if args.record else []
         wrong |= {f"{one} has no meaning without networks; drop it or --perception truth": True for one in idle}
     for sentence, is_so in wrong.items():
         if is_so:
@@ -340,8 +315,6 @@ def _settings(args: argparse.Namespace) -> dict[str, str]:
     values = {option: getattr(args, option) for option in (*OPTIONS, "drones")}
     settings = {option: f"{value:g}" for option, value in values.items() if value is not None}
     settings |= {key.rpartition(".")[2]: value for key, value in args.settings}
-    if args.swap:
-        settings["swap"] = ",".join(sorted(args.swap))
     return settings if args.gated else {**settings, "no-gate": "yes"}
 
 
@@ -374,39 +347,14 @@ def _fly_live(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) ->
         access, link = PageAccess(), stack.enter_context(SimulationLink(fleet, watcher))
         page = PageServer(source, access, may_command=True, operator=args.operator, simulation=link)
         port = stack.enter_context(_served(page, PORT if args.port is None else args.port))
-        address = f"http://{HERE}:{port}/?key={access.key}"
-        say(f"the flock is at {address}")
+        say(f"open this in a browser: http://{HERE}:{port}/?key={access.key}")
         if not args.quiet:
             complain(f"other programs find it at {endpoint}; Ctrl-C ends it")
+            if args.perception == "learned":
+                complain("loading networks and building the world")
         sys.stdout.flush()  # whoever reads a pipe needs the address now
-        # Somewhere to open it: not a text browser in this terminal.
-        screen = sys.platform in {"darwin", "win32"} or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-        if args.browser and screen:
-            stack.enter_context(_opened(address))
-        with Phases(quiet=args.quiet) as phases:
-            fly_live(
-                scenario,
-                shown,
-                controls,
-                perception=args.perception,
-                swap=args.swap,
-                gated=args.gated,
-                preparing=phases.of("loading networks and building the world", "parts"),
-            )
+        fly_live(scenario, shown, controls, perception=args.perception, gated=args.gated)
     return ExitCode.DONE
-
-
-@contextmanager
-def _opened(address: str) -> Iterator[None]:
-    """Opens the address in the browser by a page that this user alone may read, while this lasts.
-
-    The address has the key in it, and all users of a computer may see the command lines of all its processes.
-    """
-    with tempfile.NamedTemporaryFile("w", prefix="flockd-", suffix=".html", encoding="utf-8") as page:
-        page.write(f'<meta http-equiv="refresh" content="0; url={html.escape(address)}">')
-        page.flush()
-        webbrowser.open(Path(page.name).as_uri())
-        yield
 
 
 @contextmanager

@@ -11,7 +11,6 @@ Role = Literal["flow", "depth", "segmentation", "detector", "distance", "verific
 """What a network is used for: optical flow of two images, depth of one, pixels of drones in one, boxes of drones in
 one, range of the drone in a crop, and whether there is a drone in a crop."""
 ROLES: tuple[Role, ...] = get_args(Role)
-TRUTH_ROLES = tuple(role for role in ROLES if role not in ("detector", "verification"))
 """Those that a simulator can fill with the truth. True segments need no boxes, and the true distance also tells whether
 there is a drone."""
 

@@ -44,6 +44,8 @@ _OPTIONS = (
     ("sim", "speed", "write `--set drone.mission.speed_m_s=VALUE`"),
     ("sim", "radius", "write `--set drone.mission.radius_m=VALUE`"),
     ("sim", "cameras", "write `--set cameras.preset=VALUE`"),
+    ("sim", "no-browser", "leave it out: the address is printed, and no browser opened"),
+    ("sim", "swap", "`--perception truth` flies on exact states; a network's share of an error is no longer measured"),
     ("sim", "verbose", "the report says what was flown, and `flockd config show SCENARIO` what a file stands for"),
     (
         "calibrate camera",
@@ -79,6 +81,7 @@ KEYS: Mapping[str, str] = {
     "autopilot.arm_and_take_off": "leave it out: a pilot or a ground station arms, takes off and selects offboard",
     "autopilot.max_heartbeat_age_s": "write `heartbeat_timeout_s` in the section `safety`",
     "autopilot.obstacle_distance": "delete it, and set PX4's CP_DIST to -1: flockd stops no pilot who flies by hand",
+    "cameras.attitude": "delete it, and write `timing.delay_s`: what counts is images against attitudes",
     "cameras.automatic": "delete it: exposure and white balance of simulated cameras are fixed",
     "cameras.compression.h264_mbit_s": "write `jpeg_quality`; streams are no longer simulated",
     "detections.latency_s": "write `latency_s` beside `detections`",

@@ -22,7 +22,6 @@ from flockd.campaign.engine import Engine, ProcessEngine
 from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.folder import LINES_NAME, CampaignFolder
-from flockd.sim.sitl.bound_to_parent import with_package
 from tests.campaign.flights import PAPER, Shuffled, campaign_file, flown
 
 FEW = f"campaign: test\nscenario: {PAPER}\nseeds: 3\nscatter_m: 0.5\nfixed: {{duration_s: 2}}\n"
@@ -127,7 +126,7 @@ def command(path: Path, out: Path, *more: str) -> Iterator[subprocess.Popen[byte
     """`flockd campaign` of a file, as a person runs it."""
     program = "from flockd.cli import program; program()"
     words = [sys.executable, "-c", program, "campaign", str(path), "--out", str(out), *more]
-    with subprocess.Popen(words, env=with_package(os.environ), stderr=subprocess.DEVNULL) as process:
+    with subprocess.Popen(words, cwd=Path(__file__).parents[2], stderr=subprocess.DEVNULL) as process:
         yield process
 
 

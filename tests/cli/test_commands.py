@@ -91,7 +91,6 @@ def test_version(told: Told) -> None:
         (["sim", "--drones", "2.5"], "flockd sim", "--drones: '2.5'"),
         (["sim", "--seed", "-1"], "flockd sim", "--seed: '-1'"),
         (["sim", "--seed", "9" * 5000], "flockd sim", f"--seed: '{'9' * 5000}'"),
-        (["sim", "--swap", "flow,eyes"], "flockd sim", "--swap: 'eyes' is not a role; the roles are flow, depth"),
         # The command's default would replace what stands before it: the hold went to every fleet.
         (["fleet", "--fleet", "other", "hold", "drone2"], "flockd fleet", "--fleet stands before the command "),
         (
@@ -132,7 +131,6 @@ def test_without_a_command_the_help_is_shown(command: list[str], capsys: Capture
             "--set drone.perception.flow has no meaning",
         ),
         (["--perception", "truth", "--set", "cameras.preset=realistic"], 2, "--set cameras.preset has no meaning"),
-        (["--perception", "truth", "--swap", "flow"], 2, "--swap has no meaning without networks"),
         (["--perception", "truth", "--record"], 2, "--record has no meaning without networks"),
         (["--set", "vehicle.wind=[2, -1.5]"], 78, "--set: vehicle.wind: is not a known key"),
         (["--set", "seed=[2"], 2, "is no YAML"),
@@ -142,7 +140,6 @@ def test_without_a_command_the_help_is_shown(command: list[str], capsys: Capture
         (["--live", "--autopilot", "fake"], 2, "drop --autopilot"),
         (["--live", "--duration", "5"], 2, "flies on until Ctrl-C"),
         (["--port", "8000"], 2, "--port is for --live"),
-        (["--no-browser"], 2, "--no-browser is for --live"),
         (["--telemetry-at", "tcp/127.0.0.1:7999"], 2, "--telemetry-at is for --telemetry, --live and --autopilot"),
         (["--speed-factor", "0.5"], 2, "--speed-factor is for real daemons"),
         (["--autopilot", "fake", "--speed-factor", "0.01"], 2, "'0.01' is not a number from 0.02 to 10"),

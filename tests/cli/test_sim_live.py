@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
-import os
 import re
 import signal
 import sys
@@ -90,13 +88,11 @@ class Page:
 
 
 @contextlib.asynccontextmanager
-async def live(*options: str, browser: Path | None = None) -> AsyncIterator[Page]:
+async def live(*options: str) -> AsyncIterator[Page]:
     """The command as a process, and its page; ended by Ctrl-C."""
     command = ["sim", "--live", "--port", "0", "--drones", "3", "--telemetry-at", free_endpoint()]
-    command += ["--no-browser"] if browser is None else []
     flight = await asyncio.create_subprocess_exec(
         sys.executable, "-c", RUN, *command, *options, cwd=ROOT, stdout=asyncio.subprocess.PIPE,
-        env=os.environ | {"DISPLAY": ":0", "BROWSER": f"{browser} %s"},
     )  # fmt: skip
     try:
         assert flight.stdout is not None
@@ -117,27 +113,6 @@ async def live(*options: str, browser: Path | None = None) -> AsyncIterator[Page
         with contextlib.suppress(ProcessLookupError):
             flight.kill()
         await flight.wait()
-
-
-async def test_the_browser_is_told_the_key_in_a_file_that_nobody_else_may_read(tmp_path: Path) -> None:
-    """Whoever is on the computer sees every process's command line."""
-    told, browser = tmp_path / "told", tmp_path / "browser"
-    browser.write_text(
-        f"#!{sys.executable}\n"
-        "import json, os, sys, urllib.parse, urllib.request\n"
-        "path = urllib.request.url2pathname(urllib.parse.urlsplit(sys.argv[1]).path)\n"
-        f"known = {{'line': sys.argv, 'mode': os.stat(path).st_mode & 0o777, 'page': open(path).read()}}\n"
-        f"open({str(told)!r} + '.new', 'w').write(json.dumps(known))\n"
-        f"os.rename({str(told)!r} + '.new', {str(told)!r})\n"
-    )
-    browser.chmod(0o755)
-    async with live("--perception", "truth", browser=browser) as page:
-        await page.until(told.exists)
-    known = json.loads(told.read_text())
-    assert "?key=" not in " ".join(known["line"])
-    assert known["mode"] == 0o600
-    assert re.search(r"url=http://127\.0\.0\.1:\d+/\?key=\S+", known["page"])
-    assert not Path(known["line"][1].removeprefix("file://")).exists()
 
 
 async def test_a_flock_flies_where_the_page_sends_it_and_stands_still_when_it_is_paused() -> None:

@@ -247,7 +247,7 @@ async def test_forty_heartbeats_are_lost_one_at_a_time_and_no_flight_ends(
             slowest_s = 0.0
             for number in range(1, 41):
                 lost_s = clock()
-                autopilot.lose_heartbeats(1)
+                autopilot.streams.heartbeats_to_lose = 1
                 await until(lambda n=number: lost() >= n, SECONDS_TO_FAIL)  # type: ignore[misc]
                 slowest_s = max(slowest_s, clock() - lost_s)
                 assert autopilot.mode == "OFFBOARD"

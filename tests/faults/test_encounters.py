@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,8 +22,9 @@ from flockd.core.config.mission import MissionParameters
 from flockd.core.data import data_path
 from flockd.core.messages import FloatArray
 from flockd.review.flight_log.metadata import FleetMetadata
+from flockd.sim.autopilot import fake_vehicle
 from flockd.sim.scenario import StartConfig, VehicleConfig, load_scenario
-from flockd.sim.sitl import autopilots, fleet
+from flockd.sim.sitl import fleet
 from flockd.sim.sitl.ground_station import GroundStation, Poses
 from flockd.sim.vehicles.vehicles import Vehicles
 
@@ -104,8 +106,8 @@ def _head_on(speed_m_s: float) -> tuple[StartConfig, StartConfig]:
 class _Late(Vehicles):
     """Obeys setpoints some time after they came."""
 
-    def __init__(self, delay_s: float, starts: Sequence[StartConfig], config: VehicleConfig, *, seed: int) -> None:
-        super().__init__(starts, config, seed=seed)
+    def __init__(self, delay_s: float, starts: Sequence[StartConfig], config: VehicleConfig, **given: Any) -> None:
+        super().__init__(starts, config, **given)
         self._delay_s, self._now_s, self._obeyed = delay_s, 0.0, np.zeros((1, 2))
         self._waiting: deque[tuple[float, FloatArray]] = deque()
 
@@ -146,7 +148,7 @@ def test_two_drones_that_meet_stay_apart(
     fly: Fly, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     if late_s:
-        monkeypatch.setattr(autopilots, "Vehicles", partial(_Late, late_s))
+        monkeypatch.setattr(fake_vehicle, "Vehicles", partial(_Late, late_s))
     met = fly(drones, seconds, vehicle)
     assert met.apart_m.min() >= APART_M
     assert met.fastest_m_s > fastest_m_s
@@ -166,7 +168,7 @@ def test_drones_that_are_carried_off_their_setpoints_end_in_hold_with_the_reason
 ) -> None:
     """In gusts by 2.8 m/s, and `safety.max_velocity_error_m_s` is 0.8, as a root mean square over ten seconds."""
     if late_s:
-        monkeypatch.setattr(autopilots, "Vehicles", partial(_Late, late_s))
+        monkeypatch.setattr(fake_vehicle, "Vehicles", partial(_Late, late_s))
     met = fly(_head_on(speed_m_s), seconds, vehicle)
     assert met.apart_m.min() >= APART_M or late_s
     assert met.fleet.handed_over.keys() == {"drone1", "drone2"}

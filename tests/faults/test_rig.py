@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from flockd.cli import main
-from flockd.core.choices import TRUTH_ROLES
 from flockd.core.config import load_drone
 from flockd.core.data import data_path
 from flockd.core.messages import PilotOutput, ReasonKind
@@ -30,10 +29,11 @@ from flockd.ground.doctor.camera_checks import check_rig
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.reader import Recording
 from flockd.sim.cameras import camera_simulator
-from flockd.sim.cameras.camera_simulator import true_rigs
-from flockd.sim.flock.swarm import fly
+from flockd.sim.cameras.camera_simulator import CameraSimulator, true_rigs
+from flockd.sim.flock import swarm
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 from tests.faults.stories import Reacted
+from tests.flight.pilot.true_networks import TrueNetworks
 
 pytestmark = [pytest.mark.slow, pytest.mark.whole_flight]
 CAMERAS = ("front", "right", "back", "left")
@@ -70,8 +70,11 @@ def scenario(deg: float, late_s: float, focal: float, duration_s: float = 12.0) 
 
 def flown(flight: ScenarioConfig, path: Path) -> tuple[PilotOutput, ...]:
     """With true maps, so that nothing but the rig is wrong; recorded."""
-    with Told(path, drone="drone1", config=flight.drone) as recorder:
-        fly(flight, swap=frozenset(TRUTH_ROLES), recorders=[recorder], threads=0, pictured=False)
+    cameras = CameraSimulator(flight, threads=0)
+    with pytest.MonkeyPatch.context() as patch, Told(path, drone="drone1", config=flight.drone) as recorder:
+        patch.setattr(swarm, "CameraSimulator", lambda *_, **__: cameras)
+        patch.setattr(swarm, "load_networks", lambda _: TrueNetworks(cameras))
+        swarm.fly(flight, recorders=[recorder], threads=0, pictured=False)
     return recorder.outputs
 
 

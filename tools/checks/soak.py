@@ -122,7 +122,7 @@ def soak_daemon(minutes: float) -> dict[str, array[float]]:
             """The drone, and a neighbour north of it that does as it does."""
             state = autopilot.state
             places = np.stack([state.position, state.position + np.array([NEIGHBOUR_M, 0.0, 0.0])])
-            return Poses(time.monotonic(), places, np.array([state.velocity] * 2), np.array([state.R_ned_body] * 2))
+            return Poses(time.monotonic(), places, np.array([state.R_ned_body] * 2), np.array([state.velocity] * 2))
 
         folder = Path(name)
         with (

@@ -13,9 +13,10 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any, Self
 
 import numpy as np
@@ -28,13 +29,21 @@ from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.sim.autopilot.fake_telemetry import (
     ON_GROUND_M,
     Mode,
-    Outlet,
     TelemetryStreams,
     custom_mode,
     mode_by_number,
 )
-from flockd.sim.autopilot.fake_vehicle import Asked, Demand, Drift, Motion, MotionState, PointMass
-from flockd.sim.autopilot.sticks import StickOverride, stick_curve
+from flockd.sim.autopilot.fake_vehicle import (
+    Asked,
+    Demand,
+    Flown,
+    Motion,
+    MotionState,
+    StickOverride,
+    stick_curve,
+)  # fmt: skip
+from flockd.sim.scenario import SensorConfig
+from flockd.sim.vehicles.vehicles import EstimateErrors
 
 TICK_S = 0.02
 MAX_STEP_S = 0.2
@@ -75,7 +84,6 @@ class FakeAutopilot:
         truth_port: int | None = None,
         speed_factor: float = 1.0,
         range_finder: FakeRangeFinder | None = None,
-        clock_ahead_s: float = 0.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Bind a socket; nothing is sent before `start`.
@@ -85,14 +93,13 @@ class FakeAutopilot:
             system_id: its MAV_SYS_ID.
             height_m: in Hold at this height; 0: on the ground.
             yaw_rad: heading, radians clockwise from north.
-            motion: flies it instead of a `PointMass`, in metres from its home.
+            motion: flies it instead of a level `Flown`, in metres from its home.
             heartbeat_s: between two; a second is PX4's.
             home_deg: latitude and longitude of where it begins.
             truth_port: where a simulator listens: it gets the true pose, as PX4 in software
                 sends it, and may send commands, as a ground station may.
             speed_factor: how fast its time passes.
             range_finder: its own, which faces down; None: it has none.
-            clock_ahead_s: what its clock shows when it is made.
             clock: monotonic seconds, in the place of the computer's.
         """
         self._speed_factor, self._real = speed_factor, clock
@@ -101,8 +108,9 @@ class FakeAutopilot:
         """False: its position and velocity do not come any more, and all else does."""
         self.frame_off, self.heading_off_rad = np.zeros(3), 0.0
         """By what its positions (3,) in NED and its heading are off the truth, in metres and clockwise."""
-        self.drifts, self.drift = True, Drift(system_id)
-        # `drifts`, False: its estimate is the truth.
+        self.drifts, self.drift = True, EstimateErrors(SensorConfig(), seed=system_id, drone=0)
+        # `drifts`, False: its estimate is the truth. It is at first.
+        self.drift.velocity, self.drift.position = np.zeros(3), np.zeros(2)
         self.failing: set[str] = set()
         """PX4's names of further checks that fail; each refuses to arm."""
         self.silent = False
@@ -135,8 +143,8 @@ class FakeAutopilot:
         self._mav = mavlink.MAVLink(self, srcSystem=system_id, srcComponent=1)
         self._mav.robust_parsing = True
         self.checks = FakeChecks(self._mav)
-        truth = mavlink.MAVLink(Outlet(self._socket, self._ground), srcSystem=system_id, srcComponent=1)
-        self._motion = motion or PointMass(np.array([0.0, 0.0, -height_m]), yaw_rad)
+        truth = mavlink.MAVLink(SimpleNamespace(write=self._tell_simulator), srcSystem=system_id, srcComponent=1)
+        self._motion = motion or Flown(np.array([0.0, 0.0, -height_m]), yaw_rad)
         self.state: MotionState = self._motion(Demand(np.zeros(2), -height_m, yaw_rad), 0.0)
         """The truth."""
         self.armed = height_m > 0.0
@@ -150,7 +158,7 @@ class FakeAutopilot:
         self._sticks = -math.inf, np.zeros(2)
         """When a person last moved them, and forward and right from -1 to 1."""
         self._override = StickOverride()
-        self.clock_offset_s = clock_ahead_s - self._clock()
+        self.clock_offset_s = -self._clock()
         """Its own clock, of its stamps and of TIMESYNC, less ``clock`` times the speed factor."""
 
         self._new_streams = partial(
@@ -162,7 +170,7 @@ class FakeAutopilot:
             home_deg=home_deg,
             range_finder=range_finder,
         )
-        self._streams = self._new_streams(started_s=-self.clock_offset_s)
+        self.streams = self._new_streams(started_s=-self.clock_offset_s)
         self._heard_s = -math.inf
         """When no packet waited any more: what is taken later came later, whatever the wall clock says."""
         self._lock = threading.RLock()
@@ -207,22 +215,13 @@ class FakeAutopilot:
             self.intended_mode = mode
             self._update_mode()
 
-    @property
-    def stream_intervals_s(self) -> Mapping[int, float]:
-        """Seconds between two messages of each kind, by number."""
-        return self._streams.intervals_s
-
-    def lose_heartbeats(self, count: int) -> None:
-        """So many of the next heartbeats do not arrive, while all else does."""
-        self._streams.heartbeats_to_lose = count
-
     def restart(self) -> None:
         """It starts anew, on the ground: its clock, its events and the streams it sends begin as at first."""
         with self._lock:
             self._disarm()
             self.clock_offset_s = -self._clock()
             self.checks = FakeChecks(self._mav)
-            self._streams = self._new_streams(started_s=-self.clock_offset_s)
+            self.streams = self._new_streams(started_s=-self.clock_offset_s)
 
     def send_from_elsewhere(self, data: bytes) -> None:
         """It receives a packet of another program, as one on another of its links."""
@@ -234,13 +233,11 @@ class FakeAutopilot:
         if self.silent:
             return
         self._socket.sendto(data, self._link)
+        self._tell_simulator(data)
+
+    def _tell_simulator(self, data: bytes) -> None:
         if self._ground is not None:
             self._socket.sendto(data, self._ground)
-
-    @property
-    def followed_velocity(self) -> FloatArray | None:
-        """(2,) m/s, north and east, that it follows in offboard; None in other modes."""
-        return self._followed().velocity if self.mode == "OFFBOARD" and self.setpoints else None
 
     def _clock(self) -> float:
         return self._speed_factor * self._real()
@@ -252,7 +249,7 @@ class FakeAutopilot:
             with self._lock:
                 now = self._clock()
                 self._fly(min(now - flown_s, MAX_STEP_S))
-                self._streams.send_due(now)
+                self.streams.send_due(now)
                 self.checks.tell_changes(self._failing())
                 self.checks.announce(now)
             flown_s = now
@@ -334,9 +331,9 @@ class FakeAutopilot:
         if not self.armed:
             return
         if self.drifts:
-            self.drift.step(interval_s)
+            self.drift.advance(self._clock())
         demand = self._demand()
-        self.state = self._motion(replace(demand, velocity=demand.velocity - self.drift.velocity), interval_s)
+        self.state = self._motion(replace(demand, velocity=demand.velocity - self.drift.velocity[:2]), interval_s)
         height_m = -float(self.state.position[2])
         risen = height_m > self.parameters["MIS_TAKEOFF_ALT"] - 0.1
         if self.mode == "TAKEOFF" and risen:
@@ -351,7 +348,7 @@ class FakeAutopilot:
     def _demand(self) -> Demand:
         match self.mode:
             case "OFFBOARD" if self.setpoints:
-                return self._followed()
+                return self.followed()
             case "POSCTL":
                 return Demand(self._by_hand(), self._hold_down_m, self._hold_yaw_rad)
             case "TAKEOFF":
@@ -366,7 +363,7 @@ class FakeAutopilot:
             case _:
                 return Demand(np.zeros(2), self._hold_down_m, self._hold_yaw_rad)
 
-    def _followed(self) -> Demand:
+    def followed(self) -> Demand:
         """The newest setpoint, no faster than may be flown."""
         asked = self.setpoints[-1][1]
         speed_m_s, most_m_s = float(np.linalg.norm(asked.velocity)), self.parameters["MPC_XY_VEL_MAX"]
@@ -409,8 +406,8 @@ class FakeAutopilot:
                 )
             case "MANUAL_CONTROL" if message.target == self._mav.srcSystem:
                 self._feel(arrived_s, np.clip([message.x, message.y], -1000, 1000) / 1000)
-            case "STATUSTEXT" if self._ground is not None:  # forwarded, as PX4's links in software do
-                self._socket.sendto(bytes(message.get_msgbuf()), self._ground)
+            case "STATUSTEXT":  # forwarded, as PX4's links in software do
+                self._tell_simulator(bytes(message.get_msgbuf()))
             case "TIMESYNC" if message.tc1 == 0:
                 own_ns = int(1e9 * (self._clock() + self.clock_offset_s))
                 self._mav.timesync_send(own_ns, message.ts1)
@@ -442,14 +439,14 @@ class FakeAutopilot:
             case mavlink.MAV_CMD_COMPONENT_ARM_DISARM if message.param1 == 1:
                 done = self._arm()
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-                done = int(message.param1) in self._streams.intervals_s
+                done = int(message.param1) in self.streams.intervals_s
                 if done:
-                    self._streams.intervals_s[int(message.param1)] = message.param2 * 1e-6
+                    self.streams.intervals_s[int(message.param1)] = message.param2 * 1e-6
             case mavlink.MAV_CMD_RUN_PREARM_CHECKS:
                 self.checks.tell(self._failing())
                 done = True
             case mavlink.MAV_CMD_REQUEST_MESSAGE if message.param1 == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
-                self._streams.send_version()
+                self.streams.send_version()
                 done = True
             case _:
                 return int(mavlink.MAV_RESULT_UNSUPPORTED)

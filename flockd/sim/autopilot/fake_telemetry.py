@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import socket
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Literal
 
@@ -30,18 +29,6 @@ UNKNOWN_COVARIANCE = 255
 FULL_SIGNAL, NO_SIGNAL = 100, 1
 """Values of DISTANCE_SENSOR's `signal_quality`, whose 0 is for sensors that do not say."""
 ALL_ESTIMATED = 1 | 2 | 4 | 8 | 16 | 32
-
-
-class Outlet:
-    """Where pymavlink writes the true pose, if a simulator listens."""
-
-    def __init__(self, sender: socket.socket, address: tuple[str, int] | None) -> None:
-        self._socket, self._address = sender, address
-
-    def write(self, data: bytes) -> None:
-        """Takes what pymavlink has packed."""
-        if self._address is not None:
-            self._socket.sendto(data, self._address)
 
 
 class TelemetryStreams:
@@ -109,9 +96,8 @@ class TelemetryStreams:
 
     def _send_setpoint(self) -> None:
         """Only in offboard: of its other modes' setpoints nothing is simulated."""
-        velocity = self._vehicle.followed_velocity
-        if velocity is not None:
-            nothing, speeds = [math.nan] * 3, [*velocity, math.nan]
+        if self._vehicle.mode == "OFFBOARD" and self._vehicle.setpoints:
+            nothing, speeds = [math.nan] * 3, [*self._vehicle.followed().velocity, math.nan]
             self._mav.position_target_local_ned_send(self._boot_ms(), 1, 0, *nothing, *speeds, *nothing, math.nan, 0.0)
 
     def _send_attitude(self) -> None:
@@ -127,7 +113,7 @@ class TelemetryStreams:
             self._mav.local_position_ned_send(
                 self._boot_ms(),
                 *(motion.position + self._vehicle.frame_off + np.append(self._vehicle.drift.position, 0.0)),
-                *(motion.velocity[:2] + self._vehicle.drift.velocity),
+                *(motion.velocity[:2] + self._vehicle.drift.velocity[:2]),
                 motion.velocity[2],
             )
 

@@ -1,4 +1,4 @@
-"""The vehicle under the fake autopilot: a point mass, or whatever else moves to a demand."""
+"""The vehicle under the fake autopilot, a point mass or whatever else moves to a demand, and its pilot's sticks."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockd.core.messages import FloatArray
-from flockd.core.navigation import wrapped
 from flockd.flight.geometry import rotation_from_euler
-from flockd.sim.scenario import VehicleConfig
-from flockd.sim.vehicles import vehicles
+from flockd.sim.scenario import StartConfig, VehicleConfig
+from flockd.sim.vehicles.vehicles import Vehicles
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,50 +51,68 @@ Motion = Callable[[Demand, float], MotionState]
 """Advances the vehicle towards a demand by some seconds."""
 
 
-class Drift:
-    """How the autopilot's estimate wanders off the truth in flight, level: first-order Gauss-Markov processes.
+class Flown:
+    """One of the simulator's vehicles, which follows a demand as PX4's vehicle in software does."""
 
-    Standard deviations of each axis and times as seen of PX4 1.18 in software: 0.15 m/s and 0.15 m in all, for seconds.
-    """
-
-    VELOCITY_M_S, VELOCITY_S = 0.1, 2.0
-    POSITION_M, POSITION_S = 0.1, 5.0
-
-    def __init__(self, seed: int) -> None:
-        self._random = np.random.default_rng(seed)
-        self.velocity, self.position = np.zeros(2), np.zeros(2)
-        """(2,) m/s and m, north and east."""
-
-    def step(self, interval_s: float) -> None:
-        """Some seconds on."""
-        self.velocity = self._stepped(self.velocity, self.VELOCITY_M_S, interval_s / self.VELOCITY_S)
-        self.position = self._stepped(self.position, self.POSITION_M, interval_s / self.POSITION_S)
-
-    def _stepped(self, error: FloatArray, sigma: float, times: float) -> FloatArray:
-        kick: FloatArray = self._random.normal(scale=sigma * math.sqrt(-math.expm1(-2 * times)), size=2)
-        return math.exp(-times) * error + kick
-
-
-class PointMass:
-    """Follows a demand as PX4's vehicle in software does, but always level: the simulator's, without its lean."""
-
-    TURN_S = 0.25
-    MAX_CLIMB_M_S = 3.0
-    SUBSTEP_S = 0.02
-
-    def __init__(self, position: FloatArray, yaw_rad: float = 0.0) -> None:
-        """At rest at `position`, (3,) metres NED."""
-        self._place, self._velocity = position.astype(float)[None], np.zeros((1, 3))
-        self._level, self._now_s, self._yaw_rad = vehicles.Motion(VehicleConfig(), 0, 1), 0.0, yaw_rad
+    def __init__(
+        self,
+        position: FloatArray,
+        yaw_rad: float = 0.0,
+        *,
+        config: VehicleConfig | None = None,
+        seed: int = 0,
+        leans: bool = False,
+    ) -> None:
+        """At rest at `position`, (3,) metres NED; not `leans`: always level."""
+        start = StartConfig(position_m=(float(position[0]), float(position[1]), float(position[2])))
+        self._vehicles = Vehicles([start], config or VehicleConfig(), yaw_rad=yaw_rad, seed=seed)
+        self._leans = leans
 
     def __call__(self, demand: Demand, interval_s: float) -> MotionState:
         """Advances it by ``interval_s`` seconds."""
-        place, velocity, substeps = self._place, self._velocity, math.ceil(interval_s / self.SUBSTEP_S)
-        for _ in range(substeps):
-            dt_s = interval_s / substeps
-            self._level.step(self._now_s, dt_s, place, velocity, demand.velocity[None])
-            vehicles.climb(dt_s, place[:, 2], velocity[:, 2], -np.array([demand.down_m]), self.MAX_CLIMB_M_S)
-            self._now_s += dt_s
-            turn = wrapped(demand.yaw_rad - self._yaw_rad)
-            self._yaw_rad = wrapped(self._yaw_rad + turn * min(1.0, dt_s / self.TURN_S))
-        return MotionState(place[0].copy(), velocity[0].copy(), rotation_from_euler(0.0, 0.0, self._yaw_rad))
+        vehicles = self._vehicles
+        if interval_s > 0.0:
+            heading = np.array([demand.yaw_rad])
+            vehicles.step(demand.velocity[None], heading, interval_s, heights=np.array([-demand.down_m]))
+        R = vehicles.R_ned_body[0]
+        if not self._leans:
+            R = rotation_from_euler(0.0, 0.0, math.atan2(R[1, 0], R[0, 0]))
+        return MotionState(vehicles.position[0], vehicles.velocity[0], R)
+
+
+STICK_EXPO = 0.6
+"""How much of a stick's curve is cubic, as PX4 1.18 has it and MPC_XY_MAN_EXPO before: slow near the middle."""
+OVERRIDE_FILTER_S, OVERRIDE_SAMPLES = 0.05, 3
+"""Of the sticks' speed, and for how many positions on end it has to have one sign."""
+
+
+def stick_curve(sticks: FloatArray, deadzone: float = 0.0) -> FloatArray:
+    """What sticks at -1 to 1 ask for in Position mode, -1 to 1 of the full speed."""
+    moved = np.sign(sticks) * np.maximum(np.abs(sticks) - deadzone, 0.0) / (1.0 - deadzone)
+    curved: FloatArray = (1.0 - STICK_EXPO) * moved + STICK_EXPO * moved**3
+    return curved
+
+
+class StickOverride:
+    """Whether sticks move fast enough for the pilot to take over, by PX4 1.18's rule for MAN_OVERRIDE_SPD.
+
+    The low-passed speed of a stick is above the threshold, and it has moved the same way several times on end.
+    """
+
+    def __init__(self) -> None:
+        self._last: tuple[float, FloatArray] | None = None
+        self._speed, self._sign, self._same = np.zeros(2), np.zeros(2), np.zeros(2)
+
+    def moved(self, now_s: float, sticks: FloatArray, threshold: float) -> bool:
+        """Takes a new position of the sticks (2,), -1 to 1. ``threshold``: travel a second; negative: they never do."""
+        last, self._last = self._last, (now_s, sticks)
+        if last is None or now_s <= last[0]:
+            return False
+        interval_s = now_s - last[0]
+        speed = (sticks - last[1]) / interval_s
+        self._speed = self._speed + interval_s / (OVERRIDE_FILTER_S + interval_s) * (speed - self._speed)
+        sign = np.sign(speed)
+        counted = np.where(sign == self._sign, self._same + 1, 1)
+        self._same, self._sign = np.where(sign == 0, self._same, counted), np.where(sign == 0, self._sign, sign)
+        fast = (np.abs(self._speed) > threshold) & (self._same >= OVERRIDE_SAMPLES)
+        return threshold >= 0.0 and bool(fast.any())

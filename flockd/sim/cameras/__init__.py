@@ -1,1 +1,1 @@
-"""What real cameras make of ideal views: shutter, shake, lens faults, sensor, automatics, compression, timing."""
+"""What real cameras make of ideal views: shutter, shake, flare, noise, compression, timing."""

@@ -14,14 +14,13 @@ from flockd.core.messages import FloatArray, Frame, FrameSet, UInt8Array
 from flockd.flight.geometry import Rig, RigCamera, RigidTransform, build_rig, rotation_from_vector
 from flockd.flight.mission import Moment, Navigator
 from flockd.ground.calibration.camera_motion import scaled_focal
+from flockd.sim.cameras.imperfect_cameras import RigErrorsConfig
 from flockd.sim.cameras.lens_views import lens_view
 from flockd.sim.cameras.real_camera import NOISE_TILE, NoiseTile, Shot, real_cameras
 from flockd.sim.cameras.shutter import CameraMotion
-from flockd.sim.flock.truth_perception import RenderTruth
 from flockd.sim.renderer.drone_models import FAMILIES, drone_model
 from flockd.sim.renderer.renderer import Renderer, View
 from flockd.sim.scenario import CameraFaultConfig, ScenarioConfig
-from flockd.sim.scenario.imperfect_cameras import RigErrorsConfig
 from flockd.sim.vehicles.pose_trail import FlockPose, PoseTrail
 from flockd.sim.vehicles.vehicles import REFERENCE_DEG, UNDISTURBED, Disturbances, Vehicles
 from flockd.sim.world.obstacle_worlds import obstacles_of
@@ -125,8 +124,8 @@ class CameraSimulator:
     def capture(
         self, drone: int, step: int, time_s: float, vehicles: FlockPose | Vehicles, trail: PoseTrail | None = None,
         disturbed: Disturbances = UNDISTURBED,
-    ) -> tuple[FrameSet, RenderTruth]:  # fmt: skip
-        """The frame set of one drone, and the truth behind it.
+    ) -> FrameSet:  # fmt: skip
+        """The frame set of one drone.
 
         ``trail`` holds where the flock was until then, for what is late and for motion; None: what was captured before
         is taken, so that a flock's motion between two captures is even.
@@ -148,7 +147,7 @@ class CameraSimulator:
             for name, mounted in cameras.items()
         }
 
-        def view(name: str) -> tuple[View, UInt8Array]:
+        def sensed_by(name: str) -> UInt8Array:
             def draw(matrix: FloatArray, size: tuple[int, int], R_lens_part: FloatArray) -> View:
                 return self._renderer.render(
                     matrix, size, turns[name] @ R_lens_part, places[name],
@@ -157,27 +156,22 @@ class CameraSimulator:
 
             seen = lens_view(cameras[name].camera, draw)
             if self._real is None:
-                return seen, seen.rgb
+                return seen.rgb
             motion = self._motion(drone, name, shots[name].shown_s, turns[name], trail)
             sun = self._world.light[0] @ turns[name]
-            return seen, self._real[drone, name].image(seen, motion, sun)
+            return self._real[drone, name].image(seen, motion, sun)
 
         # Side by side; noise and faults are drawn in the cameras' order, so that the images do not depend on that.
-        drawn = map(view, cameras) if self._executor is None else self._executor.map(view, cameras)
-        views, frames = {}, {}
-        for name, (seen, sensed) in zip(cameras, drawn, strict=True):
-            views[name] = seen
+        drawn = map(sensed_by, cameras) if self._executor is None else self._executor.map(sensed_by, cameras)
+        frames = {}
+        for name, sensed in zip(cameras, drawn, strict=True):
             image = self._noise.add(sensed)
             if self._real is not None:
                 image = self._real[drone, name].compressed(image)
             image = self._faults.applied(drone, name, time_s, image)
             if shots[name].comes and name not in off:
                 frames[name] = Frame(name, image, shots[name].stamp_s, step)
-        truth = RenderTruth(
-            self._rigs[drone], views, turns, places, vehicles.R_ned_body[drone], vehicles.position[drone],
-            vehicles.R_ned_body, vehicles.position, others,
-        )  # fmt: skip
-        return FrameSet(time_s, frames), truth
+        return FrameSet(time_s, frames)
 
     def _turn(self, drone: int, name: str, shot: Shot, flock: FlockPose | Vehicles) -> FloatArray:
         """(3, 3) from a camera's axes to NED, shaken."""

@@ -12,9 +12,9 @@ import numpy as np
 
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, UInt8Array
 from flockd.flight.geometry import Camera
+from flockd.sim.cameras.imperfect_cameras import CamerasConfig, CameraTimingConfig, SensorNoiseConfig
 from flockd.sim.cameras.shutter import CameraMotion, LensField, Shaking, exposed
 from flockd.sim.renderer.renderer import View
-from flockd.sim.scenario.imperfect_cameras import CamerasConfig, CameraTimingConfig, SensorNoiseConfig
 
 _STEPS = 1 << 14
 """Of linear light in the table back: each grey level has five at least, so that all 256 come back as they were."""

@@ -20,8 +20,8 @@ import numpy as np
 
 from flockd.core.messages import BoolArray, Float32Array, FloatArray
 from flockd.flight.geometry import Camera
+from flockd.sim.cameras.imperfect_cameras import ShakeConfig, ShutterConfig
 from flockd.sim.renderer.renderer import View
-from flockd.sim.scenario.imperfect_cameras import ShakeConfig, ShutterConfig
 
 _PROPELLERS, _SPREAD = 4, 0.1
 _OF_REVOLUTIONS = 0.8

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
 
-from flockd.core.config.safety import SafetyParameters
 from flockd.core.messages import NO_STATUS, FloatArray, MissionStatus, Neighbour, ObstacleRanges, Setpoint, Wanted
 from flockd.flight.obstacles import nearest_points
 from flockd.flight.safety import (
@@ -73,56 +72,6 @@ _HOLD_BRAKING_M_S2 = 3.0
 """It holds where it would stop, braking so hard once it answers: PX4's default of MPC_ACC_HOR."""
 
 
-class Handover:
-    """Remembers whose autopilot has taken over: the pilot's commands count no more then."""
-
-    def __init__(self, scenario: ScenarioConfig) -> None:
-        self._starts = np.array([vehicle.position_m[:2] for vehicle in scenario.vehicles])
-        self._response_s = scenario.vehicle.dead_time_s + scenario.vehicle.velocity_time_constant_s
-        self.taken: dict[int, str] = {}
-        """How an autopilot has taken over, by its drone's number."""
-        self._held: dict[int, FloatArray] = {}
-        """Where, (3,) m NED."""
-
-    def hold(self, drone: int, position: FloatArray, velocity: FloatArray) -> None:
-        """The autopilot of a drone at `position` (3,) m NED, with (3,) m/s, goes into Hold and stays there."""
-        self.taken[drone] = "hold"
-        stops_s = self._response_s + math.hypot(*velocity[:2]) / (2 * _HOLD_BRAKING_M_S2)
-        self._held[drone] = position + velocity * [stops_s, stops_s, 0.0]
-
-    def resume(self, drone: int) -> None:
-        """Its pilot flies it again."""
-        self.taken.pop(drone, None)
-        self._held.pop(drone, None)
-
-    def holding(self, positions: FloatArray) -> dict[int, tuple[FloatArray, float]]:
-        """Of each drone in Hold the velocity (2,) m/s back to its place, from (n, 3) m NED, and its height, m."""
-        return {i: (_HOLD_PER_S * (held - positions[i])[:2], -float(held[2])) for i, held in self._held.items()}
-
-    def applied(
-        self, takeovers: Sequence[str | None], positions: FloatArray, velocity: FloatArray, height_m: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Velocities (n, 2) and heights (n,) of the pilots, with those of the autopilots that land or return.
-
-        `takeovers` are `land`, `return` or None, as of this step; `positions` (n, 3) m NED.
-        """
-        velocity, height_m = velocity.copy(), height_m.copy()
-        for i, takeover in enumerate(takeovers):
-            if takeover is not None:
-                self.taken.setdefault(i, takeover)
-        for i, takeover in self.taken.items():
-            if takeover == "hold":
-                continue
-            way = self._starts[i] - positions[i, :2]
-            away_m = math.hypot(*way)
-            if takeover == "return" and away_m > _THERE_M:
-                velocity[i] = way * (min(RETURN_M_S, away_m) / away_m)
-            else:
-                self.taken[i] = "land"
-                velocity[i], height_m[i] = 0.0, 0.0
-        return velocity, height_m
-
-
 _SEES = CameraHealth(age_s=0.0, period_s=1.0, unplugged=False, frozen=False, noisy=False)
 _LOST = replace(_SEES, unplugged=True)
 _WELL = Inputs(
@@ -137,26 +86,27 @@ _WELL = Inputs(
 )  # fmt: skip
 
 
-class WindSupervisor:
-    """The supervisor of a drone that flies from the start on."""
+class _Drone:
+    """What of its daemon's control loop each gated drone has; it flies from the start on."""
 
-    def __init__(self, parameters: SafetyParameters, cameras: Sequence[str]) -> None:
-        """``cameras``: their names."""
-        self._parameters, self._cameras = parameters, dict.fromkeys(cameras, _SEES)
+    def __init__(self, scenario: ScenarioConfig, number: int) -> None:
+        self._parameters = scenario.drone_of(number).safety
+        self.gate = Gate(self._parameters.gate)
+        self._cameras = dict.fromkeys((camera.name for camera in scenario.drone.rig.cameras), _SEES)
         self.degraded_by: frozenset[Event] = frozenset()
         """Why the drone was last degraded: it flies slower for a while after that is over."""
-        self._supervisor = Supervisor(parameters)
+        self._supervisor = Supervisor(self._parameters)
         for changes in ({"armed": False, "in_air": False, "flight_mode": "hold"}, {"flight_mode": "hold"}, {}):
             self._supervisor.step(-math.inf, replace(_WELL, **changes))
 
-    def step(self, now_s: float, gate: Gate, around: Surroundings, *, lost: Collection[str] = ()) -> Decision:
-        """As of `now_s`, with the drone's gate; `lost`: the names of its lost cameras."""
+    def decide(self, now_s: float, around: Surroundings, lost: Collection[str]) -> Decision:
+        """The supervisor's decision as of `now_s`; `lost`: the names of its lost cameras."""
         limits = self._parameters.gate
         inputs = replace(
             _WELL,
             cameras={**self._cameras, **dict.fromkeys(lost, _LOST)},
-            velocity_late_s=gate.velocity_late_s,
-            velocity_error_m_s=gate.velocity_error_m_s,
+            velocity_late_s=self.gate.velocity_late_s,
+            velocity_error_m_s=self.gate.velocity_error_m_s,
             obstacle_near=around.nearest_obstacle_m < self._parameters.hold_room_m,
             outside_fence=outside_fence(limits, around.position),
             outside_heights=outside_heights(limits, around.height_m),
@@ -213,21 +163,11 @@ _SAME_TIME_S = 1e-9
 
 
 class _Order(NamedTuple):
-    """What pilots asked for, and when and where the drones were as they looked."""
+    """What drones were asked for, by their pilots or by autopilots that took over, when, and where they were."""
 
     time_s: float
     places: FloatArray
     commands: Commands
-    velocity: FloatArray
-    """(n, 2) m/s, and heights (n,) m, as asked for or as the autopilots that took over fly."""
-    height_m: FloatArray
-
-
-class _Drone(NamedTuple):
-    """What of its daemon's control loop each gated drone has."""
-
-    gate: Gate
-    supervisor: WindSupervisor
 
 
 class ControlLoop:
@@ -239,14 +179,13 @@ class ControlLoop:
 
     def __init__(self, scenario: ScenarioConfig, *, gated: bool = True) -> None:
         """Not `gated`: setpoints are what the pilots ask for."""
-        self._step_s, self._sigmas = scenario.drone.step_s, scenario.drone.obstacles.sigmas
-        self._handover = Handover(scenario)
-        self._drones = {
-            i: _drone(scenario, i) for i, vehicle in enumerate(scenario.vehicles) if gated and not vehicle.by_hand
-        }
-        self._start_m = [-vehicle.position_m[2] for vehicle in scenario.vehicles]
-        self._scenario = scenario
-        self._latency_s = scenario.step_latency_s
+        self._scenario, self._step_s = scenario, scenario.drone.step_s
+        self._drones = {i: _Drone(scenario, i) for i, one in enumerate(scenario.vehicles) if gated and not one.by_hand}
+        self._starts = np.array([vehicle.position_m for vehicle in scenario.vehicles])
+        self._taken: dict[int, str] = {}
+        """How an autopilot has taken over, `hold`, `land` or `return`: what its pilot commands counts no more."""
+        self._held: dict[int, FloatArray] = {}
+        """Where those in Hold stay, (3,) m NED."""
         self._orders: deque[_Order] = deque()
         """The one in force, and those that are still being computed."""
         self._disturbed = UNDISTURBED
@@ -256,22 +195,26 @@ class ControlLoop:
         self.handed_over: dict[int, HandedOver] = {}
         """By the drone's number, from 0."""
 
-    def hold(self, i: int, time_s: float, vehicles: Vehicles) -> None:
-        """An operator asks for Hold: the drone's autopilot takes over and holds its place."""
-        self._hand_over(i, time_s, vehicles, "an operator asked for Hold")
+    def hold(self, i: int, time_s: float, vehicles: Vehicles, why: str = "an operator asked for Hold") -> None:
+        """The drone's autopilot takes over, goes into Hold and stays where it comes to rest."""
+        config, velocity = self._scenario.vehicle, vehicles.known_velocity[i]
+        response_s = config.dead_time_s + config.velocity_time_constant_s
+        stops_s = response_s + math.hypot(*velocity[:2]) / (2 * _HOLD_BRAKING_M_S2)
+        self._taken[i], self._held[i] = "hold", vehicles.known_position[i] + velocity * [stops_s, stops_s, 0.0]
+        self.handed_over[i] = HandedOver(time_s=time_s, reason=why)
 
     def resume(self, i: int) -> None:
         """An operator has a drone that its autopilot holds fly on as its pilot asks."""
-        if i not in self._handover.taken:
+        if self._taken.pop(i, None) is None:
             return
-        self._handover.resume(i)
+        self._held.pop(i, None)
         self._supervised.pop(i, None)
         if i in self._drones:
-            self._drones[i] = _drone(self._scenario, i)
+            self._drones[i] = _Drone(self._scenario, i)
 
     def status(self, i: int) -> tuple[State, tuple[str, ...]]:
         """Who flies a drone, and why, as in telemetry."""
-        if i in self._handover.taken:
+        if i in self._taken:
             return State.ASKING, (self.handed_over[i].reason,) if i in self.handed_over else ()
         decision = self._supervised.get(i)
         if decision is None:
@@ -285,38 +228,54 @@ class ControlLoop:
     def fly(self, time_s: float, vehicles: Vehicles, commands: Commands, disturbed: Disturbances = UNDISTURBED) -> None:
         """From `time_s` one step on."""
         self._disturbed = disturbed
-        takeovers: list[str | None] = [mission.takeover for mission in commands.missions]
+        taken = {i: one.takeover for i, one in enumerate(commands.missions) if one.takeover is not None}
         for takeover in self._scenario.takeovers:
             if time_s - self._step_s < takeover.time_s <= time_s:
                 if takeover.to == "hold":
                     self.hold(takeover.drone - 1, time_s, vehicles)
                 else:
-                    takeovers[takeover.drone - 1] = takeover.to
-        velocity, height_m = self._handover.applied(
-            takeovers, vehicles.known_position, commands.velocity, commands.height_m
-        )
-        self._orders.append(_Order(time_s, vehicles.known_position, commands, velocity, height_m))
-        periods = max(round(self._step_s / PERIOD_S), 1) if self._drones or self._latency_s else 1
+                    taken[takeover.drone - 1] = takeover.to
+        self._taken = {**taken, **self._taken}
+        self._orders.append(_Order(time_s, vehicles.known_position, self._with_landings(commands, vehicles)))
+        latency_s = self._scenario.step_latency_s
+        periods = max(round(self._step_s / PERIOD_S), 1) if self._drones or latency_s else 1
         period_s = self._step_s / periods
         for period in range(periods):
             now_s = time_s + period * period_s
-            while len(self._orders) > 1 and now_s - self._orders[1].time_s >= self._latency_s - _SAME_TIME_S:
+            while len(self._orders) > 1 and now_s - self._orders[1].time_s >= latency_s - _SAME_TIME_S:
                 self._orders.popleft()
-            order = self._orders[0]
-            setpoints, heights = order.velocity.copy(), order.height_m.copy()
-            for i in self._drones.keys() - self._handover.taken.keys() - disturbed.removed:
+            order, asked = self._orders[0], self._orders[0].commands
+            setpoints, heights = asked.velocity.copy(), asked.height_m.copy()
+            for i in self._drones.keys() - self._taken.keys() - disturbed.removed:
                 setpoint = self._setpoint(i, now_s, period_s, vehicles, order)
                 setpoints[i] = setpoint.velocity
-                if math.isfinite(order.height_m[i]):
+                if math.isfinite(asked.height_m[i]):
                     heights[i] = setpoint.height_m
-            for i, (back, held_m) in self._handover.holding(vehicles.known_position).items():
-                setpoints[i], heights[i] = back, held_m
-            vehicles.step(setpoints, order.commands.yaw_rad, period_s, heights)
+            for i, held in self._held.items():
+                setpoints[i] = _HOLD_PER_S * (held - vehicles.known_position[i])[:2]
+                heights[i] = -held[2]
+            vehicles.step(setpoints, asked.yaw_rad, period_s, heights)
+
+    def _with_landings(self, commands: Commands, vehicles: Vehicles) -> Commands:
+        """The pilots' commands, with those of the autopilots that land or return."""
+        velocity, height_m = commands.velocity.copy(), commands.height_m.copy()
+        for i, takeover in self._taken.items():
+            if takeover == "hold":
+                continue
+            way = (self._starts[i] - vehicles.known_position[i])[:2]
+            away_m = math.hypot(*way)
+            if takeover == "return" and away_m > _THERE_M:
+                velocity[i] = way * (min(RETURN_M_S, away_m) / away_m)
+            else:
+                self._taken[i] = "land"
+                velocity[i], height_m[i] = 0.0, 0.0
+        return replace(commands, velocity=velocity, height_m=height_m)
 
     def _setpoint(self, i: int, now_s: float, period_s: float, vehicles: Vehicles, order: _Order) -> Setpoint:
         """What the gate of a drone makes of its order now; its supervisor may hand it over instead."""
         drone, commands, here = self._drones[i], order.commands, vehicles.known_position[i]
         ranges, yaw_rad = commands.obstacles[i], float(commands.yaw_rad[i])
+        sigmas = self._scenario.drone.obstacles.sigmas
         around = surroundings(
             commands.neighbours[i],
             now_s - order.time_s,
@@ -325,30 +284,20 @@ class ControlLoop:
             velocity=vehicles.known_velocity[i],
             yaw_rad=yaw_rad,
             height_m=float(-here[2]),
-            obstacles=np.empty((0, 2)) if ranges is None else nearest_points(ranges, self._sigmas),
+            obstacles=np.empty((0, 2)) if ranges is None else nearest_points(ranges, sigmas),
         )
         lost = self._disturbed.cameras_off_of(i)
         if self._scenario.detections is not None:
             lost |= self._scenario.lost_cameras(i, now_s)
-        decision = drone.supervisor.step(now_s, drone.gate, around, lost=lost)
-        self._supervised[i] = decision
+        decision = self._supervised[i] = drone.decide(now_s, around, lost)
         if decision.state is State.ASKING:
-            self._hand_over(i, now_s, vehicles, decision.reasons[0].sentence)
+            self.hold(i, now_s, vehicles, decision.reasons[0].sentence)
         height_m = float(commands.height_m[i])
         wanted = Wanted(commands.velocity[i], commands.acceleration[i], yaw_rad)
-        held_m = height_m if math.isfinite(height_m) else self._start_m[i]
+        held_m = height_m if math.isfinite(height_m) else -float(self._starts[i, 2])
         request = Request(Permission(decision.action, now_s), wanted, order.time_s, held_m, around)
         verdict = drone.gate.step(now_s, request)
         assert verdict.setpoint is not None, "all that it is told is finite and of now"
         if decision.state is not State.ASKING:
-            self.slowed.add(period_s, request, verdict, drone.supervisor.degraded_by)
+            self.slowed.add(period_s, request, verdict, drone.degraded_by)
         return verdict.setpoint
-
-    def _hand_over(self, i: int, now_s: float, vehicles: Vehicles, why: str) -> None:
-        self._handover.hold(i, vehicles.known_position[i], vehicles.known_velocity[i])
-        self.handed_over[i] = HandedOver(time_s=now_s, reason=why)
-
-
-def _drone(scenario: ScenarioConfig, i: int) -> _Drone:
-    safety, cameras = scenario.drone_of(i).safety, [camera.name for camera in scenario.drone.rig.cameras]
-    return _Drone(Gate(safety.gate), WindSupervisor(safety, cameras))

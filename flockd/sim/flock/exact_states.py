@@ -260,16 +260,6 @@ def fly_exact_states(scenario: ScenarioConfig, *, gated: bool = True) -> tuple[F
     return times, np.array(positions), np.array(velocities)
 
 
-def exact_states_at(times: FloatArray, scenario: ScenarioConfig) -> tuple[FloatArray, FloatArray]:
-    """Positions (S, N, 3) m and velocities (S, N, 3) m/s of `fly_exact_states`, interpolated at ``times`` (S,) s."""
-    steps_s, position, velocity = fly_exact_states(scenario)
-
-    def at_times(column: FloatArray) -> FloatArray:
-        return np.interp(times, steps_s, column)
-
-    return np.apply_along_axis(at_times, 0, position), np.apply_along_axis(at_times, 0, velocity)
-
-
 def step_times(scenario: ScenarioConfig) -> FloatArray:
     """When the steps of a flight begin, (S,) s: 0, step, ... up to but without its end."""
     step_s = scenario.drone.step_s

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Self
 
@@ -92,7 +93,7 @@ class FlockTelemetry:
         self._checks = {i: OrderChecks(announcer.identity, time.monotonic) for i in self._drones}
         self._stepped: dict[int, tuple[FrameSet | None, VehicleState, PilotOutput]] = {}
         """The newest step of each; without frames on exact states."""
-        self._drawn: _DrawnOnRequest | None = None
+        self._drawn = _DrawnOnRequest(scenario)
         self._rig = build_rig(scenario.drone.rig)
         for i in self._drones:
             self._announce(i)
@@ -110,8 +111,7 @@ class FlockTelemetry:
         """Another flight begins, with all drones."""
         with self._lock:
             self._orders, self._requests, self._stepped = {}, {}, {}
-        if self._drawn is not None:
-            self._drawn.begin_again()
+        self._drawn.begin_again()
         self.disturb(UNDISTURBED)
 
     def disturb(self, disturbed: Disturbances) -> None:
@@ -122,8 +122,7 @@ class FlockTelemetry:
             self._sink.forget(f"drone{i + 1}")
         for i in before.removed - disturbed.removed:
             self._announce(i)
-        if self._drawn is not None:
-            self._drawn.disturbed = disturbed
+        self._drawn.disturbed = disturbed
 
     def take_requests(self, time_s: float, loop: ControlLoop, vehicles: Vehicles) -> None:
         """Has drones held, or fly on, as operators have asked since the last step."""
@@ -169,8 +168,6 @@ class FlockTelemetry:
 
     def show_exact(self, step: int, time_s: float, vehicles: Vehicles, commands: Commands) -> None:
         """Publishes a step of all drones that fly on exact states; pictures of it are drawn when someone asks."""
-        if self._drawn is None:
-            self._drawn = _DrawnOnRequest(self._scenario, self._disturbed)
         self._drawn.newest = step, FlockPose(time_s, vehicles.position, vehicles.R_ned_body)
         for i in self._there():
             position, velocity = vehicles.position[i], vehicles.velocity[i]
@@ -185,11 +182,11 @@ class FlockTelemetry:
             self.show(i, None, state, output)
 
     def _newest(self, drone: int) -> tuple[FrameSet | None, tuple[FrameSet, PilotOutput] | None]:
-        if self._drawn is not None:
-            return self._drawn.frames(drone), None
         with self._lock:
             frames, _, output = self._stepped.get(drone, (None, None, None))
-        return frames, None if frames is None or output is None else (frames, output)
+        if frames is None or output is None:
+            return self._drawn.frames(drone) if self._drawn.newest else None, None
+        return frames, (frames, output)
 
     def _ask(self, drone: int, command: str, payload: bytes) -> AnswerMessage:
         try:
@@ -224,27 +221,25 @@ class FlockTelemetry:
 class _DrawnOnRequest:
     """Camera images of a flight whose drones look at none. The world is built when the first is asked for."""
 
-    def __init__(self, scenario: ScenarioConfig, disturbed: Disturbances) -> None:
-        self._scenario, self.disturbed = scenario, disturbed
+    def __init__(self, scenario: ScenarioConfig) -> None:
+        self._scenario, self.disturbed = scenario, UNDISTURBED
         self.newest: tuple[int, FlockPose] | None = None
         """A step, and where all drones were in it."""
-        self._cameras: CameraSimulator | None = None
-        self._building: threading.Thread | None = None
+        self._cameras: Future[CameraSimulator] | None = None
         self._lock = threading.Lock()
         self._frames: dict[int, FrameSet] = {}
 
     def frames(self, drone: int) -> FrameSet | None:
         """Of the newest step; None while the world is being built."""
         with self._lock:
-            newest, cameras = self.newest, self._cameras
-            if cameras is None or newest is None:
-                if self._building is None:
-                    self._building = threading.Thread(target=self._build, name="world", daemon=True)
-                    self._building.start()
+            if self._cameras is None:
+                self._cameras = ThreadPoolExecutor(1, "world").submit(CameraSimulator, self._scenario, threads=1)
+            if self.newest is None or not self._cameras.done():
                 return None
-            (step, poses), known = newest, self._frames.get(drone)
+            (step, poses), known = self.newest, self._frames.get(drone)
             if known is None or known.time_s != poses.time_s:
-                self._frames[drone], _ = cameras.capture(drone, step, poses.time_s, poses, disturbed=self.disturbed)
+                cameras, time_s = self._cameras.result(), poses.time_s
+                self._frames[drone] = cameras.capture(drone, step, time_s, poses, disturbed=self.disturbed)
             return self._frames[drone]
 
     def begin_again(self) -> None:
@@ -252,7 +247,4 @@ class _DrawnOnRequest:
         with self._lock:
             self._frames, self.newest = {}, None
             if self._cameras is not None:
-                self._cameras.begin_again()
-
-    def _build(self) -> None:
-        self._cameras = CameraSimulator(self._scenario, threads=1)
+                self._cameras.result().begin_again()

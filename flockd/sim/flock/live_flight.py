@@ -17,7 +17,7 @@ from flockd.onboard.telemetry.topics import AnswerMessage
 from flockd.sim.flock.control_loop import ControlLoop
 from flockd.sim.flock.exact_states import vehicles_of
 from flockd.sim.flock.flock_telemetry import FlockTelemetry
-from flockd.sim.flock.swarm import ExactStatePilots, VisionPilots, fly_commands
+from flockd.sim.flock.swarm import ExactStatePilots, VisionPilots, eyes_of, fly_commands
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances
 
@@ -207,21 +207,19 @@ def fly_live(
     controls: LiveControls,
     *,
     perception: SimulatedPerception = "learned",
-    swap: frozenset[str] = frozenset(),
     gated: bool = True,
-    preparing: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Flies a scenario, beyond its end, and again from the beginning where that is asked for.
 
     Until KeyboardInterrupt. The arguments are those of `flockd.sim.flock.swarm.fly`; `controls` give the pace.
     """
-    pilots: ExactStatePilots | VisionPilots = ExactStatePilots(scenario, shown, gated=gated)
-    if perception == "learned":
-        pilots = VisionPilots(scenario, swap, shown, (), None, preparing)
+    eyes = eyes_of(scenario) if perception == "learned" else None
     while True:
         controls.begin()
         shown.begin_again()
-        pilots.begin_again()
+        pilots: ExactStatePilots | VisionPilots = ExactStatePilots(scenario, shown, gated=gated)
+        if eyes is not None:
+            pilots = VisionPilots(scenario, *eyes, shown)
         loop, vehicles = ControlLoop(scenario, gated=gated), vehicles_of(scenario)
         step = 0
         while controls.wait(time_s := step * scenario.drone.step_s):

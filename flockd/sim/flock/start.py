@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
 
 import numpy as np
 
@@ -18,6 +17,7 @@ LAYERS_DOWN_M = (-3.0, -4.0, -5.0, -6.0)
 _SCATTER = 7
 """Tells the generator of the starts from the others of the same seed."""
 _TRIES = 200
+_RINGS = 15
 
 
 def with_drones(scenario: ScenarioConfig, count: int) -> ScenarioConfig:
@@ -50,9 +50,11 @@ def scattered(scenario: ScenarioConfig, scatter_m: float) -> ScenarioConfig:
 
 
 def _further(given: tuple[StartConfig, ...], count: int) -> tuple[StartConfig, ...]:
-    north = sum(vehicle.position_m[0] for vehicle in given) / len(given)
-    east = sum(vehicle.position_m[1] for vehicle in given) / len(given)
-    places = ((north + SPACING_M * row, east + SPACING_M * column) for row, column in _spiral())
+    """On a grid, ring by ring around the middle of the given ones."""
+    north, east = np.mean([vehicle.position_m[:2] for vehicle in given], axis=0).tolist()
+    cells = itertools.product(range(-_RINGS, _RINGS + 1), repeat=2)
+    by_ring = sorted(cells, key=lambda cell: (max(map(abs, cell)), cell[0] ** 2 + cell[1] ** 2, cell))
+    places = ((north + SPACING_M * row, east + SPACING_M * column) for row, column in by_ring)
     # Grid places are farther apart than MIN_DISTANCE_M; only the given vehicles stand off the grid.
     free = (
         place
@@ -63,14 +65,3 @@ def _further(given: tuple[StartConfig, ...], count: int) -> tuple[StartConfig, .
         StartConfig(position_m=(*place, down), velocity_m_s=given[0].velocity_m_s)
         for place, down in zip(itertools.islice(free, count), itertools.cycle(LAYERS_DOWN_M), strict=False)
     )
-
-
-def _spiral() -> Iterator[tuple[int, int]]:
-    """All cells of the grid, ring by ring around (0, 0)."""
-    yield 0, 0
-    for ring in itertools.count(1):
-        cells = range(-ring, ring + 1)
-        yield from sorted(
-            ((row, column) for row in cells for column in cells if max(abs(row), abs(column)) == ring),
-            key=lambda cell: (cell[0] ** 2 + cell[1] ** 2, cell),
-        )

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 
 import numpy as np
 
 from flockd import __version__
 from flockd.core.choices import SimulatedPerception
-from flockd.core.messages import FloatArray
+from flockd.core.messages import FloatArray, FrameSet, MissionOrder, PilotOutput, VehicleState
 from flockd.flight.mission.circle_then_tangent import desired_of
+from flockd.flight.perception import Networks, load_networks
+from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.truth import TrueDrone, Truth
 from flockd.review.flight_log.builder import FlightLogBuilder
-from flockd.review.flight_log.key_frames import KeyFrame, key_frame_steps
+from flockd.review.flight_log.key_frames import KeyFrame, capture, key_frame_steps
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FlightMetadata, MissionMetadata
 from flockd.sim.cameras.camera_simulator import CameraSimulator
@@ -31,9 +36,7 @@ from flockd.sim.flock.exact_states import (
     vehicles_of,
 )
 from flockd.sim.flock.flock_telemetry import FlockTelemetry
-from flockd.sim.flock.pilots import Pilots, Stepped
 from flockd.sim.scenario import ScenarioConfig
-from flockd.sim.vehicles.pose_trail import LateAttitude
 from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances, SimulatedAutopilot, Vehicles
 from flockd.sim.world.obstacle_worlds import with_obstacles
 
@@ -55,14 +58,12 @@ def fly(
     scenario: ScenarioConfig,
     *,
     perception: SimulatedPerception = "learned",
-    swap: frozenset[str] = frozenset(),
     gated: bool = True,
     shown: FlockTelemetry | None = None,
     recorders: Sequence[Recorder] = (),
     threads: int | None = None,
     pictured: bool = True,
     progress: Callable[[int, int], None] = lambda done, total: None,
-    preparing: Callable[[int, int], None] = lambda done, total: None,
 ) -> Flight:
     """Fly a scenario. The same scenario gives the same flight, bit for bit, except for the times it took.
 
@@ -71,7 +72,6 @@ def fly(
     Args:
         scenario: what to fly.
         perception: `learned` flies from rendered images; `truth` from exact relative states.
-        swap: of `TRUTH_ROLES`, those that take the truth instead of a network's estimate.
         gated: whether each drone's gate turns what its pilot asks for into setpoints, as in the daemon.
         shown: where every drone's output is published; operators' orders come from there. A flight on exact states
             then takes as long as it takes in the air.
@@ -80,12 +80,10 @@ def fly(
             are processors.
         pictured: keep key frames for the report.
         progress: called with (steps done, steps in all).
-        preparing: the same, of what is done before the first step: the companion, the networks, the world.
     """
     begin, began = time.perf_counter(), datetime.now(UTC)
     times = step_times(scenario)
     builder = FlightLogBuilder(times, len(scenario.vehicles))
-    preparing(0, _PREPARATIONS)
     loop = ControlLoop(scenario, gated=gated)
     vehicles = vehicles_of(scenario)
     chosen = key_frame_steps(len(times)) if pictured else set()
@@ -95,8 +93,8 @@ def fly(
     pilots: ExactStatePilots | VisionPilots = ExactStatePilots(scenario, shown, gated=gated)
     if perception == "learned":
         companion = fly_exact_states(scenario, gated=gated)[1:]
-        pilots = VisionPilots(scenario, swap, shown, recorders, companion, preparing, threads)
-    preparing(_PREPARATIONS, _PREPARATIONS)
+        eyes = eyes_of(scenario, threads)
+        pilots = VisionPilots(scenario, *eyes, shown, recorders, companion, threads)
     first_s = time.perf_counter()
     try:
         for step, time_s in enumerate(times):
@@ -124,8 +122,8 @@ def fly(
         began=began.isoformat(timespec="seconds"),
         version=__version__,
         seed=scenario.seed,
-        perception=perception if not swap else f"learned, true {', '.join(sorted(swap))}",
-        flow="none" if perception == "truth" else "truth" if "flow" in swap else scenario.drone.perception.flow,
+        perception=perception,
+        flow="none" if perception == "truth" else scenario.drone.perception.flow,
         wall_s=time.perf_counter() - begin,
         gated=gated,
         slowed_share=loop.slowed.share,
@@ -152,22 +150,14 @@ def fly_commands(
         shown.show_flight(time_s, loop)
 
 
-_PREPARATIONS = 4
-"""The companion on exact states, the world, the networks, the pilots."""
-
-
 class ExactStatePilots:
     """The flocking law on the exact states of all drones."""
 
     key_frames: Sequence[KeyFrame] = ()
 
     def __init__(self, scenario: ScenarioConfig, shown: FlockTelemetry | None, *, gated: bool) -> None:
-        self._scenario, self._gated, self._shown = scenario, gated, shown
-        self.begin_again()
-
-    def begin_again(self) -> None:
-        """For another flight from the beginning."""
-        self._flock = ExactFlock(self._scenario, passes=self._gated)
+        self._scenario, self._shown = scenario, shown
+        self._flock = ExactFlock(scenario, passes=gated)
 
     def step(
         self,
@@ -194,49 +184,47 @@ class ExactStatePilots:
         return commands
 
 
+def eyes_of(scenario: ScenarioConfig, threads: int | None = None) -> tuple[CameraSimulator, Networks]:
+    """The cameras of all drones, and the networks that their pilots share. Raises ModelError."""
+    return CameraSimulator(scenario, threads=threads), load_networks(scenario.drone.perception)
+
+
 class VisionPilots:
-    """One pilot a drone, each given only its own images and its own autopilot's readings."""
+    """One pilot a drone, each given only its own images and its own autopilot's readings.
+
+    They share their networks and nothing else, so that their order does not matter.
+    """
 
     def __init__(
         self,
         scenario: ScenarioConfig,
-        swap: frozenset[str],
+        cameras: CameraSimulator,
+        networks: Networks,
         shown: FlockTelemetry | None,
-        recorders: Sequence[Recorder],
-        companion: tuple[FloatArray, FloatArray] | None,
-        preparing: Callable[[int, int], None],
+        recorders: Sequence[Recorder] = (),
+        companion: tuple[FloatArray, FloatArray] | None = None,
         threads: int | None = None,
     ) -> None:
-        """``companion``: for what is recorded; None where nothing is. ``swap``, ``threads``: see `fly`."""
-        self._companion = companion
-        preparing(1, _PREPARATIONS)
-        self._shown, self._recorders = shown, recorders
-        self._cameras = CameraSimulator(scenario, threads=threads)
-        preparing(2, _PREPARATIONS)
-        self._pilots = Pilots(scenario, swap, threads)
-        preparing(3, _PREPARATIONS)
-        self._drones = self._pilots.drones
-        self._scenario, self._yaw_rad = scenario, start_yaw(scenario)
-        self._begin()
+        """For a flight from the beginning. Pilots step on ``threads`` while the next images are drawn, see `fly`.
 
-    def begin_again(self) -> None:
-        """For another flight from the beginning, in the same world and with the same networks."""
-        self._cameras.begin_again()
-        self._pilots.begin_again()
-        self._begin()
-
-    def _begin(self) -> None:
-        scenario = self._scenario
-        self._hands = {i: navigator_of(scenario, i) for i in range(len(scenario.vehicles)) if i not in self._drones}
-        ground = self._cameras.ground_height
+        ``companion``: for what is recorded; None where nothing is.
+        """
+        self._scenario, self._yaw_rad, self._cameras = scenario, start_yaw(scenario), cameras
+        self._shown, self._recorders, self._companion = shown, recorders, companion
+        cameras.begin_again()
+        self._hands = {i: navigator_of(scenario, i) for i, one in enumerate(scenario.vehicles) if one.by_hand}
+        self._drones = tuple(i for i in range(len(scenario.vehicles)) if i not in self._hands)
+        self._pilots = {
+            i: FlockPilot(scenario.drone_of(i), networks, stopwatch=time.perf_counter) for i in self._drones
+        }
+        count = os.cpu_count() if threads is None else threads
+        self._executor = ThreadPoolExecutor(count, thread_name_prefix="pilot") if count else None
+        ground = cameras.ground_height
         self._autopilots = {
             i: SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=i, ground=ground) for i in self._drones
         }
-        late = None if scenario.camera_faults is None else scenario.camera_faults.attitude
-        self._attitudes = {} if late is None else {i: LateAttitude(late, scenario.seed, i) for i in self._drones}
-        self._stepped: dict[int, Stepped] = {}
-        self.key_frames: Sequence[KeyFrame] = ()
-        """What the pilots worked with in the last step, where that was asked for."""
+        self.key_frames: list[KeyFrame] = []
+        """What the pilots worked with in the last step, at half size, where that was asked for."""
 
     def step(
         self,
@@ -249,30 +237,28 @@ class VisionPilots:
         disturbed: Disturbances = UNDISTURBED,
     ) -> Commands:
         """Commands for all drones. Each steps as soon as its images are drawn. ``builder``: as of exact states."""
-        steps = {}
-        render_ms = {}
+        steps, render_ms = {}, {}
         flying = [i for i in self._drones if i not in disturbed.removed]
         orders = {} if self._shown is None else self._shown.take_orders(flying)
         turn_rates = vehicles.trail.motion_at(time_s).turn
         for i in flying:
             begin = time.perf_counter()
-            frames, seen = self._cameras.capture(i, step, time_s, vehicles, vehicles.trail, disturbed)
+            frames = self._cameras.capture(i, step, time_s, vehicles, vehicles.trail, disturbed)
             render_ms[i] = 1e3 * (time.perf_counter() - begin)
             state = self._autopilots[i].read(
                 time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i], turn_rates[i],
                 vehicles.errors[i] if vehicles.errors else None,
             )  # fmt: skip
-            if self._attitudes:
-                state = self._attitudes[i].heard(state, vehicles.trail)
             with_pictures = pictured and i in self._drones[:_KEY_FRAME_DRONES]
-            stepping = self._pilots.step(i, frames, state, seen, pictured=with_pictures, order=orders.get(i))
-            steps[i] = frames, state, stepping
-        self._stepped = {i: stepping.result() for i, (_, _, stepping) in steps.items()}
-        self.key_frames = [frame for stepped in self._stepped.values() for frame in stepped.key_frames]
+            stepping = partial(self._step, i, frames, state, with_pictures, orders.get(i))
+            steps[i] = frames, state, stepping if self._executor is None else self._executor.submit(stepping).result
+        outputs: dict[int, PilotOutput] = {}
+        self.key_frames = []
         truth = None if self._companion is None else self._truth(step, time_s, vehicles, self._companion)
-        for i, stepped in self._stepped.items():
-            frames, state, _ = steps[i]
-            output = stepped.output
+        for i, (frames, state, result) in steps.items():
+            output, seen = result()
+            outputs[i] = output
+            self.key_frames += seen
             if self._shown is not None:
                 self._shown.show(i, frames, state, output)
             if self._recorders and truth is not None:
@@ -281,13 +267,22 @@ class VisionPilots:
                 recorder.step(frames, state, output, truth, orders.get(i))
             if builder is not None:
                 builder.add_output(step, i, output, {"render": render_ms[i], **output.stages_ms})
-        return self._commands(time_s, vehicles)
+        return self._commands(time_s, vehicles, outputs)
 
-    def _commands(self, time_s: float, vehicles: Vehicles) -> Commands:
+    def _step(
+        self, drone: int, frames: FrameSet, vehicle: VehicleState, pictured: bool, order: MissionOrder | None
+    ) -> tuple[PilotOutput, list[KeyFrame]]:
+        """One step of one pilot, with an operator's order; ``pictured``: with its key frames."""
+        trace = StepTrace() if pictured else None
+        output = self._pilots[drone].step(frames, vehicle, trace, order)
+        seen = [] if trace is None else capture(trace, output, drone)
+        return output, [frame.at_half_size() for frame in seen]
+
+    def _commands(self, time_s: float, vehicles: Vehicles, outputs: Mapping[int, PilotOutput]) -> Commands:
         """Commands of the pilots, and of the people who fly drones by hand."""
         commands = Commands.of(len(self._scenario.vehicles))
-        for i, stepped in self._stepped.items():
-            output, command = stepped.output, stepped.output.command
+        for i, output in outputs.items():
+            command = output.command
             commands.velocity[i], commands.acceleration[i] = command.velocity, command.acceleration
             commands.yaw_rad[i] = self._yaw_rad if command.yaw_rad is None else command.yaw_rad
             commands.height_m[i] = np.nan if command.height_m is None else command.height_m

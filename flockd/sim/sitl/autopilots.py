@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 
@@ -16,12 +15,11 @@ from flockd.core.errors import UnavailableError, UsageError
 from flockd.core.messages import FloatArray
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, Ground
-from flockd.sim.autopilot.fake_vehicle import Demand, MotionState
-from flockd.sim.scenario import ScenarioConfig, StartConfig, VehicleConfig
+from flockd.sim.autopilot.fake_vehicle import Flown
+from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.sitl.ground_station import FULL_STICK_M_S, home_deg
 from flockd.sim.sitl.ports import free_port
 from flockd.sim.sitl.processes import Program, Programs
-from flockd.sim.vehicles.vehicles import Vehicles
 
 PX4_FOLDER = "FLOCKD_PX4"
 """The environment variable that names PX4's SITL build folder."""
@@ -65,7 +63,7 @@ class Ports:
     """Where the simulator does."""
 
 
-class Autopilots(ABC):
+class Autopilots(ExitStack, ABC):
     """One autopilot a vehicle, on the ground below its start until it is commanded to take off.
 
     Between ``__enter__`` and ``__exit__``.
@@ -76,15 +74,9 @@ class Autopilots(ABC):
     ports: tuple[Ports, ...]
 
     def __init__(self, scenario: ScenarioConfig, speed_factor: float) -> None:
+        super().__init__()
         self._scenario, self._speed_factor = scenario, speed_factor
-        self._stack = ExitStack()
-        self._programs = self._stack.enter_context(Programs())
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
+        self._programs = self.enter_context(Programs())
 
     @abstractmethod
     def start(self) -> None:
@@ -114,7 +106,7 @@ class SimulatedAutopilots(Autopilots):
             fake = FakeAutopilot(
                 ports.offboard,
                 system_id=i + 1,
-                motion=_Flown(self._scenario.vehicle, self._scenario.seed + i),
+                motion=Flown(np.zeros(3), config=self._scenario.vehicle, seed=self._scenario.seed + i, leans=True),
                 home_deg=home_deg(position),
                 truth_port=ports.truth,
                 speed_factor=self._speed_factor,
@@ -123,18 +115,15 @@ class SimulatedAutopilots(Autopilots):
             fake.parameters["MIS_TAKEOFF_ALT"] = -float(position[2])
             fake.parameters["MPC_VEL_MANUAL"] = FULL_STICK_M_S
             fake.parameters["MAN_DEADZONE"] = 0.0
-            self.fakes.append(self._stack.enter_context(fake))
+            self.fakes.append(self.enter_context(fake))
 
     def _range_finder(self, number: int, home: FloatArray) -> FakeRangeFinder | None:
         """A vehicle's, which counts its position from home."""
-        config = self._scenario.sensors.range_finder
+        config, ground = self._scenario.sensors.range_finder, self._ground
         if config is None:
             return None
-
-        def ground(north: FloatArray, east: FloatArray) -> FloatArray:
-            return self._ground(north + home[0], east + home[1])
-
-        return FakeRangeFinder(config, ground, (self._scenario.seed, number, 2))
+        seed = self._scenario.seed, number, 2
+        return FakeRangeFinder(config, lambda north, east: ground(north + home[0], east + home[1]), seed)
 
 
 class Px4s(Autopilots):
@@ -196,18 +185,3 @@ def px4_folder(environment: Mapping[str, str]) -> Path:
     if not os.access(folder / "bin/px4", os.X_OK) or not (folder / "etc").is_dir():
         raise UnavailableError(f"there is no PX4 in {folder}, which {PX4_FOLDER} names; {wanted}")
     return folder
-
-
-class _Flown:
-    """One of the simulator's vehicles, from its home on the ground."""
-
-    def __init__(self, config: VehicleConfig, seed: int) -> None:
-        self._vehicles = Vehicles([StartConfig(position_m=(0.0, 0.0, 0.0))], config, seed=seed)
-
-    def __call__(self, demand: Demand, interval_s: float) -> MotionState:
-        """Flies on."""
-        vehicles = self._vehicles
-        if interval_s > 0.0:
-            heading = np.array([demand.yaw_rad])
-            vehicles.step(demand.velocity[None], heading, interval_s, heights=np.array([-demand.down_m]))
-        return MotionState(vehicles.position[0], vehicles.velocity[0], vehicles.R_ned_body[0])

@@ -6,6 +6,7 @@ import re
 import socket
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Self
 
@@ -14,7 +15,6 @@ import yaml
 from flockd.core.config import DroneConfig
 from flockd.core.config.drone import RecordingConfig
 from flockd.core.config.mission import MissionParameters
-from flockd.core.errors import ConfigError, ConfigProblem
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.sitl.autopilots import Ports
 from flockd.sim.sitl.processes import Program, Programs
@@ -34,13 +34,9 @@ def fleet_configs(
     """What each drone of a scenario that is not flown by hand flies with.
 
     The pilot is the scenario's, with the mission's places counted from the drone's own home, which is below its start;
-    source, autopilot, safety and telemetry are those of ``sitl``. Raises ConfigError where ``sitl`` lacks one of them.
+    source, autopilot, safety and telemetry are those of ``sitl``, which has all of them.
     """
-    if sitl.source is None or sitl.source.kind != "shared_memory":
-        fault = "has to be of kind `shared_memory`; write it so"
-        raise ConfigError([ConfigProblem("px4_sitl.yaml", 0, "source", fault)])
-    if sitl.autopilot is None:
-        raise ConfigError([ConfigProblem("px4_sitl.yaml", 0, "autopilot", "is missing; add it")])
+    assert sitl.source is not None and sitl.autopilot is not None
     configs, fleet = [], re.sub(r"[^A-Za-z0-9_.-]+", "-", scenario.scenario)
     for i, port in enumerate(ports):
         if scenario.vehicles[i].by_hand:
@@ -69,7 +65,7 @@ def _from_home(scenario: ScenarioConfig, vehicle: int) -> MissionParameters:
     return mission.model_copy(update={"origin_m": (mission.origin_m[0] - north_m, mission.origin_m[1] - east_m)})
 
 
-class Daemons:
+class Daemons(ExitStack):
     """One `flockd run` for each configuration, between ``__enter__`` and ``__exit__``; listens as systemd would."""
 
     def __init__(
@@ -83,19 +79,12 @@ class Daemons:
             recordings: an existing one.
             environment: this process's own.
         """
+        super().__init__()
         self._configs, self._folder = configs, folder
         self._recordings = recordings.resolve()  # daemons run in `folder`
         self._environment = {**environment, **ONE_THREAD, **SMALL}
-        self._programs = Programs()
-        self._listeners = [_Listener(folder / config.name) for config in configs]
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._programs.__exit__()
-        for listener in self._listeners:
-            listener.close()
+        self._listeners = [self.enter_context(_Listener(folder / config.name)) for config in configs]
+        self._programs = self.enter_context(Programs())
 
     def start(self) -> None:
         """Starts all."""
@@ -118,11 +107,11 @@ class Daemons:
 
     def status(self, number: int) -> str:
         """Its last status line; empty before it has started."""
-        return self._listeners[number].listen().status
+        return self._listeners[number].heard().status
 
     def is_ready(self, number: int) -> bool:
         """Its networks are loaded, its autopilot is connected and frames arrive."""
-        return self._listeners[number].listen().ready
+        return self._listeners[number].heard().ready
 
     def end(self) -> dict[str, int]:
         """Ends all as SIGTERM does: standstill, Hold, the end of the recording. Exit codes by name."""
@@ -130,27 +119,24 @@ class Daemons:
         return {program.name: program.process.returncode for program in self._programs}
 
 
-class _Listener:
+class _Listener(socket.socket):
     """The notifications of one daemon, as for a service manager."""
 
     def __init__(self, base: Path) -> None:
         self.path = base.with_suffix(".notify")
         self.ready, self.status = False, ""
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._socket.bind(str(self.path))
-        self._socket.setblocking(False)
+        super().__init__(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.bind(str(self.path))
+        self.setblocking(False)
 
-    def listen(self) -> Self:
+    def heard(self) -> Self:
         """Takes in all that has come."""
         while True:
             try:
-                lines = self._socket.recv(4096).decode(errors="replace").splitlines()
+                lines = self.recv(4096).decode(errors="replace").splitlines()
             except BlockingIOError:
                 return self
             self.ready = self.ready or READY in lines
             for line in lines:
                 if line.startswith(STATUS):
                     self.status = line.removeprefix(STATUS)
-
-    def close(self) -> None:
-        self._socket.close()

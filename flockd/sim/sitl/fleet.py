@@ -7,6 +7,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -18,12 +19,12 @@ from flockd.core.errors import UnavailableError
 from flockd.onboard.simulated_time import clock_at
 from flockd.sim.autopilot.fake_telemetry import Mode
 from flockd.sim.cameras.camera_simulator import CameraSimulator
-from flockd.sim.flock.exact_states import at_home, exact_states_at, navigator_of
+from flockd.sim.flock.exact_states import at_home, navigator_of
 from flockd.sim.flock.swarm import Flight
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.sitl.autopilots import Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.sitl.daemons import Daemons, fleet_configs
-from flockd.sim.sitl.fleet_log import FleetRun, fleet_key_frames, fleet_log, were_ordered
+from flockd.sim.sitl.fleet_log import FleetRun, fleet_log
 from flockd.sim.sitl.frame_server import FrameServer
 from flockd.sim.sitl.ground_station import GroundStation, Poses
 from flockd.sim.sitl.ports import free_endpoint
@@ -103,24 +104,26 @@ def fly_fleet(
         fleet.take_off()
         run = fleet.fly(progress)
         fleet.land(run)
-        times = np.array([frame.time_s - run.frames[0].time_s for frame in run.frames])
-        ordered = any(were_ordered(recorded, config.name) for config in configs)
-        companion = None if ordered else exact_states_at(times, scenario)
-        log = fleet_log(scenario, configs, run, recorded, speed_factor, companion)
-        return Flight(with_obstacles(log, scenario), fleet_key_frames(recorded, run))
+        log = fleet_log(scenario, configs, run, recorded, speed_factor)
+        return Flight(with_obstacles(log, scenario), ())
 
 
+@dataclass
 class _Fleet:
     """Starts a fleet, flies and lands it, as its ground pilots would."""
 
-    def __init__(
-        self, scenario: ScenarioConfig, speed_factor: float, clock: Callable[[], float], autopilots: Autopilots,
-        station: GroundStation, server: FrameServer, daemons: Daemons,
-    ) -> None:  # fmt: skip
-        self._scenario, self._speed_factor, self._clock = scenario, speed_factor, clock
-        self._autopilots, self._station, self._server, self._daemons = autopilots, station, server, daemons
-        self._all = range(len(scenario.vehicles))
-        self._hands = {i: navigator_of(scenario, i) for i in self._all if scenario.vehicles[i].by_hand}
+    _scenario: ScenarioConfig
+    _speed_factor: float
+    _clock: Callable[[], float]
+    _autopilots: Autopilots
+    _station: GroundStation
+    _server: FrameServer
+    _daemons: Daemons
+
+    def __post_init__(self) -> None:
+        vehicles = self._scenario.vehicles
+        self._all = range(len(vehicles))
+        self._hands = {i: navigator_of(self._scenario, i) for i in self._all if vehicles[i].by_hand}
         self.drones = [i for i in self._all if i not in self._hands]
         """Those with a daemon, in the order of the daemons."""
         self._needed: Sequence[Program] = ()

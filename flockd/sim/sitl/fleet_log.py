@@ -1,9 +1,9 @@
-"""The log and the key frames of a fleet's flight, from the simulator's truth and the daemons' recordings."""
+"""The log of a fleet's flight, from the simulator's truth and the daemons' recordings."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -14,14 +14,10 @@ from flockd.core.config import DroneConfig
 from flockd.core.messages import NO_STATUS, FloatArray, MissionStatus, PilotOutput
 from flockd.flight.flocking.metrics import order
 from flockd.flight.mission.circle_then_tangent import desired_of
-from flockd.flight.perception import load_networks
-from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.onboard.message_json import from_json
-from flockd.onboard.recording.mcap_file import Entry, read_entries
-from flockd.onboard.recording.reader import Recording
-from flockd.onboard.recording.streams import ORDER, OUTPUT
+from flockd.onboard.recording.mcap_file import read_entries
+from flockd.onboard.recording.streams import OUTPUT
 from flockd.review.flight_log.builder import FlightLogBuilder
-from flockd.review.flight_log.key_frames import KeyFrame, capture, key_frame_steps
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FleetMetadata, FlightMetadata, MissionMetadata
 from flockd.sim.scenario import ScenarioConfig
@@ -29,7 +25,6 @@ from flockd.sim.sitl.ground_station import Poses
 
 END_OF_FLIGHT_S = 20.0
 """Over which order at the end is averaged."""
-KEY_FRAME_DRONE = 0
 
 
 @dataclass
@@ -59,13 +54,8 @@ def fleet_log(
     run: FleetRun,
     recordings: Path,
     speed_factor: float,
-    companion: tuple[FloatArray, FloatArray] | None,
 ) -> FlightLog:
-    """The flight's log: the simulator's truth, and what the daemons recorded of their pilots.
-
-    ``companion``: positions and velocities (S, N, 3) of the same flight on exact states, at the S frames' times; None:
-    operators ordered something else.
-    """
+    """The flight's log: the simulator's truth, and what the daemons recorded of their pilots."""
     frames, drone = run.frames, configs[0]
     begin_s = frames[0].time_s
     times = np.array([frame.time_s - begin_s for frame in frames])
@@ -78,7 +68,9 @@ def fleet_log(
     over: set[str] = set()
     longest_s = 0.0
     for i, config in zip(flown, configs, strict=True):
-        found = (from_json(PilotOutput, json.loads(e.data)) for e in _entries(recordings, config.name, OUTPUT.topic))
+        files = sorted(recordings.glob(f"{config.name}-*.mcap"))
+        entries = (one for file in files for one in read_entries(file) if one.stream.topic == OUTPUT.topic)
+        found = (from_json(PilotOutput, json.loads(entry.data)) for entry in entries)
         steps: list[tuple[int, PilotOutput]] = [(rows[one.time_s], one) for one in found if one.time_s in rows]
         for before, (row, output) in zip([None, *steps], steps, strict=False):
             spans_more = False
@@ -119,7 +111,7 @@ def fleet_log(
         autopilot=run.autopilot,
         fleet=fleet,
     )
-    return builder.build(metadata, companion)
+    return builder.build(metadata, None)
 
 
 def _add_missions(
@@ -145,33 +137,3 @@ def _add_missions(
             for i in vehicles
         ]
         builder.add_missions(row, np.array(desired), [newest.get(i, NO_STATUS) for i in vehicles], homes)
-
-
-def _entries(recordings: Path, drone: str, topic: str) -> Iterator[Entry]:
-    files = sorted(recordings.glob(f"{drone}-*.mcap"))
-    return (one for file in files for one in read_entries(file) if one.stream.topic == topic)
-
-
-def were_ordered(recordings: Path, drone: str) -> bool:
-    """Whether an operator ordered something of a drone in flight, so that its flight is not the scenario's any more."""
-    return any(True for _ in _entries(recordings, drone, ORDER.topic))
-
-
-def fleet_key_frames(recordings: Path, run: FleetRun) -> tuple[KeyFrame, ...]:
-    """Key frames of one drone, computed again: a fresh pilot for each, with two frame sets of the recording."""
-    drone = f"drone{KEY_FRAME_DRONE + 1}"
-    path = min(recordings.glob(f"{drone}-*.mcap"), default=None)
-    if path is None:
-        return ()
-    recording = Recording(path)
-    networks = load_networks(recording.config.perception)
-    times = [time_s for _, time_s in recording.contents.steps]
-    key_frames: list[KeyFrame] = []
-    for index in sorted(key_frame_steps(len(times))):
-        pilot = FlockPilot(recording.config, networks, learned=recording.learned)
-        for step in recording.steps(times[max(index - 1, 0)], times[index]):
-            trace = StepTrace()
-            output = pilot.step(step.frames, step.vehicle, trace, step.order)
-        begin_s = run.frames[0].time_s
-        key_frames += (replace(one, time_s=one.time_s - begin_s) for one in capture(trace, output, KEY_FRAME_DRONE))
-    return tuple(key_frames)

@@ -9,7 +9,6 @@ from typing import Self
 from flockd.onboard.sources import FramePublisher
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.sitl.ground_station import Poses
-from flockd.sim.vehicles.pose_trail import FlockPose
 
 
 class FrameServer:
@@ -69,11 +68,10 @@ class FrameServer:
 
     def _publish(self, number: int) -> None:
         poses = self._poses()
-        flock = FlockPose(poses.time_s, poses.position, poses.R_ned_body)
         for i, drone in enumerate(self._drones):
             if drone is None:
                 continue
-            frames, _ = self._cameras.capture(i, number, poses.time_s, flock)
+            frames = self._cameras.capture(i, number, poses.time_s, poses)
             for frame in frames.frames.values():
                 self._publisher.publish(drone, frame)
         self._frames.append(poses)

@@ -25,7 +25,8 @@ from flockd.core.navigation import metres_a_degree
 from flockd.flight.geometry import rotation_from_euler, rotation_from_quaternion
 from flockd.onboard.autopilot.mavlink_messages import StatusText
 from flockd.sim.autopilot.fake_telemetry import Mode
-from flockd.sim.autopilot.sticks import stick_curve
+from flockd.sim.autopilot.fake_vehicle import stick_curve
+from flockd.sim.vehicles.pose_trail import FlockPose
 from flockd.sim.vehicles.vehicles import REFERENCE_DEG
 
 SYSTEM_ID = 255
@@ -48,16 +49,11 @@ _RECEIVED = {
 
 
 @dataclass(frozen=True, eq=False)
-class Poses:
-    """Where a flock of n drones is, NED metres from the world's origin."""
+class Poses(FlockPose):
+    """Where a flock of n drones is, NED metres from the world's origin, and how it moves."""
 
-    time_s: float
-    position: FloatArray
-    """(n, 3)"""
     velocity: FloatArray
     """(n, 3) m/s."""
-    R_ned_body: FloatArray
-    """(n, 3, 3)"""
 
 
 @dataclass
@@ -166,7 +162,7 @@ class GroundStation:
         It stops half a second after the last call.
         """
         vehicle = self._vehicles[number]
-        R = np.eye(3) if vehicle.pose is None else _extrapolated(vehicle.pose[1], 0.0)[2]
+        R = np.eye(3) if vehicle.pose is None else _extrapolated(vehicle.pose[1], 0.0)[1]
         yaw_rad = math.atan2(R[1, 0], R[0, 0])
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
         ahead = np.array([cos * velocity[0] + sin * velocity[1], -sin * velocity[0] + cos * velocity[1]])
@@ -231,14 +227,14 @@ def _update(vehicle: _Vehicle, message: Any, now: float) -> None:
 
 
 def _extrapolated(message: Any, age_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Position (3,), velocity (3,) and R_ned_body after `age_s`, as if neither velocity nor turn had changed."""
+    """Position (3,), R_ned_body and velocity (3,) after `age_s`, as if neither velocity nor turn had changed."""
     north_m, east_m = metres_a_degree(REFERENCE_DEG[0])
     north = (message.lat * 1e-7 - REFERENCE_DEG[0]) * north_m
     east = (message.lon * 1e-7 - REFERENCE_DEG[1]) * east_m
     velocity = np.array([message.vx, message.vy, message.vz]) * 1e-2
     R_ned_body = rotation_from_quaternion(np.roll(message.attitude_quaternion, -1))
     turned = rotation_from_euler(age_s * message.rollspeed, age_s * message.pitchspeed, age_s * message.yawspeed)
-    return np.array([north, east, -message.alt * 1e-3]) + age_s * velocity, velocity, R_ned_body @ turned
+    return np.array([north, east, -message.alt * 1e-3]) + age_s * velocity, R_ned_body @ turned, velocity
 
 
 def _packets(data: bytes) -> Iterator[bytes]:

@@ -12,10 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from flockd.sim.sitl.bound_to_parent import bound, with_package
+import flockd
 
 END_S = 30.0
 """To end after SIGTERM, before it is killed."""
+BOUND = ("setpriv", "--pdeathsig", "TERM", "--")
+"""Of util-linux: runs a program that gets SIGTERM when the thread that started it ends, however that ends."""
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _LAST_LINE_BYTES = 4000
 
@@ -41,14 +43,6 @@ class Program:
             lines = file.read().decode(errors="replace").split("\n")
         return next((line.strip() for line in reversed(lines) if line.strip()), "nothing")
 
-    def cpu_s(self) -> float:
-        """Seconds of processor time it has used so far; 0 once it has ended."""
-        try:
-            numbers = Path(f"/proc/{self.process.pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
-        except OSError:
-            return 0.0
-        return (int(numbers[11]) + int(numbers[12])) / os.sysconf("SC_CLK_TCK")
-
 
 class Programs:
     """All of one kind, between ``__enter__`` and ``__exit__``.
@@ -73,11 +67,12 @@ class Programs:
         self, name: str, command: Sequence[str], environment: Mapping[str, str], folder: Path, log: Path
     ) -> Program:
         """Starts one in ``folder``; all it writes goes to the file ``log``. For the main thread, as `end`."""
+        package, known = str(Path(flockd.__file__).parents[1]), environment.get("PYTHONPATH")
         with _uninterrupted(), log.open("wb") as file:
             process = subprocess.Popen(
-                bound(list(command)),
+                [*BOUND, *command],
                 cwd=folder,
-                env=with_package(environment),
+                env={**environment, "PYTHONPATH": f"{package}{os.pathsep}{known}" if known else package},
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import numpy as np
-
-from flockd.core.messages import FloatArray, VehicleState
+from flockd.core.messages import FloatArray
 from flockd.flight.geometry import rotation_from_vector, vector_from_rotation
-from flockd.sim.scenario.imperfect_cameras import LateAttitudeConfig
 
 KEPT_S = 1.0
 """Longer than anything is late."""
@@ -80,18 +76,3 @@ class PoseTrail:
 def _turn(before: FlockPose, after: FlockPose) -> FloatArray:
     """(n, 3) rotation vectors in the bodies' axes."""
     return vector_from_rotation(before.R_ned_body.transpose(0, 2, 1) @ after.R_ned_body)
-
-
-class LateAttitude:
-    """Of one drone, counted from 0."""
-
-    def __init__(self, config: LateAttitudeConfig, seed: int, drone: int) -> None:
-        self._config, self._drone = config, drone
-        self._rng = np.random.default_rng([seed, drone, 5])
-
-    def heard(self, state: VehicleState, trail: PoseTrail) -> VehicleState:
-        """The state, whose attitude errs already as the autopilot does, with the attitude of before."""
-        now, then = trail.at(state.time_s), trail.at(state.time_s - self._config.late_s)
-        noise = rotation_from_vector(math.radians(self._config.noise_deg) * self._rng.standard_normal(3))
-        turned = now.R_ned_body[self._drone].T @ then.R_ned_body[self._drone]
-        return replace(state, R_ned_body=state.R_ned_body @ turned @ noise)

@@ -1,4 +1,4 @@
-"""Simulated multirotors that follow velocity setpoints, and what their autopilots say of them."""
+"""Simulated multirotors that follow velocity setpoints in gusts, and what their autopilots say of them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from flockd.flight.geometry import rotation_from_euler
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, Ground, level_ground
 from flockd.sim.scenario import SensorConfig, StartConfig, VehicleConfig
 from flockd.sim.vehicles.pose_trail import KEPT_S, FlockPose, PoseTrail
-from flockd.sim.vehicles.wind import GustField
 
 
 @dataclass(frozen=True)
@@ -54,75 +54,13 @@ REFERENCE_DEG = (1.0, 1.0)
 0.4 m in Europe."""
 
 
-class Motion:
-    """How vehicles move; remembers what gusts added to their velocities.
+class Vehicles:
+    """All vehicles of a flight.
 
     Horizontal velocity follows a setpoint, after a dead time, as a first-order lag of limited acceleration and jerk.
     With the same time constant it comes back from what gusts add, as hard as the vehicle can lean: an autopilot limits
     what it does for a setpoint, and leans against wind as far as need be. Height is held, or changed as by a critically
     damped controller of limited climb, down to the ground at z = 0.
-    """
-
-    def __init__(self, config: VehicleConfig, seed: int, drones: int) -> None:
-        """`seed` rules the gusts."""
-        self._config, self._seed = config, seed
-        self._blown = np.zeros((drones, 2))
-        """What of the velocity gusts added, m/s."""
-        self._waiting: deque[tuple[float, FloatArray]] = deque()
-        """Setpoints (n, 2) m/s that are not answered yet, and when they are."""
-        self._answered: FloatArray | None = None
-        self._followed = np.zeros((drones, 2))
-        """Acceleration towards the setpoints, m/s^2."""
-        self.blow(config.gust_m_s)
-
-    def blow(self, gust_m_s: float) -> None:
-        """From now on gusts are as strong as that."""
-        self._gusts = GustField.of(self._config.model_copy(update={"gust_m_s": gust_m_s}), self._seed)
-
-    def step(
-        self, now_s: float, dt_s: float, place: FloatArray, velocity: FloatArray, setpoints: FloatArray
-    ) -> FloatArray:
-        """Moves all `place` (n, 3) m and `velocity` (n, 3) m/s in place, towards `setpoints` (n, 2) m/s, for a moment.
-
-        Returns the acceleration (n, 2) m/s^2 that the vehicles lean for.
-        """
-        config, setpoints = self._config, self._after_dead_time(now_s, dt_s, velocity, setpoints)
-        # The exact mean acceleration of a first-order lag over dt, then its limits.
-        answer_per_s = -math.expm1(-dt_s / config.velocity_time_constant_s) / dt_s
-        wanted = limit_norms((setpoints - (velocity[:, :2] - self._blown)) * answer_per_s, config.max_acceleration_m_s2)
-        followed = self._followed = self._followed + limit_norms(wanted - self._followed, config.max_jerk_m_s3 * dt_s)
-        steered = limit_norms(followed - self._blown * answer_per_s, MAX_LEAN_M_S2)
-        push = self._gusts.push(now_s, place)
-        self._blown = self._blown + (steered - followed + push) * dt_s
-        acceleration = steered + push
-        place[:, :2] += velocity[:, :2] * dt_s + acceleration * (dt_s**2 / 2)
-        velocity[:, :2] += acceleration * dt_s
-        return steered
-
-    def _after_dead_time(self, now_s: float, dt_s: float, velocity: FloatArray, setpoints: FloatArray) -> FloatArray:
-        """The setpoints (n, 2) m/s that the vehicles answer as the substep ends; before, they keep their velocity."""
-        if self._answered is None:
-            self._answered = velocity[:, :2].copy()
-        self._waiting.append((now_s + self._config.dead_time_s, setpoints.copy()))
-        while self._waiting and self._waiting[0][0] <= now_s + min(dt_s, self._config.dead_time_s) + _SAME_TIME_S:
-            self._answered = self._waiting.popleft()[1]
-        return self._answered
-
-
-def climb(
-    dt_s: float, down: FloatArray, sink: FloatArray, heights: FloatArray, most_m_s: float = MAX_CLIMB_M_S
-) -> None:
-    """Moves (n,) m and m/s in place towards heights (n,) m, up positive; NaN: as high as now."""
-    wanted = np.clip(np.nan_to_num((-heights - down) / CLIMB_TIME_S), -most_m_s, most_m_s)
-    sink += (wanted - sink) * min(1.0, 4.0 * dt_s / CLIMB_TIME_S)
-    down += sink * dt_s
-    landed = down >= 0.0
-    sink[landed], down[landed] = np.minimum(sink[landed], 0.0), 0.0
-
-
-class Vehicles:
-    """All vehicles of a flight, which move as `Motion` says.
-
     The attitude is the one whose thrust gives the horizontal acceleration. The arrays are replaced by `step`, never
     changed in place: `position` (n, 3) m and `velocity` (n, 3) m/s in NED, `R_ned_body` (n, 3, 3). `trail` has them of
     the last second, as if the flight had begun a second before.
@@ -147,12 +85,19 @@ class Vehicles:
         if sensors is not None:
             self.errors = tuple(EstimateErrors(sensors, seed=seed, drone=i) for i in range(n))
         self._by_estimate = [i for i, start in enumerate(starts) if not start.by_hand and self.errors]
-        self._config, self._gust_m_s, self._time_s = config, config.gust_m_s, 0.0
-        self._motion = Motion(config, seed, n)
+        self._config, self._seed, self._gust_m_s, self._time_s = config, seed, config.gust_m_s, 0.0
+        self._gusts = GustField.of(config, seed)
+        self._blown = np.zeros((n, 2))
+        """What of the velocity gusts added, m/s."""
+        self._waiting: deque[tuple[float, FloatArray]] = deque()
+        """Setpoints (n, 2) m/s that are not answered yet, and when they are."""
+        self._followed = np.zeros((n, 2))
+        """Acceleration towards the setpoints, m/s^2."""
         self._wind = np.array(config.wind_m_s)
         self._yaw = np.full(n, yaw_rad)
         self.position = np.array([start.position_m for start in starts])
         self.velocity = np.array([[*start.velocity_m_s, 0.0] for start in starts])
+        self._answered = self.velocity[:, :2]
         self._thrust = self._drag(self.velocity[:, :2])
         self.R_ned_body = attitude(self._thrust, self._yaw)
         self.trail = PoseTrail()
@@ -164,7 +109,7 @@ class Vehicles:
         gust_m_s = self._config.gust_m_s if disturbed.gust_m_s is None else disturbed.gust_m_s
         if gust_m_s != self._gust_m_s:
             self._gust_m_s = gust_m_s
-            self._motion.blow(gust_m_s)
+            self._gusts = GustField.of(self._config.model_copy(update={"gust_m_s": gust_m_s}), self._seed)
         if disturbed.removed:
             gone = list(disturbed.removed)
             self.position, self.velocity = self.position.copy(), self.velocity.copy()
@@ -195,16 +140,40 @@ class Vehicles:
     def _substep(self, setpoints: FloatArray, yaw_setpoints: FloatArray, dt: float, heights: FloatArray) -> None:
         config = self._config
         self.position, self.velocity = self.position.copy(), self.velocity.copy()
-        steered = self._motion.step(self._time_s, dt, self.position, self.velocity, setpoints)
+        steered = self._follow(setpoints, dt)
         self._time_s += dt
         lean = 1.0 if config.tilt_time_constant_s == 0 else -math.expm1(-dt / config.tilt_time_constant_s)
         self._thrust = self._thrust + lean * (steered + self._drag(self.velocity[:, :2]) - self._thrust)
         error = (yaw_setpoints - self._yaw + math.pi) % (2 * math.pi) - math.pi
         limit = math.radians(config.max_yaw_rate_deg_s) * dt
         self._yaw = self._yaw + np.clip(-math.expm1(-dt / config.yaw_time_constant_s) * error, -limit, limit)
-        climb(dt, self.position[:, 2], self.velocity[:, 2], heights)
+        down, sink = self.position[:, 2], self.velocity[:, 2]
+        wanted = np.clip(np.nan_to_num((-heights - down) / CLIMB_TIME_S), -MAX_CLIMB_M_S, MAX_CLIMB_M_S)
+        sink += (wanted - sink) * min(1.0, 4.0 * dt / CLIMB_TIME_S)
+        down += sink * dt
+        landed = down >= 0.0
+        sink[landed], down[landed] = np.minimum(sink[landed], 0.0), 0.0
         self.R_ned_body = attitude(self._thrust, self._yaw)
         self.trail.add(FlockPose(self._time_s, self.position, self.R_ned_body))
+
+    def _follow(self, setpoints: FloatArray, dt: float) -> FloatArray:
+        """Moves all in place towards `setpoints` (n, 2) m/s; the acceleration (n, 2) m/s^2 that they lean for."""
+        config, now_s, velocity = self._config, self._time_s, self.velocity
+        self._waiting.append((now_s + config.dead_time_s, setpoints.copy()))
+        while self._waiting and self._waiting[0][0] <= now_s + min(dt, config.dead_time_s) + _SAME_TIME_S:
+            self._answered = self._waiting.popleft()[1]  # before, they keep their velocity
+        # The exact mean acceleration of a first-order lag over dt, then its limits.
+        answer_per_s = -math.expm1(-dt / config.velocity_time_constant_s) / dt
+        wanted = (self._answered - (velocity[:, :2] - self._blown)) * answer_per_s
+        wanted = limit_norms(wanted, config.max_acceleration_m_s2)
+        followed = self._followed = self._followed + limit_norms(wanted - self._followed, config.max_jerk_m_s3 * dt)
+        steered = limit_norms(followed - self._blown * answer_per_s, MAX_LEAN_M_S2)
+        push = self._gusts.push(now_s, self.position)
+        self._blown = self._blown + (steered - followed + push) * dt
+        acceleration = steered + push
+        self.position[:, :2] += velocity[:, :2] * dt + acceleration * (dt**2 / 2)
+        velocity[:, :2] += acceleration * dt
+        return steered
 
     @property
     def known_position(self) -> FloatArray:
@@ -325,3 +294,64 @@ def attitude(thrust: FloatArray, yaw: FloatArray) -> FloatArray:
     right = np.cos(yaw) * down[:, 1] - np.sin(yaw) * down[:, 0]
     roll, pitch = -np.arcsin(right), np.arctan2(forward, down[:, 2])
     return rotation_from_euler(roll, pitch, yaw)
+
+
+GUST_TIME_S = 2.0
+"""How long a gust lasts at one place: its length over the mean wind that carries the field along."""
+_MODES = 128
+
+
+class GustField(NamedTuple):
+    """What gusts add to the acceleration of a drone, at each place and time.
+
+    An isotropic, incompressible, Gaussian field in three dimensions as a sum of plane waves (R. Kraichnan, "Diffusion
+    by a random velocity field", Physics of Fluids 13(1), 1970), which the mean wind carries along as it is (G. Taylor's
+    hypothesis). Its spectrum is the one whose sections along the wind and across it are Dryden's of MIL-F-8785C, 3.7.2:
+    E(k) ~ (L k)^4 / (1 + (L k)^2)^3. The wind's correlation at a distance r is so exp(-r / L) along r, and
+    (1 - r / 2 L) exp(-r / L) across.
+    """
+
+    waves: FloatArray
+    """(m, 8) of each: the wave vector (1/m, NED), the angular frequency (1/s), and the pushes (m/s^2, north and
+    east) that go with its cosine and its sine. (0, 8): no gusts."""
+
+    @classmethod
+    def of(cls, vehicle: VehicleConfig, seed: int) -> Self:
+        """The field in which such a vehicle's velocity deviates by `gust_m_s` while its setpoint stays the same."""
+        if not vehicle.gust_m_s:
+            return cls(np.empty((0, 8)))
+        random, length_m = np.random.default_rng(seed), vehicle.gust_length_m
+        toward = random.normal(size=(_MODES, 3))
+        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+        k = _wave_numbers(_MODES)[:, None] / length_m * toward
+        bearing_rad = random.uniform(0.0, 2 * math.pi)
+        wind_m_s = length_m / GUST_TIME_S * np.array([math.cos(bearing_rad), math.sin(bearing_rad), 0.0])
+        sigma = push_sigma_m_s2(vehicle) * math.sqrt(1.5 / _MODES)  # two of three directions are across k
+        free = random.normal(scale=sigma, size=(2, _MODES, 3))
+        across = free - (free * toward).sum(axis=2, keepdims=True) * toward
+        return cls(np.column_stack([k, k @ wind_m_s, across[0, :, :2], across[1, :, :2]]))
+
+    def push(self, time_s: float, positions: FloatArray) -> FloatArray:
+        """(n, 2) m/s^2 north and east at places (n, 3) m NED."""
+        phase = positions @ self.waves[:, :3].T - time_s * self.waves[:, 3]
+        pushes: FloatArray = np.cos(phase) @ self.waves[:, 4:6] + np.sin(phase) @ self.waves[:, 6:]
+        return pushes
+
+
+def push_sigma_m_s2(vehicle: VehicleConfig) -> float:
+    """Standard deviation of the gusts' push, each axis, by which the velocity deviates by `gust_m_s`.
+
+    A lag of time constant tau passes a^2 tau times the integral of R(t) exp(-t / tau) of the variance of a push a with
+    autocorrelation R, here the mean of those along the wind and across it.
+    """
+    tau, rate = vehicle.velocity_time_constant_s, 1 / vehicle.velocity_time_constant_s + 1 / GUST_TIME_S
+    along = 1 / rate
+    across = along - 1 / (2 * GUST_TIME_S * rate**2)
+    return vehicle.gust_m_s / math.sqrt(tau * (along + across) / 2)
+
+
+def _wave_numbers(count: int) -> FloatArray:
+    """(count,) wave numbers times L, of equal shares of the energy: the middle of each in x^4 / (1 + x^2)^3."""
+    x = np.tan(np.linspace(0.0, math.pi / 2, 20_001)[:-1])
+    below = 2 / math.pi * (np.arctan(x) - x * (5 * x**2 + 3) / (3 * (1 + x**2) ** 2))
+    return np.interp((np.arange(count) + 0.5) / count, below, x)

@@ -187,7 +187,7 @@ def test_a_killed_drone_is_shown_with_the_reason(flock: Flock) -> None:
 
 def test_a_simulated_flock_is_flown_and_disturbed_by_hand() -> None:
     """`flockd sim --live` beside the others: a goal by a click on the map, and every control of the simulation."""
-    command = ["sim", "--live", "--perception", "truth", "--drones", "3", "--no-browser", "--port", "0"]
+    command = ["sim", "--live", "--perception", "truth", "--drones", "3", "--port", "0"]
     run = [sys.executable, "-c", "from flockd.cli import program; program()", *command]
     began_s = time.monotonic()
     with Popen([*run, "--telemetry-at", free_endpoint()], stdout=PIPE, text=True) as flight:

@@ -19,7 +19,7 @@ from flockd.flight.geometry import euler_from_rotation
 from flockd.flight.mission import Guidance, MissionParameters, Moment, Navigator, order_fault
 from flockd.flight.safety import Gate, outside_fence
 from flockd.onboard.telemetry.order_messages import order_message, parse_order
-from flockd.sim.autopilot.fake_vehicle import Demand, PointMass
+from flockd.sim.autopilot.fake_vehicle import Demand, Flown
 from flockd.sim.flock.exact_states import fly_exact_states
 from flockd.sim.scenario import load_scenario
 from tests.core.config.test_loader import CONFIG, DRONE
@@ -302,7 +302,7 @@ def test_four_squares_are_flown_without_standing_and_with_the_heading_along() ->
     """To the left, of 12 m at 1.5 m/s; the gate is stepped each 0.1 s, the mission each 0.5 s."""
     corners = [(12.0, 0.0), (12.0, -12.0), (0.0, -12.0), (0.0, 0.0)] * 4
     navigator, gate = Navigator(to(*corners, speed_m_s=1.5, reached_m=1.0), GATE), Gate(GATE)
-    fly = PointMass(np.array([0.0, 0.0, -5.0]))
+    fly = Flown(np.array([0.0, 0.0, -5.0]))
     state = fly(Demand(np.zeros(2), -5.0, 0.0), 0.0)
     setpoints: list[Setpoint] = []
     turned_rad, yaw_rad = 0.0, 0.0

@@ -8,17 +8,16 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from flockd.core.choices import ROLES
 from flockd.core.data import data_path
 from flockd.core.messages import Float32Array, Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
 from flockd.flight.geometry import RigCamera
 from flockd.flight.perception import Crop, Perception, RangeEstimate, SceneMaps
 from flockd.flight.pilot import FlockPilot
 from flockd.sim.cameras import camera_simulator
-from flockd.sim.flock.truth_perception import TruthPerception
+from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.vehicles.vehicles import Vehicles
-from tests.flight.perception.cameras import SECOND_STAGE
+from tests.flight.pilot.true_networks import TrueNetworks
 from tests.make import small_eyes
 
 STEP_S = 0.5
@@ -26,22 +25,6 @@ BAROMETER = {"drone.perception.height": "barometer"}
 """Its vehicle states hold no range."""
 CRUISE = np.array([[1.0, 0.0], [0.8, 0.2], [0.8, 0.2]])
 TURNED = np.array([0.2, 0.0, 0.0])
-
-
-class NoNetworks:
-    """A fake: every role is answered by the truth before it comes here."""
-
-    map_stride = 2
-    second_stage = SECOND_STAGE
-
-    def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
-        raise AssertionError("asked for a learned flow")
-
-    def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
-        raise AssertionError("asked for a learned scene")
-
-    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        raise AssertionError("asked for a learned range")
 
 
 def scenario_with(*places: tuple[float, float, float], sharp: bool = False) -> ScenarioConfig:
@@ -53,11 +36,11 @@ def scenario_with(*places: tuple[float, float, float], sharp: bool = False) -> S
     return scenario.model_copy(update={"vehicles": drones})
 
 
-class SpoilableTruth(TruthPerception):
+class SpoilableTruth(TrueNetworks):
     """The truth, where a test puts nothing else in the place of a role."""
 
-    def __init__(self) -> None:
-        super().__init__(NoNetworks(), frozenset(ROLES))
+    def __init__(self, cameras: CameraSimulator | None = None) -> None:
+        super().__init__(cameras)
         self.instead: dict[str, Callable[..., Any]] = {}
         """By role (``flow``, ``scene``, ``ranges``)."""
 
@@ -83,8 +66,8 @@ class Flyer:
         with pytest.MonkeyPatch.context() as patch:  # one world, wherever the drones begin
             patch.setattr(camera_simulator, "planned_path", lambda _: np.zeros((1, 2)))
             patch.setattr(camera_simulator, "_spread", lambda _: 12.0)
-            self.cameras = camera_simulator.CameraSimulator(scenario)
-        self.truth = SpoilableTruth()
+            self.cameras = camera_simulator.CameraSimulator(scenario, threads=0)
+        self.truth = SpoilableTruth(self.cameras)
         self.pilot = FlockPilot(scenario.drone, self.truth)
         self.vehicles = Vehicles(scenario.vehicles, scenario.vehicle)
         self.time_s = 100.0
@@ -96,8 +79,7 @@ class Flyer:
         return Perception(self.cameras.rig, self.truth, config)
 
     def take_frames(self) -> tuple[FrameSet, VehicleState]:
-        frames, truth = self.cameras.capture(0, self.steps, self.time_s, self.vehicles)
-        self.truth.show(truth)
+        frames = self.cameras.capture(0, self.steps, self.time_s, self.vehicles)
         v = self.vehicles
         return frames, VehicleState(self.time_s, v.R_ned_body[0], -float(v.position[0, 2]), v.velocity[0])
 

@@ -227,7 +227,8 @@ def test_a_clock_that_is_right_again_is_believed_after_ten_seconds() -> None:
 
 
 async def test_the_fake_autopilots_known_clock_is_found_through_mavsdk(port: int) -> None:
-    with FakeAutopilot(port, clock_ahead_s=1234.5, clock=clock) as fake_autopilot:
+    with FakeAutopilot(port, clock=clock) as fake_autopilot:
+        fake_autopilot.clock_offset_s += 1234.5
         link = await AutopilotLink.connect(AutopilotParameters(address=f"udpin://127.0.0.1:{port}"), clock=clock)
         synchronising = asyncio.create_task(link.synchronise())
         await until(lambda: link.received.trusted_clock() is not None)

@@ -143,10 +143,10 @@ async def test_an_autopilot_that_has_started_anew_is_asked_for_its_streams_again
     with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
         async with attended(address) as link:
             await asyncio.sleep(1.5)
-            rates = dict(fake_autopilot.stream_intervals_s)
+            rates = dict(fake_autopilot.streams.intervals_s)
             fake_autopilot.restart()
-            assert fake_autopilot.stream_intervals_s != rates
-            await until(lambda: dict(fake_autopilot.stream_intervals_s) == rates)
+            assert fake_autopilot.streams.intervals_s != rates
+            await until(lambda: dict(fake_autopilot.streams.intervals_s) == rates)
             assert "the autopilot has started anew" in link.take_reports()
 
 

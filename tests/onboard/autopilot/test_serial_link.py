@@ -72,15 +72,15 @@ async def test_it_comes_back_with_the_device_which_has_forgotten_its_streams(
     fake_autopilot: FakeAutopilot, cable: SerialCable
 ) -> None:
     async with attended(cable.address) as link:
-        asked = dict(fake_autopilot.stream_intervals_s)
+        asked = dict(fake_autopilot.streams.intervals_s)
         cable.unplug()
         await until(lambda: link.status().heartbeat_age_s > 4 * HEARTBEAT_S)
         assert link.unusable() is None, "it may only have started anew"
         link.send_setpoint(Setpoint(0.0, np.zeros(2), 2.5, 0.0))
-        fake_autopilot.stream_intervals_s.update(dict.fromkeys(asked, 9.0))  # type: ignore[attr-defined]
+        fake_autopilot.streams.intervals_s.update(dict.fromkeys(asked, 9.0))
         cable.plug_in()
         await until(lambda: link.status().heartbeat_age_s < HEARTBEAT_S)
-        await until(lambda: dict(fake_autopilot.stream_intervals_s) == asked)
+        await until(lambda: dict(fake_autopilot.streams.intervals_s) == asked)
         assert await link.parameter("COM_OBL_RC_ACT", int) == 5, "both ways"
         assert not fake_autopilot.setpoints, "what was sent meanwhile is not sent later"
         gone, back = link.take_reports()[:2]

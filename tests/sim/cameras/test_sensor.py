@@ -7,8 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from flockd.core.messages import Float32Array, VehicleState
-from flockd.flight.geometry import PinholeCamera, rotation_from_euler
+from flockd.core.messages import Float32Array
+from flockd.flight.geometry import PinholeCamera
+from flockd.sim.cameras.imperfect_cameras import (
+    CamerasConfig,
+    CameraTimingConfig,
+    SensorNoiseConfig,
+    ShakeConfig,
+)
 from flockd.sim.cameras.real_camera import (
     CameraClock,
     NoiseTile,
@@ -21,14 +27,6 @@ from flockd.sim.cameras.real_camera import (
 )
 from flockd.sim.cameras.shutter import CameraMotion, LensField, Shaking
 from flockd.sim.renderer.renderer import View
-from flockd.sim.scenario.imperfect_cameras import (
-    CamerasConfig,
-    CameraTimingConfig,
-    LateAttitudeConfig,
-    SensorNoiseConfig,
-    ShakeConfig,
-)
-from flockd.sim.vehicles.pose_trail import FlockPose, LateAttitude, PoseTrail
 
 SIZE = (320, 240)
 CAMERA = PinholeCamera(np.array([[160.0, 0.0, 160.0], [0.0, 160.0, 120.0], [0.0, 0.0, 1.0]]), SIZE)
@@ -156,21 +154,3 @@ def test_stamps_are_honest_of_what_is_known_and_not_of_delay_and_jitter() -> Non
     assert late.max() == pytest.approx(0.03, abs=1e-3)
     assert late.std() == pytest.approx(0.01 / math.sqrt(12), rel=0.1)
     assert np.mean([not shot.comes for shot in shots]) == pytest.approx(0.1, abs=0.02)
-
-
-def test_a_late_attitude_is_that_of_before() -> None:
-    """Turning at 60 degrees a second, 50 ms late: 3 degrees."""
-    trail = PoseTrail()
-    for time_s in np.arange(0.0, 1.0, 0.02):
-        turned = rotation_from_euler(0.1, 0.0, math.radians(60.0) * time_s)
-        trail.add(FlockPose(float(time_s), np.zeros((1, 3)), turned[None]))
-    now = trail.at(0.98).R_ned_body[0]
-    state = VehicleState(0.98, now, 0.0)
-    late = LateAttitude(LateAttitudeConfig(late_s=0.05), 1, 0).heard(state, trail)
-    expected = rotation_from_euler(0.1, 0.0, math.radians(60.0) * 0.93)
-    np.testing.assert_allclose(late.R_ned_body, expected, atol=1e-6)
-    noise = LateAttitude(LateAttitudeConfig(noise_deg=0.5), 1, 0)
-    angles = [
-        math.degrees(math.acos((np.trace(noise.heard(state, trail).R_ned_body @ now.T) - 1) / 2)) for _ in range(400)
-    ]
-    assert math.sqrt(np.mean(np.square(angles)) / 3) == pytest.approx(0.5, rel=0.1), "about each of three axes"

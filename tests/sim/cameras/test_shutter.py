@@ -11,12 +11,12 @@ import pytest
 
 from flockd.core.messages import Float32Array, FloatArray
 from flockd.flight.geometry import Camera, PinholeCamera, WideAngleCamera, rotation_from_vector
+from flockd.sim.cameras.imperfect_cameras import ShakeConfig, ShutterConfig
 from flockd.sim.cameras.lens_views import lens_view
 from flockd.sim.cameras.real_camera import linear_light
 from flockd.sim.cameras.shutter import CameraMotion, LensField, Shake, Shaking, exposed
 from flockd.sim.renderer.drone_models import drone_model
 from flockd.sim.renderer.renderer import Renderer, View
-from flockd.sim.scenario.imperfect_cameras import ShakeConfig, ShutterConfig
 from flockd.sim.world.world import World
 
 SIZE = (320, 240)

@@ -129,7 +129,7 @@ def test_in_gusts_nothing_touches_among_trees() -> None:
 def test_a_held_drone_takes_no_command_any_more() -> None:
     scenario = _scenario(duration_s=30.0)
     loop, vehicles = ControlLoop(scenario), Vehicles(scenario.vehicles, scenario.vehicle)
-    loop._handover.hold(1, vehicles.position[1], vehicles.velocity[1])
+    loop.hold(1, 0.0, vehicles)
     place = vehicles.position[1]
     asked = Commands.of(5)
     asked.velocity[:] = [1.0, 0.0]

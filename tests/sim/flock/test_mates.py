@@ -8,15 +8,14 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from collections.abc import Callable, Collection
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 from flockd.core.config.mission import MissionParameters
 from flockd.core.messages import FloatArray
-from flockd.flight.safety import Action, Decision, Event, State
+from flockd.flight.safety import Action, Decision, State
 from flockd.sim.flock.control_loop import ControlLoop
 from flockd.sim.flock.exact_states import ExactFlock
 from flockd.sim.scenario import ScenarioConfig, StartConfig
@@ -84,16 +83,10 @@ class _Flight:
             self.time_s += self._step_s
 
 
-class _Hovers:
-    degraded_by: Collection[Event] = ()
-
-    def step(self, *_: Any, **__: Any) -> Decision:
-        return Decision(State.HOVER, Action.HOVER, ())
-
-
 def _hovers(flight: _Flight, one: int) -> None:
     """Its own gate brakes it, as hard as it may: 5 m/s^2."""
-    flight.loop._drones[one] = flight.loop._drones[one]._replace(supervisor=_Hovers())  # type: ignore[arg-type]
+    decision = Decision(State.HOVER, Action.HOVER, ())
+    flight.loop._drones[one].decide = lambda *_: decision  # type: ignore[method-assign]
 
 
 def _is_taken_over(flight: _Flight, one: int) -> None:
@@ -101,7 +94,7 @@ def _is_taken_over(flight: _Flight, one: int) -> None:
 
 
 def _lands(flight: _Flight, one: int) -> None:
-    flight.loop._handover.taken[one] = "land"
+    flight.loop._taken[one] = "land"
 
 
 def _dies(flight: _Flight, one: int) -> None:

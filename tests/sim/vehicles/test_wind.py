@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from flockd.sim.scenario import StartConfig, VehicleConfig
-from flockd.sim.vehicles.vehicles import MAX_LEAN_M_S2, Vehicles
-from flockd.sim.vehicles.wind import GUST_TIME_S, GustField, push_sigma_m_s2
+from flockd.sim.vehicles.vehicles import GUST_TIME_S, MAX_LEAN_M_S2, GustField, Vehicles, push_sigma_m_s2
 
 GUSTY = VehicleConfig(gust_m_s=0.3, gust_length_m=20.0)
 FIELDS = [GustField.of(GUSTY, seed) for seed in range(600)]

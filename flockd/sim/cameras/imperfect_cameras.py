@@ -77,16 +77,6 @@ class CameraTimingConfig(Section):
     """Share of the images that never come."""
 
 
-class LateAttitudeConfig(Section):
-    """The attitude that the autopilot reports, beside `sensors.attitude_error_deg`. In daemons' flights, with PX4 or
-    the fake, it is the autopilot's own, and this does nothing."""
-
-    late_s: _Late = 0.0
-    """It is so much older than it says."""
-    noise_deg: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """Standard deviation about each axis, anew each time."""
-
-
 class RigErrorsConfig(Section):
     """What each camera of each drone is off, in a direction of its own, drawn from the seed; pilots do not know of it.
 
@@ -118,8 +108,6 @@ _PRESETS: Mapping[CameraPreset, Mapping[str, Mapping[str, Any]]] = {
         "compression": {"jpeg_quality": 80},
         # Free running at 30 Hz; what a calibration of the delay leaves; USB's share.
         "timing": {"apart_s": 0.0167, "delay_s": 0.005, "jitter_s": 0.003, "dropped": 0.01},
-        # ATTITUDE_QUATERNION at 30 Hz, read between two of them, and a serial port.
-        "attitude": {"late_s": 0.02, "noise_deg": 0.1},
     },
 }  # fmt: skip
 
@@ -133,7 +121,7 @@ class CamerasConfig(Section):
 
     preset: CameraPreset = "ideal"
     """`ideal`: none of it. `realistic`: a cheap USB camera with a rolling shutter on a small drone by day, from data
-    sheets (sources in `flockd/sim/scenario/imperfect_cameras.py`)."""
+    sheets (sources in `flockd/sim/cameras/imperfect_cameras.py`)."""
     shutter: ShutterConfig = ShutterConfig()
     shake: ShakeConfig = ShakeConfig()
     noise: SensorNoiseConfig = SensorNoiseConfig()
@@ -143,7 +131,6 @@ class CamerasConfig(Section):
     """As of a drone's `source.cameras`: the sensor has so many times so many pixels, each as noisy as `noise` says, and
     the compressed image is reduced."""
     timing: CameraTimingConfig = CameraTimingConfig()
-    attitude: LateAttitudeConfig = LateAttitudeConfig()
     rig: RigErrorsConfig = RigErrorsConfig()
 
     @model_validator(mode="before")
