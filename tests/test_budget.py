@@ -26,10 +26,10 @@ LINES = {
     "flockd/fleet": 2_670,
     "flockd/ground": 4_160,
     "flockd/review": 3_390,
-    "flockd/sim": 9_340,
+    "flockd/sim": 8_560,
     "flockd/campaign": 1_470,
-    "flockd/cli": 3_510,
-    "tests": 36_230,
+    "flockd/cli": 3_450,
+    "tests": 36_170,
     "tools/checks": 2_060,
     "tools/docs": 760,
     "tools/measure": 1_430,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 348}
+FILES = {"flockd": 341}
 NUMBERS_OF_FLIGHT = 315
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
