@@ -152,25 +152,22 @@ def _fields_read(kind: Any, value: Json, key: str, *, bounded: bool) -> Any:
 def _plain(kind: Any, value: Json, key: str, *, bounded: bool) -> Any:
     if kind is float and not isinstance(value, bool):
         if not bounded and isinstance(value, int | float | str):
-            return _exact(value, key)
+            try:
+                return float(value)
+            except (ValueError, OverflowError) as error:
+                raise ValueError(f"{key or 'it'} is no number") from error
         if value is None or isinstance(value, int) or (isinstance(value, float) and math.isfinite(value)):
             return _in_bounds(value, key)
     elif kind is int and isinstance(value, int) and not isinstance(value, bool):
         if abs(value) <= LARGEST_INT:
             return value
     elif kind is str and isinstance(value, str):
-        if (not bounded or len(value) <= LONGEST_TEXT) and _is_unicode(value):
+        written = value.isascii() or value.encode(errors="ignore").decode() == value  # no half surrogate pairs
+        if written and (not bounded or len(value) <= LONGEST_TEXT):
             return value
     elif kind is object or (kind is bool and isinstance(value, bool)):
         return value
     raise ValueError(f"{key} is no {_NAMES.get(kind, 'JSON value')}")
-
-
-def _exact(value: float | str, key: str) -> float:
-    try:
-        return float(value)
-    except (ValueError, OverflowError) as error:
-        raise ValueError(f"{key or 'it'} is no number") from error
 
 
 def _in_bounds(value: float | None, key: str) -> float | None:
@@ -179,14 +176,6 @@ def _in_bounds(value: float | None, key: str) -> float | None:
     if value is not None and abs(value) > largest:
         raise ValueError(f"{key} is beyond {largest:g}")
     return value
-
-
-def _is_unicode(value: str) -> bool:
-    """It can be written as UTF-8, which half a surrogate pair cannot."""
-    try:
-        return value.isascii() or bool(value.encode())
-    except UnicodeEncodeError:
-        return False
 
 
 def _shape(kind: Any) -> tuple[int, ...]:

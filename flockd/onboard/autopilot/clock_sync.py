@@ -44,8 +44,6 @@ class ClockEstimate:
     """The autopilot's clock less this computer's, then."""
     error_s: float
     """The offset is off by no more, where the clocks run evenly; where they do not, by how much they contradict it."""
-    jitter_s: float
-    """Robust standard deviation of single round trips' offsets."""
     round_trip_s: float
     """The shortest of the last seconds."""
     recent_round_trip_s: float
@@ -141,7 +139,6 @@ def _overlap(samples: FloatArray) -> ClockEstimate:
         time_s=float(time_s[-1]),
         offset_s=float(0.5 * (least_s + most_s)),
         error_s=float(0.5 * abs(most_s - least_s)),
-        jitter_s=1.4826 * float(np.median(np.abs(offset_s - np.median(offset_s)))),
         round_trip_s=float(duration_s.min()),
         recent_round_trip_s=float(duration_s[time_s >= time_s[-1] - RECENT_S].min()),
     )

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-import pwd
 import socket
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -30,10 +28,9 @@ def only_owner(autopilot: AutopilotParameters | None) -> Iterator[None]:
             own.bind(name)
         except OSError as error:
             raise UnavailableError(
-                f"autopilot.address: another flockd ({_owner(name)}) has the link {autopilot.address}; stop it first, "
+                f"autopilot.address: another flockd has the link {autopilot.address}; stop it first, "
                 "or give this one its own autopilot's address"
             ) from error
-        own.listen()
         yield
 
 
@@ -48,18 +45,3 @@ def _place(address: str) -> str:
             return f"{kind}:{number}"
         case _:
             return address
-
-
-def _owner(name: str) -> str:
-    """Its process and user, as far as the kernel tells them."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
-        asking.setblocking(False)
-        try:
-            asking.connect(name)
-        except OSError:
-            return "which has just ended, or does not say"
-        process, user, _ = struct.unpack("3i", asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
-    try:
-        return f"process {process} of user {pwd.getpwuid(user).pw_name}"
-    except KeyError:
-        return f"process {process} of user {user}"

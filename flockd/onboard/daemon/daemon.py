@@ -95,10 +95,8 @@ class Daemon:
         assert self._config.autopilot is not None
         if self.components is None:
             return f"the autopilot at {self._config.autopilot.address}, and for the networks to load"
-        if self.components.pilot_loop.frames is None:
-            faults = [status.fault for status in self.components.source.status().values() if status.fault]
-            return f"camera frames: {'; '.join(faults) or 'none came yet'}"
-        return None
+        why = self.components.lacks_frames()
+        return None if why is None else f"camera frames: {why}"
 
     def ask_to_stop(self) -> None:
         """As SIGTERM does: standstill, Hold, and the end."""

@@ -44,7 +44,7 @@ class Missions(Protocol):
     """What takes an operator's orders to the mission."""
 
     def fault(self, order: MissionOrder) -> str | None:
-        """Why it is refused; None: it is not. On any thread."""
+        """Why it is refused, one sentence; None: it is not. On any thread."""
 
     def apply(self, order: MissionOrder) -> None:
         """Has the pilot take it in its next step. On the event loop."""
@@ -218,12 +218,12 @@ class MissionOrders:
         self._config, self._pilot_loop, self._vehicle, self._state = config, pilot_loop, vehicle, state
 
     def fault(self, order: MissionOrder) -> str | None:
-        """Why it is refused, one sentence; None: it is not."""
+        """Why it is refused, one sentence; None: it is not. On any thread."""
         state = self._state()
         if state not in _TAKES_ORDERS:
             return f"flockd does not fly the drone now, as its state is {state}; its mission begins with the flight"
         return order_fault(self._config, order, self._vehicle())
 
     def apply(self, order: MissionOrder) -> None:
-        """Has the pilot take it in its next step."""
+        """Has the pilot take it in its next step. On the event loop."""
         self._pilot_loop.order = order

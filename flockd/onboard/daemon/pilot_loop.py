@@ -22,7 +22,6 @@ from flockd.core.messages import (
     MissionOrder,
     Neighbour,
     PilotOutput,
-    RangeReading,
     ReasonKind,
     VehicleState,
 )
@@ -166,11 +165,8 @@ class PilotLoop:
             output = await self._geometry.do(STEP_DEADLINE_S, pilot.step, frames, vehicle, None, order)
         except (LateError, BusyError):
             raise
-        except NetworkStuckError as error:
-            self._note_failure(str(error))
-            return
         except Exception as error:  # noqa: BLE001 - the step's border: one is lost, and the loop goes on
-            self._note_unexpected(error)
+            self._note_failure(error)
             return
         finally:
             self._took_s.append(self._clock() - taken_s)
@@ -197,19 +193,16 @@ class PilotLoop:
             flies=self._flight > 0,
         )
 
-    def _note_failure(self, why: str) -> None:
-        """Counts a failed step; an event for a new reason."""
+    def _note_failure(self, error: Exception) -> None:
+        """Counts a failed step; an event for a new reason. Raises StepsFailedError for too many that nobody expects."""
+        expected = isinstance(error, NetworkStuckError)
+        why = str(error) if expected else f"{type(error).__name__}: {error}"
         self.failed += 1
         if why != self._failure:
             self._log_event(f"a step failed: {why}")
         self._failure = why
-
-    def _note_unexpected(self, error: Exception) -> None:
-        """Counts a step that an unexpected error ended. Raises StepsFailedError for the last of some in a row."""
-        why = f"{type(error).__name__}: {error}"
-        self._note_failure(why)
-        self._unexpected += 1
-        if self._unexpected >= MAX_UNEXPECTED:
+        self._unexpected += not expected
+        if self._unexpected >= MAX_UNEXPECTED and not expected:
             raise StepsFailedError(f"{self._unexpected} steps in a row failed; the last with {why}") from error
 
     def _count(self, result: StepResult) -> None:
@@ -236,46 +229,30 @@ class Reports:
         self.begin()
 
     def begin(self) -> None:
-        """Another pilot begins, which finds all anew."""
-        self._said_of_rig: set[str] = set()
-        self._told_of_size: set[str] = set()
+        """Another pilot begins, which finds cameras and sizes anew."""
+        self._told, self._of_rig = set(self._faults), set[str]()
 
     def update(self, output: PilotOutput) -> list[str]:
-        """The sentences that a step's output is worth."""
-        return [*self._of_faults(output), *self._of_rig(output), *self._of_size(output)]
-
-    def _of_faults(self, output: PilotOutput) -> list[str]:
-        """When one begins, and when it is over; of heights, when none is left."""
+        """The sentences of a step's output: of the rig once a flight, of all else when it begins or is over."""
         before, self._faults = self._faults, {one.text: one.kind for one in output.reasons if one.kind in _OVER}
-        begun = [fault for fault in self._faults if fault not in before]
         over = [
             f"{fault.partition(':')[0]}: {_OVER[kind]}"
             for fault, kind in before.items()
             if fault not in self._faults and (kind is ReasonKind.LENS or kind not in self._faults.values())
         ]
-        return begun + over
-
-    def _of_rig(self, output: PilotOutput) -> list[str]:
-        """Once a flight, which cameras move otherwise than the drone."""
-        new = [one.text for one in output.reasons if one.kind is ReasonKind.RIG and one.text not in self._said_of_rig]
-        self._said_of_rig.update(new)
-        return new
-
-    def _of_size(self, output: PilotOutput) -> list[str]:
-        """That it weaves, and how large the others are, when it is new."""
-        size, told = output.size, dict[str, str]()
-        if size is None:
-            return []
-        if size.weaves:
+        rig = {one.text: one.text for one in output.reasons if one.kind is ReasonKind.RIG}
+        told, size = {fault: fault for fault in self._faults} | rig, output.size
+        if size is not None and size.weaves:
             told["weaves"] = "size: moves up and down to learn how large the others are"
-        if size.size_m is not None:
+        if size is not None and size.size_m is not None:
             found = f"{size.size_m:.2f} m large, +-{size.sigma:.0%}"
             told["found"] = (
                 f"size: the others are {found}; ranges follow from it; measure them and write `perception.drone_size_m`"
             )
-        new = [text for what, text in told.items() if what not in self._told_of_size]
-        self._told_of_size = set(told)
-        return new
+        begun = [text for what, text in told.items() if what not in self._told]
+        self._of_rig |= set(rig)
+        self._told = set(told) | self._of_rig
+        return begun + over
 
 
 _OVER = {ReasonKind.HEIGHT: "the range finder works again", ReasonKind.LENS: "its lens is clear again"}
@@ -327,6 +304,7 @@ def _between(before: VehicleState, after: VehicleState, time_s: float) -> Vehicl
     """At constant rates of turn and motion from the one to the other."""
     share = (time_s - before.time_s) / (after.time_s - before.time_s)
     turn = vector_from_rotation(before.R_ned_body.T @ after.R_ned_body)
+    ranges = [one for one in (before.ground_range, after.ground_range) if one is not None]
     return VehicleState(
         time_s=time_s,
         R_ned_body=before.R_ned_body @ rotation_from_vector(share * turn),
@@ -334,16 +312,10 @@ def _between(before: VehicleState, after: VehicleState, time_s: float) -> Vehicl
         velocity_ned=_between_vectors(before.velocity_ned, after.velocity_ned, share),
         position=_between_vectors(before.position, after.position, share),
         home_deg=after.home_deg,
-        ground_range=_nearest_range(before.ground_range, after.ground_range, time_s),
+        # The nearest: ranges jump at edges, so that nothing is between two.
+        ground_range=min(ranges, key=lambda reading: abs(reading.time_s - time_s), default=None),
         turn_rate=turn / (after.time_s - before.time_s),
     )
-
-
-def _nearest_range(before: RangeReading | None, after: RangeReading | None, time_s: float) -> RangeReading | None:
-    """The reading that was taken nearest to a time: ranges jump at edges, so that nothing is between two."""
-    if before is None or after is None:
-        return after or before
-    return min(before, after, key=lambda reading: abs(reading.time_s - time_s))
 
 
 def _between_vectors(before: FloatArray | None, after: FloatArray | None, share: float) -> FloatArray | None:

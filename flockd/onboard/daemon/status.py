@@ -60,12 +60,16 @@ class Components:
     over: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when the flight is over and the tasks may end."""
 
+    def lacks_frames(self) -> str | None:
+        """Why no frames have come yet; None: some have."""
+        faults = [status.fault for status in self.source.status().values() if status.fault]
+        return "; ".join(faults) or "none came yet" if self.pilot_loop.frames is None else None
+
 
 async def notify_service_manager(components: Components, service: ServiceManager) -> None:
     """Reports ready with the first frame, and a status line before and after it, until cancelled."""
-    while components.pilot_loop.frames is None:
-        faults = [status.fault for status in components.source.status().values() if status.fault]
-        service.starting(f"waits for frames: {'; '.join(faults) or 'none came yet'}", START_MORE_S)
+    while (why := components.lacks_frames()) is not None:
+        service.starting(f"waits for frames: {why}", START_MORE_S)
         await asyncio.sleep(START_POLL_S)
     sent = components.control.decision
     service.ready(state_sentence(sent))

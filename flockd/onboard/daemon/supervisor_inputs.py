@@ -7,7 +7,6 @@ import math
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -73,15 +72,16 @@ class InputCollector:
         neighbours = result.output.neighbours if result else ()
         ranges = [float(np.linalg.norm(n.position)) for n in neighbours if n.confirmed]
         noisy = result.output.noisy_cameras if result else ()
-        summary = self._camera_monitor.update(now, self._source.status(), noisy, pilot_loop.noisy_images.total())
+        noisy_images = pilot_loop.noisy_images.total()
+        cameras, dropped_share = self._camera_monitor.update(now, self._source.status(), noisy, noisy_images)
         position = position_from_home(status)
         self._had_satellites = self._had_satellites or status.gps_ok is True
         if self._was_armed and not status.armed and status.landed_state == "ground":
             operator.hold = operator.land = False  # they were for the flight that is over
         self._was_armed = status.armed
         inputs = Inputs(
-            cameras=summary.cameras,
-            dropped_share=summary.dropped_share,
+            cameras=cameras,
+            dropped_share=dropped_share,
             estimate_age_s=math.inf if result is None else now - result.time_s,
             ego_motion_age_s=pilot_loop.ego_motion_age_s,
             network_faults=self._networks.faults - self._faults_before,
@@ -131,14 +131,6 @@ def position_from_home(status: AutopilotStatus) -> FloatArray:
     return from_home
 
 
-@dataclass(frozen=True)
-class CameraSummary:
-    """The supervisor's inputs from the cameras."""
-
-    cameras: Mapping[str, CameraHealth]
-    dropped_share: float
-
-
 class CameraMonitor:
     """The health of each camera, and the share of frames dropped in the last seconds."""
 
@@ -156,8 +148,8 @@ class CameraMonitor:
 
     def update(
         self, now: float, status: Mapping[str, CameraStatus], noisy: Collection[str] = (), noisy_images: int = 0
-    ) -> CameraSummary:
-        """As of now; to be called at each tick.
+    ) -> tuple[dict[str, CameraHealth], float]:
+        """The cameras' health, and the share of frames dropped, as of now; to be called at each tick.
 
         ``noisy``: the cameras whose newest images the pilot found to be noise; ``noisy_images``: how many since the
         start, of all cameras.
@@ -169,7 +161,7 @@ class CameraMonitor:
             self._window.popleft()
         tally = _tally(status, noisy_images)
         self._window.append((now, tally))
-        return CameraSummary(cameras, _dropped_share(self._window[0][1], tally))
+        return cameras, _dropped_share(self._window[0][1], tally)
 
     def _health(self, name: str, camera: CameraStatus, now: float) -> CameraHealth:
         """A fault with frozen images counted since the last good state means that the camera is frozen."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -28,11 +30,13 @@ from flockd.onboard.recording.mcap_file import (
     Note,
     Record,
     RecordingError,
+    Stream,
     read_entries,
     read_records,
 )
 from flockd.onboard.recording.truth import Truth
 
+T = TypeVar("T")
 _OF_STEPS = {one.topic for one in (streams.FRAMES, streams.VEHICLE, streams.ORDER, streams.OUTPUT, streams.TRUTH)}
 """Streams whose messages, beside images, are parts of steps, numbered by their sequence."""
 
@@ -141,18 +145,17 @@ class Recording:
     ) -> Iterator[RecordedStep]:
         if streams.FRAMES.topic not in messages:
             return
+
+        def read(stream: Stream, kind: type[T]) -> T | None:
+            return from_json(kind, parsed(messages[stream.topic])) if stream.topic in messages else None
+
         try:
             listed: streams.StepFrames = from_json(streams.StepFrames, parsed(messages[streams.FRAMES.topic]))
             if not start_s <= listed.time_s <= end_s:
                 return
             vehicle: VehicleState = from_json(VehicleState, parsed(messages[streams.VEHICLE.topic]))
             output = parsed(messages[streams.OUTPUT.topic]) if streams.OUTPUT.topic in messages else None
-            truth = from_json(Truth, parsed(messages[streams.TRUTH.topic])) if streams.TRUTH.topic in messages else None
-            order = (
-                from_json(MissionOrder, parsed(messages[streams.ORDER.topic]))
-                if streams.ORDER.topic in messages
-                else None
-            )
+            truth, order = read(streams.TRUTH, Truth), read(streams.ORDER, MissionOrder)
             frames = {}
             for entry in listed.frames:
                 image = decoded_image(messages[foxglove.image_stream(entry.camera).topic])
@@ -218,25 +221,18 @@ def _note(found: Contents, path: Path, record: Record | Damage) -> None:
             if stream.topic == streams.FRAMES.topic:
                 found.steps.append((sequence, _time_of(path, data)))
         case Note(name, facts_of_end) if name == streams.END_NOTE:
-            found.lost = _count(path, facts_of_end.get("lost", "0"))
+            if not re.fullmatch("[0-9]{1,9}", lost := facts_of_end.get("lost", "0")):
+                raise RecordingError(f"{path}: says lost {lost[:20]!r}, which is no number; use another copy")
+            found.lost = int(lost)
         case Damage():
             found.damages.append(record)
 
 
-def _count(path: Path, text: str) -> int:
-    if not (text.isascii() and text.isdecimal() and len(text) < 10):
-        raise RecordingError(f"{path}: says lost {text[:20]!r}, which is no number; use another copy")
-    return int(text)
-
-
 def _time_of(path: Path, data: bytes) -> float:
-    try:
-        time_s = float(parsed(data)["time_s"])
-    except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise RecordingError(f"{path}: holds a frame set without a time; use another copy") from error
-    if not math.isfinite(time_s):
-        raise RecordingError(f"{path}: holds a frame set without a time; use another copy")
-    return time_s
+    with suppress(ValueError, KeyError, TypeError, OverflowError):
+        if math.isfinite(time_s := float(parsed(data)["time_s"])):
+            return time_s
+    raise RecordingError(f"{path}: holds a frame set without a time; use another copy")
 
 
 def _config(path: Path, contents: Contents) -> DroneConfig:

@@ -139,21 +139,16 @@ class _Camera(threading.Thread):
                 )
 
     def _take(self, captured: CapturedBuffer, image_format: ImageFormat) -> Count | None:
-        refused = self._refusal(captured, image_format)
+        refused: Count | None = "flagged" if captured.flagged else None
+        # Some drivers do not say which clock is in their stamps: what is of now is of ours.
+        if refused is None and not self._receiver.is_of_now(captured.time_s, self._silence_s):
+            refused = "time_stamp"
+        try:
+            image_format.check(captured.data)
+        except CorruptImageError:
+            refused = refused or "corrupt"
         if refused is not None:
             self._receiver.count(self._who, "received", refused)
             return refused
         frame = RawFrame(self._who, captured.data, image_format.decode, captured.time_s, captured.sequence)
         return self._receiver.offer(frame)
-
-    def _refusal(self, captured: CapturedBuffer, image_format: ImageFormat) -> Count | None:
-        if captured.flagged:
-            return "flagged"
-        # Some drivers do not say which clock is in their stamps: what is of now is of ours.
-        if not self._receiver.is_of_now(captured.time_s, self._silence_s):
-            return "time_stamp"
-        try:
-            image_format.check(captured.data)
-        except CorruptImageError:
-            return "corrupt"
-        return None

@@ -7,7 +7,6 @@ import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
 
 import zenoh
 
@@ -23,15 +22,9 @@ MAX_PEERS = 32
 
 Ask = Callable[[str, bytes], AnswerMessage]
 """Takes an operator's command by name, with what its query carries, on a thread of zenoh's; returns at once."""
+Declared = zenoh.LivelinessToken | zenoh.Queryable[None]
 NewestImage = Callable[[str], bytes | None]
 """Gives a camera's newest image as JPEG, on a thread of zenoh's; None where there is none."""
-
-
-class Declared(Protocol):
-    """A token or queryable of a session."""
-
-    def undeclare(self) -> None:
-        """It is there no more."""
 
 
 class ZenohTelemetry(SessionOwner):
@@ -109,7 +102,7 @@ class ZenohTelemetry(SessionOwner):
     def withdraw(self, drone: str) -> None:
         """A drone is alive no more, and replies to nothing."""
         for declared in self._kept.pop(drone, []):
-            declared.undeclare()
+            declared.undeclare()  # type: ignore[no-untyped-call]
 
     def reply_to(self, keys: str, reply: Callable[[str, bytes], Mapping[str, object]]) -> None:
         """Replies to queries for keys of something that is no drone, each by its last part and what it carries.

@@ -33,23 +33,26 @@ def open_session(
 ) -> zenoh.Session:
     """A session that listens on and connects to these endpoints only, for ever where nobody is there yet.
 
-    Args:
-        purpose: what it is for, as errors say it.
-        listen: zenoh endpoints.
-        connect: zenoh endpoints.
-        settings: a file of zenoh's own to begin with: for TLS and access control.
-        shared_memory: whether large messages go through it; None: as zenoh or the settings have it.
-        max_message_bytes: longer ones are not received; None: as zenoh or the settings have it.
-        max_peers: further ones are refused; None: as zenoh or the settings have it.
-
-    Raises SessionError.
+    A peer opens without a router, unlike a client; discovery by multicast and gossip is off. ``purpose``: as errors say
+    it; ``settings``: a file of zenoh's own to begin with, for TLS and access control. Longer messages and further peers
+    than the most are refused; None: as zenoh or the settings have it. Raises SessionError.
     """
+    wanted = {
+        "mode": "peer",
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect),
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000},
+        "transport/shared_memory/enabled": shared_memory,
+        "transport/link/rx/max_message_size": max_message_bytes,
+        "transport/unicast/max_sessions": max_peers,
+    }
     try:
-        config = _config(listen, connect, settings, shared_memory)
-        if max_message_bytes is not None:
-            config.insert_json5("transport/link/rx/max_message_size", json.dumps(max_message_bytes))
-        if max_peers is not None:
-            config.insert_json5("transport/unicast/max_sessions", json.dumps(max_peers))
+        config = zenoh.Config() if settings is None else zenoh.Config.from_file(str(settings))
+        for key, value in wanted.items():
+            if value is not None:
+                config.insert_json5(key, json.dumps(value))
         return zenoh.open(config)
     except zenoh.ZError as error:
         endpoints = ", ".join([*listen, *connect]) or "no endpoint"
@@ -78,19 +81,3 @@ class SessionOwner:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _config(
-    listen: Sequence[str], connect: Sequence[str], settings: Path | None, shared_memory: bool | None
-) -> zenoh.Config:
-    """A peer opens without a router, unlike a client; discovery by multicast and gossip is off."""
-    config = zenoh.Config() if settings is None else zenoh.Config.from_file(str(settings))
-    config.insert_json5("mode", '"peer"')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("scouting/gossip/enabled", "false")
-    config.insert_json5("listen/endpoints", json.dumps(list(listen)))
-    config.insert_json5("connect/endpoints", json.dumps(list(connect)))
-    config.insert_json5("connect/retry", json.dumps({"period_init_ms": 100, "period_max_ms": 1000}))
-    if shared_memory is not None:
-        config.insert_json5("transport/shared_memory/enabled", json.dumps(shared_memory))
-    return config

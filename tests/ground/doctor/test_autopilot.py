@@ -175,8 +175,8 @@ def _ranges(reading: RangeReading | None, arrivals: tuple[float, ...] = (), heig
 @pytest.mark.parametrize(
     ("judged", "level"),
     [
-        (lambda: judge_clock(ClockEstimate(47_000.0, -46_765.25, 0.0004, 0.002, 0.003, 0.003)), Level.PASS),
-        (lambda: judge_clock(ClockEstimate(47_000.0, -46_765.25, 0.02, 0.002, 0.003, 0.003)), Level.WARNING),
+        (lambda: judge_clock(ClockEstimate(47_000.0, -46_765.25, 0.0004, 0.003, 0.003)), Level.PASS),
+        (lambda: judge_clock(ClockEstimate(47_000.0, -46_765.25, 0.02, 0.003, 0.003)), Level.WARNING),
         (lambda: judge_clock(None), Level.WARNING),
         (lambda: judge_firmware(Firmware("PX4", "1.16.0")), Level.PASS),
         (lambda: judge_firmware(Firmware("PX4", "1.13.3")), Level.WARNING),

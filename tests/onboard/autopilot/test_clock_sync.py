@@ -60,7 +60,6 @@ def test_a_busy_computer_that_delays_nine_of_ten_on_one_way_costs_a_third_of_a_m
     assert abs(plain_s) > 5e-3, "the mean of all would be off by milliseconds"
     assert sync.estimate is not None
     assert abs(_error_s(sync, 20.0)) <= sync.estimate.error_s < 5e-4
-    assert sync.estimate.jitter_s > 2e-3, "single round trips are so bad"
 
 
 def test_a_clock_that_stands_still_at_times_is_not_known_well_however_short_the_round_trips() -> None:

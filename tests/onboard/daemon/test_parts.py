@@ -163,16 +163,16 @@ def _status(fault: str | None, **counts: int) -> dict[str, CameraStatus]:
 
 def test_monitor_tell_frozen_from_unplugged_and_count_bad_frames_of_late() -> None:
     monitor = CameraMonitor(_flyable("front"))
-    fine = monitor.update(0.0, _status(None, received=100, frozen=3)).cameras["front"]
+    fine = monitor.update(0.0, _status(None, received=100, frozen=3))[0]["front"]
     assert (fine.unplugged, fine.frozen, fine.period_s) == (False, False, 0.1)
-    gone = monitor.update(1.0, _status("front: no such device", received=100, frozen=3)).cameras["front"]
+    gone = monitor.update(1.0, _status("front: no such device", received=100, frozen=3))[0]["front"]
     assert (gone.unplugged, gone.frozen) == (True, False)
     monitor.update(2.0, _status(None, received=110, frozen=3))
-    frozen = monitor.update(3.0, _status("front: the image is frozen", received=120, frozen=5)).cameras["front"]
+    frozen = monitor.update(3.0, _status("front: the image is frozen", received=120, frozen=5))[0]["front"]
     assert (frozen.unplugged, frozen.frozen) == (False, True)
     late = monitor.update(4.0, _status(None, received=140, corrupt=10))
-    assert late.dropped_share == 10 / 40
-    assert monitor.update(12.0, _status(None, received=150, corrupt=10)).dropped_share == 0.0
+    assert late[1] == 10 / 40
+    assert monitor.update(12.0, _status(None, received=150, corrupt=10))[1] == 0.0
 
 
 def _flyable(*cameras: str) -> DroneConfig:
@@ -184,9 +184,9 @@ def test_images_found_useless_when_decoded_count_against_the_few_that_are_decode
     """A camera at 30 Hz of which every fifteenth image is used: 20 of 300, and yet all that anybody saw of it."""
     monitor = CameraMonitor(_flyable("front"))
     monitor.update(0.0, _status(None, received=0, used=0))
-    assert monitor.update(1.0, _status(None, received=300, used=15, corrupt=5, undecodable=5)).dropped_share == 5 / 20
-    assert monitor.update(2.0, _status(None, received=600, used=40), noisy_images=10).dropped_share == 10 / 40
-    assert monitor.update(3.0, _status(None, received=900, used=40, corrupt=600)).dropped_share == 600 / 900
+    assert monitor.update(1.0, _status(None, received=300, used=15, corrupt=5, undecodable=5))[1] == 5 / 20
+    assert monitor.update(2.0, _status(None, received=600, used=40), noisy_images=10)[1] == 10 / 40
+    assert monitor.update(3.0, _status(None, received=900, used=40, corrupt=600))[1] == 600 / 900
 
 
 def test_a_camera_whose_images_are_noise_for_three_of_its_periods_is_lost() -> None:
@@ -194,7 +194,7 @@ def test_a_camera_whose_images_are_noise_for_three_of_its_periods_is_lost() -> N
     status = {**_status(None), "back": _status(None)["front"]}
 
     def lost(now: float, *noisy: str) -> list[str]:
-        return [name for name, health in monitor.update(now, status, noisy).cameras.items() if health.noisy]
+        return [name for name, health in monitor.update(now, status, noisy)[0].items() if health.noisy]
 
     assert lost(10.0) == []
     assert lost(10.25, "front") == []  # at 10 Hz, 0.3 s are allowed

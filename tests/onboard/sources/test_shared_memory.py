@@ -15,7 +15,6 @@ from flockd.core.config.source import SharedMemoryParameters, SourceParameters
 from flockd.core.messages import Frame, FrameSet
 from flockd.onboard.sources import FramePublisher
 from flockd.onboard.sources.shared_memory import SharedMemorySource
-from flockd.onboard.telemetry import zenoh_session
 from flockd.sim.sitl.ports import free_endpoint
 from tests.onboard.sources.camera_images import SIZE, scene
 
@@ -83,16 +82,16 @@ def test_frames_arrive_byte_for_byte_in_one_process(endpoint: str, source: Share
 def test_without_shared_memory_the_same_bytes_come_through_the_socket(
     endpoint: str, source: SharedMemorySource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole_config = zenoh_session._config
+    whole_open = zenoh.open
     refusals: list[bool] = []
 
-    def without(listen: object, connect: object, settings: None, shared_memory: bool | None) -> zenoh.Config:
-        if shared_memory:
+    def without(config: zenoh.Config) -> zenoh.Session:
+        if config.get_json("transport/shared_memory/enabled") == "true":
             refusals.append(True)
             raise zenoh.ZError("Unable to create POSIX shm segment: OS error 30 at segment.rs:85.")
-        return whole_config([endpoint], [], None, False)
+        return whole_open(config)
 
-    monkeypatch.setattr(zenoh_session, "_config", without)
+    monkeypatch.setattr(zenoh, "open", without)
     with FramePublisher(listen=[endpoint]) as publisher:
         frames, _ = _first(publisher, source)
         _assert_same(frames, frames.frames["front"].sequence)
