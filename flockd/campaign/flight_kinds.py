@@ -17,7 +17,7 @@ from flockd.campaign.flight_plan import Run, Task
 from flockd.core.choices import SimulatedPerception
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.errors import FlockdError
-from flockd.flight.inference.hashes import model_hashes
+from flockd.flight.inference.manifest_file import model_hashes
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import ScenarioConfig
 

@@ -21,7 +21,7 @@ from flockd.core.config.document import KeyPath, Place, key_text
 from flockd.core.config.loader import PATHS
 from flockd.core.config.validation_messages import problems_of
 from flockd.core.errors import ConfigError, ConfigProblem, UsageError
-from flockd.flight.inference.hashes import model_hashes
+from flockd.flight.inference.manifest_file import model_hashes
 from flockd.sim.flock.start import scattered, with_drones
 from flockd.sim.scenario import MAX_DRONES, ScenarioConfig, load_with_places
 

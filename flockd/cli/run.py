@@ -102,7 +102,7 @@ def _check_limits() -> None:
 
 async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceManager) -> None:
     """With SIGTERM and Ctrl-C for standstill, Hold and the end. A terminal that closes ends no flight."""
-    from flockd.flight.inference.hashes import model_hashes
+    from flockd.flight.inference.manifest_file import model_hashes
     from flockd.flight.perception import load_networks
     from flockd.onboard.daemon import Daemon, cameras_at_once
     from flockd.onboard.simulated_time import clock_at

@@ -193,7 +193,7 @@ def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespac
 
 def _recorders(scenario: ScenarioConfig, directory: Path, stack: ExitStack) -> tuple[Recorder, ...]:
     """A recorder for each drone that flockd flies."""
-    from flockd.flight.inference.hashes import model_hashes
+    from flockd.flight.inference.manifest_file import model_hashes
     from flockd.onboard.recording import Recorder
 
     directory.mkdir(exist_ok=True)

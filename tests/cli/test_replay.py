@@ -16,7 +16,7 @@ from flockd.cli import main
 from flockd.core.config import Overrides
 from flockd.core.data import data_path
 from flockd.core.messages import FrameSet, PilotOutput
-from flockd.flight.inference.hashes import model_hashes
+from flockd.flight.inference.manifest_file import model_hashes
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.reader import Recording
 from flockd.review.flight_log.from_recordings import flight_log, recordings_in

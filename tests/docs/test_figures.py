@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from flockd.core.data import data_path
-from flockd.flight.inference.hashes import model_hashes
+from flockd.flight.inference.manifest_file import model_hashes
 from flockd.sim.scenario import load_scenario
 from tools.docs.figures import AGE, BLOCK, TABLES, pages, written
 from tools.measure.card import FIGURES_FILE, ROOT

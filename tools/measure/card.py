@@ -43,7 +43,7 @@ from flockd.core.choices import SimulatedPerception
 from flockd.core.config.document import Value
 from flockd.core.config.loader import Overrides
 from flockd.core.data import data_path
-from flockd.flight.inference.hashes import model_hashes
+from flockd.flight.inference.manifest_file import model_hashes
 from flockd.review.replay.profile import ComputerFiles
 from flockd.sim.cameras.camera_simulator import family_of
 from flockd.sim.flock.swarm import fly

@@ -1,7 +1,6 @@
 """Camera models, rigid fits, Algorithm 1, ego- and neighbour motion. Pure: no clock, no files, the same every time."""
 
 from flockd.flight.geometry.cameras import Camera, PinholeCamera, WideAngleCamera
-from flockd.flight.geometry.closest_approach import closest_approach, share_at_closest
 from flockd.flight.geometry.depth_maps import RangeMap, ZMap, blind_pixels, range_map, z_map
 from flockd.flight.geometry.ego_motion import estimate_ego_motion, moved_pixels
 from flockd.flight.geometry.ego_motion_refinement import refine_ego_motion
@@ -43,7 +42,6 @@ __all__ = [
     "ZMap",
     "blind_pixels",
     "build_rig",
-    "closest_approach",
     "estimate_ego_motion",
     "euler_from_rotation",
     "fit_ground",
@@ -65,7 +63,6 @@ __all__ = [
     "rotation_from_quaternion",
     "rotation_from_vector",
     "scale_on_track",
-    "share_at_closest",
     "vector_from_rotation",
     "virtual_crop",
     "z_map",

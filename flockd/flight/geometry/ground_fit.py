@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockd.core.messages import BoolArray, FloatArray
-from flockd.flight.geometry.robust.kernels import Kernel, Tukey, median
-from flockd.flight.geometry.robust.reweighting import reweighted
+from flockd.flight.geometry.robust.kernels import Kernel, Tukey, median, reweighted
 
 RELIEF = 0.03
 """Standard deviation of what the ground departs from its plane, as a share of the range, straight below; it grows with

@@ -144,3 +144,9 @@ _WITHOUT_MODEL: Mapping[str, tuple[str, ...]] = {
 def find_manifests(folder: Path) -> tuple[Path, ...]:
     """All manifests in a folder, by name."""
     return tuple(sorted(folder.glob("*.yaml")))
+
+
+def model_hashes(perception: PerceptionConfig) -> dict[str, str]:
+    """SHA-256 of each model that a configuration uses, by the name in its manifest. Raises ModelError."""
+    manifests = [load_manifest(path)[0] for path in sorted(manifests_of(perception))]
+    return {manifest.name: manifest.sha256 for manifest in manifests}

@@ -28,7 +28,7 @@ from flockd.fleet.ros.ros_input import (
     stamp_ns,
     vehicle_state,
 )
-from flockd.flight.inference.hashes import model_hashes
+from flockd.flight.inference.manifest_file import model_hashes
 from flockd.onboard.message_json import to_json
 from flockd.onboard.recording import RecordingError, foxglove
 from flockd.onboard.recording.mcap_file import Entry, Inclosure, McapFile, Note

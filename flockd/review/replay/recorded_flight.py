@@ -12,7 +12,7 @@ from typing import Any
 from flockd.core.config import DroneConfig
 from flockd.core.config.drone import RecordingConfig
 from flockd.core.data import written_whole
-from flockd.flight.inference.hashes import model_hashes
+from flockd.flight.inference.manifest_file import model_hashes
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon import load_side_by_side
 from flockd.onboard.message_json import to_json

@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flockd.core.messages import FloatArray
+from flockd.flight.flocking.metrics import closest_approach
 from flockd.flight.geometry import (
     RigidTransform,
-    closest_approach,
     euler_from_rotation,
     fit_rigid,
     rotation_from_euler,

@@ -1,4 +1,4 @@
-"""Robust kernels: how little a large residual counts, each by the name it has in the literature.
+"""Robust kernels: how little a large residual counts, each by the name it has in the literature; and fits by them.
 
 A kernel takes squared residuals and gives weights for iteratively reweighted least squares (Holland & Welsch, Robust
 regression using iteratively reweighted least-squares, 1977), which also tables the scales at which each is 95 %
@@ -7,12 +7,15 @@ efficient for Gaussian errors.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
 from flockd.core.messages import FloatArray
+
+Fit = TypeVar("Fit")
 
 
 class Kernel(Protocol):
@@ -68,3 +71,34 @@ def median(values: FloatArray) -> float:
         return float(np.partition(values, middle)[middle])
     parted = np.partition(values, (middle - 1, middle))
     return float(parted[middle - 1] + parted[middle]) / 2.0
+
+
+def reweighted(
+    fit: Callable[[FloatArray, Fit | None], Fit],
+    residuals: Callable[[Fit], FloatArray],
+    kernel: Callable[[FloatArray], Kernel],
+    weights: FloatArray,
+    *,
+    rounds: int,
+    settled: float = 0.0,
+) -> tuple[Fit, FloatArray]:
+    """The last fit, and the weights (n,) of its residuals (Holland & Welsch 1977).
+
+    Args:
+        fit: from weights (n,) and the fit before, None at first.
+        residuals: (n,) of a fit.
+        kernel: for residuals (n,), whose size gives its scale.
+        weights: (n,) to begin with.
+        rounds: fits at most.
+        settled: no further fit once no weight changes by as much.
+    """
+    found: Fit | None = None
+    for _ in range(rounds):
+        found = fit(weights, found)
+        left, before = residuals(found), weights
+        weights = kernel(left).weight(left**2)
+        if float(np.abs(weights - before).max()) < settled:
+            break
+    if found is None:
+        raise ValueError("at least one round is needed")
+    return found, weights
