@@ -21,7 +21,7 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 2_970,
-    "flockd/flight": 11_950,
+    "flockd/flight": 11_910,
     "flockd/onboard": 9_000,
     "flockd/fleet": 2_670,
     "flockd/ground": 4_160,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 341}
+FILES = {"flockd": 338}
 NUMBERS_OF_FLIGHT = 315
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
