@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -29,9 +30,6 @@ from flockd.ground.calibration.camera_motion import CameraMotion, camera_motion
 
 PRIOR_TURN_RAD, PRIOR_OFFSET_S, PRIOR_FOCAL = math.radians(4.0), 0.06, 0.04
 """Standard deviations before anything was seen: each axis of a mounting, a time, a focal length's logarithm."""
-_WANDER_TURN_RAD, _WANDER_OFFSET_S, _WANDER_FOCAL = math.radians(0.05), 5e-4, 5e-4
-"""By how much they may change in a minute: mountings give way, and a filter that is certain learns no more."""
-_WANDER_TIME_S = 60.0
 _TURN_SIGMA_RAD, _LEAST_TURN_RAD, _TURN_GAIN = math.radians(0.15), math.radians(0.05), 0.1
 """Of the autopilot's turn between two images, each axis: before anything was seen, and at least. An attitude that
 jitters by more than it counts for looks like turns of the body about axes about which it never turned, and tells
@@ -187,7 +185,9 @@ class _Camera:
 class _Sight:
     """How one camera moved, and how it is expected to have: what the rounds of an update have in common."""
 
-    name: str
+    camera: _Camera
+    place: int
+    """Of the camera in the state."""
     motion: CameraMotion
     rates: tuple[FloatArray, FloatArray]
     """(3,) rad/s of turn at both images, body axes."""
@@ -198,59 +198,23 @@ class _Sight:
     R_body_ned: FloatArray
     """(3, 3) at the first image."""
     by_shared: FloatArray
-    """(6, 5) see `_Row`."""
-    measured: FloatArray
-    """(6,) how the camera turned and went beside that, body axes."""
-    spread: FloatArray
-    """(6, 6) covariance of it."""
-    information: FloatArray
-    """Its inverse."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Row:
-    """One camera's share of an update: ``information`` of
-    ``by_state @ state + by_shared @ shared + by_noise @ noise - measured``."""
-
-    place: int
-    by_state: FloatArray
-    """(6, 5)"""
-    by_shared: FloatArray
-    """(6, 5) readout, and the velocity's error."""
-    by_noise: FloatArray
-    """(6, 6)"""
+    """(6, 5) by readout, and the velocity's error."""
     measured: FloatArray
     """(6,) how the camera turned and went beside what is expected, body axes."""
-    information: FloatArray
-    """(6, 6)"""
-
-
-class _Found(NamedTuple):
-    """What an update found."""
-
-    step: FloatArray
-    """Of the state."""
-    covariance: FloatArray
-    """Of the state, after it."""
-    off: FloatArray
-    """(6,) by how much the autopilot's turn, rad, and way, m, were off."""
-    turn_square: float
-    """The mean square that the turn was off by, each axis, rad^2: expected, as it is not known exactly."""
+    spread: FloatArray
+    """(6, 6) covariance of it."""
 
 
 class RigCalibration:
-    """The filter of one rig."""
+    """The filter of one rig. Its state: of each camera the turn, time and focal length, then what all share."""
 
     def __init__(self, rig: Rig) -> None:
         self._cameras = {
             name: _Camera(mounted, mounted.T_body_camera.rotation) for name, mounted in rig.cameras.items()
         }
         sigmas = [PRIOR_TURN_RAD] * 3 + [PRIOR_OFFSET_S, PRIOR_FOCAL]
-        wander = [_WANDER_TURN_RAD] * 3 + [_WANDER_OFFSET_S, _WANDER_FOCAL]
-        count = len(self._cameras)
-        self._wander = np.array(wander * count + [0.0] * _SHARED) ** 2 / _WANDER_TIME_S
         shared = [_READOUT_S] * 2 + [_VELOCITY_SIGMA_M_S] * 3
-        self._covariance = np.diag(np.array(sigmas * count + shared) ** 2)
+        self._covariance = np.diag(np.array(sigmas * len(self._cameras) + shared) ** 2)
         self._readout = np.zeros(2)
         self._velocity_error = np.zeros(3)
         self._turn_variance = _TURN_SIGMA_RAD**2
@@ -271,42 +235,39 @@ class RigCalibration:
             return
         self._time_s = time_s
         self._wait(elapsed_s)
-        with np.errstate(all="ignore"):
-            try:
-                found = self._found(before, after, pairs)
-            except (np.linalg.LinAlgError, ValueError):
-                return
-        if all(np.isfinite(one).all() for one in found) and (np.diag(found.covariance) > 0.0).all():
-            self._covariance = found.covariance
-            self._move(found.step)
-            jitter = max(found.turn_square, _LEAST_TURN_RAD**2)
-            self._turn_variance += _TURN_GAIN * (jitter - self._turn_variance)
+        with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError, ValueError):
+            self._take(before, after, pairs, interval_s)
 
-    def _found(self, before: Seen, after: Seen, pairs: PointPairs) -> _Found:
-        """Raises ValueError where no camera tells anything."""
-        interval_s = after.vehicle.time_s - before.vehicle.time_s
-        used, rows, off = [], [], np.zeros(6)
+    def _take(self, before: Seen, after: Seen, pairs: PointPairs, interval_s: float) -> None:
+        """The state and the body's motion together, beside what the autopilot says of it, by least squares."""
         turned_rad = np.linalg.norm(vector_from_rotation(before.vehicle.R_ned_body.T @ after.vehicle.R_ned_body))
         moves = bool(np.linalg.norm(_went(before, after)) > _MOVES_M or turned_rad > _MOVES_RAD)
-        for name, camera in self._cameras.items():
-            sight = self._sight(name, before, after, pairs)
-            if sight is None:
-                continue
-            row = self._row(sight, off)
-            if self._fits(row, sight.spread * camera.misfit, camera, moves=moves):
-                used.append(sight)
-                rows.append(row)
+        sights = [self._sight(name, before, after, pairs) for name in self._cameras]
+        used = [sight for sight in sights if sight is not None and self._fits(sight, moves=moves)]
         if not used:
-            raise ValueError("no camera tells anything")
-        known = before.vehicle.velocity_ned is not None
-        prior = np.linalg.inv(self._covariance)
-        for number in range(_ROUNDS):
-            if number:
-                rows = [self._row(sight, off) for sight in used]
-            found = self._solved(prior, rows, interval_s, known=known)
-            off = found.off.copy()
-            off[3:] += found.step[-3:] * interval_s
-        return found
+            return
+        size, off = len(self._covariance), np.zeros(6)
+        prior = np.zeros((size + 6, size + 6))
+        prior[:size, :size] = np.linalg.inv(self._covariance)
+        noise_m = (_UNKNOWN_M_S if before.vehicle.velocity_ned is None else _VELOCITY_NOISE_M_S) * interval_s
+        prior[range(size, size + 6), range(size, size + 6)] = [1.0 / self._turn_variance] * 3 + [noise_m**-2] * 3
+        for _ in range(_ROUNDS):
+            hessian, gradient = prior.copy(), np.zeros(size + 6)
+            for sight in used:
+                J = self._jacobian(sight, off)
+                weighted = J.T @ np.linalg.inv(sight.camera.misfit * sight.spread)
+                hessian += weighted @ J
+                gradient += weighted @ sight.measured
+            covariance = np.linalg.inv(hessian)
+            found = covariance @ gradient
+            off = found[size:].copy()
+            off[3:] += found[size - 3 : size] * interval_s
+        variances = np.diag(covariance)
+        if np.isfinite(found).all() and np.isfinite(covariance).all() and (variances[:size] > 0.0).all():
+            self._covariance = (covariance + covariance.T)[:size, :size] / 2.0
+            self._move(found[:size])
+            jitter = float(np.mean(found[size : size + 3] ** 2 + variances[size : size + 3]))
+            self._turn_variance += _TURN_GAIN * (max(jitter, _LEAST_TURN_RAD**2) - self._turn_variance)
 
     def deviations(self) -> tuple[CameraDeviation, ...]:
         """How each camera differs from its configuration, as far as is known."""
@@ -328,11 +289,11 @@ class RigCalibration:
         return tuple(found)
 
     def _wait(self, interval_s: float) -> None:
-        """The state as uncertain as it becomes meanwhile."""
+        """The velocity's error as uncertain as it becomes meanwhile."""
         keep = math.exp(-interval_s / _VELOCITY_TIME_S)
         kept = np.ones(len(self._covariance))
         kept[-3:] = keep
-        self._covariance = self._covariance * np.outer(kept, kept) + np.diag(self._wander * interval_s)
+        self._covariance = self._covariance * np.outer(kept, kept)
         self._covariance[-3:, -3:] += (1.0 - keep**2) * _VELOCITY_SIGMA_M_S**2 * np.eye(3)
         self._velocity_error = keep * self._velocity_error
 
@@ -356,7 +317,8 @@ class RigCalibration:
         spread = into @ np.linalg.inv(motion.information) @ into.T
         spread[3:, 3:] += (_WAY_SIGMA * np.linalg.norm(gone)) ** 2 * np.eye(3)
         return _Sight(
-            name=name,
+            camera=camera,
+            place=_SIZE * list(self._cameras).index(name),
             motion=motion,
             rates=rates,
             turn=turn,
@@ -366,36 +328,35 @@ class RigCalibration:
             measured=np.concatenate([vector_from_rotation(turn.T @ turned), gone - way])
             - by_shared[:, :2] @ self._readout,
             spread=spread,
-            information=np.asarray(np.linalg.inv(spread), np.float64),
         )
 
-    def _row(self, sight: _Sight, off: FloatArray) -> _Row:
-        """Linear about what the body did by all that is known: ``off`` (6,) beside the autopilot's turn and way.
+    def _jacobian(self, sight: _Sight, off: FloatArray) -> FloatArray:
+        """(6, n + 6) of what is measured by the state, and by how much the autopilot's turn and way are off.
 
-        About the autopilot's alone, or the camera's alone, the noise of either would count as motion.
+        About what the body did by all that is known, ``off`` (6,) beside the autopilot: about the autopilot's alone, or
+        the camera's alone, the noise of either would count as motion.
         """
-        camera, place = self._cameras[sight.name], list(self._cameras).index(sight.name)
-        R, (first, second) = camera.R_body_camera, sight.rates
+        R, (first, second), size = sight.camera.R_body_camera, sight.rates, len(self._covariance)
         about, near = sight.turn @ rotation_from_vector(off[:3]), sight.way + sight.R_body_ned @ off[3:]
-        by_state, by_noise = np.zeros((6, _SIZE)), np.eye(6)
-        by_state[:3, _TURN] = np.eye(3) - about.T
-        by_state[:3, _OFFSET] = second - about.T @ first
-        by_state[3:, _TURN] = cross_matrix(near)
-        by_state[3:, _OFFSET] = by_state[3:, _TURN] @ first
-        by_all_known = RigidTransform(R.T @ about @ R, R.T @ near)
-        by_state[:, _FOCAL] = -_into(R) @ sight.motion.by_focal(by_all_known)
-        by_noise[3:, 3:] = sight.R_body_ned
-        return _Row(place, by_state, sight.by_shared, by_noise, sight.measured, sight.information / camera.misfit)
+        J = np.zeros((6, size + 6))
+        mine = J[:, sight.place : sight.place + _SIZE]
+        mine[:3, _TURN] = np.eye(3) - about.T
+        mine[:3, _OFFSET] = second - about.T @ first
+        mine[3:, _TURN] = cross_matrix(near)
+        mine[3:, _OFFSET] = mine[3:, _TURN] @ first
+        mine[:, _FOCAL] = -_into(R) @ sight.motion.by_focal(RigidTransform(R.T @ about @ R, R.T @ near))
+        J[:, size - _SHARED : size] = sight.by_shared
+        J[:3, size : size + 3], J[3:, size + 3 :] = np.eye(3), sight.R_body_ned
+        return J
 
-    def _fits(self, row: _Row, spread: FloatArray, camera: _Camera, *, moves: bool) -> bool:
-        """Whether a camera's motion, of covariance ``spread`` (6, 6), is one that may be; learns how large its errors
-        are, and if the drone moves whether they agree."""
-        size = len(self._covariance)
-        mine = [*range(row.place * _SIZE, (row.place + 1) * _SIZE), *range(size - _SHARED, size)]
-        H = np.concatenate([row.by_state, row.by_shared], axis=1)
+    def _fits(self, sight: _Sight, *, moves: bool) -> bool:
+        """Whether a camera's motion is one that may be; learns how large its errors are, and if the drone moves whether
+        they agree."""
+        camera, size, J = sight.camera, len(self._covariance), self._jacobian(sight, np.zeros(6))
         noise = np.diag([self._turn_variance] * 3 + [_VELOCITY_NOISE_M_S**2] * 3)
-        spread = spread + H @ self._covariance[np.ix_(mine, mine)] @ H.T + row.by_noise @ noise @ row.by_noise.T
-        square = float(row.measured @ np.linalg.solve(spread, row.measured)) / len(row.measured)
+        spread = camera.misfit * sight.spread + J[:, size:] @ noise @ J[:, size:].T
+        spread += J[:, :size] @ self._covariance @ J[:, :size].T
+        square = float(sight.measured @ np.linalg.solve(spread, sight.measured)) / len(sight.measured)
         if not math.isfinite(square):
             return False
         misfit = camera.misfit * min(max(square, 0.1), _MAX_MISFIT) ** _FIT_GAIN
@@ -404,28 +365,6 @@ class RigCalibration:
         if moves:
             camera.agreement += _AGREEMENT_GAIN * ((1.0 if fits else -1.0) - camera.agreement)
         return fits
-
-    def _solved(self, prior: FloatArray, rows: list[_Row], interval_s: float, *, known: bool) -> _Found:
-        """With the inverse of the state's covariance before."""
-        size = len(self._covariance)
-        noise_m = (_VELOCITY_NOISE_M_S if known else _UNKNOWN_M_S) * interval_s
-        hessian = np.zeros((size + 6, size + 6))
-        hessian[:size, :size] = prior
-        hessian[range(size, size + 6), range(size, size + 6)] = [1.0 / self._turn_variance] * 3 + [noise_m**-2] * 3
-        gradient = np.zeros(size + 6)
-        for row in rows:
-            J = np.zeros((6, size + 6))
-            J[:, row.place * _SIZE : (row.place + 1) * _SIZE] = row.by_state
-            J[:, size - _SHARED : size], J[:, size:] = row.by_shared, row.by_noise
-            weighted = J.T @ row.information
-            hessian += weighted @ J
-            gradient += weighted @ row.measured
-        covariance = np.linalg.inv(hessian)
-        found = covariance @ gradient
-        turn = slice(size, size + 3)
-        turn_square = float(np.mean(found[turn] ** 2 + np.diag(covariance)[turn]))
-        covariance = covariance[:size, :size]
-        return _Found(found[:size], (covariance + covariance.T) / 2.0, found[size:], turn_square)
 
     def _move(self, step: FloatArray) -> None:
         for place, camera in enumerate(self._cameras.values()):
