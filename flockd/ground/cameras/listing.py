@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import math
 import os
 import re
@@ -14,10 +13,11 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+import yaml
+
 from flockd.core.choices import PixelFormat
 from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig
 from flockd.core.config.source import CameraDeviceParameters
-from flockd.core.errors import UsageError
 from flockd.ground.calibration.fragment import rig_text
 from flockd.onboard.sources.v4l2_device import CAN_CAPTURE, CAPTURE, FOURCC, camera_flags, controls_of
 from flockd.onboard.sources.v4l2_kernel import (
@@ -274,55 +274,37 @@ _BY_HAND = {"auto_exposure": 1, "exposure_auto": 1, "exposure_time_absolute": 50
 """What cameras of the USB video class take for an exposure of 5 ms that is set by hand."""
 
 
-def sections_text(cameras: Mapping[str, tuple[FoundCamera, Mode]], turn_deg: int = 0) -> str:
-    """A commented file that `flockd config check` passes; cameras by their names in the rig.
-
-    ``turn_deg``: as of `CameraDeviceParameters`. Raises UsageError where it is not 0 and one needs a pipeline.
-    """
+def sections_text(cameras: Mapping[str, tuple[FoundCamera, Mode]]) -> str:
+    """A commented file that `flockd config check` passes; cameras by their names in the rig."""
     as_pipelines = any(camera.element for camera, _ in cameras.values())
-    if as_pipelines and turn_deg:
-        raise UsageError(
-            "--turn-deg is for USB cameras, and one of these needs a pipeline; add `videoflip` to each there"
-        )
-    sizes = {name: mode.size if turn_deg % 180 == 0 else mode.size[::-1] for name, (_, mode) in cameras.items()}
-    comment = (
+    comment = [
         "Written by `flockd cameras`: the cameras of this computer, as sections of a drone's configuration.",
         "Fill in which camera looks where: exchange the names. `flockd cameras --picture FOLDER` shows what each sees.",
         "Fill in intrinsics, by `flockd calibrate camera`, and extrinsics, by a tape and the frame's drawing.",
-    )
-    lines = [
-        rig_text([_evenly(number, sizes, name) for number, name in enumerate(sizes)], comment).rstrip(),
-        "source:",
-        f"  kind: {'gstreamer' if as_pipelines else 'v4l2'}",
-        "  cameras:",
     ]
-    slowest_hz = min(mode.rates_hz[0] for _, mode in cameras.values())
+    entries = []
     for name, (camera, mode) in cameras.items():
-        parameters = camera.parameters(name, mode, as_pipeline=as_pipelines)
-        where = f", {camera.node} now" if camera.node else ""
-        keys = ("pipeline", "rate_hz") if parameters.pipeline else ("device", "pixel_format", "rate_hz")
-        values = {key: getattr(parameters, key) for key in keys} | ({"turn_deg": turn_deg} if turn_deg else {})
-        lines.append(f"    - name: {name}    # {' '.join(camera.name.split())}{where}")
-        for key, value in values.items():
-            told = f"{value:g}" if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
-            lines.append(f"      {key}: {told}")
-        lines += [] if as_pipelines else _controls(camera)
-    lines.append(f"  set_tolerance_s: {max(0.02, 0.6 / slowest_hz):.3g}    # half a frame period or more")
-    lines.append(f"  silence_s: {max(0.5, 3.0 / slowest_hz):.3g}")
-    return "\n".join(lines) + "\n"
-
-
-def _controls(camera: FoundCamera) -> list[str]:
-    """A fixed, short exposure where the camera has the usual controls; the others as comments."""
-    offered = {control.name: control for control in camera.controls}
-    set_by_hand = [name for name in _BY_HAND if name in offered]
-    lines = ["      controls:"] if set_by_hand else []
-    for name in set_by_hand:
-        low, high = offered[name].low, offered[name].high
-        value = min(max(_BY_HAND[name], low), high)
-        lines.append(f"        - {{name: {name}, value: {value}}}    # {low} to {high}")
-    others = [f"{one.name} {one.low} to {one.high}" for one in camera.controls if one.name not in set_by_hand]
-    return [*lines, *(f"      # also: {other}" for other in others)]
+        entry = camera.parameters(name, mode, as_pipeline=as_pipelines).model_dump(mode="json", exclude_defaults=True)
+        limits = {one.name: (one.low, one.high) for one in camera.controls}
+        by_hand = {
+            one: min(max(value, limits[one][0]), limits[one][1]) for one, value in _BY_HAND.items() if one in limits
+        }
+        if by_hand and not as_pipelines:
+            entry["controls"] = [{"name": one, "value": value} for one, value in by_hand.items()]
+        entries.append(entry)
+        told = "".join(f"; {one} {low} to {high}" for one, (low, high) in limits.items())
+        comment.append(f"{name}: {' '.join(camera.name.split())}{f', {camera.node} now' if camera.node else ''}{told}")
+    slowest_hz = min(mode.rates_hz[0] for _, mode in cameras.values())
+    source = {
+        "kind": "gstreamer" if as_pipelines else "v4l2",
+        "cameras": entries,
+        "set_tolerance_s": round(max(0.02, 0.6 / slowest_hz), 3),
+        "silence_s": round(max(0.5, 3.0 / slowest_hz), 3),
+    }
+    rig = [_evenly(number, len(cameras), name, mode.size) for number, (name, (_, mode)) in enumerate(cameras.items())]
+    return rig_text(rig, comment) + yaml.safe_dump(
+        {"source": source}, default_flow_style=None, sort_keys=False, width=math.inf, allow_unicode=True
+    )
 
 
 def camera_names(count: int) -> Sequence[str]:
@@ -331,11 +313,11 @@ def camera_names(count: int) -> Sequence[str]:
     return named.get(count, tuple(f"camera{number + 1}" for number in range(count)))
 
 
-def _evenly(number: int, sizes: Mapping[str, tuple[int, int]], name: str) -> CameraConfig:
+def _evenly(number: int, count: int, name: str, size: tuple[int, int]) -> CameraConfig:
     """One of the cameras that look evenly around, with perfect wide-angle lenses; the field of view is that of the
     longer side."""
-    width, height = sizes[name]
-    yaw_deg = 360.0 * number / len(sizes)
+    width, height = size
+    yaw_deg = 360.0 * number / count
     forward_m, right_m = (round(0.1 * of(math.radians(yaw_deg)), 2) + 0.0 for of in (math.cos, math.sin))  # no -0.0
     focal_px = round(max(width, height) / 2 / math.radians(FIELD_OF_VIEW_DEG / 2), 1)
     lens = IntrinsicsConfig(model="wide_angle", fx=focal_px, fy=focal_px, cx=width / 2, cy=height / 2)
