@@ -315,7 +315,7 @@ async def test_a_small_jump_of_the_local_frame_is_said_and_flown_through(
             assert -float(fake_autopilot.state.position[2]) == pytest.approx(height_m, abs=0.15)
             state = ship.heard()["state"].message
             assert state["height_m"] == pytest.approx(height_m, abs=0.2)
-            assert state["position_ne"][1] == pytest.approx(0.0, abs=0.3), "east of home"
+            assert state["position_ne"][1] == pytest.approx(0.0, abs=0.45), "east of home, by an estimate that drifts"
             assert (ship.state() in {"normal", "degraded"}, fake_autopilot.mode) == (True, "OFFBOARD"), ship.events
             await asyncio.sleep(0.02)
 
