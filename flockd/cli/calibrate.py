@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.options import camera_of, loaded, opened, refuse_overwriting
 from flockd.cli.output import complain, progress, say_facts, say_result
-from flockd.cli.parser import Commands, Parser, commands_of, flag, option, positive_count, positive_number, size
+from flockd.cli.parser import Commands, Parser, commands_of, flag, option, positive_number, size
 from flockd.core.choices import LENS_MODELS
 from flockd.core.errors import UsageError
 
@@ -53,18 +53,17 @@ def _add_camera(commands: Commands) -> None:
     examples = (
         "flockd calibrate camera --print-board board.svg",
         "flockd calibrate camera pictures/ --camera front",
-        "flockd calibrate camera drone1.mcap --camera left --every 5 --model wide_angle",
+        "flockd calibrate camera pictures/ --camera left --model wide_angle",
         "flockd calibrate camera --config my_drone.yaml --camera front",
     )
     description = "Measure a camera's lens from views of a ChArUco board."
     parser = commands("camera", description, examples, _camera)
-    help_of_source = "a folder of images or a recording; by default --config's own camera, live"
+    help_of_source = "a folder of images; by default --config's own camera, live"
     option(parser, "SOURCE", help_of_source, nargs="?")
     option(parser, "--camera NAME", "the camera's name in the rig")
     option(parser, "--model", "default: pinhole, unless the other fits clearly better", choices=LENS_MODELS)
     option(parser, "--print-board FILE", "write the board to print (.svg)", Path)
-    option(parser, "--config FILE", "the drone, for its camera's device and serial", Path)
-    option(parser, "--every N", "take every Nth frame (1)", positive_count, default=1)
+    option(parser, "--config FILE", "the drone, for its camera's device", Path)
     _add_shared(parser)
     board = parser.add_argument_group("the board", "as it was printed; measure it, printers shrink")
     option(board, "--squares CxR", "columns x rows (7x5)", size, default=(7, 5))
@@ -139,13 +138,9 @@ def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, 
     path = None if args.source is None else Path(args.source)
     if path is None:
         if config is None:
-            raise UsageError("no SOURCE was given; name images, a recording or a device, or --config for its camera")
+            raise UsageError("no SOURCE was given; name a folder of images, or --config for its camera")
         name = camera_of(config, args.camera, args.config)
         return name, image_sources.from_camera(config, str(args.config), name, enough)
-    if path.suffix.lower() == ".mcap":
-        recording = opened(path)
-        name = camera_of(recording.config, args.camera, path)
-        return name, image_sources.from_recording(recording, name, args.every)
     name = args.camera or "camera" if config is None else camera_of(config, args.camera, args.config)
     if not re.fullmatch("[a-z0-9_-]+", name):
         raise UsageError(f"--camera {name}: a camera's name has small letters, digits, _ and - only")
@@ -153,7 +148,7 @@ def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, 
         return name, image_sources.from_folder(path)
     fault = "does not exist; check the path"
     if path.exists():
-        fault = "is no folder or recording; name one, or for a live camera the drone with --config"
+        fault = "is no folder of images; name one, or for a live camera the drone with --config"
     raise UsageError(f"{path}: {fault}")
 
 

@@ -64,6 +64,7 @@ _OPTIONS = (
         "print flockd's own board with `flockd calibrate camera --print-board`",
     ),
     ("calibrate camera", "views max-blur serial seconds", "leave it out"),
+    ("calibrate camera", "every", "leave it out: all images of a folder are read"),
     ("calibrate camera", "picture", "the command prints the coverage and each view's residual"),
 )
 COMMANDS: Mapping[str, str] = {

@@ -16,18 +16,14 @@ import numpy as np
 import pytest
 
 from flockd.cli import main
-from flockd.core.config import DroneConfig, load_drone
-from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
-from flockd.core.messages import Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
+from flockd.core.config import load_drone
+from flockd.core.messages import Frame, FrameSet, UInt8Array
 from flockd.ground.calibration.board import BoardFinder, BoardSpec
-from flockd.ground.calibration.image_sources import identity
-from flockd.onboard.recording import Recorder
 from flockd.onboard.sources import CameraStatus
 from flockd.onboard.sources.device_source import Devices
 from tests.cli.conftest import Told
 from tests.ground.calibration import darkroom
-from tests.ground.calibration.darkroom import PINHOLE, WIDE, facing, photograph
-from tests.make import filled
+from tests.ground.calibration.darkroom import PINHOLE, facing, photograph
 from tests.onboard.sources.fake_kernel import FakeCamera, FakeKernel
 
 Capture = pytest.CaptureFixture[str]
@@ -100,7 +96,6 @@ def test_what_is_not_enough_is_said_in_one_sentence(folder: Path, told: Told, tm
     write(folder / "wall.png", np.full((360, 480, 3), 90, np.uint8))
     assert "the board is in none of the 1 images (1 no board)" in told(1, *command)
     assert "does not exist" in told(2, "calibrate", "camera", tmp_path / "nowhere", "--out", out)
-    assert "does not exist" in told(1, "calibrate", "camera", tmp_path / "no.mcap", "--out", out)
     assert "no SOURCE was given" in told(2, "calibrate", "camera", "--out", out)
     assert "needs 70 markers" in told(2, *command, "--squares", "10x14")
     assert not out.exists()
@@ -156,7 +151,7 @@ def test_before_a_live_camera_a_person_gets_instructions(
     assert film.ended
     measured = load_drone(out).rig.cameras[0].intrinsics.measured
     assert measured is not None
-    assert measured.camera.endswith(", /dev/video7")
+    assert measured.camera == "/dev/video7"
 
 
 def test_a_v4l2_camera_is_read(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -191,18 +186,6 @@ def test_a_camera_that_is_not_there_is_unavailable(tmp_path: Path, told: Told, m
     )
 
 
-def test_a_usb_camera_is_known_by_its_serial_number(tmp_path: Path) -> None:
-    usb = tmp_path / "devices" / "1-1"
-    (usb / "1-1:1.0").mkdir(parents=True)
-    for name, text in (("idVendor", "046d"), ("idProduct", "0825"), ("serial", "8A2B5C90")):
-        (usb / name).write_text(f"{text}\n")
-    entry = tmp_path / "class" / "video3"
-    entry.mkdir(parents=True)
-    (entry / "device").symlink_to(usb / "1-1:1.0")
-    assert identity(Path("/dev/video3"), tmp_path / "class") == "USB 046d:0825 serial 8A2B5C90"
-    assert identity(Path("/dev/video4"), tmp_path / "class").endswith(", /dev/video4")
-
-
 def test_the_board_is_printed_in_its_true_size(tmp_path: Path, told: Told) -> None:
     page = tmp_path / "board.svg"
     assert "print it at 100 % on paper of 276 x 204 mm" in told(0, "calibrate", "camera", "--print-board", page)
@@ -221,30 +204,3 @@ def test_the_board_is_printed_in_its_true_size(tmp_path: Path, told: Told) -> No
     assert drawing[2].attrib["d"] == "M0 0h100"
     assert "is written as .svg" in told(2, "calibrate", "camera", "--print-board", tmp_path / "b.gif")
     assert "exists" in told(2, "calibrate", "camera", "--print-board", page)
-
-
-WIDE_LENS = IntrinsicsConfig(model="wide_angle", fx=WIDE.fx, fy=WIDE.fy, cx=WIDE.cx, cy=WIDE.cy, distortion=WIDE.k)
-
-
-def record_walls(path: Path, steps: int) -> None:
-    """A drone on the ground, with one camera that sees no board."""
-    camera = CameraConfig(name="left", size_px=WIDE.size, intrinsics=WIDE_LENS)
-    wall = photograph(WIDE, facing((0.0, 0.0, -1.0)))
-    output: PilotOutput = filled(PilotOutput, 0.5)
-    with Recorder(path, drone="drone1", config=DroneConfig(rig=RigConfig(cameras=(camera,)))) as recorder:
-        for step in range(steps):
-            time_s = 10.0 + 0.1 * step
-            frames = FrameSet(time_s, {"left": Frame("left", wall, time_s, step)})
-            recorder.step(frames, VehicleState(time_s, np.eye(3), 1.0), output)
-            recorder.drain()
-
-
-def test_a_recording_is_searched_for_the_board(tmp_path: Path, told: Told) -> None:
-    flight = tmp_path / "drone1.mcap"
-    record_walls(flight, steps=3)
-    assert "the board is in none of the 3 images (3 no board)" in told(
-        1, "calibrate", "camera", flight, "--out", tmp_path / "left.yaml"
-    )
-    assert "has no camera 'up'; choose with --camera from left" in told(
-        2, "calibrate", "camera", flight, "--camera", "up"
-    )

@@ -15,7 +15,7 @@ class MeasurementConfig(Section):
 
     date: Annotated[str, text(r"^\d{4}-\d{2}-\d{2}$", "a date, as in `2026-11-24`")]
     camera: str
-    """Its serial number, or what else identifies it."""
+    """Its path, or what else identifies it."""
     source: str
     """What it was measured from."""
     views: Annotated[int, Field(ge=1)]

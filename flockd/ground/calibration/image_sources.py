@@ -1,4 +1,4 @@
-"""Images to calibrate with: from a folder, a recording or a live camera, and the camera's identity."""
+"""Images to calibrate with, from a folder or a live camera."""
 
 from __future__ import annotations
 
@@ -12,14 +12,12 @@ from flockd.core.errors import UnavailableError
 from flockd.core.messages import UInt8Array
 from flockd.ground.calibration.board import CalibrationError
 from flockd.ground.datasets.image_files import SUFFIXES, read_image
-from flockd.onboard.recording.reader import Recording
 from flockd.onboard.sources import FrameSource, open_source
 
 MOST_S = 120.0
 """Of a live camera."""
 FIRST_FRAME_S = 10.0
 FRAME_WAIT_S = 0.2
-SYSFS = Path("/sys/class/video4linux")
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +30,7 @@ class ImageStream:
     """How many there are about; 0 for a live camera."""
     live: bool
     identity: str
-    """What identifies the camera: its serial number where it has one."""
+    """What identifies the camera: its path, best that of its socket."""
 
 
 def from_folder(path: Path) -> ImageStream:
@@ -42,21 +40,6 @@ def from_folder(path: Path) -> ImageStream:
         raise CalibrationError(f"{path}: has no images; name the folder they are in")
     images = ((file.name, read_image(file)) for file in files)
     return ImageStream(images, len(files), live=False, identity=f"not known (images in {path.name})")
-
-
-def from_recording(recording: Recording, name: str, every: int) -> ImageStream:
-    """A camera's images in every ``every``-th step of a recording. Reading raises RecordingError."""
-    config = recording.config
-    images = (
-        (f"{step.frames.time_s - recording.start_s:.2f} s", step.frames.frames[name].image)
-        for step in recording.steps()
-        if step.number % every == 0 and name in step.frames.frames
-    )
-    cameras = () if config.source is None else config.source.cameras
-    places = {camera.name: f", {camera.place}" for camera in cameras}
-    measured = next(camera.intrinsics.measured for camera in config.rig.cameras if camera.name == name)
-    known = measured.camera if measured else f"not known ({name} of {recording.drone}{places.get(name, '')})"
-    return ImageStream(images, -(-len(recording.contents.steps) // every), live=False, identity=known)
 
 
 def from_camera(config: DroneConfig, file: str, name: str, enough: Callable[[], bool]) -> ImageStream:
@@ -70,18 +53,7 @@ def from_camera(config: DroneConfig, file: str, name: str, enough: Callable[[], 
         source = source.model_copy(update={"cameras": tuple(one for one in source.cameras if one.name == name)})
         device = source.cameras[0].device
     images = _frames(open_source(config.model_copy(update={"rig": rig, "source": source}), file), name, enough)
-    known = identity(Path(device)) if device else f"not known ({name})"
-    return ImageStream(images, 0, live=True, identity=known)
-
-
-def identity(device: Path, sysfs: Path = SYSFS) -> str:
-    """What identifies a camera: vendor, product and serial number of a USB camera, else its name and device."""
-    entry = sysfs / device.resolve().name
-    usb = (entry / "device").resolve().parent
-    vendor, product, serial = (_text(usb / name) for name in ("idVendor", "idProduct", "serial"))
-    if vendor and product:
-        return f"USB {vendor}:{product} {f'serial {serial}' if serial else f'without a serial number, {device}'}"
-    return f"{_text(entry / 'name') or 'not known'}, {device}"
+    return ImageStream(images, 0, live=True, identity=device or f"not known ({name})")
 
 
 def _frames(source: FrameSource, name: str, enough: Callable[[], bool]) -> Iterator[tuple[str, UInt8Array]]:
@@ -101,10 +73,3 @@ def _frames(source: FrameSource, name: str, enough: Callable[[], bool]) -> Itera
             raise UnavailableError(faults[0] if faults else "no camera gave a frame; check how it is plugged in")
     finally:
         source.stop()
-
-
-def _text(file: Path) -> str:
-    try:
-        return file.read_text(encoding="utf-8", errors="replace").strip()
-    except OSError:
-        return ""

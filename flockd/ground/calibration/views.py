@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import pairwise
 from typing import Literal
 
 import cv2
@@ -92,7 +92,8 @@ class Coverage:
 
 
 Refusal = Literal["no board", "blurred", "moving", "like another"]
-MOST_VIEWS = 60
+MOST_VIEWS = 100
+"""Further ones count as like another: so many that differ tell all there is."""
 _SHARP_PX, _SHARP_SHARE = 4.0, 0.003
 """Widest edge of a sharp view: so many pixels, or this share of a large image's width."""
 _ALIKE = 0.03
@@ -127,9 +128,8 @@ class Refused:
 class Collector:
     """Takes images of one camera one after the other. All are of one size: another is a CalibrationError."""
 
-    def __init__(self, finder: BoardFinder, most: int = MOST_VIEWS) -> None:
-        """Keeps at most ``most`` views: beyond that, of two that are alike one goes."""
-        self._finder, self._most = finder, most
+    def __init__(self, finder: BoardFinder) -> None:
+        self._finder = finder
         self._first = ""
         self._before: BoardDetection | None = None
         self.size: tuple[int, int] | None = None
@@ -156,12 +156,12 @@ class Collector:
             return self._refuse(Refused(name, "blurred", edge_px))
         if moving and (before is None or _apart(before, seen, image.shape[1]) >= _STILL):
             return self._refuse(Refused(name, "moving"))
-        if any(_apart(view.seen, seen, image.shape[1]) < _ALIKE for view in self.views):
+        if len(self.views) == MOST_VIEWS or any(
+            _apart(view.seen, seen, image.shape[1]) < _ALIKE for view in self.views
+        ):
             return self._refuse(Refused(name, "like another"))
         self.views.append(View(name, seen, edge_px))
         self.coverage.add(seen.pixels)
-        if len(self.views) > self._most:
-            self._drop_the_most_alike()
         return None
 
     def counts(self) -> dict[Refusal, int]:
@@ -180,14 +180,6 @@ class Collector:
     def _refuse(self, refused: Refused) -> Refusal:
         self.refused.append(refused)
         return refused.why
-
-    def _drop_the_most_alike(self) -> None:
-        assert self.size is not None
-        apart = np.full((len(self.views), len(self.views)), np.inf)
-        for i, j in combinations(range(len(self.views)), 2):
-            apart[i, j] = _apart(self.views[i].seen, self.views[j].seen, self.size[0])
-        gone = self.views.pop(int(np.unravel_index(np.argmin(apart), apart.shape)[1]))
-        self._refuse(Refused(gone.name, "like another"))
 
 
 def _apart(first: BoardDetection, second: BoardDetection, width: int) -> float:

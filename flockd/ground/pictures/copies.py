@@ -60,7 +60,7 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def annotated(image: UInt8Array, result: PictureResult) -> UInt8Array:
-    """A copy of an image (h, w, 3), RGB, with each detection's box, mask, probability, range and size."""
+    """A copy of an image (h, w, 3), RGB, with each detection's box, mask, range and probability."""
     height, width = image.shape[:2]
     mask = cv2.resize(result.mask, (width, height), interpolation=cv2.INTER_NEAREST)
     drawn = image.copy()
@@ -84,22 +84,11 @@ def _rectangle(image: UInt8Array, box: Box, colour: tuple[int, int, int], thick:
 
 
 def _write(image: UInt8Array, one: DetectedDrone, colour: tuple[int, int, int], thick: int) -> None:
-    """Below the box, or above it where the image ends."""
-    height, width = image.shape[:2]
-    texts = (
-        f"p {one.probability:.2f}",
-        f"range {one.range_m:.2f} +- {one.range_sigma_m:.2f} m",
-        f"size {one.size_m:.2f} +- {one.size_sigma_m:.2f} m",
-    )
-    scale = 0.42 * thick
-    sizes = [cv2.getTextSize(text, _FONT, scale, thick)[0] for text in texts]
-    step, wide = round(1.5 * sizes[0][1]), max(size[0] for size in sizes) + 4 * thick
-    high = step * len(texts) + 4 * thick
-    left = int(np.clip(one.box[0], 0, max(width - wide, 0)))
-    below, above = int(one.box[3]) + 3 * thick, int(one.box[1]) - 3 * thick - high
-    top = below if below <= height - high else max(above, 0)
-    part = image[top : top + high, left : left + wide]
-    part[:] = part // 4  # dark, for the letters to be read on any background
-    for row, text in enumerate(texts):
-        place = (left + 2 * thick, top + step * (row + 1))
-        cv2.putText(image, text, place, _FONT, scale, colour, thick, cv2.LINE_AA)
+    """Below the box, or above it where the image ends; on a dark ground, to be read on any background."""
+    text = f"{one.range_m:.2f} +- {one.range_sigma_m:.2f} m, p {one.probability:.2f}"
+    scale, (height, width) = 0.42 * thick, image.shape[:2]
+    (wide, high), _ = cv2.getTextSize(text, _FONT, scale, thick)
+    left, below = int(np.clip(one.box[0], 0, max(width - wide, 0))), int(one.box[3]) + 3 * thick
+    top = below if below <= height - 2 * high else max(int(one.box[1]) - 3 * thick - 2 * high, 0)
+    image[top : top + 2 * high, left : left + wide] //= 4
+    cv2.putText(image, text, (left, top + round(1.5 * high)), _FONT, scale, colour, thick, cv2.LINE_AA)
