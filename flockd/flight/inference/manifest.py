@@ -108,12 +108,6 @@ class OutputSpec(TensorSpec):
     golden_mean: float
     golden_deviation: float
 
-    @property
-    def map_size(self) -> tuple[int | str, ...]:
-        """Width and height of a map."""
-        axes = self.shape[1:3] if len(self.shape) == 3 or self.layout == "nhwc" else self.shape[2:4]
-        return axes[::-1]
-
     def by_column(self, values: Float32Array) -> dict[str, Float32Array]:
         """The columns (n,) of an output (n, k), by their names. Raises ValueError for an output of another shape."""
         if values.ndim != 2 or values.shape[1] != len(self.columns):

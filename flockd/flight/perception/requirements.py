@@ -59,11 +59,6 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
             "proposal_logit": Threshold(
                 "Logit from which pixels make proposals where a second stage refuses those that are no drones.", *_LOGIT
             ),
-            "mask_logit": Threshold(
-                "Logit from which pixels of a proposal count as the drone's; above the proposals', whose masks are a "
-                "little too wide.",
-                *_LOGIT,
-            ),
             "proposal_logit_alone": Threshold(
                 "Logit from which pixels are a drone's where there is no second stage.", *_LOGIT
             ),
@@ -170,8 +165,6 @@ def _faults_of_tensors(manifest: Manifest, role: Role, needed: Requirements) -> 
             if spec is not None and column not in spec.columns:
                 message = f"has no {column!r}; name the model's columns in their order, of which {role} needs "
                 yield Fault(("outputs", _key(manifest, result), "columns"), message + ", ".join(columns))
-    if needed.crop:
-        yield from _faults_of_mask(manifest)
 
 
 def _faults_of_numbers(manifest: Manifest, role: Role, needed: Requirements) -> Iterator[Fault]:
@@ -186,13 +179,6 @@ def _faults_of_numbers(manifest: Manifest, role: Role, needed: Requirements) -> 
         yield Fault(("crop",), f"is missing for the role {role}; add a section that says how crops are cut out")
     if needed.map_stride and manifest.map_stride is None:
         yield Fault(("map_stride",), f"is missing for the role {role}; write how many image pixels a map pixel spans")
-
-
-def _faults_of_mask(manifest: Manifest) -> Iterator[Fault]:
-    mask, crop = manifest.results.get("mask"), manifest.contents.get("crop")
-    if mask is not None and crop is not None and mask.map_size != crop.image_size:
-        message = "has to be as high and wide as the crop that enters; correct it, or leave the mask out"
-        yield Fault(("outputs", _key(manifest, "mask"), "shape"), message)
 
 
 def _unknown_to_all(manifest: Manifest, known: list[Requirements]) -> Iterator[Fault]:

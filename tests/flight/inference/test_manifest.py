@@ -125,14 +125,13 @@ def shipped(name: str) -> Callable[[Path], Path]:
         (shipped("distance"), {"thresholds.drone_probability": GONE}, "thresholds.drone_probability"),
         (shipped("distance"), {"thresholds.drone_probability": 80}, "thresholds.drone_probability"),
         (shipped("distance"), {"outputs.range.columns.2": "up_px"}, "outputs.range.columns"),
-        (shipped("distance"), {"outputs.mask.shape.1": 48}, "outputs.mask.shape"),
         (shipped("distance"), {"inputs.picture.carries": GONE}, "inputs"),
         (shipped("verification"), {"thresholds.distance_logit_limit": GONE}, "thresholds.distance_logit_limit"),
         (shipped("verification"), {"outputs.drone.columns": ["sure"]}, "outputs.drone.columns"),
         (shipped("neighbours"), {"map_stride": GONE}, "map_stride"),
         (shipped("neighbours"), {"inputs.geometry.kind": GONE}, "inputs.geometry.shape[3]"),
         (shipped("neighbours"), {"inputs.geometry.carries": "sound"}, "inputs.geometry"),
-        (shipped("neighbours"), {"thresholds.mask_logit": 51.0}, "thresholds.mask_logit"),
+        (shipped("neighbours"), {"thresholds.proposal_logit": 51.0}, "thresholds.proposal_logit"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_sentence_with_file_line_and_key(
