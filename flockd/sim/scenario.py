@@ -215,7 +215,7 @@ class DetectionsConfig(Section):
 
 
 class CameraFaultConfig(Section):
-    """That one simulated camera sends nothing but noise."""
+    """That one simulated camera delivers no images."""
 
     drone: Annotated[int, Field(ge=1)]
     """Whose: the number of its entry in `vehicles`, from 1."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -20,29 +19,11 @@ from flockd.sim.cameras.real_camera import NOISE_TILE, NoiseTile, Shot, real_cam
 from flockd.sim.cameras.shutter import CameraMotion
 from flockd.sim.renderer.drone_models import FAMILIES, drone_model
 from flockd.sim.renderer.renderer import Renderer, View
-from flockd.sim.scenario import CameraFaultConfig, ScenarioConfig
+from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.pose_trail import FlockPose, PoseTrail
 from flockd.sim.vehicles.vehicles import REFERENCE_DEG, UNDISTURBED, Disturbances, Vehicles
 from flockd.sim.world.obstacle_worlds import obstacles_of
 from flockd.sim.world.world import World
-
-
-class CameraFaults:
-    """The faults of one scenario. The same seed gives the same images."""
-
-    def __init__(self, faults: Sequence[CameraFaultConfig], seed: int) -> None:
-        self._faults = faults
-        self._rng = np.random.default_rng([seed, 3])
-        self._began_s: float | None = None
-
-    def applied(self, drone: int, camera: str, time_s: float, image: UInt8Array) -> UInt8Array:
-        """The RGB image (h, w, 3) as the camera of the drone, counted from 0, sends it at a time."""
-        self._began_s = time_s if self._began_s is None else self._began_s
-        passed_s = time_s - self._began_s
-        for fault in self._faults:
-            if (fault.drone, fault.camera) == (drone + 1, camera) and fault.begin_s <= passed_s < fault.end_s:
-                image = self._rng.integers(0, 256, image.shape, dtype=np.uint8)
-        return image
 
 
 def true_rigs(scenario: ScenarioConfig) -> list[Rig]:
@@ -111,8 +92,7 @@ class CameraSimulator:
         """For another flight from the beginning in the same world."""
         scenario, self._real = self._scenario, None
         self._noise = ImageNoise(self._image_noise, scenario.seed)
-        self._faults = CameraFaults(scenario.faults, scenario.seed)
-        self._captured = PoseTrail()
+        self._captured, self._began_s = PoseTrail(), math.nan
         if scenario.camera_faults is not None:
             lenses = {name: mounted.camera for name, mounted in self.rig.cameras.items()}
             self._real = real_cameras(scenario.camera_faults, lenses, self._count, scenario.seed)
@@ -134,7 +114,8 @@ class CameraSimulator:
             trail = self._captured
             trail.add(FlockPose(time_s, vehicles.position, vehicles.R_ned_body))
         others = [i for i in range(self._count) if i != drone and i not in disturbed.removed]
-        off = disturbed.cameras_off_of(drone)
+        self._began_s = time_s if math.isnan(self._began_s) else self._began_s
+        off = disturbed.cameras_off_of(drone) | self._scenario.lost_cameras(drone, time_s - self._began_s)
         cameras = self._rigs[drone].cameras
         flock: dict[str, FlockPose | Vehicles] = dict.fromkeys(self.rig.cameras, vehicles)
         shots = {name: Shot(time_s, time_s, comes=True) for name in cameras}
@@ -161,14 +142,13 @@ class CameraSimulator:
             sun = self._world.light[0] @ turns[name]
             return self._real[drone, name].image(seen, motion, sun)
 
-        # Side by side; noise and faults are drawn in the cameras' order, so that the images do not depend on that.
+        # Side by side; noise is drawn in the cameras' order, so that the images do not depend on that.
         drawn = map(sensed_by, cameras) if self._executor is None else self._executor.map(sensed_by, cameras)
         frames = {}
         for name, sensed in zip(cameras, drawn, strict=True):
             image = self._noise.add(sensed)
             if self._real is not None:
                 image = self._real[drone, name].compressed(image)
-            image = self._faults.applied(drone, name, time_s, image)
             if shots[name].comes and name not in off:
                 frames[name] = Frame(name, image, shots[name].stamp_s, step)
         return FrameSet(time_s, frames)

@@ -1,45 +1,13 @@
-"""What a scenario orders to go wrong with a camera does, then, and there."""
+"""Noise of any image, and rigs that are not as configured."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from flockd.core.config.perception import NoiseParameters
-from flockd.core.messages import UInt8Array
 from flockd.flight.geometry import build_rig, rotation_angle_deg
-from flockd.flight.perception.image_noise import noise_shares
-from flockd.sim.cameras.camera_simulator import CameraFaults, ImageNoise, true_rigs
-from flockd.sim.scenario import CameraFaultConfig
+from flockd.sim.cameras.camera_simulator import ImageNoise, true_rigs
 from tests import make
-
-GREY = np.full((128, 160, 3), 120, np.uint8)
-
-
-def fault(**changes: object) -> CameraFaultConfig:
-    values = {"drone": 2, "camera": "left", "begin_s": 1.0, "end_s": 2.0, **changes}
-    return CameraFaultConfig.model_validate(values)
-
-
-def shown(faults: CameraFaults, time_s: float, drone: int = 1, camera: str = "left") -> UInt8Array:
-    return faults.applied(drone, camera, time_s, GREY)
-
-
-def test_a_fault_is_of_one_camera_of_one_drone_from_its_begin_to_its_end() -> None:
-    """Times count from the first image, which came at 500 s."""
-    faults = CameraFaults([fault()], seed=3)
-    changed = [not np.array_equal(shown(faults, 500.0 + passed_s), GREY) for passed_s in (0.0, 0.9, 1.0, 1.9, 2.0)]
-    assert changed == [False, False, True, True, False]
-    assert np.array_equal(shown(faults, 501.5, drone=0), GREY)
-    assert np.array_equal(shown(faults, 501.5, camera="right"), GREY)
-
-
-def test_the_same_seed_is_the_same_noise_and_enough_to_be_told() -> None:
-    one, same, other = (CameraFaults([fault(begin_s=0.0)], seed=seed) for seed in (3, 3, 4))
-    image = shown(one, 10.0)
-    assert np.array_equal(image, shown(same, 10.0))
-    assert not np.array_equal(image, shown(other, 10.0))
-    assert noise_shares(image, NoiseParameters()).white > 0.08
 
 
 @pytest.mark.parametrize("size", [(240, 320), (1280, 960), (1500, 1100)])

@@ -19,7 +19,7 @@ from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.cameras.imperfect_cameras import CamerasConfig
 from flockd.sim.cameras.lens_views import lens_view
 from flockd.sim.renderer.renderer import Renderer
-from flockd.sim.scenario import ScenarioConfig, load_scenario
+from flockd.sim.scenario import CameraFaultConfig, ScenarioConfig, load_scenario
 from flockd.sim.vehicles.vehicles import Vehicles
 
 CONFIG = data_path("config")
@@ -111,6 +111,12 @@ def test_a_late_image_is_that_of_before_under_its_own_stamp() -> None:
 def test_images_that_never_come_are_missing() -> None:
     scenario = scenario_with(CamerasConfig.model_validate({"timing": {"dropped": 1.0}}))
     assert flown_frames(scenario, steps=1) == [{}]
+
+
+def test_a_camera_that_fails_delivers_nothing_from_its_begin_to_its_end() -> None:
+    fault = CameraFaultConfig(drone=1, camera="front", begin_s=0.5, end_s=1.0)
+    scenario = scenario_with(None).model_copy(update={"faults": (fault,)})
+    assert ["front" in frames for frames in flown_frames(scenario)] == [True, False, True]
 
 
 def test_a_preset_fills_what_is_not_written() -> None:
