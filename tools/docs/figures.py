@@ -117,17 +117,6 @@ def _px4(parts: Mapping[str, Part]) -> str:
     return _table(head, rows) + "\n" + _origin(parts["px4"])
 
 
-def _geometry(parts: Mapping[str, Part]) -> str:
-    off = "degrees", "cm"
-    rows = [
-        (one["case"], one["method"], f"{one['ms']:.2f}", *(f"{one[kind][0]:.3f} ({one[kind][1]:.3f})" for kind in off),
-         str(one["failures"]))
-        for one in parts["geometry"]["found"]
-    ]  # fmt: skip
-    head = ("pairs", "method", "ms", "degrees off, median (99 %)", "cm off", "failures")
-    return _table(head, rows) + "\n" + _origin(parts["geometry"])
-
-
 def _step(parts: Mapping[str, Part]) -> str:
     stages = parts["step"]["found"]["profile"]["stages"]
     rows = [(name, f"{one['p50_ms']:.1f}", f"{one['p95_ms']:.1f}") for name, one in stages.items()]
@@ -141,7 +130,6 @@ TABLES: dict[str, Callable[[Mapping[str, Part]], str]] = {
     "encounters": _encounters,
     "pictures": _pictures,
     "px4": _px4,
-    "geometry": _geometry,
     "step": _step,
 }
 

@@ -9,7 +9,7 @@ Beside each flight by sight stand, on the same seed, a blind one, whose drones d
 true states of all: what the blind flock matches is no achievement. A run that was stopped goes on: RESULTS/COMMIT-*
 has a line for each flight, and the logs of those by sight. `errors`: what drones perceive wrongly in these flights,
 for config/perceived. `encounters`: two drones that meet on made-up detections with such errors. `pictures`: real ones,
-with --labelled and --without-drones. `px4`: where FLOCKD_PX4 names a build. `geometry`, `step`: on this computer.
+with --labelled and --without-drones. `px4`: where FLOCKD_PX4 names a build. `step`: on this computer.
 """
 
 from __future__ import annotations
@@ -375,15 +375,13 @@ def _part(part: str, commit: str, arguments: argparse.Namespace) -> dict[str, An
         found = _pictures(arguments.labelled, arguments.without_drones)
     elif part == "px4":
         found = json.loads(_output("-m", "tools.checks.px4_rows", "--json"))["flights"]
-    elif part == "geometry":
-        found = json.loads(_output("-m", "tools.measure.bench_geometry", "--draws", "30" if quick else "300"))
     elif part == "step":
         recording = "tests/review/replay/crossing.mcap"
         found = json.loads(_flockd("replay", recording, "--profile", "--json"))
     return {**_measured_by(commit, f"python -m tools.measure.card{' --quick' * quick} --parts {part}"), "found": found}
 
 
-PARTS = ("flights", "errors", "encounters", "pictures", "px4", "geometry", "step")
+PARTS = ("flights", "errors", "encounters", "pictures", "px4", "step")
 
 
 def main() -> None:
