@@ -23,7 +23,6 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.drone import RecordingConfig
 from flockd.flight.geometry import build_rig
 from flockd.onboard.recording import Recorder
-from flockd.onboard.recording.mcap_file import Entry, read_records
 from flockd.onboard.recording.reader import Recording
 from tests.onboard.recording.made_up import MODELS, MadeUpPilot, drone_config, inputs, record
 
@@ -131,14 +130,12 @@ def test_what_is_no_readable_file_in_the_folder_is_skipped_with_a_warning(tmp_pa
     (tmp_path / "dangling.mcap").symlink_to(tmp_path / "nowhere")
     os.mkfifo(tmp_path / "pipe.mcap")
     (tmp_path / "damaged.mcap").write_bytes(b"\x89MCAP0\r\n" + b"\xff" * 100)
-    odd = sorted(path.name for path in tmp_path.iterdir())
-    record(tmp_path / "drone1.mcap", steps=5)
-    assert len(list(Recording(tmp_path / "drone1.mcap").steps())) == 5
-    told = [
-        entry.data.decode(errors="replace")
-        for entry in read_records(tmp_path / "drone1.mcap")
-        if isinstance(entry, Entry) and entry.stream.topic == "/events"
-    ]
+    odd, told = sorted(path.name for path in tmp_path.iterdir()), list[str]()
+    config = drone_config()
+    with Recorder(tmp_path / "drone1.mcap", drone="drone1", config=config, on_event=told.append) as recorder:
+        frames, vehicle = next(inputs(1))
+        recorder.step(frames, vehicle, MadeUpPilot(config).step(frames, vehicle))
+    assert len(list(Recording(tmp_path / "drone1.mcap").steps())) == 1
     for name in odd:
         assert sum(name in text and "skipped" in text for text in told) == 1, name
 
