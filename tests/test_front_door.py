@@ -45,11 +45,3 @@ def test_type_checkers_see_the_same_names_from_the_same_modules() -> None:
     imports = [node for node in block.body if isinstance(node, ast.ImportFrom)]
     assert {node.module: tuple(one.name for one in node.names) for node in imports} == flockd._HOMES
     assert sorted(name for names in flockd._HOMES.values() for name in names) == sorted(flockd.__all__)
-
-
-def test_an_unknown_name_is_an_attribute_error_as_of_any_module() -> None:
-    with pytest.raises(AttributeError, match="module 'flockd' has no attribute 'FlockPilots'") as raised:
-        flockd.FlockPilots  # noqa: B018 - raises
-    assert raised.value.name == "FlockPilots"
-    with pytest.raises(ImportError, match="cannot import name 'FlockPilots'"):
-        exec("from flockd import FlockPilots")

@@ -157,18 +157,6 @@ def test_an_open_page_goes_on_when_the_server_is_started_again(flock: Flock, tmp
             expect(trouble).to_be_hidden()
 
 
-def test_pictures_of_cameras_come_on_request(flock: Flock) -> None:
-    of = card(flock.page, "drone1")
-    flock.page.locator(f"{of} .look").click()
-    for place in range(2):
-        expect(flock.page.locator(f"{of} img").nth(place)).to_have_js_property("naturalWidth", 320)
-    flock.page.route("**/image/**", lambda route: route.fulfill(status=204))
-    expect(flock.page.locator(f"{of} figcaption").first).to_contain_text("s old: no newer one has come")
-    flock.page.unroute("**/image/**")
-    flock.page.locator(f"{of} .look").click()
-    expect(flock.page.locator(f"{of} .pictures")).to_be_hidden()
-
-
 def test_on_a_phone_nothing_is_wider_than_the_screen(flock: Flock) -> None:
     flock.page.set_viewport_size(NARROW)
     assert flock.page.evaluate("document.documentElement.scrollWidth") <= NARROW["width"]

@@ -15,7 +15,6 @@ from onnx import helper
 from flockd.core.data import data_path
 from flockd.core.errors import ModelError
 from flockd.flight.inference import OnnxModel, read_manifest
-from flockd.flight.inference.fitting import fit
 from flockd.flight.perception.requirements import check_roles
 from tests.flight.inference.foreign import (
     SIZE,
@@ -160,20 +159,3 @@ def test_an_output_is_read_by_the_names_of_its_columns(tmp_path: Path) -> None:
         np.testing.assert_allclose(named[columns[1]], [0.8, 0.2], rtol=1e-5)
     with pytest.raises(ValueError, match="columns darkness, brightness"):
         model.manifest.outputs["numbers"].by_column(np.zeros((2, 3), np.float32))
-
-
-@pytest.mark.parametrize(
-    ("image", "enters"),
-    [
-        ((640, 480), (80, 60)),
-        ((1280, 960), (160, 120)),
-        ((320, 240), (80, 60)),
-        ((480, 640), (60, 80)),
-        ((64, 48), (64, 48)),
-    ],
-)
-def test_a_small_image_enters_no_smaller_than_the_manifest_says(
-    image: tuple[int, int], enters: tuple[int, int]
-) -> None:
-    """The shipped flow sees images of an eighth of the size, and of 60 pixels at least along the shorter side."""
-    assert fit(read_manifest(MODELS / "flow.yaml").manifest, image).inner == enters

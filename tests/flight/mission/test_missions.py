@@ -209,19 +209,6 @@ def test_a_velocity_that_leads_out_of_the_fence_is_refused_and_one_back_is_not(c
 
 
 @pytest.mark.parametrize(
-    "message",
-    [{"north_m": 2e5, "east_m": 0.0}, {"latitude_deg": 89.0, "longitude_deg": 8.0}],
-    ids=["metres", "degrees"],
-)
-def test_a_goal_that_no_mission_can_have_is_refused_without_a_fence_too(
-    config: DroneConfig, message: dict[str, float]
-) -> None:
-    unfenced = changed(config, safety__gate__fence_radius_m=None)
-    here = vehicle(home_deg=[47.4, 8.5])
-    assert "farther" in str(order_fault(unfenced, parse_order("goto", message), here))
-
-
-@pytest.mark.parametrize(
     ("written", "told"),
     [
         ("{kind: spiral}", "mission.kind: "),

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tools.release import deb, wheels
-from tools.release.wheels import ROOT, names_of_lock
+from tools.release.wheels import names_of_lock
 
 VALUES = {"VERSION": "1+debian12", "ARCH": "arm64", "SYSTEM": "Debian 12", "RELEASE": "debian 12", "PYTHON": "3.11"}
 ABSOLUTE = re.compile(r"(?<![\w/.-])/(?=(?:usr/lib|usr/bin|etc|run|var)/)")
@@ -97,11 +97,6 @@ def test_a_wheel_with_files_elsewhere_is_refused(tmp_path: Path) -> None:
         wheels.unpack(path, tmp_path / "there")
 
 
-def test_what_is_copied_to_build_from_is_there(tmp_path: Path) -> None:
-    assert [name for name in wheels.SOURCES if not (ROOT / name).exists()] == []
-    assert "NOTICE" in wheels.SOURCES, "pyproject.toml names it among the licences"
-
-
 class Computer:
     """Folders in the place of a computer's, and commands that only write down how they were called."""
 
@@ -156,11 +151,6 @@ def test_a_first_installation_starts_nothing_and_says_what_is_next(computer: Com
     assert re.findall(r"systemctl.*\b(?:start|enable)\b", computer.calls) == []
     assert "systemd-sysusers flockd.conf" in computer.calls
     assert "python -I -m compileall" in computer.calls
-
-
-def test_a_unit_made_by_hand_is_named(computer: Computer) -> None:
-    (computer.root / "etc/systemd/system/flockd.service").touch()
-    assert "etc/systemd/system/flockd.service, made by hand, is used" in computer.runs("postinst", "configure").stdout
 
 
 @pytest.mark.parametrize(

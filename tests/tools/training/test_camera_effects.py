@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from tools.training.camera_effects import (
     CameraEffects,
-    smear_kernel,
     through_camera,
 )
 
@@ -47,18 +46,6 @@ def test_blur_counts_in_pixels_of_the_camera_and_not_of_the_enlarged_crop(scale:
     found = rise_px(through_camera(edge(384, 384), effects, np.random.default_rng(0)))
     assert found == pytest.approx(expected, rel=0.25)
     assert found > 0.95 * expected
-
-
-def test_a_point_that_moves_is_smeared_along_its_way_and_loses_no_light() -> None:
-    kernel = smear_kernel(6.0, 0.0)
-    middle = kernel.shape[0] // 2
-    assert kernel.sum() == pytest.approx(1.0)
-    assert kernel[middle].sum() == pytest.approx(1.0)
-    # The variance of a uniform line of length 6 is 36 / 12, and interpolation between pixels adds at most 1 / 4.
-    at = np.arange(kernel.shape[1]) - middle
-    assert 3.0 <= float((kernel[middle] * at**2).sum()) <= 3.3
-    upright = smear_kernel(6.0, np.pi / 2)
-    assert np.allclose(upright, kernel.T, atol=1e-5)
 
 
 def test_noise_has_the_strength_that_was_asked_for_and_denoising_lessens_it() -> None:

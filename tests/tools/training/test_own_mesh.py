@@ -12,9 +12,7 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial
 
 from flockd.sim.renderer.airframe import DroneModel
-from tools.training.own_mesh import painted, read_meshes
-
-RED = [255, 0, 0, 255]
+from tools.training.own_mesh import read_meshes
 
 
 def cross_of_boxes() -> Any:
@@ -57,19 +55,6 @@ def test_a_mesh_stands_upright_about_its_middle_and_is_not_mirrored(tmp_path: Pa
     half = len(drone.triangles) // 2
     again = trimesh.Trimesh(drone.vertices, drone.triangles[:half], process=False)
     assert again.volume == pytest.approx(mesh.volume, rel=1e-3), "its faces still look outwards"
-
-
-def test_colours_of_a_file_are_kept_and_a_drone_without_gets_one(tmp_path: Path) -> None:
-    mesh = cross_of_boxes()
-    mesh.visual.face_colors = RED
-    red = painted(read(written(tmp_path, "red.glb", mesh), 0.6), 1)
-    assert (red.colours[:, 0] > 0.5).all()
-    assert (red.colours[:, 1:] < 0.05).all()
-    plain = read(written(tmp_path, "plain.glb", cross_of_boxes()), 0.6)
-    paints = [painted(plain, seed).colours for seed in range(8)]
-    assert all(np.isfinite(paint).all() and paint.min() > 0 and paint.max() <= 0.9 for paint in paints)
-    assert all(len(np.unique(paint, axis=0)) == 1 for paint in paints)
-    assert len({paint.tobytes() for paint in paints}) == len(paints)
 
 
 BROWN = (128, 64, 32)
