@@ -31,6 +31,7 @@ def add(commands: Commands) -> None:
         "flockd cameras",
         "flockd cameras --picture pictures",
         "flockd cameras --size 1280x720 --names front back --write cameras.yaml",
+        "flockd cameras --turn-deg 90 --write cameras.yaml",
     )
     description = "List the cameras of this computer, measure what they give, and write the configuration of them."
     parser = commands("cameras", description, examples, _run)
@@ -38,6 +39,8 @@ def add(commands: Commands) -> None:
     option(parser, "--seconds S", f"measure this long ({SECONDS:g})", positive_number, default=SECONDS)
     option(parser, "--size WxH", "of an image, the nearest to this", size, default=(640, 480))
     option(parser, "--write FILE", "write the sections `rig` and `source` for them", Path)
+    told = "clockwise, what makes up up in their images: 90 for cameras on their sides, tops to the right"
+    option(parser, "--turn-deg", told, int, choices=(0, 90, 180, 270), default=0)
     option(parser, "--names NAME", "of the cameras in the rig, in the listed order", nargs="+")
     flag(parser, "--force", "overwrite the file if it exists")
     flag(parser, "--json", "print JSON")
@@ -66,12 +69,12 @@ def _run(args: argparse.Namespace) -> int:
         facts = [{**fact, **_offers(camera, mode)} for fact, camera, mode in zip(facts, found, modes, strict=True)]
     say_facts(args, facts)
     if args.write is not None:
-        _write(args.write, usable, args.names)
+        _write(args.write, usable, args.names, args.turn_deg)
     faulty = any(camera.fault for camera in found) or any(row.fault for row in measured.values())
     return ExitCode.CHECK_FAILED if faulty else ExitCode.DONE
 
 
-def _write(file: Path, usable: Sequence[tuple[FoundCamera, Mode]], names: Sequence[str] | None) -> None:
+def _write(file: Path, usable: Sequence[tuple[FoundCamera, Mode]], names: Sequence[str] | None, turn_deg: int) -> None:
     from flockd.ground.cameras.listing import camera_names, sections_text
 
     if not usable:
@@ -79,7 +82,7 @@ def _write(file: Path, usable: Sequence[tuple[FoundCamera, Mode]], names: Sequen
     names = names or camera_names(len(usable))
     if len(set(names)) != len(usable) or len(names) != len(usable):
         raise UsageError(f"--names gives {len(set(names))} names for {len(usable)} cameras; give each its own")
-    write_checked(file, sections_text(dict(zip(names, usable, strict=True))))
+    write_checked(file, sections_text(dict(zip(names, usable, strict=True)), turn_deg))
 
 
 def _save_pictures(folder: Path, found: Sequence[FoundCamera], measured: Mapping[str, Watched]) -> dict[str, Path]:

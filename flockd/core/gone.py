@@ -29,7 +29,6 @@ _OPTIONS = (
     ("campaign", "engine address", "each computer flies a part of the values, of a file of its own"),
     ("report", "video drone", "open the recording in Foxglove, which plays its images"),
     ("report", "ulog", "open PX4's log in Flight Review or PlotJuggler"),
-    ("cameras", "turn-deg", "write `turn_deg` to the cameras of the file, and exchange the numbers of their `size_px`"),
     ("cameras", "measure", "`flockd cameras --picture FOLDER` measures"),
     (
         "calibrate rig",

@@ -18,6 +18,7 @@ import yaml
 from flockd.core.choices import PixelFormat
 from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig
 from flockd.core.config.source import CameraDeviceParameters
+from flockd.core.errors import UsageError
 from flockd.ground.calibration.fragment import rig_text
 from flockd.onboard.sources.v4l2_device import CAN_CAPTURE, CAPTURE, FOURCC, camera_flags, controls_of
 from flockd.onboard.sources.v4l2_kernel import (
@@ -274,9 +275,14 @@ _BY_HAND = {"auto_exposure": 1, "exposure_auto": 1, "exposure_time_absolute": 50
 """What cameras of the USB video class take for an exposure of 5 ms that is set by hand."""
 
 
-def sections_text(cameras: Mapping[str, tuple[FoundCamera, Mode]]) -> str:
-    """A commented file that `flockd config check` passes; cameras by their names in the rig."""
+def sections_text(cameras: Mapping[str, tuple[FoundCamera, Mode]], turn_deg: int = 0) -> str:
+    """A commented file that `flockd config check` passes; cameras by their names in the rig.
+
+    ``turn_deg``: as of `CameraDeviceParameters`. Raises UsageError where it is not 0 and one needs a pipeline.
+    """
     as_pipelines = any(camera.element for camera, _ in cameras.values())
+    if as_pipelines and turn_deg:
+        raise UsageError("--turn-deg is for USB cameras, and one of these needs a pipeline; add `videoflip` there")
     comment = [
         "Written by `flockd cameras`: the cameras of this computer, as sections of a drone's configuration.",
         "Fill in which camera looks where: exchange the names. `flockd cameras --picture FOLDER` shows what each sees.",
@@ -285,6 +291,7 @@ def sections_text(cameras: Mapping[str, tuple[FoundCamera, Mode]]) -> str:
     entries = []
     for name, (camera, mode) in cameras.items():
         entry = camera.parameters(name, mode, as_pipeline=as_pipelines).model_dump(mode="json", exclude_defaults=True)
+        entry |= {"turn_deg": turn_deg} if turn_deg else {}
         limits = {one.name: (one.low, one.high) for one in camera.controls}
         by_hand = {
             one: min(max(value, limits[one][0]), limits[one][1]) for one, value in _BY_HAND.items() if one in limits
@@ -301,7 +308,8 @@ def sections_text(cameras: Mapping[str, tuple[FoundCamera, Mode]]) -> str:
         "set_tolerance_s": round(max(0.02, 0.6 / slowest_hz), 3),
         "silence_s": round(max(0.5, 3.0 / slowest_hz), 3),
     }
-    rig = [_evenly(number, len(cameras), name, mode.size) for number, (name, (_, mode)) in enumerate(cameras.items())]
+    sizes = {name: mode.size if turn_deg % 180 == 0 else mode.size[::-1] for name, (_, mode) in cameras.items()}
+    rig = [_evenly(number, len(sizes), name, size) for number, (name, size) in enumerate(sizes.items())]
     return rig_text(rig, comment) + yaml.safe_dump(
         {"source": source}, default_flow_style=None, sort_keys=False, width=math.inf, allow_unicode=True
     )

@@ -138,18 +138,21 @@ def test_what_is_written_checks_and_names_the_devices(computer: Shelf, capsys: C
     assert "gain 0 to 255" in file.read_text(encoding="utf-8")
     assert main(["cameras", "--write", str(file)]) == 2, "it exists"
     assert main(["cameras", "--write", str(file), "--force", "--names", "left", "left"]) == 2
-    assert main(["cameras", "--write", str(file), "--force", "--names", "left", "right"]) == 0
+    assert main(["cameras", "--write", str(file), "--force", "--names", "left", "right", "--turn-deg", "90"]) == 0
     config = load_drone(file)
     assert config.source is not None
     assert [camera.name for camera in config.rig.cameras] == ["left", "right"]
+    assert (config.rig.cameras[0].size_px, config.source.cameras[0].turn_deg) == ((480, 640), 90), "upright"
     # 320 px at 65 degrees of an equidistant lens: r = f theta.
-    assert config.rig.cameras[0].intrinsics.fx == pytest.approx(320 / 1.1344640, abs=0.05)
+    assert config.rig.cameras[0].intrinsics.fy == pytest.approx(320 / 1.1344640, abs=0.05)
 
 
 def test_a_raspberry_pis_camera_becomes_a_pipeline(computer: Shelf, tmp_path: Path, capsys: Capture) -> None:
     """Its sensor is a V4L2 device too, which gives raw values only; the USB camera beside it goes through GStreamer."""
     computer(FakeKernel(video0=SENSOR, video1=USB), gst_device_monitor=MONITOR)
     file = tmp_path / "cameras.yaml"
+    assert main(["cameras", "--write", str(file), "--turn-deg", "90"]) == 2
+    assert "add `videoflip`" in capsys.readouterr().err
     assert main(["cameras", "--write", str(file)]) == 0
     config = load_drone(file)
     assert config.source is not None
