@@ -50,9 +50,6 @@ class CameraMotion:
     """(R, t) for the focal length that was assumed."""
     information: FloatArray
     """(6, 6) inverse covariance of a rotation vector that R is multiplied by from the right, and of t in metres."""
-    sigma_px: float
-    """Standard deviation of a match off the motion."""
-    matches: int
     sights: Sights
     projection: FloatArray
     """(6, 2 n) from the residuals to the motion that they ask for."""
@@ -260,8 +257,6 @@ def _solved(sights: Sights, start: RigidTransform, together: float) -> CameraMot
     return CameraMotion(
         motion=motion,
         information=turned @ information @ turned.T,
-        sigma_px=sigma * _FLOW_PX,
-        matches=white.shape[1],
         sights=sights,
         projection=-turned @ np.linalg.inv(information) @ asked,
     )

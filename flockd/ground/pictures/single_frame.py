@@ -40,8 +40,6 @@ class DetectedDrone:
 
     box: Box
     """The detector's; where it has none, around the mask and the first stage's instances of it."""
-    centre_px: tuple[float, float]
-    """Right and down, of the detection's bearing."""
     probability: float
     range_m: float
     range_sigma_m: float
@@ -124,7 +122,6 @@ class PictureDetector:
         self, one: Detection, camera: Camera, mask: UInt8Array, candidates: Sequence[Candidate], scale: FloatArray
     ) -> DetectedDrone:
         """With pixels of the picture before it was resized by ``scale`` (2,)."""
-        centre = camera.project(one.position[None] @ _R_BODY_CAMERA)[0]
         size_px = one.size_m / one.range_m * camera.focal_px
         mine = [c for c in candidates if angle_between(c.bearing, one.bearing) < one.size_m / one.range_m / 2]
         instances = [c.proposal.instance for c in mine if c.proposal.instance is not None]
@@ -136,15 +133,14 @@ class PictureDetector:
             left, top, wide, high = cv2.boundingRect((mask == one.label).astype(np.uint8))
             boxes += [np.array([left, top, left + wide, top + high], np.float64)] if wide else []
         if not boxes:  # no mask, or a nearer drone's covers it
+            centre = camera.project(one.position[None] @ _R_BODY_CAMERA)[0]
             boxes.append(np.clip([*(centre - size_px / 2), *(centre + size_px / 2)], 0, np.tile(camera.size, 2)))
         box = np.concatenate([np.min(boxes, axis=0)[:2], np.max(boxes, axis=0)[2:]])
         x0, y0, x1, y1 = (float(value) for value in box / np.tile(scale, 2))
-        u, v = (float(value) for value in centre / scale)
         sigma = one.range_sigma_m
         known = self._config.drone_size_m is not None
         return DetectedDrone(
             box=(x0, y0, x1, y1),
-            centre_px=(u, v),
             probability=one.drone_probability,
             range_m=one.range_m,
             range_sigma_m=sigma,
