@@ -21,8 +21,8 @@ from flockd.flight.geometry.rotations import (
     rotation_from_vector,
     vector_from_rotation,
 )
+from flockd.flight.geometry.sightlines import inverse_ranges_of_rays
 from flockd.flight.geometry.transform import RigidTransform
-from flockd.flight.geometry.triangulation import inverse_ranges_of_rays
 from flockd.flight.geometry.virtual_camera import VirtualCrop, virtual_crop
 
 __all__ = [

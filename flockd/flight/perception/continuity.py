@@ -16,7 +16,7 @@ import numpy as np
 
 from flockd.core.config.perception import NoiseParameters
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, UInt8Array
-from flockd.flight.perception.flow.images import grey, shrunk
+from flockd.flight.perception.flow.lucas_kanade import grey
 
 _LONGER_SIDE_PX = 96
 """Longer side of the small images that are compared: noise of single pixels averages out, and DIS takes a
@@ -147,4 +147,12 @@ def _small_grey(image: UInt8Array) -> UInt8Array:
     height, width = image.shape[:2]
     scale = _LONGER_SIDE_PX / max(height, width)
     size = (max(round(scale * width), 1), max(round(scale * height), 1))
-    return shrunk(grey(image), size)
+    return _shrunk(grey(image), size)
+
+
+def _shrunk(image: UInt8Array, size: tuple[int, int]) -> UInt8Array:
+    """A grey image (h, w) at (width, height), by means over areas; by halves first, in a fifth of the time."""
+    while min(image.shape[1] / size[0], image.shape[0] / size[1]) >= 2.0:
+        half = image.shape[1] // 2, image.shape[0] // 2
+        image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from flockd.core.messages import Float32Array, UInt8Array
-from flockd.flight.perception.flow.images import grey
+from flockd.flight.perception.flow.lucas_kanade import grey
 from flockd.flight.perception.interface import Flow
 
 

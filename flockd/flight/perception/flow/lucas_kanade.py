@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.core.messages import UNCLASSED, BoolArray, Float32Array, UInt8Array
-from flockd.flight.perception.flow.images import grey
 
 _GRID_PX = 16
 """Between the points: with 8 the flow is as exact between them too, for three times the time."""
@@ -148,3 +147,8 @@ def _spread(values: Float32Array, weight: Float32Array) -> Float32Array:
         wider = cv2.pyrUp(around, dstsize=(weights.shape[1], weights.shape[0]))
         around = (sums + share * wider) / (weights + share)[..., None]
     return np.asarray(around, np.float32)
+
+
+def grey(image: UInt8Array) -> UInt8Array:
+    """(h, w) grey levels of (h, w, 3) RGB."""
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
