@@ -21,7 +21,7 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 2_970,
-    "flockd/flight": 11_880,
+    "flockd/flight": 11_910,
     "flockd/onboard": 9_000,
     "flockd/fleet": 2_670,
     "flockd/ground": 4_030,
@@ -38,11 +38,11 @@ LINES = {
 }
 """Lines of Python below a folder."""
 FILES = {"flockd": 336}
-NUMBERS_OF_FLIGHT = 315
+NUMBERS_OF_FLIGHT = 320
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
 """A budget that is farther above what there is is to be lowered."""
-STEPS = {"crossing": (23_400, 20), "normal": (14_700, 15)}
+STEPS = {"crossing": (24_000, 20), "normal": (15_000, 15)}
 """Python calls and network runs of a step in a recorded flight of tests/review/replay."""
 
 

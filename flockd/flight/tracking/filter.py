@@ -20,6 +20,8 @@ from flockd.flight.tracking.measurement import Measurement
 
 SIZE = 8
 """Of a state."""
+_LINEARISATIONS = 3
+"""Linearisations of the iterated update (B. Bell, F. Cathey, IEEE Transactions on Automatic Control 38(2), 1993)."""
 MIN_RANGE_M = 0.01
 """A predicted position nearer than this, inside the drone itself, has no bearing."""
 
@@ -166,10 +168,10 @@ def innovation(state: State, measurement: Measurement, parameters: TrackingParam
 
 
 def update(state: State, measurement: Measurement, parameters: TrackingParameters) -> State:
-    """The state after a measurement: an extended Kalman update in log-polar coordinates.
+    """The state after a measurement: an iterated extended Kalman update in log-polar coordinates.
 
-    It is linearised at the measurement and not at the prediction: where the prediction is vague, e.g. of a new track,
-    one at the prediction would overshoot.
+    The first linearisation is at the measurement and not at the prediction: where the prediction is vague, e.g. of a
+    new track, one at the prediction would overshoot.
     """
     predicted = innovation(state, measurement, parameters)
     excess = _excess(predicted.squared_distance, parameters)
@@ -177,8 +179,10 @@ def update(state: State, measurement: Measurement, parameters: TrackingParameter
     mean = state.mean.copy()
     mean[:3] = measurement.position * math.exp(-_lasting_sigma(measurement, parameters) * mean[7])
     mean[6] = math.log(measurement.size_m)
-    residual, derivative = _linearised(mean, measurement, parameters)
-    return State(*_kalman(state, derivative, residual - derivative @ (state.mean - mean), covariance))
+    for _ in range(_LINEARISATIONS):
+        residual, derivative = _linearised(mean, measurement, parameters)
+        mean, posterior = _kalman(state, derivative, residual - derivative @ (state.mean - mean), covariance)
+    return State(mean, posterior)
 
 
 def _noise(measurement: Measurement, parameters: TrackingParameters) -> FloatArray:

@@ -37,6 +37,13 @@ _PYRAMID_LEVELS = 3
 """Halvings of the grid over which flow spreads."""
 _SURROUNDINGS_WEIGHT = 0.1
 """What is around weighs as a point of this weight."""
+_HOMOGRAPHY_STRIDE = 2
+"""Every second point each way is enough for it."""
+_HOMOGRAPHY_MIN_WEIGHT = 0.5
+_HOMOGRAPHY_MIN_POINTS = 30
+_HOMOGRAPHY_TOLERANCE_PX = 4.0
+_HOMOGRAPHY_MAX_ERROR = 0.25
+"""A homography is no use that is off by more than this share of the image's width at the median."""
 
 
 def grid_flow(flow: Float32Array, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
@@ -44,7 +51,8 @@ def grid_flow(flow: Float32Array, first: UInt8Array, second: UInt8Array, labels:
 
     In between goes what they add to it. A point that goes astray and is not found back from there (Kalal et al. 2010)
     takes what those around it add; one without texture,
-    as of the sky, or beside a drone, their flow (normalised convolution, Knutsson & Westin 1993, over a pyramid).
+    as of the sky, or beside a drone, what they differ from the homography that most of them follow (normalised
+    convolution, Knutsson & Westin 1993, over a pyramid).
 
     Args:
         flow: (h, w, 2) pixels from the first image to the second, to some 20 px.
@@ -63,7 +71,8 @@ def grid_flow(flow: Float32Array, first: UInt8Array, second: UInt8Array, labels:
     beside = _beside(drones, size)
     weight[beside] = 0.0
     own, sure = np.minimum(weight / _OWN_WEIGHT, 1.0)[..., None], weight + np.float32(_MIN_WEIGHT)
-    unseen = _spread(moved, sure)
+    plane = _homography_flow(points, moved, weight, width)
+    unseen = _spread(moved - plane, sure) + plane
     seen = _spread(moved - start, sure) + start
     settled = own * moved + (1.0 - own) * np.where((textured & ~beside)[..., None], seen, unseen)
     full = np.asarray(cv2.add(flow, _between(settled - start, (width, height))), np.float32)
@@ -134,6 +143,23 @@ def _between(at_points: Float32Array, size: tuple[int, int]) -> Float32Array:
     if any(beyond):
         full = cv2.copyMakeBorder(full, 0, beyond[0], 0, beyond[1], cv2.BORDER_REPLICATE)
     return np.asarray(full, np.float32)
+
+
+def _homography_flow(points: Float32Array, moved: Float32Array, weight: Float32Array, width: int) -> Float32Array:
+    """The flow at all points of the homography that most of what is sure follows; none where there is no such."""
+    none = np.zeros_like(moved)
+    some = np.s_[::_HOMOGRAPHY_STRIDE, ::_HOMOGRAPHY_STRIDE]
+    sure = weight[some] > _HOMOGRAPHY_MIN_WEIGHT
+    begin, end = points[some][sure], (points + moved)[some][sure]
+    if len(begin) < _HOMOGRAPHY_MIN_POINTS:
+        return none
+    found, _ = cv2.findHomography(begin, end, cv2.USAC_MAGSAC, _HOMOGRAPHY_TOLERANCE_PX)
+    if found is None:
+        return none
+    along = (cv2.perspectiveTransform(points, np.asarray(found, np.float64)) - points).astype(np.float32)
+    off = np.linalg.norm(along - moved, axis=2)
+    usable = np.isfinite(along).all() and np.median(off) < _HOMOGRAPHY_MAX_ERROR * width and off.max() < width
+    return along if usable else none
 
 
 def _spread(values: Float32Array, weight: Float32Array) -> Float32Array:
