@@ -10,7 +10,11 @@ from scipy import stats
 from tools.checks.breakages import StaleError
 from tools.measure import ablate
 
-ONE: ablate.Mechanism = {"name": "one", "lines": 9, "changes": [{"in": "flockd/flight", "old": "nowhere in it", "new": ""}]}
+ONE: ablate.Mechanism = {
+    "name": "one",
+    "lines": 9,
+    "changes": [{"in": "flockd/flight", "old": "nowhere in it", "new": ""}],
+}
 ORDER, BEFORE, AFTER = "order_tail", [0.9, 0.8, 0.97, 0.7], [0.7, 0.65, 0.7, 0.55]
 
 
