@@ -114,7 +114,7 @@ def _rerun(args: argparse.Namespace) -> int:
     from flockd.campaign.flight_kinds import PERCEPTIONS
     from flockd.campaign.flight_plan import Run
     from flockd.campaign.folder import RERUNS, load_plan
-    from flockd.cli.flight_summary import report_flight
+    from flockd.cli.output import report_flight
     from flockd.review.report.flight_folder import prepare_folder
     from flockd.sim.flock.swarm import fly
 

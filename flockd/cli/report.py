@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
-from flockd.cli.flight_summary import show_summary
 from flockd.cli.options import opened, refuse, require
-from flockd.cli.output import complain, progress
+from flockd.cli.output import complain, progress, show_summary
 from flockd.cli.parser import Commands, flag, option
 from flockd.core.errors import UsageError
 

@@ -18,9 +18,8 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, get_args
 
 from flockd.cli.fleet import HERE, PORT, serve_page
-from flockd.cli.flight_summary import report_flight
 from flockd.cli.options import ENDPOINT, add_operator_option, add_settings
-from flockd.cli.output import Phases, complain, say
+from flockd.cli.output import Phases, complain, report_flight, say
 from flockd.cli.parser import Commands, flag, number, option, port_number, positive_count, positive_number, whole_number
 from flockd.core.choices import AutopilotKind, SimulatedPerception
 from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, UsageError

@@ -20,7 +20,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.errors import ModelError, UnavailableError
 from flockd.fleet.watcher import FleetWatcher
 from flockd.review.flight_log.log import FlightLog
-from flockd.sim.sitl.ports import free_endpoint
+from flockd.sim.sitl.processes import free_endpoint
 from flockd.sim.vehicles.vehicles import Vehicles
 from tests.cli.conftest import Told
 

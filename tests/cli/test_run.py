@@ -23,7 +23,7 @@ from flockd.cli import main
 from flockd.core.config import DroneConfig
 from flockd.core.data import data_path
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from flockd.sim.sitl.ports import free_endpoint, free_port
+from flockd.sim.sitl.processes import free_endpoint, free_port
 from tests.calm import until
 from tests.cli.conftest import Told
 from tests.faults.stories import Reacted

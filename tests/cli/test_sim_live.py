@@ -14,7 +14,7 @@ from typing import Any
 import aiohttp
 import numpy as np
 
-from flockd.sim.sitl.ports import free_endpoint
+from flockd.sim.sitl.processes import free_endpoint
 
 ROOT = Path(__file__).parents[2]
 RUN = "from flockd.cli import program; program()"

@@ -17,8 +17,7 @@ import numpy as np
 from flockd.core.messages import UInt8Array
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.sitl.daemons import Daemons
-from flockd.sim.sitl.ports import free_endpoint, free_port
-from flockd.sim.sitl.processes import Program
+from flockd.sim.sitl.processes import Program, free_endpoint, free_port
 from tests.make import changed
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import until

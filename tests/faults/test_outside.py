@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from flockd.sim.sitl.ports import free_endpoint
+from flockd.sim.sitl.processes import free_endpoint
 from tests.calm import clock
 from tests.faults.conftest import InTheAir, never_alone
 from tests.make import changed

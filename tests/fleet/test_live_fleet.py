@@ -13,7 +13,7 @@ from flockd.fleet.live_fleet import LiveFleet
 from flockd.fleet.watcher import FleetWatcher, _heard
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
-from flockd.sim.sitl.ports import free_endpoint
+from flockd.sim.sitl.processes import free_endpoint
 from tests.calm import until
 
 PICTURE = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1].tobytes()

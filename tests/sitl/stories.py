@@ -28,7 +28,7 @@ from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.onboard.simulated_time import clock_at
 from flockd.sim.sitl.autopilots import BY_HAND, Autopilots, Px4s, SimulatedAutopilots
-from flockd.sim.sitl.ports import free_port
+from flockd.sim.sitl.processes import free_port
 from tests.onboard.autopilot.pilots_link import PilotsLink
 from tests.sitl.sitl_run import Meddler, one_drone
 

@@ -21,7 +21,7 @@ from flockd.review.flight_log.log import FlightLog
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.sitl.autopilots import px4_folder
 from flockd.sim.sitl.ground_station import FULL_STICK_M_S, GroundStation, home_deg
-from flockd.sim.sitl.ports import free_port
+from flockd.sim.sitl.processes import free_port
 from tests.calm import until
 from tests.sitl.sitl_run import PX4
 

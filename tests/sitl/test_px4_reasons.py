@@ -28,7 +28,7 @@ from flockd.sim.flock.start import with_drones
 from flockd.sim.scenario import load_scenario
 from flockd.sim.sitl.autopilots import Px4s
 from flockd.sim.sitl.daemons import Daemons
-from flockd.sim.sitl.ports import free_endpoint
+from flockd.sim.sitl.processes import free_endpoint
 from tests.make import changed
 from tests.sitl.sitl_run import PX4, SitlRun
 

@@ -38,7 +38,7 @@ from flockd.sim.flock.start import with_drones
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.sitl.autopilots import px4_folder
 from flockd.sim.sitl.fleet import fly_fleet
-from flockd.sim.sitl.ports import free_endpoint
+from flockd.sim.sitl.processes import free_endpoint
 from flockd.sim.vehicles.vehicles import REFERENCE_DEG
 
 _RUN = "from flockd.cli import program; program()"

@@ -32,7 +32,7 @@ from flockd.sim.scenario import load_scenario
 from flockd.sim.sitl.daemons import Daemons
 from flockd.sim.sitl.frame_server import FrameServer
 from flockd.sim.sitl.ground_station import Poses
-from flockd.sim.sitl.ports import free_endpoint, free_port
+from flockd.sim.sitl.processes import free_endpoint, free_port
 
 SHRINK = 4
 """Factor on the simulator's front camera, the only one: 120 x 160 pixels, so that much else fits beside it."""

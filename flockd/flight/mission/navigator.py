@@ -11,11 +11,9 @@ from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray, MissionOrder, MissionStatus
 from flockd.core.navigation import wrapped
 from flockd.flight.mission.circle_then_tangent import CircleThenTangent
-from flockd.flight.mission.follow import Follow
 from flockd.flight.mission.guidance import Guidance, Mission, Moment
-from flockd.flight.mission.hover import Hover
 from flockd.flight.mission.operator import Operator
-from flockd.flight.mission.velocity import Velocity
+from flockd.flight.mission.velocity import Follow, Hover, Velocity
 from flockd.flight.mission.waypoints import Waypoints
 
 MAX_TURN_RAD_S = 0.2

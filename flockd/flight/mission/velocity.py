@@ -1,4 +1,4 @@
-"""A mission with one velocity."""
+"""Missions of one velocity, or of none of their own."""
 
 from __future__ import annotations
 
@@ -18,3 +18,19 @@ class Velocity:
     def step(self, moment: Moment) -> Guidance:
         """See `Mission`."""
         return Guidance(self._velocity, "flies at its velocity", course_of(self._velocity))
+
+
+class Hover:
+    """Wants no velocity; the law still keeps the flock together."""
+
+    def step(self, moment: Moment) -> Guidance:
+        """See `Mission`."""
+        return Guidance(np.zeros(2), "hovers")
+
+
+class Follow:
+    """Goes where the flock goes: Eq. 42 with W_i = 0, so that cohesion and alignment alone move the drone."""
+
+    def step(self, moment: Moment) -> Guidance:
+        """See `Mission`."""
+        return Guidance(np.zeros(2), "follows the flock")

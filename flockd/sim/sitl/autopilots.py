@@ -18,8 +18,7 @@ from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, Ground
 from flockd.sim.autopilot.fake_vehicle import Flown
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.sitl.ground_station import FULL_STICK_M_S, home_deg
-from flockd.sim.sitl.ports import free_port
-from flockd.sim.sitl.processes import Program, Programs
+from flockd.sim.sitl.processes import Program, Programs, free_port
 
 PX4_FOLDER = "FLOCKD_PX4"
 """The environment variable that names PX4's SITL build folder."""

@@ -27,8 +27,7 @@ from flockd.sim.sitl.daemons import Daemons, fleet_configs
 from flockd.sim.sitl.fleet_log import FleetRun, fleet_log
 from flockd.sim.sitl.frame_server import FrameServer
 from flockd.sim.sitl.ground_station import GroundStation, Poses
-from flockd.sim.sitl.ports import free_endpoint
-from flockd.sim.sitl.processes import Program
+from flockd.sim.sitl.processes import Program, free_endpoint
 from flockd.sim.world.obstacle_worlds import with_obstacles
 
 Progress = Callable[[int, int], None]

@@ -14,7 +14,7 @@ from flockd.core.config import DroneConfig, load_drone, load_real_drone
 from flockd.core.config.real_drone import PROVEN_M_S
 from flockd.core.errors import ConfigError
 from flockd.ground.doctor.setup_checks import check_limits
-from flockd.sim.sitl.ports import free_port
+from flockd.sim.sitl.processes import free_port
 from tests.core.config.test_loader import CONFIG
 from tests.core.config.test_loader import DRONE as RIG
 

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import pytest
 from playwright.sync_api import Page, expect
 
-from flockd.sim.sitl.ports import free_endpoint, free_port
+from flockd.sim.sitl.processes import free_endpoint, free_port
 from tests.fleet.page.chromium import (
     NARROW,
     PATIENCE_MS,

@@ -15,7 +15,7 @@ from flockd.fleet.simulation import SimulationLink, SimulationMessage, key_of
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import PREFIX, AboutMessage, AnswerMessage
-from flockd.sim.sitl.ports import free_endpoint
+from flockd.sim.sitl.processes import free_endpoint
 from tests.calm import until
 from tests.fleet.page.test_access import Asked, opened
 

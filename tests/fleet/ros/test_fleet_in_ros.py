@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import pytest
 
-from flockd.sim.sitl.ports import free_endpoint
+from flockd.sim.sitl.processes import free_endpoint
 from tests.calm import until
 from tests.fleet.ros.peers import Peer, bridge, ended, own_domain, peer
 

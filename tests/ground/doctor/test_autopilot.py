@@ -26,7 +26,7 @@ from flockd.onboard.autopilot.clock_sync import ClockEstimate
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.sim.scenario import RangeFinderConfig
-from flockd.sim.sitl.ports import free_port
+from flockd.sim.sitl.processes import free_port
 from tests import make
 from tests.onboard.autopilot.conftest import HEARTBEAT_S
 

@@ -26,7 +26,7 @@ from flockd.ground.doctor import Finding, Level
 from flockd.ground.doctor.camera_checks import check_cameras, coverage, lens_problems, width_deg
 from flockd.onboard.sources import FramePublisher
 from flockd.onboard.sources.device_source import Devices
-from flockd.sim.sitl.ports import free_endpoint
+from flockd.sim.sitl.processes import free_endpoint
 from tests import make
 from tests.ground.filming import JPEGS, RATE_HZ, filming
 from tests.onboard.sources.camera_images import SIZE, jpeg, scene

@@ -12,7 +12,7 @@ from flockd.ground.doctor import Finding, Level
 from flockd.ground.doctor.setup_checks import check_fleet, check_instance
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
-from flockd.sim.sitl.ports import free_endpoint
+from flockd.sim.sitl.processes import free_endpoint
 from tests import make
 
 QUADROTOR = load_drone(data_path("config") / "quadrotor.yaml")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from flockd.sim.sitl.ports import free_port
+from flockd.sim.sitl.processes import free_port
 from tests.calm import clock
 from tests.onboard.autopilot.serial_cable import SerialCable
 

@@ -34,7 +34,7 @@ from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.sim.autopilot.fake_vehicle import Demand, MotionState
 from flockd.sim.scenario import RangeFinderConfig
 from flockd.sim.sitl.ground_station import GroundStation
-from flockd.sim.sitl.ports import free_port
+from flockd.sim.sitl.processes import free_port
 from tests.calm import clock
 from tests.onboard.autopilot.conftest import HEARTBEAT_S
 from tests.onboard.autopilot.flight import attended, flying, until

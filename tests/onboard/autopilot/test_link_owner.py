@@ -14,7 +14,7 @@ import pytest
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.errors import UnavailableError
 from flockd.onboard.autopilot.link_owner import only_owner
-from flockd.sim.sitl.ports import free_port
+from flockd.sim.sitl.processes import free_port
 
 NOBODY = 65534
 

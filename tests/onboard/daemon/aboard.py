@@ -34,7 +34,7 @@ from flockd.onboard.autopilot.refusal_reasons import REASONS
 from flockd.onboard.daemon import Daemon, ServiceManager
 from flockd.onboard.sources import FramePublisher
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from flockd.sim.sitl.ports import free_endpoint
+from flockd.sim.sitl.processes import free_endpoint
 from tests import make
 from tests.calm import clock
 from tests.flight.perception.cameras import SECOND_STAGE

@@ -20,7 +20,7 @@ from flockd.onboard.daemon import DaemonError
 from flockd.onboard.message_json import to_json
 from flockd.onboard.recording.reader import Recording
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from flockd.sim.sitl.ports import free_port
+from flockd.sim.sitl.processes import free_port
 from tests.calm import clock
 from tests.faults.stories import Reacted
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M

@@ -15,7 +15,7 @@ from flockd.core.config.source import SharedMemoryParameters, SourceParameters
 from flockd.core.messages import Frame, FrameSet
 from flockd.onboard.sources import FramePublisher
 from flockd.onboard.sources.shared_memory import SharedMemorySource
-from flockd.sim.sitl.ports import free_endpoint
+from flockd.sim.sitl.processes import free_endpoint
 from tests.onboard.sources.camera_images import SIZE, scene
 
 CAMERAS = ("front", "back")

@@ -18,7 +18,7 @@ from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
-from flockd.sim.sitl.ports import free_port
+from flockd.sim.sitl.processes import free_port
 
 EXAMPLE = (data_path("config") / "zenoh_tls.json5").read_text(encoding="utf-8")
 SECONDS_TO_FAIL = 60.0

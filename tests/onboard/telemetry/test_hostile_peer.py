@@ -15,7 +15,7 @@ import zenoh
 
 from flockd.onboard.telemetry.publisher import MAX_PEERS, ZenohTelemetry
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
-from flockd.sim.sitl.ports import free_endpoint
+from flockd.sim.sitl.processes import free_endpoint
 
 pytestmark = pytest.mark.fault("messages-of-any-size")
 

@@ -32,7 +32,7 @@ from flockd.onboard.telemetry.topics import (
     StateMessage,
 )
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
-from flockd.sim.sitl.ports import free_endpoint
+from flockd.sim.sitl.processes import free_endpoint
 from tests.calm import until
 from tests.make import flight_message
 

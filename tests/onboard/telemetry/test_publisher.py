@@ -25,7 +25,7 @@ from flockd.core.messages import (
 )
 from flockd.onboard.telemetry import TOPICS, publish_step
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
-from flockd.sim.sitl.ports import free_endpoint
+from flockd.sim.sitl.processes import free_endpoint
 from tests.make import neighbour, output, vehicle, wanted
 from tests.onboard.daemon.aboard import client
 

@@ -1,8 +1,7 @@
-"""Optical flow: of whole images by a network or DIS, then of the background and of each drone by themselves."""
+"""Optical flow: of whole images by a network or DIS, made exact on a grid of points."""
 
-from flockd.flight.perception.flow.dis import DisFlow
+from flockd.flight.perception.flow.dense import DisFlow, OnnxFlow
 from flockd.flight.perception.flow.lucas_kanade import grid_flow
-from flockd.flight.perception.flow.network import OnnxFlow
 from flockd.flight.perception.interface import Flow
 
 __all__ = ["DisFlow", "Flow", "OnnxFlow", "grid_flow"]

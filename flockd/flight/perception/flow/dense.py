@@ -1,4 +1,4 @@
-"""Optical flow by OpenCV's DIS, from no motion or from another flow on."""
+"""Optical flow of all pixels: by a network, and by OpenCV's DIS, from no motion or from another flow on."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 
 from flockd.core.messages import Float32Array, UInt8Array
+from flockd.flight.inference.fitting import fit
+from flockd.flight.inference.session import OnnxModel
 from flockd.flight.perception.flow.lucas_kanade import grey
 from flockd.flight.perception.interface import Flow
 
@@ -41,3 +43,20 @@ class DisFlow:
         dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         dis.setFinestScale(self._finest_scale)
         return dis
+
+
+class OnnxFlow:
+    """A flow network; enters images as its manifest asks for."""
+
+    def __init__(self, model: OnnxModel) -> None:
+        self.name = model.manifest.name
+        self._model = model
+
+    def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
+        """See `Flow`."""
+        height, width = first.shape[:2]
+        fitting = fit(self._model.manifest, (width, height))
+        outputs = self._model.infer({"first": [fitting.enter(first)], "second": [fitting.enter(second)]})
+        flow = np.moveaxis(fitting.inside(outputs["flow"])[0], 0, 2) / np.array(fitting.scale, np.float32)
+        full = cv2.resize(flow, (width, height), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(full, dtype=np.float32)
