@@ -21,14 +21,14 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 2_970,
-    "flockd/flight": 11_910,
+    "flockd/flight": 11_870,
     "flockd/onboard": 9_000,
     "flockd/fleet": 2_670,
     "flockd/ground": 4_030,
     "flockd/review": 3_390,
-    "flockd/sim": 8_540,
+    "flockd/sim": 8_530,
     "flockd/campaign": 1_470,
-    "flockd/cli": 3_440,
+    "flockd/cli": 3_430,
     "tests": 35_960,
     "tools/checks": 2_060,
     "tools/docs": 740,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 336}
+FILES = {"flockd": 330}
 NUMBERS_OF_FLIGHT = 320
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
