@@ -79,6 +79,8 @@ TEXT_MEMORY_S = 10.0
 MAV_TYPE_ONBOARD_CONTROLLER = 18
 SETTLED_S = 2.0
 """After its first heartbeat: by then an autopilot that has checks to tell has told them."""
+CHUNKS_S = 0.2
+"""Within which all chunks of a text come."""
 TEXT_CHUNK = 50
 """Characters of a STATUSTEXT; one with fewer is the last of its text."""
 LONGEST_TEXT = 125
@@ -137,8 +139,11 @@ class ReceivedMessages:
     def add(self, name: str, fields: Fields, time_s: float) -> None:
         """Takes a message by its name and fields, NaN as null, as MAVSDK decodes them to JSON, and when it came."""
         self._heard_s = time_s
+        begun = self._text.begun
+        if begun is not None and name != "STATUSTEXT" and time_s - begun.time_s > CHUNKS_S:
+            self.add("STATUSTEXT", {**begun.fields, "chunk_seq": 1, "text": ""}, time_s)  # it does not go on
         if name == "STATUSTEXT":
-            whole = self._text.joined(fields)
+            whole = self._text.joined(fields, time_s)
             if whole is None:
                 return
             fields = {**fields, "text": whole}
@@ -402,18 +407,22 @@ class ReceivedMessages:
 class StatusText:
     """Joins the chunks of a STATUSTEXT, which carry an id and number themselves from 0.
 
-    An id of 0 is for texts that have one chunk. PX4 begins with it: of its first text, if it is long, the end is lost.
+    An id of 0 is for texts that have one chunk; but PX4 begins with it, so that one with a full chunk may go on.
     """
 
     def __init__(self) -> None:
         self._id, self._chunks = 0, [""]
+        self.begun: ReceivedMessage | None = None
+        """A text of id 0 that may go on."""
 
-    def joined(self, fields: Fields) -> str | None:
+    def joined(self, fields: Fields, time_s: float) -> str | None:
         """The whole text with its last chunk, None before; where a chunk was lost, dots stand for it."""
         text = str(fields.get("text") or "").partition("\0")[0]
         number, chunk = fields.get("id") or 0, fields.get("chunk_seq") or 0
-        if number == 0:
-            return None if chunk else text
+        may_go_on = number == chunk == 0 and len(text) >= TEXT_CHUNK
+        self.begun = ReceivedMessage(time_s, fields) if may_go_on else None
+        if number == chunk == 0 and self.begun is None:
+            return text
         if number != self._id or chunk == 0:
             self._id, self._chunks = number, []
         if chunk > len(self._chunks):

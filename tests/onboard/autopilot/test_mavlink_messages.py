@@ -159,6 +159,14 @@ def test_a_text_in_chunks_is_seen_whole_and_not_before() -> None:
     assert _text_of(received) == sentence
 
 
+def test_the_first_text_of_px4_has_the_id_of_texts_without_chunks_and_is_seen_whole() -> None:
+    """As PX4 SITL 1.18 sends it after a start: id 0, and a tab at the end."""
+    first, second = "Arming denied: Resolve system health failures firs", "t\t"
+    received, log = _received(_text(first, 0, 0), _text(second, 0, 1))
+    assert received.recent_texts(2.0, 10.0) == [f"{first}t"]
+    assert len(log) == 1 and log[0].endswith(f": {first}t")
+
+
 def test_a_stamp_from_the_past_is_a_restart_on_the_ground_and_nothing_in_flight() -> None:
     attitude = [("ATTITUDE_QUATERNION", {"time_boot_ms": stamp}) for stamp in (60_000, 0, 60_020)]
     armed, disarmed = [("HEARTBEAT", {"base_mode": mode, "custom_mode": 0, "system_status": 4}) for mode in (128, 0)]
@@ -166,6 +174,15 @@ def test_a_stamp_from_the_past_is_a_restart_on_the_ground_and_nothing_in_flight(
     assert (received.restarts, log) == (0, [])
     received, log = _received(disarmed, *attitude)
     assert (received.restarts, len(log)) == (1, 1)
+
+
+def test_a_text_of_just_one_chunk_is_seen_when_it_does_not_go_on() -> None:
+    received, log = _received(_text("a" * 50))
+    received.add("SYS_STATUS", {"battery_remaining": 50}, 0.1)
+    assert log == []
+    received.add("SYS_STATUS", {"battery_remaining": 50}, 0.3)
+    received.add("SYS_STATUS", {"battery_remaining": 50}, 0.5)
+    assert log == [f"the autopilot says: {'a' * 50}"]
 
 
 def test_a_chunk_that_is_lost_is_marked_and_does_not_mix_texts() -> None:

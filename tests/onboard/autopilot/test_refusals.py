@@ -226,7 +226,7 @@ async def test_twelve_refusals_of_the_fake_autopilot_one_by_one_through_mavsdk(p
                 await until(lambda name=name: [r.reason for r in link.refusals()] == [name])  # type: ignore[misc]
             with pytest.raises(AutopilotError) as refused:
                 await link.arm()
-            assert "Arming denied: Resolve system health failures firs; its safety button was" in str(refused.value)
+            assert "Arming denied: Resolve system health failures first; its safety button was" in str(refused.value)
             fake_autopilot.failing = set()
             await until(lambda: not link.refusals())
             await link.arm()
