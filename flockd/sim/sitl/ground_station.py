@@ -217,7 +217,7 @@ def _update(vehicle: _Vehicle, message: Any, now: float) -> None:
         case "CURRENT_MODE":
             vehicle.mode = int(message.custom_mode)
         case "STATUSTEXT":
-            text = vehicle.chunks.joined(message.to_dict())
+            text = vehicle.chunks.joined(message.to_dict(), now)
             if text is not None:
                 vehicle.texts.append(text.strip())
         case "AUTOPILOT_VERSION":
