@@ -96,7 +96,7 @@ async def test_the_range_finder_lies(
         sensor.lie = None
         await until(lambda: WORKS in ship.events[told:], SECONDS_TO_FAIL)
         limit_m_s = ship.config.safety.gate.max_speed_m_s
-        assert all(np.linalg.norm(sent.velocity[:2]) <= limit_m_s + 1e-6 for _, sent in autopilot.setpoints)
+        assert all(np.linalg.norm(sent.velocity[:2]) <= limit_m_s + 1e-6 for _, sent in list(autopilot.setpoints))
 
 
 @pytest.mark.fault("range-finder-lies", within_s=3.0)
