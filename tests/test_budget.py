@@ -21,7 +21,7 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 2_970,
-    "flockd/flight": 11_870,
+    "flockd/flight": 11_890,
     "flockd/onboard": 9_010,
     "flockd/fleet": 2_670,
     "flockd/ground": 4_030,
@@ -29,7 +29,7 @@ LINES = {
     "flockd/sim": 8_530,
     "flockd/campaign": 1_470,
     "flockd/cli": 3_430,
-    "tests": 35_980,
+    "tests": 36_000,
     "tools/checks": 2_060,
     "tools/docs": 740,
     "tools/measure": 1_270,
@@ -38,7 +38,7 @@ LINES = {
 }
 """Lines of Python below a folder."""
 FILES = {"flockd": 330}
-NUMBERS_OF_FLIGHT = 320
+NUMBERS_OF_FLIGHT = 323
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
 """A budget that is farther above what there is is to be lowered."""

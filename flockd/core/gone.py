@@ -106,7 +106,6 @@ KEYS: Mapping[str, str] = {
     "stop": "delete it: all `seeds` are flown",
     "safety.degraded_gusts_m_s": "write `degraded_velocity_error_m_s`",
     "safety.gate.max_drift_m_s": "delete it: wind is left to the autopilot",
-    "tracking.vague_factor": "delete it: detections count alike",
     "take_off_apart_s": "delete it: simulated drones take off together",
     "safety.gate.response_s": "delete it, and write `reaction_s`, which contains it",
     "safety.max_gusts_m_s": "write `max_velocity_error_m_s`",

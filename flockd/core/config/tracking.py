@@ -85,6 +85,9 @@ class TrackingParameters(Section):
     and lasts, so that it counts where places are said and not in the filter."""
     confirm_hits: Annotated[int, Field(ge=1)] = 2
     """No track is confirmed with fewer detections that agree with it, after the first each by `evidence_interval_s`."""
+    vague_factor: Annotated[float, Field(ge=1)] = 2.0
+    """A detection whose range is less certain than that of confirmed neighbours usually is, by more than this factor,
+    counts as fewer, in proportion: what is no drone is seldom seen well."""
     confirm_sigma: Positive = 3.6
     """A detection farther off than this many standard deviations does not agree: 99 % of those of the motion and
     measurement model are nearer (chi-square with 4 degrees of freedom)."""

@@ -17,9 +17,14 @@ from flockd.flight.tracking.hypotheses import Hypotheses
 from flockd.flight.tracking.manoeuvres import Manoeuvres
 from flockd.flight.tracking.measurement import Measurement
 
+_OF_USUAL = 0.02
+"""The share of one detection in what is usual: that of the last fifty."""
 _UNSEEN_SHARE = 0.1
 """Who was followed for long is looked for longer than `max_unseen_s`: for this share of that time, while it is likely
 to exist. Else its next detection, often a vague one, would be of a stranger."""
+_SUREST, _LEAST_VARIANCE = 0.01, 1e-12
+"""No usual standard deviation counts as smaller, or a network that is too sure of one neighbour would keep others from
+being confirmed; and no variance, whose logarithm is taken, is."""
 
 Shown = Callable[[FloatArray, float], BoolArray]
 """Tells around which (n,) of the positions (n, 3), metres NED from the own drone, a camera shows all within a radius in
@@ -52,6 +57,8 @@ class Tracker:
         self.parameters = parameters or TrackingParameters()
         self._tracks: list[_Track] = []
         self._manoeuvres = Manoeuvres(self.parameters)
+        self._usual_log_sigma: float | None = None
+        """Logarithm of the standard deviation of a confirmed neighbour's log range, as detected."""
         self._time_s = 0.0
         self._created = 0
 
@@ -187,13 +194,28 @@ class Tracker:
         interval_s = max(0.0, self._time_s - track.last_seen_s)
         track.hits += 1
         track.agrees = innovation.squared_distance <= self.parameters.confirm_sigma**2
-        track.agreed += weight * track.agrees
+        track.agreed += weight * track.agrees * self._share(measurement)
+        if track.confirmed:
+            self._remember(measurement, weight)
         track.existence = existence.detected(track.existence, innovation, weight, self.parameters)
         track.drone_probability = existence.averaged(
             track.drone_probability, measurement.drone_probability, track.hits, interval_s, self.parameters
         )
         track.hypotheses = track.hypotheses.updated(measurement, self.parameters)
         track.last_seen_s, track.missing_s = self._time_s, 0.0
+
+    def _share(self, measurement: Measurement) -> float:
+        """As how much of a detection one counts."""
+        if self._usual_log_sigma is None:
+            return 1.0
+        usual = max(self._usual_log_sigma, math.log(_SUREST))
+        return min(1.0, self.parameters.vague_factor * math.exp(usual - _log_sigma(measurement)))
+
+    def _remember(self, measurement: Measurement, weight: float) -> None:
+        """How certain the range of a confirmed neighbour is."""
+        log_sigma = _log_sigma(measurement)
+        usual = log_sigma if self._usual_log_sigma is None else self._usual_log_sigma
+        self._usual_log_sigma = usual + _OF_USUAL * weight * (log_sigma - usual)
 
     def _misjudged(self, measurement: Measurement, missed: Sequence[_Track]) -> State | None:
         """The neighbour, of those that were `missed`, whose bearing a detection has that fits no track; None: of none.
@@ -214,6 +236,7 @@ class Tracker:
             drone_probability=measurement.drone_probability,
             first_seen_s=self._time_s,
             last_seen_s=self._time_s,
+            agreed=self._share(measurement),
         )
 
     def _confirm(self, track: _Track) -> None:
@@ -236,6 +259,11 @@ def _probability_in_view(state: State, shown: Shown) -> float:
     return float(shown(state.position + spread @ axes.T, state.size_m / 2).mean())
 
 
+def _log_sigma(measurement: Measurement) -> float:
+    """Logarithm of the standard deviation of its log range."""
+    return math.log(max(measurement.log_range_variance, _LEAST_VARIANCE)) / 2
+
+
 @dataclass
 class _Track:
     """One neighbour."""
@@ -248,8 +276,8 @@ class _Track:
     """Probability that it is a drone if it exists."""
     first_seen_s: float
     last_seen_s: float
-    agreed: float = 1.0
-    """How many of the hits were within `confirm_sigma`, as far as they are independent evidence."""
+    agreed: float
+    """How many of the hits were within `confirm_sigma`, as far as they are independent evidence and certain."""
     hits: int = 1
     missing_s: float = 0.0
     """How long it should have been in view since it was last detected, and was not."""

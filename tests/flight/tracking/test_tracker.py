@@ -104,6 +104,30 @@ def _settled(position: Array = AHEAD, *, steps: int = 10, sigma_m: float = 0.05)
     return Follower(first_acceleration_sigma_m_s2=0.3).steps(steps, position, sigma_m=sigma_m)
 
 
+@pytest.mark.parametrize(
+    ("sigma_m", "beside_sigma_m", "steps"),
+    [
+        pytest.param(0.8, None, 3, id="nothing is known of how certain drones' ranges are"),
+        pytest.param(0.8, 1.0, 3, id="as certain as those of another drone, which nobody knows well either"),
+        pytest.param(0.05, 0.0625, 3, id="as certain, of known drones"),
+        pytest.param(0.8, 0.13, 6, id="8 times less certain: each counts as a half"),
+        pytest.param(0.15, 0.0005, 3, id="certain, beside one that a network is too sure of"),
+    ],
+)
+def test_what_is_seen_less_well_than_drones_are_takes_longer_to_be_one(
+    sigma_m: float, beside_sigma_m: float | None, steps: int
+) -> None:
+    """Standard deviations in metres, at 4 m ahead and 5 m beside: of the log range a fourth and a fifth."""
+    flock = Follower(confirm_hits=3, vague_factor=4.0)
+    known = [] if beside_sigma_m is None else [_seen(5.0 * EAST, beside_sigma_m)]
+    flock.steps(10 * len(known), *known)
+    taken = 0
+    while len(flock.confirmed) < 1 + len(known) and taken < 30:
+        flock.step(*known, _seen(AHEAD, sigma_m))
+        taken += 1
+    assert taken == steps
+
+
 def test_what_the_network_doubts_is_not_confirmed_however_often_it_is_detected() -> None:
     """The average is 0.7 for 20 s, then 1 - 0.3 exp(-t / 5 s): above 0.9 from t = 5.5 s on."""
     flock, confirmed = Follower(drone_probability_memory_s=5.0, confirm_probability=0.9), []

@@ -24,17 +24,6 @@ _SAME_RANGE = math.log(1.5)
 
 
 @dataclass(frozen=True, eq=False)
-class Predicted:
-    """Where a track should be, in log-polar coordinates of the body."""
-
-    bearing: FloatArray
-    """(3,) unit vector."""
-    log_range: float
-    covariance: FloatArray
-    """(3, 3) as of `Detection.covariance`."""
-
-
-@dataclass(frozen=True, eq=False)
 class Proposal:
     """A region of interest, and where it comes from."""
 
@@ -43,8 +32,8 @@ class Proposal:
     roi: Roi
     instance: Instance | None = None
     """What the first stage proposed; None where the proposal comes from a prediction."""
-    predicted: Predicted | None = None
-    """Where it comes from a track; None elsewhere."""
+    predicted: bool = False
+    """Whether it comes from a track."""
 
     @property
     def area_px(self) -> float:
@@ -102,7 +91,6 @@ def propose_predictions(
             reasons.append(Reason(ReasonKind.PROPOSAL, f"proposal of a track: {error}"))
             continue
         range_m = math.exp(log_range)
-        covariance = R_body_ned @ prediction.covariance @ R_body_ned.T / range_m**2
         cameras = tuple(name for name, pixel in rig.pixels_of(place[None]).items() if np.isfinite(pixel).all())
         if not cameras:
             continue
@@ -112,5 +100,5 @@ def propose_predictions(
             for other, log_other in detected
         )
         if not found:
-            proposals.append(Proposal(cameras, roi, predicted=Predicted(bearing, log_range, covariance)))
+            proposals.append(Proposal(cameras, roi, predicted=True))
     return proposals, reasons

@@ -242,7 +242,7 @@ class Cascade:
         return low < candidate.log_range < high
 
     def _needed(self, proposal: Proposal) -> float:
-        return self._thresholds.drone if proposal.predicted is None else self._thresholds.predicted_drone
+        return self._thresholds.predicted_drone if proposal.predicted else self._thresholds.drone
 
 
 def mean_candidate(one: Candidate, other: Candidate) -> Candidate:
