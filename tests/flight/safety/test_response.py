@@ -97,10 +97,11 @@ def test_a_drone_that_answers_as_expected_has_no_error() -> None:
 
 
 def test_while_another_flies_the_drone_nothing_is_an_error() -> None:
-    """Standstill is offered, and the pilot flies at 2 m/s."""
+    """Standstill is offered, and the pilot flies to and fro at up to 2 m/s."""
     gate = Gate(FREE)
     for now_s in TICK_S * np.arange(200):
-        gate.step(now_s, request(now_s, action=Action.OFFER, surroundings=around(velocity=(2.0, 0.0))))
+        near = around(velocity=(2.0 * math.cos(2.0 * now_s), 0.0))
+        gate.step(now_s, request(now_s, action=Action.OFFER, surroundings=near))
     assert gate.velocity_error_m_s == 0.0
 
 
