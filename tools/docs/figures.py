@@ -8,13 +8,15 @@ A page has a table between `<!-- figures: NAME -->` and `<!-- end of figures -->
 from __future__ import annotations
 
 import json
+import math
 import re
 import subprocess
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tools.measure.card import EYES, FIGURES_FILE, ROOT, git
+from flockd.campaign.figures import MEASURES
+from tools.measure.card import EYES, FIGURES, FIGURES_FILE, ROOT, git
 from tools.measure.labelled import WIDTH_CLASSES
 
 BLOCK = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
@@ -25,6 +27,9 @@ PAPERS = "the paper's five drones"
 SHORT = ("order_tail", "recall_within_10m", "false_share", "associated_error_median_m", "min_distance_after_10s_m",
          "slowed_share")  # fmt: skip
 """Of README."""
+EACH = ("order_tail", "convergence_time_s", "shape_deviation_tail", "recall_within_10m", "false_share",
+        "associated_error_median_m", "associated_error_max_m", "min_distance_after_10s_m")  # fmt: skip
+ENOUGH_FOR_AN_INTERVAL = 10
 
 
 def pages() -> list[Path]:
@@ -54,35 +59,51 @@ def _origin(part: Part) -> str:
 
 def _cell(figures: Part, figure: str) -> str:
     one = figures.get(figure)
-    return "-" if one is None else f"{one['median']:g}" + (f" ({one['worst']:g})" if one["count"] > 1 else "")
+    if one is None:
+        return "-"
+    between = "" if one["count"] < ENOUGH_FOR_AN_INTERVAL else " [{:g}, {:g}]".format(*one["interval"])
+    return f"{one['median']:g}{between}" + (f" ({one['worst']:g})" if one["count"] > 1 else "")
 
 
-def _flights(parts: Mapping[str, Part], scenarios: Iterable[str] | None = None, only: Sequence[str] = ()) -> str:
-    """Median and, in brackets, worst of a figure: by sight, exact and blind."""
+def _named(figure: str) -> str:
+    return f"{MEASURES[figure].name}{', ' * bool(MEASURES[figure].unit)}{MEASURES[figure].unit}"
+
+
+def _flights(parts: Mapping[str, Part], scenarios: Iterable[str] | None = None, only: Sequence[str] = FIGURES) -> str:
+    """Median, its interval at 95 % of ten flights and more, and, in brackets, worst: by sight, exact and blind."""
     part = parts["flights"]
     tables = []
-    for scenario in scenarios or part["scenarios"]:
-        eyes = part["scenarios"][scenario]
-        names = {figure: f"{of['name']}{', ' * bool(of['unit'])}{of['unit']}" for figure, of in part["figures"].items()}
+    for scenario in scenarios or part:
+        of = part[scenario]
         rows = [
-            [names[figure], *(_cell(eyes[kind]["figures"], figure) for kind in EYES)]
-            for figure in (only or names)
-            if any(figure in eyes[kind]["figures"] for kind in EYES)
+            [_named(figure), *(_cell(of[eyes]["figures"], figure) for eyes in EYES)]
+            for figure in only
+            if any(figure in of[eyes]["figures"] for eyes in EYES)
         ]
-        count = eyes["sight"]["flights"] - eyes["sight"]["failed"]
-        head = f"{scenario}: {count} flight{'s' * (count != 1)} of {part['durations_s'][scenario]:g} s, median (worst)"
-        tables.append(_table((head, *(f"by {kind}" if kind == "sight" else kind for kind in EYES)), rows))
-    return "\n\n".join(tables) + "\n" + _origin(part)
+        count = of["sight"]["flights"] - of["sight"]["failed"]
+        head = f"{scenario}: {count} flight{'s' * (count != 1)} of {of['duration_s']:g} s, median (worst)"
+        table = _table((head, *(f"by {eyes}" if eyes == "sight" else eyes for eyes in EYES)), rows)
+        tables.append(f"{table}\n{_origin(of)}")
+    return "\n\n".join(tables)
+
+
+def _each(parts: Mapping[str, Part]) -> str:
+    """Each of the paper's flights by sight, that with the largest shape deviation first."""
+    of = parts["flights"][PAPERS]
+    worst = sorted(of["sight"]["each"], key=lambda one: -one.get("shape_deviation_tail", math.inf))
+    rows = [[f"{one[figure]:g}" if figure in one else "-" for figure in ("seed", *EACH)] for one in worst]
+    return _table(("seed", *map(_named, EACH)), rows) + "\n" + _origin(of)
 
 
 def _paper(parts: Mapping[str, Part]) -> str:
     """What the paper says of the same flight: its largest errors, and its Table 3."""
-    figures = parts["flights"]["scenarios"][PAPERS]["sight"]["figures"]
+    of = parts["flights"][PAPERS]
+    figures = of["sight"]["figures"]
     rows = [
         ("distance to a neighbour, largest error, m", "0.168", _cell(figures, "associated_error_max_m")),
         ("time from which the shape stays, s", "67", _cell(figures, "convergence_time_s")),
     ]
-    return _table(("", "paper, one flight", "flockd, median (worst)"), rows) + "\n" + _origin(parts["flights"])
+    return _table(("", "paper, one flight", "flockd, median (worst)"), rows) + "\n" + _origin(of)
 
 
 def _encounters(parts: Mapping[str, Part]) -> str:
@@ -125,6 +146,7 @@ def _step(parts: Mapping[str, Part]) -> str:
 
 TABLES: dict[str, Callable[[Mapping[str, Part]], str]] = {
     "flights": _flights,
+    "each": _each,
     "readme": lambda parts: _flights(parts, (PAPERS,), SHORT),
     "paper": _paper,
     "encounters": _encounters,

@@ -3,6 +3,7 @@
 python -m tools.measure.card --quick            # for who changes something: flights of 20 minutes on two cores
 python -m tools.measure.card                    # for a release: some 30 hours on two cores
 python -m tools.measure.card --parts px4 step   # these again; the others stay as they were measured, with their commit
+python -m tools.measure.card --parts flights --scenarios forest    # of the flights these alone
 
 `flights`: the published scenarios on seeds that follow from the commit's hash, so that nobody can have tuned to them.
 Beside each flight by sight stand, on the same seed, a blind one, whose drones detect nobody, and an exact one, on the
@@ -220,22 +221,19 @@ def _key(line: Line) -> tuple[str, str, int]:
 
 
 def table_of(lines: Iterable[Line]) -> dict[str, Any]:
-    """By scenario and eyes: how many flights, how many failed, their seeds, and each figure's `Spread` as a mapping."""
-    groups: dict[tuple[str, str], list[Line]] = {}
-    for line in lines:
-        groups.setdefault((line["scenario"], line["eyes"]), []).append(line)
+    """Of one scenario's lines, by eyes: how many flights, how many failed, each figure's `Spread` as a mapping, and the
+    figures of each flight with its seed."""
     table: dict[str, Any] = {}
-    for (scenario, eyes), of_group in groups.items():
-        good = [line["figures"] for line in of_group if line["failed"] is None]
+    for eyes in EYES:
+        of_eyes = [line for line in lines if line["eyes"] == eyes]
+        good = [line for line in of_eyes if line["failed"] is None]
         figures = {}
         for figure in FIGURES:
-            known = [one[figure] for one in good if one.get(figure) is not None]
+            known = [line["figures"][figure] for line in good if line["figures"].get(figure) is not None]
             if known:
                 figures[figure] = spread(known, higher_is_better=MEASURES[figure].better == "higher")
-        table.setdefault(scenario, {})[eyes] = {
-            "flights": len(of_group), "failed": len(of_group) - len(good),
-            "seeds": sorted(line["seed"] for line in of_group), "figures": figures,
-        }  # fmt: skip
+        each = [{"seed": line["seed"], **_rounded_figures(line["figures"])} for line in good]
+        table[eyes] = {"flights": len(of_eyes), "failed": len(of_eyes) - len(good), "figures": figures, "each": each}
     return table
 
 
@@ -256,24 +254,30 @@ def _rounded(value: float) -> float:
     return value if value == 0.0 else round(value, 3 - math.floor(math.log10(abs(value))))
 
 
-def document(commit: str, lines: Sequence[Line], *, quick: bool) -> dict[str, Any]:
-    """What docs/figures.json holds of the flights."""
-    files = {name: one.file for name, one in SCENARIOS.items()}
-    networks: dict[str, str] = {}
-    durations_s = {}
-    for name, file in files.items():
-        scenario = load_scenario(data_path("config") / file)
-        networks |= model_hashes(scenario.drone.perception)
-        durations_s[name] = (SCENARIOS[name].quick if quick else SCENARIOS[name].whole)[1] or scenario.duration_s
-    return {
-        **_measured_by(commit, f"python -m tools.measure.card{' --quick' * quick} --parts flights"),
-        "networks": networks,
-        "flown_s": round(sum(line["wall_s"] for line in lines)),
-        "figures": {figure: {"name": MEASURES[figure].name, "unit": MEASURES[figure].unit} for figure in FIGURES},
-        "files": files,
-        "durations_s": durations_s,
-        "scenarios": table_of(lines),
-    }
+def _rounded_figures(figures: dict[Figure, float | None]) -> dict[str, float]:
+    return {figure: _rounded(value) for figure, value in figures.items() if value is not None}
+
+
+def document(commit: str, lines: Iterable[Line], *, quick: bool) -> dict[str, Any]:
+    """What docs/figures.json holds of each scenario's flights."""
+    found = {}
+    for name, of_scenario in itertools.groupby(sorted(lines, key=lambda line: line["scenario"]), _scenario):
+        flown = list(of_scenario)
+        scenario = load_scenario(data_path("config") / SCENARIOS[name].file)
+        command = f"python -m tools.measure.card{' --quick' * quick} --parts flights"
+        found[name] = {
+            **_measured_by(commit, command),
+            "networks": model_hashes(scenario.drone.perception),
+            "file": SCENARIOS[name].file,
+            "flown_s": round(sum(line["wall_s"] for line in flown)),
+            "duration_s": (SCENARIOS[name].quick if quick else SCENARIOS[name].whole)[1] or scenario.duration_s,
+            **table_of(flown),
+        }
+    return found
+
+
+def _scenario(line: Line) -> str:
+    return str(line["scenario"])
 
 
 def _measured_by(commit: str, command: str) -> dict[str, Any]:
@@ -353,14 +357,15 @@ def git(root: Path, *words: str) -> str:
     return subprocess.run(["git", *words], cwd=root, check=True, capture_output=True, text=True).stdout.strip()
 
 
-def _part(part: str, commit: str, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Measure one part."""
+def _part(part: str, commit: str, arguments: argparse.Namespace, known: dict[str, Any]) -> dict[str, Any]:
+    """Measure one part; of `known`, what was measured of it before, the scenarios that are not flown stay."""
     quick, workers, results = arguments.quick, arguments.workers, arguments.results / commit[:12]
     size = "quick" if quick else "whole"
     found: Any = None
     if part == "flights":
-        lines = run(flights_of(commit, quick=quick), results / f"{size}.jsonl", workers)
-        return document(commit, lines, quick=quick)
+        flights = [one for one in flights_of(commit, quick=quick) if one.scenario in arguments.scenarios]
+        measured = document(commit, run(flights, results / f"{size}.jsonl", workers), quick=quick)
+        return known | measured
     if part == "errors":
         flown_by_sight = {one.log_name: one for one in flights_of(commit, quick=False) if one.eyes == "sight"}
         logs = {path.stem: path for path in sorted(results.glob("*.npz"))}
@@ -389,6 +394,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="few and short flights")
     parser.add_argument("--parts", nargs="+", choices=PARTS, metavar="PART", help="default: all that can be measured")
+    parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=list(SCENARIOS), metavar="SCENARIO")
     parser.add_argument("--results", type=Path, default=ROOT / "out" / "card", help="default: out/card")
     parser.add_argument("--out", type=Path, default=FIGURES_FILE, help="default: docs/figures.json")
     parser.add_argument("--labelled", action="append", default=[], metavar="NAME=FOLDER")
@@ -399,8 +405,8 @@ def main() -> None:
     missing = set() if arguments.labelled or arguments.without_drones else {"pictures"}
     missing |= set() if "FLOCKD_PX4" in os.environ else {"px4"}
     for part in arguments.parts or [part for part in PARTS if part not in missing]:
-        measured = _part(part, commit, arguments)
         known = json.loads(arguments.out.read_text(encoding="utf-8")) if arguments.out.is_file() else {}
+        measured = _part(part, commit, arguments, known.get(part, {}))
         arguments.out.write_text(json.dumps(known | {part: measured}, indent=1) + "\n", encoding="utf-8")
         print(f"{arguments.out}: {part}", flush=True)
 
