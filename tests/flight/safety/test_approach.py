@@ -142,3 +142,17 @@ def test_a_vehicle_that_follows_as_expected_has_no_error_at_whatever_time_it_fli
         errors.append(gate.velocity_error_m_s)
         speed = 1.0 - math.exp(-0.05 * tick / p.reaction_s)
     assert max(errors) < 0.05
+
+
+def test_one_that_stands_counts_where_it_stands_and_one_at_no_known_distance_nowhere() -> None:
+    """Margins that are not said are none; 0.5 v + v^2 / 3 is what is left of 5 m."""
+    p, still, seen = GateParameters(), np.zeros((1, 2)), np.zeros(1)
+    directions, limits = towards_neighbours(p, np.array([[3.0, 4.0, 0.5]]), still, 1.0, None, seen)
+    np.testing.assert_allclose(directions, [[0.6, 0.8]] * 2)
+    assert limits[1] == pytest.approx(-0.75 + math.sqrt(0.5625 + 3.0 * 4.0))
+    for nowhere in (math.inf, -math.inf):
+        assert not len(towards_neighbours(p, np.array([[nowhere, 0.0, 0.0]]), still, 1.0, None, seen)[1])
+
+
+def test_a_limit_that_is_no_number_is_standstill() -> None:
+    assert nearest_within(np.array([1.0, 0.0]), np.array([[1.0, 0.0]]), np.array([math.nan])).tolist() == [0.0, 0.0]

@@ -155,3 +155,17 @@ def test_the_heights_are_a_band_and_an_unknown_height_is_outside() -> None:
     band = GateParameters(min_height_m=2.0, max_height_m=20.0)
     found = [outside_heights(band, height) for height in (1.99, 2.0, 20.0, 20.01, math.nan, math.inf)]
     assert found == [True, False, False, True, True, True]
+
+
+def test_directions_to_a_circle_are_thirty_degrees_apart_all_around() -> None:
+    directions, _ = towards_fence(fence(radius_m=50.0), np.array([20.0, 10.0]))
+    azimuths = np.sort(np.degrees(np.arctan2(directions[:, 1], directions[:, 0])))
+    np.testing.assert_allclose(np.diff(azimuths), 30.0)
+    assert len(azimuths) == 12
+
+
+@pytest.mark.parametrize("position", [(10.0, 0.0), (10.0, 10.0), (0.0, -10.0)])
+def test_on_a_fence_a_side_at_no_distance_has_no_direction(position: tuple[float, float]) -> None:
+    directions, limits = towards_fence(fence(SQUARE), np.array(position))
+    assert np.isfinite(directions).all()
+    assert len(directions) == len(limits)

@@ -543,3 +543,31 @@ def test_a_takeover_in_motion_begins_at_the_velocity_that_the_drone_has() -> Non
 def test_a_margin_that_is_not_a_number_stops_and_raises_nothing(action: Action) -> None:
     near = around(neighbours=[[3.0, 0.0, 0.0]], neighbour_margins=[[0.1, math.nan]])
     assert sent(Stream().second([1.0, 0.0], action, near)).velocity.tolist() == [0.0, 0.0]
+
+
+def test_what_may_be_farther_than_it_seems_is_known_and_what_may_be_anywhere_is_not() -> None:
+    for margin, known in ((-0.1, True), (-math.inf, False), (math.nan, False)):
+        near = around(neighbours=[[9.0, 0.0, 0.0]], neighbour_margins=[[margin, margin]])
+        assert (Objection.NEIGHBOUR_UNKNOWN not in Stream().step(STILL, near=near).objections) is known
+
+
+@pytest.mark.parametrize("velocity", [(math.nan, 1.0), (math.nan, math.nan)])
+def test_a_drone_that_does_not_know_its_velocity_begins_at_standstill(velocity: tuple[float, float]) -> None:
+    verdict = Gate(GateParameters()).step(0.0, request(0.0, (1.0, 0.0), surroundings=around(velocity=velocity)))
+    assert sent(verdict).velocity.tolist() == [0.0, 0.0]
+
+
+def test_surroundings_without_obstacles_have_none() -> None:
+    nowhere = Surroundings(np.zeros(2), np.zeros(2), 0.5, np.empty((0, 3)), np.empty((0, 2)), 5.0)
+    assert nowhere.obstacles.shape == (0, 2)
+
+
+def test_a_vehicle_that_follows_late_is_flown_as_one_that_reacts_later() -> None:
+    """To the end of the limits: before a neighbour that comes."""
+    near = around(neighbours=[[4.0, 0.0, 0.0]], neighbour_velocities=[[-0.5, 0.0]])
+    late, slow = Stream(), Stream(reaction_s=1.0, neighbour_reaction_s=DRAG_FREE.neighbour_reaction_s + 0.5)
+    late.gate._response.late_s = 0.5
+    late.gate._response.restart = lambda _: None  # type: ignore[method-assign]
+    velocities = [sent(one.second([3.0, 0.0], near=near)).velocity[0] for one in (late, slow)]
+    assert velocities[0] == pytest.approx(velocities[1])
+    assert 0.0 < velocities[0] < sent(Stream().second([3.0, 0.0], near=near)).velocity[0]

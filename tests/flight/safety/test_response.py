@@ -165,3 +165,54 @@ def test_a_late_vehicle_begins_to_brake_before_a_neighbour_by_as_much_earlier() 
     near = around(neighbours=[[3.0, 0.0, 0.0]])
     slow, quick = (flown(Gate(FREE), 2.0 * NORTH, 0.25, dead_s, near)[-1, 0] for dead_s in (2.5, 0.0))
     assert 0.0 < slow < 0.7 * quick
+
+
+def by_brute_force(response_s: float, steps: list[tuple[FloatArray, FloatArray, float]]) -> tuple[float, float]:
+    """Error and delay with all that was ever expected kept, one number at a time."""
+    history, now_s, late_s = [(0.0, np.zeros(2))], 0.0, 0.0
+    squares = dict.fromkeys((0.0, response_s, 2 * response_s, 3 * response_s, 4 * response_s), 0.0)
+    for velocity, setpoint, elapsed_s in steps:
+        now_s += elapsed_s
+        before = history[-1][1]
+        history.append((now_s, before + (1 - math.exp(-elapsed_s / response_s)) * (setpoint - before)))
+        for delay_s, square in squares.items():
+            then = [expected for time_s, expected in history if time_s <= now_s - delay_s] or [history[0][1]]
+            off = float(np.sum((velocity - then[-1]) ** 2))
+            squares[delay_s] = square + (1 - math.exp(-elapsed_s / 10.0)) * (off - square)
+        least = min(squares.values())
+        late_s = max(late_s, min(d for d, s in squares.items() if s <= 4 * least or s <= least + 0.04))
+    return math.sqrt(squares[0.0]), late_s
+
+
+@pytest.mark.parametrize("late", range(0, 60, 3))
+def test_error_and_delay_are_those_of_the_definition(late: int) -> None:
+    random, monitor = np.random.default_rng(late), ResponseMonitor(0.5)
+    assert (monitor.error_m_s, monitor.late_s) == (0.0, 0.0)
+    monitor.restart(np.zeros(2))
+    setpoints = np.repeat(random.uniform(-1.0, 1.0, (12, 2)), 20, axis=0)
+    steps, velocity = [], np.zeros(2)
+    for tick, setpoint in enumerate(setpoints):
+        elapsed_s = 0.0 if tick == 7 else TICK_S
+        velocity = velocity - math.expm1(-elapsed_s / 0.5) * (setpoints[max(tick - late, 0)] - velocity)
+        steps.append((velocity + 0.02 * late * random.normal(size=2) / 3, setpoint, elapsed_s))
+        monitor.step(*steps[-1])
+        expected = by_brute_force(0.5, steps) if tick % 40 == 39 else (monitor.error_m_s, monitor.late_s)
+        assert (monitor.error_m_s, monitor.late_s) == pytest.approx(expected)
+    monitor.restart(np.zeros(2))
+    assert (monitor.error_m_s, monitor.late_s) == (0.0, 0.0)
+
+
+def test_a_monitor_that_was_never_begun_begins_with_its_first_velocity() -> None:
+    monitor = ResponseMonitor(0.5)
+    for _ in range(3):
+        monitor.step(np.ones(2), np.ones(2), TICK_S)
+    assert (monitor.error_m_s, monitor.late_s) == (0.0, 0.0)
+
+
+def test_what_another_flies_forgets_the_error_before() -> None:
+    gate, far_off = Gate(FREE), around(velocity=(3.0, 0.0))
+    for now_s in TICK_S * np.arange(100):
+        gate.step(now_s, request(now_s, surroundings=far_off))
+    assert gate.velocity_error_m_s > 1.0
+    gate.step(5.0, request(5.0, action=Action.OFFER, surroundings=far_off))
+    assert gate.velocity_error_m_s == 0.0

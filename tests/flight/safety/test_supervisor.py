@@ -654,3 +654,13 @@ def _changes(random: Random) -> dict[str, Any]:
             case 7:
                 changes[random.choice(_SEEN)] = random.choice(("seen", None))
     return changes
+
+
+def test_one_task_that_died_is_enough() -> None:
+    assert noticed_with(dead_tasks=("telemetry",)) == [Event.TASK_DIED]
+
+
+def test_a_late_answer_is_said_where_there_is_one() -> None:
+    late = notice(quiet(velocity_late_s=0.5), SafetyParameters())[Event.VELOCITY_OFF]
+    off = notice(quiet(velocity_error_m_s=0.7), SafetyParameters())[Event.VELOCITY_OFF]
+    assert ("0.5 s later than expected" in late, "later" in off) == (True, False)
