@@ -146,15 +146,15 @@ Line = dict[str, Any]
 why it could not be flown, or null."""
 
 
-def flights_of(commit: str, *, quick: bool) -> list[Flight]:
-    """All flights of a run, those by sight first: they take longest."""
+def flights_of(commit: str, *, quick: bool, most: int | None = None) -> list[Flight]:
+    """All flights of a run, those by sight first: they take longest. `most`: of each scenario."""
     found: list[Flight] = []
     for eyes, of in EYES.items():
         for name, scenario in SCENARIOS.items():
             count, duration_s = scenario.quick if quick else scenario.whole
             found += [
                 Flight(name, eyes, seed, scenario.file, duration_s, {**scenario.overrides(seed), **of.overrides})
-                for seed in seeds_of(commit, name, count)
+                for seed in seeds_of(commit, name, count)[:most]
             ]
     return found
 
@@ -258,13 +258,14 @@ def _rounded_figures(figures: dict[Figure, float | None]) -> dict[str, float]:
     return {figure: _rounded(value) for figure, value in figures.items() if value is not None}
 
 
-def document(commit: str, lines: Iterable[Line], *, quick: bool) -> dict[str, Any]:
+def document(commit: str, lines: Iterable[Line], *, quick: bool, most: int | None = None) -> dict[str, Any]:
     """What docs/figures.json holds of each scenario's flights."""
     found = {}
     for name, of_scenario in itertools.groupby(sorted(lines, key=lambda line: line["scenario"]), _scenario):
         flown = list(of_scenario)
         scenario = load_scenario(data_path("config") / SCENARIOS[name].file)
-        command = f"python -m tools.measure.card{' --quick' * quick} --parts flights"
+        fewer = "" if most is None else f" --flights {most}"
+        command = f"python -m tools.measure.card{' --quick' * quick} --parts flights{fewer}"
         found[name] = {
             **_measured_by(commit, command),
             "networks": model_hashes(scenario.drone.perception),
@@ -363,8 +364,9 @@ def _part(part: str, commit: str, arguments: argparse.Namespace, known: dict[str
     size = "quick" if quick else "whole"
     found: Any = None
     if part == "flights":
-        flights = [one for one in flights_of(commit, quick=quick) if one.scenario in arguments.scenarios]
-        measured = document(commit, run(flights, results / f"{size}.jsonl", workers), quick=quick)
+        most = arguments.flights
+        flights = [one for one in flights_of(commit, quick=quick, most=most) if one.scenario in arguments.scenarios]
+        measured = document(commit, run(flights, results / f"{size}.jsonl", workers), quick=quick, most=most)
         return known | measured
     if part == "errors":
         flown_by_sight = {one.log_name: one for one in flights_of(commit, quick=False) if one.eyes == "sight"}
@@ -395,6 +397,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="few and short flights")
     parser.add_argument("--parts", nargs="+", choices=PARTS, metavar="PART", help="default: all that can be measured")
     parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=list(SCENARIOS), metavar="SCENARIO")
+    parser.add_argument("--flights", type=int, metavar="N", help="of each scenario; default: all of the list")
     parser.add_argument("--results", type=Path, default=ROOT / "out" / "card", help="default: out/card")
     parser.add_argument("--out", type=Path, default=FIGURES_FILE, help="default: docs/figures.json")
     parser.add_argument("--labelled", action="append", default=[], metavar="NAME=FOLDER")
