@@ -562,12 +562,12 @@ def test_surroundings_without_obstacles_have_none() -> None:
     assert nowhere.obstacles.shape == (0, 2)
 
 
-def test_a_vehicle_that_follows_late_is_flown_as_one_that_reacts_later() -> None:
+def test_a_vehicle_that_follows_late_is_flown_as_one_that_reacts_later(monkeypatch: pytest.MonkeyPatch) -> None:
     """To the end of the limits: before a neighbour that comes."""
     near = around(neighbours=[[4.0, 0.0, 0.0]], neighbour_velocities=[[-0.5, 0.0]])
     late, slow = Stream(), Stream(reaction_s=1.0, neighbour_reaction_s=DRAG_FREE.neighbour_reaction_s + 0.5)
     late.gate._response.late_s = 0.5
-    late.gate._response.restart = lambda _: None  # type: ignore[method-assign]
+    monkeypatch.setattr(late.gate._response, "restart", lambda _: None)
     velocities = [sent(one.second([3.0, 0.0], near=near)).velocity[0] for one in (late, slow)]
     assert velocities[0] == pytest.approx(velocities[1])
     assert 0.0 < velocities[0] < sent(Stream().second([3.0, 0.0], near=near)).velocity[0]
