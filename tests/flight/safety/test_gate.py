@@ -553,7 +553,8 @@ def test_what_may_be_farther_than_it_seems_is_known_and_what_may_be_anywhere_is_
 
 @pytest.mark.parametrize("velocity", [(math.nan, 1.0), (math.nan, math.nan)])
 def test_a_drone_that_does_not_know_its_velocity_begins_at_standstill(velocity: tuple[float, float]) -> None:
-    verdict = Gate(GateParameters()).step(0.0, request(0.0, (1.0, 0.0), surroundings=around(velocity=velocity)))
+    gate = Gate(GateParameters(fence_radius_m=None))
+    verdict = gate.step(0.0, request(0.0, (1.0, 0.0), surroundings=around(velocity=velocity)))
     assert sent(verdict).velocity.tolist() == [0.0, 0.0]
 
 
@@ -564,7 +565,7 @@ def test_surroundings_without_obstacles_have_none() -> None:
 
 def test_a_vehicle_that_follows_late_is_flown_as_one_that_reacts_later(monkeypatch: pytest.MonkeyPatch) -> None:
     """To the end of the limits: before a neighbour that comes."""
-    near = around(neighbours=[[4.0, 0.0, 0.0]], neighbour_velocities=[[-0.5, 0.0]])
+    near = around(neighbours=[[8.0, 0.0, 0.0]], neighbour_velocities=[[-2.0, 0.0]])
     late, slow = Stream(), Stream(reaction_s=1.0, neighbour_reaction_s=DRAG_FREE.neighbour_reaction_s + 0.5)
     late.gate._response.late_s = 0.5
     monkeypatch.setattr(late.gate._response, "restart", lambda _: None)

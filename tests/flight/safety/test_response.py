@@ -194,7 +194,7 @@ def test_error_and_delay_are_those_of_the_definition(late: int) -> None:
     for tick, setpoint in enumerate(setpoints):
         elapsed_s = 0.0 if tick == 7 else TICK_S
         velocity = velocity - math.expm1(-elapsed_s / 0.5) * (setpoints[max(tick - late, 0)] - velocity)
-        steps.append((velocity + 0.02 * late * random.normal(size=2) / 3, setpoint, elapsed_s))
+        steps.append((velocity + 0.05 * random.normal(size=2), setpoint, elapsed_s))
         monitor.step(*steps[-1])
         expected = by_brute_force(0.5, steps) if tick % 40 == 39 else (monitor.error_m_s, monitor.late_s)
         assert (monitor.error_m_s, monitor.late_s) == pytest.approx(expected)
