@@ -43,10 +43,12 @@ def test_a_table_says_median_and_worst_beside_the_exact_and_the_blind() -> None:
         order = {"median": median, "worst": median - 0.1, "interval": [0, 1], "count": 3}
         return {"flights": 3, "failed": 0, "figures": {"order_tail": order}}
 
-    part = {
+    part: dict[str, Any] = {
         "commit": "0" * 40, "date": "2026-11-28", "command": "python -m nothing", "machine": "none",
         "duration_s": 30.0, "sight": eyes(0.9), "blind": eyes(0.5), "exact": eyes(0.99),
     }  # fmt: skip
+    part["sight"]["figures"]["convergence_time_s"] = {"median": 70.0, "worst": 70.0, "interval": [70, 70], "count": 1}
     page = written("<!-- figures: flights -->\nold\n<!-- end of figures -->", {"flights": {"square": part}})
     assert "old" not in page
+    assert "| time from which the shape stays, s | 70 in 1 of 3 | - | - |" in page
     assert "| order at the end | 0.9 (0.8) | 0.5 (0.4) | 0.99 (0.89) |" in page

@@ -57,10 +57,13 @@ def _origin(part: Part) -> str:
     return f"\n`{part['command']}`, commit {commit[:8]}, {part['date']}, {part['machine']}; {since}"
 
 
-def _cell(figures: Part, figure: str) -> str:
-    one = figures.get(figure)
+def _cell(of: Part, figure: str) -> str:
+    """Of the flights that have it, and how many these are where some have not."""
+    one = of["figures"].get(figure)
     if one is None:
         return "-"
+    if one["count"] < (flown := of["flights"] - of["failed"]):
+        return f"{one['median']:g} in {one['count']} of {flown}"
     between = "" if one["count"] < ENOUGH_FOR_AN_INTERVAL else " [{:g}, {:g}]".format(*one["interval"])
     return f"{one['median']:g}{between}" + (f" ({one['worst']:g})" if one["count"] > 1 else "")
 
@@ -76,7 +79,7 @@ def _flights(parts: Mapping[str, Part], scenarios: Iterable[str] | None = None, 
     for scenario in scenarios or part:
         of = part[scenario]
         rows = [
-            [_named(figure), *(_cell(of[eyes]["figures"], figure) for eyes in EYES)]
+            [_named(figure), *(_cell(of[eyes], figure) for eyes in EYES)]
             for figure in only
             if any(figure in of[eyes]["figures"] for eyes in EYES)
         ]
@@ -98,10 +101,9 @@ def _each(parts: Mapping[str, Part]) -> str:
 def _paper(parts: Mapping[str, Part]) -> str:
     """What the paper says of the same flight: its largest errors, and its Table 3."""
     of = parts["flights"][PAPERS]
-    figures = of["sight"]["figures"]
     rows = [
-        ("distance to a neighbour, largest error, m", "0.168", _cell(figures, "associated_error_max_m")),
-        ("time from which the shape stays, s", "67", _cell(figures, "convergence_time_s")),
+        ("distance to a neighbour, largest error, m", "0.168", _cell(of["sight"], "associated_error_max_m")),
+        ("time from which the shape stays, s", "67", _cell(of["sight"], "convergence_time_s")),
     ]
     return _table(("", "paper, one flight", "flockd, median (worst)"), rows) + "\n" + _origin(of)
 

@@ -26,7 +26,7 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -220,7 +220,7 @@ def _key(line: Line) -> tuple[str, str, int]:
     return line["scenario"], line["eyes"], line["seed"]
 
 
-def table_of(lines: Iterable[Line]) -> dict[str, Any]:
+def table_of(lines: Sequence[Line]) -> dict[str, Any]:
     """Of one scenario's lines, by eyes: how many flights, how many failed, each figure's `Spread` as a mapping, and the
     figures of each flight with its seed."""
     table: dict[str, Any] = {}
@@ -258,27 +258,23 @@ def _rounded_figures(figures: dict[Figure, float | None]) -> dict[str, float]:
     return {figure: _rounded(value) for figure, value in figures.items() if value is not None}
 
 
-def document(commit: str, lines: Iterable[Line], *, quick: bool, most: int | None = None) -> dict[str, Any]:
+def document(commit: str, lines: Sequence[Line], *, quick: bool, most: int | None = None) -> dict[str, Any]:
     """What docs/figures.json holds of each scenario's flights."""
+    fewer = "" if most is None else f" --flights {most}"
+    measured_by = _measured_by(commit, f"python -m tools.measure.card{' --quick' * quick} --parts flights{fewer}")
     found = {}
-    for name, of_scenario in itertools.groupby(sorted(lines, key=lambda line: line["scenario"]), _scenario):
-        flown = list(of_scenario)
-        scenario = load_scenario(data_path("config") / SCENARIOS[name].file)
-        fewer = "" if most is None else f" --flights {most}"
-        command = f"python -m tools.measure.card{' --quick' * quick} --parts flights{fewer}"
-        found[name] = {
-            **_measured_by(commit, command),
-            "networks": model_hashes(scenario.drone.perception),
-            "file": SCENARIOS[name].file,
-            "flown_s": round(sum(line["wall_s"] for line in flown)),
-            "duration_s": (SCENARIOS[name].quick if quick else SCENARIOS[name].whole)[1] or scenario.duration_s,
-            **table_of(flown),
-        }
+    for name, one in SCENARIOS.items():
+        if of_scenario := [line for line in lines if line["scenario"] == name]:
+            scenario = load_scenario(data_path("config") / one.file)
+            found[name] = {
+                **measured_by,
+                "networks": model_hashes(scenario.drone.perception),
+                "file": one.file,
+                "flown_s": round(sum(line["wall_s"] for line in of_scenario)),
+                "duration_s": (one.quick if quick else one.whole)[1] or scenario.duration_s,
+                **table_of(of_scenario),
+            }
     return found
-
-
-def _scenario(line: Line) -> str:
-    return str(line["scenario"])
 
 
 def _measured_by(commit: str, command: str) -> dict[str, Any]:

@@ -22,9 +22,9 @@ _OF_USUAL = 0.02
 _UNSEEN_SHARE = 0.1
 """Who was followed for long is looked for longer than `max_unseen_s`: for this share of that time, while it is likely
 to exist. Else its next detection, often a vague one, would be of a stranger."""
-_SUREST, _LEAST_VARIANCE = 0.01, 1e-12
-"""No usual standard deviation counts as smaller, or a network that is too sure of one neighbour would keep others from
-being confirmed; and no variance, whose logarithm is taken, is."""
+_SUREST = 0.01
+"""No standard deviation of a log range counts as smaller, or a network that is too sure of one neighbour would keep
+others from being confirmed."""
 
 Shown = Callable[[FloatArray, float], BoolArray]
 """Tells around which (n,) of the positions (n, 3), metres NED from the own drone, a camera shows all within a radius in
@@ -40,8 +40,6 @@ class Prediction:
 
     position: FloatArray
     """(3,) metres, NED, own drone at the origin."""
-    covariance: FloatArray
-    """(3, 3) m^2 of `position`."""
     size_m: float
     """As of `Detection.size_m`."""
     existence_probability: float
@@ -131,7 +129,6 @@ class Tracker:
         return tuple(
             Prediction(
                 position=state.position,
-                covariance=state.position_covariance,
                 size_m=state.size_m,
                 existence_probability=track.drone_probability * self._survives(track, interval_s),
             )
@@ -208,8 +205,7 @@ class Tracker:
         """As how much of a detection one counts."""
         if self._usual_log_sigma is None:
             return 1.0
-        usual = max(self._usual_log_sigma, math.log(_SUREST))
-        return min(1.0, self.parameters.vague_factor * math.exp(usual - _log_sigma(measurement)))
+        return min(1.0, self.parameters.vague_factor * math.exp(self._usual_log_sigma - _log_sigma(measurement)))
 
     def _remember(self, measurement: Measurement, weight: float) -> None:
         """How certain the range of a confirmed neighbour is."""
@@ -261,7 +257,7 @@ def _probability_in_view(state: State, shown: Shown) -> float:
 
 def _log_sigma(measurement: Measurement) -> float:
     """Logarithm of the standard deviation of its log range."""
-    return math.log(max(measurement.log_range_variance, _LEAST_VARIANCE)) / 2
+    return math.log(max(measurement.log_range_variance, _SUREST**2)) / 2
 
 
 @dataclass

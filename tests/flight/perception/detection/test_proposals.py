@@ -69,7 +69,7 @@ def test_a_neighbour_is_searched_for_though_another_range_is_detected_there(rang
     front = Rig({"front": CAMERA})
     ahead = CAMERA.T_body_camera.rotation @ [0.0, 0.0, 1.0]
     beside = CAMERA.T_body_camera.rotation @ [math.sin(math.radians(2.0)), 0.0, math.cos(math.radians(2.0))]
-    near = Prediction(3.0 * ahead, 0.01 * np.eye(3), 0.5, 0.99)
+    near = Prediction(3.0 * ahead, 0.5, 0.99)
     found, _ = propose_predictions(front, vehicle(), [near], [(beside, math.log(range_m))], RULES)
     assert len(found) == searched
 
