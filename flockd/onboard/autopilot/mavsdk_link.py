@@ -84,8 +84,8 @@ MOST_OPEN = 20
 """Exchanges whose reply is waited for; older ones are lost."""
 REASON_S = 0.5
 """For how long a refusal waits for the autopilot's text, which comes after it."""
-ATTEND_S, ANNOUNCE_S, PARAMETER_S = 0.25, 1.0, 0.5
-"""Between two looks at what is missing; two announcements; and two readings of a parameter."""
+ATTEND_S, ANNOUNCE_S = 0.25, 1.0
+"""Between two looks at what is missing, and two readings of a parameter; between two announcements."""
 CHECKS_AGAIN_S = 1.0
 """Between two requests for the list of failed checks, of which events were lost."""
 ANNOUNCEMENT = {
@@ -327,7 +327,7 @@ class AutopilotLink:
                 with suppress(AutopilotError):  # an older firmware may lack one, and one that is lost says so elsewhere
                     value = await self.parameter(name, kind)
                     self.received.parameters.take(name, float(value), armed=self.status().armed)
-                await asyncio.sleep(PARAMETER_S)
+                await asyncio.sleep(ATTEND_S)
 
     def take_reports(self) -> list[str]:
         """What happened to the messages since the last call that people should know, each in one sentence."""
