@@ -32,8 +32,8 @@ from flockd.core.config import load_drone
 from flockd.core.data import data_path
 from flockd.core.errors import FlockdError
 from flockd.core.messages import FloatArray
-from flockd.flight.flocking.metrics import closest_distances
 from flockd.review.flight_log.log import FlightLog
+from flockd.review.metrics import closest_distances
 from flockd.sim.flock.start import with_drones
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 from flockd.sim.sitl.autopilots import px4_folder

@@ -1,7 +1,4 @@
-"""The flocking law (Eq. 38-42) and, in `metrics`, figures of a flock.
-
-Everything here is horizontal: north and east.
-"""
+"""The flocking law (Eq. 38-42) and how drones pass each other. Everything here is horizontal: north and east."""
 
 from __future__ import annotations
 

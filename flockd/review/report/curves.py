@@ -18,8 +18,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from flockd.core.messages import BoolArray, FloatArray
-from flockd.flight.flocking.metrics import closest_distances
 from flockd.review.flight_log.log import FlightLog
+from flockd.review.metrics import closest_distances
 from flockd.review.report.style import BAND, FEW, INK, MUTED, STYLE, colour_of, drone_handles
 from flockd.review.report.summary import TABLE_2, estimation_errors, objective_sums
 

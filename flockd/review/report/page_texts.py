@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from flockd.flight.flocking.metrics import closest_distances
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import EXACT_STATES
+from flockd.review.metrics import closest_distances
 from flockd.review.report.style import FEW
 from flockd.review.report.summary import TABLE_2, TABLE_3, causes_text, sizes_text
 

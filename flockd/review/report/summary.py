@@ -9,9 +9,9 @@ import numpy as np
 
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import BoolArray, FloatArray
-from flockd.flight.flocking.metrics import closest_distances, connectivity, obj1, obj2, order, safety, union
 from flockd.review.flight_log.builder import match_neighbours
 from flockd.review.flight_log.log import FlightLog, spread
+from flockd.review.metrics import closest_distances, connectivity, obj1, obj2, order, safety, union
 
 TAIL_S = 10.0
 """The end of a flight, over which the flock counts as converged."""

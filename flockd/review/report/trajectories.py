@@ -16,8 +16,8 @@ from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Affine2D
 
 from flockd.core.messages import BoolArray, FloatArray
-from flockd.flight.flocking.metrics import pair_distances
 from flockd.review.flight_log.log import FlightLog
+from flockd.review.metrics import pair_distances
 from flockd.review.report.curves import flock_handles, flock_lines
 from flockd.review.report.style import (
     FEW,

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from flockd.core.errors import UsageError
-from flockd.flight.flocking.metrics import min_distance
+from flockd.review.metrics import min_distance
 from flockd.sim.scenario import MIN_START_DISTANCE_M, ScenarioConfig, StartConfig
 
 SPACING_M = 3.5

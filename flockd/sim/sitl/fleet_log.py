@@ -12,7 +12,6 @@ import numpy as np
 from flockd import __version__
 from flockd.core.config import DroneConfig
 from flockd.core.messages import NO_STATUS, FloatArray, MissionStatus, PilotOutput
-from flockd.flight.flocking.metrics import order
 from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.onboard.message_json import from_json
 from flockd.onboard.recording.mcap_file import read_entries
@@ -20,6 +19,7 @@ from flockd.onboard.recording.streams import OUTPUT
 from flockd.review.flight_log.builder import FlightLogBuilder
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FleetMetadata, FlightMetadata, MissionMetadata
+from flockd.review.metrics import order
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.sitl.ground_station import Poses
 

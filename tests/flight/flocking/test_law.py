@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from flockd.flight.flocking import FlockingLaw, FlockingParameters, WeightParameters, level_offsets
-from flockd.flight.flocking.metrics import connectivity, min_distance, obj1, obj2, order, pair_distances, safety, union
 from flockd.flight.mission import MissionParameters
 from flockd.flight.mission.circle_then_tangent import course, desired_velocity
+from flockd.review.metrics import min_distance, obj1, obj2, pair_distances
 
 Array = NDArray[np.float64]
 NOBODY = np.empty((0, 2))
@@ -230,52 +230,3 @@ def test_twenty_stay_apart_with_weight_on_three_and_crowd_with_weight_on_all() -
 
     assert min(apart(kind="nearest", nearest=3)) > 1.5
     assert max(apart(kind="uniform")[60:]) < 1.5  # held apart by Eq. 41 alone
-
-
-# Figures of a flock against small flocks worked out by hand.
-
-
-def test_obj1_is_the_cosine_on_the_circle_and_the_l1_distance_after_it() -> None:
-    velocities = np.array([[0.0, 2.0], [2.0, 0.0], [0.0, -1.0]])
-    # -(V . efv) / (2 |efv|^2) with efv = (0, 2)
-    np.testing.assert_allclose(obj1(velocities, np.array([0.0, 2.0]), circling=True), [-0.5, 0.0, 0.25])
-    np.testing.assert_allclose(obj1(velocities, np.array([1.0, 0.0]), circling=False), [3.0, 1.0, 2.0])
-
-
-TWO_PAIRS = np.array([[0.0, 0.0], [50.0, 0.0], [0.0, 1.0], [50.0, 1.0]])
-NEAR = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.9], [5.0, 0.0, 0.0]])
-
-
-def row(count: int) -> Array:
-    """A metre apart."""
-    return np.column_stack([np.arange(float(count)), np.zeros(count)])
-
-
-@pytest.mark.parametrize(
-    ("figure", "expected"),
-    [
-        # the mean cosine over pairs
-        (order(np.array([[1.0, 0.0], [3.0, 0.0]])), 1.0),
-        (order(np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])), -1 / 3),  # cosines 0, -1, 0
-        (order(np.array([[1.0, 0.0], [0.0, 0.0]])), 0.0),
-        (order(np.array([[1.0, 0.0]])), 1.0),
-        # components
-        (union(row(4), 1.0), 1.0),
-        (union(row(4), 0.9), 0.0),
-        (union(TWO_PAIRS, 5.0), 2 / 3),
-        (union(row(1), 1.0), 1.0),
-        (union(row(33), 1.0), 1.0),
-        # complete graphs, of which every eigenvalue but the first is n, and paths: 2 - 2 cos(pi / n)
-        *((connectivity(row(n), 100.0), 1.0) for n in (2, 5, 9)),
-        *((connectivity(row(n), 1.0), (2 - 2 * math.cos(math.pi / n)) / n) for n in (3, 4, 7)),
-        (connectivity(row(4), 0.5), 0.0),
-        (connectivity(row(1), 0.5), 1.0),
-        (safety(NEAR), 2 / 3),  # 0.9 m < 2 * 0.5 m
-        (safety(NEAR, collision_radius_m=0.45), 1.0),
-        (safety(NEAR[:1]), 1.0),
-        (min_distance(NEAR), 0.9),
-        (min_distance(NEAR[:1]), math.inf),
-    ],
-)
-def test_figures_of_flocks_whose_answer_is_known(figure: float, expected: float) -> None:
-    assert figure == pytest.approx(expected, abs=1e-12)

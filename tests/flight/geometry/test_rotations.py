@@ -1,4 +1,4 @@
-"""Rotations, rigid transforms and their fits against scipy; the closest approach of two points by hand."""
+"""Rotations, rigid transforms and their fits against scipy."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flockd.core.messages import FloatArray
-from flockd.flight.flocking.metrics import closest_approach
 from flockd.flight.geometry import (
     RigidTransform,
     euler_from_rotation,
@@ -112,32 +111,3 @@ def test_degenerate_input_is_refused_with_its_reason(
 ) -> None:
     with pytest.raises(ValueError, match=reason):
         fit_rigid(source, target, weights)
-
-
-# The closest approach of two points.
-
-
-@pytest.mark.parametrize(
-    ("begin", "end", "least_m"),
-    [
-        pytest.param([1.0, 0.34, 0.0], [-1.0, 0.34, 0.0], 0.34, id="head-on, past each other"),
-        pytest.param([1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], 0.0, id="through each other"),
-        pytest.param([5.0, 0.0, 0.0], [3.0, 0.0, 0.0], 3.0, id="not there yet"),
-        pytest.param([3.0, 4.0, 0.0], [6.0, 8.0, 0.0], 5.0, id="going away"),
-        pytest.param([1.0, 2.0, 2.0], [1.0, 2.0, 2.0], 3.0, id="both standing still"),
-        pytest.param([0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0, id="standing at one place"),
-        pytest.param([4.0, 0.0], [0.0, 3.0], 2.4, id="height of a triangle of 3, 4 and 5"),
-        pytest.param([0.0, 2.0, -1.0], [0.0, 2.0, 3.0], 2.0, id="one climbs past the other"),
-    ],
-)
-def test_two_points_are_closest_where_algebra_says(begin: list[float], end: list[float], least_m: float) -> None:
-    assert closest_approach(np.array(begin), np.array(end)) == pytest.approx(least_m, abs=1e-12)
-    assert closest_approach(np.array(end), np.array(begin)) == pytest.approx(least_m, abs=1e-12)
-
-
-@pytest.mark.parametrize("begin_m", [0.6, 1.0, 3.0])
-def test_who_brakes_errs_by_no_more_than_the_bound(begin_m: float) -> None:
-    """At 1 m/s towards each other, braked by 4 m/s^2: they turn 1/8 m nearer after 0.25 s, and are back at 0.5 s."""
-    found = float(closest_approach(np.array([begin_m]), np.array([begin_m])))
-    assert found == begin_m
-    assert found - (begin_m - 1.0 / 8.0) == pytest.approx(4.0 * 0.5**2 / 8)

@@ -9,8 +9,8 @@ import pytest
 
 from flockd.core.data import data_path
 from flockd.core.messages import FloatArray, Setpoint, Wanted
-from flockd.flight.flocking.metrics import min_distance
 from flockd.flight.safety import Action, Event, Gate, Objection, Permission, Request, Surroundings, Verdict
+from flockd.review.metrics import min_distance
 from flockd.sim.flock.control_loop import Commands, ControlLoop, SlowedTime
 from flockd.sim.flock.exact_states import ExactFlock, step_times, vehicles_of
 from flockd.sim.flock.swarm import fly

@@ -11,7 +11,7 @@ from flockd.campaign.flight_plan import CASE, Cell, Plan
 from flockd.core.config.mission import MissionParameters
 from flockd.core.config.real_drone import PROVEN_M_S
 from flockd.flight.flocking import FlockingLaw
-from flockd.flight.flocking.metrics import closest_distances
+from flockd.review.metrics import closest_distances
 from flockd.sim.flock.exact_states import fly_exact_states
 from flockd.sim.scenario import ScenarioConfig, StartConfig, load_scenario
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from flockd.core.config.flocking import FlockingParameters
-from flockd.flight.flocking.metrics import min_distance, obj2, pair_distances
 from flockd.flight.geometry import rotation_from_euler
+from flockd.review.metrics import min_distance, obj2, pair_distances
 from flockd.sim.flock.exact_states import fly_exact_states
 from flockd.sim.scenario import SensorConfig, StartConfig, VehicleConfig
 from flockd.sim.vehicles.vehicles import SimulatedAutopilot, Vehicles, attitude
