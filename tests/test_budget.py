@@ -25,7 +25,7 @@ LINES = {
     "flockd/onboard": 9_010,
     "flockd/fleet": 2_670,
     "flockd/ground": 4_030,
-    "flockd/review": 3_390,
+    "flockd/review": 3_510,
     "flockd/sim": 8_530,
     "flockd/campaign": 1_470,
     "flockd/cli": 3_430,
