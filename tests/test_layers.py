@@ -14,8 +14,8 @@ PACKAGE = Path(__file__).parents[1] / "flockd"
 
 ROOMS = ("core", "flight", "onboard", "fleet", "ground", "review", "sim", "campaign", "cli")
 """From the ground up: a room imports itself and rooms below it."""
-FLIGHT = ("geometry", "inference", "tracking", "perception", "flocking", "safety", "obstacles", "mission", "pilot")
-"""The order inside `flight`. Mission and obstacles ask for the fence and the half planes of safety."""
+FLIGHT = ("geometry", "inference", "tracking", "perception", "safety", "flocking", "obstacles", "mission", "pilot")
+"""The order inside `flight`. Flocking, obstacles and mission ask for the half planes and the fence of safety."""
 ONBOARD = ("autopilot", "telemetry", "sources", "recording", "daemon")
 """The order inside `onboard`: frames may come over zenoh; recording asks telemetry for the table of topics."""
 

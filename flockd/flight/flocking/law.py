@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flockd.core.config.flocking import FlockingParameters, WeightParameters
-from flockd.core.messages import BoolArray, FloatArray, IntArray
+from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.geometry.level import SAME_SPOT_M, limit_norm
 
 _MIN_DISTANCE_M = 1e-3
@@ -19,7 +19,7 @@ an error e of the own velocity that lasts moves the velocity where u = -e / st, 
 
 
 class FlockingLaw:
-    """Eq. 38-42 for one drone or many. Holds no state: the same input gives the same output."""
+    """Eq. 38-42. Holds no state: the same input gives the same output."""
 
     def __init__(self, parameters: FlockingParameters | None = None) -> None:
         self.parameters = parameters or FlockingParameters()
@@ -46,46 +46,25 @@ class FlockingLaw:
         offsets = _finite(positions, (-1, 2), "the neighbours' positions")
         theirs = _finite(velocities, (len(offsets), 2), "the neighbours' velocities")
         ages = np.broadcast_to(np.asarray(ages_s, dtype=float), len(offsets))
-        owners = np.zeros(len(offsets), dtype=np.int64)
-        found: FloatArray = self.accelerations(own[None], owners, offsets, theirs, desired[None], ages)[0]
-        return found
-
-    def accelerations(
-        self,
-        own: FloatArray,
-        owners: IntArray,
-        offsets: FloatArray,
-        theirs: FloatArray,
-        desired: FloatArray,
-        ages_s: FloatArray,
-    ) -> FloatArray:
-        """U of Eq. 38 of m drones at once: (m, 2) m/s^2, as `acceleration` gives it for each, but unchecked.
-
-        `own` and `desired` (m, 2) m/s are the drones'. Each neighbour of a drone is one of p pairs: `owners` (p,) is
-        the drone's number, from 0 and in ascending order, and `offsets` (p, 2) m, `theirs` (p, 2) m/s and `ages_s` (p,)
-        are the neighbour's.
-        """
         p = self.parameters
         offsets = np.where(np.any(offsets != 0, axis=1, keepdims=True), offsets, [_MIN_DISTANCE_M, 0.0])
         distances = np.hypot(offsets[:, 0], offsets[:, 1])
         near = distances <= max(p.observation_distance_m, p.separation_distance_m)
-        owners, offsets, theirs, distances = owners[near], offsets[near], theirs[near], distances[near]
+        offsets, theirs, ages, distances = offsets[near], theirs[near], ages[near], distances[near]
         directions = offsets / distances[:, None]
+        observed = distances <= p.observation_distance_m
         distances = np.maximum(distances, _MIN_DISTANCE_M)
 
         pull = p.cohesion * distances * np.log(distances / p.desired_distance_m)
-        weights = influence_weights(p.weight, owners, distances, distances <= p.observation_distance_m)
+        weights = influence_weights(p.weight, distances, observed)
         if p.cohesion_time_s is not None:
-            pull = np.minimum(pull, p.max_acceleration_m_s2 * (ages_s[near] / p.cohesion_time_s) ** 2)
+            pull = np.minimum(pull, p.max_acceleration_m_s2 * (ages / p.cohesion_time_s) ** 2)
         cohesion = (weights * pull)[:, None] * directions  # Eq. 39
-        alignment = (p.alignment * weights)[:, None] * (theirs - own[owners])  # Eq. 40
+        alignment = (p.alignment * weights)[:, None] * (theirs - own)  # Eq. 40
         crowding = np.maximum(1 / distances - 1 / p.separation_distance_m, 0.0)  # 0 beyond D_II
         separation = (-p.separation * crowding**2)[:, None] * directions  # Eq. 41
         following = p.velocity * p.own_weight * desired  # Eq. 42
-        of_pairs = (cohesion + alignment + separation).T
-        # Pair after pair, so that a drone's sum does not depend on who else is in the arrays.
-        summed = np.column_stack([np.bincount(owners, axis, len(own)) for axis in of_pairs])
-        u: FloatArray = summed + following - own  # Eq. 38
+        u: FloatArray = (cohesion + alignment + separation).sum(axis=0) + following - own  # Eq. 38
         return u
 
     def command(
@@ -132,20 +111,15 @@ def level_offsets(offsets: FloatArray) -> FloatArray:
     return level
 
 
-def influence_weights(
-    parameters: WeightParameters, owners: IntArray, distances: FloatArray, observed: BoolArray
-) -> FloatArray:
-    """W of Eq. 39 and 40, which the paper leaves open: (p,) of 0 and 1, 0 for who is not `observed` (p,).
+def influence_weights(parameters: WeightParameters, distances: FloatArray, observed: BoolArray) -> FloatArray:
+    """W of Eq. 39 and 40, which the paper leaves open: (n,) of 0 and 1, 0 for who is not `observed` (n,).
 
-    `uniform` gives all 1, as in the paper's flight of five. `nearest` gives 1 to the k nearest of each of the `owners`
-    (p,), which is the same to k + 1 drones or fewer and keeps larger flocks from collapsing; of two equally far the
-    first counts as nearer.
+    `uniform` gives all 1, as in the paper's flight of five. `nearest` gives 1 to the k nearest, which is the same to
+    k + 1 drones or fewer and keeps larger flocks from collapsing; of two equally far the first counts as nearer.
     """
     weights = observed.astype(float)
     if parameters.kind == "nearest":
-        by_distance = np.lexsort((distances, owners))
-        ranks = np.arange(len(owners)) - np.searchsorted(owners, owners)  # `owners` are the same in either order
-        weights[by_distance[ranks >= parameters.nearest]] = 0.0
+        weights[np.argsort(distances, kind="stable")[parameters.nearest :]] = 0.0
     return weights
 
 

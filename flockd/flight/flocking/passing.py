@@ -7,10 +7,10 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import FloatArray
 from flockd.flight.flocking.law import FlockingLaw, level_offsets, lookahead_s
 from flockd.flight.geometry.level import SAME_SPOT_M
+from flockd.flight.safety.half_planes import NO_LIMITS, ROUNDING_M_S, Limits, crossings
 
 HORIZON_S = 2.5
 """Who would come too near within this time is passed: five steps of the paper's pilot."""
@@ -28,14 +28,8 @@ not go to this one, and only backing off would be left."""
 _RING = 24
 _SPEEDS = 1.0, 0.5
 """Directions, and shares of the highest speed, that are tried where no velocity keeps clear of all."""
-_ROUNDING_M_S = 1e-9
 _DIGITS = 9
 """Of m/s that count."""
-
-
-Limits = tuple[FloatArray, FloatArray]
-"""Directions (k, 2) of length 1, and how fast the last gate lets the drone fly along each, (k,) m/s, 0 or more."""
-NO_LIMITS: Limits = (np.empty((0, 2)), np.empty(0))
 
 
 class Passing:
@@ -46,7 +40,7 @@ class Passing:
     """
 
     def __init__(self, law: FlockingLaw, vertical_m: float) -> None:
-        """`vertical_m`: as of `clear_of`."""
+        """A neighbour that is `vertical_m` above or below, or more, is passed anyway."""
         self._law, self._vertical_m = law, vertical_m
         self._sides: dict[int, float] = {}
 
@@ -61,9 +55,9 @@ class Passing:
         limits: Limits = NO_LIMITS,
         ages_s: FloatArray | float = math.inf,
     ) -> tuple[FloatArray, FloatArray]:
-        """As of `FlockingLaw.command`, but clear of who would come too near; arguments as of `clear_of`.
+        """As of `FlockingLaw.command`, but clear of who would come too near; arguments as of `clear`.
 
-        `tracks`: the neighbours' numbers. The acceleration, (2,) m/s^2, is the law's, or else the one that leads to the
+        The acceleration, (2,) m/s^2, is the law's, or else the one that leads to the
         velocity within its sampling time.
         """
         wanted, acceleration = self._law.command(velocity, level_offsets(offsets), velocities, desired, step_s, ages_s)
@@ -79,57 +73,39 @@ class Passing:
         tracks: Sequence[int],
         limits: Limits = NO_LIMITS,
     ) -> FloatArray:
-        """As of `clear_of`, for neighbours of these numbers."""
-        sides = np.array([self._sides.get(track, 0.0) for track in tracks])
-        law = self._law.parameters
-        clear = clear_of(wanted, velocity, offsets, velocities, law, self._vertical_m, sides, limits)
-        self._sides = dict(zip(tracks, sides.tolist(), strict=True))
-        return clear
+        """The velocity nearest to the `wanted` one, (2,) m/s, that passes each neighbour at the separation distance.
 
+        `velocity` (2,) m/s is the own one, `offsets` (n, 3) metres NED are the neighbours', `velocities` (n, 2) m/s
+        theirs, over ground, and `tracks` their numbers. A side is taken where the last gate, as of its `limits`, leaves
+        way.
 
-def clear_of(
-    wanted: FloatArray,
-    velocity: FloatArray,
-    offsets: FloatArray,
-    velocities: FloatArray,
-    parameters: FlockingParameters,
-    vertical_m: float,
-    sides: FloatArray | None = None,
-    limits: Limits = NO_LIMITS,
-) -> FloatArray:
-    """The velocity nearest to the `wanted` one, (2,) m/s, that passes each neighbour at the separation distance.
+        Optimal reciprocal collision avoidance (J. van den Berg, S. Guy, M. Lin, D. Manocha, "Reciprocal n-body
+        collision avoidance", 2011): for each neighbour one half-plane of velocities, so that none comes nearer within
+        `HORIZON_S` if both take their share. Where one is nearer already it comes no nearer, and the law's separation
+        parts them. Where nobody would come too near it is what was wanted; where no velocity is clear of all, the one
+        that is least off.
+        """
+        distance_m, max_speed_m_s = self._law.parameters.separation_distance_m, self._law.parameters.max_speed_m_s
+        ranges = np.hypot(offsets[:, 0], offsets[:, 1])
+        near = np.flatnonzero((np.abs(offsets[:, 2]) < self._vertical_m) & (ranges > SAME_SPOT_M)).tolist()
+        taken = {one: self._sides.get(tracks[one], 0.0) for one in near}
 
-    `velocity` (2,) m/s is the own one, `offsets` (n, 3) metres NED are the neighbours' and `velocities` (n, 2) m/s
-    theirs, over ground. One that is `vertical_m` above or below, or more, is passed anyway. `sides` (n,) says on which
-    side each was being passed, 1 right, -1 left, 0 none, and is changed to what it is now; None: none were. A side is
-    taken where the last gate, as of its `limits`, leaves way.
+        def plane(one: int, side: float) -> tuple[FloatArray, float, float]:
+            return _half_plane(velocity, offsets[one, :2], velocity - velocities[one], distance_m, side)
 
-    Optimal reciprocal collision avoidance (J. van den Berg, S. Guy, M. Lin, D. Manocha, "Reciprocal n-body collision
-    avoidance", 2011): for each neighbour one half-plane of velocities, so that none comes nearer within `HORIZON_S` if
-    both take their share. Where one is nearer already it comes no nearer, and the law's separation parts them. Where
-    nobody would come too near it is what was wanted; where no velocity is clear of all, the one that is least off.
-    """
-    taken = np.zeros(len(offsets)) if sides is None else sides
-    near = np.flatnonzero((np.abs(offsets[:, 2]) < vertical_m) & (np.hypot(offsets[:, 0], offsets[:, 1]) > SAME_SPOT_M))
-
-    def plane(one: int, side: float) -> tuple[FloatArray, float, float]:
-        relative = velocity - velocities[one]
-        return _half_plane(velocity, offsets[one, :2], relative, parameters.separation_distance_m, side)
-
-    planes = {one: plane(one, taken[one]) for one in near.tolist()}
-    found = _clearest(wanted, planes.values(), parameters.max_speed_m_s, limits)
-    for one in sorted(planes, key=lambda one: math.hypot(*offsets[one, :2])):
-        normal, least_m_s, side = planes[one]
-        if found is not None and side and not taken[one] and normal @ wanted < least_m_s:
-            others = {**planes, one: plane(one, -side)}
-            # Not where the wanted one is clear there: nobody would turn, and 150 flights pass nearer (1.6, not 1.8 m).
-            other = _clearest(wanted, others.values(), parameters.max_speed_m_s, limits)
-            if other is not None and (other[0], other[1] + _WORTH_M_S) < found[:2]:
-                planes, found = others, other
-    taken[:] = 0.0
-    for one, (_, _, side) in planes.items():
-        taken[one] = side
-    return wanted if found is None else found[2]
+        planes = {one: plane(one, taken[one]) for one in near}
+        found = _clearest(wanted, planes.values(), max_speed_m_s, limits)
+        for one in sorted(planes, key=ranges.__getitem__):
+            normal, least_m_s, side = planes[one]
+            if found is not None and side and not taken[one] and normal @ wanted < least_m_s:
+                others = {**planes, one: plane(one, -side)}
+                # Not where the wanted one is clear there: nobody would turn, and 150 flights pass nearer (1.6, not
+                # 1.8 m).
+                other = _clearest(wanted, others.values(), max_speed_m_s, limits)
+                if other is not None and (other[0], other[1] + _WORTH_M_S) < found[:2]:
+                    planes, found = others, other
+        self._sides = {tracks[one]: side for one, (_, _, side) in planes.items()}
+        return wanted if found is None else found[2]
 
 
 def _clearest(
@@ -140,17 +116,17 @@ def _clearest(
     None: `wanted` is off none.
     """
     normals, least = np.reshape([one[0] for one in planes], (-1, 2)), np.array([one[1] for one in planes])
-    if (normals @ wanted >= least - _ROUNDING_M_S).all():
+    if (normals @ wanted >= least - ROUNDING_M_S).all():
         return None
     towards, most_m_s = (one[limits[1] < max_speed_m_s] for one in limits)  # the others bind nothing
     across, at_m_s = np.vstack([normals, towards]), np.concatenate([least, most_m_s])
     feet = wanted + (at_m_s - across @ wanted)[:, None] * across
-    tried = np.vstack([feet, _crossings(across, at_m_s)])
-    tried *= np.minimum(1.0, max_speed_m_s / np.maximum(np.linalg.norm(tried, axis=1), _ROUNDING_M_S))[:, None]
-    tried = tried[(tried @ towards.T <= most_m_s + _ROUNDING_M_S).all(axis=1)]
+    tried = np.vstack([feet, crossings(across, at_m_s)])
+    tried *= np.minimum(1.0, max_speed_m_s / np.maximum(np.linalg.norm(tried, axis=1), ROUNDING_M_S))[:, None]
+    tried = tried[(tried @ towards.T <= most_m_s + ROUNDING_M_S).all(axis=1)]
     angles = np.arange(_RING) * (2 * math.pi / _RING)
     ring = np.column_stack([np.cos(angles), np.sin(angles)])
-    fastest = (most_m_s / np.maximum(ring @ towards.T, _ROUNDING_M_S)).min(axis=1, initial=max_speed_m_s)[:, None]
+    fastest = (most_m_s / np.maximum(ring @ towards.T, ROUNDING_M_S)).min(axis=1, initial=max_speed_m_s)[:, None]
     tried = np.vstack([tried, *(np.minimum(max_speed_m_s * share, fastest) * ring for share in _SPEEDS)])
     off = np.round(np.maximum(least - tried @ normals.T, 0.0).max(axis=1), _DIGITS)
     best = tried[off == off.min()]
@@ -190,15 +166,3 @@ def _half_plane(
         change = -float(relative @ normal)
     share = 1.0 if comes and closing_m_s * HORIZON_S > range_m - distance_m else _SHARE
     return normal, float(velocity @ normal) + (share * change if change > 0 else change), side
-
-
-def _crossings(normals: FloatArray, least: FloatArray) -> FloatArray:
-    """(m, 2): where two of the lines n . v = least cross, for each two that are not parallel."""
-    i, j = np.triu_indices(len(normals), 1)
-    determinants = normals[i, 0] * normals[j, 1] - normals[i, 1] * normals[j, 0]
-    cross = np.abs(determinants) > 1e-6
-    a, b, c, d = normals[i][cross], normals[j][cross], least[i][cross], least[j][cross]
-    points: FloatArray = (
-        np.column_stack([c * b[:, 1] - d * a[:, 1], d * a[:, 0] - c * b[:, 0]]) / determinants[cross, None]
-    )
-    return points

@@ -9,9 +9,7 @@ import numpy as np
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.geometry.level import SAME_SPOT_M
-
-NOTHING_NEAR = np.empty((0, 2)), np.empty(0)
-"""No direction, and no limit."""
+from flockd.flight.safety.half_planes import NO_LIMITS, Limits
 
 
 def towards_neighbours(
@@ -21,7 +19,7 @@ def towards_neighbours(
     separation_m: float,
     margins: FloatArray | None = None,
     unseen_s: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray]:
+) -> Limits:
     """For each neighbour about at the drone's height its direction, (n, 2), and how fast to fly there, (n,) m/s.
 
     `offsets` (k, 3) metres NED from the drone, `velocities` (k, 2) m/s over ground; `margins` (k, 2) by how much
@@ -43,7 +41,7 @@ def _braking(
     separation_m: float,
     margins: FloatArray,
     unseen_s: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
+) -> Limits:
     """As of `towards_neighbours`, where each has braked since it was last seen, as hard as its gate lets it.
 
     It stands where that ends, or will end, and the drone stops before that place as before an obstacle. A tracker that
@@ -70,7 +68,7 @@ def _about_level(p: GateParameters, offsets: FloatArray, separation_m: float) ->
 
 def _flying_on(
     p: GateParameters, offsets: FloatArray, velocities: FloatArray, separation_m: float, margins: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+) -> Limits:
     """As of `towards_neighbours`, where each flies on as it is said to.
 
     Nearer than the separation: not at all. Farther, so fast that the distance left suffices if both brake, as in
@@ -100,15 +98,13 @@ def _flying_on(
     return towards, np.where(left_m > 0, most_m_s, 0.0)
 
 
-def towards_obstacles(
-    points: FloatArray, clearance_m: float, braking_m_s2: float, reaction_s: float
-) -> tuple[FloatArray, FloatArray]:
+def towards_obstacles(points: FloatArray, clearance_m: float, braking_m_s2: float, reaction_s: float) -> Limits:
     """For each obstacle's point its direction, (n, 2), and how fast to fly there, (n,) m/s: see `stopping_speed`.
 
     `points` (m, 2) metres north and east from the drone; those that are not finite, or at no distance, are left out.
     """
     if not len(points):
-        return NOTHING_NEAR
+        return NO_LIMITS
     ranges = np.hypot(points[:, 0], points[:, 1])
     somewhere = (ranges > 0) & (ranges < math.inf)
     points, ranges = points[somewhere], ranges[somewhere]

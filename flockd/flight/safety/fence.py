@@ -9,7 +9,8 @@ import numpy as np
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray
 from flockd.core.navigation import is_inside
-from flockd.flight.safety.approach import NOTHING_NEAR, stopping_speed
+from flockd.flight.safety.approach import stopping_speed
+from flockd.flight.safety.half_planes import NO_LIMITS, Limits
 
 
 def outside_fence(parameters: GateParameters, position: FloatArray) -> bool:
@@ -24,7 +25,7 @@ def outside_heights(parameters: GateParameters, height_m: float) -> bool:
     return not parameters.min_height_m <= height_m <= parameters.max_height_m
 
 
-def towards_fence(p: GateParameters, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+def towards_fence(p: GateParameters, position: FloatArray) -> Limits:
     """Directions (n, 2) to the fences, or outward where one was left, and how fast to fly there, (n,) m/s.
 
     A fence counts as a wall, to which the drone keeps `obstacle_clearance_m`: see `stopping_speed`. Beyond it, not at
@@ -34,7 +35,7 @@ def towards_fence(p: GateParameters, position: FloatArray) -> tuple[FloatArray, 
     offsets: list[FloatArray] = []
     left_m: list[float] = []
     if not np.isfinite(position).all():
-        return NOTHING_NEAR
+        return NO_LIMITS
     if p.fence_radius_m is not None:
         out_m = math.hypot(*position)
         off = np.linspace(0.0, 2.0 * math.pi, 12, endpoint=False)  # from the direction outward

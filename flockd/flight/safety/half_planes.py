@@ -6,9 +6,13 @@ import numpy as np
 
 from flockd.core.messages import FloatArray
 
-_ROUNDING_M_S = 1e-9
+ROUNDING_M_S = 1e-9
 _PARALLEL = 1e-6
 """Sine of the angle between two directions below which their limits are not combined."""
+
+Limits = tuple[FloatArray, FloatArray]
+"""Directions (k, 2) of length 1, and how fast the drone may fly along each, (k,) m/s, 0 or more."""
+NO_LIMITS: Limits = np.empty((0, 2)), np.empty(0)
 
 
 def nearest_within(velocity: FloatArray, directions: FloatArray, limits: FloatArray) -> FloatArray:
@@ -22,24 +26,24 @@ def nearest_within(velocity: FloatArray, directions: FloatArray, limits: FloatAr
     over = directions @ velocity - limits
     if (over <= 0).all():
         return velocity
-    binding = ~(limits > np.hypot(*velocity) + _ROUNDING_M_S)  # the others hold for all that is no longer
+    binding = ~(limits > np.hypot(*velocity) + ROUNDING_M_S)  # the others hold for all that is no longer
     directions, limits, over = directions[binding], limits[binding], over[binding]
     feet = velocity - over[:, None] * directions
-    candidates = np.vstack([np.zeros(2), feet, _crossings(directions, limits)])
-    fits = np.max(candidates @ directions.T - limits, axis=1, initial=-np.inf) <= _ROUNDING_M_S
+    candidates = np.vstack([np.zeros(2), feet, crossings(directions, limits)])
+    fits = np.max(candidates @ directions.T - limits, axis=1, initial=-np.inf) <= ROUNDING_M_S
     fitting = candidates[fits]
     nearest: FloatArray = fitting[np.argmin(np.linalg.norm(fitting - velocity, axis=1))]
     return nearest
 
 
-def _crossings(directions: FloatArray, limits: FloatArray) -> FloatArray:
+def crossings(directions: FloatArray, limits: FloatArray) -> FloatArray:
     """(m, 2): where two of the lines n . v = limit cross, for each two that are not parallel (Cramer's rule)."""
     i, j = np.triu_indices(len(directions), 1)
     a, b = directions[i], directions[j]
     determinants = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     cross = np.abs(determinants) > _PARALLEL
     a, b, c, d = a[cross], b[cross], limits[i][cross], limits[j][cross]
-    crossings: FloatArray = (
+    points: FloatArray = (
         np.column_stack([c * b[:, 1] - d * a[:, 1], d * a[:, 0] - c * b[:, 0]]) / determinants[cross, None]
     )
-    return crossings
+    return points

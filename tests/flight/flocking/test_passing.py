@@ -6,11 +6,13 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import FloatArray
 from flockd.flight.flocking import FlockingLaw
-from flockd.flight.flocking.passing import Passing, clear_of
+from flockd.flight.flocking.passing import Passing
+from flockd.flight.safety.half_planes import NO_LIMITS, Limits
 
 pytestmark = pytest.mark.fault("one-that-does-not-avoid")
 
@@ -18,9 +20,13 @@ PARAMETERS = FlockingParameters()
 NORTH = np.array([2.0, 0.0])
 
 
-def passed(offset: list[float], theirs: list[float], wanted: FloatArray = NORTH) -> FloatArray:
-    """With one neighbour, by a drone that flies as it wants to."""
-    return clear_of(wanted, wanted, np.array([offset]), np.array([theirs]), PARAMETERS, 3.0)
+def passed(
+    offset: ArrayLike, theirs: ArrayLike, wanted: FloatArray = NORTH, own: FloatArray | None = None,
+    limits: Limits = NO_LIMITS,
+) -> FloatArray:  # fmt: skip
+    """With one neighbour, met just now by a drone that flies as it wants to, or else at its `own` velocity."""
+    law, velocity = FlockingLaw(PARAMETERS), wanted if own is None else own
+    return Passing(law, 3.0).clear(wanted, velocity, np.array([offset]), np.array([theirs]), [1], limits)
 
 
 @pytest.mark.parametrize(
@@ -93,12 +99,10 @@ def test_for_one_that_comes_by_itself_it_steps_aside_at_once() -> None:
 
 def test_it_turns_to_the_side_to_which_the_gate_lets_it_fly() -> None:
     """One comes head-on; to the right, where the rule would send it, the gate lets it fly no faster than 0.1 m/s."""
-    offset, theirs = np.array([[6.0, 0.0, 0.0]]), np.array([[-2.0, 0.0]])
-    right = np.array([[0.0, 1.0]])
     for most_m_s, side in ((1.0, 1.0), (0.1, -1.0)):
-        sides, limits = np.zeros(1), (right, np.array([most_m_s]))
-        velocity = clear_of(NORTH, NORTH, offset, theirs, PARAMETERS, 3.0, sides, limits)
-        assert math.copysign(1.0, velocity[1]) == sides[0] == side
+        limits = np.array([[0.0, 1.0]]), np.array([most_m_s])
+        velocity = passed([6.0, 0.0, 0.0], [-2.0, 0.0], limits=limits)
+        assert math.copysign(1.0, velocity[1]) == side
         assert velocity[1] <= most_m_s
 
 
@@ -111,9 +115,9 @@ def test_two_on_a_course_to_meet_pass_at_the_separation(angle_deg: float, *, avo
     places, velocities, nearest_m = -8.0 * wanted, wanted, math.inf
     for _ in range(40):
         offset = np.append(places[1] - places[0], 0.0)
-        told = [clear_of(wanted[0], velocities[0], offset[None], velocities[1:], PARAMETERS, 3.0), wanted[1]]
+        told = [passed(offset, velocities[1], wanted[0], velocities[0]), wanted[1]]
         if avoids:
-            told[1] = clear_of(wanted[1], velocities[1], -offset[None], velocities[:1], PARAMETERS, 3.0)
+            told[1] = passed(-offset, velocities[0], wanted[1], velocities[1])
         for _ in range(10):
             places = places + 0.05 * velocities
             nearest_m = min(nearest_m, float(np.linalg.norm(places[0] - places[1])))
