@@ -48,9 +48,11 @@ from flockd.flight.inference.manifest_file import model_hashes
 from flockd.review.replay.profile import ComputerFiles
 from flockd.sim.cameras.camera_simulator import family_of
 from flockd.sim.flock.swarm import fly
+from flockd.sim.renderer.airframe import DroneModel
 from flockd.sim.scenario import MIN_START_DISTANCE_M, ScenarioConfig, load_scenario
 from tools.measure import perceived_errors
 from tools.measure.labelled import Box, read_labels, scored
+from tools.training.own_mesh import painted, read_meshes
 
 ROOT = Path(__file__).resolve().parents[2]
 FIGURES_FILE = ROOT / "docs" / "figures.json"
@@ -103,13 +105,20 @@ class Scenario:
         }  # fmt: skip
 
 
+REAL_AIRFRAMES = "varied, real airframes"
+"""Flown with the meshes that are given, one after another."""
 SCENARIOS = {
     "the paper's five drones": Scenario("paper_flight.yaml", (2, 30.0)),
     "varied": Scenario("paper_flight.yaml", (3, 20.0), varied=True),
     "forest": Scenario("forest.yaml", (1, 20.0)),
     "fisheye": Scenario("fisheye_flight.yaml", (1, 15.0)),
     "head-on": Scenario("head_on.yaml", (6, None)),
+    REAL_AIRFRAMES: Scenario("paper_flight.yaml", (3, 20.0), (10, None), varied=True),
 }
+
+
+Airframe = tuple[str, float]
+"""The file of its mesh, and metres from propeller tip to tip."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +131,7 @@ class Flight:
     file: str
     duration_s: float | None
     overrides: Overrides
+    airframe: Airframe | None = None
 
     @property
     def key(self) -> tuple[str, str, int]:
@@ -132,6 +142,14 @@ class Flight:
     def log_name(self) -> str:
         """That of its log's file, of one by sight."""
         return f"{self.scenario.replace(' ', '_')}-{self.seed}.npz"
+
+    def models(self) -> list[DroneModel] | None:
+        """What its drones look like: the airframe in as many paints; None: as the scenario says."""
+        if self.airframe is None:
+            return None
+        file, size_m = self.airframe
+        shapes = read_meshes([Path(file)], size_m)
+        return [painted(shapes[0], self.seed + k) for k in range(len(self.flown().vehicles))]
 
     def flown(self) -> ScenarioConfig:
         """What is flown."""
@@ -146,15 +164,18 @@ Line = dict[str, Any]
 why it could not be flown, or null."""
 
 
-def flights_of(commit: str, *, quick: bool, most: int | None = None) -> list[Flight]:
+def flights_of(
+    commit: str, *, quick: bool, most: int | None = None, airframes: Sequence[Airframe] = ()
+) -> list[Flight]:
     """All flights of a run, those by sight first: they take longest. `most`: of each scenario."""
     found: list[Flight] = []
     for eyes, of in EYES.items():
         for name, scenario in SCENARIOS.items():
+            worn: Sequence[Airframe | None] = airframes if name == REAL_AIRFRAMES else [None]
             count, duration_s = scenario.quick if quick else scenario.whole
             found += [
-                Flight(name, eyes, seed, scenario.file, duration_s, {**scenario.overrides(seed), **of.overrides})
-                for seed in seeds_of(commit, name, count)[:most]
+                Flight(name, eyes, seed, scenario.file, duration_s, {**scenario.overrides(seed), **of.overrides}, one)
+                for seed, one in zip(seeds_of(commit, name, count)[:most], itertools.cycle(worn), strict=False)
             ]
     return found
 
@@ -169,7 +190,8 @@ def flown(flight: Flight, logs: Path | None = None) -> Line:
     """Fly it on this process alone; a flight that cannot be flown has its reason. One by sight leaves its log."""
     begin, reason, figures = time.monotonic(), None, dict[Figure, float | None]()
     try:
-        log = fly(flight.flown(), perception=EYES[flight.eyes].perception, threads=0, pictured=False).log
+        perception, models = EYES[flight.eyes].perception, flight.models()
+        log = fly(flight.flown(), perception=perception, models=models, threads=0, pictured=False).log
         figures = figures_of(log, FIGURES)
         if logs is not None and flight.eyes == "sight":
             log.save(logs / flight.log_name)
@@ -361,7 +383,9 @@ def _part(part: str, commit: str, arguments: argparse.Namespace, known: dict[str
     found: Any = None
     if part == "flights":
         most = arguments.flights
-        flights = [one for one in flights_of(commit, quick=quick, most=most) if one.scenario in arguments.scenarios]
+        airframes = [(str(Path(file).resolve()), float(size_m)) for file, size_m in arguments.airframe]
+        flights = flights_of(commit, quick=quick, most=most, airframes=airframes)
+        flights = [one for one in flights if one.scenario in arguments.scenarios]
         measured = document(commit, run(flights, results / f"{size}.jsonl", workers), quick=quick, most=most)
         return known | measured
     if part == "errors":
@@ -369,7 +393,10 @@ def _part(part: str, commit: str, arguments: argparse.Namespace, known: dict[str
         logs = {path.stem: path for path in sorted(results.glob("*.npz"))}
         if not logs:
             raise SystemExit(f"{results} has no log of a flight by sight; fly them first, with `--parts flights`")
-        families = {path.stem: family_of(flown_by_sight[path.name].flown()) for path in logs.values()}
+        families = {
+            name: family_of(flown_by_sight[path.name].flown()) if path.name in flown_by_sight else "real"
+            for name, path in logs.items()
+        }
         perceived_errors.write(logs, families, commit, PERCEIVED)
         found = {"logs": list(logs)}
     elif part == "encounters":
@@ -394,6 +421,7 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", choices=PARTS, metavar="PART", help="default: all that can be measured")
     parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=list(SCENARIOS), metavar="SCENARIO")
     parser.add_argument("--flights", type=int, metavar="N", help="of each scenario; default: all of the list")
+    parser.add_argument("--airframe", nargs=2, action="append", default=[], metavar=("GLB", "SIZE_M"))
     parser.add_argument("--results", type=Path, default=ROOT / "out" / "card", help="default: out/card")
     parser.add_argument("--out", type=Path, default=FIGURES_FILE, help="default: docs/figures.json")
     parser.add_argument("--labelled", action="append", default=[], metavar="NAME=FOLDER")

@@ -79,7 +79,7 @@ def _beside_heading(turn: FloatArray) -> FloatArray:
     return np.where(seen >= 2, (turn - mean) * np.sqrt(seen / np.maximum(seen - 1, 1)), np.nan)
 
 
-def fit(samples: Mapping[str, Samples], families: Mapping[str, int]) -> dict[str, Any]:
+def fit(samples: Mapping[str, Samples], families: Mapping[str, int | str]) -> dict[str, Any]:
     """What the file holds, of flights and, where known, the airframes that all drones of a flight had, by its name."""
     flights = list(samples.values())
     near = [one.distance_m < NEAR_M for one in flights]
@@ -100,7 +100,7 @@ def fit(samples: Mapping[str, Samples], families: Mapping[str, int]) -> dict[str
         for one, c in zip(flights, near, strict=True)
     ]
     by_airframe = {}
-    for family in sorted(set(families.values())):
+    for family in sorted(set(families.values()), key=str):
         of_it = [one.distance_m < (NEAR_M if families.get(name) == family else 0.0) for name, one in samples.items()]
         by_airframe[family] = _errors(flights, of_it)
     return {
@@ -144,7 +144,7 @@ def _lasts_s(series: list[FloatArray], step_s: float) -> float:
     return round(-step_s / math.log(min(max(float(correlation), 0.01), 0.99)), 2)
 
 
-def write(logs: Mapping[str, Path], families: Mapping[str, int], commit: str, path: Path) -> None:
+def write(logs: Mapping[str, Path], families: Mapping[str, int | str], commit: str, path: Path) -> None:
     """Fit the logs, each with the name of its flight, and write the file."""
     fitted = fit({name: samples_of(FlightLog.load(log)) for name, log in logs.items()}, families)
     head = "# Written by `python -m tools.measure.card --parts errors`; do not edit. Flights, with their seeds:\n"

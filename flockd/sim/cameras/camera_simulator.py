@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -17,6 +18,7 @@ from flockd.sim.cameras.imperfect_cameras import RigErrorsConfig
 from flockd.sim.cameras.lens_views import lens_view
 from flockd.sim.cameras.real_camera import NOISE_TILE, NoiseTile, Shot, real_cameras
 from flockd.sim.cameras.shutter import CameraMotion
+from flockd.sim.renderer.airframe import DroneModel
 from flockd.sim.renderer.drone_models import FAMILIES, drone_model
 from flockd.sim.renderer.renderer import Renderer, View
 from flockd.sim.scenario import ScenarioConfig
@@ -63,8 +65,13 @@ def family_of(scenario: ScenarioConfig) -> int:
 class CameraSimulator:
     """The world of a scenario, the models of its drones, and their cameras."""
 
-    def __init__(self, scenario: ScenarioConfig, threads: int | None = None) -> None:
-        """Draws a drone's images on ``threads``; 0: on the calling one; None: as many as there are processors."""
+    def __init__(
+        self, scenario: ScenarioConfig, threads: int | None = None, models: Sequence[DroneModel] | None = None
+    ) -> None:
+        """Draws a drone's images on ``threads``; 0: on the calling one; None: as many as there are processors.
+
+        ``models``: what each drone looks like; None: as `world.drone_family` says.
+        """
         self.rig, self._rigs = build_rig(scenario.drone.rig), true_rigs(scenario)
         obstacles = obstacles_of(scenario)
         field, path = scenario.world.obstacles, planned_path(scenario)
@@ -80,7 +87,7 @@ class CameraSimulator:
         )
         rng, self._count = np.random.default_rng([scenario.seed, 1]), len(scenario.vehicles)
         rng.integers(FAMILIES)  # drawn by `family_of`
-        models = [drone_model(family_of(scenario), int(rng.integers(1 << 31))) for _ in range(self._count)]
+        models = models or [drone_model(family_of(scenario), int(rng.integers(1 << 31))) for _ in range(self._count)]
         self._world, self._renderer = world, Renderer(world, models)
         by_gain = scenario.camera_faults is not None and scenario.camera_faults.noise.gain > 0
         self._scenario, self._image_noise = scenario, 0.0 if by_gain else scenario.sensors.image_noise

@@ -36,6 +36,7 @@ from flockd.sim.flock.exact_states import (
     vehicles_of,
 )
 from flockd.sim.flock.flock_telemetry import FlockTelemetry
+from flockd.sim.renderer.airframe import DroneModel
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances, SimulatedAutopilot, Vehicles
 from flockd.sim.world.obstacle_worlds import with_obstacles
@@ -62,6 +63,7 @@ def fly(
     shown: FlockTelemetry | None = None,
     recorders: Sequence[Recorder] = (),
     threads: int | None = None,
+    models: Sequence[DroneModel] | None = None,
     pictured: bool = True,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Flight:
@@ -78,6 +80,7 @@ def fly(
         recorders: one a drone, or none; nothing comes back from there.
         threads: for pilots that see, and as many for their images; 0: all on the calling one; None: as many as there
             are processors.
+        models: what each drone looks like; None: as the scenario says.
         pictured: keep key frames for the report.
         progress: called with (steps done, steps in all).
     """
@@ -93,7 +96,7 @@ def fly(
     pilots: ExactStatePilots | VisionPilots = ExactStatePilots(scenario, shown, gated=gated)
     if perception == "learned":
         companion = fly_exact_states(scenario, gated=gated)[1:]
-        eyes = eyes_of(scenario, threads)
+        eyes = eyes_of(scenario, threads, models)
         pilots = VisionPilots(scenario, *eyes, shown, recorders, companion, threads)
     first_s = time.perf_counter()
     try:
@@ -184,9 +187,11 @@ class ExactStatePilots:
         return commands
 
 
-def eyes_of(scenario: ScenarioConfig, threads: int | None = None) -> tuple[CameraSimulator, Networks]:
+def eyes_of(
+    scenario: ScenarioConfig, threads: int | None = None, models: Sequence[DroneModel] | None = None
+) -> tuple[CameraSimulator, Networks]:
     """The cameras of all drones, and the networks that their pilots share. Raises ModelError."""
-    return CameraSimulator(scenario, threads=threads), load_networks(scenario.drone.perception)
+    return CameraSimulator(scenario, threads, models), load_networks(scenario.drone.perception)
 
 
 class VisionPilots:

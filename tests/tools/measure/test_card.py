@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 from argparse import Namespace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+import trimesh
 
 from flockd.core.data import data_path
 from flockd.sim.scenario import load_scenario
 from tools.measure.card import (
     EYES,
     FIGURES,
+    REAL_AIRFRAMES,
     SCENARIOS,
     SEEDS,
     Flight,
@@ -37,11 +41,11 @@ def made_up(flight: Flight) -> Line:
 
 
 def test_seeds_follow_from_the_commit_and_are_the_same_for_all_eyes() -> None:
-    flights = flights_of(COMMIT, quick=False)
+    flights = flights_of(COMMIT, quick=False, airframes=[("x.glb", 0.5)])
     for scenario in SCENARIOS:
         of_eyes = [[one.seed for one in flights if (one.scenario, one.eyes) == (scenario, eyes)] for eyes in EYES]
         assert of_eyes[0] == of_eyes[1] == of_eyes[2]
-        assert len(set(of_eyes[0])) == 20
+        assert len(set(of_eyes[0])) == SCENARIOS[scenario].whole[0] >= 10
         assert all(0 <= seed < SEEDS for seed in of_eyes[0])
     assert not set(seeds_of(COMMIT, "forest", 20)) & set(seeds_of("f" * 16, "forest", 20))
     assert len({one.key for one in flights}) == len(flights)
@@ -97,7 +101,7 @@ def test_the_document_names_commit_networks_and_what_each_scenario_gave() -> Non
     lines[0] |= {"failed": "no world", "figures": {}}
     found = document(COMMIT, lines, quick=True)
     json.dumps(found, allow_nan=False)
-    assert set(found) == set(SCENARIOS)
+    assert set(found) == set(SCENARIOS) - {REAL_AIRFRAMES}
     paper = found["the paper's five drones"]
     assert {"commit", "date", "machine", "networks", "command", "flown_s"} <= paper.keys()
     assert all(len(sha256) == 64 for sha256 in paper["networks"].values())
@@ -119,3 +123,17 @@ def test_a_flight_is_flown_and_measured(eyes: str) -> None:
     assert set(line["figures"]) == set(FIGURES)
     # Two that meet head-on and see each other evade; blind ones meet.
     assert (line["figures"]["min_distance_m"] < 0.5) == (eyes == "blind")
+
+
+def test_real_airframes_are_flown_in_turn_where_they_are_given(tmp_path: Path) -> None:
+    assert not [one for one in flights_of(COMMIT, quick=True) if one.scenario == REAL_AIRFRAMES]
+    bar: Any = trimesh.creation.box((0.6, 0.1, 0.3))
+    bar.export(tmp_path / "bar.glb")
+    airframes = [(str(tmp_path / "bar.glb"), 0.7), (str(tmp_path / "none.glb"), 0.7)]
+    flights = [one for one in flights_of(COMMIT, quick=True, airframes=airframes) if one.scenario == REAL_AIRFRAMES]
+    assert [one.airframe for one in flights[:3]] == [airframes[0], airframes[1], airframes[0]]
+    shapes = flights[0].models()
+    assert shapes is not None
+    assert len(shapes) == 5
+    np.testing.assert_allclose(np.ptp(shapes[4].vertices, axis=0), [0.6, 0.3, 0.1], atol=1e-6)
+    assert "none.glb: there is no such file" in str(flown(flights[1])["failed"])
