@@ -82,7 +82,8 @@ def around(
     """Of a drone 5 m high, with neighbours (n, 3) that stand still and points of obstacles (m, 2), metres from it."""
     near, points = np.reshape(np.array(neighbours, float), (-1, 3)), np.reshape(np.array(obstacles, float), (-1, 2))
     here, moves = np.array(position, float), np.array(velocity, float)
-    nearby = Surroundings(here, moves, 0.5, near, np.zeros((len(near), 2)), 5.0, points)
+    none, now = np.zeros((len(near), 2)), np.zeros(len(near))
+    nearby = Surroundings(here, moves, 0.5, near, none, 5.0, points, none, now)
     return replace(nearby, **_arrays(fields))
 
 

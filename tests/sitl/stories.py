@@ -22,13 +22,14 @@ from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.safety import SafetyParameters
 from flockd.core.errors import UnavailableError
 from flockd.core.messages import FloatArray, Setpoint, Wanted
-from flockd.flight.safety import Action, Permission, Request, Surroundings, Verdict
+from flockd.flight.safety import Action, Permission, Request, Verdict
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.onboard.simulated_time import clock_at
 from flockd.sim.sitl.autopilots import BY_HAND, Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.sitl.processes import free_port
+from tests.make import around
 from tests.onboard.autopilot.pilots_link import PilotsLink
 from tests.sitl.sitl_run import Meddler, one_drone
 
@@ -349,7 +350,7 @@ def _in_circles() -> FloatArray:
 
 
 async def _offer(world: World) -> None:
-    nowhere = Surroundings(np.zeros(2), np.zeros(2), 0.0, np.empty((0, 3)), np.empty((0, 2)), HEIGHT_M)
+    nowhere = around(yaw_rad=0.0, height_m=HEIGHT_M)
     while True:
         now = world.clock()
         wanted = Wanted(_in_circles(), np.zeros(2), 0.0, height_m=HEIGHT_M)

@@ -13,7 +13,7 @@ from flockd.flight.flocking import FlockingLaw, level_offsets, lookahead_s
 from flockd.flight.geometry.level import limit_norm
 from flockd.flight.obstacles.local_map import nearest_points, sector_of
 from flockd.flight.obstacles.steering import Steering
-from flockd.flight.safety.approach import stopping_speed, towards_neighbours, towards_obstacles
+from flockd.flight.safety.approach import stopping_speed, towards_flying_on, towards_obstacles
 from flockd.flight.safety.half_planes import nearest_within
 
 AWAY_PER_S = 1.0
@@ -75,7 +75,8 @@ class Avoidance:
         p, gate = self._parameters, self._gate
         points = nearest_points(ranges, p.sigmas)
         to_obstacles = towards_obstacles(points, p.clearance_m, gate.braking_m_s2, self._reaction_s)
-        to_neighbours = towards_neighbours(gate, neighbours, velocities, gate.degraded_separation_m)
+        exactly = np.zeros_like(velocities)
+        to_neighbours = towards_flying_on(gate, neighbours, velocities, gate.degraded_separation_m, exactly)
         directions, most_m_s = zip(to_obstacles, to_neighbours, strict=True)
         return nearest_within(velocity, np.concatenate(directions), np.concatenate(most_m_s))
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import Neighbour
-from flockd.flight.safety.gate import COLUMN
+from flockd.flight.safety.approach import COLUMN
 
 _ASKED_M = 0.43
 """The drone asks for heights this much above and below its own, which moves it by about 0.34 m, ..."""

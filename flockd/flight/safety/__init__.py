@@ -5,15 +5,9 @@ from __future__ import annotations
 from flockd.core.config.safety import GateParameters, SafetyParameters
 from flockd.flight.safety.events import OFFBOARD, CameraHealth, Event, Inputs, MissionEnd, link_lost
 from flockd.flight.safety.fence import outside_fence, outside_heights
-from flockd.flight.safety.gate import (
-    Gate,
-    Objection,
-    Permission,
-    Request,
-    Surroundings,
-    Verdict,
-)
+from flockd.flight.safety.gate import Gate
 from flockd.flight.safety.policy import Action, Reaction
+from flockd.flight.safety.request import Objection, Permission, Request, Surroundings, Verdict
 from flockd.flight.safety.supervisor import Decision, Reason, State, Supervisor
 
 __all__ = [

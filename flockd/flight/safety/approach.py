@@ -11,27 +11,31 @@ from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.geometry.level import SAME_SPOT_M
 from flockd.flight.safety.half_planes import NO_LIMITS, Limits
 
+COLUMN = 1.5
+"""A neighbour is above or below where its level range is less than this many times the degraded separation: downwash
+widens on its way down, and neither drone stays exactly where it is."""
+_HEIGHT_NOISE_M = 0.3
+"""Noise of a height over a few seconds: a difference this small between asked and own height is no climb."""
+
 
 def towards_neighbours(
     p: GateParameters,
     offsets: FloatArray,
     velocities: FloatArray,
     separation_m: float,
-    margins: FloatArray | None = None,
-    unseen_s: FloatArray | None = None,
+    margins: FloatArray,
+    unseen_s: FloatArray,
 ) -> Limits:
     """For each neighbour about at the drone's height its direction, (n, 2), and how fast to fly there, (n,) m/s.
 
     `offsets` (k, 3) metres NED from the drone, `velocities` (k, 2) m/s over ground; `margins` (k, 2) by how much
-    each may be nearer, m, and come faster, m/s; None: exact. `unseen_s` (k,) is how long ago each was seen last; None:
-    each flies as it is said to. Else each counts twice: as flying on, and as braking since then.
+    each may be nearer, m, and come faster, m/s; `unseen_s` (k,) is how long ago each was seen last. Each counts twice:
+    as flying on, and as braking since then.
     """
-    known = margins if margins is not None else np.zeros((len(offsets), 2))
     velocities = np.where(np.isfinite(velocities), velocities, 0.0)
-    limits = [_flying_on(p, offsets, velocities, separation_m, known)]
-    if unseen_s is not None:
-        limits.append(_braking(p, offsets, velocities, separation_m, known, unseen_s))
-    return np.concatenate([towards for towards, _ in limits]), np.concatenate([most_m_s for _, most_m_s in limits])
+    towards, most_m_s = towards_flying_on(p, offsets, velocities, separation_m, margins)
+    towards_it, if_it_brakes_m_s = _braking(p, offsets, velocities, separation_m, margins, unseen_s)
+    return np.concatenate([towards, towards_it]), np.concatenate([most_m_s, if_it_brakes_m_s])
 
 
 def _braking(
@@ -66,7 +70,7 @@ def _about_level(p: GateParameters, offsets: FloatArray, separation_m: float) ->
     return meets
 
 
-def _flying_on(
+def towards_flying_on(
     p: GateParameters, offsets: FloatArray, velocities: FloatArray, separation_m: float, margins: FloatArray
 ) -> Limits:
     """As of `towards_neighbours`, where each flies on as it is said to.
@@ -116,3 +120,21 @@ def stopping_speed(left_m: FloatArray, braking_m_s2: float, reaction_s: float) -
     lag = braking_m_s2 * reaction_s
     speed: FloatArray = np.sqrt(lag**2 + 2 * braking_m_s2 * np.maximum(left_m, 0.0)) - lag
     return speed
+
+
+def between_neighbours(p: GateParameters, start_m: float, own_m: float, offsets: FloatArray) -> tuple[float, float]:
+    """From which height to which one may be asked for, from `start_m` on, where neighbours are above or below.
+
+    `own_m` is the drone's height, and `offsets` (n, 3) metres NED are the neighbours' from there. A height that was
+    asked for already, and from which the drone's own differs by noise only, stays. A drone that does not know its
+    height counts as where it was asked to be.
+    """
+    own_m = own_m if math.isfinite(own_m) else start_m
+    up = -offsets[np.hypot(offsets[:, 0], offsets[:, 1]) < COLUMN * p.degraded_separation_m, 2]
+    if not len(up):
+        return -math.inf, math.inf
+    room_up = np.maximum(up[up > 0] - p.vertical_separation_m, 0.0).min(initial=math.inf)
+    room_down = np.maximum(-up[up < 0] - p.vertical_separation_m, 0.0).min(initial=math.inf)
+    highest_m = max(own_m + float(room_up), min(start_m, own_m + _HEIGHT_NOISE_M))
+    lowest_m = min(own_m - float(room_down), max(start_m, own_m - _HEIGHT_NOISE_M))
+    return lowest_m, highest_m

@@ -9,8 +9,10 @@ import numpy as np
 
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray, Neighbour, PossibleMotion
-from flockd.flight.safety.approach import towards_neighbours
-from flockd.flight.safety.gate import Surroundings
+from flockd.flight.safety.approach import towards_neighbours, towards_obstacles
+from flockd.flight.safety.fence import towards_fence
+from flockd.flight.safety.half_planes import Limits
+from flockd.flight.safety.request import Objection, Surroundings
 
 _NORMAL = NormalDist()
 BEYOND = _NORMAL.cdf(-2.0)
@@ -52,13 +54,39 @@ def surroundings(
     )
 
 
-def limits_towards(neighbours: Sequence[Neighbour], p: GateParameters) -> tuple[FloatArray, FloatArray]:
+def limits_towards(neighbours: Sequence[Neighbour], p: GateParameters) -> Limits:
     """Directions (k, 2) and how fast, (k,) m/s, the gate lets the drone fly there, as the step ends.
 
     For a pilot that is not to ask for what cannot be flown.
     """
     places, velocities, margins, unseen_s = _motions(neighbours, 0.0, np.zeros(3))
     return towards_neighbours(p, places, velocities, p.min_separation_m, margins, unseen_s)
+
+
+def limits_around(
+    p: GateParameters, around: Surroundings, separation_m: float, late_s: float
+) -> tuple[FloatArray, FloatArray, list[Objection]]:
+    """Directions (n, 2), how fast to fly there, (n,) m/s, and what is there: the fence, a neighbour or an obstacle.
+
+    For a vehicle that follows `late_s` later than expected. A drone that is measured to be faster than a limit has to
+    brake: the limit counts as lower by as much. That feeds the velocity back with a gain of one, which no lag and no
+    dead time make unstable.
+    """
+    later = {"reaction_s": p.reaction_s + late_s, "neighbour_reaction_s": p.neighbour_reaction_s + late_s}
+    p = p.model_copy(update=later)
+    neighbours = around.neighbours, around.neighbour_velocities
+    limits = {
+        Objection.FENCE: towards_fence(p, around.position),
+        Objection.SEPARATION: towards_neighbours(
+            p, *neighbours, separation_m, around.neighbour_margins, around.neighbour_unseen_s
+        ),
+        Objection.OBSTACLE: towards_obstacles(around.obstacles, p.obstacle_clearance_m, p.braking_m_s2, p.reaction_s),
+    }
+    directions = np.concatenate([towards for towards, _ in limits.values()])
+    most_m_s = np.concatenate([most for _, most in limits.values()])
+    if np.isfinite(around.velocity).all():
+        most_m_s = np.maximum(most_m_s - np.maximum(directions @ around.velocity - most_m_s, 0.0), 0.0)
+    return directions, most_m_s, [name for name, (_, most) in limits.items() for _ in most]
 
 
 def _motions(

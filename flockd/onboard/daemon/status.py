@@ -126,7 +126,7 @@ def _flight_message(components: Components, now: float) -> topics.FlightMessage:
         battery_share=status.battery_share,
         height_m=None if vehicle is None else vehicle.height_m,
         velocity_trim=[0.0, 0.0] if trim is None else trim.tolist(),
-        velocity_error_m_s=components.gate.velocity_error_m_s,
+        velocity_error_m_s=components.gate.response.error_m_s,
         silence=stream.silence,
         setpoints_sent=stream.sent,
         setpoints_missed=stream.missed,

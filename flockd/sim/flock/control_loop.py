@@ -105,8 +105,8 @@ class _Drone:
         inputs = replace(
             _WELL,
             cameras={**self._cameras, **dict.fromkeys(lost, _LOST)},
-            velocity_late_s=self.gate.velocity_late_s,
-            velocity_error_m_s=self.gate.velocity_error_m_s,
+            velocity_late_s=self.gate.response.late_s,
+            velocity_error_m_s=self.gate.response.error_m_s,
             obstacle_near=around.nearest_obstacle_m < self._parameters.hold_room_m,
             outside_fence=outside_fence(limits, around.position),
             outside_heights=outside_heights(limits, around.height_m),
@@ -223,7 +223,7 @@ class ControlLoop:
 
     def velocity_error_m_s(self, i: int) -> float:
         """By how much a drone's velocity is off its setpoints, as its gate finds; 0 without one."""
-        return self._drones[i].gate.velocity_error_m_s if i in self._drones else 0.0
+        return self._drones[i].gate.response.error_m_s if i in self._drones else 0.0
 
     def fly(self, time_s: float, vehicles: Vehicles, commands: Commands, disturbed: Disturbances = UNDISTURBED) -> None:
         """From `time_s` one step on."""

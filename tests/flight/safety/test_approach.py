@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry.level import SAME_SPOT_M
 from flockd.flight.safety import Action, Gate, GateParameters
-from flockd.flight.safety.approach import stopping_speed, towards_neighbours, towards_obstacles
+from flockd.flight.safety.approach import stopping_speed, towards_flying_on, towards_neighbours, towards_obstacles
 from flockd.flight.safety.half_planes import nearest_within
 from tests.make import around, request
 
 PARAMETERS = GateParameters()
+EXACT = np.zeros((1, 2))
 
 
 def test_a_point_without_a_direction_is_left_out() -> None:
@@ -63,20 +64,25 @@ def test_the_nearest_obstacle_is_told() -> None:
 
 def test_a_neighbour_at_the_same_spot_has_no_direction_and_one_a_little_farther_has() -> None:
     for range_m, count in ((0.9 * SAME_SPOT_M, 0), (SAME_SPOT_M, 1), (1.1 * SAME_SPOT_M, 1)):
-        directions, most_m_s = towards_neighbours(PARAMETERS, np.array([[range_m, 0.0, 0.0]]), np.zeros((1, 2)), 1.0)
+        directions, most_m_s = towards_flying_on(PARAMETERS, np.array([[range_m, 0.0, 0.0]]), EXACT, 1.0, EXACT)
         assert len(directions) == len(most_m_s) == count, range_m
 
 
 def fastest(*neighbours: tuple[float, float], velocities: ArrayLike) -> FloatArray:
     """How fast to fly towards each neighbour at this place north and east, at the drone's height."""
     offsets = np.array([[*place, 0.0] for place in neighbours])
-    return towards_neighbours(PARAMETERS, offsets, np.array(velocities, dtype=float), 1.0)[1]
+    return towards_flying_on(PARAMETERS, offsets, np.array(velocities), 1.0, np.zeros((len(offsets), 2)))[1]
 
 
 @pytest.mark.parametrize("velocity", [math.inf, -math.inf, math.nan])
 def test_a_neighbour_whose_velocity_is_no_number_counts_as_one_that_hovers(velocity: float) -> None:
     for away_m in (1.2, 3.0):
-        assert fastest((away_m, 0.0), velocities=[[velocity, 0.0]]) == fastest((away_m, 0.0), velocities=[[0.0, 0.0]])
+        there = np.array([[away_m, 0.0, 0.0]])
+        it, hovers = (
+            towards_neighbours(PARAMETERS, there, np.array([[north_m_s, 0.0]]), 1.0, EXACT, np.zeros(1))[1]
+            for north_m_s in (velocity, 0.0)
+        )
+        np.testing.assert_array_equal(it, hovers)
 
 
 def test_each_neighbours_own_velocity_counts() -> None:
@@ -127,7 +133,9 @@ def test_both_stop_within_the_distance_left_and_the_drone_stands_where_no_speed_
             low, high = (middle, high) if fits else (low, middle)
         return low
 
-    _, most_m_s = towards_neighbours(p, np.array([[distance_m, 0.0, 0.0]]), np.array([[-comes_m_s, 0.0]]), separation_m)
+    _, most_m_s = towards_flying_on(
+        p, np.array([[distance_m, 0.0, 0.0]]), np.array([[-comes_m_s, 0.0]]), separation_m, EXACT
+    )
     expected = min(fastest(comes_m_s, neighbour_reaction_s), fastest(math.nan, p.reaction_s))
     assert most_m_s == pytest.approx([expected], abs=1e-6)
 
@@ -139,19 +147,19 @@ def test_a_vehicle_that_follows_as_expected_has_no_error_at_whatever_time_it_fli
     for tick in range(100):
         now_s = 500.0 + 0.05 * tick
         gate.step(now_s, request(now_s, [1.0, 0.0], Action.FLY, around(velocity=[speed, 0.0])))
-        errors.append(gate.velocity_error_m_s)
+        errors.append(gate.response.error_m_s)
         speed = 1.0 - math.exp(-0.05 * tick / p.reaction_s)
     assert max(errors) < 0.05
 
 
 def test_one_that_stands_counts_where_it_stands_and_one_at_no_known_distance_nowhere() -> None:
-    """Margins that are not said are none; 0.5 v + v^2 / 3 is what is left of 5 m."""
-    p, still, seen = GateParameters(), np.zeros((1, 2)), np.zeros(1)
-    directions, limits = towards_neighbours(p, np.array([[3.0, 4.0, 0.5]]), still, 1.0, None, seen)
+    """0.5 v + v^2 / 3 is what is left of 5 m."""
+    p, seen = GateParameters(), np.zeros(1)
+    directions, limits = towards_neighbours(p, np.array([[3.0, 4.0, 0.5]]), EXACT, 1.0, EXACT, seen)
     np.testing.assert_allclose(directions, [[0.6, 0.8]] * 2)
     assert limits[1] == pytest.approx(-0.75 + math.sqrt(0.5625 + 3.0 * 4.0))
     for nowhere in (math.inf, -math.inf):
-        assert not len(towards_neighbours(p, np.array([[nowhere, 0.0, 0.0]]), still, 1.0, None, seen)[1])
+        assert not len(towards_neighbours(p, np.array([[nowhere, 0.0, 0.0]]), EXACT, 1.0, EXACT, seen)[1])
 
 
 def test_a_limit_that_is_no_number_is_standstill() -> None:

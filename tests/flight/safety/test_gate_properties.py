@@ -49,7 +49,7 @@ MOVES = (Action.FLY, Action.FLY_DEGRADED)
 
 @pytest.mark.parametrize("odd", [0.0, 0.02, 0.2])
 @pytest.mark.parametrize("seed", [0, 1])
-@pytest.mark.filterwarnings("ignore:overflow encountered")
+@pytest.mark.filterwarnings("ignore:overflow encountered", "ignore:invalid value encountered")
 def test_whatever_is_asked_for_what_is_sent_is_safe(seed: int, odd: float) -> None:
     """The measured velocity is random too: the drone seems to be blown about. `odd`: so many numbers cannot be."""
     rng = np.random.default_rng(seed)

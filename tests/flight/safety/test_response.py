@@ -44,7 +44,7 @@ def test_the_setpoints_settle_however_the_vehicle_answers(response_s: float, dea
     gate = Gate(FREE)
     sent = flown(gate, NORTH, response_s, dead_s, around())
     np.testing.assert_allclose(sent, np.minimum(np.arange(200)[:, None] * TICK_S * 5.0, 1.0) * NORTH, atol=1e-9)
-    assert gate.velocity_error_m_s < 0.2
+    assert gate.response.error_m_s < 0.2
     sent = flown(Gate(FREE), NORTH, response_s, dead_s, around(neighbours=[[2.0, 0.0, 0.0]]))
     assert np.ptp(sent[-40:, 0]) < 0.01
     assert 0.1 < sent[-1, 0] < 0.9
@@ -102,7 +102,7 @@ def test_while_another_flies_the_drone_nothing_is_an_error() -> None:
     for now_s in TICK_S * np.arange(200):
         near = around(velocity=(2.0 * math.cos(2.0 * now_s), 0.0))
         gate.step(now_s, request(now_s, action=Action.OFFER, surroundings=near))
-    assert gate.velocity_error_m_s == 0.0
+    assert gate.response.error_m_s == 0.0
 
 
 @pytest.mark.parametrize(
@@ -213,6 +213,6 @@ def test_what_another_flies_forgets_the_error_before() -> None:
     gate, far_off = Gate(FREE), around(velocity=(3.0, 0.0))
     for now_s in TICK_S * np.arange(100):
         gate.step(now_s, request(now_s, surroundings=far_off))
-    assert gate.velocity_error_m_s > 1.0
+    assert gate.response.error_m_s > 1.0
     gate.step(5.0, request(5.0, action=Action.OFFER, surroundings=far_off))
-    assert gate.velocity_error_m_s == 0.0
+    assert gate.response.error_m_s == 0.0

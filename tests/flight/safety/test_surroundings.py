@@ -41,8 +41,7 @@ def test_neighbours_fly_on_and_the_drone_has_moved_and_obstacles_stand_still() -
     near = told(*both, obstacles=[[3.0, 0.0], [0.0, -6.0]])
     np.testing.assert_allclose(near.neighbours, [[5.0, 4.0, 3.5], [-1.0, 9.0, 0.0]])
     np.testing.assert_allclose(near.neighbour_velocities, [[2.0, 4.0], [0.0, -2.0]])
-    assert near.neighbour_margins is not None  # two standard deviations
-    np.testing.assert_allclose(near.neighbour_margins, [[0.2, 0.4], [0.4, 0.8]])
+    np.testing.assert_allclose(near.neighbour_margins, [[0.2, 0.4], [0.4, 0.8]])  # two standard deviations
     np.testing.assert_allclose(near.obstacles, [[2.0, 2.0], [-1.0, -4.0]])
     np.testing.assert_array_equal([*near.position, *near.velocity], [30.0, 40.0, 2.0, -4.0])
     assert (near.yaw_rad, near.height_m) == (0.3, 6.0)
@@ -51,9 +50,7 @@ def test_neighbours_fly_on_and_the_drone_has_moved_and_obstacles_stand_still() -
 def test_one_that_is_as_likely_not_there_counts_by_half() -> None:
     """By tables: 0.0228 of 0.5 are 0.0455, beyond 1.690 deviations; of 0.02 it is more than all, and nothing counts."""
     doubted = (known([5.0, 0.0, 0.0], [2.0, 0.0, 0.0], existence_probability=share) for share in (0.5, 0.02))
-    margins = told(*doubted).neighbour_margins
-    assert margins is not None
-    np.testing.assert_allclose(margins, [[0.169, 0.338]], atol=1e-3)
+    np.testing.assert_allclose(told(*doubted).neighbour_margins, [[0.169, 0.338]], atol=1e-3)
 
 
 def test_one_that_may_move_in_two_ways_counts_as_both_each_by_its_probability() -> None:
@@ -61,7 +58,6 @@ def test_one_that_may_move_in_two_ways_counts_as_both_each_by_its_probability() 
     near = told(known([6.0, 0.0, 0.0], [1.4, 0.0, 0.0], possible=(may(0.9, 2.0), may(0.1, -4.0))))
     np.testing.assert_allclose(near.neighbours, [[6.0, 2.0, 0.5], [3.0, 2.0, 0.5]])
     np.testing.assert_allclose(near.neighbour_velocities, [[2.0, 0.0], [-4.0, 0.0]])
-    assert near.neighbour_margins is not None
     np.testing.assert_allclose(near.neighbour_margins, [[1.119, 2.238], [0.603, 1.207]], atol=2e-3)
 
 
@@ -101,15 +97,12 @@ def test_one_that_goes_may_have_braked_since_it_was_seen_last(unseen_s: float, l
     for unsure in (replace(one, position_sigma_m=0.25), replace(one, velocity_sigma_m_s=0.25)):
         slower_m_s = limits_towards([unsure], GateParameters())[1][1]
         assert slower_m_s == pytest.approx(math.sqrt(0.75**2 + 3 * max(left_m - 2 * 0.25, 0.0)) - 0.75)
-    later = told(one).neighbour_unseen_s
-    assert later is not None
-    np.testing.assert_allclose(later, [unseen_s + 0.5])
+    np.testing.assert_allclose(told(one).neighbour_unseen_s, [unseen_s + 0.5])
 
 
 def test_of_nobody_and_nothing_there_are_arrays_all_the_same() -> None:
     near, (directions, most_m_s) = told(), limits_towards([], GateParameters())
     assert near.neighbours.shape == (0, 3)
-    assert near.neighbour_margins is not None
     assert near.neighbour_velocities.shape == near.neighbour_margins.shape == near.obstacles.shape == (0, 2)
     assert directions.shape == (0, 2) and most_m_s.shape == (0,)
 

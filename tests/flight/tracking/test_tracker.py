@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import Neighbour
 from flockd.flight.geometry import log_polar, log_polar_covariance, rotation_from_euler
-from flockd.flight.safety.approach import towards_neighbours
+from flockd.flight.safety.approach import towards_flying_on
 from flockd.flight.safety.surroundings import surroundings
 from flockd.flight.tracking import Measurement, Shown, Tracker, TrackingParameters
 from flockd.flight.tracking.manoeuvres import Manoeuvres
@@ -96,7 +96,7 @@ class Follower:
             obstacles=np.empty((0, 2)),
         )  # fmt: skip
         flies_on = near.neighbours, near.neighbour_velocities, 1.0, near.neighbour_margins
-        return float(towards_neighbours(GateParameters(), *flies_on)[1].min(initial=math.inf))
+        return float(towards_flying_on(GateParameters(), *flies_on)[1].min(initial=math.inf))
 
 
 def _settled(position: Array = AHEAD, *, steps: int = 10, sigma_m: float = 0.05) -> Follower:

@@ -15,16 +15,17 @@ from pymavlink.dialects.v20 import development as mavlink
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.safety import SafetyParameters
 from flockd.core.messages import Setpoint, Wanted
-from flockd.flight.safety import Action, Permission, Request, Surroundings, Verdict
+from flockd.flight.safety import Action, Permission, Request, Verdict
 from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from tests import calm
+from tests.make import around
 from tests.onboard.autopilot.pilots_link import PilotsLink
 
 CONTROL_S = 0.05
 
 
-NOWHERE = Surroundings(np.zeros(2), np.zeros(2), 0.0, np.empty((0, 3)), np.empty((0, 2)), 2.5)
+NOWHERE = around(yaw_rad=0.0, height_m=2.5)
 NORTH = Wanted(np.array([1.0, 0.0]), np.zeros(2), 0.0, height_m=2.5)
 
 

@@ -35,7 +35,7 @@ from flockd.core.messages import (
 from flockd.flight.inference import OnnxModel
 from flockd.flight.perception import ImagePair
 from flockd.flight.pilot.camera_agreement import moves_otherwise
-from flockd.flight.safety import Action, Decision, Gate, Inputs, Permission, Request, State, Surroundings
+from flockd.flight.safety import Action, Decision, Gate, Inputs, Permission, Request, State
 from flockd.onboard.daemon.control import Control
 from flockd.onboard.daemon.operator_orders import OperatorRequests
 from flockd.onboard.daemon.pilot_loop import (
@@ -50,7 +50,7 @@ from flockd.onboard.daemon.supervisor_inputs import CameraMonitor, InputCollecto
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
 from flockd.onboard.sources import CameraStatus, Count
 from flockd.onboard.worker import Worker
-from tests.make import autopilot_status, camera, changed, drone, neighbour, output, vehicle, wanted
+from tests.make import around, autopilot_status, camera, changed, drone, neighbour, output, vehicle, wanted
 from tests.onboard.daemon.aboard import TinyPerceiver
 
 IMAGE = np.zeros((48, 64, 3), np.uint8)
@@ -352,10 +352,8 @@ def test_the_supervisor_is_told_of_an_obstacle_where_hold_needs_room() -> None:
 
     control._supervisor = SimpleNamespace(step=step)  # type: ignore[assignment]
     for away_m in (1.9, 2.1):
-        around = Surroundings(
-            np.zeros(2), np.zeros(2), 0.0, np.empty((0, 3)), np.empty((0, 2)), 5.0, np.array([[away_m, 0.0]])
-        )
-        control._request = Request(Permission(Action.FLY, 0.0), wanted(), 0.0, 5.0, around)
+        near = around(obstacles=[[away_m, 0.0]])
+        control._request = Request(Permission(Action.FLY, 0.0), wanted(), 0.0, 5.0, near)
         control.tick()
     control.tick()  # in silence nothing is known to be near
     assert [inputs.obstacle_near for inputs in told] == [True, False, False]

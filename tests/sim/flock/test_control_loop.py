@@ -9,13 +9,14 @@ import pytest
 
 from flockd.core.data import data_path
 from flockd.core.messages import FloatArray, Setpoint, Wanted
-from flockd.flight.safety import Action, Event, Gate, Objection, Permission, Request, Surroundings, Verdict
+from flockd.flight.safety import Action, Event, Gate, Objection, Permission, Request, Verdict
 from flockd.review.metrics import min_distance
 from flockd.sim.flock.control_loop import Commands, ControlLoop, SlowedTime
 from flockd.sim.flock.exact_states import ExactFlock, step_times, vehicles_of
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import CameraFaultConfig, ScenarioConfig, load_scenario
 from flockd.sim.vehicles.vehicles import Vehicles
+from tests.make import around
 
 
 def _scenario(**keys: Any) -> ScenarioConfig:
@@ -106,9 +107,8 @@ def test_what_a_gate_slowed_its_drone_down_for(
     action: Action, objections: tuple[Objection, ...], degraded_by: tuple[Event, ...], causes: set[str]
 ) -> None:
     """For a quarter of the time; in the rest it flew as it was asked to, but for 4 %."""
-    alone = Surroundings(np.zeros(2), np.zeros(2), 0.0, np.empty((0, 3)), np.empty((0, 2)), 5.0)
     wanted = Wanted(np.array([1.0, 0.0]), np.zeros(2), 0.0)
-    request, slowed = Request(Permission(action, 0.0), wanted, 0.0, 5.0, alone), SlowedTime()
+    request, slowed = Request(Permission(action, 0.0), wanted, 0.0, 5.0, around()), SlowedTime()
     assert (slowed.share, slowed.by_cause) == (None, {})
     for period_s, north_m_s in ((1.0, 0.5), (3.0, 0.96)):
         setpoint = Setpoint(0.0, np.array([north_m_s, 0.0]), 5.0, 0.0)
