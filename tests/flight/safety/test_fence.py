@@ -16,6 +16,7 @@ from tests.make import around, request
 Corners = tuple[tuple[float, float], ...]
 SQUARE: Corners = ((-10.0, -10.0), (-10.0, 10.0), (10.0, 10.0), (10.0, -10.0))
 L_SHAPE: Corners = ((0.0, 0.0), (40.0, 0.0), (40.0, 10.0), (10.0, 10.0), (10.0, 40.0), (0.0, 40.0))
+WEDGE: Corners = ((-30.0, 0.0), (10.0, -8.0), (10.0, 8.0))
 DIAMOND: Corners = ((0.0, -10.0), (10.0, 0.0), (0.0, 10.0), (-10.0, 0.0))
 
 
@@ -114,10 +115,13 @@ def test_with_a_circle_and_corners_both_have_to_be_kept() -> None:
         assert (limits[:12] == 0.0).any() == (math.hypot(*position) > 11.4)
 
 
-@pytest.mark.parametrize("asked", [(3.0, 0.0), (-2.0, 2.0), (1.0, -2.5)])
-@pytest.mark.parametrize("corners", [(), SQUARE, tuple((n - 5.0, e - 5.0) for n, e in L_SHAPE)])
+@pytest.mark.parametrize("asked", [(3.0, 0.0), (-2.0, 2.0), (1.0, -2.5), (-3.9, 0.0), (-3.9, 0.6), (2.8, 2.8)])
+@pytest.mark.parametrize("corners", [(), SQUARE, tuple((n - 5.0, e - 5.0) for n, e in L_SHAPE), WEDGE])
 def test_who_flies_at_a_fence_stops_before_it(corners: Corners, asked: tuple[float, float]) -> None:
-    """In the closed loop: a drone that follows its setpoints as PX4's does, with 0.45 s after a dead time of 0.2 s."""
+    """In the closed loop: a drone that follows its setpoints as PX4's does, with 0.45 s after a dead time of 0.2 s.
+
+    Also along a side into an acute corner, and towards one that leads inward.
+    """
     limits = fence(corners, None if corners else 12.0)
     setpoints = deque([np.zeros(2)] * 4)
     gate, position, velocity, nearest_m = Gate(limits), np.zeros(2), np.zeros(2), math.inf
