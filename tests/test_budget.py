@@ -42,7 +42,7 @@ NUMBERS_OF_FLIGHT = 318
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
 """A budget that is farther above what there is is to be lowered."""
-STEPS = {"crossing": (24_000, 20), "normal": (15_000, 15)}
+STEPS = {"crossing": (20_100, 20), "normal": (14_000, 15)}
 """Python calls and network runs of a step in a recorded flight of tests/review/replay."""
 
 

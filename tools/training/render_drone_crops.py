@@ -231,7 +231,7 @@ def _window(crops: list[Any]) -> tuple[int, int, int, int]:
     pixels = np.vstack(
         [
             crop.rig.cameras["camera"].camera.project(
-                crop.camera.unproject(edge, np.ones(len(edge))) @ crop.T_body_virtual.rotation.T @ R_BODY_CAMERA
+                np.insert((edge - 48.0) / crop.focal_px, 2, 1.0, axis=1) @ crop.R_body_virtual[0].T @ R_BODY_CAMERA
             )
             for crop in crops
         ]

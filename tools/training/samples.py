@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flockd.flight.geometry import Rig, VirtualCrop, virtual_crop
+from flockd.flight.geometry import Rig, VirtualCrops, virtual_crops
 from flockd.sim.renderer.airframe import DroneModel
 from tools.training.camera_effects import as_filmed
 from tools.training.dataset import (
@@ -91,12 +91,12 @@ class DroneInView:
     model: DroneModel
 
 
-def crop_around(drone: DroneInView, rng: np.random.Generator) -> VirtualCrop:
+def crop_around(drone: DroneInView, rng: np.random.Generator) -> VirtualCrops:
     """Where the second stage might look at a drone."""
     return crop_at(drone.centre, drone.model.size_m, drone.focal, rng)
 
 
-def crop_at(centre: NDArray[Any], size_m: float, focal: float, rng: np.random.Generator) -> VirtualCrop:
+def crop_at(centre: NDArray[Any], size_m: float, focal: float, rng: np.random.Generator) -> VirtualCrops:
     """Where the second stage might look, see ``drawn_fill``."""
     fill, off = drawn_fill(rng)
     half_width = size_m / 2 * fill
@@ -104,7 +104,7 @@ def crop_at(centre: NDArray[Any], size_m: float, focal: float, rng: np.random.Ge
     right, down = _across(centre)
     aim = R_BODY_CAMERA @ _in_view(centre + shift_m[0] * right + shift_m[1] * down, focal)
     half_angle = float(np.arctan(half_width / np.linalg.norm(centre)))
-    return virtual_crop(Rig({"camera": rig_camera(focal)}), aim / np.linalg.norm(aim), half_angle, 96)
+    return virtual_crops(Rig({"camera": rig_camera(focal)}), aim[None], np.array([half_angle]), 96)
 
 
 def drawn_fill(rng: np.random.Generator) -> tuple[float, NDArray[np.float64]]:
@@ -118,13 +118,13 @@ def drawn_fill(rng: np.random.Generator) -> tuple[float, NDArray[np.float64]]:
     return fill, rng.normal(0, 0.03 if aimed else 0.15, 2)
 
 
-def sample_of(drone: DroneInView, crop: VirtualCrop, image: NDArray[Any], mine: NDArray[Any]) -> Sample:
+def sample_of(drone: DroneInView, crop: VirtualCrops, image: NDArray[Any], mine: NDArray[Any]) -> Sample:
     """What ``crop`` shows of the camera's ``image`` (h, w, 3), with the truth; ``mine`` (h, w): the drone's pixels."""
-    picture, _ = crop.sample({"camera": image})
+    (picture,), _ = crop.sample({"camera": image})
     hubs = drone.centre + four_motors(drone.model.hubs) @ drone.rotation.T
-    points = np.vstack([drone.centre[None], hubs]) @ R_BODY_CAMERA.T
-    place, *motors = crop.camera.project(crop.T_body_virtual.inverse().apply(points)) - 48.0
-    log_range = np.log(np.linalg.norm(drone.centre) / crop.camera.matrix[0, 0])
+    points = np.vstack([drone.centre[None], hubs]) @ R_BODY_CAMERA.T @ crop.R_body_virtual[0]
+    place, *motors = crop.focal_px * points[:, :2] / points[:, 2:]
+    log_range = np.log(np.linalg.norm(drone.centre) / crop.focal_px[0])
     return {
         "picture": picture,
         "mask": _mask_of(crop, mine),
@@ -150,9 +150,9 @@ def four_motors(hubs: NDArray[np.float64]) -> NDArray[np.float64]:
     return hubs[list(best)]
 
 
-def _mask_of(crop: VirtualCrop, mine: NDArray[Any]) -> NDArray[np.uint8]:
+def _mask_of(crop: VirtualCrops, mine: NDArray[Any]) -> NDArray[np.uint8]:
     """(96, 96) how much of each of the crop's pixels is the drone's, 0-255."""
-    picture, seen = crop.sample({"camera": np.repeat(np.uint8(255) * mine.astype(np.uint8)[:, :, None], 3, 2)})
+    (picture,), (seen,) = crop.sample({"camera": np.repeat(np.uint8(255) * mine.astype(np.uint8)[:, :, None], 3, 2)})
     return np.where(seen, picture[:, :, 0], np.uint8(0))
 
 
@@ -172,13 +172,13 @@ def no_drone_sample(pairs: PairSet, negative: NDArray[Any] | None, rng: np.rando
     middle = np.clip(middle, 1, (WIDTH - 1, HEIGHT - 1))
     aim = R_BODY_CAMERA @ np.array([*((middle - (WIDTH / 2, HEIGHT / 2)) / focal), 1.0])
     half_angle = float(np.arctan(max(half_px, 4.0) / focal))
-    crop = virtual_crop(Rig({"camera": rig_camera(focal)}), aim / np.linalg.norm(aim), half_angle, 96)
+    crop = virtual_crops(Rig({"camera": rig_camera(focal)}), aim[None], np.array([half_angle]), 96)
     return sample_without_drone(crop, np.asarray(pairs["image"][pair][k]))
 
 
-def sample_without_drone(crop: VirtualCrop, image: NDArray[Any]) -> Sample:
+def sample_without_drone(crop: VirtualCrops, image: NDArray[Any]) -> Sample:
     """What ``crop`` shows of the camera's ``image``, where nothing is to be found."""
-    picture, _ = crop.sample({"camera": image})
+    (picture,), _ = crop.sample({"camera": image})
     return {
         "picture": picture,
         "mask": np.zeros(picture.shape[:2], np.uint8),

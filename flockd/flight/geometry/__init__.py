@@ -22,7 +22,7 @@ from flockd.flight.geometry.rotations import (
 )
 from flockd.flight.geometry.sightlines import inverse_ranges_of_rays
 from flockd.flight.geometry.transform import RigidTransform
-from flockd.flight.geometry.virtual_camera import VirtualCrop, virtual_crop
+from flockd.flight.geometry.virtual_camera import VirtualCrops, virtual_crops
 
 __all__ = [
     "BACKGROUND_LABEL",
@@ -36,7 +36,7 @@ __all__ = [
     "Rig",
     "RigCamera",
     "RigidTransform",
-    "VirtualCrop",
+    "VirtualCrops",
     "WideAngleCamera",
     "ZMap",
     "blind_pixels",
@@ -63,6 +63,6 @@ __all__ = [
     "rotation_from_vector",
     "scale_on_track",
     "vector_from_rotation",
-    "virtual_crop",
+    "virtual_crops",
     "z_map",
 ]

@@ -1,8 +1,7 @@
-"""A small camera that faces one direction, its image drawn from whichever real cameras see there."""
+"""Small cameras that each face one direction, their images drawn from whichever real cameras see there."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -10,185 +9,217 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from flockd.core.messages import BoolArray, Float32Array, FloatArray, UInt8Array
+from flockd.core.messages import BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
 from flockd.flight.geometry.cameras import PinholeCamera
 from flockd.flight.geometry.pairs import grid_pixels
 from flockd.flight.geometry.rig import Rig, RigCamera
-from flockd.flight.geometry.transform import RigidTransform
 
 _GREY = 128
-_NOT_IN_IT = -1.0
+_NOWHERE = -1
+"""In place of a camera's number, and of a distance from an image's border."""
 _MINIFICATION = 1.5
 """Image pixels per crop pixel from which on single samples would alias."""
 
 
 @dataclass(frozen=True, eq=False)
-class VirtualCrop:
-    """A square pinhole camera in the body, at the optical centre of its main camera, and the way to its image."""
+class VirtualCrops:
+    """n square pinhole cameras in the body, each at the optical centre of its main camera, and the way to their images.
 
-    camera: PinholeCamera
-    T_body_virtual: RigidTransform
-    main: str
-    """The real camera at whose optical centre it sits: from there its image is exact at every range."""
+    They are level: their x axes are horizontal in the body.
+    """
+
     rig: Rig
+    size_px: int
+    """Their width and height."""
+    focal_px: FloatArray
+    """(n,)"""
+    R_body_virtual: FloatArray
+    """(n, 3, 3)"""
+    main: IntArray
+    """(n,) the number in the rig of the camera in whose image the direction lies deepest: from its optical centre the
+    image is exact at every range. -1: no camera sees the direction, or the angle is none of a pinhole."""
 
-    def sample(self, images: Mapping[str, UInt8Array], *, range_m: float | None = None) -> tuple[UInt8Array, BoolArray]:
-        """The image (size, size, 3) and the mask (size, size) of its pixels that some camera sees; grey elsewhere.
+    @property
+    def centres(self) -> FloatArray:
+        """(n, 3) metres in the body."""
+        centres: FloatArray = np.array([one.T_body_camera.translation for one in self.rig.cameras.values()])[self.main]
+        return centres
+
+    def take(self, which: IntArray) -> VirtualCrops:
+        """Those of these numbers (m,)."""
+        return VirtualCrops(self.rig, self.size_px, self.focal_px[which], self.R_body_virtual[which], self.main[which])
+
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """(n, 3) unit vectors in the body towards one pixel (n, 2) of each."""
+        towards = np.ones((len(pixels), 3, 1))
+        towards[:, :2, 0] = (pixels - self.size_px / 2) / self.focal_px[:, None]
+        return _unit((self.R_body_virtual @ towards)[:, :, 0])
+
+    def sample(
+        self, images: Mapping[str, UInt8Array], range_m: FloatArray | None = None
+    ) -> tuple[UInt8Array, BoolArray]:
+        """The images (n, size, size, 3), and masks (n, size, size) of their pixels that a camera sees; grey elsewhere.
 
         Each pixel comes from the main camera wherever that sees it, else from the camera in whose image it lies
-        deepest. ``images`` are (h, w, 3) by camera name; a camera without an image sees nothing. With ``range_m``,
-        the distance of the target, other cameras are sampled where they see that distance, which corrects
-        their parallax; without it, where they see infinity.
+        deepest. ``images`` are (h, w, 3) by camera name; a camera without an image sees nothing. With ``range_m``
+        (n,), the distances of the targets, other cameras are sampled where they see those distances, which corrects
+        their parallax; without them, and where they are NaN, where they see infinity.
         """
-        size = self.camera.size
-        crop = np.full((size[1], size[0], 3), _GREY, dtype=np.uint8)
-        valid = np.zeros((size[1], size[0]), dtype=np.bool_)
-        for name, where in self._maps(images, range_m).items():
-            seen = np.isfinite(where[0])
-            if not seen.any():
-                continue
-            drawn = _draw(images[name], where, self._minification(self.rig.cameras[name]))
-            if seen.all():
-                crop, valid = drawn, seen
-            else:
-                cv2.copyTo(drawn, seen.view(np.uint8), crop)
-                valid |= seen
-        return crop, valid
+        drawn = np.full((len(self.main), self.size_px, self.size_px, 3), _GREY, np.uint8)
+        valid = np.zeros(drawn.shape[:3], np.bool_)
+        for index, camera in self._with(images):
+            mine = np.flatnonzero(self.main == index)
+            if len(mine):
+                crops = self.take(mine)
+                homographies, whole = crops._homographies(camera)
+                factors = crops._minification(camera).tolist()
+                for k in np.flatnonzero(whole).tolist():
+                    u, v, z = homographies[k] @ _pixels(self.size_px)
+                    where = np.array([u / z, v / z], np.float32).reshape(2, self.size_px, self.size_px)
+                    drawn[mine[k]] = _draw(images[camera.name], where, factors[k])
+                valid[mine[whole]] = True
+        rest = np.flatnonzero(~valid[:, 0, 0])
+        if len(rest):
+            ranges = np.full(len(rest), np.nan) if range_m is None else range_m[rest]
+            drawn[rest], valid[rest] = self.take(rest)._sample_by_pixel(images, ranges)
+        return drawn, valid
 
-    def _maps(self, images: Mapping[str, UInt8Array], range_m: float | None) -> dict[str, Float32Array]:
-        """For each camera that is needed, u and v (2, size, size) of what it fills the crop with; NaN elsewhere.
+    def _homographies(self, camera: RigCamera) -> tuple[FloatArray, BoolArray]:
+        """(n, 3, 3) from the crops' pixels to a camera's, and a mask (n,): which crops these draw whole.
 
-        Of several the last one counts.
+        They are those of most crops, and take half the time: of a pinhole without distortion that has their corners in
+        its image.
         """
-        shape, pixels = (2, self.camera.size[1], self.camera.size[0]), _pixels(self.camera.size)
-        to_body = self.T_body_virtual.rotation @ np.linalg.inv(self.camera.matrix)
-        if self.main in images and (where := _seen_whole(self.rig.cameras[self.main], to_body, pixels)) is not None:
-            return {self.main: where.astype(np.float32).reshape(shape)}
-        directions = to_body @ pixels  # not of unit length, which no camera needs
-        maps: dict[str, FloatArray] = {}
-        missing = np.arange(directions.shape[1])
-        if self.main in images:
-            maps[self.main] = self.rig.cameras[self.main].pixels_of_directions(directions.T).T
-            missing = np.flatnonzero(np.isnan(maps[self.main][0]))
-        towards = np.take(directions, missing, axis=1)
-        if range_m is not None:
-            towards *= range_m / np.sqrt(np.einsum("ij,ij->j", towards, towards))
-            towards += self.T_body_virtual.translation[:, None]
-        deepest = np.full(len(missing), _NOT_IN_IT)
-        for name, camera in self.rig.cameras.items():
-            if name == self.main or name not in images or not len(missing):
-                continue
-            see = camera.pixels_of_directions if range_m is None else camera.pixels_of_points
-            seen = see(towards.T)
+        if not isinstance(camera.camera, PinholeCamera) or camera.camera.distortion:
+            return np.empty((len(self.main), 3, 3)), np.zeros(len(self.main), np.bool_)
+        homographies = camera.camera.matrix @ camera.T_body_camera.rotation.T @ self._to_body
+        u, v, z = (homographies @ _pixels(self.size_px)[:, [0, self.size_px - 1, -self.size_px, -1]]).swapaxes(0, 1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            corners = np.stack([u / z, v / z], 2)
+        inside = camera.camera.in_image(corners.reshape(-1, 2)).reshape(z.shape)
+        return homographies, np.asarray((inside & (z > 0.0)).all(1))
+
+    def _sample_by_pixel(self, images: Mapping[str, UInt8Array], range_m: FloatArray) -> tuple[UInt8Array, BoolArray]:
+        """As `sample`, of any cameras."""
+        source, where = self._sources(images, range_m)
+        drawn = np.full((*source.shape, 3), _GREY, np.uint8)
+        for index, camera in self._with(images):
+            mine = source == index
+            minification = mine.any(1) * self._minification(camera)
+            for factor in set(minification.tolist()) - {0}:
+                crops = np.flatnonzero(minification == factor)
+                part = drawn[crops]
+                cv2.copyTo(_draw(images[camera.name], where[:, crops], factor), mine[crops].view(np.uint8), part)
+                drawn[crops] = part
+        shape = (len(self.main), self.size_px, self.size_px)
+        return drawn.reshape(*shape, 3), (source != _NOWHERE).reshape(shape)
+
+    def _with(self, images: Mapping[str, UInt8Array]) -> list[tuple[int, RigCamera]]:
+        return [(index, one) for index, one in enumerate(self.rig.cameras.values()) if one.name in images]
+
+    @property
+    def _to_body(self) -> FloatArray:
+        """(n, 3, 3) that make directions of pixels; not of unit length, which no camera needs."""
+        to_virtual = np.zeros((len(self.main), 3, 3))
+        to_virtual[:, [0, 1], [0, 1]] = 1.0 / self.focal_px[:, None]
+        to_virtual[:, :2, 2] = -self.size_px / 2 / self.focal_px[:, None]
+        to_virtual[:, 2, 2] = 1.0
+        return self.R_body_virtual @ to_virtual
+
+    def _sources(self, images: Mapping[str, UInt8Array], range_m: FloatArray) -> tuple[IntArray, Float32Array]:
+        """For each pixel (n, size^2) the number of the camera that shows it, and u and v (2, n, size^2) there; -1 and
+        NaN where none does."""
+        pixels = _pixels(self.size_px)
+        # Coordinate by coordinate, each in one piece.
+        towards = (self._to_body.transpose(1, 0, 2).reshape(-1, 3) @ pixels).reshape(3, len(self.main), -1)
+        where = np.full((2, *towards.shape[1:]), np.nan, np.float32)
+        for index, camera in self._with(images):
+            crops = np.flatnonzero(self.main == index)
+            if len(crops):
+                seen = camera.pixels_of_directions(towards[:, crops].reshape(3, -1).T)
+                where[:, crops] = seen.T.reshape(2, len(crops), -1)
+        source = np.where(np.isnan(where[0]), _NOWHERE, self.main[:, None])
+        missing = np.flatnonzero(source == _NOWHERE)
+        if not len(missing):
+            return source, where
+        crop = missing // pixels.shape[1]
+        towards, parallax = towards.reshape(3, -1)[:, missing], np.isfinite(range_m)[crop]
+        towards *= np.where(parallax, range_m[crop], 1.0) / np.sqrt((towards * towards).sum(0))
+        deepest = np.full(len(missing), float(_NOWHERE))
+        for index, camera in self._with(images):
+            aside = parallax * (self.centres[crop] - camera.T_body_camera.translation).T
+            seen = camera.pixels_of_directions((towards + aside).T)
             margin = _margin(camera, seen)
-            deeper = margin > deepest
-            if deeper.any():
-                maps[name] = np.full((2, directions.shape[1]), np.nan)
-                maps[name][:, missing[deeper]] = np.compress(deeper, seen.T, axis=1)
-                deepest = np.maximum(deepest, margin)
-        return {name: where.astype(np.float32).reshape(shape) for name, where in maps.items()}
+            deeper = np.flatnonzero(margin > deepest)
+            source.reshape(-1)[missing[deeper]] = index
+            where.reshape(2, -1)[:, missing[deeper]] = seen[deeper].T
+            deepest = np.maximum(deepest, margin)
+        return source, where
 
-    def _minification(self, camera: RigCamera) -> int:
-        """How many pixels of a camera's image, each way, fall into one of the crop's at its middle."""
-        R_camera_virtual = camera.T_body_camera.rotation.T @ self.T_body_virtual.rotation
+    def _minification(self, camera: RigCamera) -> IntArray:
+        """(n,) pixels of a camera's image, each way, that fall into one of each crop's at its middle; at least 1."""
+        R_camera_virtual = camera.T_body_camera.rotation.T @ self.R_body_virtual
         # Pixels of the image per radian both ways across the line of sight: their product is an area.
-        per_radian = camera.camera.jacobian(R_camera_virtual[:, 2][None])[0] @ R_camera_virtual[:, :2]
-        (a, b), (c, d) = per_radian.tolist()
+        per_radian = camera.camera.jacobian(R_camera_virtual[:, :, 2]) @ R_camera_virtual[:, :, :2]
+        (a, b), (c, d) = per_radian.transpose(1, 2, 0)
+        factor = np.sqrt(np.abs(a * d - b * c)) / self.focal_px
         # A camera that only sees the crop's rim may not see its middle (NaN); its pixels are then taken one by one.
-        minification = math.sqrt(abs(a * d - b * c)) / self.camera.focal_px
-        return round(min(minification, *camera.camera.size)) if minification > _MINIFICATION else 1
+        whole = np.where(factor > _MINIFICATION, np.rint(factor), 1.0)
+        return np.minimum(whole, min(camera.camera.size)).astype(np.int64)
 
 
-def virtual_crop(rig: Rig, direction_body: FloatArray, half_angle_rad: float, size_px: int) -> VirtualCrop:
-    """The virtual camera along ``direction_body`` (3,), ``half_angle_rad`` to its borders, ``size_px`` square.
+def virtual_crops(rig: Rig, directions_body: FloatArray, half_angles_rad: FloatArray, size_px: int) -> VirtualCrops:
+    """The virtual cameras along ``directions_body`` (n, 3), ``half_angles_rad`` (n,) to their borders.
 
-    It sits at the optical centre of the camera in whose image the direction lies deepest, and is level: its x axis is
-    horizontal in the body. A rig of the cameras that work makes it choose among those. Raises ValueError where no
-    camera sees the direction, and for an angle outside (0, pi/2).
+    A rig of the cameras that work makes them choose among those.
     """
-    if not 0.0 < half_angle_rad < math.pi / 2.0:
-        raise ValueError(
-            f"a pinhole's half angle lies between 0 and 90 degrees, not {math.degrees(half_angle_rad):.1f}"
-        )
-    forward = np.asarray(direction_body, dtype=np.float64)
-    forward = forward / np.linalg.norm(forward)
-    margins = {name: _margin_of(camera, forward) for name, camera in rig.cameras.items()}
-    main = max(margins, key=lambda name: margins[name])
-    if margins[main] < 0.0:
-        raise ValueError(f"no camera sees the body direction {np.round(forward, 3).tolist()}")
-    focal = size_px / 2.0 / math.tan(half_angle_rad)
-    centre = size_px / 2.0
-    return VirtualCrop(
-        camera=PinholeCamera(
-            np.array([[focal, 0.0, centre], [0.0, focal, centre], [0.0, 0.0, 1.0]]), (size_px, size_px)
-        ),
-        T_body_virtual=RigidTransform(_level_towards(forward), rig.cameras[main].T_body_camera.translation),
-        main=main,
-        rig=rig,
-    )
+    forward = _unit(directions_body)
+    margins = np.array([_margin(camera, camera.pixels_of_directions(forward)) for camera in rig.cameras.values()])
+    possible = (half_angles_rad > 0.0) & (half_angles_rad < np.pi / 2) & (margins.max(0) >= 0.0)
+    focal_px = size_px / 2 / np.tan(np.where(possible, half_angles_rad, 1.0))
+    main = np.where(possible, margins.argmax(0), _NOWHERE)
+    return VirtualCrops(rig, size_px, focal_px, _level_towards(forward), main)
 
 
 def _level_towards(forward: FloatArray) -> FloatArray:
-    """``R_body_virtual``: z along ``forward``, x horizontal."""
-    x, y, z = forward.tolist()
-    length = math.hypot(x, y)
+    """(n, 3, 3) ``R_body_virtual``: z along ``forward`` (n, 3), x horizontal."""
+    x, y, z = forward.T
+    length = np.hypot(x, y)
+    level, least = length > 1e-6, np.maximum(length, 1e-6)
     # The right is down x forward. Straight up or down every x is horizontal: the body's right then.
-    right_x, right_y = (-y / length, x / length) if length > 1e-6 else (0.0, 1.0)
-    return np.array([[right_x, -z * right_y, x], [right_y, z * right_x, y], [0.0, x * right_y - y * right_x, z]])
+    right_x, right_y = np.where(level, -y / least, 0.0), np.where(level, x / least, 1.0)
+    columns = [right_x, -z * right_y, x, right_y, z * right_x, y, np.zeros_like(x), x * right_y - y * right_x, z]
+    return np.array(columns).T.reshape(-1, 3, 3)
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    return np.asarray(vectors / np.sqrt((vectors * vectors).sum(1))[:, None])
 
 
 @lru_cache(maxsize=8)
-def _pixels(size: tuple[int, int]) -> FloatArray:
+def _pixels(size_px: int) -> FloatArray:
     """(3, n) homogeneous coordinates of the pixel centres, row by row."""
-    return np.insert(grid_pixels(size, 1).T, 2, 1.0, axis=0)
-
-
-def _seen_whole(camera: RigCamera, to_body: FloatArray, pixels: FloatArray) -> FloatArray | None:
-    """A camera's u and v (2, n) of homogeneous pixels of a crop (3, n) by their homography; None where there is none.
-
-    It is that of most crops, and takes half the time: of a pinhole without distortion that has all of them in its
-    image. ``to_body`` (3, 3) makes directions of the pixels.
-    """
-    if not isinstance(camera.camera, PinholeCamera) or camera.camera.distortion:
-        return None
-    seen = camera.camera.matrix @ camera.T_body_camera.rotation.T @ to_body @ pixels
-    if seen[2].min() <= 0.0:
-        return None
-    where: FloatArray = seen[:2] / seen[2]
-    return where if camera.camera.in_image(where.T).all() else None
+    return np.insert(grid_pixels((size_px, size_px), 1).T, 2, 1.0, axis=0)
 
 
 def _draw(image: UInt8Array, where: Float32Array, minification: int) -> UInt8Array:
-    """The image's colours at u and v (2, h, w), averaged over ``minification`` pixels both ways; any at NaN."""
+    """The image's colours at u and v (2, n, m), averaged over ``minification`` pixels both ways; any at NaN."""
     if minification > 1:
-        # Only the part that the crop covers, a block wider, cut along whole blocks.
-        low = np.maximum(np.nanmin(where, axis=(1, 2)) // minification - 1, 0).astype(np.int64) * minification
-        blocks = np.nanmax(where, axis=(1, 2)).astype(np.int64) // minification + 2 - low // minification
-        blocks = np.minimum(blocks, (np.array(image.shape[1::-1]) - low) // minification)
-        high = low + blocks * minification
-        part = cv2.resize(
-            image[low[1] : high[1], low[0] : high[0]],
-            (int(blocks[0]), int(blocks[1])),
-            interpolation=cv2.INTER_AREA,
-        )
-        image = part.astype(np.uint8, copy=False)
+        # Only the part that the crops cover, a block wider, cut along whole blocks.
+        low = np.maximum(np.fmin.reduce(where, axis=(1, 2)) // minification - 1, 0).astype(np.int64) * minification
+        blocks = np.fmax.reduce(where, axis=(1, 2)).astype(np.int64) // minification + 2 - low // minification
+        width, height = np.minimum(blocks, (np.array(image.shape[1::-1]) - low) // minification).tolist()
+        part = image[low[1] : low[1] + height * minification, low[0] : low[0] + width * minification]
+        image = np.asarray(cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
         where = (where - low.astype(np.float32)[:, None, None]) / np.float32(minification)
     # Centres are at integers here, and beyond the outermost ones the border repeats.
     x, y = where - np.float32(0.5)
-    drawn = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return drawn.astype(np.uint8, copy=False)
+    return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
 def _margin(camera: RigCamera, pixels: FloatArray) -> FloatArray:
-    """(n,) distance from the image's border, in focal lengths so that cameras compare; `_NOT_IN_IT` elsewhere."""
+    """(n,) distance from the image's border, in focal lengths so that cameras compare; -1 elsewhere."""
     width, height = camera.camera.size
     u, v = pixels.T
     margin = np.minimum(np.minimum(u, width - u), np.minimum(v, height - v)) / camera.camera.focal_px
-    return np.where(np.isfinite(margin), margin, _NOT_IN_IT)
-
-
-def _margin_of(camera: RigCamera, direction_body: FloatArray) -> float:
-    """The same of one direction (3,), in half the time; any negative value for what is not in it."""
-    width, height = camera.camera.size
-    u, v = camera.camera.project((direction_body @ camera.T_body_camera.rotation)[None])[0].tolist()
-    return min(u, width - u, v, height - v) / camera.camera.focal_px if math.isfinite(u) else _NOT_IN_IT
+    return np.where(np.isfinite(margin), margin, float(_NOWHERE))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import cv2
 
 from flockd.core.messages import Float32Array, FloatArray, UInt8Array
-from flockd.flight.geometry import PinholeCamera, RigidTransform, ZMap
+from flockd.flight.geometry import ZMap
 from flockd.flight.perception.detection.instances import Instance
 
 
@@ -40,14 +40,16 @@ class SceneMaps:
         return slice(top, top + max(height, 1)), slice(left, left + max(width, 1))
 
 
-@dataclass(frozen=True, eq=False)
-class Crop:
-    """A small image of one region of interest, as a virtual camera that faces it sees it."""
+class Crop(NamedTuple):
+    """A small image of one region of interest, as a virtual camera that faces it sees it: a pinhole."""
 
     image: UInt8Array
     """(size, size, 3) RGB"""
-    camera: PinholeCamera
-    T_body_camera: RigidTransform
+    focal_px: float
+    R_body_camera: FloatArray
+    """(3, 3) from optical RDF to body FRD."""
+    centre: FloatArray
+    """(3,) the camera's, metres in the body."""
     mirrored: bool = False
     """Whether the network is to be given the mirror image, on which it errs differently. The estimate is as if not."""
     evidence: float = 0.0
@@ -78,18 +80,3 @@ class RangeEstimate:
     """Probability that there is a drone at all."""
     log_size_sigma: float = 0.0
     """Standard deviation of the logarithm of `size_m`. `log_range` errs with it, by as much again."""
-
-    def of_size(self, known: KnownSize) -> RangeEstimate:
-        """With the range at which a drone of a known size has this apparent size.
-
-        What the apparent size errs by stays; the known size's own deviation stands for that of the judged one.
-        """
-        if not (self.size_m > 0 and math.isfinite(self.size_m)):
-            return replace(self, log_range=math.nan)
-        log_apparent_size = math.log(self.size_m) - self.log_range
-        return replace(
-            self,
-            log_range=math.log(known.size_m) - log_apparent_size,
-            size_m=known.size_m,
-            log_size_sigma=known.sigma_m / known.size_m,
-        )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -153,11 +153,21 @@ class OnnxNetworks(OneByOne):
             return ()
         outputs = _in_batches(distance, images)
         columns = distance.manifest.results["range"].by_column(outputs["range"])
-        evidence = logits + np.clip(columns["drone_logit"], -limit, limit)
-        return tuple(
-            _estimate({name: float(column[k]) for name, column in columns.items()}, float(evidence[k]), crop)
-            for k, crop in enumerate(crops)
+        values = {name: np.asarray(column, np.float64) for name, column in columns.items()}
+        evidence = logits + np.clip(values["drone_logit"], -limit, limit)
+        mirrored, focal_px = np.array([(crop.mirrored, crop.focal_px) for crop in crops]).T
+        right = np.where(mirrored, -values["right_px"], values["right_px"])  # turned back
+        size_sigma = np.exp(values.get("log_size_sigma", np.full(len(crops), -np.inf)))
+        rows = zip(
+            (values["log_range_per_focal"] + np.log(focal_px)).tolist(),
+            np.exp(values["log_relative_sigma"]).tolist(),
+            np.stack([right, values["down_px"]], 1) + len(crops[0].image) / 2,
+            np.exp(values["log_range_per_focal"] + values["log_apparent_size"]).tolist(),
+            _probability(evidence).tolist(),
+            np.minimum(size_sigma, _MOST_SIZE_SIGMA).tolist(),
+            strict=True,
         )
+        return tuple(RangeEstimate(*row) for row in rows)
 
     def _open_detector(self, config: PerceptionConfig) -> tuple[OnnxModel | None, BoxRules | None]:
         if self._distance is None or config.detector == NO_MODEL:
@@ -313,20 +323,6 @@ def _probability(logit: FloatArray) -> FloatArray:
 
 _MOST_SIZE_SIGMA = 0.5
 """Twice that is a factor of 2.7 in size either way: a network that says more says that it knows nothing."""
-
-
-def _estimate(columns: Mapping[str, float], drone_logit: float, crop: Crop) -> RangeEstimate:
-    """The estimate from one crop's output, with a mirror image's turned back."""
-    size = crop.camera.size[0]
-    right = -columns["right_px"] if crop.mirrored else columns["right_px"]
-    return RangeEstimate(
-        log_range=columns["log_range_per_focal"] + float(np.log(crop.camera.focal_px)),
-        log_range_sigma=float(np.exp(columns["log_relative_sigma"])),
-        centre=np.array([size / 2 + right, size / 2 + columns["down_px"]]),
-        size_m=float(np.exp(columns["log_range_per_focal"] + columns["log_apparent_size"])),
-        drone_probability=float(_probability(np.array(drone_logit))),
-        log_size_sigma=min(float(np.exp(columns.get("log_size_sigma", -np.inf))), _MOST_SIZE_SIGMA),
-    )
 
 
 def geometry_planes(camera: RigCamera, ground: Float32Array | None, stride: int) -> Float32Array:

@@ -16,7 +16,7 @@ from flockd.flight.geometry import Camera, PinholeCamera, Rig, RigCamera, RigidT
 from flockd.flight.perception import Networks, Perception, load_networks
 from flockd.flight.perception.detection.detector import DetectionTrace
 from flockd.flight.perception.detection.refinement import Candidate
-from flockd.flight.perception.detection.roi import angle_between
+from flockd.flight.perception.detection.roi import angles_between
 
 MAX_SIDE_PX = 1280
 """Larger pictures are resized to this before the networks: they were trained on cameras of 640 pixels."""
@@ -123,7 +123,7 @@ class PictureDetector:
     ) -> DetectedDrone:
         """With pixels of the picture before it was resized by ``scale`` (2,)."""
         size_px = one.size_m / one.range_m * camera.focal_px
-        mine = [c for c in candidates if angle_between(c.bearing, one.bearing) < one.size_m / one.range_m / 2]
+        mine = [c for c in candidates if angles_between(c.bearing, one.bearing) < one.size_m / one.range_m / 2]
         instances = [c.proposal.instance for c in mine if c.proposal.instance is not None]
         boxed = max((i for i in instances if i.boxed), key=lambda instance: instance.score, default=None)
         if boxed is not None:

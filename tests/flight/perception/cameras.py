@@ -7,7 +7,6 @@ import numpy as np
 
 from flockd.core.data import data_path
 from flockd.core.messages import FloatArray, UInt8Array
-from flockd.flight.geometry import RigidTransform
 from flockd.flight.inference import load_manifest
 from flockd.flight.perception import Crop
 from flockd.flight.perception.detection.second_stage import SecondStage
@@ -21,8 +20,7 @@ SECOND_STAGE = SecondStage.of(load_manifest(data_path("models") / "distance_int8
 
 
 def crop_of(image: UInt8Array, focal_px: float, *, mirrored: bool = False) -> Crop:
-    size = (image.shape[1], image.shape[0])
-    return Crop(np.ascontiguousarray(image), pinhole(focal_px, size), RigidTransform(np.eye(3), np.zeros(3)), mirrored)
+    return Crop(np.ascontiguousarray(image), focal_px, np.eye(3), np.zeros(3), mirrored)
 
 
 def rendered(

@@ -92,17 +92,17 @@ class TrueNetworks(OneByOne):
         return sorted(found, key=lambda one: -one.area_px)
 
     def _range(self, crop: Crop) -> RangeEstimate:
-        size, drawn = crop.camera.size[0], next(iter(self._now.values()))
+        size, drawn = len(crop.image), next(iter(self._now.values()))
         views = [one.view for one in self._now.values()]
         visible = [d for d in drawn.shown if any((view.ids == d + 1).sum() >= _MIN_PIXELS for view in views)]
         if not visible:
             return RangeEstimate(0.0, 1.0, np.full(2, size / 2), _SIZE_M, drone_probability=0.0)
         (own,) = set(range(len(drawn.drone_positions))) - set(drawn.shown)
         in_body = (drawn.drone_positions[visible] - drawn.drone_positions[own]) @ drawn.drone_rotations[own]
-        in_view = crop.T_body_camera.inverse().apply(in_body)
+        in_view = (in_body - crop.centre) @ crop.R_body_camera
         ranges = np.linalg.norm(in_view, axis=1)
         point = in_view[np.argmax(in_view[:, 2] / ranges)]
         log_range = float(np.log(np.linalg.norm(point)))
-        centre = size / 2 + crop.camera.focal_px * point[:2] / max(point[2], 1e-3)
+        centre = size / 2 + crop.focal_px * point[:2] / max(point[2], 1e-3)
         inside = bool(((centre > 0) & (centre < size)).all())
         return RangeEstimate(log_range, 0.001, np.clip(centre, -size, 2 * size), _SIZE_M, float(inside))

@@ -72,18 +72,18 @@ class Detector:
         if stage is None:
             trace.candidates += candidates_from_depth(rig, scenes, depths, self._parameters)
             return _masked(suppress(trace.candidates, self._parameters), scenes)
-        rules, cascade = stage.rules, Cascade(self._networks, stage, self._parameters, known_size)
+        rules, cascade = stage.rules, Cascade(self._networks, stage, self._parameters, known_size, rig, images)
         proposals = propose_instances(rig, scenes, rules, self._parameters)
-        first = cascade.refine(rig, images, proposals)
+        first = cascade.refine(proposals)
         predicted, unpredicted = propose_predictions(
             rig, vehicle, predictions, [(c.bearing, c.log_range) for c in first.candidates], rules
         )
-        second = cascade.refine(rig, images, predicted)
+        second = cascade.refine(predicted)
         candidates = [*first.candidates, *second.candidates]
         none = {proposal.instance for proposal in first.rejected if proposal.instance}
         trace.proposals += [*proposals, *predicted]
         trace.candidates += candidates
-        reasons = (*first.reasons, *unpredicted, *second.reasons)
+        reasons = (*unpredicted, *cascade.reasons)
         return _masked(suppress(candidates, self._parameters), scenes, none, reasons)
 
 

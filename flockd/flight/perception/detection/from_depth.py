@@ -12,7 +12,7 @@ from flockd.flight.geometry import RangeMap, Rig, RigCamera, log_polar
 from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.detection.proposals import Proposal
 from flockd.flight.perception.detection.refinement import Candidate
-from flockd.flight.perception.detection.roi import Roi, angle_between
+from flockd.flight.perception.detection.roi import Roi, angles_between
 from flockd.flight.perception.maps import SceneMaps
 
 _MAX_RADIUS_M = 0.6
@@ -46,7 +46,7 @@ def _candidate(
     bearing, log_range = log_polar(camera.T_body_camera.apply(centre[None])[0])
     left, top, right, _ = instance.box
     rays = camera.camera.rays(np.array([[left, top], [right, top]]))
-    width = max(angle_between(rays[0], rays[1]), _MIN_ANGLE)
+    width = max(float(angles_between(rays[0], rays[1])), _MIN_ANGLE)
     proposal = Proposal((camera.name,), Roi(bearing, width / 2), instance)
     sigma = parameters.depth_map_sigma
     return Candidate(proposal, bearing, log_range, sigma, sigma * width, math.exp(log_range) * width)

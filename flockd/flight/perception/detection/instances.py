@@ -57,22 +57,26 @@ def group_instances(
     votes = np.stack([columns + 0.5 + offset[0, rows, columns], rows + 0.5 + offset[1, rows, columns]], 1)
     centres = _vote_peaks(votes, (height, width))
     nearest = _nearest(votes, centres)
+    sizes = np.bincount(nearest, minlength=len(centres))
+    some = np.flatnonzero(sizes)
+    count = sizes[some]
+    first = np.cumsum(count) - count
     by_centre = np.argsort(nearest, kind="stable")
-    found = []
-    for mine in np.split(by_centre, np.cumsum(np.bincount(nearest, minlength=len(centres)))[:-1]):
-        area = float(len(mine)) * scale**2
-        if len(mine) == 0 or area < min_area_px:
-            continue
-        u, v = columns[mine], rows[mine]
-        box = scale * np.array([u.min(), v.min(), u.max() + 1, v.max() + 1], np.float64)
-        score = float(drone_logit[v, u].max())
-        found.append((area, scale * np.median(votes[mine], axis=0), box, mine, score))
-    found.sort(key=lambda item: -item[0])
-    instances = []
-    for label, (area, centre, box, mine, score) in enumerate(found, start=1):
-        labels[rows[mine], columns[mine]] = label
-        instances.append(Instance(label, centre, box, area, score))
-    return labels, tuple(instances)
+    pixels = np.stack([columns, rows])[:, by_centre]
+    corners = np.minimum.reduceat(pixels, first, axis=1), np.maximum.reduceat(pixels, first, axis=1) + 1
+    boxes = scale * np.concatenate(corners).T.astype(np.float64)
+    scores = np.maximum.reduceat(drone_logit[rows, columns][by_centre], first).tolist()
+    ordered = np.stack([axis[np.lexsort((axis, nearest))] for axis in votes.T], 1)
+    medians = scale * (ordered[first + (count - 1) // 2] + ordered[first + count // 2]) / 2
+    areas = scale**2 * count.astype(np.float64)
+    largest_first = np.argsort(-areas, kind="stable")
+    kept = largest_first[areas[largest_first] >= min_area_px].tolist()
+    label_of = np.zeros(len(centres), np.uint8)
+    label_of[some[kept]] = np.arange(1, len(kept) + 1)
+    labels[rows, columns] = label_of[nearest]
+    return labels, tuple(
+        Instance(label, medians[k], boxes[k], float(areas[k]), scores[k]) for label, k in enumerate(kept, start=1)
+    )
 
 
 def _nearest(votes: FloatArray, centres: FloatArray) -> NDArray[np.int64]:
@@ -106,15 +110,13 @@ def _vote_peaks(votes: FloatArray, shape: tuple[int, int]) -> FloatArray:
     order = np.argsort(-strength, kind="stable")
     places = (np.stack([columns, rows], 1) + 0.5) * _CELL - margin
     votes_right, votes_down = np.ascontiguousarray(votes.T)
-    kept = np.empty((0, 2))
-    reach = np.empty(0)
-    for place in places[order]:
+    kept: list[FloatArray] = []
+    places = places[order]
+    while len(places) and len(kept) < _MAX_INSTANCES:
+        place = places[0]
+        kept.append(place)
         # A side lobe of a big drone's votes is weaker and close by; another drone's votes are as strong as this one's.
-        if (np.hypot(*(place - kept).T) < reach).any():
-            continue
-        if len(kept) == _MAX_INSTANCES:
-            break
         own = (np.abs(votes_right - place[0]) < 6) & (np.abs(votes_down - place[1]) < 6)
-        kept = np.vstack([kept, place])
-        reach = np.append(reach, 3.0 + 0.35 * np.sqrt(np.count_nonzero(own)))
-    return kept if len(kept) else np.median(votes, axis=0)[None]
+        reach = 3.0 + 0.35 * np.sqrt(np.count_nonzero(own))
+        places = places[np.hypot(*(places - place).T) >= reach]
+    return np.array(kept) if kept else np.median(votes, axis=0)[None]

@@ -15,7 +15,7 @@ from flockd.core.config.perception import DetectionParameters
 from flockd.core.messages import FloatArray, Reason, ReasonKind, VehicleState
 from flockd.flight.geometry import Rig, log_polar
 from flockd.flight.perception.detection.instances import Instance
-from flockd.flight.perception.detection.roi import CropRules, Roi, angle_between, pixel_angle, roi_of_instance
+from flockd.flight.perception.detection.roi import CropRules, Roi, angles_between, pixel_angles, rois_of_instances
 from flockd.flight.perception.maps import SceneMaps
 from flockd.flight.tracking import Prediction
 
@@ -49,19 +49,15 @@ class Proposal:
 def propose_instances(
     rig: Rig, scenes: Mapping[str, SceneMaps], rules: CropRules, parameters: DetectionParameters
 ) -> list[Proposal]:
-    """What the first stage segments, of each image those of the highest score, in the order of the instances."""
-    return [
-        Proposal((name,), roi, instance)
-        for name, scene in scenes.items()
-        for instance in best_instances(scene, parameters.max_proposals)
-        if (roi := roi_of_instance(rig.cameras[name], instance, rules)) is not None
-    ]
-
-
-def best_instances(scene: SceneMaps, most: int) -> list[Instance]:
-    """At most so many, of the highest score; of equal scores the larger."""
-    kept = {one.label for one in sorted(scene.instances, key=lambda one: (-one.score, -one.area_px))[:most]}
-    return [one for one in scene.instances if one.label in kept]
+    """What the first stage segments, of each image those of the highest score; of equal scores the larger."""
+    found = []
+    for name, scene in scenes.items():
+        ranked = sorted(scene.instances, key=lambda one: (-one.score, -one.area_px))
+        labels = {one.label for one in ranked[: parameters.max_proposals]}
+        best = [one for one in scene.instances if one.label in labels]
+        rois = rois_of_instances(rig.cameras[name], best, rules)
+        found += [Proposal((name,), roi, one) for one, roi in zip(best, rois, strict=True) if roi is not None]
+    return found
 
 
 def propose_predictions(
@@ -82,23 +78,22 @@ def propose_predictions(
         rules: for the crops.
     """
     proposals, reasons = [], []
+    bearings = np.array([bearing for bearing, _ in detected]).reshape(-1, 3)
+    log_ranges = np.array([log_range for _, log_range in detected])
     for prediction in predictions:
-        R_body_ned = vehicle.R_ned_body.T
-        place = R_body_ned @ prediction.position
+        place = vehicle.R_ned_body.T @ prediction.position
         try:
             bearing, log_range = log_polar(place)
         except ValueError as error:
             reasons.append(Reason(ReasonKind.PROPOSAL, f"proposal of a track: {error}"))
             continue
-        range_m = math.exp(log_range)
         cameras = tuple(name for name, pixel in rig.pixels_of(place[None]).items() if np.isfinite(pixel).all())
         if not cameras:
             continue
-        roi = Roi(bearing, rules.half_angle(prediction.size_m, range_m, pixel_angle(rig, cameras, bearing)))
-        found = any(
-            angle_between(roi.direction, other) < roi.half_angle and abs(log_range - log_other) < _SAME_RANGE
-            for other, log_other in detected
-        )
-        if not found:
-            proposals.append(Proposal(cameras, roi, predicted=True))
+        finest = pixel_angles(rig, [cameras], bearing[None])
+        fitting = rules.fitting(np.array([prediction.size_m]), np.array([math.exp(log_range)]))
+        half_angle = float(rules.bounded(fitting, finest)[0])
+        same = (angles_between(bearings, bearing) < half_angle) & (np.abs(log_range - log_ranges) < _SAME_RANGE)
+        if not same.any():
+            proposals.append(Proposal(cameras, Roi(bearing, half_angle), predicted=True))
     return proposals, reasons

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockd.core.config.perception import DetectionParameters
-from flockd.core.messages import FloatArray, Reason, ReasonKind, UInt8Array
-from flockd.flight.geometry import Rig, VirtualCrop, log_polar, log_polar_covariance
+from flockd.core.messages import BoolArray, FloatArray, IntArray, Reason, ReasonKind, UInt8Array
+from flockd.flight.geometry import Rig, log_polar_covariance, virtual_crops
 from flockd.flight.perception.detection.proposals import Proposal
-from flockd.flight.perception.detection.roi import Roi, pixel_angle, take_crop
+from flockd.flight.perception.detection.roi import angles_between, pixel_angles
 from flockd.flight.perception.detection.second_stage import SecondStage
+from flockd.flight.perception.interface import Networks
 from flockd.flight.perception.maps import Crop, KnownSize, RangeEstimate
 
 
@@ -41,11 +43,6 @@ class Candidate:
         return math.exp(self.log_range)
 
     @property
-    def position(self) -> FloatArray:
-        """(3,) metres in the body."""
-        return self.range_m * self.bearing
-
-    @property
     def covariance(self) -> FloatArray:
         """(3, 3) as of `Detection.covariance`."""
         return log_polar_covariance(self.bearing, self.log_range_sigma, self.bearing_sigma_rad)
@@ -57,212 +54,215 @@ class Refined(NamedTuple):
     candidates: list[Candidate]
     rejected: list[Proposal]
     """Those that surely are no drones."""
-    reasons: list[Reason]
-    """Why others were dropped."""
 
 
-class RangeNetwork(Protocol):
-    """The part of `flockd.flight.perception.interface.Networks` that refinement needs."""
+class Looks(NamedTuple):
+    """What n crops show, in log-polar coordinates; the fields are those of `Candidate`."""
 
-    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        """Range and centre of the drone in the middle of each crop."""
-        ...
+    bearing: FloatArray
+    """(n, 3)"""
+    log_range: FloatArray
+    log_range_sigma: FloatArray
+    size_m: FloatArray
+    drone_probability: FloatArray
+    log_size_sigma: FloatArray
+
+    def take(self, which: IntArray | BoolArray) -> Looks:
+        """Those of these numbers, or of this mask."""
+        return Looks(*(column[which] for column in self))
+
+    def of_size(self, known: KnownSize) -> Looks:
+        """With the ranges at which drones of a known size have these apparent sizes.
+
+        What the apparent size errs by stays; the known size's own deviation stands for that of the judged one.
+        """
+        possible = (self.size_m > 0) & np.isfinite(self.size_m)
+        log_judged = np.log(self.size_m, where=possible, out=np.full_like(self.size_m, np.nan))
+        return self._replace(
+            log_range=math.log(known.size_m) - (log_judged - self.log_range),
+            size_m=np.full_like(self.size_m, known.size_m),
+            log_size_sigma=np.full_like(self.size_m, known.sigma_m / known.size_m),
+        )
+
+    def mean(self, other: Looks) -> Looks:
+        """The mean of log range, bearing, log size and sigmas, weighted by the variances; the lesser probability."""
+        weight = self.log_range_sigma**-2 / (self.log_range_sigma**-2 + other.log_range_sigma**-2)
+
+        def mean(a: FloatArray, b: FloatArray) -> FloatArray:
+            return np.asarray((weight * a.T + (1.0 - weight) * b.T).T)
+
+        bearing = mean(self.bearing, other.bearing)
+        return Looks(
+            bearing / np.linalg.norm(bearing, axis=1, keepdims=True),
+            mean(self.log_range, other.log_range),
+            np.exp(mean(np.log(self.log_range_sigma), np.log(other.log_range_sigma))),
+            np.exp(mean(np.log(self.size_m), np.log(other.size_m))),
+            np.minimum(self.drone_probability, other.drone_probability),
+            mean(self.log_size_sigma, other.log_size_sigma),
+        )
 
 
-@dataclass(frozen=True, eq=False)
-class _Stage:
-    """The next crop of a proposal."""
+class _Aims(NamedTuple):
+    """Where crops of n proposals are taken next."""
 
-    proposal: Proposal
-    roi: Roi
-    drone_probability: float = 1.0
-    """The least that an earlier crop gave, but for the first, which may be far from what suits the drone."""
-
-
-@dataclass(frozen=True, eq=False)
-class _LastStage(_Stage):
-    """The mirror image of the last crop."""
-
-    candidate: Candidate = field(kw_only=True)
-    """As the crop itself shows it."""
-
-
-_S = TypeVar("_S", bound=_Stage)
+    direction: FloatArray
+    """(n, 3)"""
+    half_angle: FloatArray
+    range_m: FloatArray
+    """Of what a crop should show, for the parallax between cameras; NaN: not known yet."""
 
 
 class Cascade:
-    """Refines proposals with the network of the second stage."""
+    """Refines proposals with the network of the second stage, in the images of one moment."""
 
     def __init__(
         self,
-        network: RangeNetwork,
+        network: Networks,
         second_stage: SecondStage,
         parameters: DetectionParameters,
-        known_size: KnownSize | None = None,
+        known_size: KnownSize | None,
+        rig: Rig,
+        images: Mapping[str, UInt8Array],
     ) -> None:
-        """``known_size``: of every drone; None: the network judges each one's."""
+        """``known_size``: of every drone; None: the network judges each one's. ``rig``: the cameras that have an image,
+        ``images`` (h, w, 3) by camera."""
         self._network, self._crop_size, self._known_size = network, second_stage.crop_size, known_size
         self._rules, self._thresholds, self._parameters = second_stage.rules, second_stage.thresholds, parameters
+        self._rig, self._images = rig, images
+        self.reasons: list[Reason] = []
+        """Why proposals were dropped."""
 
-    def refine(self, rig: Rig, images: Mapping[str, UInt8Array], proposals: Sequence[Proposal]) -> Refined:
-        """The drones among the proposals, the proposals that surely are none, and why others were dropped.
+    def refine(self, proposals: Sequence[Proposal]) -> Refined:
+        """The drones among the proposals of all cameras, and the proposals that surely are none.
 
         At least two crops each, the further ones cut to the drone's size with it in the middle, then one of its mirror
         image. Where two cameras share the drone, the crops show it whole.
-
-        Args:
-            rig: the cameras that have an image.
-            images: (h, w, 3) by camera.
-            proposals: of all cameras.
         """
-        settled: list[tuple[_Stage, Candidate]] = []
-        rejected: list[Proposal] = []
-        reasons: list[Reason] = []
-        stages = [_Stage(proposal, proposal.roi) for proposal in proposals]
+        count, of = len(proposals), np.array(proposals, np.object_)
+        aims = _Aims(
+            np.array([one.roi.direction for one in proposals]).reshape(-1, 3),
+            np.array([one.roi.half_angle for one in proposals]),
+            np.full(count, np.nan),
+        )
+        shown = Looks(np.empty((count, 3)), *np.empty((5, count)))
+        # The least that an earlier crop gave, but for the first, which may be far from what suits the drone.
+        least, rejected, settled = np.ones(count), np.zeros(count, np.bool_), np.zeros(count, np.bool_)
+        at = np.arange(count)
         for number in range(1, self._rules.max_crops + 1):
-            if not stages:
+            if not len(at):
                 break
-            further = []
-            judged, dropped = self._candidates(rig, images, stages)
-            reasons += dropped
-            for stage, candidate in judged:
-                probability = min(stage.drone_probability, candidate.drone_probability)
-                if probability <= self._thresholds.another_crop:
-                    rejected.append(stage.proposal)
-                    continue
-                if not self._is_in_range(candidate):
-                    continue
-                roi = self._next_roi(rig, stage, candidate)
-                following = _Stage(stage.proposal, roi, probability if number > 1 else 1.0)
-                if number == 1 or (number < self._rules.max_crops and not self._would_repeat(stage.roi, roi)):
-                    further.append(following)
-                elif probability > self._thresholds.drone:  # a mirror image would not raise it
-                    settled.append((following, candidate))
-            stages = further
-        candidates = []
-        together, dropped = self._with_mirrored(rig, images, settled)
-        reasons += dropped
-        for candidate in together:
-            if candidate.drone_probability <= self._thresholds.another_crop:
-                rejected.append(candidate.proposal)
-            elif candidate.drone_probability > self._needed(candidate.proposal):
-                candidates.append(candidate)
-        return Refined(candidates, rejected, reasons)
+            at, looks = self._look(of, at, aims)
+            probability = np.minimum(least[at], looks.drone_probability)
+            rejected[at] = probability <= self._thresholds.another_crop
+            good = ~rejected[at] & self._is_in_range(looks)
+            at, looks, probability = at[good], looks.take(good), probability[good]
+            repeats = self._aim(of[at], at, aims, looks)
+            if number == 1:
+                continue
+            least[at] = probability
+            enough = repeats | (number == self._rules.max_crops)
+            settled[at] = enough & (probability > self._thresholds.drone)  # a mirror image would not raise it
+            for column, values in zip(shown, looks, strict=True):
+                column[at] = values
+            at = at[~enough]
+        at, looks = self._with_mirrored(of, np.flatnonzero(settled), aims, shown)
+        probability = np.minimum(least[at], looks.drone_probability)
+        rejected[at] = probability <= self._thresholds.another_crop
+        needed = [self._thresholds.predicted_drone if one.predicted else self._thresholds.drone for one in of[at]]
+        sure = np.flatnonzero(~rejected[at] & (probability > needed))
+        looks, across = looks._replace(drone_probability=probability).take(sure), self._thresholds.bearing_sigma_rad
+        rows = zip(of[at[sure]], looks.bearing, *(column.tolist() for column in looks[1:]), strict=True)
+        found = [Candidate(one, bearing, log_r, sigma, across, *rest) for one, bearing, log_r, sigma, *rest in rows]
+        return Refined(found, of[rejected].tolist())
 
-    def _candidates(
-        self, rig: Rig, images: Mapping[str, UInt8Array], stages: Sequence[_S]
-    ) -> tuple[list[tuple[_S, Candidate]], list[Reason]]:
-        """What the network says of each crop, in the body, and why some crops were dropped."""
-        cut: list[tuple[_S, Crop, VirtualCrop]] = []
-        reasons = []
-        for stage in stages:
-            try:
-                crop = take_crop(rig, images, stage.roi, self._crop_size, stage.proposal.evidence)
-                cut.append((stage, *crop))
-            except ValueError as error:
-                reasons.append(_dropped(error))
-        ranged, unranged = self._ranges(cut)
-        candidates = []
-        for stage, view, estimate in ranged:
-            try:
-                candidates.append((stage, self._candidate(stage, view, estimate)))
-            except ValueError as error:
-                reasons.append(_dropped(error))
-        return candidates, [*reasons, *unranged]
-
-    def _ranges(
-        self, cut: Sequence[tuple[_S, Crop, VirtualCrop]]
-    ) -> tuple[list[tuple[_S, VirtualCrop, RangeEstimate]], list[Reason]]:
-        """One estimate a crop. Where the network fails on several, each half is tried by itself: one crop is lost."""
-        if not cut:
-            return [], []
-        try:
-            estimates = self._network.ranges([crop for _, crop, _ in cut])
-        except (FloatingPointError, ValueError) as error:
-            if len(cut) == 1:
-                return [], [_dropped(error)]
-            half = len(cut) // 2
-            (first, of_first), (second, of_second) = self._ranges(cut[:half]), self._ranges(cut[half:])
-            return [*first, *second], [*of_first, *of_second]
-        return [(stage, view, one) for (stage, _, view), one in zip(cut, estimates, strict=True)], []
-
-    def _candidate(self, stage: _Stage, view: VirtualCrop, estimate: RangeEstimate) -> Candidate:
-        """The camera sits beside the body's origin, so that bearing and range change a little."""
+    def _look(
+        self, proposals: NDArray[Any], at: IntArray, aims: _Aims, *, mirrored: bool = False
+    ) -> tuple[IntArray, Looks]:
+        """What the network says of crops of the proposals of these numbers, and those of which it says something."""
+        directions, range_m = aims.direction[at], aims.range_m[at]
+        views = virtual_crops(self._rig, directions, aims.half_angle[at], self._crop_size)
+        seen = np.flatnonzero(views.main >= 0)
+        for one in np.delete(directions, seen, 0):
+            self._drop(f"no camera sees the body direction {one.round(3).tolist()}")
+        at, views = at[seen], views.take(seen)
+        pictures, _ = views.sample(self._images, range_m[seen])
+        fields = pictures, views.focal_px.tolist(), views.R_body_virtual, views.centres, proposals[at]
+        crops = [
+            Crop(image, focal, R, centre, mirrored, one.evidence)
+            for image, focal, R, centre, one in zip(*fields, strict=True)
+        ]
+        estimates = self._ranges(crops)
+        given = np.array([k for k, one in enumerate(estimates) if one is not None], np.int64)
+        at, views = at[given], views.take(given)
+        rows = [
+            (*one.centre, one.log_range, one.log_range_sigma, one.size_m, one.drone_probability, one.log_size_sigma)
+            for one in estimates
+            if one is not None
+        ]
+        numbers = np.array(rows, np.float64).reshape(-1, 7)
+        looks = Looks(views.rays(numbers[:, :2]), *numbers[:, 2:].T)
         if self._known_size is not None:
-            estimate = estimate.of_size(self._known_size)
-        ray = view.camera.rays(estimate.centre[None])[0]
-        bearing, log_range = ray, estimate.log_range
-        if math.isfinite(log_range) and log_range < math.log(2 * self._parameters.max_range_m):
-            place = view.T_body_virtual.apply(math.exp(log_range) * ray[None])[0]
-            bearing, log_range = log_polar(place)
-        return Candidate(
-            stage.proposal, bearing, log_range, estimate.log_range_sigma, self._thresholds.bearing_sigma_rad,
-            estimate.size_m, estimate.drone_probability, estimate.log_size_sigma,
-        )  # fmt: skip
+            looks = looks.of_size(self._known_size)
+        # The camera sits beside the body's origin, so that bearing and range change a little.
+        near = np.isfinite(looks.log_range) & (looks.log_range < math.log(2 * self._parameters.max_range_m))
+        ranges = np.exp(np.where(near, looks.log_range, 0.0))[:, None]
+        places = np.where(near[:, None], views.centres, 0.0) + ranges * looks.bearing
+        range_m = np.linalg.norm(places, axis=1)
+        placed = range_m > 0.0
+        for place in places[~placed]:
+            self._drop(f"a place at {place.tolist()} m has no bearing")
+        range_m = np.where(placed, range_m, 1.0)
+        log_range = np.where(near, np.log(range_m), looks.log_range)
+        return at[placed], looks._replace(bearing=places / range_m[:, None], log_range=log_range).take(placed)
+
+    def _ranges(self, crops: Sequence[Crop]) -> list[RangeEstimate | None]:
+        """One estimate a crop. Where the network fails on several, each half is tried by itself: one crop is lost."""
+        if not crops:
+            return []
+        try:
+            return list(self._network.ranges(crops))
+        except (FloatingPointError, ValueError) as error:
+            if len(crops) == 1:
+                self._drop(str(error))
+                return [None]
+            half = len(crops) // 2
+            return [*self._ranges(crops[:half]), *self._ranges(crops[half:])]
 
     def _with_mirrored(
-        self, rig: Rig, images: Mapping[str, UInt8Array], settled: Sequence[tuple[_Stage, Candidate]]
-    ) -> tuple[list[Candidate], list[Reason]]:
-        """Each candidate together with what the mirror image of its crop says; without those that it contradicts."""
-        stages = []
-        for stage, candidate in settled:
-            half_angle = self._rules.mirror_scale * stage.roi.half_angle
-            mirrored = replace(stage.roi, half_angle=half_angle, mirrored=True)
-            stages.append(_LastStage(stage.proposal, mirrored, stage.drone_probability, candidate=candidate))
-        judged, reasons = self._candidates(rig, images, stages)
-        together = []
-        for stage, other in judged:
-            candidate = stage.candidate
-            if self._is_in_range(other) and min(candidate.log_range_sigma, other.log_range_sigma) > 0:
-                both = mean_candidate(candidate, other)
-                sigma = self._thresholds.mean_sigma * both.log_range_sigma
-                together.append(
-                    replace(
-                        both,
-                        log_range_sigma=max(sigma, self._thresholds.min_log_range_sigma),
-                        drone_probability=min(stage.drone_probability, both.drone_probability),
-                    )
-                )
-        return together, reasons
+        self, proposals: NDArray[Any], at: IntArray, aims: _Aims, shown: Looks
+    ) -> tuple[IntArray, Looks]:
+        """Each look together with what the mirror image of its crop says; without those that it contradicts."""
+        if not len(at):
+            return at, shown.take(at)
+        mirrored = aims._replace(half_angle=self._rules.mirror_scale * aims.half_angle)
+        at, others = self._look(proposals, at, mirrored, mirrored=True)
+        looks = shown.take(at)
+        agree = self._is_in_range(others) & (np.minimum(looks.log_range_sigma, others.log_range_sigma) > 0)
+        both = looks.take(agree).mean(others.take(agree))
+        sigma = np.maximum(self._thresholds.mean_sigma * both.log_range_sigma, self._thresholds.min_log_range_sigma)
+        return at[agree], both._replace(log_range_sigma=sigma)
 
-    def _next_roi(self, rig: Rig, stage: _Stage, candidate: Candidate) -> Roi:
-        """With the drone in its middle, or where the proposal was if no camera sees that direction."""
-        seen = bool(rig.covers(candidate.bearing[None])[0])
-        direction = candidate.bearing if seen else stage.proposal.roi.direction
-        finest = pixel_angle(rig, stage.proposal.cameras, direction)
-        half_angle = self._rules.half_angle(candidate.size_m, candidate.range_m, finest, stage.roi.half_angle)
-        return Roi(direction, half_angle, candidate.range_m)
+    def _aim(self, proposals: NDArray[Any], at: IntArray, aims: _Aims, looks: Looks) -> BoolArray:
+        """Aims the next crops (n,), and tells which of them would show nearly the same as the last.
 
-    def _would_repeat(self, roi: Roi, further: Roi) -> bool:
-        return roi.resembles(further, self._parameters.crop_shift, self._parameters.crop_resize)
+        They have the drones in their middle, or the proposals where no camera sees that direction.
+        """
+        first = np.array([one.roi.direction for one in proposals]).reshape(-1, 3)
+        direction = np.where(self._rig.covers(looks.bearing)[:, None], looks.bearing, first)
+        finest = pixel_angles(self._rig, [one.cameras for one in proposals], direction)
+        before, range_m, most = aims.half_angle[at], np.exp(looks.log_range), self._rules.max_resize
+        fitting = np.maximum(self._rules.fitting(looks.size_m, range_m), before / most)
+        half_angle = self._rules.bounded(np.minimum(fitting, before * most), finest)
+        moved = angles_between(aims.direction[at], direction) / before
+        resized = np.abs(np.log(half_angle / before))
+        for column, values in zip(aims, (direction, half_angle, range_m), strict=True):
+            column[at] = values
+        return (moved < self._parameters.crop_shift) & (resized < math.log(self._parameters.crop_resize))
 
-    def _is_in_range(self, candidate: Candidate) -> bool:
-        """False for NaN too."""
+    def _is_in_range(self, looks: Looks) -> BoolArray:
+        """(n,), false for NaN too."""
         low, high = math.log(self._parameters.min_range_m), math.log(self._parameters.max_range_m)
-        return low < candidate.log_range < high
+        return (low < looks.log_range) & (looks.log_range < high)
 
-    def _needed(self, proposal: Proposal) -> float:
-        return self._thresholds.predicted_drone if proposal.predicted else self._thresholds.drone
-
-
-def mean_candidate(one: Candidate, other: Candidate) -> Candidate:
-    """The mean of log range, bearing, log size and sigmas, weighted by the variances; the lesser probability."""
-    weight = one.log_range_sigma**-2 / (one.log_range_sigma**-2 + other.log_range_sigma**-2)
-
-    def mean(a: float, b: float) -> float:
-        return weight * a + (1.0 - weight) * b
-
-    bearing = weight * one.bearing + (1.0 - weight) * other.bearing
-    return replace(
-        one,
-        bearing=bearing / np.linalg.norm(bearing),
-        log_range=mean(one.log_range, other.log_range),
-        log_range_sigma=math.exp(mean(math.log(one.log_range_sigma), math.log(other.log_range_sigma))),
-        size_m=math.exp(mean(math.log(one.size_m), math.log(other.size_m))),
-        drone_probability=min(one.drone_probability, other.drone_probability),
-        log_size_sigma=mean(one.log_size_sigma, other.log_size_sigma),
-    )
-
-
-def _dropped(error: Exception) -> Reason:
-    return Reason(ReasonKind.PROPOSAL, f"proposal: {error}")
+    def _drop(self, why: str) -> None:
+        self.reasons.append(Reason(ReasonKind.PROPOSAL, f"proposal: {why}"))

@@ -16,7 +16,7 @@ from flockd.flight.perception.detection.proposals import (
     propose_instances,
     propose_predictions,
 )
-from flockd.flight.perception.detection.roi import Roi, roi_of_instance
+from flockd.flight.perception.detection.roi import Roi, rois_of_instances
 from flockd.flight.tracking import Prediction
 from tests.flight.perception.cameras import SECOND_STAGE
 from tests.make import rig_camera, vehicle
@@ -33,7 +33,7 @@ def instance(label: int, box: tuple[float, ...] | FloatArray, area_px: float = 1
 
 
 def roi_of(box: tuple[float, ...], camera: RigCamera = CAMERA) -> Roi | None:
-    return roi_of_instance(camera, instance(1, box), RULES)
+    return rois_of_instances(camera, [instance(1, box)], RULES)[0]
 
 
 # How wide.

@@ -16,7 +16,7 @@ from flockd.flight.geometry import log_polar
 from flockd.flight.perception import Crop, Instance, Perception, RangeEstimate
 from flockd.flight.perception.detection.nms import fuse, suppress
 from flockd.flight.perception.detection.proposals import Proposal
-from flockd.flight.perception.detection.refinement import Candidate
+from flockd.flight.perception.detection.refinement import Candidate, Looks
 from flockd.flight.perception.detection.roi import Roi
 from flockd.flight.perception.maps import KnownSize
 from tests.flight.pilot.flyer import Flyer, scenario_with
@@ -100,20 +100,17 @@ def test_a_low_probability_of_the_first_crop_does_not_outlive_the_next(
 
 # A known size: the range is the size over the apparent size, and its deviation is the networks' and the size's.
 
-ESTIMATE = RangeEstimate(math.log(4.0), 0.03, np.array([48.0, 48.0]), size_m=0.8, drone_probability=0.9)
-"""0.8 m at 4 m: a fifth of a radian wide."""
-
 
 def test_range_is_size_over_apparent_size() -> None:
-    """A drone of 0.5 m that is a fifth of a radian wide is 2.5 m away, and 4 % of it are its size's, whatever the
-    network said of that."""
-    known = replace(ESTIMATE, log_size_sigma=0.3).of_size(KnownSize(0.5, 0.02))
-    assert math.exp(known.log_range) == pytest.approx(2.5)
-    assert (known.log_range_sigma, known.log_size_sigma) == pytest.approx((0.03, 0.04))
-    assert known.size_m == 0.5
-    assert (known.drone_probability, known.centre.tolist()) == (0.9, [48.0, 48.0])
-    for size_m in (0.0, math.inf, math.nan):
-        assert math.isnan(replace(ESTIMATE, size_m=size_m).of_size(KnownSize(0.5, 0.02)).log_range)
+    """0.8 m at 4 m is a fifth of a radian wide: a drone of 0.5 m that is as wide is 2.5 m away, and 4 % of it are its
+    size's, whatever the network said of that."""
+    judged = np.array([0.8, 0.0, math.inf, math.nan])
+    log_range, sigma, probability = (np.full(4, value) for value in (math.log(4.0), 0.03, 0.9))
+    looks = Looks(np.tile([1.0, 0.0, 0.0], (4, 1)), log_range, sigma, judged, probability, np.full(4, 0.3))
+    known = looks.of_size(KnownSize(0.5, 0.02))
+    assert np.exp(known.log_range) == pytest.approx([2.5, math.nan, math.nan, math.nan], nan_ok=True)
+    assert (known.log_range_sigma[0], known.log_size_sigma[0]) == pytest.approx((0.03, 0.04))
+    assert (known.size_m[0], known.drone_probability[0], known.bearing[0, 0]) == (0.5, 0.9, 1.0)
 
 
 def test_a_flights_detections_are_ranged_by_the_size_that_was_said(flyer: Flyer) -> None:
