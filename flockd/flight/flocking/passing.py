@@ -28,8 +28,6 @@ not go to this one, and only backing off would be left."""
 _RING = 24
 _SPEEDS = 1.0, 0.5
 """Directions, and shares of the highest speed, that are tried where no velocity keeps clear of all."""
-_DIGITS = 9
-"""Of m/s that count."""
 
 
 class Passing:
@@ -128,7 +126,7 @@ def _clearest(
     ring = np.column_stack([np.cos(angles), np.sin(angles)])
     fastest = (most_m_s / np.maximum(ring @ towards.T, ROUNDING_M_S)).min(axis=1, initial=max_speed_m_s)[:, None]
     tried = np.vstack([tried, *(np.minimum(max_speed_m_s * share, fastest) * ring for share in _SPEEDS)])
-    off = np.round(np.maximum(least - tried @ normals.T, 0.0).max(axis=1), _DIGITS)
+    off = ROUNDING_M_S * np.round(np.maximum(least - tried @ normals.T, 0.0).max(axis=1) / ROUNDING_M_S)
     best = tried[off == off.min()]
     far = np.linalg.norm(best - wanted, axis=1)
     return float(off.min()), float(far.min()), best[np.argmin(far)]

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockd.core.config.avoidance import ObstacleParameters
-from flockd.core.messages import SECTORS, BoolArray, FloatArray, IntArray, ObstacleRanges
+from flockd.core.messages import SECTORS, FloatArray, IntArray, ObstacleRanges
 
 _CONSISTENT_SIGMAS = 3.0
 """Two ranges that differ by no more may be of one obstacle."""
@@ -22,29 +22,10 @@ AZIMUTHS = 2 * math.pi / SECTORS * np.arange(SECTORS)
 DIRECTIONS = np.column_stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)])
 """(n, 2) north and east, of length 1: the sectors' middles."""
 
-
-@dataclass(frozen=True, eq=False)
-class _Points:
-    """Obstacles seen, one a row: places (m, 2) metres north and east from the drone, and the others (m,)."""
-
-    places: FloatArray
-    sigma_m: FloatArray
-    seen_s: FloatArray
-    contradictions: FloatArray
-
-    def where(self, chosen: BoolArray) -> _Points:
-        return _Points(self.places[chosen], self.sigma_m[chosen], self.seen_s[chosen], self.contradictions[chosen])
-
-    def __add__(self, other: _Points) -> _Points:
-        return _Points(
-            np.concatenate([self.places, other.places]),
-            np.concatenate([self.sigma_m, other.sigma_m]),
-            np.concatenate([self.seen_s, other.seen_s]),
-            np.concatenate([self.contradictions, other.contradictions]),
-        )
-
-
-_NOTHING = _Points(np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0))
+_POINT = np.dtype([("place", float, 2), ("sigma_m", float), ("seen_s", float), ("contradictions", int)])
+"""An obstacle that was seen: metres north and east from the drone, and how many steps have looked past it since."""
+_Points = NDArray[np.void]
+"""(m,) of them."""
 
 
 class LocalMap:
@@ -56,7 +37,7 @@ class LocalMap:
 
     def __init__(self, parameters: ObstacleParameters) -> None:
         self._parameters = parameters
-        self._points = _NOTHING
+        self._points = np.empty(0, _POINT)
         self._seen_m = np.zeros(SECTORS)
         self._time_s: float | None = None
 
@@ -78,54 +59,51 @@ class LocalMap:
 
     def _move(self, time_s: float, displacement: FloatArray | None, sigma_m: float) -> None:
         if self._time_s is None or time_s < self._time_s:
-            self._points, self._seen_m = _NOTHING, np.zeros(SECTORS)
+            self._points, self._seen_m = np.empty(0, _POINT), np.zeros(SECTORS)
             self._time_s = time_s
             return
         elapsed_s, self._time_s = time_s - self._time_s, time_s
         way = np.zeros(2) if displacement is None else displacement
         sigma_m = _WHILE_UNKNOWN_M if displacement is None else sigma_m
-        points = self._points
-        moved = _Points(points.places - way, np.hypot(points.sigma_m, sigma_m), points.seen_s, points.contradictions)
-        p = self._parameters
-        kept = (time_s - points.seen_s <= p.memory_s) & (np.hypot(*moved.places.T) <= p.range_m)
-        self._points = moved.where(kept)
+        p, points = self._parameters, self._points.copy()
+        points["place"] -= way
+        points["sigma_m"] = np.hypot(points["sigma_m"], sigma_m)
+        kept = (time_s - points["seen_s"] <= p.memory_s) & (np.hypot(*points["place"].T) <= p.range_m)
+        self._points = points[kept]
         faded_m = p.range_m * elapsed_s / p.memory_s + math.hypot(*way)
         self._seen_m = np.maximum(self._seen_m - faded_m, 0.0)
 
     def _take(self, ranges: ObstacleRanges) -> None:
         p = self._parameters
-        found = ranges.range_m <= p.range_m
-        self._points = self._without_what_is_seen_anew(ranges) + _Points(
-            ranges.range_m[found, None] * DIRECTIONS[found],
-            ranges.sigma_m[found],
-            np.full(found.sum(), ranges.time_s),
-            np.zeros(found.sum()),
-        )
+        found = np.flatnonzero(ranges.range_m <= p.range_m)
+        new = np.zeros(len(found), _POINT)
+        new["place"] = ranges.range_m[found, None] * DIRECTIONS[found]
+        new["sigma_m"], new["seen_s"] = ranges.sigma_m[found], ranges.time_s
+        self._points = np.concatenate([self._without_what_is_seen_anew(ranges), new])
         self._seen_m = np.maximum(self._seen_m, np.minimum(ranges.seen_m, p.range_m))
 
     def _without_what_is_seen_anew(self, ranges: ObstacleRanges) -> _Points:
         """The points that newer ranges neither show again nor have looked past often enough."""
-        points = self._points
-        away_m = np.hypot(*points.places.T)
-        around = (sector_of(points.places)[:, None] + [-1, 0, 1]) % SECTORS
+        points = self._points.copy()
+        away_m = np.hypot(*points["place"].T)
+        around = (sector_of(points["place"])[:, None] + [-1, 0, 1]) % SECTORS
         own = around[:, 1]
-        allowed_m = _CONSISTENT_SIGMAS * np.hypot(points.sigma_m[:, None], ranges.sigma_m[around])
+        allowed_m = _CONSISTENT_SIGMAS * np.hypot(points["sigma_m"][:, None], ranges.sigma_m[around])
         beyond = np.minimum(ranges.range_m, ranges.seen_m)[around] > away_m[:, None] + allowed_m
         width_m = away_m * (2 * math.pi / SECTORS)
         again = np.abs(ranges.range_m[own] - away_m) <= np.maximum(allowed_m[:, 1], width_m)
-        contradictions = points.contradictions + beyond.all(axis=1)
-        counted = _Points(points.places, points.sigma_m, points.seen_s, contradictions)
-        return counted.where(~again & (contradictions < _CONTRADICTIONS))
+        points["contradictions"] += beyond.all(axis=1)
+        left: _Points = points[~again & (points["contradictions"] < _CONTRADICTIONS)]
+        return left
 
     def _now(self, time_s: float) -> ObstacleRanges:
         """In each sector the point that may be nearest."""
-        points = self._points
-        away_m = np.hypot(*points.places.T)
-        sectors = sector_of(points.places)
-        farthest_first = np.argsort(-(away_m - self._parameters.sigmas * points.sigma_m), kind="stable")
+        places, sigmas_m = self._points["place"], self._points["sigma_m"]
+        away_m, sectors = np.hypot(*places.T), sector_of(places)
+        farthest_first = np.argsort(-(away_m - self._parameters.sigmas * sigmas_m), kind="stable")
         range_m, sigma_m = np.full(SECTORS, np.inf), np.zeros(SECTORS)
         range_m[sectors[farthest_first]] = away_m[farthest_first]  # the last one written stays
-        sigma_m[sectors[farthest_first]] = points.sigma_m[farthest_first]
+        sigma_m[sectors[farthest_first]] = sigmas_m[farthest_first]
         return ObstacleRanges(time_s, range_m, sigma_m, self._seen_m)
 
 
