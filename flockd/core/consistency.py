@@ -66,12 +66,11 @@ RANGE_VISION = Check(
     "PX4's EKF2_EVV_GATE 3 SD; its velocity wanders by 0.15 m/s for seconds (measured in its simulator)",
 )
 EGO_MOTION = Check(
-    "velocity by the images, with the one before",
-    6.0,
-    "m/s²",
-    "the ego-motion is refused, twice in a row at most; then the velocity before is doubted",
-    "what a multirotor does that leans by 30 degrees",
-    ("geometry.max_acceleration_m_s2",),
+    "velocity by the images, with the autopilot's less what it erred by before",
+    5.0,
+    "SD",
+    "the ego-motion is refused, and the sigma grows until one that shows the same would not be",
+    "PX4's EKF2_GPS_V_GATE 5 SD",
 )
 STAMP = Check(
     "time of a message by its stamp and TIMESYNC's clock, with its arrival: between 0 and the shortest round trip",

@@ -40,7 +40,5 @@ class AutopilotParameters(Section):
     """Where the autopilot's velocity and the cameras' differ, setpoints are corrected by up to this: an autopilot flies
     by its own estimate, which GNSS alone leaves off by 0.1 to 0.3 m/s. 0: not at all. Does nothing with `own_velocity:
     autopilot`."""
-    velocity_trim_memory: Share = 0.7
-    """Share of a correction that is kept over half a second: noise of single steps goes, slow drifts stay."""
     low_battery_share: Share = 0.2
     """The battery counts as low when the autopilot says that no more than this is left."""

@@ -6,7 +6,6 @@ from typing import Annotated
 
 from pydantic import Field
 
-from flockd.core import consistency
 from flockd.core.config.base import Distance, Positive, Section
 
 
@@ -24,11 +23,7 @@ class GeometryParameters(Section):
     """Between the matches of an image; 16 are the points at which Lucas & Kanade's method makes the flow exact."""
     max_depth_m: Distance = 40.0
     """Background farther away says little of the translation and is left out."""
-    max_acceleration_m_s2: Positive = consistency.EGO_MOTION.limit
-    """An ego-motion that would need more than this since the last one is refused, twice in a row at most."""
-    max_refused_ego_motions: Annotated[int, Field(ge=0)] = 2
-    """In a row: after these, it is the last velocity that is doubted."""
     own_displacement_sigma_m: Positive = 0.02
-    """Standard deviation of the own motion over one step, each axis, for tracking."""
+    """Standard deviation of the own motion that images show over one step, each axis."""
     refine: bool = True
     """Polish the ego-motion by its reprojection error."""

@@ -33,6 +33,7 @@ from flockd.core.messages import (
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.flocking.passing import Passing
 from flockd.flight.geometry import build_rig, estimate_ego_motion
+from flockd.flight.geometry.level import limit_norm
 from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
 from flockd.flight.obstacles import DIRECTIONS, Avoidance, LocalMap, ObstacleRanging
@@ -42,8 +43,8 @@ from flockd.flight.perception.maps import KnownSize
 from flockd.flight.pilot.camera_agreement import CameraAgreement, moves_otherwise
 from flockd.flight.pilot.ground import GroundFilter, scaled_by_ground
 from flockd.flight.pilot.motions import background_pairs
+from flockd.flight.pilot.own_motion import OwnMotion
 from flockd.flight.pilot.size_learner import SizeLearner
-from flockd.flight.pilot.trim import VelocityTrim
 from flockd.flight.safety.surroundings import limits_towards
 from flockd.flight.tracking import Measurement, Prediction, Shown, Tracker
 
@@ -54,8 +55,7 @@ _ROUNDING = 1e-6
 _LONGEST_S = 10.0
 """Since the last step: what was known before a longer gap is forgotten."""
 _DISAGREE = "ego-motion: images and autopilot disagree on the velocity; one, or the height above ground, is wrong"
-_VELOCITY_SIGMA_M_S = 0.2
-"""Of the velocity that is known where images show no own motion, each axis: PX4's estimate, or the last by images."""
+_UNFIT = "ego-motion: images show another motion than the autopilot and the steps before"
 
 
 @dataclass
@@ -117,20 +117,12 @@ class FlockPilot:
         self._ranging = ObstacleRanging(self._rig, config.obstacles) if config.obstacles.enabled else None
         self._avoidance = Avoidance(config.obstacles, config.safety.gate, config.step_s)
         self._navigator = Navigator(config.mission, config.safety.gate)
-        limit_m_s, memory = 0.0, 0.0
-        if config.autopilot is not None and config.own_velocity == "vision":
-            limit_m_s, memory = config.autopilot.max_velocity_trim_m_s, config.autopilot.velocity_trim_memory
-        self._trim = VelocityTrim(limit_m_s, memory, config.safety.gate.max_speed_m_s)
+        self._own = OwnMotion(config.geometry.own_displacement_sigma_m)
         self._stopwatch = stopwatch
         self._first_time_s: float | None = None
         self._last_time_s: float | None = None
-        self._velocity: FloatArray | None = None
-        """(3,) m/s NED that images gave last."""
-        self._flew: FloatArray | None = None
-        """(3,) m/s NED in the last good step, by images or else by the autopilot."""
         self._yaw_rad: float | None = None
         """The heading asked for last; before the first, that of the first good attitude."""
-        self._refused_in_a_row = 0
         self._order: MissionOrder | None = None
         self._mission = NO_STATUS
         """As of the last good step."""
@@ -172,19 +164,14 @@ class FlockPilot:
         trace.observation = observation
         if self._config.perception.height == "barometer":
             ground = None  # the height says as much
-        ego, why_no_ego = self._ego_motion(observation)
-        ego = self._scaled(observation, ego, ground)
+        ego, why_no_ego = self._ego_motion(observation, ground)
         laps.end("ego_motion")
-        self._trim.update(vehicle, ego)
-        if self._trim.doubt_m_s:
-            why_no_ego = (*why_no_ego, Reason(ReasonKind.EGO_MOTION, _DISAGREE))
-        velocity = self._own_velocity(observation, ego)
+        velocity = vehicle.velocity_ned if self._config.own_velocity == "autopilot" else self._own.velocity
         detections, measurements, why_no_measurement = self._measurements(observation)
-        moved = self._moved(observation, ego)
-        tracks = self._track(observation, moved, measurements, velocity)
+        tracks = self._track(observation, measurements, velocity)
         neighbours = self._with_sizes(observation, ego, dict(zip(tracks, measurements, strict=True)), velocity)
         laps.end("tracking")
-        ranges = self._local_map(observation, ego, ground, moved)
+        ranges = self._local_map(observation, ego, ground)
         laps.end("obstacles")
         command = self._command(observation, neighbours, velocity, ranges, ground)
         laps.end("flocking")
@@ -220,8 +207,7 @@ class FlockPilot:
         last_s = 0.0 if self._last_time_s is None else self._last_time_s
         time_s = max(time_s, last_s) if math.isfinite(time_s) else last_s
         interval_s = min(time_s - last_s, _LONGEST_S)
-        moved = None if self._flew is None else interval_s * self._flew
-        sigma_m = _VELOCITY_SIGMA_M_S * interval_s
+        moved, sigma_m = self._own.ahead(interval_s)
         tracker, local_map = copy.deepcopy((self._tracker, self._map))
         if self._last_time_s is not None:
             tracker.predict(interval_s, moved, sigma_m)
@@ -230,7 +216,7 @@ class FlockPilot:
         return PilotOutput(
             time_s=time_s,
             ego_motion=None,
-            velocity=self._velocity,
+            velocity=self._own.velocity,
             detections=(),
             detection_tracks=(),
             neighbours=self._size.cautious(tracker.neighbours()),
@@ -245,65 +231,49 @@ class FlockPilot:
         """Predictions of the tracks at the frames' time; none where time does not go on, or too far."""
         if self._last_time_s is None or not 0.0 < time_s - self._last_time_s <= _LONGEST_S:
             return ()
-        return self._tracker.predictions(time_s - self._last_time_s, self._velocity)
+        return self._tracker.predictions(time_s - self._last_time_s, self._own.velocity)
 
-    def _ego_motion(self, observation: Observation) -> tuple[EgoMotion | None, Sequence[Reason]]:
-        """The own motion in C (the body frame at the previous observation), or why there is none (Eq. 7-21)."""
-        if observation.previous is None:
-            return None, ()
-        parameters = self._config.geometry
-        try:
-            pairs = background_pairs(self._rig, observation, parameters)
-        except ValueError as error:
-            return None, (Reason(ReasonKind.EGO_MOTION, f"ego-motion: {error}"),)
-        self._agreement.see(observation.previous.vehicle, observation.vehicle, observation.interval_s, pairs)
-        try:
-            ego = estimate_ego_motion(pairs, self._rig, observation.interval_s, parameters)
-        except ValueError as error:
-            return None, (Reason(ReasonKind.EGO_MOTION, f"ego-motion: {error}"),)
-        if not self._is_plausible(_displacement(observation, ego), ego.interval_s):
-            return None, (Reason(ReasonKind.EGO_MOTION, "ego-motion: no vehicle changes its velocity that fast"),)
-        return ego, ()
+    def _ego_motion(
+        self, observation: Observation, ground: GroundEstimate | None
+    ) -> tuple[EgoMotion | None, Sequence[Reason]]:
+        """The own motion by images in C (the body frame at the previous observation), or why there is none; the state
+        of the own motion takes it."""
+        ego, displacement, reasons, interval_s = None, None, [], 0.0
+        if observation.previous is not None:
+            interval_s = min(observation.interval_s, _LONGEST_S)
+            try:
+                ego = self._scaled(observation, self._by_images(observation), ground)
+            except ValueError as error:
+                reasons.append(f"ego-motion: {error}")
+            else:
+                displacement = observation.previous.vehicle.R_ned_body @ ego.translation
+        if not self._own.update(observation.vehicle, interval_s, displacement):
+            ego = None
+            reasons.append(_UNFIT)
+        elif displacement is not None and ground is not None and self._ground is not None:
+            self._ground.see_motion(displacement)
+        if self._own.disagreement_m_s:
+            reasons.append(_DISAGREE)
+        return ego, [Reason(ReasonKind.EGO_MOTION, text) for text in reasons]
 
-    def _scaled(
-        self, observation: Observation, ego: EgoMotion | None, ground: GroundEstimate | None
-    ) -> EgoMotion | None:
+    def _by_images(self, observation: Observation) -> EgoMotion:
+        """In the depth maps' scale (Eq. 7-21). ``ValueError`` says why there is none."""
+        pairs = background_pairs(self._rig, observation, self._config.geometry)
+        if observation.previous is not None:
+            self._agreement.see(observation.previous.vehicle, observation.vehicle, observation.interval_s, pairs)
+        return estimate_ego_motion(pairs, self._rig, observation.interval_s, self._config.geometry)
+
+    def _scaled(self, observation: Observation, ego: EgoMotion, ground: GroundEstimate | None) -> EgoMotion:
         """The own motion with the range finder's scale where the ground shows it, and as it is otherwise."""
-        if ego is None or ground is None or self._ground is None:
+        if ground is None or self._ground is None:
             return ego
-        scaled = self._scaled_by_ground(observation, ego, ground, self._ground)
-        self._ground.see_motion(_displacement(observation, scaled))
-        return scaled
-
-    def _scaled_by_ground(
-        self, observation: Observation, ego: EgoMotion, ground: GroundEstimate, ground_filter: GroundFilter
-    ) -> EgoMotion:
-        track = ground_filter.track(observation.vehicle)
+        track = self._ground.track(observation.vehicle)
         try:
             scaled, slope = scaled_by_ground(self._rig, observation, ego, ground, track)
         except ValueError:  # at a standstill, or over water and walls: the depth maps' scale stays
             return ego
-        ground_filter.see_slope(slope)
+        self._ground.see_slope(slope)
         return scaled
-
-    def _is_plausible(self, displacement: FloatArray, interval_s: float) -> bool:
-        """Whether the last velocity can have become this one; after some refusals the last one is doubted instead."""
-        if self._velocity is None:
-            return True
-        parameters = self._config.geometry
-        change = float(np.linalg.norm(displacement / interval_s - self._velocity))
-        allowed = parameters.max_acceleration_m_s2 * interval_s * (1 + self._refused_in_a_row)
-        if change <= allowed or self._refused_in_a_row == parameters.max_refused_ego_motions:
-            self._refused_in_a_row = 0
-            return True
-        self._refused_in_a_row += 1
-        return False
-
-    def _own_velocity(self, observation: Observation, ego: EgoMotion | None) -> FloatArray | None:
-        """(3,) NED m/s. Where vision fails, the last one that it gave."""
-        if ego is not None:
-            self._velocity = _displacement(observation, ego) / ego.interval_s  # Eq. 21
-        return observation.vehicle.velocity_ned if self._config.own_velocity == "autopilot" else self._velocity
 
     def _measurements(self, observation: Observation) -> tuple[tuple[Detection, ...], list[Measurement], list[Reason]]:
         """The detections that the tracker takes, what it takes, and why it takes others not."""
@@ -319,7 +289,6 @@ class FlockPilot:
     def _track(
         self,
         observation: Observation,
-        moved: tuple[FloatArray | None, float],
         measurements: Sequence[Measurement],
         velocity: FloatArray | None,
     ) -> tuple[int, ...]:
@@ -327,7 +296,8 @@ class FlockPilot:
         if observation.previous is not None:
             if observation.interval_s > _LONGEST_S:
                 self._tracker.forget()
-            self._tracker.predict(min(observation.interval_s, _LONGEST_S), *moved)
+            interval_s = min(observation.interval_s, _LONGEST_S)
+            self._tracker.predict(interval_s, self._own.displacement, self._own.sigma_m)
         return self._tracker.update(observation.time_s, measurements, velocity, self._shown(observation))
 
     def _with_sizes(
@@ -339,9 +309,10 @@ class FlockPilot:
     ) -> tuple[Neighbour, ...]:
         """The neighbours after what their measurements, by track, tell of their size."""
         sunk_m = 0.0
-        if observation.previous is not None:
-            before_m = observation.previous.vehicle.height_m
-            sunk_m = before_m - observation.vehicle.height_m if ego is None else _displacement(observation, ego)[2]
+        if ego is not None and self._own.displacement is not None:
+            sunk_m = float(self._own.displacement[2])
+        elif observation.previous is not None:
+            sunk_m = observation.previous.vehicle.height_m - observation.vehicle.height_m
         neighbours = self._tracker.neighbours()
         size_m = self._size.see(observation.time_s, sunk_m, measured, neighbours)
         if size_m is not None:
@@ -350,19 +321,15 @@ class FlockPilot:
         return self._size.cautious(neighbours)
 
     def _local_map(
-        self,
-        observation: Observation,
-        ego: EgoMotion | None,
-        ground: GroundEstimate | None,
-        moved: tuple[FloatArray | None, float],
+        self, observation: Observation, ego: EgoMotion | None, ground: GroundEstimate | None
     ) -> ObstacleRanges:
         """The local map now; where obstacles are not looked for, all is free but what lost cameras would show."""
         if self._ranging is None:
             ranges = self._free(observation)
         else:
             ranges = observation.obstacles or self._ranging.ranges(observation, ego, ground)
-        displacement, sigma_m = moved
-        return self._map.step(observation.time_s, ranges, None if displacement is None else displacement[:2], sigma_m)
+        displacement = None if self._own.displacement is None else self._own.displacement[:2]
+        return self._map.step(observation.time_s, ranges, displacement, self._own.sigma_m)
 
     def _free(self, observation: Observation) -> ObstacleRanges:
         gone = self._gone(observation) if observation.cameras else frozenset()  # without eyes nothing is flown
@@ -374,21 +341,6 @@ class FlockPilot:
         seen = ~self._rig.hidden(far_m, gone) if gone else np.ones(SECTORS, np.bool_)
         nothing, exact = np.full(SECTORS, np.inf), np.zeros(SECTORS)
         return ObstacleRanges(observation.time_s, nothing, exact, np.where(seen, np.inf, 0.0))
-
-    def _moved(self, observation: Observation, ego: EgoMotion | None) -> tuple[FloatArray | None, float]:
-        """(3,) metres NED that the drone went in the step, and its standard deviation, each axis; None: not known.
-
-        By the images; where they show none, by the autopilot's velocity, or by the last one that images gave.
-        """
-        known = observation.vehicle.velocity_ned
-        self._flew = self._velocity if ego is not None or known is None else known
-        if ego is not None:
-            doubt_m = self._trim.doubt_m_s * ego.interval_s
-            return _displacement(observation, ego), self._config.geometry.own_displacement_sigma_m + doubt_m
-        if self._flew is None or self._last_time_s is None:
-            return None, 0.0
-        interval_s = min(observation.time_s - self._last_time_s, _LONGEST_S)
-        return interval_s * self._flew, _VELOCITY_SIGMA_M_S * interval_s
 
     def _gone(self, observation: Observation) -> Set[str]:
         """The cameras that gave no image that can be used."""
@@ -440,10 +392,19 @@ class FlockPilot:
         ends = guidance.takeover is not None
         height_m = self._size.height(observation.time_s, vehicle, ground, guidance.height_m, neighbours, ends=ends)
         self._mission = replace(self._mission, sentence=self._mission.sentence + self._size.sentence)
-        trim = self._trim.velocity
-        return Wanted(
-            self._trim.corrected(command), acceleration, self._yaw_rad, trim if trim.any() else None, height_m
-        )
+        trim = self._trim()
+        command = limit_norm(command + trim, self._config.safety.gate.max_speed_m_s)  # not even by rounding more
+        return Wanted(command, acceleration, self._yaw_rad, trim if trim.any() else None, height_m)
+
+    def _trim(self) -> FloatArray:
+        """(2,) m/s, north and east, that setpoints are corrected by.
+
+        An autopilot flies a setpoint v so that its own estimate becomes v. Where that errs by b, the drone moves with
+        v - b, and so do neighbours with other b: a flock with equal commands drifts together. So b is added.
+        """
+        if self._config.autopilot is None or self._config.own_velocity == "autopilot":
+            return np.zeros(2)
+        return limit_norm(self._own.error[:2], self._config.autopilot.max_velocity_trim_m_s)
 
 
 def _why_refused(frames: FrameSet, vehicle: VehicleState) -> Reason | None:
@@ -483,13 +444,6 @@ def _with_rotation(vehicle: VehicleState) -> VehicleState:
         return vehicle
     u, _, vt = np.linalg.svd(vehicle.R_ned_body)
     return replace(vehicle, R_ned_body=u @ vt)
-
-
-def _displacement(observation: Observation, ego: EgoMotion) -> FloatArray:
-    """(3,) metres NED that the drone went since the previous observation."""
-    before = observation.vehicle if observation.previous is None else observation.previous.vehicle
-    displacement: FloatArray = before.R_ned_body @ ego.translation
-    return displacement
 
 
 class _Laps:

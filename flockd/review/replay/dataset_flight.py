@@ -36,8 +36,6 @@ from flockd.review.flight_log.log import spread
 
 Depth = Literal["recorded", "network"]
 
-_ANY_ACCELERATION_M_S2 = 1e9
-"""A hand-held camera does not keep to a drone's limits."""
 _STRIDE_PX = 6
 """One camera has to give as many points as the four of a drone."""
 
@@ -50,7 +48,6 @@ def dataset_config(dataset: Dataset, config: DroneConfig | None, depth: Depth, f
     rig = RigConfig(cameras=(dataset.camera,))
     if config is None:
         geometry = GeometryParameters(
-            max_acceleration_m_s2=_ANY_ACCELERATION_M_S2,
             background_stride_px=_STRIDE_PX,
             # The refinement's weights are for a network's depth; a sensor's is better than that.
             refine=depth != "recorded",

@@ -1,0 +1,112 @@
+"""The own motion as a state: the autopilot's velocity, less what it errs by, which the images' displacements show.
+
+A Kalman filter of that error, on the frames' clock: a Gauss-Markov process, alike and apart for each axis. Over a step
+the autopilot's mean velocity less the images' is the mean of the error, with the images' noise. The velocity now is the
+autopilot's, which follows accelerations within the step, less the error now. Images that show nothing, or that
+contradict all else, leave the autopilot's velocity with a larger sigma.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flockd.core import consistency
+from flockd.core.messages import FloatArray, VehicleState
+
+_ERROR_M_S, _LASTS_S = 0.15, 3.0
+"""Standard deviation of an autopilot's velocity, each axis, and for how long it errs alike: PX4 in its simulator."""
+_SCALE = 0.03
+"""Standard deviation of the scale of the images' displacements."""
+_AGES_M_S2 = 2.0
+"""Standard deviation of a velocity for each second that it is from another time than the frames."""
+_MOST_M_S = 100.0
+"""An autopilot that says more knows no velocity."""
+
+
+class OwnMotion:
+    """Of one drone. Call `update` once for each step; what the attributes say is of its end."""
+
+    def __init__(self, images_sigma_m: float) -> None:
+        """``images_sigma_m``: standard deviation of a displacement by images, each axis, beside its scale's."""
+        self._images_sigma_m = images_sigma_m
+        self._before: VehicleState | None = None
+        self._variance = _ERROR_M_S**2
+        self.error = np.zeros(3)
+        """(3,) m/s NED by which the autopilot's velocity is too large."""
+        self.disagreement_m_s = 0.0
+        """Of the level error, where it is larger than autopilots and images usually make it: one of them is wrong."""
+        self.velocity: FloatArray | None = None
+        """(3,) m/s NED; None: there was no step yet, or nothing has shown one."""
+        self.displacement: FloatArray | None = None
+        """(3,) metres NED in the step; None likewise."""
+        self.sigma_m = 0.0
+        """Standard deviation of the displacement, each axis."""
+
+    def ahead(self, interval_s: float) -> tuple[FloatArray | None, float]:
+        """The displacement in the time after the last step, and its standard deviation, each axis."""
+        return None if self.velocity is None else interval_s * self.velocity, _ERROR_M_S * interval_s
+
+    def update(self, vehicle: VehicleState, interval_s: float, by_images: FloatArray | None) -> bool:
+        """Takes a step. Whether ``by_images`` fits what is known; where it does not, it is not used.
+
+        Args:
+            vehicle: at the step's end.
+            interval_s: between the frames of both ends; 0: it begins anew.
+            by_images: (3,) metres NED that the drone went in the interval; None: images do not show it.
+
+        What is refused makes the error's variance so large that the next one fits where it is alike.
+        """
+        before, self._before = self._before, vehicle
+        if before is None:
+            return True
+        said, said_before = _velocity(vehicle), _velocity(before)
+        if said is None or said_before is None or not interval_s > 0.0:
+            return self._alone(said, interval_s, by_images)
+        limit, mean_said = consistency.EGO_MOTION.limit, (said_before + said) / 2
+        stays = self.disagreement_m_s > 0.0 and by_images is not None  # a fault, which does not fade
+        kept = 1.0 if stays else math.exp(-interval_s / _LASTS_S)
+        wandered = -math.expm1(-2.0 * interval_s / _LASTS_S) * _ERROR_M_S**2
+        error, variance = kept * self.error, kept**2 * self._variance + wandered
+        mean, covariance = (self.error + error) / 2, (kept * self._variance + variance) / 2
+        late_s = vehicle.time_s - before.time_s - interval_s
+        of_mean = ((1 + kept) * self._variance / 2 + covariance) / 2 + (_AGES_M_S2 * late_s) ** 2
+        fits = True
+        if by_images is not None:
+            innovation = mean_said - by_images / interval_s - mean
+            noise = (self._images_sigma_m / interval_s) ** 2 + _SCALE**2 * float(
+                (mean_said - mean) @ (mean_said - mean)
+            )
+            off, expected = float(np.linalg.norm(innovation)), of_mean + noise
+            fits = off <= limit * math.sqrt(expected)
+            if fits:
+                error, variance = error + covariance / expected * innovation, variance - covariance**2 / expected
+                mean, of_mean = mean + of_mean / expected * innovation, of_mean * noise / expected
+            else:
+                variance += (2 * off / limit) ** 2  # at least a quarter of it is the mean's of the next step
+        self.error, self._variance, self.velocity = error, variance, said - error
+        usual_m_s = limit * math.hypot(_ERROR_M_S, _SCALE * math.hypot(*mean_said[:2]))
+        off_m_s = math.hypot(*error[:2])
+        self.disagreement_m_s = off_m_s if off_m_s > usual_m_s else 0.0
+        self.displacement = interval_s * (mean_said - mean)
+        self.sigma_m = interval_s * (math.sqrt(of_mean) + self.disagreement_m_s)
+        return fits
+
+    def _alone(self, said: FloatArray | None, interval_s: float, by_images: FloatArray | None) -> bool:
+        """By the images or the autopilot alone, where the other says nothing of the step."""
+        self._variance = _ERROR_M_S**2
+        if said is not None:
+            self.velocity = said - self.error
+        elif by_images is not None:
+            self.velocity = by_images / interval_s  # Eq. 21
+        self.displacement, self.sigma_m = self.ahead(interval_s)
+        if by_images is not None:
+            self.displacement, self.sigma_m = by_images, self._images_sigma_m
+        return True
+
+
+def _velocity(vehicle: VehicleState) -> FloatArray | None:
+    """(3,) m/s NED that the autopilot knows."""
+    said = vehicle.velocity_ned
+    return None if said is None or not np.abs(said).max() <= _MOST_M_S else said
