@@ -15,7 +15,7 @@ import numpy as np
 from flockd.core import consistency
 from flockd.core.messages import FloatArray, VehicleState
 
-_ERROR_M_S, _LASTS_S = 0.15, 3.0
+ERROR_M_S, ERROR_LASTS_S = 0.15, 3.0
 """Standard deviation of an autopilot's velocity, each axis, and for how long it errs alike: PX4 in its simulator."""
 _SCALE = 0.03
 """Standard deviation of the scale of the images' displacements."""
@@ -32,7 +32,7 @@ class OwnMotion:
         """``images_sigma_m``: standard deviation of a displacement by images, each axis, beside its scale's."""
         self._images_sigma_m = images_sigma_m
         self._before: VehicleState | None = None
-        self._variance = _ERROR_M_S**2
+        self._variance = ERROR_M_S**2
         self.error = np.zeros(3)
         """(3,) m/s NED by which the autopilot's velocity is too large."""
         self.disagreement_m_s = 0.0
@@ -46,7 +46,7 @@ class OwnMotion:
 
     def ahead(self, interval_s: float) -> tuple[FloatArray | None, float]:
         """The displacement in the time after the last step, and its standard deviation, each axis."""
-        return None if self.velocity is None else interval_s * self.velocity, _ERROR_M_S * interval_s
+        return None if self.velocity is None else interval_s * self.velocity, ERROR_M_S * interval_s
 
     def update(self, vehicle: VehicleState, interval_s: float, by_images: FloatArray | None) -> bool:
         """Takes a step. Whether ``by_images`` fits what is known; where it does not, it is not used.
@@ -66,8 +66,8 @@ class OwnMotion:
             return self._alone(said, interval_s, by_images)
         limit, mean_said = consistency.EGO_MOTION.limit, (said_before + said) / 2
         stays = self.disagreement_m_s > 0.0 and by_images is not None  # a fault, which does not fade
-        kept = 1.0 if stays else math.exp(-interval_s / _LASTS_S)
-        wandered = -math.expm1(-2.0 * interval_s / _LASTS_S) * _ERROR_M_S**2
+        kept = 1.0 if stays else math.exp(-interval_s / ERROR_LASTS_S)
+        wandered = -math.expm1(-2.0 * interval_s / ERROR_LASTS_S) * ERROR_M_S**2
         error, variance = kept * self.error, kept**2 * self._variance + wandered
         mean, covariance = (self.error + error) / 2, (kept * self._variance + variance) / 2
         late_s = vehicle.time_s - before.time_s - interval_s
@@ -86,7 +86,7 @@ class OwnMotion:
             else:
                 variance += (2 * off / limit) ** 2  # at least a quarter of it is the mean's of the next step
         self.error, self._variance, self.velocity = error, variance, said - error
-        usual_m_s = limit * math.hypot(_ERROR_M_S, _SCALE * math.hypot(*mean_said[:2]))
+        usual_m_s = limit * math.hypot(ERROR_M_S, _SCALE * math.hypot(*mean_said[:2]))
         off_m_s = math.hypot(*error[:2])
         self.disagreement_m_s = off_m_s if off_m_s > usual_m_s else 0.0
         self.displacement = interval_s * (mean_said - mean)
@@ -95,7 +95,7 @@ class OwnMotion:
 
     def _alone(self, said: FloatArray | None, interval_s: float, by_images: FloatArray | None) -> bool:
         """By the images or the autopilot alone, where the other says nothing of the step."""
-        self._variance = _ERROR_M_S**2
+        self._variance = ERROR_M_S**2
         if said is not None:
             self.velocity = said - self.error
         elif by_images is not None:

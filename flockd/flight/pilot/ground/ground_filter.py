@@ -16,7 +16,7 @@ from flockd.core.choices import HeightSource
 from flockd.core.config.perception import RangeFinderParameters
 from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, Reason, ReasonKind, VehicleState
 from flockd.flight.pilot.ground.contradiction import ContradictionMonitor, GroundPoint, RepetitionMonitor
-from flockd.flight.pilot.ground.way_flown import Way, WayMonitor
+from flockd.flight.pilot.ground.way_flown import WayMonitor
 
 HEIGHT_NOISE_M = 0.03
 """Standard deviation of the autopilot's height from one reading to the next; what changes slowly does not matter."""
@@ -54,8 +54,10 @@ class GroundFilter:
         self._way_flown = WayMonitor(parameters.compare_s)
         self._newest: GroundPoint | None = None
         """Where the newest step's range hit the ground, used or not; None: it had none."""
-        self._moved: Way | None = None
-        """Of the newest step, by the autopilot's velocities; None: it does not say."""
+        self._elapsed_s = 0.0
+        """In the newest step."""
+        self._moved: FloatArray | None = None
+        """(3,) metres NED in the newest step, by the autopilot's velocities; None: it does not say."""
         self._used_height_m = 0.0
         """Above the ground, of the newest step's scale."""
         self._track: deque[FloatArray] = deque(maxlen=TRACK_POINTS)
@@ -100,7 +102,7 @@ class GroundFilter:
             return
         by_range = displacement * (range_height_m / self._used_height_m)
         by_barometer = displacement * (self._last.height_m / self._used_height_m)
-        if self._way_flown.update(self._last.time_s, self._moved, by_range, by_barometer):
+        if self._way_flown.update(self._elapsed_s, self._moved, by_range, by_barometer):
             self._contradictions.doubt(self._newest, self._newest.ground_m, "the range contradicts the way flown")
             self._forget()
 
@@ -149,9 +151,9 @@ class GroundFilter:
         last, self._last = self._last, vehicle
         if last is None:
             return
-        self._moved = _moved(last, vehicle)
+        self._elapsed_s, self._moved = vehicle.time_s - last.time_s, _moved(last, vehicle)
         way = _way(last, vehicle)
-        if way is None or not 0.0 < vehicle.time_s - last.time_s <= LONGEST_GAP_S:
+        if way is None or not 0.0 < self._elapsed_s <= LONGEST_GAP_S:
             self._forget()
             self._contradictions.forget()
             self._repetition.forget()
@@ -212,12 +214,11 @@ def _way(before: VehicleState, now: VehicleState) -> FloatArray | None:
     if before.position is not None and now.position is not None:
         return now.position - before.position
     moved = _moved(before, now)
-    return None if moved is None else moved.metres[:2]
+    return None if moved is None else moved[:2]
 
 
-def _moved(before: VehicleState, now: VehicleState) -> Way | None:
-    """By the autopilot's velocities; positions jump when its estimator is reset."""
+def _moved(before: VehicleState, now: VehicleState) -> FloatArray | None:
+    """(3,) metres NED by the autopilot's velocities; positions jump when its estimator is reset."""
     if before.velocity_ned is None or now.velocity_ned is None:
         return None
-    elapsed_s = now.time_s - before.time_s
-    return Way(elapsed_s, 0.5 * (before.velocity_ned + now.velocity_ned) * elapsed_s)
+    return 0.5 * (before.velocity_ned + now.velocity_ned) * (now.time_s - before.time_s)
