@@ -21,7 +21,7 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 2_970,
-    "flockd/flight": 11_610,
+    "flockd/flight": 11_590,
     "flockd/onboard": 9_010,
     "flockd/fleet": 2_670,
     "flockd/ground": 4_030,
