@@ -95,7 +95,7 @@ class OwnMotion:
 
     def _alone(self, said: FloatArray | None, interval_s: float, by_images: FloatArray | None) -> bool:
         """By the images or the autopilot alone, where the other says nothing of the step."""
-        self._variance = ERROR_M_S**2
+        self._variance, self.disagreement_m_s = ERROR_M_S**2, 0.0
         if said is not None:
             self.velocity = said - self.error
         elif by_images is not None:

@@ -116,7 +116,7 @@ def test_a_neighbour_pulls_by_how_long_it_has_been_seen() -> None:
         ("scene", lambda frame, *_: frame.camera == "back", ReasonKind.CAMERA, "camera back: model x: not finite"),
         ("flow", lambda _, second, __: second.camera == "back", ReasonKind.CAMERA, "camera back: model x: not finite"),
         (
-            "ranges", lambda crops: any(crop.T_body_camera.rotation[0, 2] < 0.0 for crop in crops),
+            "ranges", lambda crops: any(crop.R_body_camera[0, 2] < 0.0 for crop in crops),
             ReasonKind.PROPOSAL, "proposal: model x: not finite",
         ),
     ],
