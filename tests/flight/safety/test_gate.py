@@ -266,6 +266,12 @@ def test_it_takes_over_at_the_velocity_that_the_drone_has(
     np.testing.assert_allclose(flown, slows * begins)
 
 
+def test_the_heading_that_is_offered_is_the_drones_own_at_each_instant() -> None:
+    stream = Stream()
+    for yaw_rad in (0.5, 1.2):
+        assert sent(stream.step(STILL, Action.OFFER, around(yaw_rad=yaw_rad))).yaw_rad == yaw_rad
+
+
 def test_a_streamer_that_paused_does_not_jump() -> None:
     stream = Stream(max_acceleration_m_s2=2.0, permission_timeout_s=0.25)
     stream.velocities(20, [1.0, 0.0])

@@ -12,9 +12,9 @@ import pytest
 
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import Neighbour, PossibleMotion
-from flockd.flight.safety import Surroundings
-from flockd.flight.safety.surroundings import BEYOND, limits_towards, surroundings
-from tests.make import neighbour
+from flockd.flight.safety import Objection, Surroundings
+from flockd.flight.safety.surroundings import BEYOND, limits_around, limits_towards, surroundings
+from tests.make import around, neighbour
 
 
 def told(*neighbours: Neighbour, obstacles: Sequence[Sequence[float]] = ()) -> Surroundings:
@@ -117,3 +117,14 @@ def test_a_pilot_hears_how_fast_the_gate_lets_it_fly_towards_each() -> None:
     # sqrt(1.5^2 + 2 * 1.5 * 3 + 1^2) - 1.5: it may brake unseen for a second. Or it does now, and stands 0.1 m on.
     np.testing.assert_allclose(goes, [2.0, math.sqrt(0.75**2 + 2 * 1.5 * 3.1) - 0.75])
     assert limits_towards([known(here, sigma=0.5)], p)[1].min() < 1.0, "in doubt"
+
+
+@pytest.mark.parametrize("velocity", [(0.0, 0.0), (math.nan, math.nan), (math.nan, 1.0)])
+def test_where_the_own_velocity_is_not_known_the_limits_are_those_of_a_drone_within_them(
+    velocity: tuple[float, float],
+) -> None:
+    """3 m ahead, without the clearance of 0.6 m, are 2.4 m: 0.5 v + v^2 / 3."""
+    near = around(velocity=velocity, obstacles=[[3.0, 0.0]])
+    _, (most_m_s,), there = limits_around(GateParameters(fence_radius_m=None), near, 1.0, 0.0)
+    assert 0.5 * most_m_s + most_m_s**2 / 3.0 == pytest.approx(2.4)
+    assert there == [Objection.OBSTACLE]
