@@ -42,7 +42,7 @@ NUMBERS_OF_FLIGHT = 298
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
 """A budget that is farther above what there is is to be lowered."""
-STEPS = {"crossing": (17_500, 20), "normal": (11_400, 15)}
+STEPS = {"crossing": (17_000, 20), "normal": (11_100, 15)}
 """Python calls and network runs of a step in a recorded flight of tests/review/replay."""
 
 

@@ -32,8 +32,8 @@ class RigCamera:
 
     def pixels_of_directions(self, directions_body: FloatArray) -> FloatArray:
         """(n, 2) pixels of body directions (n, 3), as of points at infinity; NaN rows where not in the image."""
-        pixels = self.camera.project((self.T_body_camera.rotation.T @ np.asarray(directions_body).T).T)
-        np.copyto(pixels.T, np.nan, where=~self.camera.in_image(pixels))
+        pixels = self.camera.project((self.T_body_camera.rotation.T @ directions_body.T).T)
+        pixels[~self.camera.in_image(pixels)] = np.nan
         return pixels
 
 

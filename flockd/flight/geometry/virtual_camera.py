@@ -68,8 +68,8 @@ class VirtualCrops:
         drawn = np.full((len(self.main), self.size_px, self.size_px, 3), _GREY, np.uint8)
         valid = np.zeros(drawn.shape[:3], np.bool_)
         for index, camera in self._with(images):
-            mine = np.flatnonzero(self.main == index)
-            if len(mine):
+            if index in self.main:
+                mine = np.flatnonzero(self.main == index)
                 crops = self.take(mine)
                 homographies, whole = crops._homographies(camera)
                 factors = crops._minification(camera).tolist()
@@ -105,6 +105,8 @@ class VirtualCrops:
         drawn = np.full((*source.shape, 3), _GREY, np.uint8)
         for index, camera in self._with(images):
             mine = source == index
+            if not mine.any():
+                continue
             minification = mine.any(1) * self._minification(camera)
             for factor in set(minification.tolist()) - {0}:
                 crops = np.flatnonzero(minification == factor)
@@ -134,8 +136,8 @@ class VirtualCrops:
         towards = (self._to_body.transpose(1, 0, 2).reshape(-1, 3) @ pixels).reshape(3, len(self.main), -1)
         where = np.full((2, *towards.shape[1:]), np.nan, np.float32)
         for index, camera in self._with(images):
-            crops = np.flatnonzero(self.main == index)
-            if len(crops):
+            if index in self.main:
+                crops = np.flatnonzero(self.main == index)
                 seen = camera.pixels_of_directions(towards[:, crops].reshape(3, -1).T)
                 where[:, crops] = seen.T.reshape(2, len(crops), -1)
         source = np.where(np.isnan(where[0]), _NOWHERE, self.main[:, None])
@@ -145,9 +147,9 @@ class VirtualCrops:
         crop = missing // pixels.shape[1]
         towards, parallax = towards.reshape(3, -1)[:, missing], np.isfinite(range_m)[crop]
         towards *= np.where(parallax, range_m[crop], 1.0) / np.sqrt((towards * towards).sum(0))
-        deepest = np.full(len(missing), float(_NOWHERE))
+        deepest, centres = np.full(len(missing), float(_NOWHERE)), self.centres[crop]
         for index, camera in self._with(images):
-            aside = parallax * (self.centres[crop] - camera.T_body_camera.translation).T
+            aside = parallax * (centres - camera.T_body_camera.translation).T
             seen = camera.pixels_of_directions((towards + aside).T)
             margin = _margin(camera, seen)
             deeper = np.flatnonzero(margin > deepest)

@@ -54,7 +54,7 @@ def group_instances(
     rows, columns = np.nonzero(drone_logit > 0)
     if rows.size == 0:
         return labels, ()
-    votes = np.stack([columns + 0.5 + offset[0, rows, columns], rows + 0.5 + offset[1, rows, columns]], 1)
+    votes = np.array([columns + 0.5 + offset[0, rows, columns], rows + 0.5 + offset[1, rows, columns]]).T
     centres = _vote_peaks(votes, (height, width))
     nearest = _nearest(votes, centres)
     sizes = np.bincount(nearest, minlength=len(centres))
@@ -62,11 +62,11 @@ def group_instances(
     count = sizes[some]
     first = np.cumsum(count) - count
     by_centre = np.argsort(nearest, kind="stable")
-    pixels = np.stack([columns, rows])[:, by_centre]
+    pixels = np.array([columns, rows])[:, by_centre]
     corners = np.minimum.reduceat(pixels, first, axis=1), np.maximum.reduceat(pixels, first, axis=1) + 1
     boxes = scale * np.concatenate(corners).T.astype(np.float64)
     scores = np.maximum.reduceat(drone_logit[rows, columns][by_centre], first).tolist()
-    ordered = np.stack([axis[np.lexsort((axis, nearest))] for axis in votes.T], 1)
+    ordered = np.array([axis[np.lexsort((axis, nearest))] for axis in votes.T]).T
     medians = scale * (ordered[first + (count - 1) // 2] + ordered[first + count // 2]) / 2
     areas = scale**2 * count.astype(np.float64)
     largest_first = np.argsort(-areas, kind="stable")
@@ -108,7 +108,7 @@ def _vote_peaks(votes: FloatArray, shape: tuple[int, int]) -> FloatArray:
     rows, columns = np.nonzero(peak)
     strength = smooth[rows, columns]
     order = np.argsort(-strength, kind="stable")
-    places = (np.stack([columns, rows], 1) + 0.5) * _CELL - margin
+    places = (np.array([columns, rows]).T + 0.5) * _CELL - margin
     votes_right, votes_down = np.ascontiguousarray(votes.T)
     kept: list[FloatArray] = []
     places = places[order]
