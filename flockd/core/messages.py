@@ -281,7 +281,7 @@ class ObstacleRanges:
 
 @dataclass(frozen=True, eq=False)
 class PossibleMotion:
-    """What a track may be, by its detections: one hypothesis of how the neighbour moves."""
+    """One of the ways in which a neighbour may move, by its detections."""
 
     probability: float
     """That it is the true one; those of a neighbour add up to 1."""
@@ -314,8 +314,8 @@ class Neighbour:
     existence_probability: float = 1.0
     """Probability that it is a drone and still there; 1 in recordings from before it was estimated."""
     possible: tuple[PossibleMotion, ...] | None = None
-    """The motions that it may have, the likeliest first, where its detections do not tell yet; the position and
-    velocity above are their mean. None: one, as above."""
+    """The motions that it may have, the likeliest first; the position and velocity above are their mean. None: one, as
+    above."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,26 +18,21 @@ Probability = Annotated[float, Field(gt=0, lt=1)]
 class TrackingParameters(Section):
     """Neighbours over time: motion model, association and existence probability."""
 
-    acceleration_sigma_m_s2: Positive = 0.3
-    """How hard a neighbour may manoeuvre at least, standard deviation an axis."""
+    acceleration_sigma_m_s2: Positive = 0.45
+    """How hard a flock mate manoeuvres, standard deviation an axis; a drone on a course of its own, twice as hard."""
     manoeuvre_time_s: Duration = 0.5
     """How long an acceleration lasts. The white acceleration noise of the motion model has the spectral density
     acceleration_sigma_m_s2^2 * manoeuvre_time_s (Bar-Shalom, Li & Kirubarajan 2001, section 6.2)."""
-    first_acceleration_sigma_m_s2: Positive = 0.8
-    """The same at the beginning of a flight, when the flock takes its shape; forgotten with the time constant
-    `own_manoeuvre_memory_s`."""
-    own_manoeuvre_memory_s: Duration = 3.0
-    """Neighbours are taken to manoeuvre as hard as this drone did of late, if that is more: gusts and turns move them
-    all. Time constant of that average."""
     relative_speed_sigma_m_s: Positive = 0.7
-    """Standard deviation an axis of a flock mate's velocity relative to the own drone's, before it is measured."""
+    """Standard deviation an axis of a flock mate's velocity relative to the own drone's, before it is measured, and
+    again some time later: the mate's velocity returns to the own one as fast as its accelerations allow for that."""
     speed_sigma_m_s: Positive = 2.0
-    """Standard deviation an axis of the velocity of a drone that does not fly with the flock, comes head-on or hovers;
-    and of any drone where the own velocity is not known."""
+    """Standard deviation of how fast a drone comes that does not fly with the flock; and, an axis, of the velocity of
+    any drone where the own one is not known."""
     stranger_probability: Probability = 0.2
-    """That a drone seen for the first time does not fly with the flock; half of it, that it is on a course to meet. The
-    hypotheses are followed until detections tell (static multiple models: Bar-Shalom, Li & Kirubarajan 2001, section
-    11.6.2)."""
+    """That a drone seen for the first time does not fly with the flock, and that one which begins to fly otherwise does
+    not; half of it, that it brakes to standstill. All motions are followed, and detections weigh them (IMM: Blom &
+    Bar-Shalom 1988)."""
     hiding_stranger_probability: Probability = 0.02
     """The same, where a confirmed neighbour is not detected in its place and the new detection is in its bearing: a
     stranger would have to hide it, and not to have been seen beside it before. Mostly the range is wrong."""

@@ -29,16 +29,16 @@ def log_polar_covariance(bearing: FloatArray, log_range_sigma: float, bearing_si
 
 
 def log_polar_residual(
-    bearing: FloatArray, log_range: float, from_bearing: FloatArray, from_log_range: float
+    bearing: FloatArray, log_range: FloatArray | float, from_bearing: FloatArray, from_log_range: FloatArray | float
 ) -> FloatArray:
-    """(3,) from one place to another: across ``from_bearing`` the angle in rad, along it the change of log range.
+    """(..., 3) from one place to another: across ``from_bearing`` the angle in rad, along it the change of log range.
 
-    Its derivative with respect to the position is the identity over the range at the place it starts from.
+    Bearings (..., 3), log ranges (...). Its derivative with respect to the position is the identity over the range at
+    the place it starts from.
     """
-    cosine = float(np.clip(bearing @ from_bearing, -1.0, 1.0))
+    cosine = np.minimum(np.maximum((bearing * from_bearing).sum(axis=-1, keepdims=True), -1.0), 1.0)
     across = bearing - cosine * from_bearing
-    sine = float(np.linalg.norm(across))
-    angle = math.atan2(sine, cosine)
-    turned = across * (angle / sine) if sine > 1e-12 else across
-    residual: FloatArray = turned + (log_range - from_log_range) * from_bearing
+    sine = np.sqrt((across**2).sum(axis=-1, keepdims=True))
+    turned = across * np.where(sine > 1e-12, np.arctan2(sine, cosine) / np.maximum(sine, 1e-12), 1.0)
+    residual: FloatArray = turned + np.subtract(log_range, from_log_range)[..., None] * from_bearing
     return residual

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from flockd.core.config.tracking import TrackingParameters
-from flockd.flight.tracking.filter import Innovation
 
 
 def missed(probability: float, in_view: float, weight: float, parameters: TrackingParameters) -> float:
@@ -18,11 +19,11 @@ def missed(probability: float, in_view: float, weight: float, parameters: Tracki
     return _bayes(probability, weight * math.log(1.0 - in_view * parameters.detection_probability))
 
 
-def detected(probability: float, innovation: Innovation, weight: float, parameters: TrackingParameters) -> float:
+def detected(probability: float, log_likelihood: float, weight: float, parameters: TrackingParameters) -> float:
     """After a detection that was assigned to the track: its density as a track's against that of clutter."""
-    miss = 1.0 - parameters.detection_probability
-    density_ratio = math.exp(min(innovation.log_likelihood - math.log(parameters.clutter_density), _MAX_LOG_RATIO))
-    return _bayes(probability, weight * math.log(miss + parameters.detection_probability * density_ratio))
+    chance = parameters.detection_probability
+    log_ratio = np.logaddexp(math.log(1.0 - chance), math.log(chance / parameters.clutter_density) + log_likelihood)
+    return _bayes(probability, weight * float(log_ratio))
 
 
 def averaged(
@@ -39,9 +40,4 @@ def averaged(
 
 def _bayes(probability: float, log_likelihood_ratio: float) -> float:
     """The probability after evidence with this ratio of likelihoods, existence over absence."""
-    ratio = math.exp(log_likelihood_ratio)
-    return probability * ratio / (1.0 - probability + probability * ratio)
-
-
-_MAX_LOG_RATIO = 100.0
-"""Beyond it an exponential comes near the largest number there is; a probability is 1 long before."""
+    return probability / (probability + (1.0 - probability) * math.exp(-log_likelihood_ratio))

@@ -10,11 +10,10 @@ import numpy as np
 
 from flockd.core.config.tracking import JITTER_S, TrackingParameters
 from flockd.core.messages import BoolArray, FloatArray, Neighbour
-from flockd.flight.tracking import existence, filter  # noqa: A004 - the field's word
+from flockd.flight.tracking import existence, filter, imm  # noqa: A004 - the field's word
 from flockd.flight.tracking.association import assign
-from flockd.flight.tracking.filter import Innovation, State
-from flockd.flight.tracking.hypotheses import Hypotheses
-from flockd.flight.tracking.manoeuvres import Manoeuvres
+from flockd.flight.tracking.filter import Looks
+from flockd.flight.tracking.imm import Mixture
 from flockd.flight.tracking.measurement import Measurement
 
 _OF_USUAL = 0.02
@@ -54,7 +53,8 @@ class Tracker:
     def __init__(self, parameters: TrackingParameters | None = None) -> None:
         self.parameters = parameters or TrackingParameters()
         self._tracks: list[_Track] = []
-        self._manoeuvres = Manoeuvres(self.parameters)
+        self._motions = imm.NOBODY
+        """Of the tracks, in their order."""
         self._usual_log_sigma: float | None = None
         """Logarithm of the standard deviation of a confirmed neighbour's log range, as detected."""
         self._time_s = 0.0
@@ -67,17 +67,12 @@ class Tracker:
 
         `own_displacement` (3,) NED metres is the way the own drone went meanwhile, with its standard deviation an axis.
         None: not known; the tracks then stay where they are relative to the own drone, as flock mates move alike, and
-        grow uncertain by `relative_speed_sigma_m_s`. The own drone's changes of velocity say how hard its neighbours
-        manoeuvre (`Manoeuvres`).
+        grow uncertain by `relative_speed_sigma_m_s`.
         """
-        self._manoeuvres.see(own_displacement, own_displacement_sigma_m, interval_s)
-        density = self._manoeuvres.density
+        self._motions = imm.predicted(
+            self._motions, interval_s, own_displacement, own_displacement_sigma_m, self.parameters
+        )
         for track in self._tracks:
-            track.hypotheses = track.hypotheses.changed(
-                lambda state: filter.predict(
-                    state, interval_s, own_displacement, own_displacement_sigma_m, density, self.parameters
-                )
-            )
             track.existence = self._survives(track, interval_s)
 
     def update(
@@ -97,22 +92,41 @@ class Tracker:
         interval_s = max(0.0, time_s - self._time_s)
         weight = min(1.0, interval_s / (self.parameters.evidence_interval_s - JITTER_S))
         self._time_s = time_s
-        pairs = assign(measurements, [track.hypotheses for track in self._tracks], self.parameters)
-        missed = self._without({column for column, _ in pairs.values()})
-        self._miss(missed, interval_s, weight, shown)
+        looks = Looks.of(measurements, self.parameters)
+        squared_distances, log_likelihoods = self._motions.innovations(looks)
+        pairs = assign(squared_distances, log_likelihoods, self.parameters.gate_sigma)
+        missed = [column for column in range(len(self._tracks)) if column not in pairs.values()]
+        if missed:
+            self._miss(missed, interval_s, weight, shown)
+        for row, column in pairs.items():
+            self._detect(
+                self._tracks[column],
+                measurements[row],
+                squared_distances[row, column],
+                log_likelihoods[row, column],
+                weight,
+            )
+        known = [missed_ for missed_ in missed if self._tracks[missed_].confirmed and self._tracks[missed_].agrees]
+        others = self._motions[known].together
+        if pairs:
+            columns = list(pairs.values())
+            self._motions = self._motions.replaced(
+                columns, imm.updated(self._motions[columns], looks[list(pairs)], self.parameters)
+            )
         numbers = []
         for index, measurement in enumerate(measurements):
             if index in pairs:
-                column, innovation = pairs[index]
-                track = self._tracks[column]
-                self._detect(track, measurement, innovation, weight)
+                track = self._tracks[pairs[index]]
             else:
-                track = self._begin(measurement, own_velocity, self._misjudged(measurement, missed))
+                track = self._begin(measurement)
+                misjudged = self._misjudged(looks[[index]], others)
                 self._tracks.append(track)
+                self._motions += imm.first(measurement, own_velocity, self.parameters, misjudged)
             numbers.append(track.number)
         for track in self._tracks:
             self._confirm(track)
-        self._tracks = [track for track in self._tracks if self._is_kept(track)]
+        kept = [index for index, track in enumerate(self._tracks) if self._is_kept(track)]
+        self._tracks, self._motions = [self._tracks[index] for index in kept], self._motions[kept]
         return tuple(numbers)
 
     def predictions(self, interval_s: float, own_velocity: FloatArray | None) -> tuple[Prediction, ...]:
@@ -121,18 +135,16 @@ class Tracker:
         `own_velocity` (3,) NED m/s; None: all stay where they are relative to the own drone. Changes nothing.
         """
         displacement = None if own_velocity is None else interval_s * own_velocity
-        known = [track for track in self._tracks if track.was_confirmed]
-        density = self._manoeuvres.density
-        states = [
-            filter.predict(track.state, interval_s, displacement, 0.0, density, self.parameters) for track in known
-        ]
+        known = [index for index, track in enumerate(self._tracks) if track.was_confirmed]
+        later = imm.predicted(self._motions[known], interval_s, displacement, 0.0, self.parameters).together
         return tuple(
             Prediction(
-                position=state.position,
-                size_m=state.size_m,
-                existence_probability=track.drone_probability * self._survives(track, interval_s),
+                position=mean[:3],
+                size_m=math.exp(mean[6]),
+                existence_probability=self._tracks[index].drone_probability
+                * self._survives(self._tracks[index], interval_s),
             )
-            for track, state in zip(known, states, strict=True)
+            for index, mean in zip(known, later.mean[:, 0], strict=True)
         )
 
     def resize(self, size_m: float, own_velocity: FloatArray | None) -> None:
@@ -140,30 +152,32 @@ class Tracker:
 
         `own_velocity` (3,) NED m/s; None: not known.
         """
-        for track in self._tracks:
-            track.hypotheses = track.hypotheses.changed(lambda state: filter.resized(state, size_m, own_velocity))
+        self._motions = imm.resized(self._motions, size_m, own_velocity)
 
     def forget(self) -> None:
         """Nothing is known of anybody any more."""
-        self._tracks = []
+        self._tracks, self._motions = [], imm.NOBODY
 
     def neighbours(self) -> tuple[Neighbour, ...]:
         """All tracks as of the last `predict` and `update`, confirmed or not, by track number."""
+        together = self._motions.together
         return tuple(
             Neighbour(
                 track=track.number,
-                position=track.state.position,
-                velocity=track.state.velocity,
-                position_sigma_m=self._position_sigma_m(track.state),
-                velocity_sigma_m_s=float(np.sqrt(np.trace(track.state.velocity_covariance) / 3)),
+                position=mean[:3],
+                velocity=mean[3:6],
+                position_sigma_m=self._position_sigma_m(mean, covariance),
+                velocity_sigma_m_s=math.sqrt(covariance[3:6, 3:6].trace() / 3),
                 age_s=self._time_s - track.first_seen_s,
                 unseen_s=self._time_s - track.last_seen_s,
                 hits=track.hits,
                 confirmed=track.confirmed,
                 existence_probability=track.existence * track.drone_probability,
-                possible=track.hypotheses.possible,
+                possible=possible,
             )
-            for track in self._tracks
+            for track, mean, covariance, possible in zip(
+                self._tracks, together.mean[:, 0], together.covariance[:, 0], self._motions.possible(), strict=True
+            )
         )
 
     def _survives(self, track: _Track, interval_s: float) -> float:
@@ -172,33 +186,32 @@ class Tracker:
         lasts_s = p.survival_time_s if track.was_confirmed else p.drone_probability_memory_s
         return track.existence * math.exp(-interval_s / lasts_s)
 
-    def _position_sigma_m(self, state: State) -> float:
+    def _position_sigma_m(self, mean: FloatArray, covariance: FloatArray) -> float:
         """An axis, with what the heading turns it by."""
-        level_m = math.hypot(*state.position[:2])
-        variance = np.trace(state.position_covariance) + (self.parameters.heading_sigma_rad * level_m) ** 2
+        variance = covariance[:3, :3].trace() + (self.parameters.heading_sigma_rad * math.hypot(*mean[:2])) ** 2
         return math.sqrt(variance / 3)
 
-    def _without(self, assigned: set[int]) -> list[_Track]:
-        return [track for index, track in enumerate(self._tracks) if index not in assigned]
-
-    def _miss(self, tracks: Sequence[_Track], interval_s: float, weight: float, shown: Shown | None) -> None:
-        for track in tracks:
-            in_view = 1.0 if shown is None else _probability_in_view(track.state, shown)
+    def _miss(self, missed: Sequence[int], interval_s: float, weight: float, shown: Shown | None) -> None:
+        together = self._motions[missed].together
+        for place, index in enumerate(missed):
+            track, mean, covariance = self._tracks[index], together.mean[place, 0], together.covariance[place, 0]
+            in_view = 1.0 if shown is None else _probability_in_view(mean, covariance, shown)
             track.existence = existence.missed(track.existence, in_view, weight, self.parameters)
             track.missing_s += in_view * interval_s
 
-    def _detect(self, track: _Track, measurement: Measurement, innovation: Innovation, weight: float) -> None:
+    def _detect(
+        self, track: _Track, measurement: Measurement, squared_distance: float, log_likelihood: float, weight: float
+    ) -> None:
         interval_s = max(0.0, self._time_s - track.last_seen_s)
         track.hits += 1
-        track.agrees = innovation.squared_distance <= self.parameters.confirm_sigma**2
+        track.agrees = bool(squared_distance <= self.parameters.confirm_sigma**2)
         track.agreed += weight * track.agrees * self._share(measurement)
         if track.confirmed:
             self._remember(measurement, weight)
-        track.existence = existence.detected(track.existence, innovation, weight, self.parameters)
+        track.existence = existence.detected(track.existence, log_likelihood, weight, self.parameters)
         track.drone_probability = existence.averaged(
             track.drone_probability, measurement.drone_probability, track.hits, interval_s, self.parameters
         )
-        track.hypotheses = track.hypotheses.updated(measurement, self.parameters)
         track.last_seen_s, track.missing_s = self._time_s, 0.0
 
     def _share(self, measurement: Measurement) -> float:
@@ -213,21 +226,21 @@ class Tracker:
         usual = log_sigma if self._usual_log_sigma is None else self._usual_log_sigma
         self._usual_log_sigma = usual + _OF_USUAL * weight * (log_sigma - usual)
 
-    def _misjudged(self, measurement: Measurement, missed: Sequence[_Track]) -> State | None:
+    def _misjudged(self, look: Looks, missed: Mixture) -> Mixture | None:
         """The neighbour, of those that were `missed`, whose bearing a detection has that fits no track; None: of none.
 
         One that is confirmed and was detected before where it was to be: of one that was not, the velocity is in doubt.
         """
-        known = [track.state for track in missed if track.confirmed and track.agrees]
-        off = [filter.innovation(state, measurement, self.parameters).squared_angle(state.position) for state in known]
-        nearest = int(np.argmin(off)) if off else 0
-        return known[nearest] if off and off[nearest] <= self.parameters.confirm_sigma**2 else None
+        if not len(missed.mean):
+            return None
+        off = filter.squared_angles(missed.mean[:, 0], missed.covariance[:, 0], look[:, 0])
+        nearest = int(off.argmin())
+        return missed[[nearest]] if off[nearest] <= self.parameters.confirm_sigma**2 else None
 
-    def _begin(self, measurement: Measurement, own_velocity: FloatArray | None, misjudged: State | None) -> _Track:
+    def _begin(self, measurement: Measurement) -> _Track:
         self._created += 1
         return _Track(
             number=self._created,
-            hypotheses=Hypotheses.first(measurement, own_velocity, self.parameters, misjudged),
             existence=self.parameters.birth_probability,
             drone_probability=measurement.drone_probability,
             first_seen_s=self._time_s,
@@ -248,11 +261,11 @@ class Tracker:
         return track.missing_s <= longest_s + JITTER_S and track.existence >= self.parameters.drop_probability
 
 
-def _probability_in_view(state: State, shown: Shown) -> float:
+def _probability_in_view(mean: FloatArray, covariance: FloatArray, shown: Shown) -> float:
     """That a camera shows all of the neighbour, wherever it is: one that the border cuts is often missed."""
-    variances, axes = np.linalg.eigh(state.position_covariance)
+    variances, axes = np.linalg.eigh(covariance[:3, :3])
     spread = _SIGMA_POINTS * np.sqrt(np.maximum(variances, 0.0))  # rounding may make none of them negative
-    return float(shown(state.position + spread @ axes.T, state.size_m / 2).mean())
+    return float(shown(mean[:3] + spread @ axes.T, math.exp(mean[6]) / 2).mean())
 
 
 def _log_sigma(measurement: Measurement) -> float:
@@ -265,7 +278,6 @@ class _Track:
     """One neighbour."""
 
     number: int
-    hypotheses: Hypotheses
     existence: float
     """Probability of being anything that persists."""
     drone_probability: float
@@ -281,8 +293,3 @@ class _Track:
     """Whether the last one was."""
     confirmed: bool = False
     was_confirmed: bool = False
-
-    @property
-    def state(self) -> State:
-        """Of all hypotheses together."""
-        return self.hypotheses.state

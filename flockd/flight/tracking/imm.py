@@ -1,0 +1,222 @@
+"""How neighbours move: a few motions that interact, none of which is ever given up (IMM).
+
+H. Blom, Y. Bar-Shalom, "The interacting multiple model algorithm for systems with Markovian switching coefficients",
+IEEE Transactions on Automatic Control 33(8), 1988. A neighbour flies as the own drone does, or on a course of its own,
+or brakes to standstill. It may begin with another at any time; each motion has a filter of its own, which begins anew
+with what the others know, and detections weigh them by Bayes' rule.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.core.config.tracking import JITTER_S, TrackingParameters
+from flockd.core.messages import FloatArray, PossibleMotion
+from flockd.flight.tracking import filter  # noqa: A004 - the field's word
+from flockd.flight.tracking.filter import Looks
+from flockd.flight.tracking.measurement import Measurement
+
+_LASTS_S = 20.0
+"""How long a neighbour flies in one of the ways, on average, before another may begin."""
+_HARDER = 2.0
+"""By how much harder one manoeuvres that is on its own course: its accelerations, standard deviation."""
+_BRAKES_M_S2 = 5.0
+"""How hard a neighbour brakes: as vehicles' gates let them (`safety.gate.max_acceleration_m_s2`)."""
+_PLACE, _VELOCITY = np.arange(3), np.arange(3, 6)
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """What is known of n neighbours, by the m motions that each may have: as I fly, its own course, brakes."""
+
+    probability: FloatArray
+    """(n, m) of each motion, by neighbour adding up to 1."""
+    mean: FloatArray
+    """(n, m, 8) states, see `filter`."""
+    covariance: FloatArray
+    """(n, m, 8, 8)"""
+
+    def __getitem__(self, index: Sequence[int]) -> Mixture:
+        """Some of the neighbours."""
+        return Mixture(self.probability[index], self.mean[index], self.covariance[index])
+
+    def replaced(self, index: Sequence[int], by: Mixture) -> Mixture:
+        """With some of the neighbours as they are in another."""
+        probability, mean, covariance = self.probability.copy(), self.mean.copy(), self.covariance.copy()
+        probability[index], mean[index], covariance[index] = by.probability, by.mean, by.covariance
+        return Mixture(probability, mean, covariance)
+
+    def __add__(self, other: Mixture) -> Mixture:
+        """These neighbours and others."""
+        return Mixture(
+            np.concatenate([self.probability, other.probability]),
+            np.concatenate([self.mean, other.mean]),
+            np.concatenate([self.covariance, other.covariance]),
+        )
+
+    @property
+    def together(self) -> Mixture:
+        """Mean and covariance of all motions of each, as one."""
+        mean, covariance = _mixed(self.probability[:, :, None], self.mean, self.covariance)
+        return Mixture(np.ones((len(mean), 1)), mean, covariance)
+
+    def innovations(self, looks: Looks) -> tuple[FloatArray, FloatArray]:
+        """Squared Mahalanobis distances (k, n) of k measurements from n neighbours, each by the motion that explains it
+        best, and the logarithms of the densities, times the motion's probability."""
+        found = filter.innovations(self.mean, self.covariance, looks[:, None])
+        prior = np.log(self.probability)
+        likelihood = found.log_likelihood + prior
+        best = likelihood.argmax(axis=-1)[..., None]
+        return (
+            np.take_along_axis(found.squared_distance - 2.0 * prior, best, axis=-1)[..., 0],
+            np.take_along_axis(likelihood, best, axis=-1)[..., 0],
+        )
+
+    def possible(self) -> list[tuple[PossibleMotion, ...]]:
+        """The motions of each as the gate reckons with them, the likeliest first."""
+        places = self.mean[..., :3]
+        bearings = places / np.maximum(np.sqrt((places**2).sum(axis=-1, keepdims=True)), filter.MIN_RANGE_M)
+        blocks = self.covariance[..., :3, :3], self.covariance[..., 3:6, 3:6]
+        sigmas = [np.sqrt(np.einsum("nmx,nmxy,nmy->nm", bearings, block, bearings)) for block in blocks]
+        return [
+            tuple(
+                PossibleMotion(
+                    float(self.probability[i, j]), places[i, j], self.mean[i, j, 3:6],
+                    range_sigma_m=float(sigmas[0][i, j]), closing_sigma_m_s=float(sigmas[1][i, j]),
+                )
+                for j in order
+            )
+            for i, order in enumerate((-self.probability).argsort(axis=-1, kind="stable").tolist())
+        ]  # fmt: skip
+
+
+NOBODY = Mixture(np.empty((0, 3)), np.empty((0, 3, filter.SIZE)), np.empty((0, 3, filter.SIZE, filter.SIZE)))
+
+
+def first(
+    measurement: Measurement,
+    own_velocity: FloatArray | None,
+    parameters: TrackingParameters,
+    misjudged: Mixture | None = None,
+) -> Mixture:
+    """After a first detection. `own_velocity` (3,) NED m/s; None: no drone is known to fly with this one.
+
+    One that comes has a bearing that stays the same, as a mate's does, and the range alone tells them apart, by its
+    rate over itself: the inverse of the time to contact (D. Lee, "A theory of visual control of braking based on
+    information about time-to-collision", Perception 5, 1976). So one on its own course begins with one that leads to
+    meet. `misjudged`: a neighbour that should have been seen in this bearing, and was not, at its own range. It is most
+    likely the one that was detected, at a range that is wrong, and flies as it did.
+    """
+    p = parameters
+    unknown, alike = p.speed_sigma_m_s**2 * np.eye(3), p.relative_speed_sigma_m_s**2 * np.eye(3)
+    share, velocities, covariances = p.stranger_probability, np.zeros((3, 3)), np.array([unknown] * 3)
+    if own_velocity is not None:
+        along = np.outer(measurement.bearing, measurement.bearing)
+        velocities[:] = own_velocity - along @ own_velocity
+        covariances[:] = alike + along @ (unknown - alike)
+        velocities[0], covariances[0] = own_velocity, alike
+    if own_velocity is not None and misjudged is not None:
+        share = p.hiding_stranger_probability
+        velocities[0], covariances[0] = misjudged.mean[0, 0, 3:6], misjudged.covariance[0, 0, 3:6, 3:6]
+    mean, covariance = filter.initial(measurement, velocities, covariances, p)
+    return Mixture(_probabilities(share)[None], mean[None], covariance[None])
+
+
+def predicted(
+    mixture: Mixture,
+    interval_s: float,
+    own_displacement: FloatArray | None,
+    own_displacement_sigma_m: float,
+    parameters: TrackingParameters,
+) -> Mixture:
+    """`interval_s` later: motions mixed, and each with white acceleration noise.
+
+    `own_displacement` (3,) NED metres is the way the own drone went meanwhile, with its standard deviation an axis.
+    None: not known; the neighbour then stays where it is relative to the own drone, as flock mates move alike. Its log
+    size drifts by `size_drift`.
+    """
+    p, dt = parameters, interval_s
+    probability, mean, covariance = _interacted(mixture, dt, p)
+    density = p.manoeuvre_time_s * (p.acceleration_sigma_m_s2 * np.array([1.0, _HARDER, 1.0])) ** 2
+    kept, way_s, target = np.ones(probability.shape), np.full(probability.shape, dt), np.zeros((3, 3))
+    if own_displacement is None or dt <= 0:
+        way_s, displacement, sigma_m = 0.0 * way_s, np.zeros(3), p.relative_speed_sigma_m_s * math.sqrt(dt)
+    else:
+        target[0], displacement, sigma_m = own_displacement / dt, own_displacement, own_displacement_sigma_m
+        alike_s = 2 * p.relative_speed_sigma_m_s**2 / density[0]  # of velocities that differ by as much in the end
+        kept[:, 0] = math.exp(-dt / alike_s)
+        way_s[:, 0] = alike_s * (1.0 - kept[:, 0])
+        stops_s = np.maximum(np.sqrt((mean[:, 2, 3:6] ** 2).sum(axis=-1)) / _BRAKES_M_S2, JITTER_S)
+        brakes_s = np.minimum(stops_s, dt)
+        kept[:, 2] = 1.0 - brakes_s / stops_s
+        way_s[:, 2] = brakes_s * (1.0 + kept[:, 2]) / 2
+    transition = np.zeros((*kept.shape, filter.SIZE, filter.SIZE)) + np.eye(filter.SIZE)
+    transition[..., _PLACE, _VELOCITY] = way_s[..., None]
+    transition[..., _VELOCITY, _VELOCITY] = kept[..., None]
+    transition[..., 7, 7] = math.exp(-dt / p.range_error_time_s)
+    mean = (transition @ mean[..., None])[..., 0]
+    mean[..., :3] += (dt - way_s)[..., None] * target - displacement
+    mean[..., 3:6] += (1.0 - kept)[..., None] * target
+    noise = np.zeros((3, filter.SIZE, filter.SIZE))
+    noise[:, _PLACE, _PLACE] = (density * dt**3 / 3 + sigma_m**2)[:, None]
+    noise[:, _PLACE, _VELOCITY] = noise[:, _VELOCITY, _PLACE] = (density * dt**2 / 2)[:, None]
+    noise[:, _VELOCITY, _VELOCITY] = (density * dt)[:, None]
+    noise[:, 6, 6] = p.size_drift**2 * dt
+    noise[:, 7, 7] = 1.0 - math.exp(-2 * dt / p.range_error_time_s)
+    return Mixture(probability, mean, transition @ covariance @ transition.swapaxes(-1, -2) + noise)
+
+
+def updated(mixture: Mixture, looks: Looks, parameters: TrackingParameters) -> Mixture:
+    """After a detection of each of them."""
+    mean, covariance, log_likelihood = filter.update(mixture.mean, mixture.covariance, looks, parameters)
+    logs = log_likelihood + np.log(mixture.probability)
+    weights = np.exp(logs - logs.max(axis=-1, keepdims=True)) + 1e-12
+    return Mixture(weights / weights.sum(axis=-1, keepdims=True), mean, covariance)
+
+
+def resized(mixture: Mixture, size_m: float, own_velocity: FloatArray | None) -> Mixture:
+    """Drones that turn out to be of this size: seen as large, each is that much nearer or farther.
+
+    So is its velocity relative to the own one, (3,) NED m/s; None: that is not known, and its velocity stays.
+    """
+    scale, mean = np.ones(mixture.mean.shape), mixture.mean
+    scale[..., :6] = (size_m / np.exp(mean[..., 6]))[..., None]
+    offset = np.zeros(filter.SIZE)
+    if own_velocity is None:
+        scale[..., 3:6] = 1.0
+    else:
+        offset[3:6] = own_velocity
+    mean = scale * (mean - offset) + offset
+    mean[..., 6] = math.log(size_m)
+    return Mixture(mixture.probability, mean, scale[..., None] * mixture.covariance * scale[..., None, :])
+
+
+def _probabilities(stranger: float) -> FloatArray:
+    """(3,) of the motions, where that of no mate is known."""
+    return np.array([1.0 - stranger, stranger / 2, stranger / 2])
+
+
+def _interacted(
+    mixture: Mixture, interval_s: float, p: TrackingParameters
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Probabilities, means and covariances before motions that begin within the interval, as likely as at first sight.
+
+    The Markov chain forgets with one time constant, so that two intervals give what one as long as both gives.
+    """
+    keep = math.exp(-interval_s / _LASTS_S)
+    transition = keep * np.eye(3) + (1.0 - keep) * _probabilities(p.stranger_probability)
+    joint = mixture.probability[:, :, None] * transition
+    probability = joint.sum(axis=1)
+    return probability, *_mixed(joint / probability[:, None], mixture.mean, mixture.covariance)
+
+
+def _mixed(weights: FloatArray, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Means (n, j, 8) and covariances (n, j, 8, 8) of mixtures by `weights` (n, i, j)."""
+    mixed = weights.swapaxes(1, 2) @ mean
+    off = mean[:, :, None] - mixed[:, None]
+    spread = np.einsum("nij,nijx,nijy->njxy", weights, off, off)
+    return mixed, spread + np.einsum("nij,nixy->njxy", weights, covariance)
