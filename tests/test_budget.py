@@ -20,8 +20,8 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 2_970,
-    "flockd/flight": 11_410,
+    "flockd/core": 2_960,
+    "flockd/flight": 11_310,
     "flockd/onboard": 9_010,
     "flockd/fleet": 2_670,
     "flockd/ground": 4_030,
@@ -29,7 +29,7 @@ LINES = {
     "flockd/sim": 8_550,
     "flockd/campaign": 1_470,
     "flockd/cli": 3_430,
-    "tests": 36_170,
+    "tests": 36_160,
     "tools/checks": 2_060,
     "tools/docs": 770,
     "tools/measure": 1_300,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 329}
+FILES = {"flockd": 328}
 NUMBERS_OF_FLIGHT = 298
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02

@@ -33,9 +33,6 @@ class TrackingParameters(Section):
     """That a drone seen for the first time does not fly with the flock, and that one which begins to fly otherwise does
     not; half of it, that it brakes to standstill. All motions are followed, and detections weigh them (IMM: Blom &
     Bar-Shalom 1988)."""
-    hiding_stranger_probability: Probability = 0.02
-    """The same, where a confirmed neighbour is not detected in its place and the new detection is in its bearing: a
-    stranger would have to hide it, and not to have been seen beside it before. Mostly the range is wrong."""
     robust_sigma: Positive = 2.5
     """Innovations beyond this many standard deviations count less and less; of those of the motion and measurement
     model 82 % are nearer, of measured velocities 90 % (chi-square with 4 and 3 degrees of freedom)."""

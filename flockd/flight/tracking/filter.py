@@ -65,7 +65,7 @@ class Looks:
         sigma = np.sqrt(lasting)
         return cls(*(a[:, None] for a in (bearing, log_range, log_size, sigma, correlation * sigma, noise)))
 
-    def __getitem__(self, index: Sequence[int] | tuple[slice | None, ...]) -> Looks:
+    def __getitem__(self, index: Sequence[int] | tuple[slice | int | None, ...]) -> Looks:
         """Some of them, or all with another shape."""
         fields = (self.bearing, self.log_range, self.log_size, self.lasting, self.lasting_size, self.noise)
         return Looks(*(a[index] for a in fields))
@@ -118,13 +118,14 @@ def innovations(mean: FloatArray, covariance: FloatArray, looks: Looks) -> Innov
     return Innovations(residual, spread, squared)
 
 
-def squared_angles(mean: FloatArray, covariance: FloatArray, look: Looks) -> FloatArray:
-    """(n,) squared Mahalanobis distances of a measurement's bearing, (1,), from those of states (n, 8)."""
+def squared_distances_but_range(mean: FloatArray, covariance: FloatArray, look: Looks) -> FloatArray:
+    """(n,) squared Mahalanobis distances of a measurement, (1,), from states (n, 8), by bearing and size alone."""
     found = innovations(mean, covariance, look)
-    across = np.linalg.svd(mean[:, None, :3])[2][:, 1:]
-    angle = across @ found.residual[:, :3, None]
-    spread = across @ found.covariance[:, :3, :3] @ across.swapaxes(1, 2)
-    squared: FloatArray = (angle * np.linalg.solve(spread, angle)).sum(axis=(1, 2))
+    others = np.zeros((len(mean), 3, 4))
+    others[:, :2, :3] = np.linalg.svd(mean[:, None, :3])[2][:, 1:]  # across the line of sight
+    others[:, 2, 3] = 1.0
+    off = others @ found.residual[..., None]
+    squared: FloatArray = (off * np.linalg.solve(others @ found.covariance @ others.swapaxes(1, 2), off)).sum((1, 2))
     return squared
 
 

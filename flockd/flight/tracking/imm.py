@@ -26,7 +26,6 @@ _HARDER = 2.0
 """By how much harder one manoeuvres that is on its own course: its accelerations, standard deviation."""
 _BRAKES_M_S2 = 5.0
 """How hard a neighbour brakes: as vehicles' gates let them (`safety.gate.max_acceleration_m_s2`)."""
-_PLACE, _VELOCITY = np.arange(3), np.arange(3, 6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,36 +93,29 @@ class Mixture:
         ]  # fmt: skip
 
 
-NOBODY = Mixture(np.empty((0, 3)), np.empty((0, 3, filter.SIZE)), np.empty((0, 3, filter.SIZE, filter.SIZE)))
+def nobody() -> Mixture:
+    """Of no neighbour."""
+    return Mixture(np.empty((0, 3)), np.empty((0, 3, filter.SIZE)), np.empty((0, 3, filter.SIZE, filter.SIZE)))
 
 
-def first(
-    measurement: Measurement,
-    own_velocity: FloatArray | None,
-    parameters: TrackingParameters,
-    misjudged: Mixture | None = None,
-) -> Mixture:
+def first(measurement: Measurement, own_velocity: FloatArray | None, parameters: TrackingParameters) -> Mixture:
     """After a first detection. `own_velocity` (3,) NED m/s; None: no drone is known to fly with this one.
 
     One that comes has a bearing that stays the same, as a mate's does, and the range alone tells them apart, by its
     rate over itself: the inverse of the time to contact (D. Lee, "A theory of visual control of braking based on
     information about time-to-collision", Perception 5, 1976). So one on its own course begins with one that leads to
-    meet. `misjudged`: a neighbour that should have been seen in this bearing, and was not, at its own range. It is most
-    likely the one that was detected, at a range that is wrong, and flies as it did.
+    meet.
     """
     p = parameters
     unknown, alike = p.speed_sigma_m_s**2 * np.eye(3), p.relative_speed_sigma_m_s**2 * np.eye(3)
-    share, velocities, covariances = p.stranger_probability, np.zeros((3, 3)), np.array([unknown] * 3)
+    velocities, covariances = np.zeros((3, 3)), np.array([unknown] * 3)
     if own_velocity is not None:
         along = np.outer(measurement.bearing, measurement.bearing)
         velocities[:] = own_velocity - along @ own_velocity
         covariances[:] = alike + along @ (unknown - alike)
         velocities[0], covariances[0] = own_velocity, alike
-    if own_velocity is not None and misjudged is not None:
-        share = p.hiding_stranger_probability
-        velocities[0], covariances[0] = misjudged.mean[0, 0, 3:6], misjudged.covariance[0, 0, 3:6, 3:6]
     mean, covariance = filter.initial(measurement, velocities, covariances, p)
-    return Mixture(_probabilities(share)[None], mean[None], covariance[None])
+    return Mixture(_probabilities(p.stranger_probability)[None], mean[None], covariance[None])
 
 
 def predicted(
@@ -154,17 +146,19 @@ def predicted(
         brakes_s = np.minimum(stops_s, dt)
         kept[:, 2] = 1.0 - brakes_s / stops_s
         way_s[:, 2] = brakes_s * (1.0 + kept[:, 2]) / 2
+    axes = np.eye(3)
     transition = np.zeros((*kept.shape, filter.SIZE, filter.SIZE)) + np.eye(filter.SIZE)
-    transition[..., _PLACE, _VELOCITY] = way_s[..., None]
-    transition[..., _VELOCITY, _VELOCITY] = kept[..., None]
+    transition[..., :3, 3:6] = way_s[..., None, None] * axes
+    transition[..., 3:6, 3:6] *= kept[..., None, None]
     transition[..., 7, 7] = math.exp(-dt / p.range_error_time_s)
     mean = (transition @ mean[..., None])[..., 0]
     mean[..., :3] += (dt - way_s)[..., None] * target - displacement
     mean[..., 3:6] += (1.0 - kept)[..., None] * target
     noise = np.zeros((3, filter.SIZE, filter.SIZE))
-    noise[:, _PLACE, _PLACE] = (density * dt**3 / 3 + sigma_m**2)[:, None]
-    noise[:, _PLACE, _VELOCITY] = noise[:, _VELOCITY, _PLACE] = (density * dt**2 / 2)[:, None]
-    noise[:, _VELOCITY, _VELOCITY] = (density * dt)[:, None]
+    of_place, of_both, of_velocity = (density * dt**power / power for power in (3, 2, 1))
+    noise[:, :3, :3] = (of_place + sigma_m**2)[:, None, None] * axes
+    noise[:, :3, 3:6] = noise[:, 3:6, :3] = of_both[:, None, None] * axes
+    noise[:, 3:6, 3:6] = of_velocity[:, None, None] * axes
     noise[:, 6, 6] = p.size_drift**2 * dt
     noise[:, 7, 7] = 1.0 - math.exp(-2 * dt / p.range_error_time_s)
     return Mixture(probability, mean, transition @ covariance @ transition.swapaxes(-1, -2) + noise)

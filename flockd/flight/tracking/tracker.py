@@ -13,7 +13,6 @@ from flockd.core.messages import BoolArray, FloatArray, Neighbour
 from flockd.flight.tracking import existence, filter, imm  # noqa: A004 - the field's word
 from flockd.flight.tracking.association import assign
 from flockd.flight.tracking.filter import Looks
-from flockd.flight.tracking.imm import Mixture
 from flockd.flight.tracking.measurement import Measurement
 
 _OF_USUAL = 0.02
@@ -53,7 +52,7 @@ class Tracker:
     def __init__(self, parameters: TrackingParameters | None = None) -> None:
         self.parameters = parameters or TrackingParameters()
         self._tracks: list[_Track] = []
-        self._motions = imm.NOBODY
+        self._motions = imm.nobody()
         """Of the tracks, in their order."""
         self._usual_log_sigma: float | None = None
         """Logarithm of the standard deviation of a confirmed neighbour's log range, as detected."""
@@ -84,7 +83,7 @@ class Tracker:
     ) -> tuple[int, ...]:
         """Take in one frame set's measurements at `time_s`; the track number of each, new where it fits no track.
 
-        `own_velocity` (3,) NED m/s is what flock mates start with, as they move alike (`Hypotheses`). `shown` (None:
+        `own_velocity` (3,) NED m/s is what flock mates start with, as they move alike (`imm.first`). `shown` (None:
         everything is) is what the cameras could see. A confirmed neighbour that leaves their view is as probable as
         before and does not age, but for the share of its possible places that they see: it is remembered until it
         should have come into view again.
@@ -95,34 +94,26 @@ class Tracker:
         looks = Looks.of(measurements, self.parameters)
         squared_distances, log_likelihoods = self._motions.innovations(looks)
         pairs = assign(squared_distances, log_likelihoods, self.parameters.gate_sigma)
+        for row in range(len(measurements)):
+            if row not in pairs:
+                pairs |= self._misjudged(looks, row, set(pairs.values()))
         missed = [column for column in range(len(self._tracks)) if column not in pairs.values()]
         if missed:
             self._miss(missed, interval_s, weight, shown)
         for row, column in pairs.items():
-            self._detect(
-                self._tracks[column],
-                measurements[row],
-                squared_distances[row, column],
-                log_likelihoods[row, column],
-                weight,
-            )
-        known = [missed_ for missed_ in missed if self._tracks[missed_].confirmed and self._tracks[missed_].agrees]
-        others = self._motions[known].together
+            of_pair = squared_distances[row, column], log_likelihoods[row, column]
+            self._detect(self._tracks[column], measurements[row], *of_pair, weight)
         if pairs:
-            columns = list(pairs.values())
-            self._motions = self._motions.replaced(
-                columns, imm.updated(self._motions[columns], looks[list(pairs)], self.parameters)
-            )
+            rows, columns = list(pairs), list(pairs.values())
+            detected = imm.updated(self._motions[columns], looks[rows], self.parameters)
+            self._motions = self._motions.replaced(columns, detected)
         numbers = []
-        for index, measurement in enumerate(measurements):
-            if index in pairs:
-                track = self._tracks[pairs[index]]
-            else:
-                track = self._begin(measurement)
-                misjudged = self._misjudged(looks[[index]], others)
-                self._tracks.append(track)
-                self._motions += imm.first(measurement, own_velocity, self.parameters, misjudged)
-            numbers.append(track.number)
+        for row, measurement in enumerate(measurements):
+            if row not in pairs:
+                pairs[row] = len(self._tracks)
+                self._tracks.append(self._begin(measurement))
+                self._motions += imm.first(measurement, own_velocity, self.parameters)
+            numbers.append(self._tracks[pairs[row]].number)
         for track in self._tracks:
             self._confirm(track)
         kept = [index for index, track in enumerate(self._tracks) if self._is_kept(track)]
@@ -156,7 +147,7 @@ class Tracker:
 
     def forget(self) -> None:
         """Nothing is known of anybody any more."""
-        self._tracks, self._motions = [], imm.NOBODY
+        self._tracks, self._motions = [], imm.nobody()
 
     def neighbours(self) -> tuple[Neighbour, ...]:
         """All tracks as of the last `predict` and `update`, confirmed or not, by track number."""
@@ -226,16 +217,19 @@ class Tracker:
         usual = log_sigma if self._usual_log_sigma is None else self._usual_log_sigma
         self._usual_log_sigma = usual + _OF_USUAL * weight * (log_sigma - usual)
 
-    def _misjudged(self, look: Looks, missed: Mixture) -> Mixture | None:
-        """The neighbour, of those that were `missed`, whose bearing a detection has that fits no track; None: of none.
+    def _misjudged(self, looks: Looks, row: int, detected: set[int]) -> dict[int, int]:
+        """The measurement of no track and the neighbour, not `detected`, whose bearing and size it has; else nothing.
 
-        One that is confirmed and was detected before where it was to be: of one that was not, the velocity is in doubt.
+        A stranger would have to hide the neighbour, and not to have been seen beside it before: mostly the range is
+        wrong. So of one that is confirmed, and was detected before where it was to be, and once.
         """
-        if not len(missed.mean):
-            return None
-        off = filter.squared_angles(missed.mean[:, 0], missed.covariance[:, 0], look[:, 0])
+        known = [i for i, one in enumerate(self._tracks) if one.confirmed and one.agrees and i not in detected]
+        if not known:
+            return {}
+        together = self._motions[known].together
+        off = filter.squared_distances_but_range(together.mean[:, 0], together.covariance[:, 0], looks[[row]][:, 0])
         nearest = int(off.argmin())
-        return missed[[nearest]] if off[nearest] <= self.parameters.confirm_sigma**2 else None
+        return {row: known[nearest]} if off[nearest] <= self.parameters.confirm_sigma**2 else {}
 
     def _begin(self, measurement: Measurement) -> _Track:
         self._created += 1

@@ -346,8 +346,8 @@ def test_a_second_of_prediction_is_the_same_in_steps_of_any_length(step_s: float
     whole.tracker.predict(1.0, CRUISE)
     assert flock.one.possible and whole.one.possible
     assert flock.one.position_sigma_m == pytest.approx(whole.one.position_sigma_m, rel=0.05)
-    probabilities = [[one.probability for one in each.one.possible or ()] for each in (flock, whole)]
-    np.testing.assert_allclose(*probabilities, atol=1e-12)
+    probabilities, at_once = ([one.probability for one in each.one.possible or ()] for each in (flock, whole))
+    np.testing.assert_allclose(probabilities, at_once, atol=1e-12)
     np.testing.assert_allclose(flock.one.position, whole.one.position, atol=0.05)
 
 
