@@ -17,7 +17,6 @@ from flockd.flight.geometry import log_polar, log_polar_covariance, rotation_fro
 from flockd.flight.safety.approach import towards_flying_on
 from flockd.flight.safety.surroundings import surroundings
 from flockd.flight.tracking import Measurement, Shown, Tracker, TrackingParameters
-
 from tests.make import detection
 
 Array = NDArray[np.float64]
