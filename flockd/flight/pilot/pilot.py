@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
+from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.drone import DroneConfig
 from flockd.core.messages import (
     NO_STATUS,
@@ -402,9 +403,10 @@ class FlockPilot:
         An autopilot flies a setpoint v so that its own estimate becomes v. Where that errs by b, the drone moves with
         v - b, and so do neighbours with other b: a flock with equal commands drifts together. So b is added.
         """
-        if self._config.autopilot is None or self._config.own_velocity == "autopilot":
+        if self._config.own_velocity == "autopilot":
             return np.zeros(2)
-        return limit_norm(self._own.error[:2], self._config.autopilot.max_velocity_trim_m_s)
+        autopilot = self._config.autopilot or AutopilotParameters()  # a simulated one errs as well
+        return limit_norm(self._own.error[:2], autopilot.max_velocity_trim_m_s)
 
 
 def _why_refused(frames: FrameSet, vehicle: VehicleState) -> Reason | None:

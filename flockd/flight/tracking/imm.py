@@ -142,7 +142,8 @@ def predicted(
         alike_s = 2 * p.relative_speed_sigma_m_s**2 / density[0]  # of velocities that differ by as much in the end
         kept[:, 0] = math.exp(-dt / alike_s)
         way_s[:, 0] = alike_s * (1.0 - kept[:, 0])
-        stops_s = np.maximum(np.sqrt((mean[:, 2, 3:6] ** 2).sum(axis=-1)) / _BRAKES_M_S2, JITTER_S)
+        squared_speed = (mean[:, 2, 3:6] ** 2).sum(axis=-1) + np.einsum("nxx->n", covariance[:, 2, 3:6, 3:6])
+        stops_s = np.maximum(np.sqrt(squared_speed) / _BRAKES_M_S2, JITTER_S)
         brakes_s = np.minimum(stops_s, dt)
         kept[:, 2] = 1.0 - brakes_s / stops_s
         way_s[:, 2] = brakes_s * (1.0 + kept[:, 2]) / 2

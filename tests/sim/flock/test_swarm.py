@@ -122,13 +122,13 @@ def test_drones_fly_blind_to_each_others_telemetry(alone: FlightLog) -> None:
 
 
 def test_each_drone_decides_from_its_own_images_alone() -> None:
-    """The autopilots may say of the velocity what they like: the first step's own motion and command do not change.
+    """The autopilots may err about the velocity: the first step's own motion and command do not change.
 
     Vehicles fly by the truth here, as what their autopilots believe would move them.
     By the barometer: the ground below a range finder is followed with the own autopilot's velocity.
     """
     changed = scenario(1.0, height="barometer", ideal=True)
-    sensors = changed.sensors.model_copy(update={"velocity_error_m_s": 5.0})
+    sensors = changed.sensors.model_copy(update={"velocity_error_m_s": 0.3})
     wrongly = changed.model_copy(update={"sensors": sensors})
     right, wrong = (fly(flight, threads=0).log for flight in (changed, wrongly))
     assert np.isfinite(right.ego_translation[1]).all()
