@@ -21,7 +21,7 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 2_960,
-    "flockd/flight": 11_310,
+    "flockd/flight": 11_490,
     "flockd/onboard": 9_010,
     "flockd/fleet": 2_670,
     "flockd/ground": 4_030,
@@ -37,12 +37,12 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 328}
-NUMBERS_OF_FLIGHT = 296
+FILES = {"flockd": 330}
+NUMBERS_OF_FLIGHT = 308
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
 """A budget that is farther above what there is is to be lowered."""
-STEPS = {"crossing": (13_900, 20), "normal": (10_400, 15)}
+STEPS = {"crossing": (16_500, 20), "normal": (12_900, 15)}
 """Python calls and network runs of a step in a recorded flight of tests/review/replay."""
 
 
