@@ -29,7 +29,7 @@ MIN_RANGE_M = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Looks:
+class Measurements:
     """Measurements as arrays of one shape (...), for states of a shape that it broadcasts with."""
 
     bearing: FloatArray
@@ -49,7 +49,7 @@ class Looks:
     (`pilot.size_learner`)."""
 
     @classmethod
-    def of(cls, measurements: Sequence[Measurement], parameters: TrackingParameters) -> Looks:
+    def of(cls, measurements: Sequence[Measurement], parameters: TrackingParameters) -> Measurements:
         """(n, 1): each for all motions of a track."""
         count, correlation = len(measurements), parameters.size_correlation
         bearing = np.array([m.bearing for m in measurements]).reshape(count, 3)
@@ -65,10 +65,10 @@ class Looks:
         sigma = np.sqrt(lasting)
         return cls(*(a[:, None] for a in (bearing, log_range, log_size, sigma, correlation * sigma, noise)))
 
-    def __getitem__(self, index: Sequence[int] | tuple[slice | int | None, ...]) -> Looks:
+    def __getitem__(self, index: Sequence[int] | tuple[slice | int | None, ...]) -> Measurements:
         """Some of them, or all with another shape."""
         fields = (self.bearing, self.log_range, self.log_size, self.lasting, self.lasting_size, self.noise)
-        return Looks(*(a[index] for a in fields))
+        return Measurements(*(a[index] for a in fields))
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,31 +96,31 @@ def initial(
 ) -> tuple[FloatArray, FloatArray]:
     """Means (m, 8) and covariances (m, 8, 8) after a first detection of a drone that flies at one of `velocities`
     (m, 3) m/s, uncertain by their `covariances` (m, 3, 3)."""
-    look = Looks.of([measurement], parameters)
+    measured = Measurements.of([measurement], parameters)
     of_place = np.zeros((SIZE, 5))
     of_place[:3, :3], of_place[6, 3], of_place[7, 4] = measurement.range_m * np.eye(3), 1.0, 1.0
-    of_place[:3, 4] = -measurement.range_m * measurement.bearing * look.lasting[0]
-    of_place[6, 4] = -look.lasting_size[0, 0]
+    of_place[:3, 4] = -measurement.range_m * measurement.bearing * measured.lasting[0]
+    of_place[6, 4] = -measured.lasting_size[0, 0]
     noise = np.eye(5)
-    noise[:4, :4] = look.noise[0, 0]
+    noise[:4, :4] = measured.noise[0, 0]
     covariance = np.repeat((of_place @ noise @ of_place.T)[None], len(velocities), axis=0)
     covariance[:, 3:6, 3:6] = covariances
     mean = np.zeros((len(velocities), SIZE))
-    mean[:, :3], mean[:, 3:6], mean[:, 6] = measurement.position, velocities, look.log_size[0, 0]
+    mean[:, :3], mean[:, 3:6], mean[:, 6] = measurement.position, velocities, measured.log_size[0, 0]
     return mean, covariance
 
 
-def innovations(mean: FloatArray, covariance: FloatArray, looks: Looks) -> Innovations:
+def innovations(mean: FloatArray, covariance: FloatArray, measured: Measurements) -> Innovations:
     """Of measurements against predicted states (..., 8) with covariances (..., 8, 8)."""
-    residual, derivative = _linearised(mean, looks)
-    spread = derivative @ covariance @ derivative.swapaxes(-1, -2) + looks.noise
+    residual, derivative = _linearised(mean, measured)
+    spread = derivative @ covariance @ derivative.swapaxes(-1, -2) + measured.noise
     squared = (residual * np.linalg.solve(spread, residual[..., None])[..., 0]).sum(axis=-1)
     return Innovations(residual, spread, squared)
 
 
-def squared_distances_but_range(mean: FloatArray, covariance: FloatArray, look: Looks) -> FloatArray:
+def squared_distances_but_range(mean: FloatArray, covariance: FloatArray, measured: Measurements) -> FloatArray:
     """(n,) squared Mahalanobis distances of a measurement, (1,), from states (n, 8), by bearing and size alone."""
-    found = innovations(mean, covariance, look)
+    found = innovations(mean, covariance, measured)
     others = np.zeros((len(mean), 3, 4))
     others[:, :2, :3] = np.linalg.svd(mean[:, None, :3])[2][:, 1:]  # across the line of sight
     others[:, 2, 3] = 1.0
@@ -130,7 +130,7 @@ def squared_distances_but_range(mean: FloatArray, covariance: FloatArray, look: 
 
 
 def update(
-    mean: FloatArray, covariance: FloatArray, looks: Looks, parameters: TrackingParameters
+    mean: FloatArray, covariance: FloatArray, measured: Measurements, parameters: TrackingParameters
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Means (..., 8), covariances (..., 8, 8) and log likelihoods (...) after measurements: an iterated extended Kalman
     update in log-polar coordinates.
@@ -139,38 +139,38 @@ def update(
     new track, one at the prediction would overshoot. An innovation of d > `robust_sigma` standard deviations has its
     covariance enlarged by (d / robust_sigma)^2: the farther off, the less it moves the state.
     """
-    predicted = innovations(mean, covariance, looks)
+    predicted = innovations(mean, covariance, measured)
     excess = np.maximum(1.0, predicted.squared_distance / parameters.robust_sigma**2)
     robust = Innovations(
         predicted.residual, excess[..., None, None] * predicted.covariance, predicted.squared_distance / excess
     )
-    noise = looks.noise + robust.covariance - predicted.covariance
+    noise = measured.noise + robust.covariance - predicted.covariance
     updated = mean.copy()
-    range_m = np.exp(looks.log_range - looks.lasting * mean[..., 7])
-    updated[..., :3] = range_m[..., None] * looks.bearing
-    updated[..., 6] = looks.log_size
+    range_m = np.exp(measured.log_range - measured.lasting * mean[..., 7])
+    updated[..., :3] = range_m[..., None] * measured.bearing
+    updated[..., 6] = measured.log_size
     for _ in range(_LINEARISATIONS):
-        residual, derivative = _linearised(updated, looks)
+        residual, derivative = _linearised(updated, measured)
         residual = residual - (derivative @ (mean - updated)[..., None])[..., 0]
         updated, posterior = _kalman(mean, covariance, derivative, residual, noise)
     return updated, posterior, robust.log_likelihood
 
 
-def _linearised(mean: FloatArray, looks: Looks) -> tuple[FloatArray, FloatArray]:
+def _linearised(mean: FloatArray, measured: Measurements) -> tuple[FloatArray, FloatArray]:
     """Residuals (..., 4) of measurements from states (..., 8), and derivatives (..., 4, 8) of what is predicted."""
     distance_m = np.sqrt((mean[..., :3] ** 2).sum(axis=-1))
     range_m = np.maximum(distance_m, MIN_RANGE_M)
     near = (distance_m < MIN_RANGE_M)[..., None]
-    bearing = np.where(near, looks.bearing, mean[..., :3] / range_m[..., None])
-    log_range = np.log(range_m) + looks.lasting * mean[..., 7]
-    place = log_polar_residual(looks.bearing, looks.log_range, bearing, log_range)
+    bearing = np.where(near, measured.bearing, mean[..., :3] / range_m[..., None])
+    log_range = np.log(range_m) + measured.lasting * mean[..., 7]
+    place = log_polar_residual(measured.bearing, measured.log_range, bearing, log_range)
     derivative = np.zeros((*place.shape[:-1], 4, SIZE))
     derivative[..., :3, :3] = np.eye(3) / range_m[..., None, None]
-    derivative[..., :3, 7] = looks.lasting[..., None] * bearing
-    derivative[..., 3, 6], derivative[..., 3, 7] = 1.0, looks.lasting_size
+    derivative[..., :3, 7] = measured.lasting[..., None] * bearing
+    derivative[..., 3, 6], derivative[..., 3, 7] = 1.0, measured.lasting_size
     residual = np.empty((*place.shape[:-1], 4))
     residual[..., :3] = place
-    residual[..., 3] = looks.log_size - mean[..., 6] - derivative[..., 3, 7] * mean[..., 7]
+    residual[..., 3] = measured.log_size - mean[..., 6] - derivative[..., 3, 7] * mean[..., 7]
     return residual, derivative
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from flockd.core.config.tracking import JITTER_S, TrackingParameters
 from flockd.core.messages import FloatArray, PossibleMotion
 from flockd.flight.tracking import filter  # noqa: A004 - the field's word
-from flockd.flight.tracking.filter import Looks
+from flockd.flight.tracking.filter import Measurements
 from flockd.flight.tracking.measurement import Measurement
 
 _LASTS_S = 20.0
@@ -63,10 +63,10 @@ class Mixture:
         mean, covariance = _mixed(self.probability[:, :, None], self.mean, self.covariance)
         return Mixture(np.ones((len(mean), 1)), mean, covariance)
 
-    def innovations(self, looks: Looks) -> tuple[FloatArray, FloatArray]:
+    def innovations(self, measured: Measurements) -> tuple[FloatArray, FloatArray]:
         """Squared Mahalanobis distances (k, n) of k measurements from n neighbours, each by the motion that explains it
         best, and the logarithms of the densities, times the motion's probability."""
-        found = filter.innovations(self.mean, self.covariance, looks[:, None])
+        found = filter.innovations(self.mean, self.covariance, measured[:, None])
         prior = np.log(self.probability)
         likelihood = found.log_likelihood + prior
         best = likelihood.argmax(axis=-1)[..., None]
@@ -165,9 +165,9 @@ def predicted(
     return Mixture(probability, mean, transition @ covariance @ transition.swapaxes(-1, -2) + noise)
 
 
-def updated(mixture: Mixture, looks: Looks, parameters: TrackingParameters) -> Mixture:
+def updated(mixture: Mixture, measured: Measurements, parameters: TrackingParameters) -> Mixture:
     """After a detection of each of them."""
-    mean, covariance, log_likelihood = filter.update(mixture.mean, mixture.covariance, looks, parameters)
+    mean, covariance, log_likelihood = filter.update(mixture.mean, mixture.covariance, measured, parameters)
     logs = log_likelihood + np.log(mixture.probability)
     weights = np.exp(logs - logs.max(axis=-1, keepdims=True)) + 1e-12
     return Mixture(weights / weights.sum(axis=-1, keepdims=True), mean, covariance)

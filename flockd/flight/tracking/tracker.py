@@ -12,7 +12,7 @@ from flockd.core.config.tracking import JITTER_S, TrackingParameters
 from flockd.core.messages import BoolArray, FloatArray, Neighbour
 from flockd.flight.tracking import existence, filter, imm  # noqa: A004 - the field's word
 from flockd.flight.tracking.association import assign
-from flockd.flight.tracking.filter import Looks
+from flockd.flight.tracking.filter import Measurements
 from flockd.flight.tracking.measurement import Measurement
 
 _OF_USUAL = 0.02
@@ -91,12 +91,12 @@ class Tracker:
         interval_s = max(0.0, time_s - self._time_s)
         weight = min(1.0, interval_s / (self.parameters.evidence_interval_s - JITTER_S))
         self._time_s = time_s
-        looks = Looks.of(measurements, self.parameters)
-        squared_distances, log_likelihoods = self._motions.innovations(looks)
+        measured = Measurements.of(measurements, self.parameters)
+        squared_distances, log_likelihoods = self._motions.innovations(measured)
         pairs = assign(squared_distances, log_likelihoods, self.parameters.gate_sigma)
         for row in range(len(measurements)):
             if row not in pairs:
-                pairs |= self._misjudged(looks, row, set(pairs.values()))
+                pairs |= self._misjudged(measured, row, set(pairs.values()))
         missed = [column for column in range(len(self._tracks)) if column not in pairs.values()]
         if missed:
             self._miss(missed, interval_s, weight, shown)
@@ -105,7 +105,7 @@ class Tracker:
             self._detect(self._tracks[column], measurements[row], *of_pair, weight)
         if pairs:
             rows, columns = list(pairs), list(pairs.values())
-            detected = imm.updated(self._motions[columns], looks[rows], self.parameters)
+            detected = imm.updated(self._motions[columns], measured[rows], self.parameters)
             self._motions = self._motions.replaced(columns, detected)
         numbers = []
         for row, measurement in enumerate(measurements):
@@ -217,7 +217,7 @@ class Tracker:
         usual = log_sigma if self._usual_log_sigma is None else self._usual_log_sigma
         self._usual_log_sigma = usual + _OF_USUAL * weight * (log_sigma - usual)
 
-    def _misjudged(self, looks: Looks, row: int, detected: set[int]) -> dict[int, int]:
+    def _misjudged(self, measured: Measurements, row: int, detected: set[int]) -> dict[int, int]:
         """The measurement of no track and the neighbour, not `detected`, whose bearing and size it has; else nothing.
 
         A stranger would have to hide the neighbour, and not to have been seen beside it before: mostly the range is
@@ -227,7 +227,7 @@ class Tracker:
         if not known:
             return {}
         together = self._motions[known].together
-        off = filter.squared_distances_but_range(together.mean[:, 0], together.covariance[:, 0], looks[[row]][:, 0])
+        off = filter.squared_distances_but_range(together.mean[:, 0], together.covariance[:, 0], measured[[row]][:, 0])
         nearest = int(off.argmin())
         return {row: known[nearest]} if off[nearest] <= self.parameters.confirm_sigma**2 else {}
 

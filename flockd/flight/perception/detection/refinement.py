@@ -56,7 +56,7 @@ class Refined(NamedTuple):
     """Those that surely are no drones."""
 
 
-class Looks(NamedTuple):
+class Estimates(NamedTuple):
     """What n crops show, in log-polar coordinates; the fields are those of `Candidate`."""
 
     bearing: FloatArray
@@ -67,11 +67,11 @@ class Looks(NamedTuple):
     drone_probability: FloatArray
     log_size_sigma: FloatArray
 
-    def take(self, which: IntArray | BoolArray) -> Looks:
+    def take(self, which: IntArray | BoolArray) -> Estimates:
         """Those of these numbers, or of this mask."""
-        return Looks(*(column[which] for column in self))
+        return Estimates(*(column[which] for column in self))
 
-    def of_size(self, known: KnownSize) -> Looks:
+    def of_size(self, known: KnownSize) -> Estimates:
         """With the ranges at which drones of a known size have these apparent sizes.
 
         What the apparent size errs by stays; the known size's own deviation stands for that of the judged one.
@@ -84,7 +84,7 @@ class Looks(NamedTuple):
             log_size_sigma=np.full_like(self.size_m, known.sigma_m / known.size_m),
         )
 
-    def mean(self, other: Looks) -> Looks:
+    def mean(self, other: Estimates) -> Estimates:
         """The mean of log range, bearing, log size and sigmas, weighted by the variances; the lesser probability."""
         weight = self.log_range_sigma**-2 / (self.log_range_sigma**-2 + other.log_range_sigma**-2)
 
@@ -92,7 +92,7 @@ class Looks(NamedTuple):
             return np.asarray((weight * a.T + (1.0 - weight) * b.T).T)
 
         bearing = mean(self.bearing, other.bearing)
-        return Looks(
+        return Estimates(
             bearing / np.linalg.norm(bearing, axis=1, keepdims=True),
             mean(self.log_range, other.log_range),
             np.exp(mean(np.log(self.log_range_sigma), np.log(other.log_range_sigma))),
@@ -144,40 +144,43 @@ class Cascade:
             np.array([one.roi.half_angle for one in proposals]),
             np.full(count, np.nan),
         )
-        shown = Looks(np.empty((count, 3)), *np.empty((5, count)))
+        shown = Estimates(np.empty((count, 3)), *np.empty((5, count)))
         # The least that an earlier crop gave, but for the first, which may be far from what suits the drone.
         least, rejected, settled = np.ones(count), np.zeros(count, np.bool_), np.zeros(count, np.bool_)
         at = np.arange(count)
         for number in range(1, self._rules.max_crops + 1):
             if not len(at):
                 break
-            at, looks = self._look(of, at, aims)
-            probability = np.minimum(least[at], looks.drone_probability)
+            at, estimates = self._estimated(of, at, aims)
+            probability = np.minimum(least[at], estimates.drone_probability)
             rejected[at] = probability <= self._thresholds.another_crop
-            good = ~rejected[at] & self._is_in_range(looks)
-            at, looks, probability = at[good], looks.take(good), probability[good]
-            repeats = self._aim(of[at], at, aims, looks)
+            good = ~rejected[at] & self._is_in_range(estimates)
+            at, estimates, probability = at[good], estimates.take(good), probability[good]
+            repeats = self._aim(of[at], at, aims, estimates)
             if number == 1:
                 continue
             least[at] = probability
             enough = repeats | (number == self._rules.max_crops)
             settled[at] = enough & (probability > self._thresholds.drone)  # a mirror image would not raise it
-            for column, values in zip(shown, looks, strict=True):
+            for column, values in zip(shown, estimates, strict=True):
                 column[at] = values
             at = at[~enough]
-        at, looks = self._with_mirrored(of, np.flatnonzero(settled), aims, shown)
-        probability = np.minimum(least[at], looks.drone_probability)
+        at, estimates = self._with_mirrored(of, np.flatnonzero(settled), aims, shown)
+        probability = np.minimum(least[at], estimates.drone_probability)
         rejected[at] = probability <= self._thresholds.another_crop
         needed = [self._thresholds.predicted_drone if one.predicted else self._thresholds.drone for one in of[at]]
         sure = np.flatnonzero(~rejected[at] & (probability > needed))
-        looks, across = looks._replace(drone_probability=probability).take(sure), self._thresholds.bearing_sigma_rad
-        rows = zip(of[at[sure]], looks.bearing, *(column.tolist() for column in looks[1:]), strict=True)
+        estimates, across = (
+            estimates._replace(drone_probability=probability).take(sure),
+            self._thresholds.bearing_sigma_rad,
+        )
+        rows = zip(of[at[sure]], estimates.bearing, *(column.tolist() for column in estimates[1:]), strict=True)
         found = [Candidate(one, bearing, log_r, sigma, across, *rest) for one, bearing, log_r, sigma, *rest in rows]
         return Refined(found, of[rejected].tolist())
 
-    def _look(
+    def _estimated(
         self, proposals: NDArray[Any], at: IntArray, aims: _Aims, *, mirrored: bool = False
-    ) -> tuple[IntArray, Looks]:
+    ) -> tuple[IntArray, Estimates]:
         """What the network says of crops of the proposals of these numbers, and those of which it says something."""
         directions, range_m = aims.direction[at], aims.range_m[at]
         views = virtual_crops(self._rig, directions, aims.half_angle[at], self._crop_size)
@@ -191,29 +194,29 @@ class Cascade:
             Crop(image, focal, R, centre, mirrored, one.evidence)
             for image, focal, R, centre, one in zip(*fields, strict=True)
         ]
-        estimates = self._ranges(crops)
-        given = np.array([k for k, one in enumerate(estimates) if one is not None], np.int64)
+        of_crops = self._ranges(crops)
+        given = np.array([k for k, one in enumerate(of_crops) if one is not None], np.int64)
         at, views = at[given], views.take(given)
         rows = [
             (*one.centre, one.log_range, one.log_range_sigma, one.size_m, one.drone_probability, one.log_size_sigma)
-            for one in estimates
+            for one in of_crops
             if one is not None
         ]
         numbers = np.array(rows, np.float64).reshape(-1, 7)
-        looks = Looks(views.rays(numbers[:, :2]), *numbers[:, 2:].T)
+        estimates = Estimates(views.rays(numbers[:, :2]), *numbers[:, 2:].T)
         if self._known_size is not None:
-            looks = looks.of_size(self._known_size)
+            estimates = estimates.of_size(self._known_size)
         # The camera sits beside the body's origin, so that bearing and range change a little.
-        near = np.isfinite(looks.log_range) & (looks.log_range < math.log(2 * self._parameters.max_range_m))
-        ranges = np.exp(np.where(near, looks.log_range, 0.0))[:, None]
-        places = np.where(near[:, None], views.centres, 0.0) + ranges * looks.bearing
+        near = np.isfinite(estimates.log_range) & (estimates.log_range < math.log(2 * self._parameters.max_range_m))
+        ranges = np.exp(np.where(near, estimates.log_range, 0.0))[:, None]
+        places = np.where(near[:, None], views.centres, 0.0) + ranges * estimates.bearing
         range_m = np.linalg.norm(places, axis=1)
         placed = range_m > 0.0
         for place in places[~placed]:
             self._drop(f"a place at {place.tolist()} m has no bearing")
         range_m = np.where(placed, range_m, 1.0)
-        log_range = np.where(near, np.log(range_m), looks.log_range)
-        return at[placed], looks._replace(bearing=places / range_m[:, None], log_range=log_range).take(placed)
+        log_range = np.where(near, np.log(range_m), estimates.log_range)
+        return at[placed], estimates._replace(bearing=places / range_m[:, None], log_range=log_range).take(placed)
 
     def _ranges(self, crops: Sequence[Crop]) -> list[RangeEstimate | None]:
         """One estimate a crop. Where the network fails on several, each half is tried by itself: one crop is lost."""
@@ -229,29 +232,29 @@ class Cascade:
             return [*self._ranges(crops[:half]), *self._ranges(crops[half:])]
 
     def _with_mirrored(
-        self, proposals: NDArray[Any], at: IntArray, aims: _Aims, shown: Looks
-    ) -> tuple[IntArray, Looks]:
-        """Each look together with what the mirror image of its crop says; without those that it contradicts."""
+        self, proposals: NDArray[Any], at: IntArray, aims: _Aims, shown: Estimates
+    ) -> tuple[IntArray, Estimates]:
+        """Each estimate together with what the mirror image of its crop says; without those that it contradicts."""
         if not len(at):
             return at, shown.take(at)
         mirrored = aims._replace(half_angle=self._rules.mirror_scale * aims.half_angle)
-        at, others = self._look(proposals, at, mirrored, mirrored=True)
-        looks = shown.take(at)
-        agree = self._is_in_range(others) & (np.minimum(looks.log_range_sigma, others.log_range_sigma) > 0)
-        both = looks.take(agree).mean(others.take(agree))
+        at, others = self._estimated(proposals, at, mirrored, mirrored=True)
+        estimates = shown.take(at)
+        agree = self._is_in_range(others) & (np.minimum(estimates.log_range_sigma, others.log_range_sigma) > 0)
+        both = estimates.take(agree).mean(others.take(agree))
         sigma = np.maximum(self._thresholds.mean_sigma * both.log_range_sigma, self._thresholds.min_log_range_sigma)
         return at[agree], both._replace(log_range_sigma=sigma)
 
-    def _aim(self, proposals: NDArray[Any], at: IntArray, aims: _Aims, looks: Looks) -> BoolArray:
+    def _aim(self, proposals: NDArray[Any], at: IntArray, aims: _Aims, estimates: Estimates) -> BoolArray:
         """Aims the next crops (n,), and tells which of them would show nearly the same as the last.
 
         They have the drones in their middle, or the proposals where no camera sees that direction.
         """
         first = np.array([one.roi.direction for one in proposals]).reshape(-1, 3)
-        direction = np.where(self._rig.covers(looks.bearing)[:, None], looks.bearing, first)
+        direction = np.where(self._rig.covers(estimates.bearing)[:, None], estimates.bearing, first)
         finest = pixel_angles(self._rig, [one.cameras for one in proposals], direction)
-        before, range_m, most = aims.half_angle[at], np.exp(looks.log_range), self._rules.max_resize
-        fitting = np.maximum(self._rules.fitting(looks.size_m, range_m), before / most)
+        before, range_m, most = aims.half_angle[at], np.exp(estimates.log_range), self._rules.max_resize
+        fitting = np.maximum(self._rules.fitting(estimates.size_m, range_m), before / most)
         half_angle = self._rules.bounded(np.minimum(fitting, before * most), finest)
         moved = angles_between(aims.direction[at], direction) / before
         resized = np.abs(np.log(half_angle / before))
@@ -259,10 +262,10 @@ class Cascade:
             column[at] = values
         return (moved < self._parameters.crop_shift) & (resized < math.log(self._parameters.crop_resize))
 
-    def _is_in_range(self, looks: Looks) -> BoolArray:
+    def _is_in_range(self, estimates: Estimates) -> BoolArray:
         """(n,), false for NaN too."""
         low, high = math.log(self._parameters.min_range_m), math.log(self._parameters.max_range_m)
-        return (low < looks.log_range) & (looks.log_range < high)
+        return (low < estimates.log_range) & (estimates.log_range < high)
 
     def _drop(self, why: str) -> None:
         self.reasons.append(Reason(ReasonKind.PROPOSAL, f"proposal: {why}"))

@@ -16,7 +16,7 @@ from flockd.flight.geometry import log_polar
 from flockd.flight.perception import Crop, Instance, Perception, RangeEstimate
 from flockd.flight.perception.detection.nms import fuse, suppress
 from flockd.flight.perception.detection.proposals import Proposal
-from flockd.flight.perception.detection.refinement import Candidate, Looks
+from flockd.flight.perception.detection.refinement import Candidate, Estimates
 from flockd.flight.perception.detection.roi import Roi
 from flockd.flight.perception.maps import KnownSize
 from tests.flight.pilot.flyer import Flyer, scenario_with
@@ -106,8 +106,8 @@ def test_range_is_size_over_apparent_size() -> None:
     size's, whatever the network said of that."""
     judged = np.array([0.8, 0.0, math.inf, math.nan])
     log_range, sigma, probability = (np.full(4, value) for value in (math.log(4.0), 0.03, 0.9))
-    looks = Looks(np.tile([1.0, 0.0, 0.0], (4, 1)), log_range, sigma, judged, probability, np.full(4, 0.3))
-    known = looks.of_size(KnownSize(0.5, 0.02))
+    estimates = Estimates(np.tile([1.0, 0.0, 0.0], (4, 1)), log_range, sigma, judged, probability, np.full(4, 0.3))
+    known = estimates.of_size(KnownSize(0.5, 0.02))
     assert np.exp(known.log_range) == pytest.approx([2.5, math.nan, math.nan, math.nan], nan_ok=True)
     assert (known.log_range_sigma[0], known.log_size_sigma[0]) == pytest.approx((0.03, 0.04))
     assert (known.size_m[0], known.drone_probability[0], known.bearing[0, 0]) == (0.5, 0.9, 1.0)
