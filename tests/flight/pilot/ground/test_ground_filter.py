@@ -15,6 +15,7 @@ from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, Reaso
 from flockd.flight.geometry import rotation_from_euler
 from flockd.flight.pilot import FlockPilot
 from flockd.flight.pilot.ground import GroundFilter
+from flockd.flight.pilot.ground.way_flown import WayMonitor
 from flockd.sim.autopilot.fake_range_finder import range_to_ground
 from tests.flight.pilot.flyer import Flyer, scenario_with
 from tests.make import changed, vehicle
@@ -153,3 +154,13 @@ def test_without_a_range_there_is_no_scale_and_neighbours_are_seen_all_the_same(
     assert [reason.kind for reason in output.reasons].count(ReasonKind.HEIGHT) == 1
     assert (output.ego_motion, output.ground) == (None, None)
     assert output.velocity == pytest.approx(flies), "as the autopilot says"
+
+
+@pytest.mark.parametrize(("by_barometer", "contradicts"), [(1.0, True), (2.5, False)])
+def test_the_way_flown_contradicts_a_range_only_where_the_barometer_fits_better(
+    by_barometer: float, contradicts: bool
+) -> None:
+    """At 2 m/s, twice as far by the range; what both scales get wrong is the images' or the autopilot's fault."""
+    flown, monitor = np.array([1.0, 0.0, 0.0]), WayMonitor(10.0)
+    found = [monitor.update(0.5, flown, 2.0 * flown, by_barometer * flown) for _ in range(40)]
+    assert any(found) is contradicts
