@@ -22,7 +22,7 @@ _SCALE = 0.03
 _AGES_M_S2 = 2.0
 """Standard deviation of a velocity for each second that it is from another time than the frames."""
 _MOST_M_S = 100.0
-"""An autopilot that says more knows no velocity."""
+"""An autopilot that says more knows no velocity, and no standard deviation is larger."""
 
 
 class OwnMotion:
@@ -71,7 +71,7 @@ class OwnMotion:
         error, variance = kept * self.error, kept**2 * self._variance + wandered
         mean, covariance = (self.error + error) / 2, (kept * self._variance + variance) / 2
         late_s = vehicle.time_s - before.time_s - interval_s
-        of_mean = ((1 + kept) * self._variance / 2 + covariance) / 2 + (_AGES_M_S2 * late_s) ** 2
+        of_mean = ((1 + kept) * self._variance / 2 + covariance) / 2 + min(_AGES_M_S2 * abs(late_s), _MOST_M_S) ** 2
         fits = True
         if by_images is not None:
             innovation = mean_said - by_images / interval_s - mean
