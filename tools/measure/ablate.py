@@ -114,7 +114,7 @@ def fly_here() -> None:
         raise SystemExit(f"{flockd.__file__} was imported, not the copy in {Path.cwd()}")
     for scenario, seed, seconds in json.loads(sys.argv[1]):
         of = SCENARIOS[scenario]
-        line = flown(Flight(scenario, "sight", seed, of.file, seconds, of.overrides(seed)))
+        line = flown(Flight(scenario, "sight", seed, of.file, seconds, of.overrides(seed, turn=0)))
         print(json.dumps({**line, "plan": [scenario, seed, seconds]}), flush=True)
 
 

@@ -52,6 +52,7 @@ from flockd.sim.renderer.airframe import DroneModel
 from flockd.sim.scenario import MIN_START_DISTANCE_M, ScenarioConfig, load_scenario
 from tools.measure import perceived_errors
 from tools.measure.labelled import Box, read_labels, scored
+from tools.measure.trouble import trouble
 from tools.training.own_mesh import painted, read_meshes
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -89,12 +90,16 @@ class Scenario:
     file: str
     quick: tuple[int, float | None]
     whole: tuple[int, float | None] = (20, None)
+    troubled: bool = False
+    """Something happens to one of five that fly in formation: see `tools.measure.trouble`."""
     varied: bool = False
     """Any airframe, the two that no network learnt among them; trees and houses nearer; wind with gusts; and in two
     of three flights a drone is taken over by its autopilot, which holds or lands."""
 
-    def overrides(self, seed: int) -> Overrides:
-        """What is flown otherwise than the file says."""
+    def overrides(self, seed: int, turn: int) -> Overrides:
+        """What the flight with this seed, the one with this number, flies otherwise than the file says."""
+        if self.troubled:
+            return trouble(seed, turn)
         if not self.varied:
             return {}
         wind, after = 2.0 * math.cos(seed), 8.0 + seed % 7
@@ -110,6 +115,7 @@ REAL_AIRFRAMES = "varied, real airframes"
 SCENARIOS = {
     "the paper's five drones": Scenario("paper_flight.yaml", (2, 30.0)),
     "varied": Scenario("paper_flight.yaml", (3, 20.0), varied=True),
+    "one of five in trouble": Scenario("paper_flight.yaml", (5, 18.0), (20, 18.0), troubled=True),
     "forest": Scenario("forest.yaml", (1, 20.0)),
     "fisheye": Scenario("fisheye_flight.yaml", (1, 15.0)),
     "head-on": Scenario("head_on.yaml", (6, None)),
@@ -174,8 +180,12 @@ def flights_of(
             worn: Sequence[Airframe | None] = airframes if name == REAL_AIRFRAMES else [None]
             count, duration_s = scenario.quick if quick else scenario.whole
             found += [
-                Flight(name, eyes, seed, scenario.file, duration_s, {**scenario.overrides(seed), **of.overrides}, one)
-                for seed, one in zip(seeds_of(commit, name, count)[:most], itertools.cycle(worn), strict=False)
+                Flight(
+                    name, eyes, seed, scenario.file, duration_s, {**scenario.overrides(seed, turn), **of.overrides}, one
+                )
+                for turn, (seed, one) in enumerate(
+                    zip(seeds_of(commit, name, count)[:most], itertools.cycle(worn), strict=False)
+                )
             ]
     return found
 
