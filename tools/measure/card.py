@@ -115,7 +115,7 @@ REAL_AIRFRAMES = "varied, real airframes"
 SCENARIOS = {
     "the paper's five drones": Scenario("paper_flight.yaml", (2, 30.0)),
     "varied": Scenario("paper_flight.yaml", (3, 20.0), varied=True),
-    "one of five in trouble": Scenario("paper_flight.yaml", (5, 18.0), (20, 18.0), troubled=True),
+    "one of five in trouble": Scenario("paper_flight.yaml", (4, 15.0), (21, 18.0), troubled=True),
     "forest": Scenario("forest.yaml", (1, 20.0)),
     "fisheye": Scenario("fisheye_flight.yaml", (1, 15.0)),
     "head-on": Scenario("head_on.yaml", (6, None)),
