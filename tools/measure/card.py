@@ -83,6 +83,10 @@ EYES = {
 }
 
 
+Airframe = tuple[str, float]
+"""The file of its mesh, and metres from propeller tip to tip."""
+
+
 @dataclass(frozen=True)
 class Scenario:
     """What is flown, how often, and for how long; `quick` and `whole`: flights and seconds, None: the file's."""
@@ -96,8 +100,10 @@ class Scenario:
     """Any airframe, the two that no network learnt among them; trees and houses nearer; wind with gusts; and in two
     of three flights a drone is taken over by its autopilot, which holds or lands."""
 
-    def overrides(self, seed: int, turn: int) -> Overrides:
+    def overrides(self, seed: int, turn: int, airframe: Airframe | None = None) -> Overrides:
         """What the flight with this seed, the one with this number, flies otherwise than the file says."""
+        if airframe is not None:
+            return {**self.overrides(seed, turn), "drone.perception.drone_size_m": airframe[1]}
         if self.troubled:
             return trouble(seed, turn)
         if not self.varied:
@@ -111,7 +117,7 @@ class Scenario:
 
 
 REAL_AIRFRAMES = "varied, real airframes"
-"""Flown with the meshes that are given, one after another."""
+"""Flown with the meshes that are given, one after another; their size is said, as a drone's template asks for it."""
 SCENARIOS = {
     "the paper's five drones": Scenario("paper_flight.yaml", (2, 30.0)),
     "varied": Scenario("paper_flight.yaml", (3, 20.0), varied=True),
@@ -121,10 +127,6 @@ SCENARIOS = {
     "head-on": Scenario("head_on.yaml", (6, None)),
     REAL_AIRFRAMES: Scenario("paper_flight.yaml", (3, 20.0), (10, None), varied=True),
 }
-
-
-Airframe = tuple[str, float]
-"""The file of its mesh, and metres from propeller tip to tip."""
 
 
 @dataclass(frozen=True)
@@ -181,8 +183,14 @@ def flights_of(
             count, duration_s = scenario.quick if quick else scenario.whole
             found += [
                 Flight(
-                    name, eyes, seed, scenario.file, duration_s, {**scenario.overrides(seed, turn), **of.overrides}, one
-                )
+                    name,
+                    eyes,
+                    seed,
+                    scenario.file,
+                    duration_s,
+                    {**scenario.overrides(seed, turn, one), **of.overrides},
+                    one,
+                )  # fmt: skip
                 for turn, (seed, one) in enumerate(
                     zip(seeds_of(commit, name, count)[:most], itertools.cycle(worn), strict=False)
                 )

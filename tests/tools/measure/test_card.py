@@ -153,6 +153,7 @@ def test_real_airframes_are_flown_in_turn_where_they_are_given(tmp_path: Path) -
     airframes = [(str(tmp_path / "bar.glb"), 0.7), (str(tmp_path / "none.glb"), 0.7)]
     flights = [one for one in flights_of(COMMIT, quick=True, airframes=airframes) if one.scenario == REAL_AIRFRAMES]
     assert [one.airframe for one in flights[:3]] == [airframes[0], airframes[1], airframes[0]]
+    assert flights[0].flown().drone.perception.drone_size_m == 0.7
     shapes = flights[0].models()
     assert shapes is not None
     assert len(shapes) == 5
