@@ -190,7 +190,7 @@ def flights_of(
                     duration_s,
                     {**scenario.overrides(seed, turn, one), **of.overrides},
                     one,
-                )  # fmt: skip
+                )
                 for turn, (seed, one) in enumerate(
                     zip(seeds_of(commit, name, count)[:most], itertools.cycle(worn), strict=False)
                 )
