@@ -29,10 +29,10 @@ LINES = {
     "flockd/sim": 8_550,
     "flockd/campaign": 1_470,
     "flockd/cli": 3_430,
-    "tests": 36_170,
+    "tests": 36_200,
     "tools/checks": 2_060,
     "tools/docs": 770,
-    "tools/measure": 1_300,
+    "tools/measure": 1_390,
     "tools/release": 550,
     "tools/training": 4_330,
 }
