@@ -8,12 +8,10 @@ from dataclasses import replace
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.messages import Float32Array, Frame, FrameSet, GroundEstimate, Reason, ReasonKind, VehicleState
 from flockd.flight.geometry import RangeMap, Rig, ground_inverse_depth
-from flockd.flight.perception.continuity import ContinuityMonitor
 from flockd.flight.perception.detection.detector import DetectionTrace, Detector
 from flockd.flight.perception.detection.masks import depth_of_drones, without_borders
-from flockd.flight.perception.image_noise import NoiseMonitor
+from flockd.flight.perception.image_monitor import ImageMonitor
 from flockd.flight.perception.interface import CAMERA_FAULTS, ImagePair, ImageView, Networks
-from flockd.flight.perception.lens import LensMonitor
 from flockd.flight.perception.maps import KnownSize, SceneMaps
 from flockd.flight.perception.metric_depth import metric_depth
 from flockd.flight.perception.observation import CameraObservation, Observation
@@ -31,9 +29,7 @@ class Perception:
         self._said_size = None if size_m is None else KnownSize(size_m, config.drone_size_sigma_m)
         self._detector = Detector(rig, networks, config.detection)
         self._needs_ground = config.scale == "height"
-        self._noise = NoiseMonitor(config.noise)
-        self._continuity = ContinuityMonitor(config.noise)
-        self._lens = LensMonitor(rig.cameras, config.noise)
+        self._monitor = ImageMonitor(rig.cameras, config.noise)
         self._last: Observation | None = None
 
     def observe(
@@ -80,7 +76,7 @@ class Perception:
 
     def _usable(self, frames: FrameSet, vehicle: VehicleState) -> tuple[dict[str, Frame], tuple[str, ...], Reasons]:
         """Frames of the right size that show a scene, cameras whose show noise, damage or too little, and why."""
-        usable, noisy, reasons = {}, [], []
+        usable, reasons = {}, []
         for name, camera in self._rig.cameras.items():
             width, height = camera.camera.size
             frame = frames.frames.get(name)
@@ -89,23 +85,13 @@ class Perception:
             elif frame.image.shape != (height, width, 3):
                 found = f"{frame.image.shape[1]}x{frame.image.shape[0]}"
                 reasons.append(_of_camera(name, f"its image is {found} and not {width}x{height}"))
-            elif self._noise.is_noisy(name, frame.image, frames.time_s):
-                noisy.append(name)
-                reasons.append(_of_camera(name, "its image is noise"))
             else:
                 usable[name] = frame
         images = {name: frame.image for name, frame in usable.items()}
-        for name in self._continuity.broken(images, frames.time_s, vehicle.R_ned_body):
-            noisy.append(name)
-            reasons.append(_of_camera(name, "its image does not follow from the one before"))
+        faults = self._monitor.faults(images, frames.time_s, vehicle.R_ned_body)
+        for name in faults:
             del usable[name]
-        images = {name: frame.image for name, frame in usable.items()}
-        for name, fault in self._lens.bad(images, frames.time_s, vehicle.R_ned_body).items():
-            noisy.append(name)
-            reasons.append(Reason(ReasonKind.LENS, f"camera {name}: {fault}"))
-            self._noise.forget(name)
-            del usable[name]
-        return usable, tuple(noisy), reasons
+        return usable, tuple(faults), [*reasons, *faults.values()]
 
     def _scenes(
         self, frames: Mapping[str, Frame], vehicle: VehicleState, ground: GroundEstimate | None
