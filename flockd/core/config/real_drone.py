@@ -1,14 +1,14 @@
-"""How fast real drones may fly: the envelope in which they were shown to keep apart, and their first flights."""
+"""How fast real drones may fly: the speed from which they stop in time, and their first flights."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 
-from flockd.core.config.document import KeyPath, Place
+from flockd.core.config.document import KeyPath, Place, key_text
 from flockd.core.config.drone import DroneConfig
 from flockd.core.config.mission import MissionParameters
-from flockd.core.config.safety import layer_height_m
+from flockd.core.config.safety import GateParameters, layer_height_m
 from flockd.core.errors import ConfigProblem
 
 FIRST_SPEED_M_S = 1.0
@@ -48,30 +48,59 @@ def _slow(speed_m_s: float | None) -> float | None:
     return None if speed_m_s is None else min(speed_m_s, FIRST_SPEED_M_S)
 
 
-PROVEN_M_S: Mapping[KeyPath, float] = {("flocking", "max_speed_m_s"): 2.0, ("safety", "gate", "max_speed_m_s"): 4.0}
-"""The highest proven speed, by key: what a drone asks for, over ground, and what its gate lets through, corrections for
-wind and for the autopilot's own error included. No mission or order is faster than the first.
+_KNOWN_M = 10.0
+"""From how far away drones that meet know each other. The shipped networks know 98 % and more of the neighbours up to
+8 m away, and four of ten at 11.5 m (`config/perceived/shipped_networks.yaml`)."""
+_RANGE_ERROR = 0.06
+"""By which share of its range a neighbour is nearer than it seems, for seconds: two standard deviations of what lasts
+of the shipped networks' errors (`range_error` there, times the root of `tracking.range_error_lasts`)."""
 
-Source: what the shipped networks see. They know 98 % and more of the neighbours up to 8 m away, four of ten at 11.5 m
-(`config/perceived/shipped_networks.yaml`), and head-on by sight drones keep 1 m at up to 2 m/s each
-(`config/campaigns/head_on_by_sight.yaml`, docs/results.md). Where detections begin at 10 m and more, tracker and gate
-keep drones apart at up to 3 m/s each (`config/campaigns/encounters.yaml`): that is the law's default, not this.
-"""
+
+def safe_speeds(config: DroneConfig) -> tuple[float, float]:
+    """The speeds v, m/s, up to which a drone keeps `min_separation_m` s: behind a mate that stops; before one it meets.
+
+    What a neighbour begins shows in the drone's own velocity after t = step_s (1 + degraded_load) + reaction_s: the
+    step in which it was seen last, the next, which takes as long at most while the drone is not degraded, and the
+    drone's response. Then the drone brakes by b = `braking_m_s2`. Ranges err by the share e.
+
+    A mate ahead, at d = `desired_distance_m`, stops by a = `max_acceleration_m_s2`, as the gate reckons with (one that
+    brakes less than the drone counts as braking alike): v t + v^2 / 2b - v^2 / 2a = d (1 - e) - s.
+    One that comes as fast, known from R on, does as the drone does: 2 (v t + v^2 / 2b) = R (1 - e) - s.
+
+    Source: Shalev-Shwartz et al. 2017, "On a formal model of safe and scalable self-driving cars", definitions 1 and 2,
+    with nobody speeding up.
+    """
+    gate, load = config.safety.gate, config.safety.degraded_load
+    late_s = config.step_s * (1.0 + load) + gate.reaction_s
+    per_square = 1.0 / (2.0 * gate.braking_m_s2)
+
+    def solved(left_m: float, per_square: float) -> float:
+        """v late_s + v^2 per_square = left_m; 0 where none is left."""
+        return 2.0 * max(left_m, 0.0) / (late_s + math.sqrt(late_s**2 + 4.0 * per_square * max(left_m, 0.0)))
+
+    left_m = config.flocking.desired_distance_m * (1.0 - _RANGE_ERROR) - gate.min_separation_m
+    behind_m_s = solved(left_m, max(per_square - 1.0 / (2.0 * gate.max_acceleration_m_s2), 0.0))
+    return behind_m_s, solved((_KNOWN_M * (1.0 - _RANGE_ERROR) - gate.min_separation_m) / 2.0, per_square)
 
 
 def beyond_envelope(config: DroneConfig) -> dict[KeyPath, str]:
-    """What of a drone's speeds is outside the envelope, by key; nothing for one without an autopilot."""
+    """Which speeds are too high, and what to do, by key; nothing for a drone without an autopilot."""
     if config.autopilot is None:
         return {}
-    flown: Mapping[KeyPath, float] = {
-        ("flocking", "max_speed_m_s"): config.flocking.max_speed_m_s,
-        ("safety", "gate", "max_speed_m_s"): config.safety.gate.max_speed_m_s,
+    law_m_s, gate_m_s, usual_m_s = (of.max_speed_m_s for of in (config.flocking, config.safety.gate, GateParameters()))
+    behind_m_s, meeting_m_s = safe_speeds(config)
+    safe_m_s = math.floor(100 * min(behind_m_s, meeting_m_s)) / 100
+    whom, more = "one that comes as fast", ", or a smaller step_s"
+    if behind_m_s < meeting_m_s:
+        whom, more = "a mate that stops", ", or a larger flocking.desired_distance_m or a smaller step_s"
+    speeds: dict[KeyPath, tuple[float, float, str, str]] = {
+        ("flocking", "max_speed_m_s"): (law_m_s, safe_m_s, f"from which the drone stops in time before {whom}", more),
+        ("safety", "gate", "max_speed_m_s"): (gate_m_s, usual_m_s, "that real drones' gates let through", ""),
     }
     return {
-        key: f"{flown[key]:g} m/s is above the {most:g} m/s up to which drones were shown to keep apart; "
-        f"write {most:g} or less, or go beyond it with --force"
-        for key, most in PROVEN_M_S.items()
-        if flown[key] > most
+        key: f"{flown:g} m/s is above the {most:g} m/s {why}; write {most:g} or less{more}, or take it with --force"
+        for key, (flown, most, why, more) in speeds.items()
+        if flown > most
     }
 
 
@@ -81,6 +110,6 @@ def outside_envelope(config: DroneConfig, places: Mapping[KeyPath, Place]) -> li
     return [
         places[key].problem(text)
         if key in places
-        else ConfigProblem(file, 0, ".".join(map(str, key)), f"is not given, and its default of {text}")
+        else ConfigProblem(file, 0, key_text(key), f"is not given, and its default of {text}")
         for key, text in beyond_envelope(as_flown(config)).items()
     ]

@@ -110,7 +110,7 @@ class FlockPilot:
         by_height = config.perception.scale == "height"
         self._ground = GroundFilter(config.perception.height, config.perception.range_finder) if by_height else None
         self._agreement = CameraAgreement(self._rig)
-        self._tracker = Tracker(config.tracking)
+        self._tracker = Tracker(config.tracking, config.safety.gate)
         self._size = SizeLearner(config, learned, flies=flies)
         self._law = FlockingLaw(config.flocking)
         self._passing = Passing(self._law, config.safety.gate.vertical_separation_m)

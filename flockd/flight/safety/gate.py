@@ -123,15 +123,13 @@ class Gate:
 
     def _faults(self, wanted: Wanted, around: Surroundings) -> list[Objection]:
         """Why what is wanted may not move the drone at all."""
-        p, positions = self._parameters, np.hstack([around.neighbours, around.neighbour_velocities])
+        p, neighbours = self._parameters, np.hstack([around.neighbours, around.neighbour_velocities])
+        known = np.isfinite(neighbours).all() and (around.neighbour_margins > -math.inf).all()
         faults = (
             (Objection.COMMAND_NOT_FINITE, not np.isfinite(wanted.velocity).all()),
             (Objection.COMMAND_TOO_LARGE, math.hypot(*wanted.velocity) > p.max_speed_m_s),
             (Objection.POSITION_UNKNOWN, outside_fence(p, around.position) and not np.isfinite(around.position).all()),
-            (
-                Objection.NEIGHBOUR_UNKNOWN,
-                not (np.isfinite(positions).all() and (around.neighbour_margins > -math.inf).all()),
-            ),
+            (Objection.NEIGHBOUR_UNKNOWN, not known),
             (Objection.OBSTACLE_UNKNOWN, not np.isfinite(around.obstacles).all()),
         )
         return [objection for objection, holds in faults if holds]

@@ -24,8 +24,6 @@ _LASTS_S = 20.0
 """How long a neighbour flies in one of the ways, on average, before another may begin."""
 _HARDER = 2.0
 """By how much harder one manoeuvres that is on its own course: its accelerations, standard deviation."""
-_BRAKES_M_S2 = 5.0
-"""How hard a neighbour brakes: as vehicles' gates let them (`safety.gate.max_acceleration_m_s2`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,12 +122,13 @@ def predicted(
     own_displacement: FloatArray | None,
     own_displacement_sigma_m: float,
     parameters: TrackingParameters,
+    braking_m_s2: float,
 ) -> Mixture:
     """`interval_s` later: motions mixed, and each with white acceleration noise.
 
     `own_displacement` (3,) NED metres is the way the own drone went meanwhile, with its standard deviation an axis.
     None: not known; the neighbour then stays where it is relative to the own drone, as flock mates move alike. Its log
-    size drifts by `size_drift`.
+    size drifts by `size_drift`. One that brakes does so by `braking_m_s2`.
     """
     p, dt = parameters, interval_s
     probability, mean, covariance = _interacted(mixture, dt, p)
@@ -143,7 +142,7 @@ def predicted(
         kept[:, 0] = math.exp(-dt / alike_s)
         way_s[:, 0] = alike_s * (1.0 - kept[:, 0])
         squared_speed = (mean[:, 2, 3:6] ** 2).sum(axis=-1) + np.einsum("nxx->n", covariance[:, 2, 3:6, 3:6])
-        stops_s = np.maximum(np.sqrt(squared_speed) / _BRAKES_M_S2, JITTER_S)
+        stops_s = np.maximum(np.sqrt(squared_speed) / braking_m_s2, JITTER_S)
         brakes_s = np.minimum(stops_s, dt)
         kept[:, 2] = 1.0 - brakes_s / stops_s
         way_s[:, 2] = brakes_s * (1.0 + kept[:, 2]) / 2

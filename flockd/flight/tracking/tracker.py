@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flockd.core.config.safety import GateParameters
 from flockd.core.config.tracking import JITTER_S, TrackingParameters
 from flockd.core.messages import BoolArray, FloatArray, Neighbour
 from flockd.flight.tracking import existence, filter, imm  # noqa: A004 - the field's word
@@ -49,8 +50,10 @@ class Tracker:
     Every step: `predict`, then `update`, with no measurements too; then `neighbours`. Deterministic.
     """
 
-    def __init__(self, parameters: TrackingParameters | None = None) -> None:
+    def __init__(self, parameters: TrackingParameters | None = None, gate: GateParameters | None = None) -> None:
+        """A neighbour that brakes does so as hard as its gate lets it, which is like the own drone's `gate`."""
         self.parameters = parameters or TrackingParameters()
+        self._braking_m_s2 = (gate or GateParameters()).max_acceleration_m_s2
         self._tracks: list[_Track] = []
         self._motions = imm.nobody()
         """Of the tracks, in their order."""
@@ -69,7 +72,7 @@ class Tracker:
         grow uncertain by `relative_speed_sigma_m_s`.
         """
         self._motions = imm.predicted(
-            self._motions, interval_s, own_displacement, own_displacement_sigma_m, self.parameters
+            self._motions, interval_s, own_displacement, own_displacement_sigma_m, self.parameters, self._braking_m_s2
         )
         for track in self._tracks:
             track.existence = self._survives(track, interval_s)
@@ -127,15 +130,10 @@ class Tracker:
         """
         displacement = None if own_velocity is None else interval_s * own_velocity
         known = [index for index, track in enumerate(self._tracks) if track.was_confirmed]
-        later = imm.predicted(self._motions[known], interval_s, displacement, 0.0, self.parameters).together
+        later = imm.predicted(self._motions[known], interval_s, displacement, 0.0, self.parameters, self._braking_m_s2)
         return tuple(
-            Prediction(
-                position=mean[:3],
-                size_m=math.exp(mean[6]),
-                existence_probability=self._tracks[index].drone_probability
-                * self._survives(self._tracks[index], interval_s),
-            )
-            for index, mean in zip(known, later.mean[:, 0], strict=True)
+            Prediction(mean[:3], math.exp(mean[6]), track.drone_probability * self._survives(track, interval_s))
+            for track, mean in zip([self._tracks[index] for index in known], later.together.mean[:, 0], strict=True)
         )
 
     def resize(self, size_m: float, own_velocity: FloatArray | None) -> None:

@@ -134,7 +134,7 @@ class TrackedNeighbours:
     def __init__(self, scenario: ScenarioConfig, config: DetectionsConfig, drone: int) -> None:
         self._config, self._drone, self._step_s = config, drone, scenario.drone.step_s
         self._scenario, self._rig = scenario, build_rig(scenario.drone.rig)
-        self._tracker = Tracker(scenario.drone.tracking)
+        self._tracker = Tracker(scenario.drone.tracking, scenario.drone.safety.gate)
         self._random = np.random.default_rng([scenario.seed, drone])
         self._errors = self._random.normal(size=(len(scenario.vehicles) - 1, 5))
         """Of each other drone, in standard deviations: of the range's logarithm and the bearing (3), and the normal

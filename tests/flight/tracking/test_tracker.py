@@ -46,8 +46,9 @@ class Follower:
     """A tracker of an own drone that cruises north at 1 m/s by a true heading, and its clock."""
 
     def __init__(self, **parameters: Any) -> None:
-        parameters = {"heading_sigma_rad": 0.0, **parameters}
-        self.tracker, self.time_s = Tracker(TrackingParameters(**parameters)), -math.inf
+        gate = GateParameters(max_acceleration_m_s2=parameters.pop("max_acceleration_m_s2", 5.0))
+        tracking = TrackingParameters(**{"heading_sigma_rad": 0.0, **parameters})
+        self.tracker, self.time_s = Tracker(tracking, gate), -math.inf
 
     def step(
         self,
@@ -456,6 +457,15 @@ def test_probabilities_that_do_not_increase_are_refused() -> None:
 def test_a_measurement_that_is_no_number_is_refused(bad: dict[str, Any], reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         replace(_seen(AHEAD), **bad)
+
+
+@pytest.mark.parametrize(("limit_m_s2", "slowest_m_s"), [(5.0, (0.0, 0.0)), (0.5, (0.3, 0.9))])
+def test_one_that_brakes_does_so_as_hard_as_gates_let_it(limit_m_s2: float, slowest_m_s: tuple[float, float]) -> None:
+    """A mate at 1 m/s may stand half a second after it was seen, where gates allow more than 2 m/s^2."""
+    one = Follower(max_acceleration_m_s2=limit_m_s2).steps(8, AHEAD)
+    one.tracker.predict(STEP_S, STEP_S * CRUISE)
+    low, high = slowest_m_s
+    assert low <= min(math.hypot(*motion.velocity) for motion in one.all[0].possible) <= high
 
 
 def test_one_lie_of_the_own_motion_changes_no_track() -> None:

@@ -9,8 +9,6 @@ import pytest
 
 from flockd.campaign.flight_plan import CASE, Cell, Plan
 from flockd.core.config.mission import MissionParameters
-from flockd.core.config.real_drone import PROVEN_M_S
-from flockd.flight.flocking import FlockingLaw
 from flockd.review.metrics import closest_distances
 from flockd.sim.flock.exact_states import fly_exact_states
 from flockd.sim.scenario import ScenarioConfig, StartConfig, load_scenario
@@ -49,16 +47,8 @@ def head_on(speed_m_s: float, seed: int, **detections: Any) -> ScenarioConfig:
     return ENCOUNTER.model_copy(update=changes)
 
 
-SPEEDS_M_S = 1.5, 2.0, 3.0
-
-
-def test_what_flies_here_is_as_fast_as_the_law_and_faster_than_real_drones_may() -> None:
-    assert max(SPEEDS_M_S) == FlockingLaw().parameters.max_speed_m_s > PROVEN_M_S["flocking", "max_speed_m_s"]
-    assert ENCOUNTER.drone.safety.gate.max_speed_m_s == PROVEN_M_S["safety", "gate", "max_speed_m_s"]
-
-
 @pytest.mark.parametrize("seeds", [range(3), pytest.param(range(3, 12), marks=pytest.mark.slow)], ids=["few", "many"])
-@pytest.mark.parametrize("speed_m_s", SPEEDS_M_S)
+@pytest.mark.parametrize("speed_m_s", [1.5, 2.0, 3.0])
 def test_drones_that_meet_head_on_stay_apart(speed_m_s: float, seeds: range) -> None:
     """At least 1 m apart at every instant, with 5 % of range error, 5 % missed and a step every half second."""
     assert min(nearest_m(head_on(speed_m_s, seed)) for seed in seeds) >= 1.0
@@ -68,7 +58,7 @@ def test_drones_that_meet_head_on_stay_apart(speed_m_s: float, seeds: range) -> 
 def test_ranges_that_err_much_and_many_misses_bring_nobody_together(
     range_error: float, missed: float, least_m: float
 ) -> None:
-    """At the speed that is proven. With both, of which networks are far, drones do not touch."""
+    """Faster than real drones may. With both, of which networks are far, drones do not touch."""
     apart_m = [nearest_m(head_on(2.0, seed, range_error=range_error, missed=missed)) for seed in range(3)]
     assert min(apart_m) >= least_m
 
