@@ -29,7 +29,7 @@ LINES = {
     "flockd/sim": 8_550,
     "flockd/campaign": 1_470,
     "flockd/cli": 3_430,
-    "tests": 36_240,
+    "tests": 36_260,
     "tools/checks": 2_060,
     "tools/docs": 770,
     "tools/measure": 1_390,
@@ -38,7 +38,7 @@ LINES = {
 }
 """Lines of Python below a folder."""
 FILES = {"flockd": 328}
-NUMBERS_OF_FLIGHT = 298
+NUMBERS_OF_FLIGHT = 297
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
 """A budget that is farther above what there is is to be lowered."""
