@@ -18,6 +18,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
 from flockd.core.data import data_path
 from flockd.core.messages import (
+    SECTORS,
     Detection,
     FloatArray,
     Frame,
@@ -83,7 +84,7 @@ def around(
     near, points = np.reshape(np.array(neighbours, float), (-1, 3)), np.reshape(np.array(obstacles, float), (-1, 2))
     here, moves = np.array(position, float), np.array(velocity, float)
     none, now = np.zeros((len(near), 2)), np.zeros(len(near))
-    nearby = Surroundings(here, moves, 0.5, near, none, 5.0, points, none, now)
+    nearby = Surroundings(here, moves, 0.5, near, none, 5.0, points, none, now, np.full(SECTORS, np.inf))
     return replace(nearby, **_arrays(fields))
 
 

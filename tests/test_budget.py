@@ -21,15 +21,15 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 2_990,
-    "flockd/flight": 11_330,
+    "flockd/flight": 11_320,
     "flockd/onboard": 9_010,
     "flockd/fleet": 2_670,
     "flockd/ground": 4_030,
     "flockd/review": 3_510,
-    "flockd/sim": 8_550,
+    "flockd/sim": 8_560,
     "flockd/campaign": 1_470,
     "flockd/cli": 3_430,
-    "tests": 36_260,
+    "tests": 36_440,
     "tools/checks": 2_060,
     "tools/docs": 770,
     "tools/measure": 1_390,
@@ -38,7 +38,7 @@ LINES = {
 }
 """Lines of Python below a folder."""
 FILES = {"flockd": 328}
-NUMBERS_OF_FLIGHT = 297
+NUMBERS_OF_FLIGHT = 291
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
 """A budget that is farther above what there is is to be lowered."""

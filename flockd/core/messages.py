@@ -408,5 +408,7 @@ class PilotOutput:
     """From the range finder, or the barometer in its place; None: no range finder is wanted, or there is no scale."""
     obstacles: ObstacleRanges | None = None
     """The local map; None where obstacles are not looked for."""
+    seen_m: Sectors | None = None
+    """(n,) metres: that of the local map, always: how far cameras looked lately; None: of a simulation without any."""
     size: SizeStatus | None = None
     """None while nothing is learned of the neighbours' size."""

@@ -8,9 +8,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from flockd.core.messages import Frame
+from flockd.core.navigation import wrapped
 from tests.calm import clock
 from tests.faults.conftest import InTheAir
 from tests.faults.process import Process, flying
@@ -106,6 +108,21 @@ async def test_one_of_two_cameras_is_gone_and_comes_back(in_flight: InTheAir, re
         ship.cameras.silent.clear()
         await ship.until_matters(over=("camera_lost",))
         await ship.until_state("normal")
+
+
+@pytest.mark.fault("blind-sector", within_s=4.5)
+async def test_the_camera_ahead_is_gone_for_good(in_flight: InTheAir, reacted: Reacted) -> None:
+    """The drone flies north and is slower, then stands, and turns: the other camera of the two looks back."""
+    async with in_flight() as ship:
+        await until(lambda: ship.speed() > 0.5, SECONDS_TO_FAIL)
+        heading_rad = ship.fake_autopilot.setpoints[-1][1].yaw_rad
+        ship.cameras.silent.add("front")
+        fault_s = clock()
+        await until(lambda: float(np.hypot(*ship.fake_autopilot.setpoints[-1][1].velocity)) < 0.01, SECONDS_TO_FAIL)
+        reacted("blind-sector", clock() - fault_s)
+        turned_rad = abs(wrapped(ship.fake_autopilot.setpoints[-1][1].yaw_rad - heading_rad))
+        assert turned_rad == pytest.approx(0.2 * (clock() - fault_s), abs=0.3)
+        assert ship.fake_autopilot.mode == "OFFBOARD"
 
 
 @pytest.mark.fault("time-stamps-jump", within_s=4.0)

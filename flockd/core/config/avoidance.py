@@ -18,7 +18,7 @@ class ObstacleParameters(Section):
     enabled: bool = False
     """Whether obstacles are looked for and avoided. Without it trees and walls are seen, but not flown around."""
     range_m: _Metres = 15.0
-    """Farther obstacles do not count."""
+    """Farther obstacles do not count, and cameras count as seeing no farther, whether obstacles are avoided or not."""
     height_band_m: _Metres = 0.75
     """What is higher or lower than the drone by more is no obstacle: room for its rotors and for errors in height."""
     below_m: _Metres = 1.5
@@ -28,7 +28,7 @@ class ObstacleParameters(Section):
     min_pixels: Annotated[int, Field(ge=1, le=10_000)] = 4
     """So many of a sector's pixels, every fourth of each row and column, have to show an obstacle."""
     memory_s: _Seconds = 3.0
-    """For how long an obstacle that is not seen any more stays in the map."""
+    """For how long what is not seen any more stays in the map: an obstacle, and that nobody is in a direction."""
     clearance_m: Annotated[float, Field(gt=0, le=20)] = 0.9
     """From the drone's middle to an obstacle's surface: nearer than this, away from it."""
     margin_m: Annotated[float, Field(ge=0, le=20)] = 0.5

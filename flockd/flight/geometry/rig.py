@@ -50,11 +50,11 @@ class Rig:
             if camera.name != name:
                 raise ValueError(f"camera {camera.name!r} is filed under the name {name!r}")
 
-    def covers(self, directions: FloatArray) -> BoolArray:
-        """Mask (n,): which body directions (n, 3) are in view of any camera."""
+    def covers(self, directions: FloatArray, without: Set[str] = frozenset()) -> BoolArray:
+        """Mask (n,): which body directions (n, 3) are in view of any camera but those named."""
         seen = np.zeros(len(directions), dtype=np.bool_)
-        for camera in self.cameras.values():
-            seen |= np.isfinite(camera.pixels_of_directions(directions)[:, 0])
+        for name in self.cameras.keys() - without:
+            seen |= np.isfinite(self.cameras[name].pixels_of_directions(directions)[:, 0])
             if seen.all():
                 break
         return seen
@@ -62,11 +62,6 @@ class Rig:
     def pixels_of(self, points_body: FloatArray) -> dict[str, FloatArray]:
         """For each camera the (n, 2) pixels of body points (n, 3); NaN rows where the point is not in its image."""
         return {name: camera.pixels_of_points(points_body) for name, camera in self.cameras.items()}
-
-    def hidden(self, points_body: FloatArray, gone: Set[str]) -> BoolArray:
-        """Mask (n,): which body points (n, 3) only cameras that are `gone` would show."""
-        hidden: BoolArray = self.shows(points_body) & ~self.shows(points_body, without=gone)
-        return hidden
 
     def shows(self, points_body: FloatArray, radius_m: float = 0.0, without: Set[str] = frozenset()) -> BoolArray:
         """Mask (n,): around which body points (n, 3) any camera but those named images all within `radius_m`."""

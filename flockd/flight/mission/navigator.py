@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,14 +11,18 @@ from flockd.core.config.mission import MissionParameters, WaypointParameters
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray, MissionOrder, MissionStatus
 from flockd.core.navigation import wrapped
+from flockd.flight.geometry import Rig
 from flockd.flight.mission.circle_then_tangent import CircleThenTangent
-from flockd.flight.mission.guidance import Guidance, Mission, Moment
+from flockd.flight.mission.guidance import Guidance, Mission, Moment, course_of
 from flockd.flight.mission.operator import Operator
 from flockd.flight.mission.velocity import Follow, Hover, Velocity
 from flockd.flight.mission.waypoints import Waypoints
+from flockd.flight.obstacles import AZIMUTHS, in_view
 
 MAX_TURN_RAD_S = 0.2
 """How fast the heading follows the course, but on the paper's circle: cameras that turn faster see less."""
+_BESIDE = 3
+"""Sectors to both sides of the course that have to be in view too: a neighbour in them is wholly in the image."""
 
 
 class Navigator:
@@ -80,6 +85,34 @@ class Navigator:
         most_rad = MAX_TURN_RAD_S * max(time_s - self._turned_s, 0.0)
         turn_rad = wrapped(wanted_rad - before_rad)
         return before_rad + min(max(turn_rad, -most_rad), most_rad)
+
+
+class Lookout:
+    """Turns the heading so that a camera looks where the drone flies, if one is lost or the rig has a gap."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self._time_s = math.inf
+        self.turn_rad = 0.0
+        """By which the heading was turned last."""
+
+    def heading(self, time_s: float, heading_rad: float, velocity: FloatArray, gone: frozenset[str]) -> float:
+        """To fly with by now instead of `heading_rad`, for a drone that wants to fly with `velocity` (2,) m/s.
+
+        `gone`: the cameras that give no image. It turns so slowly that one which misses a frame hardly matters.
+        """
+        course_rad, wanted_rad = course_of(velocity), self.turn_rad
+        if course_rad is not None:
+            ahead_rad, wanted_rad = course_rad - heading_rad, 0.0
+            view, beside = in_view(self._rig, gone), np.arange(-_BESIDE, _BESIDE + 1)
+            if not view.take(round(ahead_rad / AZIMUTHS[1]) + beside, mode="wrap").all():
+                clear = np.all([np.roll(view, k) for k in beside], axis=0)
+                turns_rad = [wrapped(ahead_rad - at_rad) for at_rad in AZIMUTHS[clear]]
+                wanted_rad = min(turns_rad, key=lambda turn_rad: abs(turn_rad - self.turn_rad), default=0.0)
+        most_rad = MAX_TURN_RAD_S * max(time_s - self._time_s, 0.0)
+        self.turn_rad += min(max(wanted_rad - self.turn_rad, -most_rad), most_rad)
+        self._time_s = time_s
+        return wrapped(heading_rad + self.turn_rad)
 
 
 def ordered_mission(configured: MissionParameters, order: MissionOrder) -> MissionParameters:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from flockd.flight.obstacles.avoidance import Avoidance
-from flockd.flight.obstacles.local_map import DIRECTIONS, LocalMap, nearest_points
+from flockd.flight.obstacles.local_map import AZIMUTHS, LocalMap, in_view, nearest_points, nothing_found
 from flockd.flight.obstacles.ranging import ObstacleRanging
 
-__all__ = ["DIRECTIONS", "Avoidance", "LocalMap", "ObstacleRanging", "nearest_points"]
+__all__ = ["AZIMUTHS", "Avoidance", "LocalMap", "ObstacleRanging", "in_view", "nearest_points", "nothing_found"]

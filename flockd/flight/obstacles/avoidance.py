@@ -11,13 +11,10 @@ from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray, ObstacleRanges
 from flockd.flight.flocking import FlockingLaw, level_offsets, lookahead_s
 from flockd.flight.geometry.level import limit_norm
-from flockd.flight.obstacles.local_map import nearest_points, sector_of
+from flockd.flight.obstacles.local_map import nearest_points
 from flockd.flight.obstacles.steering import Steering
 from flockd.flight.safety.approach import stopping_speed, towards_flying_on, towards_obstacles
 from flockd.flight.safety.half_planes import nearest_within
-
-AWAY_PER_S = 1.0
-"""Nearer than the clearance, away from an obstacle at this much of what is missing each second."""
 
 
 class Avoidance:
@@ -80,20 +77,13 @@ class Avoidance:
         directions, most_m_s = zip(to_obstacles, to_neighbours, strict=True)
         return nearest_within(velocity, np.concatenate(directions), np.concatenate(most_m_s))
 
-    def within_sight(self, velocity: FloatArray, ranges: ObstacleRanges) -> FloatArray:
-        """The velocity (2,) m/s; where no camera looks any more, one that stops within what was seen there."""
-        seen_m = ranges.seen_m[sector_of(velocity[None])[0]]
-        if seen_m >= self._parameters.range_m:
-            return velocity
-        return limit_norm(velocity, float(stopping_speed(seen_m, self._gate.braking_m_s2, self._reaction_s)))
-
     def _away(self, ranges: ObstacleRanges) -> FloatArray:
-        """(2,) m/s from the nearest obstacle, where that is nearer than the clearance."""
+        """(2,) m/s from the nearest obstacle, where that is nearer than the clearance: what is missing in a second."""
         points = nearest_points(ranges, self._parameters.sigmas)
         away_m = np.hypot(*points.T)
         if not (away_m < self._parameters.clearance_m).any():
             return np.zeros(2)
         nearest = int(np.argmin(away_m))
         missing_m = self._parameters.clearance_m - away_m[nearest]
-        away: FloatArray = -AWAY_PER_S * missing_m * points[nearest] / away_m[nearest]
+        away: FloatArray = -missing_m * points[nearest] / away_m[nearest]
         return away

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flockd.core.config.avoidance import ObstacleParameters
-from flockd.core.messages import SECTORS, FloatArray, IntArray, ObstacleRanges
+from flockd.core.messages import SECTORS, BoolArray, FloatArray, IntArray, ObstacleRanges
+from flockd.flight.geometry import Rig
 
 _CONSISTENT_SIGMAS = 3.0
 """Two ranges that differ by no more may be of one obstacle."""
 _CONTRADICTIONS = 2
 """An obstacle that so many steps have looked past is none."""
-_WHILE_UNKNOWN_M = 0.5
-"""Standard deviation, each axis, of where the drone went in a step in which it does not know its own motion."""
 
 AZIMUTHS = 2 * math.pi / SECTORS * np.arange(SECTORS)
 """(n,) radians, clockwise from north: the sectors' middles."""
 DIRECTIONS = np.column_stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)])
 """(n, 2) north and east, of length 1: the sectors' middles."""
 
+_NOWHERE_M = np.full(SECTORS, np.inf)
 _POINT = np.dtype([("place", float, 2), ("sigma_m", float), ("seen_s", float), ("contradictions", int)])
 """An obstacle that was seen: metres north and east from the drone, and how many steps have looked past it since."""
 _Points = NDArray[np.void]
@@ -39,7 +40,7 @@ class LocalMap:
         self._parameters = parameters
         self._points = np.empty(0, _POINT)
         self._seen_m = np.zeros(SECTORS)
-        self._time_s: float | None = None
+        self._time_s = 0.0
 
     def step(
         self, time_s: float, ranges: ObstacleRanges | None, displacement: FloatArray | None, sigma_m: float
@@ -49,7 +50,7 @@ class LocalMap:
         Args:
             time_s: not before the last step's; if it is, the map begins anew.
             ranges: of this time; None: nothing was looked at.
-            displacement: (2,) metres north and east that the drone went since the last step; None: not known.
+            displacement: (2,) metres north and east that the drone went since the last step; None: the map begins anew.
             sigma_m: its standard deviation, each axis.
         """
         self._move(time_s, displacement, sigma_m)
@@ -58,19 +59,16 @@ class LocalMap:
         return self._now(time_s)
 
     def _move(self, time_s: float, displacement: FloatArray | None, sigma_m: float) -> None:
-        if self._time_s is None or time_s < self._time_s:
-            self._points, self._seen_m = np.empty(0, _POINT), np.zeros(SECTORS)
-            self._time_s = time_s
-            return
         elapsed_s, self._time_s = time_s - self._time_s, time_s
-        way = np.zeros(2) if displacement is None else displacement
-        sigma_m = _WHILE_UNKNOWN_M if displacement is None else sigma_m
+        if displacement is None or elapsed_s < 0:
+            self._points, self._seen_m = np.empty(0, _POINT), np.zeros(SECTORS)
+            return
         p, points = self._parameters, self._points.copy()
-        points["place"] -= way
+        points["place"] -= displacement
         points["sigma_m"] = np.hypot(points["sigma_m"], sigma_m)
         kept = (time_s - points["seen_s"] <= p.memory_s) & (np.hypot(*points["place"].T) <= p.range_m)
         self._points = points[kept]
-        faded_m = p.range_m * elapsed_s / p.memory_s + math.hypot(*way)
+        faded_m = p.range_m * elapsed_s / p.memory_s + math.hypot(*displacement)
         self._seen_m = np.maximum(self._seen_m - faded_m, 0.0)
 
     def _take(self, ranges: ObstacleRanges) -> None:
@@ -105,6 +103,18 @@ class LocalMap:
         range_m[sectors[farthest_first]] = away_m[farthest_first]  # the last one written stays
         sigma_m[sectors[farthest_first]] = sigmas_m[farthest_first]
         return ObstacleRanges(time_s, range_m, sigma_m, self._seen_m)
+
+
+@cache
+def in_view(rig: Rig, gone: frozenset[str]) -> BoolArray:
+    """(SECTORS,) in which directions, clockwise from the body's front, cameras that are not `gone` look, held level."""
+    return rig.covers(np.column_stack([DIRECTIONS, np.zeros(SECTORS)]), without=gone)
+
+
+def nothing_found(time_s: float, rig: Rig, gone: frozenset[str], yaw_rad: float) -> ObstacleRanges:
+    """Ranges of a drone with this heading that looks for no obstacles: none is anywhere; `gone` as of `in_view`."""
+    looked = in_view(rig, gone).take(np.arange(SECTORS) - round(yaw_rad / AZIMUTHS[1]), mode="wrap")
+    return ObstacleRanges(time_s, _NOWHERE_M, np.zeros(SECTORS), np.where(looked, np.inf, 0.0))
 
 
 def nearest_points(ranges: ObstacleRanges, sigmas: float) -> FloatArray:

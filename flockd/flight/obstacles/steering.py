@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from flockd.core.config.avoidance import ObstacleParameters
-from flockd.core.messages import FloatArray, ObstacleRanges
+from flockd.core.messages import SECTORS, FloatArray, ObstacleRanges
 from flockd.flight.geometry.level import limit_norm
 from flockd.flight.obstacles.local_map import AZIMUTHS, nearest_points
 
@@ -20,20 +20,14 @@ TURNS = np.linspace(-math.pi, math.pi, 144, endpoint=False)
 """(n,) radians, clockwise from the wanted direction; 0 is one of them."""
 LAST = 0.5
 """How much a turn away from the last direction counts, relative to one away from the wanted direction."""
-FLOCK = 0.15
-"""The same, away from where the neighbours fly."""
 RIGHT_RAD = 0.02
 """To the left costs this much more: of two ways alike all drones take the same."""
 LEAST_SHARE = 0.3
 """Of the wanted speed, however far a way around turns away: it has to lead out of dead ends."""
 PACE_M_S = 1.5
 """Among neighbours a direction has to be free for the wanted speed up to this one, or up to theirs."""
-SHORTER = (1.0, 0.6, 0.3)
-"""Where no direction is free as far as it should be: shares of that way that do too."""
 BESIDE_M = 0.02
 """Beside an obstacle that is nearer than the margin, the margin is smaller by this than what there is."""
-TURNED_RAD = 0.1
-"""A turn smaller than this is not worth remembering."""
 
 
 class Steering:
@@ -61,24 +55,22 @@ class Steering:
         points = nearest_points(ranges, p.sigmas)
         pace = min(speed, max(math.hypot(*flock), PACE_M_S)) if flock.any() else speed
         azimuths = wanted_rad + TURNS
-        cost = self._cost(azimuths, flock)
+        seen_m = ranges.seen_m[np.round(azimuths / AZIMUTHS[1]).astype(np.int64) % SECTORS]
+        cost = self._cost(azimuths)
         nearest_m = float(np.hypot(*points.T).min(initial=np.inf))
         with_margin_m = min(max(nearest_m - BESIDE_M, p.clearance_m), p.clearance_m + p.margin_m)
         for radius_m in (with_margin_m, p.clearance_m):
             free_m = free_way(points, radius_m, azimuths)
-            free_m = np.minimum(free_m, seen_way(ranges, azimuths) - radius_m)
-            for share in SHORTER:
-                is_free = free_m >= min(share * pace * p.horizon_s, p.range_m - radius_m)
-                if is_free.any():
-                    return self._taken(int(np.argmin(np.where(is_free, cost, np.inf))), wanted, pace, free_m)
+            free_m = np.minimum(free_m, seen_m - radius_m)
+            is_free = free_m >= min(pace * p.horizon_s, p.range_m - radius_m)
+            if is_free.any():
+                return self._taken(int(np.argmin(np.where(is_free, cost, np.inf))), wanted, pace, free_m)
         return self._taken(int(np.argmax(free_m - cost)), wanted, pace, free_m)
 
-    def _cost(self, azimuths: FloatArray, flock: FloatArray) -> FloatArray:
+    def _cost(self, azimuths: FloatArray) -> FloatArray:
         cost = np.abs(TURNS) + np.where(TURNS < 0, RIGHT_RAD, 0.0)
         if self._last_rad is not None:
-            cost = cost + LAST * np.abs(_wrapped(azimuths - self._last_rad))
-        if flock.any():
-            cost = cost + FLOCK * np.abs(_wrapped(azimuths - math.atan2(flock[1], flock[0])))
+            cost = cost + LAST * np.abs((azimuths - self._last_rad + math.pi) % math.tau - math.pi)
         return cost
 
     def _taken(self, index: int, wanted: FloatArray, pace: float, free_m: FloatArray) -> tuple[FloatArray, float]:
@@ -86,7 +78,7 @@ class Steering:
         wanted = limit_norm(wanted, max(pace, free / self._parameters.horizon_s))
         turned = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ wanted
         velocity: FloatArray = max((1.0 + math.cos(turn)) / 2.0, LEAST_SHARE) * turned
-        self._last_rad = math.atan2(velocity[1], velocity[0]) if abs(turn) > TURNED_RAD else None
+        self._last_rad = math.atan2(velocity[1], velocity[0]) if turn else None
         return velocity, free
 
 
@@ -101,15 +93,3 @@ def free_way(points: FloatArray, radius_m: float, azimuths: FloatArray) -> Float
     way_m = np.where(meets, np.maximum(ahead_m - np.sqrt(np.maximum(square, 0.0)), 0.0), np.inf)
     free: FloatArray = way_m.min(axis=0, initial=np.inf)
     return free
-
-
-def seen_way(ranges: ObstacleRanges, azimuths: FloatArray) -> FloatArray:
-    """How far, (k,) m, the sector of each direction, (k,) rad, is known."""
-    seen: FloatArray = ranges.seen_m[np.round(azimuths / AZIMUTHS[1]).astype(np.int64) % len(AZIMUTHS)]
-    return seen
-
-
-def _wrapped(angles: FloatArray) -> FloatArray:
-    """(k,) radians from -pi to pi."""
-    wrapped: FloatArray = (angles + math.pi) % (2 * math.pi) - math.pi
-    return wrapped

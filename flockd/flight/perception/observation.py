@@ -5,14 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from flockd.core.messages import (
-    Detection,
-    Float32Array,
-    ObstacleRanges,
-    Reason,
-    UInt8Array,
-    VehicleState,
-)
+from flockd.core.messages import Detection, Float32Array, Reason, UInt8Array, VehicleState
 from flockd.flight.geometry import RangeMap
 
 
@@ -46,8 +39,6 @@ class Observation:
     """Why something is missing."""
     noisy_cameras: tuple[str, ...] = ()
     """Whose images were noise, and were not used."""
-    obstacles: ObstacleRanges | None = None
-    """Exact ones, of a simulation; None: they are in the cameras' depth."""
 
     @property
     def flows(self) -> dict[str, Float32Array]:

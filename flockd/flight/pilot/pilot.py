@@ -5,9 +5,8 @@ from __future__ import annotations
 import copy
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -15,7 +14,6 @@ from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.drone import DroneConfig
 from flockd.core.messages import (
     NO_STATUS,
-    SECTORS,
     Detection,
     EgoMotion,
     FloatArray,
@@ -31,13 +29,14 @@ from flockd.core.messages import (
     VehicleState,
     Wanted,
 )
+from flockd.core.navigation import wrapped
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.flocking.passing import Passing
 from flockd.flight.geometry import build_rig, estimate_ego_motion
 from flockd.flight.geometry.level import limit_norm
 from flockd.flight.mission import Moment, Navigator
-from flockd.flight.mission.navigator import middle_of
-from flockd.flight.obstacles import DIRECTIONS, Avoidance, LocalMap, ObstacleRanging
+from flockd.flight.mission.navigator import Lookout, middle_of
+from flockd.flight.obstacles import Avoidance, LocalMap, ObstacleRanging, nothing_found
 from flockd.flight.perception import Networks, Observation, Perception, load_networks
 from flockd.flight.perception.detection.detector import DetectionTrace
 from flockd.flight.perception.maps import KnownSize
@@ -67,22 +66,6 @@ class StepTrace:
     detection: DetectionTrace = field(default_factory=DetectionTrace)
 
 
-class Observer(Protocol):
-    """What sees for the pilot: see `Perception.observe`."""
-
-    def observe(
-        self,
-        frames: FrameSet,
-        vehicle: VehicleState,
-        ground: GroundEstimate | None,
-        predictions: Sequence[Prediction],
-        trace: DetectionTrace | None,
-        lap: Callable[[str], None],
-        learned_size: KnownSize | None,
-    ) -> Observation:
-        """What the newest frame set shows."""
-
-
 class FlockPilot:
     """One drone's pilot. Remembers the last frame set and its tracks; everything else comes in with each step."""
 
@@ -91,16 +74,16 @@ class FlockPilot:
         config: DroneConfig,
         networks: Networks | None = None,
         stopwatch: Callable[[], float] | None = None,
-        observer: Observer | None = None,
+        observer: Perception | None = None,
         learned: LearnedSize | None = None,
         *,
         flies: bool = True,
     ) -> None:
         """``networks`` may be shared by several pilots; None: those that the configuration names.
 
-        ``stopwatch`` (seconds) only fills ``stages_ms``. ``observer`` takes perception's place: simulations have exact
-        ones. ``learned`` is of the others' size, before this flight. Without ``flies`` nobody flies what this pilot
-        wants, as before a flight. Raises ModelError.
+        ``stopwatch`` (seconds) only fills ``stages_ms``. ``observer`` takes perception's place. ``learned`` is of
+        the others' size, before this flight. Without ``flies`` nobody flies what this pilot wants, as before a flight.
+        Raises ModelError.
         """
         self._config = config
         self._rig = build_rig(config.rig)
@@ -118,12 +101,13 @@ class FlockPilot:
         self._ranging = ObstacleRanging(self._rig, config.obstacles) if config.obstacles.enabled else None
         self._avoidance = Avoidance(config.obstacles, config.safety.gate, config.step_s)
         self._navigator = Navigator(config.mission, config.safety.gate)
+        self._lookout = Lookout(self._rig)
         self._own = OwnMotion(config.geometry.own_displacement_sigma_m)
         self._stopwatch = stopwatch
         self._first_time_s: float | None = None
         self._last_time_s: float | None = None
         self._yaw_rad: float | None = None
-        """The heading asked for last; before the first, that of the first good attitude."""
+        """The heading asked for last, but for what the lookout turns; before, that of the first good attitude."""
         self._order: MissionOrder | None = None
         self._mission = NO_STATUS
         """As of the last good step."""
@@ -195,6 +179,7 @@ class FlockPilot:
             noisy_cameras=(*observation.noisy_cameras, *elsewhere),
             ground=ground,
             obstacles=None if self._ranging is None else ranges,
+            seen_m=ranges.seen_m,
             size=self._size.status,
         )
 
@@ -209,11 +194,12 @@ class FlockPilot:
         time_s = max(time_s, last_s) if math.isfinite(time_s) else last_s
         interval_s = min(time_s - last_s, _LONGEST_S)
         moved, sigma_m = self._own.ahead(interval_s)
+        yaw_rad = None if self._yaw_rad is None else wrapped(self._yaw_rad + self._lookout.turn_rad)
         tracker, local_map = copy.deepcopy((self._tracker, self._map))
         if self._last_time_s is not None:
             tracker.predict(interval_s, moved, sigma_m)
             tracker.update(time_s, (), shown=lambda places, radius_m: np.zeros(len(places), np.bool_))
-        level = None if moved is None else moved[:2]
+        ranges = local_map.step(time_s, None, None if moved is None else moved[:2], sigma_m)
         return PilotOutput(
             time_s=time_s,
             ego_motion=None,
@@ -221,11 +207,12 @@ class FlockPilot:
             detections=(),
             detection_tracks=(),
             neighbours=self._size.cautious(tracker.neighbours()),
-            command=Wanted(np.zeros(2), np.zeros(2), self._yaw_rad),
+            command=Wanted(np.zeros(2), np.zeros(2), yaw_rad),
             mission=self._mission,
             reasons=(reason,),
             counts={reason.text: 1},
-            obstacles=None if self._ranging is None else local_map.step(time_s, None, level, sigma_m),
+            obstacles=None if self._ranging is None else ranges,
+            seen_m=ranges.seen_m,
         )
 
     def _predictions(self, time_s: float) -> tuple[Prediction, ...]:
@@ -324,28 +311,19 @@ class FlockPilot:
     def _local_map(
         self, observation: Observation, ego: EgoMotion | None, ground: GroundEstimate | None
     ) -> ObstacleRanges:
-        """The local map now; where obstacles are not looked for, all is free but what lost cameras would show."""
+        """The local map now; where obstacles are not looked for, all is free where a camera looks."""
         if self._ranging is None:
-            ranges = self._free(observation)
+            R = observation.vehicle.R_ned_body
+            yaw_rad = math.atan2(R[1, 0], R[0, 0])
+            ranges = nothing_found(observation.time_s, self._rig, self._gone(observation), yaw_rad)
         else:
-            ranges = observation.obstacles or self._ranging.ranges(observation, ego, ground)
+            ranges = self._ranging.ranges(observation, ego, ground)
         displacement = None if self._own.displacement is None else self._own.displacement[:2]
         return self._map.step(observation.time_s, ranges, displacement, self._own.sigma_m)
 
-    def _free(self, observation: Observation) -> ObstacleRanges:
-        gone = self._gone(observation) if observation.cameras else frozenset()  # without eyes nothing is flown
-        far_m = (
-            self._config.obstacles.range_m
-            * np.column_stack([DIRECTIONS, np.zeros(SECTORS)])
-            @ observation.vehicle.R_ned_body
-        )
-        seen = ~self._rig.hidden(far_m, gone) if gone else np.ones(SECTORS, np.bool_)
-        nothing, exact = np.full(SECTORS, np.inf), np.zeros(SECTORS)
-        return ObstacleRanges(observation.time_s, nothing, exact, np.where(seen, np.inf, 0.0))
-
-    def _gone(self, observation: Observation) -> Set[str]:
+    def _gone(self, observation: Observation) -> frozenset[str]:
         """The cameras that gave no image that can be used."""
-        return self._rig.cameras.keys() - observation.cameras.keys()
+        return frozenset(self._rig.cameras.keys() - observation.cameras.keys())
 
     def _shown(self, observation: Observation) -> Shown:
         """Tells who is wholly in view of a camera that gave an image in this step."""
@@ -385,17 +363,18 @@ class FlockPilot:
             command, acceleration = self._passing.command(
                 own, places, velocities, desired, self._config.step_s, tracks, limits, ages_s
             )
-            command = self._avoidance.within_sight(command, ranges)
         else:
             command, acceleration = self._avoidance.command(self._law, own, places, velocities, desired, ranges, ages_s)
         if self._config.yaw == "course" and guidance.course_rad is not None:
             self._yaw_rad = guidance.course_rad
+        assert self._yaw_rad is not None, "the attitude is good"
+        yaw_rad = self._lookout.heading(observation.time_s, self._yaw_rad, command, self._gone(observation))
         ends = guidance.takeover is not None
         height_m = self._size.height(observation.time_s, vehicle, ground, guidance.height_m, neighbours, ends=ends)
         self._mission = replace(self._mission, sentence=self._mission.sentence + self._size.sentence)
         trim = self._trim()
         command = limit_norm(command + trim, self._config.safety.gate.max_speed_m_s)  # not even by rounding more
-        return Wanted(command, acceleration, self._yaw_rad, trim if trim.any() else None, height_m)
+        return Wanted(command, acceleration, yaw_rad, trim if trim.any() else None, height_m)
 
     def _trim(self) -> FloatArray:
         """(2,) m/s, north and east, that setpoints are corrected by.

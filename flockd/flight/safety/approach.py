@@ -9,7 +9,7 @@ import numpy as np
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.geometry.level import SAME_SPOT_M
-from flockd.flight.safety.half_planes import NO_LIMITS, Limits
+from flockd.flight.safety.half_planes import Limits
 
 COLUMN = 1.5
 """A neighbour is above or below where its level range is less than this many times the degraded separation: downwash
@@ -107,8 +107,6 @@ def towards_obstacles(points: FloatArray, clearance_m: float, braking_m_s2: floa
 
     `points` (m, 2) metres north and east from the drone; those that are not finite, or at no distance, are left out.
     """
-    if not len(points):
-        return NO_LIMITS
     ranges = np.hypot(points[:, 0], points[:, 1])
     somewhere = (ranges > 0) & (ranges < math.inf)
     points, ranges = points[somewhere], ranges[somewhere]
@@ -131,8 +129,6 @@ def between_neighbours(p: GateParameters, start_m: float, own_m: float, offsets:
     """
     own_m = own_m if math.isfinite(own_m) else start_m
     up = -offsets[np.hypot(offsets[:, 0], offsets[:, 1]) < COLUMN * p.degraded_separation_m, 2]
-    if not len(up):
-        return -math.inf, math.inf
     room_up = np.maximum(up[up > 0] - p.vertical_separation_m, 0.0).min(initial=math.inf)
     room_down = np.maximum(-up[up < 0] - p.vertical_separation_m, 0.0).min(initial=math.inf)
     highest_m = max(own_m + float(room_up), min(start_m, own_m + _HEIGHT_NOISE_M))

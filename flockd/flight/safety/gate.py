@@ -19,7 +19,7 @@ from flockd.flight.safety.half_planes import nearest_within
 from flockd.flight.safety.policy import Action
 from flockd.flight.safety.request import Objection, Request, Surroundings, Verdict
 from flockd.flight.safety.response import ResponseMonitor
-from flockd.flight.safety.surroundings import limits_around
+from flockd.flight.safety.surroundings import into_the_unseen, limits_around
 
 _MOVES = frozenset({Action.FLY, Action.FLY_DEGRADED})
 
@@ -28,8 +28,9 @@ class Gate:
     """Passes each setpoint, makes it smaller, or sends nothing.
 
     A speed above the limit or a number that is not finite is refused: the drone is brought to a standstill instead.
-    Towards a neighbour, an obstacle or the fence the drone flies no faster than it can brake before the minimum
-    distance. Every change of velocity stays within the acceleration limit, except that this one wins.
+    Towards a neighbour, an obstacle or the fence, and where nobody has looked, the drone flies no faster than it can
+    brake before the minimum distance. Every change of velocity stays within the acceleration limit, except that this
+    one wins.
 
     Wind is left to the autopilot, whose velocity controller integrates: a second loop around it, here, oscillated with
     PX4's real response. A drone that is measured to be faster than a limit brakes harder; one that is measured to
@@ -103,6 +104,9 @@ class Gate:
         velocity = nearest_within(velocity, directions, most_m_s)
         if not all(map(math.isfinite, (*velocity, height_m, yaw_rad))):
             return Verdict(None, (*objections, Objection.SETPOINT_NOT_FINITE))
+        seen = limit_norm(velocity, into_the_unseen(p, around, separation_m, self.response.late_s, velocity))
+        if (seen != velocity).any():
+            objections.append(Objection.UNSEEN)
 
         if action is not Action.OFFER:  # else on the ground, or flown by the pilot: as high as the control loop says
             most_m = p.max_climb_m_s * elapsed_s * share
@@ -113,7 +117,7 @@ class Gate:
         sent_m = _within(height_m, p.min_height_m, p.max_height_m)
         if sent_m != height_m:
             objections.append(Objection.HEIGHT)
-        return Verdict(Setpoint(now_s, velocity, sent_m, yaw_rad), tuple(objections))
+        return Verdict(Setpoint(now_s, seen, sent_m, yaw_rad), tuple(objections))
 
     def _as_it_flies(self, now_s: float, around: Surroundings, height_m: float) -> Setpoint:
         """Where there is no last setpoint: the drone's own velocity, height and heading, as far as it knows them."""

@@ -41,6 +41,8 @@ class Surroundings:
     """(n, 2) by how much each neighbour may be nearer, m, and come faster, m/s."""
     neighbour_unseen_s: FloatArray
     """(n,) how long ago each neighbour was seen last: it may brake since."""
+    seen_m: FloatArray
+    """(SECTORS,) metres: how far cameras looked lately; farther in a sector there may be anybody."""
 
     @property
     def nearest_obstacle_m(self) -> float:
@@ -81,6 +83,7 @@ class Objection(StrEnum):
     HEIGHT = "height"
     SEPARATION = "separation"
     OBSTACLE = "obstacle"
+    UNSEEN = "unseen"
 
 
 @dataclass(frozen=True)

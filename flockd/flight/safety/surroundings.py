@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from statistics import NormalDist
 
 import numpy as np
 
 from flockd.core.config.safety import GateParameters
-from flockd.core.messages import FloatArray, Neighbour, PossibleMotion
-from flockd.flight.safety.approach import towards_neighbours, towards_obstacles
+from flockd.core.messages import SECTORS, FloatArray, Neighbour, PossibleMotion
+from flockd.flight.safety.approach import stopping_speed, towards_neighbours, towards_obstacles
 from flockd.flight.safety.fence import towards_fence
 from flockd.flight.safety.half_planes import Limits
 from flockd.flight.safety.request import Objection, Surroundings
@@ -29,6 +30,7 @@ def surroundings(
     yaw_rad: float,
     height_m: float,
     obstacles: FloatArray,
+    seen_m: FloatArray | None,
 ) -> Surroundings:
     """The surroundings `age_s` after the step that gave the `neighbours`, which fly on at constant velocity.
 
@@ -38,7 +40,7 @@ def surroundings(
     Caution comes before confirmation: a track limits the speed towards it from its first detection on, by its
     uncertainty. One that may move in several ways counts once for each, see `_credible`. `moved` (3,) m NED is how far
     the drone itself flew since then; `position` (2,) m from home, `velocity` (3,) m/s NED, NaN where not known;
-    `obstacles` (m, 2) m from where the drone was then.
+    `obstacles` (m, 2) m from where the drone was then, as is `seen_m` (SECTORS,); None: nobody says how far was seen.
     """
     places, velocities, margins, unseen_s = _motions(neighbours, age_s, moved)
     return Surroundings(
@@ -51,6 +53,7 @@ def surroundings(
         neighbour_unseen_s=unseen_s,
         height_m=height_m,
         obstacles=obstacles - moved[:2],
+        seen_m=np.full(SECTORS, np.inf) if seen_m is None else seen_m - np.hypot(moved[0], moved[1]),
     )
 
 
@@ -87,6 +90,21 @@ def limits_around(
     if np.isfinite(around.velocity).all():
         most_m_s = np.maximum(most_m_s - np.maximum(directions @ around.velocity - most_m_s, 0.0), 0.0)
     return directions, most_m_s, [name for name, (_, most) in limits.items() for _ in most]
+
+
+def into_the_unseen(
+    p: GateParameters, around: Surroundings, separation_m: float, late_s: float, velocity: FloatArray
+) -> float:
+    """How fast, m/s, to fly the way of `velocity` (2,) so as to stop before somebody where no camera looked.
+
+    A neighbour reaches into the sectors beside its own. From what is too near already, the drone flies anywhere.
+    """
+    nearest_m = np.linalg.norm(around.neighbours, axis=1).min(initial=math.inf)
+    if nearest_m < separation_m or around.nearest_obstacle_m < p.obstacle_clearance_m:
+        return math.inf
+    ahead = round(math.atan2(velocity[1], velocity[0]) * SECTORS / math.tau)
+    left_m = np.fmax(around.seen_m, 0.0).take([ahead - 1, ahead, ahead + 1], mode="wrap").min() - separation_m
+    return float(stopping_speed(left_m, p.braking_m_s2, p.neighbour_reaction_s + late_s))
 
 
 def _motions(

@@ -159,6 +159,7 @@ class Control:
             yaw_rad=math.nan if vehicle is None else _yaw(vehicle),
             height_m=math.nan if vehicle is None else vehicle.height_m,
             obstacles=np.empty((0, 2)) if ranges is None else nearest_points(ranges, self._sigmas),
+            seen_m=None if result is None else result.output.seen_m,
         )
 
     def _takeover(self) -> Takeover | None:

@@ -85,6 +85,7 @@ _FROM_METADATA = (
 
 _CAUSES = {
     "neighbour": "neighbours", "obstacle": "obstacles", "fence": "the fence", "camera": "a lost camera",
+    "unseen": "directions without sight",
     "other": "other limits",
 }  # fmt: skip
 

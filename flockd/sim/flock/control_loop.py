@@ -54,6 +54,8 @@ class Commands:
     """(n, 2) m/s: what each mission wants, times its pull."""
     obstacles: list[ObstacleRanges | None]
     """What each drone saw of them; None where it does not look for any."""
+    seen_m: list[FloatArray | None]
+    """As of `PilotOutput`."""
     neighbours: list[tuple[Neighbour, ...]]
     """What each drone knows of the others."""
 
@@ -61,7 +63,7 @@ class Commands:
     def of(cls, n: int) -> Self:
         """Standstill of n drones, to be filled."""
         still = (np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.full(n, np.nan))
-        return cls(*still, [NO_STATUS] * n, np.zeros((n, 2)), [None] * n, [()] * n)
+        return cls(*still, [NO_STATUS] * n, np.zeros((n, 2)), [None] * n, [None] * n, [()] * n)
 
 
 RETURN_M_S = 2.0
@@ -117,7 +119,10 @@ class _Drone:
         return decision
 
 
-_OBJECTED = {Objection.SEPARATION: "neighbour", Objection.OBSTACLE: "obstacle", Objection.FENCE: "fence"}
+_OBJECTED = {
+    Objection.SEPARATION: "neighbour", Objection.OBSTACLE: "obstacle", Objection.FENCE: "fence",
+    Objection.UNSEEN: "unseen",
+}  # fmt: skip
 _DEGRADED = {
     Event.VELOCITY_OFF: "wind", Event.NO_ROOM_TO_HOLD: "wind", Event.CAMERA_LOST: "camera", Event.FENCE_LEFT: "fence",
 }  # fmt: skip
@@ -285,6 +290,7 @@ class ControlLoop:
             yaw_rad=yaw_rad,
             height_m=float(-here[2]),
             obstacles=np.empty((0, 2)) if ranges is None else nearest_points(ranges, sigmas),
+            seen_m=commands.seen_m[i],
         )
         lost = self._disturbed.cameras_off_of(i)
         if self._scenario.detections is not None:

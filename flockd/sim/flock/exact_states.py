@@ -14,8 +14,8 @@ from flockd.flight.flocking import FlockingLaw
 from flockd.flight.flocking.passing import Passing
 from flockd.flight.geometry import build_rig, rotation_from_euler
 from flockd.flight.mission import Moment, Navigator
-from flockd.flight.mission.navigator import middle_of
-from flockd.flight.obstacles import Avoidance
+from flockd.flight.mission.navigator import Lookout, middle_of
+from flockd.flight.obstacles import Avoidance, LocalMap, nothing_found
 from flockd.flight.safety.surroundings import limits_towards
 from flockd.flight.tracking import Measurement, Tracker
 from flockd.sim.flock.control_loop import Commands, ControlLoop
@@ -37,8 +37,13 @@ class ExactFlock:
         self._law, self._step_s = FlockingLaw(drone.flocking), drone.step_s
         self._by_hand = [vehicle.by_hand for vehicle in scenario.vehicles]
         self._pilots = [navigator_of(scenario, i) for i in range(len(self._by_hand))]
-        self._yaw_rad = np.full(len(self._pilots), start_yaw(scenario))
-        self._rig = build_rig(drone.rig)
+        self._course_rad = np.full(len(self._pilots), start_yaw(scenario))
+        self._yaw_rad = self._course_rad.copy()
+        """Asked for: as the course, but for what the lookout turns."""
+        self._scenario, self._rig = scenario, build_rig(drone.rig)
+        self._maps = [LocalMap(drone.obstacles) for _ in self._pilots]
+        self._lookouts = [Lookout(self._rig) for _ in self._pilots]
+        self._before: FloatArray | None = None
         made_up, n = scenario.detections, len(self._pilots)
         self._tracked = [] if made_up is None else [TrackedNeighbours(scenario, made_up, i) for i in range(n)]
         self._obstacles = obstacles_of(scenario)
@@ -65,11 +70,16 @@ class ExactFlock:
         """
         own, orders = velocities if own is None else own, orders or {}
         commands = Commands.of(len(positions))
-        commands.yaw_rad[:] = self._yaw_rad
+        commands.yaw_rad[:] = self._course_rad
         missions, ranges, known = commands.missions, commands.obstacles, commands.neighbours
         for i, pilot in enumerate(self._pilots):
-            here, moving = positions[i, :2], own[i, :2]
-            known[i] = self._neighbours(i, time_s, positions, velocities, disturbed.cameras_off_of(i))
+            here, moving, yaw_rad = positions[i, :2], own[i, :2], float(self._yaw_rad[i])
+            faults = self._scenario.lost_cameras(i, time_s) if self._tracked else frozenset[str]()
+            gone = disturbed.cameras_off_of(i) | faults
+            known[i] = self._neighbours(i, time_s, positions, velocities, yaw_rad, gone)
+            free = nothing_found(time_s, self._rig, gone, yaw_rad)
+            way = None if self._before is None else here - self._before[i, :2]
+            commands.seen_m[i] = self._maps[i].step(time_s, free, way, 0.0).seen_m
             if self._obstacles.solids:
                 ranges[i] = true_ranges(self._obstacles, time_s, positions[i])
             if self._by_hand[i]:
@@ -94,23 +104,25 @@ class ExactFlock:
             commands.velocity[i], commands.acceleration[i] = flown_as
             commands.desired[i], missions[i] = desired, pilot.status(guidance)
             if guidance.course_rad is not None:
-                commands.yaw_rad[i] = guidance.course_rad
+                self._course_rad[i] = guidance.course_rad
+            course_rad, wanted = float(self._course_rad[i]), commands.velocity[i]
+            commands.yaw_rad[i] = self._lookouts[i].heading(time_s, course_rad, wanted, gone)
             if guidance.height_m is not None:
                 commands.height_m[i] = guidance.height_m
-        self._yaw_rad = commands.yaw_rad
+        self._yaw_rad, self._before = commands.yaw_rad, positions.copy()
         return commands
 
     def _neighbours(
-        self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray, cameras_off: frozenset[str]
+        self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray, yaw_rad: float, gone: frozenset[str]
     ) -> tuple[Neighbour, ...]:
         if self._tracked:
-            return self._tracked[i].step(time_s, positions, velocities, float(self._yaw_rad[i]), cameras_off)
+            return self._tracked[i].step(time_s, positions, velocities, yaw_rad, gone)
         offsets = positions[:, :2] - positions[i, :2]
         seen = np.hypot(offsets[:, 0], offsets[:, 1]) <= self._law.parameters.observation_distance_m
         seen[i] = False
-        if cameras_off:
-            R_ned_body = rotation_from_euler(0.0, 0.0, float(self._yaw_rad[i]))
-            seen &= ~self._rig.hidden((positions - positions[i]) @ R_ned_body, cameras_off)
+        if gone:
+            R_ned_body = rotation_from_euler(0.0, 0.0, yaw_rad)
+            seen &= self._rig.shows((positions - positions[i]) @ R_ned_body, without=gone)
         return tuple(
             Neighbour(
                 int(j) + 1, positions[j] - positions[i], velocities[j], position_sigma_m=0.0, velocity_sigma_m_s=0.0,

@@ -292,7 +292,7 @@ class VisionPilots:
             commands.yaw_rad[i] = self._yaw_rad if command.yaw_rad is None else command.yaw_rad
             commands.height_m[i] = np.nan if command.height_m is None else command.height_m
             commands.missions[i], commands.obstacles[i] = output.mission, output.obstacles
-            commands.neighbours[i] = output.neighbours
+            commands.seen_m[i], commands.neighbours[i] = output.seen_m, output.neighbours
             commands.desired[i] = desired_of(self._scenario.drone_of(i).mission, time_s, output.mission)
         for i, hand in self._hands.items():
             commands.missions[i] = fly_by_hand(hand, i, time_s, vehicles.position[i, :2], commands)

@@ -17,12 +17,14 @@ from flockd.core.errors import ConfigError
 from flockd.core.messages import FloatArray, MissionOrder, Setpoint
 from flockd.flight.geometry import euler_from_rotation
 from flockd.flight.mission import Guidance, MissionParameters, Moment, Navigator, order_fault
+from flockd.flight.mission.navigator import MAX_TURN_RAD_S, Lookout
 from flockd.flight.safety import Gate, outside_fence
 from flockd.onboard.telemetry.order_messages import order_message, parse_order
 from flockd.sim.autopilot.fake_vehicle import Demand, Flown
 from flockd.sim.flock.exact_states import fly_exact_states
 from flockd.sim.scenario import load_scenario
 from tests.core.config.test_loader import CONFIG, DRONE
+from tests.flight.geometry.synthetic_world import four_camera_rig
 from tests.make import around, changed, request, vehicle
 from tests.sim.scenario.test_scenario_file import SCENARIO
 
@@ -316,3 +318,37 @@ def test_four_squares_are_flown_without_standing_and_with_the_heading_along() ->
     assert all(-math.pi < heading <= math.pi for heading in headings)
     jumps = [abs(math.remainder(after - before, math.tau)) for before, after in pairwise(headings)]
     assert max(jumps) <= 0.2 * 0.5 + 1e-9  # turns no faster than 0.2 rad/s, a step of 0.5 s at once
+
+
+@pytest.mark.parametrize(
+    ("cameras", "ahead_deg", "turned_deg"),
+    [
+        ({"front"}, 0.0, 60.0),  # 15 degrees beyond where the right camera's image begins, or the left one's
+        ({"back"}, 0.0, 0.0),
+        ({"right"}, 80.0, 50.0),  # a heading that is held, of a drone that flies sideways
+        ({"front", "right", "left"}, 0.0, 150.0),
+        ({"front", "right", "back", "left"}, 0.0, 0.0),
+    ],
+)
+def test_the_heading_turns_until_a_camera_looks_where_the_drone_wants_to_fly(
+    cameras: set[str], ahead_deg: float, turned_deg: float
+) -> None:
+    """It heads 20 degrees east of north, and is slow in no direction."""
+    lookout, gone, heading_rad = Lookout(four_camera_rig()), frozenset(cameras), math.radians(20.0)
+    course_rad = heading_rad + math.radians(ahead_deg)
+    way = np.array([math.cos(course_rad), math.sin(course_rad)])
+    before = [lookout.heading(0.5 * step, heading_rad, way, frozenset()) for step in range(3)]
+    turned = [lookout.heading(1.5 + 0.5 * step, heading_rad, way, gone) for step in range(40)]
+    assert before == [heading_rad] * 3
+    turned = [rad - heading_rad for rad in turned]
+    assert max(abs(b - a) for a, b in pairwise([0.0, *turned])) <= 0.5 * MAX_TURN_RAD_S + 1e-12
+    assert math.degrees(abs(turned[-1])) == pytest.approx(turned_deg)
+    assert lookout.heading(60.0, heading_rad, 0.1 * way, frozenset()) == pytest.approx(heading_rad + turned[-1])
+    assert lookout.heading(90.0, heading_rad, way, frozenset()) == heading_rad, "they are back"
+
+
+def test_a_camera_that_misses_a_frame_hardly_turns_the_heading() -> None:
+    lookout, north = Lookout(four_camera_rig()), np.array([1.0, 0.0])
+    gone = [frozenset({"front"} if step == 4 else ()) for step in range(8)]
+    turned = [lookout.heading(0.5 * step, 0.0, north, cameras) for step, cameras in enumerate(gone)]
+    assert [round(abs(math.degrees(rad))) for rad in turned] == [0, 0, 0, 0, 6, 0, 0, 0]

@@ -12,7 +12,7 @@ import pytest
 
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.mission import MissionParameters
-from flockd.core.messages import Float32Array, Frame, FrameSet, Reason, ReasonKind, VehicleState
+from flockd.core.messages import SECTORS, Float32Array, Frame, FrameSet, Reason, ReasonKind, VehicleState
 from flockd.flight.geometry import RigCamera, rotation_angle_deg, rotation_from_euler
 from flockd.flight.perception import Observation, SceneMaps
 from flockd.flight.pilot import FlockPilot
@@ -80,18 +80,32 @@ def test_a_neighbour_before_a_camera_that_is_gone_is_as_probable_as_before(
     assert (left < 0.95) is less_probable
 
 
-@pytest.mark.parametrize(("gone", "stands"), [("front", True), ("back", False)])
-def test_no_drone_flies_for_long_where_only_a_lost_camera_would_look(flyer: Flyer, gone: str, stands: bool) -> None:
-    """The mission and the neighbour lead north, where the front camera looks."""
-    speeds_m_s = []
+@pytest.mark.fault("blind-sector")
+@pytest.mark.parametrize("gone", ["front", "back"])
+def test_the_gate_is_told_how_far_was_seen_and_the_heading_turns_to_where_a_camera_looks(
+    flyer: Flyer, gone: str
+) -> None:
+    """The mission leads north, where the front camera looks. What was seen up to 15 m away fades in three seconds."""
+    ahead_m, behind_m, turned_deg = [], [], []
     for step in range(9):
         frames, state = flyer.take_frames()
         output = flyer.pilot.step(without(frames, gone) if step >= 2 else frames, state)
-        speeds_m_s.append(float(np.linalg.norm(output.command.velocity)))
+        assert output.obstacles is None, "none were looked for"
+        assert output.seen_m is not None and output.command.yaw_rad is not None
+        ahead_m.append(float(output.seen_m[0]))
+        behind_m.append(float(output.seen_m[SECTORS // 2]))
+        assert output.seen_m[SECTORS // 4] == 15.0
+        turned_deg.append(abs(math.degrees(output.command.yaw_rad)))
         flyer.move()
-    assert output.obstacles is None, "none were looked for"
-    assert min(speeds_m_s[:4]) > 0.5, "what was seen a second ago is flown into"
-    assert (speeds_m_s[-1] < 0.01) is stands
+    faded_m, seen_m = (ahead_m, behind_m) if gone == "front" else (behind_m, ahead_m)
+    assert seen_m == [15.0] * 9
+    assert faded_m[:2] == [15.0] * 2
+    assert faded_m[2] == pytest.approx(15.0 - 2.5 - 0.5 * float(np.hypot(*flyer.vehicles.velocity[0, :2])), abs=0.15)
+    assert faded_m[-1] == 0.0
+    assert (max(turned_deg) > 30.0) is (gone == "front")
+    refused = flyer.pilot.step(frames, replace(state, height_m=math.nan))
+    assert refused.command.yaw_rad == output.command.yaw_rad
+    assert refused.seen_m is not None and refused.seen_m[0] == pytest.approx(ahead_m[-1])
 
 
 def test_a_neighbour_pulls_by_how_long_it_has_been_seen() -> None:
@@ -261,7 +275,8 @@ def test_a_detection_that_the_tracker_refuses_costs_that_neighbour_only() -> Non
         def observe(self, frames: FrameSet, vehicle: VehicleState, *_: object) -> Observation:
             return Observation(frames.time_s, vehicle, {}, (spoilt, sound), None)
 
-    output = FlockPilot(ALONE.drone, NEVER_ASKED, observer=Observer()).step(frames(0.0), vehicle(height_m=4.0))
+    observer: Any = Observer()
+    output = FlockPilot(ALONE.drone, NEVER_ASKED, observer=observer).step(frames(0.0), vehicle(height_m=4.0))
     assert [reason.kind for reason in output.reasons] == [ReasonKind.NEIGHBOUR]
     assert output.detections == (sound,)
     assert output.detection_tracks == tuple(neighbour.track for neighbour in output.neighbours)
@@ -299,7 +314,7 @@ class Comes:
 @pytest.mark.parametrize("lost", ["own motion", "attitude"])
 def test_where_images_or_attitude_are_lost_neighbours_come_on_by_the_velocity_that_is_known(lost: str) -> None:
     """Detected for two seconds, by the autopilot's velocity; then not for one: it is 6 m away, not 8."""
-    observer = Comes()
+    observer: Any = Comes()
     pilot = FlockPilot(changed(ALONE.drone, own_velocity="autopilot"), NEVER_ASKED, observer=observer)
     for step in range(7):
         time_s = STEP_S * step

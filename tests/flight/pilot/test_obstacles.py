@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from flockd.core.config import DroneConfig
-from flockd.core.messages import SECTORS, FrameSet, PilotOutput, VehicleState
+from flockd.core.messages import SECTORS, FrameSet, ObstacleRanges, PilotOutput, VehicleState
+from flockd.flight.obstacles import ObstacleRanging
 from flockd.flight.perception import Observation
 from flockd.flight.pilot import FlockPilot
 from flockd.sim.world.obstacles import Box, Obstacles, true_ranges
@@ -20,14 +21,10 @@ WALL = Obstacles([Box(3.0, 0.0, 0.2, 30.0, 0.0, -0.5, 8.0)])
 
 
 class Observer:
-    """Sees a wall to the north, or nothing at all."""
-
-    def __init__(self, *, sees: bool) -> None:
-        self.sees = sees
+    """Has no images."""
 
     def observe(self, frames: FrameSet, vehicle: VehicleState, *_: object) -> Observation:
-        ranges = true_ranges(WALL, frames.time_s, np.array([0.0, 0.0, -4.0])) if self.sees else None
-        return Observation(frames.time_s, vehicle, {}, (), None, obstacles=ranges)
+        return Observation(frames.time_s, vehicle, {}, (), None)
 
 
 def drone(*, enabled: bool) -> DroneConfig:
@@ -38,19 +35,22 @@ def drone(*, enabled: bool) -> DroneConfig:
 
 
 def flown(config: DroneConfig, sees: Sequence[bool]) -> list[PilotOutput]:
-    """A drone that is held at its place, each 0.5 s; `sees`: in which steps it sees anything."""
-    observer = Observer(sees=True)
+    """A drone that is held at its place, each 0.5 s; `sees`: in which steps it sees the wall, and else nothing."""
+    ranging = ObstacleRanging.ranges
+
+    def ranges(self: ObstacleRanging, seen: Observation, *rest: Any) -> ObstacleRanges:
+        there = true_ranges(WALL, seen.time_s, np.array([0.0, 0.0, -4.0]))
+        return there if sees[round(seen.time_s / 0.5)] else ranging(self, seen, *rest)
+
     networks: Any = object()  # never asked for anything
-    pilot = FlockPilot(config, networks, observer=observer)
-    outputs = []
-    for step, observer.sees in enumerate(sees):
-        outputs.append(pilot.step(frames(0.5 * step), vehicle(0.5 * step, 4.0)))
-    return outputs
+    observer: Any = Observer()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ObstacleRanging, "ranges", ranges)
+        pilot = FlockPilot(config, networks, observer=observer)
+        return [pilot.step(frames(0.5 * step), vehicle(0.5 * step, 4.0)) for step in range(len(sees))]
 
 
-def test_switched_off_the_wall_is_flown_at_and_nothing_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where a camera looks."""
-    monkeypatch.setattr(FlockPilot, "_gone", lambda *_: frozenset())
+def test_switched_off_the_wall_is_flown_at_and_nothing_is_kept() -> None:
     output = flown(drone(enabled=False), [True])[-1]
     assert output.obstacles is None
     assert output.command.velocity[0] > 0.5

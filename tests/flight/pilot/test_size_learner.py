@@ -41,7 +41,8 @@ class Flight:
         are a tree of another size for one ("tree")."""
         self._doubt, self._random, self._mates = doubt, np.random.default_rng(seed), mates
         networks: Any = object()  # never asked for anything
-        self._pilot = FlockPilot(config, networks, observer=self, learned=learned, flies=flies)
+        observer: Any = self
+        self._pilot = FlockPilot(config, networks, observer=observer, learned=learned, flies=flies)
         self.below_m = self.time_s = 0.0
         self._drift: FloatArray = np.zeros_like(PLACES)
         self._last: Observation | None = None

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.core.messages import Setpoint
+from flockd.core.messages import SECTORS, FloatArray, Setpoint
 from flockd.flight.safety import Action, Gate, GateParameters, Objection, Permission, Surroundings, Verdict
 from tests.make import around, request
 
@@ -376,8 +376,18 @@ def test_without_a_height_of_its_own_a_drone_counts_as_where_it_was_asked_to_be(
 
 SQUARE = {"fence_corners_m": ((-10.0, -10.0), (-10.0, 10.0), (10.0, 10.0), (10.0, -10.0)), "fence_radius_m": None}
 FENCE, SEPARATION, OBSTACLE = (Objection.FENCE,), (Objection.SEPARATION,), (Objection.OBSTACLE,)
+UNSEEN = (Objection.UNSEEN,)
 BEYOND = {"position": [101.0, 0.0]}
 AHEAD_AND_RIGHT = {"neighbours": [[0.5, 0.0, 0.0], [0.0, 0.5, 0.0]]}
+
+
+def seen(range_m: float, *sectors: int) -> FloatArray:
+    """So far in these sectors, of 5 degrees from north on, and as far as can be in all others."""
+    seen_m = np.full(SECTORS, np.inf)
+    seen_m[list(sectors)] = range_m
+    return seen_m
+
+
 GAP = [(0.1 * k, side) for k in range(-20, 21) for side in (-0.9, 0.9)]
 
 
@@ -419,6 +429,26 @@ GAP = [(0.1 * k, side) for k in range(-20, 21) for side in (-0.9, 0.9)]
             [3.0, 0.0], {"obstacles": [[1.0, 0.0]]}, [math.sqrt(1.7625) - 0.75, 0.0], OBSTACLE, id="at an obstacle"
         ),
         pytest.param([1.0, 0.0], {"obstacles": GAP}, [1.0, 0.0], (), id="through the middle of a gap"),
+        # 2.5 m of 3.5 m are left before one that may hover there: v + v^2 / 3 = 2.5 m
+        *(
+            pytest.param([0.0, 3.0], {"seen_m": seen(3.5, *where)}, [0.0, most], UNSEEN, id=f"unseen {where}")
+            for where in ([18], [17], [19]) for most in [1.5 * (math.sqrt(1.0 + 10.0 / 3.0) - 1.0)]
+        ),
+        pytest.param([0.0, 3.0], {"seen_m": seen(0.0, 16, 20)}, [0.0, 3.0], (), id="unseen on both sides"),
+        pytest.param([-1.0, -1.0], {"seen_m": seen(1.0, 45)}, STILL, UNSEEN, id="not seen behind"),
+        pytest.param([0.0, 3.0], {"seen_m": seen(math.nan, 18)}, STILL, UNSEEN, id="not known to be seen"),
+        pytest.param(
+            [-1.0, 0.0], {"seen_m": seen(0.0, 36), "neighbours": [[0.9, 0.0, 0.0]]}, [-1.0, 0.0], (),
+            id="from a neighbour to where nobody looks",
+        ),
+        pytest.param(
+            [-1.0, 0.0], {"seen_m": seen(0.0, 36), "obstacles": [[0.5, 0.0]]}, [-1.0, 0.0], (),
+            id="from an obstacle to where nobody looks",
+        ),
+        pytest.param(
+            [-1.0, 0.0], {"seen_m": seen(0.0, 36), "neighbours": [[1.1, 0, 0]], "obstacles": [[0.7, 0]]}, STILL, UNSEEN,
+            id="not from those that are not too near",
+        ),
         pytest.param(
             [1.0, 1.0], {"obstacles": [[0.4, 0.0]], "neighbours": [[0.0, 0.9, 0.0]]}, STILL, SEPARATION + OBSTACLE,
             id="neighbour and obstacle",

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from flockd.core.config.safety import GateParameters
-from flockd.core.messages import Neighbour, PossibleMotion
+from flockd.core.messages import SECTORS, Neighbour, PossibleMotion
 from flockd.flight.safety import Objection, Surroundings
 from flockd.flight.safety.surroundings import BEYOND, limits_around, limits_towards, surroundings
 from tests.make import around, neighbour
@@ -22,6 +22,7 @@ def told(*neighbours: Neighbour, obstacles: Sequence[Sequence[float]] = ()) -> S
     return surroundings(
         neighbours, 0.5, moved=np.array([1.0, -2.0, -0.5]), position=np.array([30.0, 40.0]),
         velocity=np.array([2.0, -4.0, -1.0]), yaw_rad=0.3, height_m=6.0, obstacles=np.reshape(obstacles, (-1, 2)),
+        seen_m=np.full(SECTORS, 9.0),
     )  # fmt: skip
 
 
@@ -45,6 +46,7 @@ def test_neighbours_fly_on_and_the_drone_has_moved_and_obstacles_stand_still() -
     np.testing.assert_allclose(near.obstacles, [[2.0, 2.0], [-1.0, -4.0]])
     np.testing.assert_array_equal([*near.position, *near.velocity], [30.0, 40.0, 2.0, -4.0])
     assert (near.yaw_rad, near.height_m) == (0.3, 6.0)
+    np.testing.assert_allclose(near.seen_m, 9.0 - math.sqrt(5.0))
 
 
 def test_one_that_is_as_likely_not_there_counts_by_half() -> None:

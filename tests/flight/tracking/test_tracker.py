@@ -93,7 +93,7 @@ class Follower:
         """How fast, m/s, the gate lets the drone fly towards anybody as soon as the neighbours are known."""
         near = surroundings(
             self.all, 0.1, moved=0.1 * CRUISE, position=np.zeros(2), velocity=CRUISE, yaw_rad=0.0, height_m=5.0,
-            obstacles=np.empty((0, 2)),
+            obstacles=np.empty((0, 2)), seen_m=None,
         )  # fmt: skip
         flies_on = near.neighbours, near.neighbour_velocities, 1.0, near.neighbour_margins
         return float(towards_flying_on(GateParameters(), *flies_on)[1].min(initial=math.inf))
