@@ -73,8 +73,7 @@ def _written(
             del values[section]
         else:
             values.setdefault(section, {}).update(keys)
-    # Those that fly are patient with slow machines, and may not fly as fast for it.
-    values.setdefault("safety", {})["degraded_load"] = values["flocking"]["max_speed_m_s"] = 1.0
+    values.setdefault("safety", {})["degraded_load"] = values["flocking"]["max_speed_m_s"] = 1.0  # else it stops late
     path = folder / "tiny.yaml"
     path.write_text(yaml.safe_dump(values), encoding="utf-8")
     return path
