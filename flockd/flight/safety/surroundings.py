@@ -103,7 +103,7 @@ def into_the_unseen(
     if nearest_m < separation_m or around.nearest_obstacle_m < p.obstacle_clearance_m:
         return math.inf
     ahead = round(math.atan2(velocity[1], velocity[0]) * SECTORS / math.tau)
-    left_m = np.fmax(around.seen_m, 0.0).take([ahead - 1, ahead, ahead + 1], mode="wrap").min() - separation_m
+    left_m = np.fmax(around.seen_m, 0.0).take([ahead - 1, ahead, ahead + 1]).min() - separation_m
     return float(stopping_speed(left_m, p.braking_m_s2, p.neighbour_reaction_s + late_s))
 
 

@@ -13,7 +13,7 @@ import pytest
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import SECTORS, Neighbour, PossibleMotion
 from flockd.flight.safety import Objection, Surroundings
-from flockd.flight.safety.surroundings import BEYOND, limits_around, limits_towards, surroundings
+from flockd.flight.safety.surroundings import BEYOND, into_the_unseen, limits_around, limits_towards, surroundings
 from tests.make import around, neighbour
 
 
@@ -130,3 +130,25 @@ def test_where_the_own_velocity_is_not_known_the_limits_are_those_of_a_drone_wit
     _, (most_m_s,), there = limits_around(GateParameters(fence_radius_m=None), near, 1.0, 0.0)
     assert 0.5 * most_m_s + most_m_s**2 / 3.0 == pytest.approx(2.4)
     assert there == [Objection.OBSTACLE]
+
+
+def test_into_the_unseen_no_faster_than_it_stops_within_what_was_seen() -> None:
+    """v r + v^2 / 2b is what was seen that way and in the sectors beside it, less the separation."""
+    p, nobody = GateParameters(), np.empty((0, 2))
+    free = surroundings(
+        (), 0.0, moved=np.zeros(3), position=np.zeros(2), velocity=np.zeros(3), yaw_rad=0.0, height_m=5.0,
+        obstacles=nobody, seen_m=np.full(SECTORS, 8.0),
+    )  # fmt: skip
+    north = np.array([1.0, 0.0])
+    v = into_the_unseen(p, free, 1.5, 0.4, north)
+    assert v * (p.neighbour_reaction_s + 0.4) + v**2 / (2 * p.braking_m_s2) == pytest.approx(6.5)
+    for sector in (-1, 0, 1):
+        seen_m = free.seen_m.copy()
+        seen_m[sector] = 0.2
+        assert into_the_unseen(p, replace(free, seen_m=seen_m), 0.5, 0.0, north) == 0.0
+    for apart_m, limited in ((1.5, True), (1.49, False)):
+        beside = replace(free, neighbours=np.array([[0.0, apart_m, 0.0]]))
+        assert math.isfinite(into_the_unseen(p, beside, 1.5, 0.0, north)) == limited
+        clear_m = p.obstacle_clearance_m + apart_m - 1.5
+        before = replace(free, obstacles=np.array([[0.0, clear_m]]))
+        assert math.isfinite(into_the_unseen(p, before, 1.5, 0.0, north)) == limited
