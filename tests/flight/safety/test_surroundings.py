@@ -149,6 +149,6 @@ def test_into_the_unseen_no_faster_than_it_stops_within_what_was_seen() -> None:
     for apart_m, limited in ((1.5, True), (1.49, False)):
         beside = replace(free, neighbours=np.array([[0.0, apart_m, 0.0]]))
         assert math.isfinite(into_the_unseen(p, beside, 1.5, 0.0, north)) == limited
-        clear_m = p.obstacle_clearance_m + apart_m - 1.5
+        clear_m = p.obstacle_clearance_m if limited else p.obstacle_clearance_m - 0.01
         before = replace(free, obstacles=np.array([[0.0, clear_m]]))
         assert math.isfinite(into_the_unseen(p, before, 1.5, 0.0, north)) == limited
