@@ -181,20 +181,10 @@ def flights_of(
         for name, scenario in SCENARIOS.items():
             worn: Sequence[Airframe | None] = airframes if name == REAL_AIRFRAMES else [None]
             count, duration_s = scenario.quick if quick else scenario.whole
-            found += [
-                Flight(
-                    name,
-                    eyes,
-                    seed,
-                    scenario.file,
-                    duration_s,
-                    {**scenario.overrides(seed, turn, one), **of.overrides},
-                    one,
-                )
-                for turn, (seed, one) in enumerate(
-                    zip(seeds_of(commit, name, count)[:most], itertools.cycle(worn), strict=False)
-                )
-            ]
+            seeds = zip(seeds_of(commit, name, count)[:most], itertools.cycle(worn), strict=False)
+            for turn, (seed, airframe) in enumerate(seeds):
+                overrides = {**scenario.overrides(seed, turn, airframe), **of.overrides}
+                found.append(Flight(name, eyes, seed, scenario.file, duration_s, overrides, airframe))
     return found
 
 

@@ -7,11 +7,10 @@ from collections.abc import Callable
 from typing import Any
 
 from flockd.core.config.loader import Overrides
+from flockd.sim.scenario import MAX_DURATION_S
 
 _DRONES = 5
 _SIDE_M = 2.0
-_CAMERAS = "front", "right", "back", "left"
-_FOR_GOOD_S = 1000.0
 _SPEEDS_M_S = 0.5, 1.0, 1.5, 2.0
 
 
@@ -19,7 +18,7 @@ def _taken_over(to: str) -> Callable[[int, float], Overrides]:
     return lambda one, time_s: {"takeovers": ({"drone": one, "time_s": time_s, "to": to},)}
 
 
-def _blind(cameras: tuple[str, ...], lasts_s: float) -> Callable[[int, float], Overrides]:
+def _blind(*cameras: str, lasts_s: float = MAX_DURATION_S) -> Callable[[int, float], Overrides]:
     def faults(one: int, time_s: float) -> Overrides:
         end_s = time_s + lasts_s
         return {"faults": tuple({"drone": one, "camera": c, "begin_s": time_s, "end_s": end_s} for c in cameras)}
@@ -29,11 +28,11 @@ def _blind(cameras: tuple[str, ...], lasts_s: float) -> Callable[[int, float], O
 
 TROUBLES: dict[str, Callable[[int, float], Overrides]] = {
     "holds": _taken_over("hold"),
-    "front camera lost": _blind(("front",), _FOR_GOOD_S),
+    "front camera lost": _blind("front"),
     "lands": _taken_over("land"),
-    "sees nothing for 3 s": _blind(_CAMERAS, 3.0),
+    "sees nothing for 3 s": _blind("front", "right", "back", "left", lasts_s=3.0),
     "flown by a person": lambda one, time_s: {},
-    "right camera lost": _blind(("right",), _FOR_GOOD_S),
+    "right camera lost": _blind("right"),
     "short steps": lambda one, time_s: {"drone.step_s": 0.2},
 }
 """By what happens: what is flown otherwise, of the drone with this number, from 1, at this time."""

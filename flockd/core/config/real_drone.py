@@ -90,18 +90,24 @@ def beyond_envelope(config: DroneConfig) -> dict[KeyPath, str]:
     law_m_s, gate_m_s, usual_m_s = (of.max_speed_m_s for of in (config.flocking, config.safety.gate, GateParameters()))
     behind_m_s, meeting_m_s = safe_speeds(config)
     safe_m_s = math.floor(100 * min(behind_m_s, meeting_m_s)) / 100
-    whom, more = "one that comes as fast", ", or a smaller step_s"
+    whom, more = "one that comes as fast", ["a smaller step_s"]
     if behind_m_s < meeting_m_s:
-        whom, more = "a mate that stops", ", or a larger flocking.desired_distance_m or a smaller step_s"
-    speeds: dict[KeyPath, tuple[float, float, str, str]] = {
+        whom, more = "a mate that stops", ["a larger flocking.desired_distance_m or a smaller step_s"]
+    speeds: dict[KeyPath, tuple[float, float, str, list[str]]] = {
         ("flocking", "max_speed_m_s"): (law_m_s, safe_m_s, f"from which the drone stops in time before {whom}", more),
-        ("safety", "gate", "max_speed_m_s"): (gate_m_s, usual_m_s, "that real drones' gates let through", ""),
+        ("safety", "gate", "max_speed_m_s"): (gate_m_s, usual_m_s, "that real drones' gates let through", []),
     }
     return {
-        key: f"{flown:g} m/s is above the {most:g} m/s {why}; write {most:g} or less{more}, or take it with --force"
+        key: f"{flown:g} m/s is above the {most:g} m/s {why}; {_remedy(most, more)}, or take it with --force"
         for key, (flown, most, why, more) in speeds.items()
         if flown > most
     }
+
+
+def _remedy(most_m_s: float, more: list[str]) -> str:
+    """What to write instead: no lower speed where none is low enough."""
+    slower = [f"{most_m_s:g} or less"] if most_m_s > 0.0 else []
+    return "write " + ", or ".join(slower + more)
 
 
 def outside_envelope(config: DroneConfig, places: Mapping[KeyPath, Place]) -> list[ConfigProblem]:

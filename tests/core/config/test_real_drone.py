@@ -112,6 +112,14 @@ def test_what_is_written_is_what_may_be_flown(law: float, apart_m: float, stops_
     assert told == "" if stops_for is None else f"in time before {stops_for};" in told
 
 
+def test_where_no_speed_is_low_enough_none_is_advised(file: Path) -> None:
+    _write(file, law=0.1, more=f"  desired_distance_m: 1.0\n{AUTOPILOT}")
+    (problem,) = load_real_drone(file)[1]
+    assert problem.message.endswith(
+        "; write a larger flocking.desired_distance_m or a smaller step_s, or take it with --force"
+    )
+
+
 def test_shipped_drones_are_inside_the_laws_default_is_not_and_studies_may_go_beyond(file: Path) -> None:
     for inside in (CONFIG / "quadrotor.yaml", CONFIG / "px4_sitl.yaml", CONFIG / "simulator.yaml"):
         assert load_real_drone(inside)[1] == []
