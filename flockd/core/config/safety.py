@@ -89,7 +89,8 @@ class SafetyParameters(Section):
     max_dropped_share: Share = 0.2
     """Limit of the share of dropped frames of late; above it, degraded."""
     estimate_timeout_s: Annotated[float, Field(gt=0, le=60)] = services.ESTIMATE.timeout
-    """Hover when the pilot's newest output is older than this; leave it three of its steps."""
+    """Hover when the pilot's newest output is older than this; leave it three of its steps. At most
+    `gate.command_timeout_s`."""
     degraded_ego_motion_s: Annotated[float, Field(gt=0, le=600)] = 0.75
     """How long no step has found the own motion, to be degraded: at two steps a second, two in a row."""
     max_ego_motion_s: Annotated[float, Field(gt=0, le=600)] = 2.75
@@ -142,6 +143,9 @@ class SafetyParameters(Section):
         for limit in ("ego_motion_s", "load", "temperature_c", "velocity_error_m_s"):
             if getattr(self, f"degraded_{limit}") > getattr(self, f"max_{limit}"):
                 raise ValueError(f"degraded_{limit} is above max_{limit}; write a smaller one")
+        if self.estimate_timeout_s > (silent_s := self.gate.command_timeout_s):
+            told = f"is above gate.command_timeout_s {silent_s:g}, after which the gate sends nothing, not even a hover"
+            raise ValueError(f"estimate_timeout_s {told}; write a smaller one, or a larger one there")
         return self
 
     @model_validator(mode="after")

@@ -27,6 +27,7 @@ PX4_SITL = SIMULATOR.with_name("px4_sitl.yaml")
         {"safety.gate.command_fresh_s": 1.5},
         {"safety.gate.permission_timeout_s": 0.5},
         {"safety.degraded_ego_motion_s": 7.0},
+        {"safety.estimate_timeout_s": 1.6},  # the gate would send nothing, before the drone hovers
         {"safety.degraded_load": 2.5},
         {"safety.degraded_temperature_c": 99.0},
         {"safety.degraded_velocity_error_m_s": 9.0},

@@ -24,7 +24,7 @@ from flockd.core.config.flocking import FlockingParameters
 from flockd.core.config.geometry import GeometryParameters
 from flockd.core.config.mission import MissionParameters
 from flockd.core.config.perception import PerceptionConfig
-from flockd.core.config.safety import SafetyParameters
+from flockd.core.config.safety import GateParameters, SafetyParameters
 from flockd.core.config.source import SharedMemoryParameters, SourceParameters
 from flockd.core.messages import Float32Array, Frame, UInt8Array
 from flockd.fleet.watcher import FleetWatcher, Heard
@@ -51,7 +51,14 @@ SECONDS_TO_FAIL = 60.0
 """Limit on the event loop's clock. Nothing is promised within it: it ends a story that hangs."""
 QUIET_S = 1.5
 """For which nothing may be sent; PX4 would be back in offboard with one setpoint."""
-PATIENT = SafetyParameters(degraded_load=50.0, max_load=100.0, max_loop_lag_s=2.0, recovery_s=0.5)
+PATIENT = SafetyParameters(
+    gate=GateParameters(command_timeout_s=5.0),
+    degraded_load=50.0,
+    max_load=100.0,
+    max_loop_lag_s=2.0,
+    estimate_timeout_s=5.0,
+    recovery_s=0.5,
+)
 """These stories are not about how fast the computer is that tells them."""
 
 
