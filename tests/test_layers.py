@@ -66,7 +66,7 @@ def _room(path: Path) -> str:
     return _place(path)[0]
 
 
-def _taken(path: Path) -> list[list[str]]:
+def taken(path: Path) -> list[list[str]]:
     """The modules of flockd that a file imports, without `flockd`: ["flight", "safety", "gate"]."""
     return [name.split(".")[1:] for name in _imports(path) if name.startswith("flockd.") and "__version__" not in name]
 
@@ -93,20 +93,20 @@ def test_there_are_nine_rooms() -> None:
 def test_a_room_imports_only_rooms_below_it(room: str) -> None:
     below = ROOMS[: ROOMS.index(room) + 1]
     for path in _of(room):
-        assert {names[0] for names in _taken(path)} <= set(below), path
+        assert {names[0] for names in taken(path)} <= set(below), path
 
 
 @pytest.mark.parametrize(("room", "order"), [("flight", FLIGHT), ("onboard", ONBOARD)])
 def test_what_flies_stands_in_one_order(room: str, order: tuple[str, ...]) -> None:
     for path in _of(*(f"{room}/{folder}" for folder in order)):
         below = set(order[: order.index(_place(path)[1]) + 1])
-        used = {names[1] for names in _taken(path) if names[0] == room and len(names) > 1}
+        used = {names[1] for names in taken(path) if names[0] == room and len(names) > 1}
         assert used & set(order) <= below, path
 
 
 def test_the_bridge_to_ros_knows_no_page() -> None:
     for path in set(_of("fleet")) - set(_of("fleet/page")):
-        assert not any(names[:2] == ["fleet", "page"] for names in _taken(path)), path
+        assert not any(names[:2] == ["fleet", "page"] for names in taken(path)), path
 
 
 def test_the_pure_line_knows_no_clock_no_thread_and_no_network() -> None:

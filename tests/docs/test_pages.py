@@ -13,7 +13,7 @@ import yaml
 
 from flockd.cli import _parser
 from flockd.core.config import DroneConfig
-from tools.docs import docs_reference
+from tools.docs import docs_reference, rooms
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -83,6 +83,13 @@ def test_the_reference_is_up_to_date() -> None:
     for name, text in docs_reference.pages().items():
         written = (DOCS / "reference" / name).read_text(encoding="utf-8")
         assert written == text, f"docs/reference/{name}: run python -m tools.docs.docs_reference"
+
+
+def test_the_picture_of_the_rooms_is_up_to_date() -> None:
+    drawn = rooms.PICTURE.read_text(encoding="utf-8")
+    assert drawn == rooms.picture(), "docs/pictures/rooms.svg: run python -m tools.docs.docs_reference"
+    dots = drawn.partition("flockd/flight/<")[0].count('class="o"')
+    assert 20 < dots <= 9 * 8 / 2  # a pair of rooms has at most one
 
 
 def shell_lines(page: Path) -> Iterator[str]:

@@ -1,6 +1,6 @@
-"""Writes the reference pages of the documentation from the code: configuration, commands, telemetry, faults.
+"""Writes what the documentation has from the code: the reference pages, and the picture of the rooms.
 
-python -m tools.docs.docs_reference    # writes docs/reference/*.md
+python -m tools.docs.docs_reference    # writes docs/reference/*.md and docs/pictures/rooms.svg
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from flockd.onboard.autopilot.refusal_reasons import REASONS
 from flockd.onboard.telemetry import topics
 from flockd.sim.scenario import scenario_schema
 from tests.faults.stories import faults, stories
+from tools.docs import rooms
 
 FOLDER = Path(__file__).parents[2] / "docs" / "reference"
 NOTICE = "<!-- Written by tools/docs/docs_reference.py; do not edit. -->"
@@ -33,9 +34,10 @@ SCENARIO_KEY = "drone"
 
 
 def main() -> None:
-    """Writes the pages."""
+    """Writes the pages and the picture."""
     for name, text in pages().items():
         (FOLDER / name).write_text(text, encoding="utf-8")
+    rooms.PICTURE.write_text(rooms.picture(), encoding="utf-8")
 
 
 def pages() -> dict[str, str]:
