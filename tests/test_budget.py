@@ -20,16 +20,16 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_000,
+    "flockd/core": 3_010,
     "flockd/flight": 11_320,
-    "flockd/onboard": 9_010,
+    "flockd/onboard": 9_090,
     "flockd/fleet": 2_670,
-    "flockd/ground": 4_030,
+    "flockd/ground": 4_040,
     "flockd/review": 3_510,
     "flockd/sim": 8_560,
     "flockd/campaign": 1_470,
-    "flockd/cli": 3_430,
-    "tests": 36_490,
+    "flockd/cli": 3_440,
+    "tests": 36_610,
     "tools/checks": 2_060,
     "tools/docs": 850,
     "tools/measure": 1_370,

@@ -114,7 +114,10 @@ def opened(path: Path) -> Recording:
     from flockd.onboard.recording.reader import Recording
 
     with progress("checking", "bytes") as tell:
-        return Recording(path, tell)
+        recording = Recording(path, tell)
+    if recording.unknown:
+        complain(f"warning: {path}: this flockd does not know {', '.join(recording.unknown)} of its configuration")
+    return recording
 
 
 def add_force(parser: Parser) -> None:

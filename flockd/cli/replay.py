@@ -177,6 +177,14 @@ def _refuse_short(recording: Recording, start_s: float, end_s: float) -> None:
 
 def _config(args: argparse.Namespace, recording: Recording) -> DroneConfig:
     """The settings to fly with: the recorded ones, or those of --config, for the same cameras."""
+    if args.config is None and recording.unknown:
+        from flockd.onboard.recording import RecordingError
+
+        raise RecordingError(
+            f"{recording.path}: was flown with settings unknown to this flockd ({', '.join(recording.unknown)}), "
+            f"so that a replay would be another flight; use {recording.contents.flight.get('version', 'the version')} "
+            "that wrote it, or other settings with --config"
+        )
     if args.config is None:
         return recording.config
     config = loaded(args.config)

@@ -8,9 +8,12 @@ from typing import Any
 MASK = "***"
 _OF_URL = re.compile(r"(?<=://)[^\s\"']*(?=@)")
 """A user and a password before the host: `rtsp://user:password@camera/stream`."""
+_QUERY = re.compile(r"\?[^\s\"']+")
+"""Of an address. Each of its values is masked, as every maker calls a password otherwise: `pwd`, `loginpas`, `auth`."""
+_VALUE = re.compile(r"(?<=[?&;])([^&;=]*=)?[^&;]+")
 _NAMED = re.compile(
-    r"([\w-]*(?:passw|passphrase|user-pw|proxy-pw|secret|token|private_key|cookies|extra-headers)[\w-]*\s*=\s*)"
-    r"(\"(?:[^\"\\]|\\.)*\"|'[^']*'|[^\s!;&#]+)",
+    r"([\w-]*(?:passw|passphrase|-pw|pwd|secret|token|key|auth|credential|cookies|extra-headers)[\w-]*\s*=\s*)"
+    r"(\"(?:[^\"\\]|\\.)*\"|'[^']*'|[^\s;&#]+)",
     re.IGNORECASE,
 )
 """A property of a GStreamer element, a parameter of an address: `user-pw=password`."""
@@ -19,7 +22,8 @@ _NAMED = re.compile(
 def masked(value: Any) -> Any:
     """The same with `***` for each password: of a text, or of the texts in lists and objects."""
     if isinstance(value, str):
-        return _NAMED.sub(rf"\1{MASK}", _OF_URL.sub(MASK, value))
+        without = _QUERY.sub(lambda query: _VALUE.sub(rf"\1{MASK}", query[0]), _OF_URL.sub(MASK, value))
+        return _NAMED.sub(rf"\1{MASK}", without)
     if isinstance(value, dict):
         return {key: masked(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):

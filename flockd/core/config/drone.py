@@ -35,8 +35,9 @@ class RecordingConfig(Section):
     queue_mb: Positive = 64.0
     """What waits for the disk; beyond it steps are dropped."""
     quota_mb: Positive = 20000.0
-    """Limit for all recordings of the drone in one folder together: the oldest are deleted to make room. That of the
-    flight before stays, and does not count. A flight that alone is larger is recorded that far."""
+    """Limit for all recordings of the drone in one folder together: the oldest are deleted to make room, also on a full
+    disk. That of the flight before does not count, and goes last, on a full disk only. A flight that alone is larger is
+    recorded that far."""
 
 
 OperatorCommand = Literal["hold", "land", "resume", "goto", "velocity"]

@@ -18,7 +18,7 @@ from flockd.ground.cameras.watching import START_S, Watched, watch
 from flockd.ground.doctor import Finding, Level, failed, failed_from_error, graded, passed, warned
 from flockd.ground.doctor.computer_checks import STATE_FOLDER
 from flockd.onboard.recording.mcap_file import RecordingError
-from flockd.onboard.recording.reader import Recording
+from flockd.onboard.recording.reader import Recording, flight_number, head_of
 from flockd.onboard.sources.device_source import Devices
 
 SLOW, TOO_SLOW = 0.95, 0.8
@@ -177,10 +177,18 @@ def _gaps(blind: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> list[str]:
     return [f"from {begin} to {end} degrees" for begin, end in zip(begins, ends, strict=True)]
 
 
+def _flown(file: Path) -> tuple[int, float]:
+    """The larger, the later. By the flight's number: a drone's clock may be wrong."""
+    number = 0
+    with contextlib.suppress(RecordingError, OSError):
+        number = flight_number(head_of(file)[0].facts)
+    return number, file.stat().st_mtime
+
+
 def check_rig(config: DroneConfig, folder: Path | None, state_folder: Path = STATE_FOLDER) -> Iterator[Finding]:
     """Of this drone's newest recording in the folder, named as for `check_disk`."""
     files = [path for path in (folder or state_folder).glob(f"{config.name}-*.mcap") if not path.is_symlink()]
-    newest = max(filter(Path.is_file, files), key=lambda path: path.stat().st_mtime, default=None)
+    newest = max(filter(Path.is_file, files), key=_flown, default=None)
     if newest is None:
         yield passed("rig", "no flight of this drone is recorded yet that its cameras could be compared with")
         return

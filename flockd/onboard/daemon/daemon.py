@@ -133,8 +133,7 @@ class Daemon:
         stack.push_async_callback(_close_async, sinks.close)
         await closing.do(OPEN_S, self._source.start)
         stack.push_async_callback(_close, closing, self._source.stop)
-        networks, link = await _both(self._networks(loading), AutopilotLink.connect(config.autopilot, clock=clock))
-        stack.push_async_callback(_close_async, link.close)
+        networks, link = await _both(self._networks(loading), self._link(stack))
         gate = Gate(config.safety.gate)
         streamer = SetpointStreamer(
             link.send_setpoint, link.status, gate.step, config.autopilot, config.safety, clock=clock
@@ -178,10 +177,23 @@ class Daemon:
         deadline_s = self._config.perception.deadline_s / self._config.speed_factor
         return WatchedNetworks(networks, deadline_s, cameras_at_once(self._config))
 
+    async def _link(self, stack: AsyncExitStack) -> AutopilotLink:
+        """Closed by the stack, whatever becomes of the networks that load meanwhile."""
+        assert self._config.autopilot is not None
+        link = await AutopilotLink.connect(self._config.autopilot, clock=self._clock)
+        stack.push_async_callback(_close_async, link.close)
+        return link
+
     def _open_telemetry(self) -> ZenohTelemetry:
         parameters = self._config.telemetry
         settings = None if parameters.zenoh_config is None else Path(parameters.zenoh_config)
-        return ZenohTelemetry(parameters.fleet, listen=parameters.listen, connect=parameters.connect, settings=settings)
+        return ZenohTelemetry(
+            parameters.fleet,
+            listen=parameters.listen,
+            connect=parameters.connect,
+            settings=settings,
+            awaits_addresses=True,
+        )
 
     async def _unless_stopped(self, start: Coroutine[Any, Any, Components]) -> Components | None:
         """Starts; None when asked to stop before that is done."""
@@ -293,6 +305,7 @@ async def _both(
     except BaseException:
         for task in tasks:
             task.cancel()
+        await asyncio.wait(tasks)
         raise
 
 

@@ -37,6 +37,8 @@ class MessageSinks:
         self._config, self._telemetry, self._models = config, telemetry, models
         self._folder, self._clock = folder, clock
         self._worker = Worker("telemetry", BACKLOG)
+        self._closing = Worker("recordings", BACKLOG)
+        """A slow disk takes its time to end a file, and telemetry goes on."""
         self._recorder: Recorder | None = None
         self._path: Path | None = None
         self.lost = 0
@@ -87,13 +89,14 @@ class MessageSinks:
         """Ends the file in the background."""
         recorder, self._recorder = self._recorder, None
         if recorder is not None:
-            self._submit(recorder.close, CLOSE_S)
+            self._closing.submit(recorder.close, CLOSE_S)
 
     async def close(self) -> None:
         """Ends the recording, and waits until all is written or it takes too long. Raises LateError."""
         self.end_recording()
-        await self._worker.do(CLOSE_S + 1.0, lambda: None)
-        self._worker.leave()
+        for worker in (self._closing, self._worker):
+            await worker.do(CLOSE_S + 1.0, lambda: None)
+            worker.leave()
 
     def _on_event(self, sentence: str) -> None:
         """The recorder has recorded it already, if it still can."""

@@ -76,7 +76,7 @@ class InputCollector:
         cameras, dropped_share = self._camera_monitor.update(now, self._source.status(), noisy, noisy_images)
         position = position_from_home(status)
         self._had_satellites = self._had_satellites or status.gps_ok is True
-        if self._was_armed and not status.armed and status.landed_state == "ground":
+        if self._was_armed and not status.armed:
             operator.hold = operator.land = False  # they were for the flight that is over
         self._was_armed = status.armed
         inputs = Inputs(

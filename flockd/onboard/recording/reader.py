@@ -95,7 +95,9 @@ class Recording:
         """
         self.path = Path(path)
         self.contents = _survey(self.path, progress)
-        self.config = _config(self.path, self.contents)
+        self.config, self.unknown = _config(self.path, self.contents)
+        """What it was flown with, and the keys of it that this version does not know or would refuse: where there are
+        any it cannot be flown again as it was."""
         self.learned = _learned(self.path, self.contents.flight)
         """What the flight's pilot began with of the others' size."""
 
@@ -197,6 +199,12 @@ def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
     raise RecordingError(f"{path}: is an MCAP file, but not a recording of flockd; name one that flockd wrote")
 
 
+def flight_number(facts: Mapping[str, str]) -> int:
+    """Of a flight's note; 0 where its recorder counted none."""
+    text = facts.get(streams.FLIGHT_NUMBER, "")
+    return int(text) if re.fullmatch("[0-9]{1,9}", text) else 0
+
+
 def _survey(path: Path, progress: Callable[[int, int], None]) -> Contents:
     if not path.is_file():
         fault = "is a folder; name a recording in it" if path.is_dir() else "does not exist; check the path"
@@ -235,19 +243,29 @@ def _time_of(path: Path, data: bytes) -> float:
     raise RecordingError(f"{path}: holds a frame set without a time; use another copy")
 
 
-def _config(path: Path, contents: Contents) -> DroneConfig:
+def _config(path: Path, contents: Contents) -> tuple[DroneConfig, tuple[str, ...]]:
     try:
-        return DroneConfig.model_validate_json(json.dumps(_without_gone(parsed(contents.configuration))))
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"]) or "the whole"
-        version = contents.flight.get("version", "of unknown version")
-        raise RecordingError(
-            f"{path}: the configuration in it is not one of this flockd ({key}: {first['msg']}); "
-            f"use the flockd that wrote it, {version}"
-        ) from error
+        values = _without_gone(parsed(contents.configuration))
     except ValueError as error:
         raise RecordingError(f"{path}: the configuration in it is no JSON ({error}); use another copy") from error
+    unknown: list[str] = []
+    while True:
+        try:
+            return DroneConfig.model_validate_json(json.dumps(values)), tuple(unknown)
+        except ValidationError as error:
+            first = error.errors()[0]
+            key, section = ".".join(map(str, first["loc"])) or "the whole", values
+            with suppress(KeyError, IndexError, TypeError):
+                for part in first["loc"][:-1]:
+                    section = section[part]
+                del section[str(first["loc"][-1])]
+                unknown.append(key)
+                continue
+            version = contents.flight.get("version", "of unknown version")
+            raise RecordingError(
+                f"{path}: the configuration in it is not one of this flockd ({key}: {first['msg']}); "
+                f"use the flockd that wrote it, {version}"
+            ) from error
 
 
 def _without_gone(values: Any, at: str = "") -> Any:

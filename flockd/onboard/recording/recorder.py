@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import platform
 import queue
+import shutil
 import threading
 import time
 import uuid
@@ -27,7 +28,7 @@ from flockd.flight.geometry import build_rig
 from flockd.onboard.message_json import to_json
 from flockd.onboard.recording import foxglove, streams
 from flockd.onboard.recording.mcap_file import Entry, Inclosure, McapFile, Note, RecordingError
-from flockd.onboard.recording.reader import head_of
+from flockd.onboard.recording.reader import flight_number, head_of
 from flockd.onboard.recording.truth import Truth
 
 FLUSH_EVERY_S = 0.2
@@ -41,6 +42,8 @@ _VERSIONS = {
 _MB = 1e6
 _SMALL_BYTES = 4096
 """What anything but an image counts for in the queue."""
+_FREE_SHARE = 0.05
+"""Of a small disk, that stays free; of others what waits for the disk, `queue_mb`."""
 
 
 class Recorder:
@@ -287,19 +290,21 @@ class _File:
         tell: Callable[[str], None],
     ) -> None:
         self.path, self._flight, self._head, self._rig, self._tell = path, flight, head, rig, tell
-        self._quota_mb = settings.quota_mb
+        self._quota_mb, self._queue_mb = settings.quota_mb, settings.queue_mb
         self._file: McapFile | None = None
         self._earlier: dict[Path, int] = {}
         """Bytes of what may be deleted, the oldest first."""
+        self._before: Path | None = None
+        """The flight before this one: somebody may want to know how it ended. It goes last, and for free space only."""
         self._calibrated = False
 
     def begin(self) -> None:
         """Starts the file."""
-        self._earlier = self._deletable()
+        number = self._count_earlier()
+        self._make_room(0)
         self._file = McapFile(self.path)
-        self._file.write(
-            Note(streams.FLIGHT_NOTE, {"format": streams.FORMAT, "recording": uuid.uuid4().hex, **self._flight})
-        )
+        facts = {"format": streams.FORMAT, "recording": uuid.uuid4().hex, streams.FLIGHT_NUMBER: str(number)}
+        self._file.write(Note(streams.FLIGHT_NOTE, {**facts, **self._flight}))
         for record in self._head:
             self._file.write(record)
         self.flush()
@@ -318,13 +323,26 @@ class _File:
         """Makes safe what was written, within the quota: as the file grows, earlier ones go. Raises OSError."""
         assert self._file is not None
         self._file.flush()
-        while self._file.size + sum(self._earlier.values()) > self._quota_mb * _MB:
+        self._make_room(self._file.size)
+
+    def _make_room(self, size: int) -> None:
+        """Deletes the oldest recordings as long as they and ``size`` bytes are over the quota, or the disk is full."""
+        while size + sum(self._earlier.values()) > self._quota_mb * _MB:
             if not self._earlier:
                 raise OSError("recording.quota_mb is reached")
-            path = next(iter(self._earlier))
-            del self._earlier[path]
-            path.unlink(missing_ok=True)
-            self._tell(f"recording: {path} was deleted, as all recordings may take {self._quota_mb:g} MB")
+            self._delete(next(iter(self._earlier)), f"all recordings may take {self._quota_mb:g} MB")
+        while self._earlier or self._before is not None:
+            disk = shutil.disk_usage(self.path.parent)
+            if disk.free >= min(self._queue_mb * _MB, _FREE_SHARE * disk.total):
+                break
+            self._delete(next(iter(self._earlier), self._before), "the disk is full")
+
+    def _delete(self, path: Path | None, why: str) -> None:
+        assert path is not None
+        if self._earlier.pop(path, None) is None:
+            self._before = None
+        path.unlink(missing_ok=True)
+        self._tell(f"recording: {path} was deleted, as {why}")
 
     def finish(self, end: Mapping[str, str]) -> None:
         """Ends the file."""
@@ -337,15 +355,18 @@ class _File:
         if self._file is not None:
             self._file.abandon()
 
-    def _deletable(self) -> dict[Path, int]:
-        """Only what a recorder wrote: what someone replayed stays and does not count. So does the flight before this
-        one: somebody may want to know how it ended."""
-        others = [path for path in self.path.parent.glob("*.mcap") if path != self.path and self._is_ours(path)]
-        sizes = sorted((path.stat().st_mtime, path, path.stat().st_size) for path in others)
-        return {path: size for _, path, size in sizes[:-1]}
+    def _count_earlier(self) -> int:
+        """Notes what a recorder of this drone wrote, and gives this flight's number: files' times may be of a wrong
+        clock. What someone replayed stays and does not count."""
+        found = [path for path in self.path.parent.glob("*.mcap") if path != self.path]
+        numbers = {path: number for path in found if (number := self._number_of(path)) is not None}
+        order = sorted(numbers, key=lambda path: (numbers[path], path.stat().st_mtime))
+        self._earlier = {path: path.stat().st_size for path in order[:-1]}
+        self._before = order[-1] if order else None
+        return max(numbers.values(), default=0) + 1
 
-    def _is_ours(self, path: Path) -> bool:
-        """Whether a recorder of this drone wrote the file; what is no readable file is reported."""
+    def _number_of(self, path: Path) -> int | None:
+        """Of a flight that a recorder of this drone wrote; what is no readable file is reported."""
         try:
             facts = head_of(path)[0].facts if path.is_file() else None  # a pipe would wait for ever to be opened
             why = "is not a file"
@@ -353,8 +374,9 @@ class _File:
             facts, why = None, str(error).removeprefix(f"{path}: ")
         if facts is None:
             self._tell(f"recording: {path} was skipped and does not count for the quota: it {why}")
-            return False
-        return facts.get("drone") == self._flight["drone"] and not facts.keys() & streams.EDITED
+            return None
+        is_ours = facts.get("drone") == self._flight["drone"] and not facts.keys() & streams.EDITED
+        return flight_number(facts) if is_ours else None
 
 
 def _compressed(frame: Frame, settings: RecordingConfig) -> bytes | None:

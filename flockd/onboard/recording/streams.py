@@ -22,6 +22,8 @@ EDITED = (REPLAYED, "recovered_from", "cut_from")
 """Facts of a recording that was made of another; the last two of earlier versions."""
 LEARNED_SIZE = "learned_size"
 """A fact of a flight: what its pilot began with of the others' size, as JSON."""
+FLIGHT_NUMBER = "flight_number"
+"""A fact of a flight: one more than the largest of the drone's recordings in the folder."""
 CONFIGURATION = "configuration.json"
 
 

@@ -42,6 +42,7 @@ class ZenohTelemetry(SessionOwner):
         listen: Sequence[str] = (DEFAULT_ENDPOINT,),
         connect: Sequence[str] = (),
         settings: Path | None = None,
+        awaits_addresses: bool = False,
     ) -> None:
         self._prefix = f"{PREFIX}/{checked_name(fleet)}"
         self._publishers: dict[tuple[str, str], zenoh.Publisher] = {}
@@ -60,6 +61,7 @@ class ZenohTelemetry(SessionOwner):
             shared_memory=False,
             max_message_bytes=MAX_RECEIVED_BYTES,
             max_peers=MAX_PEERS,
+            awaits_addresses=awaits_addresses,
         )
 
     def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:

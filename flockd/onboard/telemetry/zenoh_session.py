@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import logging
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -11,6 +13,8 @@ from typing import Self
 import zenoh
 
 from flockd.core.errors import UnavailableError
+
+_log = logging.getLogger(__name__)
 
 
 class SessionError(UnavailableError):
@@ -30,12 +34,14 @@ def open_session(
     shared_memory: bool | None = None,
     max_message_bytes: int | None = None,
     max_peers: int | None = None,
+    awaits_addresses: bool = False,
 ) -> zenoh.Session:
     """A session that listens on and connects to these endpoints only, for ever where nobody is there yet.
 
     A peer opens without a router, unlike a client; discovery by multicast and gossip is off. ``purpose``: as errors say
     it; ``settings``: a file of zenoh's own to begin with, for TLS and access control. Longer messages and further peers
-    than the most are refused; None: as zenoh or the settings have it. Raises SessionError.
+    than the most are refused; None: as zenoh or the settings have it. ``awaits_addresses``: it listens on an address
+    that no interface has yet, such as Wi-Fi's at the start, once one has it. Raises SessionError.
     """
     wanted = {
         "mode": "peer",
@@ -53,7 +59,15 @@ def open_session(
         for key, value in wanted.items():
             if value is not None:
                 config.insert_json5(key, json.dumps(value))
-        return zenoh.open(config)
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            if not awaits_addresses or f"(os error {errno.EADDRNOTAVAIL})" not in str(error):
+                raise
+            _log.warning("%s: no interface has the address of %s yet; it is tried again", purpose, ", ".join(listen))
+            config.insert_json5("listen/exit_on_failure", "false")
+            config.insert_json5("listen/timeout_ms", "-1")
+            return zenoh.open(config)
     except zenoh.ZError as error:
         endpoints = ", ".join([*listen, *connect]) or "no endpoint"
         with_settings = f" with the settings of {settings}" if settings else ""

@@ -14,7 +14,7 @@ from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.onboard.message_json import from_json, to_json
 from flockd.onboard.recording import RecordingError
-from flockd.onboard.recording.reader import Recording, head_of
+from flockd.onboard.recording.reader import Recording, flight_number, head_of
 from flockd.onboard.recording.truth import Truth
 from flockd.review.flight_log.builder import FlightLogBuilder
 from flockd.review.flight_log.key_frames import KeyFrame, capture, key_frame_steps
@@ -31,17 +31,17 @@ def recordings_in(folder: Path) -> tuple[Path, ...]:
 
 
 def newest_recordings(folder: Path) -> tuple[tuple[Path, ...], int]:
-    """Each drone's newest recording in a folder, by when it began, and how many older ones the folder holds.
+    """Each drone's newest recording in a folder, by the flights' numbers, and how many older ones the folder holds.
 
     Raises RecordingError for other MCAP files.
     """
     found = recordings_in(folder)
-    newest: dict[str, tuple[str, Path]] = {}
+    newest: dict[str, tuple[int, str, Path]] = {}
     for path in found:
         facts = head_of(path)[0].facts
-        one = (facts.get("began", ""), path)
+        one = (flight_number(facts), facts.get("began", ""), path)
         newest[facts["drone"]] = max(newest.get(facts["drone"], one), one)
-    return tuple(sorted(path for _, path in newest.values())), len(found) - len(newest)
+    return tuple(sorted(path for *_, path in newest.values())), len(found) - len(newest)
 
 
 @dataclass

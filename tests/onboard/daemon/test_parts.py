@@ -6,9 +6,10 @@ import asyncio
 import math
 import os
 import socket
+import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +21,7 @@ from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.drone import DroneConfig
 from flockd.core.config.source import SourceParameters
 from flockd.core.data import data_path
+from flockd.core.errors import ModelError
 from flockd.core.messages import (
     EgoMotion,
     Frame,
@@ -36,7 +38,10 @@ from flockd.flight.inference import OnnxModel
 from flockd.flight.perception import ImagePair
 from flockd.flight.pilot.camera_agreement import moves_otherwise
 from flockd.flight.safety import Action, Decision, Gate, Inputs, Permission, Request, State
+from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
+from flockd.onboard.daemon import Daemon
 from flockd.onboard.daemon.control import Control
+from flockd.onboard.daemon.message_sinks import MessageSinks
 from flockd.onboard.daemon.operator_orders import OperatorRequests
 from flockd.onboard.daemon.pilot_loop import (
     PilotLoop,
@@ -48,10 +53,12 @@ from flockd.onboard.daemon.pilot_loop import (
 from flockd.onboard.daemon.status import ServiceManager
 from flockd.onboard.daemon.supervisor_inputs import CameraMonitor, InputCollector, LoopLag, thermal_zones
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
+from flockd.onboard.recording import Recorder
 from flockd.onboard.sources import CameraStatus, Count
 from flockd.onboard.worker import Worker
+from flockd.sim.sitl.processes import free_endpoint
 from tests.make import around, autopilot_status, camera, changed, drone, neighbour, output, vehicle, wanted
-from tests.onboard.daemon.aboard import TinyPerceiver
+from tests.onboard.daemon.aboard import TinyPerceiver, config_for
 
 IMAGE = np.zeros((48, 64, 3), np.uint8)
 FRAME = Frame("front", IMAGE, 0.0, 0)
@@ -357,3 +364,64 @@ def test_the_supervisor_is_told_of_an_obstacle_where_hold_needs_room() -> None:
         control.tick()
     control.tick()  # in silence nothing is known to be near
     assert [inputs.obstacle_near for inputs in told] == [True, False, False]
+
+
+@pytest.mark.parametrize("landed", ["ground", "landing", "unknown"])
+def test_an_operators_order_ends_when_the_autopilot_is_disarmed(landed: Any) -> None:
+    """Whatever is known of the ground by then: the heartbeat may come before it."""
+    config, operator = _flyable("front"), OperatorRequests(hold=True, land=True)
+    parts: Any = SimpleNamespace(
+        newest=None, noisy_images=Counter(), ego_motion_age_s=0.0, neighbour_seen_s=0.0, load=lambda: 0.5, faults=0,
+        stuck=False, worst_s=lambda: 0.0, hottest_c=None, status=dict,
+    )  # fmt: skip
+    collector = InputCollector(config, parts, parts, parts, Gate(config.safety.gate), parts, parts, {}, lambda: 0.0)
+    asked = []
+    for status in (autopilot_status(armed=True), autopilot_status(armed=False, landed_state=landed)):
+        inputs = collector.collect(status, None, operator, None, None, math.inf)
+        asked.append((inputs.hold_asked, inputs.land_asked))
+    assert asked == [(True, True), (False, False)]
+
+
+async def test_a_disk_that_takes_its_time_to_end_a_recording_delays_no_telemetry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended, heard = threading.Event(), threading.Event()
+    monkeypatch.setattr(Recorder, "close", lambda self, timeout_s: ended.wait(10.0))
+
+    def publish(drone: str, topic: str, message: Mapping[str, object]) -> None:
+        if "after" in message:
+            heard.set()
+
+    telemetry: Any = SimpleNamespace(publish=publish)
+    sinks = MessageSinks(_flyable("front"), telemetry, {}, tmp_path, lambda: 0.0)
+    sinks.begin_recording()
+    sinks.end_recording()
+    sinks.publish("flight", {"after": True})
+    assert await asyncio.to_thread(heard.wait, 5.0)
+    ended.set()
+    await sinks.close()
+
+
+async def test_a_link_that_is_there_before_the_networks_fail_to_load_is_closed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """So that a serial port is given back: the process may live on, and the next one needs it."""
+    closed = asyncio.Event()
+
+    async def close() -> None:
+        closed.set()
+
+    async def connect(*_: Any, **__: Any) -> Any:
+        return SimpleNamespace(close=close)
+
+    def fail() -> Any:
+        time.sleep(0.2)
+        raise ModelError("it is damaged")
+
+    monkeypatch.setattr(AutopilotLink, "connect", connect)
+    config = config_for(14540, free_endpoint(), free_endpoint())
+    service = ServiceManager({})
+    daemon = Daemon(config, "x.yaml", load_networks=fail, models={}, recordings=None, service=service)
+    with pytest.raises(ModelError):
+        await daemon.run()
+    assert closed.is_set()

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -25,17 +28,36 @@ def _recorded(folder: Path, name: str, size_bytes: int, number: int, *, drone: s
             recorder.step(frames, vehicle, output(frames.time_s))
     assert path.stat().st_size <= size_bytes
     os.truncate(path, size_bytes)
-    os.utime(path, (number, number))
+    os.utime(path, (-number, -number))  # a clock that is set back: order is by the flights' own numbers
     return path
 
 
 def test_as_a_flight_grows_the_oldest_go_and_no_more_than_have_to(tmp_path: Path) -> None:
     """1 MB in all; the flight before this one neither counts nor goes."""
-    files = [_recorded(tmp_path, f"flight{k}", 300_000, k) for k in (3, 1, 2, 4)]
+    files = [_recorded(tmp_path, f"flight{k}", 300_000, k) for k in (1, 2, 3, 4)]
     record(tmp_path / "now.mcap", steps=1, settings=SETTINGS)
-    assert [file.exists() for file in files] == [True, False, True, True]
+    assert [file.exists() for file in files] == [False, True, True, True]
     record(tmp_path / "now.mcap", steps=6, settings=SETTINGS)
     assert [file.exists() for file in files] == [False, False, False, True]
+
+
+def test_on_a_full_disk_the_oldest_go_and_the_flight_before_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever fills it: a disk of 2 MB, of which a twentieth stays free, that holds something else of 1 MB."""
+    files = [_recorded(tmp_path, f"flight{k}", 300_000, k) for k in (1, 2)]
+
+    def disk(folder: Path) -> Any:
+        taken = 1_000_000 + sum(file.stat().st_size for file in folder.iterdir())
+        return SimpleNamespace(total=2_000_000, free=2_000_000 - taken)
+
+    monkeypatch.setattr(shutil, "disk_usage", disk)
+    left = []
+    for steps in (1, 3, 6):
+        record(tmp_path / "now.mcap", steps=steps)
+        left.append([file.exists() for file in files])
+    assert left == [[True, True], [False, True], [False, False]]
+    assert len(list(Recording(tmp_path / "now.mcap").steps())) == 6
 
 
 @pytest.mark.parametrize("made_of_another", ["replayed_from", "cut_from"])

@@ -16,6 +16,7 @@ import pytest
 import zstandard
 from mcap.writer import Writer
 
+from flockd.cli import main
 from flockd.onboard.recording import Recorder, RecordingError
 from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, McapFile, Record, read_records
 from flockd.onboard.recording.reader import Recording
@@ -81,16 +82,33 @@ def test_a_size_that_is_none_is_refused(text: str, fault: str, tmp_path: Path, w
     assert refusal(path).startswith(f"its learned_size {fault}")
 
 
-def test_a_configuration_of_another_version_is_refused_with_the_version_that_reads_it(
-    tmp_path: Path, whole: Path
+def test_a_recording_of_another_version_is_read_and_names_what_this_one_does_not_know(
+    tmp_path: Path, whole: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def later(entry: Record) -> Record:
-        if isinstance(entry, Inclosure):
-            return replace(entry, data=json.dumps({**json.loads(entry.data), "colour": "red"}).encode())
-        return entry
+        if not isinstance(entry, Inclosure):
+            return entry
+        values = json.loads(entry.data)
+        return replace(entry, data=json.dumps(values | {"colour": "red", "yaw": "sideways"}).encode())
 
-    told = refusal(with_facts(rewritten(whole, tmp_path / "later.mcap", later), tmp_path / "x.mcap", version="9.1"))
-    assert told.startswith("the configuration in it is not one of this flockd (colour: ")
+    path = with_facts(rewritten(whole, tmp_path / "later.mcap", later), tmp_path / "x.mcap", version="9.1")
+    recording = Recording(path)
+    assert set(recording.unknown) == {"colour", "yaw"}
+    assert recording.config == Recording(whole).config
+    assert main(["record", "info", str(path)]) == 0
+    assert f"warning: {path}: this flockd does not know" in capsys.readouterr().err
+    assert main(["replay", str(path)]) == 1
+    assert "a replay would be another flight; use 9.1 that wrote it" in capsys.readouterr().err
+
+
+def test_a_configuration_that_lacks_what_no_default_gives_is_refused_with_the_version_that_reads_it(
+    tmp_path: Path, whole: Path
+) -> None:
+    def without_rig(entry: Record) -> Record:
+        return replace(entry, data=b"{}") if isinstance(entry, Inclosure) else entry
+
+    told = refusal(with_facts(rewritten(whole, tmp_path / "x.mcap", without_rig), tmp_path / "y.mcap", version="9.1"))
+    assert told.startswith("the configuration in it is not one of this flockd (rig: ")
     assert told.endswith("); use the flockd that wrote it, 9.1")
 
 

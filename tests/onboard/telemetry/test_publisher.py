@@ -6,6 +6,7 @@ import json
 import math
 import queue
 import socket
+import threading
 import time
 from collections.abc import Iterator, Mapping
 
@@ -25,6 +26,7 @@ from flockd.core.messages import (
 )
 from flockd.onboard.telemetry import TOPICS, publish_step
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
+from flockd.onboard.telemetry.zenoh_session import open_session
 from flockd.sim.sitl.processes import free_endpoint
 from tests.make import neighbour, output, vehicle, wanted
 from tests.onboard.daemon.aboard import client
@@ -156,3 +158,15 @@ def test_a_stream_is_stale_after_it_missed_two_messages() -> None:
         else:
             assert topic.stale_after_s is not None
             assert topic.stale_after_s * topic.rate_hz >= 3.0
+
+
+def test_an_address_that_no_interface_has_yet_is_listened_on_once_one_has_it(caplog: pytest.LogCaptureFixture) -> None:
+    """Wi-Fi's at the start. 192.0.2.0/24 is for documentation (RFC 5737)."""
+    telemetry, free = "tcp/192.0.2.7:7447", free_endpoint()
+    drone = ZenohTelemetry("meadow", listen=[telemetry, free], awaits_addresses=True)
+    assert f"no interface has the address of {telemetry}, {free} yet" in caplog.text
+    with zenoh.open(client(free)):  # what is there works meanwhile
+        drone.publish("drone1", "events", {"time_s": 0.0, "event": "x"})
+    threading.Thread(target=drone.close, daemon=True).start()  # zenoh takes ten seconds to give it up
+    with pytest.raises(UnavailableError, match=f"a page cannot use {telemetry}"):
+        open_session("a page", [telemetry], [])

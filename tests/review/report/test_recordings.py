@@ -283,17 +283,17 @@ def test_pictures_are_of_the_recorded_images(alone: Path, flight: Path, monkeypa
 def test_of_several_flights_of_a_drone_the_newest_is_told_and_an_earlier_report_stays(
     tmp_path: Path, capsys: Capture
 ) -> None:
-    """As after the second flight of a day: `flockd report recordings`."""
+    """As after the second flight of a day: `flockd report recordings`; its clock had been set back by an hour."""
     folder = tmp_path / "recordings"
     folder.mkdir()
-    for name, began in (("kite-2", "2026-11-24T10:30:00+00:00"), ("kite-1", "2026-11-24T10:00:00+00:00")):
+    for name, began in (("kite-2", "2026-11-24T09:30:00+00:00"), ("kite-1", "2026-11-24T10:00:00+00:00")):
         record_flight(tmp_path / "draft.mcap", name="kite", with_truth=False)
-        rewritten(tmp_path / "draft.mcap", folder / f"{name}.mcap", partial(begun, began=began))
+        rewritten(tmp_path / "draft.mcap", folder / f"{name}.mcap", partial(begun, began=began, flight_number=name[-1:]))
     out, err = told(capsys, 0, folder, "--without-pictures")
     page = folder / "kite-2.report" / "report.html"
     assert out.splitlines()[-1] == f"report: {page}"
     assert f"{folder}: also holds 1 of earlier flights; this is of the newest, kite-2.mcap" in err
-    assert "begun 2026-11-24 10:30 UTC" in text_of(page)
+    assert "begun 2026-11-24 09:30 UTC" in text_of(page)
     written = page.read_bytes()
     _, err = told(capsys, 2, folder, "--without-pictures")
     assert err.splitlines()[-1].startswith(
@@ -305,9 +305,9 @@ def test_of_several_flights_of_a_drone_the_newest_is_told_and_an_earlier_report_
     assert "begun 2026-11-24 10:00 UTC" in text_of(folder / "kite-1.report" / "report.html")
 
 
-def begun(record: Record, began: str) -> Record:
+def begun(record: Record, **facts: str) -> Record:
     if isinstance(record, Note) and record.name == "flockd":
-        return Note(record.name, {**record.facts, "began": began})
+        return Note(record.name, {**record.facts, **facts})
     return record
 
 
