@@ -288,7 +288,9 @@ def test_of_several_flights_of_a_drone_the_newest_is_told_and_an_earlier_report_
     folder.mkdir()
     for name, began in (("kite-2", "2026-11-24T09:30:00+00:00"), ("kite-1", "2026-11-24T10:00:00+00:00")):
         record_flight(tmp_path / "draft.mcap", name="kite", with_truth=False)
-        rewritten(tmp_path / "draft.mcap", folder / f"{name}.mcap", partial(begun, began=began, flight_number=name[-1:]))
+        rewritten(
+            tmp_path / "draft.mcap", folder / f"{name}.mcap", partial(begun, began=began, flight_number=name[-1:])
+        )
     out, err = told(capsys, 0, folder, "--without-pictures")
     page = folder / "kite-2.report" / "report.html"
     assert out.splitlines()[-1] == f"report: {page}"
