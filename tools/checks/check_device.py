@@ -5,7 +5,7 @@ sudo python3 -m tools.checks.check_device --cache /var/cache/flockd    # keeps w
 sudo python3 -m tools.checks.check_device --debian 13                  # on Debian 13 (trixie), with systemd 257
 
 Needs Linux on x86-64 with qemu-system-x86, mmdebstrap and e2fsprogs, and no KVM: the processor is emulated. The machine
-runs Debian 12 or 13 with its own kernel and systemd; flockd is installed by the lines of docs/real_drone.md, and its
+runs Debian 12 or 13 with its own kernel and systemd; flockd is installed by the lines of docs/install.md, and its
 unit runs `flockd run` with the shipped networks. The autopilot is flockd's fake; as an emulated processor is slow, the
 images are small and the steps far apart. The machine's clock counts instructions, a nanosecond each: how busy this
 computer is changes how long the check takes, and nothing of what it measures.
@@ -47,7 +47,7 @@ SUITES = {"12": "bookworm", "13": "trixie"}
 BOOT_MODULES = ("virtio_pci", "virtio_blk", "ext4")
 CHECKS = Path("tools/checks/device_check")
 DRONE_FILE = "my_drone.yaml"
-"""What docs/real_drone.md calls the file that its reader has written."""
+"""What docs/install.md calls the file that its reader has written."""
 FAKE_AUTOPILOT = "pymavlink>=2.4.40"
 PIP = f"pip install --quiet --no-compile --target /opt/fake-autopilot '{FAKE_AUTOPILOT}'"
 COMPILE = "import flockd.sim.autopilot.fake_autopilot"
@@ -125,8 +125,8 @@ def check(folder: Path, debian: str, groups: Sequence[str]) -> int:
 
 
 def documented_lines() -> tuple[str, str]:
-    """What docs/real_drone.md says to install flockd as a service, and to start it."""
-    page = (ROOT / "docs" / "real_drone.md").read_text(encoding="utf-8")
+    """What docs/install.md says to install flockd as a service, and to start it."""
+    page = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
     install, start = re.findall(r"```sh\n(.*?)```", page.partition("## Install it as a service")[2], re.DOTALL)[:2]
     return install, start
 
