@@ -63,7 +63,7 @@ def refine_ego_motion(
     if len(pairs) > _MAX_PAIRS:
         drawn = np.sort(np.random.default_rng(seed).choice(len(pairs), _MAX_PAIRS, replace=False))
         pairs, agreeing = pairs.select(drawn), agreeing[drawn]
-    typical = np.tile(agreeing, 2)  # there and back
+    typical = np.concatenate([agreeing, agreeing])  # there and back
     if not typical.any():
         return None
     start = _Reprojection(_Sights.of(pairs, rig), initial)
@@ -134,7 +134,7 @@ class _Reprojection:
     @cached_property
     def depths(self) -> FloatArray:
         """(m,) metres along the sights; NaN where a point is on the other side of the camera."""
-        depths = np.einsum("im,im->m", self.sights.seen, self.from_camera)
+        depths = (self.sights.seen * self.from_camera).sum(0)
         return np.where(depths > 0.0, depths, np.nan)
 
     @cached_property
@@ -149,7 +149,7 @@ class _Reprojection:
         R, t, n = self.motion.rotation, self.motion.translation[:, None], self.sights.current.shape[1]
         centres = self.sights.centres[:, :n]
         between = np.concatenate([R @ centres + t, R.T @ (centres - t)], axis=1) - self.sights.centres
-        along = np.einsum("im,im->m", self.sights.seen, between)
+        along = (self.sights.seen * between).sum(0)
         changes = (self.residuals * along - products(self.sights.across, between)) / self.depths
         return np.where(np.isnan(changes), 0.0, changes)
 
@@ -205,7 +205,9 @@ class _Refinement(Problem[_Reprojection]):
         weighting = self.weighting or _Weighting.learned(state, self.typical)
         white = weighting.whitened(state)
         weights = weighting.kernel.weight((white**2).sum(axis=0))
-        return NormalEquations.of(white.ravel(), state.jacobian(weighting).reshape(6, -1).T, np.tile(weights, 2))
+        return NormalEquations.of(
+            white.ravel(), state.jacobian(weighting).reshape(6, -1).T, np.concatenate([weights, weights])
+        )
 
     def move(self, state: _Reprojection, step: FloatArray) -> _Reprojection:
         increment = RigidTransform(rotation_from_vector(step[:3]), step[3:])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import TypeVar
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,15 +42,17 @@ class PointPairs:
 
     def select(self, which: BoolArray | IntArray) -> PointPairs:
         """Those that a mask (n,) or indices name."""
-        places = np.flatnonzero(which) if which.dtype == np.bool_ else which
-        return PointPairs(*(getattr(self, part.name).take(places, axis=0) for part in fields(self)))
+        places = which.nonzero()[0] if which.dtype == np.bool_ else which
+        return PointPairs(*[column.take(places, axis=0) for column in self._columns()])
 
     @staticmethod
     def concatenate(several: Sequence[PointPairs]) -> PointPairs:
         """All pairs in order. Raises ValueError for an empty sequence."""
-        return PointPairs(
-            *(np.concatenate([getattr(pairs, part.name) for pairs in several]) for part in fields(PointPairs))
-        )
+        return PointPairs(*map(np.concatenate, zip(*[pairs._columns() for pairs in several], strict=True)))
+
+    def _columns(self) -> tuple[NDArray[Any], ...]:
+        """As the constructor takes them."""
+        return tuple(vars(self).values())
 
 
 def grid_pixels(size: tuple[int, int], stride: int) -> FloatArray:
@@ -85,9 +87,9 @@ def lift_matches(
     for what, shape in zip(("flow", "depth", "depth", "labels", "labels"), (m.shape for m in maps), strict=True):
         if shape != (height, width):
             raise ValueError(f"camera {camera.name!r} is {width}x{height}, but its {what} map is {shape[1]}x{shape[0]}")
-    pixels_previous = pixels.take(np.flatnonzero(camera.camera.in_image(pixels)), axis=0)
+    pixels_previous = pixels.take(camera.camera.in_image(pixels).nonzero()[0], axis=0)
     pixels_current = pixels_previous + _nearest(flow, pixels_previous)
-    inside = np.flatnonzero(camera.camera.in_image(pixels_current))
+    inside = camera.camera.in_image(pixels_current).nonzero()[0]
     pixels_previous, pixels_current = pixels_previous.take(inside, axis=0), pixels_current.take(inside, axis=0)
     labels = _nearest(labels_previous, pixels_previous)
     range_previous = _sample_depth(depth_previous, pixels_previous)
@@ -99,7 +101,7 @@ def lift_matches(
     previous = camera.camera.unproject(pixels_previous, range_previous)
     current = camera.camera.unproject(pixels_current, range_current)
     # Outside a fisheye's image circle there is no ray.
-    places = np.flatnonzero(kept & np.isfinite(previous[:, 0]) & np.isfinite(current[:, 0]))
+    places = (kept & np.isfinite(previous[:, 0]) & np.isfinite(current[:, 0])).nonzero()[0]
     return PointPairs(
         previous=camera.T_body_camera.apply(previous.take(places, axis=0)),
         current=camera.T_body_camera.apply(current.take(places, axis=0)),
@@ -124,7 +126,7 @@ def _sample_depth(depth: RangeMap, pixels: FloatArray) -> FloatArray:
     """(n,) depth between pixel centres: bilinear where the four around agree, else that of the nearest pixel."""
     height, width = depth.shape
     # Pixel index i has its centre at i + 0.5; at the border the outermost centres are held.
-    x, y = np.clip(pixels[:, 0] - 0.5, 0, width - 1), np.clip(pixels[:, 1] - 0.5, 0, height - 1)
+    x, y = np.minimum(np.maximum(pixels - 0.5, 0.0), (width - 1, height - 1)).T
     left, top = np.minimum(x.astype(np.int64), width - 2), np.minimum(y.astype(np.int64), height - 2)
     right, below = x - left, y - top
     first, flat = top * width + left, depth.ravel()

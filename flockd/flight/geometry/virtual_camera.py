@@ -69,16 +69,16 @@ class VirtualCrops:
         valid = np.zeros(drawn.shape[:3], np.bool_)
         for index, camera in self._with(images):
             if index in self.main:
-                mine = np.flatnonzero(self.main == index)
+                mine = (self.main == index).nonzero()[0]
                 crops = self.take(mine)
                 homographies, whole = crops._homographies(camera)
                 factors = crops._minification(camera).tolist()
-                for k in np.flatnonzero(whole).tolist():
+                for k in whole.nonzero()[0].tolist():
                     u, v, z = homographies[k] @ _pixels(self.size_px)
                     where = np.array([u / z, v / z], np.float32).reshape(2, self.size_px, self.size_px)
                     drawn[mine[k]] = _draw(images[camera.name], where, factors[k])
                 valid[mine[whole]] = True
-        rest = np.flatnonzero(~valid[:, 0, 0])
+        rest = (~valid[:, 0, 0]).nonzero()[0]
         if len(rest):
             ranges = np.full(len(rest), np.nan) if range_m is None else range_m[rest]
             drawn[rest], valid[rest] = self.take(rest)._sample_by_pixel(images, ranges)
@@ -109,7 +109,7 @@ class VirtualCrops:
                 continue
             minification = mine.any(1) * self._minification(camera)
             for factor in set(minification.tolist()) - {0}:
-                crops = np.flatnonzero(minification == factor)
+                crops = (minification == factor).nonzero()[0]
                 part = drawn[crops]
                 cv2.copyTo(_draw(images[camera.name], where[:, crops], factor), mine[crops].view(np.uint8), part)
                 drawn[crops] = part
@@ -137,7 +137,7 @@ class VirtualCrops:
         where = np.full((2, *towards.shape[1:]), np.nan, np.float32)
         for index, camera in self._with(images):
             if index in self.main:
-                crops = np.flatnonzero(self.main == index)
+                crops = (self.main == index).nonzero()[0]
                 seen = camera.pixels_of_directions(towards[:, crops].reshape(3, -1).T)
                 where[:, crops] = seen.T.reshape(2, len(crops), -1)
         source = np.where(np.isnan(where[0]), _NOWHERE, self.main[:, None])
@@ -152,7 +152,7 @@ class VirtualCrops:
             aside = parallax * (centres - camera.T_body_camera.translation).T
             seen = camera.pixels_of_directions((towards + aside).T)
             margin = _margin(camera, seen)
-            deeper = np.flatnonzero(margin > deepest)
+            deeper = (margin > deepest).nonzero()[0]
             source.reshape(-1)[missing[deeper]] = index
             where.reshape(2, -1)[:, missing[deeper]] = seen[deeper].T
             deepest = np.maximum(deepest, margin)

@@ -46,9 +46,11 @@ class Fitting:
         width, height = self.inner[0] // stride, self.inner[1] // stride
         if planes.shape[1:] != (height, width):
             resized = [cv2.resize(plane, (width, height), interpolation=cv2.INTER_LINEAR) for plane in planes]
-            planes = np.asarray(np.stack(resized), dtype=np.float32)
+            planes = np.array(resized, np.float32)
         down, right = self.full[1] // stride - height, self.full[0] // stride - width
-        return planes if not down and not right else np.pad(planes, ((0, 0), (0, down), (0, right)), mode="edge")
+        if not down and not right:
+            return planes
+        return np.array([cv2.copyMakeBorder(plane, 0, down, 0, right, cv2.BORDER_REPLICATE) for plane in planes])
 
     def inside(self, map_: Float32Array) -> Float32Array:
         """The part of a map (..., h, w) of the whole input, at any resolution, that shows the image."""
@@ -74,7 +76,7 @@ def entering(spec: InputSpec, images: Sequence[UInt8Array]) -> NDArray[Any]:
         images = [image[..., ::-1] for image in images]
     elif spec.colour == "grey":
         images = [np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)[..., None] for image in images]
-    batch: NDArray[Any] = np.stack(images)
+    batch: NDArray[Any] = np.array(images)
     if spec.dtype != "uint8":
         batch = batch.astype(np.float32) * np.float32(spec.white / 255.0)
         if spec.mean:

@@ -313,7 +313,7 @@ def _in_batches(model: OnnxModel, images: Sequence[UInt8Array]) -> dict[str, Flo
 
 def _no_range(drone_probability: float, size: int) -> RangeEstimate:
     """The estimate for a crop that shows no drone."""
-    middle = np.full(2, size / 2)
+    middle = np.array([size / 2, size / 2])
     return RangeEstimate(math.nan, math.nan, middle, math.nan, drone_probability=drone_probability)
 
 

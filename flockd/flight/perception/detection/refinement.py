@@ -184,8 +184,8 @@ class Cascade:
         """What the network says of crops of the proposals of these numbers, and those of which it says something."""
         directions, range_m = aims.direction[at], aims.range_m[at]
         views = virtual_crops(self._rig, directions, aims.half_angle[at], self._crop_size)
-        seen = np.flatnonzero(views.main >= 0)
-        for one in np.delete(directions, seen, 0):
+        seen = (views.main >= 0).nonzero()[0]
+        for one in directions[views.main < 0]:
             self._drop(f"no camera sees the body direction {one.round(3).tolist()}")
         at, views = at[seen], views.take(seen)
         pictures, _ = views.sample(self._images, range_m[seen])

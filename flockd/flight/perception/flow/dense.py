@@ -57,6 +57,6 @@ class OnnxFlow:
         height, width = first.shape[:2]
         fitting = fit(self._model.manifest, (width, height))
         outputs = self._model.infer({"first": [fitting.enter(first)], "second": [fitting.enter(second)]})
-        flow = np.moveaxis(fitting.inside(outputs["flow"])[0], 0, 2) / np.array(fitting.scale, np.float32)
+        flow = fitting.inside(outputs["flow"])[0].transpose(1, 2, 0) / np.array(fitting.scale, np.float32)
         full = cv2.resize(flow, (width, height), interpolation=cv2.INTER_LINEAR)
         return np.asarray(full, dtype=np.float32)
