@@ -21,7 +21,7 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_010,
-    "flockd/flight": 11_320,
+    "flockd/flight": 11_340,
     "flockd/onboard": 9_090,
     "flockd/fleet": 2_670,
     "flockd/ground": 4_040,
