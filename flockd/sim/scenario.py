@@ -186,6 +186,7 @@ class WorldConfig(Section):
 _PERCEIVED: dict[str, Any] = yaml.safe_load(
     (data_path("config") / "perceived" / "shipped_networks.yaml").read_text(encoding="utf-8")
 )["detections"]
+_TRAINED = _PERCEIVED["trained"]
 
 
 class DetectionsConfig(Section):
@@ -194,24 +195,33 @@ class DetectionsConfig(Section):
     had (config/perceived/shipped_networks.yaml). In the view of a camera that has one of `faults`
     nobody is detected, and the drone flies degraded."""
 
+    airframe: Literal["trained", "unknown"] = "trained"
+    """Whose errors those are that are not written here: of airframes that the networks learnt, by default as below, or
+    of real ones that they did not, whose size is said."""
     range_m: Positive = 20.0
     """Farther away nobody is detected."""
-    missed: Share = _PERCEIVED["missed"]
+    missed: Share = _TRAINED["missed"]
     """Probability that a drone is not detected in a step."""
-    range_error: Annotated[float, Field(gt=0, le=1)] = _PERCEIVED["range_error"]
+    range_error: Annotated[float, Field(gt=0, le=1)] = _TRAINED["range_error"]
     """Standard deviation of the logarithm of a range."""
-    bearing_error_rad: Annotated[float, Field(gt=0, le=1)] = _PERCEIVED["bearing_error_rad"]
+    bearing_error_rad: Annotated[float, Field(gt=0, le=1)] = _TRAINED["bearing_error_rad"]
     """Standard deviation of a bearing, each axis."""
-    error_time_s: NonNegative = _PERCEIVED["error_time_s"]
+    error_time_s: NonNegative = _TRAINED["error_time_s"]
     """How long errors stay about the same; 0: each step has its own ..."""
-    missed_time_s: NonNegative = _PERCEIVED["missed_time_s"]
+    missed_time_s: NonNegative = _TRAINED["missed_time_s"]
     """... and the same of what is missed."""
-    false_at_once: Share = _PERCEIVED["false_at_once"]
+    false_at_once: Share = _TRAINED["false_at_once"]
     """How many false neighbours a drone has at once, mean, one at most: what is no drone, and stays where it is, ..."""
-    false_time_s: Positive = _PERCEIVED["false_time_s"]
+    false_time_s: Positive = _TRAINED["false_time_s"]
     """... for so long each, mean, from when it is confirmed ..."""
-    false_m: tuple[Positive, Positive, Positive] = _PERCEIVED["false_m"]
+    false_m: tuple[Positive, Positive, Positive] = _TRAINED["false_m"]
     """... so far away: 10th, 50th and 90th percentile."""
+
+    @property
+    def filled(self) -> Self:
+        """With the errors of the airframe where none are written."""
+        of_it = _PERCEIVED[self.airframe]
+        return self.model_copy(update={key: of_it[key] for key in of_it.keys() - self.model_fields_set})
 
 
 class CameraFaultConfig(Section):

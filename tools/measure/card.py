@@ -314,19 +314,21 @@ def _measured_by(commit: str, command: str) -> dict[str, Any]:
 
 
 def encounters(results: Results) -> list[dict[str, Any]]:
-    """Of each speed, range error and share that is missed: how many flights, the nearest, and how many touched."""
+    """Of each speed, kind of airframe and range of detection: how many flights, the nearest, and how many touched."""
     found = []
-    errors = "detections.range_error", "detections.missed"
+    varied = "detections.airframe", "detections.range_m"
     for speed in sorted({str(case).rpartition("_")[2] for case in results.values_of(CASE)}):
         cases = [case for case in results.values_of(CASE) if str(case).endswith(f"_{speed}")]
-        for wrong, missed in itertools.product(*(results.values_of(key) for key in errors)):
+        for airframe, range_m in itertools.product(*(results.values_of(key) for key in varied)):
             cells = {
-                cell for case in cases for cell in results.cells_with({CASE: case, errors[0]: wrong, errors[1]: missed})
+                cell
+                for case in cases
+                for cell in results.cells_with({CASE: case, varied[0]: airframe, varied[1]: range_m})
             }
             near_m = [row["min_distance_m"] for row in results.rows if row["cell"] in cells]
             known = sorted(metres for metres in near_m if metres is not None)
             found.append({
-                "speed_m_s": float(speed), "range_error": wrong, "missed": missed, "flights": len(known),
+                "speed_m_s": float(speed), "airframe": airframe, "range_m": range_m, "flights": len(known),
                 "nearest_m": round(known[0], 2), "touched": sum(metres < MIN_START_DISTANCE_M for metres in known),
             })  # fmt: skip
     return found
@@ -397,15 +399,16 @@ def _part(part: str, commit: str, arguments: argparse.Namespace, known: dict[str
         measured = document(commit, run(flights, results / f"{size}.jsonl", workers), quick=quick, most=most)
         return known | measured
     if part == "errors":
-        flown_by_sight = {one.log_name: one for one in flights_of(commit, quick=False) if one.eyes == "sight"}
         logs = {path.stem: path for path in sorted(results.glob("*.npz"))}
         if not logs:
             raise SystemExit(f"{results} has no log of a flight by sight; fly them first, with `--parts flights`")
+        by_sight = [one for one in flights_of(commit, quick=False, airframes=[("", 1.0)]) if one.eyes == "sight"]
+        logged = {Path(one.log_name).stem: one for one in by_sight if Path(one.log_name).stem in logs}
         families = {
-            name: family_of(flown_by_sight[path.name].flown()) if path.name in flown_by_sight else "real"
-            for name, path in logs.items()
+            name: perceived_errors.REAL if one.airframe else family_of(one.flown()) for name, one in logged.items()
         }
-        perceived_errors.write(logs, families, commit, PERCEIVED)
+        scenarios = {name: (logs[name], one.flown()) for name, one in logged.items()}
+        perceived_errors.write(scenarios, families, commit, PERCEIVED)
         found = {"logs": list(logs)}
     elif part == "encounters":
         found = encounters(_campaign("encounters", 1 if quick else None, results / f"encounters-{size}", workers))

@@ -144,7 +144,7 @@ class TrackedNeighbours:
     """What one drone knows of the others as its own tracker makes it of detections that are made up from the truth."""
 
     def __init__(self, scenario: ScenarioConfig, config: DetectionsConfig, drone: int) -> None:
-        self._config, self._drone, self._step_s = config, drone, scenario.drone.step_s
+        self._config, self._drone, self._step_s = config.filled, drone, scenario.drone.step_s
         self._scenario, self._rig = scenario, build_rig(scenario.drone.rig)
         self._tracker = Tracker(scenario.drone.tracking, scenario.drone.safety.gate)
         self._random = np.random.default_rng([scenario.seed, drone])

@@ -11,7 +11,7 @@ from flockd.campaign.flight_plan import CASE, Cell, Plan
 from flockd.core.config.mission import MissionParameters
 from flockd.review.metrics import closest_distances
 from flockd.sim.flock.exact_states import fly_exact_states
-from flockd.sim.scenario import ScenarioConfig, StartConfig, load_scenario
+from flockd.sim.scenario import DetectionsConfig, ScenarioConfig, StartConfig, load_scenario
 
 pytestmark = pytest.mark.fault("head-on")
 
@@ -50,7 +50,7 @@ def head_on(speed_m_s: float, seed: int, **detections: Any) -> ScenarioConfig:
 @pytest.mark.parametrize("seeds", [range(3), pytest.param(range(3, 12), marks=pytest.mark.slow)], ids=["few", "many"])
 @pytest.mark.parametrize("speed_m_s", [1.5, 2.0, 3.0])
 def test_drones_that_meet_head_on_stay_apart(speed_m_s: float, seeds: range) -> None:
-    """At least 1 m apart at every instant, with 5 % of range error, 5 % missed and a step every half second."""
+    """At least 1 m apart at every instant, with errors as by sight and a step every half second."""
     assert min(nearest_m(head_on(speed_m_s, seed)) for seed in seeds) >= 1.0
 
 
@@ -72,6 +72,11 @@ def test_reciprocal_encounters(cell: Cell) -> None:
 
 @pytest.mark.parametrize("number", [140, 87, 91])
 def test_among_mates_a_drone_steps_out_of_the_way_of_one_that_a_person_flies(number: int) -> None:
-    """Three flights in which it came within 0.34, 0.70 and 0.75 m: it changed sides, or chose a closed one."""
+    """Three flights in which it came within 0.34, 0.70 and 0.75 m: it changed sides, or chose a closed one. With the
+    errors with which they were found, fewer than those of flights by sight, with which one in some touches."""
     (cell,) = [cell for cell in RECIPROCAL.cells if cell.parameters[CASE] == "five_one_without_flockd"]
-    assert nearest_m(RECIPROCAL.task(cell, number).scenario()) >= 1.0
+    errors = DetectionsConfig(
+        missed=0.05, range_error=0.05, bearing_error_rad=0.005, error_time_s=1.85, missed_time_s=3.04,
+        false_at_once=0.004, false_time_s=0.7, false_m=(3.7, 5.4, 9.2),
+    )  # fmt: skip
+    assert nearest_m(RECIPROCAL.task(cell, number).scenario().model_copy(update={"detections": errors})) >= 1.0
