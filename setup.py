@@ -21,4 +21,5 @@ class BuildWithData(build_py):
                 shutil.copytree(folder, target, dirs_exist_ok=True)
 
 
-setup(cmdclass={"build_py": BuildWithData})
+# A path, not a finder: a script beside the clone would find the clone's folder before the package.
+setup(cmdclass={"build_py": BuildWithData}, options={"editable_wheel": {"mode": "compat"}})

@@ -6,8 +6,9 @@ Each loads what it needs when it is first used, so that `import flockd` loads no
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 if TYPE_CHECKING:
     from flockd.core.config import load_drone
@@ -75,3 +76,12 @@ def __getattr__(name: str) -> object:
 
 def __dir__() -> list[str]:
     return [*__all__, "__version__"]
+
+
+def program() -> NoReturn:
+    """The installed `flockd`. Ctrl-C while it is still being imported ends it without a traceback too."""
+    try:
+        import_module("flockd.cli").program()
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted\n")
+    raise SystemExit(130)

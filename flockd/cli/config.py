@@ -202,7 +202,8 @@ def write_checked(file: Path, text: str, settings: Sequence[tuple[str, str]] = (
         raise UsageError(f"{file} was not written, as it would not check ({reasons}); change the options") from error
     finally:
         draft.unlink(missing_ok=True)
-    say(f"{file}: written; `flockd config check {file}` checks it again after each change")
+    left = "fill in what is marked `fill in`; " if "fill in" in text.lower() else ""
+    say(f"{file}: written; {left}`flockd config check {file}` checks it after each change")
 
 
 def _set(file: Path, key: str, value: str) -> None:

@@ -42,3 +42,15 @@ def test_what_is_printed_last_is_not_lost() -> None:
     )  # fmt: skip
     assert ended.returncode == 0
     assert ended.stdout.startswith("model "), "to a pipe, which is written when it is full or flushed"
+
+
+def test_ctrl_c_while_it_is_imported_ends_it_without_a_traceback() -> None:
+    interrupts = "import sys, flockd; sys.modules['flockd.cli'] = type(sys)('flockd.cli')\n"
+    interrupts += (
+        "def __getattr__(name): raise KeyboardInterrupt\nsys.modules['flockd.cli'].__getattr__ = __getattr__\n"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", f"{interrupts}flockd.program()"],
+        cwd=ROOT, check=False, capture_output=True, text=True, timeout=60.0,
+    )  # fmt: skip
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "interrupted\n")

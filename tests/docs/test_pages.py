@@ -146,12 +146,12 @@ def test_plain_words(page: Path) -> None:
 
 def test_the_readme_is_short_and_shows_the_flock() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert len(readme.splitlines()) <= 150
-    assert "docs/pictures/flock.gif" in readme
+    assert len(readme.splitlines()) <= 120
+    assert "docs/pictures/by_sight.webp" in readme
     assert "make demo" in readme
 
 
 def test_pictures_are_small() -> None:
     sizes = {path.name: path.stat().st_size for path in (DOCS / "pictures").iterdir()}
-    assert sizes["flock.gif"] < 1.5e6
+    assert sizes["by_sight.webp"] < 1e6
     assert sum(sizes.values()) < 3e6

@@ -41,8 +41,11 @@ def open_session(
     A peer opens without a router, unlike a client; discovery by multicast and gossip is off. ``purpose``: as errors say
     it; ``settings``: a file of zenoh's own to begin with, for TLS and access control. Longer messages and further peers
     than the most are refused; None: as zenoh or the settings have it. ``awaits_addresses``: it listens on an address
-    that no interface has yet, such as Wi-Fi's at the start, once one has it. Raises SessionError.
+    that no interface has yet, such as Wi-Fi's at the start, once one has it. Raises UnavailableError.
     """
+    for endpoint in (*listen, *connect):
+        if "/" not in endpoint:
+            raise UnavailableError(f"{purpose} cannot use {endpoint}: it names no protocol; write tcp/{endpoint}")
     wanted = {
         "mode": "peer",
         "scouting/multicast/enabled": False,

@@ -160,6 +160,11 @@ def test_a_stream_is_stale_after_it_missed_two_messages() -> None:
             assert topic.stale_after_s * topic.rate_hz >= 3.0
 
 
+def test_an_endpoint_without_a_protocol_is_refused_with_the_one_that_is_meant() -> None:
+    with pytest.raises(UnavailableError, match=r"a page cannot use drone1:7447: .*; write tcp/drone1:7447"):
+        open_session("a page", [], ["drone1:7447"])
+
+
 def test_an_address_that_no_interface_has_yet_is_listened_on_once_one_has_it(caplog: pytest.LogCaptureFixture) -> None:
     """Wi-Fi's at the start. 192.0.2.0/24 is for documentation (RFC 5737)."""
     telemetry, free = "tcp/192.0.2.7:7447", free_endpoint()
