@@ -104,6 +104,8 @@ class DroneConfig(Section):
                 f"{trim_m_s:g} and flocking.max_speed_m_s {law_m_s:g} are together above safety.gate.max_speed_m_s, "
                 f"which would refuse them; write {gate_m_s - law_m_s:g} or less"
             )
+        if self.autopilot is not None:
+            faults |= self._late_steps()
         if self.flocking.size == "learn" and self.perception.drone_size_m is not None:
             faults["flocking", "size"] = "learns what perception.drone_size_m says; delete one of the two"
         elif self.flocking.size == "learn" and self.perception.distance == NO_MODEL:
@@ -115,6 +117,17 @@ class DroneConfig(Section):
             faults |= self._device_faults([camera.name for camera in self.source.cameras])
         refuse(self, faults)
         return self
+
+    def _late_steps(self) -> dict[tuple[str | int, ...], str]:
+        """Where steps are so far apart that each, or one that is late, would stop the drone."""
+        fresh_s, lasts_s = self.safety.gate.command_fresh_s, self.safety.estimate_timeout_s
+        if self.step_s > fresh_s:
+            told = f"safety.gate.command_fresh_s {fresh_s:g}, so that the drone would slow down before each step"
+        elif 2 * self.step_s > lasts_s:
+            told = f"half of safety.estimate_timeout_s {lasts_s:g}, so that one late step would stop the drone"
+        else:
+            return {}
+        return {("step_s",): f"{self.step_s:g} s is above {told}; write a smaller one, or a larger time there"}
 
     def _device_faults(self, devices: Sequence[str]) -> dict[tuple[str | int, ...], str]:
         """Where the cameras of the rig and the names of their devices do not match."""

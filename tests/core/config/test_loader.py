@@ -278,6 +278,28 @@ def test_the_trim_that_an_error_recommends_is_taken_though_rounding_adds_up(tmp_
     assert load_drone(path).autopilot is not None
 
 
+@pytest.mark.parametrize(
+    ("step_s", "limits", "named"),
+    [
+        (0.9, "estimate_timeout_s: 1.8, gate: {command_timeout_s: 1.8}", None),
+        (0.91, "estimate_timeout_s: 1.9, gate: {command_timeout_s: 1.9}", "safety.gate.command_fresh_s 0.9"),
+        (0.75, "", None),
+        (0.76, "", "half of safety.estimate_timeout_s 1.5"),
+    ],
+)
+def test_steps_that_a_flight_would_wait_for_are_refused(
+    tmp_path: Path, step_s: float, limits: str, named: str | None
+) -> None:
+    path = tmp_path / "drone.yaml"
+    path.write_text(f"{DRONE}step_s: {step_s}\nsafety: {{{limits}}}\n", encoding="utf-8")
+    load_drone(path)  # a simulated drone's steps wait for nothing
+    if named is None:
+        load_drone(path, {"autopilot": {}})
+    else:
+        with pytest.raises(ConfigError, match=f"step_s: {step_s:g} s is above {named}"):
+            load_drone(path, {"autopilot": {}})
+
+
 def test_what_is_wrong_with_a_camera_is_told_at_its_own_line(tmp_path: Path) -> None:
     quadrotor = (CONFIG / "quadrotor.yaml").read_text(encoding="utf-8")
     rig, source, rest = quadrotor.partition("\nsource:")
