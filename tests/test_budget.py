@@ -20,16 +20,16 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_020,
+    "flockd/core": 3_090,
     "flockd/flight": 11_340,
-    "flockd/onboard": 9_090,
+    "flockd/onboard": 9_080,
     "flockd/fleet": 2_670,
-    "flockd/ground": 4_040,
+    "flockd/ground": 4_010,
     "flockd/review": 3_510,
     "flockd/sim": 8_570,
     "flockd/campaign": 1_470,
-    "flockd/cli": 3_440,
-    "tests": 36_710,
+    "flockd/cli": 3_450,
+    "tests": 36_790,
     "tools/checks": 2_060,
     "tools/docs": 850,
     "tools/measure": 1_470,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.options import add_force, add_settings, permit, refuse_overwriting
-from flockd.cli.output import say, say_json, say_result
+from flockd.cli.output import complain, say, say_json, say_result
 from flockd.cli.parser import Commands, commands_of, flag, option
 from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, ModelError, UsageError
 
@@ -137,7 +137,11 @@ def _check_file(file: Path, *, force: bool) -> None:
     if problems:
         raise ConfigError(problems)
     if not isinstance(config, ScenarioConfig):
+        from flockd.ground.doctor.camera_checks import lens_problems
+
         permit(outside_envelope(config, places), force=force)
+        for finding in (one for camera in config.rig.cameras for one in lens_problems(camera)):
+            complain(f"warning: {file}: {finding.about}: {finding.measured}; {finding.fix}")
 
 
 def _yet_to_fill_in(config: DroneConfig, places: Mapping[KeyPath, Place]) -> list[ConfigProblem]:

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import re
+import termios
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from flockd.core import services
-from flockd.core.config.base import Distance, Section, Share, Speed, text
+from flockd.core.config.base import Distance, Port, Section, Share, Speed, text
+
+
+def _baud(address: str) -> str:
+    """Raises ValueError for a cable's rate that no serial port has."""
+    baud = address.rpartition(":")[2]
+    rates = [name[1:] for name in dir(termios) if re.fullmatch(r"B[1-9]\d*", name)]
+    if address.startswith("serial:") and baud not in rates:
+        known = ", ".join(sorted(rates, key=int)[-12:])
+        raise ValueError(f"{address} has the baud rate {baud}, which no port has; write the autopilot's, of {known}")
+    return address
 
 
 class AutopilotParameters(Section):
@@ -15,6 +27,8 @@ class AutopilotParameters(Section):
 
     address: Annotated[
         str,
+        Port,
+        AfterValidator(_baud),
         text(
             r"^((udpin|udpout|tcpin|tcpout)://[^/]+|serial:///.+):\d+$",
             "an address, as in `serial:///dev/ttyAMA0:921600` for a cable and its baud rate, or `udpin://0.0.0.0:14540`",

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 Positive = Annotated[float, Field(gt=0)]
@@ -29,8 +30,23 @@ WORDS = "words"
 """The key of a JSON schema that holds what `text` was given."""
 Name = Annotated[str, text(r"^[A-Za-z0-9_.-]+$", "a name, of letters, digits, `_`, `.` and `-`")]
 PlainName = Annotated[str, text(r"^[a-z0-9_-]+$", "a name, of small letters, digits, `_` and `-`")]
+
+
+def _port(address: str) -> str:
+    """Raises ValueError for a network's port that none is."""
+    kind, _, rest = address.partition("/")
+    port = re.search(r":(\d+)(?:[?#].*)?$", rest)
+    if port and kind.rstrip(":") in _WITH_PORTS and int(port[1]) > 65535:
+        raise ValueError(f"{address} has the port {port[1]}, and the last one is 65535; correct it")
+    return address
+
+
+_WITH_PORTS = {"tcp", "udp", "tls", "quic", "ws", "udpin", "udpout", "tcpin", "tcpout"}
+Port = AfterValidator(_port)
+"""Of a text with an address at its end."""
 Endpoint = Annotated[
     str,
+    Port,
     text(
         r"^((tcp|udp|tls|quic|ws)/.+:\d+([?#].*)?|(serial|vsock|unixpipe|unixsock-stream)/.+)$",
         "a zenoh endpoint, as in `tcp/0.0.0.0:7447`",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from flockd.core.choices import LensModel
@@ -59,18 +61,56 @@ class CameraConfig(Section):
     extrinsics: ExtrinsicsConfig = ExtrinsicsConfig()
 
     @model_validator(mode="after")
-    def _the_principal_point_is_in_the_image(self) -> Self:
-        points = {"cx": self.intrinsics.cx, "cy": self.intrinsics.cy}
-        refuse(
-            self,
-            {
-                ("intrinsics", key): f"{value:g} is outside the image, which is {size} pixels {side}; "
-                f"check {key} and size_px"
-                for (key, value), size, side in zip(points.items(), self.size_px, ("wide", "high"), strict=True)
-                if value >= size
-            },
-        )
+    def _can_be_true(self) -> Self:
+        refuse(self, {("intrinsics", key): text for key, text in _lens_faults(self.intrinsics, self.size_px).items()})
         return self
+
+
+_COEFFICIENTS = {"pinhole": (0, 4, 5), "wide_angle": (0, 4)}
+_OFF_CENTRE = 0.16
+"""Share of the width or height between the principal point and the middle. That of a lens calibrated for half or twice
+the size, or for an image on its side, is farther off; real ones lie within some percent."""
+_SQUARE = 0.15
+"""How much fx and fy may differ: pixels are square, unless images were squeezed from another aspect."""
+NARROWEST_DEG = 5.0
+WIDEST_DEG = {"pinhole": 130.0, "wide_angle": 220.0}
+
+
+def _lens_faults(lens: IntrinsicsConfig, size: tuple[int, int]) -> dict[str, str]:
+    """What makes a calibration impossible for images of this size, by its key."""
+    words = f"{size[0]} x {size[1]} images"
+    again = "correct it, or calibrate the camera at the size of its images"
+    if len(lens.distortion) not in _COEFFICIENTS[lens.model]:
+        known = "k1 k2 k3 k4" if lens.model == "wide_angle" else "k1 k2 p1 p2, and k3 or not"
+        told = f"has {len(lens.distortion)} coefficients, and those of {lens.model} are none, or {known}"
+        return {"distortion": f"{told}; give these, as `flockd calibrate import` fits them"}
+    faults = {
+        key: f"{value:g} is {abs(value / length - 0.5):.0%} of the image off the middle of {words}; {again}"
+        for key, value, length in (("cx", lens.cx, size[0]), ("cy", lens.cy, size[1]))
+        if not abs(value / length - 0.5) <= _OFF_CENTRE
+    }
+    if abs(lens.fx / lens.fy - 1.0) > _SQUARE:
+        faults["fy"] = (
+            f"{lens.fy:g} and fx {lens.fx:g} differ by more than {_SQUARE:.0%}, and pixels are square; {again}"
+        )
+    if not NARROWEST_DEG <= (angle := field_of_view_deg(lens, size)) <= WIDEST_DEG[lens.model]:
+        seen = "shows no direction at the border" if math.isnan(angle) else f"gives {angle:.0f} degrees"
+        bounds = f"between {NARROWEST_DEG:g} and {WIDEST_DEG[lens.model]:g} can be of a {lens.model}"
+        faults["fx"] = f"{lens.fx:g}, in pixels, {seen} of {words}, and {bounds}; {again}"
+    return faults
+
+
+def field_of_view_deg(lens: IntrinsicsConfig, size: tuple[int, int]) -> float:
+    """Across the longer side, the principal point in its middle; NaN where the lens images nothing at the border."""
+    pinhole = lens.model == "pinhole"
+    radial = (*lens.distortion[:2], *lens.distortion[4:5]) if pinhole else lens.distortion
+    ideal = np.linspace(0.0, 10.0 if pinhole else math.pi, 2000)  # tangents to 84 degrees, or angles off the axis
+    imaged = ideal * (1.0 + sum(k * ideal ** (2 * power) for power, k in enumerate(radial, start=1)))
+    folds = np.flatnonzero(np.diff(imaged) <= 0.0)
+    last = int(folds[0]) if len(folds) else len(ideal) - 1
+    border = max(size) / 2 / (lens.fx if size[0] >= size[1] else lens.fy)
+    at = float(np.interp(border, imaged[: last + 1], ideal[: last + 1], right=math.nan))
+    return math.degrees(2.0 * (math.atan(at) if pinhole else at))
 
 
 class RigConfig(Section):

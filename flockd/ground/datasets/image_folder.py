@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.core.config.rig import CameraConfig, IntrinsicsConfig
 from flockd.core.errors import ConfigError
 from flockd.core.messages import FloatArray, UInt8Array
-from flockd.flight.geometry import RigidTransform, ZMap, build_rig
+from flockd.flight.geometry import RigidTransform, ZMap
 from flockd.ground.datasets.image_files import SUFFIXES, DatasetError, read_depth, read_image
 
 _UNITS_PER_M = 1000.0
@@ -28,8 +28,6 @@ CAMERA = "camera"
 """Its name where the file has none."""
 _HALF_PIXEL = 0.5
 """Other people's matrices count pixel centres from 0; ours lie at +0.5."""
-_CENTRAL = (1 / 3, 2 / 3)
-"""Where between an image's borders a principal point may lie. A matrix of half or twice the size is outside."""
 MAX_TABLE_BYTES = 1 << 28
 """Hours of poses at 200 Hz."""
 
@@ -134,24 +132,12 @@ def read_calibration(file: Path, size: tuple[int, ...]) -> CameraConfig:
     if np.any(matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] != (0, 0, 0, 0, 1)):
         raise ConfigError.at(file, "is no camera matrix; write [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     fx, fy, cx, cy = (float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    for centre, length, side in ((cx, size[0], "width"), (cy, size[1], "height")):
-        if not _CENTRAL[0] * length <= centre <= _CENTRAL[1] * length:
-            raise ConfigError.at(
-                file,
-                f"is the calibration of another size: its principal point lies at {centre:.0f} of {length} pixels of "
-                f"the images' {side}; name the one that belongs to {size[0]} x {size[1]} pixels",
-            )
     try:
         intrinsics = IntrinsicsConfig(fx=fx, fy=fy, cx=cx + _HALF_PIXEL, cy=cy + _HALF_PIXEL)
-        camera = CameraConfig(name=CAMERA, size_px=(size[0], size[1]), intrinsics=intrinsics)
-        build_rig(RigConfig(cameras=(camera,)))
+        return CameraConfig(name=CAMERA, size_px=(size[0], size[1]), intrinsics=intrinsics)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        raise ConfigError.at(file, f"{key}: {first['msg']}; correct the calibration") from None
-    except ValueError as error:
-        raise ConfigError.at(file, f"{error}; correct the calibration") from None
-    return camera
+        raise ConfigError.at(file, f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
 def read_lines(file: Path) -> list[tuple[int, str]]:

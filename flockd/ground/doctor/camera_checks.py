@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from flockd.core.config import DroneConfig
-from flockd.core.config.rig import CameraConfig, RigConfig
+from flockd.core.config.rig import CameraConfig, RigConfig, field_of_view_deg
 from flockd.flight.geometry import Rig, build_rig
 from flockd.ground.calibration.from_flight import found_rig
 from flockd.ground.calibration.rig_calibration import described, rig_faults
@@ -30,15 +30,16 @@ FIX_PIPELINE = "try the pipeline with `gst-launch-1.0`, and ask it for a rate an
 DARK, BRIGHT = 12.0, 243.0
 """Mean grey, 0 to 255, of an image in which little can be seen."""
 
-# A calibration made at another size of image has its principal point far from the middle: half the width off for twice
-# the size. Real lenses sit within some percent of it.
-ODD_CENTRE, WRONG_CENTRE = 0.08, 0.2
-"""Shares of the width or height, between the principal point and the middle."""
-ODD_PIXELS, WRONG_PIXELS = 0.03, 0.15
+ODD_CENTRE = 0.08
+"""Share of the width or height between principal point and middle. Real lenses sit within some percent of it."""
+ODD_PIXELS = 0.03
 """How much fx and fy differ: pixels are square, unless images were squeezed from another aspect."""
+SEEN_DEG, UNSEEN = 63, 0.12
+"""How far off the axis networks were trained (docs/networks.md), and which share of an image may be beyond: a tenth of
+those of the shipped rig is."""
 LAST_S = 30.0
 """Of the last flight, that the rig is compared with: computed again, they take less time than they took in the air."""
-NARROW_DEG, MOST_PINHOLE_DEG, MOST_WIDE_DEG = 40.0, 130.0, 220.0
+NARROW_DEG = 40.0
 
 
 def check_cameras(
@@ -55,8 +56,7 @@ def check_cameras(
         watched = watch(sizes, source, seconds, devices or Devices(), start_s)
     for camera in config.rig.cameras:
         yield from _judged(camera, config, watched.get(camera.name))
-    with contextlib.suppress(ValueError):  # a calibration that makes no camera, which was reported above
-        yield coverage(config.rig)
+    yield coverage(config.rig)
 
 
 def _judged(camera: CameraConfig, config: DroneConfig, watched: Watched | None) -> Iterator[Finding]:
@@ -80,7 +80,7 @@ def _judged(camera: CameraConfig, config: DroneConfig, watched: Watched | None) 
         yield from problems
     else:
         size = "x".join(map(str, camera.size_px))
-        measured.append(f"calibration fits {size}, {width_deg(camera):.0f} degrees wide")
+        measured.append(f"calibration fits {size}, {field_of_view_deg(camera.intrinsics, camera.size_px):.0f} degrees")
         yield passed(f"camera {camera.name}", ", ".join(measured))
 
 
@@ -108,42 +108,35 @@ def _stream(name: str, watched: Watched, rate_hz: float, max_dropped_share: floa
         yield warned(about, f"the image is too {how} (mean {grey:.0f} of 255)", fix)
 
 
-def width_deg(camera: CameraConfig) -> float:
-    """The horizontal field of view through the image's middle row; NaN where the calibration images nothing there.
-
-    Raises ValueError where the intrinsics make no camera.
-    """
-    lens = build_rig(RigConfig(cameras=(camera,))).cameras[camera.name].camera
-    width, _ = camera.size_px
-    cy = camera.intrinsics.cy
-    left, right = lens.rays(np.array([[0.0, cy], [float(width), cy]]))
-    return math.degrees(sum(math.atan2(abs(ray[0]), ray[2]) for ray in (left, right)))
-
-
 def lens_problems(camera: CameraConfig) -> Iterator[Finding]:
-    """What makes a calibration unlikely or impossible for images of the camera's size."""
+    """What makes a calibration unlikely for images of the camera's size, and what of these the networks do not see."""
     about, lens = f"camera {camera.name}", camera.intrinsics
     again = "calibrate this camera at the size of its images"
-    try:
-        angle = width_deg(camera)
-    except ValueError as error:
-        yield failed(about, f"its calibration is unusable ({error})", again)
-        return
     off = max(abs(lens.cx / camera.size_px[0] - 0.5), abs(lens.cy / camera.size_px[1] - 0.5))
     if off > ODD_CENTRE:
         size = "x".join(map(str, camera.size_px))
         measured = f"principal point {lens.cx:g}, {lens.cy:g} is {off:.0%} of the image off the middle of {size}"
-        yield (failed if off > WRONG_CENTRE else warned)(about, measured, again)
+        yield warned(about, measured, again)
     odd = abs(lens.fx / lens.fy - 1.0)
     if odd > ODD_PIXELS:
-        measured = f"fx {lens.fx:g} and fy {lens.fy:g} differ by {odd:.0%}, and pixels are square"
-        yield (failed if odd > WRONG_PIXELS else warned)(about, measured, again)
-    most = MOST_PINHOLE_DEG if lens.model == "pinhole" else MOST_WIDE_DEG
-    if not angle <= most:
-        shown = "no direction at its border" if math.isnan(angle) else f"{angle:.0f} degrees from left to right"
-        yield failed(about, f"the {lens.model} calibration sees {shown}; up to {most:.0f} can be", again)
-    elif angle < NARROW_DEG:
-        yield warned(about, f"{angle:.0f} degrees from left to right see few neighbours", f"{again}, or widen the lens")
+        yield warned(about, f"fx {lens.fx:g} and fy {lens.fy:g} differ by {odd:.0%}, and pixels are square", again)
+    if (angle := field_of_view_deg(lens, camera.size_px)) < NARROW_DEG:
+        yield warned(about, f"{angle:.0f} degrees of view show few neighbours", f"{again}, or widen the lens")
+    if (blind := _unseen_share(camera)) > UNSEEN:
+        yield warned(
+            about,
+            f"{blind:.0%} of the image shows what is more than {SEEN_DEG} degrees right, left, above or below of the "
+            "axis, where no network was trained: neighbours there are missed or misplaced",
+            f"narrow the lens to {2 * SEEN_DEG} degrees, and add cameras",
+        )
+
+
+def _unseen_share(camera: CameraConfig) -> float:
+    """Of the image, beyond `SEEN_DEG`."""
+    lens = build_rig(RigConfig(cameras=(camera,))).cameras[camera.name].camera
+    grid = np.meshgrid(*((np.arange(50) + 0.5) / 50 * side for side in camera.size_px))
+    x, y, z = lens.rays(np.stack(grid, axis=-1).reshape(-1, 2)).T
+    return 1.0 - float(np.mean(np.maximum(abs(x), abs(y)) <= z * math.tan(math.radians(SEEN_DEG))))
 
 
 def coverage(rig: RigConfig) -> Finding:

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotSettingError
+from flockd.onboard.autopilot.autopilot_status import AutopilotError
 
 READ_BYTES = 4096
 """The most that a terminal of Linux keeps."""
@@ -33,12 +33,12 @@ class SerialPort:
 
         Args:
             device: its path.
-            baud: bits a second; 8 data bits, no parity, one stop bit, no flow control.
+            baud: bits a second, one of termios; 8 data bits, no parity, one stop bit, no flow control.
             report: called on the port's thread, with a sentence, when the device goes and when it is back.
 
         Raises AutopilotError when it cannot be opened or another program has it.
         """
-        self._device, self._speed, self._report = device, _speed(device, baud), report
+        self._device, self._speed, self._report = device, getattr(termios, f"B{baud}"), report
         self._receive: Callable[[bytes], object] = discard
         self._receiving = threading.Lock()
         self._lock = threading.Lock()
@@ -169,19 +169,6 @@ def _open(device: str, speed: int) -> int:
         os.close(descriptor)
         raise
     return descriptor
-
-
-def _speed(device: str, baud: int) -> int:
-    speed = getattr(termios, f"B{baud}", None)
-    if speed is None:
-        rates = sorted(int(name[1:]) for name in dir(termios) if name[:1] == "B" and name[1:].isdigit())
-        known = ", ".join(map(str, rates[-12:]))
-        raise AutopilotSettingError(
-            f"autopilot.address: serial://{device}:{baud}: there is no baud rate {baud}; write the autopilot's, "
-            f"of {known}"
-        )
-    assert isinstance(speed, int)
-    return speed
 
 
 def _why_not(address: str, error: OSError) -> str:

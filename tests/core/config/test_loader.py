@@ -7,11 +7,15 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
+from pydantic import ValidationError
 
+from flockd.cli import main
 from flockd.core.config import load_drone
 from flockd.core.config.document import core_scalar
+from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, field_of_view_deg
 from flockd.core.errors import ConfigError, ConfigProblem, ModelError
 from flockd.flight.perception import load_networks
 
@@ -156,7 +160,7 @@ PIPELINE = "source.cameras[0].pipeline"
         (
             DRONE.replace("cx: 320", "cx: 3200").replace("cy: 240", "cy: 480"),
             [f"5: rig.cameras[0].intrinsics.{key}" for key in ("cx", "cy")],
-            "outside the image",
+            "of the image off the middle of 640 x 480 images",
         ),
     ],
     ids=["twice", "zero", "surrogate", "no cameras", "no rig", "one name", "principal point"],
@@ -300,6 +304,32 @@ def test_steps_that_a_flight_would_wait_for_are_refused(
             load_drone(path, {"autopilot": {}})
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "told"),
+    [
+        ("autopilot.address", "udpin://0.0.0.0:99999", "has the port 99999, and the last one is 65535"),
+        ("autopilot.address", "serial:///dev/ttyAMA0:12345", "has the baud rate 12345, which no port has; write"),
+        ("autopilot.address", "serial:///dev/serial/by-path/usb-0:1:1", "has the baud rate 1, which no port has"),
+        ("telemetry.listen", ("tcp/127.0.0.1:7447", "tls/0.0.0.0:70000?x=1"), "has the port 70000"),
+        ("telemetry.connect", ("udp/10.0.0.1:65536",), "has the port 65536"),
+    ],
+)
+def test_an_address_that_nothing_can_open_is_refused(key: str, value: Any, told: str, tmp_path: Path) -> None:
+    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load_drone(tmp_path / "drone.yaml", {key: value})
+    assert told in str(caught.value)
+
+
+def test_an_address_may_have_colons_in_its_path_and_every_port(tmp_path: Path) -> None:
+    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
+    by_path = "serial:///dev/serial/by-path/platform-xhci-hcd.1-usb-0:1:1.0-port0:57600"
+    overrides: dict[str, Any] = {"autopilot.address": by_path, "telemetry.listen": ("tcp/0.0.0.0:65535",)}
+    config = load_drone(tmp_path / "drone.yaml", overrides)
+    assert config.autopilot is not None
+    assert config.autopilot.address == by_path
+
+
 def test_what_is_wrong_with_a_camera_is_told_at_its_own_line(tmp_path: Path) -> None:
     quadrotor = (CONFIG / "quadrotor.yaml").read_text(encoding="utf-8")
     rig, source, rest = quadrotor.partition("\nsource:")
@@ -311,3 +341,58 @@ def test_what_is_wrong_with_a_camera_is_told_at_its_own_line(tmp_path: Path) -> 
         (quadrotor.replace("usb-0:2:1.0", "usb-0:1:1.0"), "source.cameras[1].device"),
     ):
         assert any(told in place for place in places_of(_drone_problems(tmp_path, text)))
+
+
+def _camera(size: tuple[int, int], **lens: object) -> CameraConfig:
+    values = {"fx": 320.0, "fy": 320.0, "cx": size[0] / 2, "cy": size[1] / 2, **lens}
+    return CameraConfig(name="front", size_px=size, intrinsics=IntrinsicsConfig.model_validate(values))
+
+
+def test_how_wide_a_camera_sees() -> None:
+    pinhole, fisheye = (_camera((640, 480), model=model).intrinsics for model in ("pinhole", "wide_angle"))
+    assert field_of_view_deg(pinhole, (640, 480)) == pytest.approx(90.0, abs=0.01)  # 2 atan(320 / 320)
+    assert field_of_view_deg(fisheye, (480, 640)) == pytest.approx(math.degrees(2.0), abs=0.01)  # 640 / 320 rad
+    # k1 = 0.1: 0.9161 (1 + 0.1 * 0.9161^2) = 0.9930
+    bent = _camera((640, 480), fx=320 / 0.9930, fy=320 / 0.9930, distortion=(0.1, 0.0, 0.0, 0.0)).intrinsics
+    assert field_of_view_deg(bent, (640, 480)) == pytest.approx(2 * math.degrees(math.atan(0.9161)), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("size", "lens", "key", "told"),
+    [
+        (
+            (640, 480),
+            {"distortion": (0.1,) * 8},
+            "distortion",
+            "has 8 coefficients, and those of pinhole are none, or k1",
+        ),
+        ((640, 480), {"model": "wide_angle", "distortion": (0.1,) * 5}, "distortion", "has 5 coefficients"),
+        ((640, 480), {"fx": 1.019, "fy": 1.0, "cx": 320.0}, "fx", "shows no direction at the border of 640 x 480"),
+        ((640, 480), {"fx": 130.0, "fy": 130.0}, "fx", "gives 136 degrees of 640 x 480 images, and between 5 and 130"),
+        ((640, 480), {"fx": 9000.0, "fy": 9000.0}, "fx", "gives 4 degrees"),
+        ((640, 480), {"fx": 240.0}, "fy", "320 and fx 240 differ by more than 15%"),
+        # Calibrated at twice and half the size, and for an image that stands upright.
+        ((640, 480), {"cx": 639.0}, "cx", "639 is 50% of the image off the middle"),
+        ((640, 480), {"cx": 160.0}, "cx", "160 is 25% of the image off the middle"),
+        ((480, 640), {"cx": 320.0}, "cx", "320 is 17% of the image off the middle"),
+        # Turns back at r = 0.82 of the focal length (1 - 3 * 0.5 r^2 = 0), where it images 0.54; the border is at 1.
+        ((640, 480), {"distortion": (-0.5, 0.0, 0.0, 0.0)}, "fx", "shows no direction at the border"),
+    ],
+)
+def test_a_calibration_that_cannot_be_true_is_refused(
+    size: tuple[int, int], lens: dict[str, object], key: str, told: str
+) -> None:
+    with pytest.raises(ValidationError) as caught:
+        _camera(size, **lens)
+    (error,) = caught.value.errors()
+    assert (error["loc"], told in error["msg"]) == (("intrinsics", key), True)
+
+
+def test_a_view_that_no_network_was_trained_on_is_told_by_config_check(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "drone.yaml"
+    path.write_text(DRONE.replace("{fx: 320, fy: 320.0,", "{model: wide_angle, fx: 203.7, fy: 203.7,"))
+    assert main(["config", "check", str(path)]) == 0
+    assert f"warning: {path}: camera front: " in (told := capsys.readouterr().err)
+    assert "more than 63 degrees right, left, above or below of the axis, where no network was trained" in told

@@ -23,7 +23,7 @@ from flockd.core.config.source import (
 from flockd.core.data import data_path
 from flockd.core.messages import Frame
 from flockd.ground.doctor import Finding, Level
-from flockd.ground.doctor.camera_checks import check_cameras, coverage, lens_problems, width_deg
+from flockd.ground.doctor.camera_checks import check_cameras, coverage, lens_problems
 from flockd.onboard.sources import FramePublisher
 from flockd.onboard.sources.device_source import Devices
 from flockd.sim.sitl.processes import free_endpoint
@@ -67,7 +67,7 @@ def test_two_cameras_that_run_as_they_should() -> None:
         (finding,) = found[f"camera {name}"]
         assert finding.level is Level.PASS, finding
         assert "30.0 of 30 images a second, jitter 0.0 ms, no gaps, 2 controls accepted" in finding.measured
-        assert "calibration fits 640x480, 94 degrees wide" in finding.measured
+        assert "calibration fits 640x480, 94 degrees" in finding.measured
     assert found["rig"][0].level is Level.WARNING, "both look forward"
     assert not kernel.open_files, "all are given back"
     with filming(kernel, "front"):
@@ -210,36 +210,32 @@ def _camera(**lens: object) -> CameraConfig:
     return CameraConfig(name="front", size_px=(640, 480), intrinsics=IntrinsicsConfig.model_validate(values))
 
 
-def test_how_wide_a_camera_sees() -> None:
-    assert width_deg(_camera()) == pytest.approx(90.0)  # the pinhole: 2 atan(320 / 320)
-    assert width_deg(QUADROTOR.cameras[0]) == pytest.approx(97.5, abs=0.05)  # the equidistant: 480 / 282.1 rad
-    assert width_deg(_camera(model="wide_angle", fx=203.7, fy=203.7)) == pytest.approx(180.0, abs=0.05)
-
-
 @pytest.mark.parametrize("camera", [*QUADROTOR.cameras, *SIMULATOR.cameras], ids=lambda camera: camera.name)
 def test_the_shipped_calibrations_can_be_true(camera: CameraConfig) -> None:
     assert not list(lens_problems(camera))
 
 
 @pytest.mark.parametrize(
-    ("lens", "level", "told"),
+    ("lens", "told", "fix"),
     [
-        ({"fx": 640.0, "fy": 640.0, "cx": 608.0, "cy": 456.0}, Level.FAILURE, "principal point 608, 456 is 45%"),
-        ({"cx": 385.0}, Level.WARNING, "principal point 385, 240 is 10%"),
-        ({"fx": 240.0}, Level.FAILURE, "fx 240 and fy 320 differ by 25%"),
-        ({"fx": 337.0}, Level.WARNING, "fx 337 and fy 320 differ by 5%"),
-        ({"fx": 130.0, "fy": 130.0}, Level.FAILURE, "the pinhole calibration sees 136 degrees from left to right"),
-        ({"fx": 1100.0, "fy": 1100.0}, Level.WARNING, "32 degrees from left to right see few neighbours"),
-        ({"distortion": (0.1,)}, Level.FAILURE, "its calibration is unusable (PinholeCamera takes"),
-        # Turns back at r = 0.82 of the focal length (1 - 3 * 0.5 r^2 = 0), where it images 0.54; the border is at 1.
-        ({"distortion": (-0.5, 0.0, 0.0, 0.0)}, Level.FAILURE, "sees no direction at its border"),
+        ({"cx": 385.0}, "principal point 385, 240 is 10%", "calibrate this camera"),
+        ({"fx": 337.0}, "fx 337 and fy 320 differ by 5%", "calibrate this camera"),
+        ({"fx": 1100.0, "fy": 1100.0}, "32 degrees of view show few neighbours", "calibrate this camera"),
+        # Equidistant, half a turn wide: of the width 63 of 90 degrees are seen, and all of the height.
+        (
+            {"model": "wide_angle", "fx": 203.7, "fy": 203.7},
+            "of the image shows what is more than 63 deg",
+            "narrow the",
+        ),
     ],
 )
-def test_a_calibration_of_another_size_or_lens_is_reported(lens: dict[str, object], level: Level, told: str) -> None:
+def test_an_unlikely_calibration_or_one_beyond_the_networks_is_reported(
+    lens: dict[str, object], told: str, fix: str
+) -> None:
     (problem,) = lens_problems(_camera(**lens))
-    assert (problem.level, problem.about) == (level, "camera front")
+    assert (problem.level, problem.about) == (Level.WARNING, "camera front")
     assert told in problem.measured
-    assert "calibrate this camera" in problem.fix
+    assert problem.fix.startswith(fix)
 
 
 def test_four_cameras_see_all_around_and_three_do_not() -> None:
