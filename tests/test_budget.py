@@ -20,19 +20,19 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_090,
+    "flockd/core": 3_120,
     "flockd/flight": 11_340,
-    "flockd/onboard": 9_080,
+    "flockd/onboard": 9_110,
     "flockd/fleet": 2_670,
-    "flockd/ground": 4_010,
-    "flockd/review": 3_510,
+    "flockd/ground": 4_110,
+    "flockd/review": 3_540,
     "flockd/sim": 8_570,
     "flockd/campaign": 1_470,
     "flockd/cli": 3_450,
-    "tests": 36_790,
+    "tests": 36_980,
     "tools/checks": 2_060,
     "tools/docs": 850,
-    "tools/measure": 1_470,
+    "tools/measure": 1_490,
     "tools/release": 550,
     "tools/training": 4_330,
 }

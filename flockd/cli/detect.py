@@ -86,10 +86,10 @@ def _run(args: argparse.Namespace) -> int:
         raise UsageError("--force has no meaning without --out; add it")
     drone = loaded(args.config)
     camera = _camera_of_config(args, drone)
-    pictures = find_pictures(args.pictures, but_not=args.out)
+    left_out: list[str] = []
+    pictures = find_pictures(args.pictures, but_not=args.out, left_out=left_out.append)
     config = _perception(drone, args.drone_size)
     copies = None if args.out is None else Copies(args.out, pictures, overwrite=args.force)
-    left_out: list[str] = []
     detected = list(_detected(args, pictures, PictureDetector(config), camera, copies, left_out))
     if left_out and not detected:
         raise DatasetError("\n".join(left_out))

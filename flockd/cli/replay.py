@@ -101,7 +101,7 @@ def _recording(args: argparse.Namespace) -> Iterator[Recording]:
                 "source.kind is `ros` and whose cameras name their topics"
             )
         target = Path(folder) / f"{args.recording.resolve().name}.mcap"
-        recording_of_bag(bag, config, args.vehicle, target)
+        recording_of_bag(bag, config, args.vehicle, target, complain)
         yield opened(target)
 
 

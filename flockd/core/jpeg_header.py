@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 MAX_IMAGE_PIXELS = 1 << 26
 """8192 x 8192: more than any camera of a drone has. The command line tells OpenCV so, which refuses what has more."""
 MAX_SCANS = 100
@@ -11,7 +13,7 @@ MAX_SCANNED_PIXELS = 1 << 30
 two."""
 _STANDALONE = frozenset({0x01, *range(0xD0, 0xD8)})
 _FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_SCAN = 0xDA
+_SCAN, _END = 0xDA, 0xD9
 _JPEG = b"\xff\xd8"
 
 
@@ -23,6 +25,30 @@ def cost_fault(data: bytes) -> str | None:
     scans = data.count(b"\xff\xda") if data.startswith(_JPEG) else 0
     if scans > MAX_SCANS or scans * width * height > MAX_SCANNED_PIXELS:
         return f"has {scans} scans of {width} x {height} pixels, more than any camera writes"
+    return None
+
+
+_AFTER_SCAN = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
+"""A marker that ends the data of a scan: a byte of data that is 0xff has a zero behind it."""
+
+
+def jpeg_end(data: bytes) -> int | None:
+    """Where the JPEG at the beginning ends, behind its end marker; None where it has none, or is no JPEG.
+
+    What thumbnails and whatever follows hold does not count.
+    """
+    at = 2 if data.startswith(_JPEG) else len(data)
+    while at + 2 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == _END:
+            return at + 2
+        if marker == 0xFF or marker in _STANDALONE:
+            at += 1 if marker == 0xFF else 2
+            continue
+        at += 2 + int.from_bytes(data[at + 2 : at + 4])
+        if marker == _SCAN:
+            found = _AFTER_SCAN.search(data, at)
+            at = len(data) if found is None else found.end() - 2
     return None
 
 

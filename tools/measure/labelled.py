@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from flockd.ground.datasets.image_files import DatasetError, read_image
+
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom in pixels."""
 Fit = Callable[[Box, Box], float]
@@ -25,16 +27,39 @@ WIDTH_CLASSES = tuple(f"{a}-{b}" for a, b in zip(WIDTHS_PX, [*map(str, WIDTHS_PX
 
 
 def read_labels(path: Path) -> dict[Path, list[Box]]:
-    """The drones of each picture, by COCO's boxes of the category `drone`."""
-    coco = json.loads(path.read_text(encoding="utf-8"))
-    drones = {one["id"] for one in coco["categories"] if one["name"] == "drone"}
+    """The drones of each picture, by COCO's boxes of the category `drone`, in whatever letters.
+
+    Raises SystemExit for boxes that cannot be of these pictures.
+    """
+    coco = json.loads(path.read_text(encoding="utf-8-sig"))
+    drones = {one["id"] for one in coco["categories"] if one["name"].strip().casefold() in {"drone", "drones", "uav"}}
+    if not drones:
+        names = ", ".join(sorted(one["name"] for one in coco["categories"])) or "none"
+        raise SystemExit(f"{path}: has no category `drone`, but {names}; rename that of the drones")
     files = {one["id"]: (path.parent / one["file_name"]).resolve() for one in coco["images"]}
+    sizes = {key: _size(file) for key, file in files.items()}
     found: dict[Path, list[Box]] = {file: [] for file in files.values()}
     for one in coco["annotations"]:
-        if one["category_id"] in drones:
-            left, top, width, height = one["bbox"]
-            found[files[one["image_id"]]].append((left, top, left + width, top + height))
+        if one["category_id"] not in drones or one.get("iscrowd"):
+            continue
+        left, top, width, height = one["bbox"]
+        wide, high = sizes[one["image_id"]]
+        fault = f"{path}: annotation {one['id']}: bbox {one['bbox']} of an image of {wide:.0f} x {high:.0f} pixels"
+        if max(one["bbox"]) <= 1:
+            raise SystemExit(f"{fault} is in shares of it; write pixels: left, top, width, height")
+        if min(width, height) <= 0 or left + width > wide + 1 or top + height > high + 1 or min(left, top) < -1:
+            raise SystemExit(f"{fault} ends outside it; write left, top, width, height, not the corners")
+        found[files[one["image_id"]]].append((left, top, left + width, top + height))
     return found
+
+
+def _size(file: Path) -> tuple[float, float]:
+    """Width and height. Raises SystemExit for a picture that is not there."""
+    try:
+        height, width, _ = read_image(file).shape
+    except DatasetError as error:
+        raise SystemExit(str(error)) from None
+    return width, height
 
 
 def scored(pictures: Sequence[dict[str, Any]], labels: dict[Path, list[Box]]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 from scipy.optimize import least_squares
 
 from flockd.core.choices import LENS_MODELS, LensModel
@@ -321,7 +322,12 @@ def write_lens(camera: str, lens: Lens, measured: MeasurementConfig, out: Path) 
         f"The lens of camera {camera}, written by `flockd calibrate camera`. Copy `intrinsics` to the camera of this",
         "name in your drone's file, then run `flockd config check` on that; this file too is a drone with one camera.",
     )
-    config = CameraConfig(name=camera, size_px=lens.camera.size, intrinsics=intrinsics)
+    try:
+        config = CameraConfig(name=camera, size_px=lens.camera.size, intrinsics=intrinsics)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        told = f"the lens that fits cannot be true: {fault['loc'][-1]}: {fault['msg'].rpartition(';')[0]}"
+        raise CalibrationError(f"{told}; show the board in all corners of the image, from near and tilted") from None
     with written_whole(out) as draft:
         draft.write_text(rig_text((config,), comment), encoding="utf-8")
     return intrinsics

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import os
+import re
 import zlib
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from decimal import Decimal
 from pathlib import Path
+from tempfile import TemporaryFile
 
 import cv2
 import numpy as np
 
 from flockd.core.errors import FlockdError
-from flockd.core.jpeg_header import MAX_IMAGE_PIXELS, cost_fault
+from flockd.core.jpeg_header import MAX_IMAGE_PIXELS, cost_fault, jpeg_end
 from flockd.core.messages import Float32Array, UInt8Array
 
 
@@ -20,21 +24,50 @@ class DatasetError(FlockdError):
     """Something is no dataset, or a part of it is missing, damaged or does not fit the others."""
 
 
-SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff"})
+SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp", ".avif"})
+UNREAD_SUFFIXES = frozenset(
+    {".heic", ".heif", ".jxl", ".jp2", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
+    | {".3gp", ".mts", ".ts", ".wmv", ".flv", ".insv"}
+)
+"""Of pictures and videos that are not read: a folder's are named."""
+_WITH_PAGES = frozenset({".tif", ".tiff", ".webp", ".avif"})
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
-_JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_JPEG = b"\xff\xd8"
 MAX_FILE_BYTES = 1 << 29
 """Largest file: an image with the most pixels that are read and a depth of 16 bits, uncompressed, and some more."""
 _CHUNK_FRAME = 12
 """Bytes of a PNG chunk beside its data: length, name and checksum."""
 
 
-def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool = False) -> UInt8Array:
-    """(h, w, 3) RGB; grey images have three equal channels. Raises DatasetError, also for another ``size``.
+def unread(files: Iterable[Path]) -> str | None:
+    """What of these are pictures or videos that are not read, in a sentence, by kind; None: none."""
+    counts = Counter(suffix for file in files if (suffix := file.suffix.lower()) in UNREAD_SUFFIXES)
+    kinds = ", ".join(f"{count} {suffix}" for suffix, count in sorted(counts.items()))
+    return (
+        f"pictures or videos of kinds that are not read ({kinds}); convert them to JPEG, PNG or MP4" if kinds else None
+    )
 
-    ``upright``: turned as the file's orientation says, as a phone writes it; else as the sensor gave it.
+
+def in_order(files: Iterable[Path]) -> list[Path]:
+    """By their names, in which numbers count as such: `frame2` comes before `frame10`."""
+
+    def parts(file: Path) -> list[tuple[str, Decimal]]:
+        found = re.findall(r"(\D*)(\d*(?:(?<=\d)\.\d+)?)", str(file.with_suffix("")))
+        return [(text, Decimal(number or 0)) for text, number in found]
+
+    return sorted(files, key=lambda file: (parts(file), file))
+
+
+def read_image(path: Path, size: tuple[int, int] | None = None) -> UInt8Array:
+    """(h, w, 3) RGB, turned as the file's orientation says; grey images have three equal channels. Of images with
+    10, 12 or 16 bits the range that they use becomes 8 bits. Raises DatasetError, also for another ``size``.
     """
-    image = _decoded(path, cv2.IMREAD_COLOR_RGB | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION))
+    # Not IMREAD_COLOR_RGB: OpenCV 5.0.0 garbles TIFF of 16 bits with it.
+    image = cv2.cvtColor(_decoded(path, cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH), cv2.COLOR_BGR2RGB)
+    if image.dtype == np.uint16:
+        image = np.right_shift(np.asarray(image, np.uint16), max(int(image.max()).bit_length() - 8, 0))
+    elif image.dtype != np.uint8:
+        raise DatasetError(f"{path}: has pixels of {image.dtype}; save it with 8 or 16 bits a channel")
     if size is not None:
         _check_size(path, image.shape[1::-1], size)
     return np.asarray(image, np.uint8)
@@ -54,7 +87,7 @@ def read_depth(path: Path, size: tuple[int, int], units_per_m: float) -> Float32
 def _decoded(path: Path, flags: int) -> cv2.typing.MatLike:
     logging = cv2.utils.logging
     before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # the sentence below says it
-    image = None
+    image, fault = None, None
     try:
         if path.exists() and not path.is_file():  # a pipe or a device may never end
             fault = "is not an ordinary file"
@@ -62,9 +95,15 @@ def _decoded(path: Path, flags: int) -> cv2.typing.MatLike:
             fault = f"is larger than {MAX_FILE_BYTES >> 20} MiB"
         else:
             data = path.read_bytes()
-            known = _fault(data)
-            fault = known or "is no image"
-            image = None if known else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+            data = data[: jpeg_end(data)]  # what cameras and phones write behind it is not looked at
+            fault = _fault(data) or _pages_fault(path)
+            if fault is None:
+                with _stderr_of_libraries() as said:
+                    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+                    damage = said()
+                if image is not None and damage:
+                    image, fault = None, f"is damaged inside ({damage})"
+            fault = fault or "is no image"
     except (OSError, ValueError) as error:  # ValueError: what a list names cannot be a path
         fault = f"cannot be read ({error.strerror if isinstance(error, OSError) else error})"
     except cv2.error:  # of a header that claims more pixels than OpenCV is to take, or of no bytes at all
@@ -84,9 +123,33 @@ def _fault(data: bytes) -> str | None:
         return costs
     if data.startswith(_PNG):
         return _png_fault(data)
-    if data.startswith(_JPEG) and _JPEG_END not in data[-64:]:
+    if data.startswith(_JPEG) and jpeg_end(data) is None:
         return "the JPEG ends too early"
     return None
+
+
+def _pages_fault(path: Path) -> str | None:
+    pages = cv2.imcount(str(path)) if path.suffix.lower() in _WITH_PAGES else 1
+    return f"has {pages} pages, of which one would be read; save each as an image" if pages > 1 else None
+
+
+@contextmanager
+def _stderr_of_libraries() -> Iterator[Callable[[], str]]:
+    """What decoders write there meanwhile. libjpeg says only there that it has filled in what is damaged."""
+    with TemporaryFile() as said:
+        before = os.dup(2)
+        os.dup2(said.fileno(), 2)
+
+        def read() -> str:
+            said.seek(0)
+            lines = said.read().decode("utf-8", "replace").splitlines()
+            return next((line for line in lines if re.search("corrupt|premature", line, re.IGNORECASE)), "")
+
+        try:
+            yield read
+        finally:
+            os.dup2(before, 2)
+            os.close(before)
 
 
 def _png_fault(data: bytes) -> str | None:
@@ -116,36 +179,48 @@ VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".m
 
 @contextmanager
 def opened_video(path: Path) -> Iterator[cv2.VideoCapture]:
-    """A video for OpenCV, unrotated whatever orientation the file asks for; closed at the end."""
+    """A video for OpenCV, turned as the file's orientation says; closed at the end."""
     # The decoder's own messages about a damaged file would go to stderr, beside our own sentence.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     logging = cv2.utils.logging
     before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     logging.setLogLevel(before)
-    # As recorded: a phone's rotation metadata would turn the image away from its calibration.
-    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     try:
         yield video
     finally:
         video.release()
 
 
-def images_of_video(path: Path, every: int = 1, *, upright: bool = False) -> Iterator[tuple[int, UInt8Array]]:
+_MISSING = 0.02
+"""Share of its frames that a video may lack: containers count some that are not shown."""
+
+
+def images_of_video(path: Path, every: int = 1) -> Iterator[tuple[int, UInt8Array]]:
     """Number and image (h, w, 3), RGB, of every ``every``-th frame, as far as frames can be decoded.
 
-    ``upright``: turned as the file's orientation says. Raises DatasetError for a video that claims to be huge.
+    Raises DatasetError for a video that claims to be huge, and behind the frames of one that ends too early.
     """
     with opened_video(path) as video:
-        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(upright))
         width, height = (int(video.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if width * height > MAX_IMAGE_PIXELS:
             raise DatasetError(f"{path}: says that it has {width} x {height} pixels; convert it to a smaller one")
-        index = 0
+        count, rate_hz = video.get(cv2.CAP_PROP_FRAME_COUNT), video.get(cv2.CAP_PROP_FPS)
+        index, last_s = 0, 0.0
         while video.grab():
+            last_s = video.get(cv2.CAP_PROP_POS_MSEC) / 1e3
             if index % every == 0:
                 there, image = video.retrieve()
                 if not there:
-                    return
+                    break
                 yield index, np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
             index += 1
+        # By count and by time: of some containers the count is the duration times a rate that changed.
+        short = index < (1 - _MISSING) * count - 1
+        counted = path.suffix.lower() in _COUNTED or (rate_hz > 0 and last_s < (1 - _MISSING) * (count - 1) / rate_hz)
+        if index and short and counted:
+            raise DatasetError(f"{path}: is damaged: {index} of its {count:.0f} frames were read; restore it")
+
+
+_COUNTED = frozenset({".mp4", ".mov", ".m4v", ".avi"})
+"""Videos that hold the number of their frames."""

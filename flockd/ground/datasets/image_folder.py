@@ -1,7 +1,7 @@
 """A folder of one camera's images, with their depth maps and poses where those are known.
 
-The files of `images/` and of `depth/` in order of their names; in `poses.txt` a 4x4 camera-to-world matrix a line; and
-in `K.txt` the camera's matrix.
+The files of `images/` and of `depth/` in order of the numbers in their names; in `poses.txt` a 4x4 camera-to-world
+matrix a line; and in `K.txt` the camera's matrix.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from flockd.core.config.rig import CameraConfig, IntrinsicsConfig
 from flockd.core.errors import ConfigError
 from flockd.core.messages import FloatArray, UInt8Array
 from flockd.flight.geometry import RigidTransform, ZMap
-from flockd.ground.datasets.image_files import SUFFIXES, DatasetError, read_depth, read_image
+from flockd.ground.datasets.image_files import SUFFIXES, DatasetError, in_order, read_depth, read_image
 
 _UNITS_PER_M = 1000.0
 """Of depth maps, 16 bits a pixel."""
@@ -73,7 +73,10 @@ class Dataset:
 def open_dataset(path: Path) -> Dataset:
     """The images in a folder. Raises DatasetError, and ConfigError for a calibration that cannot be used."""
     if not (path / "images").is_dir():
-        raise DatasetError(f"{path}: is no folder of images; it needs images/, and K.txt with the camera's matrix")
+        advice = "is no folder of images; it needs images/, and K.txt with the camera's matrix"
+        if any(file.suffix in {".mcap", ".db3"} for file in path.iterdir()):
+            advice = "has no metadata.yaml of a bag, which `ros2 bag reindex` writes; or name a recording in it"
+        raise DatasetError(f"{path}: {advice}")
     images = _files(path / "images")
     camera = read_calibration(path / "K.txt", read_image(images[0]).shape[1::-1])
     depth, poses = _depth(path / "depth", images), _poses(path / "poses.txt", images)
@@ -81,7 +84,7 @@ def open_dataset(path: Path) -> Dataset:
 
 
 def _files(folder: Path) -> list[Path]:
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
+    files = in_order(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
     if not files:
         raise DatasetError(f"{folder}: holds no images; put them there")
     return files

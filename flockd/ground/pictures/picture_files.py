@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +15,10 @@ from flockd.ground.datasets.image_files import (
     VIDEO_SUFFIXES,
     DatasetError,
     images_of_video,
+    in_order,
     opened_video,
     read_image,
+    unread,
 )
 
 
@@ -51,17 +53,21 @@ class PictureFile:
         Raises DatasetError where it cannot be read.
         """
         if not self.is_video:
-            yield str(self.path), read_image(self.path, upright=True)
+            yield str(self.path), read_image(self.path)
             return
         index = None
-        for index, image in images_of_video(self.path, every, upright=True):
+        for index, image in images_of_video(self.path, every):
             yield f"{self.path}#{index}", image
         if index is None:
             raise DatasetError(f"{self.path}: is no video that can be decoded; restore it, or convert it to MP4")
 
 
-def find_pictures(paths: Sequence[Path], but_not: Path | None = None) -> list[PictureFile]:
+def find_pictures(
+    paths: Sequence[Path], but_not: Path | None = None, left_out: Callable[[str], None] = lambda sentence: None
+) -> list[PictureFile]:
     """The images and videos that are named, and those in the folders that are named and below; each once.
+
+    ``left_out`` is called with what a folder holds of kinds that are not read.
 
     Files whose name begins with a dot are other programs' notes, and count only where they are named. Nor
     does what lies in ``but_not``, a folder of copies inside one that is named.
@@ -72,11 +78,15 @@ def find_pictures(paths: Sequence[Path], but_not: Path | None = None) -> list[Pi
     found: dict[Path, PictureFile] = {}
     for path in paths:
         if path.is_dir():
-            inside = sorted(one for one in path.rglob("[!.]*") if one.suffix.lower() in endings and one.is_file())
+            there = [one for one in path.rglob("[!.]*") if one.is_file()]
             if copies is not None and path.resolve() in copies.parents:
-                inside = [one for one in inside if copies not in one.resolve().parents]
+                there = [one for one in there if copies not in one.resolve().parents]
+            inside = in_order(one for one in there if one.suffix.lower() in endings)
+            others = unread(there)
             if not inside:
-                raise UsageError(f"{path}: has no images or videos; name the folder that they are in")
+                raise UsageError(f"{path}: has {others or 'no images or videos; name the folder that they are in'}")
+            if others:
+                left_out(f"{path}: {others}")
             for one in inside:
                 found.setdefault(one.resolve(), PictureFile(one, path))
         elif not path.exists():

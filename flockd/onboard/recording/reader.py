@@ -40,6 +40,10 @@ T = TypeVar("T")
 _OF_STEPS = {one.topic for one in (streams.FRAMES, streams.VEHICLE, streams.ORDER, streams.OUTPUT, streams.TRUTH)}
 """Streams whose messages, beside images, are parts of steps, numbered by their sequence."""
 
+OF_A_BAG = (
+    "is a part of a bag of ROS 2; `flockd replay` takes the bag's folder, in which metadata.yaml is, and --config"
+)
+
 
 @dataclass(frozen=True, eq=False)
 class RecordedStep:
@@ -189,7 +193,9 @@ def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
                 if flight is None:
                     raise RecordingError(f"{path}: nothing in it can be read ({record.reason}); use another copy")
                 raise RecordingError(f"{path}: is cut off before the configuration of the flight; use another copy")
-            case Entry() if flight is None:
+            case Entry(stream) if flight is None:
+                if "/msg/" in stream.schema_name:
+                    raise RecordingError(f"{path}: {OF_A_BAG}")
                 break
         if flight and models and configuration:
             if flight.facts.get("format") != streams.FORMAT:
@@ -209,6 +215,8 @@ def _survey(path: Path, progress: Callable[[int, int], None]) -> Contents:
     if not path.is_file():
         fault = "is a folder; name a recording in it" if path.is_dir() else "does not exist; check the path"
         raise RecordingError(f"{path}: {fault}")
+    if path.suffix == ".db3":
+        raise RecordingError(f"{path}: {OF_A_BAG}")
     flight, models, configuration = head_of(path)
     found = Contents(flight.facts, models.facts, configuration.data)
     total, done = path.stat().st_size, 0

@@ -9,7 +9,7 @@ from typing import Literal, Protocol
 import cv2
 import numpy as np
 
-from flockd.core.jpeg_header import cost_fault, jpeg_size
+from flockd.core.jpeg_header import cost_fault, jpeg_end, jpeg_size
 from flockd.core.messages import UInt8Array
 
 Decoder = Callable[[bytes], UInt8Array]
@@ -66,7 +66,9 @@ class MjpegFormat:
         """See ``ImageFormat``: begin, end and size."""
         if not data.startswith(_START):
             raise CorruptImageError("no JPEG begins here")
-        if not data.rstrip(b"\0").endswith(_END):  # some cameras pad with zeros
+        if (
+            not data.rstrip(b"\0").endswith(_END) and jpeg_end(data) is None
+        ):  # some cameras pad, most of them with zeros
             raise CorruptImageError("JPEG ends too early")
         found = jpeg_size(data)
         if found != self.size:

@@ -37,6 +37,45 @@ def info_topic_of(topic: str) -> str:
     return f"{base.rpartition('/')[0]}/camera_info"
 
 
+def ros_format(
+    encoding: str, size: tuple[int, int] | None, bytes_per_line: int | None, wanted: tuple[int, int]
+) -> ImageFormat:
+    """Of a message's images, which have to be of the size ``wanted``. Raises ValueError for those that cannot be read.
+
+    ``encoding``: of an Image; of a CompressedImage, whose ``size`` is None, its `format`.
+    """
+    if size is None:
+        if "compressedDepth" not in encoding and ("jpeg" in encoding or "jpg" in encoding):
+            return MjpegFormat(wanted)
+        raise ValueError(f"sends {encoding[:40]!r}; let its transport send JPEG")
+    if size != wanted:
+        told = f"gives {size[0]}x{size[1]}, but the rig has {wanted[0]}x{wanted[1]}"
+        raise ValueError(f"{told}; correct size_px, or the driver")
+    if encoding not in ENCODINGS:
+        known = ", ".join(ENCODINGS)
+        raise ValueError(f"has the encoding {encoding[:40]!r}, and not one of {known}; convert it, as image_proc does")
+    return PackedFormat(ENCODINGS[encoding], wanted, bytes_per_line)
+
+
+def info_fault(
+    lens: IntrinsicsConfig, wanted: tuple[int, int], size: tuple[int, int], found: tuple[float, float, float, float]
+) -> str | None:
+    """What of a CameraInfo contradicts the rig: its ``size``, or fx, fy, cx and cy. One without a calibration does not.
+
+    Pixel centres are at whole numbers in ROS.
+    """
+    fx, fy, cx, cy = found
+    if fx == 0:
+        return None
+    if size != wanted:
+        return f"is of {size[0]}x{size[1]}, but the rig has {wanted[0]}x{wanted[1]}; correct one"
+    for key, value in {"fx": fx, "fy": fy, "cx": cx + CENTRE_PX, "cy": cy + CENTRE_PX}.items():
+        expected = getattr(lens, key)
+        if not abs(value - expected) <= LENS_TOLERANCE * lens.fx:
+            return f"has {key} {value:.1f}, but the rig {expected:.1f}; correct one"
+    return None
+
+
 class RosDevice(ChildDevice):
     """A ``CameraDevice`` of a topic. Its time stamps are the messages' own, carried over to CLOCK_MONOTONIC."""
 
@@ -60,39 +99,20 @@ class RosDevice(ChildDevice):
             return None
         text, width, height, bytes_per_line = IMAGE_HEAD.unpack_from(message.data)
         encoding = text.rstrip(b"\0").decode("utf-8", "replace")
-        if message.kind == IMAGE:
-            self._format = self._packed(encoding, (width, height), bytes_per_line)
-        elif "jpeg" in encoding or "jpg" in encoding:
-            self._format = MjpegFormat(self._size)
-        else:
-            raise CameraError(f"{self._name}: {self._topic} sends {encoding[:40]!r}; let its transport send JPEG")
+        size = None if message.kind == COMPRESSED else (width, height)
+        try:
+            self._format = ros_format(encoding, size, bytes_per_line, self._size)
+        except ValueError as error:
+            raise CameraError(f"{self._name}: {self._topic} {error}") from None
         return self._captured(message.data[IMAGE_HEAD.size :], message)
 
-    def _packed(self, encoding: str, size: tuple[int, int], bytes_per_line: int) -> ImageFormat:
-        self._check_size(size, f"{self._topic} gives", "correct size_px, or the driver")
-        if encoding not in ENCODINGS:
-            known = ", ".join(ENCODINGS)
-            raise CameraError(
-                f"{self._name}: {self._topic} has the encoding {encoding[:40]!r}, and not one of {known}; "
-                "convert it, as image_proc does"
-            )
-        return PackedFormat(ENCODINGS[encoding], self._size, bytes_per_line)
-
     def _compare(self, width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> None:
-        """Raises CameraError where a CameraInfo says something else than the rig. One without a calibration may.
-
-        Pixel centres are at whole numbers in ROS.
-        """
-        if self._lens is None or fx == 0:
+        """Raises CameraError where a CameraInfo says something else than the rig. One without a calibration may."""
+        if self._lens is None:
             return
-        self._check_size((width, height), f"{self._info_topic} is of", "correct one")
-        found = {"fx": fx, "fy": fy, "cx": cx + CENTRE_PX, "cy": cy + CENTRE_PX}
-        for key, value in found.items():
-            expected = getattr(self._lens, key)
-            if not abs(value - expected) <= LENS_TOLERANCE * self._lens.fx:
-                raise CameraError(
-                    f"{self._name}: {self._info_topic} has {key} {value:.1f}, but the rig {expected:.1f}; correct one"
-                )
+        fault = info_fault(self._lens, self._size, (width, height), (fx, fy, cx, cy))
+        if fault is not None:
+            raise CameraError(f"{self._name}: {self._info_topic} {fault}")
 
     def _failed(self, reason: str) -> CameraError:
         if reason == NO_ROS:

@@ -39,9 +39,10 @@ def open_session(
     """A session that listens on and connects to these endpoints only, for ever where nobody is there yet.
 
     A peer opens without a router, unlike a client; discovery by multicast and gossip is off. ``purpose``: as errors say
-    it; ``settings``: a file of zenoh's own to begin with, for TLS and access control. Longer messages and further peers
-    than the most are refused; None: as zenoh or the settings have it. ``awaits_addresses``: it listens on an address
-    that no interface has yet, such as Wi-Fi's at the start, once one has it. Raises UnavailableError.
+    it; ``settings``: a file of zenoh's own to begin with, for TLS and access control; what of it is not used is logged.
+    Longer messages and further peers than the most are refused; None: as zenoh or the settings have it.
+    ``awaits_addresses``: it listens on an address that no interface has yet, such as Wi-Fi's at the start, once one has
+    it. Raises UnavailableError.
     """
     for endpoint in (*listen, *connect):
         if "/" not in endpoint:
@@ -58,10 +59,16 @@ def open_session(
         "transport/unicast/max_sessions": max_peers,
     }
     try:
+        usual = zenoh.Config()
         config = zenoh.Config() if settings is None else zenoh.Config.from_file(str(settings))
         for key, value in wanted.items():
-            if value is not None:
-                config.insert_json5(key, json.dumps(value))
+            if value is None:
+                continue
+            own = json.loads(config.get_json(key))
+            if own not in (value, json.loads(usual.get_json(key))):
+                instead = "name endpoints in telemetry.connect or .listen" if "endpoints" in key else "leave it out"
+                _log.warning("%s: %s of %s is %s, and flockd needs %s; %s", purpose, key, settings, own, value, instead)
+            config.insert_json5(key, json.dumps(value))
         try:
             return zenoh.open(config)
         except zenoh.ZError as error:

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import json
 import uuid
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -42,19 +44,27 @@ from flockd.onboard.recording.streams import (
     VEHICLE,
     FrameEntry,
     StepFrames,
+    is_image,
     nanoseconds,
 )
 from flockd.onboard.sources.assembler import Assembler, RawFrameSet
 from flockd.onboard.sources.frames import RawFrame
-from flockd.onboard.sources.image_formats import CorruptImageError, PackedFormat
-from flockd.onboard.sources.ros_device import ENCODINGS
+from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat
+from flockd.onboard.sources.ros_device import info_fault, info_topic_of, ros_format
 
-IMAGE = "sensor_msgs/msg/Image"
+IMAGE, CAMERA_INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
 
 
-def recording_of_bag(bag: Bag, config: DroneConfig, vehicle_topic: str | None, target: Path) -> int:
+def recording_of_bag(
+    bag: Bag,
+    config: DroneConfig,
+    vehicle_topic: str | None,
+    target: Path,
+    tell: Callable[[str], None] = lambda sentence: None,
+) -> int:
     """Writes a recording of the bag's frame sets, a step every ``config.step_s``; gives their number.
 
+    ``tell`` is called with what of its images could not be used.
     Topics of the cameras are those of ``config.source``, whose kind is `ros`. Raises UsageError and RecordingError.
     """
     source = config.source
@@ -69,22 +79,24 @@ def recording_of_bag(bag: Bag, config: DroneConfig, vehicle_topic: str | None, t
         if kinds.get(topic) not in {IMAGE, COMPRESSED_IMAGE}:
             there = ", ".join(name for name, kind in kinds.items() if kind in {IMAGE, COMPRESSED_IMAGE}) or "none"
             raise UsageError(f"{bag.path}: has no images of camera {camera} in {topic}; topics with images: {there}")
+    _compare_lenses(bag, config, kinds)
     began_ns = next((stamp_ns(bag.read(one)) for one in bag.messages(topics)), 0)
     states = _states(bag, _vehicle_topic(bag, vehicle_topic), config, began_ns)
-    steps = 0
+    steps, kept, lost = 0, 0, Counter[str]()
     with McapFile(target) as file:
         facts = {"format": FORMAT, "drone": config.name, "images": "png", "recording": uuid.uuid4().hex}
         file.write(Note(FLIGHT_NOTE, {**facts, "from_bag": bag.path.name}))
         file.write(Note(MODELS_NOTE, model_hashes(config.perception)))
         file.write(Inclosure(CONFIGURATION, "application/json", config.model_dump_json(indent=1).encode()))
         last_s = -np.inf
-        for frames in _sets(bag, topics, config, began_ns):
+        for frames in _sets(bag, topics, config, began_ns, lost):
             vehicle = states.at(frames.time_s + config.rig.time_offset_s)
             if vehicle is None or frames.time_s < last_s + config.step_s - source.set_tolerance_s:
                 continue
             last_s = frames.time_s
-            for entry in _entries(steps, frames, vehicle):
+            for entry in _entries(steps, frames, vehicle, lost):
                 file.write(entry)
+                kept += is_image(entry.stream.topic)
             steps += 1
         file.write(Note(END_NOTE, {"steps": str(steps), "lost": "0"}))
     if steps == 0:
@@ -92,10 +104,31 @@ def recording_of_bag(bag: Bag, config: DroneConfig, vehicle_topic: str | None, t
             f"{bag.path}: has no image with a state of the vehicle within {LONGEST_GAP_S:g} s of it; are their stamps "
             "of one clock?"
         )
+    why = "; ".join(f"{count} of {fault}" for fault, count in lost.most_common(4))
+    if kept == 0:
+        raise RecordingError(f"{bag.path}: none of its images could be used ({why}); correct the rig, or the bag")
+    if lost:
+        tell(f"{bag.path}: {lost.total()} images could not be used: {why}")
     return steps
 
 
-def _sets(bag: Bag, topics: Mapping[str, str], config: DroneConfig, began_ns: int) -> Iterator[RawFrameSet]:
+def _compare_lenses(bag: Bag, config: DroneConfig, kinds: Mapping[str, str]) -> None:
+    """Raises RecordingError where a CameraInfo contradicts the rig, as in flight."""
+    assert config.source is not None
+    lenses = {camera.name: (camera.intrinsics, camera.size_px) for camera in config.rig.cameras}
+    for camera in config.source.cameras:
+        topic = camera.camera_info or info_topic_of(camera.place)
+        if kinds.get(topic) != CAMERA_INFO or (message := next(bag.messages([topic]), None)) is None:
+            continue
+        info, (lens, wanted) = bag.read(message), lenses[camera.name]
+        found = float(info.k[0]), float(info.k[4]), float(info.k[2]), float(info.k[5])
+        if (fault := info_fault(lens, wanted, (info.width, info.height), found)) is not None:
+            raise RecordingError(f"{bag.path}: camera {camera.name}: {topic} {fault}")
+
+
+def _sets(
+    bag: Bag, topics: Mapping[str, str], config: DroneConfig, began_ns: int, lost: Counter[str]
+) -> Iterator[RawFrameSet]:
     """Frames by their stamps, as a drone puts them together; the clock begins with the first one's."""
     assert config.source is not None
     sizes = {camera.name: camera.size_px for camera in config.rig.cameras}
@@ -109,7 +142,9 @@ def _sets(bag: Bag, topics: Mapping[str, str], config: DroneConfig, began_ns: in
         if (before := last.get(camera)) is not None:
             number = before.sequence + max(round((time_s - before.time_s) * rates[camera]), 1)
         frame = RawFrame(camera, image.data, _decoder(image, sizes[camera], message), time_s, number)
-        if assembler.offer(frame, time_s) is None:
+        if (fault := assembler.offer(frame, time_s)) is not None:
+            lost[f"camera {camera}: {fault}"] += 1
+        else:
             last[camera] = frame
             if (found := assembler.take(time_s)) is not None:
                 yield found
@@ -123,24 +158,23 @@ def _time_s(stamp_ns: int, began_ns: int) -> float:
 
 
 def _decoder(image: RosImage, size: tuple[int, int], message: BagMessage) -> Callable[[bytes], UInt8Array]:
-    """Raises RecordingError for an image that is not the camera's."""
-    if image.size is None:
-        return lambda data: _decoded(data, size)
-    if image.size != size or image.encoding not in ENCODINGS:
-        raise RecordingError(
-            f"{message.topic}: has images of {image.size[0]}x{image.size[1]} in {image.encoding[:40]!r}; the rig has "
-            f"{size[0]}x{size[1]}, and encodings that can be read are {', '.join(ENCODINGS)}"
-        )
-    return PackedFormat(ENCODINGS[image.encoding], size, image.bytes_per_line).decode
-
-
-def _decoded(data: bytes, size: tuple[int, int]) -> UInt8Array:
+    """As in flight, and PNG, which a bag may well hold. Raises RecordingError for what is not the camera's."""
+    if image.size is None and "png" in image.encoding and "compressedDepth" not in image.encoding:
+        return partial(_decoded_png, size=size)
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+        return ros_format(image.encoding, image.size, image.bytes_per_line, size).decode
+    except ValueError as error:
+        raise RecordingError(f"{message.topic}: {error}") from None
+
+
+def _decoded_png(data: bytes, size: tuple[int, int]) -> UInt8Array:
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB) if data else None
     except cv2.error:
         image = None
     if image is None or image.shape[1::-1] != size:
-        raise CorruptImageError("does not decode into an image of the rig's size")
+        shown = "no PNG" if image is None else f"a PNG of {image.shape[1]}x{image.shape[0]}"
+        raise CorruptImageError(f"{shown} instead of {size[0]}x{size[1]}")
     return np.asarray(image, np.uint8)
 
 
@@ -176,17 +210,19 @@ def _vehicle_topic(bag: Bag, wanted: str | None) -> str:
     raise UsageError(f"{bag.path}: has no odometry, pose or IMU, from which the drone's attitude is known")
 
 
-def _entries(step: int, frames: RawFrameSet, vehicle: VehicleState) -> Iterator[Entry]:
-    """Images that do not decode are left out, as a drone does; those that came as JPEG stay so, others become PNG."""
+def _entries(step: int, frames: RawFrameSet, vehicle: VehicleState, lost: Counter[str]) -> Iterator[Entry]:
+    """Images that do not decode are left out, as a drone does, and counted by the reason; those that came as JPEG stay
+    so, others become PNG."""
     kept = []
     for camera, frame in frames.frames.items():
         try:
             image = frame.decode(frame.data)
-        except CorruptImageError:
+        except CorruptImageError as error:
+            lost[f"camera {camera}: {error}"] += 1
             continue
         data, stamp = frame.data, nanoseconds(frame.time_s)
         form: ImageFormat = "jpeg"
-        if not data.startswith(b"\xff\xd8"):
+        if not isinstance(getattr(frame.decode, "__self__", None), MjpegFormat):
             data, form = bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]), "png"
         kept.append(FrameEntry(camera, frame.time_s, frame.sequence))
         yield Entry(foxglove.image_stream(camera), stamp, step, foxglove.image(stamp, camera, data, form))

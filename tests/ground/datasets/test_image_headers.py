@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from flockd.core.jpeg_header import jpeg_size
-from flockd.ground.datasets.image_files import DatasetError, read_image
+from flockd.core.jpeg_header import jpeg_end, jpeg_size
+from flockd.core.messages import UInt8Array
+from flockd.ground.datasets.image_files import DatasetError, in_order, read_image, unread
 from flockd.ground.datasets.image_folder import read_lines
 from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat
 
@@ -98,3 +99,56 @@ def test_what_is_no_ordinary_file_is_refused_without_waiting_for_its_writer(tmp_
         for path in (pipe, endless):
             with pytest.raises(DatasetError, match="is not an ordinary file"):
                 read(path)
+
+
+def _photograph() -> UInt8Array:
+    noise = np.random.default_rng(0).integers(0, 256, (120, 160, 3), dtype=np.uint8)
+    return np.asarray(cv2.GaussianBlur(noise, (0, 0), 2), np.uint8)
+
+
+def test_a_jpeg_ends_at_its_end_marker_and_is_whole_or_not_read(tmp_path: Path) -> None:
+    """As phones write it: a thumbnail inside, a movie behind. Data that are cut or zeroed inside decode to the end."""
+    path, whole = tmp_path / "x.jpg", bytes(cv2.imencode(".jpg", _photograph())[1])
+    thumbnail = b"\xff\xe1" + (2 + 4 + len(_written(".jpg"))).to_bytes(2) + b"Exif" + _written(".jpg")
+    whole = whole[:2] + thumbnail + whole[2:]
+    assert jpeg_end(whole) == len(whole)
+    path.write_bytes(whole)
+    image = read_image(path)
+    for behind in (b"\xff\xd8 a movie " * 200, b"\0" * 1000, whole):
+        path.write_bytes(whole + behind)
+        assert np.array_equal(read_image(path), image)
+    middle = len(whole) // 2 + len(thumbnail) // 2
+    for inside in (whole[:middle] + b"\xff\xd9", whole[:middle] + bytes(500) + whole[middle + 500 :]):
+        path.write_bytes(inside)
+        with pytest.raises(DatasetError, match="is damaged inside"):
+            read_image(path)
+    path.write_bytes(whole[:-2])
+    with pytest.raises(DatasetError, match="the JPEG ends too early"):
+        read_image(path)
+
+
+@pytest.mark.parametrize(("bits", "suffix"), [(10, ".png"), (12, ".tif"), (16, ".png")])
+def test_the_bits_that_an_image_uses_become_eight(bits: int, suffix: str, tmp_path: Path) -> None:
+    image, path = _photograph(), tmp_path / f"x{suffix}"
+    image[0, 0] = 255
+    cv2.imwrite(str(path), image.astype(np.uint16) << (bits - 8))
+    assert np.array_equal(read_image(path), image[..., ::-1])
+
+
+def test_what_an_image_holds_that_is_not_read_is_said(tmp_path: Path) -> None:
+    path, image = tmp_path / "x.tif", _photograph()
+    cv2.imwritemulti(str(path), [image, image])
+    with pytest.raises(DatasetError, match="has 2 pages, of which one would be read; save each as an image"):
+        read_image(path)
+    cv2.imwrite(str(path), image.astype(np.float32) / 255)
+    with pytest.raises(DatasetError, match="has pixels of float32; save it with 8 or 16 bits"):
+        read_image(path)
+    assert unread([Path(f"a/{name}") for name in ("1.HEIC", "2.heic", "3.gif", "4.jpg", "labels.json")]) == (
+        "pictures or videos of kinds that are not read (1 .gif, 2 .heic); convert them to JPEG, PNG or MP4"
+    )
+
+
+def test_numbers_in_names_count_as_such() -> None:
+    names = ["a/frame0.png", "a/frame2.png", "a/frame10.png", "b1/1.5.png", "b1/1.25.png", "b10/x.png"]
+    ordered = ["a/frame0.png", "a/frame2.png", "a/frame10.png", "b1/1.25.png", "b1/1.5.png", "b10/x.png"]
+    assert in_order(map(Path, names)) == list(map(Path, ordered))

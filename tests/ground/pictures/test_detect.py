@@ -228,3 +228,53 @@ def test_a_phones_picture_is_turned_as_it_was_held(capsys: Capture, tmp_path: Pa
     (turned,) = told_json(capsys, path, *FOV)["pictures"][0]["detections"]
     left, top, width, height = truth()[1]["2.5_m_0.jpg"]
     assert np.allclose(turned["box"], (left, top, left + width, top + height), atol=8)
+
+
+def test_a_video_that_is_damaged_in_the_middle_is_told_with_how_much_was_read(capsys: Capture, tmp_path: Path) -> None:
+    """Its second half is zeros; what a folder holds of kinds that are not read is named beside it."""
+    video = tmp_path / "clip.avi"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, SIZE)
+    image = np.asarray(cv2.imread(str(NOTHING)), np.uint8)
+    for _ in range(12):
+        writer.write(image)
+    writer.release()
+    assert told_json(capsys, video, *FOV)["images"] == 12
+    data = video.read_bytes()
+    video.write_bytes(data[: len(data) // 2])
+    (tmp_path / "1.heic").touch()
+    capsys.readouterr()
+    assert main(["detect", str(tmp_path), *FOV, "--json"]) == 1
+    result = json.loads(capsys.readouterr().out)
+    kinds, damage = result["left_out"]
+    assert "kinds that are not read (1 .heic)" in kinds
+    assert f"{video}: is damaged: {result['images']} of its 12 frames were read" in damage
+    assert 3 <= result["images"] <= 7
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        (lambda x, y, w, h: [x, y, x + w, y + h], "ends outside it; write left, top, width, height, not the corners"),
+        (lambda x, y, w, h: [x / 480, y / 360, w / 480, h / 360], "is in shares of it; write pixels"),
+        (lambda x, y, w, h: [x, y, -w, h], "ends outside it"),
+    ],
+)
+def test_labels_that_cannot_be_of_the_pictures_are_refused(change: Any, fault: str, tmp_path: Path) -> None:
+    labels = json.loads(LABELS.read_text())
+    for one in labels["images"]:
+        one["file_name"] = str(LABELS.parent / one["file_name"])
+    labels["categories"] = [{"id": 7, "name": "Drone "}, {"id": 1, "name": "drone"}, {"id": 2, "name": "bird"}]
+    labels["annotations"][0]["category_id"] = 7
+    path = tmp_path / "labels.json"
+    path.write_text(json.dumps(labels), encoding="utf-8-sig")
+    whole = read_labels(path)
+    assert sum(map(len, whole.values())) == 9, "of categories in whatever letters, behind a byte order mark"
+    for one in labels["annotations"]:
+        one["bbox"] = change(*one["bbox"])
+    path.write_text(json.dumps(labels), encoding="utf-8")
+    with pytest.raises(SystemExit, match=fault):
+        read_labels(path)
+    labels["categories"] = [{"id": 1, "name": "quadcopter"}]
+    path.write_text(json.dumps(labels), encoding="utf-8")
+    with pytest.raises(SystemExit, match="has no category `drone`, but quadcopter"):
+        read_labels(path)

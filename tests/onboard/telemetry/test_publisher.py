@@ -9,6 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -175,3 +176,15 @@ def test_an_address_that_no_interface_has_yet_is_listened_on_once_one_has_it(cap
     threading.Thread(target=drone.close, daemon=True).start()  # zenoh takes ten seconds to give it up
     with pytest.raises(UnavailableError, match=f"a page cannot use {telemetry}"):
         open_session("a page", [telemetry], [])
+
+
+def test_what_is_not_used_of_a_file_of_zenohs_settings_is_told(
+    endpoint: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    settings = tmp_path / "own.json5"
+    settings.write_text('{mode: "client", connect: {endpoints: ["tcp/10.0.0.11:7447"]}, timestamping: {enabled: true}}')
+    with ZenohTelemetry("meadow", listen=[endpoint], settings=settings):
+        pass
+    mode, connect = caplog.messages
+    assert mode == f"telemetry: mode of {settings} is client, and flockd needs peer; leave it out"
+    assert f"connect/endpoints of {settings} is ['tcp/10.0.0.11:7447'], and flockd needs []; name endpoints" in connect

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from flockd.cli import main
 from flockd.core.config import load_drone
 from flockd.core.messages import FloatArray, UInt8Array
+from flockd.onboard.recording import RecordingError
 from flockd.onboard.recording.reader import Recording
 from flockd.review.replay.bag_flight import Bag, recording_of_bag
 from tests.onboard.recording.made_up import MadeUpPilot
@@ -86,8 +88,30 @@ def imu(time_ns: int) -> Any:
 ODOMETRY = "nav_msgs/msg/Odometry"
 
 
-def bag(folder: Path, states: str = ODOMETRY, topics: tuple[str, ...] = ("/odom",)) -> Path:
-    """A second of two cameras at 10 Hz, the second one 20 ms late, and states at 50 Hz."""
+def info(time_ns: int, focal_px: float) -> Any:
+    """Pixel centres at whole numbers."""
+    roi = kind("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)
+    k = np.array([focal_px, 0.0, 31.5, 0.0, focal_px, 23.5, 0.0, 0.0, 1.0])
+    return kind("sensor_msgs/msg/CameraInfo")(
+        header=header(time_ns), height=48, width=64, distortion_model="plumb_bob", d=np.zeros(5), k=k,
+        r=np.eye(3).ravel(), p=np.zeros(12), binning_x=0, binning_y=0, roi=roi,
+    )  # fmt: skip
+
+
+def bag(
+    folder: Path,
+    states: str = ODOMETRY,
+    topics: tuple[str, ...] = ("/odom",),
+    *,
+    corner: tuple[int, int, int] | None = None,
+    small: tuple[str, bytes] | None = None,
+    focal_px: float | None = None,
+) -> Path:
+    """A second of two cameras at 10 Hz, the second one 20 ms late, and states at 50 Hz.
+
+    ``corner``: BGR of the first one's first pixel; ``small``: format and data of the second one's images; ``focal_px``:
+    of the first one's CameraInfo.
+    """
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connections: dict[str, Any] = {}
 
@@ -103,6 +127,10 @@ def bag(folder: Path, states: str = ODOMETRY, topics: tuple[str, ...] = ("/odom"
                 write(topic, states, time_ns, odometry(time_ns, place) if "Odom" in states else imu(time_ns))
             if tick % 5 == 0:
                 front = picture(tick, "front")
+                if corner is not None:
+                    front[0, 0] = corner[::-1]
+                if focal_px is not None:
+                    write("/front/camera_info", "sensor_msgs/msg/CameraInfo", time_ns, info(time_ns, focal_px))
                 image = kind("sensor_msgs/msg/Image")(
                     header=header(time_ns), height=48, width=64, encoding="bgr8", is_bigendian=0, step=192,
                     data=np.ascontiguousarray(front[..., ::-1]).ravel(),
@@ -110,10 +138,11 @@ def bag(folder: Path, states: str = ODOMETRY, topics: tuple[str, ...] = ("/odom"
                 write("/front/image_raw", "sensor_msgs/msg/Image", time_ns, image)
             if tick % 5 == 1:
                 data = cv2.imencode(".png", cv2.cvtColor(picture(tick - 1, "back"), cv2.COLOR_RGB2BGR))[1]
-                small = kind("sensor_msgs/msg/CompressedImage")(
-                    header=header(time_ns), format="png", data=np.frombuffer(data.tobytes(), np.uint8)
+                form, sent = small or ("png", data.tobytes())
+                message = kind("sensor_msgs/msg/CompressedImage")(
+                    header=header(time_ns), format=form, data=np.frombuffer(sent, np.uint8)
                 )
-                write("/back/image_raw/compressed", "sensor_msgs/msg/CompressedImage", time_ns, small)
+                write("/back/image_raw/compressed", "sensor_msgs/msg/CompressedImage", time_ns, message)
     return folder
 
 
@@ -175,3 +204,51 @@ def test_what_cannot_be_is_said_in_one_sentence(
     given = [] if changes is None else ["--config", str(config_file(tmp_path, **changes))]
     assert main(["replay", str(theirs), *given, *options]) != 0
     assert sentence in capsys.readouterr().err
+
+
+def test_a_raw_image_that_begins_as_a_jpeg_does_is_a_raw_image(tmp_path: Path) -> None:
+    """Its first pixel is of a light blue: 0xff, 0xd8."""
+    with Bag(bag(tmp_path / "bag", corner=(0xFF, 0xD8, 0x96))) as theirs:
+        recording_of_bag(theirs, load_drone(config_file(tmp_path)), None, tmp_path / "flight.mcap")
+    for step in Recording(tmp_path / "flight.mcap").steps():
+        assert step.frames.frames["front"].image[0, 0].tolist() == [0x96, 0xD8, 0xFF]
+
+
+JPEG = bytes(cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 256, (96, 128, 3), np.uint8))[1])
+"""Of twice the size."""
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"small": ("h264", b"\0\0\0\1")}, "/back/image_raw/compressed: sends 'h264'; let its transport send JPEG"),
+        ({"small": ("16UC1; compressedDepth png", b"x")}, "sends '16UC1; compressedDepth png'"),
+        ({"focal_px": 100.0}, "camera front: /front/camera_info has fx 100.0, but the rig 50.0; correct one"),
+    ],
+)
+def test_images_and_lenses_that_a_drone_would_refuse_are_refused(
+    tmp_path: Path, given: dict[str, Any], sentence: str
+) -> None:
+    with Bag(bag(tmp_path / "bag", **given)) as theirs, pytest.raises(RecordingError, match=re.escape(sentence)):
+        recording_of_bag(theirs, load_drone(config_file(tmp_path)), None, tmp_path / "flight.mcap")
+
+
+def test_images_that_cannot_be_used_are_counted_and_without_any_there_is_no_flight(tmp_path: Path) -> None:
+    theirs, file, told = bag(tmp_path / "bag", small=("bgr8; jpeg", JPEG)), config_file(tmp_path), list[str]()
+    with Bag(theirs) as opened:
+        recording_of_bag(opened, load_drone(file), None, tmp_path / "flight.mcap", told.append)
+    why = "5 of camera back: frozen; 3 of camera back: JPEG has 128x96 instead of 64x48"
+    assert told == [f"{theirs}: 8 images could not be used: {why}"]
+    alone: Any = {key: [DRONE[key]["cameras"][1]] for key in ("rig", "source")}  # type: ignore[index]
+    changes = {key: {**DRONE[key], "cameras": alone[key]} for key in alone}  # type: ignore[dict-item]
+    with Bag(theirs) as opened, pytest.raises(RecordingError, match=f"none of its images could be used .{why}"):
+        recording_of_bag(opened, load_drone(config_file(tmp_path, **changes)), None, tmp_path / "flight.mcap")
+
+
+def test_a_part_of_a_bag_is_told_to_be_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    theirs = bag(tmp_path / "bag")
+    assert main(["replay", str(theirs / "bag.mcap")]) == 1
+    assert "is a part of a bag of ROS 2; `flockd replay` takes the bag's folder" in capsys.readouterr().err
+    (theirs / "metadata.yaml").unlink()
+    assert main(["replay", str(theirs)]) == 1
+    assert "has no metadata.yaml of a bag, which `ros2 bag reindex` writes" in capsys.readouterr().err
