@@ -24,12 +24,12 @@ LINES = {
     "flockd/flight": 11_340,
     "flockd/onboard": 9_110,
     "flockd/fleet": 2_670,
-    "flockd/ground": 4_110,
+    "flockd/ground": 4_390,
     "flockd/review": 3_540,
     "flockd/sim": 8_570,
     "flockd/campaign": 1_470,
-    "flockd/cli": 3_450,
-    "tests": 36_980,
+    "flockd/cli": 3_490,
+    "tests": 37_140,
     "tools/checks": 2_060,
     "tools/docs": 850,
     "tools/measure": 1_490,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 328}
+FILES = {"flockd": 329}
 NUMBERS_OF_FLIGHT = 291
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02

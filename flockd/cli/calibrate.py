@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.options import camera_of, loaded, opened, refuse_overwriting
+from flockd.cli.options import camera_of, loaded, opened, refuse_overwriting, require
 from flockd.cli.output import complain, progress, say_facts, say_result
 from flockd.cli.parser import Commands, Parser, commands_of, flag, option, positive_number, size
 from flockd.core.choices import LENS_MODELS
@@ -25,10 +25,12 @@ def add(commands: Commands) -> None:
         "flockd calibrate camera --print-board board.svg",
         "flockd calibrate camera pictures/ --camera front",
         "flockd calibrate rig --from-flight drone1.mcap",
+        "flockd calibrate import camchain.yaml",
     )
     commands = commands_of(commands("calibrate", "Measure the cameras: lenses, mountings, time offsets.", examples))
     _add_camera(commands)
     _add_rig(commands)
+    _add_import(commands)
 
 
 def _add_shared(parser: Parser) -> None:
@@ -43,7 +45,7 @@ def _board_of(args: argparse.Namespace) -> BoardSpec:
 
     columns, rows = args.squares
     try:
-        return BoardSpec(columns, rows, args.square_mm / 1000.0)
+        return BoardSpec(columns, rows, args.square_mm / 1000.0, legacy=args.legacy)
     except CalibrationError as error:
         raise UsageError(str(error)) from None
 
@@ -68,6 +70,7 @@ def _add_camera(commands: Commands) -> None:
     board = parser.add_argument_group("the board", "as it was printed; measure it, printers shrink")
     option(board, "--squares CxR", "columns x rows (7x5)", size, default=(7, 5))
     option(board, "--square-mm MM", "of a square's side (36)", positive_number, default=36.0)
+    flag(board, "--legacy", "it was made by OpenCV before 4.6")
 
 
 def _camera(args: argparse.Namespace) -> int:
@@ -170,4 +173,41 @@ def _rig(args: argparse.Namespace) -> int:
         found = found_rig(recording, progress=tell)
     result = corrected_rig(recording, found, str(args.from_flight), out)
     advice = "put it in place of rig in your drone's file, then run flockd config check on that"
+    return say_facts(args, result, f"written: {out}; {advice}")
+
+
+def _add_import(commands: Commands) -> None:
+    """Adds the command."""
+    examples = ("flockd calibrate import camchain.yaml", "flockd calibrate import lens.yml --size 640x480 --nearest")
+    description = "Take over the lenses of Kalibr's camchain, ROS's camera_info, OpenCV's FileStorage or COLMAP's list."
+    parser = commands("import", description, examples, _import)
+    option(parser, "FILE", "of the other program", Path)
+    option(parser, "--size WxH", "of the images, where the file does not say it", size)
+    flag(parser, "--nearest", "take the nearest lens for one that flockd has not")
+    _add_shared(parser)
+
+
+def _import(args: argparse.Namespace) -> int:
+    from flockd.core.data import written_whole
+    from flockd.ground.calibration.foreign import camera_of_lens, foreign_lenses
+    from flockd.ground.calibration.fragment import rig_text
+
+    require(args.file)
+    out = args.out or Path("rig.yaml")
+    refuse_overwriting(args, out)
+    lenses = foreign_lenses(args.file, args.size)
+    found = [camera_of_lens(lens, args.file, nearest=args.nearest) for lens in lenses]
+    comment = (
+        f"Lenses of {args.file.name}, written by `flockd calibrate import`. Copy each `intrinsics` to the camera in",
+        "your drone's file, measure the mountings, then run `flockd config check` on that.",
+    )
+    with written_whole(out) as draft:
+        draft.write_text(rig_text([camera for camera, _ in found], comment), encoding="utf-8")
+    result = {
+        "cameras": [
+            {**camera.model_dump(mode="json", exclude={"extrinsics"}), "off_deg": off} for camera, off in found
+        ],
+        "out": str(out),
+    }
+    advice = "copy each camera's intrinsics into your drone's file, then run flockd config check on that"
     return say_facts(args, result, f"written: {out}; {advice}")

@@ -94,7 +94,17 @@ def test_what_is_not_enough_is_said_in_one_sentence(folder: Path, told: Told, tm
         file.unlink()
     assert "has no images" in told(1, *command)
     write(folder / "wall.png", np.full((360, 480, 3), 90, np.uint8))
-    assert "the board is in none of the 1 images (1 no board)" in told(1, *command)
+    assert "in none of the 1 images (1 no board), and the last shows no markers; check" in told(1, *command)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_250)
+    theirs = np.asarray(cv2.aruco.CharucoBoard((7, 5), 0.04, 0.03, dictionary).generateImage((480, 360)), np.uint8)
+    write(folder / "wall.png", np.stack([theirs] * 3, axis=2))
+    assert "the last shows 17 markers of 6X6_" in told(1, *command)
+    older = BoardSpec(7, 6, 0.036, legacy=True).image(60)
+    write(folder / "wall.png", np.stack([np.pad(older, 60, constant_values=255)] * 3, axis=2))
+    assert "shows the board as OpenCV before 4.6 makes it, for which --legacy is" in told(
+        1, *command, "--squares", "7x6"
+    )
+    assert "1 usable views" in told(1, *command, "--squares", "7x6", "--legacy")
     assert "does not exist" in told(2, "calibrate", "camera", tmp_path / "nowhere", "--out", out)
     assert "no SOURCE was given" in told(2, "calibrate", "camera", "--out", out)
     assert "needs 70 markers" in told(2, *command, "--squares", "10x14")

@@ -52,6 +52,10 @@ class Document:
     problems: list[ConfigProblem] = field(default_factory=list)
 
 
+_CALIBRATION = re.compile(r"^(%YAML:1|camera_matrix:|[ \t]+camera_model:)", re.MULTILINE)
+"""Of OpenCV, ROS and Kalibr."""
+
+
 def read_document(path: Path, what: str = "configuration") -> Document:
     """The values of one YAML file; ``what`` it is, for the messages.
 
@@ -59,6 +63,8 @@ def read_document(path: Path, what: str = "configuration") -> Document:
     lesser faults are listed in the document's `problems`.
     """
     text = _read_text(path, what)
+    if _CALIBRATION.search(text):
+        raise ConfigError.at(path, "is another program's calibration; `flockd calibrate import FILE` gives its lenses")
     try:
         top = _Loader(text, str(path), what).get_single_node()
     except yaml.MarkedYAMLError as error:

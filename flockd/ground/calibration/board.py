@@ -4,7 +4,7 @@ printed, found in images, and placed before a camera."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -36,6 +36,8 @@ class BoardSpec:
     """In squares."""
     square_m: float = 0.036
     """Side of a chessboard square."""
+    legacy: bool = False
+    """Made by OpenCV before 4.6: with an even number of rows a marker stands in the first square, not beside it."""
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or max(self.columns, self.rows) > 50:
@@ -49,6 +51,11 @@ class BoardSpec:
                 f"a board of {self.columns}x{self.rows} squares needs {needed} markers, and there are {_MARKERS}; take "
                 "fewer squares"
             )
+
+    @property
+    def last_marker(self) -> int:
+        """Its number; the first is 0."""
+        return self.columns * self.rows // 2 - 1
 
     @property
     def corner_count(self) -> int:
@@ -80,11 +87,14 @@ class BoardFinder:
         self.spec = spec
         self._board = _opencv_board(spec)
         self._detector = cv2.aruco.CharucoDetector(self._board)
+        self._without: UInt8Array | None = None
+        """The last image in which there was no board."""
 
     def find(self, grey: UInt8Array) -> BoardDetection | None:
         """The board in a (h, w) image; None where fewer than `MIN_CORNERS` are seen, or all in one line."""
         corners, ids, _, _ = self._detector.detectBoard(grey)
         if ids is None or len(ids) < MIN_CORNERS:
+            self._without = grey
             return None
         # The stubs want a list of images here, which would be wrong.
         points, pixels = self._board.matchImagePoints(corners, ids)  # type: ignore[call-overload]
@@ -94,10 +104,38 @@ class BoardFinder:
         pixels = np.asarray(pixels, np.float64).reshape(-1, 2) + CENTRE_PX
         return BoardDetection(np.asarray(ids, np.int64).reshape(-1), pixels, points)
 
+    def found_instead(self) -> str:
+        """What the last image without the board shows, for people."""
+        if self._without is None:
+            return "boards at an angle from which all their corners are in one line"
+        other = BoardFinder(replace(self.spec, legacy=not self.spec.legacy))
+        if other.find(self._without) is not None:
+            return (
+                f"the board as OpenCV {'before' if other.spec.legacy else 'from'} 4.6 makes it, for which --legacy is"
+            )
+        counts = {}
+        for name in sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")):
+            dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+            found = cv2.aruco.ArucoDetector(dictionary).detectMarkers(self._without)[1]
+            counts[name] = [] if found is None else np.ravel(found).tolist()
+        name = max(counts, key=lambda name: len(counts[name]))
+        if len(counts[name]) < _SOME_MARKERS:
+            return "no markers"
+        last = max(counts[name])
+        told = f"{len(counts[name])} markers of {name.removeprefix('DICT_')}, the last of number {last}"
+        return f"{told}; a board of {self.spec.columns}x{self.spec.rows} has {_OWN}, to number {self.spec.last_marker}"
+
+
+_SOME_MARKERS, _OWN = 4, "4X4_50"
+"""Fewer are taken for ones by chance; the name of the board's own."""
+
 
 def _opencv_board(spec: BoardSpec) -> cv2.aruco.CharucoBoard:
     dictionary = cv2.aruco.getPredefinedDictionary(_DICTIONARY)
-    return cv2.aruco.CharucoBoard((spec.columns, spec.rows), spec.square_m, _MARKER_SHARE * spec.square_m, dictionary)
+    side_m = spec.square_m
+    board = cv2.aruco.CharucoBoard((spec.columns, spec.rows), side_m, _MARKER_SHARE * side_m, dictionary)
+    board.setLegacyPattern(spec.legacy)
+    return board
 
 
 _CELLS = 8

@@ -294,8 +294,8 @@ def fit_lenses(collector: Collector, model: LensModel | None, source: str) -> li
     if not collector.views:
         why = ", ".join(f"{count} {reason}" for reason, count in counts.items())
         raise CalibrationError(
-            f"{source}: the board is in none of the {sum(counts.values())} images ({why}); check "
-            "--squares, and that it fills a good part of the image"
+            f"{source}: the board is in none of the {sum(counts.values())} images ({why}), and the last shows "
+            f"{collector.found_instead()}; check --squares, and that it fills a good part of the image"
         )
     found, faults = [], []
     for one in (model,) if model else LENS_MODELS:

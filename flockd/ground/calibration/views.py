@@ -164,6 +164,10 @@ class Collector:
         self.coverage.add(seen.pixels)
         return None
 
+    def found_instead(self) -> str:
+        """What the last image without a board shows, for people."""
+        return self._finder.found_instead()
+
     def counts(self) -> dict[Refusal, int]:
         """How many were refused, by reason."""
         return dict(Counter(refused.why for refused in self.refused))
