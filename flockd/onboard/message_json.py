@@ -39,7 +39,7 @@ _SCHEMAS = {float: "number", int: "integer", bool: "boolean", str: "string"}
 
 
 def parsed(data: bytes) -> Json:
-    """What stands in JSON from outside. Raises ValueError for what is none, or nested deeper than can be followed."""
+    """Parses JSON from outside. Raises ValueError if it is no JSON, or nested too deep."""
     try:
         return json.loads(data)
     except RecursionError as error:
@@ -81,8 +81,8 @@ def to_telemetry(value: object) -> Json:
 def from_json(kind: Any, value: Json) -> Any:
     """The message of this type: a dataclass that `to_json` wrote, or a TypedDict as a peer sent it.
 
-    A field that is missing and may be None is None, as of an earlier version; further keys, as of a later one, are kept
-    of a TypedDict. Raises ValueError, with a key and a few words, for JSON that is no such message.
+    A missing field that may be None becomes None, as in earlier versions' messages. A TypedDict keeps further keys, as
+    later versions send them. Raises ValueError, with a key and a few words, for JSON that is no such message.
     """
     return _read(kind, value, "", bounded=is_typeddict(kind))
 

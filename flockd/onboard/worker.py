@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 T = TypeVar("T")
 
 GOLDEN_S = 8.0
-"""For a network's run on its golden input, which takes less than a second on any computer that flies: a network that
-never ends is refused within ten."""
+"""For a network's run on its golden input, which takes less than a second on any computer that flies: one that never
+ends is refused within ten."""
 _END_S = 1.0
 """How long work may take to end when it is stopped; ONNX Runtime takes a few milliseconds."""
 
@@ -46,7 +46,7 @@ class Worker:
         return future
 
     async def do(self, deadline_s: float, job: Callable[..., T], *arguments: object) -> T:
-        """What the job returns or raises. Raises LateError when it has not by then, and BusyError."""
+        """Returns or raises what the job does. Raises LateError if the job takes longer, and BusyError."""
         try:
             async with asyncio.timeout(deadline_s) as deadline:
                 return await asyncio.wrap_future(self.submit(job, *arguments))
@@ -56,9 +56,9 @@ class Worker:
             raise LateError(f"{self._name}: not done within {deadline_s:g} s") from error
 
     def leave(self, timeout_s: float = 0.0) -> None:
-        """Lets the thread end after what it does now, and waits so long for it; if it hangs, it ends with the process.
+        """Lets the thread end after its present job, and waits so long for it; if it hangs, it ends with the process.
 
-        To wait is for threads that run foreign code, which a process had better not end under.
+        Wait for threads that run foreign code: such code may crash if the process ends meanwhile.
         """
         with suppress(queue.Full):
             self._jobs.put_nowait(None)

@@ -50,7 +50,7 @@ class AutopilotSettingError(AutopilotError):
 
 @dataclass(frozen=True, eq=False)
 class AutopilotStatus:
-    """The newest of everything, at `time_s` on the link's clock. None: not heard yet, or not known there."""
+    """The newest known state, at `time_s` on the link's clock. None: not received yet, or unknown to the autopilot."""
 
     time_s: float
     heartbeat_age_s: float
@@ -73,7 +73,7 @@ class AutopilotStatus:
     home_ned: FloatArray | None
     """(3,) metres, likewise."""
     foreign_setpoints: str | None = None
-    """What was seen of setpoints that flockd did not send."""
+    """Setpoints that flockd did not send, in a few words; None: none."""
     fastest_m_s: float = math.inf
     """The speed that the autopilot limits setpoints to; infinite where it is not known."""
     parameter_fault: str | None = None

@@ -1,7 +1,7 @@
 """The autopilot's clock against this computer's, from round trips of MAVLink's TIMESYNC; pure, knows no clock.
 
-A round trip bounds the offset between two clocks by half its duration on either side, as how long each way took is not
-known. What a busy computer delays only makes the bounds of that round trip wider: the offset lies where all overlap.
+A round trip bounds the offset between two clocks by half its duration on either side, as the time of each way is not
+known. A busy computer only makes the bounds of a round trip wider: the offset lies where the bounds of all overlap.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ class ClockEstimate:
 class StampMonitor:
     """Whether the clock that round trips give is that of the stamps in other messages: TIMESYNC may lie.
 
-    A message cannot arrive before it was stamped, and the quickest of a second takes no longer on its one way than the
-    quickest round trip takes on both. A clock that jumps, that creeps, or that is somebody else's breaks one of the
-    two, whatever a busy computer delays: that delays round trips too. The limits are `consistency.STAMP`'s.
+    A message cannot arrive before it was stamped, and the quickest in a second takes no longer on its one way than the
+    quickest round trip takes on both. A clock that jumps, drifts or belongs to another sender violates one of the
+    two. A busy computer violates neither, because it delays round trips too. The limits are `consistency.STAMP`'s.
     """
 
     def __init__(self) -> None:

@@ -18,7 +18,7 @@ class _Layout(NamedTuple):
 
     name: str
     seed: int
-    """CRC_EXTRA, by which both sides know that they mean the same fields."""
+    """CRC_EXTRA: a checksum of the message's fields, which both sides have to agree on."""
     values: struct.Struct
     fields: tuple[str, ...]
 

@@ -35,7 +35,7 @@ def only_owner(autopilot: AutopilotParameters | None) -> Iterator[None]:
 
 
 def _place(address: str) -> str:
-    """What two addresses of one link have in common: a device has several names, a port several hosts."""
+    """One text for all addresses of a link: a device has several names, a port several hosts."""
     kind, _, rest = address.partition("://")
     where, _, number = rest.rpartition(":")
     match kind:

@@ -165,10 +165,10 @@ class AutopilotLink:
         clock: Clock = time.monotonic,
         create: Callable[[Configuration], Mavsdk] = Mavsdk,
     ) -> Self:
-        """The link, once an autopilot has been heard and told what to send.
+        """Opens the link, waits for an autopilot, and tells it what to send.
 
-        Raises AutopilotError when the address cannot be used or nobody answers within `timeout_s`; where two autopilots
-        answer and `system_id` does not say which is the own, an AutopilotSettingError.
+        Raises AutopilotError when the address cannot be used or no autopilot answers within `timeout_s`, and
+        AutopilotSettingError when two answer and `system_id` does not choose one.
         """
         _refuse_a_taken_port(parameters.address)
         log_subscribe(_to_logging)
@@ -229,7 +229,7 @@ class AutopilotLink:
         return self._system_id
 
     def unusable(self) -> AutopilotError | None:
-        """Why nobody should take off with this link any more; None: it is well."""
+        """Why no drone should take off with this link any more; None: the link is well."""
         if self._port is not None and self._port.gone_for_s() > GONE_S:
             return AutopilotError(
                 f"autopilot.address: {self._parameters.address} has been gone for more than {GONE_S:g} s; "
@@ -271,11 +271,11 @@ class AutopilotLink:
             await asyncio.sleep(services.TIME_SYNC.period_s)
 
     async def attend(self) -> None:
-        """Keeps all coming that an autopilot sends on request only, until cancelled.
+        """Keeps requesting what an autopilot sends on request only, until cancelled.
 
-        So it announces flockd as a ground station, for the autopilot's texts; asks anew for checks of which events were
-        lost; requests all streams again of an autopilot that has started or been plugged in; reads the parameters that
-        flockd relies on; and listens for a second autopilot where any would do.
+        It announces flockd as a ground station, for the autopilot's texts; asks again for checks whose events were
+        lost; requests all streams from an autopilot that has started or been plugged in; reads the parameters that
+        flockd relies on; and listens for a second autopilot if `system_id` names none.
         """
         async with asyncio.TaskGroup() as group:
             group.create_task(self._announce())
@@ -318,7 +318,7 @@ class AutopilotLink:
             await asyncio.sleep(ATTEND_S)
 
     def _beginnings(self) -> int:
-        """How often it may have forgotten what it was asked to send."""
+        """Counts the events after which the autopilot may send its default messages again."""
         return self.received.restarts + (0 if self._port is None else self._port.reopened)
 
     async def _read_parameters(self) -> None:
@@ -330,14 +330,14 @@ class AutopilotLink:
                 await asyncio.sleep(ATTEND_S)
 
     def take_reports(self) -> list[str]:
-        """What happened to the messages since the last call that people should know, each in one sentence."""
+        """Reports about the messages since the last call, one sentence each."""
         return [self._reports.popleft() for _ in range(len(self._reports))]
 
     def send_setpoint(self, setpoint: Setpoint) -> None:
         """Sends it, once. Raises AutopilotError when it is not finite or MAVSDK cannot send it.
 
-        The height is asked for as a vertical velocity: PX4's frame may jump, and a height of the old frame, sent
-        once too often, makes PX4 climb or sink by as much.
+        The height is sent as a vertical velocity: PX4's frame may jump, and a height of the old frame, sent once too
+        often, would make PX4 climb or sink by the jump.
         """
         north, east = (float(v) for v in setpoint.velocity)
         down = HEIGHT_GAIN_PER_S * (self.received.height_m - setpoint.height_m)
@@ -464,7 +464,7 @@ class AutopilotLink:
             raise AutopilotError(f"the autopilot was asked {what}, which was {result_text(verdict)}{why}")
 
     async def _why(self, verdict: int, refused: str, asked_s: float) -> str:
-        """What is known of a refusal, once the autopilot has had time to say it, with what to do."""
+        """The reasons of a refusal with their remedies, after the autopilot has had time to send them."""
 
         def said() -> list[str]:
             now = self._clock()
@@ -603,7 +603,7 @@ class _Closed:
 
 
 def _destroy(mavsdk: Mavsdk, _kept: Sequence[object]) -> None:
-    """Destroys MAVSDK. What is kept meanwhile is not collected before: that ends the process too."""
+    """Destroys MAVSDK. The kept objects are collected only afterwards: earlier would end the process."""
     mavsdk.destroy()
 
 

@@ -40,7 +40,7 @@ ALL_MODES = 0xFFFFFFFF
 ERROR, WARNING = 3, 4
 """PX4's log levels, which are worse the smaller."""
 MOST_CHECKS = 300
-"""That a report may name as failed: PX4 has fewer."""
+"""The most failed checks that a report may name; PX4 has fewer."""
 NUMBERS = 1 << 16
 MOST_LATE = 20
 """An announced number that is farther back does not come late: the autopilot counts anew."""
@@ -126,7 +126,7 @@ class CheckEvents:
             self._take(number, arguments, level, time_s)
 
     def announce(self, fields: Mapping[str, Any]) -> None:
-        """Takes a CURRENT_EVENT_SEQUENCE, the number of the newest event; one that is none is ignored."""
+        """Takes a CURRENT_EVENT_SEQUENCE, the number of the newest event; an invalid one is ignored."""
         try:
             newest, reset = int(fields["sequence"]) % NUMBERS, bool(int(fields["flags"]) & SEQUENCE_RESET)
         except (KeyError, TypeError, ValueError, OverflowError):
@@ -208,7 +208,7 @@ def _few(found: Mapping[str, Refusal]) -> tuple[Refusal, ...]:
 
 
 def _of_report(report: CheckReport, status: AutopilotStatus, *, streams: bool, asked: bool) -> Iterator[Refusal]:
-    """What PX4's checks say: of arming while it is disarmed, and of offboard."""
+    """The refusals by PX4's checks: of arming while the drone is disarmed, and of offboard."""
     state = NAVIGATION_STATES.get(status.flight_mode)
     if not status.armed and state is not None and not report.can_arm >> state & 1:
         for check in _blocking(report, state, status):

@@ -42,12 +42,12 @@ class StreamReport:
 
 
 class SetpointStreamer:
-    """Sends what the gate makes of the newest request at a fixed rate for as long as all of this holds.
+    """Passes the newest request through the gate and sends the setpoint, at a fixed rate, while all conditions hold.
 
-    It was begun; the control loop beats; the request is fresh and the gate lets it pass; the autopilot is heard, not
-    in its failsafe, and has not left offboard. What ends a stream for good (the pilot's mode change, a lost link, a gap
-    in offboard flight, a fault of the gate) is final until `begin`. Every method may be called from any thread and
-    returns at once.
+    The conditions: the stream was begun; the control loop runs; the request is fresh and the gate lets it pass; the
+    autopilot is heard, not in its failsafe, and has not left offboard. After the pilot's mode change, a lost link, a
+    gap in offboard flight or a fault of the gate the stream stays silent until `begin`. Every method may be called
+    from any thread and returns at once.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class SetpointStreamer:
         self._stream.fault = None
 
     def offer(self, request: Request) -> None:
-        """What to ask the gate for from now on, until a newer request is offered or this one is too old."""
+        """Sets the request for the gate, until a newer one is offered or this one is too old."""
         self._request = request
 
     def beat(self) -> None:

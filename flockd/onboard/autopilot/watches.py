@@ -39,7 +39,7 @@ class WatchedParameters:
             self._report(f"the autopilot's {name} was changed in flight from {known:g} to {value:g}")
 
     def fault(self, max_gap_s: float) -> str | None:
-        """Why none may fly with them; None: nothing. ``max_gap_s``: of setpoints, that flockd bridges."""
+        """Why no drone may fly with them; None: it may. ``max_gap_s``: between setpoints, as flockd bridges."""
         loss_s = self.values.get(LOSS_TIME, LONGEST_LOSS_S)
         if not max_gap_s < loss_s <= LONGEST_LOSS_S:
             return (
@@ -56,10 +56,10 @@ class WatchedParameters:
 
 
 SENT_S = services.POSITION_TARGET.timeout + LONGEST_LOSS_S
-"""A setpoint of flockd's may be followed for this long after it was sent, and the next for as long not yet: for as long
-as PX4 flies on with the last one that arrived, and as a message that tells of it may take."""
+"""PX4 may follow a setpoint of flockd's for this long after it was sent, and begin to follow the next only after it:
+PX4 flies on with the last one that arrived, and the message that reports it takes time."""
 TOLERANCE_M_S = 0.3
-"""What the autopilot changes of a setpoint itself: a reset of its estimator."""
+"""By how much the autopilot itself may change a setpoint, at a reset of its estimator."""
 WINDOW, MOST_FOREIGN = 20, 2
 """Of so many messages, two seconds' worth, so few may name another setpoint."""
 
@@ -76,7 +76,7 @@ class SetpointWatch:
         self._sent: deque[tuple[float, float, float]] = deque(maxlen=200)
         self._foreign: deque[bool] = deque(maxlen=WINDOW)
         self.seen: str | None = None
-        """What was seen of another sender in the last seconds; None: nothing."""
+        """Another sender's setpoints in the last seconds, in a few words; None: none."""
 
     def sent(self, time_s: float, north_m_s: float, east_m_s: float) -> None:
         """Flockd has sent this setpoint."""
@@ -122,7 +122,7 @@ class SetpointWatch:
 
 
 JUMP_M, JUMP_RAD = 0.3, math.radians(10.0)
-"""What an estimator's corrections from one message to the next stay below by far; less is not noticed."""
+"""Far above an estimator's corrections from one message to the next; smaller jumps are not noticed."""
 MOST_ACCELERATION = 20.0
 """Of a drone, m/s^2 and rad/s^2: by so much its velocity may have changed unseen between two messages."""
 LARGEST_M = 1.0
@@ -138,7 +138,7 @@ class _Sample(NamedTuple):
 class LocalFrame:
     """Notices jumps. `offset` may be read on any thread.
 
-    On numbers: an autopilot sends 80 such messages a second, of which arrays of three take most of a link's time.
+    It computes with numbers: for the 80 messages a second, arrays of three would take most of a link's time.
     """
 
     def __init__(self) -> None:

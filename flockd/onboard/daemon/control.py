@@ -101,7 +101,7 @@ class Control:
             self._streamer.offer(replace(self._request, permission=Permission(Action.ASK_HOLD, self._clock())))
 
     def _mission_over(self) -> MissionEnd | None:
-        """What the mission of this flight asks of the autopilot; None while nothing flies, as its mission is past."""
+        """What the mission of this flight asks of the autopilot; None while the drone does not fly."""
         result = self._pilot_loop.newest
         if self.decision.state not in FLYING or result is None or result.flight != self._flight:
             return None
@@ -136,7 +136,7 @@ class Control:
         self._streamer.beat()
 
     def _wanted(self, now: float) -> tuple[Wanted, float]:
-        """What the pilot wants, and when it was made; standstill during a flight's first steps.
+        """What the pilot wants, and since when; standstill during a flight's first steps.
 
         Before those it knows neither its ego-motion nor its neighbours.
         """

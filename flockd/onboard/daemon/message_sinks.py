@@ -119,9 +119,9 @@ STDERR = 2
 
 
 class StderrLog(logging.Handler):
-    """Writes log lines from a thread of its own; those that come while too many wait are lost, and counted.
+    """Writes log lines from a separate thread; while too many wait, further lines are lost and counted.
 
-    A write to a full pipe, to a journal that hangs or to a file on a busy disk takes as long as the other side likes.
+    A write to a full pipe, to a journal that hangs or to a file on a busy disk may take any time.
     Lines contain texts of the autopilot and of operators: they are made fit for terminals.
     """
 

@@ -41,7 +41,7 @@ class OperatorRequests:
 
 
 class Missions(Protocol):
-    """What takes an operator's orders to the mission."""
+    """Takes operators' orders to the mission."""
 
     def fault(self, order: MissionOrder) -> str | None:
         """Why it is refused, one sentence; None: it is not. On any thread."""
@@ -159,7 +159,7 @@ class OrderChecks:
         self._recent: dict[str, _Taken] = {}
 
     def fault(self, command: str, ask: AskMessage) -> str | None:
-        """Why an order is refused, for its sender; None: it is not. Its number counts as used from now on."""
+        """Why an order is refused, for its sender; None: it is accepted. Its number counts as used from now on."""
         if ask["identity"] != self._identity:
             return f"it is for another drone of this name, with the identity {ask['identity']!r:.20}"
         age_s = self._clock() - ask["time_s"]

@@ -24,7 +24,7 @@ from mcap.writer import CompressionType, Writer
 from flockd.core.errors import FlockdError
 
 CHUNK_BYTES = 100_000
-"""What a killed writer loses at most, besides what it has not yet been given time to flush."""
+"""The most that a killed writer loses, besides data that it had no time to flush."""
 SYNC_EVERY_S = 1.0
 """How much a loss of power takes, where the disk keeps its word."""
 _KNOWN = {Opcode.CHUNK, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.METADATA, Opcode.ATTACHMENT}
@@ -176,7 +176,7 @@ class McapFile:
 
 
 def read_records(path: Path) -> Iterator[Record | Damage]:
-    """All records in the order in which they were written, and what could not be read.
+    """All records in the order in which they were written, and damages.
 
     A damaged chunk is yielded as `Damage`; where the file stops before its end, that comes last. Raises RecordingError
     for what is not an MCAP file, and OSError.

@@ -103,7 +103,7 @@ class Recording:
         """What it was flown with, and the keys of it that this version does not know or would refuse: where there are
         any it cannot be flown again as it was."""
         self.learned = _learned(self.path, self.contents.flight)
-        """What the flight's pilot began with of the others' size."""
+        """The others' size with which the flight's pilot began."""
 
     @property
     def drone(self) -> str:

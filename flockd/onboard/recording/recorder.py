@@ -41,7 +41,7 @@ _VERSIONS = {
 }
 _MB = 1e6
 _SMALL_BYTES = 4096
-"""What anything but an image counts for in the queue."""
+"""The size for which an entry without image counts in the queue."""
 _FREE_SHARE = 0.05
 """Of a small disk, that stays free; of others what waits for the disk, `queue_mb`."""
 
@@ -95,7 +95,7 @@ class Recorder:
         self._rig, self._north_east = build_rig(config.rig), np.zeros(2)
         self._placed_s: float | None = None
         self._queue: queue.SimpleQueue[tuple[int, Callable[[], None]] | None] = queue.SimpleQueue()
-        """Bytes held, and what writes them; None at the end."""
+        """The size of an entry, and the function that writes it; None at the end."""
         self._lock = threading.Condition()
         self._held_bytes = 0
         self._steps = 0
@@ -139,7 +139,7 @@ class Recorder:
             self._lock.wait_for(lambda: self._held_bytes == 0 or self.failure is not None)
 
     def close(self, timeout_s: float = 30.0) -> None:
-        """Writes what is left and ends the file. What is not written by then is lost, and reported."""
+        """Writes the rest and ends the file. Entries that are not written in time are lost and reported."""
         if self._closed:
             return
         self._closed = True
@@ -356,8 +356,8 @@ class _File:
             self._file.abandon()
 
     def _count_earlier(self) -> int:
-        """Notes what a recorder of this drone wrote, and gives this flight's number: files' times may be of a wrong
-        clock. What someone replayed stays and does not count."""
+        """Lists the recordings of this drone, and gives this flight's number: files' times may be of a wrong clock.
+        Replays by people stay and do not count."""
         found = [path for path in self.path.parent.glob("*.mcap") if path != self.path]
         numbers = {path: number for path in found if (number := self._number_of(path)) is not None}
         order = sorted(numbers, key=lambda path: (numbers[path], path.stat().st_mtime))

@@ -46,12 +46,11 @@ class _Line:
 
 
 class Assembler:
-    """Frames go in one by one, sets come out; the newest wins.
+    """Puts single frames together to sets; the newest set wins.
 
-    A set is complete when every camera that is awaited has a frame within ``set_tolerance_s`` of the set's time, which
-    is the stamp of one of its frames. What is not complete ``set_wait_s`` after a frame came goes on as it is, and who
-    is absent from it is not awaited again before its next usable frame. Set times increase, and no frame is in two
-    sets.
+    A set is complete when every awaited camera has a frame within ``set_tolerance_s`` of the set's time, which is the
+    stamp of one of its frames. ``set_wait_s`` after a frame came its set is handed out incomplete, and a missing camera
+    is not awaited again before its next usable frame. Set times increase, and no frame is in two sets.
 
     ``now_s`` is the caller's clock; it is only compared with itself, never with time stamps.
     """
@@ -103,7 +102,7 @@ class Assembler:
         self._lines[camera].counts.update({"corrupt": 1, "undecodable": 1, "missing": 1, "used": -1})
 
     def counts(self, camera: str) -> dict[Count, int]:
-        """What happened to a camera's frames so far; what never happened is absent."""
+        """Counts of what happened to a camera's frames so far, without zeros."""
         return {what: count for what, count in self._lines[camera].counts.items() if count}
 
     def age_s(self, camera: str, now_s: float) -> float:

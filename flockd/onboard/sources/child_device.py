@@ -1,4 +1,4 @@
-"""What cameras have in common that a process of their own fetches: what crashes there, crashes there.
+"""Cameras that a separate process reads, so that a driver that crashes ends this process alone.
 
 The process writes messages to its standard output, each a header and its data, and ends when its standard input is
 closed.
@@ -29,7 +29,7 @@ CHILD = (sys.executable, "-I", str(Path(camera_child.__file__)))
 ROS_CHILD = (sys.executable, "-P", CHILD[-1])
 """rclpy may be on the environment's path; the folder of the file is not, whose names would hide other packages."""
 _PIPE_BYTES = 1 << 20
-"""What an ordinary user may have; fewer system calls an image than with the usual 64 kB."""
+"""The largest pipe of an ordinary user; fewer system calls an image than with the usual 64 kB."""
 _MOST_BYTES = 1 << 28
 """The most bytes of one image: the largest that a rig may have is less."""
 _END_S = 1.5
@@ -120,7 +120,7 @@ class ChildDevice(CameraDevice):
 
     @abstractmethod
     def _failed(self, reason: str) -> CameraError:
-        """What to say of an error that the process tells."""
+        """The sentence for an error that the process reports."""
 
     def image_format(self) -> ImageFormat:
         """See ``CameraDevice``."""

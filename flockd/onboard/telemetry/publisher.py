@@ -107,7 +107,7 @@ class ZenohTelemetry(SessionOwner):
             declared.undeclare()  # type: ignore[no-untyped-call]
 
     def reply_to(self, keys: str, reply: Callable[[str, bytes], Mapping[str, object]]) -> None:
-        """Replies to queries for keys of something that is no drone, each by its last part and what it carries.
+        """Replies to queries for keys that are no drone's, by the last part of the key and the payload.
 
         On threads of zenoh's. Raises ValueError for keys that are drones'.
         """
@@ -145,7 +145,7 @@ class ZenohTelemetry(SessionOwner):
 
 
 def _payload(query: zenoh.Query) -> bytes:
-    """What the query carries; empty where it is nothing."""
+    """The payload of the query; empty if it has none."""
     return b"" if query.payload is None else query.payload.to_bytes()
 
 

@@ -36,7 +36,7 @@ def open_session(
     max_peers: int | None = None,
     awaits_addresses: bool = False,
 ) -> zenoh.Session:
-    """A session that listens on and connects to these endpoints only, for ever where nobody is there yet.
+    """A session that listens on and connects to these endpoints only; it tries for ever where none answers yet.
 
     A peer opens without a router, unlike a client; discovery by multicast and gossip is off. ``purpose``: as errors say
     it; ``settings``: a file of zenoh's own to begin with, for TLS and access control; what of it is not used is logged.
