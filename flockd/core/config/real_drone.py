@@ -48,12 +48,13 @@ def _slow(speed_m_s: float | None) -> float | None:
     return None if speed_m_s is None else min(speed_m_s, FIRST_SPEED_M_S)
 
 
-_KNOWN_M = 10.0
-"""From how far away drones that meet know each other. The shipped networks know 98 % and more of the neighbours up to
-8 m away, and four of ten at 11.5 m (`config/perceived/shipped_networks.yaml`)."""
-_RANGE_ERROR = 0.06
+_KNOWN_M = 7.0
+"""From how far away drones that meet are detected. By sight, drones that met head-on at 2 m/s each confirmed each other
+at 4.6 m (median of 12 tracks in six flights of commit 05b87e6f), as where detections begin at 7 m."""
+_RANGE_ERROR = 0.09
 """By which share of its range a neighbour is nearer than it seems, for seconds: two standard deviations of what lasts
-of the shipped networks' errors (`range_error` there, times the root of `tracking.range_error_lasts`)."""
+of the shipped networks' errors (`range_error` of trained airframes in `config/perceived/shipped_networks.yaml`, times
+the root of `tracking.range_error_lasts`)."""
 
 
 def safe_speeds(config: DroneConfig) -> tuple[float, float]:
@@ -65,7 +66,7 @@ def safe_speeds(config: DroneConfig) -> tuple[float, float]:
 
     A mate ahead, at d = `desired_distance_m`, stops by a = `max_acceleration_m_s2`, as the gate reckons with (one that
     brakes less than the drone counts as braking alike): v t + v^2 / 2b - v^2 / 2a = d (1 - e) - s.
-    One that comes as fast, known from R on, does as the drone does: 2 (v t + v^2 / 2b) = R (1 - e) - s.
+    One that comes as fast, detected from R on, does as the drone does: 2 (v t + v^2 / 2b) = R (1 - e) - s.
 
     Source: Shalev-Shwartz et al. 2017, "On a formal model of safe and scalable self-driving cars", definitions 1 and 2,
     with nobody speeding up.

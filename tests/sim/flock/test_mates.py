@@ -142,18 +142,18 @@ def test_whichever_of_five_stops_its_mates_keep_a_metre_apart(
     assert speed_m_s > 0.6 * SPEED_M_S, "where nobody stops they fly on"
 
 
-@pytest.mark.parametrize(("share", "nearest_m"), [(0.7, 1.9), (1.0, 1.3), (1.3, 0.7), (2.0, -0.7)])
+@pytest.mark.parametrize(("share", "nearest_m"), [(0.7, 1.8), (1.0, 1.2), (1.3, 0.6), (2.0, -0.7)])
 def test_one_that_learns_of_it_as_late_as_may_be_keeps_a_metre_up_to_the_safe_speed(
     share: float, nearest_m: float
 ) -> None:
-    """Without tracker and gate: 3.5 m ahead, which are 6 % less, a mate stops by 5 m/s^2. A step and its time later a
+    """Without tracker and gate: 3.5 m ahead, which are 9 % less, a mate stops by 5 m/s^2. A step and its time later a
     vehicle that answers as PX4's is told to brake as hard. The gate brakes softer, and expects it."""
     speed_m_s = share * safe_speeds(ENCOUNTER.drone)[0]
     start = StartConfig(position_m=(0.0, 0.0, -5.0), velocity_m_s=(speed_m_s, 0.0))
     vehicle, gaps_m = Vehicles((start,), ENCOUNTER.vehicle), []
     for time_s in np.arange(0.0, 6.0, 0.05):
         braked_s = min(time_s, speed_m_s / 5.0)
-        gaps_m.append(0.94 * 3.5 + speed_m_s * braked_s - 2.5 * braked_s**2 - vehicle.position[0, 0])
+        gaps_m.append(0.91 * 3.5 + speed_m_s * braked_s - 2.5 * braked_s**2 - vehicle.position[0, 0])
         setpoint = max(speed_m_s - 5.0 * max(time_s - 1.0, 0.0), 0.0)
         vehicle.step(np.array([[setpoint, 0.0]]), np.zeros(1), 0.05)
     assert min(gaps_m) == pytest.approx(nearest_m, abs=0.1)
