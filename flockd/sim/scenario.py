@@ -186,6 +186,8 @@ class WorldConfig(Section):
 _PERCEIVED: dict[str, Any] = yaml.safe_load(
     (data_path("config") / "perceived" / "shipped_networks.yaml").read_text(encoding="utf-8")
 )["detections"]
+for _errors in _PERCEIVED.values():
+    _errors["false_m"] = tuple(_errors["false_m"])
 _TRAINED = _PERCEIVED["trained"]
 
 
@@ -197,7 +199,7 @@ class DetectionsConfig(Section):
 
     airframe: Literal["trained", "unknown"] = "trained"
     """Whose errors those are that are not written here: of airframes that the networks learnt, by default as below, or
-    of real ones that they did not, whose size is said."""
+    of real ones, whose size is said and of which no network learnt ranges."""
     range_m: Positive = 20.0
     """Farther away nobody is detected."""
     missed: Share = _TRAINED["missed"]
@@ -220,8 +222,7 @@ class DetectionsConfig(Section):
     @property
     def filled(self) -> Self:
         """With the errors of the airframe where none are written."""
-        of_it = _PERCEIVED[self.airframe]
-        return self.model_copy(update={key: of_it[key] for key in of_it.keys() - self.model_fields_set})
+        return type(self)(**{**_PERCEIVED[self.airframe], **self.model_dump(exclude_unset=True)})
 
 
 class CameraFaultConfig(Section):

@@ -2,7 +2,8 @@
 
 `tools.measure.card --parts errors` writes it to config/perceived/shipped_networks.yaml. What is there as `detections`
 is the default of a scenario's section of that name, so that flights on made-up detections err as those by sight did:
-of `trained` airframes, all that the simulator makes, and of `unknown` ones, the real meshes.
+of `trained` airframes, all that the simulator makes, and of `unknown` ones, the real meshes. Of these no network learnt
+ranges; `detector` and `verification` learnt some of the same public repositories, so that others are missed more often.
 
 - **A track belongs to a drone within 3 m of it**, as for the errors that the card shows. Where 1 m or a quarter of the
   range was the limit, a worse range counted as a miss and as a false neighbour, and as no error of ranges: nearly all
@@ -45,7 +46,7 @@ SETTLED_S = 3.0
 SIGMAS_OF_P95 = 1.96
 """95 % of normal errors are nearer than so many standard deviations."""
 REAL = "real"
-"""The family of airframes that no network learnt."""
+"""The family of airframes of which no network learnt ranges."""
 
 
 class Samples(NamedTuple):
