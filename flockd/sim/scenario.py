@@ -183,11 +183,10 @@ class WorldConfig(Section):
         return self
 
 
-_PERCEIVED: dict[str, Any] = yaml.safe_load(
-    (data_path("config") / "perceived" / "shipped_networks.yaml").read_text(encoding="utf-8")
-)["detections"]
-for _errors in _PERCEIVED.values():
-    _errors["false_m"] = tuple(_errors["false_m"])
+_FITTED = yaml.safe_load((data_path("config") / "perceived" / "shipped_networks.yaml").read_text(encoding="utf-8"))
+_PERCEIVED: dict[str, dict[str, Any]] = {
+    kind: {**errors, "false_m": tuple(errors["false_m"])} for kind, errors in _FITTED["detections"].items()
+}
 _TRAINED = _PERCEIVED["trained"]
 
 
