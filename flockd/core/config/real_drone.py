@@ -52,8 +52,8 @@ _KNOWN_M = 7.0
 """From how far away drones that meet are detected. By sight, drones that met head-on at 2 m/s each confirmed each other
 at 4.6 m (median of 12 tracks of the flights in config/perceived/shipped_networks.yaml), as if detected from here on."""
 _RANGE_ERROR = 0.09
-"""By which share of its range a neighbour is nearer than it seems, for seconds: two standard deviations of what lasts of
-the shipped networks' errors (trained `range_error` of that file, times the root of `tracking.range_error_lasts`)."""
+"""By which share of its range a neighbour is nearer than it seems, for seconds: two standard deviations of what lasts
+of the shipped networks' errors (trained `range_error` of that file, times the root of `tracking.range_error_lasts`)."""
 
 
 def safe_speeds(config: DroneConfig) -> tuple[float, float]:
