@@ -63,6 +63,8 @@ def add(commands: Commands) -> None:
     option(camera, "--camera NAME", "which of --config's cameras, where it has several")
 
 
+_COLOUR = 1.0
+"""Grey levels by which the channels of a picture differ on average; less is no colour."""
 _FIGURES = ("probability", "range_m", "range_sigma_m", "size_m")
 
 
@@ -74,6 +76,7 @@ class _Detected:
     detections: tuple[DetectedDrone, ...]
     proposals: int
     seconds: float
+    has_colour: bool
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -101,6 +104,11 @@ def _run(args: argparse.Namespace) -> int:
     say_facts(args, result)
     if copies is not None:
         complain(f"written: {copies.written} {'copy' if copies.written == 1 else 'copies'} in {args.out}")
+    if grey := result["without_colour"]:
+        complain(
+            f"{grey} of {len(detected)} without colour, as thermal and night cameras give them: the networks learnt from "
+            "colour pictures and find few drones there; use a colour camera"
+        )
     for fault in left_out:
         complain(f"left out: {fault}")
     return ExitCode.CHECK_FAILED if left_out else ExitCode.DONE
@@ -147,6 +155,8 @@ def _detected(
     left_out: list[str],
 ) -> Iterator[_Detected]:
     """In order; what cannot be read is skipped, and why appended to ``left_out``."""
+    import numpy as np
+
     from flockd.ground.pictures.copies import annotated
 
     count = sum(picture.count(args.every) for picture in pictures)
@@ -165,7 +175,8 @@ def _detected(
                 seconds = time.perf_counter() - begin
                 if copies is not None:
                     copies.write(picture, name, annotated(image, result))
-                yield _Detected(name, result.detections, result.proposals, seconds)
+                has_colour = bool(np.ptp(image[::8, ::8], axis=2).mean() >= _COLOUR)
+                yield _Detected(name, result.detections, result.proposals, seconds, has_colour)
                 done += 1
                 tell(done, max(done, count))
 
@@ -183,6 +194,7 @@ def _result(detected: Sequence[_Detected]) -> dict[str, Any]:
     count = max(len(detected), 1)
     return {
         "images": len(detected),
+        "without_colour": sum(not one.has_colour for one in detected),
         "pictures": [
             {
                 "file": one.name,

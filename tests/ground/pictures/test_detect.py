@@ -278,3 +278,18 @@ def test_labels_that_cannot_be_of_the_pictures_are_refused(change: Any, fault: s
     path.write_text(json.dumps(labels), encoding="utf-8")
     with pytest.raises(SystemExit, match="has no category `drone`, but quadcopter"):
         read_labels(path)
+
+
+def test_pictures_without_colour_are_told(capsys: Capture, tmp_path: Path) -> None:
+    """As a thermal camera gives them; a grey sky has some colour still."""
+    image = cv2.imread(str(NEAR))
+    assert image is not None
+    grey = np.repeat(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)[..., None], 3, axis=2)
+    tinted = grey + np.array([0, 0, 2], np.uint8)
+    for name, picture in (("grey.jpg", grey), ("tinted.png", tinted), ("colour.png", image)):
+        cv2.imwrite(str(tmp_path / name), picture)
+    assert main(["detect", str(tmp_path), *FOV, "--json"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["without_colour"] == 1
+    assert "1 of 3 without colour" in captured.err
+    assert "without colour" not in told(capsys, 0, "detect", NEAR, *FOV)
