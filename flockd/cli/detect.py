@@ -106,8 +106,8 @@ def _run(args: argparse.Namespace) -> int:
         complain(f"written: {copies.written} {'copy' if copies.written == 1 else 'copies'} in {args.out}")
     if grey := result["without_colour"]:
         complain(
-            f"{grey} of {len(detected)} without colour, as thermal and night cameras give them: the networks learnt from "
-            "colour pictures and find few drones there; use a colour camera"
+            f"{grey} of {len(detected)} without colour, as thermal and night cameras give them: the networks learnt "
+            "from colour pictures and find few drones there; use a colour camera"
         )
     for fault in left_out:
         complain(f"left out: {fault}")
