@@ -1,1 +1,1 @@
-"""What decides: pure code from frames to a gated setpoint, without clock, thread or file."""
+"""The decisions: pure code from frames to a gated setpoint, without clock, thread or file."""

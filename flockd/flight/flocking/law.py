@@ -112,7 +112,7 @@ def level_offsets(offsets: FloatArray) -> FloatArray:
 
 
 def influence_weights(parameters: WeightParameters, distances: FloatArray, observed: BoolArray) -> FloatArray:
-    """W of Eq. 39 and 40, which the paper leaves open: (n,) of 0 and 1, 0 for who is not `observed` (n,).
+    """W of Eq. 39 and 40, which the paper leaves open: (n,) of 0 and 1, 0 for neighbours that are not `observed` (n,).
 
     `uniform` gives all 1, as in the paper's flight of five. `nearest` gives 1 to the k nearest, which is the same to
     k + 1 drones or fewer and keeps larger flocks from collapsing; of two equally far the first counts as nearer.

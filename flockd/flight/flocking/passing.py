@@ -13,18 +13,18 @@ from flockd.flight.geometry.level import SAME_SPOT_M
 from flockd.flight.safety.half_planes import NO_LIMITS, ROUNDING_M_S, Limits, crossings
 
 HORIZON_S = 2.5
-"""Who would come too near within this time is passed: five steps of the paper's pilot."""
+"""A neighbour that would come too near within this time is passed: five steps of the paper's pilot."""
 _SHARE = 0.5
-"""Of the change of velocity that is needed each of two takes half. Where the other does nothing, the next steps take
-half of what is left each time; of one that comes and is too near within the horizon, all of it."""
+"""Each of two drones makes half of the needed change of velocity. If the other makes none, each next step makes half of
+the rest; against a drone that comes and is too near within the horizon, the whole change."""
 _HEAD_ON_RAD = 0.1
-"""Off a course that leads to a neighbour's middle by less than this, its side is noise: each turns to its right, as
-aircraft do (ICAO Annex 2, Rules of the Air, 3.2.2.2)."""
+"""The side of a course that misses a neighbour's middle by less is noise: each turns to its right, as aircraft do
+(ICAO Annex 2, Rules of the Air, 3.2.2.2)."""
 _COMES_M_S, _COMES_S = 0.5, 2 * HORIZON_S
 """A neighbour that comes at least so fast, and would be too near within this time, is stepped aside for."""
 _WORTH_M_S = 0.5
-"""The other side is taken where its velocity is nearer to the wanted one by this much, as where the gate lets the drone
-not go to this one, and only backing off would be left."""
+"""The drone changes to the other side if its velocity there is nearer to the wanted one by this much, as where the gate
+forbids this side and the drone could only back off."""
 _RING = 24
 _SPEEDS = 1.0, 0.5
 """Directions, and shares of the highest speed, that are tried where no velocity keeps clear of all."""
@@ -33,8 +33,8 @@ _SPEEDS = 1.0, 0.5
 class Passing:
     """One drone's passing of its neighbours, each on the side that it once took until it is passed.
 
-    Without memory the noise of a course that is nearly head-on decides anew in each step, and a drone that turns now to
-    one side and now to the other stays in the way.
+    Without memory, noise would choose the side anew in each step of a nearly head-on course, and a drone that turns to
+    one side and then to the other stays in the way.
     """
 
     def __init__(self, law: FlockingLaw, vertical_m: float) -> None:

@@ -22,7 +22,7 @@ class EgoMotionAcceptance:
     explained_px: float = 3.0
     """A match is explained that is so near to where the motion moves it."""
     min_explained: float = 0.08
-    """Least share of all matches. On real images true motions explain 15 % and more; those that Algorithm 1 finds in
+    """Least share of all matches. On real images true motions explain 15 % and more; motions that Algorithm 1 finds in
     nothing but false matches, because within metres there are always some that agree, under 6 %."""
     min_kept: float = 0.9
     """Least share of the explained matches: a refinement that loses more has followed the false ones."""
@@ -36,10 +36,9 @@ def estimate_ego_motion(
 ) -> EgoMotion:
     """``P_C = R_FC P_F + T_FC`` (Eq. 7) from the pairs labelled background, of all cameras together.
 
-    Algorithm 1 finds it; with ``parameters.refine`` its reprojection error is then made small, and the result of
-    Algorithm 1 stays where that fails or leaves its matches behind. ``inliers`` and ``threshold_m`` are Algorithm 1's.
-    Raises ValueError with the reason where there is no estimate, or one that explains hardly any of the matches that
-    it was made from.
+    Algorithm 1 finds it. With ``parameters.refine`` its reprojection error is then minimised; if that fails or leaves
+    the matches behind, the result of Algorithm 1 stays. ``inliers`` and ``threshold_m`` are Algorithm 1's.
+    Raises ValueError with the reason if there is no estimate, or if it explains hardly any of its matches.
     """
     background = pairs.select(pairs.labels == BACKGROUND_LABEL)
     found = ransac_rigid(

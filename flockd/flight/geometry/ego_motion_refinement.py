@@ -113,8 +113,8 @@ class _Sights:
 class _Reprojection:
     """All pairs, reprojected both ways by one motion.
 
-    To first order in how far a point is off its pixel: what a camera's model adds is far below a pixel where that is
-    a few pixels.
+    To first order in the distance of a point from its pixel: at a few pixels, higher orders of a camera's model are
+    far below a pixel.
     """
 
     sights: _Sights

@@ -13,7 +13,7 @@ RELIEF = 0.03
 """Standard deviation of what the ground departs from its plane, as a share of the range, straight below; it grows with
 the distance from there."""
 NEAR_EXPECTED = 0.35
-"""What is seen counts as ground when its inverse range is within this share of the expected plane's."""
+"""A point counts as ground if its inverse range is within this share of the expected plane's."""
 REACH = 3.0
 """How far from the point below the drone the ground is used, in heights."""
 MIN_POINTS = 60
@@ -123,15 +123,15 @@ def _tukey(left: FloatArray) -> Kernel:
 
 
 def scale_on_track(samples: GroundSamples, track: FloatArray, slope: FloatArray, factor: float) -> float:
-    """By what the samples' unit has to be multiplied for them to lie on the measured ground.
+    """The factor by which the samples' unit has to be multiplied so that they lie on the measured ground.
 
-    Between the places the ground goes on with its slope. What stands on it is an outlier: the median counts.
+    Between the places the ground continues with its slope. Things on the ground are outliers: the median counts.
 
     Args:
         samples: in any unit.
         track: (k, 3) metres NED from the drone, places on the ground.
         slope: (2,) of the ground, to the north and to the east.
-        factor: about what is looked for.
+        factor: a first estimate of the result.
 
     Raises ValueError where too little is seen of the places.
     """

@@ -37,7 +37,7 @@ class VirtualCrops:
     """(n, 3, 3)"""
     main: IntArray
     """(n,) the number in the rig of the camera in whose image the direction lies deepest: from its optical centre the
-    image is exact at every range. -1: no camera sees the direction, or the angle is none of a pinhole."""
+    image is exact at every range. -1: no camera sees the direction, or a pinhole cannot show the angle."""
 
     @property
     def centres(self) -> FloatArray:

@@ -127,7 +127,7 @@ class OutputSpec(TensorSpec):
 
 
 class CropSpec(Section):
-    """How a model wants to see an object: in the middle of a square crop, at a certain size.
+    """How to cut a crop for a model: a square with the object in the middle, at a certain size.
 
     The same numbers serve lenses of any kind and length: the greatest width is an angle, the least is in pixels of the
     camera's image, whose sharpness it is about.
@@ -172,7 +172,7 @@ class Manifest(Section):
     crop: CropSpec | None = None
     """How the crop that enters is to be cut out; None: whole images enter."""
     thresholds: dict[str, float] = Field(default_factory=dict)
-    """Numbers by which this model's outputs are judged, by name: they belong to the weights."""
+    """Decision thresholds of this model's outputs, by name; they belong to the weights."""
     inputs: Annotated[dict[str, InputSpec], Field(min_length=1)]
     outputs: Annotated[dict[str, OutputSpec], Field(min_length=1)]
     golden_size: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]

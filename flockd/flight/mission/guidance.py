@@ -1,4 +1,4 @@
-"""What a mission goes by, and what it gives."""
+"""A mission's inputs and outputs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _COURSE_M_S = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """What a mission knows in one step."""
+    """The inputs of a mission in one step."""
 
     time_s: float
     """Since the mission began."""
@@ -40,7 +40,7 @@ class Moment:
 
 @dataclass(frozen=True, eq=False)
 class Guidance:
-    """What a mission wants."""
+    """The outputs of a mission in one step."""
 
     velocity: FloatArray
     """(2,) m/s north and east: efv of Eq. 42."""
@@ -51,11 +51,11 @@ class Guidance:
     height_m: float | None = None
     """Above the ground at home; None: as before."""
     goal: FloatArray | None = None
-    """(2,) metres north and east of home; None: none."""
+    """(2,) metres north and east of home; None: the mission has no goal."""
     arrived: bool = False
     """At the last goal."""
     takeover: Literal["land", "return"] | None = None
-    """What the autopilot is to be asked for, as the mission is over."""
+    """The mode to ask the autopilot for at the end of the mission."""
 
     def __post_init__(self) -> None:
         if self.course_rad is not None:

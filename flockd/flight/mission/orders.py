@@ -17,8 +17,8 @@ from flockd.flight.mission.places import place_of_order
 def order_fault(config: DroneConfig, order: MissionOrder, vehicle: VehicleState | None) -> str | None:
     """Why an order is refused, one sentence for its sender; None: it may be flown.
 
-    `vehicle` is the drone's newest state. A velocity is refused where the drone would be outside the fence when the
-    order runs out, or is so already and does not come nearer to home.
+    `vehicle` is the drone's newest state. A velocity is refused if the drone would be outside the fence when the
+    order ends, or if it is outside already and does not come nearer to home.
     """
     gate, mission = config.safety.gate, config.mission
     if not _finite(order):

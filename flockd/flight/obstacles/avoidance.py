@@ -40,8 +40,8 @@ class Avoidance:
     ) -> tuple[FloatArray, FloatArray]:
         """The velocity to ask for, (2,) m/s, and the acceleration that leads there, (2,) m/s^2.
 
-        As of `FlockingLaw.command`, but `neighbours` are (n, 3) metres NED from the drone. Under the law the velocity
-        tends to V + u: that one is steered around obstacles, and the one that the step leads to has to be safe.
+        Arguments as of `FlockingLaw.command`, but `neighbours` are (n, 3) metres NED from the drone. Under the law the
+        velocity tends to V + u: this is steered around obstacles, and the velocity after the step has to be safe.
         """
         u = law.acceleration(velocity, level_offsets(neighbours), velocities, desired, ages_s)
         wanted = limit_norm(velocity + u, law.parameters.max_speed_m_s)

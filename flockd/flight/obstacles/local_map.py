@@ -112,7 +112,7 @@ def in_view(rig: Rig, gone: frozenset[str]) -> BoolArray:
 
 
 def nothing_found(time_s: float, rig: Rig, gone: frozenset[str], yaw_rad: float) -> ObstacleRanges:
-    """Ranges of a drone with this heading that looks for no obstacles: none is anywhere; `gone` as of `in_view`."""
+    """Ranges for a drone that does not look for obstacles: all free in view; `gone` as of `in_view`."""
     looked = in_view(rig, gone).take(np.arange(SECTORS) - round(yaw_rad / AZIMUTHS[1]), mode="wrap")
     return ObstacleRanges(time_s, _NOWHERE_M, np.zeros(SECTORS), np.where(looked, np.inf, 0.0))
 

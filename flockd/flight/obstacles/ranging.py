@@ -55,7 +55,7 @@ class _Points:
     obstacle: BoolArray
     """(n,) whether it may be one."""
     classed: BoolArray
-    """(n,) whether it shows how far the drone sees: of what is not classed, nobody knows where it is."""
+    """(n,) whether a point shows how far the drone sees; the place of an unclassified point is not known."""
 
     def where(self, chosen: BoolArray) -> _Points:
         return _Points(self.places[:, chosen], self.relative_sigma[chosen], self.obstacle[chosen], self.classed[chosen])

@@ -23,8 +23,8 @@ _MAX_DEPTH_M = 1e3
 def metric_depth(maps: SceneMaps, ground: Float32Array | None, camera: Camera) -> RangeMap:
     """(h, w) metres along the ray: the network's own, or with the scale that flat ground gives.
 
-    That scale, ``inverse depth = factor * open + shift``, is the one that brings most of the image's lower part onto
-    the ground, by RANSAC: what stands on the ground does not count.
+    The scale, ``inverse depth = factor * open + shift``, brings most of the image's lower part onto the ground, by
+    RANSAC: things on the ground do not count.
 
     Args:
         maps: what the networks say of the image, along the optical axis.

@@ -12,8 +12,8 @@ from flockd.flight.geometry.level import SAME_SPOT_M
 from flockd.flight.safety.half_planes import Limits
 
 COLUMN = 1.5
-"""A neighbour is above or below where its level range is less than this many times the degraded separation: downwash
-widens on its way down, and neither drone stays exactly where it is."""
+"""A neighbour counts as above or below if its level range is less than this many times the degraded separation: downwash
+widens on its way down, and neither drone stays exactly in its place."""
 _HEIGHT_NOISE_M = 0.3
 """Noise of a height over a few seconds: a difference this small between asked and own height is no climb."""
 
@@ -26,7 +26,7 @@ def towards_neighbours(
     margins: FloatArray,
     unseen_s: FloatArray,
 ) -> Limits:
-    """For each neighbour about at the drone's height its direction, (n, 2), and how fast to fly there, (n,) m/s.
+    """For each neighbour near the drone's height its direction, (n, 2), and the greatest speed towards it, (n,) m/s.
 
     `offsets` (k, 3) metres NED from the drone, `velocities` (k, 2) m/s over ground; `margins` (k, 2) by how much
     each may be nearer, m, and come faster, m/s; `unseen_s` (k,) is how long ago each was seen last. Each counts twice:
@@ -46,11 +46,11 @@ def _braking(
     margins: FloatArray,
     unseen_s: FloatArray,
 ) -> Limits:
-    """As of `towards_neighbours`, where each has braked since it was last seen, as hard as its gate lets it.
+    """As `towards_neighbours`, if each neighbour has braked since it was last seen, as hard as its gate permits.
 
-    It stands where that ends, or will end, and the drone stops before that place as before an obstacle. A tracker that
-    does not believe it and has it fly on does no harm. One that believes it by half has it too far on, by as much as it
-    errs in velocity: so the distance left is less by what it may come faster in the reaction time to neighbours.
+    The neighbour stands where its braking ends, and the drone stops before that place as before an obstacle. A tracker
+    that does not notice the braking does no harm. A tracker that notices half of it places the neighbour too far
+    ahead: so the distance left is reduced by the error of its velocity times the reaction time to neighbours.
     """
     speeds = np.hypot(velocities[:, 0], velocities[:, 1])
     since = speeds / (2 * p.max_acceleration_m_s2) - unseen_s  # s of flight from where it would be by now
@@ -73,7 +73,7 @@ def _about_level(p: GateParameters, offsets: FloatArray, separation_m: float) ->
 def towards_flying_on(
     p: GateParameters, offsets: FloatArray, velocities: FloatArray, separation_m: float, margins: FloatArray
 ) -> Limits:
-    """As of `towards_neighbours`, where each flies on as it is said to.
+    """As `towards_neighbours`, if each neighbour flies on with its estimated velocity.
 
     Nearer than the separation: not at all. Farther, so fast that the distance left suffices if both brake, as in
     Shalev-Shwartz et al. 2017, "On a formal model of safe and scalable self-driving cars": with v towards a

@@ -1,4 +1,4 @@
-"""The last gate: of what is asked for, what may be sent to the autopilot. Silent until allowed.
+"""The last gate before the autopilot: limits each requested setpoint, or sends nothing. Silent until allowed.
 
 It is independent of pilot and networks: it checks every command, whatever produced it, and limits what it can do.
 """
@@ -75,7 +75,7 @@ class Gate:
         return None
 
     def _limited(self, now_s: float, request: Request, last: Setpoint | None) -> Verdict:
-        """What is wanted, or standstill, as near as the limits let it from the last setpoint on, or from the drone."""
+        """The nearest setpoint to the wanted one, or to standstill, that the limits permit from the last one on."""
         p, action, wanted, around = self._parameters, request.permission.action, request.wanted, request.around
         height_m = request.height_m if wanted.height_m is None else wanted.height_m
         start = last or self._as_it_flies(now_s, around, height_m)

@@ -1,4 +1,4 @@
-"""What is done about each event: the one table, from faults to reactions."""
+"""The one table of what flockd does about each event: from faults to reactions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Reaction(IntEnum):
 
 
 class Barrier(IntEnum):
-    """What an event means for a drone that flockd does not fly."""
+    """The meaning of an event while flockd does not fly the drone."""
 
     NONE = 0
     WAIT = 1

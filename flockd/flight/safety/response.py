@@ -11,14 +11,14 @@ from flockd.core.messages import FloatArray
 _MEMORY_S = 10.0
 """Of the mean squares: a few gusts."""
 _FASTEST_M_S = 100.0
-"""What is measured to be faster is no velocity."""
+"""A faster measurement is no velocity."""
 _UNSURE_M_S = 0.2
 """More than PX4's own velocity errs by. Responses whose errors differ by less, squared, explain it alike; so do those
 whose errors are at most twice as large."""
 
 
 class ResponseMonitor:
-    """The difference between the measured velocity and the one that is expected of the setpoints.
+    """The difference between the measured velocity and the one expected from the setpoints.
 
     Expected is a first-order lag of the setpoints. The error is a root mean square, so that wind, an autopilot that
     does not follow and one that oscillates all show in it. It says how far the velocity is off, not why.

@@ -34,8 +34,8 @@ def surroundings(
 ) -> Surroundings:
     """The surroundings `age_s` after the step that gave the `neighbours`, which fly on at constant velocity.
 
-    One that would have flown through the drone since, to its other side on the level, has braked instead, and counts as
-    where it was: such drones stop before each other, and what has passed is seen behind in the next step.
+    A neighbour that would have flown through the drone since then counts as where it was: such drones brake before each
+    other, and a neighbour that has really passed is seen behind in the next step.
 
     Caution comes before confirmation: a track limits the speed towards it from its first detection on, by its
     uncertainty. One that may move in several ways counts once for each, see `_credible`. `moved` (3,) m NED is how far
@@ -111,7 +111,7 @@ def _motions(
     neighbours: Sequence[Neighbour], age_s: float, moved: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Of all motions that neighbours may have by now: places (k, 3) m, velocities (k, 2) m/s, margins (k, 2), and how
-    long ago each was seen last, (k,) s.
+    long ago each was last seen, (k,) s.
     """
     found = [(motion, age_s + one.unseen_s) for one in neighbours for motion in _credible(one)]
     motions = [motion for motion, _ in found]
@@ -127,9 +127,9 @@ def _motions(
 def _credible(neighbour: Neighbour) -> Iterator[tuple[PossibleMotion, float]]:
     """The motions that a neighbour may have, and by how many standard deviations each may be wrong.
 
-    `BEYOND` is shared among them: the less probable one is, the nearer to its mean is what remains of it, and one less
-    probable than its share does not count (Boole's inequality: a neighbour is there, and beyond all, with at most
-    `BEYOND`). Of a single detection it is about as probable that nothing is there: that slows, and does not stop.
+    `BEYOND` is shared among the motions: the less probable a motion, the fewer standard deviations count, and a motion
+    less probable than its share does not count. By Boole's inequality the neighbour is beyond all of them with a
+    probability of `BEYOND` at most. A single detection is about as likely false: it slows the drone, and does not stop it.
     """
     possible = neighbour.possible or (
         PossibleMotion(

@@ -8,14 +8,14 @@ from scipy.optimize import linear_sum_assignment
 from flockd.core.messages import FloatArray
 
 _NO_PAIR = -1e9
-"""What a measurement that is of no track by far costs: any number does, as it has no other choice."""
+"""The cost of a measurement far from every track. Any number will do, because it has no other choice."""
 
 
 def assign(squared_distances: FloatArray, log_likelihoods: FloatArray, gate_sigma: float) -> dict[int, int]:
     """One to one, the likeliest assignment of k measurements to n tracks: measurement -> track, by index.
 
-    The cost of a pair is twice its negative log likelihood. A measurement without a track costs what the vaguest of its
-    pairs would cost at the gate, so that no pair within the gate is given up for nothing. Both arrays are (k, n).
+    The cost of a pair is twice its negative log likelihood. A measurement without a track costs as much as the vaguest
+    of its pairs would at the gate, so that no pair within the gate is given up. Both arrays are (k, n).
     """
     near = squared_distances <= gate_sigma**2
     costs = np.where(near, -2.0 * log_likelihoods, np.inf)

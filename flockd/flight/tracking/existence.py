@@ -31,8 +31,8 @@ def averaged(
 ) -> float:
     """The network's probability of a drone, averaged over a track's `hits` detections up to `measured`.
 
-    Where the network is mistaken, it is so from frame to frame: its probabilities are no independent evidence, which
-    Bayes' rule would take for certainty in the end. The memory is exponential in time.
+    A network that is mistaken stays so from frame to frame: its probabilities are not independent, and Bayes' rule
+    would turn them into certainty. The memory is exponential in time.
     """
     share = max(1.0 / hits, 1.0 - math.exp(-interval_s / parameters.drone_probability_memory_s))
     return drone_probability + share * (measured - drone_probability)

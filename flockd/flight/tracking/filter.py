@@ -43,10 +43,9 @@ class Measurements:
     noise: FloatArray
     """(..., 4, 4) covariance of what is new in log-polar coordinates and log size.
 
-    A range is a size over an apparent size, so that the two err together: by as much, with `size_correlation`. What the
-    judged size may be off (`Detection.log_size_sigma`) is no part of it: that lasts, and is no noise. A filter that
-    took it for noise would find the range from how the neighbour moves, which in a flock tells nothing of it
-    (`pilot.size_learner`)."""
+    A range is a size over an apparent size, so the two err together: by as much, with `size_correlation`. The error of
+    the judged size (`Detection.log_size_sigma`) is no part of it, because it lasts. A filter that took it for noise
+    would derive the range from the neighbour's motion, which does not show it in a flock (`pilot.size_learner`)."""
 
     @classmethod
     def of(cls, measurements: Sequence[Measurement], parameters: TrackingParameters) -> Measurements:
@@ -135,8 +134,8 @@ def update(
     """Means (..., 8), covariances (..., 8, 8) and log likelihoods (...) after measurements: an iterated extended Kalman
     update in log-polar coordinates.
 
-    The first linearisation is at the measurement and not at the prediction: where the prediction is vague, e.g. of a
-    new track, one at the prediction would overshoot. An innovation of d > `robust_sigma` standard deviations has its
+    The first linearisation is at the measurement: at a vague prediction, e.g. of a new track, the update would
+    overshoot. An innovation of d > `robust_sigma` standard deviations has its
     covariance enlarged by (d / robust_sigma)^2: the farther off, the less it moves the state.
     """
     predicted = innovations(mean, covariance, measured)

@@ -99,10 +99,9 @@ def nobody() -> Mixture:
 def first(measurement: Measurement, own_velocity: FloatArray | None, parameters: TrackingParameters) -> Mixture:
     """After a first detection. `own_velocity` (3,) NED m/s; None: no drone is known to fly with this one.
 
-    One that comes has a bearing that stays the same, as a mate's does, and the range alone tells them apart, by its
-    rate over itself: the inverse of the time to contact (D. Lee, "A theory of visual control of braking based on
-    information about time-to-collision", Perception 5, 1976). So one on its own course begins with one that leads to
-    meet.
+    A drone on a collision course has a constant bearing, as a mate has. Only the range tells them apart, by its rate
+    over itself: the inverse of the time to contact (D. Lee, "A theory of visual control of braking based on
+    information about time-to-collision", Perception 5, 1976). So the own course begins as a collision course.
     """
     p = parameters
     unknown, alike = p.speed_sigma_m_s**2 * np.eye(3), p.relative_speed_sigma_m_s**2 * np.eye(3)
@@ -173,9 +172,9 @@ def updated(mixture: Mixture, measured: Measurements, parameters: TrackingParame
 
 
 def resized(mixture: Mixture, size_m: float, own_velocity: FloatArray | None) -> Mixture:
-    """Drones that turn out to be of this size: seen as large, each is that much nearer or farther.
+    """Rescales all neighbours to this size: with its apparent size each is nearer or farther by the same factor.
 
-    So is its velocity relative to the own one, (3,) NED m/s; None: that is not known, and its velocity stays.
+    Its velocity relative to the own one, (3,) NED m/s, scales too; None: that is not known, and its velocity stays.
     """
     scale, mean = np.ones(mixture.mean.shape), mixture.mean
     scale[..., :6] = (size_m / np.exp(mean[..., 6]))[..., None]

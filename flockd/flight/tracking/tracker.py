@@ -19,8 +19,8 @@ from flockd.flight.tracking.measurement import Measurement
 _OF_USUAL = 0.02
 """The share of one detection in what is usual: that of the last fifty."""
 _UNSEEN_SHARE = 0.1
-"""Who was followed for long is looked for longer than `max_unseen_s`: for this share of that time, while it is likely
-to exist. Else its next detection, often a vague one, would be of a stranger."""
+"""A neighbour that was followed for long is searched for longer than `max_unseen_s`: for this share of that time, while it
+is likely to exist. Otherwise its next detection, often a vague one, would start a stranger."""
 _SUREST = 0.01
 """No standard deviation of a log range counts as smaller, or a network that is too sure of one neighbour would keep
 others from being confirmed."""
@@ -87,9 +87,9 @@ class Tracker:
         """Take in one frame set's measurements at `time_s`; the track number of each, new where it fits no track.
 
         `own_velocity` (3,) NED m/s is what flock mates start with, as they move alike (`imm.first`). `shown` (None:
-        everything is) is what the cameras could see. A confirmed neighbour that leaves their view is as probable as
-        before and does not age, but for the share of its possible places that they see: it is remembered until it
-        should have come into view again.
+        everything is) is what the cameras could see. A confirmed neighbour that leaves their view stays as probable
+        and does not age, except for the share of its possible places that they see: it is remembered until it should
+        have come into view again.
         """
         interval_s = max(0.0, time_s - self._time_s)
         weight = min(1.0, interval_s / (self.parameters.evidence_interval_s - JITTER_S))
@@ -254,7 +254,7 @@ class Tracker:
 
 
 def _probability_in_view(mean: FloatArray, covariance: FloatArray, shown: Shown) -> float:
-    """That a camera shows all of the neighbour, wherever it is: one that the border cuts is often missed."""
+    """The probability that a camera shows the whole neighbour: one that the border cuts is often missed."""
     variances, axes = np.linalg.eigh(covariance[:3, :3])
     spread = _SIGMA_POINTS * np.sqrt(np.maximum(variances, 0.0))  # rounding may make none of them negative
     return float(shown(mean[:3] + spread @ axes.T, math.exp(mean[6]) / 2).mean())

@@ -127,8 +127,8 @@ def _best(
     ladder: list[float],
     least: float,
 ) -> tuple[int, int, int]:
-    """The first step of the ladder within which some hypothesis has more than ``least`` pairs, else the last one; the
-    hypothesis that has most there, and how many."""
+    """The first step of the ladder at which a hypothesis has more than ``least`` pairs, else the last one; the best
+    hypothesis there, and its number of pairs."""
     # Single precision is good to 10 micrometres within 100 m, and takes half the time. Small chunks stay in the cache.
     source_rows = np.ascontiguousarray(source.T, dtype=np.float32)
     target_rows = np.ascontiguousarray(target.T, dtype=np.float32)

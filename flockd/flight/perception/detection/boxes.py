@@ -16,9 +16,9 @@ from flockd.flight.perception.detection.instances import Instance
 _SAME_OVERLAP = 0.3
 """Intersection over union from which a box and an instance are one drone."""
 _PART = 0.8
-"""An instance of which so much lies in a box of at least twice its width is a part of that drone."""
+"""An instance with this share inside a box of at least twice its width is a part of that drone."""
 _LARGE_PX = (40.0, 300.0)
-"""Width of boxes beyond which what the second stage says against a drone counts less and less, and least: it learnt on
+"""Widths of boxes between which the second stage's verdict against a drone counts less and less: it learnt on
 real drones of 6 to 60 pixels, and refuses large ones."""
 _SMALL_PX = (20.0, 8.0)
 """The same of boxes that are less wide, all of it from the second down: a crop of so few pixels shows no shape."""
