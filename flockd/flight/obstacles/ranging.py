@@ -93,9 +93,9 @@ class ObstacleRanging:
     def ranges(
         self, observation: Observation, ego: EgoMotion | None = None, ground: GroundEstimate | None = None
     ) -> ObstacleRanges:
-        """Ranges of the flow since the observation before as far as with `ego` it shows them, beyond of the depth maps.
+        """Ranges from the flow as far as it shows them with `ego`, and from the depth maps beyond.
 
-        How far the drone sees is that of the depth maps everywhere.
+        How far the drone sees comes from the depth maps everywhere.
 
         ``ground``: below the drone; None: level, at the autopilot's height.
         """

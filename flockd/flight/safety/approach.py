@@ -12,7 +12,7 @@ from flockd.flight.geometry.level import SAME_SPOT_M
 from flockd.flight.safety.half_planes import Limits
 
 COLUMN = 1.5
-"""A neighbour counts as above or below if its level range is less than this many times the degraded separation: downwash
+"""A neighbour is above or below if its level range is less than this many times the degraded separation: downwash
 widens on its way down, and neither drone stays exactly in its place."""
 _HEIGHT_NOISE_M = 0.3
 """Noise of a height over a few seconds: a difference this small between asked and own height is no climb."""

@@ -129,7 +129,7 @@ def _credible(neighbour: Neighbour) -> Iterator[tuple[PossibleMotion, float]]:
 
     `BEYOND` is shared among the motions: the less probable a motion, the fewer standard deviations count, and a motion
     less probable than its share does not count. By Boole's inequality the neighbour is beyond all of them with a
-    probability of `BEYOND` at most. A single detection is about as likely false: it slows the drone, and does not stop it.
+    probability of `BEYOND` at most. A single detection is about as likely false: it slows the drone, but not to a stop.
     """
     possible = neighbour.possible or (
         PossibleMotion(

@@ -19,7 +19,7 @@ from flockd.flight.tracking.measurement import Measurement
 _OF_USUAL = 0.02
 """The share of one detection in what is usual: that of the last fifty."""
 _UNSEEN_SHARE = 0.1
-"""A neighbour that was followed for long is searched for longer than `max_unseen_s`: for this share of that time, while it
+"""A neighbour that was followed for long is searched for longer than `max_unseen_s`: for this share of that time, if it
 is likely to exist. Otherwise its next detection, often a vague one, would start a stranger."""
 _SUREST = 0.01
 """No standard deviation of a log range counts as smaller, or a network that is too sure of one neighbour would keep
