@@ -44,8 +44,8 @@ class AutopilotParameters(Section):
     max_control_age_s: Annotated[float, Field(gt=0, le=0.4)] = services.CONTROL.timeout
     """Nothing is sent when the control loop has not run for this long."""
     max_gap_s: Annotated[float, Field(gt=0, le=0.9)] = services.SETPOINT.timeout
-    """A longer gap between setpoints in offboard flight ends the stream until it is begun anew. Keep it below PX4's
-    COM_OF_LOSS_T: PX4 returns to offboard by itself when setpoints come back."""
+    """A longer gap between setpoints in offboard flight, or a longer silence of the autopilot, ends the stream until it
+    is begun anew. Keep it below PX4's COM_OF_LOSS_T: PX4 returns to offboard by itself when setpoints come back."""
     on_failure: Literal["hold", "land"] = "hold"
     """The mode that flockd requests from the autopilot when it cannot go on."""
     height_m: Distance | None = None

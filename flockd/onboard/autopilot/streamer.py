@@ -137,6 +137,12 @@ class SetpointStreamer:
         """Why the autopilot's state forbids sending; ends the stream where that is final."""
         status = self._status()
         lost = link_lost(status.heartbeat_age_s, status.message_age_s, self._safety)
+        silent_s, limit_s = status.message_age_s, self._parameters.max_gap_s
+        if lost is None and stream.offboard and silent_s > limit_s:
+            # As long as this lasts setpoints may not arrive either: the first that does would pull the autopilot back.
+            lost = (
+                f"nothing was heard of the autopilot for {silent_s:.1f} s in offboard flight, as when the link is cut"
+            )
         if lost is not None:
             stream.fail(lost)
         elif status.flight_mode == "offboard":

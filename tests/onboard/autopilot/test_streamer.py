@@ -158,6 +158,23 @@ def test_when_the_pilot_takes_over_it_is_silent_at_once_and_for_good(in_offboard
     assert in_offboard.go_on(1.0) == 20
 
 
+@pytest.mark.parametrize(("cut_s", "goes_on"), [(0.45, True), (0.55, False), (1.5, False)])
+def test_a_cut_of_the_link_that_may_outlast_the_autopilots_failsafe_is_silence_for_good(
+    in_offboard: Story, cut_s: float, goes_on: bool
+) -> None:
+    """PX4 fails over after COM_OF_LOSS_T, and comes back to offboard at the first setpoint: it did after 1.2 s."""
+    began_s = in_offboard.now
+    for _ in range(round(cut_s / PERIOD_S)):
+        in_offboard.autopilot(message_age_s=in_offboard.now + PERIOD_S - began_s)
+        in_offboard.go_on(PERIOD_S)
+    in_offboard.autopilot(message_age_s=0.02)
+    assert in_offboard.go_on(2.0) == (40 if goes_on else 0)
+    assert (in_offboard.silence is None) is goes_on
+    if not goes_on:
+        assert in_offboard.sent[-1][0] <= began_s + 0.5 + 1e-9
+        assert "nothing was heard of the autopilot for 0.5 s in offboard" in str(in_offboard.streamer.report().fault)
+
+
 def test_a_lost_link_is_silence_for_good(in_offboard: Story) -> None:
     in_offboard.autopilot(heartbeat_age_s=3.4)
     assert in_offboard.go_on(1.0) == 20, "two heartbeats may be lost"
