@@ -72,6 +72,8 @@ LONGEST_DELAY_S = 1.0
 """A stamp that is older at its arrival is not believed."""
 RESTARTED_MS = 1000
 """A stamp that is so much older than the one before comes from a clock that began anew."""
+STAMPS_END_MS, NEAR_END_MS = 1 << 32, 10_000
+"""Where stamps begin at 0 again, and within how much of it two stamps are taken for that."""
 MAV_SEVERITY_WARNING = 4
 TEXTS_KEPT = 20
 TEXT_MEMORY_S = 10.0
@@ -125,6 +127,8 @@ class ReceivedMessages:
         """When its first heartbeat came, and its newest message."""
         self._max_gap_s = max_gap_s
         self._boot_ms = 0
+        self._counted_ms = 0
+        """What stamps of 32 bits have lost since flockd listens: they begin anew after 49.7 days."""
         self.restarts = 0
         """How often the autopilot has begun anew since flockd listens."""
         self.heartbeats_lost = 0
@@ -159,6 +163,8 @@ class ReceivedMessages:
         elif name == "POSITION_TARGET_LOCAL_NED":
             followed = [math.nan if fields.get(key) is None else float(fields[key]) for key in ("vx", "vy")]
             self.setpoints.followed(time_s, *followed, offboard=self.flight_mode() == "offboard")
+        if self._counted_ms and fields.get("time_boot_ms") is not None:
+            fields = {**fields, "time_boot_ms": fields["time_boot_ms"] + self._counted_ms}
         fields = self._without_jumps(name, fields)
         if name in STAMPED:
             arrived_s, time_s = time_s, self._stamped_s(name, fields, time_s)
@@ -222,10 +228,13 @@ class ReceivedMessages:
 
         While it is armed it cannot have: a stamp from the past is wrong then, or somebody else's.
         """
-        if boot_ms < self._boot_ms - RESTARTED_MS:
+        if boot_ms < NEAR_END_MS and self._boot_ms > STAMPS_END_MS - NEAR_END_MS:
+            self._counted_ms += STAMPS_END_MS
+        elif boot_ms < self._boot_ms - RESTARTED_MS:
             if int(self._fields("HEARTBEAT").get("base_mode") or 0) & MAV_MODE_FLAG_SAFETY_ARMED:
                 return
             self.restarts += 1
+            self._counted_ms = 0
             self.check_events, self.clock = CheckEvents(), ClockSync()
             self._report("the autopilot has started anew")
         self._boot_ms = boot_ms
