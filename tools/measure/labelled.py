@@ -54,7 +54,9 @@ def read_labels(path: Path) -> dict[Path, list[Box]]:
 
 
 def _size(file: Path) -> tuple[float, float]:
-    """Width and height. Raises SystemExit for a picture that is not there."""
+    """Width and height, without end where the picture is not here to be asked. Raises SystemExit for a damaged one."""
+    if not file.exists():
+        return np.inf, np.inf
     try:
         height, width, _ = read_image(file).shape
     except DatasetError as error:
