@@ -44,7 +44,7 @@ def read_labels(path: Path) -> dict[Path, list[Box]]:
             continue
         left, top, width, height = one["bbox"]
         wide, high = sizes[one["image_id"]]
-        fault = f"{path}: annotation {one['id']}: bbox {one['bbox']} of an image of {wide:.0f} x {high:.0f} pixels"
+        fault = f"{path}: image {one['image_id']}: bbox {one['bbox']} in {wide:g} x {high:g} pixels"
         if max(one["bbox"]) <= 1:
             raise SystemExit(f"{fault} is in shares of it; write pixels: left, top, width, height")
         if min(width, height) <= 0 or left + width > wide + 1 or top + height > high + 1 or min(left, top) < -1:
