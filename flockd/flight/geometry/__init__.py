@@ -5,7 +5,7 @@ from flockd.flight.geometry.depth_maps import RangeMap, ZMap, blind_pixels, rang
 from flockd.flight.geometry.ego_motion import estimate_ego_motion, moved_pixels
 from flockd.flight.geometry.ego_motion_refinement import refine_ego_motion
 from flockd.flight.geometry.ground import ground_inverse_depth
-from flockd.flight.geometry.ground_fit import FittedGround, GroundSamples, fit_ground, scale_on_track
+from flockd.flight.geometry.ground_fit import GroundSamples, fit_ground
 from flockd.flight.geometry.pairs import BACKGROUND_LABEL, PointPairs, grid_pixels, lift_matches
 from flockd.flight.geometry.polar import log_polar, log_polar_covariance, log_polar_residual
 from flockd.flight.geometry.rig import Rig, RigCamera, build_rig
@@ -27,7 +27,6 @@ from flockd.flight.geometry.virtual_camera import VirtualCrops, virtual_crops
 __all__ = [
     "BACKGROUND_LABEL",
     "Camera",
-    "FittedGround",
     "GroundSamples",
     "PinholeCamera",
     "PointPairs",
@@ -61,7 +60,6 @@ __all__ = [
     "rotation_from_euler",
     "rotation_from_quaternion",
     "rotation_from_vector",
-    "scale_on_track",
     "vector_from_rotation",
     "virtual_crops",
     "z_map",

@@ -2,14 +2,13 @@
 
 Two images and the motion between them give the depth of matched points in units of that motion, and so the ground's
 plane: its slope, and the drone's height above it. Where a range finder says how high that is, the unit is known. Ground
-is not plane, and a bump of 0.2 m straight below would be 4 % at 5 m. So, once the drone has flown far enough, the
-places that the last ranges hit are compared with the same places in the images.
+is not plane, and a bump of 0.2 m straight below would be 4 % at 5 m. So the plane is that around the middle of the
+places that the last ranges hit, and its height is these places' mean.
 """
 
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -23,9 +22,9 @@ from flockd.flight.geometry import (
     fit_ground,
     grid_pixels,
     inverse_ranges_of_rays,
-    scale_on_track,
 )
 from flockd.flight.geometry.ego_motion_refinement import FLOW_SIGMA_PX
+from flockd.flight.geometry.ground_fit import REACH
 from flockd.flight.perception import CameraObservation, Observation
 
 MATCHES = 1200
@@ -33,8 +32,6 @@ MATCHES = 1200
 exact."""
 MIN_BASELINE_M = 0.08
 """Across the line of sight; with less, the ground's depth is noise."""
-MAX_CORRECTION = 1.4
-"""Factor, or one over it: what would be more is a false plane."""
 
 
 def scaled_by_ground(
@@ -61,13 +58,12 @@ def scaled_by_ground(
     if not samples:
         raise ValueError("no camera has both frames")
     seen = GroundSamples.concatenate(samples)
-    plane = fit_ground(seen, ground.height_m, ground.slope)
-    factor = ground.height_m / plane.height
-    with suppress(ValueError):  # before it has flown far enough, the plane alone tells
-        factor = scale_on_track(seen, track, plane.slope, factor)
-    if not abs(math.log(factor)) < math.log(MAX_CORRECTION):
-        raise ValueError("the ground that is seen does not fit the range")
-    return replace(ego, translation=ego.translation * factor), plane.slope
+    places = track[np.hypot(track[:, 0], track[:, 1]) < 2.0 * REACH * ground.height_m]
+    if not len(places):
+        raise ValueError("no range hit the ground that is seen")
+    height, slope = fit_ground(seen, ground.height_m, ground.slope, places[:, :2].mean(axis=0))
+    height_m = float((places[:, 2] + places[:, :2] @ slope).mean())
+    return replace(ego, translation=ego.translation * (height_m / height)), slope
 
 
 def _samples(
