@@ -21,7 +21,7 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_120,
-    "flockd/flight": 11_330,
+    "flockd/flight": 11_180,
     "flockd/onboard": 9_130,
     "flockd/fleet": 2_670,
     "flockd/ground": 4_390,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 329}
+FILES = {"flockd": 328}
 NUMBERS_OF_FLIGHT = 291
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02

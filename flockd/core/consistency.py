@@ -31,20 +31,20 @@ RANGE_GROUND = Check(
     "range to the ground, with the ground expected from the ranges before and the own motion",
     4.0,
     "SD",
-    "not used; the second in a row is believed, if the barometer does not contradict",
+    "not used; the next one like it is, if the barometer does not contradict",
     "PX4's EKF2_RNG_GATE 5 SD",
     ("perception.range_finder.gate_sigma",),
 )
 RANGE_BAROMETER = Check(
-    "height of the ground by range finder and barometer, between two places of the last seconds",
+    "height of the ground by range finder and barometer, with the bounds that the ranges before leave it",
     1.0,
     "m",
-    "the second in a row: the range finder is not used, the scale is the barometer's",
+    "not of one range alone: the range finder is not used, the scale is the barometer's",
     "steps of the ground, and a barometer's drift in 15 s; PX4's EKF2_RNG_K_GATE 0.5 SD needs level ground",
     ("perception.range_finder.tolerance_m",),
 )
 RANGE_SLOPE = Check(
-    "the same, for each metre between the places",
+    "how far these bounds move apart, for each metre flown",
     0.25,
     "m/m",
     "as for the one above",
@@ -59,7 +59,7 @@ RANGE_REPEATED = Check(
     "PX4's range_stuck_threshold 0.1 m; more, as a range in whole centimetres may repeat along a slope",
 )
 RANGE_VISION = Check(
-    "way flown by the images, whose scale is the range, with the way by the autopilot, over 5 m and more",
+    "way flown by the images, whose scale is the range, with the way by the autopilot, in fading sums",
     3.0,
     "SD",
     "the range finder is not used where the barometer's height fits better",

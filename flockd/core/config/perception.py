@@ -84,14 +84,14 @@ class RangeFinderParameters(Section):
     """So long after the last good reading the ground is expected where it was, with its slope and the own motion."""
     gate_sigma: Positive = consistency.RANGE_GROUND.limit
     """A reading farther from the expected ground, in standard deviations, is that of something else: a crate, another
-    drone, a hole. The second in a row is believed, if it does not contradict the height as the next three say."""
+    drone, a hole. The next one like it is believed, if it does not contradict the height as the next three say."""
     max_slope: Annotated[float, Field(ge=0, le=2)] = consistency.RANGE_SLOPE.limit
-    """Between two places of the last `compare_s`, the ground rises by no more than this for each metre between them,
-    ..."""
+    """For each metre flown the ground rises or falls by no more than this, ..."""
     tolerance_m: Annotated[float, Field(gt=0, le=100)] = consistency.RANGE_BAROMETER.limit
-    """... this for a step in it and the barometer's drift, and `gate_sigma` of the range. Where ranges and the
-    barometer's height say that it does, the range finder is not believed."""
+    """... this for a step in it, the barometer's drift, and `gate_sigma` of the range. Where ranges and the barometer's
+    height say that it does, the range finder is not believed."""
     compare_s: Annotated[float, Field(gt=0, le=120)] = 15.0
+    """In which the barometer may drift by `tolerance_m`. After a longer gap the ground is not known any more."""
 
 
 class PerceptionConfig(Section):

@@ -6,15 +6,13 @@ import math
 
 import numpy as np
 
+from flockd.core.consistency import RANGE_VISION
 from flockd.core.messages import VehicleState
 from flockd.flight.geometry import PointPairs, Rig, RigidTransform, moved_pixels
+from flockd.flight.pilot.own_motion import ERROR_M_S
 
-_MOVES_M_S = 0.4
-"""Slower, what the autopilot's velocity errs by is as large."""
 _MOVED_PX, _FEWEST = 2.0, 40
 """A pair that moved less has no direction; fewer pairs tell nothing."""
-_COHERENT = 0.4
-"""Length from which on a mean turn tells something: whether it is under 45 degrees."""
 _TIME_S, _SURE = 8.0, 0.4
 """Time that looks count for, and the mean from which on a camera agrees or not: after four seconds if all do alike."""
 
@@ -44,7 +42,7 @@ class CameraAgreement:
         if before.velocity_ned is None or after.velocity_ned is None:
             return
         velocity = before.R_ned_body.T @ (before.velocity_ned + after.velocity_ned) / 2.0
-        if np.linalg.norm(velocity) < _MOVES_M_S:
+        if np.linalg.norm(velocity) < RANGE_VISION.limit * ERROR_M_S:
             return
         turn, gain = before.R_ned_body.T @ after.R_ned_body, 1.0 - math.exp(-interval_s / _TIME_S)
         turned, moved = RigidTransform(turn, np.zeros(3)), RigidTransform(turn, velocity * interval_s)
@@ -57,9 +55,8 @@ class CameraAgreement:
             told, far = (abs(by_both) > _MOVED_PX) & (abs(seen) > _MOVED_PX), abs(by_both - by_turn) < abs(by_turn)
             groups = [group for group in (told & far, told & ~far) if np.count_nonzero(group) >= _FEWEST]
             turns = np.array([np.mean(np.exp(1.0j * np.angle(seen[group] / by_both[group]))) for group in groups])
-            clear, alike = abs(turns) > _COHERENT, abs(turns.imag) < turns.real
-            if len(turns) and (clear.all() or (clear & ~alike).any()):
-                self._agreements[name] += gain * ((1.0 if alike.all() else -1.0) - self._agreements[name])
+            if len(turns):  # above zero within 45 degrees
+                self._agreements[name] += gain * (float((turns.real - abs(turns.imag)).min()) - self._agreements[name])
 
     def elsewhere(self) -> tuple[str, ...]:
         """Cameras to fly without: none where more contradict the autopilot than agree, as it may be what errs."""

@@ -17,7 +17,7 @@ from flockd.core.messages import FloatArray, VehicleState
 
 ERROR_M_S, ERROR_LASTS_S = 0.15, 3.0
 """Standard deviation of an autopilot's velocity, each axis, and for how long it errs alike: PX4 in its simulator."""
-_SCALE = 0.03
+SCALE = 0.03
 """Standard deviation of the scale of the images' displacements."""
 _AGES_M_S2 = 2.0
 """Standard deviation of a velocity for each second that it is from another time than the frames."""
@@ -75,9 +75,7 @@ class OwnMotion:
         fits = True
         if by_images is not None:
             innovation = mean_said - by_images / interval_s - mean
-            noise = (self._images_sigma_m / interval_s) ** 2 + _SCALE**2 * float(
-                (mean_said - mean) @ (mean_said - mean)
-            )
+            noise = (self._images_sigma_m / interval_s) ** 2 + SCALE**2 * float((mean_said - mean) @ (mean_said - mean))
             off, expected = float(np.linalg.norm(innovation)), of_mean + noise
             fits = off <= limit * math.sqrt(expected)
             if fits:
@@ -86,7 +84,7 @@ class OwnMotion:
             else:
                 variance += (2 * off / limit) ** 2  # at least a quarter of it is the mean's of the next step
         self.error, self._variance, self.velocity = error, variance, said - error
-        usual_m_s = limit * math.hypot(ERROR_M_S, _SCALE * math.hypot(*mean_said[:2]))
+        usual_m_s = limit * math.hypot(ERROR_M_S, SCALE * math.hypot(*mean_said[:2]))
         off_m_s = math.hypot(*error[:2])
         self.disagreement_m_s = off_m_s if off_m_s > usual_m_s else 0.0
         self.displacement = interval_s * (mean_said - mean)

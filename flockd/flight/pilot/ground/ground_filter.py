@@ -15,25 +15,18 @@ import numpy as np
 from flockd.core.choices import HeightSource
 from flockd.core.config.perception import RangeFinderParameters
 from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, Reason, ReasonKind, VehicleState
-from flockd.flight.pilot.ground.contradiction import ContradictionMonitor, GroundPoint, RepetitionMonitor
-from flockd.flight.pilot.ground.way_flown import WayMonitor
+from flockd.flight.pilot.ground.contradiction import ContradictionMonitor, GroundPoint
 
 HEIGHT_NOISE_M = 0.03
 """Standard deviation of the autopilot's height from one reading to the next; what changes slowly does not matter."""
-FIRST_SLOPE = 0.1
-"""Standard deviation of the ground's slope where nothing is known of it."""
 SLOPE_CHANGE = 0.02
 """Standard deviation of what the slope changes over a metre: a hill of 5 m turns from 15 % up to 15 % down in 100 m."""
 SEEN_SLOPE = 0.04
 """Standard deviation, each axis, of a slope from images of rough ground, which has bumps around the drone, too."""
 ROUGHNESS_M = 0.03
 """Standard deviation of what the ground departs from its slope over a metre."""
-TRACK_POINTS = 40
-"""Ranges remembered: 20 s of steps of the paper's length."""
-LONGEST_GAP_S = 5.0
-"""After a longer one between two steps nothing is known of the ground any more."""
-BELIEVED_AFTER = 2
-"""Readings in a row that the expected ground does not explain: then the ground is as they say."""
+TRACK_POINTS = 100
+"""Ranges remembered: 10 s of ten steps a second."""
 
 
 class GroundFilter:
@@ -46,12 +39,9 @@ class GroundFilter:
         self._covariance = np.zeros((3, 3))
         self._last: VehicleState | None = None
         self._measured_s = -math.inf
-        self._unexplained = 0
         self._flown = np.zeros(2)
         """North and east since the beginning, as the autopilot says."""
         self._contradictions = ContradictionMonitor(parameters)
-        self._repetition = RepetitionMonitor(parameters.compare_s)
-        self._way_flown = WayMonitor(parameters.compare_s)
         self._newest: GroundPoint | None = None
         """Where the newest step's range hit the ground, used or not; None: it had none."""
         self._elapsed_s = 0.0
@@ -93,18 +83,12 @@ class GroundFilter:
 
     def see_motion(self, displacement: FloatArray) -> None:
         """Takes the way (3,) metres NED that the images of the newest step show, by the scale of its ground."""
-        if self._newest is None or self._moved is None or self._last is None:
-            self._way_flown.forget()
+        if self._newest is None or self._moved is None:
             return
-        range_height_m = self._last.height_m - self._newest.ground_m
-        if not (range_height_m > 0.0 and self._used_height_m > 0.0):
-            self._way_flown.forget()
-            return
-        by_range = displacement * (range_height_m / self._used_height_m)
-        by_barometer = displacement * (self._last.height_m / self._used_height_m)
-        if self._way_flown.update(self._elapsed_s, self._moved, by_range, by_barometer):
-            self._contradictions.doubt(self._newest, self._newest.ground_m, "the range contradicts the way flown")
-            self._forget()
+        heights_m = np.array([self._newest.height_m - self._newest.ground_m, self._newest.height_m])
+        if heights_m[0] > 0.0 and self._used_height_m > 0.0:
+            by_images = np.outer(heights_m / self._used_height_m, displacement)
+            self._contradictions.see_way(self._elapsed_s, self._moved, by_images)
 
     def _follow(self, vehicle: VehicleState) -> str | None:
         """Takes a step and its range; why that one is not used, None: it is."""
@@ -116,36 +100,38 @@ class GroundFilter:
             return fault
         point = reading.range_m * vehicle.R_ned_body[:, 2]
         ground_m = _height_at(reading.time_s, vehicle) - float(point[2])
-        place = GroundPoint(vehicle.time_s, self._flown + point[:2], ground_m, reading.range_m)
-        home = None if vehicle.position is None else self._flown - vehicle.position
-        self._newest = place
-        repeated = self._repetition.update(place, reading.time_s, vehicle.height_m)
-        if repeated is not None:
-            self._contradictions.doubt(place, repeated.ground_m, "the range stays the same while the height changes")
-        if self._contradictions.update(place, home):
-            if self._contradictions.doubted:  # the readings before made the state false, too
-                self._forget()
-            return self._contradictions.why
+        self._newest = GroundPoint(
+            vehicle.time_s, reading.time_s, self._flown, reading.range_m, vehicle.height_m, ground_m
+        )
+        self._contradictions.see_repetition(self._newest)
         variance = (self._parameters.noise * reading.range_m) ** 2 + HEIGHT_NOISE_M**2
         row = np.array([1.0, point[0], point[1]])
-        if self._state is not None and self._is_unexplained(row, ground_m, variance):
-            self._unexplained += 1
-            if self._unexplained < BELIEVED_AFTER:
-                return "the range is not that of the ground expected"
+        if self._contradictions.why is None and self._is_unexplained(row, ground_m, variance):
+            return "the range is not that of the ground expected"
+        home = None if vehicle.position is None else self._flown - vehicle.position
+        why = self._contradictions.update(self._newest, home)
+        if why is not None:  # the readings before made the state false, too
             self._forget()
+            return why
         if self._state is None:
             self._state = np.array([ground_m, 0.0, 0.0])
-            self._covariance = np.diag([variance, FIRST_SLOPE**2, FIRST_SLOPE**2])
+            slope = self._parameters.max_slope / self._parameters.gate_sigma
+            self._covariance = np.diag([variance, slope**2, slope**2])
         else:
             self._correct(row[None], np.array([ground_m]), np.array([[variance]]))
-        self._unexplained, self._measured_s = 0, vehicle.time_s
+        self._measured_s = vehicle.time_s
         self._track.append(np.array([*(self._flown + point[:2]), ground_m]))
         return None
 
     def _is_unexplained(self, row: FloatArray, ground_m: float, variance: float) -> bool:
-        assert self._state is not None
-        sigma_m = math.sqrt(float(row @ self._covariance @ row) + variance)
-        return abs(ground_m - float(row @ self._state)) > self._parameters.gate_sigma * sigma_m
+        """Whether a reading is farther from the expected ground than it errs; one that says the same fits after it."""
+        if self._state is None:
+            return False
+        off_m, gate = abs(ground_m - float(row @ self._state)), self._parameters.gate_sigma
+        if off_m <= gate * math.sqrt(float(row @ self._covariance @ row) + variance):
+            return False
+        self._covariance = self._covariance + np.diag([(2.0 * off_m / gate) ** 2, 0.0, 0.0])
+        return True
 
     def _predict(self, vehicle: VehicleState) -> None:
         last, self._last = self._last, vehicle
@@ -153,11 +139,9 @@ class GroundFilter:
             return
         self._elapsed_s, self._moved = vehicle.time_s - last.time_s, _moved(last, vehicle)
         way = _way(last, vehicle)
-        if way is None or not 0.0 < self._elapsed_s <= LONGEST_GAP_S:
+        if way is None or not 0.0 < self._elapsed_s <= self._parameters.compare_s:
             self._forget()
             self._contradictions.forget()
-            self._repetition.forget()
-            self._way_flown.forget()
             return
         self._flown = self._flown + way
         if self._state is None:
@@ -170,7 +154,7 @@ class GroundFilter:
         self._covariance = onward @ self._covariance @ onward.T + np.diag(change)
 
     def _forget(self) -> None:
-        self._state, self._unexplained = None, 0
+        self._state = None
         self._track.clear()
 
     def _correct(self, rows: FloatArray, measured: FloatArray, noise: FloatArray) -> None:

@@ -15,7 +15,7 @@ from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, Reaso
 from flockd.flight.geometry import rotation_from_euler
 from flockd.flight.pilot import FlockPilot
 from flockd.flight.pilot.ground import GroundFilter
-from flockd.flight.pilot.ground.way_flown import WayMonitor
+from flockd.flight.pilot.ground.contradiction import ContradictionMonitor
 from flockd.sim.autopilot.fake_range_finder import range_to_ground
 from tests.flight.pilot.flyer import Flyer, scenario_with
 from tests.make import changed, vehicle
@@ -161,6 +161,7 @@ def test_the_way_flown_contradicts_a_range_only_where_the_barometer_fits_better(
     by_barometer: float, contradicts: bool
 ) -> None:
     """At 2 m/s, twice as far by the range; what both scales get wrong is the images' or the autopilot's fault."""
-    flown, monitor = np.array([1.0, 0.0, 0.0]), WayMonitor(10.0)
-    found = [monitor.update(0.5, flown, 2.0 * flown, by_barometer * flown) for _ in range(40)]
-    assert any(found) is contradicts
+    flown, monitor = np.array([1.0, 0.0, 0.0]), ContradictionMonitor(RangeFinderParameters())
+    for _ in range(40):
+        monitor.see_way(0.5, flown, np.array([2.0 * flown, by_barometer * flown]))
+    assert (monitor.why is not None) is contradicts
