@@ -175,7 +175,6 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
     """What is the matter, each with one short sentence for people; empty in a quiet flight."""
     lost = [f"{name} {fault}" for name, camera in inputs.cameras.items() if (fault := _fault(camera, p))]
     sightless = len(lost) == len(inputs.cameras) or len(lost) > p.max_lost_cameras
-    temperature = inputs.temperature_c
     lost_link = link_lost(inputs.heartbeat_age_s, inputs.message_age_s, p)
     # While another's setpoints are followed, the own ones are not.
     far_off = not (
@@ -188,87 +187,41 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         off = f"{off}, and follows them {inputs.velocity_late_s:.1f} s later than expected"
     most = f"at most {p.max_velocity_error_m_s:g} m/s and {p.gate.reaction_s:g} s are flown"
     cause = f"{off} ({most}): wind, or an autopilot that does not follow"
+    room = f"the drone flies on to where no obstacle is within {p.hold_room_m:g} m, and asks for Hold there"
+    ego_motion = {Event.EGO_MOTION_POOR: p.degraded_ego_motion_s, Event.EGO_MOTION_LOST: p.max_ego_motion_s}
+    load = {Event.OVERLOADED: p.degraded_load, Event.FAR_OVERLOADED: p.max_load}
+    heat = {Event.HOT: p.degraded_temperature_c, Event.TOO_HOT: p.max_temperature_c}
+    temperature_c = -math.inf if inputs.temperature_c is None else inputs.temperature_c
+    motion, ended = "no position and velocity from the autopilot", f"setpoints ended: {inputs.stream_fault}"
+    close = f"a neighbour is {inputs.nearest_neighbour_m:.1f} m away"
     table = (
         (Event.SIGHT_LOST, sightless, f"too few cameras deliver images: {', '.join(lost) or 'there are none'}"),
         (Event.CAMERA_LOST, len(lost) > 0 and not sightless, f"a camera is lost: {', '.join(lost)}"),
-        (
-            Event.FRAMES_DROPPED,
-            not inputs.dropped_share <= p.max_dropped_share,
-            f"{inputs.dropped_share:.0%} of the frames were dropped",
+        *_beyond(
+            {Event.FRAMES_DROPPED: p.max_dropped_share}, inputs.dropped_share, "{:.0%} of the frames were dropped"
         ),
-        (
-            Event.ESTIMATE_STALE,
-            not inputs.estimate_age_s <= p.estimate_timeout_s,
-            f"no estimate {_since(inputs.estimate_age_s)}",
-        ),
-        (
-            Event.EGO_MOTION_POOR,
-            p.degraded_ego_motion_s < inputs.ego_motion_age_s <= p.max_ego_motion_s,
-            f"no ego-motion estimated {_since(inputs.ego_motion_age_s)}",
-        ),
-        (
-            Event.EGO_MOTION_LOST,
-            not inputs.ego_motion_age_s <= p.max_ego_motion_s,
-            f"no ego-motion estimated {_since(inputs.ego_motion_age_s)}",
-        ),
+        *_older({Event.ESTIMATE_STALE: p.estimate_timeout_s}, inputs.estimate_age_s, "no estimate"),
+        *_older(ego_motion, inputs.ego_motion_age_s, "no ego-motion estimated"),
         (Event.NETWORK_FAULT, inputs.network_faults > 0, "a network's output is not finite or not plausible"),
         (Event.INFERENCE_STUCK, inputs.inference_stuck, "a network does not respond"),
-        (
-            Event.OVERLOADED,
-            p.degraded_load < inputs.load <= p.max_load,
-            f"a step takes {inputs.load:.0%} of the step time",
-        ),
-        (Event.FAR_OVERLOADED, not inputs.load <= p.max_load, f"a step takes {inputs.load:.0%} of the step time"),
-        (
-            Event.HOT,
-            temperature is not None and p.degraded_temperature_c < temperature <= p.max_temperature_c,
-            f"the computer is at {temperature} °C",
-        ),
-        (
-            Event.TOO_HOT,
-            temperature is not None and not temperature <= p.max_temperature_c,
-            f"the computer is at {temperature} °C",
-        ),
-        (
-            Event.LOOP_LATE,
-            not inputs.loop_lag_s <= p.max_loop_lag_s,
-            f"the event loop is {inputs.loop_lag_s:.2f} s late",
-        ),
+        *_beyond(load, inputs.load, "a step takes {:.0%} of the step time"),
+        *_beyond(heat, temperature_c, "the computer is at {} °C"),
+        *_beyond({Event.LOOP_LATE: p.max_loop_lag_s}, inputs.loop_lag_s, "the event loop is {:.2f} s late"),
         (Event.FOREIGN_SETPOINTS, inputs.foreign_setpoints is not None, f"{inputs.foreign_setpoints}"),
         (Event.PARAMETERS_UNSUITABLE, inputs.parameter_fault is not None, f"{inputs.parameter_fault}"),
         (Event.FRAME_JUMPED, inputs.frame_jumped, "the autopilot's estimate of position or heading has jumped"),
         (Event.VELOCITY_OFF, is_off and not far_off, off),
         (Event.VELOCITY_FAR_OFF, too_far_off and not inputs.obstacle_near, cause),
-        (
-            Event.NO_ROOM_TO_HOLD,
-            too_far_off and inputs.obstacle_near,
-            f"{cause}; the drone flies on to where no obstacle is within {p.hold_room_m:g} m, and asks for Hold there",
-        ),
+        (Event.NO_ROOM_TO_HOLD, too_far_off and inputs.obstacle_near, f"{cause}; {room}"),
         (Event.TASK_DIED, len(inputs.dead_tasks) > 0, f"ended and should not have: {', '.join(inputs.dead_tasks)}"),
-        (
-            Event.NEIGHBOURS_LOST,
-            not inputs.neighbours_age_s <= p.neighbours_timeout_s,
-            f"no neighbour seen {_since(inputs.neighbours_age_s)}",
-        ),
-        (
-            Event.NEIGHBOUR_CLOSE,
-            not inputs.nearest_neighbour_m >= p.gate.min_separation_m,
-            f"a neighbour is {inputs.nearest_neighbour_m:.1f} m away",
-        ),
+        *_older({Event.NEIGHBOURS_LOST: p.neighbours_timeout_s}, inputs.neighbours_age_s, "no neighbour seen"),
+        (Event.NEIGHBOUR_CLOSE, not inputs.nearest_neighbour_m >= p.gate.min_separation_m, close),
         (Event.COMMAND_REFUSED, inputs.refused_commands > 0, "a command was not finite or far too large"),
         (Event.FENCE_LEFT, inputs.outside_fence, "outside the fence"),
         (Event.HEIGHTS_LEFT, inputs.outside_heights, "above or below the heights allowed"),
         (Event.LINK_LOST, lost_link is not None, f"{lost_link}"),
-        (
-            Event.MOTION_UNKNOWN,
-            not inputs.motion_age_s <= services.MOTION.timeout,
-            f"no position and velocity from the autopilot {_since(inputs.motion_age_s)}",
-        ),
-        (
-            Event.STREAM_ENDED,
-            inputs.stream_fault is not None and lost_link is None,
-            f"setpoints ended: {inputs.stream_fault}",
-        ),
+        *_older({Event.MOTION_UNKNOWN: services.MOTION.timeout}, inputs.motion_age_s, motion),
+        (Event.STREAM_ENDED, lost_link is None and inputs.stream_fault is not None, ended),
         (Event.AUTOPILOT_FAILSAFE, inputs.autopilot_failsafe, _FAILSAFE),
         (Event.NOT_OFFBOARD, inputs.flight_mode != OFFBOARD, f"the flight mode is {inputs.flight_mode or 'not known'}"),
         (Event.NOT_ARMED, not inputs.armed, "not armed"),
@@ -288,6 +241,15 @@ _FAILSAFE = (
     "the autopilot is in its failsafe, and would take up any setpoint by itself; select Hold or Position, and offboard "
     "once flockd is ready"
 )
+
+
+def _beyond(limits: Mapping[Event, float], value: float, sentence: str) -> list[tuple[Event, bool, str]]:
+    """The event of the last limit that a number is not within, as a row of the table; its sentence names the number."""
+    return [(event, True, sentence.format(value)) for event, limit in limits.items() if not value <= limit][-1:]
+
+
+def _older(limits: Mapping[Event, float], age_s: float, sentence: str) -> list[tuple[Event, bool, str]]:
+    return _beyond(limits, age_s, f"{sentence} {_since(age_s)}")
 
 
 def _since(age_s: float) -> str:
