@@ -140,10 +140,10 @@ def test_other_settings_can_be_tried(path: Path, told: Told) -> None:
     file = path.with_name("other.yaml")
     file.write_text(yaml.safe_dump(values), encoding="utf-8")
     assert main(["replay", str(path), "--config", str(file), "--diff"]) == 1
-    values["rig"]["cameras"][1]["size_px"] = [320, 240]
+    values["rig"]["cameras"][1]["size_px"] = [164, 124]
     file.write_text(yaml.safe_dump(values), encoding="utf-8")
     error = told(2, "replay", path, "--config", file)
-    assert error.startswith(f"{file}: rig.cameras: camera 'left' has 320 x 240 pixels, but {path} ")
+    assert error.startswith(f"{file}: rig.cameras: camera 'left' has 164 x 124 pixels, but {path} ")
 
 
 def test_what_keeps_a_replay_from_being_the_flight_is_told(
