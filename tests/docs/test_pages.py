@@ -147,6 +147,7 @@ def test_plain_words(page: Path) -> None:
 def test_the_readme_is_short_and_shows_the_flock() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert len(readme.splitlines()) <= 120
+    assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()) < 150, "git has what is older"
     assert "docs/pictures/by_sight.webp" in readme
     assert "make demo" in readme
 
