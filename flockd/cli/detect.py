@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from flockd.ground.pictures.picture_files import PictureFile
     from flockd.ground.pictures.single_frame import DetectedDrone, PictureDetector
 
-MAX_FOV_DEG = 170.0
+MIN_FOV_DEG, MAX_FOV_DEG = 4.0, 170.0
+"""Less are radians, or a telescope's."""
 NOTES = """\
 Larger pictures are resized to 1280 pixels for the networks; boxes are in pixels of the picture.
 A picture that cannot be read is reported and left out, and the exit code is 1."""
@@ -57,7 +58,7 @@ def add(commands: Commands) -> None:
         camera,
         "--fov DEG",
         "field of view across the longer side, of a lens without distortion; above 100, of a fisheye",
-        number(f"an angle above 0 and up to {MAX_FOV_DEG:g} degrees", high=MAX_FOV_DEG, above=0.0),
+        number(f"an angle in degrees, {MIN_FOV_DEG:g} to {MAX_FOV_DEG:g}", MIN_FOV_DEG, MAX_FOV_DEG),
     )
     option(camera, "--config FILE", "a drone, for its networks and settings and, without --fov, its camera", Path)
     option(camera, "--camera NAME", "which of --config's cameras, where it has several")
@@ -143,7 +144,8 @@ def _perception(drone: DroneConfig | None, drone_size_m: float | None) -> Percep
         return PerceptionConfig.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
-        raise UsageError(f"perception.{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        key = "--drone-size, in metres" if first["loc"] == ("drone_size_m",) else f"perception.{first['loc'][0]}"
+        raise UsageError(f"{key}: {first['msg']}; correct it") from None
 
 
 def _detected(

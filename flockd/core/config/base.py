@@ -32,7 +32,7 @@ Name = Annotated[str, text(r"^[A-Za-z0-9_.-]+$", "a name, of letters, digits, `_
 PlainName = Annotated[str, text(r"^[a-z0-9_-]+$", "a name, of small letters, digits, `_` and `-`")]
 
 
-def _port(address: str) -> str:
+def checked_port(address: str) -> str:
     """Raises ValueError for a network's port that none is."""
     kind, _, rest = address.partition("/")
     port = re.search(r":(\d+)(?:[?#].*)?$", rest)
@@ -42,7 +42,7 @@ def _port(address: str) -> str:
 
 
 _WITH_PORTS = {"tcp", "udp", "tls", "quic", "ws", "udpin", "udpout", "tcpin", "tcpout"}
-Port = AfterValidator(_port)
+Port = AfterValidator(checked_port)
 """Of a text with an address at its end."""
 Endpoint = Annotated[
     str,

@@ -83,13 +83,17 @@ def _read(file: Path, size: tuple[int, int] | None) -> list[ForeignLens]:
     if text.startswith("%YAML:1") or "opencv-matrix" in text or "opencv_storage" in text:
         return [_of_matrices(_opencv(file), file.stem, size)]
     values = yaml.safe_load(text)
+    if not isinstance(values, dict):
+        raise ValueError("keys with values")  # noqa: TRY004 - told as what else is wrong with a file
     if "camera_matrix" in values:
         return [_of_matrices(values, file.stem, size)]
-    return [_of_kalibr(name, one) for name, one in values.items() if "intrinsics" in one]
+    return [_of_kalibr(name, one) for name, one in values.items() if isinstance(one, dict) and "intrinsics" in one]
 
 
 def _lens(name: str, size: Any, model: str, numbers: Any, distortion: Any, shift: float) -> ForeignLens:
     """``numbers``: fx, fy, cx, cy; ``shift``: of the file's pixel centres."""
+    if len(numbers) != 4:
+        raise ValueError(f"fx, fy, cx and cy of {name}")
     fx, fy, cx, cy = map(float, numbers)
     coefficients = tuple(float(k) for k in np.ravel(distortion))
     plain = re.sub("[^a-z0-9_-]", "_", name.lower())
@@ -102,6 +106,8 @@ def _of_colmap(words: list[str]) -> ForeignLens:
     if words[1] not in _COLMAP:
         return _lens(f"camera{words[0]}", words[2:4], words[1], (1, 1, 0, 0), (), 0.0)
     model, names = _COLMAP[words[1]]
+    if len(words) != 4 + len(names.split()):
+        raise ValueError(f"the parameters of {words[1]}, {names}")
     found = dict(zip(names.split(), map(float, words[4:]), strict=True))
     focal = (found.get("fx", found.get("f", 0.0)), found.get("fy", found.get("f", 0.0)))
     order = "k1 k2 k3 k4" if model == "equidistant" else "k1 k2 p1 p2 k3 k4 k5 k6"
@@ -191,7 +197,7 @@ def _config(
         return CameraConfig(name=lens.name, size_px=lens.size, intrinsics=intrinsics)
     except ValidationError as error:
         first = error.errors()[0]
-        raise CalibrationError(f"{where}: {first['loc'][-1]}: {first['msg']}") from None
+        raise CalibrationError(f"{where}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
 def _directions(lens: ForeignLens, where: str) -> tuple[FloatArray, FloatArray]:

@@ -12,6 +12,7 @@ from typing import Self
 
 import zenoh
 
+from flockd.core.config.base import checked_port
 from flockd.core.errors import UnavailableError
 
 _log = logging.getLogger(__name__)
@@ -47,6 +48,10 @@ def open_session(
     for endpoint in (*listen, *connect):
         if "/" not in endpoint:
             raise UnavailableError(f"{purpose} cannot use {endpoint}: it names no protocol; write tcp/{endpoint}")
+        try:
+            checked_port(endpoint)
+        except ValueError as error:
+            raise UnavailableError(f"{purpose}: {error}") from None
     wanted = {
         "mode": "peer",
         "scouting/multicast/enabled": False,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -118,9 +119,18 @@ def test_a_lens_without_an_equal_is_refused_with_how_far_the_nearest_is_off(tmp_
         (_filled(KALIBR, [], MODEL="none", CAMERA="omni"), "cam0: has the lens model omni, which is not known"),
         (_filled(KALIBR, [0.9], MODEL="fov", CAMERA="pinhole"), "cam0: has the lens model fov, which is not known"),
         ("1 THIN_PRISM_FISHEYE 640 480 1 2 3\n", "camera1: has the lens model THIN_PRISM_FISHEYE"),
-        (_filled(ROS, PINHOLE, MODEL="plumb_bob").replace("640", "320"), "head_camera: cx: 324.6 is 51% of the image"),
+        (
+            _filled(ROS, PINHOLE, MODEL="plumb_bob").replace("640", "320"),
+            "head_camera: intrinsics.cx: 324.6 is 51% of the image",
+        ),
         ("rig: {}\n", "holds no camera; give Kalibr's camchain"),
-        ("just a text\n", "give Kalibr's camchain"),
+        ("just a text\n", "lacks or garbles keys with values; give Kalibr's camchain"),
+        (
+            _filled(KALIBR, [], MODEL="none", CAMERA="pinhole").replace(", 324.1, 235.0]", "]"),
+            "lacks or garbles fx, fy, cx and cy of cam0",
+        ),
+        (_filled(KALIBR, [0.1, 0, 0, math.nan], MODEL="radtan", CAMERA="pinhole").replace("nan", ".nan"), "finite"),
+        ("1 OPENCV 640 480 1 2 3\n", "lacks or garbles the parameters of OPENCV, fx fy cx cy k1 k2 p1 p2"),
         ("camera_matrix: 3\n", "give Kalibr's camchain"),
         ("[\n", "cannot be read ("),
         ("%YAML:1.0\n---\nK: 3\n", "OpenCV cannot read it; write it again"),

@@ -173,7 +173,7 @@ def test_a_drones_own_camera_is_taken(capsys: Capture, tmp_path: Path) -> None:
         ((NEAR, *FOV, "--force"), 2, "--force has no meaning without --out"),
         (("nowhere.jpg", *FOV), 2, "nowhere.jpg: does not exist; name an image, a video or a folder"),
         ((LABELS, *FOV), 2, "drones.json: is no image or video by its name"),
-        ((NEAR, *FOV, "--drone-size", "0.01"), 2, "perception.drone_size_m: "),
+        ((NEAR, *FOV, "--drone-size", "0.01"), 2, "--drone-size, in metres: Input should be"),
     ],
 )
 def test_what_cannot_be_is_said_in_one_sentence(

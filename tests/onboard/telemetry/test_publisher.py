@@ -174,6 +174,8 @@ def test_an_address_that_no_interface_has_yet_is_listened_on_once_one_has_it(cap
     with zenoh.open(client(free)):  # what is there works meanwhile
         drone.publish("drone1", "events", {"time_s": 0.0, "event": "x"})
     threading.Thread(target=drone.close, daemon=True).start()  # zenoh takes ten seconds to give it up
+    with pytest.raises(UnavailableError, match="has the port 70000, and the last one is 65535"):
+        open_session("a page", [], ["tcp/127.0.0.1:70000"])
     with pytest.raises(UnavailableError, match=f"a page cannot use {telemetry}"):
         open_session("a page", [telemetry], [])
 
