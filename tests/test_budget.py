@@ -21,7 +21,7 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_120,
-    "flockd/flight": 11_140,
+    "flockd/flight": 11_130,
     "flockd/onboard": 9_130,
     "flockd/fleet": 2_670,
     "flockd/ground": 4_390,
