@@ -68,6 +68,28 @@ def vehicle_state(kind: str, message: Any, time_s: float) -> VehicleState | None
     return VehicleState(time_s, R_ned_body, -float(place[2]), velocity, place[:2])
 
 
+PX4_STATES = PX4_ODOMETRY, PX4_ATTITUDE = "px4_msgs/msg/VehicleOdometry", "px4_msgs/msg/VehicleAttitude"
+"""PX4's own, without a header."""
+_NED, _BODY_FRD = 1, 3
+
+
+def px4_state(kind: str, message: Any, time_s: float) -> VehicleState | None:
+    """Of PX4's own messages, whose axes are flockd's; None where its estimator had none. An attitude alone knows no
+    height, so that it is 0."""
+    try:
+        R_ned_body = rotation_of(np.array([*message.q[1:], message.q[0]], np.float64))
+    except ValueError:
+        return None
+    if kind == PX4_ATTITUDE:
+        return VehicleState(time_s, R_ned_body, 0.0)
+    place, velocity = np.array(message.position, np.float64), np.array(message.velocity, np.float64)
+    if message.pose_frame != _NED or not np.isfinite(place).all():
+        return None
+    velocity = R_ned_body @ velocity if message.velocity_frame == _BODY_FRD else velocity
+    known = message.velocity_frame in {_NED, _BODY_FRD} and bool(np.isfinite(velocity).all())
+    return VehicleState(time_s, R_ned_body, -float(place[2]), velocity if known else None, place[:2])
+
+
 class NearestState:
     """Keeps the newest states, from any thread, and gives the one that is nearest in time."""
 

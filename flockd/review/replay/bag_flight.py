@@ -23,10 +23,14 @@ from flockd.core.messages import UInt8Array, VehicleState
 from flockd.fleet.ros.message_trees import COMPRESSED_IMAGE, IMU
 from flockd.fleet.ros.ros_input import (
     LONGEST_GAP_S,
+    PX4_ATTITUDE,
+    PX4_ODOMETRY,
+    PX4_STATES,
     STATES,
     NearestState,
     RosImage,
     image_of,
+    px4_state,
     stamp_ns,
     vehicle_state,
 )
@@ -81,7 +85,7 @@ def recording_of_bag(
             raise UsageError(f"{bag.path}: has no images of camera {camera} in {topic}; topics with images: {there}")
     _compare_lenses(bag, config, kinds)
     began_ns = next((stamp_ns(bag.read(one)) for one in bag.messages(topics)), 0)
-    states = _states(bag, _vehicle_topic(bag, vehicle_topic), config, began_ns)
+    states = _states(bag, _vehicle_topic(bag, vehicle_topic), config, began_ns, tell)
     steps, kept, lost = 0, 0, Counter[str]()
     with McapFile(target) as file:
         facts = {"format": FORMAT, "drone": config.name, "images": "png", "recording": uuid.uuid4().hex}
@@ -178,30 +182,43 @@ def _decoded_png(data: bytes, size: tuple[int, int]) -> UInt8Array:
     return np.asarray(image, np.uint8)
 
 
-def _states(bag: Bag, topic: str, config: DroneConfig, began_ns: int) -> NearestState:
+def _states(bag: Bag, topic: str, config: DroneConfig, began_ns: int, tell: Callable[[str], None]) -> NearestState:
     """All of the bag."""
-    if bag.kinds()[topic] == IMU and config.perception.scale == "height":
+    if bag.kinds()[topic] in {IMU, PX4_ATTITUDE} and config.perception.scale == "height":
         raise UsageError(
             f"{bag.path}: {topic} has an attitude and no height; set perception.scale to `network`, or name "
             "odometry with --vehicle"
         )
-    states = NearestState(kept=None)
+    states, own_clock = NearestState(kept=None), False
     for message in bag.messages([topic]):
         content = bag.read(message)
-        states.add(vehicle_state(message.kind, content, _time_s(stamp_ns(content), began_ns)))
+        if message.kind not in PX4_STATES:
+            stamp = stamp_ns(content)
+        elif abs((stamp := 1000 * int(content.timestamp)) - message.time_ns) > _OF_ONE_CLOCK_NS:
+            own_clock, stamp = True, message.time_ns
+        state = vehicle_state if message.kind not in PX4_STATES else px4_state
+        states.add(state(message.kind, content, _time_s(stamp, began_ns)))
+    if own_clock:
+        tell(
+            f"{bag.path}: stamps of {topic} are of the autopilot's own clock; the times at which it was recorded count"
+        )
     return states
+
+
+_OF_ONE_CLOCK_NS = 1_000_000_000
+"""Stamps of PX4 that are not so near the recording's times are since its start, not since 1970."""
 
 
 def _vehicle_topic(bag: Bag, wanted: str | None) -> str:
     """The topic that is named, or the only one of the best kind there is. Raises UsageError."""
-    kinds = bag.kinds()
+    kinds, known = bag.kinds(), (*STATES[:1], PX4_ODOMETRY, *STATES[1:], PX4_ATTITUDE)
     if wanted is not None:
-        if kinds.get(wanted) not in STATES:
+        if kinds.get(wanted) not in known:
             raise UsageError(
-                f"{bag.path}: {wanted} is {kinds.get(wanted, 'not in it')}; name one of {', '.join(STATES)}"
+                f"{bag.path}: {wanted} is {kinds.get(wanted, 'not in it')}; name one of {', '.join(known)}"
             )
         return wanted
-    for kind in STATES:
+    for kind in known:
         topics = sorted(topic for topic, its in kinds.items() if its == kind)
         if len(topics) == 1:
             return topics[0]
@@ -254,13 +271,17 @@ class Bag:
 
     def __init__(self, folder: Path) -> None:
         from rosbags.rosbag2 import Reader, ReaderError  # noqa: PLC0415 - of an extra
+        from rosbags.typesys import TypesysError, get_types_from_msg  # noqa: PLC0415 - of an extra
 
         self.path = folder
         self._store = _store()
         try:
             self._reader = Reader(folder)
             self._reader.open()
-        except (ReaderError, OSError, ValueError, KeyError) as error:
+            for one in self._reader.connections:  # such as PX4's, as the bag defines them
+                if one.msgtype not in self._store.fielddefs and one.msgdef.data:
+                    self._store.register(get_types_from_msg(one.msgdef.data, one.msgtype))
+        except (ReaderError, TypesysError, OSError, ValueError, KeyError) as error:
             raise RecordingError(f"{folder}: is no bag that can be read ({error}); use another copy") from error
 
     def __enter__(self) -> Self:

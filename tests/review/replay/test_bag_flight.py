@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from flockd.cli import main
 from flockd.core.config import load_drone
@@ -98,6 +98,23 @@ def info(time_ns: int, focal_px: float) -> Any:
     )  # fmt: skip
 
 
+PX4 = "px4_msgs/msg/VehicleOdometry"
+STORE.register(
+    get_types_from_msg(
+        "uint64 timestamp\nuint8 pose_frame\nfloat32[3] position\nfloat32[4] q\n"
+        "uint8 velocity_frame\nfloat32[3] velocity",
+        PX4,
+    )
+)
+
+
+def px4_odometry(stamp_us: int, place: FloatArray) -> Any:
+    """In NED, facing east: the body's 2 m/s ahead are east."""
+    turn = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)], np.float32)
+    position, ahead = place.astype(np.float32), np.array([2.0, 0.0, 0.0], np.float32)
+    return kind(PX4)(timestamp=stamp_us, pose_frame=1, position=position, q=turn, velocity_frame=3, velocity=ahead)
+
+
 def bag(
     folder: Path,
     states: str = ODOMETRY,
@@ -124,7 +141,12 @@ def bag(
             time_ns = BEGAN_NS + 20_000_000 * tick
             for topic in topics:
                 place = np.array([1.0, 0.04 * tick, 3.0])
-                write(topic, states, time_ns, odometry(time_ns, place) if "Odom" in states else imu(time_ns))
+                if states == PX4:
+                    own_us = 20_000 * tick if topic == "/own" else time_ns // 1000
+                    message = px4_odometry(own_us, np.array([0.04 * tick, 1.0, -3.0]))
+                else:
+                    message = odometry(time_ns, place) if "Odom" in states else imu(time_ns)
+                write(topic, states, time_ns, message)
             if tick % 5 == 0:
                 front = picture(tick, "front")
                 if corner is not None:
@@ -252,3 +274,20 @@ def test_a_part_of_a_bag_is_told_to_be_one(tmp_path: Path, capsys: pytest.Captur
     (theirs / "metadata.yaml").unlink()
     assert main(["replay", str(theirs)]) == 1
     assert "has no metadata.yaml of a bag, which `ros2 bag reindex` writes" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("topic", ["/fmu/out/vehicle_odometry", "/own"])
+def test_px4s_own_odometry_is_the_vehicles_state(topic: str, tmp_path: Path) -> None:
+    """On either clock: the bag's, or since PX4's start, which is told."""
+    told = list[str]()
+    with Bag(bag(tmp_path / "bag", PX4, (topic,))) as theirs:
+        recording_of_bag(theirs, load_drone(config_file(tmp_path)), None, tmp_path / "flight.mcap", told.append)
+    assert ["of the autopilot's own clock" in one for one in told] == ([True] if topic == "/own" else [])
+    steps = list(Recording(tmp_path / "flight.mcap").steps())
+    assert len(steps) == 5
+    for number, step in enumerate(steps):
+        assert (step.vehicle.position is not None, step.vehicle.velocity_ned is not None) == (True, True)
+        np.testing.assert_allclose(step.vehicle.position, [0.04 + 0.4 * number, 1.0], atol=1e-6)  # type: ignore[arg-type]
+        np.testing.assert_allclose(step.vehicle.velocity_ned, [0.0, 2.0, 0.0], atol=1e-6)  # type: ignore[arg-type]
+        np.testing.assert_allclose(step.vehicle.R_ned_body[:, 0], [0.0, 1.0, 0.0], atol=1e-6)
+        assert step.vehicle.height_m == 3.0
