@@ -21,7 +21,7 @@ from flockd.onboard.telemetry import TelemetrySink, publish_step
 from flockd.onboard.telemetry.order_messages import parse_ask, parse_order
 from flockd.onboard.telemetry.preview import Previews
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
-from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage, FlightMessage, ReasonMessage
+from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage, EventMessage, FlightMessage, ReasonMessage
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.control_loop import Commands, ControlLoop
 from flockd.sim.scenario import ScenarioConfig
@@ -61,7 +61,8 @@ class Repeater:
     def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
         """See `TelemetrySink`."""
         with self._lock:
-            self._newest[drone, topic] = message
+            if topic != "events":  # each happened once
+                self._newest[drone, topic] = message
             self._sink.publish(drone, topic, message)
 
     def _repeat(self) -> None:
@@ -93,6 +94,8 @@ class FlockTelemetry:
         self._checks = {i: OrderChecks(announcer.identity, time.monotonic) for i in self._drones}
         self._stepped: dict[int, tuple[FrameSet | None, VehicleState, PilotOutput]] = {}
         """The newest step of each; without frames on exact states."""
+        self._told = dict.fromkeys(self._drones, State.NORMAL.value)
+        """The state of each that the last event has told, with its reasons."""
         self._drawn = _DrawnOnRequest(scenario)
         self._rig = build_rig(scenario.drone.rig)
         for i in self._drones:
@@ -111,6 +114,7 @@ class FlockTelemetry:
         """Another flight begins, with all drones."""
         with self._lock:
             self._orders, self._requests, self._stepped = {}, {}, {}
+        self._told = dict.fromkeys(self._drones, State.NORMAL.value)
         self._drawn.begin_again()
         self.disturb(UNDISTURBED)
 
@@ -122,7 +126,14 @@ class FlockTelemetry:
             self._sink.forget(f"drone{i + 1}")
         for i in before.removed - disturbed.removed:
             self._announce(i)
+        for i, camera in sorted(disturbed.cameras_off ^ before.cameras_off):
+            self._tell(i, f"camera {camera} was switched {'off' if (i, camera) in disturbed.cameras_off else 'on'}")
         self._drawn.disturbed = disturbed
+
+    def _tell(self, drone: int, sentence: str) -> None:
+        stepped = self._stepped.get(drone)
+        time_s = stepped[1].time_s if stepped else 0.0
+        self._sink.publish(f"drone{drone + 1}", "events", {**EventMessage(time_s=time_s, event=sentence)})
 
     def take_requests(self, time_s: float, loop: ControlLoop, vehicles: Vehicles) -> None:
         """Has drones held, or fly on, as operators have asked since the last step."""
@@ -136,6 +147,9 @@ class FlockTelemetry:
         for i in self._there():
             _, vehicle, output = self._stepped[i]
             (state, why), reasons = loop.status(i), [reason.text for reason in output.reasons]
+            if (told := f"{state.value}: {'; '.join(why)}".removesuffix(": ")) != self._told[i]:
+                self._told[i] = told
+                self._tell(i, told)
             held = state is State.ASKING
             state = State.DEGRADED if state is State.NORMAL and reasons else state
             message = FlightMessage(
@@ -193,6 +207,7 @@ class FlockTelemetry:
             self._take(drone, command, payload)
         except ValueError as error:
             self._refused[drone] += 1
+            self._tell(drone, f"{command:.40} was refused: {error}")
             return AnswerMessage(accepted=False, sentence=str(error))
         return AnswerMessage(accepted=True, sentence=f"{command} is being tried; the drone's state shows the result")
 
@@ -211,6 +226,7 @@ class FlockTelemetry:
         if fault is not None:
             raise ValueError(fault)
         checks.take(command, ask)
+        self._tell(drone, f"{ask['operator']} ordered {command}")
         with self._lock:
             if order is None:
                 self._requests[drone] = command

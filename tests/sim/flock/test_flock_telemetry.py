@@ -66,6 +66,9 @@ def test_a_drone_is_held_where_it_would_stop_and_flies_on_when_it_is_resumed(mon
     assert told == [("normal", "simulated")] * 20 + [("asking", "hold")] * 20 + [("normal", "simulated")] * 20
     (why,) = watching.flights["drone1"][30]["reasons"]
     assert why["sentence"].endswith("asked for Hold")
+    ordered, asking, resumed, normal = watching.events
+    assert (ordered, resumed) == (("drone1", "anna ordered hold"), ("drone1", "anna ordered resume"))
+    assert (asking, normal) == (("drone1", f"asking: {why['sentence']}"), ("drone1", "normal"))
     speed_m_s = np.linalg.norm(log.velocity[:, 0, :2], axis=1)
     assert speed_m_s[20] > 0.8
     assert speed_m_s[30:40].max() < 0.05
@@ -87,6 +90,8 @@ def test_newest_messages_are_sent_again_while_the_simulation_computes() -> None:
     with Repeater(Sink(), every_s=0.01) as repeater:
         repeater.publish("drone1", "state", {"time_s": 1})
         repeater.publish("drone1", "state", {"time_s": 2})
+        repeater.publish("drone1", "events", {"time_s": 3})
         assert again.wait(30.0)
     assert sent[0] == ("drone1", "state", 1)
+    assert sent.count(("drone1", "events", 3)) == 1, "it happened once"
     assert sent[1:].count(("drone1", "state", 1)) <= len(sent) - 4

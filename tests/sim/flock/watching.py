@@ -26,6 +26,7 @@ class Watching:
         self.states: dict[str, list[Mapping[str, object]]] = {}
         self.flights: dict[str, list[Mapping[str, Any]]] = {}
         self.commands: list[tuple[str, Mapping[str, object]]] = []
+        self.events: list[tuple[str, object]] = []
         self.asked = 0
 
     def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
@@ -39,6 +40,8 @@ class Watching:
             self.states.setdefault(drone, []).append(message)
         if topic == "flight":
             self.flights.setdefault(drone, []).append(message)
+        if topic == "events":
+            self.events.append((drone, message["event"]))
         if topic == "command":
             self.commands.append((drone, message))
 
