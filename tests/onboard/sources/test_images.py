@@ -29,11 +29,12 @@ def test_a_jpeg_keeps_its_colours_and_its_place() -> None:
     assert right[2] > 200
 
 
-def test_a_jpeg_may_leave_out_the_tables_that_all_cameras_share_and_end_in_zeros() -> None:
+def test_a_jpeg_may_leave_out_the_tables_that_all_cameras_share_and_be_padded() -> None:
     whole = jpeg(scene())
     bare = _without_huffman_tables(whole)
     assert len(bare) < len(whole) - 400
-    np.testing.assert_array_equal(MjpegFormat(SIZE).decode(bare + bytes(513)), MjpegFormat(SIZE).decode(whole))
+    for padding in (bytes(513), b"\xff\xff\x55" * 171):  # whatever the driver's buffer held
+        np.testing.assert_array_equal(MjpegFormat(SIZE).decode(bare + padding), MjpegFormat(SIZE).decode(whole))
 
 
 @pytest.mark.fault("damaged-images")
