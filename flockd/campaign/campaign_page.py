@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -148,12 +149,15 @@ def parameter_curves(results: Results, figure: Figure) -> Drawing:
                     (value, list(results.by_seed(figure, results.cells_with({**of_case, parameter: value})).values()))
                     for value in results.values_of(parameter)
                 ]
-                _band(axes, points, colour, case, is_share=MEASURES[figure].is_share)
+                _band(axes, points, colour, case, is_share=MEASURES[figure].is_share, unit=MEASURES[figure].unit)
             axes.set_xlabel(parameter)
         for axes in panels.flat[len(parameters) :]:
             axes.set_axis_off()
         for axes in panels[:, 0]:
-            axes.set_ylabel(label_of(figure))
+            axes.set_ylabel(textwrap.fill(label_of(figure), 26))
+            low, high = axes.get_ylim()
+            if high - low < 0.2 and np.ptp(axes.dataLim.intervaly) == 0.0:  # a constant, which is no scatter of 0.04
+                axes.set_ylim(low - 0.5, high + 0.5)
         if len(cases) > 1:
             drawing.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=len(cases))
     return drawing
@@ -170,7 +174,7 @@ def shown(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _band(axes: Axes, points: Points, colour: str, label: str | None, *, is_share: bool) -> None:
+def _band(axes: Axes, points: Points, colour: str, label: str | None, *, is_share: bool, unit: str) -> None:
     known = [(value, seeds) for value, seeds in points if len(seeds)]
     if not known:
         axes.text(0.5, 0.5, "no numbers to draw", transform=axes.transAxes, ha="center", color=MUTED)
@@ -181,6 +185,7 @@ def _band(axes: Axes, points: Points, colour: str, label: str | None, *, is_shar
     intervals = [mean_interval(s, is_share=is_share and set(s) <= {0.0, 1.0}) for _, s in known]
     means = np.array([np.mean(seeds) for _, seeds in known])
     ends = np.array([(np.nan, np.nan) if i is None else (i.low, i.high) for i in intervals])
+    ends = np.clip(ends, 0.0, 1.0) if is_share or unit == "of 1" else ends
     if numeric and len(places) > 1:
         axes.plot(places, means, color=colour, marker="o", markersize=3.5, label=label)
         axes.fill_between(places, ends[:, 0], ends[:, 1], color=colour, alpha=0.2, linewidth=0)
