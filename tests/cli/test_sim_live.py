@@ -145,7 +145,7 @@ async def test_a_flock_flies_where_the_page_sends_it_and_stands_still_when_it_is
         await page.until(lambda: page.now["paused"])
         await page.until(lambda: page.rows["drone1"]["rate_hz"] is None)  # nothing new has come for a while
         stood_s, places = page.now["time_s"], {drone: page.place(drone) for drone in page.rows}
-        page.states = {}
+        page.states, page.events = {}, []
         for _ in range(10):  # of the page's messages, longer than a message of a drone counts as new
             await page.until(lambda: True)
         assert page.now["time_s"] == stood_s, "no step"
