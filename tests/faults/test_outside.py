@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 async def _flies_on(ship: Aboard) -> None:
     await ship.steps_on()
-    assert ship.fake_autopilot.mode == "OFFBOARD"
+    assert ship.fake_autopilot.mode == "OFFBOARD", "; ".join(ship.events)
     assert not ship.ending.done()
 
 
