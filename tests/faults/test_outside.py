@@ -50,7 +50,7 @@ async def test_the_router_of_the_telemetry_goes_and_comes_back(in_flight: InTheA
         sent = [at_s for at_s, _ in list(ship.fake_autopilot.setpoints) if at_s > gone_s]
         gaps = [after - before for before, after in itertools.pairwise(sent)]
         assert max(gaps) < 0.5, "PX4 wants two setpoints a second"
-        router, keys = _router(endpoint)
+        router, keys = await asyncio.to_thread(_router, endpoint)
         await until(lambda: "flockd/v1/test/tiny/flight" in keys, 60.0)
         router.close()
 
@@ -59,17 +59,18 @@ async def test_the_router_of_the_telemetry_goes_and_comes_back(in_flight: InTheA
 async def test_nonsense_on_the_telemetry_bus(in_flight: InTheAir) -> None:
     """The drone reads nothing but questions; `hold` is not among `telemetry.commands` of this one."""
     async with in_flight() as ship:
-        session = zenoh.open(client(ship.config.telemetry.listen[0]))
+        # In threads: the drone flies on this event loop, and a session takes its time.
+        session = await asyncio.to_thread(zenoh.open, client(ship.config.telemetry.listen[0]))
         key = "flockd/v1/test/tiny"
         for payload in (b"\xff\x00", b"[" * 10_000, b"", json.dumps({"time_s": "now"}).encode()):
             for topic in ("state", "flight", "ask/hold", "ask/land", "about", "alive", "image/front", "x/y/z"):
-                session.put(f"{key}/{topic}", payload)
+                await asyncio.to_thread(session.put, f"{key}/{topic}", payload)
         for question in ("ask/hold", "ask/HOLD", "ask/land/now", "ask/*", "image/none", "image/" + "x" * 500):
             await asyncio.to_thread(_asked, session, f"{key}/{question}")
         assert (await ship.ask("ask/hold"))["accepted"] is False
         await _flies_on(ship)
         assert not any("asked for land" in event for event in ship.events)
-        session.close()  # type: ignore[no-untyped-call]
+        await asyncio.to_thread(session.close)
 
 
 def _asked(session: zenoh.Session, question: str) -> None:
