@@ -179,7 +179,7 @@ CHANGED = (
         ("battery-or-estimate", _sets(battery_share=0.05), "battery_low", ("silent: ",), "LOITER"),
         ("battery-or-estimate", _sets(battery_share=0.05), "battery_low", ("silent: ",), "RTL"),
         ("battery-or-estimate", _sets(estimate_ok=False), "position_lost", ("silent: ",), "LOITER"),
-        ("others-interfere", partial(Foreigner, north_m_s=0.0, east_m_s=3.0), "foreign_setpoints", FOREIGN, "LOITER"),
+        ("others-interfere", partial(Foreigner, north_m_s=0.0, east_m_s=1.0), "foreign_setpoints", FOREIGN, "LOITER"),
         ("others-interfere", partial(_parameter, COM_OBL_RC_ACT=-1), "parameters_unsuitable", CHANGED, "LOITER"),
         ("frame-jumps", _jumps(0.0, 0.0, -4.0), "frame_jumped", FRAME, "LOITER"),
         ("frame-jumps", _jumps(0.0, 0.0, 30.0), "frame_jumped", FRAME, "LOITER"),

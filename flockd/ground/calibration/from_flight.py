@@ -83,7 +83,7 @@ def corrected_rig(
 ) -> dict[str, Any]:
     """Writes the recording's rig, corrected by what `found_rig` found, to ``out`` and gives the result.
 
-    What is not known well, and what differs by less than three standard deviations, stays as it was configured.
+    What is not known well, and what differs by less than four standard deviations, stays as it was configured.
     Raises CalibrationError where nothing is to be taken over.
     """
     found = {one.camera: one for one in deviations}
@@ -152,4 +152,4 @@ def _offset_s(found: Sequence[CameraDeviation]) -> tuple[float | None, str | Non
     if apart_s.max() > MAX_OFFSET_S:
         worst = known[int(apart_s.argmax())].camera
         note = f"the time of camera {worst!r} is {1e3 * apart_s.max():.0f} ms off the others'; the offset is their mean"
-    return (mean_s, note) if abs(mean_s) > 3.0 * sigma_s else (None, note)
+    return (mean_s, note) if abs(mean_s) > 4.0 * sigma_s else (None, note)

@@ -67,8 +67,9 @@ _MOVES_M, _MOVES_RAD = 0.2, math.radians(1.0)
 that is elsewhere."""
 WORTH_TURN_RAD, WORTH_OFFSET_S, WORTH_FOCAL = math.radians(0.5), 0.01, 0.01
 """What is less is not worth a warning: half a degree puts a drone at 10 m by 0.09 m, and 1 % a range by 1 %."""
-_SURE, _SURE_OF_TURN = 9.0, 14.16
-"""Squares of three standard deviations of one number, and what as few of three numbers together exceed (99.73 %)."""
+_SURE, _SURE_OF_TURN = 16.0, 22.06
+"""Squares of four standard deviations of one number, and what as few of three numbers together exceed (1 in 15,800): it
+is asked of every camera before every flight."""
 _SIZE, _SHARED = 5, 5
 _TURN, _OFFSET, _FOCAL = slice(0, 3), 3, 4
 _LASTING = np.diag(np.array([math.radians(0.1)] * 3 + [1.5e-3, 3e-3]) ** 2)
@@ -113,7 +114,7 @@ class Seen:
 
 
 class Differs(NamedTuple):
-    """Which numbers of a camera differ from the configured ones by three standard deviations and more."""
+    """Which numbers of a camera differ from the configured ones by four standard deviations and more."""
 
     turn: bool
     time: bool

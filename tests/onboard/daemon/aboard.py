@@ -221,7 +221,10 @@ class Watched:
         await until(lambda: self.state() in states, SECONDS_TO_FAIL)
 
     async def until_event(self, beginning: str) -> None:
-        await until(lambda: any(event.startswith(beginning) for event in self.events), SECONDS_TO_FAIL)
+        try:
+            await until(lambda: any(event.startswith(beginning) for event in self.events), SECONDS_TO_FAIL)
+        except AssertionError as problem:
+            raise AssertionError(f"no event begins with {beginning!r}: {self.events}") from problem
 
     async def until_matters(self, *events: str, over: tuple[str, ...] = ()) -> None:
         """Until these events of the supervisor are there, and those that are ``over`` are not."""
