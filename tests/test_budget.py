@@ -25,7 +25,7 @@ LINES = {
     "flockd/onboard": 9_130,
     "flockd/fleet": 2_700,
     "flockd/ground": 4_390,
-    "flockd/review": 3_560,
+    "flockd/review": 3_570,
     "flockd/sim": 8_590,
     "flockd/campaign": 1_480,
     "flockd/cli": 3_500,

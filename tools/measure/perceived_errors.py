@@ -32,9 +32,8 @@ import yaml
 from flockd.core.data import data_path
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.geometry import build_rig
-from flockd.review.flight_log.builder import match_neighbours
+from flockd.review.flight_log.builder import ASSOCIATED_M, match_neighbours
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.report.summary import ASSOCIATED_M
 from flockd.sim.flock.exact_states import TrackedNeighbours
 from flockd.sim.scenario import DetectionsConfig, ScenarioConfig, load_scenario
 

@@ -11,6 +11,10 @@ from flockd.core.messages import BoolArray, FloatArray, MissionStatus, PilotOutp
 from flockd.review.flight_log.log import SHAPES, FlightLog, shape_of
 from flockd.review.flight_log.metadata import FlightMetadata, LearnedSize
 
+ASSOCIATED_M = 3.0
+"""A track so near to a drone is that drone's, however wrong: no large error of a distance is left out, and none counts
+as a false neighbour."""
+
 
 class FlightLogBuilder:
     """Builds the log of ``drones`` drones whose steps begin at ``times`` (S,) s; NaN where nothing is added."""
@@ -94,17 +98,16 @@ class FlightLogBuilder:
             self._stages.setdefault(stage, []).append(ms)
 
     def _match(self, step: int, i: int, output: PilotOutput) -> None:
-        """Match confirmed tracks to true drones; those without a match are false."""
+        """Match confirmed tracks to true drones; those near none are false."""
         others = [j for j in range(self._drones) if j != i]
         true = self._rows["position"][step, others] - self._rows["position"][step, i]
         confirmed = [n for n in output.neighbours if n.confirmed]
         tracked = np.array([n.position for n in confirmed]).reshape(-1, 3)
-        matches = match_neighbours(tracked, true)
-        for estimate, truth in matches:
+        for estimate, truth in match_neighbours(tracked, true):
             self._rows["neighbour_position"][step, i, others[truth]] = confirmed[estimate].position
             self._rows["neighbour_velocity"][step, i, others[truth]] = confirmed[estimate].velocity
-        matched = {estimate for estimate, _ in matches}
-        false = {n.track for k, n in enumerate(confirmed) if k not in matched} - self._false_so_far[i]
+        associated = {estimate for estimate, _ in match_neighbours(tracked, true, ASSOCIATED_M)}
+        false = {n.track for k, n in enumerate(confirmed) if k not in associated} - self._false_so_far[i]
         self._false_so_far[i] |= false
         self._rows["false_tracks"][step, i] = len(false)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import BoolArray, FloatArray
-from flockd.review.flight_log.builder import match_neighbours
+from flockd.review.flight_log.builder import ASSOCIATED_M, match_neighbours
 from flockd.review.flight_log.log import FlightLog, spread
 from flockd.review.metrics import closest_distances, connectivity, obj1, obj2, order, safety, union
 
@@ -20,8 +20,6 @@ CONVERGENCE_BAND = {"obj1": 0.05, "obj2": 0.2}
 RECALL_RANGE_M = 10.0
 HOVERS_M_S = 0.1
 """Slower on the mean, a flock has no direction of flight that its drones could share."""
-ASSOCIATED_M = 3.0
-"""A track so near to a drone is that drone's, however wrong: no large error of a distance is left out."""
 SAME_GOAL_M = 1e-6
 NEAR_M = 1.0
 """To an obstacle."""
@@ -292,8 +290,9 @@ def _tracks(log: FlightLog) -> tuple[FloatArray, BoolArray]:
     keys, starts = np.unique(rows[:, :2].astype(int), axis=0, return_index=True)
     for (step, observer), tracks in zip(keys, np.split(rows[:, 3:], starts)[1:], strict=True):
         true = np.delete(relative[step, observer], observer, axis=0)
-        has_false[step, observer] = len(match_neighbours(tracks, true)) < len(tracks)
-        for track, drone in match_neighbours(tracks, true, ASSOCIATED_M):
+        associated = match_neighbours(tracks, true, ASSOCIATED_M)
+        has_false[step, observer] = len(associated) < len(tracks)
+        for track, drone in associated:
             errors.append(float(np.linalg.norm(tracks[track]) - np.linalg.norm(true[drone])))
     return np.array(errors), has_false
 

@@ -237,9 +237,9 @@ def test_every_track_near_a_drone_counts_with_its_error_and_any_other_as_false()
     tracked = np.vstack([ghosts, np.column_stack([steps, 0 * steps, 0 * steps + 1, far])])
     neighbours = summarise(replace(log, tracked=tracked))["neighbours"]
     assert neighbours["associated_error_m"] == pytest.approx(dict.fromkeys(("mean", "median", "p95", "max"), 2.5))
-    assert neighbours["false_share"] == pytest.approx(18 / 60), "beyond 1 m the far one is false as well"
+    assert neighbours["false_share"] == pytest.approx(9 / 60), "the far one is a wrong distance, not a false neighbour"
     first = summarise(replace(log, tracked=tracked[9:]))["neighbours"]
-    assert first["false_share"] == pytest.approx(18 / 60)
+    assert first["false_share"] == 0.0
 
 
 def test_a_flight_with_exact_states_has_no_estimates_and_is_the_truth() -> None:
