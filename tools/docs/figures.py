@@ -140,6 +140,11 @@ def _px4(parts: Mapping[str, Part]) -> str:
     return _table(head, rows) + "\n" + _origin(parts["px4"])
 
 
+def _px4_stories(parts: Mapping[str, Part]) -> str:
+    rows = list(parts["px4_stories"]["found"].items())
+    return _table(("story", "with PX4"), rows) + "\n" + _origin(parts["px4_stories"])
+
+
 def _step(parts: Mapping[str, Part]) -> str:
     stages = parts["step"]["found"]["profile"]["stages"]
     rows = [(name, f"{one['p50_ms']:.1f}", f"{one['p95_ms']:.1f}") for name, one in stages.items()]
@@ -154,6 +159,7 @@ TABLES: dict[str, Callable[[Mapping[str, Part]], str]] = {
     "encounters": _encounters,
     "pictures": _pictures,
     "px4": _px4,
+    "px4_stories": _px4_stories,
     "step": _step,
 }
 

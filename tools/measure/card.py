@@ -10,7 +10,8 @@ Beside each flight by sight stand, on the same seed, a blind one, whose drones d
 true states of all: what the blind flock matches is no achievement. A run that was stopped goes on: RESULTS/COMMIT-*
 has a line for each flight, and the logs of those by sight. `errors`: what drones perceive wrongly in these flights,
 for config/perceived. `encounters`: two drones that meet on made-up detections with such errors. `pictures`: real ones,
-with --labelled and --without-drones. `px4`: where FLOCKD_PX4 names a build. `step`: on this computer.
+with --labelled and --without-drones. `px4` and `px4_stories` (of faults): where FLOCKD_PX4 names a build. `step`: on
+this computer.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import os
 import platform
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -33,6 +35,7 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import yaml
 from scipy.stats import binom
@@ -373,6 +376,19 @@ def _output(*words: str) -> str:
     return ended.stdout
 
 
+def _stories() -> dict[str, str]:
+    """What became of each story of a fault that PX4 flies: "passed", or else."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "stories.xml"
+        _output("-m", "pytest", "-q", "-m", "fault", "-k", "not fake", "tests/sitl", f"--junitxml={file}")
+        cases = list(ElementTree.parse(file).iter("testcase"))
+    told = {case.attrib["name"].removeprefix("test_"): [one.tag for one in case] for case in cases}
+    return {
+        name.replace("_", " "): next((tag for tag in ("failure", "error", "skipped") if tag in tags), "passed")
+        for name, tags in told.items()
+    }
+
+
 def commit_of(root: Path) -> str:
     """The commit that is checked out. Raises SystemExit where what flies differs from it."""
     changed = git(root, "status", "--porcelain", "--", "flockd", "models", "config")
@@ -416,13 +432,15 @@ def _part(part: str, commit: str, arguments: argparse.Namespace, known: dict[str
         found = _pictures(arguments.labelled, arguments.without_drones)
     elif part == "px4":
         found = json.loads(_output("-m", "tools.checks.px4_rows", "--json"))["flights"]
+    elif part == "px4_stories":
+        found = _stories()
     elif part == "step":
         recording = "tests/review/replay/crossing.mcap"
         found = json.loads(_flockd("replay", recording, "--profile", "--json"))
     return {**_measured_by(commit, f"python -m tools.measure.card{' --quick' * quick} --parts {part}"), "found": found}
 
 
-PARTS = ("flights", "errors", "encounters", "pictures", "px4", "step")
+PARTS = ("flights", "errors", "encounters", "pictures", "px4", "px4_stories", "step")
 
 
 def main() -> None:
@@ -441,7 +459,7 @@ def main() -> None:
     arguments = parser.parse_args()
     commit = commit_of(ROOT)
     missing = set() if arguments.labelled or arguments.without_drones else {"pictures"}
-    missing |= set() if "FLOCKD_PX4" in os.environ else {"px4"}
+    missing |= set() if "FLOCKD_PX4" in os.environ else {"px4", "px4_stories"}
     for part in arguments.parts or [part for part in PARTS if part not in missing]:
         known = json.loads(arguments.out.read_text(encoding="utf-8")) if arguments.out.is_file() else {}
         measured = _part(part, commit, arguments, known.get(part, {}))
