@@ -24,12 +24,12 @@ LINES = {
     "flockd/flight": 11_130,
     "flockd/onboard": 9_130,
     "flockd/fleet": 2_700,
-    "flockd/ground": 4_390,
+    "flockd/ground": 4_610,
     "flockd/review": 3_570,
     "flockd/sim": 8_590,
     "flockd/campaign": 1_480,
-    "flockd/cli": 3_500,
-    "tests": 37_280,
+    "flockd/cli": 3_560,
+    "tests": 37_390,
     "tools/checks": 2_060,
     "tools/docs": 860,
     "tools/measure": 1_510,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 328}
+FILES = {"flockd": 329}
 NUMBERS_OF_FLIGHT = 270
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02

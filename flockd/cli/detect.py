@@ -6,8 +6,10 @@ import argparse
 import os
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from flockd.cli.options import camera_of, loaded
@@ -18,16 +20,17 @@ from flockd.core.errors import ExitCode, UsageError
 if TYPE_CHECKING:
     from flockd.core.config import DroneConfig
     from flockd.core.config.perception import PerceptionConfig
-    from flockd.core.messages import UInt8Array
     from flockd.flight.geometry import Camera
     from flockd.ground.pictures.copies import Copies
-    from flockd.ground.pictures.picture_files import PictureFile
-    from flockd.ground.pictures.single_frame import DetectedDrone, PictureDetector
+    from flockd.ground.pictures.picture_files import Picture, PictureFile
+    from flockd.ground.pictures.single_frame import DetectedDrone, PictureDetector, PictureResult
+    from flockd.ground.pictures.video_tracks import VideoTracker
 
 MIN_FOV_DEG, MAX_FOV_DEG = 4.0, 170.0
 """Less are radians, or a telescope's."""
 NOTES = """\
 Larger pictures are resized to 1280 pixels for the networks; boxes are in pixels of the picture.
+Drones of a video are followed from frame to frame, each by its number; they count once half a second has shown them.
 A picture that cannot be read is reported and left out, and the exit code is 1."""
 
 
@@ -35,13 +38,16 @@ def add(commands: Commands) -> None:
     """Adds the command."""
     examples = (
         "flockd detect photograph.jpg --fov 70 --out drawn",
-        "flockd detect pictures/ clip.mp4 --every 10 --fov 70 --json",
+        "flockd detect clip.mp4 --fov 70 --out annotated.mp4",
+        "flockd detect pictures/ clip.mp4 --every 3 --fov 70 --json",
         "flockd detect front/ --config my_drone.yaml --camera front",
         "flockd detect photograph.jpg --fov 70 --drone-size 0.35",
     )
     parser = commands("detect", "Detect drones in pictures, with the code that flies.", examples, _run, notes=NOTES)
     option(parser, "PICTURES", "images, folders of them, videos", Path, nargs="+")
-    option(parser, "--out FOLDER", "write copies of the pictures with the detections drawn in", Path)
+    option(
+        parser, "--out PATH", "write copies of the pictures with the detections drawn in: a folder, or one .mp4", Path
+    )
     flag(parser, "--force", "overwrite what is there")
     option(
         parser,
@@ -67,13 +73,15 @@ def add(commands: Commands) -> None:
 _COLOUR = 1.0
 """Grey levels by which the channels of a picture differ on average; less is no colour."""
 _FIGURES = ("probability", "range_m", "range_sigma_m", "size_m")
+_HEADS = ("probability", "range, m", "size, m")
 
 
 @dataclass(frozen=True)
 class _Detected:
     """One picture with what was found in it."""
 
-    name: str
+    file: PictureFile
+    picture: Picture
     detections: tuple[DetectedDrone, ...]
     proposals: int
     seconds: float
@@ -99,9 +107,11 @@ def _run(args: argparse.Namespace) -> int:
         raise DatasetError("\n".join(left_out))
     result = {**_result(detected), "left_out": left_out}
     if not args.json:
-        _say_detections(detected)
+        _say_detections(detected, result)
         found = {"detections": sum(len(one.detections) for one in detected)}
-        result = found | {name: fact for name, fact in result.items() if name not in {"pictures", "left_out"}}
+        result = found | {
+            name: fact for name, fact in result.items() if name not in {"pictures", "drones_of_videos", "left_out"}
+        }
     say_facts(args, result)
     if copies is not None:
         complain(f"written: {copies.written} {'copy' if copies.written == 1 else 'copies'} in {args.out}")
@@ -160,30 +170,52 @@ def _detected(
     import numpy as np
 
     from flockd.ground.pictures.copies import annotated
+    from flockd.ground.pictures.video_tracks import VideoTracker
 
     count = sum(picture.count(args.every) for picture in pictures)
+    done = 0
     with progress("detecting", "pictures") as tell:
-        done = 0
         for picture in pictures:
-            for name, image in _readable(picture, args.every, left_out):
-                size = (image.shape[1], image.shape[0])
-                if camera is not None and camera.size != size:
-                    raise UsageError(
-                        f"{name}: is {size[0]} x {size[1]} pixels, and the camera of {args.config} {camera.size[0]} x "
-                        f"{camera.size[1]}; give pictures of that camera, or --fov too"
-                    )
-                begin = time.perf_counter()
-                result = detector.detect(image, camera, fov_deg=args.fov).at_least(args.min_probability)
-                seconds = time.perf_counter() - begin
-                if copies is not None:
-                    copies.write(picture, name, annotated(image, result))
-                has_colour = bool(np.ptp(image[::8, ::8], axis=2).mean() >= _COLOUR)
-                yield _Detected(name, result.detections, result.proposals, seconds, has_colour)
-                done += 1
-                tell(done, max(done, count))
+            tracker = VideoTracker() if picture.is_video else None
+            with nullcontext() if copies is None else copies.of(picture, args.every) as write:
+                for one in _readable(picture, args.every, left_out):
+                    _check_size(args, one, camera)
+                    begin = time.perf_counter()
+                    result = _look(args, detector, camera, tracker, one)
+                    seconds = time.perf_counter() - begin
+                    if write is not None:
+                        write(annotated(one.image, result))
+                    has_colour = bool(np.ptp(one.image[::8, ::8], axis=2).mean() >= _COLOUR)
+                    yield _Detected(picture, one, result.detections, result.proposals, seconds, has_colour)
+                    done += 1
+                    tell(done, max(done, count))
 
 
-def _readable(picture: PictureFile, every: int, left_out: list[str]) -> Iterator[tuple[str, UInt8Array]]:
+def _look(
+    args: argparse.Namespace,
+    detector: PictureDetector,
+    camera: Camera | None,
+    tracker: VideoTracker | None,
+    picture: Picture,
+) -> PictureResult:
+    """The detections in a picture, or those of the tracks of a video."""
+    result = detector.detect(picture.image, camera, fov_deg=args.fov).at_least(args.min_probability)
+    if tracker is None:
+        return result
+    size = (picture.image.shape[1], picture.image.shape[0])
+    return replace(result, detections=tracker.update(picture.time_s, size, result.detections))
+
+
+def _check_size(args: argparse.Namespace, picture: Picture, camera: Camera | None) -> None:
+    height, width, _ = picture.image.shape
+    if camera is not None and camera.size != (width, height):
+        raise UsageError(
+            f"{picture.name}: is {width} x {height} pixels, and the camera of {args.config} {camera.size[0]} x "
+            f"{camera.size[1]}; give pictures of that camera, or --fov too"
+        )
+
+
+def _readable(picture: PictureFile, every: int, left_out: list[str]) -> Iterator[Picture]:
     from flockd.ground.datasets.image_files import DatasetError
 
     try:
@@ -199,30 +231,57 @@ def _result(detected: Sequence[_Detected]) -> dict[str, Any]:
         "without_colour": sum(not one.has_colour for one in detected),
         "pictures": [
             {
-                "file": one.name,
+                "file": one.picture.name,
                 "detections": [
                     {"box": [round(value, 2) for value in found.box]}
                     | {key: round(getattr(found, key), 4) for key in _FIGURES}
+                    | ({} if found.track is None else {"drone": found.track, "seen": found.label > 0})
                     for found in one.detections
                 ],
             }
             for one in detected
+        ],
+        "drones_of_videos": [
+            {"file": str(file), "drone": track, "frames": len(seen)}
+            | {"first_s": round(seen[0][0], 3), "last_s": round(seen[-1][0], 3)}
+            | {key: round(median(getattr(found, key) for _, found in seen), 4) for key in (*_FIGURES, "size_sigma_m")}
+            for (file, track), seen in _tracks(detected).items()
         ],
         "proposals_per_image": round(sum(one.proposals for one in detected) / count, 2),
         "ms_per_image": round(1000 * sum(one.seconds for one in detected) / count, 2),
     }
 
 
-def _say_detections(detected: Sequence[_Detected]) -> None:
-    """A row each, its picture named from the folder on that all are in."""
-    common = os.path.commonpath([Path(one.name).parent for one in detected]) if detected else ""
-    rows = []
+def _tracks(detected: Sequence[_Detected]) -> dict[tuple[Path, int], list[tuple[float, DetectedDrone]]]:
+    """Of each drone of a video the times and detections of the frames that show it."""
+    tracks: dict[tuple[Path, int], list[tuple[float, DetectedDrone]]] = {}
     for one in detected:
         for found in one.detections:
+            if found.track is not None and found.label > 0:
+                tracks.setdefault((one.file.path, found.track), []).append((one.picture.time_s, found))
+    return tracks
+
+
+def _say_detections(detected: Sequence[_Detected], result: dict[str, Any]) -> None:
+    """A row each, its picture named from the folder on that all are in; of a video a row for each drone."""
+    common = os.path.commonpath([one.file.path.parent for one in detected]) if detected else "."
+    rows, videos = [], []
+    for one in detected:
+        name = os.path.relpath(one.picture.name, common)
+        for found in (found for found in one.detections if found.track is None):
             box = " ".join(f"{value:.0f}" for value in found.box)
-            range_m = f"{found.range_m:.2f} +- {found.range_sigma_m:.2f}"
-            size_m = f"{found.size_m:.2f} +- {found.size_sigma_m:.2f}"
-            name = os.path.relpath(one.name, common or ".")
-            rows.append((name, box, f"{found.probability:.2f}", range_m, size_m))
+            rows.append((name, box, *_cells(vars(found))))
+    for one in result["drones_of_videos"]:
+        when = f"{one['first_s']:.1f}-{one['last_s']:.1f}"
+        name = os.path.relpath(one["file"], common)
+        videos.append((name, str(one["drone"]), when, str(one["frames"]), *_cells(one)))
     if rows:
-        say_table(("picture", "box, px", "probability", "range, m", "size, m"), rows)
+        say_table(("picture", "box, px", *_HEADS), rows)
+    if videos:
+        say_table(("video", "drone", "seen, s", "frames", *_HEADS), videos)
+
+
+def _cells(found: dict[str, Any]) -> tuple[str, str, str]:
+    """Of `_HEADS`."""
+    range_m = f"{found['range_m']:.2f} +- {found['range_sigma_m']:.2f}"
+    return f"{found['probability']:.2f}", range_m, f"{found['size_m']:.2f} +- {found['size_sigma_m']:.2f}"

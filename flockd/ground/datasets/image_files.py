@@ -196,8 +196,8 @@ _MISSING = 0.02
 """Share of its frames that a video may lack: containers count some that are not shown."""
 
 
-def images_of_video(path: Path, every: int = 1) -> Iterator[tuple[int, UInt8Array]]:
-    """Number and image (h, w, 3), RGB, of every ``every``-th frame, as far as frames can be decoded.
+def images_of_video(path: Path, every: int = 1) -> Iterator[tuple[int, float, UInt8Array]]:
+    """Number, time in seconds and image (h, w, 3), RGB, of every ``every``-th frame, as far as frames can be decoded.
 
     Raises DatasetError for a video that claims to be huge, and behind the frames of one that ends too early.
     """
@@ -213,7 +213,7 @@ def images_of_video(path: Path, every: int = 1) -> Iterator[tuple[int, UInt8Arra
                 there, image = video.retrieve()
                 if not there:
                     break
-                yield index, np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+                yield index, last_s, np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
             index += 1
         # By count and by time: of some containers the count is the duration times a rate that changed.
         short = index < (1 - _MISSING) * count - 1

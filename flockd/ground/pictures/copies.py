@@ -1,8 +1,9 @@
-"""Copies of pictures with what was detected drawn into them, of videos of each frame."""
+"""Copies of pictures and videos with what was detected drawn into them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -14,45 +15,70 @@ from flockd.ground.pictures.picture_files import PictureFile
 from flockd.ground.pictures.single_frame import Box, DetectedDrone, PictureResult
 
 _JPEG = {".jpg", ".jpeg"}
+_VIDEO = ".mp4"
+_CODEC = cv2.VideoWriter.fourcc(*"vp09")
+"""VP9, which OpenCV's wheels encode, and browsers and players show."""
 
 
 class Copies:
-    """A folder of copies, each at its picture's place in the folder that was named: JPEG stays JPEG, else it is PNG. Of
-    a video's frames each has its number behind the video's name."""
+    """A folder of copies, each at its picture's place in the folder that was named: JPEG stays JPEG, videos become MP4,
+    all else PNG. Or the copy of a single video, by its name."""
 
-    def __init__(self, folder: Path, pictures: Sequence[PictureFile], *, overwrite: bool) -> None:
+    def __init__(self, out: Path, pictures: Sequence[PictureFile], *, overwrite: bool) -> None:
         """Raises UsageError where a copy would take a file's place: before the work, not after it."""
         self._targets: dict[PictureFile, Path] = {}
         self.written = 0
         sources = {picture.path.resolve() for picture in pictures}
-        if folder.exists() and not folder.is_dir():
-            raise UsageError(f"{folder}: is no folder; name one with --out")
+        names_video = out.suffix.lower() == _VIDEO and not out.is_dir()
+        if names_video and not (len(pictures) == 1 and pictures[0].is_video):
+            raise UsageError(f"{out}: is the name of one video, and there are other pictures; name a folder with --out")
+        if out.exists() and not out.is_dir() and not names_video:
+            raise UsageError(f"{out}: is no folder; name one with --out, or a video ending in .mp4")
         taken: dict[Path, Path] = {}
         for picture in pictures:
-            suffix = picture.path.suffix if picture.path.suffix.lower() in _JPEG else ".png"
-            target = folder / picture.relative.with_suffix(suffix)
+            kept = picture.path.suffix if picture.path.suffix.lower() in _JPEG else ".png"
+            suffix = _VIDEO if picture.is_video else kept
+            target = out if names_video else out / picture.relative.with_suffix(suffix)
             if target.resolve() in sources:
                 raise UsageError(f"{target}: is one of the pictures themselves; name another folder with --out")
             if target in taken:
                 both = f"{taken[target]} and {picture.path}"
                 raise UsageError(f"{both}: both copies would be {target}; draw them with a command each")
-            frames = target.parent.glob(f"{target.stem}-*{suffix}") if picture.is_video else ()
-            if (target.exists() or any(frames)) and not overwrite:
-                raise UsageError(f"{target}: exists; name another folder, or overwrite it with --force")
+            if target.exists() and not overwrite:
+                raise UsageError(f"{target}: exists; name another with --out, or overwrite it with --force")
             self._targets[picture], taken[target] = target, picture.path
 
-    def write(self, picture: PictureFile, name: str, image: UInt8Array) -> None:
-        """The image (h, w, 3), RGB, of this name as `PictureFile.images` gives it. Raises OSError."""
-        target = self._targets[picture]
-        if picture.is_video:
-            target = target.with_stem(f"{target.stem}-{name.rpartition('#')[2]}")
+    @contextmanager
+    def of(self, picture: PictureFile, every: int) -> Iterator[Callable[[UInt8Array], None]]:
+        """Writes the copy of an image, or of a video's ``every``-th frames, (h, w, 3), RGB, one after the other.
+
+        Raises OSError.
+        """
+        target, written = self._targets[picture], 0
         target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(cv2.imencode(target.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes())
-        self.written += 1
+        video = cv2.VideoWriter()
+
+        def write(image: UInt8Array) -> None:
+            nonlocal written
+            bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+            if not picture.is_video:
+                target.write_bytes(cv2.imencode(target.suffix, bgr)[1].tobytes())
+            else:
+                size = (bgr.shape[1], bgr.shape[0])
+                if not written and not video.open(str(target), _CODEC, picture.rate_hz(every), size):
+                    raise OSError(f"{target}: cannot be written; name another place with --out")
+                video.write(bgr)
+            written += 1
+
+        try:
+            yield write
+        finally:
+            video.release()
+            self.written += written > 0
 
 
 _COLOURS = ((255, 109, 0), (0, 176, 255), (213, 0, 249), (0, 200, 83), (255, 214, 0), (255, 23, 68))
-"""RGB, of one detection after the other."""
+"""RGB, of one detection after the other; of videos, one drone after the other."""
 _MASK_WEIGHT = 0.4
 _REFERENCE_PX = 900.0
 """Longer side of a picture that lines of one pixel suit."""
@@ -65,14 +91,15 @@ def annotated(image: UInt8Array, result: PictureResult) -> UInt8Array:
     mask = cv2.resize(result.mask, (width, height), interpolation=cv2.INTER_NEAREST)
     drawn = image.copy()
     thick = max(round(max(width, height) / _REFERENCE_PX), 1)
-    for number, one in enumerate(result.detections):
-        colour = _COLOURS[number % len(_COLOURS)]
-        mine = mask == one.label
+    numbers = [number if one.track is None else one.track - 1 for number, one in enumerate(result.detections)]
+    colours = [_COLOURS[number % len(_COLOURS)] for number in numbers]
+    for one, colour in zip(result.detections, colours, strict=True):
+        mine = (mask == one.label) & (one.label > 0)
         tint = (1 - _MASK_WEIGHT) * drawn[mine] + _MASK_WEIGHT * np.array(colour)
         drawn[mine] = np.round(tint).astype(np.uint8)
         _rectangle(drawn, one.box, colour, thick)
-    for number, one in enumerate(result.detections):
-        _write(drawn, one, _COLOURS[number % len(_COLOURS)], thick)
+    for one, colour in zip(result.detections, colours, strict=True):
+        _write(drawn, one, colour, thick)
     return drawn
 
 
@@ -86,6 +113,7 @@ def _rectangle(image: UInt8Array, box: Box, colour: tuple[int, int, int], thick:
 def _write(image: UInt8Array, one: DetectedDrone, colour: tuple[int, int, int], thick: int) -> None:
     """Below the box, or above it where the image ends; on a dark ground, to be read on any background."""
     text = f"{one.range_m:.2f} +- {one.range_sigma_m:.2f} m, p {one.probability:.2f}"
+    text = text if one.track is None else f"drone {one.track}: {text}"
     scale, (height, width) = 0.42 * thick, image.shape[:2]
     (wide, high), _ = cv2.getTextSize(text, _FONT, scale, thick)
     left, below = int(np.clip(one.box[0], 0, max(width - wide, 0))), int(one.box[3]) + 3 * thick

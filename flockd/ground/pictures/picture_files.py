@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 
@@ -20,6 +21,16 @@ from flockd.ground.datasets.image_files import (
     read_image,
     unread,
 )
+
+
+class Picture(NamedTuple):
+    """An image, or a frame of a video."""
+
+    name: str
+    image: UInt8Array
+    """(h, w, 3) RGB"""
+    time_s: float = 0.0
+    """Of a frame, since the beginning of its video."""
 
 
 @dataclass(frozen=True)
@@ -47,19 +58,28 @@ class PictureFile:
         with opened_video(self.path) as opened:
             return max(-(-int(opened.get(cv2.CAP_PROP_FRAME_COUNT)) // every), 1)
 
-    def images(self, every: int) -> Iterator[tuple[str, UInt8Array]]:
-        """Names and images (h, w, 3), RGB, as the camera was held; ``every``-th frames of a video.
+    def rate_hz(self, every: int) -> float:
+        """Of a video's ``every``-th frames."""
+        with opened_video(self.path) as opened:
+            return (opened.get(cv2.CAP_PROP_FPS) or _USUAL_RATE_HZ) / every
+
+    def images(self, every: int) -> Iterator[Picture]:
+        """As the camera was held; ``every``-th frames of a video.
 
         Raises DatasetError where it cannot be read.
         """
         if not self.is_video:
-            yield str(self.path), read_image(self.path)
+            yield Picture(str(self.path), read_image(self.path))
             return
         index = None
-        for index, image in images_of_video(self.path, every):
-            yield f"{self.path}#{index}", image
+        for index, time_s, image in images_of_video(self.path, every):
+            yield Picture(f"{self.path}#{index}", image, time_s)
         if index is None:
             raise DatasetError(f"{self.path}: is no video that can be decoded; restore it, or convert it to MP4")
+
+
+_USUAL_RATE_HZ = 30.0
+"""Of videos that do not say theirs."""
 
 
 def find_pictures(

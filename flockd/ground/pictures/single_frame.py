@@ -47,7 +47,9 @@ class DetectedDrone:
     size_sigma_m: float
     """Standard deviation: of the known size, else the range's share."""
     label: int
-    """Its value in the mask."""
+    """Its value in the mask; 0: this frame of the video does not show it, and the box is where it should be."""
+    track: int | None = None
+    """The number of the drone in a video; None in a picture."""
 
 
 @dataclass(frozen=True, eq=False)

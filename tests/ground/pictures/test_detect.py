@@ -115,7 +115,7 @@ def test_copies_show_what_was_found_and_nothing_is_lost(capsys: Capture, tmp_pat
     changed = np.abs(after.astype(int) - before).max(axis=2) > 40
     assert changed[top - 4 : top + height + 4, left - 4 : left + width + 4].mean() > 0.1
     assert changed[:, left + width + 80 :].mean() < 0.001
-    assert "exists; name another folder" in told(capsys, 2, "detect", tmp_path / "a.jpg", *FOV, "--out", out)
+    assert "exists; name another with --out" in told(capsys, 2, "detect", tmp_path / "a.jpg", *FOV, "--out", out)
     own = (tmp_path / "a.jpg", *FOV, "--out", tmp_path, "--force")
     assert "is one of the pictures themselves" in told(capsys, 2, "detect", *own)
     told(capsys, 0, "detect", tmp_path / "a.jpg", *FOV, "--out", out, "--force", "--min-probability", 1)
@@ -124,17 +124,41 @@ def test_copies_show_what_was_found_and_nothing_is_lost(capsys: Capture, tmp_pat
     assert np.abs(again.astype(int) - before).max() < 40, "nothing is that probable"
 
 
-def test_frames_of_a_video_are_pictures(capsys: Capture, tmp_path: Path) -> None:
-    clip, frame = tmp_path / "clip.avi", cv2.imread(str(NEAR))
-    assert frame is not None
+def test_a_drone_of_a_video_is_followed_by_its_number(capsys: Capture, tmp_path: Path) -> None:
+    """It moves by 4 pixels a frame, and is hidden in one; the copy has each second frame, as fast as the clip."""
+    clip, copy = tmp_path / "clip.avi", tmp_path / "annotated.mp4"
+    seen, empty = cv2.imread(str(NEAR)), cv2.imread(str(NOTHING))
+    assert seen is not None
+    assert empty is not None
     writer = cv2.VideoWriter(str(clip), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, SIZE)
-    for _ in range(5):
-        writer.write(frame)
+    for k in range(20):
+        writer.write(np.roll(empty if k == 14 else seen, 4 * k, axis=1))
     writer.release()
-    result = told_json(capsys, clip, *FOV, "--every", 2, "--out", tmp_path / "drawn")
-    assert [picture["file"] for picture in result["pictures"]] == [f"{clip}#{k}" for k in (0, 2, 4)]
-    assert all(len(picture["detections"]) == 1 for picture in result["pictures"])
-    assert {path.name for path in (tmp_path / "drawn").iterdir()} == {f"clip-{k}.png" for k in (0, 2, 4)}
+    result = told_json(capsys, clip, *FOV, "--every", 2, "--out", copy)
+    frames = result["pictures"]
+    assert [picture["file"] for picture in frames] == [f"{clip}#{k}" for k in range(0, 20, 2)]
+    assert not any(picture["detections"] for picture in frames[:3]), "it is shown for half a second first"
+    left, _, width, _ = truth()[1]["2.5_m_0.jpg"]
+    for k, picture in enumerate(frames[3:], start=3):
+        (one,) = picture["detections"]
+        assert (one["drone"], one["seen"]) == (1, k != 7)
+        assert (one["box"][0] + one["box"][2]) / 2 == pytest.approx(left + width / 2 + 8 * k, abs=8)
+    (drone,) = result["drones_of_videos"]
+    assert (drone["drone"], drone["frames"], drone["first_s"], drone["last_s"]) == (1, 6, 0.6, 1.8)
+    video = cv2.VideoCapture(str(copy))
+    assert (video.get(cv2.CAP_PROP_FRAME_COUNT), video.get(cv2.CAP_PROP_FPS)) == (10, 5)
+    drawn = [video.read()[1].astype(int) for _ in range(10)]
+    original = [np.roll(seen, 8 * k, axis=1).astype(int) for k in range(10)]
+    changed = [float((np.abs(a - b).max(axis=2) > 60).mean()) for a, b in zip(drawn, original, strict=True)]
+    assert max(changed[:3]) < 0.001
+    assert min(changed[3:]) > 0.01
+    text = told(capsys, 0, "detect", clip, *FOV, "--every", 2, "--out", copy, "--force").splitlines()
+    assert text[0].split() == ["video", "drone", "seen,", "s", "frames", "probability", "range,", "m", "size,", "m"]
+    assert text[1].split()[:4] == ["clip.avi", "1", "0.6-1.8", "6"]
+    assert "exists; name another with --out" in told(capsys, 2, "detect", clip, *FOV, "--out", copy)
+    assert "is the name of one video" in told(capsys, 2, "detect", clip, NEAR, *FOV, "--out", tmp_path / "both.mp4")
+    told(capsys, 0, "detect", clip, *FOV, "--every", 9, "--out", tmp_path / "drawn")
+    assert [path.name for path in (tmp_path / "drawn").iterdir()] == ["clip.mp4"]
 
 
 def drone_file(path: Path, cameras: tuple[str, ...] = ("front",)) -> Path:
