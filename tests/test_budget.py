@@ -24,12 +24,12 @@ LINES = {
     "flockd/flight": 11_130,
     "flockd/onboard": 9_130,
     "flockd/fleet": 2_700,
-    "flockd/ground": 4_610,
+    "flockd/ground": 4_960,
     "flockd/review": 3_570,
     "flockd/sim": 8_590,
     "flockd/campaign": 1_480,
-    "flockd/cli": 3_560,
-    "tests": 37_390,
+    "flockd/cli": 3_590,
+    "tests": 37_600,
     "tools/checks": 2_060,
     "tools/docs": 860,
     "tools/measure": 1_510,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 329}
+FILES = {"flockd": 331}
 NUMBERS_OF_FLIGHT = 270
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02

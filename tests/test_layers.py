@@ -33,12 +33,13 @@ LIBRARIES = {
     "joblib": ("campaign/engine.py",),
     "rosbags": ("review/replay/bag_flight.py",),
     "rclpy": ("fleet/ros/ros_node.py", "onboard/sources/camera_child.py"),
+    "onnx": ("ground/detector_import.py",),
     "numba": SIMULATION,
     "matplotlib": SIMULATION,
     "jinja2 markupsafe": SIMULATION,
 }
 """Where outside libraries sit behind their adapters."""
-TOOL_LIBRARIES = {"torch", "onnx", "trimesh", "embreex", "pytest"}
+TOOL_LIBRARIES = {"torch", "trimesh", "embreex", "pytest"}
 """For training and tests: nothing in the package may need them."""
 
 

@@ -40,6 +40,7 @@ EXTRAS = {
     "argcomplete": "completion",
     **dict.fromkeys(("aiohttp", "plotly"), "fleet"),
     "rosbags": "bags",
+    "onnx": "models",
 }
 
 EXIT_CODES = """\

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flockd.cli.options import loaded
-from flockd.cli.output import noted_table, progress, say, say_facts, say_json, tables_console
+from flockd.cli.output import complain, noted_table, progress, say, say_facts, say_json, tables_console
 from flockd.cli.parser import Commands, Parser, commands_of, flag, option
 from flockd.core.errors import ExitCode, ModelError, UnavailableError
 
@@ -16,12 +16,13 @@ if TYPE_CHECKING:
     from flockd.core.config import DroneConfig
 
 THREADS = 2
+_IMPORT = "flockd models import best.onnx --drone drone --licence AGPL-3.0"
 
 
 def add(commands: Commands) -> None:
     """Adds the command."""
     examples: tuple[str, ...] = (
-        "flockd models list", "flockd models verify", "flockd models prepare --config my_drone.yaml"
+        "flockd models list", "flockd models verify", "flockd models prepare --config my_drone.yaml", _IMPORT
     )  # fmt: skip
     commands = commands_of(commands("models", "List, verify and prepare the networks.", examples))
     examples = ("flockd models list", "flockd models list --json", "flockd models list --dir my_models")
@@ -36,6 +37,21 @@ def add(commands: Commands) -> None:
     )
     parser = commands("prepare", description, examples, _prepare)
     option(parser, "--config FILE", "the drone's configuration", Path, required=True)
+    flag(parser, "--json", "print JSON")
+    description = (
+        "Make a detector of your own one for `perception.detector`: ONNX as Ultralytics (YOLOv5, v8, 11, 26) or YOLOX "
+        "export it, with a fixed size. Its boxes are decoded, and a manifest is written; FILE stays as it is."
+    )
+    parser = commands("import", description, (_IMPORT,), _import)
+    option(parser, "FILE", "the ONNX file", Path)
+    option(parser, "--drone CLASS", "the class of drones, by its name in FILE or its number from 0", required=True)
+    option(
+        parser,
+        "--licence TEXT",
+        "of its weights, for the manifest; Ultralytics' are AGPL-3.0, and so are yours by them",
+    )
+    option(parser, "--out FOLDER", "where network and manifest go (my_models)", Path, default=Path("my_models"))
+    flag(parser, "--force", "overwrite what is there")
     flag(parser, "--json", "print JSON")
 
 
@@ -83,6 +99,22 @@ def _verify(args: argparse.Namespace) -> int:
         for name, fault in faults.items():
             say(f"{name}: fine" if fault is None else fault)
     return ExitCode.CHECK_FAILED if any(faults.values()) else ExitCode.DONE
+
+
+def _import(args: argparse.Namespace) -> int:
+    from flockd.ground.detector_import import import_detector
+
+    made = import_detector(args.file, args.drone, args.licence, args.out, overwrite=args.force)
+    if made.terms:
+        complain(
+            f"{args.file} says {made.terms!r}: whoever gets a drone, or uses a service, with this network may ask for "
+            "the source of the whole program; give it, or get another licence from Ultralytics"
+        )
+    complain(
+        "write it as perception.detector in a drone's file; try it: flockd detect PICTURES --config FILE --fov DEG"
+    )
+    facts = {"manifest": str(made.manifest), "kind": made.kind, "drone": made.drone, "classes": made.classes}
+    return say_facts(args, facts)
 
 
 def _prepare(args: argparse.Namespace) -> int:

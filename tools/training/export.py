@@ -26,8 +26,8 @@ from flockd.core.data import data_path
 from flockd.flight.inference import load_manifest
 from flockd.flight.inference.feeds import golden_feeds
 from flockd.flight.inference.manifest import Manifest
+from flockd.ground.manifest_writer import write_manifest
 from tools.training.detector import Boxes
-from tools.training.manifests import write_manifest
 from tools.training.networks import DistanceNet, FlowNet, NeighboursNet, VerificationNet
 from tools.training.weights import HALVED
 

@@ -22,8 +22,8 @@ from onnxruntime.quantization.shape_inference import quant_pre_process
 from flockd.flight.inference import Manifest, load_manifest
 from flockd.flight.inference.feeds import golden_feeds
 from flockd.flight.inference.fitting import fit
+from flockd.ground.manifest_writer import write_manifest
 from tools.training.dataset import HEIGHT, WIDTH, ground_plane, open_pairs, ray_tangents
-from tools.training.manifests import write_manifest
 
 Feeds = dict[str, NDArray[Any]]
 IMAGES, COMPARED = 32, 16

@@ -52,7 +52,7 @@ class Copies:
     def of(self, picture: PictureFile, every: int) -> Iterator[Callable[[UInt8Array], None]]:
         """Writes the copy of an image, or of a video's ``every``-th frames, (h, w, 3), RGB, one after the other.
 
-        Raises OSError.
+        Raises OSError, and UsageError for a video that cannot be written.
         """
         target, written = self._targets[picture], 0
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -66,7 +66,7 @@ class Copies:
             else:
                 size = (bgr.shape[1], bgr.shape[0])
                 if not written and not video.open(str(target), _CODEC, picture.rate_hz(every), size):
-                    raise OSError(f"{target}: cannot be written; name another place with --out")
+                    raise UsageError(f"{target}: cannot be written; name another place with --out")
                 video.write(bgr)
             written += 1
 
