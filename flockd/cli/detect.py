@@ -235,6 +235,7 @@ def _result(detected: Sequence[_Detected]) -> dict[str, Any]:
                 "detections": [
                     {"box": [round(value, 2) for value in found.box]}
                     | {key: round(getattr(found, key), 4) for key in _FIGURES}
+                    | {"kind_known": found.kind_known}
                     | ({} if found.track is None else {"drone": found.track, "seen": found.label > 0})
                     for found in one.detections
                 ],
@@ -245,6 +246,7 @@ def _result(detected: Sequence[_Detected]) -> dict[str, Any]:
             {"file": str(file), "drone": track, "frames": len(seen)}
             | {"first_s": round(seen[0][0], 3), "last_s": round(seen[-1][0], 3)}
             | {key: round(median(getattr(found, key) for _, found in seen), 4) for key in (*_FIGURES, "size_sigma_m")}
+            | {"kind_known": 2 * sum(found.kind_known for _, found in seen) > len(seen)}
             for (file, track), seen in _tracks(detected).items()
         ],
         "proposals_per_image": round(sum(one.proposals for one in detected) / count, 2),
@@ -283,5 +285,8 @@ def _say_detections(detected: Sequence[_Detected], result: dict[str, Any]) -> No
 
 def _cells(found: dict[str, Any]) -> tuple[str, str, str]:
     """Of `_HEADS`."""
-    range_m = f"{found['range_m']:.2f} +- {found['range_sigma_m']:.2f}"
-    return f"{found['probability']:.2f}", range_m, f"{found['size_m']:.2f} +- {found['size_sigma_m']:.2f}"
+    from flockd.ground.pictures.copies import range_text
+
+    known = found["kind_known"]
+    size_m = f"{found['size_m']:.2f} +- {found['size_sigma_m']:.2f}" if known else "kind unknown"
+    return f"{found['probability']:.2f}", range_text(found["range_m"], found["range_sigma_m"], known=known), size_m

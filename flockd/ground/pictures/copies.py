@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -103,6 +104,14 @@ def annotated(image: UInt8Array, result: PictureResult) -> UInt8Array:
     return drawn
 
 
+def range_text(range_m: float, sigma_m: float, *, known: bool) -> str:
+    """A range with its standard deviation; where the kind is not known from where to where, in two of three cases."""
+    if known:
+        return f"{range_m:.2f} +- {sigma_m:.2f}"
+    factor = math.exp(sigma_m / range_m)
+    return f"{range_m / factor:.1f} to {range_m * factor:.1f}"
+
+
 def _rectangle(image: UInt8Array, box: Box, colour: tuple[int, int, int], thick: int) -> None:
     """Around the box, not over what is in it."""
     left, top = (int(np.floor(value)) - thick for value in box[:2])
@@ -112,7 +121,8 @@ def _rectangle(image: UInt8Array, box: Box, colour: tuple[int, int, int], thick:
 
 def _write(image: UInt8Array, one: DetectedDrone, colour: tuple[int, int, int], thick: int) -> None:
     """Below the box, or above it where the image ends; on a dark ground, to be read on any background."""
-    text = f"{one.range_m:.2f} +- {one.range_sigma_m:.2f} m, p {one.probability:.2f}"
+    kind = "" if one.kind_known else ", kind unknown"
+    text = f"{range_text(one.range_m, one.range_sigma_m, known=one.kind_known)} m{kind}, p {one.probability:.2f}"
     text = text if one.track is None else f"drone {one.track}: {text}"
     scale, (height, width) = 0.42 * thick, image.shape[:2]
     (wide, high), _ = cv2.getTextSize(text, _FONT, scale, thick)

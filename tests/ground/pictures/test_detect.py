@@ -59,7 +59,8 @@ def test_drones_of_a_folder_are_found(capsys: Capture) -> None:
             left, top, width, height = boxes[name]
             assert np.allclose(one["box"], (left, top, left + width, top + height), atol=8)
             assert one["range_m"] == pytest.approx(distances[name], rel=0.06)
-            assert 0 < one["range_sigma_m"] < 0.1 * one["range_m"]
+            assert one["kind_known"] is (name != "2.5_m_0.jpg"), "the network doubts the size of that one by 3.4 %"
+            assert 0 < one["range_sigma_m"] < (0.1 if one["kind_known"] else 0.9) * one["range_m"]
             assert one["size_m"] == pytest.approx(DRONE_SIZE_M, rel=0.06)
 
 
@@ -114,7 +115,7 @@ def test_copies_show_what_was_found_and_nothing_is_lost(capsys: Capture, tmp_pat
     left, top, width, height = (round(value) for value in truth()[1]["2.5_m_0.jpg"])
     changed = np.abs(after.astype(int) - before).max(axis=2) > 40
     assert changed[top - 4 : top + height + 4, left - 4 : left + width + 4].mean() > 0.1
-    assert changed[:, left + width + 80 :].mean() < 0.001
+    assert changed[:, left + width + 110 :].mean() < 0.001
     assert "exists; name another with --out" in told(capsys, 2, "detect", tmp_path / "a.jpg", *FOV, "--out", out)
     own = (tmp_path / "a.jpg", *FOV, "--out", tmp_path, "--force")
     assert "is one of the pictures themselves" in told(capsys, 2, "detect", *own)

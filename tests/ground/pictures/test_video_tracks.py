@@ -18,7 +18,7 @@ Place = tuple[float, float]
 def boxed(middle: Place, side: float = 30.0) -> DetectedDrone:
     """A drone as the detector gives it."""
     (u, v), half = middle, side / 2
-    return DetectedDrone((u - half, v - half, u + half, v + half), 0.97, 5.0, 0.5, 0.4, 0.04, 1)
+    return DetectedDrone((u - half, v - half, u + half, v + half), 0.97, 5.0, 0.5, 0.4, 0.04, True, 1)
 
 
 def followed(
