@@ -20,16 +20,16 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_120,
+    "flockd/core": 3_200,
     "flockd/flight": 11_130,
-    "flockd/onboard": 9_130,
+    "flockd/onboard": 9_250,
     "flockd/fleet": 2_700,
-    "flockd/ground": 4_980,
-    "flockd/review": 3_570,
+    "flockd/ground": 4_990,
+    "flockd/review": 3_590,
     "flockd/sim": 8_590,
     "flockd/campaign": 1_480,
     "flockd/cli": 3_600,
-    "tests": 37_690,
+    "tests": 38_080,
     "tools/checks": 2_060,
     "tools/docs": 860,
     "tools/measure": 1_510,

@@ -6,6 +6,7 @@ import math
 
 from flockd.core.config import DroneConfig
 from flockd.core.config.mission import describe
+from flockd.core.secrets import masked
 from flockd.flight.safety.policy import Reaction, rules
 
 REACTIONS = {
@@ -75,6 +76,10 @@ def _limits(config: DroneConfig) -> dict[str, str]:
     safety, gate, autopilot = config.safety, config.safety.gate, config.autopilot
     fences = [] if gate.fence_radius_m is None else [f"{gate.fence_radius_m:g} m around home"]
     fences += [f"a polygon of {len(gate.fence_corners_m)} corners"] if gate.fence_corners_m else []
+    by_image: dict[str, list[str]] = {}
+    for camera in () if config.source is None else config.source.cameras:
+        by_image.setdefault(masked(camera.place), []).append(camera.name)
+    shared = [f"{', '.join(names)}: all of {place}" for place, names in by_image.items() if len(names) > 1]
     own_m = config.mission.height_m
     height_m = own_m if own_m is not None or autopilot is None else autopilot.height_m
     off = f"{safety.degraded_velocity_error_m_s:g}; {safety.max_velocity_error_m_s:g} m/s"
@@ -90,6 +95,7 @@ def _limits(config: DroneConfig) -> dict[str, str]:
         "fence": " and ".join(fences) or "NONE",
         "level distance to a neighbour": f"{gate.min_separation_m:g} m",
         "velocity off its setpoints: slower; Hold": off,
+        **({"cameras that fail together": "; ".join(shared)} if shared else {}),
         **({} if autopilot is None else {"battery counts as low at": f"{100 * autopilot.low_battery_share:.0f} %"}),
         "alone for so long: Hold": "never" if safety.alone_s is None else f"{safety.alone_s:g} s",
     }

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
+import yaml
 
 from flockd.cli import main
 from flockd.core.data import data_path
@@ -37,6 +39,17 @@ def test_limits_heights_and_people_are_those_of_the_file(capsys: Capture, tmp_pa
     card = rows(capsys, tmp_path / "other.yaml")
     assert (card["it flies at"][:4], card["fence"]) == ("7 m ", "20 m around home")
     assert "hold, land" in card["over telemetry"]
+
+
+def test_cameras_that_one_device_takes_with_it_are_named(capsys: Capture, tmp_path: Path) -> None:
+    """Four in one image of 1920 x 640."""
+    assert "cameras that fail together" not in rows(capsys, QUADROTOR)
+    drone = yaml.safe_load(QUADROTOR.read_text(encoding="utf-8"))
+    for number, camera in enumerate(drone["source"]["cameras"]):
+        camera |= {"device": "/dev/video0", "crop": [480 * number, 0, 480, 640], "turn_deg": 0, "reduce": 1}
+    (tmp_path / "board.yaml").write_text(json.dumps(drone), encoding="utf-8")
+    told = rows(capsys, tmp_path / "board.yaml")["cameras that fail together"]
+    assert told == "front, right, back, left: all of /dev/video0"
 
 
 def test_every_fault_stands_there_with_what_it_does(capsys: Capture) -> None:

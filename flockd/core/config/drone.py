@@ -22,7 +22,7 @@ from flockd.core.config.mission import MissionParameters, mission_faults
 from flockd.core.config.perception import NO_MODEL, PerceptionConfig
 from flockd.core.config.rig import RigConfig
 from flockd.core.config.safety import SafetyParameters
-from flockd.core.config.source import SourceParameters
+from flockd.core.config.source import CameraDeviceParameters, SourceParameters
 from flockd.core.config.tracking import TrackingParameters
 
 
@@ -114,7 +114,7 @@ class DroneConfig(Section):
             fault = "is for simulations, and an autopilot on a cable is none; delete it"
             faults["source", "shared_memory", "speed_factor"] = fault
         if self.source is not None and self.source.kind != "shared_memory":
-            faults |= self._device_faults([camera.name for camera in self.source.cameras])
+            faults |= self._device_faults(self.source.cameras)
         refuse(self, faults)
         return self
 
@@ -129,16 +129,21 @@ class DroneConfig(Section):
             return {}
         return {("step_s",): f"{self.step_s:g} s is above {told}; write a smaller one, or a larger time there"}
 
-    def _device_faults(self, devices: Sequence[str]) -> dict[tuple[str | int, ...], str]:
-        """Where the cameras of the rig and the names of their devices do not match."""
-        rig = [camera.name for camera in self.rig.cameras]
+    def _device_faults(self, cameras: Sequence[CameraDeviceParameters]) -> dict[tuple[str | int, ...], str]:
+        """Where the cameras of the rig do not match the names and crops of their devices."""
+        rig = {camera.name: camera.size_px for camera in self.rig.cameras}
+        devices = [camera.name for camera in cameras]
         faults: dict[tuple[str | int, ...], str] = {}
-        for number, name in enumerate(devices):
+        for number, (name, cut_px) in enumerate((camera.name, camera.cut_px) for camera in cameras):
             if name not in rig:
                 told = f"{name} is no camera of the rig; write one of {', '.join(rig)}"
                 faults["source", "cameras", number, "name"] = told
             elif name in devices[:number]:
                 faults["source", "cameras", number, "name"] = f"{name} has an entry already; keep one"
+            elif cut_px is not None and cut_px != rig[name]:
+                cut, size = (" x ".join(map(str, sides)) for sides in (cut_px, rig[name]))
+                told = f"gives images of {cut}, but camera {name} of the rig has size_px {size}; correct one"
+                faults["source", "cameras", number, "crop"] = told
         missing = [name for name in rig if name not in devices]
         if missing and not faults:
             told = f"has no entry of the name {missing[0]}, which is a camera of the rig; add one"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -9,6 +10,7 @@ from pydantic import Field, model_validator
 from flockd.core import services
 from flockd.core.choices import PixelFormat
 from flockd.core.config.base import Endpoint, Name, PlainName, Section, refuse, text
+from flockd.core.secrets import masked
 
 _TOPIC = r"^(/[A-Za-z_][A-Za-z0-9_]*)+$"
 """A whole name of ROS 2."""
@@ -21,6 +23,10 @@ class ControlParameters(Section):
     """As `v4l2-ctl --list-ctrls` prints it."""
     value: int
     """A menu's entry by its number; a switch as 0 or 1."""
+
+
+_Edge = Annotated[int, Field(ge=0, le=32768)]
+_Side = Annotated[int, Field(ge=32, le=32768)]
 
 
 class CameraDeviceParameters(Section):
@@ -45,7 +51,14 @@ class CameraDeviceParameters(Section):
     """For kind `v4l2`; pipelines and topics say it themselves."""
     turn_deg: Literal[0, 90, 180, 270] = 0
     """For kind `v4l2`: by how much its images are turned, clockwise, so that up is up, where the camera is mounted on
-    its side or upside down. `size_px` and the lens in the rig are of the turned image. Pipelines have `videoflip`."""
+    its side or upside down. `size_px` and the lens in the rig are of the turned image. Pipelines have `videoflip`; the
+    parts that `crop` cuts are turned for each kind."""
+    crop: tuple[_Edge, _Edge, _Side, _Side] | None = None
+    """Left, top, width and height of this camera's part, in pixels of the image as it comes. Boards for several cameras
+    send one image of all: their entries name one device, pipeline or topic, each with its crop. `size_px` and the lens
+    in the rig are of the part."""
+    crop_of: tuple[_Side, _Side] | None = None
+    """Width and height of the image that `crop` is cut from; by default it ends where the crops end."""
     reduce: Literal[1, 2, 4] = 1
     """For kind `v4l2`: the camera sends images so many times as wide and as high as the rig says, which are reduced:
     they have less noise then, and less of what compression leaves."""
@@ -57,6 +70,19 @@ class CameraDeviceParameters(Section):
     def place(self) -> str:
         """Where its images come from: the device, the pipeline or the topic."""
         return self.device or self.pipeline or self.topic or ""
+
+    @property
+    def size_words(self) -> tuple[str, str]:
+        """What says how large its device's images are, and the key that says it."""
+        return ("the rig has", "size_px") if self.crop is None else ("its crop is of", "crop_of")
+
+    @property
+    def cut_px(self) -> tuple[int, int] | None:
+        """Width and height of `crop`, reduced and turned: what `size_px` in the rig has to be."""
+        if self.crop is None:
+            return None
+        width, height = (side // self.reduce for side in self.crop[2:])
+        return (width, height) if self.turn_deg % 180 == 0 else (height, width)
 
 
 class SharedMemoryParameters(Section):
@@ -108,16 +134,58 @@ class SourceParameters(Section):
                         f"is less than {words} of camera {camera.name!r}; write {periods / camera.rate_hz:.3f} or more"
                     )
                     refuse(self, {(key,): f"{getattr(self, key):g} {told}"})
-        refuse(
-            self,
-            {
-                ("cameras", number, key): f"two cameras share {place}; give each its own {key}"
-                for number, camera in enumerate(self.cameras)
-                for key, place in (("device", camera.device), ("topic", camera.topic))
-                if place and place in {getattr(one, key) for one in self.cameras[:number]}
-            },
-        )
+        for number, camera in enumerate(self.cameras):
+            first = next(one for one in self.cameras if one.place == camera.place)
+            faults = _crop_faults(camera, self.whole_px(camera)) if camera.crop else {}
+            if camera is not first:
+                faults |= _sharing_faults(camera, self.cameras[:number], _KEYS[self.kind][0])
+            refuse(self, {("cameras", number, key): text for key, text in faults.items()})
         return self
+
+    def whole_px(self, camera: CameraDeviceParameters) -> tuple[int, int]:
+        """Width and height of the image that a camera's `crop` is cut from."""
+        crops = [one.crop for one in self.cameras if one.place == camera.place and one.crop is not None]
+        right, lower = (max(crop[axis] + crop[axis + 2] for crop in crops) for axis in (0, 1))
+        return camera.crop_of or (right, lower)
+
+
+def _crop_faults(camera: CameraDeviceParameters, whole: tuple[int, int]) -> dict[str, str]:
+    assert camera.crop is not None
+    left, top, width, height = camera.crop
+    faults = {}
+    if left + width > whole[0] or top + height > whole[1]:
+        faults["crop"] = (
+            f"{list(camera.crop)} ends outside {whole[0]} x {whole[1]} of the image; correct it, or crop_of"
+        )
+    elif any(length % camera.reduce for length in (*camera.crop, *whole)):
+        faults["crop"] = f"{list(camera.crop)} and its image are no multiples of reduce {camera.reduce}; correct one"
+    if camera.camera_info is not None:
+        faults["camera_info"] = "is of a whole image, and this camera has a crop of it; delete it"
+    return faults
+
+
+def _sharing_faults(
+    camera: CameraDeviceParameters, others: Sequence[CameraDeviceParameters], key: str
+) -> dict[str, str]:
+    """Of a camera whose device, pipeline or topic is that of others too."""
+    mates = [one for one in others if one.place == camera.place]
+    first = mates[0]
+    if camera.crop is None or first.crop is None:
+        told = f"two cameras share {masked(camera.place)}; give each its own {key}, or each its `crop` of one image"
+        return {key: told}
+    faults = {
+        field: f"differs from that of camera {first.name}, which is cut from the same image; write both alike"
+        for field in ("crop_of", "pixel_format", "reduce", "rate_hz", "stamps", "controls")
+        if getattr(camera, field) != getattr(first, field)
+    }
+    for mate in mates:
+        if mate.crop and all(
+            camera.crop[axis] < mate.crop[axis] + mate.crop[axis + 2]
+            and mate.crop[axis] < camera.crop[axis] + camera.crop[axis + 2]
+            for axis in (0, 1)
+        ):
+            faults["crop"] = f"{list(camera.crop)} overlaps that of camera {mate.name}; cut each from a part of its own"
+    return faults
 
 
 _KEYS = {
@@ -140,7 +208,10 @@ def _misplaced(camera: CameraDeviceParameters, kind: str) -> dict[tuple[str, ...
         for other, keys in _KEYS.items()
         for key in keys
         if other != kind and getattr(camera, key) != type(camera).model_fields[key].default
+        if not (camera.crop and key == "turn_deg")
     }
+    if camera.crop_of is not None and camera.crop is None:
+        faults["crop_of",] = "is of a `crop`, and there is none; add it, or delete this"
     if not faults and kind in _KEYS and not getattr(camera, _KEYS[kind][0]):
         faults[()] = _LACKS[kind]
     return faults

@@ -52,8 +52,10 @@ def from_camera(config: DroneConfig, file: str, name: str, enough: Callable[[], 
     rig = config.rig.model_copy(update={"cameras": tuple(one for one in config.rig.cameras if one.name == name)})
     source, device = config.source, None
     if source is not None and source.cameras:
-        source = source.model_copy(update={"cameras": tuple(one for one in source.cameras if one.name == name)})
-        device = source.cameras[0].device
+        wanted = next(one for one in source.cameras if one.name == name)
+        if wanted.crop is not None:
+            wanted = wanted.model_copy(update={"crop_of": source.whole_px(wanted)})
+        source, device = source.model_copy(update={"cameras": (wanted,)}), wanted.device
     images = _frames(open_source(config.model_copy(update={"rig": rig, "source": source}), file), name, enough)
     return ImageStream(images, 0, live=True, identity=device or f"not known ({name})")
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from flockd.core.config import DroneConfig
 from flockd.core.config.rig import CameraConfig, RigConfig, field_of_view_deg
+from flockd.core.secrets import masked
 from flockd.flight.geometry import Rig, build_rig
 from flockd.ground.calibration.from_flight import found_rig
 from flockd.ground.calibration.rig_calibration import described, rig_faults
@@ -76,6 +77,8 @@ def _judged(camera: CameraConfig, config: DroneConfig, watched: Watched | None) 
         jitter_ms = 1e3 * watched.jitter_s()
         measured.append(f"{watched.rate_hz:.1f} of {rate_hz:g} images a second, jitter {jitter_ms:.1f} ms, no gaps")
         measured += [f"{len(device.controls)} controls accepted"] if device and device.device else []
+        if device and device.crop:
+            measured.append(f"cut at {device.crop[0]}, {device.crop[1]} from images of {masked(device.place)}")
     if problems:
         yield from problems
     else:

@@ -9,8 +9,10 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from flockd.core.config.source import SourceParameters
-from flockd.core.messages import Frame, FrameSet
+from flockd.core.messages import Frame, FrameSet, UInt8Array
 from flockd.onboard.sources.frames import CameraStatus, Count, RawFrame
 from flockd.onboard.sources.image_formats import CorruptImageError
 
@@ -97,9 +99,10 @@ class Assembler:
         """Adds something that happened outside to a camera's counts."""
         self._lines[camera].counts[what] += 1
 
-    def spoil(self, camera: str) -> None:
-        """A frame of the last set turned out to be no image: the set is without this camera."""
-        self._lines[camera].counts.update({"corrupt": 1, "undecodable": 1, "missing": 1, "used": -1})
+    def spoil(self, camera: str, *what: Count) -> None:
+        """A frame of the last set turned out to be worth nothing: the set is without this camera."""
+        self._lines[camera].counts.update((*what, "missing"))
+        self._lines[camera].counts["used"] -= 1
 
     def counts(self, camera: str) -> dict[Count, int]:
         """Counts of what happened to a camera's frames so far, without zeros."""
@@ -162,6 +165,8 @@ _TICK_S = 0.01
 _USELESS_AFTER = 3
 """So many frames in a row that are worth nothing are a fault of their camera; the drone flies on by the others."""
 
+_FROZEN = "{}: the image is frozen; restart its camera or program"
+
 MAX_AHEAD_S = 0.02
 """Drivers that work out time stamps from the camera's own clock may be this much ahead."""
 
@@ -180,8 +185,13 @@ class FrameReceiver:
         self._clock, self._on_frame = clock, on_frame
         self._assembler = Assembler(cameras, parameters)
         self._faults: dict[str, str | None] = dict.fromkeys(cameras)
+        self._frozen_after = parameters.frozen_after or math.inf
         self._useless: Counter[str] = Counter()
         """Images in a row that could not be decoded, by camera."""
+        self._parts: dict[str, tuple[UInt8Array, int]] = {}
+        """Of cameras that share an image: what each showed when its part last changed, and the number of that frame."""
+        self._still: set[str] = set()
+        """Those whose part is frozen."""
         self._refused: Counter[str] = Counter()
         """Frames in a row that `refuse` was called for, by camera."""
         self._changed = threading.Condition()
@@ -204,7 +214,7 @@ class FrameReceiver:
                 self._on_frame(frame)
                 self._changed.notify_all()
             elif refused == "frozen":
-                self._faults[frame.camera] = f"{frame.camera}: the image is frozen; restart its camera or program"
+                self._faults[frame.camera] = _FROZEN.format(frame.camera)
         return refused
 
     def count(self, camera: str, *what: Count) -> None:
@@ -255,6 +265,8 @@ class FrameReceiver:
             self._changed.notify_all()
 
     def _fault(self, camera: str) -> str | None:
+        if camera in self._still:
+            return _FROZEN.format(camera)
         useless = self._useless[camera] >= _USELESS_AFTER
         return f"{camera}: its images show nothing; check its lens and cable" if useless else self._faults[camera]
 
@@ -273,8 +285,22 @@ class FrameReceiver:
             image = raw.decode(raw.data)
         except CorruptImageError:
             with self._changed:
-                self._assembler.spoil(raw.camera)
+                self._assembler.spoil(raw.camera, "corrupt", "undecodable")
                 self._useless[raw.camera] += 1
             return None
         self._useless[raw.camera] = 0
+        if raw.shared and self._is_still(raw, image):
+            with self._changed:
+                self._assembler.spoil(raw.camera, "frozen")
+            return None
         return Frame(raw.camera, image, raw.time_s, raw.sequence)
+
+    def _is_still(self, raw: RawFrame, image: UInt8Array) -> bool:
+        """Whether a camera's part has not changed for as many images as make a whole one frozen."""
+        before, number = self._parts.get(raw.camera, (None, 0))
+        if before is None or raw.sequence < number or not np.array_equal(before, image):
+            self._parts[raw.camera] = image, raw.sequence
+            self._still.discard(raw.camera)
+        elif raw.sequence - number >= self._frozen_after:
+            self._still.add(raw.camera)
+        return raw.camera in self._still

@@ -69,6 +69,7 @@ class ChildDevice(CameraDevice):
         Every user of the computer can read arguments, and what is told may hold a password.
         """
         self._name, self._rate_hz, self._size = camera.name, camera.rate_hz, size
+        self._size_words = camera.size_words
         self._format: ImageFormat | None = None
         self._last_s: float | None = None
         self._sequence = 0
@@ -131,7 +132,8 @@ class ChildDevice(CameraDevice):
         """Raises CameraError for another width and height than the rig's."""
         if size != self._size:
             gives, asked = (f"{width}x{height}" for width, height in (size, self._size))
-            raise CameraError(f"{self._name}: {who} {gives}, but the rig has {asked}; {remedy}")
+            whose, key = self._size_words
+            raise CameraError(f"{self._name}: {who} {gives}, but {whose} {asked}; {remedy} {key}")
 
     def _captured(self, data: bytes, message: ChildMessage) -> CapturedBuffer:
         """An image with its number."""

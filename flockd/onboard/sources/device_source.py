@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from flockd.core.config.rig import IntrinsicsConfig
@@ -14,7 +14,7 @@ from flockd.onboard.sources.assembler import FrameReceiver
 from flockd.onboard.sources.child_device import CHILD, ROS_CHILD
 from flockd.onboard.sources.frames import CameraDevice, CameraError, CapturedBuffer, Count, RawFrame
 from flockd.onboard.sources.gstreamer_device import GstreamerDevice
-from flockd.onboard.sources.image_formats import CorruptImageError, ImageFormat
+from flockd.onboard.sources.image_formats import CorruptImageError, ImageFormat, SharedImage
 from flockd.onboard.sources.ros_device import RosDevice
 from flockd.onboard.sources.v4l2_device import V4l2Device
 from flockd.onboard.sources.v4l2_kernel import Kernel
@@ -41,7 +41,8 @@ class Devices:
         if camera.pipeline:
             return GstreamerDevice(camera, size, self.command)
         if camera.topic:
-            return RosDevice(camera, size, self.lenses.get(camera.name), self.ros_command)
+            lens = None if camera.crop else self.lenses.get(camera.name)
+            return RosDevice(camera, size, lens, self.ros_command)
         return V4l2Device(camera, size, self.kernel)
 
 
@@ -60,10 +61,16 @@ class DeviceSource(FrameReceiver):
         ``on_frame`` is called with each usable frame, on its camera's thread.
         """
         super().__init__(tuple(sizes), parameters, on_frame=on_frame)
-        self._cameras = [
-            _Camera(camera, sizes[camera.name], parameters.silence_s, self, devices or Devices())
-            for camera in parameters.cameras
-        ]
+        by_image: dict[str, list[CameraDeviceParameters]] = {}
+        for camera in parameters.cameras:
+            by_image.setdefault(camera.place if camera.crop else camera.name, []).append(camera)
+        self._cameras = []
+        for cameras in by_image.values():
+            first, size = cameras[0], sizes[cameras[0].name]
+            if first.crop is not None:
+                width, height = parameters.whole_px(first)
+                size = width // first.reduce, height // first.reduce
+            self._cameras.append(_Device(cameras, size, parameters.silence_s, self, devices or Devices()))
 
     def start(self) -> None:
         """See ``FrameSource``."""
@@ -80,21 +87,24 @@ class DeviceSource(FrameReceiver):
             camera.join(max(until_s - time.monotonic(), 0.0))
 
 
-class _Camera(threading.Thread):
-    """The thread that keeps one camera running."""
+class _Device(threading.Thread):
+    """The thread that keeps one device running, of one camera, or of several that are cut from its images."""
 
     def __init__(
         self,
-        parameters: CameraDeviceParameters,
+        cameras: Sequence[CameraDeviceParameters],
         size: tuple[int, int],
         silence_s: float,
         receiver: FrameReceiver,
         devices: Devices,
     ) -> None:
-        super().__init__(name=f"camera-{parameters.name}", daemon=True)
-        self._parameters, self._size, self._silence_s = parameters, size, silence_s
+        first = cameras[0]
+        super().__init__(name=f"camera-{first.name}", daemon=True)
+        self._parameters = first if first.crop is None else first.model_copy(update={"turn_deg": 0})
+        """Parts of an image are turned when they are cut, each by its own angle."""
+        self._cameras, self._size, self._silence_s = cameras, size, silence_s
         self._receiver, self._devices = receiver, devices
-        self._who = parameters.name
+        self._who = first.name
         self._delivered = False
         """Whether this opening of the device has brought a usable frame."""
         self._has_delivered = False
@@ -108,12 +118,12 @@ class _Camera(threading.Thread):
             self._delivered = False
             try:
                 with self._devices.open(self._parameters, self._size) as device:
-                    self._receiver.count(self._who, "opened")
+                    self._count("opened")
                     self._capture(device)
             except CameraError as error:
-                self._receiver.fault(self._who, str(error))
+                self._fault(str(error).removeprefix(f"{self._who}: "))
             except Exception as error:  # noqa: BLE001 - the thread's border: a camera that fails so is seen, too
-                self._receiver.fault(self._who, f"{self._who}: cannot be run ({type(error).__name__}: {error})")
+                self._fault(f"cannot be run ({type(error).__name__}: {error})")
             pause_s = _FIRST_PAUSE_S if self._delivered else pause_s
             self.stopping.wait(pause_s)
             pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S)
@@ -125,7 +135,7 @@ class _Camera(threading.Thread):
         while not self.stopping.is_set():
             captured = device.read(_LOOK_S)
             if captured is not None and left_over:
-                self._receiver.count(self._who, "received", "late")
+                self._count("received", "late")
                 left_over = False
             elif captured is not None:
                 refused = self._take(captured, device.image_format())
@@ -148,7 +158,26 @@ class _Camera(threading.Thread):
         except CorruptImageError:
             refused = refused or "corrupt"
         if refused is not None:
-            self._receiver.count(self._who, "received", refused)
+            self._count("received", refused)
             return refused
-        frame = RawFrame(self._who, captured.data, image_format.decode, captured.time_s, captured.sequence)
-        return self._receiver.offer(frame)
+        taken = [self._receiver.offer(frame) for frame in frames_of(self._cameras, captured, image_format)]
+        return None if None in taken else taken[0]
+
+    def _count(self, *what: Count) -> None:
+        for camera in self._cameras:
+            self._receiver.count(camera.name, *what)
+
+    def _fault(self, sentence: str) -> None:
+        for camera in self._cameras:
+            self._receiver.fault(camera.name, f"{camera.name}: {sentence}")
+
+
+def frames_of(
+    cameras: Sequence[CameraDeviceParameters], captured: CapturedBuffer, image_format: ImageFormat
+) -> Iterator[RawFrame]:
+    """The frames of all cameras of one image, whose data they share."""
+    whole = SharedImage(image_format)
+    for camera in cameras:
+        decode = image_format.decode if camera.crop is None else whole.decoder(camera)
+        shared = camera.crop is not None
+        yield RawFrame(camera.name, captured.data, decode, captured.time_s, captured.sequence, shared)

@@ -39,6 +39,8 @@ class RawFrame:
     time_s: float
     """Monotonic, when the image was taken."""
     sequence: int
+    shared: bool = False
+    """Other cameras' images are in these data too: they change when this camera's part does not."""
 
 
 @dataclass(frozen=True)

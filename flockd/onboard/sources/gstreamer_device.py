@@ -54,7 +54,7 @@ class GstreamerDevice(ChildDevice):
             raise CameraError(f"{self._name}: its pipeline gives {masked(text)[:80]}; end it with `videoconvert`")
         self._format, size = found
         scale = f"`videoscale ! video/x-raw,width={self._size[0]},height={self._size[1]}`"
-        self._check_size(size, "its pipeline gives", f"end it with {scale}, or correct size_px")
+        self._check_size(size, "its pipeline gives", f"end it with {scale}, or correct")
 
     def _failed(self, reason: str) -> CameraError:
         if reason == NOT_INSTALLED:
@@ -80,11 +80,15 @@ class PlanarFormat:
         """See ``ImageFormat``: size."""
         check_length(data, self.size[0] * self.size[1] * 3 // 2)
 
-    def decode(self, data: bytes) -> UInt8Array:
+    def pixels(self, data: bytes) -> UInt8Array:
         """See ``ImageFormat``."""
         self.check(data)
         planes = np.frombuffer(data, np.uint8).reshape(-1, self.size[0])
-        return plausible(np.asarray(cv2.cvtColor(planes, _PLANAR[self.name]), np.uint8))
+        return np.asarray(cv2.cvtColor(planes, _PLANAR[self.name]), np.uint8)
+
+    def decode(self, data: bytes) -> UInt8Array:
+        """See ``ImageFormat``."""
+        return plausible(self.pixels(data))
 
 
 def _formats(size: tuple[int, int]) -> tuple[str, ...]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, Protocol
 
 import cv2
 import numpy as np
 
+from flockd.core.config.source import CameraDeviceParameters
 from flockd.core.jpeg_header import cost_fault, jpeg_end, jpeg_size
 from flockd.core.messages import UInt8Array
 
@@ -49,8 +51,11 @@ class ImageFormat(Protocol):
     def check(self, data: bytes) -> None:
         """Raises CorruptImageError for what can be seen to be wrong without decoding: takes microseconds."""
 
+    def pixels(self, data: bytes) -> UInt8Array:
+        """(height, width, 3) RGB, whatever it shows; raises CorruptImageError."""
+
     def decode(self, data: bytes) -> UInt8Array:
-        """(height, width, 3) RGB; raises CorruptImageError."""
+        """The same, which also raises CorruptImageError where a camera's image shows too little."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,7 @@ class MjpegFormat:
         if (fault := cost_fault(data)) is not None:
             raise CorruptImageError(f"JPEG {fault}")
 
-    def decode(self, data: bytes) -> UInt8Array:
+    def pixels(self, data: bytes) -> UInt8Array:
         """See ``ImageFormat``."""
         self.check(data)
         flags = _REDUCING[self.reduce] | cv2.IMREAD_IGNORE_ORIENTATION
@@ -89,7 +94,11 @@ class MjpegFormat:
             raise CorruptImageError("JPEG cannot be decoded")
         if self.reduce > 1:  # OpenCV reduces in its own order of colours only
             image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-        return plausible(np.asarray(image, np.uint8))
+        return np.asarray(image, np.uint8)
+
+    def decode(self, data: bytes) -> UInt8Array:
+        """See ``ImageFormat``."""
+        return plausible(self.pixels(data))
 
 
 @dataclass(frozen=True)
@@ -113,18 +122,27 @@ class PackedFormat:
             raise CorruptImageError(f"rows of {self._bytes_per_line()} bytes, where {width} pixels take {row}")
         check_length(data, self._bytes_per_line() * self.size[1])
 
+    def pixels(self, data: bytes) -> UInt8Array:
+        """See ``ImageFormat``."""
+        return self._reduced(self._whole(data))
+
     def decode(self, data: bytes) -> UInt8Array:
         """See ``ImageFormat``."""
+        return self._reduced(plausible(self._whole(data)))
+
+    def _whole(self, data: bytes) -> UInt8Array:
         self.check(data)
         (width, height), (depth, conversion) = self.size, PACKED[self.name]
         across = up_to(2, width) if depth == 2 else width  # two pixels share their colours
         rows = np.frombuffer(data, np.uint8).reshape(height, self._bytes_per_line())
         pixels = np.ascontiguousarray(rows[:, : depth * across]).reshape(height, across, depth)
         image = pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion), np.uint8)
-        whole = plausible(np.ascontiguousarray(image[:, :width]))
+        return np.ascontiguousarray(image[:, :width])
+
+    def _reduced(self, whole: UInt8Array) -> UInt8Array:
         if self.reduce == 1:
             return whole
-        size = width // self.reduce, height // self.reduce
+        size = self.size[0] // self.reduce, self.size[1] // self.reduce
         return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.uint8)
 
     def _bytes_per_line(self) -> int:
@@ -160,9 +178,37 @@ class TurnedFormat:
         """See ``ImageFormat``."""
         self.inner.check(data)
 
+    def pixels(self, data: bytes) -> UInt8Array:
+        """See ``ImageFormat``: up is up."""
+        return turned(self.inner.pixels(data), self.clockwise_deg)
+
     def decode(self, data: bytes) -> UInt8Array:
         """See ``ImageFormat``: up is up."""
-        return np.asarray(cv2.rotate(self.inner.decode(data), _TURNS[self.clockwise_deg]), np.uint8)
+        return turned(self.inner.decode(data), self.clockwise_deg)
+
+
+class SharedImage:
+    """One image of several cameras: decoded once, when the first of them is asked for."""
+
+    def __init__(self, image_format: ImageFormat) -> None:
+        self._format = image_format
+        self._pixels: UInt8Array | None = None
+
+    def decoder(self, camera: CameraDeviceParameters) -> Decoder:
+        """Of a camera's part, a view of the whole unless it is turned."""
+        return partial(self._part, camera)
+
+    def _part(self, camera: CameraDeviceParameters, data: bytes) -> UInt8Array:
+        assert camera.crop is not None
+        if self._pixels is None:
+            self._pixels = self._format.pixels(data)
+        left, top, width, height = (length // camera.reduce for length in camera.crop)
+        return turned(plausible(self._pixels[top : top + height, left : left + width]), camera.turn_deg)
+
+
+def turned(image: UInt8Array, clockwise_deg: Literal[0, 90, 180, 270]) -> UInt8Array:
+    """The image as it is seen when it is turned so."""
+    return np.asarray(cv2.rotate(image, _TURNS[clockwise_deg]), np.uint8) if clockwise_deg else image
 
 
 def check_length(data: bytes, length: int) -> None:

@@ -38,19 +38,23 @@ def info_topic_of(topic: str) -> str:
 
 
 def ros_format(
-    encoding: str, size: tuple[int, int] | None, bytes_per_line: int | None, wanted: tuple[int, int]
+    encoding: str,
+    size: tuple[int, int] | None,
+    bytes_per_line: int | None,
+    wanted: tuple[int, int],
+    size_words: tuple[str, str],
 ) -> ImageFormat:
     """Of a message's images, which have to be of the size ``wanted``. Raises ValueError for those that cannot be read.
 
-    ``encoding``: of an Image; of a CompressedImage, whose ``size`` is None, its `format`.
+    ``encoding``: of an Image; of a CompressedImage, whose ``size`` is None, its `format`. ``size_words``: its camera's.
     """
     if size is None:
         if "compressedDepth" not in encoding and ("jpeg" in encoding or "jpg" in encoding):
             return MjpegFormat(wanted)
         raise ValueError(f"sends {encoding[:40]!r}; let its transport send JPEG")
     if size != wanted:
-        told = f"gives {size[0]}x{size[1]}, but the rig has {wanted[0]}x{wanted[1]}"
-        raise ValueError(f"{told}; correct size_px, or the driver")
+        told = f"gives {size[0]}x{size[1]}, but {size_words[0]} {wanted[0]}x{wanted[1]}"
+        raise ValueError(f"{told}; correct {size_words[1]}, or the driver")
     if encoding not in ENCODINGS:
         known = ", ".join(ENCODINGS)
         raise ValueError(f"has the encoding {encoding[:40]!r}, and not one of {known}; convert it, as image_proc does")
@@ -101,7 +105,7 @@ class RosDevice(ChildDevice):
         encoding = text.rstrip(b"\0").decode("utf-8", "replace")
         size = None if message.kind == COMPRESSED else (width, height)
         try:
-            self._format = ros_format(encoding, size, bytes_per_line, self._size)
+            self._format = ros_format(encoding, size, bytes_per_line, self._size, self._size_words)
         except ValueError as error:
             raise CameraError(f"{self._name}: {self._topic} {error}") from None
         return self._captured(message.data[IMAGE_HEAD.size :], message)

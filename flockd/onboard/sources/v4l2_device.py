@@ -50,6 +50,8 @@ class V4l2Device(CameraDevice):
         width, height = size if camera.turn_deg % 180 == 0 else (size[1], size[0])
         self._size = width * camera.reduce, height * camera.reduce
         self._pixel_format, self._turn_deg, self._reduce = camera.pixel_format, camera.turn_deg, camera.reduce
+        self._other_size = f", or write a smaller reduce than {camera.reduce}" if camera.reduce > 1 else ""
+        self._other_size += ", or correct crop_of" if camera.crop else ""
         self._maps: list[mmap.mmap] = []
         self._bytes_per_line = 0
         with self._telling("cannot be opened"):
@@ -120,10 +122,9 @@ class V4l2Device(CameraDevice):
             self._kernel.ioctl(self._descriptor, v4l2.VIDIOC_S_FMT, asked)
         if (asked.width, asked.height) != size or asked.pixelformat != FOURCC[pixel_format]:
             offered = int(asked.pixelformat).to_bytes(4, "little").decode("ascii", "replace")
-            smaller = f", or write a smaller reduce than {self._reduce}" if self._reduce > 1 else ""
             raise CameraError(
                 f"{self._who} offers {asked.width}x{asked.height} {offered} instead of {size[0]}x{size[1]} "
-                f"{pixel_format}; choose from what `v4l2-ctl --list-formats-ext` lists{smaller}"
+                f"{pixel_format}; choose from what `v4l2-ctl --list-formats-ext` lists{self._other_size}"
             )
         self._bytes_per_line = int(asked.bytesperline) or 2 * size[0]
 

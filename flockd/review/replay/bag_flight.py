@@ -8,8 +8,8 @@ from __future__ import annotations
 import json
 import uuid
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
-from functools import partial
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -18,6 +18,7 @@ import numpy as np
 
 from flockd.core.choices import ImageFormat
 from flockd.core.config import DroneConfig
+from flockd.core.config.source import CameraDeviceParameters
 from flockd.core.errors import UsageError
 from flockd.core.messages import UInt8Array, VehicleState
 from flockd.fleet.ros.message_trees import COMPRESSED_IMAGE, IMU
@@ -51,8 +52,10 @@ from flockd.onboard.recording.streams import (
     is_image,
     nanoseconds,
 )
+from flockd.onboard.sources import image_formats
 from flockd.onboard.sources.assembler import Assembler, RawFrameSet
-from flockd.onboard.sources.frames import RawFrame
+from flockd.onboard.sources.device_source import frames_of
+from flockd.onboard.sources.frames import CapturedBuffer
 from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat
 from flockd.onboard.sources.ros_device import info_fault, info_topic_of, ros_format
 
@@ -77,12 +80,15 @@ def recording_of_bag(
             f"{bag.path}: is a bag of ROS 2; replay it with --config, a drone's whose source.kind is `ros` and whose "
             "cameras name their topics"
         )
-    topics = {camera.place: camera.name for camera in source.cameras}
+    topics: dict[str, list[CameraDeviceParameters]] = {}
+    for camera in source.cameras:
+        topics.setdefault(camera.place, []).append(camera)
     kinds = bag.kinds()
-    for topic, camera in topics.items():
+    for topic, cameras in topics.items():
         if kinds.get(topic) not in {IMAGE, COMPRESSED_IMAGE}:
             there = ", ".join(name for name, kind in kinds.items() if kind in {IMAGE, COMPRESSED_IMAGE}) or "none"
-            raise UsageError(f"{bag.path}: has no images of camera {camera} in {topic}; topics with images: {there}")
+            told = f"has no images of camera {cameras[0].name} in {topic}; topics with images: {there}"
+            raise UsageError(f"{bag.path}: {told}")
     _compare_lenses(bag, config, kinds)
     began_ns = next((stamp_ns(bag.read(one)) for one in bag.messages(topics)), 0)
     states = _states(bag, _vehicle_topic(bag, vehicle_topic), config, began_ns, tell)
@@ -120,7 +126,7 @@ def _compare_lenses(bag: Bag, config: DroneConfig, kinds: Mapping[str, str]) -> 
     """Raises RecordingError where a CameraInfo contradicts the rig, as in flight."""
     assert config.source is not None
     lenses = {camera.name: (camera.intrinsics, camera.size_px) for camera in config.rig.cameras}
-    for camera in config.source.cameras:
+    for camera in (one for one in config.source.cameras if one.crop is None):
         topic = camera.camera_info or info_topic_of(camera.place)
         if kinds.get(topic) != CAMERA_INFO or (message := next(bag.messages([topic]), None)) is None:
             continue
@@ -131,27 +137,33 @@ def _compare_lenses(bag: Bag, config: DroneConfig, kinds: Mapping[str, str]) -> 
 
 
 def _sets(
-    bag: Bag, topics: Mapping[str, str], config: DroneConfig, began_ns: int, lost: Counter[str]
+    bag: Bag,
+    topics: Mapping[str, Sequence[CameraDeviceParameters]],
+    config: DroneConfig,
+    began_ns: int,
+    lost: Counter[str],
 ) -> Iterator[RawFrameSet]:
     """Frames by their stamps, as a drone puts them together; the clock begins with the first one's."""
     assert config.source is not None
     sizes = {camera.name: camera.size_px for camera in config.rig.cameras}
     assembler = Assembler(tuple(sizes), config.source)
-    rates = {camera.name: camera.rate_hz for camera in config.source.cameras}
-    last: dict[str, RawFrame] = {}
+    last: dict[str, CapturedBuffer] = {}
     for message in bag.messages(topics):
-        camera = topics[message.topic]
+        cameras = topics[message.topic]
+        first = cameras[0]
+        size = sizes[first.name] if first.crop is None else config.source.whole_px(first)
         image = image_of(bag.read(message))
         time_s, number = _time_s(image.stamp_ns, began_ns), 0
-        if (before := last.get(camera)) is not None:
-            number = before.sequence + max(round((time_s - before.time_s) * rates[camera]), 1)
-        frame = RawFrame(camera, image.data, _decoder(image, sizes[camera], message), time_s, number)
-        if (fault := assembler.offer(frame, time_s)) is not None:
-            lost[f"camera {camera}: {fault}"] += 1
-        else:
-            last[camera] = frame
-            if (found := assembler.take(time_s)) is not None:
-                yield found
+        if (before := last.get(message.topic)) is not None:
+            number = before.sequence + max(round((time_s - before.time_s) * first.rate_hz), 1)
+        captured = CapturedBuffer(image.data, time_s, number, flagged=False)
+        for frame in frames_of(cameras, captured, _format(image, size, first.size_words, message)):
+            if (fault := assembler.offer(frame, time_s)) is not None:
+                lost[f"camera {frame.camera}: {fault}"] += 1
+            else:
+                last[message.topic] = captured
+        if last.get(message.topic) is captured and (found := assembler.take(time_s)) is not None:
+            yield found
     if (found := assembler.take(np.inf)) is not None:
         yield found
 
@@ -161,25 +173,39 @@ def _time_s(stamp_ns: int, began_ns: int) -> float:
     return (stamp_ns - began_ns) * 1e-9
 
 
-def _decoder(image: RosImage, size: tuple[int, int], message: BagMessage) -> Callable[[bytes], UInt8Array]:
+def _format(
+    image: RosImage, size: tuple[int, int], words: tuple[str, str], message: BagMessage
+) -> image_formats.ImageFormat:
     """As in flight, and PNG, which a bag may well hold. Raises RecordingError for what is not the camera's."""
     if image.size is None and "png" in image.encoding and "compressedDepth" not in image.encoding:
-        return partial(_decoded_png, size=size)
+        return _PngFormat(size)
     try:
-        return ros_format(image.encoding, image.size, image.bytes_per_line, size).decode
+        return ros_format(image.encoding, image.size, image.bytes_per_line, size, words)
     except ValueError as error:
         raise RecordingError(f"{message.topic}: {error}") from None
 
 
-def _decoded_png(data: bytes, size: tuple[int, int]) -> UInt8Array:
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB) if data else None
-    except cv2.error:
-        image = None
-    if image is None or image.shape[1::-1] != size:
-        shown = "no PNG" if image is None else f"a PNG of {image.shape[1]}x{image.shape[0]}"
-        raise CorruptImageError(f"{shown} instead of {size[0]}x{size[1]}")
-    return np.asarray(image, np.uint8)
+@dataclass(frozen=True)
+class _PngFormat:
+    """Whatever it shows is right."""
+
+    size: tuple[int, int]
+
+    def check(self, data: bytes) -> None:
+        """Nothing: decoding tells."""
+
+    def pixels(self, data: bytes) -> UInt8Array:
+        """See ``ImageFormat``."""
+        try:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB) if data else None
+        except cv2.error:
+            image = None
+        if image is None or image.shape[1::-1] != self.size:
+            shown = "no PNG" if image is None else f"a PNG of {image.shape[1]}x{image.shape[0]}"
+            raise CorruptImageError(f"{shown} instead of {self.size[0]}x{self.size[1]}")
+        return np.asarray(image, np.uint8)
+
+    decode = pixels
 
 
 def _states(bag: Bag, topic: str, config: DroneConfig, began_ns: int, tell: Callable[[str], None]) -> NearestState:

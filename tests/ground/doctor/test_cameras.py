@@ -77,6 +77,28 @@ def test_two_cameras_that_run_as_they_should() -> None:
     assert (cameras.level, camera.level) == (Level.WARNING, Level.PASS), "without a source it can be simulated"
 
 
+def test_two_cameras_in_one_image_are_judged_each_by_itself() -> None:
+    """Side by side in 1280 x 480; the board that is not there is a fault of both."""
+    config = _config("front", "back")
+    assert config.source is not None
+    halves = [
+        one.model_copy(update={"device": "/dev/board", "crop": (640 * number, 0, 640, 480)})
+        for number, one in enumerate(config.source.cameras)
+    ]
+    config = config.model_copy(update={"source": config.source.model_copy(update={"cameras": tuple(halves)})})
+    kernel = FakeKernel(board=FakeCamera(formats=((1280, 480, b"MJPG"),)))
+    both = [jpeg(np.concatenate([scene(number), scene(number + 10)], axis=1)) for number in range(8)]
+    with filming(kernel, "board", pictures=both):
+        found = _examined(config, kernel)
+    for name, left in (("front", 0), ("back", 640)):
+        (finding,) = found[f"camera {name}"]
+        assert finding.level is Level.PASS, finding
+        assert f"no gaps, 2 controls accepted, cut at {left}, 0 from images of /dev/board" in finding.measured
+    found = _examined(config, FakeKernel())
+    for name in ("front", "back"):
+        _problem(found, Level.FAILURE, "/dev/board is not there", f"camera {name}")
+
+
 def _problem(found: dict[str, list[Finding]], level: Level, told: str, about: str = "camera front") -> Finding:
     (problem,) = found[about]
     assert problem.level is level, problem

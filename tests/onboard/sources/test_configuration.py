@@ -88,7 +88,8 @@ def test_frames_come_from_where_the_file_says_and_so_does_its_recording(
 def test_the_examples_of_the_documentation_check(tmp_path: Path) -> None:
     """Pipelines and topics on the page of cameras, and the drone of the page on ROS 2."""
     docs = QUADROTOR.parents[1] / "docs"
-    examples = re.findall(r"```yaml\n(source:.*?)```", (docs / "cameras.md").read_text(encoding="utf-8"), re.DOTALL)
+    page = (docs / "cameras.md").read_text(encoding="utf-8")
+    examples = re.findall(r"```yaml\n(source:.*?)```", page, re.DOTALL)
     path, places = tmp_path / "drone.yaml", []
     for example in examples:
         names = re.findall(r"- name: (\w+)", example)
@@ -103,6 +104,11 @@ def test_the_examples_of_the_documentation_check(tmp_path: Path) -> None:
         ["nvarguscamerasrc", "libcamerasrc", "rtspsrc", "v4l2src"],
         ["/front/image_raw", "/back/image_raw/compressed"],
     ]
+    (board,) = (one for one in re.findall(r"```yaml\n(rig:.*?)```", page, re.DOTALL) if "crop:" in one)
+    path.write_text(board, encoding="utf-8")
+    shared = load_drone(path).source
+    assert shared is not None
+    assert shared.whole_px(shared.cameras[0]) == (1280, 400), "as the page says"
     (eyes,) = re.findall(r"```yaml\n(.*?)```", (docs / "ros.md").read_text(encoding="utf-8"), re.DOTALL)
     path.write_text(eyes, encoding="utf-8")
     assert load_drone(path).name == "uav1"

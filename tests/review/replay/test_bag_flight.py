@@ -10,7 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import yaml
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -170,7 +169,7 @@ def bag(
 
 def config_file(folder: Path, **changes: Any) -> Path:
     file = folder / "theirs.yaml"
-    file.write_text(yaml.safe_dump({**DRONE, **changes}), encoding="utf-8")
+    file.write_text(json.dumps({**DRONE, **changes}), encoding="utf-8")
     return file
 
 
@@ -291,3 +290,51 @@ def test_px4s_own_odometry_is_the_vehicles_state(topic: str, tmp_path: Path) -> 
         np.testing.assert_allclose(step.vehicle.velocity_ned, [0.0, 2.0, 0.0], atol=1e-6)  # type: ignore[arg-type]
         np.testing.assert_allclose(step.vehicle.R_ned_body[:, 0], [0.0, 1.0, 0.0], atol=1e-6)
         assert step.vehicle.height_m == 3.0
+
+
+NAMES = ("front", "right", "back", "left")
+
+
+def test_four_parts_of_one_topic_are_replayed_as_four_topics(tmp_path: Path) -> None:
+    """The same pictures: of a topic each, and side by side in one topic, with a crop each."""
+    recordings = {}
+    for folder in ("four", "one"):
+        with Writer(tmp_path / folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+            topics = [f"/{name}/image_raw" for name in NAMES] if folder == "four" else ["/board/image_raw"]
+            kinds = dict.fromkeys(topics, "sensor_msgs/msg/Image") | {"/odom": ODOMETRY}
+            connections = {one: writer.add_connection(one, name, typestore=STORE) for one, name in kinds.items()}
+            for tick in range(5):
+                time_ns = BEGAN_NS + 100_000_000 * tick
+                shown = [picture(10 * tick + number, name) for number, name in enumerate(NAMES)]
+                sent: list[Any] = shown if folder == "four" else [np.concatenate(shown, axis=1)]
+                messages = {"/odom": odometry(time_ns, np.array([0.0, 0.1 * tick, 3.0]))}
+                messages |= {topic: raw(time_ns, image) for topic, image in zip(topics, sent, strict=True)}
+                for topic, message in messages.items():
+                    writer.write(connections[topic], time_ns, STORE.serialize_cdr(message, kinds[topic]))
+        cameras = [{"name": name, "topic": f"/{name}/image_raw", "rate_hz": 10} for name in NAMES]
+        if folder == "one":
+            crops = [{"topic": "/board/image_raw", "crop": [64 * number, 0, *SIZE]} for number in range(4)]
+            cameras = [camera | crop for camera, crop in zip(cameras, crops, strict=True)]
+        rig = [DRONE["rig"]["cameras"][0] | {"name": name} for name in NAMES]  # type: ignore[index]
+        source = DRONE["source"] | {"cameras": cameras}  # type: ignore[operator]
+        config = load_drone(config_file(tmp_path, rig={"cameras": rig}, source=source))
+        with Bag(tmp_path / folder) as theirs:
+            told = list[str]()
+            assert recording_of_bag(theirs, config, None, tmp_path / f"{folder}.mcap", told.append) == 3
+            assert told == []
+        recordings[folder] = list(Recording(tmp_path / f"{folder}.mcap").steps())
+    for number, (four, one) in enumerate(zip(recordings["four"], recordings["one"], strict=True)):
+        assert four.frames.frames.keys() == one.frames.frames.keys() == {*NAMES}
+        for place, name in enumerate(NAMES):
+            a, b = four.frames.frames[name], one.frames.frames[name]
+            assert (a.time_s, a.sequence) == (b.time_s, b.sequence)
+            assert np.array_equal(a.image, b.image)
+            assert np.array_equal(b.image, picture(20 * number + place, name))
+
+
+def raw(time_ns: int, shown: UInt8Array) -> Any:
+    height, width = shown.shape[:2]
+    return kind("sensor_msgs/msg/Image")(
+        header=header(time_ns), height=height, width=width, encoding="rgb8", is_bigendian=0, step=3 * width,
+        data=shown.ravel(),
+    )  # fmt: skip
