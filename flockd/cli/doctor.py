@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import json
 import logging
+import os
+import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.options import add_force, load_to_fly
-from flockd.cli.output import progress, say, say_json, tables_console
+from flockd.cli.options import add_force, load_to_fly, refuse
+from flockd.cli.output import Phases, progress, say, say_json, tables_console
 from flockd.cli.parser import Commands, flag, option, positive_number
-from flockd.core.errors import ExitCode, UnavailableError
+from flockd.core.errors import ExitCode, UnavailableError, UsageError
 from flockd.core.printable import printable
 
 if TYPE_CHECKING:
@@ -20,6 +23,8 @@ if TYPE_CHECKING:
     from flockd.ground.doctor import Finding
 
 SECONDS = 4.0
+BENCH = "bench.yaml"
+MADE_UP = "autopilot and images are made up: this examines the computer, and no camera, autopilot or drone"
 STYLES = {"FAILURE": "bold red", "WARNING": "yellow", "PASS": "green"}
 """The worst first."""
 
@@ -33,16 +38,21 @@ def add(commands: Commands) -> None:
         "sudo -u flockd flockd doctor --config /etc/flockd/drone.yaml --record /var/lib/flockd",
         "flockd doctor --config config/quadrotor.yaml --only cameras --seconds 30",
         "flockd doctor --config config/simulator.yaml --json",
+        "flockd doctor --bench --demo",
+        "flockd doctor --bench --demo --config config/quadrotor.yaml",
     )
     description = (
         "Examine a drone on the ground: cameras, models, autopilot, computer, telemetry. Changes nothing: "
         "never arms, switches modes or sends setpoints."
     )
     parser = commands("doctor", description, examples, _run)
-    option(parser, "--config FILE", "the drone's configuration", Path, required=True)
+    option(parser, "--config FILE", "the drone's configuration; with --demo by default the simulator's", Path)
     option(parser, "--record DIR", "where `flockd run` is to record flights", Path)
-    option(parser, "--seconds S", f"watch the cameras this long ({SECONDS:g})", positive_number, default=SECONDS)
+    seconds = f"watch the cameras this long ({SECONDS:g}), or fly the bench"
+    option(parser, "--seconds S", seconds, positive_number)
     option(parser, "--only CHECK", f"only this one, of {', '.join(CHECKS)}", action="append", choices=CHECKS)
+    flag(parser, "--bench", "run the daemon and time its steps; needs --demo, and the extra `sim`")
+    flag(parser, "--demo", "with nothing attached: a made-up autopilot, and images drawn by the simulator")
     flag(parser, "--json", "print JSON")
     add_force(parser)
 
@@ -50,13 +60,23 @@ def add(commands: Commands) -> None:
 def _run(args: argparse.Namespace) -> int:
     from flockd.ground.doctor import Level
 
-    config = load_to_fly(args.config, force=args.force)
-    logging.getLogger("flockd.onboard.autopilot").setLevel(logging.CRITICAL)  # what MAVSDK has to tell, the findings do
-    found = _examine(config, args)
-    if args.json:
-        say_json(_as_json(config.name, found))
+    if args.bench != args.demo:
+        own = "run `flockd run` with propellers off, and watch `flockd status`"
+        raise UsageError(f"--bench and --demo go together; add the other one, or, for the bench of a drone, {own}")
+    if args.bench:
+        refuse(args, ("record", "only", "force"), "has no meaning with --demo; drop it")
+        drone, found = "bench", _fly_bench(args)
+    elif args.config is None:
+        raise UsageError("--config is missing; name the drone's file, or try `flockd doctor --bench --demo`")
     else:
-        _print(config.name, found)
+        config = load_to_fly(args.config, force=args.force)
+        # What MAVSDK has to tell, the findings do.
+        logging.getLogger("flockd.onboard.autopilot").setLevel(logging.CRITICAL)
+        drone, found = config.name, _examine(config, args)
+    if args.json:
+        say_json(_as_json(drone, found))
+    else:
+        _print(drone, found)
     failed = any(finding.level is Level.FAILURE for findings in found.values() for finding in findings)
     return ExitCode.CHECK_FAILED if failed else ExitCode.DONE
 
@@ -72,9 +92,49 @@ def _examine(config: DroneConfig, args: argparse.Namespace) -> Mapping[str, Sequ
             stack.enter_context(only_owner(config.autopilot))
         except UnavailableError as error:
             taken = error
-        drone = Examined(config, args.record, args.seconds, taken)
+        drone = Examined(config, args.record, args.seconds or SECONDS, taken)
         checks = plan(drone, args.only or CHECKS)
         return run_checks(checks, stack.enter_context(progress("examining", "checks")))
+
+
+def _fly_bench(args: argparse.Namespace) -> Mapping[str, Sequence[Finding]]:
+    """A daemon in real time, with the simulator's autopilot and images. Raises UnavailableError if it does not fly."""
+    from flockd.cli.sim import SITL
+    from flockd.core.config import load_drone
+    from flockd.core.data import data_path
+    from flockd.core.messages import PilotOutput
+    from flockd.ground.doctor import failed, passed, warned
+    from flockd.ground.doctor.model_checks import judge_steps
+    from flockd.onboard.message_json import from_json
+    from flockd.onboard.recording.mcap_file import read_entries
+    from flockd.onboard.recording.streams import OUTPUT
+    from flockd.sim.scenario import load_scenario
+    from flockd.sim.sitl.fleet import fly_fleet
+
+    scenario = load_scenario(data_path("config") / BENCH, {} if args.seconds is None else {"duration_s": args.seconds})
+    if args.config is not None:
+        drone = load_drone(args.config).model_copy(update={"mission": scenario.drone.mission})
+        scenario = scenario.model_copy(update={"drone": drone})
+    with tempfile.TemporaryDirectory(prefix="flockd-bench-") as folder, Phases(quiet=args.json) as phases:
+        phases.say(f"{MADE_UP}; starting the daemon, and taking off")
+        flight = fly_fleet(
+            scenario, load_drone(data_path("config") / SITL), kind="fake", speed_factor=1.0, logs=Path(folder, "logs"),
+            recordings=Path(folder), environment=os.environ, progress=phases.of("flying", "s"),
+        )  # fmt: skip
+        entries = (entry for file in Path(folder).glob("*.mcap") for entry in read_entries(file))
+        outputs = [from_json(PilotOutput, json.loads(one.data)) for one in entries if one.stream.topic == OUTPUT.topic]
+    fleet = flight.log.metadata.fleet
+    assert fleet is not None
+    again = f"examine the drone itself: flockd doctor --config {args.config or 'FILE'}"
+    faults = [*fleet.handed_over.values(), *(f"exit code {code}" for code in fleet.exit_codes.values() if code)]
+    saw = sum(any(neighbour.confirmed for neighbour in output.neighbours) for output in outputs)
+    told = f"flew {scenario.duration_s:g} s in offboard; of {len(outputs)} steps {saw} saw the drone beside it"
+    timed = [(sum(output.stages_ms.values()) / 1e3, output) for output in outputs]
+    daemon = passed("daemon", told)
+    if faults:
+        daemon = failed("daemon", f"did not fly to the end: {'; '.join(faults)}", "stop other programs, and try again")
+    step = judge_steps(scenario.drone, timed, os.getloadavg()[0], os.cpu_count() or 1)
+    return {"bench": (warned("made up", MADE_UP, again), daemon, step)}
 
 
 def _as_json(drone: str, found: Mapping[str, Sequence[Finding]]) -> dict[str, object]:

@@ -20,7 +20,7 @@ _OPTIONS = (
     ("config new", "duration", "write `--set duration_s=S`"),
     ("config new", "obstacles", "write `--set world.obstacles.kind=KIND --set obstacles.enabled=true`"),
     ("config new", "drone", "write `--set drone=FILE`"),
-    ("doctor", "bench minutes", "run `flockd run` with propellers off, and watch `flockd status`"),
+    ("doctor", "minutes", "run `flockd run` with propellers off, and watch `flockd status`"),
     ("doctor", "unit", "`systemd-analyze security flockd` judges the unit"),
     ("fleet", "recordings", "`flockd report FOLDER` writes a report of the recordings that plays them"),
     ("replay", "trajectory", "`--json` gives the motion of each pair, to be put together"),

@@ -4,19 +4,27 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import statistics
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from flockd.cli import main
+from flockd.core.config import DroneConfig
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.data import data_path
 from flockd.core.errors import ModelError
 from flockd.ground.doctor import CHECKS, Check, Finding, Level, passed, run_checks
 from flockd.onboard.autopilot.link_owner import only_owner
+from flockd.onboard.recording.reader import Recording
+from flockd.sim.scenario import ScenarioConfig
 
+FLIGHT = Path(__file__).parents[2] / "review" / "replay" / "crossing.mcap"
 QUADROTOR = str(data_path("config") / "quadrotor.yaml")
 
 
@@ -130,3 +138,64 @@ def test_the_documentation_names_every_check() -> None:
     section = page[page.index("## 3. Check the drone on the ground") :]
     for name in CHECKS:
         assert f"`{name}`" in section[: section.index("\n## ")], name
+
+
+MADE_UP = "autopilot and images are made up: this examines the computer, and no camera, autopilot or drone"
+
+
+@pytest.mark.parametrize(
+    ("handed_over", "exit_code", "level", "told"),
+    [
+        ({}, 0, "PASS", "flew 15 s in offboard; of 10 steps 8 saw the drone beside it"),
+        ({"drone1": "after 3.1 s it left offboard"}, 0, "FAILURE", "did not fly to the end: after 3.1 s it left offb"),
+        ({}, 70, "FAILURE", "did not fly to the end: exit code 70"),
+    ],
+)
+def test_the_bench_of_a_demo_tells_what_is_made_up_and_how_long_its_steps_took(
+    handed_over: dict[str, str], exit_code: int, level: str, told: str,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Its flight is one of those that are recorded: 10 steps."""
+
+    def fly(scenario: ScenarioConfig, sitl: DroneConfig, *, recordings: Path, **rest: Any) -> Any:
+        assert (rest["kind"], rest["speed_factor"], scenario.duration_s) == ("fake", 1.0, 15.0)
+        shutil.copy(FLIGHT, recordings / "drone1-0.mcap")
+        fleet = SimpleNamespace(handed_over=handed_over, exit_codes={"drone1": exit_code})
+        return SimpleNamespace(log=SimpleNamespace(metadata=SimpleNamespace(fleet=fleet)))
+
+    monkeypatch.setattr("flockd.sim.sitl.fleet.fly_fleet", fly)
+    code = main(["doctor", "--bench", "--demo", "--json"])
+    findings = {one["about"]: one for one in json.loads(capsys.readouterr().out)["findings"]}
+    assert code == (0 if level == "PASS" else 1)
+    assert (findings["made up"]["level"], findings["made up"]["measured"]) == ("WARNING", MADE_UP)
+    assert findings["daemon"]["level"] == level
+    assert findings["daemon"]["measured"].startswith(told)
+    recorded = [step.output for step in Recording(FLIGHT).steps() if step.output]
+    assert sum(any(one["confirmed"] for one in output["neighbours"]) for output in recorded) == 8
+    took_ms = statistics.median(sum(output["stages_ms"].values()) for output in recorded[1:])
+    assert f"a step takes {took_ms:.0f} of 500 ms" in findings["step"]["measured"]
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ([], "--config is missing; name the drone's file, or try `flockd doctor --bench --demo`"),
+        (["--bench", "--config", QUADROTOR], "for the bench of a drone, run `flockd run` with propellers off, and"),
+        (["--demo"], "--bench and --demo go together; add the other one"),
+        (["--bench", "--demo", "--only", "rig"], "--only has no meaning with --demo; drop it"),
+    ],
+)
+def test_options_that_do_not_go_together(options: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", *options]) == 2
+    assert told in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.whole_flight
+def test_the_bench_of_a_demo_flies_with_nothing_attached(capsys: pytest.CaptureFixture[str]) -> None:
+    """Whatever the computer's speed: the daemon comes up, takes off, steps and ends."""
+    main(["doctor", "--bench", "--demo", "--seconds", "8"])
+    told = capsys.readouterr()
+    assert MADE_UP in told.out
+    assert MADE_UP in told.err
+    assert re.search(r"a step takes \d+ of 500 ms with 1 thread and 4 cameras", told.out)
