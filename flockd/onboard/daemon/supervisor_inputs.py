@@ -225,21 +225,24 @@ class Thermometer:
     """Reads the hottest thermal zone once a second, on a worker: some drivers take their time."""
 
     def __init__(self) -> None:
-        self._worker = Worker("thermometer")
         self.hottest_c: float | None = None
         """None on a computer that has no thermal zone, and while the reading hangs."""
 
     async def run(self) -> None:
         """Reads until cancelled."""
-        while True:
-            try:
-                zones = await self._worker.do(READ_DEADLINE_S, thermal_zones)
-                self.hottest_c = max((celsius for _, celsius in zones), default=None)
-            except LateError:
-                self.hottest_c = None
-                self._worker.leave()
-                self._worker = Worker("thermometer")
-            await asyncio.sleep(1.0)
+        worker = Worker("thermometer")
+        try:
+            while True:
+                try:
+                    zones = await worker.do(READ_DEADLINE_S, thermal_zones)
+                    self.hottest_c = max((celsius for _, celsius in zones), default=None)
+                except LateError:
+                    self.hottest_c = None
+                    worker.leave()
+                    worker = Worker("thermometer")
+                await asyncio.sleep(1.0)
+        finally:
+            worker.leave()
 
 
 def thermal_zones(folder: Path = THERMAL_ZONES) -> list[tuple[str, float]]:
