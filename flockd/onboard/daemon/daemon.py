@@ -42,8 +42,9 @@ LOAD_S = 60.0
 """To load the networks from a slow card."""
 OPEN_S = 10.0
 CLOSE_S = 3.0
-HOLD_S = 2.0
-"""For the autopilot to confirm Hold after the control loop has failed."""
+HOLD_S = 1.5
+"""For the autopilot to confirm Hold after the control loop has failed, which fed the service's watchdog: that kills 2 s
+later."""
 
 
 class DaemonError(FlockdError):

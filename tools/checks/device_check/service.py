@@ -36,7 +36,7 @@ MAX_EXPOSURE = 1.5
 NOTICED_S = 0.5
 """Three frame periods, or this."""
 SETPOINTS_STOP_S, RESTARTED_S = 0.5, 8.0
-WATCHDOG_S, STOPPED_S = 2.0, 20.0
+WATCHDOG_S, STOPPED_S = 2.0, 30.0
 """The unit's WatchdogSec and TimeoutStopSec."""
 WATCHED_S = 10.0
 LITTLE_MEMORY, OUT_OF_MEMORY_S = "32M", 5.0
