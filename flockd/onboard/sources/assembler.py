@@ -165,6 +165,8 @@ _TICK_S = 0.01
 _USELESS_AFTER = 3
 """So many frames in a row that are worth nothing are a fault of their camera; the drone flies on by the others."""
 
+_BLOCK_PX = 16
+"""Of JPEG, with colours at half the resolution."""
 _FROZEN = "{}: the image is frozen; restart its camera or program"
 
 MAX_AHEAD_S = 0.02
@@ -296,7 +298,10 @@ class FrameReceiver:
         return Frame(raw.camera, image, raw.time_s, raw.sequence)
 
     def _is_still(self, raw: RawFrame, image: UInt8Array) -> bool:
-        """Whether a camera's part has not changed for as many images as make a whole one frozen."""
+        """Whether a camera's part has not changed for as many images as make a whole one frozen. JPEG's blocks reach
+        across the border to the next part."""
+        border = min(_BLOCK_PX, *(side // 4 for side in image.shape[:2]))
+        image = image[border:-border, border:-border]
         before, number = self._parts.get(raw.camera, (None, 0))
         if before is None or raw.sequence < number or not np.array_equal(before, image):
             self._parts[raw.camera] = image, raw.sequence

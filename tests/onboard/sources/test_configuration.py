@@ -144,6 +144,10 @@ SWAPPED = PIPELINES.replace("back, pipeline", "back, device").replace("lib", "/d
             "gstreamer\n" + PIPELINES.replace("pipeline: libcamerasrc", "rate_hz: 20"),
             "9: source.cameras[1]: has no `pip",
         ),
+        (
+            "gstreamer\n" + PIPELINES.replace("libcamerasrc", "nvarguscamerasrc sensor-id=0"),
+            "9: source.cameras[1].pipeline: two cameras share nvarguscamerasrc sensor-id=0; give each its own pipeline",
+        ),
         ("v4l2\n  set_tolerance_s: 0.01\n" + TWO, "7: source.set_tolerance_s: 0.01 is less than half a frame period "),
         (
             "v4l2\n  silence_s: 0.05\n" + TWO,

@@ -148,20 +148,27 @@ def test_each_part_is_turned_and_reduced(watch: Watch, turn_deg: Any, quarters: 
 
 
 @pytest.mark.fault("frozen-frames")
-def test_a_part_that_freezes_while_the_others_go_on_is_noticed(watch: Watch) -> None:
-    """One sensor of a board hangs: the images of all still differ. Five repetitions, as of any camera."""
-    kernel, source = _board(watch)
-    still = _yuyv(_noise(0)["left"])
+@pytest.mark.parametrize(("code", "pixel_format"), [(b"YUYV", "yuyv"), (b"MJPG", "mjpeg")])
+def test_a_part_that_freezes_while_the_others_go_on_is_noticed(watch: Watch, code: bytes, pixel_format: str) -> None:
+    """One sensor of a board hangs: the images of all still differ. Five repetitions, as of any camera.
+
+    Colours of a JPEG are smoothed across the border of two parts.
+    """
+    kernel, source = _board(watch, code, pixel_format=pixel_format)
+
+    def send(parts: Mapping[str, UInt8Array]) -> None:
+        whole = _side_by_side(parts)
+        kernel.send("board", jpeg(whole) if code == b"MJPG" else _yuyv(whole).tobytes())
+
     for number in range(7):
-        parts = {name: _yuyv(picture) for name, picture in _noise(number).items()} | {"left": still}
-        kernel.send("board", _side_by_side(parts).tobytes())
+        send(_noise(number) | {"left": _noise(0)["left"]})
         there = source.next().frames.keys()
         assert there == (PARTS.keys() if number < 5 else PARTS.keys() - {"left"}), number
     status = source.status()
     assert status["left"].fault == "left: the image is frozen; restart its camera or program"
     assert status["left"].counts["frozen"] == 2
     assert {status[name].fault for name in PARTS if name != "left"} == {None}
-    kernel.send("board", _yuyv(_side_by_side(_noise(9))).tobytes())
+    send(_noise(9))
     assert source.next().frames.keys() == PARTS.keys()
     assert source.status()["left"].fault is None
 
