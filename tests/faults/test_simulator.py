@@ -15,7 +15,7 @@ from tests.calm import until
 from tests.faults.stories import Reacted
 from tests.sitl.test_fleet import _processes, _scenario
 
-pytestmark = [pytest.mark.slow, pytest.mark.whole_flight]
+pytestmark = pytest.mark.slow
 SECONDS_TO_START = 180.0
 
 

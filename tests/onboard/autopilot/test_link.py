@@ -164,7 +164,7 @@ async def test_what_still_sends_over_a_closed_link_is_refused(port: int, address
     with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock):
         link = await AutopilotLink.connect(_parameters(address))
         attending = asyncio.create_task(link.attend())
-        await asyncio.sleep(0)
+        await until(lambda: math.isfinite(link.received.height_m))
         await link.close()
         with pytest.raises(AutopilotError, match="could not send a setpoint"):
             link.send_setpoint(Setpoint(0.0, np.zeros(2), 2.5, 0.0))
