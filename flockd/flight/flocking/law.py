@@ -1,4 +1,4 @@
-"""The flocking law of the paper: from what a drone sees of its neighbours to an acceleration (Eq. 38-42)."""
+"""The flocking law of the paper: from the neighbours' positions and velocities to an acceleration (Eq. 38-42)."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.geometry.level import SAME_SPOT_M, limit_norm
 
 _MIN_DISTANCE_M = 1e-3
-"""Nearer than this counts as this far: Eq. 39 and 41 have a pole at zero distance."""
+"""Shortest distance used: Eq. 39 and 41 have a pole at zero."""
 SAMPLING_TIME_S = 0.5
-"""The sampling time st of the paper, and the least that a command looks ahead. A command is the own velocity plus u st:
-an error e of the own velocity that lasts moves the velocity where u = -e / st, so short steps would amplify it."""
+"""The sampling time st of the paper, and the shortest one used. A command is the own velocity plus u st. A lasting
+error e of the own velocity shifts the equilibrium to u = -e / st, so short steps would amplify it."""
 
 
 class FlockingLaw:
-    """Eq. 38-42. Holds no state: the same input gives the same output."""
+    """Eq. 38-42. Stateless and deterministic."""
 
     def __init__(self, parameters: FlockingParameters | None = None) -> None:
         self.parameters = parameters or FlockingParameters()
@@ -34,12 +34,11 @@ class FlockingLaw:
     ) -> FloatArray:
         """U of Eq. 38: (2,) m/s^2, not limited.
 
-        All arguments are level, north and east. `velocity` (2,) is the own one over ground; `positions` (n, 2) metres
-        are the neighbours' relative to the own drone (Q_j - Q_i); `velocities` (n, 2) theirs over ground;
-        `desired_velocity` (2,) is efv of Eq. 42. `ages_s` (n,), or one for all, says how long they have been seen:
-        see `FlockingParameters.cohesion_time_s`. n may be 0. A neighbour at no distance pushes to the south, as one
-        that sits 1 mm to the north; `level_offsets` keeps two drones from that. Raises ValueError for other shapes
-        and for numbers that are not finite.
+        All arguments are horizontal, north and east. `velocity` (2,) is the own one over ground; `positions` (n, 2)
+        metres are the neighbours' relative to the own drone (Q_j - Q_i); `velocities` (n, 2) theirs over ground;
+        `desired_velocity` (2,) is efv of Eq. 42. `ages_s` (n,), or one for all, is the age of their tracks: see
+        `FlockingParameters.cohesion_time_s`. n may be 0. A neighbour at distance zero counts as 1 mm to the north;
+        `level_offsets` avoids that. Raises ValueError for other shapes and for numbers that are not finite.
         """
         own = _finite(velocity, (2,), "the own velocity")
         desired = _finite(desired_velocity, (2,), "the desired velocity")
@@ -76,10 +75,10 @@ class FlockingLaw:
         step_s: float,
         ages_s: ArrayLike = math.inf,
     ) -> tuple[FloatArray, FloatArray]:
-        """The velocity to ask for, (2,) m/s, and the acceleration that leads there, (2,) m/s^2, both within limits.
+        """The velocity to command, (2,) m/s, and the acceleration that leads to it, (2,) m/s^2, both within limits.
 
         The acceleration's norm is limited first, then that of V + u * st. Arguments and errors as of `acceleration`;
-        `step_s` is the sampling time st, which counts as `SAMPLING_TIME_S` where it is shorter.
+        `step_s` is the sampling time st; a shorter one than `SAMPLING_TIME_S` is replaced by that.
         """
         return self.limited(velocity, self.acceleration(velocity, positions, velocities, desired, ages_s), step_s)
 
@@ -93,16 +92,16 @@ class FlockingLaw:
 
 
 def lookahead_s(step_s: float) -> float:
-    """The st of V + u st, s, for steps that are so long."""
+    """The st of V + u st, s, for steps of this length."""
     return max(step_s, SAMPLING_TIME_S)
 
 
 def level_offsets(offsets: FloatArray) -> FloatArray:
-    """(n, 2) metres north and east of neighbours at (n, 3) metres NED, such that drones at one level spot part.
+    """(n, 2) metres north and east of neighbours at (n, 3) metres NED, such that drones above each other separate.
 
-    Directions within `SAME_SPOT_M` are noise, and two drones with the same noise would fly off the same way. Such a
-    neighbour counts as that far to the west where it is below and to the east where it is not: of two drones that face
-    each other, both with north overhead, each then flies to its own right.
+    Directions within `SAME_SPOT_M` are noise; two drones with the same noise would fly off in the same direction. Such
+    a neighbour is placed at that distance to the west if it is below, else to the east. Both fly apart: the upper one
+    east.
     """
     same_spot = np.hypot(offsets[:, 0], offsets[:, 1]) < SAME_SPOT_M
     sides = np.where(offsets[:, 2] > 0, -SAME_SPOT_M, SAME_SPOT_M)
@@ -112,10 +111,11 @@ def level_offsets(offsets: FloatArray) -> FloatArray:
 
 
 def influence_weights(parameters: WeightParameters, distances: FloatArray, observed: BoolArray) -> FloatArray:
-    """W of Eq. 39 and 40, which the paper leaves open: (n,) of 0 and 1, 0 for neighbours that are not `observed` (n,).
+    """W of Eq. 39 and 40, which the paper does not define: (n,) of 0 and 1; 0 where the mask `observed` (n,) is false.
 
-    `uniform` gives all 1, as in the paper's flight of five. `nearest` gives 1 to the k nearest, which is the same to
-    k + 1 drones or fewer and keeps larger flocks from collapsing; of two equally far the first counts as nearer.
+    `uniform` gives all 1, as in the paper's flight of five. `nearest` gives 1 to the k nearest, which changes nothing
+    in flocks of up to k + 1 drones and keeps larger ones from collapsing; of two at equal distance the first counts as
+    nearer.
     """
     weights = observed.astype(float)
     if parameters.kind == "nearest":

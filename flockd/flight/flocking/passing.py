@@ -1,4 +1,4 @@
-"""How drones that would come too near pass each other: the velocity nearest to the law's that keeps clear of all."""
+"""How drones pass each other: the velocity nearest to the law's that keeps the separation distance from all."""
 
 from __future__ import annotations
 
@@ -13,32 +13,33 @@ from flockd.flight.geometry.level import SAME_SPOT_M
 from flockd.flight.safety.half_planes import NO_LIMITS, ROUNDING_M_S, Limits, crossings
 
 HORIZON_S = 2.5
-"""A neighbour that would come too near within this time is passed: five steps of the paper's pilot."""
+"""Time within which a conflict with a neighbour is resolved: five steps of the paper's pilot."""
 _SHARE = 0.5
 """Each of two drones makes half of the needed change of velocity. If the other makes none, each next step makes half of
-the rest; against a drone that comes and is too near within the horizon, the whole change."""
+the rest. If the conflict with an approaching drone is within the horizon, the drone makes the whole change."""
 _HEAD_ON_RAD = 0.1
-"""The side of a course that misses a neighbour's middle by less is noise: each turns to its right, as aircraft do
-(ICAO Annex 2, Rules of the Air, 3.2.2.2)."""
+"""A course that misses a neighbour by a smaller angle is head-on: each turns to its right, as aircraft do (ICAO Annex
+2, Rules of the Air, 3.2.2.2)."""
 _COMES_M_S, _COMES_S = 0.5, 2 * HORIZON_S
-"""A neighbour that comes at least so fast, and would be too near within this time, is stepped aside for."""
+"""The drone sidesteps, instead of backing off, a neighbour that approaches at least this fast and would be too near
+within the second number of seconds."""
 _WORTH_M_S = 0.5
-"""The drone changes to the other side if its velocity there is nearer to the wanted one by this much, as where the gate
-forbids this side and the drone could only back off."""
+"""The drone changes sides if its velocity there is nearer to the wanted one by this much, for example because the gate
+blocks this side and it could only back off."""
 _RING = 24
 _SPEEDS = 1.0, 0.5
-"""Directions, and shares of the highest speed, that are tried where no velocity keeps clear of all."""
+"""Shares of the highest speed that are tried in all directions if no velocity keeps clear of all."""
 
 
 class Passing:
-    """One drone's passing of its neighbours, each on the side that it once took until it is passed.
+    """One drone's passing of its neighbours: it keeps the side of each until it has passed.
 
-    Without memory, noise would choose the side anew in each step of a nearly head-on course, and a drone that turns to
-    one side and then to the other stays in the way.
+    Without memory, noise would choose the side anew in each step of a nearly head-on course, and a drone that
+    alternates stays in the way.
     """
 
     def __init__(self, law: FlockingLaw, vertical_m: float) -> None:
-        """A neighbour that is `vertical_m` above or below, or more, is passed anyway."""
+        """Neighbours at least `vertical_m` above or below are ignored."""
         self._law, self._vertical_m = law, vertical_m
         self._sides: dict[int, float] = {}
 
@@ -53,10 +54,9 @@ class Passing:
         limits: Limits = NO_LIMITS,
         ages_s: FloatArray | float = math.inf,
     ) -> tuple[FloatArray, FloatArray]:
-        """As of `FlockingLaw.command`, but clear of who would come too near; arguments as of `clear`.
+        """As of `FlockingLaw.command`, but clear of all neighbours; arguments as of `clear`.
 
-        The acceleration, (2,) m/s^2, is the law's, or else the one that leads to the
-        velocity within its sampling time.
+        The acceleration, (2,) m/s^2, is the law's, or else the one that leads to the velocity within its sampling time.
         """
         wanted, acceleration = self._law.command(velocity, level_offsets(offsets), velocities, desired, step_s, ages_s)
         clear = self.clear(wanted, velocity, offsets, velocities, tracks, limits)
@@ -74,14 +74,13 @@ class Passing:
         """The velocity nearest to the `wanted` one, (2,) m/s, that passes each neighbour at the separation distance.
 
         `velocity` (2,) m/s is the own one, `offsets` (n, 3) metres NED are the neighbours', `velocities` (n, 2) m/s
-        theirs, over ground, and `tracks` their numbers. A side is taken where the last gate, as of its `limits`, leaves
-        way.
+        theirs, over ground, and `tracks` their numbers. `limits` are the gate's: sides that it blocks are avoided.
 
         Optimal reciprocal collision avoidance (J. van den Berg, S. Guy, M. Lin, D. Manocha, "Reciprocal n-body
-        collision avoidance", 2011): for each neighbour one half-plane of velocities, so that none comes nearer within
-        `HORIZON_S` if both take their share. Where one is nearer already it comes no nearer, and the law's separation
-        parts them. Where nobody would come too near it is what was wanted; where no velocity is clear of all, the one
-        that is least off.
+        collision avoidance", 2011): each neighbour permits one half-plane of velocities, so that the distance is kept
+        for `HORIZON_S` if both take their share. One that is nearer already may come no nearer, and the law separates
+        them. Without conflict the result is `wanted`. If no velocity satisfies all half-planes, it is the one that
+        violates them least.
         """
         distance_m, max_speed_m_s = self._law.parameters.separation_distance_m, self._law.parameters.max_speed_m_s
         ranges = np.hypot(offsets[:, 0], offsets[:, 1])
@@ -97,7 +96,7 @@ class Passing:
             normal, least_m_s, side = planes[one]
             if found is not None and side and not taken[one] and normal @ wanted < least_m_s:
                 others = {**planes, one: plane(one, -side)}
-                # Not where the wanted one is clear there: nobody would turn, and 150 flights pass nearer (1.6, not
+                # Not if the wanted one is clear there: neither would turn, and 150 flights pass nearer (1.6, not
                 # 1.8 m).
                 other = _clearest(wanted, others.values(), max_speed_m_s, limits)
                 if other is not None and (other[0], other[1] + _WORTH_M_S) < found[:2]:
@@ -109,14 +108,14 @@ class Passing:
 def _clearest(
     wanted: FloatArray, planes: Iterable[tuple[FloatArray, float, float]], max_speed_m_s: float, limits: Limits
 ) -> tuple[float, float, FloatArray] | None:
-    """By how much, m/s, the velocity that is least off the half-planes is off them and off `wanted`, and it.
+    """(violation m/s, distance from `wanted` m/s, velocity (2,)) of the velocity that violates the half-planes least.
 
-    None: `wanted` is off none.
+    None: `wanted` violates none.
     """
     normals, least = np.reshape([one[0] for one in planes], (-1, 2)), np.array([one[1] for one in planes])
     if (normals @ wanted >= least - ROUNDING_M_S).all():
         return None
-    towards, most_m_s = (one[limits[1] < max_speed_m_s] for one in limits)  # the others bind nothing
+    towards, most_m_s = (one[limits[1] < max_speed_m_s] for one in limits)  # the others do not bind
     across, at_m_s = np.vstack([normals, towards]), np.concatenate([least, most_m_s])
     feet = wanted + (at_m_s - across @ wanted)[:, None] * across
     tried = np.vstack([feet, crossings(across, at_m_s)])
@@ -135,12 +134,12 @@ def _clearest(
 def _half_plane(
     velocity: FloatArray, offset: FloatArray, relative: FloatArray, distance_m: float, side: float
 ) -> tuple[FloatArray, float, float]:
-    """Of one neighbour its normal (2,), the least part, m/s, that the own velocity is to have along it, and its side.
+    """One neighbour's half-plane: its normal (2,), the least component of the own velocity along it, m/s, and its side.
 
-    It leads to the nearest point outside the cone of relative velocities that lead to the neighbour, cut off at the
-    horizon. The cone's apex is standstill; its end is a circle of `distance_m` over the horizon around the offset over
-    it. Where the neighbour itself comes, backing off would only delay it: the cone is not cut off. A `side` that was
-    taken (0: none) stays while the relative velocity leads into the cone.
+    The normal leads to the nearest point outside the cone of relative velocities that lead to a conflict, cut off at
+    the horizon. The cone's apex is zero; its end is a circle of radius `distance_m` / horizon around offset / horizon.
+    Against an approaching neighbour backing off would only delay the conflict: the cone is not cut off. A `side` (0:
+    none) is kept while the relative velocity is inside the cone.
     """
     range_m = math.hypot(*offset)
     ahead = offset / range_m
@@ -157,7 +156,7 @@ def _half_plane(
         right = np.array([-ahead[1], ahead[0]])  # north and east: a quarter turn clockwise
         sine = distance_m / range_m
         cosine, to_right_m_s = math.sqrt(1 - sine**2), float(relative @ right)
-        if cosine * abs(to_right_m_s) > sine * closing_m_s or not side:  # past the cone, or at the beginning
+        if cosine * abs(to_right_m_s) > sine * closing_m_s or not side:  # outside the cone, or no side yet
             head_on = abs(to_right_m_s) < _HEAD_ON_RAD * math.hypot(*relative)
             side = math.copysign(1.0, to_right_m_s) if side or not head_on else 1.0
         normal = cosine * side * right - sine * ahead

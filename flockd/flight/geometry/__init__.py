@@ -1,4 +1,4 @@
-"""Camera models, rigid fits, Algorithm 1, ego- and neighbour motion. Pure: no clock, no files, the same every time."""
+"""Camera models, rigid fits, Algorithm 1, ego- and neighbour motion. Pure and deterministic: no clock, no files."""
 
 from flockd.flight.geometry.cameras import Camera, PinholeCamera, WideAngleCamera
 from flockd.flight.geometry.depth_maps import RangeMap, ZMap, blind_pixels, range_map, z_map

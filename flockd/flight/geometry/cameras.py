@@ -49,7 +49,7 @@ class Camera(ABC):
 
     @abstractmethod
     def project(self, points: FloatArray) -> FloatArray:
-        """Pixels (n, 2) of points (n, 3); NaN rows for what the lens cannot see. The image's border does not cut."""
+        """Pixels (n, 2) of points (n, 3), inside the image or not; NaN rows for points that the lens does not image."""
 
     @abstractmethod
     def jacobian(self, points: FloatArray) -> FloatArray:
@@ -57,13 +57,13 @@ class Camera(ABC):
 
     @abstractmethod
     def rays(self, pixels: FloatArray) -> FloatArray:
-        """Unit vectors (n, 3) towards what pixels (n, 2) show; NaN rows where no direction is imaged there."""
+        """Unit vectors (n, 3) along the rays of pixels (n, 2); NaN rows outside the lens's image."""
 
     @abstractmethod
     def pixel_angle(self, rays: FloatArray) -> FloatArray:
         """(n,) radians that a pixel spans along unit vectors (n, 3), in the direction in which it spans more.
 
-        Of the lens without its distortion, which changes it little.
+        Computed without distortion, which changes it little.
         """
 
     def unproject(self, pixels: FloatArray, range_m: FloatArray) -> FloatArray:
@@ -72,7 +72,7 @@ class Camera(ABC):
         return points
 
     def in_image(self, pixels: FloatArray) -> BoolArray:
-        """Mask (n,): which pixels (n, 2) lie inside the image; NaN does not."""
+        """Mask (n,): which pixels (n, 2) lie inside the image; false for NaN."""
         u, v = pixels[:, 0], pixels[:, 1]
         inside: BoolArray = (u >= 0.0) & (u < self.size[0]) & (v >= 0.0) & (v < self.size[1])
         return inside
@@ -83,8 +83,8 @@ class Camera(ABC):
         return math.sqrt(float(self.matrix[0, 0] * self.matrix[1, 1]))
 
     def _to_pixels(self, normalised: FloatArray) -> FloatArray:
-        """In place."""
-        # Column by column: numpy broadcasts a row of two several times slower, and a crop has thousands of pixels.
+        """Changes its argument."""
+        # One column at a time: broadcasting a row of two is several times slower, and a crop has thousands of pixels.
         for axis, (focal, centre) in enumerate(self._intrinsics):
             normalised[:, axis] *= focal
             normalised[:, axis] += centre
@@ -99,7 +99,7 @@ class Camera(ABC):
 
     @cached_property
     def _intrinsics(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Focal length and principal point in pixels, of each axis."""
+        """Focal length and principal point of each axis, pixels."""
         (fx, _, cx), (_, fy, cy), _ = self.matrix.tolist()
         return (fx, cx), (fy, cy)
 
@@ -117,7 +117,7 @@ class PinholeCamera(Camera):
         """Pixels (n, 2) of points (n, 3); NaN rows behind the camera."""
         points = np.asarray(points, dtype=np.float64)
         inverse_z = 1.0 / np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
-        normalised = np.empty((2, len(points))).T  # each column in one piece, for what follows
+        normalised = np.empty((2, len(points))).T  # columns contiguous, for the operations below
         np.multiply(points[:, 0], inverse_z, out=normalised[:, 0])
         np.multiply(points[:, 1], inverse_z, out=normalised[:, 1])
         if self.distortion:
@@ -151,7 +151,7 @@ class PinholeCamera(Camera):
         return unit
 
     def pixel_angle(self, rays: FloatArray) -> FloatArray:
-        """(n,) radians: most across the direction to the axis, where it falls with the cosine."""
+        """(n,) radians: largest across the direction to the axis, where it falls with the cosine."""
         angle: FloatArray = rays[:, 2] / self.focal_px
         return angle
 
@@ -192,7 +192,7 @@ class PinholeCamera(Camera):
         return derivative
 
     def _undistort(self, distorted: FloatArray) -> FloatArray:
-        """Newton's method; NaN where no undistorted point leads to the distorted one."""
+        """Newton's method; NaN if no undistorted point gives the distorted one."""
         estimate = distorted.copy()
         with np.errstate(all="ignore"):
             for _ in range(_NEWTON_STEPS):
@@ -218,7 +218,7 @@ class WideAngleCamera(Camera):
     _coefficient_counts = (0, 4)
 
     def project(self, points: FloatArray) -> FloatArray:
-        """Pixels (n, 2) of points (n, 3), of whichever side; NaN rows where theta is beyond what the lens images."""
+        """Pixels (n, 2) of points (n, 3), in front or behind; NaN rows beyond the largest imaged theta."""
         points = np.asarray(points, dtype=np.float64)
         off_axis = np.hypot(points[:, 0], points[:, 1])
         theta = np.arctan2(off_axis, points[:, 2])
@@ -231,7 +231,7 @@ class WideAngleCamera(Camera):
         """(n, 2, 3) derivative of `project`."""
         points = np.asarray(points, dtype=np.float64)
         x, y, z = points.T
-        # On the axis the derivative has a limit; a hair off it the formula below reaches it.
+        # The derivative has a limit on the axis; the formula below gives it very near to the axis.
         off_axis = np.maximum(np.hypot(x, y), 1e-9 * np.abs(z))
         with np.errstate(divide="ignore", invalid="ignore"):
             ex = np.where(np.hypot(x, y) >= off_axis, x / off_axis, 1.0)
@@ -257,7 +257,7 @@ class WideAngleCamera(Camera):
         return np.concatenate([normalised * sideways[:, None], np.cos(theta)[:, None]], axis=1)
 
     def pixel_angle(self, rays: FloatArray) -> FloatArray:
-        """(n,) radians: most towards the axis, where it is the same everywhere."""
+        """(n,) radians: largest towards the axis, where it is constant."""
         return np.full(len(rays), 1.0 / self.focal_px)
 
     @cached_property
@@ -295,7 +295,7 @@ class WideAngleCamera(Camera):
 def _first_turning_point(coefficients: tuple[float, ...]) -> float:
     """The smallest positive x at which ``x (1 + c1 x^2 + c2 x^4 + ...)`` stops growing; infinity if it never does.
 
-    Beyond it the polynomial no longer describes a lens: far directions would fold back into the image.
+    Beyond it the polynomial does not describe a lens: directions further out would fold back into the image.
     """
     derivative = [1.0, *((2 * power + 1) * c for power, c in enumerate(coefficients, start=1))]
     roots = np.roots(derivative[::-1])

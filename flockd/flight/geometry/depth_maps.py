@@ -1,4 +1,4 @@
-"""The two kinds of depth map, and the border between them: ranges inside flockd, z where others measure it."""
+"""The two kinds of depth map: range along the ray inside flockd, z along the optical axis outside."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from flockd.core.messages import BoolArray, Float32Array
 from flockd.flight.geometry.cameras import Camera
 
 ZMap = NewType("ZMap", Float32Array)
-"""(h, w) metres along the optical axis: what networks, renderers and depth cameras give."""
+"""(h, w) metres along the optical axis: the output of networks, renderers and depth cameras."""
 RangeMap = NewType("RangeMap", Float32Array)
-"""(h, w) metres along each pixel's ray, as `Camera.unproject` takes them: what all of flockd computes with."""
+"""(h, w) metres along each pixel's ray, as `Camera.unproject` takes them: used everywhere in flockd."""
 
 
 def range_map(z: ZMap, camera: Camera) -> RangeMap:
-    """The ranges of a map of the camera's size; NaN where the lens images nothing, or 90 degrees off its axis."""
+    """The ranges of a map of the camera's size; NaN outside the lens's image, and 90 degrees or more off its axis."""
     return RangeMap(z / _axial_share(camera))
 
 
 def z_map(ranges: RangeMap, camera: Camera) -> ZMap:
-    """The way back, for what shows depth as others do."""
+    """The inverse of `range_map`, for output."""
     return ZMap(ranges * _axial_share(camera))
 
 
 @lru_cache(maxsize=32)
 def _axial_share(camera: Camera) -> Float32Array:
-    """(h, w) z over range of each pixel; NaN where there is none, or it is not positive."""
+    """(h, w) z over range of each pixel; NaN outside the lens's image, or if it is not positive."""
     width, height = camera.size
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     share = camera.rays(np.stack([u.ravel(), v.ravel()], axis=1))[:, 2].reshape(height, width)
@@ -37,7 +37,7 @@ def _axial_share(camera: Camera) -> Float32Array:
 
 @lru_cache(maxsize=64)
 def blind_pixels(camera: Camera, stride: int = 1) -> BoolArray:
-    """(h / stride, w / stride) blocks of pixels in which the lens images nothing, by their centres."""
+    """(h / stride, w / stride) mask of the blocks whose centres the lens does not image."""
     width, height = camera.size
     u, v = np.meshgrid(np.arange(0, width, stride) + stride / 2.0, np.arange(0, height, stride) + stride / 2.0)
     rays = camera.rays(np.stack([u.ravel(), v.ravel()], axis=1))

@@ -1,4 +1,4 @@
-"""The drone's own motion from the background that all its cameras see (Eq. 7-21, Algorithm 1)."""
+"""The drone's own motion, from the background in all its cameras (Eq. 7-21, Algorithm 1)."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from flockd.flight.geometry.transform import RigidTransform
 
 @dataclass(frozen=True)
 class EgoMotionAcceptance:
-    """Which motions are believed, by the matches that they explain."""
+    """Conditions for accepting a motion, by the matches that it explains."""
 
     explained_px: float = 3.0
-    """A match is explained that is so near to where the motion moves it."""
+    """A motion explains a match if it moves it to within this distance."""
     min_explained: float = 0.08
-    """Least share of all matches. On real images true motions explain 15 % and more; motions that Algorithm 1 finds in
-    nothing but false matches, because within metres there are always some that agree, under 6 %."""
+    """Least share of all matches. On real images true motions explain 15 % and more. Motions found in false matches
+    only, some of which always agree within metres, explain less than 6 %."""
     min_kept: float = 0.9
-    """Least share of the explained matches: a refinement that loses more has followed the false ones."""
+    """Least share of the explained matches after the refinement: one that loses more has followed false matches."""
 
 
 ACCEPTANCE = EgoMotionAcceptance()
@@ -36,9 +36,9 @@ def estimate_ego_motion(
 ) -> EgoMotion:
     """``P_C = R_FC P_F + T_FC`` (Eq. 7) from the pairs labelled background, of all cameras together.
 
-    Algorithm 1 finds it. With ``parameters.refine`` its reprojection error is then minimised; if that fails or leaves
-    the matches behind, the result of Algorithm 1 stays. ``inliers`` and ``threshold_m`` are Algorithm 1's.
-    Raises ValueError with the reason if there is no estimate, or if it explains hardly any of its matches.
+    By Algorithm 1. With ``parameters.refine`` its reprojection error is then minimised; if that fails or loses matches,
+    the result of Algorithm 1 is kept. ``inliers`` and ``threshold_m`` are Algorithm 1's. Raises ValueError with the
+    reason if there is no estimate, or if it explains too few of its matches.
     """
     background = pairs.select(pairs.labels == BACKGROUND_LABEL)
     found = ransac_rigid(
@@ -74,15 +74,15 @@ def estimate_ego_motion(
 
 
 def _explained(by_camera: list[tuple[RigCamera, PointPairs]], motion: RigidTransform) -> int:
-    """Of how many matches, by the camera that saw them, the point, seen first and moved, falls on its second pixel."""
+    """Number of matches, by the camera that saw them, that the motion explains."""
     near = 0
     for camera, pairs in by_camera:
         u, v = (moved_pixels(camera, pairs.previous, motion) - pairs.pixels_current).T
-        near += int(np.count_nonzero(u * u + v * v < ACCEPTANCE.explained_px**2))  # NaN behind a camera, and not near
+        near += int(np.count_nonzero(u * u + v * v < ACCEPTANCE.explained_px**2))  # NaN behind a camera compares false
     return near
 
 
 def moved_pixels(camera: RigCamera, points: FloatArray, motion: RigidTransform) -> FloatArray:
-    """(n, 2) where a camera of a body that moved, as in Eq. 7, sees points (n, 3) of C; NaN where it does not."""
+    """(n, 2) where a camera of a body that moved, as in Eq. 7, sees points (n, 3) of C; NaN if not visible."""
     mount = camera.T_body_camera
     return camera.camera.project((motion.inverse().apply(points) - mount.translation) @ mount.rotation)

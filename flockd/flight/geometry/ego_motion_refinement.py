@@ -1,4 +1,4 @@
-"""The ego-motion refined by its reprojection error: metric scale from the depths, accuracy from the flow."""
+"""Refines the ego-motion by its reprojection error: metric scale from the depths, accuracy from the flow."""
 
 from __future__ import annotations
 
@@ -18,22 +18,19 @@ from flockd.flight.geometry.sightlines import products, times, whitening
 from flockd.flight.geometry.transform import RigidTransform
 
 _MAX_PAIRS = 800
-"""Drawn of more: each costs two residuals a step."""
+"""Pairs used, drawn at random: each costs two residuals a step."""
 FLOW_SIGMA_PX = 0.3
 _DEPTH_SIGMA = 0.05
-"""Relative error of depth. Only its ratio to the flow's error matters: their common size is found from the
-residuals."""
+"""Relative error of depth. Only its ratio to the flow's error matters: residuals show the common scale."""
 _CAUCHY_SIGMAS = 1.2
-"""Cauchy's scale in standard deviations. Half of the 2.385 that Gaussian errors ask for: the depth of a whole
-object is wrong together, and the stricter scale halved the error where that is 15 %, for 5 % where all errors are
-Gaussian."""
+"""Scale of Cauchy's kernel in standard deviations, half of the 2.385 for Gaussian errors: the depth of a whole object
+is wrong together. It halved the error at depth errors of 15 %, and costs 5 % if all errors are Gaussian."""
 _UNSEEN_PX = 1e3
-"""Residual of a point that a motion moves out of the lens's reach."""
+"""Residual of a point that a motion moves out of the lens's image."""
 _ROUGH_SOLVER = GaussNewton(max_steps=3, tolerance=0.0, max_condition=1e12)
-"""While the motion is still rough, so are the size of the residuals and the direction of the parallax: they are
-found anew at each step."""
+"""First stage: residual scale and parallax directions are estimated anew at each step, while the motion is rough."""
 _FINE_SOLVER = GaussNewton(max_steps=17, tolerance=1e-4, min_steps=2, max_condition=1e12)
-"""Then they stay; until a step is under so many radians and metres."""
+"""Second stage: they are fixed; steps end below this many radians and metres."""
 
 
 def refine_ego_motion(
@@ -44,17 +41,16 @@ def refine_ego_motion(
     agreeing: BoolArray | None = None,
     seed: int = 0,
 ) -> RigidTransform | None:
-    """The motion near ``initial`` (F to C) that best reprojects the pairs, or None where there is no better one.
+    """The motion near ``initial`` (F to C) that best reprojects the pairs; None if there is no better one.
 
-    Both ways over all cameras: the point lifted at t must fall on its pixel at t+1 and the point lifted at t+1 on its
-    pixel at t. Gauss-Newton on the six parameters with Cauchy weights. A residual along the point's parallax is
-    discounted by what the depth's own error makes of it. Across it only the flow's error counts. So far points fix the
-    rotation, near ones with sound depth the translation's length, and all of them its direction. How large a residual
-    may be is learned from the pairs that ``agreeing`` (n,) marks, those that agree with ``initial`` in space: of all
-    pairs, more than half may be false matches.
+    Both ways over all cameras: the point lifted at t must fall on its pixel at t+1, and the point lifted at t+1 on its
+    pixel at t. Gauss-Newton on the six parameters with Cauchy weights. Along the point's parallax, a residual is
+    whitened by the depth's error too, across it by the flow's error only. So distant points fix the rotation, near ones
+    with good depth the translation's length, and all of them its direction. The scale of residuals is estimated from
+    the pairs in ``agreeing`` (n,), which agree with ``initial`` in space: more than half of all pairs may be false.
 
-    None means that the steps did not converge or the robust cost did not fall. Raises ValueError for pairs of a camera
-    that is not in the rig.
+    None: the steps did not converge or the robust cost did not fall. Raises ValueError for pairs of a camera that is
+    not in the rig.
     """
     known = np.isin(pairs.camera_names, list(rig.cameras))
     if not known.all():
@@ -63,7 +59,7 @@ def refine_ego_motion(
     if len(pairs) > _MAX_PAIRS:
         drawn = np.sort(np.random.default_rng(seed).choice(len(pairs), _MAX_PAIRS, replace=False))
         pairs, agreeing = pairs.select(drawn), agreeing[drawn]
-    typical = np.concatenate([agreeing, agreeing])  # there and back
+    typical = np.concatenate([agreeing, agreeing])  # both ways
     if not typical.any():
         return None
     start = _Reprojection(_Sights.of(pairs, rig), initial)
@@ -80,7 +76,7 @@ def refine_ego_motion(
 
 @dataclass(frozen=True, eq=False)
 class _Sights:
-    """n pairs, and m = 2 n sights of them: those of the points lifted at t+1 at t, then those of the others at t+1."""
+    """n pairs, and m = 2 n sights: the points lifted at t+1, seen at t, then the points lifted at t, seen at t+1."""
 
     current: FloatArray
     """(3, n) body axes at t+1."""
@@ -91,7 +87,7 @@ class _Sights:
     seen: FloatArray
     """(3, m) unit vectors towards the pixels, body axes."""
     across: FloatArray
-    """(3, 2, m) derivatives of the pixels by a point, at a distance of 1 m along these."""
+    """(3, 2, m) directions in the body: derivatives of the pixels by the point, at a distance of 1 m."""
 
     @classmethod
     def of(cls, pairs: PointPairs, rig: Rig) -> _Sights:
@@ -113,8 +109,7 @@ class _Sights:
 class _Reprojection:
     """All pairs, reprojected both ways by one motion.
 
-    To first order in the distance of a point from its pixel: at a few pixels, higher orders of a camera's model are
-    far below a pixel.
+    First order in the distance of a point from its pixel: at a few pixels, higher orders are far below a pixel.
     """
 
     sights: _Sights
@@ -122,18 +117,18 @@ class _Reprojection:
 
     @cached_property
     def moved(self) -> FloatArray:
-        """(3, m) the points in body axes at the time that they are seen."""
+        """(3, m) the points in body axes at the time of the sight."""
         R, t = self.motion.rotation, self.motion.translation[:, None]
         return np.concatenate([R @ self.sights.current + t, R.T @ (self.sights.previous - t)], axis=1)
 
     @cached_property
     def from_camera(self) -> FloatArray:
-        """(3, m) likewise, from the camera that sees them."""
+        """(3, m) the same, from the camera that sees them."""
         return self.moved - self.sights.centres
 
     @cached_property
     def depths(self) -> FloatArray:
-        """(m,) metres along the sights; NaN where a point is on the other side of the camera."""
+        """(m,) metres along the sights; NaN for points behind the camera."""
         depths = (self.sights.seen * self.from_camera).sum(0)
         return np.where(depths > 0.0, depths, np.nan)
 
@@ -145,7 +140,7 @@ class _Reprojection:
 
     @property
     def parallaxes(self) -> FloatArray:
-        """(2, m) derivatives by the logarithm of each point's depth: it moves from the camera that saw it."""
+        """(2, m) derivatives by the logarithm of each point's depth in the camera that lifted it."""
         R, t, n = self.motion.rotation, self.motion.translation[:, None], self.sights.current.shape[1]
         centres = self.sights.centres[:, :n]
         between = np.concatenate([R @ centres + t, R.T @ (centres - t)], axis=1) - self.sights.centres
@@ -168,7 +163,7 @@ class _Reprojection:
 
 @dataclass(frozen=True, eq=False)
 class _Weighting:
-    """What a residual counts."""
+    """Whitening and weights of residuals."""
 
     whitening: FloatArray
     """(2, 2, m) inverse roots of the residuals' covariances ``flow^2 I + depth^2 p p'``, p the parallax"""
@@ -177,10 +172,10 @@ class _Weighting:
 
     @classmethod
     def learned(cls, state: _Reprojection, typical: BoolArray) -> _Weighting:
-        """From the parallax of all residuals, and the size of the ``typical`` (m,) ones."""
+        """From the parallax of all residuals, and the median size of the ``typical`` (m,) ones."""
         white_by = whitening(state.parallaxes, FLOW_SIGMA_PX, _DEPTH_SIGMA)
         squared = (times(white_by, state.residuals) ** 2).sum(axis=0)
-        # Outliers under a half do not move the median, which for a Rayleigh distribution is sqrt(2 ln 2) sigma.
+        # Fewer than half outliers do not move the median, which is sqrt(2 ln 2) sigma of a Rayleigh distribution.
         sigma = max(math.sqrt(median(squared[typical]) / (2.0 * math.log(2.0))), 1e-3)
         return cls(white_by, Cauchy(_CAUCHY_SIGMAS * sigma))
 
@@ -195,11 +190,11 @@ class _Weighting:
 
 @dataclass(frozen=True, eq=False)
 class _Refinement(Problem[_Reprojection]):
-    """Six parameters: rotation vector and translation that the motion is multiplied by from the left."""
+    """Six parameters: rotation vector and translation of a left increment of the motion."""
 
     typical: BoolArray
     weighting: _Weighting | None = None
-    """None: learned anew at each state."""
+    """None: estimated anew at each state."""
 
     def linearise(self, state: _Reprojection) -> NormalEquations:
         weighting = self.weighting or _Weighting.learned(state, self.typical)

@@ -1,4 +1,4 @@
-"""The ground as a plane, fitted to the ranges of what is seen of it around a place near the drone."""
+"""Fits a plane to the visible ground around a place near the drone."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.geometry.robust.kernels import Kernel, Tukey, median, reweighted
 
 RELIEF = 0.03
-"""Standard deviation of what the ground departs from its plane at the place, as a share of the range; it grows with the
-distance from there."""
+"""Standard deviation of the ground's departure from its plane at the place, relative to the range; it grows with
+distance from the place."""
 NEAR_EXPECTED = 0.35
 """A point counts as ground if its inverse range is within this share of the expected plane's."""
 REACH = 1.0
-"""How far from the place the ground is used, in heights: the larger, the less it is a plane."""
+"""Radius around the place in which the ground is used, in heights: the larger, the less it is a plane."""
 MIN_POINTS = 60
 MIN_AGREEING = 0.4
-"""Least share of the points: with fewer, what is there is no plane."""
+"""Least share of points that agree with the plane."""
 ROUNDS = 8
 MEDIAN_DEVIATIONS = 6.0
-"""Beyond so many of the residuals' median size a point counts nothing."""
+"""Residuals beyond this many median deviations have no weight."""
 
 
 @dataclass(frozen=True, eq=False)
 class GroundSamples:
-    """Points seen, by their direction and inverse range, with level axes at the drone's place."""
+    """Points by direction and inverse range, in level axes with the drone at the origin."""
 
     rays: FloatArray
     """(n, 3) NED unit vectors."""
@@ -38,12 +38,12 @@ class GroundSamples:
     """(n,) standard deviation of `inverse`."""
 
     def select(self, chosen: BoolArray) -> GroundSamples:
-        """Those of a mask (n,)."""
+        """The samples of a mask (n,)."""
         return GroundSamples(self.rays[chosen], self.inverse[chosen], self.offsets[chosen], self.sigma[chosen])
 
     @staticmethod
     def concatenate(parts: list[GroundSamples]) -> GroundSamples:
-        """All together."""
+        """All samples of several."""
         return GroundSamples(
             np.concatenate([part.rays for part in parts]), np.concatenate([part.inverse for part in parts]),
             np.concatenate([part.offsets for part in parts]), np.concatenate([part.sigma for part in parts]),
@@ -51,9 +51,9 @@ class GroundSamples:
 
 
 def fit_ground(samples: GroundSamples, height: float, slope: FloatArray, place: FloatArray) -> tuple[float, FloatArray]:
-    """The plane that most of the samples around a place lie on: as `height` and `slope`, of those expected.
+    """The plane that most of the samples around a place lie on: its `height` and `slope`, given expected ones.
 
-    What stands on the ground is nearer than it and does not count. Raises ValueError where too little ground is seen.
+    What stands on the ground is nearer than the ground and is rejected. Raises ValueError if too little ground is seen.
 
     Args:
         samples: in a unit of about a metre.
@@ -63,7 +63,7 @@ def fit_ground(samples: GroundSamples, height: float, slope: FloatArray, place: 
     """
     normal = np.array([*slope, 1.0])
     expected = samples.rays @ normal / (height - samples.offsets @ normal)
-    with np.errstate(divide="ignore"):  # above the horizon
+    with np.errstate(divide="ignore"):  # zero above the horizon
         level = samples.rays[:, :2] / np.maximum(expected, 0.0)[:, None] - place
     away = np.hypot(*level.T) / height
     near = (away < REACH) & (np.abs(samples.inverse - expected) < NEAR_EXPECTED * expected)
@@ -85,7 +85,7 @@ def fit_ground(samples: GroundSamples, height: float, slope: FloatArray, place: 
 
 
 def _rows(ground: GroundSamples) -> FloatArray:
-    """(4, n) whose first three, times height and slope, make the last. A point at inverse range w is on the plane where
+    """(4, n): the first three rows times (height, slope) give the last. A point at inverse range w is on the plane if
     ``n . (ray + w offset) = w height``."""
     x, y, z = (ground.rays + ground.inverse[:, None] * ground.offsets).T
     return np.stack([ground.inverse, -x, -y, z])
@@ -98,7 +98,7 @@ def _fitted(rows: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def _residuals(ground: GroundSamples, plane: FloatArray) -> FloatArray:
-    """(n,) of the inverse range."""
+    """(n,) residuals of the inverse range."""
     normal = np.array([plane[1], plane[2], 1.0])
     left: FloatArray = ground.inverse - ground.rays @ normal / (plane[0] - ground.offsets @ normal)
     return left

@@ -1,4 +1,4 @@
-"""Level vectors, north and east: their length, and from where on they have a direction."""
+"""Horizontal vectors, north and east: limits of their length, and the length below which they have no direction."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import math
 from flockd.core.messages import FloatArray
 
 SAME_SPOT_M = 0.1
-"""A neighbour at a smaller level range is above or below, in no direction: cameras do not measure one that well."""
+"""A neighbour at a smaller horizontal range has no direction: cameras do not measure such a bearing."""
 _ROUNDING = 2.0**-50
-"""Share by which a length may be off after scaling: two roundings in the product and two in the lengths."""
+"""Relative rounding error of a scaled length: two roundings in the product and two in the lengths."""
 
 
 def limit_norm(vector: FloatArray, maximum: float) -> FloatArray:
-    """The vector (2,) itself if it is no longer than `maximum`, else one in its direction of that length at most.
+    """The vector (2,) itself if it is no longer than `maximum`, else one in its direction of at most that length.
 
-    `math.hypot` of the result is never above `maximum`, so that what is limited twice passes the second time as it is.
+    `math.hypot` of the result is never above `maximum`, so that limiting it again changes nothing.
     """
     length = math.hypot(*vector)
     if length <= maximum:

@@ -14,15 +14,15 @@ from flockd.flight.geometry.depth_maps import RangeMap
 from flockd.flight.geometry.rig import RigCamera
 
 BACKGROUND_LABEL = 0
-"""The class of everything that stands still; drones have the labels from 1 up."""
+"""The class of all that does not move; drones have labels from 1 up."""
 
 _DEPTH_AGREEMENT = 0.05
-"""Depths that differ by more lie on two surfaces: what is between them is on neither."""
+"""Neighbouring depths that differ by more are of two surfaces and are not interpolated."""
 
 
 @dataclass(frozen=True, eq=False)
 class PointPairs:
-    """n points of the world seen at an interval's start (in body frame C) and at its end (in body frame F)."""
+    """n points seen at an interval's start (in body frame C) and at its end (in body frame F)."""
 
     previous: FloatArray
     """(n, 3) metres in C."""
@@ -31,7 +31,7 @@ class PointPairs:
     labels: IntArray
     """(n,)"""
     camera_names: NDArray[np.str_]
-    """(n,) which camera saw it, both times."""
+    """(n,) the camera that saw each point, both times."""
     pixels_previous: FloatArray
     """(n, 2)"""
     pixels_current: FloatArray
@@ -41,7 +41,7 @@ class PointPairs:
         return len(self.previous)
 
     def select(self, which: BoolArray | IntArray) -> PointPairs:
-        """Those that a mask (n,) or indices name."""
+        """The pairs of a mask (n,) or of indices."""
         places = which.nonzero()[0] if which.dtype == np.bool_ else which
         return PointPairs(*[column.take(places, axis=0) for column in self._columns()])
 
@@ -51,7 +51,7 @@ class PointPairs:
         return PointPairs(*map(np.concatenate, zip(*[pairs._columns() for pairs in several], strict=True)))
 
     def _columns(self) -> tuple[NDArray[Any], ...]:
-        """As the constructor takes them."""
+        """In the order of the constructor."""
         return tuple(vars(self).values())
 
 
@@ -78,9 +78,9 @@ def lift_matches(
     """Matches ``p -> p + flow(p)`` of one camera as pairs of points in the body frame (Eq. 6, then the extrinsics).
 
     ``pixels`` (n, 2) of the previous image; all maps have the camera's size: ``flow`` (h, w, 2) pixels, depths (h, w)
-    metres along the ray, labels (h, w) integers. A pair is dropped where an end lies outside the image,
-    its depth is not finite, not positive or above ``max_depth_m``, or the labels of both ends differ. Raises
-    ValueError for a map of another size.
+    metres along the ray, labels (h, w) integers. A pair is dropped if an end lies outside the image, its depth is not
+    finite, not positive or above ``max_depth_m``, or the labels of both ends differ. Raises ValueError for a map of
+    another size.
     """
     width, height = camera.camera.size
     maps = (flow[..., 0], depth_previous, depth_current, labels_previous, labels_current)
@@ -94,7 +94,7 @@ def lift_matches(
     labels = _nearest(labels_previous, pixels_previous)
     range_previous = _sample_depth(depth_previous, pixels_previous)
     range_current = _sample_depth(depth_current, pixels_current)
-    # A comparison with NaN is false, so depths that are not finite go too.
+    # NaN compares false, so depths that are not finite are dropped too.
     kept = (range_previous > 0.0) & (range_previous <= max_depth_m)
     kept &= (range_current > 0.0) & (range_current <= max_depth_m)
     kept &= labels == _nearest(labels_current, pixels_current)
@@ -116,16 +116,16 @@ _Value = TypeVar("_Value", bound=np.generic)
 
 
 def _nearest(values: NDArray[_Value], pixels: FloatArray) -> NDArray[_Value]:
-    """The value of the pixel that each of ``pixels`` (n, 2), inside the image, falls in."""
+    """The value of the pixel that contains each of ``pixels`` (n, 2), which are inside the image."""
     column, row = pixels.astype(np.int64).T
     found: NDArray[_Value] = values[row, column]
     return found
 
 
 def _sample_depth(depth: RangeMap, pixels: FloatArray) -> FloatArray:
-    """(n,) depth between pixel centres: bilinear where the four around agree, else that of the nearest pixel."""
+    """(n,) depth between pixel centres: bilinear if the four around agree, else that of the nearest pixel."""
     height, width = depth.shape
-    # Pixel index i has its centre at i + 0.5; at the border the outermost centres are held.
+    # Pixel index i has its centre at i + 0.5; beyond the outermost centres the border repeats.
     x, y = np.minimum(np.maximum(pixels - 0.5, 0.0), (width - 1, height - 1)).T
     left, top = np.minimum(x.astype(np.int64), width - 2), np.minimum(y.astype(np.int64), height - 2)
     right, below = x - left, y - top

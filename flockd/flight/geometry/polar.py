@@ -1,4 +1,4 @@
-"""Log-polar coordinates of a place: a bearing (unit vector) and the natural logarithm of the range.
+"""Log-polar coordinates of a position: a bearing (unit vector) and the natural logarithm of the range.
 
 Their covariance is a (3, 3) matrix in the axes of the bearing: along it the variance of the log range, across it that
 of the angle in rad^2. To first order it is the covariance of the position over the range squared.
@@ -22,7 +22,7 @@ def log_polar(position: FloatArray) -> tuple[FloatArray, float]:
 
 
 def log_polar_covariance(bearing: FloatArray, log_range_sigma: float, bearing_sigma_rad: float) -> FloatArray:
-    """(3, 3) where range and bearing err independently, the bearing alike in all directions."""
+    """(3, 3) for independent errors of range and bearing, the bearing's equal in all directions."""
     along = np.outer(bearing, bearing)
     covariance: FloatArray = bearing_sigma_rad**2 * (np.eye(3) - along) + log_range_sigma**2 * along
     return covariance
@@ -31,10 +31,9 @@ def log_polar_covariance(bearing: FloatArray, log_range_sigma: float, bearing_si
 def log_polar_residual(
     bearing: FloatArray, log_range: FloatArray | float, from_bearing: FloatArray, from_log_range: FloatArray | float
 ) -> FloatArray:
-    """(..., 3) from one place to another: across ``from_bearing`` the angle in rad, along it the change of log range.
+    """(..., 3) between positions: across ``from_bearing`` the angle in rad, along it the change of log range.
 
-    Bearings (..., 3), log ranges (...). Its derivative with respect to the position is the identity over the range at
-    the place it starts from.
+    Bearings (..., 3), log ranges (...). Its derivative by the position, at the first one, is I / range.
     """
     cosine = np.minimum(np.maximum((bearing * from_bearing).sum(axis=-1, keepdims=True), -1.0), 1.0)
     across = bearing - cosine * from_bearing

@@ -1,4 +1,4 @@
-"""The rig: every camera of the drone and where it sits in the body (FRD)."""
+"""The rig: every camera of the drone and its mounting in the body (FRD)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class RigCamera:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """All cameras, by name. Raises ValueError if there is none or a name does not fit its camera."""
+    """All cameras, by name. Raises ValueError without cameras, or if a name does not fit its camera."""
 
     cameras: Mapping[str, RigCamera]
 
@@ -51,7 +51,7 @@ class Rig:
                 raise ValueError(f"camera {camera.name!r} is filed under the name {name!r}")
 
     def covers(self, directions: FloatArray, without: Set[str] = frozenset()) -> BoolArray:
-        """Mask (n,): which body directions (n, 3) are in view of any camera but those named."""
+        """Mask (n,): body directions (n, 3) in view of any camera that is not in ``without``."""
         seen = np.zeros(len(directions), dtype=np.bool_)
         for name in self.cameras.keys() - without:
             seen |= np.isfinite(self.cameras[name].pixels_of_directions(directions)[:, 0])
@@ -64,7 +64,7 @@ class Rig:
         return {name: camera.pixels_of_points(points_body) for name, camera in self.cameras.items()}
 
     def shows(self, points_body: FloatArray, radius_m: float = 0.0, without: Set[str] = frozenset()) -> BoolArray:
-        """Mask (n,): around which body points (n, 3) any camera but those named images all within `radius_m`."""
+        """Mask (n,): body points (n, 3) around which any camera not in ``without`` images all within `radius_m`."""
         shown = np.zeros(len(points_body), dtype=np.bool_)
         for name in self.cameras.keys() - without:
             camera = self.cameras[name]
@@ -76,7 +76,7 @@ class Rig:
 
 
 def build_rig(config: RigConfig) -> Rig:
-    """The rig of a configuration. Raises ValueError where a camera's intrinsics make no camera."""
+    """The rig of a configuration. Raises ValueError if a camera's intrinsics are invalid."""
     return Rig({camera.name: _build_camera(camera) for camera in config.cameras})
 
 

@@ -32,7 +32,7 @@ def fit_rigid(source: FloatArray, target: FloatArray, weights: FloatArray | None
 
 
 def checked_pairs(source: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Both as float64, or ValueError with what is wrong with them as paired points."""
+    """Both as float64; raises ValueError if they are not paired points."""
     source, target = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
     for name, points in (("source", source), ("target", target)):
         if points.ndim != 2 or points.shape[1] != 3:
@@ -67,7 +67,7 @@ def _rotations(covariances: FloatArray) -> FloatArray:
 
 
 def require_spread(name: str, points: FloatArray, weights: FloatArray | None = None) -> None:
-    """Raises ValueError where points (n, 3) of weights (n,), which sum to 1, coincide or are collinear."""
+    """Raises ValueError if points (n, 3) with weights (n,), which sum to 1, coincide or are collinear."""
     if weights is None:
         weights = np.full(len(points), 1.0 / len(points))
     centred = points - weights @ points

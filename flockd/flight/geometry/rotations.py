@@ -1,4 +1,4 @@
-"""Rotation matrices from and to angles, vectors and quaternions, by scipy, which has no types."""
+"""Rotation matrices from and to angles, vectors and quaternions: the adapter of scipy, which has no types."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flockd.core.messages import FloatArray
 
 
 def rotation_angle_deg(rotation: FloatArray) -> float:
-    """How far a (3, 3) rotation turns, degrees in [0, 180]."""
+    """Angle of a (3, 3) rotation, degrees in [0, 180]."""
     return math.degrees(float(Rotation.from_matrix(rotation).magnitude()))
 
 
@@ -27,10 +27,10 @@ def rotation_from_euler(roll: float | FloatArray, pitch: float | FloatArray, yaw
 def euler_from_rotation(rotation: FloatArray) -> tuple[float, float, float]:
     """Roll, pitch, yaw in radians of a (3, 3) ``R_ned_body``; pitch in [-pi/2, pi/2].
 
-    With the nose straight up or down roll and yaw turn about one axis: roll is then given as 0.
+    With the nose straight up or down roll and yaw share one axis: roll is then 0.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # scipy's of the nose straight up or down
+        warnings.simplefilter("ignore", UserWarning)  # scipy warns if the nose is straight up or down
         yaw, pitch, roll = Rotation.from_matrix(rotation).as_euler("ZYX")
     return float(roll), float(pitch), float(yaw)
 
@@ -43,11 +43,11 @@ def rotation_from_vector(vector: FloatArray) -> FloatArray:
 
 
 def _rotation(x: float, y: float, z: float) -> FloatArray:
-    """Rodrigues' formula: fits take hundreds of single rotations a step, and scipy seven times as long for one."""
+    """Rodrigues' formula: fits compute hundreds of single rotations a step, and scipy is seven times slower for one."""
     angle = math.sqrt(x * x + y * y + z * z)
     if not math.isfinite(angle):
         return np.full((3, 3), np.nan)
-    # sin(a) / a and (1 - cos(a)) / a^2, which go to 1 and 1/2.
+    # sin(a) / a and (1 - cos(a)) / a^2, with the limits 1 and 1/2.
     a = math.sin(angle) / angle if angle > 0.0 else 1.0
     b = 2.0 * (math.sin(angle / 2.0) / angle) ** 2 if angle > 0.0 else 0.5
     c = math.cos(angle)
@@ -61,14 +61,14 @@ def _rotation(x: float, y: float, z: float) -> FloatArray:
 
 
 def vector_from_rotation(rotation: FloatArray) -> FloatArray:
-    """The inverse: (3,) of a (3, 3) rotation, (n, 3) of (n, 3, 3)."""
+    """The inverse of `rotation_from_vector`: (3,) of a (3, 3) rotation, (n, 3) of (n, 3, 3)."""
     if rotation.ndim == 2:
         return _vector(rotation)
     return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
 
 
 def _vector(rotation: FloatArray) -> FloatArray:
-    """By the quaternion of which no part is small (Shepperd 1978): scipy takes ten times as long for a single one."""
+    """By the largest component of the quaternion (Shepperd 1978): scipy is ten times slower for a single one."""
     (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
     parts = 1.0 + a + e + i, 1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i
     largest = max(parts)
@@ -87,9 +87,9 @@ def _vector(rotation: FloatArray) -> FloatArray:
 
 
 def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
-    """(3, 3) of a quaternion (4,) x y z w of any length. Raises ValueError for one of no length.
+    """(3, 3) of a quaternion (4,) x y z w of any length. Raises ValueError for length zero.
 
-    By Rodrigues' formula: an autopilot's is read 20 times a second, and scipy takes ten times as long.
+    By Rodrigues' formula: an autopilot's is read 20 times a second, and scipy is ten times slower.
     """
     cross, w, square = cross_matrix(quaternion[:3]), quaternion[3], float(quaternion @ quaternion)
     if not square > 0.0:
@@ -104,7 +104,7 @@ def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
 
 
 def crossed(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(3, ...) cross products: `np.cross` takes most of its time to arrange its axes."""
+    """(3, ...) cross products: `np.cross` spends most of its time on rearranging axes."""
     a, b = np.concatenate([a, a[:2]]), np.concatenate([b, b[:2]])
     product: FloatArray = a[1:4] * b[2:5]
     product -= a[2:5] * b[1:4]

@@ -1,4 +1,4 @@
-"""Residuals of directions, coordinate by coordinate, as numpy is faster so; and the ranges that two of them tell."""
+"""Residuals of directions, one coordinate at a time, which is faster in numpy; and ranges from two directions."""
 
 from __future__ import annotations
 
@@ -22,13 +22,14 @@ def times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
 
 
 def whitening(parallax: FloatArray, flow_px: float, depth_sigma: float) -> FloatArray:
-    """(2, 2, n) roots of the inverses of ``flow^2 I + depth^2 p p'``, p the parallaxes (2, n): its transpose times
-    itself is that. The first row is along the parallax, the second across it.
+    """(2, 2, n) inverse roots W of ``C = flow^2 I + depth^2 p p'``, p the parallaxes (2, n): W' W = inverse of C.
+
+    The first row of W is along the parallax, the second across it.
 
     Args:
-        parallax: (2, n) pixels by the logarithm of a point's depth.
+        parallax: (2, n) derivative of the pixels by the logarithm of a point's depth.
         flow_px: standard deviation of a match.
-        depth_sigma: that of the logarithm.
+        depth_sigma: standard deviation of that logarithm.
     """
     x, y = parallax
     length2 = x * x + y * y
@@ -44,16 +45,16 @@ def whitening(parallax: FloatArray, flow_px: float, depth_sigma: float) -> Float
 
 
 def inverse_ranges_of_rays(p: FloatArray, q: FloatArray, between: RigidTransform) -> tuple[FloatArray, FloatArray]:
-    """Inverse ranges (n,) in the second image, in 1 over the motion's unit, and baselines (n,) across the ray.
+    """Inverse ranges (n,) in the second image, per unit of the motion, and baselines (n,) across the ray.
 
-    Where a baseline is small, or NaN for pixels outside a lens's image circle, the inverse range is noise.
+    If a baseline is small, or NaN for pixels outside a lens's image circle, the inverse range is noise.
 
     Args:
         p: (n, 3) unit vectors in the first image, in the camera's axes.
-        q: (n, 3) those of the same points in the second.
+        q: (n, 3) unit vectors of the same points in the second image.
         between: takes coordinates of the camera at the second image to those at the first.
     """
-    # p is parallel to R q / w + t, so that p x R q + w (p x t) = 0: linear in w, and honest about noise around zero.
+    # p is parallel to R q / w + t, so that p x R q + w (p x t) = 0: linear in w, and unbiased around zero.
     # With unit p, by Lagrange, (p x a) . (p x b) = a . b - (p . a) (p . b).
     turned, along = q @ between.rotation.T, p @ between.translation
     parallax = turned @ between.translation - along * np.einsum("ij,ij->i", p, turned)

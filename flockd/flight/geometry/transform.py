@@ -1,4 +1,4 @@
-"""A rigid motion, as a value."""
+"""A rigid transform, as a value."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from flockd.core.messages import FloatArray
 
 _EYE = np.eye(3)
 _TOLERANCE = 1e-6 + 1e-5 * _EYE
-"""How far a rotation times its transpose may be from the identity."""
+"""Largest deviation of a rotation times its transpose from the identity."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigidTransform:
     """``p_a = rotation @ p_b + translation``: named ``T_a_b``, it takes coordinates from frame b to frame a.
 
-    Raises ValueError where ``rotation`` (3, 3) is not a rotation or ``translation`` (3,) is not finite.
+    Raises ValueError if ``rotation`` (3, 3) is not a rotation or ``translation`` (3,) is not finite.
     """
 
     rotation: FloatArray
@@ -31,7 +31,7 @@ class RigidTransform:
             raise ValueError(f"a rigid transform is (3, 3) and (3,), not {rotation.shape} and {translation.shape}")
         if not np.isfinite(translation).all():
             raise ValueError("a rigid transform's translation must be finite")
-        if not (np.abs(rotation @ rotation.T - _EYE) <= _TOLERANCE).all() or _is_mirrored(rotation):  # NaN neither
+        if not (np.abs(rotation @ rotation.T - _EYE) <= _TOLERANCE).all() or _is_mirrored(rotation):  # NaN fails too
             raise ValueError("the matrix is not a rotation: its columns must be orthonormal and right-handed")
         object.__setattr__(self, "rotation", rotation)
         object.__setattr__(self, "translation", translation)
@@ -60,6 +60,6 @@ class RigidTransform:
 
 
 def _is_mirrored(matrix: FloatArray) -> bool:
-    """Whether the determinant of a (3, 3) matrix is negative: a pilot's step asks that a hundred times."""
+    """Whether the determinant of a (3, 3) matrix is negative; called a hundred times in a pilot's step."""
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     return bool(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0.0)

@@ -1,4 +1,4 @@
-"""Small cameras that each face one direction, their images drawn from whichever real cameras see there."""
+"""Virtual cameras that each face one direction, with images sampled from the real cameras."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from flockd.flight.geometry.rig import Rig, RigCamera
 
 _GREY = 128
 _NOWHERE = -1
-"""In place of a camera's number, and of a distance from an image's border."""
+"""Stands for no camera, and for no distance from an image's border."""
 _MINIFICATION = 1.5
-"""Image pixels per crop pixel from which on single samples would alias."""
+"""Image pixels per crop pixel above which single samples would alias."""
 
 
 @dataclass(frozen=True, eq=False)
 class VirtualCrops:
-    """n square pinhole cameras in the body, each at the optical centre of its main camera, and the way to their images.
+    """n square pinhole cameras in the body, each at the optical centre of its main camera, and their sampling.
 
     They are level: their x axes are horizontal in the body.
     """
@@ -36,8 +36,8 @@ class VirtualCrops:
     R_body_virtual: FloatArray
     """(n, 3, 3)"""
     main: IntArray
-    """(n,) the number in the rig of the camera in whose image the direction lies deepest: from its optical centre the
-    image is exact at every range. -1: no camera sees the direction, or a pinhole cannot show the angle."""
+    """(n,) index in the rig of the camera in whose image the direction is farthest from the border: its view is exact
+    at every range. -1: no camera sees the direction, or a pinhole cannot show the angle."""
 
     @property
     def centres(self) -> FloatArray:
@@ -46,11 +46,11 @@ class VirtualCrops:
         return centres
 
     def take(self, which: IntArray) -> VirtualCrops:
-        """Those of these numbers (m,)."""
+        """The cameras at these indices (m,)."""
         return VirtualCrops(self.rig, self.size_px, self.focal_px[which], self.R_body_virtual[which], self.main[which])
 
     def rays(self, pixels: FloatArray) -> FloatArray:
-        """(n, 3) unit vectors in the body towards one pixel (n, 2) of each."""
+        """(n, 3) unit vectors in the body towards one pixel (n, 2) of each camera."""
         towards = np.ones((len(pixels), 3, 1))
         towards[:, :2, 0] = (pixels - self.size_px / 2) / self.focal_px[:, None]
         return _unit((self.R_body_virtual @ towards)[:, :, 0])
@@ -60,10 +60,10 @@ class VirtualCrops:
     ) -> tuple[UInt8Array, BoolArray]:
         """The images (n, size, size, 3), and masks (n, size, size) of their pixels that a camera sees; grey elsewhere.
 
-        Each pixel comes from the main camera wherever that sees it, else from the camera in whose image it lies
-        deepest. ``images`` are (h, w, 3) by camera name; a camera without an image sees nothing. With ``range_m``
-        (n,), the distances of the targets, other cameras are sampled where they see those distances, which corrects
-        their parallax; without them, and where they are NaN, where they see infinity.
+        Each pixel comes from the main camera if that sees it, else from the camera in whose image it is farthest from
+        the border. ``images`` are (h, w, 3) by camera name; a camera without an image sees nothing. With ``range_m``
+        (n,), the ranges of the targets, other cameras are sampled at those ranges, which corrects their parallax;
+        without, or if NaN, at infinity.
         """
         drawn = np.full((len(self.main), self.size_px, self.size_px, 3), _GREY, np.uint8)
         valid = np.zeros(drawn.shape[:3], np.bool_)
@@ -85,10 +85,10 @@ class VirtualCrops:
         return drawn, valid
 
     def _homographies(self, camera: RigCamera) -> tuple[FloatArray, BoolArray]:
-        """(n, 3, 3) from the crops' pixels to a camera's, and a mask (n,): which crops these draw whole.
+        """(n, 3, 3) from the crops' pixels to a camera's, and a mask (n,) of the crops that they draw whole.
 
-        They are those of most crops, and take half the time: of a pinhole without distortion that has their corners in
-        its image.
+        They suit most crops, and take half the time: for a pinhole without distortion with all their corners in its
+        image.
         """
         if not isinstance(camera.camera, PinholeCamera) or camera.camera.distortion:
             return np.empty((len(self.main), 3, 3)), np.zeros(len(self.main), np.bool_)
@@ -100,7 +100,7 @@ class VirtualCrops:
         return homographies, np.asarray((inside & (z > 0.0)).all(1))
 
     def _sample_by_pixel(self, images: Mapping[str, UInt8Array], range_m: FloatArray) -> tuple[UInt8Array, BoolArray]:
-        """As `sample`, of any cameras."""
+        """As `sample`, for any camera."""
         source, where = self._sources(images, range_m)
         drawn = np.full((*source.shape, 3), _GREY, np.uint8)
         for index, camera in self._with(images):
@@ -121,7 +121,7 @@ class VirtualCrops:
 
     @property
     def _to_body(self) -> FloatArray:
-        """(n, 3, 3) that make directions of pixels; not of unit length, which no camera needs."""
+        """(n, 3, 3) from pixels to directions in the body, not of unit length."""
         to_virtual = np.zeros((len(self.main), 3, 3))
         to_virtual[:, [0, 1], [0, 1]] = 1.0 / self.focal_px[:, None]
         to_virtual[:, :2, 2] = -self.size_px / 2 / self.focal_px[:, None]
@@ -129,10 +129,10 @@ class VirtualCrops:
         return self.R_body_virtual @ to_virtual
 
     def _sources(self, images: Mapping[str, UInt8Array], range_m: FloatArray) -> tuple[IntArray, Float32Array]:
-        """For each pixel (n, size^2) the number of the camera that shows it, and u and v (2, n, size^2) there; -1 and
-        NaN where none does."""
+        """For each pixel (n, size^2) the index of the camera that shows it, and u and v (2, n, size^2) there; -1 and
+        NaN if none does."""
         pixels = _pixels(self.size_px)
-        # Coordinate by coordinate, each in one piece.
+        # One contiguous array for each coordinate.
         towards = (self._to_body.transpose(1, 0, 2).reshape(-1, 3) @ pixels).reshape(3, len(self.main), -1)
         where = np.full((2, *towards.shape[1:]), np.nan, np.float32)
         for index, camera in self._with(images):
@@ -159,21 +159,21 @@ class VirtualCrops:
         return source, where
 
     def _minification(self, camera: RigCamera) -> IntArray:
-        """(n,) pixels of a camera's image, each way, that fall into one of each crop's at its middle; at least 1."""
+        """(n,) image pixels per crop pixel in the middle of each crop; at least 1."""
         R_camera_virtual = camera.T_body_camera.rotation.T @ self.R_body_virtual
-        # Pixels of the image per radian both ways across the line of sight: their product is an area.
+        # Pixels of the image per radian in both directions across the ray: the determinant is an area.
         per_radian = camera.camera.jacobian(R_camera_virtual[:, :, 2]) @ R_camera_virtual[:, :, :2]
         (a, b), (c, d) = per_radian.transpose(1, 2, 0)
         factor = np.sqrt(np.abs(a * d - b * c)) / self.focal_px
-        # A camera that only sees the crop's rim may not see its middle (NaN); its pixels are then taken one by one.
+        # A camera that sees only the crop's border may not see its middle (NaN); its pixels are then taken as they are.
         whole = np.where(factor > _MINIFICATION, np.rint(factor), 1.0)
         return np.minimum(whole, min(camera.camera.size)).astype(np.int64)
 
 
 def virtual_crops(rig: Rig, directions_body: FloatArray, half_angles_rad: FloatArray, size_px: int) -> VirtualCrops:
-    """The virtual cameras along ``directions_body`` (n, 3), ``half_angles_rad`` (n,) to their borders.
+    """The virtual cameras along ``directions_body`` (n, 3), with ``half_angles_rad`` (n,) to their borders.
 
-    A rig of the cameras that work makes them choose among those.
+    They use only the cameras of ``rig``: pass one with the cameras that work.
     """
     forward = _unit(directions_body)
     margins = np.array([_margin(camera, camera.pixels_of_directions(forward)) for camera in rig.cameras.values()])
@@ -188,7 +188,7 @@ def _level_towards(forward: FloatArray) -> FloatArray:
     x, y, z = forward.T
     length = np.hypot(x, y)
     level, least = length > 1e-6, np.maximum(length, 1e-6)
-    # The right is down x forward. Straight up or down every x is horizontal: the body's right then.
+    # Right is down x forward. Straight up or down every x is horizontal: then the body's right.
     right_x, right_y = np.where(level, -y / least, 0.0), np.where(level, x / least, 1.0)
     columns = [right_x, -z * right_y, x, right_y, z * right_x, y, np.zeros_like(x), x * right_y - y * right_x, z]
     return np.array(columns).T.reshape(-1, 3, 3)
@@ -205,9 +205,9 @@ def _pixels(size_px: int) -> FloatArray:
 
 
 def _draw(image: UInt8Array, where: Float32Array, minification: int) -> UInt8Array:
-    """The image's colours at u and v (2, n, m), averaged over ``minification`` pixels both ways; any at NaN."""
+    """The image's colours at u and v (2, n, m), averaged over ``minification`` pixels each way; arbitrary at NaN."""
     if minification > 1:
-        # Only the part that the crops cover, a block wider, cut along whole blocks.
+        # Only the part that the crops cover plus a block, cut along whole blocks.
         low = np.maximum(np.fmin.reduce(where, axis=(1, 2)) // minification - 1, 0).astype(np.int64) * minification
         blocks = np.fmax.reduce(where, axis=(1, 2)).astype(np.int64) // minification + 2 - low // minification
         width, height = np.minimum(blocks, (np.array(image.shape[1::-1]) - low) // minification).tolist()
@@ -220,7 +220,7 @@ def _draw(image: UInt8Array, where: Float32Array, minification: int) -> UInt8Arr
 
 
 def _margin(camera: RigCamera, pixels: FloatArray) -> FloatArray:
-    """(n,) distance from the image's border, in focal lengths so that cameras compare; -1 elsewhere."""
+    """(n,) distance from the image's border in focal lengths, so that cameras compare; -1 outside."""
     width, height = camera.camera.size
     u, v = pixels.T
     margin = np.minimum(np.minimum(u, width - u), np.minimum(v, height - v)) / camera.camera.focal_px

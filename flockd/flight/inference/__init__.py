@@ -1,4 +1,4 @@
-"""ONNX networks behind manifests: what enters, what comes out, what runs them. Knows nothing of their use."""
+"""ONNX networks with manifests: their inputs, outputs and runtimes. Independent of their use."""
 
 from flockd.flight.inference.manifest import Fault, Manifest
 from flockd.flight.inference.manifest_file import (

@@ -1,4 +1,4 @@
-"""Whether a model file is what its manifest says: its tensors, and its outputs for the golden input."""
+"""Checks that a model file agrees with its manifest: its tensors, and its outputs for the golden input."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _ROUNDED_TOLERANCE = 0.05
 """The same for a network in 8 bits on another provider than the first it is made for: they round between layers."""
 
 Deadline = Callable[[Callable[[], None], Callable[[], None]], None]
-"""Runs the first; where that takes too long, calls the second, which ends it, and raises TimeoutError.
+"""Runs the first function; if it takes too long, calls the second, which stops it, and raises TimeoutError.
 
-This folder knows no clock: whoever opens a model and wants a deadline brings it along.
+This folder has no clock: the caller that opens a model passes a deadline.
 """
 
 
@@ -30,7 +30,7 @@ def no_deadline(work: Callable[[], None], stop: Callable[[], None]) -> None:
 
 
 class Tensor(Protocol):
-    """What ONNX Runtime says of an input or an output."""
+    """An input or an output, as ONNX Runtime describes it."""
 
     name: str
     type: str
@@ -44,7 +44,7 @@ def check_tensors(file: ManifestFile, inputs: Sequence[Tensor], outputs: Sequenc
 
 
 def _misfits(manifest: Manifest, inputs: Mapping[str, Tensor], outputs: Mapping[str, Tensor]) -> Iterator[Fault]:
-    # Every input has to be fed; of the outputs, some may be of no use.
+    # Every input has to be fed; some outputs may be unused.
     for key, wanted, found, fits in (
         ("inputs", manifest.inputs, inputs, set(manifest.inputs) == set(inputs)),
         ("outputs", manifest.outputs, outputs, set(manifest.outputs) <= set(outputs)),
@@ -59,12 +59,12 @@ def _misfits(manifest: Manifest, inputs: Mapping[str, Tensor], outputs: Mapping[
 
 
 def _misfit(spec: InputSpec | OutputSpec, type_: str, shape: Sequence[int | str | None]) -> Fault | None:
-    """Where a manifest's and a model file's tensor differ. What is free in the file, the manifest may fix."""
+    """The difference between a manifest's and a model file's tensor. The manifest may fix what is free in the file."""
     of_file = {"tensor(float)": "float32"}.get(type_, type_.removeprefix("tensor(").removesuffix(")"))
     if of_file != spec.dtype:
         return Fault(("dtype",), f"the manifest says {spec.dtype} but the model file {of_file}")
     if isinstance(spec, OutputSpec) and not shape:
-        return None  # exporters may leave out the shape of what comes out
+        return None  # exporters may leave out shapes of outputs
     may_be_free = isinstance(spec, OutputSpec)
     if len(shape) == len(spec.shape) and all(
         not isinstance(there, int) or here == there or (may_be_free and isinstance(here, str))
@@ -85,7 +85,7 @@ def check_golden(file: ManifestFile, provider: Provider, outputs: Mapping[str, N
 
 
 def cannot_run(file: ManifestFile, provider: str, error: Exception) -> FlockdError:
-    """The error that a model does not run on the golden input."""
+    """The error for a model that does not run on the golden input."""
     if (lacking := shortage_of(error)) is not None:
         return UnavailableError(f"{file.model} cannot be run: out of {lacking}; raise the limits")
     if isinstance(error, TimeoutError):

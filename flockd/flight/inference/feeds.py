@@ -1,4 +1,4 @@
-"""Tensors to run a model on when there is nothing real to see: the golden input, and inputs of a camera's size."""
+"""Inputs for a model without real images: the golden input, and empty inputs of a camera's size."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def golden_feeds(manifest: Manifest) -> Feeds:
 
 
 def feeds_for(manifest: Manifest, image: Size, batch: int = 1) -> Feeds:
-    """What enters for images of a camera, or for so many crops, with nothing in them."""
+    """Empty inputs for images of a camera, or for a batch of crops."""
     fitting, feeds = fit(manifest, image), {}
     for name, spec in manifest.inputs.items():
         if spec.kind == "planes":

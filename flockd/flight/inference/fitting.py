@@ -1,4 +1,4 @@
-"""Pre- and post-processing: from an image to what a model takes, and from the model's maps back to the image."""
+"""Pre- and post-processing: from an image to a model's input, and from the model's maps back to the image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What one model is: all that has to be known of its ONNX file to feed it and to read what comes out."""
+"""A model's manifest: everything needed to feed its ONNX file and to interpret its outputs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _CHANNELS = {"rgb": 3, "bgr": 3, "grey": 1}
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing wrong with a manifest: at which key, and a sentence that says what, and what to do."""
+    """A fault of a manifest: its key, and a sentence that says what is wrong and what to do."""
 
     key: Key
     message: str
@@ -42,13 +42,13 @@ class InputSpec(TensorSpec):
 
     dtype: Literal["uint8", "float32", "float16"]
     carries: str | None = None
-    """What it is fed with; by default what the input's name says."""
+    """Meaning of the input; by default its name."""
     kind: Literal["image", "planes"] = "image"
     """`planes` are (n, c, h, w) numbers that are fed as they are, at `map_stride` image pixels a number."""
     layout: Literal["nhwc", "nchw"] = "nhwc"
     colour: Literal["rgb", "bgr", "grey"] = "rgb"
     white: Positive = 255.0
-    """What the brightest grey level, 255, becomes; often 1."""
+    """Value of the brightest grey level, 255; often 1."""
     mean: tuple[float, ...] = ()
     deviation: tuple[Positive, ...] = ()
 
@@ -59,7 +59,7 @@ class InputSpec(TensorSpec):
         return width, height
 
     def faults(self) -> Iterator[Fault]:
-        """Why nothing can become this."""
+        """Why no image can be converted to this input."""
         if len(self.shape) != 4:
             wanted = self.layout if self.kind == "image" else "nchw"
             yield Fault(("shape",), f"has {len(self.shape)} axes; write the 4 of {wanted}")
@@ -83,27 +83,27 @@ class InputSpec(TensorSpec):
 
 
 class DepthMeaning(Section):
-    """What the numbers of a depth output say."""
+    """Meaning of a depth output."""
 
     quantity: Literal["depth", "inverse_depth"] = "depth"
     unknown: Unknown = "nothing"
     """What the network cannot know. `perception.scale` then has to be `height`, which fixes it."""
     focal_px: Positive | None = None
-    """Metric only for cameras of this focal length, in pixels of the input; others' depth is scaled by theirs."""
+    """Focal length in pixels of the input for which depth is metric; for other cameras it is scaled."""
 
 
 class OutputSpec(TensorSpec):
-    """One output of the network, and what it is for the golden input."""
+    """One output of the network, and its statistics for the golden input."""
 
     dtype: Literal["float32", "float16"]
     gives: str | None = None
-    """What it is used as; by default what the output's name says."""
+    """Meaning of the output; by default its name."""
     layout: Literal["nhwc", "nchw"] = "nchw"
     """Layout of a map with 4 axes; with 3 it is (n, h, w)."""
     columns: tuple[Annotated[str, Field(min_length=1)], ...] = ()
     """Names of the k numbers of an output (n, k), in their order."""
     factor: float = 1.0
-    """Makes pixels of the input (flow), pixels of the map (offset), metres or 1/m (depth) of what comes out."""
+    """Converts the output to pixels of the input (flow), pixels of the map (offset), metres or 1/m (depth)."""
     depth: DepthMeaning = DepthMeaning()
     golden_mean: float
     golden_deviation: float
@@ -115,7 +115,7 @@ class OutputSpec(TensorSpec):
         return {name: values[:, index] for index, name in enumerate(self.columns)}
 
     def faults(self) -> Iterator[Fault]:
-        """Why the columns cannot be."""
+        """Why the columns are impossible."""
         if not self.columns:
             return
         doubled = sorted({name for name in self.columns if self.columns.count(name) > 1})
@@ -136,41 +136,41 @@ class CropSpec(Section):
     fill: Positive
     """Half of a crop's width over the object's size, both at the object's range; for an object of known size."""
     first_margin: Positive
-    """Half of the first crop's width, over the way from the centre of the object's box to its farthest corner."""
+    """Half of the first crop's width, over the distance from the centre of the object's box to its farthest corner."""
     cut_margin: Positive
-    """The same where the box is cut off by the image's border: the object is larger than what is seen of it."""
+    """The same if the image's border cuts the box: the object is larger than its visible part."""
     mirror_scale: Positive
-    """Width of the last crop, over the width that suits the object. It enters mirrored: the model errs on it in another
-    way, and so the mean of both errs less."""
+    """Width of the last crop, over the width that fits the object. It is mirrored: the model's errors then differ, and
+    the mean of both is better."""
     min_half_width_px: Positive
     """Half of a crop's width is at least this, in pixels of the camera's image: smaller objects stay small in it."""
     max_half_angle_deg: Annotated[float, Field(gt=0, lt=90)]
-    """And at most this, seen from the camera."""
+    """Largest half width, as an angle seen from the camera."""
     max_resize: Annotated[float, Field(gt=1)]
     """A further crop is at most this many times as wide as the one before it, and at least as much narrower."""
     max_crops: Annotated[int, Field(ge=2)]
-    """How often an object is cropped anew before the mirrored crop, at most: the first crop and the refined ones."""
+    """Largest number of crops before the mirrored one: the first and the refined ones."""
 
 
 class Manifest(Section):
-    """All that is known about one model."""
+    """All facts about one model."""
 
     name: PlainName
     roles: Annotated[tuple[str, ...], Field(min_length=1)]
-    """What it can be used for; who uses it knows what each role needs."""
+    """Roles that it can fill; the user of a role defines its requirements."""
     file: Annotated[str, Field(min_length=1)]
     sha256: Annotated[str, text(r"^[0-9a-f]{64}$", "a SHA-256, 64 hexadecimal digits in small letters")]
     description: str
     image_scale: Positive = 1.0
-    """The images are resized by this factor before they enter. A model of fixed size takes them as large as fits."""
+    """The images are resized by this factor. A model of fixed size takes them as large as they fit."""
     least_side_px: Annotated[int, Field(ge=0)] = 0
-    """The shorter side enters with so many pixels at least, as far as the image has them."""
+    """The shorter side keeps at least so many pixels, if the image has them."""
     size_multiple: Annotated[int, Field(ge=1)] = 1
-    """Height and width that enter are padded to a multiple of this."""
+    """The input's height and width are padded to a multiple of this."""
     map_stride: Annotated[int, Field(ge=1, le=64)] | None = None
-    """Pixels of the image that enters per number of its planes, and per pixel of the maps that come out."""
+    """Pixels of the input image per number of its planes, and per pixel of the output maps."""
     crop: CropSpec | None = None
-    """How the crop that enters is to be cut out; None: whole images enter."""
+    """How input crops are cut; None: the input are whole images."""
     thresholds: dict[str, float] = Field(default_factory=dict)
     """Decision thresholds of this model's outputs, by name; they belong to the weights."""
     inputs: Annotated[dict[str, InputSpec], Field(min_length=1)]
@@ -178,7 +178,7 @@ class Manifest(Section):
     golden_size: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
     """Width and height of the golden input image."""
     providers: tuple[Provider, ...] = ()
-    """Those that it was made for; none: any."""
+    """The providers that it was made for; empty: any."""
     licence: str
     data: str
     accuracy: dict[str, str]

@@ -1,6 +1,6 @@
-"""Where a drone wants to go: time, own place and own flock to a desired velocity, height and status; one file a kind.
+"""Missions: from time, own position and own flock to a desired velocity, height and status; one file for each kind.
 
-Everything is level but heights. Nothing here knows another drone's intentions.
+All is horizontal except heights. No mission knows another drone's intentions.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ class CircleThenTangent:
 
 
 def desired_of(parameters: MissionParameters, t: float, status: MissionStatus) -> FloatArray:
-    """(2,) m/s: what a drone wanted `t` seconds into its flight; Eq. 43 where a recording lacks the circle's status."""
+    """(2,) m/s: desired velocity at `t` seconds into the flight; by Eq. 43 if a recording lacks the circle's status."""
     if not status.known and parameters.kind == "circle_then_tangent":
         return desired_velocity(parameters, t) * parameters.pull
     return status.desired
@@ -40,9 +40,8 @@ def desired_velocity(parameters: MissionParameters, t: float) -> FloatArray:
 def course(parameters: MissionParameters, t: float) -> float:
     """The direction of the desired velocity, radians clockwise from north in [0, 2 pi): delta of Eq. 43.
 
-    The printed dots before 2 pi are read as the remainder. With the paper's 10 m of radius and 1 m/s it turns at
-    0.1 rad/s until 66 s and stays at 6.6 - 2 pi = 0.317 rad from there. Raises ValueError for a negative or
-    non-finite time.
+    The dots printed before 2 pi are read as a modulo. With the paper's 10 m of radius and 1 m/s it turns at 0.1 rad/s
+    until 66 s and stays at 6.6 - 2 pi = 0.317 rad from there. Raises ValueError for a negative or non-finite time.
     """
     if not (math.isfinite(t) and t >= 0):
         raise ValueError(f"the time into the flight must be finite and not negative, not {t}")

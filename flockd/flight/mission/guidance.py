@@ -12,9 +12,9 @@ from flockd.core.messages import FloatArray, MissionOrder
 from flockd.core.navigation import wrapped
 
 SLOW_DOWN_S = 2.0
-"""The way to the last goal is flown no faster than the distance left over this."""
+"""Near the last goal, the speed is at most the distance left over this."""
 _COURSE_M_S = 0.2
-"""Slower than this is in no particular direction."""
+"""A slower velocity has no course."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,19 +22,19 @@ class Moment:
     """The inputs of a mission in one step."""
 
     time_s: float
-    """Since the mission began."""
+    """Time since the mission began."""
     position: FloatArray | None = None
     """(2,) metres north and east of home; None: not known."""
     middle: FloatArray = field(default_factory=lambda: np.zeros(2))
-    """(2,) metres north and east from the drone to the middle of it and of the neighbours that it sees."""
+    """(2,) metres north and east from the drone to the centroid of itself and its neighbours."""
     home_deg: FloatArray | None = None
-    """(2,) latitude and longitude; None: not known."""
+    """(2,) latitude and longitude of home; None: not known."""
     order: MissionOrder | None = None
-    """An operator's, where a new one came."""
+    """An operator's new order; None: no new one."""
 
     @property
     def flock(self) -> FloatArray | None:
-        """(2,) metres north and east of home: the middle of the flock, as far as it is seen."""
+        """(2,) metres north and east of home: the centroid of the visible flock."""
         return None if self.position is None else self.position + self.middle
 
 
@@ -45,17 +45,17 @@ class Guidance:
     velocity: FloatArray
     """(2,) m/s north and east: efv of Eq. 42."""
     sentence: str
-    """What it does, for people."""
+    """What the mission does, for people."""
     course_rad: float | None = None
-    """Heading to fly with, clockwise from north, `wrapped`; None: as before."""
+    """Heading, clockwise from north, `wrapped`; None: unchanged."""
     height_m: float | None = None
-    """Above the ground at home; None: as before."""
+    """Height above home; None: unchanged."""
     goal: FloatArray | None = None
     """(2,) metres north and east of home; None: the mission has no goal."""
     arrived: bool = False
-    """At the last goal."""
+    """Whether the drone is at the last goal."""
     takeover: Literal["land", "return"] | None = None
-    """The mode to ask the autopilot for at the end of the mission."""
+    """The autopilot's mode at the end of the mission; None: it has not ended."""
 
     def __post_init__(self) -> None:
         if self.course_rad is not None:
@@ -66,16 +66,16 @@ class Mission(Protocol):
     """One kind of mission."""
 
     def step(self, moment: Moment) -> Guidance:
-        """What it wants now; called in order of time."""
+        """The guidance at a moment; called in order of time."""
 
 
 def course_of(velocity: FloatArray) -> float | None:
-    """Direction of a velocity (2,), radians clockwise from north; None for hardly any."""
+    """Direction of a velocity (2,), radians clockwise from north; None if it is too slow."""
     return math.atan2(velocity[1], velocity[0]) if math.hypot(*velocity) > _COURSE_M_S else None
 
 
 def towards(goal: FloatArray, here: FloatArray, speed_m_s: float, *, stops: bool) -> FloatArray:
-    """The velocity, (2,) m/s, from `here` to `goal`; `stops`: slower near it, and none at it."""
+    """The velocity, (2,) m/s, from `here` to `goal`; `stops`: slows down near it and stops there."""
     way = goal - here
     distance_m = math.hypot(*way)
     if stops:

@@ -1,4 +1,4 @@
-"""Flies a drone's mission: the configured one, or the one that an operator's order has put in its place."""
+"""Flies a drone's mission: the configured one, or the one of an operator's order."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from flockd.flight.mission.waypoints import Waypoints
 from flockd.flight.obstacles import AZIMUTHS, in_view
 
 MAX_TURN_RAD_S = 0.2
-"""How fast the heading follows the course, but on the paper's circle: cameras that turn faster see less."""
+"""Largest turn rate of the heading, except on the paper's circle: fast turns blur the images."""
 _BESIDE = 3
-"""Sectors to both sides of the course that have to be in view too: a neighbour in them is wholly in the image."""
+"""Sectors on both sides of the course that have to be in view too: a neighbour in them is wholly in the image."""
 
 
 class Navigator:
-    """The mission of one flight; remembers how far it is."""
+    """The mission of one flight, with its progress."""
 
     def __init__(self, parameters: MissionParameters, gate: GateParameters) -> None:
         self._configured, self._gate = parameters, gate
@@ -34,14 +34,14 @@ class Navigator:
         self._mission = _mission(parameters, gate)
         self._began_s = 0.0
         self._height_m = parameters.height_m
-        """The mission's or an order's last, without offset: what stays where no other is asked for."""
+        """The last height of the mission or an order, without offset; kept until there is another."""
         self._course_rad: float | None = None
         self._turned_s = 0.0
 
     def step(self, moment: Moment) -> Guidance:
-        """What the mission wants, `moment.time_s` after the flight began; an order may put another in its place.
+        """The mission's guidance, `moment.time_s` after the flight began; an order may replace the mission.
 
-        Its height has the offset of the configuration, its course turns no faster than `MAX_TURN_RAD_S`.
+        The configured offset is added to its height, and its course turns no faster than `MAX_TURN_RAD_S`.
         """
         if moment.order is not None and self._configured.kind != "operator":
             self._replace(moment.order, moment.time_s)
@@ -56,7 +56,7 @@ class Navigator:
         return guidance
 
     def pull(self, guidance: Guidance) -> FloatArray:
-        """(2,) m/s: efv of Eq. 42 with the mission's own part of W_i, which is 0 for `follow`."""
+        """(2,) m/s: efv of Eq. 42 times the mission's W_i, which is 0 for `follow`."""
         return guidance.velocity * self._parameters.pull
 
     def status(self, guidance: Guidance) -> MissionStatus:
@@ -72,13 +72,13 @@ class Navigator:
         )
 
     def _replace(self, order: MissionOrder, time_s: float) -> None:
-        """Begins the mission that an order asks for: a goal for good, or an operator's velocity for some seconds."""
+        """Begins an order's mission: a goal without time limit, or an operator's velocity for some seconds."""
         self._parameters = ordered_mission(self._configured, order)
         self._mission = _mission(self._parameters, self._gate)
         self._began_s = time_s
 
     def _turned(self, wanted_rad: float | None, time_s: float) -> float | None:
-        """The course after turning from the last one, as far as there was time for."""
+        """The course after turning from the last one at the largest turn rate."""
         before_rad = self._course_rad
         if wanted_rad is None or before_rad is None:
             return before_rad if wanted_rad is None else wanted_rad
@@ -88,18 +88,18 @@ class Navigator:
 
 
 class Lookout:
-    """Turns the heading so that a camera looks where the drone flies, if one is lost or the rig has a gap."""
+    """Turns the heading so that a camera looks in the direction of flight, if one is lost or the rig has a gap."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self._time_s = math.inf
         self.turn_rad = 0.0
-        """By which the heading was turned last."""
+        """The current turn of the heading."""
 
     def heading(self, time_s: float, heading_rad: float, velocity: FloatArray, gone: frozenset[str]) -> float:
-        """To fly with by now instead of `heading_rad`, for a drone that wants to fly with `velocity` (2,) m/s.
+        """The heading to fly with instead of `heading_rad`, given the wanted `velocity` (2,) m/s.
 
-        `gone`: the cameras that give no image. It turns so slowly that one which misses a frame hardly matters.
+        `gone`: cameras without image. It turns so slowly that a single missing frame hardly matters.
         """
         course_rad, wanted_rad = course_of(velocity), self.turn_rad
         if course_rad is not None:
@@ -116,7 +116,7 @@ class Lookout:
 
 
 def ordered_mission(configured: MissionParameters, order: MissionOrder) -> MissionParameters:
-    """The mission that an order puts in place of the configured one; see `Navigator`."""
+    """The mission that replaces the configured one by an order; see `Navigator`."""
     kept = configured.model_dump(include={"speed_m_s", "reached_m", "timeout_s", "origin_m"})
     if order.velocity is not None:
         return MissionParameters(kind="operator", **kept)
@@ -130,7 +130,7 @@ def ordered_mission(configured: MissionParameters, order: MissionOrder) -> Missi
 
 
 def middle_of(neighbours: FloatArray) -> FloatArray:
-    """(2,) metres: the middle of a drone, which is the origin, and of its neighbours at (n, 2) metres."""
+    """(2,) metres: the centroid of the drone, at the origin, and its neighbours at (n, 2) metres."""
     middle: FloatArray = neighbours.sum(axis=0) / (len(neighbours) + 1)
     return middle if len(neighbours) else np.zeros(2)
 

@@ -1,4 +1,4 @@
-"""A mission that an operator steers over telemetry."""
+"""A mission steered by an operator over telemetry."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flockd.flight.mission.places import place_of_order
 
 
 class Operator:
-    """Flies the newest order; without a new one for `timeout_s` it hovers."""
+    """Flies the newest order; hovers if there is no new one for `timeout_s`."""
 
     def __init__(self, parameters: MissionParameters) -> None:
         self._parameters = parameters

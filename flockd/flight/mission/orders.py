@@ -1,4 +1,4 @@
-"""Whether an operator's order may be flown."""
+"""Checks an operator's order."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from flockd.flight.mission.places import place_of_order
 def order_fault(config: DroneConfig, order: MissionOrder, vehicle: VehicleState | None) -> str | None:
     """Why an order is refused, one sentence for its sender; None: it may be flown.
 
-    `vehicle` is the drone's newest state. A velocity is refused if the drone would be outside the fence when the
-    order ends, or if it is outside already and does not come nearer to home.
+    `vehicle` is the drone's newest state. A velocity is refused if the drone would be outside the fence at the end of
+    the order, or is outside already and would not come nearer to home.
     """
     gate, mission = config.safety.gate, config.mission
     if not _finite(order):
@@ -46,7 +46,7 @@ def order_fault(config: DroneConfig, order: MissionOrder, vehicle: VehicleState 
         return f"the goal {fault}"
     try:
         ordered_mission(mission, order)
-    except ValidationError:  # of the only numbers of an order that are not checked above
+    except ValidationError:  # only the goal is not checked above
         return "the goal is farther than any mission leads; name one nearer to home"
     return None
 

@@ -1,4 +1,4 @@
-"""Places of waypoints and orders, as metres from home."""
+"""Positions of waypoints and orders, in metres from home."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from flockd.core.navigation import degrees_apart, metres_a_degree
 
 
 def place_of_order(order: MissionOrder, origin: FloatArray, home_deg: FloatArray | None) -> FloatArray | None:
-    """(2,) metres north and east of home; None where the order names no place, or home is not known."""
+    """(2,) metres north and east of home; None: the order names no place, or home is not known."""
     if order.place is not None:
         place: FloatArray = origin + order.place
         return place
@@ -20,16 +20,16 @@ def place_of_order(order: MissionOrder, origin: FloatArray, home_deg: FloatArray
 def place_of_waypoint(
     waypoint: WaypointParameters, origin: FloatArray, home_deg: FloatArray | None
 ) -> FloatArray | None:
-    """(2,) metres north and east of home; None where the waypoint is in degrees and home is not known."""
+    """(2,) metres north and east of home; None: the waypoint is in degrees and home is not known."""
     if waypoint.north_m is not None and waypoint.east_m is not None:
         place: FloatArray = origin + np.array([waypoint.north_m, waypoint.east_m])
         return place
-    assert waypoint.latitude_deg is not None and waypoint.longitude_deg is not None  # its own check asks for a pair
+    assert waypoint.latitude_deg is not None and waypoint.longitude_deg is not None  # checked by WaypointParameters
     return _from_degrees(np.array([waypoint.latitude_deg, waypoint.longitude_deg]), home_deg)
 
 
 def _from_degrees(place_deg: FloatArray, home_deg: FloatArray | None) -> FloatArray | None:
-    """Level metres near home; within 10 km they are right to a few metres, within 1 km to centimetres."""
+    """Metres north and east, on a plane at home: correct to a few metres within 10 km, to centimetres within 1 km."""
     if home_deg is None:
         return None
     across_deg = degrees_apart(float(place_deg[1]), float(home_deg[1]))

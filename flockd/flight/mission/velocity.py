@@ -1,4 +1,4 @@
-"""Missions of one velocity, or of none of their own."""
+"""Missions with a constant velocity, and without one."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from flockd.flight.mission.guidance import Guidance, Moment, course_of
 
 
 class Velocity:
-    """Wants the same velocity at all times."""
+    """Always flies the same velocity."""
 
     def __init__(self, parameters: MissionParameters) -> None:
-        assert parameters.velocity_m_s is not None  # its own check asks for it
+        assert parameters.velocity_m_s is not None  # checked by MissionParameters
         self._velocity = np.array(parameters.velocity_m_s)
 
     def step(self, moment: Moment) -> Guidance:
@@ -21,7 +21,7 @@ class Velocity:
 
 
 class Hover:
-    """Wants no velocity; the law still keeps the flock together."""
+    """Desires velocity zero; the law still keeps the flock together."""
 
     def step(self, moment: Moment) -> Guidance:
         """See `Mission`."""
@@ -29,7 +29,7 @@ class Hover:
 
 
 class Follow:
-    """Goes where the flock goes: Eq. 42 with W_i = 0, so that cohesion and alignment alone move the drone."""
+    """Follows the flock: Eq. 42 with W_i = 0, so that only cohesion and alignment move the drone."""
 
     def step(self, moment: Moment) -> Guidance:
         """See `Mission`."""

@@ -1,4 +1,4 @@
-"""A mission from place to place."""
+"""A mission along waypoints."""
 
 from __future__ import annotations
 
@@ -14,20 +14,19 @@ from flockd.flight.mission.places import place_of_waypoint
 from flockd.flight.safety.fence import outside_fence
 
 PATIENCE_S = 5.0
-"""A flock that comes no nearer for so long has been at its waypoint, if that is no farther than it flies in as long."""
+"""A waypoint within this flight time counts as reached if the flock has come no nearer for this time."""
 PROGRESS = 0.05
-"""Share of its speed; a flock that is slower on the way to a waypoint comes no nearer."""
+"""Least share of its speed at which a flock comes nearer to a waypoint."""
 
 
 class Waypoints:
-    """Leads the middle of the flock to one waypoint after the other, and stays at the last one.
+    """Leads the centroid of the flock to one waypoint after the other, and stays at the last one.
 
-    The middle is of the drone and of the neighbours that it sees. Drones that fly the same waypoints see nearly the
-    same middle and so want the same velocity, as on the paper's circle, instead of all wanting to be at one spot.
-
-    Drones that see different neighbours see different middles: one may see its own at a waypoint and turn to the next
-    while another still flies to this one, and both hold the flock where it is. So a waypoint counts as reached, too,
-    where the flock has come near to it and comes no nearer.
+    It is the centroid of the drone and its visible neighbours. Drones with the same waypoints see nearly the same
+    centroid and so desire the same velocity, as on the paper's circle, instead of crowding at one point. Drones that
+    see different neighbours have different centroids: one may turn to the next waypoint while another still flies to
+    this one, and the flock stands still. So a waypoint also counts as reached when the flock is near and comes no
+    nearer.
     """
 
     def __init__(self, parameters: MissionParameters, gate: GateParameters) -> None:
@@ -59,7 +58,7 @@ class Waypoints:
         return self._towards(goal, here)
 
     def _is_reached(self, time_s: float, away_m: float) -> bool:
-        """Whether the waypoint that is flown to counts as reached, with the flock's middle so far from it."""
+        """Whether the current waypoint counts as reached, with the flock's centroid `away_m` from it."""
         reached_m = self._parameters.reached_m
         if self._approach is None:
             self._approach = _Approach(time_s, away_m)
@@ -97,7 +96,7 @@ class Waypoints:
 
     @property
     def _height(self) -> float | None:
-        """That of the waypoint that is flown to, or of the one before it."""
+        """Height of the current waypoint, or of the one before it."""
         height_m = self._parameters.waypoints[self._next].height_m
         return self._height_m if height_m is None else height_m
 
@@ -106,16 +105,16 @@ class Waypoints:
 
 
 class _Approach:
-    """How near the middle of the flock has come to a waypoint, and since when it has not come nearer."""
+    """The shortest distance of the flock's centroid to a waypoint, and since when it has not decreased."""
 
     def __init__(self, time_s: float, away_m: float) -> None:
         self._first_m = self._nearest_m = away_m
         self._since_s = time_s
 
     def ended(self, time_s: float, away_m: float, speed_m_s: float, reached_m: float) -> bool:
-        """Whether it came near, and comes no nearer; of one that has not moved yet, it is not known."""
+        """Whether the flock came near and comes no nearer; never before it has moved."""
         reach_m = PATIENCE_S * speed_m_s
-        far = away_m > reached_m + 2 * reach_m  # than it can have flown from near within its patience
+        far = away_m > reached_m + 2 * reach_m  # farther than it flies from there in the meantime
         if far or away_m <= self._nearest_m - PROGRESS * reach_m:
             self._nearest_m, self._since_s = away_m, time_s
         moved, near = self._nearest_m < self._first_m, self._nearest_m <= reached_m + reach_m

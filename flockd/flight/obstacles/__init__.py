@@ -1,4 +1,4 @@
-"""Obstacles: ranged in the images, kept in a local map for a few seconds, and flown around."""
+"""Obstacles: ranges from the images, a local map of the last few seconds, and avoidance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Obstacle avoidance: what the flocking law wants, steered around obstacles and slowed before them."""
+"""Obstacle avoidance: steers the flocking law's velocity around obstacles and slows it in front of them."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from flockd.flight.safety.half_planes import nearest_within
 
 
 class Avoidance:
-    """One drone's. Remembers which way around it goes."""
+    """Obstacle avoidance of one drone. It keeps the side on which it passes."""
 
     def __init__(self, parameters: ObstacleParameters, gate: GateParameters, step_s: float) -> None:
         self._parameters = parameters
-        # A step passes before the next velocity here, too, but the gate that follows keeps its own, longer distance.
+        # The next velocity comes a step later here too; the gate behind keeps its own, longer distance.
         self._gate = gate.model_copy(update={"neighbour_reaction_s": gate.reaction_s})
         self._step_s = step_s
         self._reaction_s = gate.reaction_s + step_s
@@ -38,10 +38,10 @@ class Avoidance:
         ranges: ObstacleRanges,
         ages_s: FloatArray | float = math.inf,
     ) -> tuple[FloatArray, FloatArray]:
-        """The velocity to ask for, (2,) m/s, and the acceleration that leads there, (2,) m/s^2.
+        """The velocity to command, (2,) m/s, and the acceleration that leads to it, (2,) m/s^2.
 
         Arguments as of `FlockingLaw.command`, but `neighbours` are (n, 3) metres NED from the drone. Under the law the
-        velocity tends to V + u: this is steered around obstacles, and the velocity after the step has to be safe.
+        velocity tends to V + u: that is steered around obstacles, and the velocity after the step has to be safe.
         """
         u = law.acceleration(velocity, level_offsets(neighbours), velocities, desired, ages_s)
         wanted = limit_norm(velocity + u, law.parameters.max_speed_m_s)
@@ -51,10 +51,10 @@ class Avoidance:
         return safe, (safe - velocity) / lookahead_s(self._step_s)
 
     def steered(self, wanted: FloatArray, ranges: ObstacleRanges, flock: FloatArray) -> FloatArray:
-        """The velocity (2,) m/s to fly with instead of the `wanted` one, which the flocking law tends to.
+        """The velocity (2,) m/s to fly with instead of the `wanted` one, to which the flocking law tends.
 
-        No faster than the drone can stop within what is known to be free. `flock` (2,) m/s is the neighbours' mean
-        velocity, zero without any.
+        It is no faster than the drone can stop within the free distance. `flock` (2,) m/s is the neighbours' mean
+        velocity, zero without neighbours.
         """
         velocity, free_m = self._steering.around(wanted, ranges, flock)
         most_m_s = float(stopping_speed(np.array(free_m), self._gate.braking_m_s2, self._reaction_s))
@@ -63,11 +63,10 @@ class Avoidance:
     def within(
         self, velocity: FloatArray, ranges: ObstacleRanges, neighbours: FloatArray, velocities: FloatArray
     ) -> FloatArray:
-        """The velocity (2,) m/s nearest to the given one from which the drone can stop before what is near.
+        """The velocity (2,) m/s nearest to the given one from which the drone can stop in time.
 
-        `neighbours` (n, 3) metres NED from the drone, with their `velocities` (n, 2) m/s. A step passes before the
-        next velocity, which counts as reaction. Neighbours turn aside here without notice: they are kept as far off as
-        by a degraded drone.
+        `neighbours` (n, 3) metres NED from the drone, with their `velocities` (n, 2) m/s. The time until the next
+        velocity counts as reaction time. Neighbours sidestep without notice here, so the degraded separation is kept.
         """
         p, gate = self._parameters, self._gate
         points = nearest_points(ranges, p.sigmas)
@@ -78,7 +77,7 @@ class Avoidance:
         return nearest_within(velocity, np.concatenate(directions), np.concatenate(most_m_s))
 
     def _away(self, ranges: ObstacleRanges) -> FloatArray:
-        """(2,) m/s from the nearest obstacle, where that is nearer than the clearance: what is missing in a second."""
+        """(2,) m/s away from the nearest obstacle if it is within the clearance: restores the clearance in a second."""
         points = nearest_points(ranges, self._parameters.sigmas)
         away_m = np.hypot(*points.T)
         if not (away_m < self._parameters.clearance_m).any():

@@ -1,4 +1,4 @@
-"""The local map: where obstacles are around the drone, from the ranges of the last few seconds."""
+"""The local map: obstacles around the drone, from the ranges of the last few seconds."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from flockd.core.messages import SECTORS, BoolArray, FloatArray, IntArray, Obsta
 from flockd.flight.geometry import Rig
 
 _CONSISTENT_SIGMAS = 3.0
-"""Two ranges that differ by no more may be of one obstacle."""
+"""Two ranges that differ by no more standard deviations may be of one obstacle."""
 _CONTRADICTIONS = 2
-"""An obstacle that so many steps have looked past is none."""
+"""An obstacle is deleted after so many steps with longer ranges in its direction."""
 
 AZIMUTHS = 2 * math.pi / SECTORS * np.arange(SECTORS)
-"""(n,) radians, clockwise from north: the sectors' middles."""
+"""(SECTORS,) radians, clockwise from north: the sectors' middles."""
 DIRECTIONS = np.column_stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)])
-"""(n, 2) north and east, of length 1: the sectors' middles."""
+"""(SECTORS, 2) unit vectors north and east: the sectors' middles."""
 
 _NOWHERE_M = np.full(SECTORS, np.inf)
 _POINT = np.dtype([("place", float, 2), ("sigma_m", float), ("seen_s", float), ("contradictions", int)])
-"""An obstacle that was seen: metres north and east from the drone, and how many steps have looked past it since."""
+"""A point of an obstacle: metres north and east from the drone, and the number of steps that contradicted it."""
 _Points = NDArray[np.void]
-"""(m,) of them."""
+"""(m,) points."""
 
 
 class LocalMap:
     """Obstacles as points in level axes that point north and east, with the drone at the origin.
 
-    A point moves as the drone does not, and grows uncertain by the drone's own motion. It is replaced by a newer one
-    of the same obstacle, and forgotten after `memory_s`, or when newer ranges look past it.
+    Points move opposite to the drone, and the uncertainty of its motion is added to theirs. A newer range of the same
+    obstacle replaces a point; it is deleted after `memory_s`, or when longer ranges contradict it.
     """
 
     def __init__(self, parameters: ObstacleParameters) -> None:
@@ -45,12 +45,12 @@ class LocalMap:
     def step(
         self, time_s: float, ranges: ObstacleRanges | None, displacement: FloatArray | None, sigma_m: float
     ) -> ObstacleRanges:
-        """What the map says at `time_s`.
+        """The map's ranges at `time_s`.
 
         Args:
-            time_s: not before the last step's; if it is, the map begins anew.
-            ranges: of this time; None: nothing was looked at.
-            displacement: (2,) metres north and east that the drone went since the last step; None: the map begins anew.
+            time_s: if it is before the last step's, the map starts anew.
+            ranges: of this time; None: not measured.
+            displacement: (2,) displacement since the last step, metres north and east; None: the map starts anew.
             sigma_m: its standard deviation, each axis.
         """
         self._move(time_s, displacement, sigma_m)
@@ -81,7 +81,7 @@ class LocalMap:
         self._seen_m = np.maximum(self._seen_m, np.minimum(ranges.seen_m, p.range_m))
 
     def _without_what_is_seen_anew(self, ranges: ObstacleRanges) -> _Points:
-        """The points that newer ranges neither show again nor have looked past often enough."""
+        """The points that newer ranges neither replace nor contradict often enough."""
         points = self._points.copy()
         away_m = np.hypot(*points["place"].T)
         around = (sector_of(points["place"])[:, None] + [-1, 0, 1]) % SECTORS
@@ -95,30 +95,30 @@ class LocalMap:
         return left
 
     def _now(self, time_s: float) -> ObstacleRanges:
-        """In each sector the point that may be nearest."""
+        """The nearest possible point of each sector."""
         places, sigmas_m = self._points["place"], self._points["sigma_m"]
         away_m, sectors = np.hypot(*places.T), sector_of(places)
         farthest_first = np.argsort(-(away_m - self._parameters.sigmas * sigmas_m), kind="stable")
         range_m, sigma_m = np.full(SECTORS, np.inf), np.zeros(SECTORS)
-        range_m[sectors[farthest_first]] = away_m[farthest_first]  # the last one written stays
+        range_m[sectors[farthest_first]] = away_m[farthest_first]  # the last assignment to an index wins
         sigma_m[sectors[farthest_first]] = sigmas_m[farthest_first]
         return ObstacleRanges(time_s, range_m, sigma_m, self._seen_m)
 
 
 @cache
 def in_view(rig: Rig, gone: frozenset[str]) -> BoolArray:
-    """(SECTORS,) in which directions, clockwise from the body's front, cameras that are not `gone` look, held level."""
+    """(SECTORS,) mask of directions, clockwise from the body's front, in view of a camera not in `gone`, body level."""
     return rig.covers(np.column_stack([DIRECTIONS, np.zeros(SECTORS)]), without=gone)
 
 
 def nothing_found(time_s: float, rig: Rig, gone: frozenset[str], yaw_rad: float) -> ObstacleRanges:
-    """Ranges for a drone that does not look for obstacles: all free in view; `gone` as of `in_view`."""
+    """Ranges without obstacle detection: all is free in view; `gone` as of `in_view`."""
     looked = in_view(rig, gone).take(np.arange(SECTORS) - round(yaw_rad / AZIMUTHS[1]), mode="wrap")
     return ObstacleRanges(time_s, _NOWHERE_M, np.zeros(SECTORS), np.where(looked, np.inf, 0.0))
 
 
 def nearest_points(ranges: ObstacleRanges, sigmas: float) -> FloatArray:
-    """(m, 2) metres north and east: the obstacles, each nearer by so many standard deviations than it was measured."""
+    """(m, 2) metres north and east: the obstacles, each moved nearer by so many standard deviations of its range."""
     known = np.isfinite(ranges.range_m)
     away_m = np.maximum(ranges.range_m[known] - sigmas * ranges.sigma_m[known], NEAREST_M)
     points: FloatArray = away_m[:, None] * DIRECTIONS[known]
@@ -126,11 +126,11 @@ def nearest_points(ranges: ObstacleRanges, sigmas: float) -> FloatArray:
 
 
 NEAREST_M = 0.01
-"""No obstacle counts as nearer: it needs a direction."""
+"""Shortest range of an obstacle: it needs a direction."""
 
 
 def sector_of(places: FloatArray) -> IntArray:
-    """(m,) of places (m, 2)."""
+    """(m,) sector of each place (m, 2)."""
     azimuths = np.arctan2(places[:, 1], places[:, 0])
     sectors: IntArray = np.round(azimuths * SECTORS / (2 * math.pi)).astype(np.int64) % SECTORS
     return sectors

@@ -1,4 +1,4 @@
-"""From the depth maps of all cameras to the nearest obstacle in each direction."""
+"""The nearest obstacle in each direction, from the depth maps of all cameras."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from flockd.flight.geometry import Rig, RigCamera, RigidTransform, grid_pixels, 
 from flockd.flight.perception.observation import CameraObservation, Observation
 
 _STRIDE_PX = 4
-"""Between pixels that are taken: a trunk of 0.2 m at 10 m is 4 px wide at 222 px a radian."""
+"""Distance of the pixels used: a trunk of 0.2 m at 10 m is 4 px wide at 222 px per radian."""
 _NEAREST_M = 0.3
 _RATIO = 1.1
-"""Ratio of a range to that of the bin before it."""
+"""Ratio of the ranges of successive bins."""
 _GROUND_MARGIN_M = 0.7
-"""What is no higher than this above the ground counts as ground."""
+"""Height above the ground up to which a point counts as ground."""
 _HORIZON = 0.1
-"""Tangent of the elevation up to which a ray shows how far the drone sees at its own height."""
+"""Largest tangent of the elevation at which a ray shows the range of sight at the drone's own height."""
 
 
 _GRID = slice(_STRIDE_PX // 2, None, _STRIDE_PX)
-"""Rows or columns that `grid_pixels` takes."""
+"""The rows or columns of `grid_pixels`."""
 _STEEPEST = 0.6
-"""Sine of the elevation up to which pixels are triangulated: all that is 1.5 m lower from 2 m on. In the direction of
-flight nothing but what is higher or lower has a parallax."""
+"""Largest sine of the elevation at which pixels are triangulated: at 2 m, it includes all down to 1.5 m below the
+drone. In the direction of flight, only points above or below have a parallax."""
 _MIN_BASELINE_M = 0.05
-"""Across the line of sight: with less between two images, their flow shows no depth."""
+"""Shortest baseline across the line of sight; below it the flow between two images shows no depth."""
 _FLOW_SIGMA_PX = 1.0
 _CERTAIN_SIGMAS = 5.0
-"""A point by flow counts where its inverse range is so many standard deviations from that of the sky."""
+"""A triangulated point counts if its inverse range is this many standard deviations above zero, the sky's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +53,9 @@ class _Points:
     places: Float32Array
     relative_sigma: Float32Array
     obstacle: BoolArray
-    """(n,) whether it may be one."""
+    """(n,) whether the point may be an obstacle."""
     classed: BoolArray
-    """(n,) whether a point shows how far the drone sees; the place of an unclassified point is not known."""
+    """(n,) whether the point shows the range of sight; an unclassified point has no known place."""
 
     def where(self, chosen: BoolArray) -> _Points:
         return _Points(self.places[:, chosen], self.relative_sigma[chosen], self.obstacle[chosen], self.classed[chosen])
@@ -74,10 +74,10 @@ _NOTHING = _Points(np.empty((3, 0), np.float32), np.empty(0, np.float32), np.emp
 
 
 class ObstacleRanging:
-    """Takes pixels of the depth maps for points, and of each sector the nearest distance that enough of them agree on.
+    """Computes points from pixels of the depth maps, and in each sector the nearest range that enough points agree on.
 
-    Points count in the band of heights that the drone needs, where they are no ground and on no drone. The sky is far.
-    Glass, wires thinner than a pixel, and what is in the dark have no depth, or a wrong one: they are not seen.
+    Points count within the drone's band of heights, unless they are ground or on a drone. The sky is at infinity.
+    Glass, wires thinner than a pixel, and anything in the dark have no depth or a wrong one: they are not detected.
     """
 
     def __init__(self, rig: Rig, parameters: ObstacleParameters) -> None:
@@ -95,9 +95,8 @@ class ObstacleRanging:
     ) -> ObstacleRanges:
         """Ranges from the flow as far as it shows them with `ego`, and from the depth maps beyond.
 
-        How far the drone sees comes from the depth maps everywhere.
-
-        ``ground``: below the drone; None: level, at the autopilot's height.
+        The range of sight always comes from the depth maps. ``ground``: below the drone; None: level, at the
+        autopilot's height zero.
         """
         R_ned_body = observation.vehicle.R_ned_body.astype(np.float32)
         parts = [_NOTHING]
@@ -118,18 +117,18 @@ class ObstacleRanging:
         return self._nearest(observation, _Points.concatenate(parts), ground)
 
     def _flow_shows_m(self, name: str, ego: EgoMotion) -> Float32Array:
-        """(n,) metres up to which an obstacle in a pixel that is taken would be certain by this motion's flow."""
+        """(n,) metres: longest range at which the flow of this motion would show an obstacle in each pixel."""
         way = (ego.rotation.T @ ego.translation).astype(np.float32)
         baseline = np.linalg.norm(np.cross(way, self._rays[name].T), axis=1)
         shows = baseline / (_CERTAIN_SIGMAS * _FLOW_SIGMA_PX * self._pixel_angles[name])
         return np.where(baseline > _MIN_BASELINE_M, shows, 0.0).astype(np.float32)
 
     def _about_level(self, points: _Points) -> _Points:
-        """Those that are in the drone's band of heights, or show how far it sees."""
+        """The points in the drone's band of heights, and those that show the range of sight."""
         return points.where(self._in_band(points.places[2]) | _is_level(*points.places))
 
     def _in_band(self, down: Float32Array) -> BoolArray:
-        """(n,) of points so far below the drone."""
+        """(n,) whether points this far below the drone are in its band of heights."""
         p = self._parameters
         return (down >= -p.height_band_m) & (down <= max(p.height_band_m, p.below_m))
 
@@ -154,10 +153,8 @@ class ObstacleRanging:
         )
 
     def _agreed(self, sectors: IntArray, away_m: FloatArray, relative: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(SECTORS,) metres: the mean of the nearest points of each sector that are enough; inf where none are.
-
-        And the mean of their relative standard deviations.
-        """
+        """(SECTORS,) metres: mean range of the nearest points of each sector that are enough; inf if there are none.
+        And the mean of their relative standard deviations."""
         bins = np.minimum(np.floor(_bin(away_m)), self._bins - 1).astype(np.int64)
         shape = (SECTORS, self._bins)
         cells = sectors * shape[1] + bins
@@ -177,33 +174,33 @@ class ObstacleRanging:
 def _ground_down_m(
     observation: Observation, ground: GroundEstimate | None, north: Float32Array, east: Float32Array
 ) -> float | Float32Array:
-    """How far below the drone the ground is under points (n,): level, or the plane that ranges to it tell."""
+    """How far below the drone the ground is at points (n,): level, or the plane from measured ranges."""
     if ground is None:
         return observation.vehicle.height_m
     return np.asarray(ground.height_m - north * ground.slope[0] - east * ground.slope[1], np.float32)
 
 
 def _bin(range_m: FloatArray | float) -> FloatArray:
-    """On the logarithmic scale of ranges."""
+    """Index of the bin on the logarithmic scale of ranges."""
     bins: FloatArray = np.log(np.maximum(range_m, _NEAREST_M) / _NEAREST_M) / math.log(_RATIO)
     return bins
 
 
 def _is_level(north: Float32Array, east: Float32Array, down: Float32Array) -> BoolArray:
-    """(n,) of points: whether they are about as high as the drone, seen from it; NaN is not."""
+    """(n,) whether points are about as high as the drone, seen from it; false for NaN."""
     level: BoolArray = down**2 <= _HORIZON**2 * (north**2 + east**2)
     return level
 
 
 def _body_rays(camera: RigCamera) -> Float32Array:
-    """(3, n) unit vectors of the pixels that are taken, in body axes."""
+    """(3, n) unit vectors of the pixels used, in body axes."""
     pixels = grid_pixels(camera.camera.size, _STRIDE_PX)
     rays: FloatArray = camera.T_body_camera.rotation @ camera.camera.rays(pixels).T
     return rays.astype(np.float32)
 
 
 def _medians(sectors: IntArray, values: Float32Array) -> FloatArray:
-    """(SECTORS,) of each sector's values; 0 where there are none."""
+    """(SECTORS,) median of each sector's values; 0 without values."""
     order = np.lexsort((values, sectors))
     count = np.bincount(sectors, minlength=SECTORS)
     first = np.cumsum(count) - count
@@ -214,12 +211,12 @@ def _medians(sectors: IntArray, values: Float32Array) -> FloatArray:
 
 
 class _Triangulation:
-    """Triangulation for one camera: places of what stood still between two of its images."""
+    """Triangulates background points between two images of one camera."""
 
     def __init__(self, camera: RigCamera) -> None:
         self._camera = camera
         width, height = camera.camera.size
-        rows = slice(_STRIDE_PX // 2, height, 2 * _STRIDE_PX)  # every second one of those of `grid_pixels`
+        rows = slice(_STRIDE_PX // 2, height, 2 * _STRIDE_PX)  # every second row of `grid_pixels`
         self._grid = rows, slice(_STRIDE_PX // 2, width, _STRIDE_PX)
         row, column = np.mgrid[self._grid].reshape(2, -1)
         self._pixels = np.stack([column, row], axis=1) + 0.5
@@ -227,9 +224,9 @@ class _Triangulation:
         self._down_body = camera.T_body_camera.rotation @ self._rays.T
 
     def points(self, ego: EgoMotion, before: Observation, now: CameraObservation) -> _Points:
-        """From the flow and the drone's own motion, in body axes, without the camera's own place.
+        """From the flow and the drone's own motion, in body axes, relative to the camera.
 
-        Where a pixel's inverse range is not well above that of the sky, it is left out.
+        Pixels whose inverse range is not well above that of the sky are left out.
         """
         assert now.flow is not None
         mounted, lens = self._camera.T_body_camera, self._camera.camera

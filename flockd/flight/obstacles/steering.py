@@ -1,8 +1,8 @@
-"""Which way around obstacles: the direction nearest to the wanted one that is free for some seconds.
+"""Chooses the direction around obstacles: the one nearest to the wanted direction that is free for some seconds.
 
 After Ulrich and Borenstein 1998, "VFH+: reliable obstacle avoidance for fast mobile robots". Directions in which an
-obstacle, enlarged by the clearance, is met too soon are closed. Of the others the cheapest is taken, and the one taken
-last is cheaper than it would be otherwise.
+obstacle, enlarged by the clearance, is met too soon are closed. Of the others the cheapest is taken; a direction near
+the last one costs less.
 """
 
 from __future__ import annotations
@@ -19,33 +19,33 @@ from flockd.flight.obstacles.local_map import AZIMUTHS, nearest_points
 TURNS = np.linspace(-math.pi, math.pi, 144, endpoint=False)
 """(n,) radians, clockwise from the wanted direction; 0 is one of them."""
 LAST = 0.5
-"""How much a turn away from the last direction counts, relative to one away from the wanted direction."""
+"""Cost of a turn away from the last direction, relative to one away from the wanted direction."""
 RIGHT_RAD = 0.02
-"""To the left costs this much more: of two ways alike all drones take the same."""
+"""Extra cost of a turn to the left: of two equal ways all drones take the same."""
 LEAST_SHARE = 0.3
-"""Of the wanted speed, however far a way around turns away: it has to lead out of dead ends."""
+"""Least share of the wanted speed, at any turn: the drone has to leave dead ends."""
 PACE_M_S = 1.5
-"""Among neighbours a direction has to be free for the wanted speed up to this one, or up to theirs."""
+"""Among neighbours, a direction has to be free for at most this speed, or theirs if that is faster."""
 BESIDE_M = 0.02
-"""Beside an obstacle that is nearer than the margin, the margin is smaller by this than what there is."""
+"""Near an obstacle, the radius that has to be free is reduced to the obstacle's distance minus this."""
 
 
 class Steering:
-    """Remembers the last way around, so that the next step takes the same side."""
+    """Keeps the last direction, so that the next step passes on the same side."""
 
     def __init__(self, parameters: ObstacleParameters) -> None:
         self._parameters = parameters
         self._last_rad: float | None = None
 
     def around(self, wanted: FloatArray, ranges: ObstacleRanges, flock: FloatArray) -> tuple[FloatArray, float]:
-        """The velocity (2,) m/s in a free direction, and how far that direction is free, metres.
+        """The velocity (2,) m/s in a free direction, and the free distance in that direction, metres.
 
-        The more it turns away from the wanted one, the slower: by (1 + cos(turn)) / 2, at least `LEAST_SHARE`.
-        Who has to fly away from the flock for a way around is pulled back the more, and would fly off the faster.
-        Nor does that pull ask for a longer free way: among trees none but that back would be long enough. Faster than
-        for what has to be free, it flies only where nothing is met within `horizon_s` either.
+        The more it turns away from the wanted direction, the slower it is: by (1 + cos(turn)) / 2, at least
+        `LEAST_SHARE`. A drone that leaves the flock to pass an obstacle is pulled back the harder, so the law asks for
+        a higher speed. That speed does not lengthen the distance that has to be free: among trees only the way back
+        would be long enough. It is only flown if nothing is met within `horizon_s`.
 
-        `wanted` (2,) m/s; `flock` (2,) m/s is the neighbours' mean velocity, zero without any.
+        `wanted` (2,) m/s; `flock` (2,) m/s is the neighbours' mean velocity, zero without neighbours.
         """
         p = self._parameters
         speed = math.hypot(*wanted)
@@ -83,9 +83,9 @@ class Steering:
 
 
 def free_way(points: FloatArray, radius_m: float, azimuths: FloatArray) -> FloatArray:
-    """How far, (k,) m, a disc flies straight in each direction, (k,) rad, before it touches one of the points (m, 2).
+    """(k,) m: how far a disc can move in each direction, (k,) rad, before it touches one of the points (m, 2).
 
-    inf where it touches none. Of a point within the disc it flies no way nearer, and any way off.
+    inf if it touches none. From a point inside the disc it can move away, but no nearer.
     """
     ahead_m = points @ np.array([np.cos(azimuths), np.sin(azimuths)])
     square = radius_m**2 - (np.sum(points**2, axis=1)[:, None] - ahead_m**2)

@@ -1,4 +1,4 @@
-"""Perception: frames in, an observation out; each role of it an ONNX model behind a manifest."""
+"""Perception: frames in, an observation out; each role is an ONNX model with a manifest."""
 
 from flockd.flight.perception.detection.instances import Instance, group_instances
 from flockd.flight.perception.flow import DisFlow, Flow, OnnxFlow

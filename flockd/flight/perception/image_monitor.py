@@ -1,25 +1,24 @@
-"""Whether a camera's image is to be used: it is no noise, follows from the one before, and shows the ground clearly.
+"""Decides whether a camera's image is used: not noise, consistent with the image before, and the ground is clear.
 
 Each image is reduced once: to the strength of its details of 2 to 16 pixels in blocks, by the diagonal details of an
-orthonormal Haar transform, and to a small grey image. What these are is judged by what the camera showed before, and by
-what the other cameras of the rig show at the same moment.
+orthonormal Haar transform, and to a small grey image. Both are compared with the camera's earlier images, and with
+those of the rig's other cameras at the same moment.
 
 Noise: white noise is as strong at each scale, while scenes lose their contrast from scale to scale. The power spectrum
 of photographs falls with the square of the frequency (Field 1987, Ruderman and Bialek 1994), so the details are about
-half as strong at the finest scale as at the next. The finest alone (Donoho and Johnstone 1994, Immerkaer 1996) would
-not do: grass and leaves have as much of them as noise. Noise that was filtered, as by a camera's own electronics, has
-the spectrum of gravel. It is told by how it comes: at once and everywhere, while what a drone sees changes slowly.
+half as strong at the finest scale as at the next. The finest scale alone (Donoho and Johnstone 1994, Immerkaer 1996) is
+not enough: grass and leaves are as strong there as noise. Filtered noise, as from a camera's electronics, has the
+spectrum of gravel, but it appears at once and everywhere, while a drone's view changes slowly.
 
-Continuity: a scene is explained by its last image, moved along the optical flow, whatever its texture is. Noise and
-damage in blocks come anew with each image. How much is left unexplained also depends on how the drone moves, but it
-moves all of its cameras: one is compared with the others, while the drone turns slowly. A single camera is not judged.
+Continuity: the last image, moved along the optical flow, explains the next one, whatever its texture. Noise and damaged
+blocks are new in each image. The unexplained share also depends on the drone's motion, which all cameras share: one is
+compared with the others while the drone turns slowly. A single camera is not judged.
 
-Lens: cover, dirt, fog and sun take contrast or sharpness from the image, and stay. Sky has none of either, so only
-blocks that look at the ground count. Ground without contrast, dusk and mist take it from all cameras. Local contrast
-and the share of it at a finer scale are usual measures of quality (S. Pertuz et al., "Analysis of focus measure
-operators for shape-from-focus", Pattern Recognition 46(5), 2013). Contrast is a share of the brightness (E. Peli,
-"Contrast in complex images", JOSA A 7(10), 1990): asphalt beside gravel is darker as well as smoother, while a veil of
-fog or stray light is bright.
+Lens: a cover, dirt, fog and sun reduce contrast or sharpness for a long time. Sky has neither, so only blocks that look
+at the ground count. Plain ground, dusk and mist reduce them in all cameras. Local contrast and the share of it at a
+finer scale are usual measures of quality (S. Pertuz et al., "Analysis of focus measure operators for shape-from-focus",
+Pattern Recognition 46(5), 2013). Contrast is a share of the brightness (E. Peli, "Contrast in complex images", JOSA A
+7(10), 1990): asphalt beside gravel is darker as well as smoother, while a veil of fog or stray light is bright.
 """
 
 from __future__ import annotations
@@ -40,62 +39,63 @@ from flockd.flight.geometry import RigCamera, grid_pixels
 
 _BLOCK_PX = 32
 _SIGMA_PER_MEAN = math.sqrt(math.pi / 2)
-"""Standard deviation over the mean magnitude, for normal numbers."""
+"""Standard deviation over mean magnitude of a normal distribution."""
 _FORGOTTEN_S = 2.0
-"""After so long without an image, a camera may see something else entirely."""
+"""Longest gap between images of a camera that are compared; after it the view may be entirely different."""
 _FADES_S = 30.0
-"""Within which the noisiest that a camera showed fades: gravel that a wall covered is no noise when it comes back."""
+"""Time constant of the noisiest view of a camera: gravel that a wall hid for a while is not noise."""
 
 _LONGER_SIDE_PX = 96
-"""Of the small images that are compared: noise of single pixels averages out, and DIS takes a millisecond."""
+"""Longer side of the small images that are compared: pixel noise averages out, and DIS takes a millisecond."""
 _PATCH_PX = 8
 _WINDOW_PX = 15
-"""Over which they are compared, so that a damaged block has contrast in any window that it is in."""
+"""Side of the windows of the comparison, so that a damaged block has contrast in each window that contains it."""
 _MIN_CONTRAST, _MIN_CORRELATION = 10.0, 0.7
-"""Where both have at least so much contrast, standard deviation in grey levels, and less correlation, they differ."""
+"""Two windows differ if both have this contrast (standard deviation in grey levels) and correlate less than this."""
 _MAX_TURN = math.radians(10.0)
-"""Of the drone between two images: beyond it the flow is lost, in one camera before the others."""
+"""Largest turn of the drone between two images; beyond it the flow fails, in some cameras before others."""
 
 _BELOW_RAD = math.radians(10.0)
-"""A block that looks down at least so steeply shows ground, over hills too."""
+"""Angle below the horizon from which a block shows ground, over hills too."""
 _LEAST_BLOCKS, _QUANTILE = 12, 0.75
-"""With fewer that show ground nothing is said. A plain wall takes the contrast from some blocks, a lens from all."""
+"""Fewest ground blocks that are judged, and the quantile that is compared: a plain wall takes the contrast from some
+blocks, a bad lens from all."""
 _DARK = 32.0
-"""Grey levels that are added to the brightness: a camera's noise under a dark cover is no contrast."""
+"""Grey levels added to the brightness, so that a camera's noise under a dark cover is not contrast."""
 _FAINTEST = 0.004
-"""Contrast of a camera's noise; ground that has less says nothing of sharpness."""
+"""Contrast of a camera's noise; the sharpness of ground with less is not judged."""
 _REMEMBERED_S, _KNOWN_S = 300.0, 10.0
-"""What a camera usually shows of the ground is the mean over so long. Before it is known for so long, only images that
-have lost more say that a lens is bad: the limit grows from 0."""
+"""Time over which a camera's usual clarity is averaged. While it is known for less than the second number of seconds,
+only images that lost more show a bad lens: the limit grows from 0."""
 _LASTS_S, _LEAST_IMAGES = 2.0, 3
-"""So long, and in so many images, a lens is bad, or good again, before it counts: a gust turns a camera briefly."""
+"""Time and images for which a lens has to be bad, or good again, before it counts: a gust turns a camera briefly."""
 _ALL_LOST = 0.1
-"""Where the other cameras keep no more, as after a landing in grass, no lens is judged."""
+"""If the other cameras keep no more of their contrast, as after a landing in grass, no lens is judged."""
 _GOOD_AGAIN = 1.25
-"""Factor on the limit for a lens that was bad."""
+"""Factor on the limit of a lens that was bad."""
 
 
 class Shown(NamedTuple):
-    """What one image is reduced to."""
+    """One image, reduced."""
 
     white: float
-    """The share of its blocks, 0 to 1, where fine details are strong, and not much weaker than those twice the size."""
+    """Share of blocks, 0 to 1, with strong fine details that are not much weaker than those twice the size."""
     rough: float
-    """The share where details of one of the three scales are very strong."""
+    """Share of blocks in which the details of one of the three scales are very strong."""
     clarity: FloatArray | None
     """(2,) contrast of the ground, a share of its brightness, and sharpness, a share of its contrast; None: too little
     ground is in view."""
     small: UInt8Array
-    """Grey, `_LONGER_SIDE_PX` along the longer side."""
+    """Grey, with `_LONGER_SIDE_PX` along the longer side."""
 
 
 def shown_in(image: UInt8Array, parameters: NoiseParameters, downwards: FloatArray) -> Shown:
-    """Of an RGB image (h, w, 3).
+    """Reduces an RGB image (h, w, 3).
 
     Args:
-        image: of any size; of one smaller than a block nothing is said but its small image.
+        image: of any size; one smaller than a block only gives the small image.
         parameters: of the configuration.
-        downwards: (rows, columns) of its blocks: the sine of the angle below the horizon; NaN where nothing is imaged.
+        downwards: (rows, columns) sine of each block's angle below the horizon; NaN outside the lens's image.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     shrink, (rows, columns) = _LONGER_SIDE_PX / max(grey.shape), downwards.shape
@@ -140,31 +140,31 @@ class _Fault(Enum):
 
 @dataclass
 class _Camera:
-    """What is remembered of one camera."""
+    """The monitor's state of one camera."""
 
     rays: FloatArray
-    """(rows, columns, 3) unit vectors in body axes through its blocks' middles; NaN where the lens images nothing."""
+    """(rows, columns, 3) unit vectors in body axes through the blocks' centres; NaN outside the lens's image."""
     time_s: float = -math.inf
-    """Of its last image."""
+    """Time of its last image."""
     last: UInt8Array | None = None
-    """Small; None after noise."""
+    """The last small image; None after noise."""
     used_s: float = -math.inf
-    """Of the last that was used."""
+    """Time of the last image that was used."""
     noisiest: FloatArray | None = None
-    """(2,) shares of white and of rough blocks in images that were used, fading."""
+    """(2,) fading maxima of the shares of white and of rough blocks in images that were used."""
     usual: FloatArray | None = None
     """(2,) mean clarity of images that were used."""
     remembered_s: float = 0.0
-    """For so long."""
+    """Time over which `usual` was averaged."""
     fault: _Fault | None = None
     since_s: float = math.inf
-    """Since when it shows otherwise than it counts."""
+    """Since when its images contradict its current verdict."""
     images: int = 0
-    """As many since then."""
+    """Number of those images."""
 
 
 class ImageMonitor:
-    """Tells which images of a rig's cameras are not to be used."""
+    """Decides which images of a rig's cameras are not used."""
 
     def __init__(self, cameras: Mapping[str, RigCamera], parameters: NoiseParameters) -> None:
         self._parameters = parameters
@@ -172,9 +172,9 @@ class ImageMonitor:
         self._R_ned_body: FloatArray = np.eye(3)
 
     def faults(self, images: Mapping[str, UInt8Array], time_s: float, R_ned_body: FloatArray) -> dict[str, Reason]:
-        """The cameras whose newest images are not to be used, and why; to be called once for each moment.
+        """Cameras whose newest images are not used, and why; to be called once for each moment.
 
-        After noise or damage, so are those that follow until some in a row were clean.
+        After noise or damage, images are refused until some in a row are clean.
 
         Args:
             images: RGB images (h, w, 3) of one moment, by camera, of the rig's sizes.
@@ -221,7 +221,7 @@ class ImageMonitor:
         return bool(white_rise > parameters.max_white_rise or rough_rise > parameters.max_rough_rise)
 
     def _kept(self, now: Shown, camera: _Camera) -> float | None:
-        """Contrast or sharpness, whichever has lost more, over the camera's own; None: one of them is not known."""
+        """Contrast or sharpness over the camera's usual one, whichever is less; None: one of them is not known."""
         if now.clarity is None or camera.usual is None:
             return None
         contrast, sharpness = (now.clarity / np.maximum(camera.usual, 1e-6)).tolist()
@@ -230,7 +230,7 @@ class ImageMonitor:
         return float(min(contrast, sharpness) if now.clarity[0] > _FAINTEST else contrast)
 
     def _judge(self, camera: _Camera, verdict: _Fault | None, now: Shown, time_s: float) -> None:
-        """What the camera counts as from now on; an image that is used is remembered."""
+        """Updates the camera's verdict, and its memory with an image that is used."""
         if verdict in (_Fault.NOISE, _Fault.DAMAGE):
             camera.fault, camera.since_s, camera.images = verdict, math.inf, 0
         elif verdict is camera.fault:
@@ -243,7 +243,7 @@ class ImageMonitor:
             elif time_s - camera.since_s >= _LASTS_S and camera.images >= _LEAST_IMAGES:
                 camera.fault, camera.since_s, camera.images = verdict, math.inf, 0
         if camera.fault is _Fault.LENS:
-            camera.noisiest = None  # once it is clear, any view may come all at once
+            camera.noisiest = None  # after a bad lens the view may change at once
         elif camera.fault is None:
             shares = np.array([now.white, now.rough])
             if camera.noisiest is not None:
@@ -258,8 +258,7 @@ class ImageMonitor:
 
 
 def unexplained_share(before: UInt8Array, now: UInt8Array) -> float:
-    """The share, 0 to 1, of a small grey image (h, w) that the one before does not explain; what came into view is not
-    counted."""
+    """Share, 0 to 1, of a small grey image (h, w) that the one before does not explain, without what came into view."""
     height, width = now.shape
     if before.shape != now.shape or min(now.shape) < 2 * _PATCH_PX:
         return 0.0
@@ -275,7 +274,7 @@ def unexplained_share(before: UInt8Array, now: UInt8Array) -> float:
     planes[..., 2:4] = planes[..., :2] ** 2
     planes[..., 4] = planes[..., 0] * planes[..., 1]
     moved, new, moved2, new2, product = cv2.blur(planes, (_WINDOW_PX, _WINDOW_PX)).transpose(2, 0, 1)
-    # Light that changes is no damage: neither level nor gain counts.
+    # A change of light is no damage: level and gain do not count.
     before2, now2 = moved2 - moved**2, new2 - new**2
     correlation = (product - moved * new) / np.sqrt(np.maximum(before2 * now2, 1.0))
     differs = (np.minimum(before2, now2) > _MIN_CONTRAST**2) & (correlation < _MIN_CORRELATION) & seen_before

@@ -1,4 +1,4 @@
-"""What perception asks of networks: flow of a pair of images, depth and drones of one, range of the drone in a crop."""
+"""Interface of the networks: flow of an image pair, depth and drones of one image, range of the drone in a crop."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flockd.flight.perception.maps import Crop, RangeEstimate, SceneMaps
 
 T = TypeVar("T")
 CAMERA_FAULTS = (FloatingPointError, ValueError, cv2.error)
-"""What one camera's image may end in: an output that is not finite, a height below the ground, an image to no use."""
+"""Errors that one camera's image may cause: output not finite, height below the ground, unusable image."""
 
 
 class ImageView(NamedTuple):
@@ -23,8 +23,7 @@ class ImageView(NamedTuple):
     frame: Frame
     camera: RigCamera
     ground: Float32Array | None
-    """(h / map_stride, w / map_stride) the inverse depth (1/m) of flat ground, where attitude and height are to fix the
-    scale."""
+    """(h / map_stride, w / map_stride) inverse depth of flat ground, 1/m; None: not used for the scale."""
 
 
 class ImagePair(NamedTuple):
@@ -44,22 +43,22 @@ class _Stages(Protocol):
 
     @property
     def second_stage(self) -> SecondStage | None:
-        """How the crops are cut that `ranges` takes; None: there is no second stage."""
+        """How the crops for `ranges` are cut; None: there is no second stage."""
         ...
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         """Range and centre of the drone in the middle of each crop.
 
-        The range may be NaN where the probability is no more than `second_stage` asks for another crop.
+        The range may be NaN if the probability is at most `Thresholds.another_crop`.
         """
         ...
 
 
 class Networks(_Stages, Protocol):
-    """What perception asks of networks: `OnnxNetworks`, or exact ones that a simulator puts in their place."""
+    """Interface of all networks: `OnnxNetworks`, or exact ones that a simulator puts in their place."""
 
     def flows(self, pairs: Sequence[ImagePair]) -> list[Float32Array | Exception]:
-        """Of each pair (h, w, 2) pixels from the first image to the second, or one of `CAMERA_FAULTS`."""
+        """For each pair (h, w, 2) pixels from the first image to the second, or one of `CAMERA_FAULTS`."""
         ...
 
     def scenes(self, views: Sequence[ImageView]) -> list[SceneMaps | Exception]:
@@ -68,19 +67,19 @@ class Networks(_Stages, Protocol):
 
 
 class ImageNetworks(_Stages, Protocol):
-    """The same for one image, or one pair, at a time: what `OneByOne` makes `Networks` of."""
+    """The same for one image or pair at a time; `OneByOne` makes `Networks` of it."""
 
     def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
-        """Of one `ImagePair`; raises one of `CAMERA_FAULTS`."""
+        """Flow of one `ImagePair`; raises one of `CAMERA_FAULTS`."""
         ...
 
     def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
-        """Of one `ImageView`; raises one of `CAMERA_FAULTS`."""
+        """Maps of one `ImageView`; raises one of `CAMERA_FAULTS`."""
         ...
 
 
 class OneByOne:
-    """Answers for several images one after the other; to inherit from."""
+    """Processes several images one after the other; to inherit from."""
 
     def flows(self: ImageNetworks, pairs: Sequence[ImagePair]) -> list[Float32Array | Exception]:
         """See `Networks`."""
@@ -92,7 +91,7 @@ class OneByOne:
 
 
 def outcome(function: Callable[..., T], *arguments: object) -> T | Exception:
-    """What a function returns, or which of `CAMERA_FAULTS` it raises."""
+    """The return value of a function, or the one of `CAMERA_FAULTS` that it raises."""
     try:
         return function(*arguments)
     except CAMERA_FAULTS as error:
@@ -100,7 +99,7 @@ def outcome(function: Callable[..., T], *arguments: object) -> T | Exception:
 
 
 class Flow(Protocol):
-    """A method of optical flow: where every pixel of the first image has gone in the second."""
+    """A method of optical flow: the displacement of each pixel of the first image in the second."""
 
     name: str
 

@@ -1,4 +1,4 @@
-"""What networks say, in units: the maps of one image, and the range of the drone in one crop."""
+"""Outputs of networks, in units: the maps of one image, and the range of the drone in one crop."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from flockd.flight.perception.detection.instances import Instance
 
 @dataclass(frozen=True, eq=False)
 class OpenDepth:
-    """Depth that a network knows up to its scale."""
+    """Depth known up to scale."""
 
     inverse: Float32Array
-    """(h, w): a factor makes 1/m along the optical axis of it."""
+    """(h, w) inverse depth along the optical axis; a factor makes it 1/m."""
     shift: bool
-    """Whether something has to be added as well: the inverse depth is known up to scale and shift."""
+    """Whether a shift is unknown too."""
 
 
 @dataclass(frozen=True, eq=False)
 class SceneMaps:
-    """What the networks say of one image."""
+    """A network's maps of one image."""
 
     depth: ZMap | OpenDepth
-    """(h, w) metres along the optical axis, the sky very far; or what ground of known height gives its scale."""
+    """(h, w) metres along the optical axis, the sky very far; or depth whose scale the ground's height gives."""
     labels: UInt8Array
-    """(h, w) 0 for background, then one value a drone."""
+    """(h, w) 0 for background, then one value for each drone."""
     instances: tuple[Instance, ...]
 
     @cached_property
     def labelled(self) -> tuple[slice, slice]:
-        """The part of the image, at least one pixel, that has all labels: they are few."""
+        """The smallest part of the image, at least one pixel, that contains all labels: they are few."""
         left, top, width, height = cv2.boundingRect(self.labels)
         return slice(top, top + max(height, 1)), slice(left, left + max(width, 1))
 
 
 class Crop(NamedTuple):
-    """A small image of one region of interest, as a virtual camera that faces it sees it: a pinhole."""
+    """An image of one region of interest, taken by a virtual pinhole camera that faces it."""
 
     image: UInt8Array
     """(size, size, 3) RGB"""
@@ -49,11 +49,11 @@ class Crop(NamedTuple):
     R_body_camera: FloatArray
     """(3, 3) from optical RDF to body FRD."""
     centre: FloatArray
-    """(3,) the camera's, metres in the body."""
+    """(3,) optical centre, metres in the body."""
     mirrored: bool = False
-    """Whether the network is to be given the mirror image, on which it errs differently. The estimate is as if not."""
+    """Whether the network gets the mirror image, on which its errors differ. The estimate is for the crop itself."""
     evidence: float = 0.0
-    """Log odds of a drone that are known already; they add to what the crop shows."""
+    """Log odds of a drone known before; they are added to the crop's."""
 
 
 @dataclass(frozen=True)
@@ -66,17 +66,17 @@ class KnownSize:
 
 @dataclass(frozen=True, eq=False)
 class RangeEstimate:
-    """What the second stage says of one crop."""
+    """The second stage's estimate from one crop."""
 
     log_range: float
     """Natural logarithm of the range in metres, from the virtual camera's optical centre."""
     log_range_sigma: float
-    """Standard deviation of `log_range`, if the size is right."""
+    """Standard deviation of `log_range`, given the size."""
     centre: FloatArray
     """(2,) u, v of the drone's centre in the crop."""
     size_m: float
-    """The drone's size from tip to tip; errs like the range does, but is the same in every crop of one drone."""
+    """The drone's size from tip to tip; its error is that of the range, but the same in every crop of one drone."""
     drone_probability: float = 1.0
     """Probability that there is a drone at all."""
     log_size_sigma: float = 0.0
-    """Standard deviation of the logarithm of `size_m`. `log_range` errs with it, by as much again."""
+    """Standard deviation of the logarithm of `size_m`. `log_range` has the same error besides its own."""

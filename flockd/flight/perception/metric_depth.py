@@ -1,4 +1,4 @@
-"""From what a network says of depth to metric ranges, with the scale that flat ground gives where it is left open."""
+"""From a network's depth to metric ranges; if its scale is unknown, flat ground gives it."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from flockd.flight.geometry.robust.line import ransac_line
 from flockd.flight.perception.maps import OpenDepth, SceneMaps
 
 _MAX_GROUND_M = 40.0
-"""Flat ground beyond is a few rows under the horizon: a degree of attitude moves it by half."""
+"""Farthest ground that is used: in the rows above, a degree of attitude halves the range."""
 _TOLERANCE = 0.1
-"""A pixel agrees with a scale when its inverse depth is off by less than this share."""
+"""Largest relative difference of inverse depth at which a pixel agrees with a scale."""
 _MIN_SHARE = 0.25
-"""Least share of the pixels that has to agree: on a plain with trees and houses about half is ground."""
+"""Least share of agreeing pixels: on a plain with trees and houses about half is ground."""
 _MIN_PIXELS = 100
 _MAX_DEPTH_M = 1e3
-"""Farther is as far: the sky's inverse depth is about 0, or less."""
+"""Largest depth; the sky's inverse depth is about 0, or less."""
 
 
 def metric_depth(maps: SceneMaps, ground: Float32Array | None, camera: Camera) -> RangeMap:
-    """(h, w) metres along the ray: the network's own, or with the scale that flat ground gives.
+    """(h, w) metres along the ray: the network's own depth, or with the scale that flat ground gives.
 
-    The scale, ``inverse depth = factor * open + shift``, brings most of the image's lower part onto the ground, by
-    RANSAC: things on the ground do not count.
+    The scale, ``inverse depth = factor * open + shift``, puts most of the image's lower part onto the ground, by
+    RANSAC: things that stand on the ground are outliers.
 
     Args:
-        maps: what the networks say of the image, along the optical axis.
-        ground: (h/stride, w/stride) inverse depth of flat ground, 1/m along that axis, 0 where there is none; None:
-            nothing is known of the ground.
+        maps: the networks' maps of the image, along the optical axis.
+        ground: (h/stride, w/stride) inverse depth of flat ground, 1/m along that axis, 0 where there is none; None: not
+            known.
         camera: of the image. Where its lens images nothing, the range is NaN.
 
-    Raises ValueError where too little of the image is ground.
+    Raises ValueError if too little of the image is ground.
     """
     if not isinstance(maps.depth, OpenDepth):
         return range_map(maps.depth, camera)

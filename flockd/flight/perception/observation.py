@@ -1,4 +1,4 @@
-"""What all cameras saw in one frame set, with one label a drone across the whole rig."""
+"""Maps and detections of all cameras in one frame set, with one label for each drone across the rig."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class CameraObservation:
     labels: UInt8Array
     """(h, w) 0 background, k the detection with label k, 255 not to be used."""
     flow: Float32Array | None
-    """(h, w, 2) pixels from the image before to this one; None where there is none before, or the flow failed."""
+    """(h, w, 2) pixels from the image before to this one; None: there is no image before, or the flow failed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,20 +34,20 @@ class Observation:
     cameras: Mapping[str, CameraObservation]
     detections: tuple[Detection, ...]
     previous: Observation | None
-    """What the flow comes from; its own previous one is None. None where the pair starts anew."""
+    """The observation that the flow starts from; its own previous one is None. None: a new start."""
     reasons: tuple[Reason, ...] = ()
-    """Why something is missing."""
+    """Why parts are missing."""
     noisy_cameras: tuple[str, ...] = ()
-    """Whose images were noise, and were not used."""
+    """Cameras whose images were noise and were not used."""
 
     @property
     def flows(self) -> dict[str, Float32Array]:
-        """By camera, where both observations have an image."""
+        """Flow by camera, if both observations have an image."""
         return {name: camera.flow for name, camera in self.cameras.items() if camera.flow is not None}
 
     @property
     def interval_s(self) -> float:
-        """Since the previous observation. Raises ValueError where there is none."""
+        """Time since the previous observation. Raises ValueError if there is none."""
         if self.previous is None:
             raise ValueError("a single observation has no interval")
         return self.time_s - self.previous.time_s

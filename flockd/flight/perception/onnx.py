@@ -30,27 +30,27 @@ from flockd.flight.perception.maps import Crop, OpenDepth, RangeEstimate, SceneM
 from flockd.flight.perception.requirements import check_roles
 
 CROPS_PER_RUN = 24
-"""Crops in one run of a network, so that an image full of false proposals does not take more memory."""
+"""Crops in one run of a network, so that an image full of false proposals takes no more memory."""
 _WHOLE_PX = 800
-"""Longer side of an image in which a detector sees drones of any size."""
+"""Longest side of an image in which a detector finds drones of any size."""
 _MIN_DEPTH_M, _MAX_DEPTH_M = 1e-3, 1e3
-"""Where a reciprocal of depth is taken: nearer than the lens, and where flow and height measure nothing any more."""
+"""Limits of depth before a reciprocal is taken: the lens itself, and what flow and height can measure."""
 _NO_DRONE_LOGIT = np.float32(-50.0)
-"""Where the lens images nothing."""
+"""The logit outside the lens's image."""
 _MIN_RAY_Z = 0.1
-"""Least z of a unit ray, for its tangents to stay finite: 84 degrees off the optical axis."""
+"""Least z of a unit ray, so that its tangents stay finite: 84 degrees from the optical axis."""
 
 
 def load_networks(config: PerceptionConfig, deadline: Deadline = no_deadline, *, at_once: int = 1) -> OnnxNetworks:
     """The networks that a configuration names; `deadline` is for the golden input of each. Raises ModelError.
 
-    Of the configured threads each of so many images `at_once` has its share; crops of all images have all.
+    Each of `at_once` images gets its share of the configured threads; the crops of all images get all.
     """
     return OnnxNetworks(config, models_folder(config), deadline, at_once)
 
 
 class OnnxNetworks(OneByOne):
-    """The networks that a configuration names. Stateless: may serve several pilots."""
+    """The networks that a configuration names. Stateless: several pilots may share them."""
 
     def __init__(
         self, config: PerceptionConfig, models_dir: Path, deadline: Deadline = no_deadline, at_once: int = 1
@@ -75,7 +75,7 @@ class OnnxNetworks(OneByOne):
             self.second_stage = SecondStage.of(self._distance.manifest, verification)
 
     def terminate(self) -> None:
-        """Ends every run of a network that is under way; its caller gets an error."""
+        """Ends every run in progress; its caller gets an error."""
         self._models.terminate()
 
     def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
@@ -99,7 +99,7 @@ class OnnxNetworks(OneByOne):
         if blind.any():
             logit = np.where(blind, _NO_DRONE_LOGIT, logit)
         offset = self._at_map_stride(maps["offset"], (width, height))
-        # A second stage weeds out false proposals, so that the first may propose more.
+        # A second stage rejects false proposals, so the first may propose more.
         threshold = self._segmentation.manifest.threshold
         alone = threshold("proposal_logit_alone")
         proposal = alone if self._distance is None else threshold("proposal_logit")
@@ -124,7 +124,7 @@ class OnnxNetworks(OneByOne):
         logits = self._verification.manifest.results["drone"].by_column(outputs["drone"])["drone_logit"] + evidence
         judge = self._verification if self._detector is None else self._detector
         limit = judge.manifest.threshold("distance_logit_limit")
-        # Where there is no drone, there is no range to ask for: most crops of a cluttered image end here.
+        # Without a drone no range is needed: most crops of a cluttered image end here.
         most = _probability(logits + limit)
         rest = [k for k, p in enumerate(most) if p > self.second_stage.thresholds.another_crop]
         ranged = self._ranges(
@@ -144,10 +144,9 @@ class OnnxNetworks(OneByOne):
         *,
         limit: float,
     ) -> tuple[RangeEstimate, ...]:
-        """What the distance network says of crops, given their images as they enter.
+        """The distance network's estimates from crops, given their images as its input.
 
-        Of there being a drone, what it says is added to ``logits`` (n,), up to ``limit``: log odds of independent
-        evidence add.
+        Its own log odds of a drone are added to ``logits`` (n,), up to ``limit``: log odds of independent evidence add.
         """
         if not crops:
             return ()
@@ -156,7 +155,7 @@ class OnnxNetworks(OneByOne):
         values = {name: np.asarray(column, np.float64) for name, column in columns.items()}
         evidence = logits + np.clip(values["drone_logit"], -limit, limit)
         mirrored, focal_px = np.array([(crop.mirrored, crop.focal_px) for crop in crops]).T
-        right = np.where(mirrored, -values["right_px"], values["right_px"])  # turned back
+        right = np.where(mirrored, -values["right_px"], values["right_px"])  # mirrored back
         size_sigma = np.exp(values.get("log_size_sigma", np.full(len(crops), -np.inf)))
         rows = zip(
             (values["log_range_per_focal"] + np.log(focal_px)).tolist(),
@@ -180,7 +179,7 @@ class OnnxNetworks(OneByOne):
     ) -> tuple[FloatArray, FloatArray]:
         """Boxes (n, 4) of drones, left, top, right, bottom in pixels of the image, and their log odds (n,).
 
-        A large image is looked at in half its size too, and so on: a drone may be larger than the network can see.
+        A large image is also searched at half its size, and so on: a drone may be larger than the network can see.
         """
         seen, scale, found = image, 1.0, []
         while True:
@@ -199,7 +198,7 @@ class OnnxNetworks(OneByOne):
         return boxes[inside], odds[inside]
 
     def _run(self, model: OnnxModel, image: UInt8Array, planes: Float32Array) -> dict[str, Float32Array]:
-        """One model's maps (c, h, w) that show all of an image, at the model's resolution."""
+        """One model's maps (c, h, w) of a whole image, at the model's resolution."""
         fitting = fit(model.manifest, (image.shape[1], image.shape[0]))
         contents: dict[str, Sequence[UInt8Array] | Float32Array] = {"image": [fitting.enter(image)]}
         if "geometry" in model.manifest.contents:
@@ -207,7 +206,7 @@ class OnnxNetworks(OneByOne):
         return {name: fitting.inside(map_)[0] for name, map_ in model.infer(contents).items()}
 
     def _at_map_stride(self, maps: Float32Array, image: tuple[int, int]) -> Float32Array:
-        """(c, h, w) at the resolution that drones are segmented at; two channels are pixels of the map."""
+        """(c, h, w) at the resolution of the segmentation; two channels are offsets in map pixels."""
         width, height = image[0] // self.map_stride, image[1] // self.map_stride
         if maps.shape[1:] == (height, width):
             return maps
@@ -217,7 +216,7 @@ class OnnxNetworks(OneByOne):
         return np.asarray(resized, dtype=np.float32)
 
     def _depth_of(self, depth: Float32Array, camera: RigCamera) -> ZMap | OpenDepth:
-        """Metres where the depth network knows them, else what it leaves open; from its output, resized."""
+        """Metric depth if the network gives it, else depth with its unknowns; from its output, resized."""
         meaning = self._depth.manifest.results["depth"].depth
         is_inverse = meaning.quantity == "inverse_depth"
         if meaning.focal_px:
@@ -231,7 +230,7 @@ class OnnxNetworks(OneByOne):
         return OpenDepth(np.asarray(inverse, np.float32), shift=self._unknown == "scale_and_shift")
 
     def _what_is_unknown(self, config: PerceptionConfig) -> Unknown:
-        """What of the depth is left for the height above ground to fix. Raises ModelError."""
+        """What the height above ground has to fix of the depth. Raises ModelError."""
         manifest = self._depth.manifest
         unknown = manifest.results["depth"].depth.unknown
         if config.scale == "network" and unknown != "nothing":
@@ -252,19 +251,19 @@ class OnnxNetworks(OneByOne):
 
 
 _OF_CROPS = frozenset({"distance", "verification"})
-"""Roles on crops of all images, in one batch."""
+"""Roles that process the crops of all images, in one batch."""
 
 
 class _Models:
     """Opens each model once, however many roles it fills."""
 
     def __init__(self, config: PerceptionConfig, folder: Path, deadline: Deadline, share: int) -> None:
-        """``share``: threads of what runs on single images."""
+        """``share``: threads of models that process single images."""
         self._config, self._folder, self._deadline, self._share = config, folder, deadline, share
         self._opened: dict[Path, OnnxModel] = {}
 
     def open(self, name: str, role: Role) -> OnnxModel:
-        """The model for a role. Raises ModelError where there is none, or where it does not fill the role."""
+        """The model for a role. Raises ModelError if it is missing or does not fill the role."""
         path = manifest_path(self._folder, name)
         if path not in self._opened:
             if not path.is_file():
@@ -286,7 +285,7 @@ class _Models:
         return model
 
     def terminate(self) -> None:
-        """Ends every run that is under way."""
+        """Ends every run in progress."""
         for model in self._opened.values():
             model.terminate()
 
@@ -305,7 +304,7 @@ def _one_of(role: Role, folder: Path) -> str:
 
 
 def _in_batches(model: OnnxModel, images: Sequence[UInt8Array]) -> dict[str, Float32Array]:
-    """A model's outputs for all crops, (n, ...) each."""
+    """A model's outputs (n, ...) for all crops."""
     batches = [images[i : i + CROPS_PER_RUN] for i in range(0, len(images), CROPS_PER_RUN)]
     outputs = [model.infer({"crop": batch}) for batch in batches]
     return {name: np.concatenate([output[name] for output in outputs]) for name in outputs[0]}
@@ -322,7 +321,7 @@ def _probability(logit: FloatArray) -> FloatArray:
 
 
 _MOST_SIZE_SIGMA = 0.5
-"""Twice that is a factor of 2.7 in size either way: a network that says more says that it knows nothing."""
+"""Largest sigma of log size: twice it is a factor of 2.7 either way, which means that nothing is known."""
 
 
 def geometry_planes(camera: RigCamera, ground: Float32Array | None, stride: int) -> Float32Array:
@@ -334,10 +333,10 @@ def geometry_planes(camera: RigCamera, ground: Float32Array | None, stride: int)
 
 @lru_cache(maxsize=32)
 def _ray_tangents(camera: RigCamera, stride: int) -> Float32Array:
-    """(2, h / stride, w / stride) of the block centres' rays, right and down of the optical axis."""
+    """(2, h / stride, w / stride) tangents of the rays of the blocks' centres, right and down from the optical axis."""
     width, height = camera.camera.size
     u, v = np.meshgrid(np.arange(stride / 2, width, stride), np.arange(stride / 2, height, stride))
     rays = camera.camera.rays(np.stack([u.ravel(), v.ravel()], 1))
-    rays[np.isnan(rays[:, 0])] = 0.0  # where the lens images nothing
+    rays[np.isnan(rays[:, 0])] = 0.0  # outside the lens's image
     tangents = rays[:, :2] / np.maximum(rays[:, 2:], _MIN_RAY_Z)
     return np.ascontiguousarray(tangents.T.reshape(2, *u.shape), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Perception: a frame set in, an observation out; images to maps, flow, metric depth, detections and masks."""
+"""Perception: a frame set in, an observation out: maps, flow, metric depth, detections and masks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Reasons = list[Reason]
 
 
 class Perception:
-    """One drone's perception. Remembers the last observation; the networks may serve several drones."""
+    """One drone's perception. It keeps the last observation; several drones may share the networks."""
 
     def __init__(self, rig: Rig, networks: Networks, config: PerceptionConfig) -> None:
         self._rig, self._networks, self._config = rig, networks, config
@@ -42,16 +42,16 @@ class Perception:
         lap: Callable[[str], None] = lambda stage: None,
         learned_size: KnownSize | None = None,
     ) -> Observation:
-        """What the newest frame set shows.
+        """The observation of the newest frame set.
 
         Args:
             frames: the newest image of every camera that has one.
-            vehicle: what the own autopilot says, at the frames' time.
-            ground: below the drone, for `scale: height`, where without it there is no depth; else not used.
-            predictions: where tracks should be; the detector searches there too.
-            trace: filled with what the detector went through, where a caller wants to see it.
+            vehicle: the own autopilot's state at the frames' time.
+            ground: below the drone. `scale: height` needs it for depth; otherwise it is not used.
+            predictions: expected positions of tracks; the detector searches there too.
+            trace: filled with the detector's intermediate results.
             lap: called at the end of each stage with its name, to time it.
-            learned_size: of every drone, where the configuration says none; None: the network judges each one's.
+            learned_size: of every drone, if the configuration gives none; None: the network estimates each one's.
         """
         usable, noisy, without_image = self._usable(frames, vehicle)
         scenes, depths, without_scene = self._scenes(usable, vehicle, ground)
@@ -75,7 +75,7 @@ class Perception:
         return self._last
 
     def _usable(self, frames: FrameSet, vehicle: VehicleState) -> tuple[dict[str, Frame], tuple[str, ...], Reasons]:
-        """Frames of the right size that show a scene, cameras whose show noise, damage or too little, and why."""
+        """Usable frames, cameras whose frames are noise, damaged or unclear, and the reasons."""
         usable, reasons = {}, []
         for name, camera in self._rig.cameras.items():
             width, height = camera.camera.size
@@ -96,7 +96,7 @@ class Perception:
     def _scenes(
         self, frames: Mapping[str, Frame], vehicle: VehicleState, ground: GroundEstimate | None
     ) -> tuple[dict[str, SceneMaps], dict[str, RangeMap], Reasons]:
-        """The networks' maps of every camera, and the metres of those that have any."""
+        """The networks' maps of every camera, and metric depth of those that have it."""
         views, scenes, depths, reasons = {}, {}, {}, []
         for name, frame in frames.items():
             try:
@@ -115,7 +115,7 @@ class Perception:
         return scenes, depths, reasons
 
     def _plane(self, camera: str, vehicle: VehicleState, ground: GroundEstimate | None) -> Float32Array | None:
-        """The inverse depth of the ground at the maps' stride; None: nothing is known of it. Raises ValueError."""
+        """The inverse depth of the ground at the maps' stride; None: not known. Raises ValueError."""
         if ground is None or not self._needs_ground:
             return None
         north, east = (float(rise) for rise in ground.slope)
@@ -128,7 +128,7 @@ class Perception:
         )
 
     def _pair(self, frames: FrameSet) -> tuple[Observation | None, Reasons]:
-        """The observation before, unless time runs backwards."""
+        """The observation before; None if time runs backwards."""
         if self._last is None:
             return None, []
         if frames.time_s <= self._last.time_s:
@@ -138,7 +138,7 @@ class Perception:
     def _flows(
         self, previous: Observation | None, frames: Mapping[str, Frame]
     ) -> tuple[dict[str, Float32Array], Reasons]:
-        """By camera, from the image before to this one."""
+        """Flow by camera, from the image before to this one."""
         if previous is None:
             return {}, []
         pairs = {}

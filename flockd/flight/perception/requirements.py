@@ -1,4 +1,4 @@
-"""What each role of perception needs of a model's manifest: inputs, outputs, columns, thresholds, crop."""
+"""What each role of perception requires of a model's manifest: inputs, outputs, columns, thresholds, crop."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from flockd.flight.inference.manifest import Fault, Manifest
 
 @dataclass(frozen=True)
 class Threshold:
-    """A number by which a model's outputs are judged."""
+    """A threshold on a model's outputs."""
 
     meaning: str
     low: float
     high: float
-    """It lies between these, both included."""
+    """Bounds of the threshold, both included."""
 
 
 @dataclass(frozen=True)
@@ -24,15 +24,15 @@ class Requirements:
     """Requirements of one role."""
 
     inputs: tuple[str, ...]
-    """What its inputs carry."""
+    """Meanings of its inputs."""
     outputs: tuple[str, ...]
-    """What its outputs give."""
+    """Meanings of its outputs."""
     optional_inputs: tuple[str, ...] = ()
     columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """For an output (n, k): the columns it has to have, in any order."""
+    """Required columns of an output (n, k), in any order."""
     thresholds: Mapping[str, Threshold] = field(default_factory=dict)
     crop: bool = False
-    """Whether the manifest has to say how crops are cut."""
+    """Whether the manifest has to define how crops are cut."""
     map_stride: bool = False
 
 
@@ -44,9 +44,9 @@ _PROBABILITIES = {
     ),
 }
 _LOGIT = (-50.0, 50.0)
-"""The bounds of a threshold that is a logit: beyond, a float32 probability is 0 or 1."""
+"""Bounds of a threshold that is a logit: beyond them a float32 probability is 0 or 1."""
 _GEOMETRY = ("geometry",)
-"""Planes of the rays' tangents right and down, and of the inverse depth (1/m) of flat ground, 0 where unknown."""
+"""Planes: tangents of the rays right and down, and inverse depth (1/m) of flat ground, 0 where unknown."""
 
 REQUIREMENTS: Mapping[Role, Requirements] = {
     "flow": Requirements(inputs=("first", "second"), outputs=("flow",)),
@@ -137,7 +137,7 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
 
 
 def check_roles(manifest: Manifest) -> Iterator[Fault]:
-    """What a manifest lacks for its roles, and what none of them knows: the check to open perception's models with."""
+    """Faults of a manifest: what its roles require and it lacks, and entries that no role knows."""
     known: list[Requirements] = []
     for index, name in enumerate(manifest.roles):
         role = next((role for role in ROLES if role == name), None)
@@ -182,7 +182,7 @@ def _faults_of_numbers(manifest: Manifest, role: Role, needed: Requirements) -> 
 
 
 def _unknown_to_all(manifest: Manifest, known: list[Requirements]) -> Iterator[Fault]:
-    """What stands in the manifest and would not be used, which is a slip more often than not."""
+    """Entries of the manifest that would not be used: most often a typing error."""
     inputs = {content for one in known for content in (*one.inputs, *one.optional_inputs)}
     for name, spec in manifest.inputs.items():
         content = spec.carries or name
@@ -199,5 +199,5 @@ def _unknown_to_all(manifest: Manifest, known: list[Requirements]) -> Iterator[F
 
 
 def _key(manifest: Manifest, result: str) -> str:
-    """The name of the output that gives a result."""
+    """The name of the output with a meaning."""
     return next(name for name, spec in manifest.outputs.items() if (spec.gives or name) == result)

@@ -1,4 +1,4 @@
-"""The pure line from pixels to command."""
+"""The pure pipeline from images to a velocity command."""
 
 from flockd.flight.pilot.pilot import FlockPilot, StepTrace
 

@@ -1,4 +1,4 @@
-"""From an observation and the one before it to pairs of points that stand still."""
+"""Pairs of background points of an observation and the one before it."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from flockd.flight.geometry import PointPairs, Rig, RigCamera, grid_pixels, lift
 from flockd.flight.perception import CameraObservation, Observation
 
 _LEAST_MATCHES = 300
-"""Of an image: of each camera of 640x480 pixels 300 gave the own motion as exactly as 4,800."""
+"""Matches of one image: at 640x480 pixels, 300 gave the own motion as precisely as 4,800."""
 
 
 def background_pairs(rig: Rig, observation: Observation, parameters: GeometryParameters) -> PointPairs:
-    """What stands still, seen by the same camera before and now. ``ValueError`` says why there is nothing."""
+    """Background points that one camera sees in both frame sets. ValueError gives the reason if there are none."""
     pairs, seen = [], list(_seen_twice(rig, observation))
     for camera, before, after, flow in seen:
         if before.depth is None or after.depth is None:
@@ -31,7 +31,7 @@ def background_pairs(rig: Rig, observation: Observation, parameters: GeometryPar
 
 
 def _stride_px(camera: RigCamera, parameters: GeometryParameters) -> int:
-    """As configured, or smaller where a small image would give too few matches."""
+    """The configured stride, or a smaller one if a small image would give too few matches."""
     width, height = camera.camera.size
     return max(min(parameters.background_stride_px, math.isqrt(width * height // _LEAST_MATCHES)), 1)
 
@@ -39,7 +39,7 @@ def _stride_px(camera: RigCamera, parameters: GeometryParameters) -> int:
 def _seen_twice(
     rig: Rig, observation: Observation
 ) -> Iterator[tuple[RigCamera, CameraObservation, CameraObservation, Float32Array]]:
-    """Each camera with an image before and now: the camera, both, and the flow between them."""
+    """Each camera with an image in both frame sets: the camera, both observations, and the flow between them."""
     if observation.previous is not None:
         for name, flow in observation.flows.items():
             yield rig.cameras[name], observation.previous.cameras[name], observation.cameras[name], flow

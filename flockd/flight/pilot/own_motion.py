@@ -1,9 +1,9 @@
-"""The own motion as a state: the autopilot's velocity, less what it errs by, which the images' displacements show.
+"""The own motion as a state: the autopilot's velocity minus its error, which the images' displacements show.
 
-A Kalman filter of that error, on the frames' clock: a Gauss-Markov process, alike and apart for each axis. Over a step
-the autopilot's mean velocity less the images' is the mean of the error, with the images' noise. The velocity now is the
-autopilot's, which follows accelerations within the step, less the error now. Images that show nothing, or that
-contradict all else, leave the autopilot's velocity with a larger sigma.
+A Kalman filter of that error on the clock of the frames: a Gauss-Markov process, with equal parameters on each axis.
+Over a step, the autopilot's mean velocity minus the images' mean velocity measures the mean error, with the images'
+noise. The velocity now is the autopilot's, which follows accelerations within the step, minus the error now. If images
+show no motion, or contradict the filter, the autopilot's velocity remains, with a larger sigma.
 """
 
 from __future__ import annotations
@@ -16,47 +16,47 @@ from flockd.core import consistency
 from flockd.core.messages import FloatArray, VehicleState
 
 ERROR_M_S, ERROR_LASTS_S = 0.15, 3.0
-"""Standard deviation of an autopilot's velocity, each axis, and for how long it errs alike: PX4 in its simulator."""
+"""Standard deviation of an autopilot's velocity, each axis, and its time constant in s, from PX4 in simulation."""
 SCALE = 0.03
-"""Standard deviation of the scale of the images' displacements."""
+"""Relative standard deviation of the scale of the images' displacements."""
 _AGES_M_S2 = 2.0
-"""Standard deviation of a velocity for each second that it is from another time than the frames."""
+"""Growth of a velocity's standard deviation with the time between it and the frames, in m/s per second."""
 _MOST_M_S = 100.0
-"""An autopilot that says more knows no velocity, and no standard deviation is larger."""
+"""A velocity above this is taken for an error of the autopilot. Also the limit of standard deviations."""
 
 
 class OwnMotion:
-    """Of one drone. Call `update` once for each step; what the attributes say is of its end."""
+    """The own motion of one drone. Call `update` once a step; the attributes are as of the step's end."""
 
     def __init__(self, images_sigma_m: float) -> None:
-        """``images_sigma_m``: standard deviation of a displacement by images, each axis, beside its scale's."""
+        """``images_sigma_m``: standard deviation of a displacement by images, each axis, besides that of its scale."""
         self._images_sigma_m = images_sigma_m
         self._before: VehicleState | None = None
         self._variance = ERROR_M_S**2
         self.error = np.zeros(3)
-        """(3,) m/s NED by which the autopilot's velocity is too large."""
+        """(3,) error of the autopilot's velocity, m/s NED: what it reports minus the truth."""
         self.disagreement_m_s = 0.0
-        """Of the level error, where it is larger than autopilots and images usually make it: one of them is wrong."""
+        """The horizontal error if it is larger than usual, so that autopilot or images are faulty; else 0."""
         self.velocity: FloatArray | None = None
-        """(3,) m/s NED; None: there was no step yet, or nothing has shown one."""
+        """(3,) m/s NED; None: not known yet."""
         self.displacement: FloatArray | None = None
-        """(3,) metres NED in the step; None likewise."""
+        """(3,) metres NED in the step; None: not known yet."""
         self.sigma_m = 0.0
         """Standard deviation of the displacement, each axis."""
 
     def ahead(self, interval_s: float) -> tuple[FloatArray | None, float]:
-        """The displacement in the time after the last step, and its standard deviation, each axis."""
+        """The displacement expected in the time after the last step, and its standard deviation, each axis."""
         return None if self.velocity is None else interval_s * self.velocity, ERROR_M_S * interval_s
 
     def update(self, vehicle: VehicleState, interval_s: float, by_images: FloatArray | None) -> bool:
-        """Takes a step. Whether ``by_images`` fits what is known; where it does not, it is not used.
+        """Takes a step. Returns whether ``by_images`` fits the filter; if not, it is not used.
 
         Args:
             vehicle: at the step's end.
-            interval_s: between the frames of both ends; 0: it begins anew.
-            by_images: (3,) metres NED that the drone went in the interval; None: images do not show it.
+            interval_s: time between the frames of both ends; 0: the filter starts anew.
+            by_images: (3,) displacement in the interval, metres NED; None: images do not show it.
 
-        What is refused makes the error's variance so large that the next one fits where it is alike.
+        A refused displacement enlarges the error's variance, so that the next one fits if it says the same.
         """
         before, self._before = self._before, vehicle
         if before is None:
@@ -65,7 +65,7 @@ class OwnMotion:
         if said is None or said_before is None or not interval_s > 0.0:
             return self._alone(said, interval_s, by_images)
         limit, mean_said = consistency.EGO_MOTION.limit, (said_before + said) / 2
-        stays = self.disagreement_m_s > 0.0 and by_images is not None  # a fault, which does not fade
+        stays = self.disagreement_m_s > 0.0 and by_images is not None  # a faulty sensor stays faulty
         kept = 1.0 if stays else math.exp(-interval_s / ERROR_LASTS_S)
         wandered = -math.expm1(-2.0 * interval_s / ERROR_LASTS_S) * ERROR_M_S**2
         error, variance = kept * self.error, kept**2 * self._variance + wandered
@@ -82,7 +82,7 @@ class OwnMotion:
                 error, variance = error + covariance / expected * innovation, variance - covariance**2 / expected
                 mean, of_mean = mean + of_mean / expected * innovation, of_mean * noise / expected
             else:
-                variance += (2 * off / limit) ** 2  # at least a quarter of it is the mean's of the next step
+                variance += (2 * off / limit) ** 2  # at least a quarter reaches the next step's mean
         self.error, self._variance, self.velocity = error, variance, said - error
         usual_m_s = limit * math.hypot(ERROR_M_S, SCALE * math.hypot(*mean_said[:2]))
         off_m_s = math.hypot(*error[:2])
@@ -92,7 +92,7 @@ class OwnMotion:
         return fits
 
     def _alone(self, said: FloatArray | None, interval_s: float, by_images: FloatArray | None) -> bool:
-        """By the images or the autopilot alone, where the other says nothing of the step."""
+        """Uses the images or the autopilot alone if the other gives no motion for the step."""
         self._variance, self.disagreement_m_s = ERROR_M_S**2, 0.0
         if said is not None:
             self.velocity = said - self.error
@@ -105,6 +105,6 @@ class OwnMotion:
 
 
 def _velocity(vehicle: VehicleState) -> FloatArray | None:
-    """(3,) m/s NED that the autopilot knows."""
+    """(3,) the autopilot's velocity, m/s NED; None: not known, or impossible."""
     said = vehicle.velocity_ned
     return None if said is None or not np.abs(said).max() <= _MOST_M_S else said

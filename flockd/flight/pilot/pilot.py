@@ -1,4 +1,4 @@
-"""``FlockPilot.step``: camera frames and the own autopilot's state in, velocity command out. No clock, no I/O."""
+"""``FlockPilot.step``: camera frames and the autopilot's state in, velocity command out. No clock, no I/O."""
 
 from __future__ import annotations
 
@@ -49,25 +49,25 @@ from flockd.flight.safety.surroundings import limits_towards
 from flockd.flight.tracking import Measurement, Prediction, Shown, Tracker
 
 _ROTATION_TOLERANCE = 1e-3
-"""How far an attitude's R R^T may be from the identity: beyond it is no attitude, and not only rounded."""
+"""Largest deviation of an attitude's R R^T from the identity. A larger one is not rounding: the attitude is refused."""
 _ROUNDING = 1e-6
-"""The same: what is farther off is replaced by the nearest rotation, as measurements and transforms ask for one."""
+"""Deviation above which an attitude is replaced by the nearest rotation, as measurements and transforms need one."""
 _LONGEST_S = 10.0
-"""Since the last step: what was known before a longer gap is forgotten."""
+"""Longest time between two steps; after a longer gap the pilot starts anew."""
 _DISAGREE = "ego-motion: images and autopilot disagree on the velocity; one, or the height above ground, is wrong"
 _UNFIT = "ego-motion: images show another motion than the autopilot and the steps before"
 
 
 @dataclass
 class StepTrace:
-    """What a step saw on its way, for reports and viewers: filled where a caller passes one in."""
+    """Intermediate results of a step, for reports and viewers: filled if a caller passes one in."""
 
     observation: Observation | None = None
     detection: DetectionTrace = field(default_factory=DetectionTrace)
 
 
 class FlockPilot:
-    """One drone's pilot. Remembers the last frame set and its tracks; everything else comes in with each step."""
+    """One drone's pilot. It keeps the last frame set and its tracks; all other inputs come with each step."""
 
     def __init__(
         self,
@@ -79,12 +79,9 @@ class FlockPilot:
         *,
         flies: bool = True,
     ) -> None:
-        """``networks`` may be shared by several pilots; None: those that the configuration names.
-
-        ``stopwatch`` (seconds) only fills ``stages_ms``. ``observer`` takes perception's place. ``learned`` is of
-        the others' size, before this flight. Without ``flies`` nobody flies what this pilot wants, as before a flight.
-        Raises ModelError.
-        """
+        """``networks`` may be shared by several pilots; None: those that the configuration names. ``stopwatch``
+        (seconds) only fills ``stages_ms``. ``observer`` replaces perception. ``learned``: the others' size from an
+        earlier flight. Without ``flies``, as before a flight, the output is not flown. Raises ModelError."""
         self._config = config
         self._rig = build_rig(config.rig)
         self._perception = observer or Perception(
@@ -107,10 +104,10 @@ class FlockPilot:
         self._first_time_s: float | None = None
         self._last_time_s: float | None = None
         self._yaw_rad: float | None = None
-        """The heading asked for last, but for what the lookout turns; before, that of the first good attitude."""
+        """The heading commanded last, without what the lookout adds; at first that of the first valid attitude."""
         self._order: MissionOrder | None = None
         self._mission = NO_STATUS
-        """As of the last good step."""
+        """As of the last valid step."""
 
     def step(
         self,
@@ -119,16 +116,16 @@ class FlockPilot:
         trace: StepTrace | None = None,
         order: MissionOrder | None = None,
     ) -> PilotOutput:
-        """One step of the pure line.
+        """One step of the pipeline.
 
         Args:
             frames: the newest image of every camera that has one.
-            vehicle: what the own autopilot says, at the frames' time.
-            trace: filled with what was seen; changes nothing.
-            order: an operator's to the mission, in the first step after it came.
+            vehicle: the own autopilot's state at the frames' time.
+            trace: filled with intermediate results; changes no output.
+            order: an operator's order to the mission, in the first step after it arrived.
 
-        Input that cannot be is refused with a reason: the command is standstill, and nothing of it is remembered but
-        the order, and the heading where there was none before.
+        Impossible input is refused with a reason: the command is standstill. Of such a step the pilot keeps only the
+        order, and the heading if it had none.
         """
         self._order = self._order if order is None else order
         if self._yaw_rad is None and _is_rotation(vehicle.R_ned_body):
@@ -148,7 +145,7 @@ class FlockPilot:
         observation = self._perception.observe(frames, vehicle, ground, predictions, trace.detection, laps.end, known)
         trace.observation = observation
         if self._config.perception.height == "barometer":
-            ground = None  # the height says as much
+            ground = None  # the height alone gives the same
         ego, why_no_ego = self._ego_motion(observation, ground)
         laps.end("ego_motion")
         velocity = vehicle.velocity_ned if self._config.own_velocity == "autopilot" else self._own.velocity
@@ -185,11 +182,11 @@ class FlockPilot:
 
     @property
     def learned(self) -> LearnedSize | None:
-        """What the steps until now showed of the others' size, for the next flight's pilot."""
+        """What the steps so far showed of the others' size, for the next flight's pilot."""
         return self._size.learned
 
     def _refused(self, time_s: float, reason: Reason) -> PilotOutput:
-        """The output of a step that was not done: neighbours and obstacles as of the last one, which went on since."""
+        """The output of a refused step: neighbours and obstacles of the last valid step, predicted to now."""
         last_s = 0.0 if self._last_time_s is None else self._last_time_s
         time_s = max(time_s, last_s) if math.isfinite(time_s) else last_s
         interval_s = min(time_s - last_s, _LONGEST_S)
@@ -216,7 +213,7 @@ class FlockPilot:
         )
 
     def _predictions(self, time_s: float) -> tuple[Prediction, ...]:
-        """Predictions of the tracks at the frames' time; none where time does not go on, or too far."""
+        """Predictions of the tracks at the frames' time; empty if time runs backwards or jumps too far."""
         if self._last_time_s is None or not 0.0 < time_s - self._last_time_s <= _LONGEST_S:
             return ()
         return self._tracker.predictions(time_s - self._last_time_s, self._own.velocity)
@@ -224,8 +221,8 @@ class FlockPilot:
     def _ego_motion(
         self, observation: Observation, ground: GroundEstimate | None
     ) -> tuple[EgoMotion | None, Sequence[Reason]]:
-        """The own motion by images in C (the body frame at the previous observation), or why there is none; the state
-        of the own motion takes it."""
+        """The own motion by images in C (the body frame at the previous observation), or the reasons why there is none.
+        Updates the state of the own motion."""
         ego, displacement, reasons, interval_s = None, None, [], 0.0
         if observation.previous is not None:
             interval_s = min(observation.interval_s, _LONGEST_S)
@@ -245,26 +242,26 @@ class FlockPilot:
         return ego, [Reason(ReasonKind.EGO_MOTION, text) for text in reasons]
 
     def _by_images(self, observation: Observation) -> EgoMotion:
-        """In the depth maps' scale (Eq. 7-21). ``ValueError`` says why there is none."""
+        """The own motion in the depth maps' scale (Eq. 7-21). ValueError gives the reason if there is none."""
         pairs = background_pairs(self._rig, observation, self._config.geometry)
         if observation.previous is not None:
             self._agreement.see(observation.previous.vehicle, observation.vehicle, observation.interval_s, pairs)
         return estimate_ego_motion(pairs, self._rig, observation.interval_s, self._config.geometry)
 
     def _scaled(self, observation: Observation, ego: EgoMotion, ground: GroundEstimate | None) -> EgoMotion:
-        """The own motion with the range finder's scale where the ground shows it, and as it is otherwise."""
+        """The own motion in the range finder's scale if the ground gives it, else unchanged."""
         if ground is None or self._ground is None:
             return ego
         track = self._ground.track(observation.vehicle)
         try:
             scaled, slope = scaled_by_ground(self._rig, observation, ego, ground, track)
-        except ValueError:  # at a standstill, or over water and walls: the depth maps' scale stays
+        except ValueError:  # standing still, or over water and walls: keep the depth maps' scale
             return ego
         self._ground.see_slope(slope)
         return scaled
 
     def _measurements(self, observation: Observation) -> tuple[tuple[Detection, ...], list[Measurement], list[Reason]]:
-        """The detections that the tracker takes, what it takes, and why it takes others not."""
+        """The detections that the tracker uses, their measurements, and the reasons for those left out."""
         taken, measurements, reasons = [], [], []
         for detection in observation.detections:
             try:
@@ -280,7 +277,7 @@ class FlockPilot:
         measurements: Sequence[Measurement],
         velocity: FloatArray | None,
     ) -> tuple[int, ...]:
-        """The track of each measurement."""
+        """Updates the tracker. Returns the track of each measurement."""
         if observation.previous is not None:
             if observation.interval_s > _LONGEST_S:
                 self._tracker.forget()
@@ -295,7 +292,7 @@ class FlockPilot:
         measured: Mapping[int, Measurement],
         velocity: FloatArray | None,
     ) -> tuple[Neighbour, ...]:
-        """The neighbours after what their measurements, by track, tell of their size."""
+        """The neighbours after their size is updated with their measurements, by track."""
         sunk_m = 0.0
         if ego is not None and self._own.displacement is not None:
             sunk_m = float(self._own.displacement[2])
@@ -311,7 +308,7 @@ class FlockPilot:
     def _local_map(
         self, observation: Observation, ego: EgoMotion | None, ground: GroundEstimate | None
     ) -> ObstacleRanges:
-        """The local map now; where obstacles are not looked for, all is free where a camera looks."""
+        """The local map now; if obstacles are not detected, all is free within view of a camera."""
         if self._ranging is None:
             R = observation.vehicle.R_ned_body
             yaw_rad = math.atan2(R[1, 0], R[0, 0])
@@ -322,11 +319,11 @@ class FlockPilot:
         return self._map.step(observation.time_s, ranges, displacement, self._own.sigma_m)
 
     def _gone(self, observation: Observation) -> frozenset[str]:
-        """The cameras that gave no image that can be used."""
+        """Cameras without a usable image in this step."""
         return frozenset(self._rig.cameras.keys() - observation.cameras.keys())
 
     def _shown(self, observation: Observation) -> Shown:
-        """Tells who is wholly in view of a camera that gave an image in this step."""
+        """A function that tells which neighbours are wholly in view of a camera with a usable image."""
         gone, R_ned_body = self._gone(observation), observation.vehicle.R_ned_body
         return lambda places, radius_m: self._rig.shows(places @ R_ned_body, radius_m, gone)  # rows R^T p: in the body
 
@@ -357,7 +354,7 @@ class FlockPilot:
         self._order = None
         self._mission = self._navigator.status(guidance)
         desired = self._mission.desired
-        own = guidance.velocity if velocity is None else velocity[:2]  # before the first pair: as desired
+        own = guidance.velocity if velocity is None else velocity[:2]  # before the first pair: the mission's
         if self._ranging is None:
             tracks, limits = [n.track for n in seen], limits_towards(neighbours, self._config.safety.gate)
             command, acceleration = self._passing.command(
@@ -373,23 +370,23 @@ class FlockPilot:
         height_m = self._size.height(observation.time_s, vehicle, ground, guidance.height_m, neighbours, ends=ends)
         self._mission = replace(self._mission, sentence=self._mission.sentence + self._size.sentence)
         trim = self._trim()
-        command = limit_norm(command + trim, self._config.safety.gate.max_speed_m_s)  # not even by rounding more
+        command = limit_norm(command + trim, self._config.safety.gate.max_speed_m_s)  # exact after rounding
         return Wanted(command, acceleration, yaw_rad, trim if trim.any() else None, height_m)
 
     def _trim(self) -> FloatArray:
-        """(2,) m/s, north and east, that setpoints are corrected by.
+        """(2,) m/s, north and east, that are added to setpoints.
 
-        An autopilot flies a setpoint v so that its own estimate becomes v. Where that errs by b, the drone moves with
-        v - b, and so do neighbours with other b: a flock with equal commands drifts together. So b is added.
+        An autopilot flies a setpoint v so that its own estimate becomes v. If that is wrong by b, the drone moves with
+        v - b. Other drones have other b, so a flock with equal commands drifts apart. Adding b corrects it.
         """
         if self._config.own_velocity == "autopilot":
             return np.zeros(2)
-        autopilot = self._config.autopilot or AutopilotParameters()  # a simulated one errs as well
+        autopilot = self._config.autopilot or AutopilotParameters()  # a simulated autopilot has errors too
         return limit_norm(self._own.error[:2], autopilot.max_velocity_trim_m_s)
 
 
 def _why_refused(frames: FrameSet, vehicle: VehicleState) -> Reason | None:
-    """What of a step's input cannot be; None: nothing."""
+    """What in a step's input is impossible; None: nothing."""
     velocity = vehicle.velocity_ned
     if not (math.isfinite(frames.time_s) and math.isfinite(vehicle.time_s)):
         return Reason(ReasonKind.INPUT, "input refused: a time is not finite")
@@ -411,16 +408,16 @@ def _why_refused(frames: FrameSet, vehicle: VehicleState) -> Reason | None:
 
 
 def _is_rotation(matrix: FloatArray) -> bool:
-    return bool(_off_rotation(matrix) <= _ROTATION_TOLERANCE and np.linalg.det(matrix) > 0.0)  # false for NaN too
+    return bool(_off_rotation(matrix) <= _ROTATION_TOLERANCE and np.linalg.det(matrix) > 0.0)  # NaN compares false
 
 
 def _off_rotation(matrix: FloatArray) -> float:
-    """How far a (3, 3) matrix times its transpose is from the identity."""
+    """Largest deviation of R R^T from the identity, of a (3, 3) matrix R."""
     return float(np.abs(matrix @ matrix.T - np.eye(3)).max())
 
 
 def _with_rotation(vehicle: VehicleState) -> VehicleState:
-    """With a rotation for its attitude: the nearest one where it was rounded more than a step can take."""
+    """The state with a rotation as attitude: the nearest one if rounding is larger than a step allows."""
     if _off_rotation(vehicle.R_ned_body) <= _ROUNDING:
         return vehicle
     u, _, vt = np.linalg.svd(vehicle.R_ned_body)
@@ -436,7 +433,7 @@ class _Laps:
         self.stages_ms: dict[str, float] = {}
 
     def end(self, stage: str) -> None:
-        """Takes the time of a stage that ends now."""
+        """Records the time of a stage that ends now."""
         if self._watch:
             now = self._watch()
             self.stages_ms[stage] = 1e3 * (now - self._last)

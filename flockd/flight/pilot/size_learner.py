@@ -1,9 +1,9 @@
-"""How large the others are: how far off what the networks judge may be, and what a drone that is to learns in flight.
+"""The size of the other drones: how far it may be off, and how a drone learns it in flight if so configured.
 
-An apparent size gives a range only in units of the drone's size. If the own drone moves by a known way that its
-neighbours do not follow, their bearings shift by that way over the range: the shift gives the metres. Any other motion
-gives nothing, as mates move as one does oneself. So, in units of the drones' size, a neighbour's height below the own
-drone is a smooth course of its own plus the own weave over the size: linear in that scale, 1 / size, one for all.
+An apparent size gives the range only in units of the drone's size. If the own drone moves by a known distance and its
+neighbours do not follow, their bearings shift by that distance over the range, which gives metres. Flock mates follow
+any other motion. In units of the drones' size, a neighbour's height below the own drone is a smooth course of its own
+plus the own weave over the size. That is linear in the scale, 1 / size, which all neighbours share.
 """
 
 from __future__ import annotations
@@ -21,56 +21,52 @@ from flockd.flight.pilot.weave import DURATION_S, PERIOD_S, Weave
 from flockd.flight.tracking import Measurement
 
 _KNOWN_SIGMA = 0.1
-"""A learned size is used, and the drone weaves no more, below this relative standard deviation."""
+"""Relative standard deviation below which a learned size is used and the drone stops weaving."""
 _LEAST_SIGMA = 0.04
-"""What the model does not know of adds this to it."""
+"""Relative standard deviation added for errors that the model leaves out."""
 _JUDGED_SIGMA = 0.5
-"""By how much the judged size may be off, as a share, before anything is learned."""
+"""Relative standard deviation of the networks' size before anything is learned."""
 _PLAUSIBLE = 2.0
-"""No family that the networks do not know is judged wrong by more than this factor, but drones that rise together look
-larger."""
+"""Largest factor between a learned size and the networks': drones that rise together look larger."""
 _ROBUST_SIGMA, _TIMES = 2.5, 10
-"""A track that is beyond this many standard deviations off the scale counts less and less: it may be of a tree. So many
-times it is looked at which are."""
+"""Deviations beyond which a track's scale loses weight, as it may be of a tree; iterations of the weighting."""
 _LASTS_S = PERIOD_S / (2 * math.pi)
-"""Errors of bearings and heights last. Of all that last for some time, as an Ornstein-Uhlenbeck process, those that
-last so long have most power at the weave's frequency: as much as if each so long were one independent measurement."""
+"""Time between independent measurements: errors of bearings and heights persist, as an Ornstein-Uhlenbeck process. With
+this time constant they have the most power at the weave's frequency."""
 _JUDGED, _NEAR_M = 400, 8.0
-"""So many judged sizes are kept, the newest, of drones so near: farther ones look like much."""
+"""Newest sizes by the networks that are kept, and the largest range of their drones: farther ones are unreliable."""
 _FEWEST_DOUBTS, _DOUBTED = 8, 0.15
-"""What the networks' own standard deviations of the log sizes say, at the median of so many, where they do not know the
-drones: of families that they know it is 0.01 to 0.06, of two that they do not know 0.31. Beyond this, the gate reckons
-with so much, twice its standard deviations being near what those two are off: with all of it drones would stop before
-each other two thirds of the time."""
+"""The networks do not know the drones if the median of so many of their standard deviations of log size is above the
+second number: it is 0.01 to 0.06 for families of the training, 0.31 for two others. The gate then uses the second
+number: twice that is near the error of these two. With 0.31 drones would stop before each other most of the time."""
 
 
 class SizeLearner:
-    """One drone's, for one flight."""
+    """The size learner of one drone, for one flight."""
 
     def __init__(self, config: DroneConfig, learned: LearnedSize | None = None, *, flies: bool = True) -> None:
-        """``learned``: before the flight. Without ``flies`` the autopilot or a person flies the drone, and it does not
-        weave."""
+        """``learned``: the size from an earlier flight. Without ``flies`` the autopilot or a person flies the drone,
+        and it does not weave."""
         self._is_said = config.perception.drone_size_m is not None
         self._learns, self._gate, self._name = config.flocking.size == "learn", config.safety.gate, config.name
         self._weave: Weave | None = None
         self._may_weave = flies and config.safety.first_flight_layer is None
         self.learned = learned if self._learns else None
-        """What ranges follow from, and what goes into the next flight; None: from what the networks judge, or the
-        configuration says."""
+        """The size for ranges and for the next flight; None: the networks' or the configured one is used."""
         self._known: tuple[float, float] | None = None
-        """The scale, 1 / size in 1/m, by all weaves, and its variance."""
+        """The scale, 1 / size in 1/m, from all weaves, and its variance."""
         self._judged: deque[float] = deque(maxlen=_JUDGED)
-        """Sizes of confirmed neighbours as the networks judge them."""
+        """Sizes of confirmed neighbours by the networks, in m."""
         self._doubts: deque[float] = deque(maxlen=_JUDGED)
-        """What they say that the logarithms of those may be off."""
+        """Their standard deviations of log size, by the networks."""
         self._risen_m = 0.0
         self._shown: defaultdict[int, list[tuple[float, float, float]]] = defaultdict(list)
-        """Of the weave that moves the drone, by track: times in s, how far the drone has risen since the flight began
-        in m, and how far the neighbour is below it in drone sizes."""
+        """Of the current weave, by track: time in s, height of the own drone since the flight began in m, and the
+        neighbour's height below it in drone sizes."""
 
     @property
     def status(self) -> SizeStatus | None:
-        """As of now; None: nothing is learned."""
+        """The size as of now; None: nothing is learned."""
         weaves = self._weave is not None and self._weave.moves
         if self.learned is not None:
             return SizeStatus(weaves, self.learned.size_m, self.learned.sigma)
@@ -78,14 +74,14 @@ class SizeLearner:
 
     @property
     def sentence(self) -> str:
-        """For people, to be added to what the mission does; empty where there is nothing to say."""
+        """A phrase for people, appended to the mission's; empty if there is nothing to say."""
         weaves = "; weaves up and down to learn the others' size" if self._weave and self._weave.moves else ""
         return weaves + (f"; has found the others to be {self.learned.size_m:.2f} m large" if self.learned else "")
 
     def see(
         self, time_s: float, sunk_m: float, measured: Mapping[int, Measurement], neighbours: Sequence[Neighbour]
     ) -> float | None:
-        """Take in a step's measurements by track; the size in metres that ranges follow from now on, if it is new.
+        """Takes a step's measurements by track. Returns the size in metres for ranges from now on, if it is new.
 
         `sunk_m` is how far the drone went down since the last step.
         """
@@ -108,7 +104,7 @@ class SizeLearner:
         return None if self.learned is None else self.learned.size_m
 
     def _learn(self) -> None:
-        """The mean of what is known of the one scale and of what each track showed, weighed again and again."""
+        """Robust mean of the known scale and of the scale that each track showed, by iterated weighting."""
         judged = 1 / float(np.median(self._judged))
         known = self._known or (judged, (_JUDGED_SIGMA * judged) ** 2)
         found = [one for one in map(scale_of, map(np.array, self._shown.values())) if one is not None]
@@ -132,10 +128,10 @@ class SizeLearner:
         *,
         ends: bool,
     ) -> float | None:
-        """The height to ask for, with the weave in it; as of `Wanted`. ``ends``: the mission is over."""
+        """The height to command, with the weave added, as of `Wanted`. ``ends``: the mission is over."""
         if not self._learns:
             return wanted_m
-        if self._weave is None:  # simulated drones may have one name
+        if self._weave is None:  # simulated drones may share a name
             begun = np.array([vehicle.height_m, *vehicle.R_ned_body.flat])
             self._weave = Weave(self._gate, self._name.encode() + begun.tobytes())
         needed = self._may_weave and self.learned is None and not ends
@@ -143,9 +139,9 @@ class SizeLearner:
         return self._weave.height(time_s, vehicle.height_m, above_ground_m, wanted_m, neighbours, needed=needed)
 
     def cautious(self, neighbours: Sequence[Neighbour]) -> tuple[Neighbour, ...]:
-        """With what the size may be off in the ranges that the gate reckons with: it errs alike in all steps.
+        """The neighbours with the size's uncertainty, the same in all steps, added to their range sigmas for the gate.
 
-        That of the learned size; before, of drones that the networks do not know, `_DOUBTED`.
+        It is that of the learned size; before, `_DOUBTED` for drones that the networks do not know.
         """
         if self.learned is not None:
             sigma = self.learned.sigma
@@ -157,10 +153,10 @@ class SizeLearner:
 
 
 def scale_of(shown: FloatArray) -> tuple[float, float] | None:
-    """The scale, 1 / size in 1/m, by what one track showed in a weave, (n, 3) as of `SizeLearner`, and its variance.
+    """The scale, 1 / size in 1/m, and its variance, from one track in a weave, (n, 3) as in `SizeLearner`.
 
-    Least squares of the neighbour's height over the own one and a parabola in time, its own course. None: it was seen
-    too seldom, or the drone did not move otherwise.
+    Least squares of the neighbour's height over the own height and a parabola in time, its own course. None: too few
+    measurements, or the own drone did not move otherwise.
     """
     time_s, risen_m, below = shown.T
     independent = min(len(shown), float(np.ptp(time_s)) / _LASTS_S)

@@ -1,7 +1,7 @@
 """The weave: twelve seconds up and down, from which a drone learns how large the others are (`size_learner`).
 
-The flocking law is level, so that nobody follows. One drone weaves at a time: of two that rise together no bearing
-shifts.
+The flocking law is horizontal, so neighbours do not follow. One drone weaves at a time: if two rise together, no
+bearing shifts.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from flockd.core.messages import Neighbour
 from flockd.flight.safety.approach import COLUMN
 
 _ASKED_M = 0.43
-"""The drone asks for heights this much above and below its own, which moves it by about 0.34 m, ..."""
+"""Amplitude of the commanded height; the drone moves by about 0.34 m."""
 PERIOD_S, DURATION_S = 6.0, 12.0
-"""... in a sine of this period, for so long."""
+"""Period of the sine, and duration of a weave."""
 _DRAWN_WITHIN_S = 8.0
-"""It begins at a time drawn from so many seconds, for not all to weave at once; where it may not, it draws from
-half of them again."""
+"""The start is drawn from an interval of this length, so that not all drones weave at once; if the drone may not weave
+then, it is drawn again from half of it."""
 _CLIMB_M_S = 0.2
-"""A neighbour that rises or sinks faster, or did so in the last half period, is weaving, and the drone waits."""
+"""A neighbour with a higher vertical speed is weaving; the drone waits until half a period after it."""
 _ROOM_M = 0.5
-"""From the mission's height the drone is no farther off when it begins, and it stays so far within the heights that the
-gate allows: the lowest is near the ground."""
+"""Largest distance from the mission's height at the start, and margin to the gate's height limits: the lower one is
+near the ground."""
 _ABOVE_GROUND_M = 2.0
-"""Nor does it begin lower above the ground, which may be higher than at home."""
+"""Least height above the ground at the start; the ground may be higher than at home."""
 
 
 class Weave:
-    """When one drone moves up and down, and how."""
+    """Decides when one drone weaves, and at which height."""
 
     def __init__(self, gate: GateParameters, own: bytes) -> None:
-        """``own``: what no two drones have in common, so that they draw other times."""
+        """``own``: bytes that no two drones share, so that they draw different times."""
         self._gate = gate
         self._random = np.random.default_rng(zlib.crc32(own))
         self._next_s: float | None = None
@@ -44,18 +44,18 @@ class Weave:
         """When a neighbour last rose or sank."""
         self._began_s: float | None = None
         self._base_m: float | None = None
-        """Where the newest weave began, and where the drone stays since, if the mission wants no height."""
+        """Height at which the newest weave began; the drone stays at it if the mission gives no height."""
         self._wanted_m: float | None = None
         self._steady_since_s: float | None = None
-        """Since when that is the mission's height: a flock changes its height together."""
+        """Since when the mission's height is unchanged: a flock changes its height together."""
 
     @property
     def moves(self) -> bool:
-        """Whether it moves the drone up and down."""
+        """Whether the drone weaves now."""
         return self._began_s is not None
 
     def is_over(self, time_s: float) -> bool:
-        """Whether it has moved the drone for as long as it should."""
+        """Whether the current weave has lasted its full duration."""
         return self._began_s is not None and time_s - self._began_s >= DURATION_S
 
     def height(
@@ -68,9 +68,9 @@ class Weave:
         *,
         needed: bool,
     ) -> float | None:
-        """The height to ask for instead of the mission's, `wanted_m`; None: the one that the flight began at.
+        """The height to command instead of the mission's, `wanted_m`; None: the height at which the flight began.
 
-        The drone is at `height_m` above home. `needed`: there is something to learn, and nothing that forbids it.
+        The drone is at `height_m` above home. `needed`: there is something to learn, and nothing forbids it.
         """
         if any(one.confirmed and abs(one.velocity[2]) > _CLIMB_M_S for one in neighbours):
             self._climbed_s = time_s

@@ -1,4 +1,4 @@
-"""Whether the drone may be flown, and what may be sent: a supervisor and a last gate, without clock or I/O."""
+"""Whether the drone may fly, and which setpoints may be sent: a supervisor and a gate, without clock or I/O."""
 
 from __future__ import annotations
 

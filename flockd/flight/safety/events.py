@@ -1,4 +1,4 @@
-"""The supervisor's inputs, and the events in them: faults, and other reasons to end a flight."""
+"""The supervisor's inputs, and the events detected in them: faults, and other reasons to end a flight."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from flockd.core import services
 from flockd.core.config.safety import SafetyParameters
 
 OFFBOARD = "offboard"
-"""The flight mode in which the autopilot follows setpoints; all others are the pilot's or the autopilot's own."""
+"""The flight mode in which the autopilot follows setpoints; the pilot or the autopilot itself flies in all others."""
 
 
 @dataclass(frozen=True)
 class CameraHealth:
-    """How one camera is doing."""
+    """State of one camera."""
 
     age_s: float
     """Age of its newest usable frame; infinite before the first."""
     period_s: float
-    """How far apart its frames should be."""
+    """Expected time between its frames."""
     unplugged: bool
-    """Its device reported an error or is gone, and is not open again yet."""
+    """Whether its device reported an error or is gone, and is not open again yet."""
     frozen: bool
-    """It keeps sending the same image or the same sequence number."""
+    """Whether it keeps sending the same image or the same sequence number."""
     noisy: bool
-    """Its images have been noise for too long."""
+    """Whether its images have been noise for too long."""
 
 
 class MissionEnd(StrEnum):
-    """What a mission that is over wants of the autopilot."""
+    """How a mission that is over ends the flight."""
 
     LAND = "land"
     RETURN = "return"
@@ -39,7 +39,7 @@ class MissionEnd(StrEnum):
 
 @dataclass(frozen=True)
 class Inputs:
-    """All that the supervisor goes by, as of one instant. A number that is NaN counts as bad."""
+    """All inputs of the supervisor, at one instant. NaN counts as a fault."""
 
     cameras: Mapping[str, CameraHealth]
     """Every camera of the rig, by name."""
@@ -48,72 +48,72 @@ class Inputs:
     estimate_age_s: float
     """Age of the pilot's newest output; infinite before the first."""
     ego_motion_age_s: float
-    """For how long the pilot's steps have found no motion of the drone's own."""
+    """Time since a step of the pilot last found the drone's own motion."""
     network_faults: int
     """Outputs of a network that are NaN, infinite or out of range, since the last call."""
     inference_stuck: bool
     """A network has passed its deadline and not returned yet."""
     load: float
-    """How long the steps take (95th percentile, slowest stage) over how long they may."""
+    """95th percentile of the steps' durations over the permitted one, of the slowest stage."""
     temperature_c: float | None
-    """Temperature of the hottest thermal zone; None on a computer that has none."""
+    """Temperature of the hottest thermal zone; None: the computer has none."""
     loop_lag_s: float
-    """How late the event loop runs."""
+    """Lag of the event loop."""
     velocity_error_m_s: float
-    """How strongly the drone was carried off its setpoints in the last seconds."""
+    """Root mean square of the velocity's deviation from its setpoints in the last seconds."""
     velocity_late_s: float
-    """By how much later than expected it follows them."""
+    """Additional delay, beyond the expected one, with which the velocity follows them."""
     dead_tasks: tuple[str, ...]
-    """Names of tasks that have ended and should not have."""
+    """Names of tasks that have ended unexpectedly."""
     neighbours_age_s: float
-    """Since a neighbour was last seen, confirmed or about to be; infinite before the first."""
+    """Time since a neighbour was last seen, confirmed or not yet; infinite before the first."""
     nearest_neighbour_m: float
     """Range of the nearest confirmed neighbour; infinite without one."""
     refused_commands: int
-    """Commands since the last call that the gate found not finite or too large."""
+    """Commands since the last call that the gate refused as not finite or too large."""
     obstacle_near: bool
-    """An obstacle is nearer than `hold_room_m`."""
+    """Whether an obstacle is nearer than `hold_room_m`."""
     outside_fence: bool
-    """As of `outside_fence`."""
+    """As of the function `outside_fence`."""
     outside_heights: bool
-    """As of `outside_heights`."""
+    """As of the function `outside_heights`."""
     motion_age_s: float
     """Age of the autopilot's newest position and velocity; infinite before the first."""
     heartbeat_age_s: float
     """Age of the autopilot's newest heartbeat; infinite before the first."""
     message_age_s: float
-    """The same of its newest message of any kind."""
+    """Age of its newest message of any kind."""
     stream_fault: str | None
     """Why the streamer has ended offboard flight by itself, until the supervisor has silenced it; None: it has not."""
     autopilot_failsafe: bool
-    """The autopilot flies by its own failsafe, and not as it was asked."""
+    """Whether the autopilot flies its own failsafe instead of what it was commanded."""
     foreign_setpoints: str | None
-    """What was seen of setpoints of another sender; None: nothing."""
+    """The evidence of another sender's setpoints; None: there is none."""
     parameter_fault: str | None
-    """What is wrong with a parameter of the autopilot, before the flight or since; None: nothing."""
+    """The fault of an autopilot's parameter, before the flight or since; None: none."""
     frame_jumped: bool
-    """The autopilot's local frame or heading has jumped far in this flight."""
+    """Whether the autopilot's local frame or heading has jumped far in this flight."""
     flight_mode: str | None
-    """The autopilot's; `OFFBOARD` or any other word. None: not known yet, as for the next two."""
+    """The autopilot's: `OFFBOARD` or any other word. None: not known yet, as for the next two."""
     armed: bool | None
     in_air: bool | None
     battery_low: bool
-    """So says the autopilot."""
+    """Reported by the autopilot."""
     position_lost: bool
-    """The autopilot has lost its estimate, or the satellites that it needs for it."""
+    """Whether the autopilot has lost its estimate, or the satellites that it needs for it."""
     shutdown_asked: bool
-    """The process was asked to end."""
+    """Whether the process was asked to end."""
     hold_asked: bool
-    """By an operator; so `land_asked`."""
+    """Whether an operator asked for it; `land_asked` likewise."""
     land_asked: bool
     resume_asked: bool
-    """By an operator, since the last call: may be ready again, after a flight that was ended in the air."""
+    """Whether an operator asked, since the last call, to be ready again after a flight that ended in the air."""
     mission_over: MissionEnd | None = None
-    """The mission of this flight has come to its end, and how it ends; None: it has not, or ends in the air."""
+    """How the flight's mission ended; None: it has not, or it ends in the air."""
 
 
 class Event(StrEnum):
-    """Something that is not as it is in a quiet flight. The value is its name in telemetry."""
+    """A fault or another reason to react. The value is its name in telemetry."""
 
     SIGHT_LOST = "sight_lost"
     CAMERA_LOST = "camera_lost"
@@ -154,7 +154,7 @@ class Event(StrEnum):
     LAND_ASKED = "land_asked"
     MISSION_LANDS = "mission_lands"
     MISSION_RETURNS = "mission_returns"
-    # The supervisor's own, not noticed in the inputs:
+    # From the supervisor itself, not from its inputs:
     STARTED = "started"
     NO_ANSWER = "no_answer"
 
@@ -162,7 +162,7 @@ class Event(StrEnum):
 def link_lost(heartbeat_age_s: float, message_age_s: float, p: SafetyParameters) -> str | None:
     """Why the link to the autopilot counts as lost, by the ages of its newest heartbeat and message; None: it does not.
 
-    The supervisor's judgement and the streamer's.
+    Used by the supervisor and by the streamer.
     """
     if not message_age_s <= p.link_timeout_s:
         return f"no message from the autopilot {_since(message_age_s)}"
@@ -172,11 +172,11 @@ def link_lost(heartbeat_age_s: float, message_age_s: float, p: SafetyParameters)
 
 
 def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
-    """What is the matter, each with one short sentence for people; empty in a quiet flight."""
+    """The events present in the inputs, each with one short sentence for people; empty in a flight without faults."""
     lost = [f"{name} {fault}" for name, camera in inputs.cameras.items() if (fault := _fault(camera, p))]
     sightless = len(lost) == len(inputs.cameras) or len(lost) > p.max_lost_cameras
     lost_link = link_lost(inputs.heartbeat_age_s, inputs.message_age_s, p)
-    # While another's setpoints are followed, the own ones are not.
+    # While another sender's setpoints are followed, the own ones are not.
     far_off = not (
         inputs.velocity_error_m_s <= p.max_velocity_error_m_s and inputs.velocity_late_s <= p.gate.reaction_s
     )
@@ -244,7 +244,7 @@ _FAILSAFE = (
 
 
 def _beyond(limits: Mapping[Event, float], value: float, sentence: str) -> list[tuple[Event, bool, str]]:
-    """The event of the last limit that a number is not within, as a row of the table; its sentence names the number."""
+    """The event of the last limit that a number exceeds, as a row of the table; its sentence names the number."""
     return [(event, True, sentence.format(value)) for event, limit in limits.items() if not value <= limit][-1:]
 
 
@@ -257,7 +257,7 @@ def _since(age_s: float) -> str:
 
 
 def _fault(camera: CameraHealth, p: SafetyParameters) -> str:
-    """What is wrong with a camera, in a word; empty if it is fine."""
+    """The fault of a camera, in one word; empty without a fault."""
     if camera.unplugged:
         return "unplugged"
     if camera.frozen:

@@ -1,4 +1,4 @@
-"""The fence and the heights within which the drone has to stay."""
+"""The fence and the height limits of the drone."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flockd.flight.safety.half_planes import NO_LIMITS, Limits
 
 
 def outside_fence(parameters: GateParameters, position: FloatArray) -> bool:
-    """Whether (2,) metres north and east of home are outside the fence; so is what is not finite, if there is one."""
+    """Whether (2,) metres north and east of home are outside the fence; with a fence, also if they are not finite."""
     radius_m, corners_m = parameters.fence_radius_m, parameters.fence_corners_m
     beyond = radius_m is not None and not math.hypot(*position) <= radius_m
     return beyond or (corners_m != () and not is_inside(corners_m, *position.tolist()))
@@ -26,11 +26,11 @@ def outside_heights(parameters: GateParameters, height_m: float) -> bool:
 
 
 def towards_fence(p: GateParameters, position: FloatArray) -> Limits:
-    """Directions (n, 2) to the fences, or outward where one was left, and how fast to fly there, (n,) m/s.
+    """Directions (n, 2) to the fences, or outward if one was left, and the greatest speed towards each, (n,) m/s.
 
-    A fence counts as a wall, to which the drone keeps `obstacle_clearance_m`: see `stopping_speed`. Beyond it, not at
-    all outward. A round one limits the speed along it too: a vehicle that answers late leaves a circle at the tangent.
-    For a `position` that is not finite there is no direction.
+    A fence counts as a wall with `obstacle_clearance_m`: see `stopping_speed`. Outside it the speed outward is zero. A
+    round one limits the speed along it too: a vehicle that responds late leaves a circle along the tangent. A
+    `position` that is not finite gives no direction.
     """
     offsets: list[FloatArray] = []
     left_m: list[float] = []
@@ -38,7 +38,7 @@ def towards_fence(p: GateParameters, position: FloatArray) -> Limits:
         return NO_LIMITS
     if p.fence_radius_m is not None:
         out_m = math.hypot(*position)
-        off = np.linspace(0.0, 2.0 * math.pi, 12, endpoint=False)  # from the direction outward
+        off = np.linspace(0.0, 2.0 * math.pi, 12, endpoint=False)  # from the outward direction
         azimuths = math.atan2(position[1], position[0]) + off
         offsets.extend(np.column_stack([np.cos(azimuths), np.sin(azimuths)]))
         half_chord = np.sqrt(np.maximum(p.fence_radius_m**2 - (out_m * np.sin(off)) ** 2, 0.0))
@@ -60,7 +60,7 @@ def towards_fence(p: GateParameters, position: FloatArray) -> Limits:
 
 
 def _nearest_of_sides(point: FloatArray, corners: FloatArray) -> FloatArray:
-    """(n, 2): of each side of a polygon the point that is nearest to a point."""
+    """(n, 2): the point of each side of a polygon that is nearest to a point."""
     sides = np.roll(corners, -1, axis=0) - corners
     along = np.sum((point - corners) * sides, axis=1) / np.sum(sides**2, axis=1)
     nearest: FloatArray = corners + np.clip(along, 0.0, 1.0)[:, None] * sides

@@ -1,6 +1,6 @@
-"""The last gate before the autopilot: limits each requested setpoint, or sends nothing. Silent until allowed.
+"""The last gate before the autopilot: limits each requested setpoint, or sends nothing. Silent until permitted.
 
-It is independent of pilot and networks: it checks every command, whatever produced it, and limits what it can do.
+It is independent of pilot and networks: it checks every command, whatever produced it.
 """
 
 from __future__ import annotations
@@ -25,33 +25,32 @@ _MOVES = frozenset({Action.FLY, Action.FLY_DEGRADED})
 
 
 class Gate:
-    """Passes each setpoint, makes it smaller, or sends nothing.
+    """Passes each setpoint, reduces it, or sends nothing.
 
     A speed above the limit or a number that is not finite is refused: the drone is brought to a standstill instead.
-    Towards a neighbour, an obstacle or the fence, and where nobody has looked, the drone flies no faster than it can
-    brake before the minimum distance. Every change of velocity stays within the acceleration limit, except that this
-    one wins.
+    Towards a neighbour, an obstacle or the fence, and into sectors that no camera has seen, the drone flies no faster
+    than it can brake before the minimum distance. Every change of velocity is within the acceleration limit, unless
+    braking needs more.
 
     Wind is left to the autopilot, whose velocity controller integrates: a second loop around it, here, oscillated with
-    PX4's real response. A drone that is measured to be faster than a limit brakes harder; one that is measured to
-    follow late keeps the distance that it then needs, and one that does not follow (`ResponseMonitor`) is for the
-    supervisor.
+    PX4's real response. A drone measured to be faster than a limit brakes harder; one that follows late keeps the
+    distance that it then needs; the supervisor handles one that does not follow (`ResponseMonitor`).
     """
 
     def __init__(self, parameters: GateParameters) -> None:
         self._parameters = parameters
         self._last: Setpoint | None = None
         self.response = ResponseMonitor(parameters.reaction_s)
-        """How well, and how late, the drone follows what is sent."""
+        """How well, and how late, the drone follows its setpoints."""
         self.counts: Counter[Objection] = Counter()
         """Objections since the start."""
 
     def step(self, now_s: float, request: Request) -> Verdict:
-        """What may be sent at `now_s`, on the clock of the other times; never raises, whatever the numbers are."""
+        """The setpoint at `now_s`, on the clock of the other times; never raises, whatever the numbers are."""
         last, measured = self._last, request.around.velocity
         if last is not None and now_s - last.time_s > self._parameters.permission_timeout_s:
-            last = None  # too long ago to go on from it
-        if request.permission.action is Action.OFFER:  # whatever flies it: the takeover begins at the drone's own
+            last = None  # too old to continue from
+        if request.permission.action is Action.OFFER:  # the takeover starts at the drone's own velocity
             last = None
         if last is None:
             self.response.restart(measured)
@@ -64,7 +63,7 @@ class Gate:
         return verdict
 
     def _refusal(self, now_s: float, request: Request) -> Objection | None:
-        """Why nothing at all may be sent; None: something may."""
+        """Why no setpoint may be sent; None: one may."""
         p, permission = self._parameters, request.permission
         if permission.action is Action.SILENCE:
             return Objection.NOT_ALLOWED
@@ -75,7 +74,7 @@ class Gate:
         return None
 
     def _limited(self, now_s: float, request: Request, last: Setpoint | None) -> Verdict:
-        """The nearest setpoint to the wanted one, or to standstill, that the limits permit from the last one on."""
+        """The setpoint nearest to the wanted one, or to standstill, that the limits permit after the last one."""
         p, action, wanted, around = self._parameters, request.permission.action, request.wanted, request.around
         height_m = request.height_m if wanted.height_m is None else wanted.height_m
         start = last or self._as_it_flies(now_s, around, height_m)
@@ -83,7 +82,7 @@ class Gate:
         target, yaw_rad, share = np.zeros(2), start.yaw_rad, 0.0
         objections: list[Objection] = []
         if action in _MOVES:
-            age_s = now_s - request.wanted_s  # slower once a newer command is missed, nothing at the time-out
+            age_s = now_s - request.wanted_s  # slower once a newer command is due, zero at the time-out
             share = min((p.command_timeout_s - age_s) / (p.command_timeout_s - p.command_fresh_s), 1.0)
             if wanted.yaw_rad is not None and math.isfinite(wanted.yaw_rad):
                 yaw_rad = wanted.yaw_rad
@@ -108,7 +107,7 @@ class Gate:
         if (seen != velocity).any():
             objections.append(Objection.UNSEEN)
 
-        if action is not Action.OFFER:  # else on the ground, or flown by the pilot: as high as the control loop says
+        if action is not Action.OFFER:  # an offer on the ground, or flown by the pilot, keeps the control loop's height
             most_m = p.max_climb_m_s * elapsed_s * share
             climbed_m = _within(height_m, start.height_m - most_m, start.height_m + most_m)
             height_m = _within(climbed_m, *between_neighbours(p, start.height_m, around.height_m, around.neighbours))
@@ -120,13 +119,13 @@ class Gate:
         return Verdict(Setpoint(now_s, seen, sent_m, yaw_rad), tuple(objections))
 
     def _as_it_flies(self, now_s: float, around: Surroundings, height_m: float) -> Setpoint:
-        """Where there is no last setpoint: the drone's own velocity, height and heading, as far as it knows them."""
+        """The start without a last setpoint: the drone's own velocity, height and heading, as far as they are known."""
         own = around.velocity if np.isfinite(around.velocity).all() else np.zeros(2)
         own_m = around.height_m if math.isfinite(around.height_m) else height_m
         return Setpoint(now_s, limit_norm(own, self._parameters.max_speed_m_s), own_m, around.yaw_rad)
 
     def _faults(self, wanted: Wanted, around: Surroundings) -> list[Objection]:
-        """Why what is wanted may not move the drone at all."""
+        """Why the wanted velocity may not move the drone at all."""
         p, neighbours = self._parameters, np.hstack([around.neighbours, around.neighbour_velocities])
         known = np.isfinite(neighbours).all() and (around.neighbour_margins > -math.inf).all()
         faults = (

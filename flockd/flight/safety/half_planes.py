@@ -11,22 +11,21 @@ _PARALLEL = 1e-6
 """Sine of the angle between two directions below which their limits are not combined."""
 
 Limits = tuple[FloatArray, FloatArray]
-"""Directions (k, 2) of length 1, and how fast the drone may fly along each, (k,) m/s, 0 or more."""
+"""Directions (k, 2) of length 1, and the greatest speed along each, (k,) m/s, 0 or more."""
 NO_LIMITS: Limits = np.empty((0, 2)), np.empty(0)
 
 
 def nearest_within(velocity: FloatArray, directions: FloatArray, limits: FloatArray) -> FloatArray:
-    """The nearest velocity whose part along each direction, (n, 2) of length 1, is within its limit, (n,), 0 or more.
+    """The nearest velocity whose components along directions (n, 2) of length 1 are within limits (n,), 0 or more.
 
-    In the plane that is the velocity itself, or its foot on the line where one limit is reached, or the point where
-    two such lines cross. Standstill always fits, so that the result is never longer than the velocity. A limit that is
-    not a number counts as 0.
+    It is the velocity itself, its foot on the line of one limit, or the crossing of two such lines. Standstill always
+    satisfies all limits, so that the result is never longer than the velocity. A limit of NaN counts as 0.
     """
     limits = np.nan_to_num(limits, nan=0.0, posinf=np.inf)
     over = directions @ velocity - limits
     if (over <= 0).all():
         return velocity
-    binding = ~(limits > np.hypot(*velocity) + ROUNDING_M_S)  # the others hold for all that is no longer
+    binding = ~(limits > np.hypot(*velocity) + ROUNDING_M_S)  # the others hold for any vector that is no longer
     directions, limits, over = directions[binding], limits[binding], over[binding]
     feet = velocity - over[:, None] * directions
     candidates = np.vstack([np.zeros(2), feet, crossings(directions, limits)])
@@ -37,7 +36,7 @@ def nearest_within(velocity: FloatArray, directions: FloatArray, limits: FloatAr
 
 
 def crossings(directions: FloatArray, limits: FloatArray) -> FloatArray:
-    """(m, 2): where two of the lines n . v = limit cross, for each two that are not parallel (Cramer's rule)."""
+    """(m, 2): crossings of the lines n . v = limit, for each two that are not parallel (Cramer's rule)."""
     i, j = np.triu_indices(len(directions), 1)
     a, b = directions[i], directions[j]
     determinants = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -1,4 +1,4 @@
-"""The one table of what flockd does about each event: from faults to reactions."""
+"""The table of all events and reactions."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from flockd.flight.safety.events import Event
 
 
 class Reaction(IntEnum):
-    """What is done in flight; of several the worst wins."""
+    """The reaction in flight; of several the worst applies."""
 
     NOTE = 0
-    """Fly on, and say so."""
+    """Fly on, and report it."""
     DEGRADE = 1
     """Fly on, slower and farther from neighbours."""
     HOVER = 2
-    """Stand still, if it passes soon; then hold."""
+    """Stand still; if the event lasts, hold."""
     HOLD = 3
     """Stand still and ask the autopilot to take over: in Hold, to return home, or to land."""
     RETURN = 4
     LAND = 5
     SILENCE = 6
-    """Send nothing more: the pilot has taken over, or the autopilot's failsafe is to act."""
+    """Send nothing: the pilot has taken over, or the autopilot's failsafe has to act."""
 
 
 class Barrier(IntEnum):
@@ -35,20 +35,20 @@ class Barrier(IntEnum):
     WAIT = 1
     """Not ready while it lasts."""
     LATCH = 2
-    """Not ready any more, before the vehicle was seen disarmed on the ground or an operator asked to resume."""
+    """Not ready until the vehicle was seen disarmed on the ground or an operator asked to resume."""
 
 
 class Action(StrEnum):
     """What the daemon does now."""
 
     SILENCE = "silence"
-    """Send nothing and ask for nothing."""
+    """Send nothing and request nothing."""
     OFFER = "offer"
-    """Send standstill, so that the autopilot lets the pilot switch to offboard; it does not follow it before."""
+    """Send standstill, so that the autopilot lets the pilot switch to offboard; it does not follow it before that."""
     FLY = "fly"
     FLY_DEGRADED = "fly_degraded"
     HOVER = "hover"
-    """Send standstill. So do the three that ask the autopilot for a mode, until it has changed."""
+    """Send standstill. The three actions that request a mode do so too, until it has changed."""
     ASK_HOLD = "ask_hold"
     ASK_RETURN = "ask_return"
     ASK_LAND = "ask_land"
@@ -63,7 +63,7 @@ ASKS: Mapping[Reaction, Action] = {
 
 @dataclass(frozen=True)
 class Rule:
-    """What is done about one event."""
+    """Barrier and reactions of one event."""
 
     barrier: Barrier
     """Before the flight and after it."""
@@ -71,21 +71,21 @@ class Rule:
     """In flight."""
     after_s: float = math.inf
     later: Reaction = Reaction.HOLD
-    """In flight, instead, once it has lasted `after_s`."""
+    """In flight, instead of `reaction`, once the event has lasted `after_s`."""
 
     def reaction_at(self, lasted_s: float) -> Reaction:
-        """What is done in flight about the event when it has lasted this long."""
+        """The reaction in flight to an event that has lasted this long."""
         return self.later if lasted_s >= self.after_s else self.reaction
 
 
 ROOM_S = 30.0
-"""For how long a drone whose velocity is far off its setpoints flies on for room before it asks for Hold."""
+"""Time for which a drone with a large velocity error gains distance before it requests Hold."""
 FOREIGN_S = 0.5
-"""For how long somebody else may interfere before Hold is asked for."""
+"""Time for which another sender may interfere before Hold is requested."""
 
 
 def rules(p: SafetyParameters) -> dict[Event, Rule]:
-    """The rule of every event that can be noticed."""
+    """The rule of every event."""
     on_battery_low = Reaction[p.on_battery_low.upper()]
     on_position_lost = Reaction[p.on_position_lost.upper()]
     alone_s = math.inf if p.alone_s is None else p.alone_s

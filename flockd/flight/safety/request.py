@@ -1,4 +1,4 @@
-"""What the gate is asked, and what it answers."""
+"""Inputs and outputs of the gate."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flockd.flight.safety.policy import Action
 
 @dataclass(frozen=True)
 class Permission:
-    """What the supervisor said, and when."""
+    """A decision of the supervisor, and its time."""
 
     action: Action
     time_s: float
@@ -22,7 +22,7 @@ class Permission:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """Where the drone is, and who is near."""
+    """The drone's state, its neighbours and obstacles."""
 
     position: FloatArray
     """(2,) metres north and east of home."""
@@ -36,13 +36,13 @@ class Surroundings:
     height_m: float
     """Height of the drone, as in `VehicleState`; NaN: not known."""
     obstacles: FloatArray
-    """(m, 2) metres, north and east, relative to the drone: points of obstacles, each the nearest that it may be."""
+    """(m, 2) metres, north and east, relative to the drone: the nearest possible points of obstacles."""
     neighbour_margins: FloatArray
-    """(n, 2) by how much each neighbour may be nearer, m, and come faster, m/s."""
+    """(n, 2) how much nearer, m, and how much faster in approach, m/s, each neighbour may be."""
     neighbour_unseen_s: FloatArray
-    """(n,) how long ago each neighbour was seen last: it may brake since."""
+    """(n,) time since each neighbour was last seen: it may brake since then."""
     seen_m: FloatArray
-    """(SECTORS,) metres: how far cameras looked lately; farther in a sector there may be anybody."""
+    """(SECTORS,) metres: range of sight lately; beyond it there may be a drone."""
 
     @property
     def nearest_obstacle_m(self) -> float:
@@ -52,21 +52,21 @@ class Surroundings:
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """All that the gate judges, as of one tick of the control loop."""
+    """All inputs of the gate, as of one tick of the control loop."""
 
     permission: Permission
     wanted: Wanted
     wanted_s: float
-    """When `wanted` was made, on the permission's clock."""
+    """When `wanted` was computed, on the permission's clock."""
     height_m: float
-    """To hold where `wanted` names no height."""
+    """The height to hold if `wanted` gives none."""
     around: Surroundings
     fastest_m_s: float = math.inf
-    """The speed that the autopilot itself limits setpoints to."""
+    """The autopilot's own speed limit for setpoints."""
 
 
 class Objection(StrEnum):
-    """Why something was not sent as it was asked for. The value is its name in counts."""
+    """Why a setpoint was not sent as requested. The value is its name in counts."""
 
     NOT_ALLOWED = "not_allowed"
     PERMISSION_STALE = "permission_stale"
@@ -88,7 +88,7 @@ class Objection(StrEnum):
 
 @dataclass(frozen=True)
 class Verdict:
-    """What may be sent; None: nothing. And why it is not what was asked for."""
+    """The permitted setpoint, or None, and why it differs from the request."""
 
     setpoint: Setpoint | None
     objections: tuple[Objection, ...]

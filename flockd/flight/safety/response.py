@@ -1,4 +1,4 @@
-"""How well the drone's velocity follows its setpoints, and how late."""
+"""How well, and how late, the drone's velocity follows its setpoints."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import numpy as np
 from flockd.core.messages import FloatArray
 
 _MEMORY_S = 10.0
-"""Of the mean squares: a few gusts."""
+"""Time constant of the mean squares: a few gusts."""
 _FASTEST_M_S = 100.0
-"""A faster measurement is no velocity."""
+"""A faster measurement is not a velocity."""
 _UNSURE_M_S = 0.2
-"""More than PX4's own velocity errs by. Responses whose errors differ by less, squared, explain it alike; so do those
-whose errors are at most twice as large."""
+"""Above the error of PX4's own velocity. Delays whose mean squares differ by less than its square explain the response
+equally well; so do those whose errors are at most twice as large."""
 
 
 class ResponseMonitor:
     """The difference between the measured velocity and the one expected from the setpoints.
 
     Expected is a first-order lag of the setpoints. The error is a root mean square, so that wind, an autopilot that
-    does not follow and one that oscillates all show in it. It says how far the velocity is off, not why.
+    does not follow and one that oscillates all increase it. It measures the deviation, not its cause.
 
-    A delay shows where setpoints change: the same response is compared as of up to four time constants before. The
-    shortest delay that explains the measured velocity nearly as well as the best one is kept for the flight, as a drone
-    that flies straight on tells nothing. Wind and an error of the measured velocity make all of them worse alike.
+    A delay shows when setpoints change: the response is also compared with delays of up to four time constants. The
+    shortest delay that explains the measured velocity nearly as well as the best one is kept for the flight, since
+    straight flight shows no delay. Wind and errors of the measured velocity affect all delays equally.
     """
 
     def __init__(self, response_s: float) -> None:
@@ -35,26 +35,26 @@ class ResponseMonitor:
         self._now_s = 0.0
         self._times_s: FloatArray = np.empty(0)
         self._expected: FloatArray = np.empty((0, 2))
-        """m/s, at `_times_s`, of the last seconds; empty: nothing is expected."""
+        """m/s, at `_times_s`, of the last seconds; empty: none yet."""
         self._mean_squares = np.zeros(len(self._delays_s))
         self.late_s = 0.0
-        """By how much later than expected the vehicle was seen to follow its setpoints."""
+        """Additional delay, beyond the expected one, with which the vehicle was seen to follow its setpoints."""
 
     @property
     def error_m_s(self) -> float:
-        """Root mean square of the difference's norm over the last ten seconds or so."""
+        """Root mean square of the difference's norm over about the last ten seconds."""
         return math.sqrt(self._mean_squares[0])
 
     def restart(self, velocity: FloatArray) -> None:
-        """Begins anew, while something else flies the drone, with its measured `velocity` (2,) m/s."""
+        """Starts anew with the measured `velocity` (2,) m/s, while something else flies the drone."""
         self._expect(velocity)
         self._mean_squares = np.zeros_like(self._mean_squares)
         self.late_s = 0.0
 
     def step(self, velocity: FloatArray, setpoint: FloatArray, elapsed_s: float) -> None:
-        """With the measured `velocity` (2,) m/s, and the `setpoint` (2,) m/s that was flown for the last `elapsed_s`.
+        """Takes the measured `velocity` (2,) m/s, and the `setpoint` (2,) m/s that was flown for the last `elapsed_s`.
 
-        Where a velocity is not known, or no time, what is expected begins anew.
+        If a velocity or the time is not known, the monitor starts anew.
         """
         if not len(self._expected) or not _is_known(velocity) or not elapsed_s >= 0:
             self._expect(velocity)

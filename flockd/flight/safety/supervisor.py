@@ -1,8 +1,8 @@
-"""The supervisor: whether flockd may fly the drone now, and what it does when something is the matter.
+"""The supervisor: whether flockd may fly the drone now, and how it reacts to events.
 
-The ladder goes normal, degraded, hover, ask the autopilot, silence. It is climbed down at once and up only a little:
-a drone once handed over stays so, until it was seen disarmed on the ground or an operator asks to resume. The pilot
-always wins.
+Its levels are normal, degraded, hover, ask the autopilot, silence. It worsens at once and recovers only partly: a drone
+once handed over stays so until it was seen disarmed on the ground or an operator asks to resume. The pilot always has
+priority.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from flockd.flight.safety.policy import ASKS, Action, Barrier, Reaction, rules
 
 
 class State(StrEnum):
-    """Where on the ladder the drone is. The value is its name in telemetry."""
+    """The supervisor's state. The value is its name in telemetry."""
 
     IDLE = "idle"
-    """Not ready. So it starts, in the air too."""
+    """Not ready. The initial state, in the air too."""
     READY = "ready"
     """Waiting for the pilot to switch to offboard."""
     NORMAL = "normal"
@@ -45,52 +45,52 @@ _ACTIONS = {
 
 
 class Reason(NamedTuple):
-    """Something that is the matter, for programs and for people."""
+    """An event, for programs and for people."""
 
     event: Event
     sentence: str
 
 
 class Decision(NamedTuple):
-    """What the supervisor decided."""
+    """The supervisor's decision."""
 
     state: State
     action: Action
     reasons: tuple[Reason, ...]
-    """First why the drone was handed over, if it was; then what is the matter now, the worst first."""
+    """First why the drone was handed over, if it was; then the present events, the worst first."""
 
 
 @dataclass
 class _Flight:
-    """What is remembered of the flight under way."""
+    """State of the current flight."""
 
     unwell_s: float = -math.inf
-    """When the drone last had to be degraded, or worse."""
+    """When the reaction was last DEGRADE or worse."""
     hovered_s: float = 0.0
-    """How long it hovered since it last flew as usual."""
+    """Time hovered since it last flew normally."""
     asked: Reaction = Reaction.NOTE
-    """What the autopilot was asked for."""
+    """The mode requested from the autopilot."""
     asked_s: float = math.inf
 
 
 class Supervisor:
-    """Steps the state machine. Knows no clock: `now_s` is monotonic and never goes back."""
+    """The state machine. It has no clock: `now_s` is monotonic and never decreases."""
 
     def __init__(self, parameters: SafetyParameters) -> None:
         self._parameters = parameters
         self._rules = rules(parameters)
         self._state = State.IDLE
         self._since_s: dict[Event, float] = {}
-        """When each event that is now so began; in flight, not before the flight did."""
+        """When each present event began; in flight, not before the flight began."""
         self._latched: dict[Event, str] = {
             Event.STARTED: "just started; waits to see the vehicle disarmed on the ground"
         }
-        """Why flockd may not fly any more, though all may be well again."""
+        """Why flockd may not fly, even if all events have ended."""
         self._flight = _Flight()
         self._now_s = -math.inf
 
     def step(self, now_s: float, inputs: Inputs) -> Decision:
-        """Takes in how things are at `now_s`; call it at 10 Hz or more."""
+        """Takes the inputs at `now_s`; call it at 10 Hz or more."""
         if self._state is State.HOVER:
             self._flight.hovered_s += now_s - self._now_s
         self._now_s = now_s
@@ -105,7 +105,7 @@ class Supervisor:
         return Decision(self._state, action, self._reasons(noticed))
 
     def _wait(self, noticed: dict[Event, str], released: bool) -> None:
-        """Idle, ready or silent: may it fly, and does the pilot want it to?"""
+        """Idle, ready or silent: may the drone fly, and has the pilot switched to offboard?"""
         if released:
             self._latched = {}
         barriers = {event: self._rules[event].barrier for event in noticed}
@@ -145,7 +145,7 @@ class Supervisor:
             self._flight.hovered_s = 0.0
 
     def _ask(self, wanted: Reaction, noticed: dict[Event, str]) -> None:
-        """Asks the autopilot to take over, for worse when things get worse, and not for long."""
+        """Requests a mode from the autopilot, later perhaps a worse one; silent if it does not comply in time."""
         if wanted > self._flight.asked:
             self._flight.asked, self._flight.asked_s = wanted, self._now_s
             self._hand_over(State.ASKING, noticed)
@@ -154,7 +154,7 @@ class Supervisor:
             self._latched[Event.NO_ANSWER] = "the autopilot did not take over; silence makes it"
 
     def _hand_over(self, state: State, noticed: dict[Event, str]) -> None:
-        """Leaves the flight for good, and remembers why."""
+        """Ends the flight for good, and keeps the reason."""
         self._state = state
         grave = [event for event in noticed if self._reaction(event) >= Reaction.HOVER]
         self._latched |= {event: noticed[event] for event in sorted(grave, key=self._reaction, reverse=True)}

@@ -1,4 +1,4 @@
-"""What the gate is told of the neighbours: every track, confirmed or not, where it may be by now."""
+"""The gate's view of the neighbours: every track, confirmed or not, predicted to now."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from flockd.flight.safety.request import Objection, Surroundings
 
 _NORMAL = NormalDist()
 BEYOND = _NORMAL.cdf(-2.0)
-"""Probability that a neighbour is nearer, or comes faster, than it counts: 2.3 %, as two standard deviations."""
+"""Probability that a neighbour is nearer, or approaches faster, than it counts: 2.3 %, as two standard deviations."""
 
 
 def surroundings(
@@ -34,13 +34,12 @@ def surroundings(
 ) -> Surroundings:
     """The surroundings `age_s` after the step that gave the `neighbours`, which fly on at constant velocity.
 
-    A neighbour that would have flown through the drone since then counts as where it was: such drones brake before each
-    other, and a neighbour that has really passed is seen behind in the next step.
-
-    Caution comes before confirmation: a track limits the speed towards it from its first detection on, by its
-    uncertainty. One that may move in several ways counts once for each, see `_credible`. `moved` (3,) m NED is how far
-    the drone itself flew since then; `position` (2,) m from home, `velocity` (3,) m/s NED, NaN where not known;
-    `obstacles` (m, 2) m from where the drone was then, as is `seen_m` (SECTORS,); None: nobody says how far was seen.
+    A neighbour that would have flown through the drone since then counts as where it was: such drones brake for each
+    other, and one that has really passed is seen behind in the next step. Unconfirmed tracks count: a track limits the
+    speed towards it from its first detection on, by its uncertainty. Each of its possible motions counts once, see
+    `_credible`. `moved` (3,) m NED is the drone's displacement since then; `position` (2,) m from home, `velocity` (3,)
+    m/s NED, NaN if not known; `obstacles` (m, 2) m from where the drone was then, and `seen_m` (SECTORS,); None: the
+    range of sight is not known.
     """
     places, velocities, margins, unseen_s = _motions(neighbours, age_s, moved)
     return Surroundings(
@@ -58,9 +57,9 @@ def surroundings(
 
 
 def limits_towards(neighbours: Sequence[Neighbour], p: GateParameters) -> Limits:
-    """Directions (k, 2) and how fast, (k,) m/s, the gate lets the drone fly there, as the step ends.
+    """Directions (k, 2) to neighbours, and the greatest speed, (k,) m/s, that the gate permits there as the step ends.
 
-    For a pilot that is not to ask for what cannot be flown.
+    For a pilot, so that it does not command what the gate refuses.
     """
     places, velocities, margins, unseen_s = _motions(neighbours, 0.0, np.zeros(3))
     return towards_neighbours(p, places, velocities, p.min_separation_m, margins, unseen_s)
@@ -69,11 +68,11 @@ def limits_towards(neighbours: Sequence[Neighbour], p: GateParameters) -> Limits
 def limits_around(
     p: GateParameters, around: Surroundings, separation_m: float, late_s: float
 ) -> tuple[FloatArray, FloatArray, list[Objection]]:
-    """Directions (n, 2), how fast to fly there, (n,) m/s, and what is there: the fence, a neighbour or an obstacle.
+    """Directions (n, 2), greatest speeds there, (n,) m/s, and what is there: the fence, a neighbour or an obstacle.
 
-    For a vehicle that follows `late_s` later than expected. A drone that is measured to be faster than a limit has to
-    brake: the limit counts as lower by as much. That feeds the velocity back with a gain of one, which no lag and no
-    dead time make unstable.
+    For a vehicle that follows `late_s` later than expected. A drone measured to be faster than a limit has to brake:
+    the limit is lowered by the excess. That is feedback of the velocity with a gain of one, which is stable with any
+    lag and dead time.
     """
     later = {"reaction_s": p.reaction_s + late_s, "neighbour_reaction_s": p.neighbour_reaction_s + late_s}
     p = p.model_copy(update=later)
@@ -95,9 +94,9 @@ def limits_around(
 def into_the_unseen(
     p: GateParameters, around: Surroundings, separation_m: float, late_s: float, velocity: FloatArray
 ) -> float:
-    """How fast, m/s, to fly the way of `velocity` (2,) so as to stop before somebody where no camera looked.
+    """The greatest speed, m/s, in the direction of `velocity` (2,) from which the drone stops before unseen space.
 
-    A neighbour reaches into the sectors beside its own. From what is too near already, the drone flies anywhere.
+    A neighbour extends into the sectors beside its own. A drone that is too near already may fly in any direction.
     """
     nearest_m = np.linalg.norm(around.neighbours, axis=1).min(initial=math.inf)
     if nearest_m < separation_m or around.nearest_obstacle_m < p.obstacle_clearance_m:
@@ -110,9 +109,8 @@ def into_the_unseen(
 def _motions(
     neighbours: Sequence[Neighbour], age_s: float, moved: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Of all motions that neighbours may have by now: places (k, 3) m, velocities (k, 2) m/s, margins (k, 2), and how
-    long ago each was last seen, (k,) s.
-    """
+    """All possible motions of neighbours by now: places (k, 3) m, velocities (k, 2) m/s, margins (k, 2), and the time
+    since each was last seen, (k,) s."""
     found = [(motion, age_s + one.unseen_s) for one in neighbours for motion in _credible(one)]
     motions = [motion for motion, _ in found]
     k = len(motions)
@@ -125,11 +123,12 @@ def _motions(
 
 
 def _credible(neighbour: Neighbour) -> Iterator[tuple[PossibleMotion, float]]:
-    """The motions that a neighbour may have, and by how many standard deviations each may be wrong.
+    """The possible motions of a neighbour, and by how many standard deviations each may be wrong.
 
     `BEYOND` is shared among the motions: the less probable a motion, the fewer standard deviations count, and a motion
     less probable than its share does not count. By Boole's inequality the neighbour is beyond all of them with a
-    probability of `BEYOND` at most. A single detection is about as likely false: it slows the drone, but not to a stop.
+    probability of at most `BEYOND`. A single detection is about as likely false: it slows the drone, but does not stop
+    it.
     """
     possible = neighbour.possible or (
         PossibleMotion(
@@ -144,6 +143,7 @@ def _credible(neighbour: Neighbour) -> Iterator[tuple[PossibleMotion, float]]:
 
 
 def _by_now(place: FloatArray, way: FloatArray, moved: FloatArray) -> FloatArray:
-    """(3,) m from the drone, which moved: a neighbour that was at `place` and flew `way` on, or else braked."""
+    """(3,) m from the drone, which moved: a neighbour that was at `place` and flew `way`; at `place` if `way` leads
+    through the drone."""
     flown, braked = place + way - moved, place - moved
     return braked if flown[:2] @ braked[:2] <= 0 else flown

@@ -1,4 +1,4 @@
-"""Neighbours over time: which detection is of which drone, where it is now, how it moves and whether it exists."""
+"""Tracking of neighbours: association of detections, position, velocity and probability of existence."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which measurement is of which track: gate and optimal assignment in log-polar coordinates and size."""
+"""Association of measurements with tracks: gate and optimal assignment in log-polar coordinates and size."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from scipy.optimize import linear_sum_assignment
 from flockd.core.messages import FloatArray
 
 _NO_PAIR = -1e9
-"""The cost of a measurement far from every track. Any number will do, because it has no other choice."""
+"""The cost of a measurement beyond every track's gate. Any number will do, because it has no other choice."""
 
 
 def assign(squared_distances: FloatArray, log_likelihoods: FloatArray, gate_sigma: float) -> dict[int, int]:

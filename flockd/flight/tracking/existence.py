@@ -20,7 +20,7 @@ def missed(probability: float, in_view: float, weight: float, parameters: Tracki
 
 
 def detected(probability: float, log_likelihood: float, weight: float, parameters: TrackingParameters) -> float:
-    """After a detection that was assigned to the track: its density as a track's against that of clutter."""
+    """After a detection was assigned to the track: ``log_likelihood`` is compared with the density of clutter."""
     chance = parameters.detection_probability
     log_ratio = np.logaddexp(math.log(1.0 - chance), math.log(chance / parameters.clutter_density) + log_likelihood)
     return _bayes(probability, weight * float(log_ratio))
@@ -29,10 +29,10 @@ def detected(probability: float, log_likelihood: float, weight: float, parameter
 def averaged(
     drone_probability: float, measured: float, hits: int, interval_s: float, parameters: TrackingParameters
 ) -> float:
-    """The network's probability of a drone, averaged over a track's `hits` detections up to `measured`.
+    """The network's probability of a drone, averaged over the track's `hits` detections; `measured` is the newest.
 
-    A network that is mistaken stays so from frame to frame: its probabilities are not independent, and Bayes' rule
-    would turn them into certainty. The memory is exponential in time.
+    A wrong network stays wrong from frame to frame: its probabilities are not independent, and Bayes' rule would turn
+    them into certainty. The memory is exponential in time.
     """
     share = max(1.0 / hits, 1.0 - math.exp(-interval_s / parameters.drone_probability_memory_s))
     return drone_probability + share * (measured - drone_probability)

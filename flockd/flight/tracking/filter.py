@@ -1,9 +1,10 @@
 """The Kalman filter of many states at once: update in log-polar coordinates and size.
 
-Errors of ranges last from frame to frame, so that many near in time tell little more than one. The state has the
-lasting error beside the motion (coloured measurement noise: A. Bryson, L. Henrikson, "Estimation using sampled data
-containing sequentially correlated noise", Journal of Spacecraft and Rockets 5(6), 1968), in standard deviations of the
-newest detection's log range: a first-order Gauss-Markov process with the time constant `range_error_time_s`.
+Range errors persist from frame to frame, so many measurements within a short time tell little more than one. The state
+holds the persistent error besides the motion (coloured measurement noise: A. Bryson, L. Henrikson, "Estimation using
+sampled data containing sequentially correlated noise", Journal of Spacecraft and Rockets 5(6), 1968), in standard
+deviations of the newest detection's log range: a first-order Gauss-Markov process with the time constant
+`range_error_time_s`.
 """
 
 from __future__ import annotations
@@ -20,36 +21,35 @@ from flockd.flight.geometry import log_polar_residual
 from flockd.flight.tracking.measurement import Measurement
 
 SIZE = 8
-"""Of a state: position relative to the own drone (3, metres) and velocity over ground (3, m/s), NED, the natural
-logarithm of the size in metres, and the lasting error of log ranges, in standard deviations."""
+"""Elements of a state: position relative to the own drone (3, metres) and velocity over ground (3, m/s), NED, natural
+logarithm of the size in metres, and the persistent error of log ranges in standard deviations."""
 _LINEARISATIONS = 3
 """Linearisations of the iterated update (B. Bell, F. Cathey, IEEE Transactions on Automatic Control 38(2), 1993)."""
 MIN_RANGE_M = 0.01
-"""A predicted position nearer than this, inside the drone itself, has no bearing."""
+"""Shortest range of a predicted position; nearer, inside the drone itself, it has no bearing."""
 
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """Measurements as arrays of one shape (...), for states of a shape that it broadcasts with."""
+    """Measurements as arrays of shape (...), which broadcasts with the shape of the states."""
 
     bearing: FloatArray
     """(..., 3)"""
     log_range: FloatArray
     log_size: FloatArray
     lasting: FloatArray
-    """Standard deviation of what of a log range's error lasts, ..."""
+    """Standard deviation of the persistent part of a log range's error."""
     lasting_size: FloatArray
-    """... and of what goes with it in the log size."""
+    """Standard deviation of the log size's error that goes with it."""
     noise: FloatArray
-    """(..., 4, 4) covariance of what is new in log-polar coordinates and log size.
-
-    A range is a size over an apparent size, so the two err together: by as much, with `size_correlation`. The error of
-    the judged size (`Detection.log_size_sigma`) is no part of it, because it lasts. A filter that took it for noise
-    would derive the range from the neighbour's motion, which does not show it in a flock (`pilot.size_learner`)."""
+    """(..., 4, 4) covariance of the independent part of the error, in log-polar coordinates and log size. A range is a
+    size over an apparent size, so both err together, with correlation `size_correlation`. The error of the size itself
+    (`Detection.log_size_sigma`) is left out because it persists. A filter that took it for noise would derive the range
+    from the neighbour's motion, which does not show it in a flock (`pilot.size_learner`)."""
 
     @classmethod
     def of(cls, measurements: Sequence[Measurement], parameters: TrackingParameters) -> Measurements:
-        """(n, 1): each for all motions of a track."""
+        """(n, 1): each measurement is compared with all motions of a track."""
         count, correlation = len(measurements), parameters.size_correlation
         bearing = np.array([m.bearing for m in measurements]).reshape(count, 3)
         variance = np.array([m.log_range_variance for m in measurements])
@@ -65,20 +65,19 @@ class Measurements:
         return cls(*(a[:, None] for a in (bearing, log_range, log_size, sigma, correlation * sigma, noise)))
 
     def __getitem__(self, index: Sequence[int] | tuple[slice | int | None, ...]) -> Measurements:
-        """Some of them, or all with another shape."""
+        """Some of the measurements, or all in another shape."""
         fields = (self.bearing, self.log_range, self.log_size, self.lasting, self.lasting_size, self.noise)
         return Measurements(*(a[index] for a in fields))
 
 
 @dataclass(frozen=True, eq=False)
 class Innovations:
-    """How far measurements are from where states predict them, in log-polar coordinates and log size."""
+    """Differences between measurements and their predictions, in log-polar coordinates and log size."""
 
     residual: FloatArray
-    """(..., 4) as of `flockd.flight.geometry.log_polar_residual`, from the prediction to the measurement, and of the
-    log size."""
+    """(..., 4) measured minus predicted, as `flockd.flight.geometry.log_polar_residual`, and of the log size."""
     covariance: FloatArray
-    """(..., 4, 4) of the residual, the prediction's and the measurement's together."""
+    """(..., 4, 4) of the residual: sum of the prediction's and the measurement's covariance."""
     squared_distance: FloatArray
     """(...) the squared Mahalanobis distance."""
 
@@ -93,8 +92,8 @@ class Innovations:
 def initial(
     measurement: Measurement, velocities: FloatArray, covariances: FloatArray, parameters: TrackingParameters
 ) -> tuple[FloatArray, FloatArray]:
-    """Means (m, 8) and covariances (m, 8, 8) after a first detection of a drone that flies at one of `velocities`
-    (m, 3) m/s, uncertain by their `covariances` (m, 3, 3)."""
+    """Means (m, 8) and covariances (m, 8, 8) after the first detection of a drone, for m hypotheses of its velocity:
+    `velocities` (m, 3) m/s with `covariances` (m, 3, 3)."""
     measured = Measurements.of([measurement], parameters)
     of_place = np.zeros((SIZE, 5))
     of_place[:3, :3], of_place[6, 3], of_place[7, 4] = measurement.range_m * np.eye(3), 1.0, 1.0
@@ -110,7 +109,7 @@ def initial(
 
 
 def innovations(mean: FloatArray, covariance: FloatArray, measured: Measurements) -> Innovations:
-    """Of measurements against predicted states (..., 8) with covariances (..., 8, 8)."""
+    """Measurements against predicted states (..., 8) with covariances (..., 8, 8)."""
     residual, derivative = _linearised(mean, measured)
     spread = derivative @ covariance @ derivative.swapaxes(-1, -2) + measured.noise
     squared = (residual * np.linalg.solve(spread, residual[..., None])[..., 0]).sum(axis=-1)
@@ -118,7 +117,7 @@ def innovations(mean: FloatArray, covariance: FloatArray, measured: Measurements
 
 
 def squared_distances_but_range(mean: FloatArray, covariance: FloatArray, measured: Measurements) -> FloatArray:
-    """(n,) squared Mahalanobis distances of a measurement, (1,), from states (n, 8), by bearing and size alone."""
+    """(n,) squared Mahalanobis distances of one measurement, (1,), from states (n, 8), in bearing and size only."""
     found = innovations(mean, covariance, measured)
     others = np.zeros((len(mean), 3, 4))
     others[:, :2, :3] = np.linalg.svd(mean[:, None, :3])[2][:, 1:]  # across the line of sight
@@ -135,8 +134,8 @@ def update(
     update in log-polar coordinates.
 
     The first linearisation is at the measurement: at a vague prediction, e.g. of a new track, the update would
-    overshoot. An innovation of d > `robust_sigma` standard deviations has its
-    covariance enlarged by (d / robust_sigma)^2: the farther off, the less it moves the state.
+    overshoot. The covariance of an innovation of d > `robust_sigma` standard deviations is enlarged by (d /
+    robust_sigma)^2: outliers move the state less.
     """
     predicted = innovations(mean, covariance, measured)
     excess = np.maximum(1.0, predicted.squared_distance / parameters.robust_sigma**2)

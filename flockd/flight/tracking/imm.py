@@ -1,9 +1,9 @@
-"""How neighbours move: a few motions that interact, none of which is ever given up (IMM).
+"""How neighbours move: three motions that interact (IMM), none of which is ever discarded.
 
 H. Blom, Y. Bar-Shalom, "The interacting multiple model algorithm for systems with Markovian switching coefficients",
-IEEE Transactions on Automatic Control 33(8), 1988. A neighbour flies as the own drone does, or on a course of its own,
-or brakes to standstill. It may begin with another at any time; each motion has a filter of its own, which begins anew
-with what the others know, and detections weigh them by Bayes' rule.
+IEEE Transactions on Automatic Control 33(8), 1988. A neighbour flies as the own drone does, flies a course of its own,
+or brakes to standstill. It may switch at any time. Each motion has its own filter, which is mixed with the others'
+states before a prediction; detections weigh the motions by Bayes' rule.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from flockd.flight.tracking.filter import Measurements
 from flockd.flight.tracking.measurement import Measurement
 
 _LASTS_S = 20.0
-"""How long a neighbour flies in one of the ways, on average, before another may begin."""
+"""Mean time in s between switches of a neighbour's motion."""
 _HARDER = 2.0
-"""By how much harder one manoeuvres that is on its own course: its accelerations, standard deviation."""
+"""Factor on the acceleration's standard deviation of a neighbour on its own course."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """What is known of n neighbours, by the m motions that each may have: as I fly, its own course, brakes."""
+    """States of n neighbours, each with m possible motions: flies as the own drone does, its own course, brakes."""
 
     probability: FloatArray
-    """(n, m) of each motion, by neighbour adding up to 1."""
+    """(n, m) probability of each motion; each row adds up to 1."""
     mean: FloatArray
     """(n, m, 8) states, see `filter`."""
     covariance: FloatArray
@@ -42,13 +42,13 @@ class Mixture:
         return Mixture(self.probability[index], self.mean[index], self.covariance[index])
 
     def replaced(self, index: Sequence[int], by: Mixture) -> Mixture:
-        """With some of the neighbours as they are in another."""
+        """A copy in which the neighbours at `index` are those of another mixture."""
         probability, mean, covariance = self.probability.copy(), self.mean.copy(), self.covariance.copy()
         probability[index], mean[index], covariance[index] = by.probability, by.mean, by.covariance
         return Mixture(probability, mean, covariance)
 
     def __add__(self, other: Mixture) -> Mixture:
-        """These neighbours and others."""
+        """These neighbours followed by others."""
         return Mixture(
             np.concatenate([self.probability, other.probability]),
             np.concatenate([self.mean, other.mean]),
@@ -57,13 +57,13 @@ class Mixture:
 
     @property
     def together(self) -> Mixture:
-        """Mean and covariance of all motions of each, as one."""
+        """Mean and covariance of each neighbour over all its motions, as a mixture of one motion."""
         mean, covariance = _mixed(self.probability[:, :, None], self.mean, self.covariance)
         return Mixture(np.ones((len(mean), 1)), mean, covariance)
 
     def innovations(self, measured: Measurements) -> tuple[FloatArray, FloatArray]:
-        """Squared Mahalanobis distances (k, n) of k measurements from n neighbours, each by the motion that explains it
-        best, and the logarithms of the densities, times the motion's probability."""
+        """Squared Mahalanobis distances (k, n) of k measurements from n neighbours, by the motion that explains each
+        best, and logarithms of the densities times that motion's probability."""
         found = filter.innovations(self.mean, self.covariance, measured[:, None])
         prior = np.log(self.probability)
         likelihood = found.log_likelihood + prior
@@ -74,7 +74,7 @@ class Mixture:
         )
 
     def possible(self) -> list[tuple[PossibleMotion, ...]]:
-        """The motions of each as the gate reckons with them, the likeliest first."""
+        """The motions of each neighbour for the gate, the likeliest first."""
         places = self.mean[..., :3]
         bearings = places / np.maximum(np.sqrt((places**2).sum(axis=-1, keepdims=True)), filter.MIN_RANGE_M)
         blocks = self.covariance[..., :3, :3], self.covariance[..., 3:6, 3:6]
@@ -92,16 +92,16 @@ class Mixture:
 
 
 def nobody() -> Mixture:
-    """Of no neighbour."""
+    """A mixture of no neighbours."""
     return Mixture(np.empty((0, 3)), np.empty((0, 3, filter.SIZE)), np.empty((0, 3, filter.SIZE, filter.SIZE)))
 
 
 def first(measurement: Measurement, own_velocity: FloatArray | None, parameters: TrackingParameters) -> Mixture:
-    """After a first detection. `own_velocity` (3,) NED m/s; None: no drone is known to fly with this one.
+    """The mixture after a first detection. `own_velocity` (3,) NED m/s; None: not known.
 
-    A drone on a collision course has a constant bearing, as a mate has. Only the range tells them apart, by its rate
-    over itself: the inverse of the time to contact (D. Lee, "A theory of visual control of braking based on
-    information about time-to-collision", Perception 5, 1976). So the own course begins as a collision course.
+    A drone on a collision course has a constant bearing, as a flock mate has. Only the range tells them apart: its
+    relative rate is the inverse of the time to contact (D. Lee, "A theory of visual control of braking based on
+    information about time-to-collision", Perception 5, 1976). So the motion "own course" starts as a collision course.
     """
     p = parameters
     unknown, alike = p.speed_sigma_m_s**2 * np.eye(3), p.relative_speed_sigma_m_s**2 * np.eye(3)
@@ -123,11 +123,11 @@ def predicted(
     parameters: TrackingParameters,
     braking_m_s2: float,
 ) -> Mixture:
-    """`interval_s` later: motions mixed, and each with white acceleration noise.
+    """The mixture `interval_s` later: motions are mixed, then predicted with white acceleration noise.
 
-    `own_displacement` (3,) NED metres is the way the own drone went meanwhile, with its standard deviation an axis.
-    None: not known; the neighbour then stays where it is relative to the own drone, as flock mates move alike. Its log
-    size drifts by `size_drift`. One that brakes does so by `braking_m_s2`.
+    `own_displacement` (3,) NED metres is the own drone's displacement meanwhile, with its standard deviation on each
+    axis. None: not known; the neighbour then keeps its place relative to the own drone, as flock mates move alike. Its
+    log size drifts by `size_drift`. A braking neighbour decelerates by `braking_m_s2`.
     """
     p, dt = parameters, interval_s
     probability, mean, covariance = _interacted(mixture, dt, p)
@@ -137,7 +137,7 @@ def predicted(
         way_s, displacement, sigma_m = 0.0 * way_s, np.zeros(3), p.relative_speed_sigma_m_s * math.sqrt(dt)
     else:
         target[0], displacement, sigma_m = own_displacement / dt, own_displacement, own_displacement_sigma_m
-        alike_s = 2 * p.relative_speed_sigma_m_s**2 / density[0]  # of velocities that differ by as much in the end
+        alike_s = 2 * p.relative_speed_sigma_m_s**2 / density[0]  # a mate's velocity differs by as much in the end
         kept[:, 0] = math.exp(-dt / alike_s)
         way_s[:, 0] = alike_s * (1.0 - kept[:, 0])
         squared_speed = (mean[:, 2, 3:6] ** 2).sum(axis=-1) + np.einsum("nxx->n", covariance[:, 2, 3:6, 3:6])
@@ -164,7 +164,7 @@ def predicted(
 
 
 def updated(mixture: Mixture, measured: Measurements, parameters: TrackingParameters) -> Mixture:
-    """After a detection of each of them."""
+    """The mixture after a detection of each neighbour."""
     mean, covariance, log_likelihood = filter.update(mixture.mean, mixture.covariance, measured, parameters)
     logs = log_likelihood + np.log(mixture.probability)
     weights = np.exp(logs - logs.max(axis=-1, keepdims=True)) + 1e-12
@@ -172,9 +172,9 @@ def updated(mixture: Mixture, measured: Measurements, parameters: TrackingParame
 
 
 def resized(mixture: Mixture, size_m: float, own_velocity: FloatArray | None) -> Mixture:
-    """Rescales all neighbours to this size: with its apparent size each is nearer or farther by the same factor.
+    """Rescales all neighbours to this size: at the same apparent size each is nearer or farther by the same factor.
 
-    Its velocity relative to the own one, (3,) NED m/s, scales too; None: that is not known, and its velocity stays.
+    The velocity relative to `own_velocity`, (3,) NED m/s, is scaled too; None: not known, and velocities stay.
     """
     scale, mean = np.ones(mixture.mean.shape), mixture.mean
     scale[..., :6] = (size_m / np.exp(mean[..., 6]))[..., None]
@@ -189,16 +189,16 @@ def resized(mixture: Mixture, size_m: float, own_velocity: FloatArray | None) ->
 
 
 def _probabilities(stranger: float) -> FloatArray:
-    """(3,) of the motions, where that of no mate is known."""
+    """(3,) of the motions, given the probability that a new neighbour is not a flock mate."""
     return np.array([1.0 - stranger, stranger / 2, stranger / 2])
 
 
 def _interacted(
     mixture: Mixture, interval_s: float, p: TrackingParameters
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Probabilities, means and covariances before motions that begin within the interval, as likely as at first sight.
+    """Probabilities, means and covariances after switches within the interval, to motions as likely as at first sight.
 
-    The Markov chain forgets with one time constant, so that two intervals give what one as long as both gives.
+    The Markov chain has one time constant, so two short intervals give the same as one long interval.
     """
     keep = math.exp(-interval_s / _LASTS_S)
     transition = keep * np.eye(3) + (1.0 - keep) * _probabilities(p.stranger_probability)

@@ -1,4 +1,4 @@
-"""One detection in the axes the tracker works in."""
+"""One detection in the coordinates of the tracker."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Measurement:
     log_range: float
     """Natural logarithm of the range in metres."""
     covariance: FloatArray
-    """(3, 3) of what `flockd.flight.geometry.log_polar_residual` measures, in NED axes: along the bearing the variance
-    of the log range, across it that of the angle, rad^2."""
+    """(3, 3) of the residual of `flockd.flight.geometry.log_polar_residual`, in NED axes: along the bearing the
+    variance of the log range, across it that of the angle, rad^2."""
     size_m: float
     """As of `Detection.size_m`."""
     drone_probability: float = 1.0
@@ -34,7 +34,7 @@ class Measurement:
     """As of `Detection`."""
 
     def __post_init__(self) -> None:
-        if not abs(float(np.linalg.norm(self.bearing)) - 1.0) < 1e-6:  # a NaN fails too
+        if not abs(float(np.linalg.norm(self.bearing)) - 1.0) < 1e-6:  # NaN fails too
             raise ValueError("a measured bearing must be a unit vector")
         if not math.isfinite(self.log_range):
             raise ValueError("a measured log range must be finite")
@@ -49,7 +49,7 @@ class Measurement:
 
     @classmethod
     def of(cls, detection: Detection, R_ned_body: FloatArray) -> Self:
-        """A detection, turned by the attitude (3, 3) from body into NED axes."""
+        """A detection, rotated by the attitude (3, 3) from body into NED axes."""
         return cls(
             bearing=R_ned_body @ detection.bearing,
             log_range=detection.log_range,
@@ -69,7 +69,7 @@ class Measurement:
         size_m: float,
         drone_probability: float = 1.0,
     ) -> Self:
-        """A position (3,) in metres, NED, own drone at the origin, whose range and bearing err independently.
+        """A position (3,) in metres, NED, own drone at the origin, with independent errors of range and bearing.
 
         `bearing_sigma_rad` is the standard deviation across the line of sight, in each direction. Raises ValueError for
         the origin too.
@@ -80,7 +80,7 @@ class Measurement:
 
     @property
     def range_m(self) -> float:
-        """From the own drone."""
+        """Range from the own drone."""
         return math.exp(self.log_range)
 
     @property

@@ -1,4 +1,4 @@
-"""The tracker: neighbours followed from frame set to frame set, each with a probability of existing."""
+"""The tracker: follows neighbours from frame set to frame set, each with a probability of existing."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from flockd.flight.tracking.filter import Measurements
 from flockd.flight.tracking.measurement import Measurement
 
 _OF_USUAL = 0.02
-"""The share of one detection in what is usual: that of the last fifty."""
+"""Weight of one detection in the usual range sigma: it averages over about fifty."""
 _UNSEEN_SHARE = 0.1
-"""A neighbour that was followed for long is searched for longer than `max_unseen_s`: for this share of that time, if it
-is likely to exist. Otherwise its next detection, often a vague one, would start a stranger."""
+"""A track that is likely to exist is kept unseen for `max_unseen_s`, or for this share of its age if that is longer.
+Otherwise its next detection, often a vague one, would start a new track."""
 _SUREST = 0.01
-"""No standard deviation of a log range counts as smaller, or a network that is too sure of one neighbour would keep
-others from being confirmed."""
+"""Least standard deviation of a log range: with a smaller one, a network that is too certain of one neighbour would
+keep others from being confirmed."""
 
 Shown = Callable[[FloatArray, float], BoolArray]
-"""Tells around which (n,) of the positions (n, 3), metres NED from the own drone, a camera shows all within a radius in
-metres at this time."""
+"""(positions (n, 3) in metres NED from the own drone, radius in metres) -> (n,) whether a camera now shows the whole
+sphere around each position."""
 _SIGMA_POINTS = math.sqrt(3) * np.concatenate([np.eye(3), -np.eye(3)])
-"""(6, 3) points that stand for three independent standard normal numbers (S. Julier, J. Uhlmann, "Unscented filtering
-and nonlinear estimation", 2004), all of one weight."""
+"""(6, 3) sigma points of equal weight for three independent standard normal numbers (S. Julier, J. Uhlmann, "Unscented
+filtering and nonlinear estimation", 2004)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Where a confirmed neighbour should be detected next."""
+    """Where a confirmed neighbour is expected next."""
 
     position: FloatArray
     """(3,) metres, NED, own drone at the origin."""
@@ -47,29 +47,29 @@ class Prediction:
 class Tracker:
     """Follows neighbours in level axes that point north, east and down, with the own drone at the origin.
 
-    Every step: `predict`, then `update`, with no measurements too; then `neighbours`. Deterministic.
+    In each step call `predict`, then `update`, even without measurements, then `neighbours`. Deterministic.
     """
 
     def __init__(self, parameters: TrackingParameters | None = None, gate: GateParameters | None = None) -> None:
-        """A neighbour that brakes does so as hard as its gate lets it, which is like the own drone's `gate`."""
+        """`gate`: the own drone's; a neighbour is expected to brake as hard as its limit allows."""
         self.parameters = parameters or TrackingParameters()
         self._braking_m_s2 = (gate or GateParameters()).max_acceleration_m_s2
         self._tracks: list[_Track] = []
         self._motions = imm.nobody()
-        """Of the tracks, in their order."""
+        """The states of the tracks, in their order."""
         self._usual_log_sigma: float | None = None
-        """Logarithm of the standard deviation of a confirmed neighbour's log range, as detected."""
+        """Logarithm of the usual standard deviation of a confirmed neighbour's log range, as detected."""
         self._time_s = 0.0
         self._created = 0
 
     def predict(
         self, interval_s: float, own_displacement: FloatArray | None, own_displacement_sigma_m: float = 0.0
     ) -> None:
-        """Move all tracks on by `interval_s`.
+        """Predicts all tracks `interval_s` ahead.
 
-        `own_displacement` (3,) NED metres is the way the own drone went meanwhile, with its standard deviation an axis.
-        None: not known; the tracks then stay where they are relative to the own drone, as flock mates move alike, and
-        grow uncertain by `relative_speed_sigma_m_s`.
+        `own_displacement` (3,) NED metres is the own drone's displacement meanwhile, with its standard deviation on
+        each axis. None: not known; the tracks then keep their places relative to the own drone, as flock mates move
+        alike, and their uncertainty grows by `relative_speed_sigma_m_s`.
         """
         self._motions = imm.predicted(
             self._motions, interval_s, own_displacement, own_displacement_sigma_m, self.parameters, self._braking_m_s2
@@ -84,12 +84,12 @@ class Tracker:
         own_velocity: FloatArray | None = None,
         shown: Shown | None = None,
     ) -> tuple[int, ...]:
-        """Take in one frame set's measurements at `time_s`; the track number of each, new where it fits no track.
+        """Takes one frame set's measurements at `time_s`. Returns each one's track number, new if it fits no track.
 
-        `own_velocity` (3,) NED m/s is what flock mates start with, as they move alike (`imm.first`). `shown` (None:
-        everything is) is what the cameras could see. A confirmed neighbour that leaves their view stays as probable
-        and does not age, except for the share of its possible places that they see: it is remembered until it should
-        have come into view again.
+        `own_velocity` (3,) NED m/s is the velocity that new tracks start with, as flock mates move alike (`imm.first`).
+        `shown` tells what the cameras can see (None: everything). A confirmed neighbour that leaves their view keeps
+        its probability, except for the share of its possible positions that they see: it is kept until it should have
+        come into view again.
         """
         interval_s = max(0.0, time_s - self._time_s)
         weight = min(1.0, interval_s / (self.parameters.evidence_interval_s - JITTER_S))
@@ -124,9 +124,9 @@ class Tracker:
         return tuple(numbers)
 
     def predictions(self, interval_s: float, own_velocity: FloatArray | None) -> tuple[Prediction, ...]:
-        """Where the tracks that were ever confirmed should be after `interval_s`, at constant velocities.
+        """Expected positions of all tracks that were ever confirmed, after `interval_s`, at constant velocities.
 
-        `own_velocity` (3,) NED m/s; None: all stay where they are relative to the own drone. Changes nothing.
+        `own_velocity` (3,) NED m/s; None: all keep their places relative to the own drone. Changes no track.
         """
         displacement = None if own_velocity is None else interval_s * own_velocity
         known = [index for index, track in enumerate(self._tracks) if track.was_confirmed]
@@ -137,14 +137,14 @@ class Tracker:
         )
 
     def resize(self, size_m: float, own_velocity: FloatArray | None) -> None:
-        """The neighbours are found to be `size_m` large, from tip to tip, and so much nearer or farther.
+        """Rescales all neighbours to `size_m`, from tip to tip, and their ranges by the same factor.
 
         `own_velocity` (3,) NED m/s; None: not known.
         """
         self._motions = imm.resized(self._motions, size_m, own_velocity)
 
     def forget(self) -> None:
-        """Nothing is known of anybody any more."""
+        """Deletes all tracks."""
         self._tracks, self._motions = [], imm.nobody()
 
     def neighbours(self) -> tuple[Neighbour, ...]:
@@ -170,13 +170,13 @@ class Tracker:
         )
 
     def _survives(self, track: _Track, interval_s: float) -> float:
-        """Its existence, later: one that was never confirmed is soon forgotten where no camera looks."""
+        """Probability of existence after `interval_s`: a track that was never confirmed decays faster."""
         p = self.parameters
         lasts_s = p.survival_time_s if track.was_confirmed else p.drone_probability_memory_s
         return track.existence * math.exp(-interval_s / lasts_s)
 
     def _position_sigma_m(self, mean: FloatArray, covariance: FloatArray) -> float:
-        """An axis, with what the heading turns it by."""
+        """Standard deviation of the position, each axis, with the share of the heading's error."""
         variance = covariance[:3, :3].trace() + (self.parameters.heading_sigma_rad * math.hypot(*mean[:2])) ** 2
         return math.sqrt(variance / 3)
 
@@ -204,22 +204,22 @@ class Tracker:
         track.last_seen_s, track.missing_s = self._time_s, 0.0
 
     def _share(self, measurement: Measurement) -> float:
-        """As how much of a detection one counts."""
+        """The evidence of one detection, 0 to 1: vague ranges count less."""
         if self._usual_log_sigma is None:
             return 1.0
         return min(1.0, self.parameters.vague_factor * math.exp(self._usual_log_sigma - _log_sigma(measurement)))
 
     def _remember(self, measurement: Measurement, weight: float) -> None:
-        """How certain the range of a confirmed neighbour is."""
+        """Updates the usual range sigma of confirmed neighbours."""
         log_sigma = _log_sigma(measurement)
         usual = log_sigma if self._usual_log_sigma is None else self._usual_log_sigma
         self._usual_log_sigma = usual + _OF_USUAL * weight * (log_sigma - usual)
 
     def _misjudged(self, measured: Measurements, row: int, detected: set[int]) -> dict[int, int]:
-        """The measurement of no track and the neighbour, not `detected`, whose bearing and size it has; else nothing.
+        """A measurement without a track -> the undetected neighbour that fits its bearing and size, if any.
 
-        A stranger would have to hide the neighbour, and not to have been seen beside it before: mostly the range is
-        wrong. So of one that is confirmed, and was detected before where it was to be, and once.
+        Either a stranger hides the neighbour, and was never seen beside it before, or, more often, the range is wrong.
+        So it is given to a neighbour that is confirmed and whose last detection was where it was expected.
         """
         known = [i for i, one in enumerate(self._tracks) if one.confirmed and one.agrees and i not in detected]
         if not known:
@@ -254,9 +254,9 @@ class Tracker:
 
 
 def _probability_in_view(mean: FloatArray, covariance: FloatArray, shown: Shown) -> float:
-    """The probability that a camera shows the whole neighbour: one that the border cuts is often missed."""
+    """The probability that a camera shows the whole neighbour: one cut by the image's border is often missed."""
     variances, axes = np.linalg.eigh(covariance[:3, :3])
-    spread = _SIGMA_POINTS * np.sqrt(np.maximum(variances, 0.0))  # rounding may make none of them negative
+    spread = _SIGMA_POINTS * np.sqrt(np.maximum(variances, 0.0))  # rounding may make one slightly negative
     return float(shown(mean[:3] + spread @ axes.T, math.exp(mean[6]) / 2).mean())
 
 
@@ -267,21 +267,21 @@ def _log_sigma(measurement: Measurement) -> float:
 
 @dataclass
 class _Track:
-    """One neighbour."""
+    """One neighbour, without its state."""
 
     number: int
     existence: float
-    """Probability of being anything that persists."""
+    """Probability that the track is of something that persists."""
     drone_probability: float
     """Probability that it is a drone if it exists."""
     first_seen_s: float
     last_seen_s: float
     agreed: float
-    """How many of the hits were within `confirm_sigma`, as far as they are independent evidence and certain."""
+    """Sum of the evidence of hits within `confirm_sigma`: independent and precise ones count 1."""
     hits: int = 1
     missing_s: float = 0.0
-    """How long it should have been in view since it was last detected, and was not."""
+    """Time in view without a detection since the last one."""
     agrees: bool = True
-    """Whether the last one was."""
+    """Whether the last hit was within `confirm_sigma`."""
     confirmed: bool = False
     was_confirmed: bool = False

@@ -1,7 +1,7 @@
-"""Robust kernels: how little a large residual counts, each by the name it has in the literature; and fits by them.
+"""Robust kernels, which reduce the weight of large residuals, and fits with them.
 
 A kernel takes squared residuals and gives weights for iteratively reweighted least squares (Holland & Welsch, Robust
-regression using iteratively reweighted least-squares, 1977), which also tables the scales at which each is 95 %
+regression using iteratively reweighted least-squares, 1977), which also lists the scales at which each is 95 %
 efficient for Gaussian errors.
 """
 
@@ -19,7 +19,7 @@ Fit = TypeVar("Fit")
 
 
 class Kernel(Protocol):
-    """What a squared residual counts."""
+    """The weight of a squared residual."""
 
     def weight(self, squared: FloatArray) -> FloatArray:
         """(n,) weights, 1 at zero, of squared residuals (n,)."""
@@ -28,13 +28,13 @@ class Kernel(Protocol):
 
 @dataclass(frozen=True)
 class Cauchy:
-    """Falls off with the square of the residual and never reaches zero: a far start still finds its way.
+    """The weight falls with the square of the residual and never reaches zero: a distant start still converges.
 
     95 % efficient for a scale of 2.385 standard deviations.
     """
 
     scale: float
-    """Residual that counts half."""
+    """Residual with weight one half."""
 
     def weight(self, squared: FloatArray) -> FloatArray:
         """See `Kernel`."""
@@ -49,7 +49,7 @@ class Cauchy:
 
 @dataclass(frozen=True)
 class Tukey:
-    """The biweight (Beaton & Tukey 1974): what is farther off than its scale counts nothing.
+    """The biweight (Beaton & Tukey 1974): the weight is zero beyond its scale.
 
     95 % efficient for a scale of 4.685 standard deviations; six median deviations are Cleveland's choice (Robust
     locally weighted regression, 1979).
@@ -65,7 +65,7 @@ class Tukey:
 
 
 def median(values: FloatArray) -> float:
-    """Of values (n,) without NaN, n at least 1: `np.median` takes several times as long for a few hundred."""
+    """Median of values (n,) without NaN, n at least 1; for a few hundred `np.median` takes several times as long."""
     middle = len(values) // 2
     if len(values) % 2:
         return float(np.partition(values, middle)[middle])
@@ -82,15 +82,15 @@ def reweighted(
     rounds: int,
     settled: float = 0.0,
 ) -> tuple[Fit, FloatArray]:
-    """The last fit, and the weights (n,) of its residuals (Holland & Welsch 1977).
+    """Iteratively reweighted fit: the last fit, and the weights (n,) of its residuals (Holland & Welsch 1977).
 
     Args:
         fit: from weights (n,) and the fit before, None at first.
         residuals: (n,) of a fit.
-        kernel: for residuals (n,), whose size gives its scale.
-        weights: (n,) to begin with.
-        rounds: fits at most.
-        settled: no further fit once no weight changes by as much.
+        kernel: a kernel for residuals (n,), whose size gives its scale.
+        weights: (n,) at the start.
+        rounds: largest number of fits.
+        settled: stops when no weight changes by as much.
     """
     found: Fit | None = None
     for _ in range(rounds):

@@ -9,9 +9,9 @@ import numpy as np
 from flockd.core.messages import FloatArray
 
 _HYPOTHESES = 200
-"""With a quarter of inliers, one of so many pairs is free of outliers all but once in 400,000 times."""
+"""Pairs drawn: with a quarter of inliers, one of them is free of outliers all but once in 400,000 times."""
 _MAX_POINTS = 3000
-"""Drawn of more: the share that agrees with a line is then known to 1 %."""
+"""Points used, drawn at random: the share that agrees with a line is then known to 1 %."""
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,11 @@ class RansacLine:
 def ransac_line(
     x: FloatArray, y: FloatArray, tolerance: FloatArray, *, intercept: bool, min_inliers: int, min_inlier_ratio: float
 ) -> RansacLine | None:
-    """The line of positive slope with the most points (n,) within their ``tolerance`` (n,), fitted again to those.
+    """The line of positive slope with the most points (n,) within their ``tolerance`` (n,), refitted to those.
 
-    A hypothesis goes through two random points, or through one and the origin where there is no ``intercept``. Each
-    inlier weighs by its tolerance. None where fewer than ``min_inliers`` points, or less than ``min_inlier_ratio`` of
-    them, agree with any line. Deterministic.
+    A hypothesis goes through two random points, or through one and the origin without ``intercept``. Each inlier is
+    weighted by its tolerance. None: no line agrees with ``min_inliers`` points and ``min_inlier_ratio`` of them.
+    Deterministic.
     """
     random = np.random.default_rng(0)
     if len(x) > _MAX_POINTS:

@@ -1,4 +1,4 @@
-"""The rigid motion that most pairs agree on: Algorithm 1, whose threshold finds its own size."""
+"""The rigid motion that most pairs agree on: Algorithm 1, with its adaptive threshold."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _CHUNK = 100_000  # residuals held at once while scoring
 
 @dataclass(frozen=True, eq=False)
 class RansacResult:
-    """The motion, the mask (n,) of the pairs that agree with it, and the threshold in metres within which they do."""
+    """The motion, the mask (n,) of the pairs that agree with it, and their threshold in metres."""
 
     transform: RigidTransform
     inliers: BoolArray
@@ -35,16 +35,16 @@ def ransac_rigid(
     hypotheses: int = 200,
     max_threshold: float = 2.0,
 ) -> RansacResult:
-    """The motion ``target = R source + t`` of ``source`` and ``target`` (n, 3) metres, despite outliers.
+    """The motion ``target = R source + t`` of ``source`` and ``target`` (n, 3) metres, robust to outliers.
 
     Algorithm 1: the threshold doubles from ``threshold`` metres, at most to ``max_threshold``, until some hypothesis,
-    fitted to three random pairs, has more than ``min_inlier_ratio`` n pairs within it; the hypothesis with the most
-    wins and is fitted again to all its inliers. Every threshold sees ``hypotheses`` hypotheses, as when Algorithm 1's
-    inner counter is reset; they are the same ones, so each is scored only once. Beyond the paper: fitting and selecting
-    alternate for as long as that finds more inliers.
+    fitted to three random pairs, has more than ``min_inlier_ratio`` n pairs within it; the hypothesis with the most is
+    refitted to all its inliers. Every threshold is tried with ``hypotheses`` hypotheses, as when Algorithm 1's inner
+    counter is reset; they are the same ones, so each is scored only once. Beyond the paper, fitting and selecting
+    alternate as long as the inliers increase.
 
-    Deterministic for a ``seed``. Raises ValueError with the reason for degenerate input (see `fit_rigid`), and where
-    no motion has enough inliers.
+    Deterministic for a ``seed``. Raises ValueError with the reason for degenerate input (see `fit_rigid`), and if no
+    motion has enough inliers.
     """
     source, target = checked_pairs(source, target)
     if not 0.0 < threshold <= max_threshold:
@@ -53,7 +53,7 @@ def ransac_rigid(
     ladder = [threshold]
     while ladder[-1] * 2.0 <= max_threshold:
         ladder.append(ladder[-1] * 2.0)
-    # Three pairs always fit their own motion: they are evidence of nothing, but fewer cannot be refitted.
+    # Three pairs always fit their own motion, so they prove nothing; fewer cannot be refitted.
     least = max(min_inlier_ratio * len(source), 2)
     step, winner, count = _best(source, target, rotations, translations, ladder, least)
     if not count > least:
@@ -75,9 +75,9 @@ def ransac_rigid(
 def _hypotheses(
     source: FloatArray, target: FloatArray, count: int, random: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Motions (b, 3, 3), (b, 3) that fit random triples best (Eq. 18-20), of those that are not collinear.
+    """Motions (b, 3, 3), (b, 3) that fit random triples best (Eq. 18-20), without collinear triples.
 
-    Three points are in a plane. The best motion takes one triangle's plane to the other's, and turns it there.
+    Three points are in a plane. The best motion takes one triangle's plane to the other's, and rotates within it.
     """
     corners = np.stack([source.T, target.T], axis=1)[:, :, _random_triples(len(source), count, random).T]
     a, b = corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]
@@ -86,11 +86,11 @@ def _hypotheses(
     wide = (np.sqrt(doubled_area2) > _FLAT_TRIANGLE * np.maximum(np.maximum(a2, b2), c2)).all(axis=0)
     if not wide.any():
         raise ValueError("the points are collinear: no three of those drawn span a triangle")
-    with np.errstate(divide="ignore", invalid="ignore"):  # of those that are collinear
+    with np.errstate(divide="ignore", invalid="ignore"):  # of collinear triples
         length, axes = np.sqrt(a2), np.empty((3, *a.shape))
         axes[0], axes[2] = a / length, normal / np.sqrt(doubled_area2)
         axes[1] = crossed(axes[2], axes[0])
-        # The corners in the planes' axes, about their middles.
+        # The corners in the planes' axes, relative to their centroids.
         x, y = np.zeros((2, 3, *length.shape))
         x[1], x[2], y[2] = length, np.einsum("ijk,ijk->jk", b, axes[0]), np.einsum("ijk,ijk->jk", b, axes[1])
         x, y = x - (x[1] + x[2]) / 3.0, y - y[2] / 3.0
@@ -113,7 +113,7 @@ def _random_triples(n: int, count: int, random: np.random.Generator) -> IntArray
     second = random.integers(0, n - 1, count)
     second += second >= first
     third = random.integers(0, n - 2, count)
-    # Step over the two that are taken, the lower one first.
+    # Skip the two that are taken, the lower one first.
     third += third >= np.minimum(first, second)
     third += third >= np.maximum(first, second)
     return np.stack([first, second, third], axis=1)
@@ -127,8 +127,8 @@ def _best(
     ladder: list[float],
     least: float,
 ) -> tuple[int, int, int]:
-    """The first step of the ladder at which a hypothesis has more than ``least`` pairs, else the last one; the best
-    hypothesis there, and its number of pairs."""
+    """The first threshold at which a hypothesis has more than ``least`` pairs, else the last one; the best hypothesis
+    there, and its number of pairs."""
     # Single precision is good to 10 micrometres within 100 m, and takes half the time. Small chunks stay in the cache.
     source_rows = np.ascontiguousarray(source.T, dtype=np.float32)
     target_rows = np.ascontiguousarray(target.T, dtype=np.float32)

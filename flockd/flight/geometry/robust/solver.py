@@ -1,6 +1,6 @@
-"""Nonlinear least squares on normal equations, by Gauss and Newton.
+"""Nonlinear least squares on normal equations, by Gauss-Newton.
 
-A `Problem` has the residuals, their derivatives and the robust kernel; `GaussNewton` has when to stop.
+A `Problem` gives residuals, derivatives and the robust kernel; `GaussNewton` iterates and decides when to stop.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ State = TypeVar("State")
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """A problem near one state: ``hessian @ step = -gradient`` is its best step."""
+    """A problem linearised at one state: ``hessian @ step = -gradient`` gives the step."""
 
     cost: float
-    """Weighted sum of squares; infinite where the state is no solution at all."""
+    """Weighted sum of squares; infinite for an impossible state."""
     gradient: FloatArray
     """(n,) J^T W r"""
     hessian: FloatArray
@@ -30,7 +30,7 @@ class NormalEquations:
 
     @classmethod
     def of(cls, residuals: FloatArray, jacobian: FloatArray, weights: FloatArray | None = None) -> NormalEquations:
-        """From residuals (m,), their derivatives (m, n) and weights (m,); unsolvable where a number is not finite."""
+        """From residuals (m,), their derivatives (m, n) and weights (m,); unsolvable if a number is not finite."""
         weighted = jacobian if weights is None else jacobian * weights[:, None]
         cost = float(residuals @ (residuals if weights is None else weights * residuals))
         if not (math.isfinite(cost) and np.isfinite(weighted).all()):
@@ -39,12 +39,12 @@ class NormalEquations:
 
     @classmethod
     def unsolvable(cls, parameters: int) -> NormalEquations:
-        """The equations for a state that is no solution."""
+        """The equations of an impossible state."""
         return cls(math.inf, np.zeros(parameters), np.eye(parameters))
 
     @property
     def solvable(self) -> bool:
-        """Whether the state is a solution, if not the best."""
+        """Whether the state is possible."""
         return math.isfinite(self.cost)
 
     def damped(self, diagonal: FloatArray) -> NormalEquations:
@@ -59,7 +59,7 @@ class NormalEquations:
 
 
 class Problem(ABC, Generic[State]):
-    """What is minimised, over states that a step of n numbers moves."""
+    """A minimisation over states, which steps of n numbers move."""
 
     @abstractmethod
     def linearise(self, state: State) -> NormalEquations:
@@ -70,39 +70,39 @@ class Problem(ABC, Generic[State]):
         """A state moved by a step (n,)."""
 
     def limited(self, step: FloatArray) -> FloatArray:
-        """The step (n,), or the part of it within which the linearisation holds."""
+        """The step (n,), or the part of it for which the linearisation holds."""
         return step
 
     def step_size(self, step: FloatArray) -> float:
-        """What an optimiser's ``tolerance`` is compared with; by default the largest number of the step (n,)."""
+        """The size that a solver's ``tolerance`` is compared with; by default the largest number of the step (n,)."""
         return float(np.abs(step).max())
 
 
 @dataclass(frozen=True, eq=False)
 class Solution(Generic[State]):
-    """Where an optimiser stopped."""
+    """The state at which a solver stopped."""
 
     state: State
     equations: NormalEquations
-    """The last that were made, one step before ``state``."""
+    """The last ones computed, one step before ``state``."""
     converged: bool
-    """Whether the last step was too small to matter; else the steps were used up or led to no solution."""
+    """Whether the last step was below the tolerance; else the steps ran out or led to an impossible state."""
 
 
 @dataclass(frozen=True)
 class GaussNewton:
-    """Takes every step, whatever it does to the cost: for starts that are near, and weights that change on the way."""
+    """Takes every step, whether or not the cost falls: for good starts, and weights that change on the way."""
 
     max_steps: int
     tolerance: float
-    """A step smaller than this has converged."""
+    """A smaller step has converged."""
     min_steps: int = 1
-    """Before this many it has not."""
+    """Fewest steps before convergence."""
     max_condition: float = math.inf
-    """Largest condition number of a hessian: beyond, some parameter is not known at all."""
+    """Largest condition number of a hessian: beyond it some parameter is not observable."""
 
     def minimise(self, problem: Problem[State], state: State) -> Solution[State]:
-        """Goes downhill from ``state``."""
+        """Iterates from ``state``."""
         equations = problem.linearise(state)
         for number in range(1, self.max_steps + 1):
             if number > 1:
@@ -119,7 +119,7 @@ class GaussNewton:
         return Solution(state, equations, converged=False)
 
     def _step(self, equations: NormalEquations) -> FloatArray | None:
-        """(n,) or None where the hessian is singular."""
+        """(n,); None: the hessian is singular."""
         try:
             if math.isfinite(self.max_condition):
                 sizes = np.abs(np.linalg.eigvalsh(equations.hessian))

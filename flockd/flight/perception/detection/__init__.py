@@ -1,1 +1,1 @@
-"""Detection of drones in two stages, as a pipeline: propose, crop, refine, suppress, mask."""
+"""Detection of drones in two stages: propose, crop, refine, suppress, mask."""

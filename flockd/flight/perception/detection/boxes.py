@@ -1,4 +1,4 @@
-"""Boxes of drones in a whole image, as a detector finds them, beside the pixels that the segmentation finds."""
+"""Boxes of drones in a whole image, by a detector, merged with the instances that the segmentation finds."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from flockd.flight.perception.detection.instances import Instance
 _SAME_OVERLAP = 0.3
 """Intersection over union from which a box and an instance are one drone."""
 _PART = 0.8
-"""An instance with this share inside a box of at least twice its width is a part of that drone."""
+"""An instance with this share of its area inside a box of at least twice its width is a part of that drone."""
 _LARGE_PX = (40.0, 300.0)
-"""Widths of boxes between which the second stage's verdict against a drone counts less and less: it learnt on
-real drones of 6 to 60 pixels, and refuses large ones."""
+"""Widths of boxes between which evidence against a drone from the second stage loses its weight: it was trained on real
+drones of 6 to 60 pixels, and rejects large ones."""
 _SMALL_PX = (20.0, 8.0)
-"""The same of boxes that are less wide, all of it from the second down: a crop of so few pixels shows no shape."""
+"""The same for narrow boxes, fully from the second width down: a crop of so few pixels shows no shape."""
 _SUREST = 0.95
-"""No box counts as more probable: a detector that is sure and wrong may not overrule whatever the second stage says."""
+"""Upper limit of a box's probability: a detector that is certain and wrong may not overrule the second stage."""
 _SUREST_ODDS = math.log(_SUREST / (1 - _SUREST))
 _FIRST = 50.0
-"""Added to the score of what a detector found: it is proposed before what the segmentation alone finds."""
+"""Added to the score of a detector's boxes: they are proposed before what only the segmentation finds."""
 
 
 @dataclass(frozen=True)
 class BoxRules:
-    """How a detector's output is judged, as its manifest says."""
+    """Rules for a detector's output, from its manifest."""
 
     least_probability: float
     overlap: float
@@ -42,7 +42,7 @@ class BoxRules:
 
     @classmethod
     def of(cls, manifest: Manifest) -> BoxRules:
-        """Raises ModelError where the manifest does not say."""
+        """Raises ModelError if a threshold is missing in the manifest."""
         return cls(
             least_probability=manifest.threshold("box_probability"),
             overlap=manifest.threshold("overlap"),
@@ -53,16 +53,16 @@ class BoxRules:
         )
 
     def evidence(self, box: FloatArray, log_odds: float) -> float:
-        """Log odds of a drone, to add to the second stage's, of a box (4,) that has these of the detector's own."""
+        """Log odds of a drone, added to the second stage's, for a box (4,) with the detector's ``log_odds``."""
         width = max(float(box[2] - box[0]), 1.0)
-        # Being small makes a doubtful box count more, and never more than the surest one.
+        # A small doubtful box counts more, but never more than the most probable one.
         room = max(self.gain * (_SUREST_ODDS - log_odds), 0.0)
         small = min(self.small * _share(width, _SMALL_PX), room)
         return self.gain * log_odds + self.large * _share(width, _LARGE_PX) + small
 
 
 def _share(width: float, ends: tuple[float, float]) -> float:
-    """0 at the first of ``ends``, 1 at the second, by the logarithm."""
+    """0 at the first of ``ends``, 1 at the second, logarithmic between them."""
     first, second = np.log(ends)
     return float(np.clip((math.log(width) - first) / (second - first), 0.0, 1.0))
 
@@ -70,12 +70,12 @@ def _share(width: float, ends: tuple[float, float]) -> float:
 def probable_boxes(
     columns: Mapping[str, Float32Array], rules: BoxRules, scale: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray]:
-    """Boxes (n, 4) left, top, right, bottom that are probable enough, and their probabilities (n,).
+    """Boxes (n, 4) left, top, right, bottom above the least probability, and their probabilities (n,).
 
     Args:
         columns: a detector's output, (m,) each.
         rules: of the detector.
-        scale: pixels of what it saw per pixel of the image, right and down.
+        scale: pixels of the network's input per pixel of the image, right and down.
     """
     good = np.flatnonzero(columns["drone_probability"] >= rules.least_probability)
     right, down, width, height = (
@@ -86,7 +86,7 @@ def probable_boxes(
 
 
 def kept_boxes(boxes: FloatArray, probability: FloatArray, rules: BoxRules) -> tuple[FloatArray, FloatArray]:
-    """Those of the boxes (n, 4) that are no second ones of a drone, the most probable first; their log odds (n,)."""
+    """The boxes (n, 4) without duplicates, the most probable first, and their log odds (n,)."""
     corners = np.hstack([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]])
     kept = np.asarray(cv2.dnn.NMSBoxes(corners.tolist(), probability.tolist(), 0.0, rules.overlap), int).reshape(-1)
     p = np.clip(probability[kept], 1 - _SUREST, _SUREST)
@@ -96,13 +96,13 @@ def kept_boxes(boxes: FloatArray, probability: FloatArray, rules: BoxRules) -> t
 def with_boxes(
     labels: UInt8Array, instances: tuple[Instance, ...], boxes: FloatArray, odds: FloatArray, rules: BoxRules
 ) -> tuple[UInt8Array, tuple[Instance, ...]]:
-    """The instances of an image with what a detector says of each, and those that only the detector has found.
+    """The instances of an image, with the detector's evidence, and those that only the detector found.
 
-    Where a box and an instance are one drone, the instance takes the box. Parts of a drone become one with it.
+    An instance that is the same drone as a box takes the box. Instances that are parts of one drone are joined.
 
     Args:
-        labels: (h, w) of the instances; changed where parts become one.
-        instances: as the segmentation has them.
+        labels: (h, w) of the instances; a changed copy is returned if parts are joined.
+        instances: by the segmentation.
         boxes: (n, 4) left, top, right, bottom, the most probable first.
         odds: (n,) log odds of each.
         rules: of the detector.

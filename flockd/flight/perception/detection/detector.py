@@ -21,7 +21,7 @@ from flockd.flight.tracking import Prediction
 
 @dataclass(frozen=True, eq=False)
 class Detected:
-    """The drones in view."""
+    """The drones in view, with their masks."""
 
     detections: tuple[Detection, ...]
     masks: Mapping[str, UInt8Array]
@@ -32,7 +32,7 @@ class Detected:
 
 @dataclass
 class DetectionTrace:
-    """What the detector went through, for reports and measurements: filled where a caller passes one in."""
+    """Intermediate results of the detector, for reports and measurements: filled if a caller passes one in."""
 
     proposals: list[Proposal] = field(default_factory=list)
     candidates: list[Candidate] = field(default_factory=list)
@@ -58,12 +58,12 @@ class Detector:
 
         Args:
             images: (h, w, 3) by camera.
-            scenes: what the first stage says of each.
+            scenes: the first stage's maps of each.
             depths: (h, w) metres along the ray, of the cameras that have them.
             vehicle: for the attitude.
-            predictions: of tracks, where the second stage searches too.
+            predictions: of tracks; the second stage searches there too.
             trace: filled.
-            known_size: of every drone; None: the network judges each one's.
+            known_size: of every drone; None: the network estimates each one's.
         """
         if not images:
             return Detected((), {})

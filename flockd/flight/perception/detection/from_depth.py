@@ -1,4 +1,4 @@
-"""Detection without a second stage: a drone's place by the depth map alone (Eq. 37)."""
+"""Detection without a second stage: a drone's position from the depth map alone (Eq. 37)."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from flockd.flight.perception.detection.roi import Roi, angles_between
 from flockd.flight.perception.maps import SceneMaps
 
 _MAX_RADIUS_M = 0.6
-"""Pixels whose depth is farther from the median are not the drone's: it is at most 1.2 m wide."""
+"""Pixels whose depth differs by more from the median are not of the drone: it is at most 1.2 m wide."""
 _MIN_ANGLE = 1e-3
-"""rad, about a pixel of a 90 degree camera of 1280 pixels: no instance appears narrower."""
+"""Least angular width of an instance in rad, about a pixel of a 90 degree camera of 1280 pixels."""
 
 
 def candidates_from_depth(
     rig: Rig, scenes: Mapping[str, SceneMaps], depths: Mapping[str, RangeMap], parameters: DetectionParameters
 ) -> list[Candidate]:
-    """One an instance of the first stage: the centre of the bounding box of its points. None without depth."""
+    """For each instance of the first stage the centre of the bounding box of its points. Empty without depth."""
     found = []
     for name, depth in depths.items():
         camera, scene = rig.cameras[name], scenes[name]

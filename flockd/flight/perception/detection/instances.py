@@ -1,4 +1,4 @@
-"""From the segmentation network's maps to separate drones: pixels vote for the centre that they belong to."""
+"""From the segmentation network's maps to separate drones: each pixel votes for the centre of its drone."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from flockd.core.messages import Float32Array, FloatArray, UInt8Array
 
 _CELL = 2
-"""Map pixels: the side of the cells in which votes are counted, as the bins of a Hough transform (Ballard 1981)."""
+"""Side of the cells in which votes are counted, in map pixels, as the bins of a Hough transform (Ballard 1981)."""
 _MAX_INSTANCES = 48
-"""In one image; the weakest are joined to the others. Far more than the drones of a flock in view: it bounds the time
-of a faulty output, as every instance costs crops."""
+"""Instances in one image; the weakest are joined to the others. Far more than a flock has in view: it limits the time
+that a faulty output costs in crops."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,17 +28,17 @@ class Instance:
     """(4,) left, top, right, bottom of its pixels."""
     area_px: float
     score: float = 0.0
-    """By how much the highest logit of its pixels exceeds the threshold of a pixel; the more, the likelier a drone."""
+    """Highest logit of its pixels minus the threshold of a pixel; the higher, the likelier a drone."""
     evidence: float = 0.0
-    """What a detector says of it: log odds of a drone, which add to those of the second stage."""
+    """Log odds of a drone by a detector; they are added to the second stage's."""
     boxed: bool = False
-    """Whether the box is a detector's, and so of the whole drone."""
+    """Whether the box comes from a detector, and so shows the whole drone."""
 
 
 def group_instances(
     drone_logit: Float32Array, offset: Float32Array, *, scale: int, min_area_px: float = 10.0
 ) -> tuple[UInt8Array, tuple[Instance, ...]]:
-    """Split a mask into drones by the centres its pixels point to.
+    """Splits a mask into drones by the centres that its pixels point to.
 
     Args:
         drone_logit: (h, w) at a ``scale``-th of the image's size; above 0 is drone.
@@ -80,9 +80,9 @@ def group_instances(
 
 
 def _nearest(votes: FloatArray, centres: FloatArray) -> NDArray[np.int64]:
-    """(n,) which of the centres each vote is nearest to; of equally near ones the first.
+    """(n,) index of the centre nearest to each vote; of equally near ones the first.
 
-    Centre by centre: n numbers stay in the processor's cache, n times k do not.
+    One centre at a time: n numbers fit the processor's cache, n times k do not.
     """
     nearest = np.zeros(len(votes), np.int64)
     right, down = np.ascontiguousarray(votes.T)
@@ -96,7 +96,7 @@ def _nearest(votes: FloatArray, centres: FloatArray) -> NDArray[np.int64]:
 
 
 def _vote_peaks(votes: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """(k, 2) places where votes gather, the strongest first; at least one."""
+    """(k, 2) peaks of the votes, the strongest first; at least one."""
     margin = 32  # centres may lie outside the image
     size = np.array([shape[1], shape[0]])
     cell = np.clip((votes + margin) // _CELL, 0, (size + 2 * margin) // _CELL - 1).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Masks: which pixels are which drone's, by the first stage's map and what the second says of its instances."""
+"""Masks: which pixels belong to which drone, from the first stage's map and the second stage's decisions."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from flockd.flight.perception.maps import SceneMaps
 
 
 def first_stage_labels(scene: SceneMaps, label_of: Mapping[int, int], rejected: Container[Instance]) -> UInt8Array:
-    """(h, w) the first stage's instances with their detections' labels.
+    """(h, w) the first stage's instances, with the labels of their detections.
 
-    Background where the second stage rejects them, `UNCLASSED` where it is not certain of them.
+    Instances that the second stage rejects become background, undecided ones `UNCLASSED`.
     """
     table = np.full(256, UNCLASSED, np.uint8)
     table[0] = 0
@@ -33,13 +33,13 @@ def without_borders(labels: UInt8Array, border_px: int) -> UInt8Array:
     """Background within ``border_px`` of a drone becomes `UNCLASSED`: masks and depth maps are least certain there."""
     drone = cv2.threshold(labels, 0, UNCLASSED, cv2.THRESH_BINARY)[1]
     wide = cv2.dilate(drone, np.ones((2 * border_px + 1, 2 * border_px + 1), np.uint8))
-    return np.asarray(cv2.bitwise_or(labels, cv2.bitwise_xor(wide, drone)), np.uint8)  # `UNCLASSED` has all bits
+    return np.asarray(cv2.bitwise_or(labels, cv2.bitwise_xor(wide, drone)), np.uint8)  # `UNCLASSED` has all bits set
 
 
 def depth_of_drones(
     depth: RangeMap, labels: UInt8Array, camera: RigCamera, detections: Sequence[Detection]
 ) -> RangeMap:
-    """The depth map (h, w) with each drone's pixels moved to its detection's range; their relief is kept."""
+    """The depth map (h, w) with each drone's pixels moved to its detection's range, keeping their relief."""
     moved = RangeMap(depth.copy())
     for detection in detections:
         if camera.name not in detection.cameras:

@@ -1,4 +1,4 @@
-"""Non-maximum suppression in log-polar coordinates: of several candidates for one drone, one detection is left."""
+"""Non-maximum suppression in log-polar coordinates: of several candidates for one drone, one detection remains."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from flockd.flight.geometry import log_polar_covariance, log_polar_residual
 from flockd.flight.perception.detection.refinement import Candidate
 
 MAX_DETECTIONS = UNCLASSED - 1
-"""In one frame set: as many labels as a mask of bytes has."""
+"""Detections in one frame set: the labels that fit in a mask of bytes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Suppressed:
-    """One detection a drone, and whose instances are whose."""
+    """One detection for each drone, and the instances of each."""
 
     detections: tuple[Detection, ...]
     label_of: Mapping[tuple[str, int], int]
     """The detection's label, by camera and the label of the first stage's instance."""
 
     def labels_of(self, camera: str) -> dict[int, int]:
-        """The detections' labels by those of one camera's instances."""
+        """The detections' labels, by the labels of one camera's instances."""
         return {instance: label for (name, instance), label in self.label_of.items() if name == camera}
 
 
 def suppress(candidates: Sequence[Candidate], parameters: DetectionParameters) -> Suppressed:
-    """With all candidates of one drone fused.
+    """The detections: all candidates of one drone are fused.
 
-    Greedy, as non-maximum suppression is: the candidate of the largest instance is compared first.
+    Greedy, as usual: the candidate of the largest instance is compared first.
     """
     groups: list[list[Candidate]] = []
     for one in sorted(candidates, key=lambda candidate: -candidate.proposal.area_px):
@@ -54,7 +54,7 @@ def suppress(candidates: Sequence[Candidate], parameters: DetectionParameters) -
 def are_one_drone(one: Candidate, other: Candidate, parameters: DetectionParameters) -> bool:
     """Whether two candidates lie within a Mahalanobis distance of each other.
 
-    To both covariances comes that of a drone's extent: where its centre is, its views disagree by a share of its size.
+    The covariance of a drone's extent is added to both: from two views its centre differs by a share of its size.
     """
     residual = log_polar_residual(other.bearing, other.log_range, one.bearing, one.log_range)
     extent = parameters.drone_extent * max(one.size_m, other.size_m) / min(one.range_m, other.range_m)
@@ -63,9 +63,9 @@ def are_one_drone(one: Candidate, other: Candidate, parameters: DetectionParamet
 
 
 def fuse(group: Sequence[Candidate], label: int) -> Detection:
-    """The mean of the candidates of one drone, weighted by the variances of their log ranges.
+    """The mean of one drone's candidates, weighted by the variances of their log ranges.
 
-    The errors of two crops of one drone are alike, so the best candidate's variance stays.
+    Crops of one drone have similar errors, so the variance of the best candidate is kept.
     """
     weights = np.array([one.log_range_sigma**-2 for one in group])
     weights /= weights.sum()

@@ -1,6 +1,6 @@
-"""Where a drone may be: what the first stage segments, and where tracks are predicted.
+"""Proposals: the instances of the first stage, and the predictions of tracks.
 
-A proposal costs a few crops of the second stage, which decides.
+Each proposal costs a few crops of the second stage, which decides.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from flockd.flight.perception.maps import SceneMaps
 from flockd.flight.tracking import Prediction
 
 _SAME_RANGE = math.log(1.5)
-"""By which a log range may be off where it is that of the neighbour that is predicted."""
+"""Largest difference of log range between a detection and the neighbour predicted there."""
 
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A region of interest, and where it comes from."""
+    """A region of interest, and its origin."""
 
     cameras: tuple[str, ...]
-    """Those that show it."""
+    """The cameras that show it."""
     roi: Roi
     instance: Instance | None = None
-    """What the first stage proposed; None where the proposal comes from a prediction."""
+    """The first stage's instance; None: the proposal comes from a prediction."""
     predicted: bool = False
     """Whether it comes from a track."""
 
     @property
     def area_px(self) -> float:
-        """Area of its pixels in the first stage."""
+        """Area of the instance in the first stage."""
         return self.instance.area_px if self.instance else 0.0
 
     @property
@@ -49,7 +49,7 @@ class Proposal:
 def propose_instances(
     rig: Rig, scenes: Mapping[str, SceneMaps], rules: CropRules, parameters: DetectionParameters
 ) -> list[Proposal]:
-    """What the first stage segments, of each image those of the highest score; of equal scores the larger."""
+    """The first stage's instances: in each image those of the highest score; of equal scores the larger."""
     found = []
     for name, scene in scenes.items():
         ranked = sorted(scene.instances, key=lambda one: (-one.score, -one.area_px))
@@ -67,14 +67,14 @@ def propose_predictions(
     detected: Sequence[tuple[FloatArray, float]],
     rules: CropRules,
 ) -> tuple[list[Proposal], list[Reason]]:
-    """Where a track is predicted and nothing was found, and why a prediction is none.
+    """Predictions of tracks at which nothing was found, and reasons for those that are left out.
 
     Args:
         rig: the cameras that have an image.
         vehicle: for the attitude.
         predictions: of the confirmed tracks.
-        detected: bearings (3,), in the body, of what was found already, and the logarithm of its range in metres: who
-            is at quite another range is not the one that is predicted.
+        detected: bearing (3,) in the body, and log range in metres, of each drone found so far. One at another range is
+            not the predicted one.
         rules: for the crops.
     """
     proposals, reasons = [], []

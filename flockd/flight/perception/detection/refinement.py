@@ -1,4 +1,4 @@
-"""The second stage as a cascade: each crop's estimate aims the next one, until the next would show the same again."""
+"""The second stage as a cascade: each crop's estimate aims the next one, until the next would show nearly the same."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from flockd.flight.perception.maps import Crop, KnownSize, RangeEstimate
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A drone as one proposal's crops show it, in log-polar coordinates of the body."""
+    """A drone from the crops of one proposal, in log-polar coordinates of the body."""
 
     proposal: Proposal
     bearing: FloatArray
@@ -30,7 +30,7 @@ class Candidate:
     log_range: float
     """Natural logarithm of the range in metres."""
     log_range_sigma: float
-    """Standard deviation of `log_range`, if the size is right."""
+    """Standard deviation of `log_range`, given the size."""
     bearing_sigma_rad: float
     size_m: float
     drone_probability: float = 1.0
@@ -39,7 +39,7 @@ class Candidate:
 
     @property
     def range_m(self) -> float:
-        """From the body's origin."""
+        """Range from the body's origin."""
         return math.exp(self.log_range)
 
     @property
@@ -49,15 +49,15 @@ class Candidate:
 
 
 class Refined(NamedTuple):
-    """What became of proposals."""
+    """The proposals after the second stage."""
 
     candidates: list[Candidate]
     rejected: list[Proposal]
-    """Those that surely are no drones."""
+    """Proposals that are certainly not drones."""
 
 
 class Estimates(NamedTuple):
-    """What n crops show, in log-polar coordinates; the fields are those of `Candidate`."""
+    """Estimates from n crops in log-polar coordinates; the fields are those of `Candidate`."""
 
     bearing: FloatArray
     """(n, 3)"""
@@ -68,13 +68,13 @@ class Estimates(NamedTuple):
     log_size_sigma: FloatArray
 
     def take(self, which: IntArray | BoolArray) -> Estimates:
-        """Those of these numbers, or of this mask."""
+        """Those at these indices, or of this mask."""
         return Estimates(*(column[which] for column in self))
 
     def of_size(self, known: KnownSize) -> Estimates:
-        """With the ranges at which drones of a known size have these apparent sizes.
+        """The ranges at which drones of the known size have these apparent sizes.
 
-        What the apparent size errs by stays; the known size's own deviation stands for that of the judged one.
+        The error of the apparent size stays; the known size's sigma replaces that of the estimated one.
         """
         possible = (self.size_m > 0) & np.isfinite(self.size_m)
         log_judged = np.log(self.size_m, where=possible, out=np.full_like(self.size_m, np.nan))
@@ -103,13 +103,13 @@ class Estimates(NamedTuple):
 
 
 class _Aims(NamedTuple):
-    """Where crops of n proposals are taken next."""
+    """Directions and ranges of the next crops of n proposals."""
 
     direction: FloatArray
     """(n, 3)"""
     half_angle: FloatArray
     range_m: FloatArray
-    """Of what a crop should show, for the parallax between cameras; NaN: not known yet."""
+    """(n,) range of the target, for the parallax between cameras; NaN: not known yet."""
 
 
 class Cascade:
@@ -124,8 +124,8 @@ class Cascade:
         rig: Rig,
         images: Mapping[str, UInt8Array],
     ) -> None:
-        """``known_size``: of every drone; None: the network judges each one's. ``rig``: the cameras that have an image,
-        ``images`` (h, w, 3) by camera."""
+        """``known_size``: of every drone; None: the network estimates each one's. ``rig``: the cameras that have an
+        image, ``images`` (h, w, 3) by camera."""
         self._network, self._crop_size, self._known_size = network, second_stage.crop_size, known_size
         self._rules, self._thresholds, self._parameters = second_stage.rules, second_stage.thresholds, parameters
         self._rig, self._images = rig, images
@@ -133,10 +133,10 @@ class Cascade:
         """Why proposals were dropped."""
 
     def refine(self, proposals: Sequence[Proposal]) -> Refined:
-        """The drones among the proposals of all cameras, and the proposals that surely are none.
+        """The drones among the proposals of all cameras, and the proposals that are certainly not drones.
 
-        At least two crops each, the further ones cut to the drone's size with it in the middle, then one of its mirror
-        image. Where two cameras share the drone, the crops show it whole.
+        Each proposal gets at least two crops. The later ones are cut to the drone's size and centred on it; the last
+        one is mirrored. If two cameras share the drone, the crops show it whole.
         """
         count, of = len(proposals), np.array(proposals, np.object_)
         aims = _Aims(
@@ -145,7 +145,7 @@ class Cascade:
             np.full(count, np.nan),
         )
         shown = Estimates(np.empty((count, 3)), *np.empty((5, count)))
-        # The least that an earlier crop gave, but for the first, which may be far from what suits the drone.
+        # Least probability of the earlier crops, without the first, which may not fit the drone.
         least, rejected, settled = np.ones(count), np.zeros(count, np.bool_), np.zeros(count, np.bool_)
         at = np.arange(count)
         for number in range(1, self._rules.max_crops + 1):
@@ -161,7 +161,7 @@ class Cascade:
                 continue
             least[at] = probability
             enough = repeats | (number == self._rules.max_crops)
-            settled[at] = enough & (probability > self._thresholds.drone)  # a mirror image would not raise it
+            settled[at] = enough & (probability > self._thresholds.drone)  # a mirrored crop would not raise it
             for column, values in zip(shown, estimates, strict=True):
                 column[at] = values
             at = at[~enough]
@@ -181,7 +181,7 @@ class Cascade:
     def _estimated(
         self, proposals: NDArray[Any], at: IntArray, aims: _Aims, *, mirrored: bool = False
     ) -> tuple[IntArray, Estimates]:
-        """What the network says of crops of the proposals of these numbers, and those of which it says something."""
+        """The network's estimates from crops of the proposals at these indices, and the indices that have one."""
         directions, range_m = aims.direction[at], aims.range_m[at]
         views = virtual_crops(self._rig, directions, aims.half_angle[at], self._crop_size)
         seen = (views.main >= 0).nonzero()[0]
@@ -206,7 +206,7 @@ class Cascade:
         estimates = Estimates(views.rays(numbers[:, :2]), *numbers[:, 2:].T)
         if self._known_size is not None:
             estimates = estimates.of_size(self._known_size)
-        # The camera sits beside the body's origin, so that bearing and range change a little.
+        # The camera is not at the body's origin, so bearing and range change a little.
         near = np.isfinite(estimates.log_range) & (estimates.log_range < math.log(2 * self._parameters.max_range_m))
         ranges = np.exp(np.where(near, estimates.log_range, 0.0))[:, None]
         places = np.where(near[:, None], views.centres, 0.0) + ranges * estimates.bearing
@@ -219,7 +219,7 @@ class Cascade:
         return at[placed], estimates._replace(bearing=places / range_m[:, None], log_range=log_range).take(placed)
 
     def _ranges(self, crops: Sequence[Crop]) -> list[RangeEstimate | None]:
-        """One estimate a crop. Where the network fails on several, each half is tried by itself: one crop is lost."""
+        """One estimate for each crop. If the network fails on several, each half is tried alone: one crop is lost."""
         if not crops:
             return []
         try:
@@ -234,7 +234,7 @@ class Cascade:
     def _with_mirrored(
         self, proposals: NDArray[Any], at: IntArray, aims: _Aims, shown: Estimates
     ) -> tuple[IntArray, Estimates]:
-        """Each estimate together with what the mirror image of its crop says; without those that it contradicts."""
+        """The mean of each estimate and that of its mirrored crop; estimates that it contradicts are dropped."""
         if not len(at):
             return at, shown.take(at)
         mirrored = aims._replace(half_angle=self._rules.mirror_scale * aims.half_angle)
@@ -248,7 +248,7 @@ class Cascade:
     def _aim(self, proposals: NDArray[Any], at: IntArray, aims: _Aims, estimates: Estimates) -> BoolArray:
         """Aims the next crops (n,), and tells which of them would show nearly the same as the last.
 
-        They have the drones in their middle, or the proposals where no camera sees that direction.
+        They are centred on the drones, or on the proposals if no camera sees that direction.
         """
         first = np.array([one.roi.direction for one in proposals]).reshape(-1, 3)
         direction = np.where(self._rig.covers(estimates.bearing)[:, None], estimates.bearing, first)
@@ -263,7 +263,7 @@ class Cascade:
         return (moved < self._parameters.crop_shift) & (resized < math.log(self._parameters.crop_resize))
 
     def _is_in_range(self, estimates: Estimates) -> BoolArray:
-        """(n,), false for NaN too."""
+        """(n,) whether each range is possible; false for NaN."""
         low, high = math.log(self._parameters.min_range_m), math.log(self._parameters.max_range_m)
         return (low < estimates.log_range) & (estimates.log_range < high)
 

@@ -1,4 +1,4 @@
-"""Regions of interest: the direction and width of a virtual camera that may show a drone."""
+"""Regions of interest: direction and width of a virtual camera that may show a drone."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from flockd.flight.geometry import Rig, RigCamera
 from flockd.flight.perception.detection.instances import Instance
 
 _BORDER_PX = 2
-"""A box so near to the image's border is cut by it: the first stage's maps have two image pixels a pixel."""
+"""A box this near to the image's border is cut by it: the first stage's maps have two image pixels a pixel."""
 
 
 @dataclass(frozen=True)
 class CropRules:
-    """How crops are to be cut for a network, as its manifest says: as those that it was trained on."""
+    """How crops are cut for a network, by its manifest: as in its training."""
 
     fill: float
     """Half of the crop's width over the drone's size, both as seen from the camera."""
     first_margin: float
-    """Half of the first crop's width over the way from a box's centre to its farthest corner."""
+    """Half of the first crop's width over the distance from a box's centre to its farthest corner."""
     cut_margin: float
-    """The same where the image's border cuts the box: the drone is larger than what is seen of it."""
+    """The same if the image's border cuts the box: the drone is larger than its visible part."""
     mirror_scale: float
-    """Width of the mirrored crop over what suits the drone."""
+    """Width of the mirrored crop over the width that fits the drone."""
     min_half_width_px: float
-    """In pixels of the camera's image."""
+    """Least half width in pixels of the camera's image."""
     max_half_angle: float
     max_resize: float
-    """A further crop is at most this many times as wide as the last one, and at least as much narrower."""
+    """Largest ratio between the widths of successive crops, either way."""
     max_crops: int
-    """The most crops of one proposal, before the mirrored one."""
+    """Largest number of crops for one proposal, before the mirrored one."""
 
     def fitting(self, size_m: FloatArray, range_m: FloatArray) -> FloatArray:
-        """(n,) half the angle, rad, of crops that suit drones of known size and range (n,)."""
+        """(n,) half angles of crops, rad, that fit drones of known size and range (n,)."""
         return np.asarray(np.arctan(self.fill * size_m / range_m))
 
     def bounded(self, half_angle: FloatArray, pixel_angle: FloatArray) -> FloatArray:
-        """(n,) within what the network was trained on. ``pixel_angle`` (n,): rad a pixel of the image there."""
+        """(n,) limited to the training's bounds. ``pixel_angle`` (n,): rad of a pixel of the image there."""
         return np.minimum(np.maximum(half_angle, self.min_half_width_px * pixel_angle), self.max_half_angle)
 
 
@@ -55,7 +55,7 @@ class Roi(NamedTuple):
 
 
 def rois_of_instances(camera: RigCamera, instances: Sequence[Instance], rules: CropRules) -> list[Roi | None]:
-    """Around boxes of the first stage; None where the lens images nothing there."""
+    """Regions around boxes of the first stage; None if the lens images nothing there."""
     if not instances:
         return []
     boxes, centres = np.array([one.box for one in instances]), np.array([one.centre for one in instances])
@@ -78,10 +78,8 @@ def rois_of_instances(camera: RigCamera, instances: Sequence[Instance], rules: C
 
 
 def pixel_angles(rig: Rig, cameras: Sequence[Sequence[str]], directions: FloatArray) -> FloatArray:
-    """(n,) rad a pixel along body directions (n, 3), each of the camera that sees the finest there among those named.
-
-    Infinity where none of them sees it.
-    """
+    """(n,) rad of a pixel along body directions (n, 3), of the camera with the finest resolution among those named.
+    Infinity if none of them sees it."""
     finest = np.full(len(directions), np.inf)
     for name, camera in rig.cameras.items():
         angles = camera.camera.pixel_angle(directions @ camera.T_body_camera.rotation)

@@ -1,4 +1,4 @@
-"""What a network of the second stage asks for: how its crops are cut, and how its outputs are judged."""
+"""Interface of a network of the second stage: how its crops are cut, and how its outputs are judged."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from flockd.flight.perception.detection.roi import CropRules
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Decision thresholds on the network's outputs. They belong to its weights, and are in its manifest."""
+    """Decision thresholds on the network's outputs. They belong to its weights and stand in its manifest."""
 
     drone: float
-    """Least drone probability of a detection."""
+    """Least probability of a detection."""
     predicted_drone: float
-    """The same where a track was predicted."""
+    """Least probability of a detection where a track was predicted."""
     another_crop: float
-    """With no more than this, a proposal is rejected without another crop."""
+    """A proposal with at most this probability is rejected without another crop."""
     mean_sigma: float
-    """Error of the mean of a crop and its mirrored one, as a share of what a single crop's would be."""
+    """Error of the mean of a crop and its mirrored one, relative to that of a single crop."""
     min_log_range_sigma: float
     bearing_sigma_rad: float
 
 
 @dataclass(frozen=True)
 class SecondStage:
-    """A network's interface."""
+    """Interface of the second stage's networks."""
 
     crop_size: int
     """Width and height of its crops, pixels."""
@@ -37,11 +37,10 @@ class SecondStage:
 
     @classmethod
     def of(cls, manifest: Manifest, verification: Manifest | None = None) -> SecondStage:
-        """The second stage from a distance network, and the verification network whose probability counts instead of
-        its own.
+        """The second stage from a distance network, and the verification network whose probability replaces its own.
 
-        Raises ModelError where a manifest does not say how crops are cut or outputs are judged, or where the two take
-        crops of different sizes.
+        Raises ModelError if a manifest lacks the section `crop` or a threshold, or if the two take crops of different
+        sizes.
         """
         judge = verification or manifest
         if judge.fixed_size != manifest.fixed_size:

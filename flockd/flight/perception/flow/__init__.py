@@ -1,4 +1,4 @@
-"""Optical flow: of whole images by a network or DIS, made exact on a grid of points."""
+"""Optical flow: dense, by a network or DIS, then refined on a grid of points."""
 
 from flockd.flight.perception.flow.dense import DisFlow, OnnxFlow
 from flockd.flight.perception.flow.lucas_kanade import grid_flow

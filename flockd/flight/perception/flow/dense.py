@@ -1,4 +1,4 @@
-"""Optical flow of all pixels: by a network, and by OpenCV's DIS, from no motion or from another flow on."""
+"""Dense optical flow: by a network, or by OpenCV's DIS, which may start from another flow."""
 
 from __future__ import annotations
 
@@ -13,21 +13,19 @@ from flockd.flight.perception.interface import Flow
 
 
 class DisFlow:
-    """OpenCV's dense inverse search (Kroeger et al. 2016): alone for small computers, or after another flow.
+    """OpenCV's dense inverse search (Kroeger et al. 2016): alone on small computers, or after another flow.
 
-    It is exact to a fraction of a pixel where it converges, but loses what moves far; a network is the other way round.
+    It is exact to a fraction of a pixel if it converges, but loses large motions; a network is the opposite.
     """
 
     def __init__(self, start: Flow | None = None, finest_scale: int = 1) -> None:
-        """``start``: the flow to begin with at the coarsest scale; None: no motion.
-
-        ``finest_scale``: it stops at a 2^n-th of the size.
-        """
+        """``start``: the flow that initialises the coarsest scale; None: no motion. ``finest_scale``: it stops at a
+        2^n-th of the size."""
         self.name = f"{start.name}+dis" if start else "dis"
         self._start = start
         self._finest_scale = finest_scale
         self._idle: list[cv2.DISOpticalFlow] = []
-        """None is for two callers at once. Each keeps its memory, which to take anew costs a third of its time."""
+        """Instances not in use: none serves two callers at once. Reusing one's memory saves a third of the time."""
 
     def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
         """See `Flow`."""
@@ -46,7 +44,7 @@ class DisFlow:
 
 
 class OnnxFlow:
-    """A flow network; enters images as its manifest asks for."""
+    """A flow network; scales images as its manifest asks."""
 
     def __init__(self, model: OnnxModel) -> None:
         self.name = model.manifest.name

@@ -1,4 +1,4 @@
-"""A flow made exact on a grid of points, and between them by what the points differ from it."""
+"""Refines a flow on a grid of points, and interpolates the corrections between them."""
 
 from __future__ import annotations
 
@@ -12,50 +12,50 @@ from numpy.typing import NDArray
 from flockd.core.messages import UNCLASSED, BoolArray, Float32Array, UInt8Array
 
 _GRID_PX = 16
-"""Between the points: with 8 the flow is as exact between them too, for three times the time."""
+"""Distance of the points. With 8 px the flow between them is as exact, for three times the time."""
 _WINDOW_PX = 9
 _HALVINGS = 2
-"""Of the images: an error of some 20 px of the flow is found."""
+"""Pyramid levels of the images: errors of the flow up to some 20 px are corrected."""
 _STEPS = 10
 _CONVERGED_PX = 0.03
 _MIN_EIGENVALUE = 1e-4
-"""Of the structure tensor, in OpenCV's units: below it a point has no texture to follow."""
+"""Least eigenvalue of the structure tensor, in OpenCV's units; below it a point has no texture to track."""
 _DIFFERENCE_LEVELS = 4.0
-"""Grey levels by which the windows may differ before a point counts for half."""
+"""Difference of the windows in grey levels at which a point has half weight."""
 _ASTRAY_PX = 3.0
-"""By which a point may differ from the median of the nine around it before it counts for half."""
+"""Distance of a point's motion from the median of the nine around it at which it has half weight."""
 _ALONE, _RETURNS_PX = 0.5, 1.0
-"""A point that is astray by more than this share of that counts whole if it is found back from where it went, begun
-where those around it came from: something thin and near moves otherwise than what is around it."""
+"""An outlier beyond this share of `_ASTRAY_PX` keeps its weight if tracking backwards, started from the median motion,
+ends within the second number of pixels of its start: thin near things move differently from what is around them."""
 _MIN_WEIGHT = 1e-4
 _OWN_WEIGHT = np.float32(0.25)
-"""From this weight on a point keeps its own flow; below, it takes part of what is around."""
+"""Weight above which a point keeps its own flow; below, it takes a share of its surroundings' flow."""
 _DRONE_MARGIN_PX = 20
-"""So near to a drone no point is used, and no flow: both see the drone's own motion."""
+"""Points and flow within this distance of a drone are not used: both contain the drone's own motion."""
 _NEAR_DRONES = np.ones((2 * _DRONE_MARGIN_PX + 1, 2 * _DRONE_MARGIN_PX + 1), np.uint8)
 _PYRAMID_LEVELS = 3
 """Halvings of the grid over which flow spreads."""
 _SURROUNDINGS_WEIGHT = 0.1
-"""What is around weighs as a point of this weight."""
+"""Weight of the surroundings, as a point of this weight."""
 _HOMOGRAPHY_STRIDE = 2
-"""Every second point each way is enough for it."""
+"""Every second point in each direction is enough for the homography."""
 _HOMOGRAPHY_MIN_WEIGHT = 0.5
 _HOMOGRAPHY_MIN_POINTS = 30
 _HOMOGRAPHY_TOLERANCE_PX = 4.0
 _HOMOGRAPHY_MAX_ERROR = 0.25
-"""A homography is no use that is off by more than this share of the image's width at the median."""
+"""Largest median error of a useful homography, relative to the image's width."""
 
 
 def grid_flow(flow: Float32Array, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
-    """The flow of the background made exact by Lucas & Kanade (1981; Bouguet 2001) at points 16 px apart.
+    """Refines the background's flow by Lucas & Kanade (1981; Bouguet 2001) at points 16 px apart.
 
-    In between goes what they add to it. A point that goes astray and is not found back from there (Kalal et al. 2010)
-    takes what those around it add; one without texture,
-    as of the sky, or beside a drone, what they differ from the homography that most of them follow (normalised
-    convolution, Knutsson & Westin 1993, over a pyramid).
+    Corrections are interpolated between points. A point that is an outlier and fails the backward check (Kalal et al.
+    2010) takes the corrections around it. A point without texture, such as sky, or beside a drone takes the differences
+    around it from the homography that most points follow (normalised convolution, Knutsson & Westin 1993, over a
+    pyramid).
 
     Args:
-        flow: (h, w, 2) pixels from the first image to the second, to some 20 px.
+        flow: (h, w, 2) pixels from the first image to the second, with errors of up to some 20 px.
         first: (h, w, 3) RGB.
         second: (h, w, 3) RGB.
         labels: (h, w) of the first image: 0 the background, 255 not to be used, else one value a drone, whose pixels
@@ -90,7 +90,7 @@ def grid_flow(flow: Float32Array, first: UInt8Array, second: UInt8Array, labels:
 def _followed(
     first: UInt8Array, second: UInt8Array, points: Float32Array, start: Float32Array
 ) -> tuple[Float32Array, Float32Array, BoolArray]:
-    """How far points (n, m, 2) of grey images have moved, (n, m, 2), by which weights, and where there is texture."""
+    """Motions (n, m, 2) of points (n, m, 2) of grey images, their weights, and where there is texture."""
     begin = points.reshape(-1, 1, 2)
     end, status, difference = _tracked(first, second, begin, begin + start.reshape(-1, 1, 2))
     shape = points.shape[:2]
@@ -112,7 +112,7 @@ def _followed(
 def _tracked(
     first: UInt8Array, second: UInt8Array, points: Float32Array, start: Float32Array
 ) -> tuple[Float32Array, UInt8Array, Float32Array]:
-    """Where points (n, 1, 2) of a grey image are in the next, begun at ``start``; 1 where found; grey levels apart."""
+    """Tracks points (n, 1, 2) into the second grey image from ``start``: positions, 1 if found, change of grey."""
     end, status, difference = cv2.calcOpticalFlowPyrLK(
         first, second, np.ascontiguousarray(points), np.ascontiguousarray(start), winSize=(_WINDOW_PX, _WINDOW_PX),
         maxLevel=_HALVINGS, criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _STEPS, _CONVERGED_PX),
@@ -122,7 +122,7 @@ def _tracked(
 
 
 def _beside(drones: UInt8Array, size: tuple[int, int]) -> BoolArray:
-    """Which of the points are on a drone or beside one."""
+    """Which points are on a drone or beside one."""
     cells = cv2.resize(drones, size, interpolation=cv2.INTER_AREA)
     reach = 2 * -(-_DRONE_MARGIN_PX // _GRID_PX) + 1
     return np.asarray(cv2.dilate(cells, np.ones((reach, reach), np.uint8)) > 0)
@@ -130,13 +130,13 @@ def _beside(drones: UInt8Array, size: tuple[int, int]) -> BoolArray:
 
 @lru_cache(maxsize=8)
 def _points(size: tuple[int, int]) -> Float32Array:
-    """(n, m, 2) the pixels of `grid_pixels` of an image of (width, height), centres whole; not to be changed."""
+    """(n, m, 2) pixels of `grid_pixels` of an image of (width, height), with whole numbers as centres; read only."""
     u, v = (np.arange(min(_GRID_PX, length) // 2, length, _GRID_PX) for length in size)
     return np.stack(np.meshgrid(u, v), axis=2).astype(np.float32)
 
 
 def _between(at_points: Float32Array, size: tuple[int, int]) -> Float32Array:
-    """(h, w, 2) of an image of (width, height), from what is at the points (n, m, 2)."""
+    """(h, w, 2) of an image of (width, height), interpolated from values at the points (n, m, 2)."""
     rows, columns = (_GRID_PX * count for count in at_points.shape[:2])
     full = cv2.resize(at_points, (columns, rows), interpolation=cv2.INTER_LINEAR)[: size[1], : size[0]]
     beyond = size[1] - full.shape[0], size[0] - full.shape[1]
@@ -146,7 +146,7 @@ def _between(at_points: Float32Array, size: tuple[int, int]) -> Float32Array:
 
 
 def _homography_flow(points: Float32Array, moved: Float32Array, weight: Float32Array, width: int) -> Float32Array:
-    """The flow at all points of the homography that most of what is sure follows; none where there is no such."""
+    """The flow of the homography that most certain points follow, at all points; zero if there is none."""
     none = np.zeros_like(moved)
     some = np.s_[::_HOMOGRAPHY_STRIDE, ::_HOMOGRAPHY_STRIDE]
     sure = weight[some] > _HOMOGRAPHY_MIN_WEIGHT
@@ -163,7 +163,7 @@ def _homography_flow(points: Float32Array, moved: Float32Array, weight: Float32A
 
 
 def _spread(values: Float32Array, weight: Float32Array) -> Float32Array:
-    """(n, m, 2) each point's own by its weight (n, m), what is around by a fixed one."""
+    """(n, m, 2) each point's own value by its weight (n, m), its surroundings' by a fixed one."""
     levels: list[tuple[NDArray[Any], NDArray[Any]]] = [(values * weight[..., None], weight)]
     for _ in range(_PYRAMID_LEVELS):
         levels.append((cv2.pyrDown(levels[-1][0]), cv2.pyrDown(levels[-1][1])))

@@ -1,12 +1,12 @@
-"""Whether ranges to the ground contradict the barometer's height, themselves, or the way flown.
+"""Detects ranges to the ground that contradict the barometer, each other, or the distance flown.
 
-The height less the range is the ground's height, which each range says to lie between two bounds. On the way they move
-apart by the ground's greatest slope, and with time by the barometer's drift; a new range brings them together. What is
-beyond them by more than a step of the ground is not the ground: a range of the landing gear, of a cable in the beam, or
-one that jumps. Which of the two is wrong two sensors cannot tell: it is taken to be the range finder, since the
-autopilot flies by the height. Ground that rises as fast as the drone climbs looks to both as a range that is stuck
-does. Readings that are the same to the last bit tell, and else the way flown by the images, whose scale is the range:
-it is off by the same factor.
+The drone's height minus the range is the ground's height. Each range puts it between two bounds. The bounds widen with
+the distance flown, by the steepest slope of the ground, and with time, by the barometer's drift; each new range narrows
+them. A reading outside them by more than a step of the ground is not of the ground: the beam hit the landing gear or a
+cable, or the range jumped. Two sensors cannot show which of them is wrong. The range finder is blamed, since the
+autopilot flies by the barometer. Ground that rises as fast as the drone climbs looks like a range that is stuck. Two
+tests tell them apart: whether readings are equal to the last bit, and whether the distance flown by the images, whose
+scale comes from the range, is wrong by the same factor.
 """
 
 from __future__ import annotations
@@ -22,96 +22,96 @@ from flockd.core.messages import FloatArray
 from flockd.flight.pilot.own_motion import ERROR_LASTS_S, ERROR_M_S, SCALE
 
 PROBATION_S = 3.0
-"""For which a range that was doubted has to agree with itself before it is believed again."""
+"""Time for which a blamed range finder has to agree with itself before it is used again."""
 REPEATED = 8
-"""Readings: of noise of 1 cm, in whole centimetres, so many in a row are the same once in ten thousand."""
+"""Equal readings in a row that count as stuck: of noise of 1 cm in whole centimetres, chance once in ten thousand."""
 
 
 @dataclass(frozen=True, eq=False)
 class GroundPoint:
-    """Where a range hit the ground."""
+    """A point of the ground that a range finder measured."""
 
     time_s: float
     reading_s: float
-    """When the range was measured: a reading may be there for several steps."""
+    """Time of the measurement. Several steps may have the same one."""
     place: FloatArray
-    """(2,) metres north and east, of a fixed origin: the drone's, as where its tilt turns the beam is no way flown."""
+    """(2,) metres north and east of a fixed origin: the drone's place. The beam's also moves with its tilt."""
     range_m: float
-    """As it was measured, slant."""
+    """Slant range, as measured."""
     height_m: float
-    """The barometer's, of the drone."""
+    """Height of the drone by the barometer."""
     ground_m: float
-    """The ground's height there, above the zero of the barometer's."""
+    """Height of the ground at this point, above the barometer's zero."""
 
 
 class ContradictionMonitor:
-    """Monitors one range finder. Call `update` for each reading, and `see_way` where images show the way, too."""
+    """Monitors one range finder. Call `update` for each reading, and `see_way` if images show the displacement."""
 
     def __init__(self, parameters: RangeFinderParameters) -> None:
         self._parameters = parameters
         self.why: str | None = None
-        """The range finder is doubted; None: it is believed."""
+        """Why the range finder is not used; None: it is."""
         self._before_m = 0.0
-        """The ground's height before it was doubted."""
+        """Height of the ground before the range finder was blamed."""
         self._same: GroundPoint | None = None
-        """The first of the readings that are the same to the last bit, ..."""
+        """The first of the readings that are equal to the last bit."""
         self._times = 0
-        """... and how many they are."""
+        """How many of them there are."""
         self._reading_s = -math.inf
-        """When the newest of them was measured."""
+        """Time of the newest of them."""
         self.forget()
 
     def forget(self) -> None:
-        """What follows cannot be compared with what was; a doubt remains."""
+        """Drops earlier readings, with which later ones cannot be compared. Blame remains."""
         self._first: GroundPoint | None = None
-        """Of the readings that agree with each other, since it was doubted."""
+        """The first reading, since the range finder was blamed, that agrees with those after it."""
         self._newest: GroundPoint | None = None
         self._bounds_m = np.array([-math.inf, math.inf])
-        """By those readings, of the ground's height below the drone at the newest one."""
+        """(2,) bounds of the ground's height below the drone at the newest reading."""
         self._way = np.zeros(3)
-        """Fading sums of the squared way by the autopilot, and of the images' ways along it."""
+        """(3,) fading sums: squared displacement by the autopilot, and the images' displacements along it."""
 
     def doubt(self, why: str) -> None:
-        """From now on the range finder is not believed, before its next readings agree with each other."""
+        """Blames the range finder; it is not used until its next readings agree with each other."""
         if self.why is None:
             self._before_m = 0.0 if self._newest is None else float(self._bounds_m.mean())
         self.why, self._first = why, None
 
     def see_repetition(self, point: GroundPoint) -> None:
-        """Whether a sensor that works would have said something else by now."""
+        """Blames the range finder if its readings stay equal while the height changes."""
         if self._same is None or point.range_m != self._same.range_m:
             self._same, self._times = point, 0
-        self._times += point.reading_s != self._reading_s  # not the same one again
+        self._times += point.reading_s != self._reading_s  # a reading counts once
         self._reading_s = point.reading_s
         climbed_m = abs(point.height_m - self._same.height_m)
         if climbed_m >= RANGE_REPEATED.limit and self._times >= REPEATED:
             self.doubt("the range stays the same while the height changes")
 
     def see_way(self, elapsed_s: float, flown: FloatArray, by_images: FloatArray) -> None:
-        """Whether the way by the images contradicts the autopilot's in the range's scale, and less in the barometer's.
+        """Blames the range finder if images contradict the autopilot in its scale more than in the barometer's.
 
         Args:
-            elapsed_s: in the step.
-            flown: (3,) metres NED by the autopilot.
-            by_images: (2, 3) likewise by the images, in the range finder's scale and in the barometer's.
+            elapsed_s: duration of the step.
+            flown: (3,) displacement by the autopilot, metres NED.
+            by_images: (2, 3) displacement by the images, in the range finder's scale and in the barometer's.
         """
         kept = math.exp(-elapsed_s / self._parameters.compare_s)
         self._way = kept * self._way + np.array([flown @ flown, *(by_images @ flown)])
         square, *along = self._way.tolist()
         if not square > 0.0:
             return
-        of_velocity = ERROR_M_S * math.sqrt(2.0 * ERROR_LASTS_S * elapsed_s / square)  # of a Gauss-Markov error's mean
+        of_velocity = ERROR_M_S * math.sqrt(2.0 * ERROR_LASTS_S * elapsed_s / square)  # mean of a Gauss-Markov error
         off, off_by_barometer = (abs(one / square - 1.0) for one in along)
         if off > RANGE_VISION.limit * math.hypot(SCALE, of_velocity) and off_by_barometer < off:
             self.doubt("the range contradicts the way flown")
 
     def update(self, point: GroundPoint, home: FloatArray | None) -> str | None:
-        """Why the newest reading is not to be used; None: it is.
+        """Takes a reading. Returns why it may not be used; None: it may.
 
         Args:
-            point: where it hit the ground.
-            home: (2,) where the ground's height is zero, as points' places; None: not known. Counts while nothing else
-                is known.
+            point: where the range hit the ground.
+            home: (2,) place at which the ground's height is zero, as `GroundPoint.place`; None: not known. Only used
+                for the first reading.
         """
         p = self._parameters
         if self._newest is not None:
@@ -134,9 +134,9 @@ class ContradictionMonitor:
         self._bounds_m = self._bounds_m + np.array([-by_m, by_m])
 
     def _is_rehabilitated(self, first: GroundPoint, newest: GroundPoint) -> bool:
-        """Its readings agree with each other, and with the ground as it was before; or they change as the height does.
+        """Whether readings agree with each other and with the ground as it was before, or else follow the height.
 
-        What is stuck or blocked does not change.
+        A range that is stuck or blocked does not follow it.
         """
         if newest.time_s - first.time_s < PROBATION_S:
             return False

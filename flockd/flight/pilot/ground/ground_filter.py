@@ -1,8 +1,8 @@
-"""The ground below the drone as a plane, from ranges to it, the own motion and the slope that images show.
+"""The ground below the drone as a plane, estimated from ranges, the own motion and the slope that images show.
 
-A Kalman filter of three numbers: the ground's height below the drone, in the frame of the autopilot's height, and its
-slope to the north and to the east. Flying on, the ground rises by the slope; a range says where the ground is at one
-point; points one after the other tell the slope along the path, and images that across it.
+A Kalman filter with three states: the ground's height below the drone, in the frame of the autopilot's height, and its
+slopes to the north and to the east. As the drone moves, the height changes by the slope. A range measures the height at
+one point; successive points show the slope along the path, images the slope across it.
 """
 
 from __future__ import annotations
@@ -18,48 +18,48 @@ from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, Reaso
 from flockd.flight.pilot.ground.contradiction import ContradictionMonitor, GroundPoint
 
 HEIGHT_NOISE_M = 0.03
-"""Standard deviation of the autopilot's height from one reading to the next; what changes slowly does not matter."""
+"""Standard deviation of the autopilot's height between readings. Its slow drift does not matter here."""
 SLOPE_CHANGE = 0.02
-"""Standard deviation of what the slope changes over a metre: a hill of 5 m turns from 15 % up to 15 % down in 100 m."""
+"""Standard deviation of the change of slope per metre: a hill of 5 m goes from 15 % up to 15 % down in 100 m."""
 SEEN_SLOPE = 0.04
-"""Standard deviation, each axis, of a slope from images of rough ground, which has bumps around the drone, too."""
+"""Standard deviation, each axis, of a slope from images. Rough ground has bumps, which images show too."""
 ROUGHNESS_M = 0.03
-"""Standard deviation of what the ground departs from its slope over a metre."""
+"""Standard deviation by which the ground departs from its slope over a metre."""
 TRACK_POINTS = 100
-"""Ranges remembered: 10 s of ten steps a second."""
+"""Points of the ground that are kept: 10 s at ten steps a second."""
 
 
 class GroundFilter:
-    """Follows the ground below one drone. Call `update` once for each step."""
+    """Estimates the ground below one drone. Call `update` once a step."""
 
     def __init__(self, source: HeightSource, parameters: RangeFinderParameters) -> None:
         self._source, self._parameters = source, parameters
         self._state: FloatArray | None = None
-        """(3,): metres above the zero of the autopilot's height, then the slope to the north and to the east."""
+        """(3,) height above the zero of the autopilot's height in metres, slope to the north, slope to the east."""
         self._covariance = np.zeros((3, 3))
         self._last: VehicleState | None = None
         self._measured_s = -math.inf
         self._flown = np.zeros(2)
-        """North and east since the beginning, as the autopilot says."""
+        """(2,) metres north and east since the start, by the autopilot."""
         self._contradictions = ContradictionMonitor(parameters)
         self._newest: GroundPoint | None = None
-        """Where the newest step's range hit the ground, used or not; None: it had none."""
+        """Where the newest step's range hit the ground, used or not; None: the step had no range."""
         self._elapsed_s = 0.0
-        """In the newest step."""
+        """Duration of the newest step."""
         self._moved: FloatArray | None = None
-        """(3,) metres NED in the newest step, by the autopilot's velocities; None: it does not say."""
+        """(3,) displacement in the newest step by the autopilot's velocities, metres NED; None: not known."""
         self._used_height_m = 0.0
-        """Above the ground, of the newest step's scale."""
+        """Height above the ground from which the newest step's scale follows."""
         self._track: deque[FloatArray] = deque(maxlen=TRACK_POINTS)
-        """(3,) each: where a range hit the ground, north and east in that frame, and the ground's height there."""
+        """(3,) each: metres north and east of the start, and height of the ground, where a range hit it."""
 
     def track(self, vehicle: VehicleState) -> FloatArray:
-        """(k, 3) metres NED from the drone: where the last ranges hit the ground; of the step of the last `update`."""
+        """(k, 3) metres NED from the drone: where the last ranges hit the ground, as of the last `update`."""
         places = np.array(self._track).reshape(-1, 3)
         return np.column_stack([places[:, :2] - self._flown, vehicle.height_m - places[:, 2]])
 
     def update(self, vehicle: VehicleState) -> tuple[GroundEstimate | None, Reason | None]:
-        """The ground at a step, and why its source is not the one that was wanted."""
+        """The ground in this step, and the reason if another source than the configured one is used."""
         if self._source == "barometer":
             return level_ground(vehicle), None
         ground, reason = self._judged(vehicle)
@@ -77,12 +77,12 @@ class GroundFilter:
         return None, Reason(ReasonKind.HEIGHT, f"height: {fault}; there is no scale")
 
     def see_slope(self, slope: FloatArray) -> None:
-        """Takes the slope (2,) that the images of the newest step show."""
+        """Takes the slope (2,), north and east, that the images of the newest step show."""
         if self._state is not None:
             self._correct(np.eye(3)[1:], slope, np.eye(2) * SEEN_SLOPE**2)
 
     def see_motion(self, displacement: FloatArray) -> None:
-        """Takes the way (3,) metres NED that the images of the newest step show, by the scale of its ground."""
+        """Takes the displacement (3,), metres NED, that images show in the newest step, in the scale of its ground."""
         if self._newest is None or self._moved is None:
             return
         heights_m = np.array([self._newest.height_m - self._newest.ground_m, self._newest.height_m])
@@ -91,7 +91,7 @@ class GroundFilter:
             self._contradictions.see_way(self._elapsed_s, self._moved, by_images)
 
     def _follow(self, vehicle: VehicleState) -> str | None:
-        """Takes a step and its range; why that one is not used, None: it is."""
+        """Takes a step and its range. Returns why the range is not used; None: it is."""
         self._newest = None
         self._predict(vehicle)
         reading = vehicle.ground_range
@@ -110,7 +110,7 @@ class GroundFilter:
             return "the range is not that of the ground expected"
         home = None if vehicle.position is None else self._flown - vehicle.position
         why = self._contradictions.update(self._newest, home)
-        if why is not None:  # the readings before made the state false, too
+        if why is not None:  # earlier readings may have been wrong as well
             self._forget()
             return why
         if self._state is None:
@@ -124,7 +124,7 @@ class GroundFilter:
         return None
 
     def _is_unexplained(self, row: FloatArray, ground_m: float, variance: float) -> bool:
-        """Whether a reading is farther from the expected ground than it errs; one that says the same fits after it."""
+        """Whether a reading is outside the gate. If so the variance grows, so that a second one like it fits."""
         if self._state is None:
             return False
         off_m, gate = abs(ground_m - float(row @ self._state)), self._parameters.gate_sigma
@@ -162,11 +162,11 @@ class GroundFilter:
         gain = self._covariance @ rows.T @ np.linalg.inv(rows @ self._covariance @ rows.T + noise)
         self._state = self._state + gain @ (measured - rows @ self._state)
         kept = np.eye(3) - gain @ rows
-        self._covariance = kept @ self._covariance @ kept.T + gain @ noise @ gain.T  # Joseph's form stays symmetric
+        self._covariance = kept @ self._covariance @ kept.T + gain @ noise @ gain.T  # Joseph's form keeps it symmetric
 
 
 def reading_fault(reading: RangeReading | None, now_s: float, parameters: RangeFinderParameters) -> str | None:
-    """Why a range says nothing of the ground; None: it does."""
+    """Why a range cannot be used; None: it can."""
     if reading is None:
         return "no range finder is heard"
     if not math.isfinite(reading.range_m):
@@ -183,18 +183,18 @@ def reading_fault(reading: RangeReading | None, now_s: float, parameters: RangeF
 
 
 def level_ground(vehicle: VehicleState) -> GroundEstimate:
-    """Level, as far below as the autopilot's height says."""
+    """Level ground at height zero of the autopilot."""
     return GroundEstimate(vehicle.height_m, np.zeros(2), "barometer")
 
 
 def _height_at(time_s: float, vehicle: VehicleState) -> float:
-    """The autopilot's height shortly before or after a state."""
+    """The drone's height at a time near that of the vehicle's state, by its vertical speed."""
     sink_m_s = 0.0 if vehicle.velocity_ned is None else float(vehicle.velocity_ned[2])
     return vehicle.height_m + sink_m_s * (vehicle.time_s - time_s)
 
 
 def _way(before: VehicleState, now: VehicleState) -> FloatArray | None:
-    """(2,) metres north and east that the autopilot says it flew; None: it does not say."""
+    """(2,) displacement north and east in metres by the autopilot; None: not known."""
     if before.position is not None and now.position is not None:
         return now.position - before.position
     moved = _moved(before, now)
@@ -202,7 +202,7 @@ def _way(before: VehicleState, now: VehicleState) -> FloatArray | None:
 
 
 def _moved(before: VehicleState, now: VehicleState) -> FloatArray | None:
-    """(3,) metres NED by the autopilot's velocities; positions jump when its estimator is reset."""
+    """(3,) displacement by the autopilot's velocities, metres NED; its positions jump when its estimator is reset."""
     if before.velocity_ned is None or now.velocity_ned is None:
         return None
     return 0.5 * (before.velocity_ned + now.velocity_ned) * (now.time_s - before.time_s)

@@ -1,9 +1,9 @@
-"""The own motion's metric scale from the height above the ground that the motion itself shows.
+"""The metric scale of the own motion, from the height above the ground.
 
-Two images and the motion between them give the depth of matched points in units of that motion, and so the ground's
-plane: its slope, and the drone's height above it. Where a range finder says how high that is, the unit is known. Ground
-is not plane, and a bump of 0.2 m straight below would be 4 % at 5 m. So the plane is that around the middle of the
-places that the last ranges hit, and its height is these places' mean.
+Two images and the motion between them give the depth of matched points in units of that motion, and with it the plane
+of the ground: its slope, and the drone's height above it. A range finder measures that height in metres, which gives
+the unit. Real ground is not flat: at 5 m, a bump of 0.2 m straight below would be an error of 4 %. So the plane is
+fitted around the middle of the points that the last ranges hit, and its height is their mean.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from flockd.flight.geometry.ground_fit import REACH
 from flockd.flight.perception import CameraObservation, Observation
 
 MATCHES = 1200
-"""Of each image: with four times as many the scale was no better. Of 640x480 pixels they are those at which the flow is
-exact."""
+"""Matched points of each image; four times as many did not improve the scale. At 640x480 pixels, these are the points
+at which the flow is refined."""
 MIN_BASELINE_M = 0.08
-"""Across the line of sight; with less, the ground's depth is noise."""
+"""Shortest baseline across the line of sight; below it the depth of the ground is noise."""
 
 
 def scaled_by_ground(
     rig: Rig, observation: Observation, ego: EgoMotion, ground: GroundEstimate, track: FloatArray
 ) -> tuple[EgoMotion, FloatArray]:
-    """The motion with the scale of the range finder's height, and the ground's slope (2,), north and east.
+    """The own motion in the range finder's scale, and the slope of the ground (2,), north and east.
 
     Args:
         rig: the drone's cameras.
-        observation: of the motion's end, with the one before.
+        observation: at the end of the motion, with the one before it.
         ego: in the depth maps' scale.
         ground: below the drone at the motion's end.
         track: (k, 3) metres NED from the drone, where the last ranges hit the ground.
 
-    Raises ValueError with the reason where the ground does not tell.
+    Raises ValueError with the reason if the ground gives no scale.
     """
     if ground.source != "range_finder":
         raise ValueError("no range to the ground")
@@ -69,7 +69,7 @@ def scaled_by_ground(
 def _samples(
     camera: RigCamera, observation: Observation, now: CameraObservation, flow: Float32Array, ego: EgoMotion
 ) -> GroundSamples:
-    """Matched background of one camera, at its place in the newest image."""
+    """Matched background points of one camera, at their places in the newest image."""
     assert observation.previous is not None
     labels_before = observation.previous.cameras[camera.name].labels
     width, height = camera.camera.size
@@ -86,7 +86,7 @@ def _samples(
     seen = camera.camera.rays(end)
     inverse, baseline = inverse_ranges_of_rays(camera.camera.rays(start), seen, between)
     rays = seen @ (R_ned_body @ mount.rotation).T
-    clear = (baseline > MIN_BASELINE_M) & (inverse > 0.0)  # false for NaN
+    clear = (baseline > MIN_BASELINE_M) & (inverse > 0.0)  # NaN compares false
     offsets = np.broadcast_to(R_ned_body @ mount.translation, rays.shape)
     sigma = FLOW_SIGMA_PX * camera.camera.pixel_angle(seen) / np.maximum(baseline, MIN_BASELINE_M)
     return GroundSamples(rays, inverse, offsets, sigma).select(clear)
