@@ -1,1 +1,1 @@
-"""The process on the drone: time, devices, threads and failure."""
+"""The process on the drone: time, devices, threads and failures."""

@@ -1,10 +1,10 @@
-"""Messages as JSON and back, their checks, and the JSON schema of each: all from the types themselves, declared once.
+"""Messages to JSON and back, their checks, and the JSON schema of each, all derived from their types.
 
-Dataclasses are recorded, without losing a bit: a number is written with as many digits as bring the same number back;
-one that is not finite is the text `NaN`, `Infinity` or `-Infinity`, which JSON's own grammar lacks; a field that is
-None is left out. An array of the `Shape` in its annotation is a flat list of numbers, row by row, as viewers do not
-take lists of lists. A `Reason` is its text. TypedDicts are telemetry, which peers send: every number is finite or null,
-and numbers, texts, lists and objects have bounds.
+Dataclasses are recorded without loss: a number has as many digits as restore it exactly; one that is not finite is the
+text `NaN`, `Infinity` or `-Infinity`, which JSON's own grammar lacks; a field that is None is left out. An array with a
+`Shape` in its annotation is a flat list of numbers, row by row, as viewers do not take lists of lists. A `Reason` is
+its text. TypedDicts are telemetry, which peers send: every number is finite or null, and numbers, texts, lists and
+objects have limits.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ import numpy as np
 from flockd.core.messages import Reason, ReasonKind, Shape
 
 Json = Any
-"""What `json` writes and reads: text, numbers, booleans, lists, and mappings by text."""
+"""The types that `json` writes and reads: text, numbers, booleans, lists, and mappings by text."""
 
 LARGEST_INT = 2**53
-"""The largest that a browser counts exactly."""
+"""The largest integer that browsers represent exactly."""
 LARGEST_NUMBER = 1e10
-"""Far beyond every clock and measure, and small enough for a watcher to calculate with it."""
+"""Larger than every clock and measurement, and small enough for a watcher's arithmetic."""
 LARGEST_OF_UNIT = {"_deg": 360.0, "_m": 1e6, "_ne": 1e6, "_ned": 1e6, "_m_s": 1e6}
-"""By the end of a field's name: no drone is, sees or flies farther or faster."""
+"""Limits by the end of a field's name: no drone is, sees or flies farther or faster."""
 LONGEST_TEXT = 4096
 """Characters; a path may have as many."""
 MOST_ITEMS = 1000
-"""Of a list or an object."""
+"""Largest number of entries of a list or an object."""
 _NAMES: Mapping[Any, str] = {float: "finite number", int: "whole number", bool: "true or false", str: "text"}
 _SCHEMAS = {float: "number", int: "integer", bool: "boolean", str: "string"}
 
 
 def parsed(data: bytes) -> Json:
-    """Parses JSON from outside. Raises ValueError if it is no JSON, or nested too deep."""
+    """Parses JSON from outside. Raises ValueError if it is not JSON, or nested too deep."""
     try:
         return json.loads(data)
     except RecursionError as error:
@@ -47,7 +47,7 @@ def parsed(data: bytes) -> Json:
 
 
 def to_json(value: object) -> Json:
-    """A message to be recorded, or any value within one. Raises TypeError for what has no place in a message."""
+    """A message to be recorded, or any value in one. Raises TypeError for a type that no message has."""
     if isinstance(value, Reason):
         return value.text
     if dataclasses.is_dataclass(value):
@@ -64,12 +64,12 @@ def to_json(value: object) -> Json:
         return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
     if value is None or isinstance(value, str | bool | int | float):
         return value
-    raise TypeError(f"a {type(value).__name__} has no place in a message")
+    raise TypeError(f"a {type(value).__name__} cannot be part of a message")
 
 
 def to_telemetry(value: object) -> Json:
     """A message to be published: null for every number that is not finite."""
-    if type(value) is float:  # most are: this runs for every number of every message
+    if type(value) is float:  # the most frequent type: this runs for every number of every message
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
         return {key: to_telemetry(inner) for key, inner in value.items()}
@@ -81,8 +81,8 @@ def to_telemetry(value: object) -> Json:
 def from_json(kind: Any, value: Json) -> Any:
     """The message of this type: a dataclass that `to_json` wrote, or a TypedDict as a peer sent it.
 
-    A missing field that may be None becomes None, as in earlier versions' messages. A TypedDict keeps further keys, as
-    later versions send them. Raises ValueError, with a key and a few words, for JSON that is no such message.
+    A missing field that may be None becomes None, as in earlier versions' messages. A TypedDict keeps additional keys,
+    as later versions send them. Raises ValueError, with a key and a few words, if the JSON is not such a message.
     """
     return _read(kind, value, "", bounded=is_typeddict(kind))
 
@@ -115,7 +115,7 @@ def _read(kind: Any, value: Json, key: str, *, bounded: bool) -> Any:
 
 @functools.cache
 def _fields(kind: Any) -> dict[str, tuple[Any, bool, bool]]:
-    """Of a type by its fields' names: the type of each, whether it may be None, and whether it may be missing."""
+    """For each field of a type by name: its type, whether it may be None, and whether it may be missing."""
     missing = dataclasses.MISSING
     given = (
         kind.__optional_keys__
@@ -162,7 +162,7 @@ def _plain(kind: Any, value: Json, key: str, *, bounded: bool) -> Any:
         if abs(value) <= LARGEST_INT:
             return value
     elif kind is str and isinstance(value, str):
-        written = value.isascii() or value.encode(errors="ignore").decode() == value  # no half surrogate pairs
+        written = value.isascii() or value.encode(errors="ignore").decode() == value  # no unpaired surrogates
         if written and (not bounded or len(value) <= LONGEST_TEXT):
             return value
     elif kind is object or (kind is bool and isinstance(value, bool)):
@@ -179,7 +179,7 @@ def _in_bounds(value: float | None, key: str) -> float | None:
 
 
 def _shape(kind: Any) -> tuple[int, ...]:
-    """The shape of an annotated array. Raises TypeError where none is declared."""
+    """The shape of an annotated array. Raises TypeError if none is declared."""
     for part in get_args(kind)[1:]:
         if isinstance(part, Shape):
             return part.sizes

@@ -1,4 +1,4 @@
-"""Simulated time: the computer's own made slower or faster, so that all of its programs have the same."""
+"""Simulated time: the computer's clock made slower or faster, the same in all of its programs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 
 def event_loop_at(speed_factor: float) -> asyncio.AbstractEventLoop:
-    """Sleeps and time-outs by `clock_at`; at 1 asyncio's own loop."""
+    """An event loop with sleeps and time-outs by `clock_at`; asyncio's own for a factor of 1."""
     return asyncio.new_event_loop() if speed_factor == 1.0 else _SimulatedLoop(speed_factor)
 
 
@@ -24,7 +24,7 @@ class _SimulatedLoop(asyncio.SelectorEventLoop):
 
 
 class _SimulatedSelector(selectors.DefaultSelector):
-    """Waits in real time for what is asked in simulated time."""
+    """Waits in real time for intervals of simulated time."""
 
     def __init__(self, speed_factor: float) -> None:
         super().__init__()
@@ -35,5 +35,5 @@ class _SimulatedSelector(selectors.DefaultSelector):
 
 
 def clock_at(speed_factor: float) -> Callable[[], float]:
-    """Seconds on the monotonic clock times ``speed_factor``; at 1 the clock itself."""
+    """Seconds on the monotonic clock times ``speed_factor``; the clock itself for a factor of 1."""
     return time.monotonic if speed_factor == 1.0 else lambda: speed_factor * time.monotonic()

@@ -1,4 +1,4 @@
-"""A thread for one concern: nothing waits in asyncio's own executor, and a job that hangs costs its thread alone."""
+"""A thread for one concern: nothing waits in asyncio's own executor, and a job that hangs costs only its thread."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ from typing import Any, TypeVar
 T = TypeVar("T")
 
 GOLDEN_S = 8.0
-"""For a network's run on its golden input, which takes less than a second on any computer that flies: one that never
-ends is refused within ten."""
+"""Time limit of a network's run on its golden input, which takes less than a second on any computer that flies."""
 _END_S = 1.0
-"""How long work may take to end when it is stopped; ONNX Runtime takes a few milliseconds."""
+"""Longest time for work to end when it is stopped; ONNX Runtime takes a few milliseconds."""
 
 
 class LateError(Exception):
-    """A job was not done by its deadline; it may still be running."""
+    """A job missed its deadline; it may still be running."""
 
 
 class BusyError(Exception):
@@ -37,7 +36,7 @@ class Worker:
         self._thread.start()
 
     def submit(self, job: Callable[..., T], *arguments: object) -> Future[T]:
-        """Gives it a job, from any thread. Raises BusyError when too many wait."""
+        """Queues a job, from any thread. Raises BusyError if too many wait."""
         future: Future[T] = Future()
         try:
             self._jobs.put_nowait((future, lambda: job(*arguments)))
@@ -46,7 +45,7 @@ class Worker:
         return future
 
     async def do(self, deadline_s: float, job: Callable[..., T], *arguments: object) -> T:
-        """Returns or raises what the job does. Raises LateError if the job takes longer, and BusyError."""
+        """Returns the job's result or raises its error. Raises LateError if the job takes too long, and BusyError."""
         try:
             async with asyncio.timeout(deadline_s) as deadline:
                 return await asyncio.wrap_future(self.submit(job, *arguments))
@@ -56,7 +55,7 @@ class Worker:
             raise LateError(f"{self._name}: not done within {deadline_s:g} s") from error
 
     def leave(self, timeout_s: float = 0.0) -> None:
-        """Lets the thread end after its present job, and waits so long for it; if it hangs, it ends with the process.
+        """Lets the thread end after its present job, and waits up to ``timeout_s``. If it hangs, the process ends it.
 
         Wait for threads that run foreign code: such code may crash if the process ends meanwhile.
         """
@@ -71,7 +70,7 @@ class Worker:
                 continue
             try:
                 result = job()
-            except BaseException as error:  # noqa: BLE001 - it is the asker's to handle
+            except BaseException as error:  # noqa: BLE001 - the caller handles it
                 future.set_exception(error)
             else:
                 future.set_result(result)
@@ -79,9 +78,9 @@ class Worker:
 
 
 def within(seconds: float) -> Callable[[Callable[[], None], Callable[[], None]], None]:
-    """Something that runs its first argument, and where that takes longer stops it by the second.
+    """A function that runs its first argument and, after that time, stops it by the second.
 
-    It then raises TimeoutError, whether or not the work has ended; what the work itself raises passes through.
+    It then raises TimeoutError, whether or not the work has ended; errors of the work pass through.
     """
 
     def run(work: Callable[[], None], stop: Callable[[], None]) -> None:

@@ -33,17 +33,17 @@ LandedState = Literal["unknown", "ground", "air", "taking off", "landing"]
 
 
 def mode_of(custom_mode: float) -> FlightMode:
-    """By PX4's number of it in MAVLink; one that is not in `MODES` is `other`."""
+    """The mode of PX4's `custom_mode` in MAVLink; `other` if it is not in `MODES`."""
     number = int(custom_mode)
     return MODES.get((number >> 16 & 0xFF, number >> 24 & 0xFF), "other")
 
 
 class AutopilotError(UnavailableError):
-    """The autopilot is not there, did not answer, or refused; the text says which, and what to do."""
+    """The autopilot is missing, did not answer, or refused; the text says which, and what to do."""
 
 
 class AutopilotSettingError(AutopilotError):
-    """The configuration's section `autopilot` does not say what it has to; a restart corrects nothing."""
+    """The configuration's section `autopilot` is incomplete; a restart does not help."""
 
     exit_code = ExitCode.BAD_CONFIGURATION
 
@@ -54,42 +54,42 @@ class AutopilotStatus:
 
     time_s: float
     heartbeat_age_s: float
-    """Since the last heartbeat; infinite before the first."""
+    """Time since the last heartbeat; infinite before the first."""
     message_age_s: float
-    """Since its last message of any kind."""
+    """Time since its last message of any kind."""
     flight_mode: FlightMode
     armed: bool
     failsafe: bool
-    """It flies by its own failsafe and no longer as it was asked."""
+    """Whether it flies its own failsafe instead of what it was commanded."""
     landed_state: LandedState
     battery_share: float | None
     """0 to 1."""
     estimate_ok: bool | None
-    """Attitude, height and horizontal velocity and position are estimated."""
+    """Whether attitude, height, horizontal velocity and position are estimated."""
     gps_ok: bool | None
-    """A three-dimensional fix."""
+    """Whether it has a three-dimensional fix."""
     position_ned: FloatArray | None
-    """(3,) metres from where the estimator's origin was at the start of the flight, which is not home."""
+    """(3,) metres from the estimator's origin at the start of the flight, which is not home."""
     home_ned: FloatArray | None
-    """(3,) metres, likewise."""
+    """(3,) metres from the same origin."""
     foreign_setpoints: str | None = None
-    """Setpoints that flockd did not send, in a few words; None: none."""
+    """Evidence of setpoints that flockd did not send, in a few words; None: none."""
     fastest_m_s: float = math.inf
-    """The speed that the autopilot limits setpoints to; infinite where it is not known."""
+    """The autopilot's speed limit for setpoints; infinite if it is not known."""
     parameter_fault: str | None = None
-    """What is wrong with a parameter that was changed since it was armed."""
+    """The fault of a parameter that was changed since the drone was armed."""
     frame_jumped: bool = False
-    """Its local frame, or its heading, has jumped far since offboard began."""
+    """Whether its local frame, or its heading, has jumped far since offboard began."""
 
     @property
     def in_air(self) -> bool:
-        """Off the ground; not so while it is unknown."""
+        """Whether it is off the ground; false if unknown."""
         return self.landed_state in {"air", "taking off", "landing"}
 
 
 @dataclass(frozen=True)
 class Firmware:
-    """What runs on the autopilot."""
+    """The autopilot's firmware."""
 
     autopilot: str
     """`PX4`, or `autopilot N` by its MAV_AUTOPILOT."""

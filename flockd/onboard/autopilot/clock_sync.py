@@ -1,7 +1,7 @@
-"""The autopilot's clock against this computer's, from round trips of MAVLink's TIMESYNC; pure, knows no clock.
+"""The autopilot's clock relative to this computer's, from round trips of MAVLink's TIMESYNC; pure, without a clock.
 
-A round trip bounds the offset between two clocks by half its duration on either side, as the time of each way is not
-known. A busy computer only makes the bounds of a round trip wider: the offset lies where the bounds of all overlap.
+A round trip limits the offset between two clocks to within half its duration, as the time of each way is not known. A
+busy computer only widens the bounds of a round trip: the offset lies in the intersection of all bounds.
 """
 
 from __future__ import annotations
@@ -16,66 +16,66 @@ from flockd.core.consistency import STAMP
 from flockd.core.messages import FloatArray
 
 WINDOW_S = 30.0
-"""Older round trips do not count."""
+"""Age up to which round trips count."""
 MOST_SAMPLES = 300
 LEAST_SAMPLES = 5
 DRIFT = 5e-5
-"""Seconds a second by which two crystals may run apart: the bounds of a round trip widen with its age."""
+"""Largest drift between two crystals in s per s: the bounds of a round trip widen with its age."""
 JUMP_S = 0.01
 JUMPS = 3
-"""So many round trips in a row that contradict the estimate by `JUMP_S` and half their duration begin a new one."""
+"""Round trips in a row that contradict the estimate, by `JUMP_S` and half their duration, before a new one begins."""
 RECENT_S = 2.0
 COMPARED_S = 1.0
-"""Messages that are compared with the clock: at 30 Hz enough for one that nothing has held up, ..."""
+"""Messages of this time are compared with the clock: at 30 Hz, one of them was not delayed."""
 LEAST_MESSAGES = 10
-"""... and at any rate so many."""
+"""Fewest messages that are compared."""
 LIES_AFTER_S = 1.5
-"""Longer than an autopilot that has started again contradicts its old clock."""
+"""Longer than the time for which a restarted autopilot contradicts its old clock."""
 BELIEVED_AGAIN_S = 10.0
 
 
 @dataclass(frozen=True)
 class ClockEstimate:
-    """The autopilot's clock as of one time of this computer's."""
+    """The autopilot's clock at one time of this computer's."""
 
     time_s: float
     """Time of the newest round trip, on this computer's clock."""
     offset_s: float
-    """The autopilot's clock less this computer's, then."""
+    """The autopilot's clock minus this computer's."""
     error_s: float
-    """The offset is off by no more, where the clocks run evenly; where they do not, by how much they contradict it."""
+    """Largest error of the offset if the clocks run evenly; else the gap between contradicting bounds."""
     round_trip_s: float
-    """The shortest of the last seconds."""
+    """The shortest round trip of the last seconds."""
     recent_round_trip_s: float
-    """The shortest of the last `RECENT_S`."""
+    """The shortest round trip of the last `RECENT_S`."""
 
     def local_s(self, autopilot_s: float) -> float:
-        """When on this computer's clock the autopilot's showed that."""
+        """This computer's time at which the autopilot's clock showed `autopilot_s`."""
         return autopilot_s - self.offset_s
 
 
 class StampMonitor:
-    """Whether the clock that round trips give is that of the stamps in other messages: TIMESYNC may lie.
+    """Checks that round trips and the stamps of other messages show the same clock: TIMESYNC may be wrong.
 
-    A message cannot arrive before it was stamped, and the quickest in a second takes no longer on its one way than the
-    quickest round trip takes on both. A clock that jumps, drifts or belongs to another sender violates one of the
-    two. A busy computer violates neither, because it delays round trips too. The limits are `consistency.STAMP`'s.
+    A message cannot arrive before it was stamped, and the fastest in a second takes no longer one way than the fastest
+    round trip takes both ways. A clock that jumps, drifts or belongs to another sender violates one of the two. A busy
+    computer violates neither, because it delays round trips too. The limits are `consistency.STAMP`'s.
     """
 
     def __init__(self) -> None:
         self._differences: deque[tuple[float, float]] = deque()
-        """Of the last `COMPARED_S`: when a message arrived, and that less its stamp."""
+        """(arrival, arrival minus stamp) of the messages of the last `COMPARED_S`."""
         self._begun_s: float | None = None
-        """Since when stamps contradict the clock; None: they do not."""
+        """Since when stamps contradict the clock; None: they agree."""
         self._last_s = -np.inf
-        """When they last did."""
+        """When they last contradicted it."""
         self.lies = False
-        """It has contradicted for long enough to say so, and has not agreed again for long enough."""
+        """Whether they have contradicted it for long enough, and have not agreed again for long enough."""
         self.delay_s = 0.0
-        """On the way, the quickest message by this clock."""
+        """Delay of the fastest message by this clock."""
 
     def believes(self, clock: ClockEstimate | None, stamp_s: float, arrived_s: float) -> bool:
-        """Whether a message's stamp, on the autopilot's clock, may be used with that clock."""
+        """Whether a message's stamp, on the autopilot's clock, may be converted with that clock."""
         self._differences.append((arrived_s, arrived_s - stamp_s))
         while len(self._differences) > LEAST_MESSAGES and arrived_s - self._differences[0][0] > COMPARED_S:
             self._differences.popleft()
@@ -96,17 +96,17 @@ class StampMonitor:
 
 
 class ClockSync:
-    """Estimates the offset from the round trips of the last `WINDOW_S`. `add` is for one thread, the rest for any."""
+    """Estimates the offset from the round trips of the last `WINDOW_S`. Call `add` on one thread, the rest on any."""
 
     def __init__(self) -> None:
         self._samples: deque[tuple[float, float, float]] = deque(maxlen=MOST_SAMPLES)
-        """Middle of the round trip on this computer's clock, the autopilot's time less that, and the duration."""
+        """Middle of the round trip on this computer's clock, the autopilot's time minus it, and the duration."""
         self._contradicting: list[tuple[float, float, float]] = []
         self.estimate: ClockEstimate | None = None
-        """None before `LEAST_SAMPLES` round trips, and after the autopilot has started again."""
+        """None before `LEAST_SAMPLES` round trips, and after a restart of the autopilot."""
 
     def add(self, sent_s: float, autopilot_s: float, received_s: float) -> None:
-        """Takes a round trip: when it began and ended on this computer's clock, and the autopilot's time between."""
+        """Takes a round trip: its start and end on this computer's clock, and the autopilot's time between them."""
         duration_s, middle_s = received_s - sent_s, 0.5 * (sent_s + received_s)
         if not 0.0 <= duration_s <= services.TIME_SYNC.timeout:
             return
@@ -126,12 +126,12 @@ class ClockSync:
 
 
 def _contradict(sample: tuple[float, float, float], offset_s: float) -> bool:
-    """Whether a round trip cannot be one with that offset."""
+    """Whether a round trip is impossible with that offset."""
     return abs(sample[1] - offset_s) > 0.5 * sample[2] + JUMP_S
 
 
 def _overlap(samples: FloatArray) -> ClockEstimate:
-    """The middle of what the bounds of all round trips (n, 3) have in common, or of the gap where they have nothing."""
+    """The middle of the intersection of the bounds of all round trips (n, 3), or of the gap if it is empty."""
     time_s, offset_s, duration_s = samples.T
     within_s = 0.5 * duration_s + DRIFT * (time_s[-1] - time_s)
     least_s, most_s = (offset_s - within_s).max(), (offset_s + within_s).min()

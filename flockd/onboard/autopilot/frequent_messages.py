@@ -1,6 +1,6 @@
-"""The messages that come ten and more times a second, taken out of the bytes of a serial port.
+"""Decodes messages that come ten times a second or more, directly from the bytes of a serial port.
 
-MAVSDK wakes three threads and writes JSON for each message: for a hundred a second that is most of what a link costs.
+MAVSDK wakes three threads and writes JSON for each message: at a hundred a second that is most of the link's CPU time.
 Layouts and checksum: MAVLink 2, https://mavlink.io/en/guide/serialization.html, and its dialect `common`.
 """
 
@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 
 
 class _Layout(NamedTuple):
-    """Of a message's payload: its fields in the order of the wire, without the extensions that nobody reads."""
+    """A message's payload: its fields in the order on the wire, without unused extensions."""
 
     name: str
     seed: int
-    """CRC_EXTRA: a checksum of the message's fields, which both sides have to agree on."""
+    """CRC_EXTRA: a checksum of the message's fields, on which both sides have to agree."""
     values: struct.Struct
     fields: tuple[str, ...]
 
@@ -38,21 +38,21 @@ LAYOUTS: Mapping[int, _Layout] = {
 }  # fmt: skip
 """By message number; of each the fields that `ReceivedMessages` reads."""
 BEGINS, HEADER, CHECKSUM, SIGNATURE, SIGNED = 0xFD, 10, 2, 13, 1
-"""A MAVLink 2 frame's first byte, and the lengths of its parts, of which only a frame with this flag has the last."""
+"""First byte of a MAVLink 2 frame, and the lengths of its parts; the signature is present only with the flag SIGNED."""
 _MIRRORED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
-"""Bytes with their bits the other way round: MAVLink's checksum is `crc_hqx` from the other end."""
+"""Bytes with their bits reversed: MAVLink's checksum is `crc_hqx` with reversed bits."""
 
 
 class FrequentMessages:
-    """Splits what a port receives; for one thread."""
+    """Splits the bytes that a port receives; for one thread."""
 
     def __init__(self, system: int, component: int, take: Callable[[str, dict[str, Any]], object]) -> None:
-        """``take``: gets name and fields of each message of that component, NaN and infinite as None."""
+        """``take``: called with name and fields of each message of that component, NaN and infinity as None."""
         self._sender, self._take = bytes([system, component]), take
         self._begun = b""
 
     def without(self, data: bytes) -> bytes:
-        """The rest of the bytes. A frame that is not whole yet waits for the next call."""
+        """The other bytes. An incomplete frame waits for the next call."""
         data, rest, at = self._begun + data, [], 0
         while (start := data.find(BEGINS, at)) >= 0:
             rest.append(data[at:start])

@@ -1,4 +1,4 @@
-"""One owner a link: a second process is refused before it can touch anything, whoever has started it."""
+"""One owner for each link: a second process is refused before it can touch anything, whoever has started it."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from flockd.core.errors import UnavailableError
 
 @contextmanager
 def only_owner(autopilot: AutopilotParameters | None) -> Iterator[None]:
-    """Owns the link to the autopilot; without one there is nothing to own.
+    """Owns the link to the autopilot, if there is one.
 
-    The owner is who has bound the address's name among Linux's abstract sockets. These are the same for all users of a
-    computer, need no folder, and are gone with their process. Raises UnavailableError while another process owns it.
+    The owner binds the address's name as one of Linux's abstract sockets. All users of a computer share these; they
+    need no folder and end with their process. Raises UnavailableError while another process owns it.
     """
     if autopilot is None:
         yield
@@ -35,7 +35,7 @@ def only_owner(autopilot: AutopilotParameters | None) -> Iterator[None]:
 
 
 def _place(address: str) -> str:
-    """One text for all addresses of a link: a device has several names, a port several hosts."""
+    """One text for all addresses of a link: a device may have several names, a port several hosts."""
     kind, _, rest = address.partition("://")
     where, _, number = rest.rpartition(":")
     match kind:

@@ -1,7 +1,7 @@
-"""What the autopilot's MAVLink messages say: decoding, without MAVSDK and without I/O.
+"""Decodes the autopilot's MAVLink messages, without MAVSDK and without I/O.
 
-Messages are kept as they come, the newest of each kind, so that no queue grows and the state is known at any time.
-Values of enumerations are checked where they enter: one that is not known here counts as unknown.
+The newest message of each kind is kept, so that no queue grows and the state is known at any time. Values of
+enumerations are checked on arrival: one that is not known here counts as unknown.
 """
 
 from __future__ import annotations
@@ -54,58 +54,56 @@ VALUES: Mapping[str, tuple[str, range]] = {
 }
 """What a field of these messages may be: of the MAVLink dialect `common`."""
 FACES_DOWN = 25
-"""MAV_SENSOR_ROTATION_PITCH_270 of MAV_SENSOR_ORIENTATION."""
+"""MAV_SENSOR_ROTATION_PITCH_270 of MAV_SENSOR_ORIENTATION: the sensor faces down."""
 RANGES_KEPT = 200
-"""Arrivals of its readings, to tell their rate."""
+"""Arrival times of its readings that are kept, for their rate."""
 FULL_SIGNAL, NO_SIGNAL = 100, 1
-"""Values of DISTANCE_SENSOR's `signal_quality`, in percent; 0 is for sensors that do not say."""
+"""Values of DISTANCE_SENSOR's `signal_quality`, in percent; 0 means that it is not known."""
 QUATERNION_TOLERANCE = 0.1
-"""How far a quaternion's norm may be from 1; one that is farther off is no attitude."""
+"""Largest deviation of a quaternion's norm from 1; beyond it, the attitude is refused."""
 HOME_TOLERANCE_M = 0.5
-"""A home that moves less in flight is not reported: estimators drift."""
+"""Shortest move of home in flight that is reported: estimators drift."""
 DISTANCE_SENSOR = "DISTANCE_SENSOR"
 STAMPED = frozenset({"ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", DISTANCE_SENSOR})
-"""Messages whose `time_boot_ms` says when they were true."""
+"""Messages whose `time_boot_ms` gives their time of validity."""
 MOST_ERROR_S = 0.005
-"""Largest error of a clock whose stamps are better than times of arrival."""
+"""Largest error of a clock at which stamps are more precise than arrival times."""
 LONGEST_DELAY_S = 1.0
-"""A stamp that is older at its arrival is not believed."""
+"""Largest age of a stamp at arrival; older ones are not used."""
 RESTARTED_MS = 1000
-"""A stamp that is so much older than the one before comes from a clock that began anew."""
+"""A stamp that goes back by this much comes from a restarted clock."""
 STAMPS_END_MS, NEAR_END_MS = 1 << 32, 10_000
-"""Where stamps begin at 0 again, and within how much of it two stamps are taken for that."""
+"""Stamps wrap here to 0; and how near to the wrap two successive stamps have to be to count as one."""
 MAV_SEVERITY_WARNING = 4
 TEXTS_KEPT = 20
 TEXT_MEMORY_S = 10.0
-"""For how long a text counts as a reason for a refusal; nor is it reported again meanwhile."""
+"""Time for which a text counts as the reason of a refusal, and is not reported again."""
 MAV_TYPE_ONBOARD_CONTROLLER = 18
 SETTLED_S = 2.0
-"""After its first heartbeat: by then an autopilot that has checks to tell has told them."""
+"""Time after its first heartbeat by which an autopilot has sent its failed checks."""
 CHUNKS_S = 0.2
-"""Within which all chunks of a text come."""
+"""Longest time between the first and the last chunk of a text."""
 TEXT_CHUNK = 50
-"""Characters of a STATUSTEXT; one with fewer is the last of its text."""
+"""Characters of a full STATUSTEXT; a shorter one is the last of its text."""
 LONGEST_TEXT = 125
 """Characters of a text that flockd sends."""
 
 
 @dataclass(frozen=True)
 class ReceivedMessage:
-    """A message, and when it arrived on the link's clock."""
+    """A message, and its arrival time on the link's clock."""
 
     time_s: float
     fields: Fields
 
 
 class ReceivedMessages:
-    """The newest message of each kind. `add` is for one thread, everything else for any."""
+    """The newest message of each kind. Call `add` on one thread, everything else on any."""
 
     def __init__(self, report: Callable[[str], None], max_gap_s: float = services.SETPOINT.timeout) -> None:
-        """``report`` is called by `add` with one sentence on the first of each unknown value, of a home that moves or
-        a frame that jumps in flight, of a landing, of a restart, of lost heartbeats, of a clock that lies, and of what
-        the autopilot says as a warning or worse.
-        ``max_gap_s``: between setpoints, which flockd bridges.
-        """
+        """``report`` is called by `add` with one sentence for the first of each unknown value, for a home that moves or
+        a frame that jumps in flight, for a landing, a restart, lost heartbeats, a wrong clock, and for texts of the
+        autopilot that are warnings or worse. ``max_gap_s``: longest gap between setpoints that flockd bridges."""
         self._report = report
         self._newest: dict[str, ReceivedMessage] = {}
         self._unknown_values: set[str] = set()
@@ -117,22 +115,22 @@ class ReceivedMessages:
         self._landed = False
         self._text = StatusText()
         self._texts: deque[tuple[float, str]] = deque(maxlen=TEXTS_KEPT)
-        """Warnings and worse, with their times."""
+        """Texts that are warnings or worse, with their times."""
         self.ground_range: RangeReading | None = None
-        """The newest of the range finder that faces down."""
+        """The newest reading of the range finder that faces down."""
         self.ranges_s: deque[float] = deque(maxlen=RANGES_KEPT)
-        """When its last readings came."""
+        """Arrival times of its last readings."""
         self._other_computer_s = -math.inf
         self._first_s, self._heard_s = math.inf, -math.inf
-        """When its first heartbeat came, and its newest message."""
+        """Arrival times of its first heartbeat and of its newest message."""
         self._max_gap_s = max_gap_s
         self._boot_ms = 0
         self._counted_ms = 0
-        """What stamps of 32 bits have lost since flockd listens: they begin anew after 49.7 days."""
+        """Milliseconds lost by wraps of 32-bit stamps since flockd listens: they wrap after 49.7 days."""
         self.restarts = 0
-        """How often the autopilot has begun anew since flockd listens."""
+        """Restarts of the autopilot since flockd listens."""
         self.heartbeats_lost = 0
-        """Heartbeats that did not come while other messages did."""
+        """Heartbeats that were missing while other messages came."""
         self._frame = LocalFrame()
         self.parameters = WatchedParameters(report)
         self.setpoints = SetpointWatch(report, self.parameters.values)
@@ -141,11 +139,11 @@ class ReceivedMessages:
         self._stamps = StampMonitor()
 
     def add(self, name: str, fields: Fields, time_s: float) -> None:
-        """Takes a message by its name and fields, NaN as null, as MAVSDK decodes them to JSON, and when it came."""
+        """Takes a message's name, fields as MAVSDK decodes them to JSON, with NaN as null, and arrival time."""
         self._heard_s = time_s
         begun = self._text.begun
         if begun is not None and name != "STATUSTEXT" and time_s - begun.time_s > CHUNKS_S:
-            self.add("STATUSTEXT", {**begun.fields, "chunk_seq": 1, "text": ""}, time_s)  # it does not go on
+            self.add("STATUSTEXT", {**begun.fields, "chunk_seq": 1, "text": ""}, time_s)  # it has no further chunk
         if name == "STATUSTEXT":
             whole = self._text.joined(fields, time_s)
             if whole is None:
@@ -175,7 +173,7 @@ class ReceivedMessages:
         self._follow(name, time_s)
 
     def _follow(self, name: str, time_s: float) -> None:
-        """Draws the conclusions of a message that is known now."""
+        """Updates the state after a message."""
         if name in ("HEARTBEAT", "EXTENDED_SYS_STATE"):
             status = self.status(time_s)
             self._flies = status.in_air or (self._flies and status.armed)
@@ -187,7 +185,7 @@ class ReceivedMessages:
         elif name == "HOME_POSITION":
             self._take_home()
         if name in ("HEARTBEAT", "CURRENT_MODE") and self.flight_mode() != "offboard":
-            self._frame.large = False  # nobody flies on with it
+            self._frame.large = False  # the flight with it is over
 
     def add_other_heartbeat(self, fields: Fields, time_s: float) -> None:
         """Takes a HEARTBEAT of another component on the link."""
@@ -195,7 +193,7 @@ class ReceivedMessages:
             self._other_computer_s = time_s
 
     def recent_texts(self, now_s: float, memory_s: float) -> list[str]:
-        """What the autopilot has said in the last seconds as a warning or worse, each once."""
+        """Warnings and graver texts of the autopilot in the last seconds, each once."""
         return list(dict.fromkeys(text for time_s, text in list(self._texts) if now_s - time_s < memory_s))
 
     def refusals(self, now_s: float, *, streams: bool) -> tuple[Refusal, ...]:
@@ -224,9 +222,9 @@ class ReceivedMessages:
             self.heartbeats_lost += lost
 
     def _notice_restart(self, boot_ms: int) -> None:
-        """Its clock begins anew, and with it the numbers of its events; of its checks nothing is known.
+        """Resets what a restart invalidates: its clock, the numbers of its events, and its checks.
 
-        While it is armed it cannot have: a stamp from the past is wrong then, or somebody else's.
+        An armed autopilot cannot restart: then a stamp from the past is wrong, or another sender's.
         """
         if boot_ms < NEAR_END_MS and self._boot_ms > STAMPS_END_MS - NEAR_END_MS:
             self._counted_ms += STAMPS_END_MS
@@ -255,8 +253,8 @@ class ReceivedMessages:
         clock, boot_ms = self.clock.estimate, fields.get("time_boot_ms")
         if boot_ms is None:
             return arrived_s
-        stamp_s, lied = 1e-3 * (boot_ms + 0.5), self._stamps.lies  # the stamp is cut to a millisecond
-        if name == DISTANCE_SENSOR:  # as old as its sensor is slow: it says nothing of the clock
+        stamp_s, lied = 1e-3 * (boot_ms + 0.5), self._stamps.lies  # the stamp is truncated to a millisecond
+        if name == DISTANCE_SENSOR:  # its age is its sensor's delay, not the clock's
             believed = not lied
         else:
             believed = self._stamps.believes(clock, stamp_s, arrived_s)
@@ -277,17 +275,17 @@ class ReceivedMessages:
 
     @property
     def home_down_m(self) -> float | None:
-        """Down from the estimator's origin; None: not known yet."""
+        """Home below the estimator's origin; None: not known yet."""
         return None if self._home is None else float(self._home[2])
 
     @property
     def height_m(self) -> float:
-        """Above home as the newest position says; NaN before the first."""
+        """Height above home of the newest position; NaN before the first."""
         place = _numbers(self._fields("LOCAL_POSITION_NED"), "x", "y", "z")
         return math.nan if place is None else float((self.home_down_m or 0.0) - place[2])
 
     def _without_jumps(self, name: str, fields: Fields) -> Fields:
-        """The same with a position in a frame that does not jump in flight."""
+        """The fields with the position in a frame that does not jump in flight."""
         jump: str | None = None
         stamp_s = 1e-3 * float(fields.get("time_boot_ms") or 0)
         if name == "LOCAL_POSITION_NED":
@@ -304,11 +302,11 @@ class ReceivedMessages:
         if jump is not None and self._flies:
             self._report(jump)
         elif jump is not None:
-            self._frame.restart()  # on the ground nothing is held yet that would have to move with it
+            self._frame.restart()  # on the ground no goal or height depends on it yet
         return fields
 
     def _take_home(self) -> None:
-        """Home as it is until the next flight: one that moves in flight would move the height band and the fence."""
+        """Takes home once a flight: if it moved in flight, the height band and the fence would move too."""
         fields = self._fields("HOME_POSITION")
         sent, home_e7 = _vector(fields, "x", "y", "z"), _vector(fields, "latitude", "longitude")
         if sent is None:
@@ -318,7 +316,7 @@ class ReceivedMessages:
             self._home = home
             self._home_deg = None if home_e7 is None else home_e7 * 1e-7
             return
-        # PX4 may go on sending it in the frame of before a jump.
+        # PX4 may still send it in the frame before a jump.
         moved_m = min(np.linalg.norm(one - self._home) for one in (sent, home))
         if not self._home_moved and moved_m > HOME_TOLERANCE_M:
             self._home_moved = True
@@ -334,11 +332,11 @@ class ReceivedMessages:
         self._landed = landed
 
     def newest(self, name: str) -> ReceivedMessage | None:
-        """The newest of a kind; None before the first."""
+        """The newest message of a kind; None before the first."""
         return self._newest.get(name)
 
     def status(self, now_s: float) -> AutopilotStatus:
-        """What they say of the autopilot."""
+        """The autopilot's status by these messages."""
         heartbeat = self._newest.get("HEARTBEAT", ReceivedMessage(-math.inf, {}))
         percent = self._fields("SYS_STATUS").get("battery_remaining")
         landed_state = self._fields("EXTENDED_SYS_STATE").get("landed_state")
@@ -363,9 +361,9 @@ class ReceivedMessages:
         )
 
     def vehicle_state(self) -> VehicleState | None:
-        """Attitude, height above home and velocity, as old as the older of them; None before they are known.
+        """Attitude, height above home and velocity, with the age of the older; None before they are known.
 
-        Before home is known the height is above the place where the estimator began.
+        Before home is known, the height is above the estimator's origin.
         """
         attitude, position = self._newest.get("ATTITUDE_QUATERNION"), self._newest.get("LOCAL_POSITION_NED")
         if attitude is None or position is None:
@@ -386,14 +384,14 @@ class ReceivedMessages:
         )
 
     def flight_mode(self) -> FlightMode:
-        """By the newer of heartbeat and CURRENT_MODE; a mode that is not in `MODES` is `other`."""
+        """By the newer of heartbeat and CURRENT_MODE; `other` for a mode that is not in `MODES`."""
         reports = [self._newest[name] for name in ("HEARTBEAT", "CURRENT_MODE") if name in self._newest]
         if not reports:
             return "unknown"
         return mode_of(max(reports, key=lambda message: message.time_s).fields["custom_mode"])
 
     def _would_return(self) -> bool:
-        """It was asked for offboard and flies another mode: it would be back in offboard with the next setpoint."""
+        """Whether it was asked for offboard and flies another mode: the next setpoint would return it to offboard."""
         asked = self._fields("CURRENT_MODE").get("intended_custom_mode") or 0
         return mode_of(asked) == "offboard" and self.flight_mode() != "offboard"
 
@@ -402,7 +400,7 @@ class ReceivedMessages:
         return {} if message is None else message.fields
 
     def _checked(self, name: str, fields: Fields) -> Fields:
-        """The same fields with None for a value that is none of `VALUES`."""
+        """The fields with None for each value that is not in `VALUES`."""
         field, known = VALUES.get(name, ("", range(0)))
         if fields.get(field) is None or fields[field] in known:
             return fields
@@ -414,18 +412,18 @@ class ReceivedMessages:
 
 
 class StatusText:
-    """Joins the chunks of a STATUSTEXT, which carry an id and number themselves from 0.
+    """Joins the chunks of a STATUSTEXT, which carry an id and a number from 0.
 
-    An id of 0 is for texts that have one chunk; but PX4 begins with it, so that one with a full chunk may go on.
+    An id of 0 is for texts of one chunk; but PX4's first text has it, so a full chunk of id 0 may have more.
     """
 
     def __init__(self) -> None:
         self._id, self._chunks = 0, [""]
         self.begun: ReceivedMessage | None = None
-        """A text of id 0 that may go on."""
+        """A text of id 0 that may have more chunks."""
 
     def joined(self, fields: Fields, time_s: float) -> str | None:
-        """The whole text with its last chunk, None before; where a chunk was lost, dots stand for it."""
+        """The whole text with its last chunk, None before; dots stand for a lost chunk."""
         text = str(fields.get("text") or "").partition("\0")[0]
         number, chunk = fields.get("id") or 0, fields.get("chunk_seq") or 0
         may_go_on = number == chunk == 0 and len(text) >= TEXT_CHUNK
@@ -441,9 +439,9 @@ class StatusText:
 
 
 def text_chunks(text: str, number: int) -> Iterator[Fields]:
-    """A text as STATUSTEXT messages, without their severity; ``number``, above 0, is for one of several chunks.
+    """A text as STATUSTEXT messages, without their severity; ``number``, above 0, identifies one of several chunks.
 
-    The last has an end within its 50 bytes. PX4 would cut a lone chunk of 50 bytes to 49, and logs no more than 126.
+    The last ends within its 50 bytes. PX4 would cut a single chunk of 50 bytes to 49, and logs at most 126.
     """
     sent = text if text.isascii() else text.encode("ascii", "replace").decode()
     sent = sent if len(sent) <= LONGEST_TEXT else f"{sent[: LONGEST_TEXT - 3]}..."
@@ -455,12 +453,12 @@ def text_chunks(text: str, number: int) -> Iterator[Fields]:
 
 
 def result_text(result: int) -> str:
-    """What a MAV_RESULT means, for people."""
+    """The meaning of a MAV_RESULT, for people."""
     return RESULTS[result] if 0 <= result < len(RESULTS) else f"answered with the unknown result {result}"
 
 
 def _range_reading(fields: Fields, time_s: float) -> RangeReading:
-    """In metres; a field that is missing is not known."""
+    """In metres; a missing field is not known."""
     centimetres = [fields.get(f"{name}_distance") for name in ("current", "min", "max")]
     current, least, most = (None if value is None else 0.01 * float(value) for value in centimetres)
     signal = int(fields.get("signal_quality") or 0)
@@ -474,7 +472,7 @@ def _range_reading(fields: Fields, time_s: float) -> RangeReading:
 
 
 def _numbers(fields: Fields, *names: str) -> list[float] | None:
-    """The named numbers, or None where one is missing, null, which is how NaN comes, or infinite."""
+    """The named numbers; None if one is missing, infinite, or null, which stands for NaN."""
     numbers: list[Any] = [fields.get(name) for name in names]
     return None if any(number is None or not math.isfinite(number) for number in numbers) else numbers
 

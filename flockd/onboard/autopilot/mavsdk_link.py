@@ -1,7 +1,7 @@
-"""The link to the autopilot: the one file that knows MAVSDK.
+"""The link to the autopilot: the adapter of MAVSDK.
 
-Everything goes through MAVSDK's raw MAVLink path. Its offboard plugin repeats the last setpoint for ever, also when
-the program that gave it has ended; here a setpoint is sent once. What received messages mean is in `mavlink_messages`.
+It uses MAVSDK's raw MAVLink path. MAVSDK's offboard plugin repeats the last setpoint for ever, even after the program
+that gave it has ended; here a setpoint is sent once. `mavlink_messages` decodes received messages.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ COMMAND_SET_MESSAGE_INTERVAL = 511
 COMMAND_REQUEST_MESSAGE = 512
 COMMAND_RUN_CHECKS = 401
 HEIGHT_GAIN_PER_S = 1.0
-"""A setpoint asks for so much climb for each metre that is missing."""
+"""Climb rate of a setpoint for each metre of missing height."""
 STREAMS_HZ = {
     "ATTITUDE_QUATERNION": (31, services.VEHICLE_STATE.rate_hz),
     "LOCAL_POSITION_NED": (32, 30.0),
@@ -79,24 +79,24 @@ most; its heartbeat comes once a second whatever one asks."""
 RECEIVED = (*STREAMS_HZ, "HEARTBEAT", "AUTOPILOT_VERSION", "STATUSTEXT", "EVENT", "CURRENT_EVENT_SEQUENCE")
 TIME_SYNC = "TIMESYNC"
 UNTARGETED = frozenset({"HEARTBEAT", "STATUSTEXT"})
-"""Messages without a target: for all who hear them."""
+"""Messages without a target: for all receivers."""
 MOST_OPEN = 20
-"""Exchanges whose reply is waited for; older ones are lost."""
+"""Time exchanges that may wait for a reply; older ones are lost."""
 REASON_S = 0.5
-"""For how long a refusal waits for the autopilot's text, which comes after it."""
+"""Time for which a refusal waits for the autopilot's text, which follows it."""
 ATTEND_S, ANNOUNCE_S = 0.25, 1.0
-"""Between two looks at what is missing, and two readings of a parameter; between two announcements."""
+"""Time between two checks for missing data, and two readings of a parameter; time between two announcements."""
 CHECKS_AGAIN_S = 1.0
-"""Between two requests for the list of failed checks, of which events were lost."""
+"""Time between two requests for the list of failed checks after events were lost."""
 ANNOUNCEMENT = {
     "type": 6, "autopilot": 8, "base_mode": 0, "custom_mode": 0, "system_status": 4, "mavlink_version": 3
 }  # fmt: skip
 """A HEARTBEAT of MAV_TYPE_GCS: PX4 sends its texts on no link on which it hears no ground station."""
 MOST_REPORTS = 100
 MAX_TEXTS = 100
-"""Of MAVSDK's that are remembered, to be logged once each."""
+"""Texts of MAVSDK that are remembered, so that each is logged once."""
 GONE_S = 10.0
-"""A serial port that is gone for longer is not waited for on the ground; an autopilot that starts anew takes 5."""
+"""Longest absence of a serial port on the ground before the link is given up; an autopilot restarts in 5 s."""
 
 _JSON = json.JSONEncoder(allow_nan=False)
 _log = logging.getLogger(__name__)
@@ -109,7 +109,7 @@ _LOG_LEVELS = {
 
 
 class Severity(IntEnum):
-    """MAV_SEVERITY of a text; the graver, the smaller."""
+    """MAV_SEVERITY of a text; smaller is graver."""
 
     CRITICAL = 2
     WARNING = 4
@@ -118,7 +118,7 @@ class Severity(IntEnum):
 
 
 class AutopilotLink:
-    """One autopilot. Everything that is not a coroutine may be called from any thread and returns at once."""
+    """One autopilot. All methods that are not coroutines may be called from any thread and return at once."""
 
     def __init__(
         self,
@@ -141,13 +141,13 @@ class AutopilotLink:
         self._heard = {self._system_id}
         """System ids of the autopilots on the link."""
         self.received = ReceivedMessages(self._reports.append, parameters.max_gap_s)
-        """What the autopilot has sent; its clock is measured by `synchronise`, its parameters are read by `attend`."""
+        """The autopilot's messages; `synchronise` measures its clock, `attend` reads its parameters."""
         self._sent_s = -math.inf
         """When the last setpoint was sent."""
         self._param = Param(system)
         self._direct: MavlinkDirect | _Closed = MavlinkDirect(system)
         self._time_syncs: deque[int] = deque(maxlen=MOST_OPEN)
-        """This computer's times in nanoseconds of exchanges that were not answered yet."""
+        """Start times of unanswered exchanges, in nanoseconds of this computer's clock."""
         self._text_ids = cycle(range(1, 0x10000))
         self._receiving = threading.Lock()
         if port is not None:
@@ -165,16 +165,12 @@ class AutopilotLink:
         clock: Clock = time.monotonic,
         create: Callable[[Configuration], Mavsdk] = Mavsdk,
     ) -> Self:
-        """Opens the link, waits for an autopilot, and tells it what to send.
-
-        Raises AutopilotError when the address cannot be used or no autopilot answers within `timeout_s`, and
-        AutopilotSettingError when two answer and `system_id` does not choose one.
-        """
+        """Opens the link, waits for an autopilot, and requests its messages."""
         _refuse_a_taken_port(parameters.address)
         log_subscribe(_to_logging)
         reports: deque[str] = deque(maxlen=MOST_REPORTS)
         port = _serial_port(parameters.address, reports.append)
-        executor = ThreadPoolExecutor(1, thread_name_prefix="mavsdk")  # never asyncio's own: it may be saturated
+        executor = ThreadPoolExecutor(1, thread_name_prefix="mavsdk")  # asyncio's own may be saturated
         configuration = _configuration(parameters.system_id)
         mavsdk = create(configuration)
         kept: list[object] = []
@@ -183,7 +179,7 @@ class AutopilotLink:
             await _open(mavsdk, parameters.address, port, executor)
             system = await _find_system(mavsdk, parameters, deadline, timeout_s, clock)
             system_id = int(system.get_system_id())
-            if configuration.system_id != system_id:  # again, as a computer of the autopilot's own system
+            if configuration.system_id != system_id:  # again, with the autopilot's system id
                 system.destroy()
                 if port is not None:
                     port.hand_to(discard)
@@ -200,15 +196,15 @@ class AutopilotLink:
         except BaseException:
             if port is not None:
                 port.close()
-            executor.submit(_destroy, mavsdk, kept)  # after a call of it that still runs, which would end the process
+            executor.submit(_destroy, mavsdk, kept)  # after any call that still runs, which would crash
             executor.shutdown(wait=False)
             raise
         return link
 
     async def close(self) -> None:
-        """Ends the link; nothing of it may be used afterwards.
+        """Closes the link; it may not be used afterwards.
 
-        It is ended even where nobody waits for that so long, after a call that still runs.
+        If the caller does not wait, it is closed after the call that still runs.
         """
         if self._port is not None:
             self._port.close()
@@ -218,8 +214,8 @@ class AutopilotLink:
         await asyncio.shield(asyncio.wrap_future(ended))
 
     def _callbacks(self) -> list[tuple[object, ...]]:
-        """What MAVSDK 4.1 calls from its own thread. Its plugins let go of them before that thread has ended: a message
-        that still waits for its turn then calls memory that is free (seen on a busy computer)."""
+        """What MAVSDK 4.1 calls from its own thread. Its plugins release them before that thread has ended: a waiting
+        message would then call freed memory (seen on a busy computer)."""
         held = [vars(plugin) for plugin in (self._direct, self._param)]
         return [(*one.get("_callbacks", ()), *one.get("_subscriptions", {}).values()) for one in held]
 
@@ -229,7 +225,7 @@ class AutopilotLink:
         return self._system_id
 
     def unusable(self) -> AutopilotError | None:
-        """Why no drone should take off with this link any more; None: the link is well."""
+        """Why no drone should take off with this link; None: the link is usable."""
         if self._port is not None and self._port.gone_for_s() > GONE_S:
             return AutopilotError(
                 f"autopilot.address: {self._parameters.address} has been gone for more than {GONE_S:g} s; "
@@ -240,7 +236,7 @@ class AutopilotLink:
         return None
 
     def status(self) -> AutopilotStatus:
-        """The newest of everything that the autopilot has sent."""
+        """The autopilot's status by its newest messages."""
         return self.received.status(self._clock())
 
     def vehicle_state(self) -> VehicleState | None:
@@ -253,12 +249,12 @@ class AutopilotLink:
         return self.received.refusals(now, streams=now - self._sent_s < services.SETPOINT_STREAM.timeout)
 
     def knows_checks(self) -> bool:
-        """Whether the autopilot's list of failed checks is here, and whole."""
+        """Whether the autopilot's list of failed checks is known and complete."""
         events = self.received.check_events
         return events.report is not None and not events.lost
 
     async def ask_for_checks(self) -> None:
-        """Asks it to send its list of failed checks. Raises AutopilotError where it cannot."""
+        """Requests its list of failed checks. Raises AutopilotError if the link cannot send."""
         await self._command("for its checks", COMMAND_RUN_CHECKS)
 
     async def synchronise(self) -> None:
@@ -271,7 +267,7 @@ class AutopilotLink:
             await asyncio.sleep(services.TIME_SYNC.period_s)
 
     async def attend(self) -> None:
-        """Keeps requesting what an autopilot sends on request only, until cancelled.
+        """Repeats requests for what the autopilot sends only on request, until cancelled.
 
         It announces flockd as a ground station, for the autopilot's texts; asks again for checks whose events were
         lost; requests all streams from an autopilot that has started or been plugged in; reads the parameters that
@@ -298,9 +294,9 @@ class AutopilotLink:
             await asyncio.sleep(ANNOUNCE_S)
 
     def announces(self) -> bool:
-        """Whether it may pass for a ground station: never where PX4 acts on the loss of one, which that would hide.
+        """Whether flockd may appear as a ground station: not if PX4 acts on the loss of one, which flockd would hide.
 
-        That is with NAV_DLL_ACT other than 0, or at the end of a mission.
+        PX4 does with NAV_DLL_ACT other than 0, and at the end of a mission.
         """
         acts = self.received.parameters.values.get(GROUND_STATION_LOSS)
         return acts == 0 and self.received.flight_mode() != "mission"
@@ -324,7 +320,7 @@ class AutopilotLink:
     async def _read_parameters(self) -> None:
         while True:
             for name, kind in KINDS.items():
-                with suppress(AutopilotError):  # an older firmware may lack one, and one that is lost says so elsewhere
+                with suppress(AutopilotError):  # an older firmware may lack one; a lost link is reported elsewhere
                     value = await self.parameter(name, kind)
                     self.received.parameters.take(name, float(value), armed=self.status().armed)
                 await asyncio.sleep(ATTEND_S)
@@ -334,10 +330,10 @@ class AutopilotLink:
         return [self._reports.popleft() for _ in range(len(self._reports))]
 
     def send_setpoint(self, setpoint: Setpoint) -> None:
-        """Sends it, once. Raises AutopilotError when it is not finite or MAVSDK cannot send it.
+        """Sends a setpoint, once. Raises AutopilotError if it is not finite or MAVSDK cannot send it.
 
-        The height is sent as a vertical velocity: PX4's frame may jump, and a height of the old frame, sent once too
-        often, would make PX4 climb or sink by the jump.
+        The height is sent as a vertical velocity: PX4's frame may jump, and a height in the old frame would then make
+        PX4 climb or sink by the jump.
         """
         north, east = (float(v) for v in setpoint.velocity)
         down = HEIGHT_GAIN_PER_S * (self.received.height_m - setpoint.height_m)
@@ -361,27 +357,27 @@ class AutopilotLink:
         self.received.setpoints.sent(self._sent_s, north, east)
 
     def send_text(self, text: str, severity: Severity) -> None:
-        """Sends a text once, for ground stations, to which PX4 forwards it, and for PX4's log; cut where too long."""
+        """Sends a text once, for PX4's log and for ground stations, to which PX4 forwards it; cut if too long."""
         for chunk in text_chunks(text, next(self._text_ids)):
             with suppress(MavlinkDirectError):  # a link that cannot send says so where setpoints are sent
                 self._direct.send_message(self._message("STATUSTEXT", {"severity": int(severity), **chunk}))
 
     async def hold(self) -> None:
-        """Asks it to stop and stay. Raises AutopilotError when refused."""
+        """Requests Hold. Raises AutopilotError when refused."""
         await self._set_mode("hold")
 
     async def land(self) -> None:
-        """Asks it to land here. Raises AutopilotError when refused."""
+        """Requests landing here. Raises AutopilotError when refused."""
         await self._leave_offboard()
         await self._set_mode("land")
 
     async def return_home(self) -> None:
-        """Asks it to fly home and land. Raises AutopilotError when refused."""
+        """Requests return home and landing. Raises AutopilotError when refused."""
         await self._leave_offboard()
         await self._set_mode("return")
 
     async def parameter(self, name: str, kind: type[T]) -> T:
-        """One of its parameters, of `kind` int or float as the firmware has it. Raises AutopilotError."""
+        """A parameter of the autopilot, of `kind` int or float as in the firmware. Raises AutopilotError."""
         read = self._param.get_param_int if kind is int else self._param.get_param_float
         try:
             return kind(await self._call(read, name))  # type: ignore[call-arg]
@@ -390,7 +386,7 @@ class AutopilotLink:
             raise AutopilotError(f"the autopilot's parameter {name} could not be read ({reason})") from error
 
     async def firmware(self, timeout_s: float = 3.0) -> Firmware:
-        """What runs on it. Raises AutopilotError when it does not say within `timeout_s`."""
+        """Its firmware. Raises AutopilotError without an answer within `timeout_s`."""
         await self._command("for its version", COMMAND_REQUEST_MESSAGE, 148)
         number = int((await self._wait_for("AUTOPILOT_VERSION", self._clock() + timeout_s))["flight_sw_version"])
         kind = (await self._wait_for("HEARTBEAT", math.inf))["autopilot"]
@@ -400,7 +396,7 @@ class AutopilotLink:
         )
 
     def _receive(self, message: MavlinkMessage, _: object) -> None:
-        """Called on MAVSDK's thread, one message after the other."""
+        """Called on MAVSDK's thread, one message at a time."""
         now = self._clock()
         if message.system_id != self._system_id or message.component_id != AUTOPILOT_COMPONENT:
             if message.message_name == "HEARTBEAT":
@@ -416,7 +412,7 @@ class AutopilotLink:
             self.received.add(name, fields, self._clock())
 
     def _take_time(self, fields: Fields, now: float) -> None:
-        """Takes the reply to an exchange of ours; the autopilot asks in the same message, which is left to others."""
+        """Takes the reply to a time exchange; the autopilot's own requests use the same message and are ignored."""
         sent_ns = int(fields["ts1"])
         if fields["tc1"] and sent_ns in self._time_syncs:
             self._time_syncs.remove(sent_ns)
@@ -427,7 +423,7 @@ class AutopilotLink:
         await self._command(f"for {mode}", COMMAND_SET_MODE, 1, main, sub, refused=mode)
 
     async def _leave_offboard(self) -> None:
-        """PX4 goes back to the last mode it was asked for after landing, and cannot be armed if that was offboard."""
+        """After landing, PX4 returns to the last mode requested, and cannot be armed if that was offboard."""
         if self.received.flight_mode() == "offboard":
             await self.hold()
 
@@ -435,11 +431,11 @@ class AutopilotLink:
         for name, (number, rate_hz) in STREAMS_HZ.items():
             try:
                 await self._command(f"for {name}", COMMAND_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz)
-            except AutopilotError as error:  # an older firmware may lack one; whatever needs it then says so
+            except AutopilotError as error:  # an older firmware may lack one; what needs it reports that
                 _log.warning("%s", error)
 
     async def _command(self, what: str, command: int, *values: float, refused: str | None = None) -> None:
-        """Sends a command until it is acknowledged. Raises AutopilotError when refused or never answered.
+        """Sends a command until it is acknowledged. Raises AutopilotError if it is refused or not answered.
 
         ``refused``: what its checks may refuse with it, as in `Refusal.refused`; None: nothing.
         """
@@ -464,7 +460,7 @@ class AutopilotLink:
             raise AutopilotError(f"the autopilot was asked {what}, which was {result_text(verdict)}{why}")
 
     async def _why(self, verdict: int, refused: str, asked_s: float) -> str:
-        """The reasons of a refusal with their remedies, after the autopilot has had time to send them."""
+        """The reasons of a refusal with their remedies, after the autopilot had time to send them."""
 
         def said() -> list[str]:
             now = self._clock()
@@ -505,7 +501,7 @@ def _configuration(system_id: int | None) -> Configuration:
 
 
 def _refuse_a_taken_port(address: str) -> None:
-    """Two programs can share a UDP port without an error, and then both command the drone."""
+    """Refuses a UDP port in use: two programs can share one without an error, and both would command the drone."""
     kind, _, rest = address.partition("://")
     if kind != "udpin":
         return
@@ -520,7 +516,7 @@ def _refuse_a_taken_port(address: str) -> None:
 
 
 def _serial_port(address: str, report: Callable[[str], None]) -> SerialPort | None:
-    """None where the address is of the network."""
+    """None for a network address."""
     kind, _, rest = address.partition("://")
     device, _, baud = rest.rpartition(":")
     return SerialPort(device, int(baud), report) if kind == "serial" else None
@@ -543,7 +539,7 @@ async def _open(mavsdk: Mavsdk, address: str, port: SerialPort | None, executor:
 async def _find_system(
     mavsdk: Mavsdk, parameters: AutopilotParameters, deadline: float, timeout_s: float, clock: Clock
 ) -> System:
-    """The autopilot, once all have had the time for a heartbeat where any of them would do."""
+    """The autopilot; if any would do, after all had time for a heartbeat."""
     wanted = parameters.system_id
     first_heard_s = math.inf
     while True:
@@ -554,7 +550,7 @@ async def _find_system(
         known = wanted is not None or clock() - first_heard_s > services.HEARTBEAT.timeout
         chosen = next(iter(systems), None) if wanted is None else wanted
         found = systems.pop(chosen, None) if known and chosen is not None else None
-        for system in systems.values():  # now: one that is collected while MAVSDK is destroyed ends the process
+        for system in systems.values():  # now: collected while MAVSDK is destroyed they would crash
             system.destroy()
         if wanted is None and len(heard) > 1:
             raise _ambiguous(parameters.address, heard)
@@ -578,7 +574,7 @@ def _ambiguous(address: str, heard: Iterable[int]) -> AutopilotSettingError:
 
 
 def _autopilots(mavsdk: Mavsdk) -> set[int]:
-    """System ids of those on the link."""
+    """System ids of the autopilots on the link."""
     found = set()
     for system in mavsdk.get_systems():
         if system.has_autopilot():
@@ -588,9 +584,9 @@ def _autopilots(mavsdk: Mavsdk) -> set[int]:
 
 
 class _Closed:
-    """In the plugin's place once the link is closed: what still runs must not call memory that is free.
+    """Replaces the plugin once the link is closed: running code must not call freed memory.
 
-    A task that is cancelled runs once more where its time had come already.
+    A cancelled task runs once more if its time had come already.
     """
 
     def send_message(self, _message: object) -> None:
@@ -603,7 +599,7 @@ class _Closed:
 
 
 def _destroy(mavsdk: Mavsdk, _kept: Sequence[object]) -> None:
-    """Destroys MAVSDK. The kept objects are collected only afterwards: earlier would end the process."""
+    """Destroys MAVSDK. The kept objects are released afterwards: earlier would crash."""
     mavsdk.destroy()
 
 
@@ -613,7 +609,7 @@ def _settle(answer: asyncio.Future[T], value: T) -> None:
 
 
 def _to_logging(level: LogLevel, message: str, *_: object) -> bool:
-    """MAVSDK would print; this says that it is taken care of."""
+    """Redirects MAVSDK's prints to the log; True tells MAVSDK that they are handled."""
     expected = message.startswith("No raw connection available. Subscription")  # `_open` subscribes before it connects
     _tell_once(logging.DEBUG if expected else _LOG_LEVELS[level], message)
     return True
@@ -621,5 +617,5 @@ def _to_logging(level: LogLevel, message: str, *_: object) -> bool:
 
 @lru_cache(MAX_TEXTS)
 def _tell_once(level: int, message: str) -> None:
-    """MAVSDK sends a heartbeat a second, and complains of each that an autopilot which is gone does not take."""
+    """Logs each text once: MAVSDK repeats its complaint about an absent autopilot every second."""
     _log.log(level, "%s", message)

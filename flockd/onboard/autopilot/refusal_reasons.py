@@ -1,7 +1,7 @@
-"""Why an autopilot refuses to arm or to fly offboard: the one table of reasons, each with what to do.
+"""The table of reasons why an autopilot refuses to arm or to fly offboard, each with its remedy.
 
-Reasons of PX4's own checks have the names of PX4's events; those that flockd tells from other messages have names of
-their own. PX4 sends an event's number, which follows from its name.
+Reasons of PX4's checks have the names of PX4's events; those that flockd derives from other messages have their own
+names. PX4 sends an event's number, which follows from its name.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ NOT_STREAMING = "no_setpoints_sent"
 SEVERAL_SENDERS = "several_senders"
 UNKNOWN_CHECK = "unknown_check"
 OF_STATE: Mapping[int, str] = {1: "boots", 2: "calibrates", 7: "powers_off", 8: "terminated"}
-"""By the heartbeat's MAV_STATE."""
+"""Reasons by the heartbeat's MAV_STATE."""
 
 
 class Reason(NamedTuple):
     """One row of the table."""
 
     what: str
-    """Is the matter."""
+    """The reason, for people."""
     remedy: str
     """What to do."""
 
@@ -180,7 +180,7 @@ def _reasons() -> dict[str, Reason]:
 
 
 REASONS: Mapping[str, Reason] = _reasons()
-"""By name, and in the order in which several are told: the one that others follow from first."""
+"""By name, in the order in which several are reported: causes before consequences."""
 
 RANK: Mapping[str, int] = {name: place for place, name in enumerate(REASONS)}
 
@@ -212,7 +212,7 @@ NAVIGATION_STATES: Mapping[FlightMode, int] = {
 
 
 def event_number(name: str) -> int:
-    """The number by which PX4 sends an event of its autopilot component: 24 bits of FNV-1a, and the component."""
+    """The number of an event of PX4's autopilot component: 24 bits of FNV-1a, and the component."""
     value = 0x811C9DC5
     for byte in name.encode():
         value = ((value ^ byte) * 0x01000193) & 0xFFFFFFFF

@@ -1,7 +1,7 @@
 """Why the autopilot would refuse to arm or to fly offboard now, from its messages; without I/O.
 
-PX4 sends the checks that fail as MAVLink events: a summary with the modes that can be armed and flown, one event for
-each check, and a second summary at the end.
+PX4 sends failed checks as MAVLink events: a summary of the modes that can be armed and flown, one event for each check,
+and a second summary at the end.
 """
 
 from __future__ import annotations
@@ -38,46 +38,46 @@ DENIALS = frozenset(
 MODE_DENIED = event_number("commander_modeswitch_not_avail")
 ALL_MODES = 0xFFFFFFFF
 ERROR, WARNING = 3, 4
-"""PX4's log levels, which are worse the smaller."""
+"""PX4's log levels; smaller is worse."""
 MOST_CHECKS = 300
-"""The most failed checks that a report may name; PX4 has fewer."""
+"""The most failed checks that a report may contain; PX4 has fewer."""
 NUMBERS = 1 << 16
 MOST_LATE = 20
-"""An announced number that is farther back does not come late: the autopilot counts anew."""
+"""A number that goes back by more is not a late event: the autopilot has restarted its count."""
 SEQUENCE_RESET = 1
 """MAV_EVENT_CURRENT_SEQUENCE_FLAGS."""
 PREARM_CHECK = 1 << 28
 """Bit of MAV_SYS_STATUS_SENSOR."""
 QUIET_ERRORS = frozenset({"check_system_safety_button", "check_modes_mission"})
-"""PX4 sends them as information, and refuses to arm all the same."""
+"""PX4 sends them as information, but still refuses to arm."""
 REMEMBERED_S = 15.0
-"""For how long a request that was refused is told."""
+"""Time for which a refused request is reported."""
 MOST_TOLD = 5
-"""Reasons at once; further ones are counted."""
+"""Reasons that are reported at once; the others are counted."""
 STICKS = "check_modes_manual_control"
 MANUAL_MODES = frozenset({"manual", "stabilized", "acro", "altitude", "position"})
 
 
 class Refusal(NamedTuple):
-    """One reason, in the words of `REASONS`."""
+    """One reason, with the words of `REASONS`."""
 
     reason: str
     """Its name in the table."""
     refused: str
-    """`to arm` or `offboard`; empty for what is the matter with both."""
+    """`to arm` or `offboard`; empty for both."""
     what: str
     remedy: str
 
     @property
     def sentence(self) -> str:
-        """For people."""
+        """A sentence for people."""
         if not self.refused:
             return f"the autopilot: {self.what}; {self.remedy}"
         return f"the autopilot refuses {self.refused}: {self.what}; {self.remedy}"
 
 
 class FailedCheck(NamedTuple):
-    """A check of PX4 that fails."""
+    """A failed check of PX4."""
 
     number: int
     """The event's number."""
@@ -88,31 +88,31 @@ class FailedCheck(NamedTuple):
 
 @dataclass(frozen=True)
 class CheckReport:
-    """All checks of PX4 as of one time."""
+    """All checks of PX4 at one time."""
 
     can_arm: int
-    """Bits of the modes; so `can_run`."""
+    """Bits of the modes that can be armed; `can_run`: of those that can be flown."""
     can_run: int
     failed: tuple[FailedCheck, ...]
 
 
 class CheckEvents:
-    """Puts reports together from EVENT messages. Where one is lost the whole list is asked for anew."""
+    """Assembles reports from EVENT messages. If one is lost, the whole list is requested again."""
 
     def __init__(self) -> None:
         self.report: CheckReport | None = None
-        """The newest whole one."""
+        """The newest complete report."""
         self.lost = False
-        """Events were lost since."""
+        """Whether events were lost since."""
         self.denied: tuple[float, str] | None = None
-        """When a request was last refused, and why: a switch to offboard, for want of setpoints."""
+        """Time and reason of the last refused request: for a switch to offboard, missing setpoints."""
         self._last: int | None = None
-        """Number of the newest event that the autopilot has sent."""
+        """Number of the autopilot's newest event."""
         self._begun: tuple[int, int] | None = None
         self._failed: list[FailedCheck] = []
 
     def add(self, fields: Mapping[str, Any], time_s: float) -> None:
-        """Takes an EVENT; one that is none, or came already, is ignored."""
+        """Takes an EVENT; invalid and repeated ones are ignored."""
         try:
             sequence, number = int(fields["sequence"]) % NUMBERS, int(fields["id"])
             arguments, level = bytes(fields["arguments"]), int(fields["log_levels"]) & 0xF
@@ -126,7 +126,7 @@ class CheckEvents:
             self._take(number, arguments, level, time_s)
 
     def announce(self, fields: Mapping[str, Any]) -> None:
-        """Takes a CURRENT_EVENT_SEQUENCE, the number of the newest event; an invalid one is ignored."""
+        """Takes a CURRENT_EVENT_SEQUENCE, the number of the newest event; invalid ones are ignored."""
         try:
             newest, reset = int(fields["sequence"]) % NUMBERS, bool(int(fields["flags"]) & SEQUENCE_RESET)
         except (KeyError, TypeError, ValueError, OverflowError):
@@ -138,7 +138,7 @@ class CheckEvents:
                 self._lose()
 
     def _ahead(self, number: int) -> int:
-        """How far a number is ahead of the newest, where 0 follows 65535; 1 for the first of all."""
+        """How far a number is ahead of the newest, modulo 65536; 1 for the first of all."""
         half = NUMBERS // 2
         return 1 if self._last is None else (number - self._last + half) % NUMBERS - half
 
@@ -170,21 +170,21 @@ def refusals(
     streams: bool,
     settled: bool,
 ) -> tuple[Refusal, ...]:
-    """Why it would refuse now, the cause first; empty in offboard flight and where nothing is known against it.
+    """Why it would refuse now, the cause first; empty in offboard flight and if no reason is known.
 
     Args:
-        status: the newest.
-        events: what the events say.
+        status: the newest one.
+        events: the reports of PX4's checks.
         messages: the newest fields of SYS_STATUS and HEARTBEAT, by name.
-        other_computers: one more onboard computer is heard.
-        streams: flockd sends setpoints.
-        settled: an autopilot that tells its checks by events would have done so by now.
+        other_computers: whether another onboard computer is heard.
+        streams: whether flockd sends setpoints.
+        settled: whether an autopilot that reports its checks by events had time to do so.
     """
     found = [_refusal(SEVERAL_SENDERS, "")] if other_computers else []
     if not (status.armed and status.flight_mode == "offboard"):
         state = OF_STATE.get(int(messages["HEARTBEAT"].get("system_status") or 0))
         found += [] if state is None else [_refusal(state, "to arm")]
-        # Somebody has just tried to switch to offboard.
+        # A switch to offboard was just attempted.
         denied = events.denied
         asked = denied is not None and denied[1] == NO_SETPOINTS and status.time_s - denied[0] < REMEMBERED_S
         report = events.report
@@ -197,7 +197,7 @@ def refusals(
 
 
 def _few(found: Mapping[str, Refusal]) -> tuple[Refusal, ...]:
-    """Each reason once, the cause first; the last that is told says how many are not."""
+    """Each reason once, the cause first; the last one counts those left out."""
     ordered = sorted(found.values(), key=lambda refusal: RANK[refusal.reason])
     rest = len(ordered) - MOST_TOLD
     if rest <= 0:
@@ -222,7 +222,7 @@ def _of_report(report: CheckReport, status: AutopilotStatus, *, streams: bool, a
 
 
 def _blocking(report: CheckReport, state: int, status: AutopilotStatus) -> list[FailedCheck]:
-    """The failed checks of a mode that keep it from being armed; PX4 does not say which do."""
+    """The failed checks of a mode that may keep it from being armed; PX4 does not report which do."""
     failed = [check for check in report.failed if check.modes >> state & 1]
     certain = [
         check
@@ -235,13 +235,13 @@ def _blocking(report: CheckReport, state: int, status: AutopilotStatus) -> list[
 
 
 def _checks_fail(system: Mapping[str, Any]) -> bool:
-    """By SYS_STATUS, of a firmware that does not tell which."""
+    """Whether checks fail by SYS_STATUS, for firmware that does not report which."""
     enabled, healthy = (int(system.get(f"onboard_control_sensors_{what}") or 0) for what in ("enabled", "health"))
     return bool(enabled & ~healthy & PREARM_CHECK)
 
 
 def _of_denial(events: CheckEvents, status: AutopilotStatus, found: Sequence[Refusal]) -> Iterator[Refusal]:
-    """Arming that was refused a moment ago, unless the reasons are told already."""
+    """The last refusal to arm, unless its reasons are already among ``found``."""
     if status.armed or events.denied is None or status.time_s - events.denied[0] >= REMEMBERED_S:
         return
     name = events.denied[1]

@@ -1,7 +1,7 @@
-"""A serial port to the autopilot: one owner, no work while nothing comes, opened again when the device is back.
+"""A serial port to the autopilot: one owner, idle without data, and reopened when the device is back.
 
-MAVSDK 4.1 has a serial link of its own. It polls without a pause, up to a whole core, shares its port with any other
-program, and is over for good once the device has been unplugged. It gets the bytes through this port instead.
+MAVSDK 4.1's own serial link polls without a pause, using up to a whole core, shares its port with any other program,
+and does not recover after the device was unplugged. It gets the bytes through this port instead.
 """
 
 from __future__ import annotations
@@ -20,37 +20,37 @@ from contextlib import suppress
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 
 READ_BYTES = 4096
-"""The most that a terminal of Linux keeps."""
+"""The most that a Linux terminal buffers."""
 REOPEN_S = 0.2
-"""Between two attempts to open a device that is gone."""
+"""Time between two attempts to open a missing device."""
 
 
 class SerialPort:
     """Everything but `close` may be called from any thread and returns at once."""
 
     def __init__(self, device: str, baud: int, report: Callable[[str], None]) -> None:
-        """Opens it, and discards what comes before `hand_to`.
+        """Opens the port, and discards data until `hand_to`.
 
         Args:
             device: its path.
-            baud: bits a second, one of termios; 8 data bits, no parity, one stop bit, no flow control.
-            report: called on the port's thread, with a sentence, when the device goes and when it is back.
+            baud: bits per second, one of termios; 8 data bits, no parity, one stop bit, no flow control.
+            report: called on the port's thread, with a sentence, when the device disappears and when it is back.
 
-        Raises AutopilotError when it cannot be opened or another program has it.
+        Raises AutopilotError if it cannot be opened or another program has it.
         """
         self._device, self._speed, self._report = device, getattr(termios, f"B{baud}"), report
         self._receive: Callable[[bytes], object] = discard
         self._receiving = threading.Lock()
         self._lock = threading.Lock()
-        """Held to write to the descriptor and to change it."""
+        """Held while the descriptor is written to or changed."""
         try:
             self._descriptor = _open(device, self._speed)
         except OSError as error:
             raise AutopilotError(_why_not(f"serial://{device}:{baud}", error)) from error
         self._unsent = b""
-        """What is left of a message that was begun."""
+        """The rest of a partly sent message."""
         self._gone_s = math.inf
-        """When the device went, on the monotonic clock; infinite while it is there."""
+        """When the device disappeared, on the monotonic clock; infinite while it is present."""
         self.reopened = 0
         """How often the device has come back."""
         self._closing = os.eventfd(0)
@@ -58,12 +58,12 @@ class SerialPort:
         self._thread.start()
 
     def hand_to(self, receive: Callable[[bytes], object]) -> None:
-        """Calls ``receive`` with all that comes, on the port's thread, and the one before not any more."""
+        """Calls ``receive`` with all data from now on, on the port's thread, instead of the receiver before."""
         with self._receiving:
             self._receive = receive
 
     def close(self) -> None:
-        """Ends it; nothing is handed to anybody once this returns. Called once."""
+        """Closes the port; no receiver is called once this returns. Call it once."""
         os.eventfd_write(self._closing, 1)
         self._thread.join()
         os.close(self._closing)
@@ -71,19 +71,19 @@ class SerialPort:
             self._drop()
 
     def gone_for_s(self) -> float:
-        """For how many seconds the device has been gone; 0 while it is there."""
+        """Seconds since the device disappeared; 0 while it is present."""
         return max(time.monotonic() - self._gone_s, 0.0)
 
     def send(self, message: bytes) -> None:
-        """Sends a message as a whole, or not at all where the device is gone or the line is too slow for it."""
-        with self._lock, suppress(OSError):  # a device that is gone is noticed where it is read
+        """Sends a message completely, or not at all if the device is missing or the line is too slow for it."""
+        with self._lock, suppress(OSError):  # the reading thread notices a missing device
             self._unsent = self._write(self._unsent)
             if not self._unsent:
                 rest = self._write(message)
                 self._unsent = rest if len(rest) < len(message) else b""
 
     def _write(self, data: bytes) -> bytes:
-        """What did not fit."""
+        """Returns what did not fit."""
         if self._descriptor < 0 or not data:
             return data
         try:
@@ -121,7 +121,7 @@ class SerialPort:
             self._lose("it hung up")
 
     def _lose(self, why: str) -> None:
-        """Closes the device, without which the system would give it another name when it is back."""
+        """Closes the device; otherwise the system would give it another name when it is back."""
         with self._lock:
             self._drop()
             self._gone_s = time.monotonic()
@@ -140,21 +140,21 @@ class SerialPort:
 
     def _drop(self) -> None:
         if self._descriptor >= 0:
-            with suppress(OSError):  # a pseudo-terminal would keep it
+            with suppress(OSError):  # a pseudo-terminal would stay exclusive
                 fcntl.ioctl(self._descriptor, termios.TIOCNXCL)
             os.close(self._descriptor)
         self._descriptor = -1
 
 
 def discard(_data: bytes) -> None:
-    """Takes what nobody needs."""
+    """Discards data."""
 
 
 def _open(device: str, speed: int) -> int:
-    """Its descriptor, of a terminal in raw mode that no other program can open. Raises OSError."""
+    """The descriptor of the device, a raw terminal that no other program can open. Raises OSError."""
     descriptor = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # for programs of root, which TIOCEXCL lets through
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # TIOCEXCL does not stop programs of root
         fcntl.ioctl(descriptor, termios.TIOCEXCL)
         control: list[bytes | int] = [0] * len(termios.tcgetattr(descriptor)[6])
         control[termios.VMIN] = 1

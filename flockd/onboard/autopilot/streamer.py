@@ -1,8 +1,8 @@
-"""Streams setpoints to the autopilot, and falls silent when anything is wrong: silence is what stops a drone.
+"""Streams setpoints to the autopilot, and falls silent when anything is wrong: silence stops the drone.
 
-It runs on its own thread with its own deadlines, so that neither busy cores nor a stuck event loop make it stutter, and
-sends only while the control loop runs. PX4 goes back to offboard by itself when setpoints return after
-its failsafe; so a stream that was interrupted in flight never resumes unless it is begun anew.
+It runs on its own thread with its own deadlines, so that neither busy cores nor a stuck event loop delay it, and sends
+only while the control loop runs. PX4 returns to offboard by itself when setpoints come back after its failsafe; so a
+stream that was interrupted in flight stays silent until it is begun again.
 """
 
 from __future__ import annotations
@@ -20,34 +20,34 @@ from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotS
 
 Send = Callable[[Setpoint], None]
 Gate = Callable[[float, Request], Verdict]
-"""See `flockd.flight.safety.Gate.step`: it judges each request on the streamer's thread, just before it is sent."""
+"""As `flockd.flight.safety.Gate.step`: judges each request on the streamer's thread, just before it is sent."""
 
 CLOSE_TIMEOUT_S = 1.0
-"""A cable that takes no more bytes may hold the thread for ever; it ends with the process."""
+"""A blocked cable may hold the thread for ever; it then ends with the process."""
 
 
 @dataclass(frozen=True)
 class StreamReport:
-    """What the streamer has done since it was made."""
+    """The streamer's state and counts since its creation."""
 
     offboard: bool
-    """This stream has seen the autopilot in offboard."""
+    """Whether this stream has seen the autopilot in offboard."""
     silence: str | None
     """Why nothing was sent at the last deadline; None: a setpoint was."""
     fault: str | None
-    """Why the stream ended by itself, unless it was because the autopilot left offboard; None after `end`."""
+    """Why the stream ended by itself, other than by the autopilot leaving offboard; None after `end`."""
     sent: int
     missed: int
-    """Deadlines that passed unused because the thread did not get to run."""
+    """Deadlines missed because the thread did not run."""
 
 
 class SetpointStreamer:
-    """Passes the newest request through the gate and sends the setpoint, at a fixed rate, while all conditions hold.
+    """Passes the newest request through the gate and sends its setpoint, at a fixed rate, while all conditions hold.
 
-    The conditions: the stream was begun; the control loop runs; the request is fresh and the gate lets it pass; the
-    autopilot is heard, not in its failsafe, and has not left offboard. After the pilot's mode change, a lost link, a
-    gap in offboard flight or a fault of the gate the stream stays silent until `begin`. Every method may be called
-    from any thread and returns at once.
+    The conditions: the stream was begun; the control loop runs; the request is fresh and passes the gate; the autopilot
+    sends messages, is not in its failsafe, and has not left offboard. After the pilot's mode change, a lost link, a gap
+    in offboard flight or a fault of the gate the stream stays silent until `begin`. Every method may be called from any
+    thread and returns at once.
     """
 
     def __init__(
@@ -60,8 +60,7 @@ class SetpointStreamer:
         *,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`status` is asked before each setpoint; `clock` is the one that requests are dated by; `safety` says when the
-        link counts as lost."""
+        """`status` is called before each setpoint; `clock` dates requests; `safety` says when the link is lost."""
         self._send = send
         self._status = status
         self._gate = gate
@@ -89,12 +88,12 @@ class SetpointStreamer:
             self._thread.join(CLOSE_TIMEOUT_S)
 
     def begin(self) -> None:
-        """Streams from now on, with requests given from now on."""
+        """Starts streaming, with requests offered from now on."""
         self._request = None
         self._stream = _Stream(begun_s=self._clock())
 
     def end(self, reason: str) -> None:
-        """Silence until `begin`; `reason` is reported unless the stream had ended before. Its fault counts as known."""
+        """Silence until `begin`; `reason` is reported unless the stream had ended before. Clears its fault."""
         self._stream.end(reason)
         self._stream.fault = None
 
@@ -103,11 +102,11 @@ class SetpointStreamer:
         self._request = request
 
     def beat(self) -> None:
-        """The control loop runs. To be called by the control loop itself, several times in `max_control_age_s`."""
+        """Shows that the control loop runs. The control loop calls it several times in `max_control_age_s`."""
         self._beat_s = self._clock()
 
     def report(self) -> StreamReport:
-        """What has been done so far."""
+        """State and counts so far."""
         stream = self._stream
         self._end_after_a_gap(stream)
         return StreamReport(
@@ -119,27 +118,27 @@ class SetpointStreamer:
         )
 
     def step(self) -> None:
-        """One deadline: sends a setpoint, or keeps why not. The thread calls this."""
+        """One deadline: sends a setpoint, or keeps the reason why not. The thread calls this."""
         stream = self._stream
         if stream.ended is not None:
             return
-        self._end_after_a_gap(stream)  # before looking at the autopilot, whose failsafe is what follows from the gap
+        self._end_after_a_gap(stream)  # before the autopilot's failsafe, which follows from the gap
         self._silence = stream.ended or self._watch(stream) or self._send_one(stream)
 
     def _end_after_a_gap(self, stream: _Stream) -> None:
         """Ends a stream whose last setpoint in offboard flight was sent too long ago."""
         limit_s = self._parameters.max_gap_s
         if stream.offboard and self._clock() - stream.last_sent_s > limit_s:
-            why = self._silence or "the thread was stopped"  # SIGSTOP, or a machine that slept
+            why = self._silence or "the thread was stopped"  # SIGSTOP, or a suspended computer
             stream.fail(f"{why}, for more than {limit_s:g} s in offboard flight")
 
     def _watch(self, stream: _Stream) -> str | None:
-        """Why the autopilot's state forbids sending; ends the stream where that is final."""
+        """Why the autopilot's state forbids sending; ends the stream if that is final."""
         status = self._status()
         lost = link_lost(status.heartbeat_age_s, status.message_age_s, self._safety)
         silent_s, limit_s = status.message_age_s, self._parameters.max_gap_s
         if lost is None and stream.offboard and silent_s > limit_s:
-            # As long as this lasts setpoints may not arrive either: the first that does would pull the autopilot back.
+            # Meanwhile setpoints may be lost too: the first one to arrive would bring the autopilot back to offboard.
             lost = (
                 f"nothing was heard of the autopilot for {silent_s:.1f} s in offboard flight, as when the link is cut"
             )
@@ -154,7 +153,7 @@ class SetpointStreamer:
         return stream.ended
 
     def _send_one(self, stream: _Stream) -> str | None:
-        """Sends what the gate makes of the newest request; why not, where nothing can be sent."""
+        """Sends the gate's setpoint for the newest request. Returns why not, if it cannot."""
         request = self._request
         now = self._clock()
         if now - self._beat_s > self._parameters.max_control_age_s:
@@ -177,13 +176,13 @@ class SetpointStreamer:
         return None
 
     def _run(self) -> None:
-        """Deadlines on the wall of the real clock; one that has passed is counted and not made up for."""
+        """Keeps deadlines on the real clock; a missed one is counted and not made up for."""
         period_s = 1.0 / self._parameters.setpoint_rate_hz
         deadline = time.monotonic()
         while not self._closing.wait(max(0.0, deadline - time.monotonic())):
             try:
                 self.step()
-            except Exception as error:  # noqa: BLE001 - the thread's last line: silence, and the reason is reported
+            except Exception as error:  # noqa: BLE001 - whatever fails here ends in silence, and the reason is reported
                 self._stream.fail(f"the streamer failed: {error!r}")
             deadline += period_s
             late = int((time.monotonic() - deadline) / period_s)

@@ -1,4 +1,4 @@
-"""What the link watches in flight: parameters, whose setpoints are followed, jumps of the local frame; pure."""
+"""What the link watches in flight: parameters, foreign setpoints, and jumps of the local frame; pure."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ KINDS: Mapping[str, type[int] | type[float]] = {
 }  # fmt: skip
 """As PX4 declares them."""
 LONGEST_LOSS_S = 1.0
-"""PX4 flies on with the last velocity for as long as COM_OF_LOSS_T."""
+"""Largest COM_OF_LOSS_T: PX4 flies on with the last velocity for so long."""
 SAFE_ACTIONS: Mapping[int, str] = {0: "Position", 3: "Return", 4: "Land", 5: "Hold"}
-"""Values of COM_OBL_RC_ACT with which the autopilot stays where it is, lands or returns."""
+"""Values of COM_OBL_RC_ACT with which the autopilot stays, lands or returns."""
 
 
 class WatchedParameters:
-    """The newest values, and what is wrong with them."""
+    """The newest values, and their fault."""
 
     def __init__(self, report: Callable[[str], None]) -> None:
-        """``report`` is called with one sentence on each change in flight."""
+        """``report`` is called with one sentence for each change in flight."""
         self._report = report
         self.values: dict[str, float] = {}
 
@@ -39,7 +39,7 @@ class WatchedParameters:
             self._report(f"the autopilot's {name} was changed in flight from {known:g} to {value:g}")
 
     def fault(self, max_gap_s: float) -> str | None:
-        """Why no drone may fly with them; None: it may. ``max_gap_s``: between setpoints, as flockd bridges."""
+        """Why no drone may fly with them; None: it may. ``max_gap_s``: longest gap between setpoints in flight."""
         loss_s = self.values.get(LOSS_TIME, LONGEST_LOSS_S)
         if not max_gap_s < loss_s <= LONGEST_LOSS_S:
             return (
@@ -56,34 +56,33 @@ class WatchedParameters:
 
 
 SENT_S = services.POSITION_TARGET.timeout + LONGEST_LOSS_S
-"""PX4 may follow a setpoint of flockd's for this long after it was sent, and begin to follow the next only after it:
-PX4 flies on with the last one that arrived, and the message that reports it takes time."""
+"""Time for which PX4 may follow a setpoint after it was sent, and before it follows the next: PX4 flies on with the
+last one that arrived, and the message that reports it takes time."""
 TOLERANCE_M_S = 0.3
-"""By how much the autopilot itself may change a setpoint, at a reset of its estimator."""
+"""Largest change of a setpoint by the autopilot itself, at a reset of its estimator."""
 WINDOW, MOST_FOREIGN = 20, 2
-"""Of so many messages, two seconds' worth, so few may name another setpoint."""
+"""Messages that are compared, two seconds' worth, and how many of them may name another setpoint."""
 
 
 class SetpointWatch:
-    """Compares what is followed with what was sent. `sent` and `followed` may be called on different threads."""
+    """Compares the setpoint that PX4 follows with those sent. `sent` and `followed` may run on different threads."""
 
     def __init__(self, report: Callable[[str], None], parameters: Mapping[str, float]) -> None:
-        """``report`` is called with one sentence where setpoints are clipped, once in a flight; ``parameters``: the
-        newest values of the autopilot's.
-        """
+        """``report`` is called with one sentence, once in a flight, if setpoints are clipped; ``parameters``: the
+        newest values of the autopilot's parameters."""
         self._report, self._parameters = report, parameters
         self._told = False
         self._sent: deque[tuple[float, float, float]] = deque(maxlen=200)
         self._foreign: deque[bool] = deque(maxlen=WINDOW)
         self.seen: str | None = None
-        """Another sender's setpoints in the last seconds, in a few words; None: none."""
+        """Evidence of another sender's setpoints in the last seconds, in a few words; None: none."""
 
     def sent(self, time_s: float, north_m_s: float, east_m_s: float) -> None:
-        """Flockd has sent this setpoint."""
+        """Takes a setpoint that flockd has sent."""
         self._sent.append((time_s, north_m_s, east_m_s))
 
     def followed(self, time_s: float, north_m_s: float, east_m_s: float, *, offboard: bool) -> None:
-        """The autopilot follows this one; NaN: it does not follow a velocity. ``offboard``: it is in that mode."""
+        """Takes the setpoint that the autopilot follows; NaN: not a velocity. ``offboard``: it is in that mode."""
         sent = list(self._sent)
         recent = [one for one in sent if time_s - one[0] <= SENT_S]
         if not offboard or not recent or time_s - sent[0][0] <= SENT_S:
@@ -102,7 +101,7 @@ class SetpointWatch:
             self.seen = f"another program sends setpoints: the autopilot follows {what}, which flockd did not send"
 
     def _is_clipped(self, north_m_s: float, east_m_s: float, recent: list[tuple[float, float, float]]) -> bool:
-        """Whether it is one of flockd's, but shorter, and as long as the autopilot's limit where that is known."""
+        """Whether it is one of flockd's setpoints, shortened, to the autopilot's limit if that is known."""
         flown_m_s, limit_m_s = math.hypot(north_m_s, east_m_s), self._parameters.get(MOST_SPEED)
         if not flown_m_s > TOLERANCE_M_S or (limit_m_s is not None and abs(flown_m_s - limit_m_s) > TOLERANCE_M_S):
             return False
@@ -122,11 +121,11 @@ class SetpointWatch:
 
 
 JUMP_M, JUMP_RAD = 0.3, math.radians(10.0)
-"""Far above an estimator's corrections from one message to the next; smaller jumps are not noticed."""
+"""Smallest jumps that are detected: far above an estimator's corrections between two messages."""
 MOST_ACCELERATION = 20.0
-"""Of a drone, m/s^2 and rad/s^2: by so much its velocity may have changed unseen between two messages."""
+"""Largest acceleration of a drone, m/s^2 and rad/s^2: bounds the change of velocity between two messages."""
 LARGEST_M = 1.0
-"""A larger jump, or one of the heading, is not flown on with."""
+"""A larger jump, or one of the heading, ends the flight."""
 
 
 class _Sample(NamedTuple):
@@ -136,25 +135,25 @@ class _Sample(NamedTuple):
 
 
 class LocalFrame:
-    """Notices jumps. `offset` may be read on any thread.
+    """Detects jumps of the local frame. `offset` may be read on any thread.
 
-    It computes with numbers: for the 80 messages a second, arrays of three would take most of a link's time.
+    It uses plain numbers: at 80 messages a second, arrays of three would take most of a link's CPU time.
     """
 
     def __init__(self) -> None:
         self.offset = np.zeros(3)
-        """(3,) m NED to be added to the autopilot's own positions."""
+        """(3,) m NED that are added to the autopilot's positions."""
         self.large = False
-        """One was larger than `LARGEST_M`, or of the heading; whoever has acted on it sets it back."""
+        """Whether one was larger than `LARGEST_M`, or of the heading; reset by the code that acts on it."""
         self._place: _Sample | None = None
         self._attitude: _Sample | None = None
 
     def restart(self) -> None:
-        """The autopilot's own frame counts from now on."""
+        """Resets the offset: the autopilot's own frame counts from now on."""
         self.offset, self.large = np.zeros(3), False
 
     def move(self, stamp_s: float, place: Sequence[float], velocity: Sequence[float]) -> str | None:
-        """Takes a position and velocity (3,) of the autopilot's, by its own clock; one sentence on a jump."""
+        """Takes a position and velocity (3,) of the autopilot, by its own clock; returns one sentence on a jump."""
         before, self._place = self._place, _Sample(stamp_s, place, velocity)
         if before is None or stamp_s < before.stamp_s:
             return None
@@ -174,8 +173,8 @@ class LocalFrame:
     def turn(self, stamp_s: float, attitude: Sequence[float], rate: Sequence[float]) -> str | None:
         """The same of unit quaternions w x y z from the body to NED and rates (3,) in rad/s of the body.
 
-        Only the heading is looked at: of the rotation w x y z from the attitude that the rates lead to, to the one that
-        was sent, the turn about the vertical is 2 atan2(z, w).
+        Only the heading counts: of the rotation w x y z from the attitude predicted by the rates to the one that was
+        sent, the turn about the vertical is 2 atan2(z, w).
         """
         before, self._attitude = self._attitude, _Sample(stamp_s, attitude, rate)
         if before is None or stamp_s < before.stamp_s:
@@ -194,7 +193,7 @@ class LocalFrame:
 
 
 def _product(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float, float]:
-    """Of quaternions w x y z."""
+    """Product of quaternions w x y z."""
     (aw, ax, ay, az), (bw, bx, by, bz) = a, b
     return (
         aw * bw - ax * bx - ay * by - az * bz,
@@ -205,5 +204,5 @@ def _product(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, floa
 
 
 def _unseen(interval_s: float) -> float:
-    """How far off the mean of two velocities may lead."""
+    """Largest distance by which the mean of two velocities may be wrong."""
     return 0.25 * MOST_ACCELERATION * interval_s**2

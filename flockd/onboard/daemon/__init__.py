@@ -1,4 +1,4 @@
-"""The daemon on the drone: owns time, devices, threads and failure around the pure line."""
+"""The daemon on the drone: time, devices, threads and failures around the pure pipeline."""
 
 from flockd.onboard.daemon.daemon import Daemon, DaemonError
 from flockd.onboard.daemon.message_sinks import StderrLog

@@ -1,4 +1,4 @@
-"""What the daemon tells and asks the autopilot beside setpoints: takeovers, the map, its state, why it would refuse."""
+"""What the daemon exchanges with the autopilot besides setpoints: takeovers, texts, and reasons to refuse."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ Takeover = Literal["hold", "return", "land"]
 
 POLL_S = 0.02
 REPLY_S = 1.0
-"""How long the autopilot may take to answer one request; its own repetitions are within."""
+"""Longest time for the autopilot's reply to one request, with its own repetitions."""
 RETRY_S = 0.3
-"""Between two requests for the same, where the first changed nothing."""
+"""Time before a request that changed nothing is repeated."""
 SAME_AGAIN_S = 30.0
-"""Until the same answer is logged again: an autopilot that has died is asked about once a second, for ever."""
+"""Time before the same answer is logged again: a dead autopilot is asked once a second, for ever."""
 
 
 class AutopilotRequests:
-    """Repeats the request that the control loop has set until the autopilot has complied."""
+    """Repeats the control loop's request until the autopilot has complied."""
 
     def __init__(self, link: AutopilotLink, log_event: Callable[[str], None]) -> None:
         self._link, self._log_event = link, log_event
         self._logged, self._logged_s = "", -math.inf
         self.takeover: Takeover | None = None
-        """The mode to request, set by the control loop; None: none."""
+        """The mode to request, set by the control loop; None: no request."""
         self.asking = False
-        """A request is under way; a landing takes two, and the first already ends offboard."""
+        """Whether a request is in progress; a landing takes two, and the first already ends offboard."""
 
     async def run(self) -> None:
         """Sends requests until cancelled."""
@@ -66,7 +66,7 @@ class AutopilotRequests:
             self.asking = False
 
     def _log(self, answer: str) -> None:
-        """An event for an answer, unless it is the last one's repetition."""
+        """Logs an answer as an event, unless it repeats the last one."""
         now_s = asyncio.get_running_loop().time()
         if answer != self._logged or now_s - self._logged_s >= SAME_AGAIN_S:
             self._logged, self._logged_s = answer, now_s
@@ -80,7 +80,7 @@ class AutopilotRequests:
 
 
 EVERY_S = 2.0
-"""Between two texts, but for a graver one: a state that comes and goes meanwhile is not told."""
+"""Time between two texts, except for a graver one: states that pass in between are not sent."""
 
 SEVERITIES: Mapping[State, Severity] = {
     State.IDLE: Severity.INFO,
@@ -94,7 +94,7 @@ SEVERITIES: Mapping[State, Severity] = {
 
 
 class StateTexts:
-    """Tells each new state once, the newest where several came too quickly."""
+    """Sends each new state once, the newest if several came too quickly."""
 
     def __init__(self, send: Callable[[str, Severity], None], clock: Callable[[], float]) -> None:
         self._send, self._clock = send, clock
@@ -102,7 +102,7 @@ class StateTexts:
         self._told_s = -math.inf
 
     def update(self, decision: Decision) -> None:
-        """Takes what the supervisor has decided; call it at each tick."""
+        """Takes the supervisor's decision; call it at each tick."""
         state, now_s = decision.state, self._clock()
         if state is self._told:
             return
@@ -114,26 +114,26 @@ class StateTexts:
 
 
 def state_sentence(decision: Decision) -> str:
-    """The state, and why it is so."""
+    """The state, and its reason."""
     reasons = "; ".join(reason.sentence for reason in decision.reasons)
     return f"{decision.state}: {reasons}" if reasons else str(decision.state)
 
 
 CHECKS_POLL_S = 0.5
 ASK_AGAIN_S = 10.0
-"""Between two requests for the list of failed checks, where the first brought none."""
+"""Time between two requests for the list of failed checks if the first one brought none."""
 LOG_AGAIN_S = 60.0
-"""Until a reason that comes and goes is logged again."""
+"""Time before a recurring reason is logged again."""
 
 
 class RefusalWatch:
-    """Asks for the list of failed checks where it is missing, and logs each new reason."""
+    """Requests the list of failed checks if it is missing, and logs each new reason."""
 
     def __init__(self, link: AutopilotLink, log_event: Callable[[str], None], clock: Callable[[], float]) -> None:
         self._link, self._log_event, self._clock = link, log_event, clock
         self._seen_s: dict[str, float] = {}
         self.current: tuple[Refusal, ...] = ()
-        """As of the last half second, the cause first."""
+        """The reasons of the last half second, the cause first."""
 
     async def run(self) -> None:
         """Watches until cancelled."""
@@ -145,10 +145,10 @@ class RefusalWatch:
                 if now - self._seen_s.get(refusal.reason, -math.inf) >= LOG_AGAIN_S:
                     self._log_event(refusal.sentence)
                 self._seen_s[refusal.reason] = now
-            # On the ground alone. Where events were lost, `AutopilotLink.attend` asks too, and in flight.
+            # Only on the ground. After lost events, `AutopilotLink.attend` asks too, also in flight.
             if not self._link.knows_checks() and not self._link.status().armed and now - asked_s >= ASK_AGAIN_S:
                 asked_s = now
-                with suppress(AutopilotError, TimeoutError):  # of a firmware without one single messages tell reasons
+                with suppress(AutopilotError, TimeoutError):  # firmware without the list has single messages
                     async with asyncio.timeout(ASK_AGAIN_S):
                         await self._link.ask_for_checks()
             await asyncio.sleep(CHECKS_POLL_S)

@@ -67,7 +67,7 @@ class Control:
         self._yaw_rad = math.nan
         self._flight = 0
         self._request: Request | None = None
-        """The last one offered; None in silence."""
+        """The last request offered; None in silence."""
         self.decision = Decision(State.IDLE, Action.SILENCE, ())
 
     async def run(self) -> None:
@@ -96,12 +96,12 @@ class Control:
         self._on_tick(before, self.decision)
 
     def stand_still(self) -> None:
-        """For when no tick follows: the streamer sends standstill until it notices that the control loop is late."""
+        """Called if no tick follows: the streamer sends standstill until it notices that the control loop is late."""
         if self._request is not None:
             self._streamer.offer(replace(self._request, permission=Permission(Action.ASK_HOLD, self._clock())))
 
     def _mission_over(self) -> MissionEnd | None:
-        """What the mission of this flight asks of the autopilot; None while the drone does not fly."""
+        """How this flight's mission ended; None: it has not, or the drone does not fly."""
         result = self._pilot_loop.newest
         if self.decision.state not in FLYING or result is None or result.flight != self._flight:
             return None
@@ -109,7 +109,7 @@ class Control:
         return None if takeover is None else MissionEnd(takeover)
 
     def _begin_or_end_flight(self, before: Decision, vehicle: VehicleState | None) -> None:
-        """A flight begins with a new pilot, and holds the height and the heading that the drone has then."""
+        """A flight begins with a new pilot, and holds the drone's height and heading at that time."""
         flies = self.decision.state in FLYING
         if flies and before.state not in FLYING:
             self._flight += 1
@@ -119,7 +119,7 @@ class Control:
             self._yaw_rad = _yaw(vehicle)
 
     def _stream(self, now: float, status: AutopilotStatus, vehicle: VehicleState | None, before: Decision) -> None:
-        """Offers what the pilot wants, with the permission for it, or ends the stream."""
+        """Offers the pilot's command with the supervisor's permission, or ends the stream."""
         action = self.decision.action
         if action is Action.SILENCE:
             self._request = None
@@ -136,9 +136,9 @@ class Control:
         self._streamer.beat()
 
     def _wanted(self, now: float) -> tuple[Wanted, float]:
-        """What the pilot wants, and since when; standstill during a flight's first steps.
+        """The pilot's command and its time; standstill during a flight's first steps.
 
-        Before those it knows neither its ego-motion nor its neighbours.
+        Before them it knows neither its ego-motion nor its neighbours.
         """
         result = self._pilot_loop.newest
         if result is None or result.flight != self._flight or result.number < self._first_steps:

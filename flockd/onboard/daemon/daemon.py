@@ -39,20 +39,20 @@ from flockd.onboard.telemetry.topics import AboutMessage
 from flockd.onboard.worker import BusyError, LateError, Worker
 
 LOAD_S = 60.0
-"""To load the networks from a slow card."""
+"""Time to load the networks, from a slow card too."""
 OPEN_S = 10.0
 CLOSE_S = 3.0
 HOLD_S = 1.5
-"""For the autopilot to confirm Hold after the control loop has failed, which fed the service's watchdog: that kills 2 s
-later."""
+"""Time for the autopilot to confirm Hold after the control loop has failed, which fed the service's watchdog: systemd kills the
+process 2 s later."""
 
 
 class DaemonError(FlockdError):
-    """The flight ended because something in flockd did; the text says what."""
+    """The flight ended because of a fault in flockd; the text says which."""
 
 
 class Daemon:
-    """One drone's flight program, from its start to its end. `run` once."""
+    """One drone's flight program, from start to end. Call `run` once."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class Daemon:
         """Checks the configuration; nothing is opened before `run`.
 
         Args:
-            config: the drone's.
+            config: the drone's configuration.
             file: its path, named in errors.
             load_networks: runs on a thread of its own.
             models: SHA-256 of each model, by name, for the recordings.
@@ -92,7 +92,7 @@ class Daemon:
         """All parts of the flight, once they are open."""
 
     def waits_for(self) -> str | None:
-        """What has to come before it can fly, for people; None once it has all."""
+        """What is missing before it can fly, for people; None: nothing."""
         assert self._config.autopilot is not None
         if self.components is None:
             return f"the autopilot at {self._config.autopilot.address}, and for the networks to load"
@@ -100,15 +100,15 @@ class Daemon:
         return None if why is None else f"camera frames: {why}"
 
     def ask_to_stop(self) -> None:
-        """As SIGTERM does: standstill, Hold, and the end."""
+        """Stops like SIGTERM: standstill, Hold, and the end."""
         self._operator.shutdown = True
         self._stopping.set()
 
     async def run(self) -> None:
         """Flies until it is asked to stop.
 
-        Raises FlockdError when it cannot start, DaemonError when a task died or Hold was not confirmed, AutopilotError
-        when the link is not usable any more on the ground.
+        Raises FlockdError if it cannot start, DaemonError if a task died or Hold was not confirmed, AutopilotError if
+        the link became unusable on the ground.
         """
         async with AsyncExitStack() as stack:
             components = await self._unless_stopped(self._open(stack))
@@ -117,14 +117,11 @@ class Daemon:
                 await self._fly(components)
 
     async def _open(self, stack: AsyncExitStack) -> Components:
-        """Opens and connects all components; ``stack`` closes what was opened, in reverse order.
-
-        Raises FlockdError for what cannot be opened.
-        """
+        """Opens and connects all components; ``stack`` closes them in reverse order. Raises FlockdError on failure."""
         config, clock = self._config, self._clock
         assert config.autopilot is not None
         loading = Worker("loading")
-        # A process that ends while a thread is inside ONNX Runtime is aborted; nothing else runs by then.
+        # A process that ends while a thread is inside ONNX Runtime aborts, so this comes last.
         stack.callback(loading.leave, LOAD_S)
         closing = Worker("closing", backlog=8)
         stack.callback(closing.leave)
@@ -179,7 +176,7 @@ class Daemon:
         return WatchedNetworks(networks, deadline_s, cameras_at_once(self._config))
 
     async def _link(self, stack: AsyncExitStack) -> AutopilotLink:
-        """Closed by the stack, whatever becomes of the networks that load meanwhile."""
+        """Opens the link; the stack closes it even if loading the networks fails meanwhile."""
         assert self._config.autopilot is not None
         link = await AutopilotLink.connect(self._config.autopilot, clock=self._clock)
         stack.push_async_callback(_close_async, link.close)
@@ -197,7 +194,7 @@ class Daemon:
         )
 
     async def _unless_stopped(self, start: Coroutine[Any, Any, Components]) -> Components | None:
-        """Starts; None when asked to stop before that is done."""
+        """Starts; None if asked to stop before the start is complete."""
         starting = asyncio.create_task(start)
         stopping = asyncio.create_task(self._stopping.wait())
         try:
@@ -236,11 +233,11 @@ class Daemon:
             raise self._unusable
 
     async def _supervised(self, name: str, run: Callable[[], Awaitable[None]], components: Components) -> None:
-        """A task that ends is an event for the supervisor, which ends the flight; it does not end the other tasks."""
+        """A task that ends becomes an event for the supervisor, which ends the flight; the other tasks go on."""
         try:
             await run()
             components.dead_tasks[name] = "it returned"
-        except Exception as error:  # noqa: BLE001 - whatever it is, the drone has to be handed over
+        except Exception as error:  # noqa: BLE001 - after any error the drone has to be handed over
             components.dead_tasks[name] = repr(error)
         components.sinks.event(f"the task {name} died: {components.dead_tasks[name]}")
         if name in {"control", "requests"}:
@@ -286,7 +283,7 @@ class Daemon:
 
 
 def _raise_failure(components: Components) -> None:
-    """Raises DaemonError unless all ended as it should."""
+    """Raises DaemonError unless the flight ended normally."""
     if components.dead_tasks:
         deaths = "; ".join(f"{name}: {why}" for name, why in components.dead_tasks.items())
         raise DaemonError(f"flockd ended because a task died ({deaths}); read its log")

@@ -1,4 +1,4 @@
-"""Every message of the daemon goes to its sinks: telemetry, the recording of the flight, and the log."""
+"""Sends every message of the daemon to telemetry, the recording of the flight, and the log."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class MessageSinks:
         folder: Path | None,
         clock: Callable[[], float],
     ) -> None:
-        """``folder``: where flights are recorded; None: nowhere. ``models``: SHA-256 of each, by name."""
+        """``folder``: for recordings of flights; None: no recording. ``models``: SHA-256 of each, by name."""
         self._config, self._telemetry, self._models = config, telemetry, models
         self._folder, self._clock = folder, clock
         self._worker = Worker("telemetry", BACKLOG)
         self._closing = Worker("recordings", BACKLOG)
-        """A slow disk takes its time to end a file, and telemetry goes on."""
+        """A slow disk takes long to close a file; telemetry goes on meanwhile."""
         self._recorder: Recorder | None = None
         self._path: Path | None = None
         self.lost = 0
@@ -50,7 +50,7 @@ class MessageSinks:
         self.publish("events", EventMessage(time_s=self._clock(), event=sentence))
 
     def publish(self, topic: str, message: Mapping[str, object]) -> None:
-        """One message; see `flockd.onboard.telemetry.TOPICS`."""
+        """Publishes one message; see `flockd.onboard.telemetry.TOPICS`."""
         self._submit(self._telemetry.publish, self._config.name, topic, message)
         if self._recorder is not None:
             self._recorder.publish(self._config.name, topic, message)
@@ -63,13 +63,13 @@ class MessageSinks:
 
     @property
     def recording(self) -> str | None:
-        """The file, or why its recording ended; None where nothing is being recorded."""
+        """The recording's file, or why it ended; None: not recording."""
         if self._recorder is None:
             return None
         return self._recorder.failure or str(self._path)
 
     def begin_recording(self, learned: LearnedSize | None = None) -> None:
-        """Begins a new file for a flight, where flights are recorded; ``learned``: what its pilot begins with."""
+        """Begins a file for a flight, if flights are recorded; ``learned``: the size that its pilot begins with."""
         if self._folder is None:
             return
         self.end_recording()
@@ -92,14 +92,14 @@ class MessageSinks:
             self._closing.submit(recorder.close, CLOSE_S)
 
     async def close(self) -> None:
-        """Ends the recording, and waits until all is written or it takes too long. Raises LateError."""
+        """Ends the recording, and waits until all is written. Raises LateError if that takes too long."""
         self.end_recording()
         for worker in (self._closing, self._worker):
             await worker.do(CLOSE_S + 1.0, lambda: None)
             worker.leave()
 
     def _on_event(self, sentence: str) -> None:
-        """The recorder has recorded it already, if it still can."""
+        """For the recorder's own events, which it has recorded itself if it can."""
         _log.warning("%s", sentence)
         message = EventMessage(time_s=self._clock(), event=sentence)
         self._submit(self._telemetry.publish, self._config.name, "events", message)
@@ -112,17 +112,17 @@ class MessageSinks:
 
 
 MOST_LINES = 1000
-"""Lines that may wait."""
+"""Lines that may wait to be written."""
 LAST_LINES_S = 1.0
-"""Given at the end to whoever reads them."""
+"""Time at the end to write the remaining lines."""
 STDERR = 2
 
 
 class StderrLog(logging.Handler):
     """Writes log lines from a separate thread; while too many wait, further lines are lost and counted.
 
-    A write to a full pipe, to a journal that hangs or to a file on a busy disk may take any time.
-    Lines contain texts of the autopilot and of operators: they are made fit for terminals.
+    A write to a full pipe, a hanging journal or a busy disk may take any time. Control characters in texts of the
+    autopilot and of operators are replaced.
     """
 
     def __init__(self, descriptor: int = STDERR) -> None:
@@ -132,7 +132,7 @@ class StderrLog(logging.Handler):
         self._lost = 0
 
     def emit(self, record: logging.LogRecord) -> None:
-        """One line, from any thread; does not wait."""
+        """Queues one line, from any thread; does not wait."""
         lost = f"({self._lost} lines were lost: nobody read them)\n" if self._lost else ""
         try:
             self._worker.submit(self._write, f"{lost}{printable(self.format(record))}\n")
@@ -142,12 +142,12 @@ class StderrLog(logging.Handler):
             self._lost = 0
 
     def close(self) -> None:
-        """Waits a moment for the lines that are left."""
+        """Waits a moment for the remaining lines."""
         self._worker.leave(LAST_LINES_S)
         super().close()
 
     def _write(self, text: str) -> None:
-        # Not by sys.stderr, whose lock the process would wait for when it ends.
+        # Not with sys.stderr: the process would wait for its lock at exit.
         data = text.encode("utf-8", "backslashreplace")
         while data:
             data = data[os.write(self._descriptor, data) :]

@@ -1,4 +1,4 @@
-"""Operators' orders: whether each is for this drone, allowed, new and in time, and to whom it goes."""
+"""Operators' orders: checks that each is for this drone, allowed, new and in time, and passes it on."""
 
 from __future__ import annotations
 
@@ -25,35 +25,35 @@ ORDERS = frozenset({"goto", "velocity"})
 
 @dataclass
 class OperatorRequests:
-    """What operators have requested."""
+    """Requests of operators to the supervisor."""
 
     shutdown: bool = False
     hold: bool = False
     land: bool = False
     resume: bool = False
-    """Counts once: reset when the supervisor has seen it. So does the next."""
+    """Counts once: reset after the supervisor has seen it, like the next one."""
 
     def apply(self, command: str) -> None:
-        """Sets the request of one command: hold, land or resume; it replaces an earlier one."""
+        """Takes one command, hold, land or resume; it replaces an earlier one."""
         self.hold = command == "hold"
         self.land = command == "land"
         self.resume = command == "resume"
 
 
 class Missions(Protocol):
-    """Takes operators' orders to the mission."""
+    """Receives operators' orders to the mission."""
 
     def fault(self, order: MissionOrder) -> str | None:
-        """Why it is refused, one sentence; None: it is not. On any thread."""
+        """Why an order is refused, one sentence; None: it is accepted. On any thread."""
 
     def apply(self, order: MissionOrder) -> None:
-        """Has the pilot take it in its next step. On the event loop."""
+        """Passes the order to the pilot's next step. On the event loop."""
 
 
 class OperatorCommands:
     """Accepts or refuses a command on any thread, and applies it on the event loop.
 
-    However many come, their events fill neither the log nor the recording: what is said too often is counted.
+    A flood of commands fills neither the log nor the recording: repeated events are only counted.
     """
 
     def __init__(
@@ -67,17 +67,17 @@ class OperatorCommands:
         identity: str,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``identity`` and ``clock``: those that the drone tells its watchers."""
+        """``identity`` and ``clock``: those that the drone publishes."""
         self._allowed, self._requests, self._missions, self._loop = allowed, requests, missions, loop
         self._checks = OrderChecks(identity, clock)
         self.recent = self._checks.recent
         self._taken = _Limited(log_event, burst=60, refill_s=1.0, clock=clock)
         self._refusals = _Limited(log_event, burst=10, refill_s=60.0, clock=clock)
         self.refused = 0
-        """Since the start."""
+        """Commands refused since the start."""
 
     def handle(self, command: str, payload: bytes) -> AnswerMessage:
-        """The answer to a command, by its name and what its query carries."""
+        """The answer to a command, by its name and the payload of its query."""
         operator = ""
         try:
             if command not in self._allowed:
@@ -94,7 +94,7 @@ class OperatorCommands:
         return AnswerMessage(accepted=True, sentence=f"{command} is being tried; the drone's state shows the result")
 
     def _apply(self, command: str, ask: AskMessage) -> None:
-        """Raises ValueError with the reason for which it is refused."""
+        """Applies a command. Raises ValueError with the reason if it is refused."""
         order = parse_order(command, ask["order"]) if command in ORDERS else None
         fault = self._checks.fault(command, ask) or (None if order is None else self._missions.fault(order))
         if fault is not None:
@@ -107,7 +107,7 @@ class OperatorCommands:
 
 
 class _Limited:
-    """Passes on events up to a number at once and one more every ``refill_s``; the next one counts the others."""
+    """Passes on a number of events at once and then one every ``refill_s``; the next one counts those left out."""
 
     def __init__(
         self, log_event: Callable[[str], None], *, burst: int, refill_s: float, clock: Callable[[], float]
@@ -117,7 +117,7 @@ class _Limited:
         self._left, self._filled_s, self._unsaid = float(burst), clock(), 0
 
     def tell(self, sentence: str) -> None:
-        """Passes it on, or counts it."""
+        """Passes an event on, or counts it."""
         with self._lock:
             now_s = self._clock()
             self._left = min(self._left + (now_s - self._filled_s) / self._refill_s, float(self._burst))
@@ -131,12 +131,12 @@ class _Limited:
 
 
 LATEST_S = services.ORDER.timeout
-"""Older than this an order may surprise whoever gave it. A sender asks for the drone's clock just before."""
+"""Greatest age of an order; an older one may surprise its operator. A sender asks for the drone's clock just before."""
 AHEAD_S = 0.5
-"""No order comes from later than now; its sender's own clock runs on while the two are on their way."""
+"""Largest time of an order after now: the sender's clock runs on while the order travels."""
 MOST_SESSIONS = 1000
 SAFE = frozenset({"hold", "land"})
-"""Taken although another operator's later order has come before: they end a flight."""
+"""Accepted even after another operator's later order: they end a flight."""
 RECENT_S, MOST_RECENT = 60.0, 8
 
 
@@ -148,10 +148,10 @@ class _Taken(NamedTuple):
 
 
 class OrderChecks:
-    """Takes orders on any thread."""
+    """Checks orders, on any thread."""
 
     def __init__(self, identity: str, clock: Callable[[], float]) -> None:
-        """``identity``: the drone's; ``clock``: the one that it tells its watchers."""
+        """``identity``: the drone's; ``clock``: the one that it publishes."""
         self._identity, self._clock = identity, clock
         self._lock = threading.Lock()
         self._sequences: OrderedDict[str, int] = OrderedDict()
@@ -159,7 +159,7 @@ class OrderChecks:
         self._recent: dict[str, _Taken] = {}
 
     def fault(self, command: str, ask: AskMessage) -> str | None:
-        """Why an order is refused, for its sender; None: it is accepted. Its number counts as used from now on."""
+        """Why an order is refused, for its sender; None: it is accepted, and its number counts as used from now on."""
         if ask["identity"] != self._identity:
             return f"it is for another drone of this name, with the identity {ask['identity']!r:.20}"
         age_s = self._clock() - ask["time_s"]
@@ -179,7 +179,7 @@ class OrderChecks:
         return None
 
     def take(self, command: str, ask: AskMessage) -> None:
-        """An order is carried out."""
+        """Notes that an order is carried out."""
         taken = _Taken(ask["operator"], command, ask["sequence"], self._clock())
         with self._lock:
             if self._newest is None or ask["time_s"] >= self._newest[0]:
@@ -190,7 +190,7 @@ class OrderChecks:
                 self._recent.pop(next(iter(self._recent)))
 
     def recent(self) -> list[TakenOrderMessage]:
-        """For telemetry: the last of each operator within `RECENT_S`, the newest first."""
+        """The last order of each operator within `RECENT_S`, the newest first, for telemetry."""
         now_s = self._clock()
         with self._lock:
             taken = [(*one[:3], now_s - one.taken_s) for one in reversed(self._recent.values())]
@@ -205,7 +205,7 @@ _TAKES_ORDERS = frozenset({State.NORMAL, State.DEGRADED, State.HOVER})
 
 
 class MissionOrders:
-    """See `Missions`."""
+    """Implements `Missions`."""
 
     def __init__(
         self,
@@ -214,16 +214,16 @@ class MissionOrders:
         vehicle: Callable[[], VehicleState | None],
         state: Callable[[], State],
     ) -> None:
-        """``vehicle``: its newest state; ``state``: the supervisor's. Both may be called on any thread."""
+        """``vehicle``: the vehicle's newest state; ``state``: the supervisor's. Both may be called on any thread."""
         self._config, self._pilot_loop, self._vehicle, self._state = config, pilot_loop, vehicle, state
 
     def fault(self, order: MissionOrder) -> str | None:
-        """Why it is refused, one sentence; None: it is not. On any thread."""
+        """Why an order is refused, one sentence; None: it is accepted. On any thread."""
         state = self._state()
         if state not in _TAKES_ORDERS:
             return f"flockd does not fly the drone now, as its state is {state}; its mission begins with the flight"
         return order_fault(self._config, order, self._vehicle())
 
     def apply(self, order: MissionOrder) -> None:
-        """Has the pilot take it in its next step. On the event loop."""
+        """Passes the order to the pilot's next step. On the event loop."""
         self._pilot_loop.order = order

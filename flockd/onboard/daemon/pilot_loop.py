@@ -33,38 +33,38 @@ from flockd.onboard.worker import BusyError, LateError, Worker
 
 FRAME_WAIT_S = 0.1
 FRAME_DEADLINE_S = 5.0
-"""To decode one set."""
+"""Deadline to decode one frame set."""
 STEP_DEADLINE_S = 30.0
-"""Deadline of a whole step, whose networks have deadlines of their own; the drone has been handed over long before."""
+"""Deadline of a whole step; its networks have earlier ones, and the drone is handed over long before."""
 LEAVE_S = 0.7
 STEPS_REMEMBERED = 20
 SEEN_PROBABILITY = 0.9
-"""Of a track with two detections that agree: who has one is not alone, though flocking waits for a third."""
+"""Existence probability after two detections that agree: company for a drone, though flocking waits for a third."""
 MAX_UNEXPECTED = 3
-"""Steps in a row that end in an error that nobody expects; then the loop ends, and the drone holds."""
+"""Steps in a row with an unexpected error after which the loop ends and the drone holds."""
 
 
 @dataclass(frozen=True, eq=False)
 class StepResult:
-    """The output of one step, and when its images were taken, on the daemon's clock: all ages count from there."""
+    """The output of one step, and the time of its images on the daemon's clock, from which all ages count."""
 
     time_s: float
     output: PilotOutput
     flight: int
-    """The number of the flight whose pilot computed it."""
+    """Number of the flight whose pilot computed it."""
     number: int
     """Number of the step, from 1 for the first of its pilot."""
 
 
 class StepsFailedError(Exception):
-    """Too many steps in a row ended in an error that nobody expects."""
+    """Too many steps in a row ended in an unexpected error."""
 
 
 OnStep = Callable[[FrameSet, VehicleState, PilotOutput, MissionOrder | None], None]
 
 
 class PilotLoop:
-    """Steps the pilot at its own rate; the source drops frames that come meanwhile."""
+    """Steps the pilot at its own rate; the source drops frames that come in between."""
 
     def __init__(
         self,
@@ -83,34 +83,34 @@ class PilotLoop:
         self._geometry = Worker("geometry")
         self._pilot: FlockPilot | None = None
         self._flight = self._begun = 0
-        """Number of the flight, and how often a pilot was begun."""
+        """Number of the flight, and number of pilots begun."""
         self._learned: LearnedSize | None = None
         self.learned_before: LearnedSize | None = None
-        """Of the others' size, which the flight's pilot began with."""
+        """The others' size with which the flight's pilot began."""
         self._failure: str | None = None
         self._unexpected = 0
-        """Errors in a row that nobody expects."""
+        """Unexpected errors in a row."""
         self._reports = Reports()
         self._took_s: deque[float] = deque(maxlen=STEPS_REMEMBERED)
         self.frames: FrameSet | None = None
-        """The newest; None before the first."""
+        """The newest frame set; None before the first."""
         self.newest: StepResult | None = None
         self.stepped: tuple[FrameSet, PilotOutput] | None = None
-        """The frames of the newest result, and its output."""
+        """The newest result's frames and output."""
         self.steps = 0
         self.failed = 0
-        """Steps without a result, because a network was late or an error came that nobody expects."""
+        """Steps without a result because of a late network or an unexpected error."""
         self._ego_motion_s = 0.0
-        """Time of the flight's newest step that found the own motion, or of its first, which has nothing to compare."""
+        """Time of the flight's newest step with an own motion, or of its first step."""
         self.noisy_images: Counter[str] = Counter()
-        """That were not used, by camera."""
+        """Images that were not used, by camera."""
         self.neighbour_seen_s = -math.inf
-        """When a neighbour was last seen: one that is confirmed, or about to be (`SEEN_PROBABILITY`)."""
+        """When a neighbour was last seen, confirmed or nearly (`SEEN_PROBABILITY`)."""
         self.order: MissionOrder | None = None
-        """An operator's that no finished step has taken yet."""
+        """An operator's order that no finished step has taken yet."""
 
     def begin_flight(self, number: int) -> None:
-        """Uses a new pilot from the next step on: its time begins there, so that a recording can be replayed."""
+        """Uses a new pilot from the next step on: its time starts there, so that a recording can be replayed."""
         self._flight, self.learned_before = number, self._learned
         self._begun += 1
         self._pilot = self.order = None
@@ -118,18 +118,18 @@ class PilotLoop:
 
     @property
     def ego_motion_age_s(self) -> float:
-        """For how long the steps, as of the newest, have found no own motion."""
+        """Time without own motion, as of the newest step."""
         return 0.0 if self.newest is None else self.newest.time_s - self._ego_motion_s
 
     def load(self) -> float:
-        """How long the steps take, 95th percentile of the last ones, over how long they may."""
+        """95th percentile of the last steps' durations, over the permitted one."""
         return float(np.percentile(self._took_s, 95)) / self._config.step_s if self._took_s else 0.0
 
     async def run(self) -> None:
         """Steps until cancelled.
 
-        Raises LateError when decoding or a step hangs, and StepsFailedError when some steps in a row had no result for
-        an error that nobody expects; one such step is counted, and the next comes as if it had not been.
+        Raises LateError if decoding or a step hangs, and StepsFailedError after some steps in a row with unexpected
+        errors; a single one is counted, and the loop goes on.
         """
         assert self._config.source is not None
         source, due_s = self._config.source, self._clock()
@@ -147,10 +147,10 @@ class PilotLoop:
                 await self._step(taken_s, exposed_s if on_our_clock else taken_s, frames, vehicle)
             now = self._clock()
             due_s = max(due_s + self._config.step_s, now)
-            await asyncio.sleep(due_s - frame_period_s - now)  # the next frame is the one that comes when a step is due
+            await asyncio.sleep(due_s - frame_period_s - now)  # then the next frame comes when a step is due
 
     def leave(self) -> None:
-        """Ends what runs; takes up to two seconds, from any thread."""
+        """Ends running work; takes up to two seconds, from any thread."""
         self._networks.leave()
         self._geometry.leave(LEAVE_S)
         self._decoding.leave(LEAVE_S)
@@ -165,15 +165,15 @@ class PilotLoop:
             output = await self._geometry.do(STEP_DEADLINE_S, pilot.step, frames, vehicle, None, order)
         except (LateError, BusyError):
             raise
-        except Exception as error:  # noqa: BLE001 - the step's border: one is lost, and the loop goes on
+        except Exception as error:  # noqa: BLE001 - an unexpected error costs one step
             self._note_failure(error)
             return
         finally:
             self._took_s.append(self._clock() - taken_s)
         if begun != self._begun:
-            return  # another pilot began meanwhile; this result is the old one's
+            return  # a new pilot began meanwhile; this result is of the old one
         if self.order is order:
-            self.order = None  # a step that fails is not recorded, so that the next takes the order again
+            self.order = None  # a failed step is not recorded: the next one takes the order again
         self._failure, self._unexpected = None, 0
         number = 1 if self._pilot is None or self.newest is None else self.newest.number + 1
         self._pilot, self._learned = pilot, pilot.learned
@@ -194,7 +194,7 @@ class PilotLoop:
         )
 
     def _note_failure(self, error: Exception) -> None:
-        """Counts a failed step; an event for a new reason. Raises StepsFailedError for too many that nobody expects."""
+        """Counts a failed step; an event for a new reason. Raises StepsFailedError after too many unexpected errors."""
         expected = isinstance(error, NetworkStuckError)
         why = str(error) if expected else f"{type(error).__name__}: {error}"
         self.failed += 1
@@ -213,7 +213,7 @@ class PilotLoop:
 
 
 def last_seen_s(time_s: float, neighbours: Sequence[Neighbour]) -> float:
-    """When one of the `neighbours` of the step at `time_s` was seen: one that is confirmed, or as good as that."""
+    """When one of the `neighbours` of the step at `time_s` was last seen, if it is confirmed or nearly."""
     return max(
         (time_s - n.unseen_s for n in neighbours if n.confirmed or n.existence_probability >= SEEN_PROBABILITY),
         default=-math.inf,
@@ -221,19 +221,19 @@ def last_seen_s(time_s: float, neighbours: Sequence[Neighbour]) -> float:
 
 
 class Reports:
-    """The sentences that outputs are worth: what begins, what of it is over, and what is found of cameras and sizes."""
+    """Event sentences from outputs: faults that begin or end, and findings about cameras and sizes."""
 
     def __init__(self) -> None:
         self._faults: dict[str, ReasonKind] = {}
-        """Of the step before, by their texts."""
+        """Faults of the step before, by their texts."""
         self.begin()
 
     def begin(self) -> None:
-        """Another pilot begins, which finds cameras and sizes anew."""
+        """Starts anew, with a new pilot."""
         self._told, self._of_rig = set(self._faults), set[str]()
 
     def update(self, output: PilotOutput) -> list[str]:
-        """The sentences of a step's output: of the rig once a flight, of all else when it begins or is over."""
+        """The sentences for a step's output: once a flight for the rig, else at the beginning and end of a fault."""
         before, self._faults = self._faults, {one.text: one.kind for one in output.reasons if one.kind in _OVER}
         over = [
             f"{fault.partition(':')[0]}: {_OVER[kind]}"
@@ -256,7 +256,7 @@ class Reports:
 
 
 _OVER = {ReasonKind.HEIGHT: "the range finder works again", ReasonKind.LENS: "its lens is clear again"}
-"""Said, after its subject, when a fault is over."""
+"""Said, after its subject, when a fault has ended."""
 
 
 HISTORY_S = services.VEHICLE_STATE.timeout
@@ -276,7 +276,7 @@ class VehicleHistory:
             self._states.popleft()
 
     def at(self, time_s: float) -> VehicleState | None:
-        """The state at that time, interpolated; the newest for a time of another clock; None before the first."""
+        """The state at that time, interpolated; the newest for a time on another clock; None before the first."""
         if not self._states:
             return None
         if not self._states[0].time_s - HISTORY_S <= time_s <= self._states[-1].time_s + HISTORY_S:
@@ -287,7 +287,7 @@ class VehicleHistory:
         return _between(self._states[later - 1], self._states[later], time_s)
 
     def moved_since(self, time_s: float) -> FloatArray:
-        """(3,) m NED from where the vehicle was then to where it was last, by its velocities; 0 where none are known.
+        """(3,) m NED: displacement since that time, by the vehicle's velocities; 0 if none are known.
 
         Positions of an autopilot jump when its estimator is reset; velocities hardly do.
         """
@@ -301,7 +301,7 @@ class VehicleHistory:
 
 
 def _between(before: VehicleState, after: VehicleState, time_s: float) -> VehicleState:
-    """At constant rates of turn and motion from the one to the other."""
+    """Interpolated, with constant turn rate and velocity."""
     share = (time_s - before.time_s) / (after.time_s - before.time_s)
     turn = vector_from_rotation(before.R_ned_body.T @ after.R_ned_body)
     ranges = [one for one in (before.ground_range, after.ground_range) if one is not None]
@@ -312,12 +312,12 @@ def _between(before: VehicleState, after: VehicleState, time_s: float) -> Vehicl
         velocity_ned=_between_vectors(before.velocity_ned, after.velocity_ned, share),
         position=_between_vectors(before.position, after.position, share),
         home_deg=after.home_deg,
-        # The nearest: ranges jump at edges, so that nothing is between two.
+        # The nearest in time: ranges jump at edges, so they are not interpolated.
         ground_range=min(ranges, key=lambda reading: abs(reading.time_s - time_s), default=None),
         turn_rate=turn / (after.time_s - before.time_s),
     )
 
 
 def _between_vectors(before: FloatArray | None, after: FloatArray | None, share: float) -> FloatArray | None:
-    """The later one where only that is known."""
+    """Interpolated; the later one if only that is known."""
     return after if before is None or after is None else before + share * (after - before)

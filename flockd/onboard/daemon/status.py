@@ -33,12 +33,12 @@ START_POLL_S = 0.1
 START_MORE_S = 10.0
 STATUS_EVERY_S = 2.0
 STATUS_POLL_S = 0.05
-"""A new status is sent after this long at most, so that whoever reads the lines has them in the order of events."""
+"""Longest delay of a new status, so that its lines keep the order of events."""
 
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """Of a running daemon, created and connected by `Daemon`."""
+    """The parts of a running daemon, created and connected by `Daemon`."""
 
     link: AutopilotLink
     gate: Gate
@@ -56,7 +56,7 @@ class Components:
     lag: LoopLag
     thermometer: Thermometer
     dead_tasks: dict[str, str]
-    """Why each task that has ended did, by name."""
+    """Why each dead task ended, by name."""
     over: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when the flight is over and the tasks may end."""
 
@@ -84,7 +84,7 @@ async def notify_service_manager(components: Components, service: ServiceManager
 
 
 async def publish_status(components: Components, clock: Callable[[], float]) -> None:
-    """Publishes `flight` and `computer` at the rates of the table of topics, until cancelled."""
+    """Publishes `flight` and `computer` at the rates in the table of topics, until cancelled."""
     messages: dict[str, Callable[[float], Mapping[str, object]]] = {
         "flight": lambda now: _flight_message(components, now),
         "computer": lambda now: _computer_message(components, now),
@@ -102,7 +102,7 @@ async def publish_status(components: Components, clock: Callable[[], float]) -> 
 
 
 def _matters(decision: Decision) -> tuple[State, tuple[Event, ...]]:
-    """What changes a status line, but for the numbers in it."""
+    """What changes a status line, apart from its numbers."""
     return decision.state, tuple(reason.event for reason in decision.reasons)
 
 
@@ -162,14 +162,14 @@ def _computer_message(components: Components, now: float) -> topics.ComputerMess
 
 
 FEEDS_A_PERIOD = 4
-"""How often in its period the watchdog is fed."""
+"""How often the watchdog is fed in its period."""
 
 
 class ServiceManager:
-    """systemd, if it started this process with a notify socket; else a no-op. Sending never waits and never fails."""
+    """systemd, if it started this process with a notify socket; else does nothing. Sending never waits or fails."""
 
     def __init__(self, environment: Mapping[str, str], *, clock: Callable[[], float] = time.monotonic) -> None:
-        """``environment`` is the process's own: NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID."""
+        """``environment``: the process's own: NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID."""
         self._clock = clock
         address = environment.get("NOTIFY_SOCKET", "")
         self._address = f"\0{address[1:]}" if address.startswith("@") else address
@@ -179,11 +179,11 @@ class ServiceManager:
         self._fed_s = float("-inf")
 
     def ready(self, status: str) -> None:
-        """Startup is complete."""
+        """Reports that startup is complete."""
         self._send("READY=1", f"STATUS={status}")
 
     def status(self, status: str) -> None:
-        """One line for people."""
+        """Sends one line for people."""
         self._send(f"STATUS={status}")
 
     def starting(self, status: str, more_s: float) -> None:
@@ -191,11 +191,11 @@ class ServiceManager:
         self._send(f"EXTEND_TIMEOUT_USEC={round(more_s * 1e6)}", f"STATUS={status}")
 
     def stopping(self) -> None:
-        """About to end."""
+        """Reports that the process is about to end."""
         self._send("STOPPING=1")
 
     def alive(self) -> None:
-        """Feeds the watchdog when due. Only the control loop may call it: its hanging is what the watchdog detects."""
+        """Feeds the watchdog when due. Only the control loop may call it: the watchdog detects that it hangs."""
         now = self._clock()
         if self._period_s and now - self._fed_s >= self._period_s / FEEDS_A_PERIOD:
             self._fed_s = now

@@ -1,4 +1,4 @@
-"""Collects the supervisor's inputs: of cameras, pilot, autopilot and operators, and of the computer's own monitors."""
+"""Collects the supervisor's inputs from cameras, pilot, autopilot, operators, and the computer's own monitors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from flockd.onboard.worker import LateError, Worker
 
 DROPS_WINDOW_S = 5.0
 _Tally = tuple[int, int, int, int]
-"""Frames: received, of these refused when they came; decoded, of these such that show nothing, or noise."""
+"""Counts of frames: received, refused on arrival, decoded, useless after decoding or noise."""
 _BAD: tuple[Count, ...] = ("time_stamp", "flagged", "corrupt", "malformed")
 _REFUSED = (Objection.COMMAND_NOT_FINITE, Objection.COMMAND_TOO_LARGE, Objection.HEADING_NOT_FINITE)
 
@@ -43,7 +43,7 @@ class InputCollector:
         dead_tasks: Mapping[str, str],
         clock: Callable[[], float],
     ) -> None:
-        """``dead_tasks``: why each task that has ended did, by name; grows elsewhere."""
+        """``dead_tasks``: why each dead task ended, by name; updated elsewhere."""
         self._config, self._source, self._pilot_loop, self._networks = config, source, pilot_loop, networks
         self._gate, self._lag, self._thermometer, self._dead_tasks = gate, lag, thermometer, dead_tasks
         assert config.autopilot is not None
@@ -63,7 +63,7 @@ class InputCollector:
         stream_fault: str | None,
         obstacle_m: float,
     ) -> Inputs:
-        """All inputs as of now; requests that count once, or for a flight that is over, are reset in ``operator``.
+        """All inputs as of now; requests that count once, or for a finished flight, are reset in ``operator``.
 
         ``obstacle_m``: the range of the nearest obstacle.
         """
@@ -77,7 +77,7 @@ class InputCollector:
         position = position_from_home(status)
         self._had_satellites = self._had_satellites or status.gps_ok is True
         if self._was_armed and not status.armed:
-            operator.hold = operator.land = False  # they were for the flight that is over
+            operator.hold = operator.land = False  # they were for the finished flight
         self._was_armed = status.armed
         inputs = Inputs(
             cameras=cameras,
@@ -124,7 +124,7 @@ class InputCollector:
 
 
 def position_from_home(status: AutopilotStatus) -> FloatArray:
-    """(2,) metres north and east; NaN while the autopilot has not sent its position or home."""
+    """(2,) metres north and east; NaN until the autopilot has sent its position and home."""
     if status.position_ned is None or status.home_ned is None:
         return np.full(2, np.nan)
     from_home: FloatArray = (status.position_ned - status.home_ned)[:2]
@@ -143,15 +143,15 @@ class CameraMonitor:
         self._timeout_periods = config.safety.camera_timeout_periods
         self._frozen_before = dict.fromkeys(self._periods_s, 0)
         self._clean_s: dict[str, float] = {}
-        """When each camera's images were last not noise."""
+        """Time of each camera's last image without noise."""
         self._window: deque[tuple[float, _Tally]] = deque()
 
     def update(
         self, now: float, status: Mapping[str, CameraStatus], noisy: Collection[str] = (), noisy_images: int = 0
     ) -> tuple[dict[str, CameraHealth], float]:
-        """The cameras' health, and the share of frames dropped, as of now; to be called at each tick.
+        """The cameras' health, and the share of frames dropped, as of now; call it at each tick.
 
-        ``noisy``: the cameras whose newest images the pilot found to be noise; ``noisy_images``: how many since the
+        ``noisy``: cameras whose newest images are noise by the pilot; ``noisy_images``: number of such images since the
         start, of all cameras.
         """
         for name in status.keys() - set(noisy):
@@ -176,7 +176,7 @@ class CameraMonitor:
 
 
 def _tally(status: Mapping[str, CameraStatus], noisy_images: int) -> _Tally:
-    """Of all cameras since the start. Few frames are decoded, so that these are counted for themselves."""
+    """Counts of all cameras since the start. Few frames are decoded, so these are counted separately."""
     counts = Counter[Count]()
     for camera in status.values():
         counts.update(camera.counts)
@@ -186,7 +186,7 @@ def _tally(status: Mapping[str, CameraStatus], noisy_images: int) -> _Tally:
 
 
 def _dropped_share(before: _Tally, now: _Tally) -> float:
-    """The larger of the shares of those refused and of those useless."""
+    """The share of refused frames or that of useless ones, whichever is larger."""
     received, refused, decoded, useless = (b - a for a, b in zip(before, now, strict=True))
     return max(refused / max(received, 1), useless / max(decoded, 1))
 
@@ -214,7 +214,7 @@ class LoopLag:
             self._measured.append((now, max(0.0, now - self._due_s)))
 
     def worst_s(self) -> float:
-        """In the last second, and now."""
+        """Largest lag in the last second, and now."""
         now = self._clock()
         while self._measured and now - self._measured[0][0] > MEMORY_S:
             self._measured.popleft()
@@ -222,11 +222,11 @@ class LoopLag:
 
 
 class Thermometer:
-    """Reads the hottest thermal zone once a second, on a worker: some drivers take their time."""
+    """Reads the hottest thermal zone once a second, on a worker: some drivers are slow."""
 
     def __init__(self) -> None:
         self.hottest_c: float | None = None
-        """None on a computer that has no thermal zone, and while the reading hangs."""
+        """None if the computer has no thermal zone, and while the reading hangs."""
 
     async def run(self) -> None:
         """Reads until cancelled."""
@@ -246,7 +246,7 @@ class Thermometer:
 
 
 def thermal_zones(folder: Path = THERMAL_ZONES) -> list[tuple[str, float]]:
-    """Name and temperature in degrees Celsius of those that can be read; a zone that is switched off cannot."""
+    """Name and temperature in degrees Celsius of all readable zones; a disabled one is not readable."""
     found = []
     for zone in sorted(folder.glob("thermal_zone*")):
         with suppress(OSError, ValueError):

@@ -1,4 +1,4 @@
-"""The networks on workers of their own, with a deadline for each call: end the runs, then the workers, then give up."""
+"""The networks on their own workers, each call with a deadline: then its run is ended, or else its worker abandoned."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from flockd.onboard.worker import Worker
 
 T = TypeVar("T")
 TERMINATE_S = 0.5
-"""How long a run may take to end when told to; ONNX Runtime takes a few milliseconds."""
+"""Longest time for a run to end when told to; ONNX Runtime takes a few milliseconds."""
 MAX_ABANDONED = 2
-"""Calls of one kind in a row whose workers were given up, before only a new process can help."""
+"""Calls of one kind in a row with abandoned workers; after them only a restart of the process helps."""
 
 
 class InterruptibleNetworks(ImageNetworks, Protocol):
     """Networks whose runs can be ended."""
 
     def terminate(self) -> None:
-        """Ends every call under way, from any thread."""
+        """Ends every running call, from any thread."""
 
 
 def cameras_at_once(config: DroneConfig) -> int:
-    """On how many cameras' images `perception.threads` lets the networks run side by side."""
+    """The number of cameras whose images the networks process in parallel, by `perception.threads`."""
     return min(config.perception.threads, len(config.rig.cameras))
 
 
 def load_side_by_side(config: DroneConfig) -> WatchedNetworks:
-    """The drone's networks as they run in flight, but for deadlines. Raises ModelError."""
+    """The drone's networks as in flight, but without deadlines. Raises ModelError."""
     at_once = cameras_at_once(config)
     return WatchedNetworks(load_networks(config.perception, at_once=at_once), math.inf, at_once)
 
@@ -53,10 +53,10 @@ class NetworkStuckError(Exception):
 
 
 class WatchedNetworks:
-    """`Networks` in front of others, on so many images `at_once`; one thread calls it, the counts are for any thread.
+    """`Networks` that watch others, on `at_once` images in parallel; called on one thread, counts on any.
 
-    What an image gives does not depend on how many are computed at once: each is computed by one worker. Each has
-    `deadline_s` from when its worker begins.
+    The result for an image does not depend on the parallelism: one worker computes each. Each call has `deadline_s`
+    from the start of its worker.
     """
 
     def __init__(self, networks: InterruptibleNetworks, deadline_s: float, at_once: int = 1) -> None:
@@ -66,10 +66,10 @@ class WatchedNetworks:
         self._deadline_s = deadline_s
         self._workers = [Worker("networks") for _ in range(at_once)]
         self._abandoned: Counter[str] = Counter()
-        """Calls whose workers were given up since the last call of that name returned."""
+        """Calls with abandoned workers since the last call of that name returned."""
         self._left = False
         self.stuck = False
-        """The last call passed its deadline."""
+        """Whether the last call passed its deadline."""
         self.faults = 0
         """Outputs that were not finite, since the start."""
         self.ended = 0
@@ -77,11 +77,11 @@ class WatchedNetworks:
 
     @property
     def hopeless(self) -> bool:
-        """Only a new process can help."""
+        """Whether only a restart of the process helps."""
         return max(self._abandoned.values(), default=0) >= MAX_ABANDONED
 
     def flows(self, pairs: Sequence[ImagePair]) -> list[Float32Array | Exception]:
-        """Raises NetworkStuckError; so do the next two."""
+        """Flow of each pair. Raises NetworkStuckError, as the next two do."""
         return self._counted(self._each("flow", self._networks.flow, pairs))
 
     def scenes(self, views: Sequence[ImageView]) -> list[SceneMaps | Exception]:
@@ -108,7 +108,7 @@ class WatchedNetworks:
         return results
 
     def _each(self, kind: str, function: Callable[..., T], calls: Sequence[tuple[object, ...]]) -> list[T | Exception]:
-        """For each call what it returns, or which of `CAMERA_FAULTS` it raises."""
+        """For each call its return value, or the one of `CAMERA_FAULTS` that it raises."""
         results: list[T | Exception | None] = [None] * len(calls)
         left, idle = iter(range(len(calls))), list(self._workers)
         running: dict[Future[Any], tuple[int, Worker, float]] = {}
@@ -131,7 +131,7 @@ class WatchedNetworks:
                 k, worker, _ = running.pop(call)
                 idle.append(worker)
                 if call.exception() is not None:
-                    self._wait_for_end(running)  # none is left inside ONNX Runtime
+                    self._wait_for_end(running)  # so that no thread is left inside ONNX Runtime
                 results[k] = call.result()
         self.stuck = False
         self._abandoned[kind] = 0

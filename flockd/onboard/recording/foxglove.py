@@ -1,7 +1,7 @@
-"""The one adapter to Foxglove's well-known schemas (protobuf): what its app and Rerun show with nothing added.
+"""The adapter of Foxglove's well-known schemas (protobuf), which its app and Rerun show without additions.
 
-Places are in the drone's own axes: `local` points north, east and down from where the recording began, `body` is FRD,
-and each camera's frame carries the camera's name and is RDF.
+Frames: `local` points north, east and down from where the recording began, `body` is FRD, and each camera's frame has
+the camera's name and is RDF.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def image_data(message: bytes) -> tuple[bytes, str]:
 
 
 def calibration(time_ns: int, camera: CameraConfig) -> bytes:
-    """A CameraCalibration, whose pixel centres lie at whole numbers."""
+    """A CameraCalibration, in which pixel centres are whole numbers."""
     lens, (width, height) = camera.intrinsics, camera.size_px
     cx, cy = lens.cx - CENTRE_PX, lens.cy - CENTRE_PX
     model, coefficients = ("plumb_bob", 5) if lens.model == "pinhole" else ("kannala_brandt", 4)
@@ -82,7 +82,7 @@ def transforms(time_ns: int, position: FloatArray, R_ned_body: FloatArray, rig: 
 
 
 def odometry(time_ns: int, position: FloatArray, R_ned_body: FloatArray, velocity_ned: FloatArray) -> bytes:
-    """An Odometry: the path that adds up from the own velocity."""
+    """An Odometry: the path integrated from the own velocity."""
     pose = {"position": _vector(position), "orientation": _turn(R_ned_body)}
     velocity = _vector(R_ned_body.T @ velocity_ned)
     frames = {"frame_id": "local", "body_frame_id": "body"}
@@ -111,7 +111,7 @@ def _stamp(time_ns: int) -> dict[str, int]:
 
 
 def _descriptor_set(file: Any) -> bytes:
-    """A schema with all that it imports, imports first."""
+    """A schema with all its imports, imports first."""
     found: dict[str, Any] = {}
 
     def visit(one: Any) -> None:
@@ -138,7 +138,7 @@ def image_stream(camera: str) -> Stream:
 
 @cache
 def calibration_stream(camera: str) -> Stream:
-    """Where a camera's calibration goes."""
+    """The stream of a camera's calibration."""
     return _stream(f"/camera/{camera}/calibration", CameraCalibration)
 
 

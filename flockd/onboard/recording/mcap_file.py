@@ -1,4 +1,4 @@
-"""The one adapter to the MCAP format: writes it in small chunks, and reads whatever of a file is whole."""
+"""The adapter of the MCAP format: writes it in small chunks, and reads all intact parts of a file."""
 
 from __future__ import annotations
 
@@ -26,19 +26,18 @@ from flockd.core.errors import FlockdError
 CHUNK_BYTES = 100_000
 """The most that a killed writer loses, besides data that it had no time to flush."""
 SYNC_EVERY_S = 1.0
-"""How much a loss of power takes, where the disk keeps its word."""
+"""The most that a loss of power costs, if the disk keeps what it confirms."""
 _KNOWN = {Opcode.CHUNK, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.METADATA, Opcode.ATTACHMENT}
 _MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")
 MAX_RECORD_BYTES = 256 << 20
-"""Limit of a record in the file, and of a chunk uncompressed: what takes more is damaged. The largest holds one
-image."""
+"""Largest record, and chunk uncompressed; larger ones count as damaged. The largest real ones hold one image."""
 # RuntimeError and EOFError: lz4; ValueError: a wrong checksum, text that is not UTF-8; OverflowError: sizes over 2^63
 _BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError, RuntimeError, EOFError, MemoryError)
 
 
 class RecordingError(FlockdError):
-    """A file is no recording, or not one that can do what was asked of it."""
+    """A file is not a recording, or cannot be used as asked."""
 
 
 Encoding = Literal["json", "protobuf"]
@@ -46,7 +45,7 @@ Encoding = Literal["json", "protobuf"]
 
 @dataclass(frozen=True)
 class Stream:
-    """One topic of a file and what its messages are."""
+    """One topic of a file and the schema of its messages."""
 
     topic: str
     encoding: Encoding
@@ -75,7 +74,7 @@ class Note:
 
 @dataclass(frozen=True)
 class Inclosure:
-    """A whole file within the file."""
+    """A file embedded in the file."""
 
     name: str
     media_type: str
@@ -87,16 +86,16 @@ Record = Entry | Note | Inclosure
 
 @dataclass(frozen=True)
 class Damage:
-    """Where and why a file cannot be read any further, or one chunk of it not at all."""
+    """Where and why a file is unreadable from here on, or one chunk of it is."""
 
     offset: int
     reason: str
     at_end: bool
-    """The file just stops, or zeros follow: its writer was killed. Otherwise something within it is damaged."""
+    """Whether the file just stops, or zeros follow: its writer was killed. Otherwise it is damaged inside."""
 
 
 class McapFile:
-    """Writes one file. Every method may raise OSError; then only `abandon` is left to call."""
+    """Writes one file. Every method may raise OSError; after that only `abandon` may be called."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -146,7 +145,7 @@ class McapFile:
         self._file.close()
 
     def abandon(self) -> None:
-        """Closes the file as it stands, without another byte: what is in it can be recovered."""
+        """Closes the file as it is, without another byte: its contents can be recovered."""
         self._file.raw.close()  # closing the buffered file would try to write once more
 
     def __enter__(self) -> Self:
@@ -159,7 +158,7 @@ class McapFile:
             self.abandon()
 
     def _sync(self, descriptor: int) -> None:
-        """In a thread of its own: a slow disk takes long for this, and a simulator waits for the messages."""
+        """On a thread of its own: a slow disk takes long, and a simulator waits for the messages."""
         try:
             os.fsync(descriptor)
         except OSError as error:
@@ -176,10 +175,10 @@ class McapFile:
 
 
 def read_records(path: Path) -> Iterator[Record | Damage]:
-    """All records in the order in which they were written, and damages.
+    """All records in the order of writing, and damages.
 
-    A damaged chunk is yielded as `Damage`; where the file stops before its end, that comes last. Raises RecordingError
-    for what is not an MCAP file, and OSError.
+    A damaged chunk is yielded as `Damage`; if the file stops before its end, that comes last. Raises RecordingError if
+    it is not an MCAP file, and OSError.
     """
     with path.open("rb") as file:
         if file.read(len(_MAGIC)) != _MAGIC:
@@ -188,12 +187,12 @@ def read_records(path: Path) -> Iterator[Record | Damage]:
 
 
 def read_entries(path: Path) -> Iterator[Entry]:
-    """The messages alone that can be read."""
+    """The readable messages only."""
     return (record for record in read_records(path) if isinstance(record, Entry))
 
 
 class _Reader:
-    """Walks from record to record by their lengths, so that one broken record does not hide the next."""
+    """Steps from record to record by their lengths, so that a broken record does not hide the next."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -245,12 +244,12 @@ class _Reader:
                 name, data = (schema.name, schema.data) if schema else ("", b"")
                 encoding: Encoding = "protobuf" if record.message_encoding == "protobuf" else "json"
                 self._streams[record.id] = Stream(record.topic, encoding, name, data)
-            case Message() if record.channel_id in self._streams:  # its channel was in a damaged chunk
+            case Message() if record.channel_id in self._streams:  # else its channel was in a damaged chunk
                 yield Entry(self._streams[record.channel_id], record.log_time, record.sequence, record.data)
 
 
 def _uncompressed(chunk: Chunk) -> Chunk:
-    """The chunk without its compression, in no more memory than it says. Raises ValueError and those of `_BROKEN`."""
+    """The chunk without compression, in no more memory than it declares. Raises ValueError and those of `_BROKEN`."""
     size = chunk.uncompressed_size
     if size > MAX_RECORD_BYTES:
         raise ValueError(f"{size:,} bytes uncompressed")

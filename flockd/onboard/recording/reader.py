@@ -1,4 +1,4 @@
-"""Reads a recording: finished, or cut off by a kill. Refuses other MCAP files and what is too damaged to replay."""
+"""Reads a recording, complete or cut off by a kill. Refuses other MCAP files and those too damaged to replay."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from flockd.onboard.recording.truth import Truth
 
 T = TypeVar("T")
 _OF_STEPS = {one.topic for one in (streams.FRAMES, streams.VEHICLE, streams.ORDER, streams.OUTPUT, streams.TRUTH)}
-"""Streams whose messages, beside images, are parts of steps, numbered by their sequence."""
+"""Streams whose messages, besides images, are parts of steps, numbered by their sequence."""
 
 OF_A_BAG = (
     "is a part of a bag of ROS 2; `flockd replay` takes the bag's folder, in which metadata.yaml is, and --config"
@@ -54,16 +54,16 @@ class RecordedStep:
     frames: FrameSet
     vehicle: VehicleState
     output: Mapping[str, Any] | None
-    """A `PilotOutput` as JSON, every number exact; None where the recording ends before it."""
+    """A `PilotOutput` as JSON with exact numbers; None if the recording ends before it."""
     truth: Truth | None
     """The truth of a simulated flight."""
     order: MissionOrder | None = None
-    """An operator's that the step took."""
+    """The operator's order that the step took."""
 
 
 @dataclass
 class Contents:
-    """What one pass over a recording found."""
+    """Result of one pass over a recording."""
 
     flight: Mapping[str, str]
     models: Mapping[str, str]
@@ -78,12 +78,12 @@ class Contents:
 
     @property
     def finished(self) -> bool:
-        """Whether its writer came to the end of it."""
+        """Whether its writer finished it."""
         return not any(damage.at_end for damage in self.damages)
 
     @property
     def gaps(self) -> tuple[tuple[int, int], ...]:
-        """Each run of steps that is missing, as its first and last number."""
+        """First and last number of each run of missing steps."""
         numbers = [number for number, _ in self.steps]
         return tuple((a + 1, b - 1) for a, b in pairwise(numbers) if b > a + 1)
 
@@ -94,30 +94,30 @@ class Recording:
     def __init__(self, path: Path | str, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
         """Opens the file.
 
-        Raises RecordingError for what is not a recording of flockd, or too damaged to replay, and OSError.
-        `progress` is called with (bytes checked, bytes in all).
+        Raises RecordingError if it is not a recording of flockd or too damaged to replay, and OSError. `progress` is
+        called with (bytes checked, bytes in total).
         """
         self.path = Path(path)
         self.contents = _survey(self.path, progress)
         self.config, self.unknown = _config(self.path, self.contents)
-        """What it was flown with, and the keys of it that this version does not know or would refuse: where there are
-        any it cannot be flown again as it was."""
+        """The flight's configuration, and the keys of it that this version does not know or would refuse: with such
+        keys the flight cannot be repeated exactly."""
         self.learned = _learned(self.path, self.contents.flight)
         """The others' size with which the flight's pilot began."""
 
     @property
     def drone(self) -> str:
-        """Whose flight it is."""
+        """Name of the drone."""
         return self.contents.flight["drone"]
 
     @property
     def start_s(self) -> float:
-        """The first step's time."""
+        """Time of the first step."""
         return self.contents.steps[0][1]
 
     @property
     def duration_s(self) -> float:
-        """From the first step to the last."""
+        """Time from the first step to the last."""
         return self.contents.steps[-1][1] - self.start_s
 
     @property
@@ -127,15 +127,15 @@ class Recording:
 
     @property
     def pilot_began_s(self) -> float | None:
-        """When the pilot took its first step, from which it counts its time; None where that is not known."""
+        """When the pilot took its first step, from which its time counts; None: not known."""
         number, time_s = self.contents.steps[0]
         return time_s if number == 0 else None
 
     def steps(self, start_s: float = -np.inf, end_s: float = np.inf) -> Iterator[RecordedStep]:
-        """The steps at these times (of the recording's clock) in the order in which they were flown.
+        """The steps in this interval of the recording's clock, in the order of the flight.
 
-        Without those that lost a message where the file is damaged (`Contents.damages`) or ends. Raises RecordingError
-        for a message that cannot be read though its checksum is right.
+        Steps that lost a message by damage (`Contents.damages`), or at the end of the file, are left out. Raises
+        RecordingError for a message that is unreadable despite a correct checksum.
         """
         number, messages = -1, dict[str, bytes]()
         for entry in read_entries(self.path):
@@ -176,9 +176,9 @@ class Recording:
 
 
 def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
-    """What every file begins with: the flight, its models and its configuration.
+    """The head of every file: the flight, its models and its configuration.
 
-    Raises RecordingError where the file is not a recording of flockd or ends before all three, and OSError.
+    Raises RecordingError if the file is not a recording of flockd or ends before all three, and OSError.
     """
     flight, models, configuration = None, None, None
     for record in read_records(path):
@@ -206,7 +206,7 @@ def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
 
 
 def flight_number(facts: Mapping[str, str]) -> int:
-    """Of a flight's note; 0 where its recorder counted none."""
+    """Number in a flight's note; 0 if its recorder counted none."""
     text = facts.get(streams.FLIGHT_NUMBER, "")
     return int(text) if re.fullmatch("[0-9]{1,9}", text) else 0
 
@@ -255,7 +255,7 @@ def _config(path: Path, contents: Contents) -> tuple[DroneConfig, tuple[str, ...
     try:
         values = _without_gone(parsed(contents.configuration))
     except ValueError as error:
-        raise RecordingError(f"{path}: the configuration in it is no JSON ({error}); use another copy") from error
+        raise RecordingError(f"{path}: the configuration in it is not JSON ({error}); use another copy") from error
     unknown: list[str] = []
     while True:
         try:
@@ -277,7 +277,7 @@ def _config(path: Path, contents: Contents) -> tuple[DroneConfig, tuple[str, ...
 
 
 def _without_gone(values: Any, at: str = "") -> Any:
-    """The values of an older configuration, without the keys that this version has not."""
+    """The values of an older configuration, without keys that this version has removed."""
     if not isinstance(values, dict):
         return values
     return {
@@ -302,7 +302,7 @@ def _learned(path: Path, flight: Mapping[str, str]) -> LearnedSize | None:
 
 
 def decoded_image(message: bytes) -> UInt8Array:
-    """(h, w, 3) RGB of an image's message. Raises ValueError and RecordingError."""
+    """(h, w, 3) RGB from an image's message. Raises ValueError and RecordingError."""
     data, kind = foxglove.image_data(message)
     if (fault := cost_fault(data)) is not None:
         raise ValueError(f"a {kind} image {fault}")
@@ -316,7 +316,7 @@ def decoded_image(message: bytes) -> UInt8Array:
 
 
 def recording_info(recording: Recording) -> dict[str, Any]:
-    """What a recording contains, as JSON: flight, duration, models, gaps, damages and messages of each topic."""
+    """A summary of a recording, as JSON: flight, duration, models, gaps, damages and messages of each topic."""
     contents = recording.contents
     return {
         **contents.flight,

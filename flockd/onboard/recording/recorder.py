@@ -1,4 +1,4 @@
-"""Records one drone's flight in a thread of its own. The flight never waits for it, and never ends because of it."""
+"""Records one drone's flight on its own thread. The flight never waits for it, and never ends because of it."""
 
 from __future__ import annotations
 
@@ -41,16 +41,16 @@ _VERSIONS = {
 }
 _MB = 1e6
 _SMALL_BYTES = 4096
-"""The size for which an entry without image counts in the queue."""
+"""Size in the queue of an entry without image."""
 _FREE_SHARE = 0.05
-"""Of a small disk, that stays free; of others what waits for the disk, `queue_mb`."""
+"""Share of a small disk that stays free; of a large one `queue_mb` stay free."""
 
 
 class Recorder:
     """Writes the file of one flight.
 
-    `step` and `publish` return at once, whatever the disk does. What does not fit into the queue is dropped, counted
-    and reported once; a disk that fails or is full ends the recording alone. Times are those of the messages.
+    `step` and `publish` return at once, whatever the disk does. Entries that do not fit into the queue are dropped,
+    counted and reported once; a failed or full disk ends only the recording. Times are those of the messages.
     """
 
     def __init__(
@@ -65,17 +65,17 @@ class Recorder:
         learned: LearnedSize | None = None,
         on_event: Callable[[str], None] = lambda event: None,
     ) -> None:
-        """Begins a new recording over whatever `path` held.
+        """Begins a new recording; replaces the contents of `path`.
 
         Args:
-            path: of the file; its folder must exist.
-            drone: whose flight.
-            config: what its pilot flies with; goes into each file.
-            settings: how to record; by default the configuration's own.
+            path: the file; its folder must exist.
+            drone: its name.
+            config: the flight's configuration; stored in each file.
+            settings: how to record; by default as the configuration says.
             models: SHA-256 of each model in use, by name.
-            facts: more to be known of the flight, such as what of it was not learned.
-            learned: of the others' size before the flight; its pilot began with it.
-            on_event: called, from the recorder's thread or the caller's, with what went wrong, in one sentence.
+            facts: additional facts about the flight, stored in its note.
+            learned: the others' size with which its pilot began.
+            on_event: called on the recorder's thread or the caller's, with one sentence about a failure.
         """
         self._settings = settings or config.recording
         self._drone = drone
@@ -84,7 +84,7 @@ class Recorder:
         flight = {"drone": drone, "began": began, "images": self._settings.images, **_VERSIONS, **(facts or {})}
         if learned is not None:
             flight[streams.LEARNED_SIZE] = json.dumps(to_json(learned))
-        shown = masked(config.model_dump(mode="json"))  # it is passed on; nobody needs passwords to fly it
+        shown = masked(config.model_dump(mode="json"))  # recordings are passed on, and replay needs no passwords
         head = (
             Note(streams.MODELS_NOTE, models or {}),
             Inclosure(
@@ -95,16 +95,16 @@ class Recorder:
         self._rig, self._north_east = build_rig(config.rig), np.zeros(2)
         self._placed_s: float | None = None
         self._queue: queue.SimpleQueue[tuple[int, Callable[[], None]] | None] = queue.SimpleQueue()
-        """The size of an entry, and the function that writes it; None at the end."""
+        """Size of an entry, and the function that writes it; None at the end."""
         self._lock = threading.Condition()
         self._held_bytes = 0
         self._steps = 0
         self.lost = 0
-        """Steps and messages that were dropped."""
+        """Steps and messages dropped."""
         self._told_full = False
         self._closed = False
         self.failure: str | None = None
-        """Why the recording ended before the flight; None while all is well."""
+        """Why the recording ended before the flight; None: it did not."""
         self._time_s: float | None = None
         self._thread = threading.Thread(target=self._write_all, name=f"recorder {drone}", daemon=True)
         self._thread.start()
@@ -117,9 +117,9 @@ class Recorder:
         truth: Truth | None = None,
         order: MissionOrder | None = None,
     ) -> None:
-        """Takes one step of the pilot: what went in and what came out, and all telemetry that follows from it.
+        """Takes one step of the pilot: its inputs, its output, and all telemetry that follows from them.
 
-        A simulator adds the ``truth``, which no pilot knows. ``order`` is the operator's that the step took.
+        A simulator adds the ``truth``, which no pilot knows. ``order``: the operator's order that the step took.
         """
         number, self._steps = self._steps, self._steps + 1
         size = sum(frame.image.nbytes for frame in frames.frames.values())
@@ -128,18 +128,18 @@ class Recorder:
     def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
         """Takes one telemetry message, if the table of topics marks it as recorded; a `TelemetrySink`.
 
-        For what does not follow from a step, such as events: all that does is written with the step.
+        Only for messages that do not follow from a step, such as events: the others are written with the step.
         """
         if drone == self._drone and topic in streams.TABLE:
             self._put(_SMALL_BYTES, lambda: self._write_message(topic, message))
 
     def drain(self) -> None:
-        """Waits until all is written: only for those whose time stands still meanwhile, such as a simulator."""
+        """Waits until all is written: only for callers whose time stands still meanwhile, such as a simulator."""
         with self._lock:
             self._lock.wait_for(lambda: self._held_bytes == 0 or self.failure is not None)
 
     def close(self, timeout_s: float = 30.0) -> None:
-        """Writes the rest and ends the file. Entries that are not written in time are lost and reported."""
+        """Writes the rest and closes the file. Entries not written in time are lost and reported."""
         if self._closed:
             return
         self._closed = True
@@ -169,20 +169,20 @@ class Recorder:
             self._tell("recording: the disk is too slow, so that steps are dropped; record smaller or fewer images")
 
     def _tell(self, event: str) -> None:
-        """Into the file, where a step has told the time, and to the subscribers."""
+        """Records an event, once a step has given the time, and reports it to subscribers."""
         with self._lock:
             self._held_bytes += _SMALL_BYTES
             self._queue.put((_SMALL_BYTES, lambda: self._write_message("events", {"event": event})))
         self._on_event(event)
 
     def _write_all(self) -> None:
-        """The thread."""
+        """Runs on the recorder's thread."""
         try:
             self._write_queue()
             self._file.finish({"steps": str(self._steps), "lost": str(self.lost)})
         except OSError as error:
             self._fail((error.strerror or str(error)).lower())
-        except Exception as error:  # noqa: BLE001 - no fault of the recorder may end a flight, or hide
+        except Exception as error:  # noqa: BLE001 - no error of the recorder may end a flight, or stay hidden
             self._fail(repr(error))
 
     def _fail(self, reason: str) -> None:
@@ -190,7 +190,7 @@ class Recorder:
         with self._lock:
             self.failure = sentence
             self._held_bytes = 0
-            while not self._queue.empty():  # the thread that takes these has failed
+            while not self._queue.empty():  # the thread that would write these has failed
                 self.lost += self._queue.get() is not None
             self._lock.notify_all()
         self._file.abandon()
@@ -200,7 +200,7 @@ class Recorder:
         self._file.begin()
         flushed_s = time.monotonic()
         closing = unflushed = False
-        while not (closing and self._queue.empty()):  # events of closing belong into the file too
+        while not (closing and self._queue.empty()):  # events while closing are recorded too
             size = 0
             with suppress(queue.Empty):
                 item = self._queue.get(timeout=FLUSH_EVERY_S)
@@ -209,7 +209,7 @@ class Recorder:
                     size, write = item
                     write()
                     unflushed = True
-                    del item, write  # or the last frames would stay in memory until the next
+                    del item, write  # or the last frames would stay in memory until the next entry
             if unflushed and (size == 0 or time.monotonic() - flushed_s >= FLUSH_EVERY_S):
                 self._file.flush()
                 flushed_s, unflushed = time.monotonic(), False
@@ -227,7 +227,7 @@ class Recorder:
         truth: Truth | None,
         order: MissionOrder | None,
     ) -> None:
-        """All messages that a step becomes; its output comes late, so that a step with an output is whole."""
+        """Writes all messages of a step; its output comes last, so a step with an output is complete."""
         time_s = self._time_s = frames.time_s
         kept = []
         for camera, frame in frames.frames.items():
@@ -256,7 +256,7 @@ class Recorder:
     def _places(
         self, number: int, time_s: float, vehicle: VehicleState, velocity: FloatArray | None
     ) -> Iterator[Entry]:
-        """Of all frames, and the own path, for viewers: north and east from the first step, up by the autopilot."""
+        """Transforms of all frames, and the own path, for viewers: from the first step on, height by the autopilot."""
         if velocity is not None and self._placed_s is not None:
             self._north_east = self._north_east + velocity[:2] * (time_s - self._placed_s)
         self._placed_s = time_s
@@ -268,7 +268,7 @@ class Recorder:
             yield Entry(foxglove.ODOMETRY, stamp, number, path)
 
     def _write_message(self, topic: str, message: Mapping[str, object]) -> None:
-        stamp = message.get("time_s", self._time_s)  # without one: the recorder's own events
+        stamp = message.get("time_s", self._time_s)  # the recorder's own events have none
         if not isinstance(stamp, int | float):
             return
         time_s = float(stamp)
@@ -278,7 +278,7 @@ class Recorder:
 
 
 class _File:
-    """The file of one recording: it begins with all that is needed to understand it alone."""
+    """The file of one recording: it begins with everything needed to understand it."""
 
     def __init__(
         self,
@@ -293,9 +293,9 @@ class _File:
         self._quota_mb, self._queue_mb = settings.quota_mb, settings.queue_mb
         self._file: McapFile | None = None
         self._earlier: dict[Path, int] = {}
-        """Bytes of what may be deleted, the oldest first."""
+        """Sizes in bytes of recordings that may be deleted, the oldest first."""
         self._before: Path | None = None
-        """The flight before this one: somebody may want to know how it ended. It goes last, and for free space only."""
+        """The flight before this one, which may need study: deleted last, and only for free space."""
         self._calibrated = False
 
     def begin(self) -> None:
@@ -310,7 +310,7 @@ class _File:
         self.flush()
 
     def write(self, entry: Entry) -> None:
-        """Adds a message, before the first one what is known of the cameras."""
+        """Adds a message; before the first one, the cameras' calibrations."""
         assert self._file is not None
         if not self._calibrated:
             self._calibrated = True
@@ -320,13 +320,13 @@ class _File:
         self._file.write(entry)
 
     def flush(self) -> None:
-        """Makes safe what was written, within the quota: as the file grows, earlier ones go. Raises OSError."""
+        """Makes written data safe, and deletes earlier recordings beyond the quota. Raises OSError."""
         assert self._file is not None
         self._file.flush()
         self._make_room(self._file.size)
 
     def _make_room(self, size: int) -> None:
-        """Deletes the oldest recordings as long as they and ``size`` bytes are over the quota, or the disk is full."""
+        """Deletes the oldest recordings while they and ``size`` bytes exceed the quota, or the disk is full."""
         while size + sum(self._earlier.values()) > self._quota_mb * _MB:
             if not self._earlier:
                 raise OSError("recording.quota_mb is reached")
@@ -345,7 +345,7 @@ class _File:
         self._tell(f"recording: {path} was deleted, as {why}")
 
     def finish(self, end: Mapping[str, str]) -> None:
-        """Ends the file."""
+        """Closes the file."""
         assert self._file is not None
         self._file.write(Note(streams.END_NOTE, end))
         self._file.finish()
@@ -356,8 +356,8 @@ class _File:
             self._file.abandon()
 
     def _count_earlier(self) -> int:
-        """Lists the recordings of this drone, and gives this flight's number: files' times may be of a wrong clock.
-        Replays by people stay and do not count."""
+        """Lists this drone's recordings, and returns this flight's number: file times may come from a wrong clock.
+        Replays by people are kept and do not count."""
         found = [path for path in self.path.parent.glob("*.mcap") if path != self.path]
         numbers = {path: number for path in found if (number := self._number_of(path)) is not None}
         order = sorted(numbers, key=lambda path: (numbers[path], path.stat().st_mtime))
@@ -366,9 +366,9 @@ class _File:
         return max(numbers.values(), default=0) + 1
 
     def _number_of(self, path: Path) -> int | None:
-        """Of a flight that a recorder of this drone wrote; what is no readable file is reported."""
+        """Number of a flight that this drone's recorder wrote; unreadable files are reported."""
         try:
-            facts = head_of(path)[0].facts if path.is_file() else None  # a pipe would wait for ever to be opened
+            facts = head_of(path)[0].facts if path.is_file() else None  # opening a pipe would wait for ever
             why = "is not a file"
         except (RecordingError, OSError) as error:
             facts, why = None, str(error).removeprefix(f"{path}: ")
@@ -383,7 +383,7 @@ def _compressed(frame: Frame, settings: RecordingConfig) -> bytes | None:
     if frame.image.ndim != 3 or frame.image.shape[2] != 3 or frame.image.size == 0:
         return None
     bgr = cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR)
-    options = [cv2.IMWRITE_PNG_COMPRESSION, 1]  # higher takes several times longer for a few per cent
+    options = [cv2.IMWRITE_PNG_COMPRESSION, 1]  # higher levels take several times longer for a few per cent
     if settings.images == "jpeg":
         options = [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality]
     return bytes(cv2.imencode(f".{settings.images}", bgr, options)[1])

@@ -1,4 +1,4 @@
-"""What a recording consists of: the streams that replay needs, those of the table of topics, and those for viewers."""
+"""The streams of a recording: those that replay needs, those of the table of topics, and those for viewers."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ MODELS_NOTE = "models"
 END_NOTE = "end"
 REPLAYED = "replayed_from"
 EDITED = (REPLAYED, "recovered_from", "cut_from")
-"""Facts of a recording that was made of another; the last two of earlier versions."""
+"""Facts of a recording made from another one; the last two come from earlier versions."""
 LEARNED_SIZE = "learned_size"
-"""A fact of a flight: what its pilot began with of the others' size, as JSON."""
+"""A fact of a flight: the others' size with which its pilot began, as JSON."""
 FLIGHT_NUMBER = "flight_number"
-"""A fact of a flight: one more than the largest of the drone's recordings in the folder."""
+"""A fact of a flight: the largest number among the drone's recordings in the folder, plus one."""
 CONFIGURATION = "configuration.json"
 
 
@@ -38,10 +38,10 @@ class FrameEntry:
 
 @dataclass(frozen=True)
 class StepFrames:
-    """Which images went into a step."""
+    """The images of a step."""
 
     step: int
-    """Counted from 0 over the whole recording; a missing number is a step that was dropped."""
+    """Counted from 0 over the whole recording; a missing number is a dropped step."""
     time_s: float
     frames: tuple[FrameEntry, ...]
 
@@ -54,7 +54,7 @@ def _json_stream(topic: str, kind: Any) -> Stream:
 FRAMES = _json_stream("/frames", StepFrames)
 VEHICLE = _json_stream("/vehicle", VehicleState)
 ORDER = _json_stream("/order", MissionOrder)
-"""Orders of the steps in which the pilot took an operator's."""
+"""Operators' orders, with the step that took each."""
 OUTPUT = _json_stream("/output", PilotOutput)
 TRUTH = _json_stream("/truth", Truth)
 """Only in recordings of simulated flights."""
@@ -68,5 +68,5 @@ def is_image(topic: str) -> bool:
 
 
 def nanoseconds(time_s: float) -> int:
-    """A time as MCAP has it; the exact one stands in the messages themselves."""
+    """A time as in MCAP; the messages themselves contain the exact one."""
     return max(0, round(time_s * 1e9))

@@ -1,4 +1,4 @@
-"""True states from a simulator: recorded beside a flight, to evaluate it. Nothing that flies reads it."""
+"""True states from a simulator: recorded with a flight, for its evaluation. No code that flies reads them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from flockd.core.messages import Matrix3, Vector3
 
 @dataclass(frozen=True, eq=False)
 class TrueDrone:
-    """Where one drone of the flock truly was."""
+    """The true state of one drone."""
 
     name: str
     position: Vector3
@@ -19,14 +19,14 @@ class TrueDrone:
     R_ned_body: Matrix3
     """(3, 3)"""
     exact_position: Vector3 | None = None
-    """(3,) m NED in the companion flight, in which all drones had all exact states; None in such a flight."""
+    """(3,) m NED in the companion flight on exact states; None in such a flight."""
     exact_velocity: Vector3 | None = None
-    """(3,) likewise."""
+    """(3,) m/s NED in the companion flight; None likewise."""
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The whole flock as one step began, the own drone among it."""
+    """The whole flock at the beginning of one step, including the own drone."""
 
     time_s: float
     drones: tuple[TrueDrone, ...]

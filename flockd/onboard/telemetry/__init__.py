@@ -1,4 +1,4 @@
-"""Telemetry: what a drone knows, published for people and tools to watch. No drone reads it to fly."""
+"""Telemetry: a drone's state, published for people and tools. No drone reads it to fly."""
 
 from flockd.onboard.telemetry.step_messages import TelemetrySink, publish_step
 from flockd.onboard.telemetry.topics import TOPICS, Topic

@@ -1,4 +1,4 @@
-"""Operators' commands, and orders to a drone's mission, as they travel in queries."""
+"""Operators' commands, and orders to a drone's mission, as messages in queries."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _OF_GOTO = frozenset({"north_m", "east_m", "latitude_deg", "longitude_deg", "hei
 _OF_VELOCITY = frozenset({"velocity_ne", "height_m"})
 _LONGEST = 4096
 LONGEST_NAME = 120
-"""Of an operator and of a session."""
+"""Longest name of an operator or a session, characters."""
 
 
 def parse_ask(payload: bytes) -> AskMessage:
-    """What a query for a command carries. Raises ValueError, with a sentence for its sender, for what is none."""
+    """The contents of a query for a command. Raises ValueError, with a sentence for its sender, if it is invalid."""
     message = _object(payload)
     try:
         ask: AskMessage = from_json(AskMessage, message)
@@ -38,7 +38,7 @@ def parse_ask(payload: bytes) -> AskMessage:
 def parse_order(command: str, message: Mapping[str, object] | None) -> MissionOrder:
     """The order of a `goto` or `velocity`.
 
-    Raises ValueError, with a sentence for its sender, for what is none; whether it may be flown is not checked here.
+    Raises ValueError, with a sentence for its sender, if it is invalid; whether it may be flown is not checked here.
     """
     if not isinstance(message, Mapping):
         raise ValueError(f"{command} needs an order, a JSON object")  # noqa: TRY004 - of the message, not of the caller
@@ -68,7 +68,7 @@ def parse_order(command: str, message: Mapping[str, object] | None) -> MissionOr
 
 
 def order_message(order: MissionOrder) -> OrderMessage:
-    """What `parse_order` reads."""
+    """The inverse of `parse_order`."""
     message = OrderMessage()
     if order.place is not None:
         message["north_m"], message["east_m"] = order.place.tolist()

@@ -1,4 +1,4 @@
-"""Small JPEGs of what cameras see, with the detected drones, for telemetry over a radio link."""
+"""Small JPEGs of the cameras' images, with the detected drones, for telemetry over a radio link."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from flockd.flight.geometry import Rig, RigCamera
 LARGEST_SIDE_PX = 320
 JPEG_QUALITY = 70
 EVERY_S = 0.2
-"""A camera's picture is made no oftener, however many ask."""
+"""Shortest time between two pictures of a camera, however many watchers ask."""
 FRESH_S = services.PREVIEW.timeout
-"""While the pilot steps, frames of its newest step are at most this much older than the newest."""
+"""While the pilot steps, the newest step's frames are shown if they are at most this much older than the newest."""
 _COLOUR = (255, 109, 0)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
@@ -39,7 +39,7 @@ class Previews:
         self._made: dict[str, tuple[float, bytes]] = {}
 
     def picture(self, camera: str) -> bytes | None:
-        """A JPEG, at most ``EVERY_S`` old where the camera delivers; None without a frame of it."""
+        """A JPEG, at most ``EVERY_S`` old if the camera delivers; None without a frame."""
         with self._lock:
             now_s = self._clock()
             made = self._made.get(camera)
@@ -75,7 +75,7 @@ def preview(frame: Frame, camera: RigCamera | None = None, detections: Sequence[
 
 
 def _circle(image: UInt8Array, camera: RigCamera, detection: Detection, scale: float) -> None:
-    """Around a drone as large as the detection says, where it is in this camera's image."""
+    """Draws a circle of the detected size around a drone, at its place in this camera's image."""
     (u, v), *_ = scale * camera.pixels_of_points(detection.position[None])
     if not math.isfinite(u):
         return

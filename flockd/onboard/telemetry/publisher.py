@@ -16,23 +16,23 @@ from flockd.onboard.telemetry.zenoh_session import SessionOwner, open_session
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 MAX_RECEIVED_BYTES = 1 << 16
-"""Longer messages are dropped before they are whole in memory: anybody may send them. An order has less than 1 KiB."""
+"""Longer messages are dropped before they are completely in memory; an order has less than 1 KiB."""
 MAX_PEERS = 32
-"""At once. Each of the fleet's commands is two; each may leave a message unfinished in each of zenoh's 8 priorities."""
+"""Largest number of peers. A fleet command is two; each may leave 8 unfinished messages, one for each priority."""
 
 Ask = Callable[[str, bytes], AnswerMessage]
-"""Takes an operator's command by name, with what its query carries, on a thread of zenoh's; returns at once."""
+"""Takes an operator's command by name, with its query's payload, on a thread of zenoh's; returns at once."""
 Declared = zenoh.LivelinessToken | zenoh.Queryable[None]
 NewestImage = Callable[[str], bytes | None]
-"""Gives a camera's newest image as JPEG, on a thread of zenoh's; None where there is none."""
+"""A camera's newest image as JPEG, on a thread of zenoh's; None without one."""
 
 
 class ZenohTelemetry(SessionOwner):
-    """A telemetry sink that puts each message under `flockd/v1/<fleet>/<drone>/<topic>`.
+    """A telemetry sink that publishes each message under `flockd/v1/<fleet>/<drone>/<topic>`.
 
-    It listens on and connects to the given endpoints only: discovery by multicast and gossip is off. A put never
-    waits: without a subscriber it goes nowhere, and a congested link drops it. Raises UnavailableError when an endpoint
-    or the file of settings cannot be used, and ValueError for a fleet's name that does not fit into a key.
+    It listens on and connects to the given endpoints only; discovery by multicast and gossip is disabled. Publishing
+    never waits: a message without a subscriber is discarded, and a congested link drops it. Raises UnavailableError if
+    an endpoint or the file of settings cannot be used, and ValueError if a fleet's name does not fit into a key.
     """
 
     def __init__(
@@ -47,12 +47,12 @@ class ZenohTelemetry(SessionOwner):
         self._prefix = f"{PREFIX}/{checked_name(fleet)}"
         self._publishers: dict[tuple[str, str], zenoh.Publisher] = {}
         self._kept: dict[str, list[Declared]] = {}
-        """What is declared of each drone."""
+        """The declarations of each drone."""
         self.lost = 0
-        """Messages that zenoh refused to take; congestion on the way is not known here."""
+        """Messages that zenoh refused; congestion on the way is not counted."""
         self.identity = secrets.token_hex(4)
-        """Of this process's drones, beside their names, which two drones may share by mistake."""
-        # Memory that another process shares counts as the drone's, and has no limit of its own.
+        """Distinguishes this process's drones from others of the same name."""
+        # Memory shared by another process counts as the drone's, without a limit.
         self._session = open_session(
             "telemetry",
             listen,
@@ -67,7 +67,7 @@ class ZenohTelemetry(SessionOwner):
     def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
         """Publishes one message; a number that is not finite becomes null.
 
-        Raises ValueError for a topic that is not in `TOPICS` or a drone's name that does not fit into a key.
+        Raises ValueError if the topic is not in `TOPICS` or the drone's name does not fit into a key.
         """
         payload = json.dumps(to_telemetry(message), allow_nan=False).encode()
         try:
@@ -76,7 +76,7 @@ class ZenohTelemetry(SessionOwner):
             self.lost += 1
 
     def show_alive(self, drone: str) -> None:
-        """Publishes that a drone is alive for as long as this session is, and tells its clocks; no daemon to ask."""
+        """Publishes that a drone is alive while this session exists, and its clocks; without a daemon to ask."""
         key = f"{self._prefix}/{checked_name(drone)}"
         self._keep(
             drone,
@@ -85,9 +85,9 @@ class ZenohTelemetry(SessionOwner):
         )
 
     def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
-        """Publishes that a drone is alive for as long as this session is, and replies to queries.
+        """Publishes that a drone is alive while this session exists, and replies to queries.
 
-        Queries are for what it flies with, its clocks, operators' commands, and a camera's newest image.
+        Queries ask for its configuration, its clocks, operators' commands, and a camera's newest image.
         """
         self.show_alive(drone)
         key = f"{self._prefix}/{drone}"
@@ -102,14 +102,14 @@ class ZenohTelemetry(SessionOwner):
         )
 
     def withdraw(self, drone: str) -> None:
-        """A drone is alive no more, and replies to nothing."""
+        """A drone is not alive any more, and does not reply."""
         for declared in self._kept.pop(drone, []):
             declared.undeclare()  # type: ignore[no-untyped-call]
 
     def reply_to(self, keys: str, reply: Callable[[str, bytes], Mapping[str, object]]) -> None:
-        """Replies to queries for keys that are no drone's, by the last part of the key and the payload.
+        """Replies to queries for keys that belong to no drone, by the last part of the key and the payload.
 
-        On threads of zenoh's. Raises ValueError for keys that are drones'.
+        On threads of zenoh's. Raises ValueError for keys of drones.
         """
         if keys.startswith(f"{PREFIX}/"):
             raise ValueError(f"{keys!r} is a drone's")
@@ -121,7 +121,7 @@ class ZenohTelemetry(SessionOwner):
         )
 
     def _queryable(self, keys: str, answer: Callable[[zenoh.Query], None]) -> Declared:
-        """Answers on the thread that receives: who asks faster than is answered waits, and no queue grows."""
+        """Replies on the receiving thread: a sender that asks too fast waits, and no queue grows."""
         return self._session.declare_queryable(keys, zenoh.handlers.Callback(answer, indirect=False))
 
     def _keep(self, what: str, *declared: Declared) -> None:
@@ -150,7 +150,7 @@ def _payload(query: zenoh.Query) -> bytes:
 
 
 def _reply(query: zenoh.Query, message: Mapping[str, object]) -> None:
-    """Replies under the key of the query; a query for several at once, as with `*`, gets one reply."""
+    """Replies under the key of the query; a query for several keys, as with `*`, gets one reply."""
     query.reply(
         query.key_expr, json.dumps(to_telemetry(message), allow_nan=False), encoding=zenoh.Encoding.APPLICATION_JSON
     )

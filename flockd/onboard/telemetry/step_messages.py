@@ -1,4 +1,4 @@
-"""Turns what one step of the pilot found into messages, and hands them to a sink."""
+"""Turns one step of the pilot into messages, and hands them to a sink."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class TelemetrySink(Protocol):
 
 
 def publish_step(sink: TelemetrySink, drone: str, vehicle: VehicleState, output: PilotOutput) -> None:
-    """Publishes all that one step of one drone's pilot has to tell."""
+    """Publishes all messages of one step of one drone's pilot."""
     time_s, command, mission, obstacles = output.time_s, output.command, output.mission, output.obstacles
     roll_deg, pitch_deg, yaw_deg = map(math.degrees, euler_from_rotation(vehicle.R_ned_body))
     position_ne = None if vehicle.position is None else vehicle.position.tolist()
@@ -36,7 +36,7 @@ def publish_step(sink: TelemetrySink, drone: str, vehicle: VehicleState, output:
     sink.publish(drone, "state", state)
     neighbours = [neighbour_message(neighbour) for neighbour in output.neighbours]
     sink.publish(drone, "neighbours", topics.NeighboursMessage(time_s=time_s, neighbours=neighbours))
-    if obstacles is not None:  # to the centimetre
+    if obstacles is not None:  # rounded to centimetres
         range_m, seen_m = obstacles.range_m.round(2).tolist(), obstacles.seen_m.round(2).tolist()
         sink.publish(
             drone, "obstacles", topics.ObstaclesMessage(time_s=obstacles.time_s, range_m=range_m, seen_m=seen_m)
@@ -62,7 +62,7 @@ def publish_step(sink: TelemetrySink, drone: str, vehicle: VehicleState, output:
 
 
 def neighbour_message(neighbour: Neighbour) -> topics.NeighbourMessage:
-    """One neighbour, as telemetry has it."""
+    """One neighbour as a telemetry message."""
     return topics.NeighbourMessage(
         track=neighbour.track,
         position_ned=neighbour.position.tolist(),

@@ -1,13 +1,13 @@
-"""The one table of published streams, and the fields of each message.
+"""The table of published streams, and the fields of each message.
 
 A key is `flockd/v1/<fleet>/<drone>/<topic>`; a message is a JSON object in UTF-8. Every number is finite or null.
 Vectors are lists: NED is north, east, down. Times are seconds on the drone's monotonic clock.
 
-`state` to `mission` follow from each step of the pilot; the others come from the daemon, at all times. Beside
-the topics, a drone's daemon has a liveliness token `.../alive/<identity>`, whose identity no other process has. It
-replies to a query for `.../about` with an `AboutMessage`, for `.../time` with a `TimeMessage`, and for
-`.../image/<camera>` with a small JPEG of what that camera sees. A query for `.../ask/hold`, `land`, `resume`, `goto` or
-`velocity` carries an `AskMessage`; the reply is an `AnswerMessage`.
+`state` to `mission` follow from each step of the pilot; the daemon sends the others at all times. Besides the topics, a
+drone's daemon has a liveliness token `.../alive/<identity>`, whose identity no other process has. It replies to a query
+for `.../about` with an `AboutMessage`, for `.../time` with a `TimeMessage`, and for `.../image/<camera>` with a small
+JPEG of that camera's image. A query for `.../ask/hold`, `land`, `resume`, `goto` or `velocity` carries an `AskMessage`;
+the reply is an `AnswerMessage`.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ _NAME = re.compile(r"[A-Za-z0-9_.-]{1,200}")
 
 
 def is_name(name: str) -> bool:
-    """Whether it fits into a key."""
+    """Whether a name fits into a key."""
     return _NAME.fullmatch(name) is not None
 
 
 def checked_name(name: str) -> str:
-    """The name; raises ValueError for one that does not fit into a key."""
+    """The name; raises ValueError if it does not fit into a key."""
     if not is_name(name):
         raise ValueError(f"{name!r} does not fit into a key; use letters, digits, '_', '.' and '-'")
     return name
 
 
 class StateMessage(TypedDict):
-    """What the drone believes of itself."""
+    """The drone's own state."""
 
     time_s: float
     height_m: float
@@ -45,15 +45,15 @@ class StateMessage(TypedDict):
     yaw_deg: float
     """Clockwise from north, -180 to 180."""
     velocity_ned: list[float] | None
-    """m/s, as the flock law used it; null before there is one."""
+    """m/s, as the flocking law used it; null: not known yet."""
     position_ne: list[float] | None
-    """Metres from home, as the autopilot has it; null where it has none. For people: the flock law does not use it."""
+    """Metres from home by the autopilot; null: not known. For people: the flocking law does not use it."""
     home_deg: list[float] | None
-    """Latitude and longitude of home; null where the autopilot does not know it."""
+    """Latitude and longitude of home; null: the autopilot does not know it."""
 
 
 class NeighbourMessage(TypedDict):
-    """One tracked drone, as its observer sees it."""
+    """One tracked drone, relative to its observer."""
 
     track: int
     position_ned: list[float]
@@ -75,17 +75,17 @@ class NeighboursMessage(TypedDict):
 
 
 class ObstaclesMessage(TypedDict):
-    """The nearest obstacle in each of 72 directions, clockwise from north; not sent where none are looked for."""
+    """The nearest obstacle in each of 72 directions, clockwise from north; not sent without obstacle detection."""
 
     time_s: float
     range_m: list[float]
-    """Level, from the drone's centre; null where nothing was seen."""
+    """Horizontal, from the drone's centre; null: no obstacle seen."""
     seen_m: list[float]
-    """How far each direction is known to be free or measured; 0 where it was not looked at."""
+    """Distance up to which each direction is known to be free or measured; 0: not observed."""
 
 
 class CommandMessage(TypedDict):
-    """What the flock law asks of the autopilot."""
+    """The flocking law's command to the autopilot."""
 
     time_s: float
     velocity_ne: list[float]
@@ -96,31 +96,31 @@ class CommandMessage(TypedDict):
 
 
 class MissionMessage(TypedDict):
-    """How far the drone is with its mission; not sent before its pilot's first good step."""
+    """Progress of the mission; not sent before the pilot's first valid step."""
 
     time_s: float
     kind: str
     sentence: str
-    """What it does now, for people."""
+    """What the mission does now, for people."""
     goal_ne: list[float] | None
-    """Metres from home; null where there is no goal."""
+    """Metres from home; null: no goal."""
     goal_height_m: float | None
-    """null: as high as when the flight began."""
+    """null: the height at the start of the flight."""
     position_ne: list[float] | None
-    """Metres from home, as the autopilot has it."""
+    """Metres from home, by the autopilot."""
     arrived: bool
-    """At the last goal."""
+    """Whether the drone is at the last goal."""
 
 
 class EventMessage(TypedDict):
-    """Something that happened once."""
+    """An event, sent once."""
 
     time_s: float
     event: str
 
 
 class ReasonMessage(TypedDict):
-    """Something that is the matter."""
+    """A present fault or other reason."""
 
     event: str
     """For programs: a value of `flockd.flight.safety.Event`, or the name of an autopilot's reason to refuse, as in
@@ -130,7 +130,7 @@ class ReasonMessage(TypedDict):
 
 
 class TakenOrderMessage(TypedDict):
-    """The last order that one operator gave and the drone took."""
+    """The last order of one operator that the drone accepted."""
 
     operator: str
     command: str
@@ -139,83 +139,83 @@ class TakenOrderMessage(TypedDict):
 
 
 class FlightMessage(TypedDict):
-    """Who flies the drone, and why."""
+    """Which program or person flies the drone, and why."""
 
     time_s: float
     state: str
     """`idle`, `ready`, `normal`, `degraded`, `hover`, `asking` (for Hold or worse) or `silent` (handed over)."""
     reasons: list[ReasonMessage]
-    """What is the matter, the worst first; then why the autopilot would refuse to arm or to fly offboard."""
+    """The present events, the worst first; then why the autopilot would refuse to arm or to fly offboard."""
     flight_mode: str
-    """The autopilot's."""
+    """The autopilot's flight mode."""
     armed: bool | None
     in_air: bool | None
     heartbeat_age_s: float | None
     """Age of the autopilot's newest heartbeat; null before the first."""
     heartbeats_lost: int
-    """Of the autopilot's, since the start, while its other messages came."""
+    """Heartbeats of the autopilot that were missing since the start, while its other messages came."""
     battery_share: float | None
     """0 to 1."""
     height_m: float | None
     """Above home, up positive."""
     velocity_trim: list[float]
-    """m/s north and east, added to the pilot's commands: the autopilot's velocity less the cameras'."""
+    """m/s north and east, added to the pilot's commands: the autopilot's velocity minus the cameras'."""
     velocity_error_m_s: float
-    """By how much the velocity was off its setpoints in the last ten seconds, root mean square."""
+    """Root mean square of the velocity's deviation from its setpoints in the last ten seconds."""
     silence: str | None
-    """Why no setpoint goes to the autopilot; null while they do."""
+    """Why no setpoints are sent to the autopilot; null: they are."""
     setpoints_sent: int
     setpoints_missed: int
-    """Deadlines that this computer was too busy to keep."""
+    """Deadlines that this computer missed."""
     orders: list[TakenOrderMessage] | None
-    """Of the last minute, one of each operator, the newest first."""
+    """Accepted orders of the last minute, one of each operator, the newest first."""
     orders_refused: int | None
-    """Since the start."""
+    """Orders refused since the start."""
 
 
 class CameraMessage(TypedDict):
-    """How one camera is doing."""
+    """State of one camera."""
 
     age_s: float | None
-    """Since its newest usable frame; null before the first."""
+    """Age of its newest usable frame; null before the first."""
     fault: str | None
     counts: dict[str, int]
-    """Frames since the start, by what became of them."""
+    """Frames since the start, by their fate."""
 
 
 class ComputerMessage(TypedDict):
-    """How the computer keeps up. Counts are since the start."""
+    """Load and faults of the computer. Counts are since the start."""
 
     time_s: float
     cameras: dict[str, CameraMessage]
     load: float
-    """How long the steps take (95th percentile) over how long they may."""
+    """95th percentile of the steps' durations over the permitted one."""
     steps: int
     steps_failed: int
     network_faults: int
     """Outputs that are NaN, infinite or out of range."""
     networks_stuck: int
-    """Calls that were ended because they passed their deadline."""
+    """Calls that were ended after their deadline."""
     loop_lag_s: float
-    """How late the event loop was, at worst, in the last second."""
+    """Largest lag of the event loop in the last second."""
     temperature_c: float | None
     messages_lost: int
     recording: str | None
-    """The file, or why the recording ended; null where nothing is recorded."""
+    """The file, or why the recording ended; null: not recording."""
 
 
 class AboutMessage(TypedDict):
-    """What a drone flies with."""
+    """The drone's configuration."""
 
     version: str
     configuration: dict[str, object]
     """Every key of the drone's configuration, defaults filled in."""
     commands: list[str]
-    """What operators may ask of it."""
+    """Commands that operators may send."""
 
 
 class TimeMessage(TypedDict):
-    """The drone's clocks as it replies: for its watchers, who learn from it the delay of the link too."""
+    """The drone's clocks at its reply: watchers also learn the link's delay from it."""
 
     time_s: float
     """Monotonic."""
@@ -226,10 +226,10 @@ class TimeMessage(TypedDict):
 
 
 class OrderMessage(TypedDict, total=False):
-    """What `goto` and `velocity` ask: a goal in metres or degrees, or a velocity; what is left out stays as it is."""
+    """A `goto` or `velocity`: a goal in metres or degrees, or a velocity; missing keys leave values unchanged."""
 
     north_m: float
-    """From the mission's origin; so `east_m`."""
+    """From the mission's origin; `east_m` likewise."""
     east_m: float
     latitude_deg: float
     longitude_deg: float
@@ -242,27 +242,27 @@ class OrderMessage(TypedDict, total=False):
 
 
 class AskMessage(TypedDict):
-    """An operator's command. A drone takes each once, in order and while it is new."""
+    """An operator's command. A drone accepts each once, in order and while it is new."""
 
     identity: str
-    """The drone's, of its liveliness token: another drone of the same name refuses it."""
+    """The drone's, from its liveliness token: another drone of the same name refuses it."""
     operator: str
-    """Who asks, for people; who may ask is decided by the access rules of the network."""
+    """The operator's name, for people; the network's access rules decide who may send commands."""
     session: str
-    """Of the program that asks, from its start to its end."""
+    """Identifies one run of the sending program."""
     sequence: int
-    """Counts up within the session."""
+    """Increases within the session."""
     time_s: float
-    """The drone's own clock, as its reply to `time` had it just before."""
+    """The drone's own clock, by its reply to `time` just before."""
     order: dict[str, object] | None
     """An `OrderMessage` for `goto` and `velocity`; else null."""
 
 
 class AnswerMessage(TypedDict):
-    """What became of an operator's command."""
+    """The reply to an operator's command."""
 
     accepted: bool
-    """The drone will try; `flight` reports the result."""
+    """Whether the drone will try; `flight` reports the result."""
     sentence: str
 
 
@@ -276,9 +276,9 @@ class Topic:
     rate_hz: float | None
     """Expected rate at the paper's step of 0.5 s; None: only when something happens."""
     stale_after_s: float | None
-    """Older than this, a message says nothing of now; None: it keeps its meaning."""
+    """Age from which a message is outdated; None: it stays valid."""
     recorded: bool
-    """By itself; what follows from a step is recorded as that step's input and output."""
+    """Whether it is recorded by itself; what follows from a step is recorded as that step's input and output."""
 
 
 _STEP = services.STEP_TOPIC.rate_hz, services.STEP_TOPIC.timeout

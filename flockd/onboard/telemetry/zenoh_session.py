@@ -1,4 +1,4 @@
-"""Opens and closes zenoh sessions, as peers without discovery. No other file does."""
+"""Opens and closes zenoh sessions, as peers without discovery: the only file that does."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _log = logging.getLogger(__name__)
 
 
 class SessionError(UnavailableError):
-    """Endpoints, or a file of settings, that cannot be used."""
+    """Endpoints, or a file of settings, are not usable."""
 
     def __init__(self, purpose: str, endpoints: str, reason: str) -> None:
         super().__init__(f"{purpose} cannot use {endpoints} ({reason}); name another endpoint")
@@ -37,13 +37,13 @@ def open_session(
     max_peers: int | None = None,
     awaits_addresses: bool = False,
 ) -> zenoh.Session:
-    """A session that listens on and connects to these endpoints only; it tries for ever where none answers yet.
+    """A session that listens on and connects to these endpoints only; it retries for ever until one answers.
 
-    A peer opens without a router, unlike a client; discovery by multicast and gossip is off. ``purpose``: as errors say
-    it; ``settings``: a file of zenoh's own to begin with, for TLS and access control; what of it is not used is logged.
-    Longer messages and further peers than the most are refused; None: as zenoh or the settings have it.
-    ``awaits_addresses``: it listens on an address that no interface has yet, such as Wi-Fi's at the start, once one has
-    it. Raises UnavailableError.
+    A peer opens without a router, unlike a client; discovery by multicast and gossip is disabled. ``purpose``: its name
+    in errors; ``settings``: a file of zenoh's settings to start from, for TLS and access control; unused parts are
+    logged. Longer messages and more peers than the limits are refused; None: as in zenoh or the settings.
+    ``awaits_addresses``: an address that no interface has yet, such as Wi-Fi's at the start, is listened on once one
+    has it. Raises UnavailableError.
     """
     for endpoint in (*listen, *connect):
         if "/" not in endpoint:
@@ -91,8 +91,8 @@ def open_session(
 
 
 def close_session(session: zenoh.Session) -> None:
-    """Ends a session and all that was declared in it."""
-    with suppress(zenoh.ZError):  # after ten seconds, where a peer that is lost does not hear that it ends
+    """Ends a session and all its declarations."""
+    with suppress(zenoh.ZError):  # raised after ten seconds if a lost peer does not respond
         session.close()  # type: ignore[no-untyped-call]
 
 
@@ -102,7 +102,7 @@ class SessionOwner:
     _session: zenoh.Session
 
     def close(self) -> None:
-        """Ends the session; what is sent later is lost."""
+        """Ends the session; later messages are lost."""
         close_session(self._session)
 
     def __enter__(self) -> Self:
