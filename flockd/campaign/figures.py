@@ -148,7 +148,7 @@ MEASURES: dict[str, Measure] = {
 
 def _known(figure: str) -> str:
     if figure not in MEASURES:
-        raise PydanticCustomError("unknown_figure", "is no figure")
+        raise PydanticCustomError("unknown_figure", "is not a figure")
     return figure
 
 

@@ -120,7 +120,7 @@ def _failed(sentence: str, code: int) -> int:
 def _parser() -> Parser:
     parser = Parser(
         prog="flockd",
-        description="Drones that flock by vision alone.",
+        description="Drones that flock by sight alone.",
         examples=("flockd sim --duration 10 --drones 3", "flockd sim", "flockd config check config/paper_flight.yaml"),
         notes=EXIT_CODES,
     )

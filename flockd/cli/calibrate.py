@@ -34,7 +34,7 @@ def add(commands: Commands) -> None:
 
 
 def _add_shared(parser: Parser) -> None:
-    option(parser, "--out FILE", "where the result goes (CAMERA.yaml or rig.yaml)", Path)
+    option(parser, "--out FILE", "write the result to this file (CAMERA.yaml or rig.yaml)", Path)
     flag(parser, "--force", "overwrite what is there")
     flag(parser, "--json", "print the result as JSON")
 
@@ -65,12 +65,12 @@ def _add_camera(commands: Commands) -> None:
     option(parser, "--camera NAME", "the camera's name in the rig")
     option(parser, "--model", "default: pinhole, unless the other fits clearly better", choices=LENS_MODELS)
     option(parser, "--print-board FILE", "write the board to print (.svg)", Path)
-    option(parser, "--config FILE", "the drone, for its camera's device", Path)
+    option(parser, "--config FILE", "the drone whose camera is used", Path)
     _add_shared(parser)
     board = parser.add_argument_group("the board", "as it was printed; measure it, printers shrink")
     option(board, "--squares CxR", "columns x rows (7x5)", size, default=(7, 5))
-    option(board, "--square-mm MM", "of a square's side (36)", positive_number, default=36.0)
-    flag(board, "--legacy", "it was made by OpenCV before 4.6")
+    option(board, "--square-mm MM", "side of a square (36)", positive_number, default=36.0)
+    flag(board, "--legacy", "the board was made by OpenCV before 4.6")
 
 
 def _camera(args: argparse.Namespace) -> int:
@@ -157,7 +157,7 @@ def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, 
 
 def _add_rig(commands: Commands) -> None:
     """Adds the command."""
-    description = "Take over what a flight found of its own rig: the cameras' mountings, time offset and focal lengths."
+    description = "Use a flight's own calibration of its rig: the cameras' mountings, time offset and focal lengths."
     parser = commands("rig", description, ("flockd calibrate rig --from-flight drone1.mcap",), _rig)
     option(parser, "--from-flight RECORDING", "the flight", Path, required=True)
     _add_shared(parser)
@@ -179,11 +179,11 @@ def _rig(args: argparse.Namespace) -> int:
 def _add_import(commands: Commands) -> None:
     """Adds the command."""
     examples = ("flockd calibrate import camchain.yaml", "flockd calibrate import lens.yml --size 640x480 --nearest")
-    description = "Take over the lenses of Kalibr's camchain, ROS's camera_info, OpenCV's FileStorage or COLMAP's list."
+    description = "Import the lenses of Kalibr's camchain, ROS's camera_info, OpenCV's FileStorage or COLMAP's list."
     parser = commands("import", description, examples, _import)
-    option(parser, "FILE", "of the other program", Path)
-    option(parser, "--size WxH", "of the images, where the file does not say it", size)
-    flag(parser, "--nearest", "take the nearest lens for one that flockd has not")
+    option(parser, "FILE", "the other program's file", Path)
+    option(parser, "--size WxH", "size of the images, if the file does not contain it", size)
+    flag(parser, "--nearest", "use the nearest lens model if flockd lacks the file's")
     _add_shared(parser)
 
 

@@ -33,15 +33,15 @@ def add(commands: Commands) -> None:
         "flockd cameras --size 1280x720 --names front back --write cameras.yaml",
         "flockd cameras --turn-deg 90 --write cameras.yaml",
     )
-    description = "List the cameras of this computer, measure what they give, and write the configuration of them."
+    description = "List the cameras of this computer, measure their images, and write their configuration."
     parser = commands("cameras", description, examples, _run)
-    option(parser, "--picture FOLDER", "run all cameras, measure what comes, and save an image of each", Path)
+    option(parser, "--picture FOLDER", "run all cameras, measure their images, and save one of each", Path)
     option(parser, "--seconds S", f"measure this long ({SECONDS:g})", positive_number, default=SECONDS)
-    option(parser, "--size WxH", "of an image, the nearest to this", size, default=(640, 480))
+    option(parser, "--size WxH", "image size; the nearest one available is used", size, default=(640, 480))
     option(parser, "--write FILE", "write the sections `rig` and `source` for them", Path)
-    told = "clockwise, what makes up up in their images: 90 for cameras on their sides, tops to the right"
+    told = "turn their images clockwise until they are upright: 90 for cameras on their sides, tops to the right"
     option(parser, "--turn-deg", told, int, choices=(0, 90, 180, 270), default=0)
-    option(parser, "--names NAME", "of the cameras in the rig, in the listed order", nargs="+")
+    option(parser, "--names NAME", "names of the cameras in the rig, in the listed order", nargs="+")
     flag(parser, "--force", "overwrite the file if it exists")
     flag(parser, "--json", "print JSON")
 

@@ -42,11 +42,11 @@ def add(commands: Commands) -> None:
         "flockd campaign config/campaigns/separation.yaml --dry-run",
         "flockd campaign config/campaigns/separation.yaml --workers 4 --out out/tonight",
     )
-    parser = commands(RUN, "Fly what is missing of a campaign, and write its report.", examples, _run, notes=COSTS)
-    option(parser, "FILE", "of the campaign", Path)
-    option(parser, "--out FOLDER", "default: out/NAME, by the campaign's name", Path)
+    parser = commands(RUN, "Fly the missing flights of a campaign, and write its report.", examples, _run, notes=COSTS)
+    option(parser, "FILE", "the campaign's file", Path)
+    option(parser, "--out FOLDER", "default: out/NAME, with the campaign's name", Path)
     option(parser, "--workers N", "flights at once (default: processors)", positive_count)
-    flag(parser, "--dry-run", "print how many flights and hours it is; keep nothing")
+    flag(parser, "--dry-run", "print the number of flights and hours; fly and write nothing")
     flag(parser, "--json", "print what was flown as JSON")
     examples = (
         "flockd campaign rerun out/separation/c3-s12",
@@ -60,8 +60,8 @@ def add(commands: Commands) -> None:
     parser.set_defaults(quiet=False)
     examples = ("flockd campaign report out/separation", "flockd campaign report out/old_networks out/new_networks")
     parser = commands("report", "Write the report of a campaign, or compare a second one with it.", examples, _report)
-    option(parser, "FOLDER", "of a campaign", Path)
-    option(parser, "OTHER", "is compared with it: is this one better?", Path, nargs="?")
+    option(parser, "FOLDER", "a campaign's folder", Path)
+    option(parser, "OTHER", "compare this campaign with FOLDER: is it better?", Path, nargs="?")
     option(parser, "--out FILE", "default: report.html in the folder", Path)
     flag(parser, "--json", "print the figures as JSON")
 

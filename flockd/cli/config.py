@@ -39,22 +39,22 @@ def add(commands: Commands) -> None:
     add_force(parser)
     examples = ("flockd config show config/paper_flight.yaml", "flockd config show --json config/simulator.yaml")
     parser = commands("show", "Show a file with every default filled in, a scenario with its drone.", examples, _show)
-    option(parser, "FILE", "of a drone or a scenario", Path)
+    option(parser, "FILE", "a drone's or a scenario's file", Path)
     flag(parser, "--json", "print JSON instead of YAML")
     examples = ("flockd config schema drone", "flockd config schema scenario > scenario.schema.json")
     description = "Print the JSON schema of a kind of file, for editors and other tools."
     parser = commands("schema", description, examples, _schema)
-    parser.add_argument("kind", choices=("drone", "scenario", "campaign"), help="of the file")
+    parser.add_argument("kind", choices=("drone", "scenario", "campaign"), help="kind of file")
     examples = ("flockd config card my_drone.yaml", "flockd config card /etc/flockd/drone.yaml > card.md")
-    description = "Print the card of a flight day, as Markdown: limits, heights, what each fault does, who does what."
-    option(commands("card", description, examples, _card), "FILE", "of a drone", Path)
+    description = "Print the card of a flight day, as Markdown: limits, heights, reactions to faults, people's tasks."
+    option(commands("card", description, examples, _card), "FILE", "a drone's file", Path)
     examples = (
         "flockd config new drone my_drone.yaml --set name=kite2 --set safety.first_flight_layer=2",
         "flockd config new scenario woods.yaml --set world.obstacles.kind=forest --set obstacles.enabled=true",
     )
     description = "Write a commented file of a real drone or a simulated flight, to be filled in."
     parser = commands("new", description, examples, _new)
-    parser.add_argument("kind", choices=("drone", "scenario"), help="of the file")
+    parser.add_argument("kind", choices=("drone", "scenario"), help="kind of file")
     option(parser, "FILE", "to write", Path)
     flag(parser, "--force", "overwrite the file if it exists")
     add_settings(parser, "write this value")

@@ -43,20 +43,23 @@ def add(commands: Commands) -> None:
         "flockd detect front/ --config my_drone.yaml --camera front",
         "flockd detect photograph.jpg --fov 70 --drone-size 0.35",
     )
-    parser = commands("detect", "Detect drones in pictures, with the code that flies.", examples, _run, notes=NOTES)
+    parser = commands("detect", "Detect drones in pictures, with the code of the flight.", examples, _run, notes=NOTES)
     option(parser, "PICTURES", "images, folders of them, videos", Path, nargs="+")
     option(
-        parser, "--out PATH", "write copies of the pictures with the detections drawn in: a folder, or one .mp4", Path
+        parser,
+        "--out PATH",
+        "write copies of the pictures with the detections drawn into them: a folder, or one .mp4",
+        Path,
     )
     flag(parser, "--force", "overwrite what is there")
     option(
         parser,
         "--min-probability P",
-        "leave out what is less probable (0)",
+        "leave out less probable detections (0)",
         number("a probability, 0 to 1", 0, 1),
         default=0.0,
     )
-    option(parser, "--drone-size M", "of every drone, tip to tip, if known", positive_number)
+    option(parser, "--drone-size M", "size of every drone, from tip to tip, if known", positive_number)
     option(parser, "--every N", "every Nth frame of a video (1)", positive_count, default=1)
     flag(parser, "--json", "print the result as JSON")
     camera = parser.add_argument_group("the camera of the pictures")
@@ -67,7 +70,7 @@ def add(commands: Commands) -> None:
         number(f"an angle in degrees, {MIN_FOV_DEG:g} to {MAX_FOV_DEG:g}", MIN_FOV_DEG, MAX_FOV_DEG),
     )
     option(camera, "--config FILE", "a drone, for its networks and settings and, without --fov, its camera", Path)
-    option(camera, "--camera NAME", "which of --config's cameras, where it has several")
+    option(camera, "--camera NAME", "the camera of --config, if it has several")
 
 
 _COLOUR = 1.0
@@ -132,7 +135,7 @@ def _camera_of_config(args: argparse.Namespace, drone: DroneConfig | None) -> Ca
     if drone is None and args.fov is None:
         raise UsageError(
             "the pictures' camera is not known; give its field of view with --fov (a phone's main camera has 65 to "
-            "75 degrees, its data sheet says), or a drone with --config"
+            "75 degrees, see its data sheet), or a drone with --config"
         )
     if args.camera is not None and (drone is None or args.fov is not None):
         raise UsageError("--camera is one of --config's, in place of --fov; name the drone's file alone")

@@ -47,10 +47,10 @@ def add(commands: Commands) -> None:
     )
     parser = commands("doctor", description, examples, _run)
     option(parser, "--config FILE", "the drone's configuration; with --demo by default the simulator's", Path)
-    option(parser, "--record DIR", "where `flockd run` is to record flights", Path)
+    option(parser, "--record DIR", "the folder in which `flockd run` will record", Path)
     seconds = f"watch the cameras this long ({SECONDS:g}), or fly the bench"
     option(parser, "--seconds S", seconds, positive_number)
-    option(parser, "--only CHECK", f"only this one, of {', '.join(CHECKS)}", action="append", choices=CHECKS)
+    option(parser, "--only CHECK", f"run only this check, one of {', '.join(CHECKS)}", action="append", choices=CHECKS)
     flag(parser, "--bench", "run the daemon and time its steps; needs --demo, and the extra `sim`")
     flag(parser, "--demo", "with nothing attached: a made-up autopilot, and images drawn by the simulator")
     flag(parser, "--json", "print JSON")

@@ -37,9 +37,9 @@ PLAIN = {
     "resume": "Make drones ready again after their flight was ended in the air; their pilots then select offboard.",
 }
 _NOTES = """\
-Without a command it serves the page, and prints its address with a key: who has it may open the page.
-A drone takes only what its `telemetry.commands` allows, and no goal outside its fence. Its answer says that it tries;
-`flockd status` shows what becomes of it. Each drone is asked as soon as it is found, whatever the others do.
+Without a command it serves the page, and prints its address with a key: anyone with the key may open the page.
+A drone accepts only the commands in its `telemetry.commands`, and no goal outside its fence. Its answer says that it
+tries; `flockd status` shows the result. Each drone is asked as soon as it is found, independently of the others.
 Exit code 1: a drone refused, did not answer, or was not found; 69: none was found."""
 _number = number("a number")
 PORT = 8470
@@ -56,7 +56,7 @@ def add(commands: Commands) -> None:
         "flockd fleet velocity drone1 0.5 0 --seconds 10",
         "flockd fleet hold all",
     )
-    what = "Show the fleet on a page in the browser; with a command: ask drones to fly elsewhere, hold, land, or go on."
+    what = "Show the fleet on a page in the browser. With a command: send drones to a place, or make them hold or land."
     parser = commands("fleet", what, examples, notes=_NOTES)
     _add_orders(commands_of(parser))
     _add_page(parser)
@@ -78,17 +78,17 @@ def _add_orders(commands: Commands) -> None:
     parser = _ordering(commands("goto", what, examples, _goto, notes=notes))
     option(parser, "NORTH", "metres north of the mission's origin", _number)
     option(parser, "EAST", "metres east of it", _number)
-    flag(parser, "--degrees", "NORTH and EAST are latitude and longitude")
+    flag(parser, "--degrees", "read NORTH and EAST as latitude and longitude")
     option(parser, "--height M", "height above the ground at home (default: the present one)", _number)
     option(parser, "--speed V", "in m/s (default: the mission's)", positive_number)
     flag(parser, "--repeat", "send it every second until Ctrl-C")
     examples = ("flockd fleet velocity drone1 0.5 0 --seconds 10", "flockd fleet velocity all 0 -1 --height 6")
-    what = "Make drones fly at a velocity for as long as it is sent."
+    what = "Make drones fly at a velocity while it is sent."
     parser = _ordering(commands("velocity", what, examples, _velocity))
     option(parser, "NORTH", "m/s to the north", _number)
     option(parser, "EAST", "m/s to the east", _number)
     option(parser, "--height M", "height above the ground at home (default: the present one)", _number)
-    option(parser, "--seconds S", "repeat it every second for S seconds (default: once)", positive_number)
+    option(parser, "--seconds S", "send it every second for S seconds (default: once)", positive_number)
     for command, what in PLAIN.items():
         examples = (f"flockd fleet {command} all", f"flockd fleet {command} drone1")
         _ordering(commands(command, what, examples, functools.partial(_ask, command=command)))
@@ -109,7 +109,7 @@ def _goto(args: argparse.Namespace) -> int:
 
     place = np.array([args.north, args.east])
     if args.degrees and not (abs(args.north) <= 90 and abs(args.east) <= 180):
-        raise UsageError(f"{args.north:g} {args.east:g} is no latitude and longitude; swap them, or drop --degrees")
+        raise UsageError(f"{args.north:g} {args.east:g} is not a latitude and longitude; swap them, or drop --degrees")
     where = {"place_deg": place} if args.degrees else {"place": place}
     order = MissionOrder(height_m=args.height, speed_m_s=args.speed, **where)
     return _ask(args, "goto", order, repeat_s=math.inf if args.repeat else 0.0)
@@ -207,21 +207,21 @@ def _verdict(args: argparse.Namespace, answers: dict[str, dict[str, object]], na
 
 
 def _add_page(parser: Parser) -> None:
-    option(parser, "--port N", f"(default: {PORT}; 0: any)", port_number, default=PORT)
+    option(parser, "--port N", f"port of the page (default: {PORT}; 0: any)", port_number, default=PORT)
     option(
         parser,
         "--listen ADDRESS",
-        f"of the server, such as 0.0.0.0 for other computers too (default: {HERE})",
+        f"address of the page; 0.0.0.0 admits other computers (default: {HERE})",
         _ip_address,
         default=HERE,
         dest="server_address",
     )
     add_endpoint_options(parser, "--drones-at")
-    flag(parser, "--watch-only", "the page passes no command on")
+    flag(parser, "--watch-only", "refuse all commands from the page")
     option(
         parser,
         "--key-file FILE",
-        "keep the key of the page's address in it, so that open pages go on after a new start (default: a new key "
+        "keep the page's key in this file, so that open pages still work after a restart (default: a new key "
         "at each start)",
         Path,
     )

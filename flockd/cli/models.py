@@ -32,8 +32,8 @@ def add(commands: Commands) -> None:
     _add_options(commands("verify", description, examples, _verify))
     examples = ("flockd models prepare --config my_drone.yaml", "flockd models prepare --config my_drone.yaml --json")
     description = (
-        "Build what a drone's provider needs for its models and cameras, ahead of flight. TensorRT takes minutes, and "
-        "a flight with it is refused before; OpenVINO starts sooner; CPU and CUDA have nothing to build."
+        "Build the engines of a drone's models and cameras ahead of flight. TensorRT takes minutes, and flights "
+        "without its engines are refused; OpenVINO starts sooner with them; CPU and CUDA need none."
     )
     parser = commands("prepare", description, examples, _prepare)
     option(parser, "--config FILE", "the drone's configuration", Path, required=True)

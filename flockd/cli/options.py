@@ -26,10 +26,10 @@ LONGEST_OPERATOR = 40
 
 def add_endpoint_options(parser: Parser, listen: str = "--listen") -> None:
     """Adds the fleet's name and the endpoints; ``listen``: the option for where drones connect to."""
-    option(parser, "--fleet NAME", "only this one; by default every fleet that is heard")
-    option(parser, "--connect ENDPOINT", f"of a drone or a router; by default {ENDPOINT}", action="append")
+    option(parser, "--fleet NAME", "watch only this fleet; by default all that are found")
+    option(parser, "--connect ENDPOINT", f"connect to this drone or router; by default {ENDPOINT}", action="append")
     parser.add_argument(listen, metavar="ENDPOINT", action="append", dest="drones_at", help="where drones connect to")
-    option(parser, "--zenoh-config FILE", "zenoh's own settings, as for TLS", Path)
+    option(parser, "--zenoh-config FILE", "a file of zenoh's settings, for example for TLS", Path)
 
 
 def add_operator_option(parser: Parser) -> None:
@@ -37,7 +37,7 @@ def add_operator_option(parser: Parser) -> None:
     option(
         parser,
         "--operator NAME",
-        "who gives orders, as drones show and log it (default: USER@COMPUTER)",
+        "the operator's name, which drones show and log (default: USER@COMPUTER)",
         _operator,
         default=_this_person(),
     )
@@ -45,7 +45,7 @@ def add_operator_option(parser: Parser) -> None:
 
 def _operator(text: str) -> str:
     if not 0 < len(text) <= LONGEST_OPERATOR or printable(text, lines=False) != text:
-        raise argparse.ArgumentTypeError(f"{text!r} is no name of 1 to {LONGEST_OPERATOR} printable characters")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a name of 1 to {LONGEST_OPERATOR} printable characters")
     return text
 
 
@@ -122,7 +122,7 @@ def opened(path: Path) -> Recording:
 
 def add_force(parser: Parser) -> None:
     """Adds the option."""
-    flag(parser, "--force", "take speeds beyond those that were shown to be safe")
+    flag(parser, "--force", "accept speeds above those that were shown to be safe")
 
 
 def load_to_fly(file: Path, *, force: bool) -> DroneConfig:
@@ -177,4 +177,4 @@ def refuse_overwriting(args: argparse.Namespace, *files: Path | None) -> None:
             instead = "" if force is None else ", or overwrite it with --force"
             raise UsageError(f"{file}: exists; name another file{instead}")
         if file is not None and not file.parent.is_dir():
-            raise UsageError(f"{file.parent}: is no folder; make it first, or name another file")
+            raise UsageError(f"{file.parent}: is not a folder; create it first, or name another file")

@@ -18,7 +18,7 @@ Number = Callable[[str], float]
 
 
 class Parser(argparse.ArgumentParser):
-    """With examples below the help, no abbreviated options, and errors of one sentence."""
+    """A parser with examples below the help, without abbreviated options, and with errors of one sentence."""
 
     def __init__(self, *, prog: str, description: str, examples: Sequence[str], notes: str = "") -> None:
         """``notes`` stand below the examples."""
@@ -32,13 +32,13 @@ class Parser(argparse.ArgumentParser):
         self.commands: list[str] = []
         """Names of its commands, if it has any."""
         self.default_command: str | None = None
-        """Which of them is meant where none is named."""
+        """The command that is used if none is named."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As argparse does, with the default command in its place; a command that is named comes first.
+        """As argparse, with the default command if none is named; a named command comes first.
 
-        What is gone is refused with what to use instead. argparse would take options before the command, and then put
-        the command's own defaults in their place.
+        Removed commands and options are refused with their replacement. argparse would accept options before the
+        command, and then overwrite them with the command's own defaults.
         """
         args = sys.argv[1:] if args is None else list(args)
         for place, word in enumerate(args):
@@ -79,17 +79,17 @@ class Commands(Protocol):
     def __call__(
         self, name: str, description: str, examples: Sequence[str], run: Run | None = None, *, notes: str = ""
     ) -> Parser:
-        """By name, one-line description, examples, its function (None: it has commands of its own), and what stands
-        below the examples in its help."""
+        """Adds a command by name, one-line description, examples, function (None: it has its own commands), and the
+        notes below the examples in its help."""
         ...
 
 
 def commands_of(parser: Parser) -> Commands:
-    """What gives a parser its commands; without one it prints its help and exits with a usage error.
+    """A function that adds commands to a parser; without a command it prints its help and exits with a usage error.
 
-    A parser that does something without a command too gets its own `run` and options afterwards, and `ALONE` as usage.
+    A parser that also works without a command gets its own `run` and options afterwards, and `ALONE` as usage.
 
-    What is parsed has `run`, the command's function, and `parser`, the command's own.
+    The parsed namespace has `run`, the command's function, and `parser`, the command's own.
     """
     subparsers = parser.add_subparsers(metavar="COMMAND", parser_class=Parser)
 
@@ -136,7 +136,7 @@ def flag(parser: argparse._ActionsContainer, name: str, what: str) -> None:
 
 
 def number(words: str, low: float = -math.inf, high: float = math.inf, *, above: float = -math.inf) -> Number:
-    """The kind of options whose value is a finite number within these limits: ``words`` say what it is not else."""
+    """The kind of an option whose value is a finite number within these limits; ``words`` describe it in errors."""
 
     def parsed(text: str) -> float:
         try:

@@ -14,7 +14,7 @@ def add(commands: Commands) -> None:
     """Adds the command."""
     commands = commands_of(commands("record", "Inspect recordings.", ("flockd record info drone1.mcap",)))
     examples = ("flockd record info drone1.mcap", "flockd record info --json drone1.mcap")
-    parser = commands("info", "Show what a recording contains: duration, gaps, damage, messages.", examples, _info)
+    parser = commands("info", "Show the contents of a recording: duration, gaps, damage, messages.", examples, _info)
     option(parser, "RECORDING", "an MCAP file of flockd", Path)
     flag(parser, "--json", "print the result as JSON")
 

@@ -41,10 +41,10 @@ def add(commands: Commands) -> None:
     parser = commands("replay", description, examples, _run)
     option(parser, "RECORDING", "a recording, or a dataset (see below)", Path)
     add_stretch(parser)
-    option(parser, "--config FILE", "fly with this drone's or scenario's settings", Path)
+    option(parser, "--config FILE", "use the settings of this drone or scenario", Path)
     option(parser, "--out FILE", "write a new recording", Path)
-    flag(parser, "--diff", "compare every output with what was recorded")
-    flag(parser, "--profile", "say where time goes on this computer, and which step_s it can keep")
+    flag(parser, "--diff", "compare every output with the recorded one")
+    flag(parser, "--profile", "show where time goes on this computer, and which step_s it can keep")
     option(parser, "--reference FILE", "compare with this file instead", Path)
     flag(parser, "--update-reference", "write the outputs to the reference")
     option(
@@ -89,7 +89,7 @@ def _recording(args: argparse.Namespace) -> Iterator[Recording]:
     from flockd.review.replay.bag_flight import Bag, is_bag, recording_of_bag
 
     if args.vehicle is not None and not is_bag(args.recording):
-        raise UsageError("--vehicle is for bags of ROS 2, and this is none; leave it out")
+        raise UsageError("--vehicle is for bags of ROS 2, and this is not one; leave it out")
     if not is_bag(args.recording):
         yield opened(args.recording)
         return
@@ -239,7 +239,7 @@ def _add_dataset(parser: Parser) -> None:
     option(
         group,
         "--depth",
-        "the recorded depth, or that of the network (default: network)",
+        "use the recorded depth, or the network's (default: network)",
         choices=("recorded", "network"),
     )
     option(group, "--stride N", "pair frame i with frame i + N (default: 1)", positive_count)
@@ -248,7 +248,7 @@ def _add_dataset(parser: Parser) -> None:
 
 def _run_dataset(args: argparse.Namespace) -> int:
     """Runs the command for a dataset."""
-    refuse(args, _OF_RECORDINGS, "is for recordings of flockd, and this is none; leave it out")
+    refuse(args, _OF_RECORDINGS, "is for recordings of flockd, and this is not one; leave it out")
     from flockd.ground.datasets.image_folder import open_dataset
     from flockd.review.replay.dataset_flight import dataset_config, dataset_result, replay_dataset
 

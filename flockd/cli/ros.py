@@ -24,7 +24,7 @@ def add(commands: Commands) -> None:
         "flockd ros --connect tcp/10.0.0.11:7447 --connect tcp/10.0.0.12:7447 --orders",
         "flockd ros perceive --config my_drone.yaml",
     )
-    what = "Show the fleet to ROS 2, and take orders from there; with `perceive`: only see drones, for another stack."
+    what = "Publish the fleet in ROS 2, and take orders from there. With `perceive`: only detect drones."
     parser = commands("ros", what, examples, notes=_NOTES)
     _add_perceive(commands_of(parser))
     add_endpoint_options(parser, "--drones-at")
@@ -36,7 +36,7 @@ def add(commands: Commands) -> None:
 
 
 def _add_network(parser: Parser) -> None:
-    flag(parser, "--network", "let other computers find it in ROS 2 (default: this computer alone)")
+    flag(parser, "--network", "let other computers find it in ROS 2 (default: only this one)")
 
 
 def _add_perceive(commands: Commands) -> None:
@@ -49,7 +49,7 @@ def _add_perceive(commands: Commands) -> None:
         "NAME and all cameras from the configuration. Without --vehicle it needs `perception.scale: network`."
     )
     parser = commands(
-        "perceive", "See drones in the images of topics, and publish them; command nothing.", examples, _perceive,
+        "perceive", "Detect drones in the images of topics and publish them; command no vehicle.", examples, _perceive,
         notes=notes,
     )  # fmt: skip
     option(parser, "--config FILE", "a drone's, with its source", Path, required=True)

@@ -42,7 +42,7 @@ def add(commands: Commands) -> None:
     option(
         parser,
         "--record DIR",
-        "write a recording of each flight to this folder, which is made; see `recording` in the configuration",
+        "write a recording of each flight to this folder, created if missing; see `recording` in the configuration",
         Path,
     )
     add_force(parser)
@@ -75,7 +75,7 @@ def _run_daemon(args: argparse.Namespace) -> int:
         try:
             args.record.mkdir(parents=True, exist_ok=True)
         except (FileExistsError, NotADirectoryError) as error:
-            raise UsageError(f"{args.record}: is no folder; name another with --record") from error
+            raise UsageError(f"{args.record}: is not a folder; name another with --record") from error
     event_loop = functools.partial(event_loop_at, config.speed_factor)
     with only_owner(config.autopilot), asyncio.Runner(loop_factory=event_loop) as runner:
         runner.run(_fly(config, args, service))

@@ -71,7 +71,7 @@ def add(commands: Commands) -> None:
     option(
         parser,
         "--perception",
-        "fly on networks, or on the exact states of all drones (default: learned)",
+        "fly by sight, or on the exact states of all drones (default: learned)",
         choices=get_args(SimulatedPerception),
         default="learned",
     )
@@ -88,35 +88,35 @@ def add(commands: Commands) -> None:
         f"with --autopilot: how fast simulated time passes (default: {DEFAULT_SPEED_FACTOR})",
         number("a number from {:g} to {:g}".format(*SPEED_FACTORS), *SPEED_FACTORS),
     )
-    add_settings(parser, "fly with this value of the scenario's, or of the drone's below `drone.`")
+    add_settings(parser, "use this value of the scenario, or of its drone below `drone.`")
     option(parser, "--drones N", "size of the flock", _flock_size)
-    option(parser, "--duration S", "seconds to fly; it changes the world", positive_number)
-    option(parser, "--seed N", "of the world and of all noise", whole_number("a whole number, 0 or more"))
+    option(parser, "--duration S", "seconds to fly; the world is made to fit", positive_number)
+    option(parser, "--seed N", "seed of the world and of all noise", whole_number("a whole number, 0 or more"))
     option(
         parser,
         "--out DIR",
-        "a new folder; default: out/SCENARIO-PERCEPTION-seedN, or -AUTOPILOT-, with -2, -3, ... if there is one",
+        "a new folder; default: out/SCENARIO-PERCEPTION-seedN, or -AUTOPILOT-, with -2, -3, ... if it exists",
         Path,
     )
     parser.add_argument(
         "--no-gate",
         dest="gated",
         action="store_false",
-        help="fly what the pilots ask for, without their safety gates: to study the flocking law alone",
+        help="fly the pilots' commands without their safety gates, to study the flocking law",
     )
     flag(parser, "--force", "overwrite an earlier flight in that folder")
     flag(
         parser,
         "--live",
-        "fly on the fleet page in the browser, in real time where the computer can: send drones places, pause, "
-        "slow down, disturb, begin again; until Ctrl-C, without a report",
+        "fly on the fleet page in the browser, in real time where the computer can: send drones to places, "
+        "pause, slow down, disturb, restart; until Ctrl-C, without a report",
     )
-    option(parser, "--port N", f"with --live: of the page (default: {PORT}; 0: any)", port_number)
+    option(parser, "--port N", f"with --live: port of the page (default: {PORT}; 0: any)", port_number)
     add_operator_option(parser)
     flag(
         parser,
         "--telemetry",
-        "publish over zenoh while flying, with pictures, and take orders; with --perception truth in real time",
+        "publish over zenoh while flying, with pictures, and take orders; with --perception truth, in real time",
     )
     option(
         parser,
@@ -274,7 +274,7 @@ def _value(key: str, text: str) -> Value:
     try:
         return with_tuples(yaml.safe_load(text))
     except yaml.YAMLError as error:
-        raise UsageError(f"--set {key}: {text!r} is no YAML ({str(error).splitlines()[0]}); quote it") from error
+        raise UsageError(f"--set {key}: {text!r} is not YAML ({str(error).splitlines()[0]}); quote it") from error
 
 
 def _of_option(problem: ConfigProblem) -> ConfigProblem:

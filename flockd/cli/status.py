@@ -33,7 +33,7 @@ def add(commands: Commands) -> None:
         "flockd status --listen tcp/0.0.0.0:7447 --fleet meadow",
         "flockd status --json --seconds 2",
     )
-    parser = commands("status", "Show how each drone of a fleet is doing, the worst first.", examples, _run)
+    parser = commands("status", "Show the state of each drone of a fleet, the worst first.", examples, _run)
     add_endpoint_options(parser)
     option(parser, "--seconds S", "listen this long and print once, also on a terminal", positive_number)
     flag(parser, "--json", "print JSON, once")

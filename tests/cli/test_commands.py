@@ -133,7 +133,7 @@ def test_without_a_command_the_help_is_shown(command: list[str], capsys: Capture
         (["--perception", "truth", "--set", "cameras.preset=realistic"], 2, "--set cameras.preset has no meaning"),
         (["--perception", "truth", "--record"], 2, "--record has no meaning without networks"),
         (["--set", "vehicle.wind=[2, -1.5]"], 78, "--set: vehicle.wind: is not a known key"),
-        (["--set", "seed=[2"], 2, "is no YAML"),
+        (["--set", "seed=[2"], 2, "is not YAML"),
         (["--duration", "0.1"], 78, "--duration: 0.1 s is shorter than a step of 0.5 s"),
         (["--live", "--record"], 2, "--live keeps nothing"),
         (["--live", "--telemetry"], 2, "--live has --telemetry in it"),

@@ -201,7 +201,7 @@ def test_it_flies_in_its_layer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_a_file_where_the_recordings_folder_would_be(tmp_path: Path, told: Told) -> None:
     config = _written(tmp_path)
     for name in (config, config / "recordings"):
-        assert told(2, "run", "--config", config, "--record", name).startswith(f"{name}: is no folder; ")
+        assert told(2, "run", "--config", config, "--record", name).startswith(f"{name}: is not a folder; ")
 
 
 def test_a_fleet_that_is_not_there_is_unavailable(told: Told) -> None:

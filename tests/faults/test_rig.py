@@ -190,4 +190,4 @@ def test_a_rig_as_configured_is_flown_without_a_word(
     assert finding.level is Level.PASS
     assert "saw 4 cameras as they are configured" in finding.measured
     assert main(["calibrate", "rig", "--from-flight", str(tmp_path / NAME), "--out", str(tmp_path / "rig.yaml")]) == 1
-    assert "nothing of the rig is to be corrected" in capsys.readouterr().err
+    assert "the rig needs no correction" in capsys.readouterr().err

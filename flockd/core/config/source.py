@@ -122,7 +122,7 @@ class SourceParameters(Section):
         if self.kind == "shared_memory" and self.cameras:
             raise ValueError("a source of kind `shared_memory` has no devices; delete `cameras`")
         if self.kind != "shared_memory" and self.shared_memory.speed_factor != 1.0:
-            raise ValueError("real cameras know real time only; delete `shared_memory.speed_factor`")
+            raise ValueError("real cameras need real time; delete `shared_memory.speed_factor`")
         for number, camera in enumerate(self.cameras):
             refuse(self, {("cameras", number, *key): text for key, text in _misplaced(camera, self.kind).items()})
             for key, periods, words in (

@@ -157,7 +157,7 @@ class FleetBridge:
         row, known = self._source.rows(self._source.now_s()).get(key), self._source.known().get(key, Known())
         try:
             if row is None:
-                raise ValueError("the drone is not heard any more")  # noqa: TRY301 - told below
+                raise ValueError("the drone does not send any more")  # noqa: TRY301 - told below
             accepted, sentence = self._ask(key, command, parse(message, Names(name), row, known.about))
         except ValueError as error:
             accepted, sentence = False, str(error)

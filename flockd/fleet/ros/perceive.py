@@ -29,7 +29,7 @@ def check(config: DroneConfig, vehicle_topic: str | None) -> None:
     """Raises UsageError where the configuration needs a height that nobody tells."""
     if vehicle_topic is None and config.perception.scale == "height":
         raise UsageError(
-            "perception.scale: is `height`, which nobody tells here; name odometry or a pose with --vehicle, or "
+            "perception.scale: is `height`, which needs a height; name odometry or a pose with --vehicle, or "
             "write `scale: network`"
         )
 

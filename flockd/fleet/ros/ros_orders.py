@@ -22,7 +22,7 @@ def goal_of(message: Any, names: Names, row: Row, about: AboutMessage | None) ->
     north, east, down = ned_of_enu(np.array([place.x, place.y, place.z])).tolist()
     origin = None if about is None else origin_of(about["configuration"])
     if origin is None:
-        raise ValueError("where the drone's mission has its origin is not known yet; send the goal again in a second")
+        raise ValueError("the origin of the drone's mission is not known yet; send the goal again in a second")
     if frame == MAP:
         if row["home_ne"] is None:
             raise ValueError(f"the drone's home is not known in `{MAP}`; send the goal in {names.odom!r}")

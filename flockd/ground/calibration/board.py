@@ -41,7 +41,7 @@ class BoardSpec:
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or max(self.columns, self.rows) > 50:
-            raise CalibrationError(f"a board of {self.columns}x{self.rows} squares is none; take 3 to 50 each way")
+            raise CalibrationError(f"a board of {self.columns}x{self.rows} squares does not exist; take 3 to 50 a side")
         if self.corner_count < MIN_CORNERS:
             raise CalibrationError(
                 f"a board of {self.columns}x{self.rows} squares has too few corners; take 5x4 or more"

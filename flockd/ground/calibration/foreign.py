@@ -181,7 +181,7 @@ def camera_of_lens(lens: ForeignLens, file: Path, *, nearest: bool) -> tuple[Cam
     off_deg, own, numbers = fits[0]
     if not nearest:
         raise CalibrationError(
-            f"{where}: its {lens.model} of {count} coefficients has no equal here; the nearest {own} is {off_deg:.3f} "
+            f"{where}: its {lens.model} of {count} coefficients has no equivalent; the nearest {own} is {off_deg:.3f} "
             "degrees off at most, and --nearest takes it"
         )
     return _config(lens, own, numbers[:4], tuple(numbers[4:]), measured, where), off_deg

@@ -49,7 +49,7 @@ def found_rig(
     ModelError.
     """
     if not any(map(is_image, recording.contents.messages)):
-        raise RecordingError(f"{recording.path}: holds no images, and without them nothing of its cameras can be told")
+        raise RecordingError(f"{recording.path}: holds no images, which the calibration needs; name another recording")
     config, began_s = recording.config, recording.start_s + recording.duration_s - last_s
     total = sum(began_s <= time_s for _, time_s in recording.contents.steps)
     pilot = FlockPilot(config, load_side_by_side(config), learned=recording.learned)
@@ -88,7 +88,7 @@ def corrected_rig(
     """
     found = {one.camera: one for one in deviations}
     if not found:
-        raise CalibrationError(f"{source}: says nothing of the rig: it is shorter than {LEAST_S:g} s; fly again")
+        raise CalibrationError(f"{source}: does not show the rig: it is shorter than {LEAST_S:g} s; fly again")
     config = recording.config.rig
     offset_s, note = _offset_s(list(found.values()))
     cameras, results, notes = [], {}, [] if note is None else [note]
@@ -128,7 +128,7 @@ def corrected_rig(
             )
     if offset_s is None and not any(one["taken"] for one in results.values()):
         told = "; ".join([*notes, "what is known agrees with the configuration"])
-        raise CalibrationError(f"{source}: nothing of the rig is to be corrected: {told}")
+        raise CalibrationError(f"{source}: the rig needs no correction: {told}")
     total_s = round(config.time_offset_s + (offset_s or 0.0), 4)
     comment = (
         "The cameras of a drone, written by `flockd calibrate rig`. Put this in place of `rig` in your drone's file,",

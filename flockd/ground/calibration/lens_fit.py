@@ -184,7 +184,7 @@ def _begin(views: Sequence[View], size: tuple[int, int], model: LensModel) -> tu
     assert best is not None
     lost = [view.name for view, (_, pose) in zip(views, best[2], strict=True) if pose is None]
     if lost:
-        raise CalibrationError(f"{lost[0]}: what is seen is no flat board; remove it, or check the board's squares")
+        raise CalibrationError(f"{lost[0]}: does not show a flat board; remove it, or check the board's squares")
     numbers = [*_first_numbers(best[1], size), *np.zeros(_COEFFICIENTS[model])]
     return _camera(model, size, numbers), [pose for _, pose in best[2] if pose is not None]
 
@@ -228,7 +228,7 @@ def _fitted(
 
     start = np.concatenate([lens, *([0.0, 0.0, 0.0, *pose.translation] for pose in poses)])
     if not np.isfinite(residuals(start)).all():
-        raise CalibrationError("what is seen contradicts itself; check the board's squares")
+        raise CalibrationError("the views contradict each other; check the board's squares")
     found = least_squares(residuals, start, derivative, x_scale="jac", xtol=_GAIN, ftol=_GAIN, max_nfev=_MAX_STEPS)
     hessian = found.jac.T @ found.jac
     scale = np.sqrt(np.diag(hessian))

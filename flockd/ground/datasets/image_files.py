@@ -77,7 +77,7 @@ def read_depth(path: Path, size: tuple[int, int], units_per_m: float) -> Float32
     """(h, w) metres, NaN where the file has 0. Raises DatasetError, also for a file that has 0 everywhere."""
     raw = _decoded(path, cv2.IMREAD_UNCHANGED)
     if raw.dtype != np.uint16 or raw.ndim != 2:
-        raise DatasetError(f"{path}: is no depth map; it needs one channel of 16 bits")
+        raise DatasetError(f"{path}: is not a depth map; it needs one channel of 16 bits")
     _check_size(path, raw.shape[1::-1], size)
     if not raw.any():
         raise DatasetError(f"{path}: its depth is 0 everywhere; restore it, or replay with --depth network")

@@ -34,7 +34,7 @@ class Copies:
         if names_video and not (len(pictures) == 1 and pictures[0].is_video):
             raise UsageError(f"{out}: is the name of one video, and there are other pictures; name a folder with --out")
         if out.exists() and not out.is_dir() and not names_video:
-            raise UsageError(f"{out}: is no folder; name one with --out, or a video ending in .mp4")
+            raise UsageError(f"{out}: is not a folder; name one with --out, or a video ending in .mp4")
         taken: dict[Path, Path] = {}
         for picture in pictures:
             kept = picture.path.suffix if picture.path.suffix.lower() in _JPEG else ".png"

@@ -75,7 +75,7 @@ class PictureFile:
         for index, time_s, image in images_of_video(self.path, every):
             yield Picture(f"{self.path}#{index}", image, time_s)
         if index is None:
-            raise DatasetError(f"{self.path}: is no video that can be decoded; restore it, or convert it to MP4")
+            raise DatasetError(f"{self.path}: cannot be decoded as a video; restore it, or convert it to MP4")
 
 
 _USUAL_RATE_HZ = 30.0
@@ -115,7 +115,7 @@ def find_pictures(
             raise UsageError(f"{path}: is not an ordinary file; name an image, a video or a folder")
         elif path.suffix.lower() not in endings:
             raise UsageError(
-                f"{path}: is no image or video by its name; its name ends in one of {', '.join(sorted(endings))}"
+                f"{path}: is not an image or a video by its name; its name ends in one of {', '.join(sorted(endings))}"
             )
         else:
             found.setdefault(path.resolve(), PictureFile(path, path.parent))

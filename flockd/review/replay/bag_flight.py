@@ -308,7 +308,7 @@ class Bag:
                 if one.msgtype not in self._store.fielddefs and one.msgdef.data:
                     self._store.register(get_types_from_msg(one.msgdef.data, one.msgtype))
         except (ReaderError, TypesysError, OSError, ValueError, KeyError) as error:
-            raise RecordingError(f"{folder}: is no bag that can be read ({error}); use another copy") from error
+            raise RecordingError(f"{folder}: is not a readable bag ({error}); use another copy") from error
 
     def __enter__(self) -> Self:
         return self

@@ -108,7 +108,7 @@ def load_reference(path: Path) -> Outputs:
         if len(outputs) != head["steps"]:
             raise RecordingError(f"{path}: is cut off after {len(outputs)} of {head['steps']} steps; {_WHAT_TO_DO}")
     except (ValueError, KeyError, TypeError) as error:
-        raise RecordingError(f"{path}: is no reference of outputs ({error}); {_WHAT_TO_DO}") from error
+        raise RecordingError(f"{path}: is not a file of reference outputs ({error}); {_WHAT_TO_DO}") from error
     return outputs
 
 

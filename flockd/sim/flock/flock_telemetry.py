@@ -214,7 +214,7 @@ class FlockTelemetry:
     def _take(self, drone: int, command: str, payload: bytes) -> None:
         """Raises ValueError with the reason for which it is refused."""
         if command not in ORDERS | REQUESTS:
-            raise ValueError(f"{command:.40} is an autopilot's, and simulated drones have Hold alone")
+            raise ValueError(f"{command:.40} needs an autopilot; simulated drones only accept hold")
         ask = parse_ask(payload)
         order = parse_order(command, ask["order"]) if command in ORDERS else None
         with self._lock:

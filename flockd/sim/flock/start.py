@@ -46,7 +46,7 @@ def scattered(scenario: ScenarioConfig, scatter_m: float) -> ScenarioConfig:
             places = zip(scenario.vehicles, moved.tolist(), strict=True)
             vehicles = tuple(vehicle.model_copy(update={"position_m": tuple(place)}) for vehicle, place in places)
             return scenario.model_copy(update={"vehicles": vehicles})
-    raise UsageError(f"no starts of seed {scenario.seed} were {MIN_START_DISTANCE_M:g} m apart; write less scatter_m")
+    raise UsageError(f"no starts of seed {scenario.seed} were {MIN_START_DISTANCE_M:g} m apart; reduce scatter_m")
 
 
 def _further(given: tuple[StartConfig, ...], count: int) -> tuple[StartConfig, ...]:

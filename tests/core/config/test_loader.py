@@ -130,7 +130,7 @@ SLIPS = (
     ("---", "a second document begins here"),
     ("autopilot: {address: /dev/ttyAMA0}", "autopilot.address: /dev/ttyAMA0 is not an address; write an address, as"),
     ("telemetry: {listen: ['0.0.0.0:7447']}", "telemetry.listen[0]: '0.0.0.0:7447' is not a zenoh endpoint; write a"),
-    (f"source: {{kind: v4l2, cameras: [{CAMERA}], {SLOW}}}", "source: real cameras know real time only; delete"),
+    (f"source: {{kind: v4l2, cameras: [{CAMERA}], {SLOW}}}", "source: real cameras need real time; delete"),
     (f"source: {{kind: shared_memory, {SLOW.replace('0.5', '0.01')}}}", "source.shared_memory.speed_factor: 0.01 is"),
     (f"source: {{kind: shared_memory, {SLOW}}}\n{CABLE}", "source.shared_memory.speed_factor: is for simulations, and"),
 )

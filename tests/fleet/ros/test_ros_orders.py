@@ -49,7 +49,7 @@ def test_a_goal_counts_from_the_missions_origin() -> None:
         ("", (1.0, 0.0, 0.0), ROW, ABOUT, "and not in ''"),
         ("map", (np.nan, 0.0, 0.0), ROW, ABOUT, "finite"),
         ("map", (1.0, 0.0, 0.0), {**ROW, "home_ne": None}, ABOUT, "home is not known in `map`"),
-        ("drone1/odom", (1.0, 0.0, 0.0), ROW, None, "origin is not known yet"),
+        ("drone1/odom", (1.0, 0.0, 0.0), ROW, None, "mission is not known yet"),
     ],
 )
 def test_goals_that_are_none(frame: str, place: tuple[float, ...], row: Any, about: Any, sentence: str) -> None:

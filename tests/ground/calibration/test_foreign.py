@@ -100,7 +100,7 @@ def test_a_lens_without_an_equal_is_refused_with_how_far_the_nearest_is_off(tmp_
     file, out = tmp_path / "theirs.yaml", tmp_path / "ours.yaml"
     file.write_text(_filled(ROS, RATIONAL, MODEL="rational_polynomial"), encoding="utf-8")
     assert main(["calibrate", "import", str(file), "--out", str(out)]) == 1
-    assert "its rational_polynomial of 8 coefficients has no equal here; the nearest" in capsys.readouterr().err
+    assert "its rational_polynomial of 8 coefficients has no equivalent; the nearest" in capsys.readouterr().err
     assert main(["calibrate", "import", str(file), "--out", str(out), "--nearest", "--json"]) == 0
     off_deg = json.loads(capsys.readouterr().out)["cameras"][0]["off_deg"]
     camera = build_rig(load_drone(out).rig).cameras["head_camera"].camera

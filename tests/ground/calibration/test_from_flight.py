@@ -96,7 +96,7 @@ def test_a_rolling_shutter_is_said(tmp_path: Path) -> None:
     said = "rows are read over the images' width in -17 +- 2 ms: a rolling shutter"
     recording, found = recorded(tmp_path), (as_configured, replace(as_configured, camera="left"))
     assert corrected_rig(recording, (turned, seen("left")), "flight", tmp_path / "rig.yaml")["notes"] == [said]
-    with pytest.raises(CalibrationError, match=rf"to be corrected: {re.escape(said)}; what is known agrees"):
+    with pytest.raises(CalibrationError, match=rf"needs no correction: {re.escape(said)}; what is known agrees"):
         corrected_rig(recording, found, "flight", tmp_path / "again.yaml")
 
 
@@ -121,8 +121,8 @@ LITTLE = (np.radians([0.1, -0.2, 0.1]), 0.002, 1.004)
 @pytest.mark.parametrize(
     ("found", "told"),
     [
-        ((seen("front", *LITTLE), seen("left", *LITTLE)), "nothing of the rig is to be corrected"),
-        ((), "says nothing of the rig"),
+        ((seen("front", *LITTLE), seen("left", *LITTLE)), "the rig needs no correction"),
+        ((), "does not show the rig"),
     ],
     ids=["agrees", "silent"],
 )

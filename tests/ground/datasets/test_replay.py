@@ -136,7 +136,7 @@ ODD = "200 0 160\n0 200 120\n0 0 one\n"
         (lambda folder: np.savetxt(folder / "poses.txt", np.ones((6, 16))), 1, "pose 1: its first three columns are"),
         (lambda folder: np.savetxt(folder / "poses.txt", np.full((6, 16), np.inf)), 1, "poses.txt:1: does not fit"),
         (drawn("depth", np.zeros((HEIGHT, WIDTH), np.uint16)), 1, ".png: its depth is 0 everywhere"),
-        (drawn("depth", np.full((HEIGHT, WIDTH), 200, np.uint8)), 1, "is no depth map; it needs one channel of 16"),
+        (drawn("depth", np.full((HEIGHT, WIDTH), 200, np.uint8)), 1, "is not a depth map; it needs one channel of 16"),
         (drawn("depth", np.full(SMALL, 2000, np.uint16)), 1, ".png: is 160 x 120 pixels, and the camera 320"),
         (drawn("images", np.zeros((*SMALL, 3), np.uint8)), 1, ".png: is 160 x 120 pixels, and the camera 320"),
         (calibrated(DOUBLED), 78, "of the image off the middle of"),

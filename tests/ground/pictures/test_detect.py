@@ -197,7 +197,7 @@ def test_a_drones_own_camera_is_taken(capsys: Capture, tmp_path: Path) -> None:
         ((NEAR, *FOV, "--camera", "front"), 2, "--camera is one of --config's, in place of --fov"),
         ((NEAR, *FOV, "--force"), 2, "--force has no meaning without --out"),
         (("nowhere.jpg", *FOV), 2, "nowhere.jpg: does not exist; name an image, a video or a folder"),
-        ((LABELS, *FOV), 2, "drones.json: is no image or video by its name"),
+        ((LABELS, *FOV), 2, "drones.json: is not an image or a video by its name"),
         ((NEAR, *FOV, "--drone-size", "0.01"), 2, "--drone-size, in metres: Input should be"),
     ],
 )
@@ -215,7 +215,7 @@ def test_what_cannot_be_is_said_in_one_sentence(
         ("a.jpg", NEAR.read_bytes()[:9000], "the JPEG ends too early"),
         ("a.jpg", b"P6\n60000 60000\n255\n", "has more pixels than any camera, or none"),
         ("a.jpg", b"P6\n600 600\n255\n", "is no image"),
-        ("a.mp4", b"no video", "is no video that can be decoded"),
+        ("a.mp4", b"no video", "cannot be decoded as a video"),
     ],
     ids=["empty", "text", "cut", "huge PPM", "cut PPM", "video"],
 )
