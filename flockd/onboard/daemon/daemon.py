@@ -43,8 +43,8 @@ LOAD_S = 60.0
 OPEN_S = 10.0
 CLOSE_S = 3.0
 HOLD_S = 1.5
-"""Time for the autopilot to confirm Hold after the control loop has failed, which fed the service's watchdog: systemd kills the
-process 2 s later."""
+"""Time for the autopilot to confirm Hold after the control loop has failed, which fed the service's watchdog: systemd
+kills the process 2 s later."""
 
 
 class DaemonError(FlockdError):
