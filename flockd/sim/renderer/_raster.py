@@ -3,6 +3,9 @@
 No fastmath: a shared edge must give the same crossing from both of its triangles (no holes). Each runs on the thread
 that calls it and releases the GIL, so that several images are drawn side by side. Compiled for parallel rows, they took
 three times as long to compile, and half as much processor time again to run.
+
+The world's pixels are sorted by row into sky, ground and things, and each kind is shaded by a loop without branches, in
+float32: LLVM makes vectors of it, table lookups included, and that takes a quarter of the time.
 """
 # Compiled loops are long: a call for each few lines would cost more than it explains.
 
@@ -14,11 +17,25 @@ from typing import Any
 
 import numpy as np
 from numba import njit
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
 
 from flockd.sim.world.baking import GROUND_MAP_BITS, sun_reaches
 from flockd.sim.world.sky import SKY_BITS
 from flockd.sim.world.textures import TEXTURE_BITS
 
+
+class _Apart(CompilerBase):
+    """For functions whose arrays do not overlap: only then does LLVM make vectors of loops that look things up."""
+
+    def define_pipelines(self) -> Any:
+        """The usual one."""
+        self.state.flags.noalias = True
+        return [DefaultPassBuilder.define_nopython_pipeline(self.state)]  # type: ignore[no-untyped-call]
+
+
+_loop = njit(nogil=True, cache=True, error_model="numpy", pipeline_class=_Apart)
+_part = njit(cache=True, error_model="numpy", forceinline=True)
+f32, i32, u32 = np.float32, np.int32, np.uint32  # numba's operations give the widest type of their numbers
 _TEXTURE_AREA = ((4 << (2 * TEXTURE_BITS)) - 1) // 3
 """Texels of a texture's pyramid."""
 SUBSAMPLES = 3
@@ -27,15 +44,14 @@ Eye = namedtuple("Eye", ["K", "inverse_K", "R", "origin", "focal"])
 """A pinhole camera in the world: `Renderer.render` says of what shapes; `R` is from optical axes to NED."""
 Scene = namedtuple(
     "Scene",
-    "normals texture uv level tint texels ground_map ground_kind ground_detail extent_m shadow_map shadow_frame light "
-    "fog_per_m sky tone",
+    "faces texels ground_map ground_kind ground_detail extent_m shadow_map shadow_frame light fog_per_m sky tone",
 )
-"""What colours of a `World` are made of, by the names and with the shapes that it has there."""
-Thing = namedtuple("Thing", ["identity", "rotation", "position", "normals", "texture", "uv", "colours", "texels"])
-"""What is laid over an image: a drone of a pose, and its number there.
+"""What colours of a `World` are made of, by the names and with the shapes that it has there, in float32.
 
-`normals` are NED, `uv` is in body axes, `texels` are its machine textures.
+`faces` (m, 16): each triangle's normal, tint, log2 of texels per metre, texture and uv.
 """
+Thing = namedtuple("Thing", ["identity", "faces", "texels"])
+"""What is laid over an image: a drone of a pose, and its number there. `texels` are its machine textures."""
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -86,10 +102,10 @@ def _cross(a: Any, b: Any) -> Any:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@njit(cache=True, error_model="numpy")
-def _at(plane: Any, begin: int, x: float, y: float) -> float:
-    """A plane's edge function or 1/z, the one whose coefficients begin there."""
-    return float(plane[begin] * x + plane[begin + 1] * y + plane[begin + 2])
+@_part
+def _at(planes: Any, t: Any, begin: int, x: float, y: float) -> Any:
+    """A triangle's edge function or 1/z, the one whose coefficients begin there."""
+    return planes[u32(t), begin] * x + planes[u32(t), begin + 1] * y + planes[u32(t), begin + 2]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -114,79 +130,98 @@ def fill(visible: Any, rows: Any, planes: Any, inverse_depth: Any, hit: Any) -> 
             if low > high:
                 continue
             x0 = math.ceil(low)
-            step, start = np.float32(p[9]), np.float32(_at(p, 9, x0 + 0.5, v))
+            step, start = np.float32(p[9]), np.float32(_at(planes, t, 9, x0 + 0.5, v))
             for x in range(x0, math.floor(high) + 1):
                 value = start + step * np.float32(x - x0)
                 if value > inverse_depth[y, x]:
                     inverse_depth[y, x], hit[y, x] = value, t
 
 
-@njit(cache=True, error_model="numpy")
-def _spread(packed: Any) -> Any:
-    """Four packed bytes, each in 16 bits of its own: the first, third, second and fourth from below."""
-    wide = np.uint64(packed)
-    return (wide | wide << np.uint64(24)) & np.uint64(0x00FF00FF00FF00FF)
-
-
-@njit(cache=True, error_model="numpy")
+@_part
 def _blend(a: Any, b: Any, weight: Any) -> Any:
-    """Four spread bytes of a and b mixed, weight of b in 1/256."""
-    lanes = np.uint64(0x00FF00FF00FF00FF)
-    return ((a * (np.uint64(256) - weight) + b * weight) >> np.uint64(8)) & lanes
+    """Two bytes of a and b, in 16 bits each, mixed, weight of b in 1/256."""
+    return u32(((a * u32(256 - weight) + b * weight) >> u32(8)) & u32(0x00FF00FF))
 
 
-@njit(cache=True, error_model="numpy")
-def _bilinear(texels: Any, base: int, bits: int, u: float, v: float) -> Any:
-    """Spread colour of one level at (u, v) in tiles, repeating."""
-    mask = (1 << bits) - 1
-    fu, fv = u * ((1 << bits) * 256.0) - 128.0, v * ((1 << bits) * 256.0) - 128.0
-    iu, iv = math.floor(fu), math.floor(fv)
-    x0, y0 = (iu >> 8) & mask, (iv >> 8) & mask
-    x1, row0, row1 = (x0 + 1) & mask, base + (y0 << bits), base + (((y0 + 1) & mask) << bits)
+@_part
+def _bilinear(texels: Any, base: Any, bits: Any, iu: Any, iv: Any) -> Any:
+    """First and third byte, second and fourth of one level at (iu, iv) in 1/256 of a texel, repeating."""
+    mask, lanes, odd = i32((1 << bits) - 1), u32(0x00FF00FF), u32(8)
+    x0, y0 = i32((iu >> 8) & mask), i32((iv >> 8) & mask)
+    x1, row0, row1 = i32((x0 + 1) & mask), i32(base + (y0 << bits)), i32(base + (i32((y0 + 1) & mask) << bits))
+    wide, high = u32(iu & 255), u32(iv & 255)
     # Unsigned indices spare the check for negative ones.
-    wide, high = np.uint64(iu & 255), np.uint64(iv & 255)
-    a = _blend(_spread(texels[np.uint64(row0 + x0)]), _spread(texels[np.uint64(row0 + x1)]), wide)
-    b = _blend(_spread(texels[np.uint64(row1 + x0)]), _spread(texels[np.uint64(row1 + x1)]), wide)
-    return _blend(a, b, high)
+    a, b, c, d = texels[u32(row0 + x0)], texels[u32(row0 + x1)], texels[u32(row1 + x0)], texels[u32(row1 + x1)]
+    return (
+        _blend(_blend(a & lanes, b & lanes, wide), _blend(c & lanes, d & lanes, wide), high),
+        _blend(
+            _blend((a >> odd) & lanes, (b >> odd) & lanes, wide), _blend((c >> odd) & lanes, (d >> odd) & lanes, wide),
+            high,
+        ),
+    )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
-def sample(texels: Any, base: int, bits: int, u: float, v: float, level: float) -> Any:
-    """Trilinear spread colour; ``level`` 0 is the finest of ``bits`` + 1 levels, stored in turn from ``base``."""
-    if level <= 0.0:
-        return _bilinear(texels, base, bits, u, v)
-    whole = int(level)
-    if whole >= bits:
-        return _spread(texels[base + ((4 << (2 * bits)) - 1) // 3 - 1])
-    # Levels before this one hold 4^bits + 4^(bits-1) + ... texels.
-    start = base + ((4 << (2 * bits)) - (4 << (2 * (bits - whole)))) // 3
-    fine = _bilinear(texels, start, bits - whole, u, v)
-    weight = np.uint64((level - whole) * 256.0)
-    coarse = _bilinear(texels, start + (1 << (2 * (bits - whole))), bits - whole - 1, u, v)
-    return _blend(fine, coarse, weight)
+@_part
+def sample(texels: Any, base: Any, bits: Any, u: Any, v: Any, level: Any) -> Any:
+    """Trilinear colour at (u, v) in tiles, repeating, its bytes spread: the first in bits 0 to 15, then 3rd, 2nd, 4th.
+
+    ``level`` 0 is the finest of ``bits`` + 1 levels, stored in turn from ``base``.
+    """
+    level = min(max(level, f32(0.0)), f32(bits))
+    whole = min(i32(level), i32(bits - 1))
+    weight, left = u32((level - f32(whole)) * f32(256.0)), i32(bits - whole)
+    across, area = f32(i32(i32(256) << left)), i32(i32(1) << i32(2 * left))
+    iu, iv = i32(np.floor(u * across - f32(128.0))), i32(np.floor(v * across - f32(128.0)))
+    # Levels before this one hold 4^bits + 4^(bits-1) + ... texels: every second bit of a number.
+    start = i32(base + 4 * (0x55555555 & (1 << 2 * bits) - 1) - 4 * (0x55555555 & i32(area - 1)))
+    fine = _bilinear(texels, start, left, iu, iv)
+    coarse = _bilinear(texels, i32(start + area), i32(left - 1), i32((iu - 128) >> 1), i32((iv - 128) >> 1))
+    odd = np.uint64(_blend(fine[1], coarse[1], weight))
+    return np.uint64(_blend(fine[0], coarse[0], weight)) | odd << np.uint64(32)
 
 
-@njit(cache=True, error_model="numpy")
-def _byte(spread: Any, shift: int) -> float:
+@_part
+def _byte(spread: Any, shift: int) -> Any:
     """One channel of a spread colour, linear light: textures are stored as square roots."""
-    value = float((spread >> np.uint64(shift)) & np.uint64(255)) * (1.0 / 255.0)
+    value = f32(i32((spread >> np.uint64(shift)) & np.uint64(255))) * f32(1.0 / 255.0)
     return value * value
 
 
-@njit(cache=True, error_model="numpy")
-def _seen(scene: Any, colour: Any, fine: Any, normal_d: float, lit: float, away: float) -> Any:
+@_part
+def _log2(value: Any) -> Any:
+    """Of a positive float32, to 1.2e-4, by a polynomial of its mantissa."""
+    bits = f32(value).view(i32)
+    m = i32((bits & 0x7FFFFF) | 0x3F800000).view(f32)
+    return f32((bits >> 23) - 127) + (
+        f32(-2.49835315) + m * (f32(4.02921139) + m * (f32(-2.07833517) + m * (f32(0.62603218) - m * f32(0.07844068))))
+    )
+
+
+@_part
+def _exp2(value: Any) -> Any:
+    """2 to the power of a float32 from -125 to 0, to 1e-4 of it."""
+    whole = np.floor(value)
+    f = value - whole
+    of_f = f32(0.99990029) + f * (f32(0.69632477) + f * (f32(0.22469316) + f * f32(0.07896726)))
+    return of_f * i32((i32(whole) + 127) << 23).view(f32)
+
+
+@_part
+def _seen(scene: Any, colour: Any, fine: Any, normal_d: Any, lit: Any, away: Any) -> Any:
     """Linear light (r, g, b) of a surface's colour and texel, in the sun's share ``lit``, through so much haze.
 
     On it falls sun, sky from above and light from the ground.
     """
-    light, up, clear = scene.light, 0.5 - 0.5 * normal_d, math.exp(-scene.fog_per_m * away)
-    red = light[1, 0] * lit + light[2, 0] * up + light[3, 0] * (1.0 - up)
-    green = light[1, 1] * lit + light[2, 1] * up + light[3, 1] * (1.0 - up)
-    blue = light[1, 2] * lit + light[2, 2] * up + light[3, 2] * (1.0 - up)
+    light, up = scene.light, f32(0.5) - f32(0.5) * f32(normal_d)
+    clear = _exp2(max(f32(-125.0), f32(-1.0 / math.log(2.0)) * scene.fog_per_m * f32(away)))
+    red = light[1, 0] * f32(lit) + light[2, 0] * up + light[3, 0] * (f32(1.0) - up)
+    green = light[1, 1] * f32(lit) + light[2, 1] * up + light[3, 1] * (f32(1.0) - up)
+    blue = light[1, 2] * f32(lit) + light[2, 2] * up + light[3, 2] * (f32(1.0) - up)
+    clear_2, haze = f32(2.0) * clear, f32(1.0) - clear
     return (
-        2.0 * colour[0] * _byte(fine, 0) * red * clear + light[4, 0] * (1.0 - clear),
-        2.0 * colour[1] * _byte(fine, 32) * green * clear + light[4, 1] * (1.0 - clear),
-        2.0 * colour[2] * _byte(fine, 16) * blue * clear + light[4, 2] * (1.0 - clear),
+        colour[0] * _byte(fine, 0) * red * clear_2 + light[4, 0] * haze,
+        colour[1] * _byte(fine, 32) * green * clear_2 + light[4, 1] * haze,
+        colour[2] * _byte(fine, 16) * blue * clear_2 + light[4, 2] * haze,
     )
 
 
@@ -216,122 +251,241 @@ def shade_scene(hit: Any, planes: Any, eye: Any, scene: Any, blobs: Any, rgb: An
 
     ``blobs`` (k, 9): a drone's place, radius and darkness; left, top, right and bottom of where its shadow may be.
     """
-    origin, tone, sun, size = eye.origin, scene.tone, scene.light[0], 1 << GROUND_MAP_BITS
-    limit = 0.5 - 0.51 / (1 << SKY_BITS)  # off the opposite border
-    sharper, of_map = math.log2(eye.focal) + 0.4, GROUND_MAP_BITS - math.log2(2.0 * scene.extent_m)
+    width, tone, blobs = hit.shape[1], scene.tone.astype(i32), blobs.astype(f32)
+    columns, shown, free = np.empty((3, width), dtype=u32), np.empty(width, dtype=u32), np.empty(width, dtype=f32)
+    skies, grounds, things = columns[0], columns[1], columns[2]
     for y in range(hit.shape[0]):
-        for x in range(hit.shape[1]):
-            t = hit[y, x]
-            cx, cy, rn, re, rd = _ray(eye, x + 0.5, y + 0.5)
-            if t < 0:  # on the sky's map: an octahedral one of the upper half
-                depth[y, x] = np.inf
-                scale = 0.5 / max(1e-9, abs(rn) + abs(re) + max(0.0, -rd))
-                u = max(-limit, min(limit, (rn + re) * scale)) + 0.5
-                v = max(-limit, min(limit, (rn - re) * scale)) + 0.5
-                found = sample(scene.sky, 0, SKY_BITS, u, v, 0.0)
-                _put(rgb, y, x, tone, (4.0 * _byte(found, 0), 4.0 * _byte(found, 32), 4.0 * _byte(found, 16)))
-                continue
-            z = 1.0 / _at(planes[t], 9, x + 0.5, y + 0.5)
-            depth[y, x] = z
-            n, e, d = origin[0] + rn * z, origin[1] + re * z, origin[2] + rd * z
-            nn, ne, nd = scene.normals[t, 0], scene.normals[t, 1], scene.normals[t, 2]
-            length = math.sqrt(cx * cx + cy * cy + 1.0)
-            facing = max(0.02 * length, -(rn * nn + re * ne + rd * nd))
-            # A pixel's footprint: midway between its short side and its long one, which grazing views stretch; a
-            # little sharper than that.
-            level = 0.5 * math.log2(z * z * length / facing) - sharper
-            lit = 1.0
-            for k in range(blobs.shape[0]):
-                if blobs[k, 5] <= x < blobs[k, 7] and blobs[k, 6] <= y < blobs[k, 8]:
-                    lit *= _left_by(blobs[k], sun, n, e, d)
-            kind = scene.texture[t]
-            if kind < 0:
-                u, v = _mirrored(0.5 * e / scene.extent_m + 0.5), _mirrored(0.5 * n / scene.extent_m + 0.5)
-                mapped = sample(scene.ground_map, 0, GROUND_MAP_BITS, u, v, level + of_map)
-                colour = _byte(mapped, 0), _byte(mapped, 32), _byte(mapped, 16)
-                # The ground's sunlight is baked into its map, and beyond that there is no shade.
-                lit *= -sun[2] if max(abs(n), abs(e)) > scene.extent_m else _byte(mapped, 48)
-                ground = scene.ground_kind[min(int(v * size), size - 1), min(int(u * size), size - 1)]
-                kind, tiles = int(scene.ground_detail[ground, 0]), scene.ground_detail[ground, 1]
-                u, v, level, nd = e * tiles, n * tiles, level + scene.ground_detail[ground, 2], -1.0
-            else:
-                colour, of = (scene.tint[t, 0], scene.tint[t, 1], scene.tint[t, 2]), scene.uv[t]
-                u = of[0, 0] * n + of[0, 1] * e + of[0, 2] * d + of[0, 3]
-                v = of[1, 0] * n + of[1, 1] * e + of[1, 2] * d + of[1, 3]
-                level += scene.level[t]
-                cosine = max(0.0, nn * sun[0] + ne * sun[1] + nd * sun[2])
-                if cosine > 0.0:
-                    at = n + 0.08 * nn, e + 0.08 * ne, d + 0.08 * nd
-                    cosine *= sun_reaches(scene.shadow_map, scene.shadow_frame, at[0], at[1], at[2])
-                lit *= cosine
-            fine = sample(scene.texels, kind * _TEXTURE_AREA, TEXTURE_BITS, u, v, level)
-            _put(rgb, y, x, tone, _seen(scene, colour, fine, nd, lit, z * length))
+        row = _row(eye, y)
+        m, g, k = _sort(hit[y], planes, scene.faces, y + 0.5, depth[y], skies, grounds, things)
+        _cast_shadows(blobs, scene.light[0], y, row, depth[y], free)
+        _shade_sky(skies[:m], row, scene.sky, tone, shown)
+        _shade_ground(grounds[:g], hit[y], depth[y], free, row, scene, tone, shown)
+        _shade_things(things[:k], hit[y], depth[y], free, row, scene, tone, shown)
+        for x in range(width):
+            rgb[y, x, 0], rgb[y, x, 1], rgb[y, x, 2] = shown[x] & 255, (shown[x] >> 8) & 255, (shown[x] >> 16) & 255
 
 
-@njit(cache=True, error_model="numpy")
-def _mirrored(share: float) -> float:
+@_part
+def _row(eye: Any, y: int) -> Any:
+    """The `_ray` of a row's first pixel, what one of the next pixel has more, and the eye, in float32."""
+    cx, cy, n, e, d = _ray(eye, 0.5, y + 0.5)
+    dx, _, dn, de, dd = _ray(eye, 1.5, y + 0.5)
+    first, more = (f32(cx), f32(cy), f32(n), f32(e), f32(d)), (f32(dx - cx), f32(dn - n), f32(de - e), f32(dd - d))
+    return first, more, (f32(eye.origin[0]), f32(eye.origin[1]), f32(eye.origin[2]), f32(math.log2(eye.focal) + 0.4))
+
+
+@_part
+def _ray_of(row: Any, column: Any) -> Any:
+    """Through a row's pixel, as `_ray`."""
+    (cx, cy, n, e, d), (dx, dn, de, dd), _ = row
+    x = f32(i32(column))
+    return cx + dx * x, cy, n + dn * x, e + de * x, d + dd * x
+
+
+@_loop
+def _sort(hit: Any, planes: Any, faces: Any, v: float, depth: Any, skies: Any, grounds: Any, things: Any) -> Any:
+    """How many pixels of a row are sky, ground and things; their columns, and all depths."""
+    m, g, k, last, ground, slope, rest, start = 0, 0, 0, -1, False, 0.0, 0.0, 0.0
+    for x in range(hit.shape[0]):
+        t = hit[x]
+        if t < 0:
+            depth[x], skies[m] = np.inf, x
+            m += 1
+            continue
+        if t != last:
+            last, ground = t, faces[t, 7] < 0.0
+            slope, rest, start = planes[t, 9], planes[t, 10] * v, planes[t, 11]
+        depth[x] = 1.0 / (slope * (x + 0.5) + rest + start)
+        if ground:
+            grounds[g] = x
+            g += 1
+        else:
+            things[k] = x
+            k += 1
+    return m, g, k
+
+
+@_loop
+def _cast_shadows(blobs: Any, sun: Any, y: int, row: Any, depth: Any, free: Any) -> None:
+    """Share of sunlight that drones leave to each pixel of a row.
+
+    Of a disc whose edge softens with distance, as the sun is not a point.
+    """
+    one, none = f32(1.0), f32(0.0)
+    free[:] = one
+    for k in range(blobs.shape[0]):
+        bn, be, bd, radius, dark = blobs[k, 0], blobs[k, 1], blobs[k, 2], blobs[k, 3], blobs[k, 4]
+        for x in range(u32(blobs[k, 5]), u32(blobs[k, 7] if blobs[k, 6] <= y < blobs[k, 8] else none)):
+            (_, _, n, e, d), (on, oe, od, _), z = _ray_of(row, x), row[2], depth[x]
+            n, e, d = bn - on - n * z, be - oe - e * z, bd - od - d * z
+            along = n * sun[0] + e * sun[1] + d * sun[2]
+            off = np.sqrt(max(none, n * n + e * e + d * d - along * along))
+            soft = f32(0.35) * radius + f32(0.01) * along
+            covered = max(none, min(one, (radius + f32(0.5) * soft - off) / soft))
+            free[x] *= one - dark * (covered if along > none else none)
+
+
+@_loop
+def _shade_sky(columns: Any, row: Any, sky: Any, tone: Any, shown: Any) -> None:
+    """From its map, an octahedral one of the upper half."""
+    limit = f32(0.5 - 0.51 / (1 << SKY_BITS))  # off the opposite border
+    for i in range(columns.shape[0]):  # over the array itself it would not become vectors
+        x = columns[i]
+        _, _, n, e, d = _ray_of(row, x)
+        scale = f32(0.5) / max(f32(1e-9), abs(n) + abs(e) + max(f32(0.0), -d))
+        u = max(-limit, min(limit, (n + e) * scale)) + f32(0.5)
+        v = max(-limit, min(limit, (n - e) * scale)) + f32(0.5)
+        found, bright = sample(sky, 0, SKY_BITS, u, v, f32(0.0)), f32(4.0)
+        shown[x] = _toned(tone, (bright * _byte(found, 0), bright * _byte(found, 32), bright * _byte(found, 16)))
+
+
+@_loop
+def _shade_ground(columns: Any, hit: Any, depth: Any, free: Any, row: Any, scene: Any, tone: Any, shown: Any) -> None:
+    """From its map of colours and sunlight, which is mirrored beyond its borders, and its detail."""
+    scale, half, size = f32(0.5) / scene.extent_m, f32(0.5), 1 << GROUND_MAP_BITS
+    of_map, unshaded = f32(GROUND_MAP_BITS - math.log2(2.0 * scene.extent_m)), -scene.light[0, 2]
+    for i in range(columns.shape[0]):
+        x = columns[i]
+        n, e, _, level, away = _met(_ray_of(row, x), row[2], scene.faces, u32(hit[x]), depth[x])
+        u, v = _mirrored(e * scale + half), _mirrored(n * scale + half)
+        mapped = sample(scene.ground_map, 0, GROUND_MAP_BITS, u, v, level + of_map)
+        # The ground's sunlight is baked into its map, and beyond that there is no shade.
+        lit = free[x] * (unshaded if max(abs(n), abs(e)) > scene.extent_m else _byte(mapped, 48))
+        column, line = u32(min(u * f32(size), f32(size - 1))), u32(min(v * f32(size), f32(size - 1)))
+        kind, of = u32(scene.ground_kind[line, column]), scene.ground_detail
+        first, tiles, level = i32(i32(of[kind, 0]) * _TEXTURE_AREA), of[kind, 1], level + of[kind, 2]
+        fine = sample(scene.texels, first, TEXTURE_BITS, e * tiles, n * tiles, level)
+        colour = _byte(mapped, 0), _byte(mapped, 32), _byte(mapped, 16)
+        shown[x] = _toned(tone, _seen(scene, colour, fine, f32(-1.0), lit, away))
+
+
+@_loop
+def _shade_things(columns: Any, hit: Any, depth: Any, free: Any, row: Any, scene: Any, tone: Any, shown: Any) -> None:
+    for i in range(columns.shape[0]):
+        x = columns[i]
+        of = _of_thing(scene, scene.faces, scene.texels, u32(hit[x]), _ray_of(row, x), row[2], depth[x], free[x])
+        shown[x] = _toned(tone, of)
+
+
+@_part
+def _of_thing(scene: Any, faces: Any, texels: Any, t: Any, ray: Any, eye: Any, z: Any, free: Any) -> Any:
+    """Linear light (r, g, b) of a triangle's texture and tint, of the sun's share that drones leave it."""
+    n, e, d, level, away = _met(ray, eye, faces, t, z)
+    nn, ne, nd, sun, beside = faces[t, 0], faces[t, 1], faces[t, 2], scene.light[0], f32(0.08)
+    u = faces[t, 8] * n + faces[t, 9] * e + faces[t, 10] * d + faces[t, 11]
+    v = faces[t, 12] * n + faces[t, 13] * e + faces[t, 14] * d + faces[t, 15]
+    at = n + beside * nn, e + beside * ne, d + beside * nd
+    lit = max(f32(0.0), nn * sun[0] + ne * sun[1] + nd * sun[2]) * free
+    lit *= sun_reaches(scene.shadow_map, scene.shadow_frame, at[0], at[1], at[2])
+    fine = sample(texels, i32(i32(faces[t, 7]) * _TEXTURE_AREA), TEXTURE_BITS, u, v, level + faces[t, 6])
+    return _seen(scene, (faces[t, 3], faces[t, 4], faces[t, 5]), fine, nd, lit, away)
+
+
+@_part
+def _met(ray: Any, eye: Any, faces: Any, t: Any, z: Any) -> Any:
+    """Where a ray meets a triangle, north, east and down; log2 of the pixel's footprint in metres; the distance.
+
+    The footprint is midway between its short side and its long one, which grazing views stretch; a little sharper.
+    """
+    (cx, cy, n, e, d), (on, oe, od, sharper) = ray, eye
+    length = np.sqrt(cx * cx + cy * cy + f32(1.0))
+    facing = max(f32(0.02) * length, -(n * faces[t, 0] + e * faces[t, 1] + d * faces[t, 2]))
+    level = f32(0.5) * _log2(z * z * length / facing) - sharper
+    return on + n * z, oe + e * z, od + d * z, level, z * length
+
+
+@_part
+def _toned(tone: Any, linear: Any) -> Any:
+    """Linear light (r, g, b) through the tone curve, which is tabulated over the square root; packed."""
+    most = f32(tone.shape[0] - 1)
+    red = u32(min(most, np.sqrt(max(f32(0.0), linear[0])) * f32(1024.0)))
+    green = u32(min(most, np.sqrt(max(f32(0.0), linear[1])) * f32(1024.0)))
+    blue = u32(min(most, np.sqrt(max(f32(0.0), linear[2])) * f32(1024.0)))
+    return u32(tone[red] | tone[green] << 8 | tone[blue] << 16)
+
+
+@_part
+def _mirrored(share: Any) -> Any:
     """Beyond 0 and 1 a map goes on as its mirror image."""
-    return 1.0 - abs(1.0 - (share - 2.0 * math.floor(0.5 * share)))
-
-
-@njit(cache=True, error_model="numpy")
-def _left_by(blob: Any, sun: Any, n: float, e: float, d: float) -> float:
-    """Share of sunlight that a drone leaves: of a disc whose edge softens with distance, as the sun is not a point."""
-    bn, be, bd = blob[0] - n, blob[1] - e, blob[2] - d
-    along = bn * sun[0] + be * sun[1] + bd * sun[2]
-    if along <= 0.0:
-        return 1.0
-    off = math.sqrt(max(0.0, bn * bn + be * be + bd * bd - along * along))
-    soft = 0.35 * blob[3] + 0.01 * along
-    return float(1.0 - blob[4] * max(0.0, min(1.0, (blob[3] + 0.5 * soft - off) / soft)))
+    return f32(1.0) - abs(f32(1.0) - (share - f32(2.0) * np.floor(f32(0.5) * share)))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def smooth_edges(hit: Any, texture: Any, planes: Any, linear: Any, tone: Any, sharp: Any, rgb: Any) -> None:
+def smooth_edges(hit: Any, grounds: int, planes: Any, linear: Any, tone: Any, sharp: Any, rgb: Any) -> None:
     """Blend colours along edges by coverage: four samples in a pixel ask which of the 3x3 pixels' triangles covers it.
 
-    A sample takes the colour of the pixel where its triangle was seen, so nothing is shaded twice. ``rgb`` comes as a
-    copy of ``sharp``.
+    A sample takes the colour of the pixel where its triangle was seen, so nothing is shaded twice. The first
+    ``grounds`` triangles are the ground. ``rgb`` comes as a copy of ``sharp``.
     """
     height, width = hit.shape
+    marked, near, row, column = np.empty(width, u32), np.empty(9, i32), np.empty(9, i32), np.empty(9, i32)
+    differs = np.empty(width, np.bool_)
     for y in range(height):
-        for x in range(width):
+        above, below = hit[max(0, y - 1)], hit[min(height - 1, y + 1)]
+        for x in marked[: _mark_edges(grounds, hit[y], above, below, differs, marked)]:
             t, edge = hit[y, x], False
             for k in range(4):
                 i, j = x + (k == 0) - (k == 1), y + (k == 2) - (k == 3)
-                if i < 0 or j < 0 or i >= width or j >= height or hit[j, i] == t:
+                if i < 0 or j < 0 or i >= width or j >= height or not _part_ways(grounds, t, hit[j, i]):
                     continue
-                if t >= 0 and hit[j, i] >= 0 and texture[t] < 0 and texture[hit[j, i]] < 0:
-                    continue  # the ground runs on
                 change = 0.0
                 for channel in range(3):
                     change += abs(float(sharp[j, i, channel]) - float(sharp[y, x, channel]))
                 edge = edge or change > 24.0
             if not edge:
                 continue
+            others = 0
+            for j in range(max(0, y - 1), min(height, y + 2)):
+                for i in range(max(0, x - 1), min(width, x + 2)):
+                    if hit[j, i] != t and (others == 0 or hit[j, i] != near[others - 1]):
+                        near[others], row[others], column[others] = hit[j, i], j, i
+                        others += 1
             red, green, blue = 0.0, 0.0, 0.0
             for k in range(4):
                 u, v = x + 0.125 + 0.25 * k, y + 0.125 + 0.25 * ((2 * k + 1) % 5)
                 # The pixel's own triangle first. Where none covers the sample: a neighbour's sky, else the pixel.
-                best, nearest = (y, x), _covering(planes, t, u, v)
-                for j in range(max(0, y - 1), min(height, y + 2)):
-                    for i in range(max(0, x - 1), min(width, x + 2)):
-                        inverse = _covering(planes, hit[j, i], u, v)
-                        if inverse > nearest or (nearest == 0.0 and hit[j, i] < 0 <= hit[best[0], best[1]]):
-                            best, nearest = (j, i), inverse
-                j, i = best
+                j, i, nearest = y, x, _covering(planes, t, u, v)
+                for one in range(others):
+                    inverse = _covering(planes, near[one], u, v)
+                    if inverse > nearest or (nearest == 0.0 and near[one] < 0 <= hit[j, i]):
+                        j, i, nearest = row[one], column[one], inverse
                 red += 0.25 * linear[sharp[j, i, 0]]
                 green += 0.25 * linear[sharp[j, i, 1]]
                 blue += 0.25 * linear[sharp[j, i, 2]]
             _put(rgb, y, x, tone, (red, green, blue))
 
 
-@njit(cache=True, error_model="numpy")
-def _covering(planes: Any, t: int, u: float, v: float) -> float:
+@_loop
+def _mark_edges(grounds: int, row: Any, above: Any, below: Any, differs: Any, marked: Any) -> Any:
+    """In how many places a row differs from its pixel beside, above or below, and where."""
+    count = 0
+    for x in range(row.shape[0]):
+        differs[x] = _part_ways(grounds, row[x], above[x]) | _part_ways(grounds, row[x], below[x])
+    for x in range(1, row.shape[0]):
+        differs[x] |= _part_ways(grounds, row[x], row[x - 1])
+    for x in range(1, row.shape[0]):
+        differs[x - 1] |= _part_ways(grounds, row[x], row[x - 1])
+    for x in range(row.shape[0]):
+        if differs[x]:
+            marked[count] = x
+            count += 1
+    return count
+
+
+@_part
+def _part_ways(grounds: int, t: Any, other: Any) -> Any:
+    """Whether two triangles differ; the ground runs on."""
+    return (t != other) & ((t >= grounds) | (other >= grounds) | (t < 0) | (other < 0))
+
+
+@_part
+def _covering(planes: Any, t: Any, u: float, v: float) -> Any:
     """1/z of a triangle there; 0 beside it, and of the sky."""
-    if t < 0 or _at(planes[t], 0, u, v) < 0.0 or _at(planes[t], 3, u, v) < 0.0 or _at(planes[t], 6, u, v) < 0.0:
-        return 0.0
-    return max(0.0, _at(planes[t], 9, u, v))
+    one = max(t, 0)
+    inside = (
+        (_at(planes, one, 0, u, v) >= 0.0) & (_at(planes, one, 3, u, v) >= 0.0) & (_at(planes, one, 6, u, v) >= 0.0)
+    )
+    return max(0.0, _at(planes, one, 9, u, v)) if inside & (t >= 0) else 0.0
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -343,8 +497,8 @@ def lay_over(
 
     Depth and identity come from the middle sample, the pixel's centre.
     """
-    s, origin, R, position, uv = SUBSAMPLES, eye.origin, thing.rotation, thing.position, thing.uv
-    sun, share = scene.light[0], 1.0 / (s * s)
+    s, share = SUBSAMPLES, 1.0 / (SUBSAMPLES * SUBSAMPLES)
+    at = eye.origin[0], eye.origin[1], eye.origin[2], math.log2(eye.focal)
     for row in range(hit.shape[0] // s):
         y = top + row
         for column in range(hit.shape[1] // s):
@@ -359,28 +513,9 @@ def lay_over(
                         continue
                     covered += 1
                     if t != last:
-                        last, z = t, 1.0 / _at(planes[t], 9, i + 0.5, j + 0.5)
-                        _, _, rn, re, rd = _ray(eye, left + (i + 0.5) / s, top + (j + 0.5) / s)
-                        rn, re, rd = rn * z, re * z, rd * z
-                        away = math.sqrt(rn * rn + re * re + rd * rd)
-                        nn, ne, nd = thing.normals[t, 0], thing.normals[t, 1], thing.normals[t, 2]
-                        n, e = origin[0] + rn - position[0], origin[1] + re - position[1]
-                        d = origin[2] + rd - position[2]
-                        bx = R[0, 0] * n + R[1, 0] * e + R[2, 0] * d
-                        by = R[0, 1] * n + R[1, 1] * e + R[2, 1] * d
-                        bz = R[0, 2] * n + R[1, 2] * e + R[2, 2] * d
-                        tu = uv[t, 0, 0] * bx + uv[t, 0, 1] * by + uv[t, 0, 2] * bz + uv[t, 0, 3]
-                        tv = uv[t, 1, 0] * bx + uv[t, 1, 1] * by + uv[t, 1, 2] * bz + uv[t, 1, 3]
-                        facing = max(0.05, -(rn * nn + re * ne + rd * nd) / away)
-                        # Tiles per metre are the same both ways on a drone.
-                        tile = abs(uv[t, 0, 0]) + abs(uv[t, 0, 1]) + abs(uv[t, 0, 2])
-                        level = math.log2(z / eye.focal / math.sqrt(facing) * float(1 << TEXTURE_BITS) * tile)
-                        fine = sample(thing.texels, thing.texture[t] * _TEXTURE_AREA, TEXTURE_BITS, tu, tv, level)
-                        lit = max(0.0, nn * sun[0] + ne * sun[1] + nd * sun[2])
-                        if lit > 0.0:
-                            at = n + position[0], e + position[1], d + position[2]
-                            lit *= sun_reaches(scene.shadow_map, scene.shadow_frame, at[0], at[1], at[2])
-                        colour = _seen(scene, thing.colours[t], fine, nd, lit, away)
+                        last, z = t, 1.0 / _at(planes, t, 9, i + 0.5, j + 0.5)
+                        ray = _ray(eye, left + (i + 0.5) / s, top + (j + 0.5) / s)
+                        colour = _of_thing(scene, thing.faces, thing.texels, u32(t), ray, at, z, f32(1.0))
                     red, green, blue = red + colour[0], green + colour[1], blue + colour[2]
             if covered == 0:
                 continue
@@ -391,5 +526,5 @@ def lay_over(
             _put(rgb, y, x, scene.tone, (red, green, blue))
             j, i = row * s + s // 2, column * s + s // 2
             if hit[j, i] >= 0 and inverse_depth[j, i] > limit:
-                depth[y, x] = 1.0 / _at(planes[hit[j, i]], 9, i + 0.5, j + 0.5)
+                depth[y, x] = 1.0 / _at(planes, hit[j, i], 9, i + 0.5, j + 0.5)
                 ids[y, x] = thing.identity

@@ -17,7 +17,8 @@ from flockd.sim.renderer import _raster
 from flockd.sim.renderer._raster import Eye, Scene, Thing
 from flockd.sim.renderer.airframe import Solid, machine_texels
 from flockd.sim.world.mesh import face_normals
-from flockd.sim.world.world import World
+from flockd.sim.world.textures import SIZE
+from flockd.sim.world.world import GROUND, World
 
 Indices = NDArray[np.int32]
 Pair = tuple[FloatArray, FloatArray]
@@ -47,7 +48,9 @@ class Renderer:
         self._drones = tuple(drones)
         self._machine = machine_texels()
         self._normals = [face_normals(one.vertices.astype(np.float64), one.triangles) for one in self._drones]
-        self._scene = scene_of(world)
+        # Tiles per metre are the same both ways on a drone.
+        self._levels = [np.log2(SIZE * np.abs(one.uv[:, 0, :3]).sum(axis=1)) for one in self._drones]
+        self._scene, self._grounds = scene_of(world), int((world.texture == GROUND).sum())
         # The middle of the linear values that show as each byte.
         codes = world.tone[: 1 + int(world.tone.argmax())].astype(np.float64)
         self._linear = np.interp(np.arange(256), codes, (np.arange(len(codes)) / 1024.0) ** 2)
@@ -83,7 +86,7 @@ class Renderer:
         planes, hit, _ = rasterized(world.vertices, world.triangles, P, origin, width, height)
         _raster.shade_scene(hit, planes, eye, self._scene, blobs, sharp, depth)
         view = View(rgb=sharp.copy(), depth=depth, ids=np.zeros((height, width), dtype=np.uint8))
-        _raster.smooth_edges(hit, world.texture, planes, self._linear, world.tone, sharp, view.rgb)
+        _raster.smooth_edges(hit, self._grounds, planes, self._linear, world.tone, sharp, view.rgb)
         chosen = np.arange(count)[np.asarray(shown)] if len(np.asarray(shown)) else np.arange(0)
         away_m = np.array([np.linalg.norm(positions[k] - origin) for k in chosen])
         for k in chosen[np.argsort(-away_m, kind="stable")]:
@@ -104,7 +107,9 @@ class Renderer:
         wide, high = s * (right - left), s * (bottom - top)
         zoomed = np.ascontiguousarray(zoom @ P)
         planes, hit, inverse_depth = rasterized(vertices, model.triangles, zoomed, np.zeros(3), wide, high)
-        thing = Thing(k + 1, rotation, position, normals, model.texture, model.uv, model.colours, self._machine)
+        uv = model.uv[:, :, :3] @ rotation.T
+        uv = np.concatenate([uv, model.uv[:, :, 3:] - (uv @ position)[..., None]], axis=2)
+        thing = Thing(k + 1, _faces(normals, model.colours, self._levels[k], model.texture, uv), self._machine)
         _raster.lay_over(
             hit, inverse_depth, planes, left, top, eye, thing, self._scene, self._linear, view.rgb, view.depth, view.ids
         )
@@ -129,7 +134,17 @@ class Renderer:
 
 def scene_of(world: World) -> Scene:
     """What the compiled loops need of a world."""
-    return Scene(**{name: getattr(world, name) for name in Scene._fields})
+    of_world = {name: getattr(world, name) for name in Scene._fields if name != "faces"}
+    single = {name: np.float32(one) for name, one in of_world.items() if np.result_type(one) == np.float64}
+    faces = _faces(world.normals, world.tint, world.level, world.texture, world.uv)
+    return Scene(faces=faces, **(of_world | single))
+
+
+def _faces(
+    normals: FloatArray, colours: FloatArray | Float32Array, level: FloatArray, texture: Indices, uv: FloatArray
+) -> Float32Array:
+    """As `Scene` has them."""
+    return np.column_stack([normals, colours, level, texture, uv.reshape(-1, 8)]).astype(np.float32)
 
 
 def rasterized(

@@ -90,25 +90,29 @@ def shadow_map(
     return shadow, frame
 
 
-@njit(cache=True, error_model="numpy")
-def sun_reaches(shadow: Any, frame: Any, n: float, e: float, d: float) -> float:
+@njit(cache=True, error_model="numpy", forceinline=True)
+def sun_reaches(shadow: Any, frame: Any, n: Any, e: Any, d: Any) -> Any:
     """Share of sunlight at a point, 0 to 1: four neighbours of the shadow map, weighted.
 
     ``frame`` (3, 4) takes a point to map column, map row and height towards the sun; the map holds the highest
     thing's height.
     """
     size = shadow.shape[0]
-    s = frame[0, 0] * n + frame[0, 1] * e + frame[0, 2] * d + frame[0, 3] - 0.5
-    t = frame[1, 0] * n + frame[1, 1] * e + frame[1, 2] * d + frame[1, 3] - 0.5
-    if s < 0.0 or t < 0.0 or s >= size - 1.0 or t >= size - 1.0:
-        return 1.0
+    s = frame[0, 0] * n + frame[0, 1] * e + frame[0, 2] * d + frame[0, 3] - np.float32(0.5)
+    t = frame[1, 0] * n + frame[1, 1] * e + frame[1, 2] * d + frame[1, 3] - np.float32(0.5)
     here = frame[2, 0] * n + frame[2, 1] * e + frame[2, 2] * d + frame[2, 3]
-    i, j = int(s), int(t)
-    ws, wt = s - i, t - j
-    lit = (1.0 - ws) * (1.0 - wt) if here >= shadow[j, i] else 0.0
-    lit += ws * (1.0 - wt) if here >= shadow[j, i + 1] else 0.0
-    lit += (1.0 - ws) * wt if here >= shadow[j + 1, i] else 0.0
-    return lit + (ws * wt if here >= shadow[j + 1, i + 1] else 0.0)
+    first, last = np.int32(0), np.int32(size - 2)
+    column, row = min(max(np.int32(s), first), last), min(max(np.int32(t), first), last)
+    ws, wt = s - np.float32(column), t - np.float32(row)
+    # Unsigned indices spare the check for negative ones.
+    i, j, k, m = np.uint32(column), np.uint32(row), np.uint32(column + 1), np.uint32(row + 1)
+    one, none = np.float32(1.0), np.float32(0.0)
+    lit = (one - ws) * (one - wt) if here >= shadow[j, i] else none
+    lit += ws * (one - wt) if here >= shadow[j, k] else none
+    lit += (one - ws) * wt if here >= shadow[m, i] else none
+    lit += ws * wt if here >= shadow[m, k] else none
+    outside = s < none or t < none or s >= np.float32(size - 1) or t >= np.float32(size - 1)
+    return one if outside else lit
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
