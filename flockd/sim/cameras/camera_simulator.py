@@ -199,15 +199,15 @@ class ImageNoise:
     """Noise that differs from image to image."""
 
     def __init__(self, sigma: float, seed: int) -> None:
-        self._sigma, self._rng = sigma, np.random.default_rng([seed, 2])
-        self._tile = NoiseTile(self._rng) if sigma > 0 else None
+        self._rng = np.random.default_rng([seed, 2])
+        self._tile = NoiseTile(self._rng, sigma) if sigma > 0 else None
 
     def add(self, image: UInt8Array) -> UInt8Array:
         """The image (h, w, 3) with it."""
         if self._tile is None:
             return image
         within = max(NOISE_TILE[0] - image.shape[0], 1), max(NOISE_TILE[1] - image.shape[1], 1)
-        noise = self._sigma * self._tile.crop(image.shape[:2], self._rng, within)
+        noise = self._tile.crop(image.shape[:2], self._rng, within)
         return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), dtype=np.uint8)
 
 

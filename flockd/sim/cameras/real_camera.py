@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, UInt8Array
 from flockd.flight.geometry import Camera
@@ -83,15 +84,21 @@ NOISE_TILE = (1031, 1033)
 class NoiseTile:
     """Standard normal noise that images take crops of."""
 
-    def __init__(self, rng: np.random.Generator) -> None:
-        self._tile = rng.standard_normal((*NOISE_TILE, 3), dtype=np.float32)
+    def __init__(self, rng: np.random.Generator, levels: float | None = None) -> None:
+        """``levels``: its standard deviation in grey levels, to which it is then rounded."""
+        self._tile: NDArray[Any] = rng.standard_normal((*NOISE_TILE, 3), dtype=np.float32)
+        if levels is not None:
+            self._tile = np.rint(levels * self._tile).clip(-255, 255).astype(np.int16)
 
     def crop(
         self, size: tuple[int, ...], rng: np.random.Generator, within: tuple[int, int] = NOISE_TILE
-    ) -> Float32Array:
+    ) -> NDArray[Any]:
         """(height, width, 3) of `size` from a place drawn `within` the first rows and columns, on past its borders."""
-        rows, columns = (rng.integers(begins) + np.arange(side) for begins, side in zip(within, size, strict=True))
-        return self._tile.take(rows, axis=0, mode="wrap").take(columns, axis=1, mode="wrap")
+        (top, left), (height, width) = (int(rng.integers(begins)) for begins in within), size
+        if top + height <= NOISE_TILE[0] and left + width <= NOISE_TILE[1]:
+            return self._tile[top : top + height, left : left + width]
+        rows = self._tile.take(np.arange(top, top + height), axis=0, mode="wrap")
+        return rows.take(np.arange(left, left + width), axis=1, mode="wrap")
 
 
 def noisy(light: Float32Array, normal: Float32Array, config: SensorNoiseConfig) -> Float32Array:
@@ -153,6 +160,9 @@ class RealCamera:
         ``sun`` (3,) is the unit vector towards it in the camera's axes. What is not configured changes no bit.
         """
         config, lens = self._config, self._lens
+        faults = config.shutter.exposure_s, config.shutter.readout_s, config.lens.flare, config.noise.gain
+        if not any(faults) and config.reduce == 1:
+            return view.rgb
         light = linear_light(view.rgb)
         light = exposed(light, view, lens, motion, config.shutter)
         if config.lens.flare:

@@ -55,24 +55,22 @@ Thing = namedtuple("Thing", ["identity", "faces", "texels"])
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def set_up_triangles(q: Any, triangles: Any, width: int, height: int, rows: Any, planes: Any) -> None:
-    """Row range and plane coefficients of each triangle that can be seen; rows (0, -1) for the others.
+def set_up_triangles(
+    vertices: Any, triangles: Any, P: Any, origin: Any, width: int, height: int, rows: Any, planes: Any, visible: Any
+) -> int:
+    """How many triangles can be seen, which, and their row ranges and plane coefficients.
 
     ``planes[t]`` holds three edge functions (a, b, c), positive inside, and 1/z, each linear in (u, v, 1). They are
     homogeneous (cross products of the corners), so a triangle that reaches behind the camera needs no clipping.
     """
+    q, beyond, count = np.empty(vertices.shape), np.empty(len(vertices), np.uint8), 0
+    _project(vertices, P, origin, float(width), float(height), q, beyond)
     for t in range(triangles.shape[0]):
-        rows[t, 0], rows[t, 1] = 0, -1
-        a, b, c = q[triangles[t, 0]], q[triangles[t, 1]], q[triangles[t, 2]]
-        (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (a[0], a[1], a[2]), (b[0], b[1], b[2]), (c[0], c[1], c[2])
-        if az <= 0.0 and bz <= 0.0 and cz <= 0.0:
+        i, j, k = u32(triangles[t, 0]), u32(triangles[t, 1]), u32(triangles[t, 2])
+        if beyond[i] & beyond[j] & beyond[k]:
             continue
-        if (ax < 0.0 and bx < 0.0 and cx < 0.0) or (ay < 0.0 and by < 0.0 and cy < 0.0):
-            continue
-        if ax > width * az and bx > width * bz and cx > width * cz:
-            continue
-        if ay > height * az and by > height * bz and cy > height * cz:
-            continue
+        a, b, c = (q[i, 0], q[i, 1], q[i, 2]), (q[j, 0], q[j, 1], q[j, 2]), (q[k, 0], q[k, 1], q[k, 2])
+        (ax, ay, az), (bx, by, bz), (cx, cy, cz) = a, b, c
         first = _cross(b, c)
         determinant = ax * first[0] + ay * first[1] + az * first[2]
         if determinant > -1e-9:  # seen from behind, or edge on
@@ -87,7 +85,8 @@ def set_up_triangles(q: Any, triangles: Any, width: int, height: int, rows: Any,
                 continue
         if top > bottom:
             continue
-        rows[t, 0], rows[t, 1] = top, bottom
+        visible[count], rows[t, 0], rows[t, 1] = t, top, bottom
+        count += 1
         second, third, p = _cross(c, a), _cross(a, b), planes[t]
         p[0], p[1], p[2] = -first[0], -first[1], -first[2]
         p[3], p[4], p[5] = -second[0], -second[1], -second[2]
@@ -95,9 +94,21 @@ def set_up_triangles(q: Any, triangles: Any, width: int, height: int, rows: Any,
         p[9] = (first[0] + second[0] + third[0]) / determinant
         p[10] = (first[1] + second[1] + third[1]) / determinant
         p[11] = (first[2] + second[2] + third[2]) / determinant
+    return count
 
 
-@njit(cache=True, error_model="numpy")
+@_loop
+def _project(points: Any, P: Any, origin: Any, width: float, height: float, q: Any, beyond: Any) -> None:
+    """Homogeneous pixels, and a bit each for behind the camera, left, above, right and below of the image."""
+    for i in range(points.shape[0]):
+        n, e, d = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+        x, y = P[0, 0] * n + P[0, 1] * e + P[0, 2] * d, P[1, 0] * n + P[1, 1] * e + P[1, 2] * d
+        z = P[2, 0] * n + P[2, 1] * e + P[2, 2] * d
+        q[i, 0], q[i, 1], q[i, 2] = x, y, z
+        beyond[i] = (z <= 0.0) | (x < 0.0) << 1 | (y < 0.0) << 2 | (x > width * z) << 3 | (y > height * z) << 4
+
+
+@_part
 def _cross(a: Any, b: Any) -> Any:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
@@ -114,13 +125,12 @@ def fill(visible: Any, rows: Any, planes: Any, inverse_depth: Any, hit: Any) -> 
     width = hit.shape[1]
     inverse_depth[:], hit[:] = 0.0, -1
     for t in visible:
-        p = planes[t]
         for y in range(rows[t, 0], rows[t, 1] + 1):
             v = y + 0.5
             low, high = 0.0, width - 1.0
             for e in range(0, 9, 3):
-                slope = p[e]
-                rest = p[e + 1] * v + p[e + 2]
+                slope = planes[t, e]
+                rest = planes[t, e + 1] * v + planes[t, e + 2]
                 if slope > 0.0:
                     low = max(low, -rest / slope - 0.5)
                 elif slope < 0.0:
@@ -130,9 +140,9 @@ def fill(visible: Any, rows: Any, planes: Any, inverse_depth: Any, hit: Any) -> 
             if low > high:
                 continue
             x0 = math.ceil(low)
-            step, start = np.float32(p[9]), np.float32(_at(planes, t, 9, x0 + 0.5, v))
+            step, start = f32(planes[t, 9]), f32(_at(planes, t, 9, x0 + 0.5, v))
             for x in range(x0, math.floor(high) + 1):
-                value = start + step * np.float32(x - x0)
+                value = start + step * f32(x - x0)
                 if value > inverse_depth[y, x]:
                     inverse_depth[y, x], hit[y, x] = value, t
 

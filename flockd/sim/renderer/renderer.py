@@ -24,6 +24,7 @@ Indices = NDArray[np.int32]
 Pair = tuple[FloatArray, FloatArray]
 _MOST_DRONES = 254
 """Their ids are bytes."""
+_CORNERS = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-0.4, 0.4)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,16 +119,14 @@ class Renderer:
         """(k, 9) discs that stand for the drones in the sun, and where in the image their shadows may be."""
         world = self._world
         sun = world.light[0]
-        blobs = []
-        for model, position in zip(self._drones, positions, strict=True):
-            if not np.isfinite(position).all():
-                continue
+        blobs, flying = [], np.flatnonzero(np.isfinite(positions).all(axis=1))
+        grounds = -world.height_at(positions[flying, 0], positions[flying, 1])
+        for k, ground in zip(flying, grounds, strict=True):
             # A quadrotor fills roughly half of the disc around it.
-            radius = 0.36 * model.size_m
-            ground = -world.height_at(position[:1], position[1:2])[0]
+            position, radius = positions[k], 0.36 * self._drones[k].size_m
             foot = position - sun * (max(0.0, ground - position[2]) / -sun[2])
             reach = 2.0 * radius + 0.02 * (ground - position[2])
-            spread = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-0.4, 0.4)]) * reach / -sun[2]
+            spread = _CORNERS * reach / -sun[2]
             blobs.append((*position, radius, 0.6, *_bounds((foot + spread - origin) @ P.T, width, height)))
         return np.array(blobs, dtype=np.float64).reshape(-1, 9)
 
@@ -152,12 +151,10 @@ def rasterized(
 ) -> tuple[FloatArray, Indices, Float32Array]:
     """Planes (m, 12) of triangles, and of each pixel the nearest one, -1 for none, and 1/z of it, (h, w)."""
     rows, planes = np.empty((len(triangles), 2), dtype=np.int32), np.empty((len(triangles), 12))
-    x, y, z = (vertices - origin).T[..., None]
-    pixels = np.ascontiguousarray(P[:, 0] * x + P[:, 1] * y + P[:, 2] * z)
-    _raster.set_up_triangles(pixels, triangles, width, height, rows, planes)
+    visible = np.empty(len(triangles), dtype=np.int32)
+    count = _raster.set_up_triangles(vertices, triangles, P, origin, width, height, rows, planes, visible)
     hit, inverse_depth = np.empty((height, width), dtype=np.int32), np.empty((height, width), dtype=np.float32)
-    visible = np.flatnonzero(rows[:, 1] >= rows[:, 0]).astype(np.int32)
-    _raster.fill(visible, rows, planes, inverse_depth, hit)
+    _raster.fill(visible[:count], rows, planes, inverse_depth, hit)
     return planes, hit, inverse_depth
 
 
