@@ -21,7 +21,7 @@ _STEPS = 1 << 14
 """Of linear light in the table back: each grey level has five at least, so that all 256 come back as they were."""
 _GREY = np.arange(256) / 255.0
 _LINEAR = np.where(_GREY <= 0.04045, _GREY / 12.92, ((_GREY + 0.055) / 1.055) ** 2.4).astype(np.float32)
-_LIGHT = np.arange(_STEPS) / (_STEPS - 1)
+_LIGHT = np.minimum(np.arange(1 << 16) / (_STEPS - 1), 1.0)
 _BACK = np.rint(
     255.0 * np.where(_LIGHT <= 0.0031308, 12.92 * _LIGHT, 1.055 * np.maximum(_LIGHT, 1e-9) ** (1 / 2.4) - 0.055)
 ).astype(np.uint8)
@@ -34,7 +34,7 @@ def linear_light(image: UInt8Array) -> Float32Array:
 
 def grey_levels(light: Float32Array) -> UInt8Array:
     """(h, w, 3) of linear light; what is beyond white or below black is cut."""
-    steps = np.rint(np.clip(light, 0.0, 1.0) * np.float32(_STEPS - 1)).astype(np.uint16)
+    steps = cv2.multiply(light, np.full(4, _STEPS - 1.0), dtype=cv2.CV_16U)
     return np.asarray(_BACK[steps], np.uint8)
 
 
@@ -108,8 +108,13 @@ def noisy(light: Float32Array, normal: Float32Array, config: SensorNoiseConfig) 
     gain, and the gain times the mean. The gain is white over the electrons that give it.
     """
     per_electron = np.float32(config.gain / config.full_well_e)
-    variance = np.maximum(light, 0.0) * per_electron + np.float32((per_electron * config.read_noise_e) ** 2)
-    return np.asarray(light + np.sqrt(variance) * normal, np.float32)
+    noise = np.maximum(light, 0.0)  # in place from here on: an image of twice the size fills the cache
+    noise *= per_electron
+    noise += np.float32((per_electron * config.read_noise_e) ** 2)
+    np.sqrt(noise, out=noise)
+    noise *= normal
+    noise += light
+    return noise
 
 
 _HALO_RAD = 0.15
@@ -125,22 +130,26 @@ def veiled(light: Float32Array, flare: float, lens: LensField, sky: BoolArray, s
 
     ``sky`` (h, w): where nothing hides it; ``sun`` (3,): unit vector towards it, in the camera's axes.
     """
-    scattered = flare * (light[lens.imaged].mean(axis=0) + _of_sun(lens, sky, sun)[..., None])
-    return np.asarray(np.where(lens.imaged[..., None], (1 - flare) * light + scattered, light), np.float32)
+    imaged = lens.imaged.view(np.uint8)
+    shown = np.asarray(cv2.add((1 - flare) * light, flare * np.array(cv2.mean(light, imaged))), np.float32)
+    of_sun = _of_sun(lens, sky, sun)
+    if of_sun is not None:
+        shown += flare * of_sun[..., None]
+    return shown if lens.imaged.all() else np.where(lens.imaged[..., None], shown, light)
 
 
-def _of_sun(lens: LensField, sky: BoolArray, sun: FloatArray) -> Float32Array:
-    """(h, w) of its light, all scattered over the image: half evenly, half around it; 0 where it is not seen.
+def _of_sun(lens: LensField, sky: BoolArray, sun: FloatArray) -> Float32Array | None:
+    """(h, w) of its light, all scattered over the image: half evenly, half around it; None where it is not seen.
 
     On the scale where white paper, square to the sun, is 1: it gets pi times as much light as it has radiance.
     """
-    cosine = np.where(lens.imaged, lens.rays @ sun.astype(np.float32), -1.0)
+    cosine = np.where(lens.imaged, lens.rays @ sun.astype(np.float32), np.float32(-1.0))
     row, column = np.unravel_index(int(cosine.argmax()), cosine.shape)
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0)).astype(np.float32)
-    if angle[row, column] > _PIXELS * math.sqrt(lens.solid_angle_sr / lens.imaged.sum()) or not sky[row, column]:
-        return np.zeros(lens.u.shape, np.float32)
+    nearest = math.acos(min(1.0, float(cosine[row, column])))
+    if nearest > _PIXELS * math.sqrt(lens.solid_angle_sr / lens.imaged.sum()) or not sky[row, column]:
+        return None
     falls_in = math.pi * max(float(lens.z_share[row, column]), 0.0)
-    around = np.exp(-angle / _HALO_RAD) / (2 * math.pi * _HALO_RAD**2)
+    around = np.exp(np.arccos(np.clip(cosine, -1.0, 1.0)) / -_HALO_RAD) / (2 * math.pi * _HALO_RAD**2)
     return np.asarray(falls_in * (0.5 / lens.solid_angle_sr + 0.5 * around), np.float32)
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -78,9 +79,9 @@ class LensField:
     v: Float32Array
     """(h, w) as OpenCV counts."""
     by_turn: Float32Array
-    """(h, w, 2, 3) pixels for each radian that the camera turns about its axes."""
+    """(3, h, w, 2) pixels for each radian that the camera turns about its axes."""
     by_move: Float32Array
-    """(h, w, 2, 3) pixels for each metre that it moves, at a range of 1 m."""
+    """(3, h, w, 2) pixels for each metre that it moves, at a range of 1 m."""
     z_share: Float32Array
     """(h, w) z over range along the pixel's ray."""
     imaged: BoolArray
@@ -101,14 +102,14 @@ class LensField:
         x, y, z = np.nan_to_num(rays).T
         zero = np.zeros_like(x)
         cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-        shape = (height, width, 2, 3)
+        shape = (3, height, width, 2)
         grid = np.nan_to_num(rays).reshape(height, width, 3)
         across, down = np.gradient(grid, axis=1), np.gradient(grid, axis=0)
         return cls(
             u=u.astype(np.float32),
             v=v.astype(np.float32),
-            by_turn=(by_point @ cross).reshape(shape).astype(np.float32),
-            by_move=(-by_point).reshape(shape).astype(np.float32),
+            by_turn=np.moveaxis(by_point @ cross, 2, 0).reshape(shape).astype(np.float32),
+            by_move=np.moveaxis(-by_point, 2, 0).reshape(shape).astype(np.float32),
             z_share=z.reshape(height, width).astype(np.float32),
             imaged=imaged.reshape(height, width),
             rays=grid.astype(np.float32),
@@ -128,7 +129,7 @@ def exposed(
     samples = _samples(velocity, lens, motion, shutter.exposure_s)
     instants = (np.arange(samples) + 0.5) / samples - 0.5
     ways = [_way(velocity, lens, motion, row_s + instant * shutter.exposure_s) for instant in instants]
-    if max(float(np.abs(way).max()) for way in ways) < _STILL_PX:
+    if max(_most(way) for way in ways) < _STILL_PX:
         return light
     total = np.zeros_like(light)
     # Between pixels a linear interpolation blurs by itself; a mean of many ways is soft anyway.
@@ -136,7 +137,8 @@ def exposed(
     for way in ways:
         shown = cv2.remap(light, lens.u - way[..., 0], lens.v - way[..., 1], kind, borderMode=cv2.BORDER_REPLICATE)
         total += np.asarray(shown, np.float32)
-    return np.where(lens.imaged[..., None], total / samples, light)
+    total /= samples
+    return total if lens.imaged.all() else np.where(lens.imaged[..., None], total, light)
 
 
 def _read_at(lens: LensField, shutter: ShutterConfig) -> FloatArray:
@@ -157,23 +159,32 @@ def pixel_velocity(view: View, lens: LensField, motion: CameraMotion, within_s: 
     seen = {number: view.ids == number for number in sorted(motion.drones) if (view.ids == number).any()}
     of_drones = {number: _times(lens.by_move, motion.velocity - motion.drones[number]) for number in seen}
     drones_px_s = [_most(turning[mask] + of_drones[n][mask] / range_m[mask][:, None]) for n, mask in seen.items()]
-    reach_px = math.ceil(max([_most(turning + moving / range_m[..., None]), *drones_px_s]) * within_s)
+    reach_px = math.ceil(max([_most(turning + moving / _twice(range_m)), *drones_px_s]) * within_s)
     around = np.ones((2 * min(reach_px, _MOST_WAY_PX) + 1,) * 2, np.uint8)
     range_m = np.asarray(cv2.erode(range_m, around), np.float32)
     for number, mask in seen.items():
         nearest_m = float(view.depth[mask].min())
         mine = (cv2.dilate(mask.astype(np.uint8), around) > 0) & (range_m * lens.z_share > _SAME_DEPTH * nearest_m)
         moving[mine] = of_drones[number][mine]
-    return np.asarray(turning + moving / range_m[..., None], np.float32)
+    return np.asarray(turning + moving / _twice(range_m), np.float32)
 
 
-def _times(by: Float32Array, vector: FloatArray) -> Float32Array:
-    """(h, w, 2) of (h, w, 2, 3) and (3,)."""
-    return np.asarray((by.reshape(-1, 3) @ vector.astype(np.float32)).reshape(by.shape[:3]), np.float32)
+def _twice(values: FloatArray | Float32Array) -> Any:
+    """(..., 2): numpy multiplies whole rows at once, pairs by one number each would take it many times as long."""
+    return values[..., None].repeat(2, axis=-1)
+
+
+def _times(by: Float32Array, vectors: FloatArray) -> Float32Array:
+    """(h, w, 2) of (3, h, w, 2) and (3,), or (3, h, 1, 2) or (3, 1, w, 2) for each row or column."""
+    x, y, z = vectors.astype(np.float32)
+    total = by[0] * x
+    total += by[1] * y
+    total += by[2] * z
+    return np.asarray(total, np.float32)
 
 
 def _most(velocity: Float32Array) -> float:
-    return float(np.abs(velocity).max(initial=0.0))
+    return float(max(velocity.max(initial=0.0), -velocity.min(initial=0.0)))
 
 
 def _samples(velocity: Float32Array, lens: LensField, motion: CameraMotion, exposure_s: float) -> int:
@@ -190,12 +201,7 @@ def _way(velocity: Float32Array, lens: LensField, motion: CameraMotion, row_s: F
     """(h, w, 2) pixels that what is seen has moved since the image's time, when each row of the sensor is exposed."""
     since = motion.shake(np.append(row_s, 0.0))
     shaken = (since[:-1] - since[-1]).astype(np.float32)
-    way = velocity * row_s.astype(np.float32)[..., None]
+    way = velocity * _twice(row_s.astype(np.float32))
     if shaken.any():
-        if len(row_s) == 1:
-            shaken = shaken.reshape(1, -1, 3)
-            way += sum(lens.by_turn[..., axis] * shaken[..., axis, None] for axis in range(3))
-        else:
-            height, width = lens.u.shape
-            way += (lens.by_turn.reshape(height, 2 * width, 3) @ shaken[..., None]).reshape(height, width, 2)
+        way += _times(lens.by_turn, _twice(shaken.T.reshape(3, *row_s.shape)))
     return np.asarray(np.clip(way, -_MOST_WAY_PX, _MOST_WAY_PX), np.float32)
