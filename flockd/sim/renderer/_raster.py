@@ -5,7 +5,8 @@ that calls it and releases the GIL, so that several images are drawn side by sid
 three times as long to compile, and half as much processor time again to run.
 
 The world's pixels are sorted by row into sky, ground and things, and each kind is shaded by a loop without branches, in
-float32: LLVM makes vectors of it, table lookups included, and that takes a quarter of the time.
+float32: LLVM makes vectors of it, table lookups included, which takes a third of the time. Iterating over an array
+within such a loop, or unpacking one, prevents that.
 """
 # Compiled loops are long: a call for each few lines would cost more than it explains.
 
@@ -235,24 +236,29 @@ def _seen(scene: Any, colour: Any, fine: Any, normal_d: Any, lit: Any, away: Any
     )
 
 
-@njit(cache=True, error_model="numpy")
-def _ray(eye: Any, u: float, v: float) -> Any:
+@_part
+def _ray(eye: Any, u: Any, v: Any) -> Any:
     """Through a pixel: right and down of 1 m ahead of the camera, and the ray north, east and down."""
     inverse_K, R = eye.inverse_K, eye.R
     cx = inverse_K[0, 0] * u + inverse_K[0, 1] * v + inverse_K[0, 2]
     cy = inverse_K[1, 1] * v + inverse_K[1, 2]
-    return (
-        cx, cy, R[0, 0] * cx + R[0, 1] * cy + R[0, 2], R[1, 0] * cx + R[1, 1] * cy + R[1, 2],
-        R[2, 0] * cx + R[2, 1] * cy + R[2, 2],
-    )  # fmt: skip
+    n, e = R[0, 0] * cx + R[0, 1] * cy + R[0, 2], R[1, 0] * cx + R[1, 1] * cy + R[1, 2]
+    return f32(cx), f32(cy), f32(n), f32(e), f32(R[2, 0] * cx + R[2, 1] * cy + R[2, 2])
 
 
-@njit(cache=True, error_model="numpy")
-def _put(rgb: Any, y: int, x: int, tone: Any, linear: Any) -> None:
-    """Linear light (r, g, b) into a pixel, through the tone curve, which is tabulated over the square root."""
-    for channel in range(3):
-        index = int(math.sqrt(max(0.0, linear[channel])) * 1024.0)
-        rgb[y, x, channel] = tone[min(index, tone.shape[0] - 1)]
+@_part
+def _toned(tone: Any, linear: Any) -> Any:
+    """Linear light (r, g, b) through the tone curve, which is tabulated over the square root; packed."""
+    most = f32(tone.shape[0] - 1)
+    red = u32(min(most, np.sqrt(max(f32(0.0), linear[0])) * f32(1024.0)))
+    green = u32(min(most, np.sqrt(max(f32(0.0), linear[1])) * f32(1024.0)))
+    blue = u32(min(most, np.sqrt(max(f32(0.0), linear[2])) * f32(1024.0)))
+    return u32(tone[red] | tone[green] << 8 | tone[blue] << 16)
+
+
+@_part
+def _put(rgb: Any, y: Any, x: Any, packed: Any) -> None:
+    rgb[y, x, 0], rgb[y, x, 1], rgb[y, x, 2] = packed & 255, (packed >> 8) & 255, (packed >> 16) & 255
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -264,32 +270,15 @@ def shade_scene(hit: Any, planes: Any, eye: Any, scene: Any, blobs: Any, rgb: An
     width, tone, blobs = hit.shape[1], scene.tone.astype(i32), blobs.astype(f32)
     columns, shown, free = np.empty((3, width), dtype=u32), np.empty(width, dtype=u32), np.empty(width, dtype=f32)
     skies, grounds, things = columns[0], columns[1], columns[2]
+    eye = Eye(eye.K, eye.inverse_K, eye.R, eye.origin, 2.0**0.4 * eye.focal)  # a little sharper
     for y in range(hit.shape[0]):
-        row = _row(eye, y)
         m, g, k = _sort(hit[y], planes, scene.faces, y + 0.5, depth[y], skies, grounds, things)
-        _cast_shadows(blobs, scene.light[0], y, row, depth[y], free)
-        _shade_sky(skies[:m], row, scene.sky, tone, shown)
-        _shade_ground(grounds[:g], hit[y], depth[y], free, row, scene, tone, shown)
-        _shade_things(things[:k], hit[y], depth[y], free, row, scene, tone, shown)
+        _cast_shadows(blobs, scene.light[0], eye, y, depth[y], free)
+        _shade_sky(skies[:m], eye, y, scene.sky, tone, shown)
+        _shade_ground(grounds[:g], eye, y, hit[y], depth[y], free, scene, tone, shown)
+        _shade_things(things[:k], eye, y, hit[y], depth[y], free, scene, tone, shown)
         for x in range(width):
-            rgb[y, x, 0], rgb[y, x, 1], rgb[y, x, 2] = shown[x] & 255, (shown[x] >> 8) & 255, (shown[x] >> 16) & 255
-
-
-@_part
-def _row(eye: Any, y: int) -> Any:
-    """The `_ray` of a row's first pixel, what one of the next pixel has more, and the eye, in float32."""
-    cx, cy, n, e, d = _ray(eye, 0.5, y + 0.5)
-    dx, _, dn, de, dd = _ray(eye, 1.5, y + 0.5)
-    first, more = (f32(cx), f32(cy), f32(n), f32(e), f32(d)), (f32(dx - cx), f32(dn - n), f32(de - e), f32(dd - d))
-    return first, more, (f32(eye.origin[0]), f32(eye.origin[1]), f32(eye.origin[2]), f32(math.log2(eye.focal) + 0.4))
-
-
-@_part
-def _ray_of(row: Any, column: Any) -> Any:
-    """Through a row's pixel, as `_ray`."""
-    (cx, cy, n, e, d), (dx, dn, de, dd), _ = row
-    x = f32(i32(column))
-    return cx + dx * x, cy, n + dn * x, e + de * x, d + dd * x
+            _put(rgb, y, x, shown[x])
 
 
 @_loop
@@ -316,18 +305,19 @@ def _sort(hit: Any, planes: Any, faces: Any, v: float, depth: Any, skies: Any, g
 
 
 @_loop
-def _cast_shadows(blobs: Any, sun: Any, y: int, row: Any, depth: Any, free: Any) -> None:
+def _cast_shadows(blobs: Any, sun: Any, eye: Any, y: int, depth: Any, free: Any) -> None:
     """Share of sunlight that drones leave to each pixel of a row.
 
     Of a disc whose edge softens with distance, as the sun is not a point.
     """
-    one, none = f32(1.0), f32(0.0)
+    one, none, (on, oe, od) = f32(1.0), f32(0.0), eye.origin
     free[:] = one
     for k in range(blobs.shape[0]):
-        bn, be, bd, radius, dark = blobs[k, 0], blobs[k, 1], blobs[k, 2], blobs[k, 3], blobs[k, 4]
+        bn, be, bd = f32(blobs[k, 0] - on), f32(blobs[k, 1] - oe), f32(blobs[k, 2] - od)
+        radius, dark = blobs[k, 3], blobs[k, 4]
         for x in range(u32(blobs[k, 5]), u32(blobs[k, 7] if blobs[k, 6] <= y < blobs[k, 8] else none)):
-            (_, _, n, e, d), (on, oe, od, _), z = _ray_of(row, x), row[2], depth[x]
-            n, e, d = bn - on - n * z, be - oe - e * z, bd - od - d * z
+            (_, _, n, e, d), z = _ray(eye, i32(x) + 0.5, y + 0.5), depth[x]
+            n, e, d = bn - n * z, be - e * z, bd - d * z
             along = n * sun[0] + e * sun[1] + d * sun[2]
             off = np.sqrt(max(none, n * n + e * e + d * d - along * along))
             soft = f32(0.35) * radius + f32(0.01) * along
@@ -336,12 +326,12 @@ def _cast_shadows(blobs: Any, sun: Any, y: int, row: Any, depth: Any, free: Any)
 
 
 @_loop
-def _shade_sky(columns: Any, row: Any, sky: Any, tone: Any, shown: Any) -> None:
+def _shade_sky(columns: Any, eye: Any, y: int, sky: Any, tone: Any, shown: Any) -> None:
     """From its map, an octahedral one of the upper half."""
     limit = f32(0.5 - 0.51 / (1 << SKY_BITS))  # off the opposite border
-    for i in range(columns.shape[0]):  # over the array itself it would not become vectors
+    for i in range(columns.shape[0]):
         x = columns[i]
-        _, _, n, e, d = _ray_of(row, x)
+        _, _, n, e, d = _ray(eye, i32(x) + 0.5, y + 0.5)
         scale = f32(0.5) / max(f32(1e-9), abs(n) + abs(e) + max(f32(0.0), -d))
         u = max(-limit, min(limit, (n + e) * scale)) + f32(0.5)
         v = max(-limit, min(limit, (n - e) * scale)) + f32(0.5)
@@ -350,13 +340,15 @@ def _shade_sky(columns: Any, row: Any, sky: Any, tone: Any, shown: Any) -> None:
 
 
 @_loop
-def _shade_ground(columns: Any, hit: Any, depth: Any, free: Any, row: Any, scene: Any, tone: Any, shown: Any) -> None:
+def _shade_ground(
+    columns: Any, eye: Any, y: int, hit: Any, depth: Any, free: Any, scene: Any, tone: Any, shown: Any
+) -> None:
     """From its map of colours and sunlight, which is mirrored beyond its borders, and its detail."""
     scale, half, size = f32(0.5) / scene.extent_m, f32(0.5), 1 << GROUND_MAP_BITS
     of_map, unshaded = f32(GROUND_MAP_BITS - math.log2(2.0 * scene.extent_m)), -scene.light[0, 2]
     for i in range(columns.shape[0]):
         x = columns[i]
-        n, e, _, level, away = _met(_ray_of(row, x), row[2], scene.faces, u32(hit[x]), depth[x])
+        n, e, _, level, away = _met(eye, i32(x) + 0.5, y + 0.5, scene.faces, u32(hit[x]), depth[x])
         u, v = _mirrored(e * scale + half), _mirrored(n * scale + half)
         mapped = sample(scene.ground_map, 0, GROUND_MAP_BITS, u, v, level + of_map)
         # The ground's sunlight is baked into its map, and beyond that there is no shade.
@@ -370,48 +362,41 @@ def _shade_ground(columns: Any, hit: Any, depth: Any, free: Any, row: Any, scene
 
 
 @_loop
-def _shade_things(columns: Any, hit: Any, depth: Any, free: Any, row: Any, scene: Any, tone: Any, shown: Any) -> None:
+def _shade_things(
+    columns: Any, eye: Any, y: int, hit: Any, depth: Any, free: Any, scene: Any, tone: Any, shown: Any
+) -> None:
     for i in range(columns.shape[0]):
         x = columns[i]
-        of = _of_thing(scene, scene.faces, scene.texels, u32(hit[x]), _ray_of(row, x), row[2], depth[x], free[x])
+        u, v = i32(x) + 0.5, y + 0.5
+        of = _of_thing(scene, scene.faces, scene.texels, u32(hit[x]), eye, u, v, depth[x], free[x])
         shown[x] = _toned(tone, of)
 
 
 @_part
-def _of_thing(scene: Any, faces: Any, texels: Any, t: Any, ray: Any, eye: Any, z: Any, free: Any) -> Any:
+def _of_thing(scene: Any, faces: Any, texels: Any, t: Any, eye: Any, u: Any, v: Any, z: Any, free: Any) -> Any:
     """Linear light (r, g, b) of a triangle's texture and tint, of the sun's share that drones leave it."""
-    n, e, d, level, away = _met(ray, eye, faces, t, z)
+    n, e, d, level, away = _met(eye, u, v, faces, t, z)
     nn, ne, nd, sun, beside = faces[t, 0], faces[t, 1], faces[t, 2], scene.light[0], f32(0.08)
-    u = faces[t, 8] * n + faces[t, 9] * e + faces[t, 10] * d + faces[t, 11]
-    v = faces[t, 12] * n + faces[t, 13] * e + faces[t, 14] * d + faces[t, 15]
+    tu = faces[t, 8] * n + faces[t, 9] * e + faces[t, 10] * d + faces[t, 11]
+    tv = faces[t, 12] * n + faces[t, 13] * e + faces[t, 14] * d + faces[t, 15]
     at = n + beside * nn, e + beside * ne, d + beside * nd
     lit = max(f32(0.0), nn * sun[0] + ne * sun[1] + nd * sun[2]) * free
     lit *= sun_reaches(scene.shadow_map, scene.shadow_frame, at[0], at[1], at[2])
-    fine = sample(texels, i32(i32(faces[t, 7]) * _TEXTURE_AREA), TEXTURE_BITS, u, v, level + faces[t, 6])
+    fine = sample(texels, i32(i32(faces[t, 7]) * _TEXTURE_AREA), TEXTURE_BITS, tu, tv, level + faces[t, 6])
     return _seen(scene, (faces[t, 3], faces[t, 4], faces[t, 5]), fine, nd, lit, away)
 
 
 @_part
-def _met(ray: Any, eye: Any, faces: Any, t: Any, z: Any) -> Any:
-    """Where a ray meets a triangle, north, east and down; log2 of the pixel's footprint in metres; the distance.
+def _met(eye: Any, u: Any, v: Any, faces: Any, t: Any, z: Any) -> Any:
+    """Where a pixel's ray meets a triangle, north, east and down; log2 of the pixel's footprint in metres; how far.
 
-    The footprint is midway between its short side and its long one, which grazing views stretch; a little sharper.
+    The footprint is midway between its short side and its long one, which grazing views stretch.
     """
-    (cx, cy, n, e, d), (on, oe, od, sharper) = ray, eye
+    (cx, cy, n, e, d), at = _ray(eye, u, v), eye.origin
     length = np.sqrt(cx * cx + cy * cy + f32(1.0))
     facing = max(f32(0.02) * length, -(n * faces[t, 0] + e * faces[t, 1] + d * faces[t, 2]))
-    level = f32(0.5) * _log2(z * z * length / facing) - sharper
-    return on + n * z, oe + e * z, od + d * z, level, z * length
-
-
-@_part
-def _toned(tone: Any, linear: Any) -> Any:
-    """Linear light (r, g, b) through the tone curve, which is tabulated over the square root; packed."""
-    most = f32(tone.shape[0] - 1)
-    red = u32(min(most, np.sqrt(max(f32(0.0), linear[0])) * f32(1024.0)))
-    green = u32(min(most, np.sqrt(max(f32(0.0), linear[1])) * f32(1024.0)))
-    blue = u32(min(most, np.sqrt(max(f32(0.0), linear[2])) * f32(1024.0)))
-    return u32(tone[red] | tone[green] << 8 | tone[blue] << 16)
+    level = f32(0.5) * _log2(z * z * length / facing) - f32(math.log2(eye.focal))
+    return f32(at[0]) + n * z, f32(at[1]) + e * z, f32(at[2]) + d * z, level, z * length
 
 
 @_part
@@ -429,10 +414,9 @@ def smooth_edges(hit: Any, grounds: int, planes: Any, linear: Any, tone: Any, sh
     """
     height, width = hit.shape
     marked, near, row, column = np.empty(width, u32), np.empty(9, i32), np.empty(9, i32), np.empty(9, i32)
-    differs = np.empty(width, np.bool_)
     for y in range(height):
         above, below = hit[max(0, y - 1)], hit[min(height - 1, y + 1)]
-        for x in marked[: _mark_edges(grounds, hit[y], above, below, differs, marked)]:
+        for x in marked[: _mark_edges(grounds, hit[y], above, below, marked)]:
             t, edge = hit[y, x], False
             for k in range(4):
                 i, j = x + (k == 0) - (k == 1), y + (k == 2) - (k == 3)
@@ -462,23 +446,20 @@ def smooth_edges(hit: Any, grounds: int, planes: Any, linear: Any, tone: Any, sh
                 red += 0.25 * linear[sharp[j, i, 0]]
                 green += 0.25 * linear[sharp[j, i, 1]]
                 blue += 0.25 * linear[sharp[j, i, 2]]
-            _put(rgb, y, x, tone, (red, green, blue))
+            _put(rgb, y, x, _toned(tone, (red, green, blue)))
 
 
 @_loop
-def _mark_edges(grounds: int, row: Any, above: Any, below: Any, differs: Any, marked: Any) -> Any:
+def _mark_edges(grounds: int, row: Any, above: Any, below: Any, marked: Any) -> Any:
     """In how many places a row differs from its pixel beside, above or below, and where."""
-    count = 0
+    count, before = 0, row[0]
     for x in range(row.shape[0]):
-        differs[x] = _part_ways(grounds, row[x], above[x]) | _part_ways(grounds, row[x], below[x])
-    for x in range(1, row.shape[0]):
-        differs[x] |= _part_ways(grounds, row[x], row[x - 1])
-    for x in range(1, row.shape[0]):
-        differs[x - 1] |= _part_ways(grounds, row[x], row[x - 1])
-    for x in range(row.shape[0]):
-        if differs[x]:
+        t, after = row[x], row[min(x + 1, row.shape[0] - 1)]
+        if t != before or t != after or t != above[x] or t != below[x]:
+            beside = _part_ways(grounds, t, before) | _part_ways(grounds, t, after)
             marked[count] = x
-            count += 1
+            count += beside | _part_ways(grounds, t, above[x]) | _part_ways(grounds, t, below[x])
+        before = t
     return count
 
 
@@ -508,7 +489,6 @@ def lay_over(
     Depth and identity come from the middle sample, the pixel's centre.
     """
     s, share = SUBSAMPLES, 1.0 / (SUBSAMPLES * SUBSAMPLES)
-    at = eye.origin[0], eye.origin[1], eye.origin[2], math.log2(eye.focal)
     for row in range(hit.shape[0] // s):
         y = top + row
         for column in range(hit.shape[1] // s):
@@ -523,9 +503,9 @@ def lay_over(
                         continue
                     covered += 1
                     if t != last:
-                        last, z = t, 1.0 / _at(planes, t, 9, i + 0.5, j + 0.5)
-                        ray = _ray(eye, left + (i + 0.5) / s, top + (j + 0.5) / s)
-                        colour = _of_thing(scene, thing.faces, thing.texels, u32(t), ray, at, z, f32(1.0))
+                        last, z = t, f32(1.0 / _at(planes, t, 9, i + 0.5, j + 0.5))
+                        u, v = left + (i + 0.5) / s, top + (j + 0.5) / s
+                        colour = _of_thing(scene, thing.faces, thing.texels, u32(t), eye, u, v, z, f32(1.0))
                     red, green, blue = red + colour[0], green + colour[1], blue + colour[2]
             if covered == 0:
                 continue
@@ -533,7 +513,7 @@ def lay_over(
             red = linear[rgb[y, x, 0]] * rest + red * share
             green = linear[rgb[y, x, 1]] * rest + green * share
             blue = linear[rgb[y, x, 2]] * rest + blue * share
-            _put(rgb, y, x, scene.tone, (red, green, blue))
+            _put(rgb, y, x, _toned(scene.tone, (red, green, blue)))
             j, i = row * s + s // 2, column * s + s // 2
             if hit[j, i] >= 0 and inverse_depth[j, i] > limit:
                 depth[y, x] = 1.0 / _at(planes, hit[j, i], 9, i + 0.5, j + 0.5)

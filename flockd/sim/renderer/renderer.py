@@ -109,8 +109,9 @@ class Renderer:
         zoomed = np.ascontiguousarray(zoom @ P)
         planes, hit, inverse_depth = rasterized(vertices, model.triangles, zoomed, np.zeros(3), wide, high)
         uv = model.uv[:, :, :3] @ rotation.T
-        uv = np.concatenate([uv, model.uv[:, :, 3:] - (uv @ position)[..., None]], axis=2)
-        thing = Thing(k + 1, _faces(normals, model.colours, self._levels[k], model.texture, uv), self._machine)
+        uv = np.concatenate([uv, model.uv[:, :, 3:] - (uv @ position)[..., None]], axis=2).reshape(-1, 8)
+        faces = np.column_stack([normals, model.colours, self._levels[k], model.texture, uv]).astype(np.float32)
+        thing = Thing(k + 1, faces, self._machine)
         _raster.lay_over(
             hit, inverse_depth, planes, left, top, eye, thing, self._scene, self._linear, view.rgb, view.depth, view.ids
         )
@@ -135,15 +136,8 @@ def scene_of(world: World) -> Scene:
     """What the compiled loops need of a world."""
     of_world = {name: getattr(world, name) for name in Scene._fields if name != "faces"}
     single = {name: np.float32(one) for name, one in of_world.items() if np.result_type(one) == np.float64}
-    faces = _faces(world.normals, world.tint, world.level, world.texture, world.uv)
-    return Scene(faces=faces, **(of_world | single))
-
-
-def _faces(
-    normals: FloatArray, colours: FloatArray | Float32Array, level: FloatArray, texture: Indices, uv: FloatArray
-) -> Float32Array:
-    """As `Scene` has them."""
-    return np.column_stack([normals, colours, level, texture, uv.reshape(-1, 8)]).astype(np.float32)
+    columns = world.normals, world.tint, world.level, world.texture, world.uv.reshape(-1, 8)
+    return Scene(faces=np.column_stack(columns).astype(np.float32), **(of_world | single))
 
 
 def rasterized(
