@@ -26,7 +26,7 @@ LINES = {
     "flockd/fleet": 2_700,
     "flockd/ground": 4_990,
     "flockd/review": 3_590,
-    "flockd/sim": 8_590,
+    "flockd/sim": 8_750,
     "flockd/campaign": 1_480,
     "flockd/cli": 3_660,
     "tests": 38_390,

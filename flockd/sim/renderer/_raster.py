@@ -275,8 +275,8 @@ def shade_scene(hit: Any, planes: Any, eye: Any, scene: Any, blobs: Any, rgb: An
         m, g, k = _sort(hit[y], planes, scene.faces, y + 0.5, depth[y], skies, grounds, things)
         _cast_shadows(blobs, scene.light[0], eye, y, depth[y], free)
         _shade_sky(skies[:m], eye, y, scene.sky, tone, shown)
-        _shade_ground(grounds[:g], eye, y, hit[y], depth[y], free, scene, tone, shown)
-        _shade_things(things[:k], eye, y, hit[y], depth[y], free, scene, tone, shown)
+        _shade_ground(grounds[:g], eye, y, (hit[y], depth[y], free), scene, tone, shown)
+        _shade_things(things[:k], eye, y, (hit[y], depth[y], free), scene, tone, shown)
         for x in range(width):
             _put(rgb, y, x, shown[x])
 
@@ -340,11 +340,9 @@ def _shade_sky(columns: Any, eye: Any, y: int, sky: Any, tone: Any, shown: Any) 
 
 
 @_loop
-def _shade_ground(
-    columns: Any, eye: Any, y: int, hit: Any, depth: Any, free: Any, scene: Any, tone: Any, shown: Any
-) -> None:
+def _shade_ground(columns: Any, eye: Any, y: int, row: Any, scene: Any, tone: Any, shown: Any) -> None:
     """From its map of colours and sunlight, which is mirrored beyond its borders, and its detail."""
-    scale, half, size = f32(0.5) / scene.extent_m, f32(0.5), 1 << GROUND_MAP_BITS
+    (hit, depth, free), scale, half, size = row, f32(0.5) / scene.extent_m, f32(0.5), 1 << GROUND_MAP_BITS
     of_map, unshaded = f32(GROUND_MAP_BITS - math.log2(2.0 * scene.extent_m)), -scene.light[0, 2]
     for i in range(columns.shape[0]):
         x = columns[i]
@@ -362,9 +360,8 @@ def _shade_ground(
 
 
 @_loop
-def _shade_things(
-    columns: Any, eye: Any, y: int, hit: Any, depth: Any, free: Any, scene: Any, tone: Any, shown: Any
-) -> None:
+def _shade_things(columns: Any, eye: Any, y: int, row: Any, scene: Any, tone: Any, shown: Any) -> None:
+    hit, depth, free = row
     for i in range(columns.shape[0]):
         x = columns[i]
         u, v = i32(x) + 0.5, y + 0.5
