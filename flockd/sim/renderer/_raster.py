@@ -179,7 +179,7 @@ def sample(texels: Any, base: Any, bits: Any, u: Any, v: Any, level: Any) -> Any
     ``level`` 0 is the finest of ``bits`` + 1 levels, stored in turn from ``base``.
     """
     level = min(max(level, f32(0.0)), f32(bits))
-    whole = min(i32(level), i32(bits - 1))
+    whole = max(i32(0), min(i32(level), i32(bits - 1)))  # also of NaN
     weight, left = u32((level - f32(whole)) * f32(256.0)), i32(bits - whole)
     across, area = f32(i32(i32(256) << left)), i32(i32(1) << i32(2 * left))
     iu, iv = i32(np.floor(u * across - f32(128.0))), i32(np.floor(v * across - f32(128.0)))
@@ -249,10 +249,10 @@ def _ray(eye: Any, u: Any, v: Any) -> Any:
 @_part
 def _toned(tone: Any, linear: Any) -> Any:
     """Linear light (r, g, b) through the tone curve, which is tabulated over the square root; packed."""
-    most = f32(tone.shape[0] - 1)
-    red = u32(min(most, np.sqrt(max(f32(0.0), linear[0])) * f32(1024.0)))
-    green = u32(min(most, np.sqrt(max(f32(0.0), linear[1])) * f32(1024.0)))
-    blue = u32(min(most, np.sqrt(max(f32(0.0), linear[2])) * f32(1024.0)))
+    most = u32(tone.shape[0] - 1)
+    red = min(most, u32(np.sqrt(max(f32(0.0), linear[0])) * f32(1024.0)))
+    green = min(most, u32(np.sqrt(max(f32(0.0), linear[1])) * f32(1024.0)))
+    blue = min(most, u32(np.sqrt(max(f32(0.0), linear[2])) * f32(1024.0)))
     return u32(tone[red] | tone[green] << 8 | tone[blue] << 16)
 
 
@@ -351,7 +351,7 @@ def _shade_ground(columns: Any, eye: Any, y: int, row: Any, scene: Any, tone: An
         mapped = sample(scene.ground_map, 0, GROUND_MAP_BITS, u, v, level + of_map)
         # The ground's sunlight is baked into its map, and beyond that there is no shade.
         lit = free[x] * (unshaded if max(abs(n), abs(e)) > scene.extent_m else _byte(mapped, 48))
-        column, line = u32(min(u * f32(size), f32(size - 1))), u32(min(v * f32(size), f32(size - 1)))
+        column, line = min(u32(u * f32(size)), u32(size - 1)), min(u32(v * f32(size)), u32(size - 1))
         kind, of = u32(scene.ground_kind[line, column]), scene.ground_detail
         first, tiles, level = i32(i32(of[kind, 0]) * _TEXTURE_AREA), of[kind, 1], level + of[kind, 2]
         fine = sample(scene.texels, first, TEXTURE_BITS, e * tiles, n * tiles, level)
