@@ -417,7 +417,7 @@ def smooth_edges(hit: Any, grounds: int, planes: Any, linear: Any, tone: Any, sh
             t, edge = hit[y, x], False
             for k in range(4):
                 i, j = x + (k == 0) - (k == 1), y + (k == 2) - (k == 3)
-                if i < 0 or j < 0 or i >= width or j >= height or not _part_ways(grounds, t, hit[j, i]):
+                if i < 0 or j < 0 or i >= width or j >= height or not _differ(grounds, t, hit[j, i]):
                     continue
                 change = 0.0
                 for channel in range(3):
@@ -452,17 +452,17 @@ def _mark_edges(grounds: int, row: Any, above: Any, below: Any, marked: Any) -> 
     count, before = 0, row[0]
     for x in range(row.shape[0]):
         t, after = row[x], row[min(x + 1, row.shape[0] - 1)]
-        if t != before or t != after or t != above[x] or t != below[x]:
-            beside = _part_ways(grounds, t, before) | _part_ways(grounds, t, after)
+        if t != before or t != after or t != above[x] or t != below[x]:  # seldom
+            beside = _differ(grounds, t, before) | _differ(grounds, t, after)
             marked[count] = x
-            count += beside | _part_ways(grounds, t, above[x]) | _part_ways(grounds, t, below[x])
+            count += beside | _differ(grounds, t, above[x]) | _differ(grounds, t, below[x])
         before = t
     return count
 
 
 @_part
-def _part_ways(grounds: int, t: Any, other: Any) -> Any:
-    """Whether two triangles differ; the ground runs on."""
+def _differ(grounds: int, t: Any, other: Any) -> Any:
+    """Whether two pixels show different surfaces: all triangles of the ground are one."""
     return (t != other) & ((t >= grounds) | (other >= grounds) | (t < 0) | (other < 0))
 
 
