@@ -46,7 +46,7 @@ test-all: lint ### lint and all tests, those too that take minutes each
 ros: $(ROS_VENV)/ros.installed ### what needs ROS 2: nodes in processes of their own, cameras by topic; with the times it takes
 	$(ROS_VENV)/bin/python -m pytest -m ros -rP tests/fleet/ros tests/tools/release/test_licences.py
 
-faults: $(VENV)/test.installed ### the slow stories of faults of a whole drone, and 20 s of flight from pixels; in about 15 minutes
+faults: $(VENV)/test.installed ### the slow stories of faults of a whole drone, and 20 s of flight from pixels; in about 10 minutes
 	$(BIN)/python -m pytest -n 2 -m "slow and fault and not whole_flight and not browser and not ros" --durations=10
 	$(BIN)/python -m pytest -m slow tests/sim/flock/test_swarm.py -k twenty_seconds_from_pixels
 
