@@ -61,6 +61,15 @@ def test_a_rig_as_configured_is_not_complained_of() -> None:
             assert off_deg(found, np.zeros(3)) < 0.2 or way is STRAIGHT
 
 
+@pytest.mark.parametrize(("sigmas", "told"), [(3.5, 0), (4.5, 3)])
+def test_what_differs_by_less_than_one_in_ten_thousand_right_rigs_do_is_not_told(sigmas: float, told: int) -> None:
+    """Three numbers as one exceed 3.9 standard deviations once in 608 times, 4.9 once in 40,000 (chi-squared)."""
+    sigma = np.array([math.radians(0.5)] * 3 + [0.01, 0.01])
+    turn = np.array([(sigmas + 0.4) * sigma[0], 0.0, 0.0])
+    found = CameraDeviation("front", turn, sigmas * sigma[3], math.exp(sigmas * sigma[4]), np.diag(sigma**2))
+    assert len(rig_faults(found)) == told
+
+
 def test_what_the_attitude_jitters_is_learnt_and_tells_no_mountings() -> None:
     """In still air a circle says little of how mountings are turned about the vertical, with or without jitter."""
     circle = Way(lambda t: rotation_from_euler(0.0, 0.0, 0.1 * t), lively(np.random.default_rng(0)).position)

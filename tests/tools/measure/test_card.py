@@ -13,6 +13,7 @@ import trimesh
 
 from flockd.core.data import data_path
 from flockd.sim.scenario import load_scenario
+from tools.measure import card
 from tools.measure.card import (
     EYES,
     FIGURES,
@@ -159,3 +160,15 @@ def test_real_airframes_are_flown_in_turn_where_they_are_given(tmp_path: Path) -
     assert len(shapes) == 5
     np.testing.assert_allclose(np.ptp(shapes[4].vertices, axis=0), [0.6, 0.3, 0.1], atol=1e-6)
     assert "none.glb: there is no such file" in str(flown(flights[1])["failed"])
+
+
+def test_a_story_that_px4_failed_or_did_not_fly_does_not_count_as_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+    cases = '<testcase name="test_a_b"/>'
+    cases += '<testcase name="test_c[x]"><failure/></testcase><testcase name="d"><skipped/></testcase>'
+
+    def output(*words: str) -> str:
+        Path(words[-1].removeprefix("--junitxml=")).write_text(f"<testsuite>{cases}</testsuite>", encoding="utf-8")
+        return ""
+
+    monkeypatch.setattr(card, "_output", output)
+    assert card._stories() == {"a b": "passed", "c[x]": "failure", "d": "skipped"}
