@@ -52,6 +52,8 @@ class CampaignConfig(Section):
     seed: Annotated[int, Field(ge=0, le=2**53)] = 0
     """Flight n of each cell, from 0, flies with the scenario's seed `seed` + n, in all cells alike: so differences
     between cells and between campaigns are of flights with the same gusts and worlds."""
+    paired: bool = True
+    """False: each cell has seeds of its own, cell c from `seed` + c `seeds` on: so all flights are independent."""
     seeds: Annotated[int, Field(ge=1, le=MAX_SEEDS)]
     """Flights of each cell."""
     fixed: dict[str, Any] = Field(default_factory=dict)
@@ -71,6 +73,10 @@ class CampaignConfig(Section):
     def wanted(self) -> tuple[Figure, ...]:
         """What is measured."""
         return self.measure or tuple(MEASURES)
+
+    def seed_of(self, cell: int, number: int) -> int:
+        """The scenario's seed in one flight, both from 0."""
+        return self.seed + number + (0 if self.paired else cell * self.seeds)
 
     @model_validator(mode="after")
     def _says_nothing_twice(self) -> Self:

@@ -69,7 +69,7 @@ def _lead(results: Results) -> str:
 
 _CURVES = (
     "How to read this: the mean over the seeds, at each value the mean of all cells with it; the band is the 95 % "
-    "confidence interval of that mean. All cells fly the same seeds."
+    "confidence interval of that mean."
 )
 _CELLS = "How to read this: mean over the seeds, and half the width of its 95 % confidence interval."
 _NEAREST = "The flights in which two drones came nearest; the command flies one again, with its full report."

@@ -53,7 +53,7 @@ class Task:
 
     def scenario(self, *, scatter: bool = True) -> ScenarioConfig:
         """Raises ValueError (pydantic's ValidationError) for values that cannot be flown, and UsageError for starts."""
-        values = merged(self.base, {**self.overrides, "seed": self.config.seed + self.run.number})
+        values = merged(self.base, {**self.overrides, "seed": self.config.seed_of(self.run.cell, self.run.number)})
         count = values.pop(DRONES, None)
         scenario = ScenarioConfig.model_validate(values)
         if count is not None:

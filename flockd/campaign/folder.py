@@ -115,7 +115,7 @@ def flight_rows(plan: Plan, flown: Sequence[FlownRun]) -> list[dict[str, Any]]:
             "run": one.run.name,
             "cell": one.run.cell,
             "number": one.run.number,
-            "seed": plan.config.seed + one.run.number,
+            "seed": plan.config.seed_of(one.run.cell, one.run.number),
             **plan.cells[one.run.cell].parameters,
             "status": "flown" if one.reason is None else "failed",
             "reason": one.reason,

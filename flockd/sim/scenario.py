@@ -10,6 +10,7 @@ from math import dist
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 import yaml
 from pydantic import Field, model_validator
 
@@ -20,6 +21,7 @@ from flockd.core.config.loader import Overrides, drone_document, kind_of, overri
 from flockd.core.config.mission import MissionParameters, mission_faults
 from flockd.core.data import data_path
 from flockd.core.errors import ConfigError
+from flockd.core.messages import FloatArray
 from flockd.sim.cameras.imperfect_cameras import CamerasConfig, CameraTimingConfig
 from flockd.sim.renderer.drone_models import FAMILIES
 
@@ -185,8 +187,11 @@ class WorldConfig(Section):
 
 _FITTED = yaml.safe_load((data_path("config") / "perceived" / "shipped_networks.yaml").read_text(encoding="utf-8"))
 _PERCEIVED: dict[str, dict[str, Any]] = {
-    kind: {**errors, "false_m": tuple(errors["false_m"])} for kind, errors in _FITTED["detections"].items()
+    kind: {**errors, "missed": None, "false_m": tuple(errors["false_m"])}
+    for kind, errors in _FITTED["detections"].items()
 }
+_MISSED: dict[str, FloatArray] = {kind: np.transpose(one["missed"]) for kind, one in _FITTED["detections"].items()}
+"""Distances, m, and the share that is missed there."""
 _TRAINED = _PERCEIVED["trained"]
 
 
@@ -201,8 +206,9 @@ class DetectionsConfig(Section):
     of real ones, whose size is said and of which no network learnt ranges."""
     range_m: Positive = 20.0
     """Farther away nobody is detected."""
-    missed: Share = _TRAINED["missed"]
-    """Probability that a drone is not detected in a step."""
+    missed: Share | None = None
+    """Probability that a drone is not detected in a step, the same at all distances; null: at each as measured, and 1
+    beyond."""
     range_error: Annotated[float, Field(gt=0, le=1)] = _TRAINED["range_error"]
     """Standard deviation of the logarithm of a range."""
     bearing_error_rad: Annotated[float, Field(gt=0, le=1)] = _TRAINED["bearing_error_rad"]
@@ -222,6 +228,15 @@ class DetectionsConfig(Section):
     def filled(self) -> Self:
         """With the errors of the airframe where none are written."""
         return type(self)(**{**_PERCEIVED[self.airframe], **self.model_dump(exclude_unset=True)})
+
+    def missed_at(self, range_m: float) -> float:
+        """Probability that a drone so far away is not detected in a step."""
+        if range_m > self.range_m:
+            return 1.0
+        if self.missed is not None:
+            return self.missed
+        distances_m, shares = _MISSED[self.airframe]
+        return float(np.interp(range_m, distances_m, shares, right=1.0))
 
 
 class CameraFaultConfig(Section):

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_plan import Plan, Run
+from flockd.campaign.folder import flight_rows
 from flockd.core.data import data_path
 from flockd.core.errors import ConfigError
 from tests.campaign.flights import HEAD, PAPER, campaign_file
@@ -66,6 +68,16 @@ def test_a_flight_moves_its_starts_by_its_seed_alone(tmp_path: Path) -> None:
     assert all(abs(north - 0.5) <= 0.5 and abs(east + 2.8) <= 0.5 and down == -4.0 for north, east, down in starts)
     later = Plan.load(campaign_file(tmp_path, "seed: 2\n"))
     assert later.task(later.cells[0], 0).scenario() == plan.task(plan.cells[0], 2).scenario()
+
+
+def test_cells_that_are_not_paired_have_seeds_of_their_own(tmp_path: Path) -> None:
+    """Cell c begins at `seed` + c `seeds`: two cells of six flights, from 7 on."""
+    path = campaign_file(tmp_path, "seed: 7\npaired: false\nvary: {drones: {values: [2, 3]}}\n")
+    plan = Plan.load(path)
+    tasks = [plan.task(cell, number) for cell in plan.cells for number in range(plan.config.seeds)]
+    assert [task.scenario().seed for task in tasks] == list(range(7, 19))
+    rows = flight_rows(plan, [FlownRun(task.run) for task in tasks])
+    assert [row["seed"] for row in rows] == list(range(7, 19))
 
 
 def test_a_plan_is_its_own_copy(tmp_path: Path) -> None:

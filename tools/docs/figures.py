@@ -110,11 +110,11 @@ def _paper(parts: Mapping[str, Part]) -> str:
 
 def _encounters(parts: Mapping[str, Part]) -> str:
     rows = [
-        (f"{one['speed_m_s']:g} m/s", one["airframe"], f"{one['range_m']:g} m", str(one["flights"]),
-         f"{one['nearest_m']:g} m", str(one["touched"]))
+        (f"{one['speed_m_s']:g} m/s", one["airframe"], str(one["flights"]), f"{one['nearest_m']:g} m",
+         str(one["touched"]))
         for one in parts["encounters"]["found"]
     ]  # fmt: skip
-    head = "each flies", "airframe", "detected from", "flights", "nearest", "touched"
+    head = "each flies", "airframe", "flights", "nearest", "touched"
     return _table(head, rows) + "\n" + _origin(parts["encounters"])
 
 

@@ -317,22 +317,17 @@ def _measured_by(commit: str, command: str) -> dict[str, Any]:
 
 
 def encounters(results: Results) -> list[dict[str, Any]]:
-    """Of each speed, kind of airframe and range of detection: how many flights, the nearest, and how many touched."""
-    found = []
-    varied = "detections.airframe", "detections.range_m"
+    """Of each speed and kind of airframe: how many flights, the nearest, and how many touched."""
+    found, varied = [], "detections.airframe"
     for speed in sorted({str(case).rpartition("_")[2] for case in results.values_of(CASE)}):
         cases = [case for case in results.values_of(CASE) if str(case).endswith(f"_{speed}")]
-        for airframe, range_m in itertools.product(*(results.values_of(key) for key in varied)):
-            cells = {
-                cell
-                for case in cases
-                for cell in results.cells_with({CASE: case, varied[0]: airframe, varied[1]: range_m})
-            }
+        for airframe in results.values_of(varied):
+            cells = {cell for case in cases for cell in results.cells_with({CASE: case, varied: airframe})}
             near_m = [row["min_distance_m"] for row in results.rows if row["cell"] in cells]
             known = sorted(metres for metres in near_m if metres is not None)
             found.append({
-                "speed_m_s": float(speed), "airframe": airframe, "range_m": range_m, "flights": len(known),
-                "nearest_m": round(known[0], 2), "touched": sum(metres < MIN_START_DISTANCE_M for metres in known),
+                "speed_m_s": float(speed), "airframe": airframe, "flights": len(known), "nearest_m": round(known[0], 2),
+                "touched": sum(metres < MIN_START_DISTANCE_M for metres in known),
             })  # fmt: skip
     return found
 
@@ -427,7 +422,7 @@ def _part(part: str, commit: str, arguments: argparse.Namespace, known: dict[str
         perceived_errors.write(scenarios, families, commit, PERCEIVED)
         found = {"logs": list(logs)}
     elif part == "encounters":
-        found = encounters(_campaign("encounters", 1 if quick else None, results / f"encounters-{size}", workers))
+        found = encounters(_campaign("encounters", 12 if quick else None, results / f"encounters-{size}", workers))
     elif part == "pictures":
         found = _pictures(arguments.labelled, arguments.without_drones)
     elif part == "px4":

@@ -205,7 +205,7 @@ class TrackedNeighbours:
     def _detection(self, offset: FloatArray, errors: FloatArray) -> Measurement | None:
         config = self._config
         range_m = float(np.linalg.norm(offset))
-        if range_m > config.range_m or errors[4] < ndtri(config.missed):
+        if errors[4] < ndtri(config.missed_at(range_m)):
             return None
         bearing = offset / range_m + config.bearing_error_rad * errors[1:4]
         bearing /= np.linalg.norm(bearing)

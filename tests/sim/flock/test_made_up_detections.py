@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -54,9 +55,20 @@ def test_errors_that_are_not_written_are_of_the_airframe() -> None:
 
 
 def test_nobody_is_known_beyond_the_range_nor_when_all_are_missed() -> None:
-    assert np.isnan(known(range_m=9.9)).all()
-    assert np.isfinite(known(range_m=10.1)[0]).all()
+    assert np.isnan(known(missed=0.0, range_m=9.9)).all()
+    assert np.isfinite(known(missed=0.0, range_m=10.1)[0]).all()
     assert np.isnan(known(missed=1.0)).all()
+
+
+@pytest.mark.parametrize(("airframe", "beyond_m"), [("trained", 17.0), ("unknown", 10.1)])
+def test_a_drone_is_missed_as_often_as_it_was_by_sight_at_that_distance(airframe: str, beyond_m: float) -> None:
+    """Half way between two distances by the mean of both; beyond those that were measured always."""
+    perceived = yaml.safe_load((CONFIG / "perceived/shipped_networks.yaml").read_text())["detections"][airframe]
+    for (near_m, near), (far_m, far) in itertools.pairwise(perceived["missed"]):
+        place = np.array([[0.0, 0.0, -5.0], [(near_m + far_m) / 2, 0.0, -5.0]])
+        missed = np.mean([np.isnan(known(seed, 1, place, airframe=airframe)[0]).all() for seed in range(300)])
+        assert missed == pytest.approx((near + far) / 2, abs=0.08), place
+    assert np.isnan(known(steps=40, positions=np.array([[0, 0, -5], [beyond_m, 0, -5]]), airframe=airframe)).all()
 
 
 def test_nobody_is_detected_in_the_view_of_a_camera_that_has_a_fault() -> None:

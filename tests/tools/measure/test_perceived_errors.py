@@ -13,7 +13,7 @@ from flockd.core.messages import FloatArray
 from flockd.review.flight_log.log import FlightLog
 from flockd.sim.scenario import load_scenario
 from tools.measure import perceived_errors
-from tools.measure.perceived_errors import REAL, Samples, detections_missed, fit, samples_of
+from tools.measure.perceived_errors import REAL, Samples, detections_missed, fit, missed_at, samples_of
 
 STEP_S, STEPS = 0.5, 6000
 
@@ -48,7 +48,7 @@ def test_errors_misses_and_false_neighbours_are_measured_as_they_were_made_up(mo
     """Three 6 m apart, whose headings are wrong by 2 degrees; ranges err by 5 % for 2 s, bearings by 0.03, a tenth is
     missed for 2 s and less, and one drone has a false neighbour 4 m away in every tenth step, each time another. In a
     second flight, a hundredth as long, ranges err by 30 % and nobody is missed: it counts as much."""
-    monkeypatch.setattr(perceived_errors, "detections_missed", lambda share, lasts_s: share)
+    monkeypatch.setattr(perceived_errors, "detections_missed", lambda shares, lasts_s: shares)
     random = np.random.default_rng(0)
     position = np.zeros((STEPS, 3, 3))
     position[:, 1, 0] = 6.0
@@ -66,7 +66,9 @@ def test_errors_misses_and_false_neighbours_are_measured_as_they_were_made_up(mo
     like = found["detections"]["trained"]
     assert like["range_error"] == pytest.approx(0.05, rel=0.1)
     assert like["bearing_error_rad"] == pytest.approx(0.03, rel=0.1)
-    assert like["missed"] == pytest.approx(0.1, rel=0.2)
+    (middle_m, missed), (end_m, same) = like["missed"]
+    assert (middle_m, end_m, missed) == (6.0, 7.0, same), "nobody is farther"
+    assert missed == pytest.approx(0.1, rel=0.2)
     assert like["error_time_s"] == pytest.approx(2.0, rel=0.2)
     assert 0.3 < like["missed_time_s"] < 2.0, "one who is missed for 2 s is not always missed"
     assert like["false_at_once"] == pytest.approx(0.1 / 3, rel=0.01)
@@ -75,7 +77,7 @@ def test_errors_misses_and_false_neighbours_are_measured_as_they_were_made_up(mo
     assert (bin_["from_m"], bin_["samples"]) == (5.0, 6 * (STEPS - 6) - STEPS), "but what a lost camera would show"
     assert found["detections"]["unknown"]["range_error"] == pytest.approx(np.log(1.12) / 1.96, abs=1e-4)
     both = fit({"a": flight(position, rows(seen)), "b": unknown, "c": unknown}, {"a": 3, "b": 3, "c": REAL})
-    assert both["detections"]["trained"]["missed"] == pytest.approx(0.05, rel=0.2), "however long, a flight is a flight"
+    assert both["detections"]["trained"]["missed"][0][1] == pytest.approx(0.05, rel=0.2), "each flight counts alike"
 
 
 def test_a_wrong_range_is_neither_a_miss_nor_a_false_neighbour() -> None:
@@ -100,5 +102,14 @@ def test_who_comes_near_is_missed_from_three_seconds_later_on() -> None:
 
 def test_detections_are_missed_more_often_than_tracks() -> None:
     """Which bridge 1.5 s: half of the drones missed for 3 s and more, for which the tracker's own flights are asked."""
-    for_long, shorter = detections_missed(0.2, 30.0), detections_missed(0.2, 3.0)
+    (for_long,), (shorter,) = detections_missed([0.2], 30.0), detections_missed([0.2], 3.0)
     assert 0.2 <= for_long < shorter - 0.04 < 0.46
+
+
+def test_of_a_distance_at_which_few_were_seen_misses_are_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(perceived_errors, "detections_missed", lambda shares, lasts_s: shares)
+    bins = [
+        {"from_m": low, "to_m": high, "samples": samples, "missed": missed}
+        for low, high, samples, missed in ((4, 5, 300, 0.1), (5, 7, 30, 0.4), (7, 10, 29, 0.0))
+    ]
+    assert missed_at(bins, 3.0) == [[4.5, 0.1], [6.0, 0.4], [7, 0.4]]
