@@ -207,8 +207,8 @@ class DetectionsConfig(Section):
     range_m: Positive = 20.0
     """Farther away nobody is detected."""
     missed: Share | None = None
-    """Probability that a drone is not detected in a step, the same at all distances; null: at each as measured, and 1
-    beyond."""
+    """Probability that a drone is not detected in a step, the same at all distances; null: at each distance as it was
+    measured, 1 beyond those."""
     range_error: Annotated[float, Field(gt=0, le=1)] = _TRAINED["range_error"]
     """Standard deviation of the logarithm of a range."""
     bearing_error_rad: Annotated[float, Field(gt=0, le=1)] = _TRAINED["bearing_error_rad"]

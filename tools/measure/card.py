@@ -422,7 +422,7 @@ def _part(part: str, commit: str, arguments: argparse.Namespace, known: dict[str
         perceived_errors.write(scenarios, families, commit, PERCEIVED)
         found = {"logs": list(logs)}
     elif part == "encounters":
-        found = encounters(_campaign("encounters", 12 if quick else None, results / f"encounters-{size}", workers))
+        found = encounters(_campaign("encounters", 18 if quick else None, results / f"encounters-{size}", workers))
     elif part == "pictures":
         found = _pictures(arguments.labelled, arguments.without_drones)
     elif part == "px4":

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.fault("blind-sector")
 
 LOST_S, FLIES_S = 6.0, 30.0
 SEEN_M = 10.0
-"""Detections of flights by sight begin about there."""
+"""Farther away nobody is detected."""
 APART_M = 1.0
 
 
