@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from flockd.campaign.flight_plan import Plan
+from flockd.campaign.results import Results
 from flockd.core.data import data_path
 from flockd.sim.scenario import load_scenario
 from tools.measure import card
@@ -24,6 +26,7 @@ from tools.measure.card import (
     Line,
     _part,
     document,
+    encounters,
     flights_of,
     flown,
     read_lines,
@@ -110,6 +113,21 @@ def test_the_document_names_commit_networks_and_what_each_scenario_gave() -> Non
     assert (paper["sight"]["flights"], paper["sight"]["failed"]) == (2, 1)
     assert paper["sight"]["figures"]["order_tail"]["count"] == 1
     assert "associated_error_p95_m" not in paper["blind"]["figures"]
+
+
+def test_encounters_are_told_by_speed_and_airframe_and_each_flies_with_a_seed_of_its_own() -> None:
+    """Six ways to meet and three strengths of gusts in each row; one that meets head-on at 2 m/s touches."""
+    plan = Plan.load(data_path("config") / "campaigns/encounters.yaml")
+    cells = plan.cells
+    assert len({plan.task(cell, n).scenario().seed for cell in cells for n in (0, plan.config.seeds - 1)}) == 2 * 108
+    bad = {"case": "head_on_2", "detections.airframe": "unknown", "vehicle.gust_m_s": 0.2}
+    rows = [{"cell": one.number, "min_distance_m": 0.69 if one.parameters == bad else 1.234} for one in cells]
+    found = encounters(Results(Path(), plan, (*rows, {"cell": 0, "min_distance_m": None}), 0.0))
+    assert [tuple(one.values()) for one in found] == [
+        (speed, airframe, 18, *((0.69, 1) if (speed, airframe) == (2.0, "unknown") else (1.23, 0)))
+        for speed in (1.0, 2.0, 3.0)
+        for airframe in ("trained", "unknown")
+    ]
 
 
 def test_without_flights_by_sight_one_sentence_says_what_to_fly_before_their_errors(tmp_path: Path) -> None:
