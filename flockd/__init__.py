@@ -6,6 +6,7 @@ Each loads what it needs when it is first used, so that `import flockd` loads no
 
 from __future__ import annotations
 
+import os
 import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, NoReturn
@@ -79,7 +80,13 @@ def __dir__() -> list[str]:
 
 
 def program() -> NoReturn:
-    """The installed `flockd`. Ctrl-C while it is still being imported ends it without a traceback too."""
+    """The installed `flockd`. Ctrl-C while it is still being imported ends it without a traceback too.
+
+    NumPy's linear algebra gets one thread, unless the environment says otherwise: more threads wait for each other on
+    processors that cameras and networks need, and small matrices take ten times as long.
+    """
+    for library in ("OPENBLAS", "MKL"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     try:
         import_module("flockd.cli").program()
     except KeyboardInterrupt:

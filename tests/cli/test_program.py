@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -54,3 +55,23 @@ def test_ctrl_c_while_it_is_imported_ends_it_without_a_traceback() -> None:
         cwd=ROOT, check=False, capture_output=True, text=True, timeout=60.0,
     )  # fmt: skip
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "interrupted\n")
+
+
+def test_linear_algebra_starts_no_threads() -> None:
+    counts = """
+import os, sys, flockd
+
+def program():
+    import numpy
+    print(len(os.listdir("/proc/self/task")))
+
+sys.modules["flockd.cli"] = type(sys)("flockd.cli")
+sys.modules["flockd.cli"].program = program
+flockd.program()
+"""
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    ended = subprocess.run(
+        [sys.executable, "-c", counts], cwd=ROOT, env=environment, check=False, capture_output=True, text=True,
+        timeout=60.0,
+    )  # fmt: skip
+    assert ended.stdout == "1\n", ended.stderr

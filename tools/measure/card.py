@@ -360,7 +360,7 @@ def _campaign(name: str, seeds: int | None, folder: Path, workers: int) -> Resul
 
 def _flockd(*words: str) -> str:
     """What a command of flockd prints."""
-    return _output("-c", "from flockd.cli import program; program()", *words)
+    return _output("-c", "from flockd import program; program()", *words)
 
 
 def _output(*words: str) -> str:

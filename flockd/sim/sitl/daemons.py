@@ -20,12 +20,11 @@ from flockd.sim.sitl.autopilots import Ports
 from flockd.sim.sitl.processes import Program, Programs
 
 READY, STATUS = "READY=1", "STATUS="
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 SMALL = {"MALLOC_ARENA_MAX": "2"}
 """As systemd's unit sets it: fewer, fuller pools of memory."""
 RECORDING = RecordingConfig(images="jpeg", jpeg_quality=80, quota_mb=100000.0)
 """One file for a flight, which costs the daemon little."""
-_RUN = "from flockd.cli import program; program()"
+_RUN = "from flockd import program; program()"
 
 
 def fleet_configs(
@@ -82,7 +81,7 @@ class Daemons(ExitStack):
         super().__init__()
         self._configs, self._folder = configs, folder
         self._recordings = recordings.resolve()  # daemons run in `folder`
-        self._environment = {**environment, **ONE_THREAD, **SMALL}
+        self._environment = {**environment, **SMALL}
         self._listeners = [self.enter_context(_Listener(folder / config.name)) for config in configs]
         self._programs = self.enter_context(Programs())
 
