@@ -13,7 +13,8 @@ import numpy as np
 
 from flockd.core.config.rig import RigConfig
 from flockd.core.data import written_whole
-from flockd.flight.geometry import RigidTransform, build_rig, rotation_from_vector
+from flockd.flight.geometry import Rig, RigidTransform, build_rig, rotation_from_vector
+from flockd.flight.geometry.pairs import PointPairs
 from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.flight.pilot.camera_agreement import moves_otherwise
 from flockd.flight.pilot.motions import background_pairs
@@ -38,6 +39,9 @@ MAX_TURN_RAD, MAX_OFFSET_S, MAX_FOCAL = math.radians(0.5), 0.01, 0.01
 of a focal length."""
 LEAST_S = 5.0
 """Of looks: less says nothing."""
+_AGAIN = 60
+"""So many first looks are judged again by what all of them showed."""
+Look = tuple[Seen, Seen, PointPairs]
 
 
 def found_rig(
@@ -55,6 +59,7 @@ def found_rig(
     pilot = FlockPilot(config, load_side_by_side(config), learned=recording.learned)
     rig = build_rig(config.rig)
     calibration, looks_s, told = RigCalibration(rig), 0.0, set[str]()
+    looks: list[Look] = []
     before: Seen | None = None
     for done, step in enumerate(recording.steps(began_s), start=1):
         trace = StepTrace()
@@ -66,16 +71,30 @@ def found_rig(
             after = Seen(observation.vehicle, step.frames.time_s, times_s)
             if before is not None and observation.previous and observation.previous.time_s == before.frames_s:
                 with contextlib.suppress(ValueError):  # no depth has a scale, or no camera both frames
-                    calibration.update(before, after, background_pairs(rig, observation, config.geometry))
+                    look = before, after, background_pairs(rig, observation, config.geometry)
+                    calibration.update(*look)
                     looks_s += observation.interval_s
+                    if len(looks) < _AGAIN:
+                        looks.append(look)
+                        calibration = judged_again(rig, calibration, looks) if len(looks) == _AGAIN else calibration
         before = after
         progress(done, total)
     if looks_s < LEAST_S:
         return ()
+    if len(looks) < _AGAIN:
+        calibration = judged_again(rig, calibration, looks)
     return tuple(
         replace(one, elsewhere=one.elsewhere or any(text.startswith(moves_otherwise(one.camera)) for text in told))
         for one in calibration.deviations()
     )
+
+
+def judged_again(rig: Rig, first: RigCalibration, looks: Sequence[Look]) -> RigCalibration:
+    """The filter after the same looks, without what ``first`` does not expect after all of them."""
+    again = RigCalibration(rig, first)
+    for look in looks:
+        again.update(*look)
+    return again
 
 
 def corrected_rig(

@@ -57,6 +57,8 @@ _ROUNDS = 2
 _FIT_GAIN = 0.1
 _MAX_MISFIT = 16.0
 """A camera's motion whose normalised square is larger is not used: it followed something that moves."""
+_MAX_UNEXPECTED = 2.8
+"""The same of a motion beside what the whole flight showed: 99 % are less (chi-square with 6 degrees of freedom)."""
 _MAX_INFLATION = 9.0
 """No camera's errors are taken to be larger than three times what it says."""
 _AGREEMENT_GAIN, _AGREES = 0.125, 0.5
@@ -209,7 +211,12 @@ class _Sight:
 class RigCalibration:
     """The filter of one rig. Its state: of each camera the turn, time and focal length, then what all share."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, first: RigCalibration | None = None) -> None:
+        """``first`` has seen the same looks, and is used up: what it does not expect in the end is left out. While
+        nothing is known a camera that is wrong for a step, before the sky for example, is believed."""
+        self._first = first
+        if first is not None:
+            first._wait(math.inf)  # the velocity's error was another one then
         self._cameras = {
             name: _Camera(mounted, mounted.T_body_camera.rotation) for name, mounted in rig.cameras.items()
         }
@@ -243,8 +250,10 @@ class RigCalibration:
         """The state and the body's motion together, beside what the autopilot says of it, by least squares."""
         turned_rad = np.linalg.norm(vector_from_rotation(before.vehicle.R_ned_body.T @ after.vehicle.R_ned_body))
         moves = bool(np.linalg.norm(_went(before, after)) > _MOVES_M or turned_rad > _MOVES_RAD)
-        sights = [self._sight(name, before, after, pairs) for name in self._cameras]
-        used = [sight for sight in sights if sight is not None and self._fits(sight, moves=moves)]
+        looks = before, after, pairs
+        sights = ((name, self._sight(name, *looks)) for name in self._cameras)
+        fitting = [(name, sight) for name, sight in sights if sight is not None and self._fits(sight, moves=moves)]
+        used = [sight for name, sight in fitting if self._first is None or self._first.expects(name, *looks)]
         if not used:
             return
         size, off = len(self._covariance), np.zeros(6)
@@ -350,14 +359,23 @@ class RigCalibration:
         J[:3, size : size + 3], J[3:, size + 3 :] = np.eye(3), sight.R_body_ned
         return J
 
+    def expects(self, name: str, before: Seen, after: Seen, pairs: PointPairs) -> bool:
+        """Whether a camera moved as one of 99 that are as what is known of it now."""
+        sight = self._sight(name, before, after, pairs)
+        return sight is not None and self._square(sight) < _MAX_UNEXPECTED
+
+    def _square(self, sight: _Sight) -> float:
+        """How far a camera's motion is from the expected one: its normalised square."""
+        size, J = len(self._covariance), self._jacobian(sight, np.zeros(6))
+        noise = np.diag([self._turn_variance] * 3 + [_VELOCITY_NOISE_M_S**2] * 3)
+        spread = sight.camera.misfit * sight.spread + J[:, size:] @ noise @ J[:, size:].T
+        spread += J[:, :size] @ self._covariance @ J[:, :size].T
+        return float(sight.measured @ np.linalg.solve(spread, sight.measured)) / len(sight.measured)
+
     def _fits(self, sight: _Sight, *, moves: bool) -> bool:
         """Whether a camera's motion is one that may be; learns how large its errors are, and if the drone moves whether
         they agree."""
-        camera, size, J = sight.camera, len(self._covariance), self._jacobian(sight, np.zeros(6))
-        noise = np.diag([self._turn_variance] * 3 + [_VELOCITY_NOISE_M_S**2] * 3)
-        spread = camera.misfit * sight.spread + J[:, size:] @ noise @ J[:, size:].T
-        spread += J[:, :size] @ self._covariance @ J[:, :size].T
-        square = float(sight.measured @ np.linalg.solve(spread, sight.measured)) / len(sight.measured)
+        camera, square = sight.camera, self._square(sight)
         if not math.isfinite(square):
             return False
         misfit = camera.misfit * min(max(square, 0.1), _MAX_MISFIT) ** _FIT_GAIN
