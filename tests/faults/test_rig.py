@@ -35,7 +35,7 @@ from flockd.sim.scenario import ScenarioConfig, load_scenario
 from tests.faults.stories import Reacted
 from tests.flight.pilot.true_networks import TrueNetworks
 
-pytestmark = [pytest.mark.slow, pytest.mark.whole_flight]
+pytestmark = pytest.mark.slow
 CAMERAS = ("front", "right", "back", "left")
 FAULTS = ("it is not turned as configured", "its time stamps are not as configured", "its focal length is not")
 NAME = "drone1-20261124T120000000000Z.mcap"
