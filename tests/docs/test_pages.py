@@ -38,7 +38,8 @@ def prose_of(page: Path) -> str:
 def anchors_of(page: Path) -> set[str]:
     """As both MkDocs and GitHub make them."""
     headings = re.findall(r"^#+ (.+)$", prose_of(page), re.MULTILINE)
-    return {re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", heading).strip().lower()) for heading in headings}
+    places = re.findall(r'<a id="([\w-]+)"></a>', prose_of(page))
+    return {*places, *(re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", line).strip().lower()) for line in headings)}
 
 
 @by_name

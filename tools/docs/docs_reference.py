@@ -29,8 +29,6 @@ from tools.docs import rooms
 
 FOLDER = Path(__file__).parents[2] / "docs" / "reference"
 NOTICE = "<!-- Written by tools/docs/docs_reference.py; do not edit. -->"
-SCENARIO_KEY = "drone"
-"""A scenario's key: the path of a drone's file, which has its own part of the page."""
 
 
 def main() -> None:
@@ -48,11 +46,18 @@ def pages() -> dict[str, str]:
         "messages.md": messages_page(),
         "faults.md": faults_page(),
         "refusals.md": refusals_page(),
+        "files.md": files_page(),
     }
 
 
 def refusals_page() -> str:
-    """Every reason to refuse arming or offboard, with what to do."""
+    """Every reason to refuse arming or offboard, with what to do; checks that PX4 only names share a row by remedy."""
+    rows: dict[tuple[str, str], tuple[list[str], list[str]]] = {}
+    for name, reason in REASONS.items():
+        check = re.fullmatch("its check (`.+`) fails", reason.what)
+        texts, names = rows.setdefault(("its check fails: " if check else reason.what, reason.remedy), ([], []))
+        texts += [check[1]] if check else []
+        names.append(f"`{name}`")
     return _page(
         "Why the autopilot refuses",
         "Every reason that flockd knows for which an autopilot refuses to arm or to fly offboard, and what to do, in",
@@ -60,56 +65,79 @@ def refusals_page() -> str:
         "[Why not offboard](../real_drone.md#why-not-offboard) shows how they are found.",
         "Names that begin with `check_` or `commander_` are those of PX4's events; the others are flockd's.",
         "",
-        *_table("what is the matter | what to do | name", ((r.what, r.remedy, f"`{n}`") for n, r in REASONS.items())),
+        *_table(
+            "what is the matter | what to do | name",
+            ((what + ", ".join(texts), remedy, ", ".join(names)) for (what, remedy), (texts, names) in rows.items()),
+        ),
     )
 
 
 def configuration_page() -> str:
-    """Every key of drone and scenario files."""
-    drone, scenario = DroneConfig.model_json_schema(), scenario_schema()
-    campaign = CampaignConfig.model_json_schema()
+    """Every key of drone, scenario and campaign files; a section that several keys hold is listed once."""
+    written: dict[str, str] = {}
     return _page(
         "Configuration reference",
         "Every key of the three kinds of file: its default, its type and limits, and what it means. Units are part of",
         "the names: `_m` metres, `_s` seconds, `_deg` degrees, `_px` pixels, `_hz` per second. Ranges and positions",
         "of a drone are in the body frame, of a scenario in the world frame:",
         "see [Frames](../concepts/pipeline.md#coordinate-frames).",
-        "`required` has no default; `none` means that the key may be left out or be `null`.",
+        "`required` has no default; `none` means that the key may be left out or be `null`; `its own`: the section may",
+        "be left out, and each of its keys then has its default. `rig.cameras[].name` is the key `name` of each",
+        "entry of the list `rig.cameras`.",
         "",
         "The [shipped files](files.md) are good to start from. `flockd config check FILE` reports everything that is",
         "wrong in a file, and `flockd config schema drone` prints the JSON schema that this page was made from.",
         "",
-        *("## Drone files", "", *_described(drone), *_section(drone, drone, "")),
-        *("## Scenario files", "", *_described(scenario), *_section(scenario, scenario, "")),
-        *("## Campaign files", "", *_described(campaign), *_section(campaign, campaign, "")),
+        *_kind_of_file("Drone files", DroneConfig.model_json_schema(), written),
+        *_kind_of_file("Scenario files", scenario_schema(), written),
+        *_kind_of_file("Campaign files", CampaignConfig.model_json_schema(), written),
     )
 
 
-def _described(schema: Mapping[str, Any]) -> list[str]:
-    text = _one_line(schema.get("description", ""))
-    return [text, ""] if text else []
-
-
-def _section(root: Mapping[str, Any], schema: Mapping[str, Any], path: str, level: int = 3) -> list[str]:
-    """The table of a section's own keys, then its sub-sections."""
+def _kind_of_file(heading: str, schema: Mapping[str, Any], written: dict[str, str]) -> list[str]:
+    """The table of a file's own keys, then one for each of its sections."""
     rows, below = [], []
-    required = schema.get("required", ())
+    written[schema["title"]] = f"[{heading.lower()}](#{_slug(heading)})"
+    for key, value in schema["properties"].items():
+        inner, many = _inner(schema, value)
+        meaning = _meaning(value)
+        if inner is not None and inner["title"] in written:
+            meaning = _section(inner, many, value, written)
+        elif inner is not None:
+            shown = f"{key}{many}"
+            meaning = f"{KINDS[many]}, see [`{shown}`](#{_slug(shown)})"
+            written[inner["title"]] = f"[`{shown}`](#{_slug(shown)})"
+            text = _one_line(value.get("description") or inner.get("description", ""))
+            below += [f"### `{shown}`", "", *([text, ""] if text else [])]
+            below += _table("key | default | meaning", _keys(schema, inner, shown, written))
+        rows.append((f"`{key}`", _default(key, value, schema.get("required", ())), meaning))
+    text = _one_line(schema.get("description", ""))
+    return [f"## {heading}", "", text, "", *_table("key | default | meaning", rows), *below]
+
+
+KINDS = {"": "section", "[]": "list of sections", ".KEY": "section for each key"}
+
+
+def _keys(
+    root: Mapping[str, Any], schema: Mapping[str, Any], path: str, written: dict[str, str]
+) -> Iterator[tuple[str, str, str]]:
+    """The keys of the section at a path, those of a section in it right below that one's own row."""
     for key, value in schema["properties"].items():
         inner, many = _inner(root, value)
-        dotted = f"{path}.{key}" if path else key
+        default, here = _default(key, value, schema.get("required", ())), f"{path}.{key}"
         if inner is None:
-            rows.append((f"`{key}`", _default(key, value, required), _meaning(value)))
-            continue
-        shown = f"{dotted}{many}"
-        kind = {"": "section", "[]": "list of sections", ".KEY": "section for each key"}[many]
-        rows.append((f"`{key}`", _default(key, value, required), f"{kind}, see [`{shown}`](#{_slug(shown)})"))
-        below += [f"{'#' * level} `{shown}`", "", *_described({**inner, **_own_description(value)})]
-        below += _section(root, inner, shown, level + 1 if level < 5 else level)
-    return [*_table("key | default | meaning", rows), *below]
+            yield f"`{here}`", default, _meaning(value)
+        elif inner["title"] in written:
+            yield f"`{here}`", default, _section(inner, many, value, written)
+        else:
+            yield f"{_anchor(here + many)}`{here}`", default, _section(inner, many, value, written)
+            written[inner["title"]] = f"[`{here}{many}`](#{_slug(here + many)})"
+            yield from _keys(root, inner, here + many, written)
 
 
-def _own_description(value: Mapping[str, Any]) -> dict[str, Any]:
-    return {"description": value["description"]} if value.get("description") else {}
+def _section(inner: Mapping[str, Any], many: str, value: Mapping[str, Any], written: Mapping[str, str]) -> str:
+    where = f" as {written[inner['title']]}" if inner["title"] in written else ""
+    return f"{KINDS[many]}{where}. {_one_line(value.get('description') or inner.get('description', ''))}".strip()
 
 
 def _inner(root: Mapping[str, Any], value: Mapping[str, Any]) -> tuple[Mapping[str, Any] | None, str]:
@@ -118,15 +146,10 @@ def _inner(root: Mapping[str, Any], value: Mapping[str, Any]) -> tuple[Mapping[s
         others = choice.get("additionalProperties")
         for many, one in (("", choice), ("[]", choice.get("items")), (".KEY", others)):
             if isinstance(one, Mapping) and "$ref" in one:
-                found = _resolve(root, one)
+                found = root["$defs"][one["$ref"].rpartition("/")[2]]
                 if "properties" in found:
                     return found, many
     return None, ""
-
-
-def _resolve(root: Mapping[str, Any], value: Mapping[str, Any]) -> Mapping[str, Any]:
-    found: Mapping[str, Any] = root["$defs"][value["$ref"].rpartition("/")[2]]
-    return found
 
 
 def _default(key: str, value: Mapping[str, Any], required: Sequence[str]) -> str:
@@ -176,8 +199,9 @@ def _kind(value: Mapping[str, Any]) -> str:
 
 
 def commands_page() -> str:
-    """Every command with its options and examples."""
+    """Every command with its options and examples; what several commands of a group take is listed once."""
     codes = EXIT_CODES.splitlines()[1:]
+    (groups,) = (action for action in _parser()._actions if isinstance(action, argparse._SubParsersAction))
     return _page(
         "Command-line reference",
         "Every command prints this with `--help`. `--json` prints for programs what is otherwise printed for people.",
@@ -185,7 +209,7 @@ def commands_page() -> str:
         *_table("exit code | meaning", (map(str.strip, line.split(maxsplit=1)) for line in codes)),
         "No command overwrites a file or an earlier flight, unless `--force` is given.",
         "",
-        *(line for command in _leaves(_parser()) for line in _command(command)),
+        *(line for group in dict.fromkeys(groups.choices.values()) for line in _group(group)),
     )
 
 
@@ -200,22 +224,43 @@ def _leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser
             yield from _leaves(command)
 
 
-def _command(parser: argparse.ArgumentParser) -> list[str]:
+def _group(group: argparse.ArgumentParser) -> list[str]:
+    """A command, or those that begin with the same word."""
+    commands = {command.prog.rpartition(" ")[2]: command for command in _leaves(group)}
+    takers: dict[tuple[str, str], list[str]] = {}
+    examples, notes = [], []
+    for name, command in commands.items():
+        for action in _shown(command):
+            takers.setdefault((_named(action), _help(command, action)), []).append(f"`{name}`")
+        shown, _, note = (command.epilog or "").partition("\n\n")
+        examples += [line.strip() for line in shown.splitlines()[1:]]
+        fence = ["```"] if "\n  " in note else []
+        notes += [*fence, *note.splitlines(), *fence, ""] if note else []
+    usage = [f"`{_usage(command)}`: {command.description}" for command in commands.values()]
+    if len(commands) == 1:
+        options = _table("option | meaning", takers)
+    else:
+        usage = [f"- {line}" for line in usage]
+        options = _table(
+            "option | of | meaning",
+            (
+                (option, "all" if len(of) == len(commands) else ", ".join(of), text)
+                for (option, text), of in takers.items()
+            ),
+        )
+    return [f"## {group.prog}", "", *usage, "", *options, "```sh", *dict.fromkeys(examples), "```", "", *notes]
+
+
+def _shown(parser: argparse.ArgumentParser) -> list[argparse.Action]:
     hidden = (argparse._HelpAction, argparse._SubParsersAction)
-    shown = [a for a in parser._actions if a.help != argparse.SUPPRESS and not isinstance(a, hidden)]
-    positional = [action for action in shown if not action.option_strings]
-    words = [parser.prog, *(_positional(action) for action in positional)]
+    return [a for a in parser._actions if a.help != argparse.SUPPRESS and not isinstance(a, hidden)]
+
+
+def _usage(parser: argparse.ArgumentParser) -> str:
+    shown = _shown(parser)
+    words = [parser.prog, *(_positional(action) for action in shown if not action.option_strings)]
     words += [_option(action) for action in shown if action.option_strings and action.required]
-    if any(action.option_strings and not action.required for action in shown):
-        words.append("[OPTIONS]")
-    lines = [f"## {parser.prog}", "", parser.description or "", "", "```", " ".join(words), "```", ""]
-    if shown:
-        lines += _table("option | meaning", ((_named(action), _help(parser, action)) for action in shown))
-    examples, _, notes = (parser.epilog or "").partition("\n\n")
-    commands = [line.strip() for line in examples.splitlines()[1:]]
-    if commands:
-        lines += ["```sh", *commands, "```", ""]
-    return [*lines, *notes.splitlines(), ""] if notes else lines
+    return " ".join([*words, *(["[OPTIONS]"] if any(a.option_strings and not a.required for a in shown) else [])])
 
 
 def _positional(action: argparse.Action) -> str:
@@ -250,7 +295,7 @@ def _help(parser: argparse.ArgumentParser, action: argparse.Action) -> str:
 
 def messages_page() -> str:
     """Topics and the fields of their messages."""
-    rows, types = [], []
+    rows, fields = [], []
     for topic in topics.TOPICS.values():
         name = topic.type.__name__
         rate = "on events" if topic.rate_hz is None else f"{topic.rate_hz:g}"
@@ -258,11 +303,10 @@ def messages_page() -> str:
         rows.append((f"`{topic.key}`", f"[{name}](#{_slug(name)})", rate, stale, "yes" if topic.recorded else "no"))
     for node in ast.parse(inspect.getsource(topics)).body:
         if isinstance(node, ast.ClassDef) and any(isinstance(b, ast.Name) and b.id == "TypedDict" for b in node.bases):
-            types += [f"## {node.name}", "", _one_line(ast.get_docstring(node) or ""), ""]
-            fields = (
+            fields.append((f"{_anchor(node.name)}**{node.name}**", "", _one_line(ast.get_docstring(node) or "")))
+            fields += [
                 (f"`{name}`", f"`{kind.replace(' | None', ' or null')}`", text) for name, kind, text in _fields(node)
-            )
-            types += _table("field | type | meaning", fields)
+            ]
     return _page(
         "Telemetry messages",
         "A key is `flockd/v1/<fleet>/<drone>/<topic>`; a message is a JSON object in UTF-8. Every number is finite or",
@@ -271,7 +315,9 @@ def messages_page() -> str:
         "How to connect: [Telemetry](../fleet_page.md#telemetry).",
         "",
         *_table("topic | message | expected rate, Hz | stale after, s | recorded", rows),
-        *types,
+        "## Fields",
+        "",
+        *_table("message, its fields | type | meaning", fields),
     )
 
 
@@ -283,6 +329,24 @@ def _fields(node: ast.ClassDef) -> Iterator[tuple[str, str, str]]:
             if isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant):
                 text = str(following.value.value)
             yield here.target.id, ast.unparse(here.annotation), _one_line(text)
+
+
+def files_page() -> str:
+    """Every shipped file of `config/`, with the first paragraph of the comment at its head."""
+    folder, rows = FOLDER.parents[1] / "config", []
+    for path in [*folder.glob("*.*"), *folder.glob("campaigns/*"), *folder.glob("templates/*")]:
+        name = path.relative_to(folder.parent)
+        head = "".join(re.findall(r"\A((?:(?:#|//) .+\n)+)", path.read_text(encoding="utf-8")))
+        rows.append((f"{_anchor(str(name))}`{name}`", _one_line(re.sub("^(?:#|//) ", "", head, flags=re.MULTILINE))))
+    rows.sort(key=lambda row: (row[0].count("/"), row))
+    return _page(
+        "Shipped configuration files",
+        "They come with the repository and with the installed package. Copy one and change the copy. Every key that",
+        "a file leaves out has the default of the [configuration reference](configuration.md);",
+        "`flockd config show FILE` prints a file with every default filled in.",
+        "",
+        *_table("file | what it is for", rows),
+    )
 
 
 BEFORE = {Barrier.NONE: "may fly", Barrier.WAIT: "waits until it has passed", Barrier.LATCH: "waits for the ground"}
@@ -367,6 +431,11 @@ def _table(columns: str, rows: Iterable[Iterable[str]]) -> list[str]:
 def _one_line(text: str) -> str:
     """As one line that can stand in a table."""
     return re.sub(r"\s+", " ", text.replace("``", "`")).strip().replace("|", "\\|").replace("<", "&lt;")
+
+
+def _anchor(heading: str) -> str:
+    """A place in a table to link to, as one would link to a heading."""
+    return f'<a id="{_slug(heading)}"></a>'
 
 
 def _slug(heading: str) -> str:
