@@ -51,13 +51,15 @@ def pages() -> dict[str, str]:
 
 
 def refusals_page() -> str:
-    """Every reason to refuse arming or offboard, with what to do; checks that PX4 only names share a row by remedy."""
-    rows: dict[tuple[str, str], tuple[list[str], list[str]]] = {}
+    """Every reason to refuse arming or offboard, with what to do: a row for each remedy."""
+    rows: dict[str, tuple[list[str], list[str]]] = {}
     for name, reason in REASONS.items():
-        check = re.fullmatch("its check (`.+`) fails", reason.what)
-        texts, names = rows.setdefault(("its check fails: " if check else reason.what, reason.remedy), ([], []))
-        texts += [check[1]] if check else []
+        whats, names = rows.setdefault(reason.remedy, ([], []))
+        whats.append(reason.what)
         names.append(f"`{name}`")
+    texts = {
+        remedy: re.sub("fails; its check", "fails;", "; ".join(dict.fromkeys(w))) for remedy, (w, _) in rows.items()
+    }
     return _page(
         "Why the autopilot refuses",
         "Every reason that flockd knows for which an autopilot refuses to arm or to fly offboard, and what to do, in",
@@ -67,7 +69,7 @@ def refusals_page() -> str:
         "",
         *_table(
             "what is the matter | what to do | name",
-            ((what + ", ".join(texts), remedy, ", ".join(names)) for (what, remedy), (texts, names) in rows.items()),
+            ((texts[remedy], remedy, ", ".join(names)) for remedy, (_, names) in rows.items()),
         ),
     )
 
@@ -95,26 +97,27 @@ def configuration_page() -> str:
 
 
 def _kind_of_file(heading: str, schema: Mapping[str, Any], written: dict[str, str]) -> list[str]:
-    """The table of a file's own keys, then one for each of its sections."""
+    """The table of a file's own keys, then one for each of its sections that was not written before."""
     rows, below = [], []
     written[schema["title"]] = f"[{heading.lower()}](#{_slug(heading)})"
     for key, value in schema["properties"].items():
         inner, many = _inner(schema, value)
-        meaning = _meaning(value)
-        if inner is not None and inner["title"] in written:
-            meaning = _section(inner, many, value, written)
-        elif inner is not None:
-            shown = f"{key}{many}"
-            meaning = f"{KINDS[many]}, see [`{shown}`](#{_slug(shown)})"
-            written[inner["title"]] = f"[`{shown}`](#{_slug(shown)})"
-            text = _one_line(value.get("description") or inner.get("description", ""))
-            below += [f"### `{shown}`", "", *([text, ""] if text else [])]
-            below += _table("key | default | meaning", _keys(schema, inner, shown, written))
-        rows.append((f"`{key}`", _default(key, value, schema.get("required", ())), meaning))
+        default = _default(key, value, schema.get("required", ()))
+        if inner is None or inner["title"] in written:
+            meaning = _meaning(value) if inner is None else _section(inner, many, value, written)
+            rows.append((f"`{key}`", default, meaning))
+            continue
+        shown = f"{key}{many}"
+        written[inner["title"]] = f"[`{shown}`](#{_slug(shown)})"
+        text = _one_line(value.get("description") or inner.get("description", ""))
+        below += [f"### `{shown}`", f"{DEFAULTS.get(default, NONE)}{text}", ""]
+        below += _table("key | default | meaning", _keys(schema, inner, shown, written))
     text = _one_line(schema.get("description", ""))
-    return [f"## {heading}", "", text, "", *_table("key | default | meaning", rows), *below]
+    return [f"## {heading}", text, "", *_table("key | default | meaning", rows), *below]
 
 
+NONE = "None by default. "
+DEFAULTS = {"required": "Required. ", "its own": ""}
 KINDS = {"": "section", "[]": "list of sections", ".KEY": "section for each key"}
 
 
@@ -248,7 +251,7 @@ def _group(group: argparse.ArgumentParser) -> list[str]:
                 for (option, text), of in takers.items()
             ),
         )
-    return [f"## {group.prog}", "", *usage, "", *options, "```sh", *dict.fromkeys(examples), "```", "", *notes]
+    return [f"## {group.prog}", *usage, "", *options, "```sh", *dict.fromkeys(examples), "```", "", *notes]
 
 
 def _shown(parser: argparse.ArgumentParser) -> list[argparse.Action]:
@@ -304,9 +307,12 @@ def messages_page() -> str:
     for node in ast.parse(inspect.getsource(topics)).body:
         if isinstance(node, ast.ClassDef) and any(isinstance(b, ast.Name) and b.id == "TypedDict" for b in node.bases):
             fields.append((f"{_anchor(node.name)}**{node.name}**", "", _one_line(ast.get_docstring(node) or "")))
-            fields += [
-                (f"`{name}`", f"`{kind.replace(' | None', ' or null')}`", text) for name, kind, text in _fields(node)
-            ]
+            for name, kind, text in _fields(node):
+                type_ = f"`{kind.replace(' | None', ' or null')}`"
+                if not text and fields[-1][1:] == (type_, ""):
+                    fields[-1] = (f"{fields[-1][0]}, `{name}`", type_, "")
+                else:
+                    fields.append((f"`{name}`", type_, text))
     return _page(
         "Telemetry messages",
         "A key is `flockd/v1/<fleet>/<drone>/<topic>`; a message is a JSON object in UTF-8. Every number is finite or",
@@ -316,7 +322,6 @@ def messages_page() -> str:
         "",
         *_table("topic | message | expected rate, Hz | stale after, s | recorded", rows),
         "## Fields",
-        "",
         *_table("message, its fields | type | meaning", fields),
     )
 
@@ -374,7 +379,6 @@ def faults_page() -> str:
         "",
         *_table("event | before the flight | in flight | if it lasts", rows),
         "## Time-outs",
-        "",
         "How old each message may become, and what is done then. A reaction in code type is an event of the table",
         "above. The keys of the [configuration](configuration.md) change a time-out for one drone.",
         "",
@@ -386,7 +390,6 @@ def faults_page() -> str:
             ),
         ),
         "## Consistency of sensors",
-        "",
         "What one source says is compared with what the others lead to expect, as an extended Kalman filter does with",
         "its innovations. SD: standard deviations of what is expected.",
         "",
@@ -409,7 +412,6 @@ def _stories() -> list[str]:
         rows.append((str(fault.row), f"`{name}`", fault.fault, fault.reaction, within, runs, tests))
     return [
         "## Stories",
-        "",
         "The faults that flockd has to survive, by the name that `pytest -m fault --fault NAME` takes, and the tests",
         "that inject each. s: the longest reaction that they allow. Run: by CI (`.ci/run`), by hand (`make flights`),",
         "or with PX4.",
