@@ -39,7 +39,8 @@ class Engine(Protocol):
         ...
 
     def wait(self) -> Sequence[FlownRun]:
-        """What of the submitted is finished since the last call; waits for one at least, if there is one."""
+        """Results of submitted tasks that have finished since the last call; waits for at least one, if any is under
+        way."""
         ...
 
 
@@ -55,7 +56,7 @@ class ProcessEngine:
         self._executor = self._started()
         self._flying: dict[Future[FlownRun], Task] = {}
         self._suspects: deque[Task] = deque()
-        """Were in an executor that broke."""
+        """Tasks that were in an executor that broke."""
         self._tries: Counter[Run] = Counter()
         """How often a flight was the only one in an executor that broke."""
 
@@ -119,7 +120,7 @@ class ProcessEngine:
 
 
 def _ended(task: Task) -> FlownRun:
-    """The result of a task whose process did not live to its end."""
+    """The result of a task whose process ended before it did."""
     reason = f"the process that flew it ended, {MAX_TRIES} times; run it by itself to see why, and watch the memory"
     return FlownRun(task.run, reason=reason)
 

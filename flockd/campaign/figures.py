@@ -20,7 +20,7 @@ from flockd.review.report.summary import TAIL_S, estimation_errors, objective_su
 
 
 class Interval(NamedTuple):
-    """A mean, and between which values the true one lies with 95 % confidence."""
+    """A mean with its 95 % confidence interval."""
 
     mean: float
     low: float

@@ -22,7 +22,7 @@ from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import ScenarioConfig
 
 PERCEPTIONS: dict[FlightKindName, SimulatedPerception] = {"truth": "truth", "sight": "learned"}
-"""With which `flockd sim` flies the flights of a kind."""
+"""The `--perception` of `flockd sim` for each kind of flight."""
 
 
 def figures_flown(scenario: ScenarioConfig, task: Task) -> Figures:

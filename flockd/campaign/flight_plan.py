@@ -182,7 +182,7 @@ def _count_of_cells(config: CampaignConfig) -> int:
 
 
 def _idle_seeds(plan: Plan) -> str | None:
-    """What is wrong where all seeds of a cell fly the very same flight."""
+    """What is wrong where all seeds of a cell fly exactly the same flight."""
     config = plan.config
     if config.seeds == 1 or config.perception == "sight" or config.scatter_m:
         return None
@@ -220,7 +220,7 @@ def _with_tuples(value: Any) -> Any:
 
 
 def _check_keys(config: CampaignConfig, places: Places) -> None:
-    """Raises ConfigError for what needs no scenario: sizes of flocks, how many cells, a wind that nobody notices."""
+    """Raises ConfigError for what needs no scenario: sizes of flocks, how many cells, a wind without effect."""
     wrong = [
         places[path].problem(f"must be whole numbers from 1 to {MAX_DRONES}, as in `values: [5, 10]`")
         for path, values in _given(config, DRONES).items()

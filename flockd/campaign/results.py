@@ -115,7 +115,7 @@ class Verdict:
     difference: Interval
     """Second less first, with its 95 % confidence interval."""
     pairs: int
-    """Seeds that both flew."""
+    """Seeds that both campaigns flew."""
     p: float
     """How often a difference so large would come up if there were none, times the number of figures (Bonferroni)."""
 
@@ -134,7 +134,7 @@ class Comparison:
     first: Results
     second: Results
     cells: int
-    """That both have."""
+    """Cells that both campaigns have."""
     verdicts: tuple[Verdict, ...]
     changes: tuple[tuple[str, str, str], ...]
     """Keys whose values differ for all flights, with both values."""

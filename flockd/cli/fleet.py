@@ -167,10 +167,8 @@ def _ask(args: argparse.Namespace, command: str, order: MissionOrder | None = No
 
 
 def _found(watcher: FleetWatcher, names: list[str]) -> Iterator[str]:
-    """The keys `fleet/drone` of drones that are alive, each when it is found.
-
-    Until all that are named are found; without names, and where some are not found, for a while.
-    """
+    """Yields the keys `fleet/drone` of drones that are alive, as they are found. Ends when all that are named are
+    found; without names, and where some are not found, after a while."""
     found: set[str] = set()
     until_s = time.monotonic() + FIND_S
     while True:
@@ -185,13 +183,13 @@ def _found(watcher: FleetWatcher, names: list[str]) -> Iterator[str]:
 
 
 def _missing(names: list[str], drones: Iterable[str]) -> list[str]:
-    """Those that none of these keys is of."""
+    """Names that no key belongs to."""
     there = {drone.partition("/")[2] for drone in drones}
     return [name for name in names if name not in there]
 
 
 def _verdict(args: argparse.Namespace, answers: dict[str, dict[str, object]], names: list[str], places: str) -> int:
-    """Says at the end who did not do it. Raises UnavailableError where nobody was found."""
+    """Says at the end which drones did not do it. Raises UnavailableError where none was found."""
     from flockd.fleet.drone_rows import by_name
 
     missing = _missing(names, answers)
@@ -251,7 +249,7 @@ def _show_page(args: argparse.Namespace) -> int:
 
 
 async def serve_page(page: PageServer, address: str, port: int, served: Callable[[int], None]) -> None:
-    """Until it is cancelled, as Ctrl-C does. ``served``: is told the port, once there is somebody at it.
+    """Until it is cancelled, as Ctrl-C does. ``served`` gets the port once the page can be opened.
 
     Raises UnavailableError for an address or a port that cannot be used.
     """

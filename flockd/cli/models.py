@@ -1,4 +1,4 @@
-"""`flockd models`: which networks there are, whether they are intact, and their engines."""
+"""`flockd models`: lists, checks, prepares and imports networks."""
 
 from __future__ import annotations
 

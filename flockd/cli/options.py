@@ -97,7 +97,8 @@ def add_stretch(parser: Parser) -> None:
 
 
 def stretch(recording: Recording, args: argparse.Namespace) -> tuple[float, float]:
-    """From when to when, on the recording's clock, --start and --end ask for. Raises UsageError for nothing."""
+    """From when to when, on the recording's clock, --start and --end ask for. Raises UsageError for an empty
+    stretch."""
     rounding_s = 1e-6
     end_s = recording.duration_s if args.end is None else args.end
     begin, end = recording.start_s + args.start - rounding_s, recording.start_s + end_s + rounding_s

@@ -58,7 +58,7 @@ def _add_perceive(commands: Commands) -> None:
 
 
 def _perceive(args: argparse.Namespace) -> int:
-    """Until Ctrl-C."""
+    """Runs until Ctrl-C."""
     from flockd.core.config import load_drone
     from flockd.fleet.ros.perceive import PerceptionNode, check
     from flockd.fleet.ros.ros_node import RosNode
@@ -77,7 +77,7 @@ def _perceive(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace) -> int:
-    """Until Ctrl-C."""
+    """Runs until Ctrl-C."""
     from flockd.fleet.live_fleet import LiveFleet
     from flockd.fleet.ros.fleet_bridge import FleetBridge
     from flockd.fleet.ros.ros_node import RosNode

@@ -64,7 +64,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _run_daemon(args: argparse.Namespace) -> int:
-    """Until it is asked to end."""
+    """Runs the daemon until it is asked to end."""
     from flockd.onboard.autopilot.link_owner import only_owner
     from flockd.onboard.daemon import ServiceManager
     from flockd.onboard.simulated_time import event_loop_at

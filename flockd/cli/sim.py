@@ -310,7 +310,7 @@ def _folder_name(scenario: ScenarioConfig, args: argparse.Namespace) -> str:
 
 
 def _settings(args: argparse.Namespace) -> dict[str, str]:
-    """What options set otherwise than the scenario's file, as text."""
+    """The options' values that differ from the scenario's file, as text."""
     values = {option: getattr(args, option) for option in (*OPTIONS, "drones")}
     settings = {option: f"{value:g}" for option, value in values.items() if value is not None}
     settings |= {key.rpartition(".")[2]: value for key, value in args.settings}
@@ -358,7 +358,7 @@ def _fly_live(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) ->
 
 @contextmanager
 def _served(page: PageServer, port: int) -> Iterator[int]:
-    """Serves the page on a thread of its own. Gives its port; raises what its start did."""
+    """Serves the page on a thread of its own. Gives its port; raises what stopped its start."""
     loop, begun = asyncio.new_event_loop(), Future[int]()
     task = loop.create_task(serve_page(page, HERE, port, begun.set_result))
 

@@ -82,7 +82,7 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _notes(row: dict[str, Any]) -> list[str]:
-    """Its mission, and each thing that is the matter."""
+    """Its mission, and each fault."""
     mission = [f"mission: {cell(row['mission'])}"] if row["mission"] else []
     return [*mission, *(cell(matter) for matter in row["matters"])]
 

@@ -1,1 +1,1 @@
-"""The words: messages, choices, errors, configuration and shipped files."""
+"""What all rooms share: messages, choices, errors, configuration and shipped files."""

@@ -1,4 +1,4 @@
-"""What earlier versions had and this one has not: for each, what to use instead."""
+"""Commands, keys and values of earlier versions that this one lacks: for each, what to use instead."""
 
 from __future__ import annotations
 

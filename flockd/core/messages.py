@@ -37,10 +37,10 @@ Matrix3 = Annotated[FloatArray, Shape((3, 3))]
 
 
 class ReasonKind(StrEnum):
-    """What of a step a reason explains the lack of."""
+    """What a reason says is missing from a step."""
 
     INPUT = "input"
-    """All of it: the frames or the vehicle state cannot be."""
+    """All of it: the frames or the vehicle state cannot be right."""
     HEIGHT = "height"
     """The height's wanted source."""
     CAMERA = "camera"
@@ -180,7 +180,7 @@ class MissionStatus:
 
     @property
     def known(self) -> bool:
-        """Whether a mission has said it."""
+        """Whether a mission has reported it."""
         return self.kind != NO_STATUS.kind
 
 
@@ -228,13 +228,13 @@ class Detection:
     drone_probability: float
     """Probability that it is a drone at all."""
     size_m: float
-    """About the drone's own size, constant over time: its range times its angular size."""
+    """An estimate of the drone's own size, constant over time: its range times its angular size."""
     cameras: tuple[str, ...]
     """More than one where the drone straddles an image border."""
     label: int
     """Its value in the masks of this frame set, from 1 up."""
     log_size_sigma: float = 0.0
-    """Standard deviation of the logarithm of `size_m`: the log range errs with it, alike in all of a drone's."""
+    """Standard deviation of the logarithm of `size_m`: the log range has the same error, alike in all of a drone's."""
 
     @property
     def range_m(self) -> float:
@@ -253,7 +253,7 @@ class Detection:
 
     @property
     def way_sigma_m(self) -> float:
-        """The same if the size is right: of how far the drone went between two detections of it."""
+        """The same if the size is right: of the distance that the drone flew between two detections of it."""
         return self.range_m * math.sqrt(float(self.bearing @ self.covariance @ self.bearing))
 
 
@@ -328,8 +328,8 @@ class Wanted:
     velocity: Vector2
     """(2,) m/s, north and east: the law's after limits, and the trim."""
     acceleration: Vector2
-    """(2,) m/s^2, north and east: u of Eq. 38 after limits; where who or what is near changed the velocity, what leads
-    to that one in a step."""
+    """(2,) m/s^2, north and east: u of Eq. 38 after limits; where a neighbour or an obstacle changed the velocity, the
+    acceleration that leads to that in a step."""
     yaw_rad: float | None
     """Heading, clockwise from north, `wrapped`; None: as it is, while no good attitude is known."""
     trim: Vector2 | None = None
@@ -403,7 +403,8 @@ class PilotOutput:
     mission: MissionStatus = NO_STATUS
     """As of the last good step."""
     noisy_cameras: tuple[str, ...] = ()
-    """Whose images were not used: noise, damage, a lens that shows too little, another motion than the drone's."""
+    """Cameras whose images were not used: noise, damage, a lens that shows too little, another motion than the
+    drone's."""
     ground: GroundEstimate | None = None
     """From the range finder, or the barometer in its place; None: no range finder is wanted, or there is no scale."""
     obstacles: ObstacleRanges | None = None

@@ -1,1 +1,1 @@
-"""During a flight, for people: who is there, orders, the page, ROS 2."""
+"""During a flight, for people: the drones that are there, orders, the page, ROS 2."""

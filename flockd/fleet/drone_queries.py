@@ -18,7 +18,7 @@ from flockd.onboard.telemetry.topics import PREFIX, AboutMessage, AnswerMessage,
 ANSWER_S = 3.0
 PICTURE_S = 1.5
 MAX_REPLY_BYTES = 1 << 16
-"""Ten times what a drone flies with, and twice a small picture."""
+"""Ten times a drone's configuration, and twice a small picture."""
 MAX_PICTURE_PX = 1024
 
 
@@ -32,7 +32,7 @@ class ClockReading(NamedTuple):
 
 
 class DroneQueries:
-    """Queries to drones, each by its key `fleet/drone`; None where no reply comes in time, or none that is one.
+    """Queries to drones, each by its key `fleet/drone`; None where no valid reply comes in time.
 
     Every call waits for the reply, up to ``ANSWER_S``: not for an event loop.
     """
@@ -69,7 +69,7 @@ class DroneQueries:
         return None
 
     def about(self, drone: str) -> AboutMessage | None:
-        """What a drone flies with."""
+        """The drone's configuration."""
         about: AboutMessage | None = self.message(f"{drone}/about", AboutMessage)
         return about
 
@@ -101,7 +101,7 @@ class DroneQueries:
     def _reply(
         self, key: str, payload: bytes = b"", *, timeout_s: float = ANSWER_S, session: zenoh.Session | None = None
     ) -> bytes | None:
-        """The first, of those that are not too long. What is asked over the connection for orders goes first."""
+        """The first reply that is not too long. What is asked over the connection for orders goes first."""
         priority = zenoh.Priority.DATA_LOW if session is None else zenoh.Priority.REAL_TIME
         for reply in (session or self._session).get(
             f"{self._prefix}/{key}", payload=payload, timeout=timeout_s, priority=priority

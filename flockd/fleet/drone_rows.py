@@ -13,7 +13,7 @@ from flockd.fleet.watcher import Heard, Watched, ambiguity
 from flockd.onboard.telemetry.topics import AboutMessage, is_name
 
 GONE, QUIET = "gone", "quiet"
-"""Instead of a state: its process has ended or cannot be reached; it is there, and publishes nothing."""
+"""In the place of a state: the drone's process has ended or cannot be reached, or it publishes nothing."""
 WORST_FIRST = (GONE, QUIET, "asking", "hover", "silent", "degraded", "idle", "ready", "normal")
 
 
@@ -78,7 +78,7 @@ def _operators(orders: list[dict[str, Any]]) -> str | None:
 
 
 def _told(why: str) -> str:
-    """What is wrong with a message, and what it may come from."""
+    """What is wrong with a message, and its likely cause."""
     return f"{why}; it may run another version of flockd" if why.endswith("is missing") else why
 
 
@@ -89,15 +89,15 @@ HISTORY_COLUMNS = (
 """Columns of a drone's history: seconds, metres from the map's origin, metres, m/s, shares, degrees Celsius, steps a
 second, milliseconds, seconds."""
 MAX_CORNERS = 200
-"""The most corners of a fence that is drawn."""
+"""The most corners of a drawn fence."""
 MAX_CAMERAS = 16
-"""The most of one drone whose pictures are offered."""
+"""The most cameras of one drone whose pictures are offered."""
 _FARTHEST_M = 1e6
 
 
 @dataclass(frozen=True)
 class Known:
-    """What queries found of one drone."""
+    """What a drone has answered to queries."""
 
     about: AboutMessage | None = None
     delay_s: float | None = None
@@ -123,7 +123,7 @@ def drone_rows(drones: Iterable[Watched], known: Mapping[str, Known], now_s: flo
 
 
 def history_row(row: Row, time_s: float) -> list[float | None]:
-    """What of a row is kept for trails and curves: `HISTORY_COLUMNS`."""
+    """The part of a row that is kept for trails and curves: `HISTORY_COLUMNS`."""
     north, east = row["position_ne"] or (None, None)
     home = row["home_ne"] or (0.0, 0.0)
     if north is not None and east is not None:
@@ -135,7 +135,7 @@ def history_row(row: Row, time_s: float) -> list[float | None]:
 
 
 def _row(drone: Watched, status: Mapping[str, Any], known: Known, now_s: float) -> Row:
-    """With everything that is null where it is not known, or too old to be true now."""
+    """Everything is null that is not known, or too old to be true now."""
 
     def of(topic: str) -> Mapping[str, Any]:
         return drone.message(topic, now_s) or {}
@@ -178,7 +178,7 @@ def _row(drone: Watched, status: Mapping[str, Any], known: Known, now_s: float) 
 
 
 def _silence(drone: Watched, state: str, now_s: float) -> list[str]:
-    """Why there is nothing of it."""
+    """Why there is no news of it."""
     if state not in {GONE, QUIET}:
         return []
     last_s = max((heard.time_s for heard in drone.topics.values()), default=None)
@@ -189,7 +189,7 @@ def _silence(drone: Watched, state: str, now_s: float) -> list[str]:
 
 
 def _ago(seconds: float) -> str:
-    """Coarse, so that a row changes seldom."""
+    """Coarse, so that a row seldom changes."""
     if seconds < 10:
         return "a few seconds"
     return f"{10 * int(seconds // 10)} s" if seconds < 120 else f"{int(seconds // 60)} min"
@@ -203,7 +203,7 @@ def _rate(heard: Heard | None, now_s: float) -> float | None:
 
 
 def _seen(neighbour: Mapping[str, Any]) -> Row:
-    """A neighbour as its observer has it, metres north, east and down of that one."""
+    """A neighbour as its observer sees it, metres north, east and down from that one."""
     return {
         "track": neighbour["track"],
         "ned": _vector(neighbour["position_ned"], size=3),
@@ -251,7 +251,7 @@ def _offset(origin: list[float] | tuple[float, float] | None, home_deg: list[flo
 
 
 def origin_of(configuration: Mapping[str, Any]) -> list[float] | None:
-    """(2,) metres from a drone's home to its mission's origin; None for what is none."""
+    """(2,) metres from a drone's home to its mission's origin; None for a malformed one."""
     return _vector(_section(configuration, "mission").get("origin_m"))
 
 

@@ -19,18 +19,18 @@ Event = tuple[float, str, str]
 """When it was heard, of which drone by its key, and what it says."""
 
 ASK_EVERY_S = 5.0
-"""Each drone for its clocks, and for what it flies with until it has told."""
+"""Interval of asking each drone for its clocks, and for its configuration until it has answered."""
 ASK_SILENT_S = 60.0
-"""The longest until one that never answers is asked again."""
+"""The longest interval of asking a drone that never answers."""
 LOOK_EVERY_S = 0.5
-"""For drones that are new, and at what belongs into the history."""
+"""Interval of looking for new drones, and of rows for the history."""
 HISTORY_S = 300.0
 MANY = 100
-"""Malformed messages that a fault or two may bring."""
+"""Malformed messages that a single fault or two may cause."""
 CLOCK_READINGS = 8
-"""The one with the least delay among the last so many says how far the clocks are apart."""
+"""Of this many last readings the one with the least delay says how far the clocks are apart."""
 ROWS_S = 0.1
-"""So long rows are the same for all that ask."""
+"""Rows are computed anew after this time."""
 _ASKING_THREADS = 16
 
 
@@ -79,7 +79,7 @@ class LiveFleet:
         return self._watcher.drones()
 
     def known(self) -> Mapping[str, Known]:
-        """What each drone flies with, by its key, as far as queries have found it."""
+        """What each drone has answered to queries, by its key."""
         with self._lock:
             return dict(self._known)
 
@@ -92,7 +92,7 @@ class LiveFleet:
         return rows
 
     def notes(self) -> list[str]:
-        """Where somebody sends what no drone does."""
+        """Warnings of messages that no drone sends."""
         malformed, forgotten = self._watcher.malformed, self._watcher.forgotten
         notes = []
         if malformed > MANY:
@@ -144,7 +144,7 @@ class LiveFleet:
                 kept.append(history_row(row, now_s))
 
     def _forget(self, key: str) -> None:
-        """When it comes back, it may fly with something else."""
+        """When it comes back, its configuration may differ."""
         self._due_s.pop(key, None)
         self._waits_s.pop(key, None)
         with self._lock:
@@ -179,5 +179,5 @@ class LiveFleet:
 
 
 def _rounded(count: int) -> int:
-    """To one digit, so that a note changes seldom."""
+    """To one digit, so that a note seldom changes."""
     return int(float(f"{count:.0e}"))

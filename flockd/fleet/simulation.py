@@ -1,4 +1,4 @@
-"""Controls of a simulation that is flown live: what they say, and the way to the simulator.
+"""Controls of a live simulation: their content, and the way to the simulator.
 
 They are no orders to drones. They go under a key of the simulator's own, `flockd-sim/v1/<fleet>/simulator`, where
 nothing that flies replies: a query for `.../state` is answered with a `SimulationMessage`, one for `.../ask/<control>`,
@@ -25,7 +25,7 @@ _ASK_EVERY_S = 0.25
 
 
 class SimulationMessage(TypedDict):
-    """How a simulation is doing."""
+    """The state of a simulation."""
 
     identity: str
     """Of all of its drones, in their liveliness tokens."""
@@ -53,7 +53,7 @@ def key_of(fleet: str) -> str:
 
 
 def checked_control(control: object, value: object) -> dict[str, object]:
-    """What a control carries. Raises ValueError, with a sentence for its sender, for what is none."""
+    """The values of a control. Raises ValueError, with a sentence for its sender, for a malformed one."""
     if not isinstance(control, str) or control not in CONTROLS:
         raise ValueError(f"the simulation's controls are {', '.join(CONTROLS)}")
     given = value if isinstance(value, Mapping) else {}

@@ -21,10 +21,10 @@ from flockd.onboard.telemetry.zenoh_session import SessionOwner, close_session, 
 MAX_BYTES = 1 << 15
 """The largest message: that of a drone which sees a hundred others."""
 MAX_DRONES = 200
-"""The most drones that are remembered, on a bus on which somebody invents drones."""
+"""The most drones that are remembered, in case a sender invents names."""
 FORGOTTEN_AT_ONCE = 20
 MAX_EVENTS, MAX_EVENTS_OF_ONE = 500, 100
-"""So many of the newest are remembered: of all, and of one drone."""
+"""The newest events that are remembered: of all drones, and of one."""
 MAX_LINK_BYTES = 1 << 20
 """Of one message on its way, before anything of flockd's sees it."""
 _PERIOD_SHARE = 0.2
@@ -44,7 +44,7 @@ class Heard:
     period_s: float | None = None
     """Between new messages, by the watcher's clock, smoothed; None before the second."""
     new_s: float | None = None
-    """When the newest came that was not sent once more."""
+    """When the newest message came that was not a repetition."""
 
 
 def _heard(before: Heard | None, now_s: float, message: Mapping[str, Any]) -> Heard:
@@ -76,7 +76,7 @@ class Watched:
     """Its liveliness token is there: its process runs and can be reached."""
     topics: Mapping[str, Heard] = field(default_factory=dict)
     malformed: Mapping[str, str] = field(default_factory=dict)
-    """What is wrong with the newest message of a topic, by topic; one that is well formed again is not here."""
+    """What is wrong with the newest message of a topic, by topic, until a well-formed one comes."""
     seen: bool = False
     """Something of it was well formed, or its token was there: it is a drone."""
     identities: frozenset[str] = frozenset()
@@ -233,7 +233,7 @@ class FleetWatcher(SessionOwner):
         return Watched(fleet, drone)
 
     def _remember(self, event: HeardEvent) -> None:
-        """However much one drone says, what the others said stays."""
+        """Keeps each drone's events, however many another drone sends."""
         of_one = [old for old in self._events if (old.fleet, old.drone) == (event.fleet, event.drone)]
         if len(of_one) >= MAX_EVENTS_OF_ONE:
             self._events.remove(of_one[0])
@@ -241,7 +241,7 @@ class FleetWatcher(SessionOwner):
 
 
 def ambiguity(drone: Watched) -> str | None:
-    """What is wrong where several drones have one name; None where it is one's."""
+    """What is wrong where several drones have one name; None for a unique name."""
     if len(drone.identities) < 2:
         return None
     identities = ", ".join(sorted(identity or "of an earlier version" for identity in drone.identities))
@@ -252,7 +252,7 @@ def ambiguity(drone: Watched) -> str | None:
 
 
 def _standing(drone: Watched) -> tuple[bool, bool, int, float]:
-    """The less, the sooner it is forgotten."""
+    """The drone with the least is forgotten first."""
     last_s = max((heard.time_s for heard in drone.topics.values()), default=0.0)
     return drone.alive, drone.announced, drone.messages, last_s
 

@@ -41,7 +41,7 @@ _TYPES: dict[int, str] = {TensorProto.FLOAT: "float32", TensorProto.FLOAT16: "fl
 
 @dataclass(frozen=True)
 class Imported:
-    """What became of a file."""
+    """The result of an import."""
 
     manifest: Path
     kind: str
@@ -100,7 +100,7 @@ def import_detector(file: Path, drone: str, licence: str | None, folder: Path, *
 
 @dataclass(frozen=True)
 class _Kind:
-    """How a network says what it found."""
+    """How a network's output holds its boxes."""
 
     name: str
     image: onnx.ValueInfoProto

@@ -45,7 +45,8 @@ class StartConfig(Section):
     mission: MissionParameters | None = None
     """Its own; null: that of `drone`. Places count from the world's origin."""
     by_hand: bool = False
-    """A person flies it along its mission, in Position mode and without flockd; the others see it as one of them."""
+    """A person flies it along its mission, in Position mode and without flockd; to the others it looks like one of
+    them."""
 
 
 class VehicleConfig(Section):
@@ -63,9 +64,9 @@ class VehicleConfig(Section):
     """Mean wind, north and east."""
     gust_m_s: NonNegative = 0.0
     """Standard deviation of the velocity that gusts add, each axis, to that of a drone whose setpoint stays the same.
-    The flocking law begins its setpoint at the own velocity: there drones are carried farther."""
+    Gusts carry drones under the flocking law farther, because its setpoint begins at the own velocity."""
     gust_length_m: Annotated[float, Field(ge=1, le=1000)] = 36.6
-    """Length of gusts: drones that are much nearer to each other are pushed alike. By default that of MIL-F-8785C at a
+    """Length of gusts: drones much nearer to each other than this are pushed alike. By default that of MIL-F-8785C at a
     height of 5 m over open ground; it is less among trees and houses."""
     radius_m: Annotated[float, Field(gt=0, le=5)] = 0.35
     """Radius of the sphere around its centre that holds the whole drone: nearer to an obstacle it collides."""
@@ -80,13 +81,13 @@ class RangeFinderConfig(Section):
     min_m: NonNegative = 0.15
     """Nearer ground is not measured: the reading then has no signal."""
     max_m: Positive = 20.0
-    """Nor is ground that is farther."""
+    """Farther ground is not measured either."""
     tilt_deg: Annotated[float, Field(ge=0, le=10)] = 0.5
     """Standard deviation of the angle, about each axis, by which it is mounted off the body's down axis."""
     dropouts_per_min: NonNegative = 2.0
-    """How often it stops giving readings, ..."""
+    """How often it stops giving readings."""
     dropout_s: Positive = 0.5
-    """... and for how long, mean."""
+    """Mean duration of such a dropout."""
 
 
 class SensorConfig(Section):
@@ -103,13 +104,13 @@ class SensorConfig(Section):
     turn_rate_noise_deg_s: NonNegative = 1.0
     """Standard deviation of the noise on the rate of turn, each axis."""
     velocity_error_m_s: NonNegative = 0.1
-    """Standard deviation of the wandering error of the autopilot's own velocity, each axis, as seen of PX4 1.18, ..."""
+    """Standard deviation of the wandering error of the autopilot's own velocity, each axis, as measured of PX4 1.18."""
     velocity_error_time_s: Positive = 2.0
-    """... and for how long it stays about the same."""
+    """How long that error stays about the same."""
     position_error_m: NonNegative = 0.1
-    """The same of its own position, ..."""
+    """Standard deviation of the wandering error of its own position, each axis."""
     position_error_time_s: Positive = 5.0
-    """... and for how long."""
+    """How long that error stays about the same."""
     range_finder: RangeFinderConfig | None = RangeFinderConfig()
     """null: the drone has none."""
     image_noise: NonNegative = 2.0
@@ -166,14 +167,13 @@ class WorldConfig(Section):
     ground_relief_m: NonNegative = 0.15
     """Standard deviation of the gently uneven ground; 0 is flat."""
     hills_m: Annotated[float, Field(ge=0, le=20)] = 0.0
-    """From the lowest to the highest point of its hills, where `hills_slope` lets them be so high; level at the
-    origin."""
+    """From the lowest to the highest point of its hills, where `hills_slope` permits that; level at the origin."""
     hills_slope: Annotated[float, Field(gt=0, le=0.5)] = 0.15
     """Rise for each metre where they are steepest."""
     clearance_m: NonNegative = 9.0
-    """Free of obstacles on both sides of the planned path."""
+    """Width without obstacles on both sides of the planned path."""
     drone_family: Annotated[int, Field(ge=0, le=FAMILIES - 1)] | Literal["any"] = "any"
-    """Which mesh the drones wear; `any`: drawn from the seed, the same for the whole flock."""
+    """Shape of the drones; `any`: drawn from the seed, the same for the whole flock."""
     obstacles: ObstaclesConfig | None = None
     """Trees, or houses, walls, poles and wires, for the flock to fly between, on level ground; null: none within
     `clearance_m`."""
@@ -202,10 +202,10 @@ class DetectionsConfig(Section):
     nobody is detected, and the drone flies degraded."""
 
     airframe: Literal["trained", "unknown"] = "trained"
-    """Whose errors those are that are not written here: of airframes that the networks learnt, by default as below, or
-    of real ones, whose size is said and of which no network learnt ranges."""
+    """Source of the errors that are not given here: airframes that the networks learnt, by default as below, or real
+    ones, whose size is known and whose ranges no network learnt."""
     range_m: Positive = 20.0
-    """Farther away nobody is detected."""
+    """Drones beyond this are not detected."""
     missed: Share | None = None
     """Probability that a drone is not detected in a step, the same at all distances; null: at each distance as it was
     measured, 1 beyond those."""
@@ -214,15 +214,15 @@ class DetectionsConfig(Section):
     bearing_error_rad: Annotated[float, Field(gt=0, le=1)] = _TRAINED["bearing_error_rad"]
     """Standard deviation of a bearing, each axis."""
     error_time_s: NonNegative = _TRAINED["error_time_s"]
-    """How long errors stay about the same; 0: each step has its own ..."""
+    """How long errors stay about the same; 0: each step has its own."""
     missed_time_s: NonNegative = _TRAINED["missed_time_s"]
-    """... and the same of what is missed."""
+    """How long misses last, likewise."""
     false_at_once: Share = _TRAINED["false_at_once"]
-    """How many false neighbours a drone has at once, mean, one at most: what is no drone, and stays where it is, ..."""
+    """Mean number of false neighbours that a drone has at a time, one at most; each stays where it is."""
     false_time_s: Positive = _TRAINED["false_time_s"]
-    """... for so long each, mean, from when it is confirmed ..."""
+    """Mean duration of a false neighbour, from its confirmation on."""
     false_m: tuple[Positive, Positive, Positive] = _TRAINED["false_m"]
-    """... so far away: 10th, 50th and 90th percentile."""
+    """Distances of false neighbours: 10th, 50th and 90th percentile."""
 
     @property
     def filled(self) -> Self:
@@ -240,10 +240,10 @@ class DetectionsConfig(Section):
 
 
 class CameraFaultConfig(Section):
-    """That one simulated camera delivers no images."""
+    """One simulated camera delivers no images."""
 
     drone: Annotated[int, Field(ge=1)]
-    """Whose: the number of its entry in `vehicles`, from 1."""
+    """The drone: the number of its entry in `vehicles`, from 1."""
     camera: str
     """Its name in the rig."""
     begin_s: NonNegative = 0.0
@@ -252,10 +252,10 @@ class CameraFaultConfig(Section):
 
 
 class TakeoverConfig(Section):
-    """That one drone's autopilot takes over in flight, as when a person flips a switch: flockd flies it no more."""
+    """One drone's autopilot takes over in flight, as when a person flips a switch: flockd no longer flies it."""
 
     drone: Annotated[int, Field(ge=1)]
-    """Whose: the number of its entry in `vehicles`, from 1."""
+    """The drone: the number of its entry in `vehicles`, from 1."""
     time_s: NonNegative
     to: Literal["hold", "land"]
 
@@ -285,27 +285,27 @@ class ScenarioConfig(Section):
     """One step of the drone at least, one day at most."""
     seed: Annotated[int, Field(ge=0)] = 0
     ideal: bool = False
-    """Kinder than what is outside, for studies of a part: gates are told the truth, autopilots fly by it, steps take no
-    time, drones' clocks and frames keep time, vehicles answer at once. What is written beside it stays."""
+    """Easier than reality, for studies of a part: gates know the truth, autopilots fly by it, steps take no time,
+    drones' clocks and frames keep time, vehicles answer at once. Keys that are given beside it still count."""
     latency_s: Annotated[float, Field(ge=0, le=5)] | None = None
-    """From the images until the commands that follow from them are flown. null: 0.25 s, or a step if that is shorter;
-    nothing where `ideal`."""
+    """From the images until the resulting commands are flown. null: 0.25 s, or a step if that is shorter; 0 where
+    `ideal`."""
     clocks_apart_s: Annotated[float, Field(ge=0, le=10)] | None = None
-    """How far drones' clocks are apart: standard deviation of when each leaves the paper's circle. null: 0.2 s;
-    nothing where `ideal`."""
+    """Standard deviation of the time at which each drone leaves the paper's circle, as drones' clocks differ. null: 0.2
+    s; 0 where `ideal`."""
     vehicles: Annotated[tuple[StartConfig, ...], Field(min_length=1, max_length=MAX_DRONES)]
     vehicle: VehicleConfig = VehicleConfig()
     sensors: SensorConfig = SensorConfig()
     cameras: CamerasConfig | None = None
-    """How the cameras differ from ideal ones. null: their images are as old as their time stamps say to 2 ms; where
-    `ideal`, in nothing but `sensors.image_noise`."""
+    """Faults of the cameras. null: images are as old as their time stamps say, to 2 ms; where `ideal`, only
+    `sensors.image_noise`."""
     world: WorldConfig = WorldConfig()
     detections: DetectionsConfig | None = None
     """For `--perception truth`: drones know each other by tracking such detections; null: exactly and at once."""
     faults: tuple[CameraFaultConfig, ...] = ()
-    """None, unless a flight is to show what flockd does about them."""
+    """Cameras that fail in flight; by default none."""
     takeovers: tuple[TakeoverConfig, ...] = ()
-    """Not with real daemons."""
+    """Autopilots that take over in flight; by default none. Not with real daemons."""
     drone: DroneConfig
     """In the file: the path of the drone's own configuration, relative to the scenario's; or that configuration. Keys
     `mission` and `obstacles` beside it are flown instead of its own."""

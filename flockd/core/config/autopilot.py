@@ -13,7 +13,7 @@ from flockd.core.config.base import Distance, Port, Section, Share, Speed, text
 
 
 def _baud(address: str) -> str:
-    """Raises ValueError for a cable's rate that no serial port has."""
+    """Raises ValueError for a baud rate that no serial port has."""
     baud = address.rpartition(":")[2]
     rates = [name[1:] for name in dir(termios) if re.fullmatch(r"B[1-9]\d*", name)]
     if address.startswith("serial:") and baud not in rates:
@@ -51,8 +51,8 @@ class AutopilotParameters(Section):
     height_m: Distance | None = None
     """Height above home to fly at; by default the height at which the flight begins."""
     max_velocity_trim_m_s: Speed = 0.5
-    """Where the autopilot's velocity and the cameras' differ, setpoints are corrected by up to this: an autopilot flies
-    by its own estimate, which GNSS alone leaves off by 0.1 to 0.3 m/s. 0: not at all. Does nothing with `own_velocity:
+    """Setpoints are corrected by up to this where the autopilot's velocity and the cameras' differ: an autopilot flies
+    by its own estimate, which errs by 0.1 to 0.3 m/s with GNSS alone. 0: no correction. No effect with `own_velocity:
     autopilot`."""
     low_battery_share: Share = 0.2
-    """The battery counts as low when the autopilot says that no more than this is left."""
+    """The battery counts as low when the autopilot reports this share or less."""

@@ -22,7 +22,7 @@ Vector3 = tuple[float, float, float]
 
 
 def text(pattern: str, words: str) -> Any:
-    """The field of a text that has to match; ``words`` say how it looks, to people: what it is, then a comma."""
+    """The field of a text that has to match; ``words`` describe it for people: what it is, then a comma."""
     return Field(pattern=pattern, json_schema_extra={WORDS: words})
 
 
@@ -33,7 +33,7 @@ PlainName = Annotated[str, text(r"^[a-z0-9_-]+$", "a name, of small letters, dig
 
 
 def checked_port(address: str) -> str:
-    """Raises ValueError for a network's port that none is."""
+    """Raises ValueError for a number that is no network port."""
     kind, _, rest = address.partition("/")
     port = re.search(r":(\d+)(?:[?#].*)?$", rest)
     if port and kind.rstrip(":") in _WITH_PORTS and int(port[1]) > 65535:
@@ -63,9 +63,9 @@ class Section(BaseModel):
 
 
 def refuse(model: BaseModel, faults: Mapping[tuple[str | int, ...], str]) -> None:
-    """Raises the validation error that has these messages at these keys of the section; nothing without any.
+    """Raises the validation error that has these messages at these keys of the section; does nothing without messages.
 
-    For the validators of a section: a ValueError of theirs would stand at the section as a whole.
+    For the validators of a section: a ValueError of theirs would be reported for the section as a whole.
     """
     if faults:
         details = [

@@ -24,7 +24,7 @@ Value = str | int | float | bool | None | tuple["Value", ...] | dict[str, "Value
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 32
 MAX_VALUES = 30_000
-"""A hundred times what any of ours holds; reading more takes longer than anyone would wait for an error."""
+"""A hundred times the values of our largest file; reading more takes longer than anyone would wait for an error."""
 LARGEST_INT = 2**63 - 1
 
 
@@ -191,7 +191,7 @@ def _line(node: yaml.Node) -> int:
 
 
 _UNUSABLE = re.compile("[\0\ud800-\udfff]")
-"""Ends a text for the system's calls, or cannot be written in UTF-8; in quotes YAML has escapes for both."""
+"""Characters that end a text for the system's calls, or are not in UTF-8; in quotes YAML has escapes for both."""
 _NUMBERS: tuple[tuple[str, Callable[[str], int | float]], ...] = (
     (r"[-+]?[0-9]+", lambda text: LARGEST_INT + 1 if len(text) > _LONGEST_INT_TEXT else int(text)),
     (r"0o[0-7]+", lambda text: int(text[2:], 8)),

@@ -27,43 +27,43 @@ from flockd.core.config.tracking import TrackingParameters
 
 
 class RecordingConfig(Section):
-    """How a flight is written down, where it is."""
+    """How a flight is recorded, where it is recorded at all."""
 
     images: ImageFormat = "png"
     """`png` loses nothing: only then does a replay equal the flight."""
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 90
     queue_mb: Positive = 64.0
-    """What waits for the disk; beyond it steps are dropped."""
+    """Memory for what waits for the disk; beyond it steps are dropped."""
     quota_mb: Positive = 20000.0
     """Limit for all recordings of the drone in one folder together: the oldest are deleted to make room, also on a full
-    disk. That of the flight before does not count, and goes last, on a full disk only. A flight that alone is larger is
-    recorded that far."""
+    disk. The previous flight's does not count, and is deleted last, on a full disk only. A flight that exceeds the
+    limit alone is recorded up to it."""
 
 
 OperatorCommand = Literal["hold", "land", "resume", "goto", "velocity"]
 
 
 class TelemetryParameters(Section):
-    """Who may watch this drone, and what they may ask of it."""
+    """Who may watch this drone, and what they may command."""
 
     fleet: Name = "fleet"
     listen: tuple[Endpoint, ...] = ("tcp/127.0.0.1:7447",)
     """zenoh endpoints at which watchers find this drone, as in `tcp/0.0.0.0:7447`."""
     connect: tuple[Endpoint, ...] = ()
-    """zenoh endpoints, of a router or of `flockd status --listen`, that this drone tries to reach for ever."""
+    """zenoh endpoints, of a router or of `flockd status --listen`, that this drone keeps trying to reach."""
     zenoh_config: str | None = None
     """A file of zenoh's own settings to begin with, for TLS and access control; see `config/zenoh_tls.json5`. A
     relative path counts from the folder of the configuration file."""
     commands: tuple[OperatorCommand, ...] = ()
-    """What operators may ask over telemetry; by default nothing. `goto` and `velocity` change the drone's mission until
-    the flight ends."""
+    """Commands that operators may send over telemetry; by default none. `goto` and `velocity` change the drone's
+    mission until the flight ends."""
 
 
 class DroneConfig(Section):
     """Everything one drone's pilot needs."""
 
     name: Name = "drone"
-    """By which it is known in telemetry and recordings; different for each drone of a fleet."""
+    """Its name in telemetry and recordings; different for each drone of a fleet."""
     step_s: Annotated[float, Field(gt=0, le=60)] = 0.5
     rig: RigConfig
     source: SourceParameters | None = None
@@ -80,7 +80,7 @@ class DroneConfig(Section):
     """Heading: kept as it is, or along the desired velocity."""
     recording: RecordingConfig = RecordingConfig()
     autopilot: AutopilotParameters | None = None
-    """None: this drone's commands go nowhere but to the simulator."""
+    """Without it this drone's commands go to the simulator only."""
     telemetry: TelemetryParameters = TelemetryParameters()
 
     @property

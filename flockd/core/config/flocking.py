@@ -13,9 +13,9 @@ class WeightParameters(Section):
     """The influence weight W of Eq. 39 and 40."""
 
     kind: Literal["uniform", "nearest"] = "nearest"
-    """`nearest`: 1 on the nearest, 0 on the others; `uniform`: 1 on all, with which more than ten drones crowd."""
+    """`nearest`: 1 for the nearest neighbours, 0 for the others; `uniform`: 1 for all: more than ten drones crowd."""
     nearest: Annotated[int, Field(ge=1)] = 6
-    """With kind `nearest`: on how many. Seven drones or fewer fly with 6 as with `uniform`."""
+    """With kind `nearest`: how many neighbours. For seven drones or fewer, 6 equals `uniform`."""
 
 
 class FlockingParameters(Section):
@@ -37,13 +37,13 @@ class FlockingParameters(Section):
     """D_II"""
     weight: WeightParameters = WeightParameters()
     cohesion_time_s: Duration | None = 5.0
-    """After how long a neighbour may pull with `max_acceleration_m_s2`; until then with the square of the share of that
-    time for which it has been seen. What is no drone is mostly seen for a few seconds, and far away, where Eq. 39 pulls
-    most. null: no limit, as in the paper. docs/concepts/flocking_law.md says what it wins and costs."""
+    """Time after which a neighbour may pull with `max_acceleration_m_s2`; before, the limit grows with the square of
+    the time for which it has been seen. False neighbours are mostly seen for a few seconds, and far away, where Eq. 39
+    pulls most. null: no limit, as in the paper. docs/concepts/flocking_law.md says what it gains and costs."""
     size: Literal["off", "learn"] = "off"
-    """`learn`: the drone finds out how large the others are, all alike, where nobody knows and the networks do not. For
-    twelve seconds it moves up and down by 0.3 m, and the shift of the others' bearings tells their ranges without their
-    size; ranges follow from that size from then on. Who knows it writes `perception.drone_size_m` instead."""
+    """`learn`: the drone estimates in flight how large the others are, all alike, where neither its owner nor the
+    networks know. For twelve seconds it moves up and down by 0.3 m; the shift of the others' bearings gives their
+    ranges, and so their size, for all later ranges. If you know the size, write `perception.drone_size_m`."""
     own_weight: NonNegative = 1.0
     """W_i of Eq. 42"""
     max_speed_m_s: Annotated[float, Field(gt=0, le=50)] = 3.0

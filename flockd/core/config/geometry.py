@@ -13,7 +13,7 @@ class GeometryParameters(Section):
     """Motions from paired points, and what feeds them."""
 
     initial_threshold_m: Distance = 0.01
-    """Algorithm 1's first."""
+    """The first threshold of Algorithm 1."""
     min_inlier_ratio: Annotated[float, Field(gt=0, lt=1)] = 0.2
     hypotheses: Annotated[int, Field(ge=1, le=100_000)] = 200
     """IT_MAX of Algorithm 1."""
@@ -22,7 +22,7 @@ class GeometryParameters(Section):
     background_stride_px: Annotated[int, Field(ge=1, le=256)] = 16
     """Between the matches of an image; 16 are the points at which Lucas & Kanade's method makes the flow exact."""
     max_depth_m: Distance = 40.0
-    """Background farther away says little of the translation and is left out."""
+    """Background beyond this tells little of the translation and is left out."""
     own_displacement_sigma_m: Positive = 0.02
     """Standard deviation of the own motion that images show over one step, each axis."""
     refine: bool = True

@@ -17,9 +17,9 @@ from flockd.core.config.validation_messages import problems_of
 from flockd.core.errors import ConfigError, ConfigProblem
 
 PATHS = {("perception", key) for key in ("models_dir", "engines_dir", *ROLES)} | {("telemetry", "zenoh_config")}
-"""Keys of a drone whose values are paths; of a model's role only where it ends in `.yaml`, else it is a name."""
+"""Keys of a drone whose values are paths; the value of a model's role only if it ends in `.yaml`, else it is a name."""
 OVERRIDE = "override"
-"""Stands where else a file's name does."""
+"""Stands in a problem in the place of a file's name."""
 
 FileKind = Literal["drone", "scenario", "campaign"]
 Model = TypeVar("Model", bound=BaseModel)
@@ -124,7 +124,7 @@ def validated(model: type[Model], document: Document) -> Model:
         config = model.model_validate(document.values)
     except ValidationError as error:
         problems = problems_of(error.errors(), model, document.places)
-        # A value that could not be read is told already, and not also that there is none.
+        # An unreadable value was reported already: it is not also reported as missing.
         told = {(one.line, one.key) for one in document.problems}
         fresh = [one for one in problems if (one.line, one.key) not in told]
         raise ConfigError([*document.problems, *fresh]) from error

@@ -71,8 +71,8 @@ class MissionParameters(Section):
     at_end: AtEnd = "hold"
     """After the last of the `waypoints`: hold the flock there, or have the autopilot land, or return home."""
     reached_m: Distance = 1.0
-    """A goal is reached when the middle of the flock, of this drone and of the neighbours that it sees, is as near, or
-    has come near and comes no nearer. For flocks of a hundred about the radius of the flock."""
+    """A goal is reached when the middle of the flock (this drone and the neighbours that it sees) is within this
+    distance, or came near it and comes no nearer. In flocks of a hundred, about the radius of the flock."""
     timeout_s: Annotated[float, Field(gt=0, le=60)] = 2.0
     """An operator's velocity holds for this long, and with kind `operator` a goal does too; then the drone hovers."""
     pull: NonNegative = 1.0
@@ -116,7 +116,7 @@ def describe(mission: MissionParameters) -> str:
 
 
 def mission_faults(mission: MissionParameters, gate: GateParameters, law_speed_m_s: float) -> Faults:
-    """What of a mission the gate and the law, up to `law_speed_m_s`, would not let a drone fly; by key."""
+    """What the gate and the law, up to `law_speed_m_s`, would not permit of a mission; by key."""
     limit_m_s = min(law_speed_m_s, gate.max_speed_m_s)
     faults = _faults_of_speeds(mission, limit_m_s)
     heights: dict[tuple[str | int, ...], float | None] = {("height_m",): mission.height_m}

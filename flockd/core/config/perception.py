@@ -11,7 +11,7 @@ from flockd.core.choices import ROLES, FlowRefinement, HeightSource, Provider, R
 from flockd.core.config.base import Distance, NonNegative, Positive, Section, Share, refuse
 
 DIS, NO_MODEL = "dis", "none"
-"""What stands where else a model's name does: OpenCV's DIS flow, and no second stage."""
+"""Stands in the place of a model's name: OpenCV's DIS flow, and no second stage."""
 
 MIN_DRONE_SIZE_M, MAX_DRONE_SIZE_M = 0.05, 5.0
 """Limits of a drone's size from tip to tip: less is a toy that the networks do not find, more is an aircraft."""
@@ -37,10 +37,10 @@ class DetectionParameters(Section):
     """Share of its size by which a drone's centre may be misplaced between two of its detections, as a standard
     deviation: with the gate, two drones are never nearer to each other than 0.6 of their size."""
     max_proposals: Annotated[int, Field(ge=1)] = 12
-    """Regions of one image that the first stage segments and the second stage is given: those of the highest score, for
-    a cluttered image not to cost the deadline. More than the drones that one camera sees."""
+    """The most regions of one image that pass from the first stage to the second: those of the highest score, so that a
+    cluttered image does not exceed the deadline. More than the drones that one camera sees."""
     mask_border_px: Annotated[int, Field(ge=0)] = 5
-    """Background so near to a mask is not used: masks and depth maps are least certain there."""
+    """Background this near to a mask is not used: masks and depth maps are least certain there."""
     depth_map_sigma: Positive = 0.08
     """Standard deviation of a drone's log range where the depth map alone gives it (`perception.distance: none`)."""
 
@@ -53,22 +53,22 @@ class NoiseParameters(Section):
     whiteness: Share = 0.8
     """White noise is at the finest scale at least this strong as a share of the next; photographs have 0.3 to 0.6."""
     max_white: Share = 0.25
-    """The image is not used where more of it than this is white noise. 1, here and in the next two: all are used."""
+    """The image is not used where a larger share of it is white noise. 1, also of the rises below: all are used."""
     max_white_rise: Share = 0.08
-    """Nor is it where this much more of it is white noise than of any image of the last half minute, ..."""
+    """The image is not used where the share of white noise exceeds that of the last half minute by this."""
     rough_level: Positive = 20.0
-    """... or where details at one of the finest scales are stronger than this, in grey levels, ..."""
+    """Strength, in grey levels, above which details at one of the finest scales count as rough."""
     max_rough_rise: Share = 0.4
-    """... in this much more of it than in any of those."""
+    """The image is not used where the rough share exceeds that of the last half minute by this."""
     max_unexplained: Share = 0.35
-    """Nor is it where this much more of it than of the other cameras' images does not follow from the image before, as
-    when it is damaged in blocks, or covered by soft noise. 1: all are used."""
+    """The image is not used where the share that does not follow from the image before is larger by this than in the
+    other cameras, as when it is damaged in blocks, or covered by soft noise. 1: all are used."""
     min_clarity: Share = 0.35
-    """Nor is it where the ground in it has kept less than this share of the contrast, or of the sharpness, that the
-    camera showed before, and the other cameras did not lose as much: its lens is covered, dirty, fogged or in the sun.
-    0: all are used."""
+    """The image is not used where its ground has kept less than this share of the contrast, or of the sharpness, that
+    the camera showed before, and the other cameras did not lose as much: its lens is covered, dirty, fogged or in the
+    sun. 0: all are used."""
     clean_images: Annotated[int, Field(ge=1, le=100)] = 2
-    """So many clean images in a row before a camera that was noisy is used again."""
+    """Clean images in a row before a camera that was noisy is used again."""
 
 
 class RangeFinderParameters(Section):
@@ -77,21 +77,21 @@ class RangeFinderParameters(Section):
     max_age_s: Annotated[float, Field(gt=0, le=5)] = services.GROUND_RANGE.timeout
     """An older reading is not used: the sensor has stopped."""
     min_quality: Share = 0.1
-    """Nor is one whose signal is weaker, where the sensor says how strong it is."""
+    """A reading with a weaker signal is not used, where the sensor reports its strength."""
     noise: Annotated[float, Field(gt=0, le=0.2)] = 0.02
     """Standard deviation of a range, as a share of it."""
     bridge_s: Annotated[float, Field(ge=0, le=10)] = 2.0
-    """So long after the last good reading the ground is expected where it was, with its slope and the own motion."""
+    """For this long after the last good reading the ground is expected where it was, with its slope."""
     gate_sigma: Positive = consistency.RANGE_GROUND.limit
-    """A reading farther from the expected ground, in standard deviations, is that of something else: a crate, another
-    drone, a hole. The next one like it is believed, if it does not contradict the height as the next three say."""
+    """A reading farther than this from the expected ground, in standard deviations, is of something else: a crate,
+    another drone, a hole. The next one like it is used, unless it contradicts the height by the next three keys."""
     max_slope: Annotated[float, Field(ge=0, le=2)] = consistency.RANGE_SLOPE.limit
-    """For each metre flown the ground rises or falls by no more than this, ..."""
+    """For each metre flown the ground rises or falls by no more than this."""
     tolerance_m: Annotated[float, Field(gt=0, le=100)] = consistency.RANGE_BAROMETER.limit
-    """... this for a step in it, the barometer's drift, and `gate_sigma` of the range. Where ranges and the barometer's
-    height say that it does, the range finder is not believed."""
+    """Added for a step in the ground, for the barometer's drift, and to `gate_sigma` of the range. A range finder whose
+    readings and the barometer's height contradict each other by more is not used."""
     compare_s: Annotated[float, Field(gt=0, le=120)] = 15.0
-    """In which the barometer may drift by `tolerance_m`. After a longer gap the ground is not known any more."""
+    """Time in which the barometer may drift by `tolerance_m`. After a longer gap the ground is no longer known."""
 
 
 class PerceptionConfig(Section):
@@ -132,10 +132,11 @@ class PerceptionConfig(Section):
     noise: NoiseParameters = NoiseParameters()
     drone_size_m: Annotated[float, Field(ge=MIN_DRONE_SIZE_M, le=MAX_DRONE_SIZE_M)] | None = None
     """Size of every drone of the fleet, from tip to tip with propellers, where it is known: a drone's range is then
-    this over its apparent size. By default the network judges each drone's size, which is often a quarter off where it
-    was not trained on that airframe."""
+    this over its apparent size. By default the network estimates each drone's size, which is often wrong by a quarter
+    for an airframe that it was not trained on."""
     drone_size_sigma_m: NonNegative = 0.01
-    """Standard deviation of `drone_size_m`: by default of a tape measure. It adds to the deviation of every range."""
+    """Standard deviation of `drone_size_m`; the default is a tape measure's. It adds to the deviation of every
+    range."""
     scale: ScaleSource = "height"
     """The background's metric scale: `network` (pure RGB, as in the paper) or `height` (attitude and height above
     ground from the autopilot)."""

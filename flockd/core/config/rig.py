@@ -13,7 +13,7 @@ from flockd.core.config.base import NonNegative, PlainName, Positive, Section, V
 
 
 class MeasurementConfig(Section):
-    """Where calibrated numbers come from: for people, nothing flies by it. `flockd calibrate` writes it."""
+    """Where calibrated numbers come from, for people: nothing flies by it. `flockd calibrate` writes it."""
 
     date: Annotated[str, text(r"^\d{4}-\d{2}-\d{2}$", "a date, as in `2026-11-24`")]
     camera: str
@@ -21,9 +21,9 @@ class MeasurementConfig(Section):
     source: str
     """What it was measured from."""
     views: Annotated[int, Field(ge=1)]
-    """Number of views of a board, or of pairs of images of what lay about."""
+    """Number of views of a board, or of pairs of images of a scene."""
     residual_px: NonNegative | None = None
-    """Root mean square of what the fit left over."""
+    """Root mean square of the fit's residuals."""
     residual_deg: NonNegative | None = None
     """The same, of a fit to attitudes."""
 
@@ -118,7 +118,7 @@ class RigConfig(Section):
 
     cameras: Annotated[tuple[CameraConfig, ...], Field(min_length=1)]
     time_offset_s: Annotated[float, Field(ge=-1, le=1)] = 0.0
-    """Added to the time stamp of a frame, the time at which the autopilot had the attitude it was taken in."""
+    """Added to the time stamp of a frame: the time at which the autopilot had the attitude in which it was taken."""
 
     @model_validator(mode="after")
     def _names_are_unique(self) -> Self:

@@ -19,17 +19,16 @@ class GateParameters(Section):
     """The last limits on what is sent to the autopilot, whatever asks for it."""
 
     permission_timeout_s: Annotated[float, Field(gt=0, le=0.4)] = services.PERMISSION.timeout
-    """The supervisor's permission is good for this long: what has stalled sends nothing half a second later."""
+    """The supervisor's permission is valid for this long: what has stalled sends nothing half a second later."""
     command_fresh_s: Annotated[float, Field(gt=0, le=60)] = services.WANTED.timeout
-    """A command older than this is flown ever slower: the pilot has missed a step. Leave it a step and its duration."""
+    """A command older than this is flown ever more slowly. Allow a step and its duration."""
     command_timeout_s: Annotated[float, Field(gt=0, le=60)] = services.WANTED_GONE.timeout
-    """By this age of the command the drone stands still, and one that is older is not flown at all; leave the pilot
-    three of its steps."""
+    """At this age of the command the drone stands still; it flies no older one. Allow three pilot's steps."""
     max_speed_m_s: Annotated[float, Field(gt=0, le=50)] = 4.0
     """A command that asks for more is a fault, and refused."""
     max_acceleration_m_s2: Annotated[float, Field(gt=0, le=50)] = 5.0
     degraded_speed_m_s: Annotated[float, Field(gt=0, le=50)] = 1.0
-    """Instead, while the drone is degraded: a command that asks for more is flown this fast."""
+    """Instead, while the drone is degraded: a faster command is flown at this speed."""
     min_separation_m: Annotated[float, Field(ge=0, le=1000)] = 1.0
     """Nearer than this to a neighbour, no velocity towards it."""
     degraded_separation_m: Annotated[float, Field(ge=0, le=1000)] = 1.5
@@ -39,7 +38,7 @@ class GateParameters(Section):
     leads nearer to one whose level distance is within one and a half times `degraded_separation_m`: the lower flies in
     the other's downwash."""
     max_climb_m_s: Annotated[float, Field(gt=0, le=20)] = 1.5
-    """The height that is asked for changes no faster, up or down."""
+    """The height setpoint changes no faster than this, up or down."""
     braking_m_s2: Annotated[float, Field(gt=0, le=20)] = 1.5
     """How hard every drone of the flock can brake: none flies faster towards a neighbour or an obstacle than it can
     stop in time."""
@@ -87,30 +86,29 @@ class SafetyParameters(Section):
     max_lost_cameras: Annotated[int, Field(ge=0)] = 1
     """Fly on with the others, degraded, while no more than this many are lost; at least one has to see."""
     max_dropped_share: Share = 0.2
-    """Limit of the share of dropped frames of late; above it, degraded."""
+    """Degraded when a larger share of the latest frames was dropped."""
     estimate_timeout_s: Annotated[float, Field(gt=0, le=60)] = services.ESTIMATE.timeout
-    """Hover when the pilot's newest output is older than this; leave it three of its steps. At most
-    `gate.command_timeout_s`."""
+    """Hover when the pilot's newest output is older; allow three steps. At most `gate.command_timeout_s`."""
     degraded_ego_motion_s: Annotated[float, Field(gt=0, le=600)] = 0.75
-    """How long no step has found the own motion, to be degraded: at two steps a second, two in a row."""
+    """Degraded when no step has found the own motion for this long: at two steps a second, two in a row."""
     max_ego_motion_s: Annotated[float, Field(gt=0, le=600)] = 2.75
-    """The same, to hover."""
+    """Hover when no step has found it for this long."""
     degraded_load: Positive = 1.0
-    """How long the steps take (95th percentile) over how long they may, to be degraded."""
+    """Degraded when the duration of the steps (95th percentile) over the permitted one is above this."""
     max_load: Positive = 2.0
-    """The same, to hover."""
+    """Hover when it is above this."""
     degraded_temperature_c: float = 85.0
-    """Temperature of the hottest thermal zone from which the drone is degraded."""
+    """Degraded from this temperature of the hottest thermal zone on."""
     max_temperature_c: float = 95.0
-    """The same, to hover."""
+    """Hover from this temperature on."""
     max_loop_lag_s: Annotated[float, Field(gt=0, le=10)] = 0.2
-    """Lag of the event loop; above it, degraded."""
+    """Degraded when the event loop lags by more."""
     degraded_velocity_error_m_s: Positive = consistency.RESPONSE_DEGRADED.limit
-    """By how much the drone's velocity is off its setpoints (root mean square over ten seconds), to be degraded."""
+    """Degraded when the drone's velocity deviates from its setpoints by more (root mean square over ten seconds)."""
     max_velocity_error_m_s: Positive = consistency.RESPONSE.limit
-    """The same, to ask for Hold."""
+    """Hold is requested when it deviates by more than this."""
     hold_room_m: Annotated[float, Field(ge=0, le=100)] = 2.0
-    """Hold, which knows of no obstacles, is then asked for where none is nearer than this to the drone's middle; until
+    """Hold knows of no obstacles. So it is then requested where none is nearer than this to the drone's middle; until
     then, for 30 s at most, the drone flies on, degraded."""
     heartbeat_timeout_s: Annotated[float, Field(gt=0, le=10)] = services.HEARTBEAT.timeout
     """The link to the autopilot counts as lost without a heartbeat for this long, and flockd falls silent for good; two
@@ -124,15 +122,15 @@ class SafetyParameters(Section):
     outside_s: Annotated[float, Field(gt=0, le=60)] = 3.0
     """How long it may take to come back into the fence and the heights before it asks for Hold."""
     on_battery_low: AutopilotMode = "hold"
-    """What is asked of the autopilot when it says that its battery is low."""
+    """What flockd requests from the autopilot when that reports a low battery."""
     on_position_lost: AutopilotMode = "hold"
-    """What is asked of the autopilot when it has lost its position; it acts by itself too."""
+    """What flockd requests from the autopilot when that has lost its position; the autopilot acts by itself too."""
     hover_s: Annotated[float, Field(gt=0, le=3)] = 1.0
     """The longest hover, before Hold is asked for."""
     recovery_s: Annotated[float, Field(ge=0, le=600)] = 2.0
-    """How long all has to be well before a degraded drone flies as usual again."""
+    """How long a degraded drone has to be without a fault before it flies as usual again."""
     ask_timeout_s: Annotated[float, Field(gt=0, le=5)] = 2.0
-    """How long the autopilot has to leave offboard when asked, before silence makes it."""
+    """How long the autopilot has to leave offboard on request, before silence makes it."""
     first_flight_layer: Annotated[int, Field(ge=1, le=100)] | None = None
     """For first flights: the drone's number in its flock, another for each. A real drone then flies at 1 m/s at most,
     and at 3 m above the ground at home and 4 m more for each number after 1, whatever its mission says. null: off.

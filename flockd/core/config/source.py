@@ -60,8 +60,8 @@ class CameraDeviceParameters(Section):
     crop_of: tuple[_Side, _Side] | None = None
     """Width and height of the image that `crop` is cut from; by default it ends where the crops end."""
     reduce: Literal[1, 2, 4] = 1
-    """For kind `v4l2`: the camera sends images so many times as wide and as high as the rig says, which are reduced:
-    they have less noise then, and less of what compression leaves."""
+    """For kind `v4l2`: the camera sends images this many times as wide and as high as the rig says, and flockd reduces
+    them: they then have less noise and less of what compression leaves."""
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 30.0
     controls: tuple[ControlParameters, ...] = ()
     """For kind `v4l2`: set in this order whenever the camera is opened; what is not named here stays as it was."""
@@ -103,7 +103,7 @@ class SourceParameters(Section):
     """Where camera frames come from, and how those of several cameras become sets."""
 
     kind: Literal["v4l2", "gstreamer", "ros", "shared_memory"]
-    """Cameras of the kernel, those behind a GStreamer pipeline each, topics of ROS 2, or another program's frames."""
+    """Cameras of the kernel, GStreamer pipelines, topics of ROS 2, or another program's frames."""
     cameras: tuple[CameraDeviceParameters, ...] = ()
     """For all kinds but `shared_memory`: one for each camera of the rig."""
     shared_memory: SharedMemoryParameters = SharedMemoryParameters()
@@ -111,11 +111,11 @@ class SourceParameters(Section):
     set_tolerance_s: Annotated[float, Field(gt=0, le=60)] = 0.02
     """How far the time stamp of a frame may be from that of its set; half a frame period or more."""
     set_wait_s: Annotated[float, Field(gt=0, le=60)] = 0.1
-    """How long a set waits for a camera that is late, or gone."""
+    """How long a set waits for a late or lost camera."""
     silence_s: Annotated[float, Field(gt=0, le=60)] = services.FRAME_SILENCE.timeout
     """A camera without a usable frame for this long is closed and opened again."""
     frozen_after: Annotated[int, Field(ge=0)] = 5
-    """An image that repeats itself this many times is frozen, and counts as no image; 0: may repeat for ever."""
+    """An image that repeats itself this many times is frozen, and does not count; 0: it may repeat for ever."""
 
     @model_validator(mode="after")
     def _fits_its_kind(self) -> Self:
@@ -167,7 +167,7 @@ def _crop_faults(camera: CameraDeviceParameters, whole: tuple[int, int]) -> dict
 def _sharing_faults(
     camera: CameraDeviceParameters, others: Sequence[CameraDeviceParameters], key: str
 ) -> dict[str, str]:
-    """Of a camera whose device, pipeline or topic is that of others too."""
+    """Faults of a camera that shares its device, pipeline or topic with others."""
     mates = [one for one in others if one.place == camera.place]
     first = mates[0]
     if camera.crop is None or first.crop is None:

@@ -19,7 +19,7 @@ class TrackingParameters(Section):
     """Neighbours over time: motion model, association and existence probability."""
 
     acceleration_sigma_m_s2: Positive = 0.45
-    """How hard a flock mate manoeuvres, standard deviation an axis; a drone on a course of its own, twice as hard."""
+    """Manoeuvres of a flock mate, standard deviation of each axis; of a drone on its own course, twice this."""
     manoeuvre_time_s: Duration = 0.5
     """How long an acceleration lasts. The white acceleration noise of the motion model has the spectral density
     acceleration_sigma_m_s2^2 * manoeuvre_time_s (Bar-Shalom, Li & Kirubarajan 2001, section 6.2)."""
@@ -30,17 +30,17 @@ class TrackingParameters(Section):
     """Standard deviation of how fast a drone comes that does not fly with the flock; and, an axis, of the velocity of
     any drone where the own one is not known."""
     stranger_probability: Probability = 0.2
-    """That a drone seen for the first time does not fly with the flock, and that one which begins to fly otherwise does
-    not; half of it, that it brakes to standstill. All motions are followed, and detections weigh them (IMM: Blom &
-    Bar-Shalom 1988)."""
+    """Probability that a newly seen drone, or one that changes its motion, flies on a course of its own; half of it,
+    that it brakes to standstill. All motions are followed, and detections weigh them (IMM: Blom & Bar-Shalom 1988)."""
     robust_sigma: Positive = 2.5
     """Innovations beyond this many standard deviations count less and less; of those of the motion and measurement
     model 82 % are nearer, of measured velocities 90 % (chi-square with 4 and 3 degrees of freedom)."""
 
     size_correlation: Probability = 0.3
     """Correlation of the errors of a detection's log range and log size, taken to be equally large: a range is the
-    size, which the appearance tells, over the apparent size. Measured as 0.2 with drones of families that the shipped
-    networks know and 0.9 with others; taken low, so that ranges count as uncertain as the networks say they are."""
+    size, estimated from the appearance, over the apparent size. Measured as 0.2 with drones of families that the
+    shipped networks know and 0.9 with others; taken low, so that ranges count as uncertain as the networks say they
+    are."""
     range_error_time_s: Duration = 1.5
     """How long errors of one neighbour's log ranges last. With the shipped networks' detections in the simulator the
     correlation of errors that are 0.5, 1, 2 and 4 s apart is 0.53, 0.38, 0.21 and 0.09 ..."""
@@ -56,7 +56,7 @@ class TrackingParameters(Section):
     track."""
 
     detection_probability: Probability = 0.7
-    """P_D: of a neighbour that the cameras can show being detected in one frame set. Less than what the shipped
+    """P_D: probability that a neighbour in view is detected in one frame set. Lower than the share that the shipped
     networks detect of drones at least 12 px wide, because misses come in runs: at 0.7 a track stays confirmed through
     three frame sets in a row without a detection."""
     clutter_density: Positive = 0.01
@@ -74,15 +74,16 @@ class TrackingParameters(Section):
     multiplied by it."""
     heading_sigma_rad: NonNegative = 0.035
     """Error of the autopilot's heading, as PX4's magnetometer has it: it turns all neighbours alike about the drone,
-    and lasts, so that it counts where places are said and not in the filter."""
+    and lasts, so that it is added where positions are reported, and not in the filter."""
     confirm_hits: Annotated[int, Field(ge=1)] = 2
-    """No track is confirmed with fewer detections that agree with it, after the first each by `evidence_interval_s`."""
+    """A track needs this many detections that agree with it to be confirmed; after the first each counts by
+    `evidence_interval_s`."""
     vague_factor: Annotated[float, Field(ge=1)] = 2.0
-    """A detection whose range is less certain than that of confirmed neighbours usually is, by more than this factor,
-    counts as fewer, in proportion: what is no drone is seldom seen well."""
+    """A detection whose range is less certain than those of confirmed neighbours usually are, by more than this factor,
+    counts less, in proportion: false detections seldom have certain ranges."""
     confirm_sigma: Positive = 3.6
-    """A detection farther off than this many standard deviations does not agree: 99 % of those of the motion and
-    measurement model are nearer (chi-square with 4 degrees of freedom)."""
+    """A detection farther than this many standard deviations from the track does not agree: 99 % of those of the motion
+    and measurement model are nearer (chi-square with 4 degrees of freedom)."""
     confirm_probability: Probability = 0.925
     """A track is confirmed when its existence probability is above this."""
     keep_probability: Probability = 0.6

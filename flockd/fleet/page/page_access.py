@@ -37,7 +37,8 @@ _KEY_BYTES = 1024
 class PageAccess:
     """Sessions of one key. The key opens the page; a session's token, which only its page knows, commands.
 
-    All follows from the key: a server that is started again with the same one knows the sessions of the last.
+    Sessions and tokens are derived from the key: a server that is started again with the same key knows the earlier
+    sessions.
     """
 
     def __init__(self, key: str | None = None) -> None:
@@ -135,9 +136,9 @@ def is_own_origin(headers: Mapping[str, str]) -> bool:
 
 
 MAX_STRANGERS = 64
-"""Connections over which no page with the key has asked for anything; one more closes the oldest."""
+"""Connections over which no page with the key has asked for anything; a further one closes the oldest."""
 STRANGER_S = 10.0
-"""For a whole request; a browser needs a fraction of a second."""
+"""Time for a whole request; a browser needs a fraction of a second."""
 _TIDY_EVERY_S = 1.0
 
 

@@ -31,9 +31,9 @@ COMMANDS = ("hold", "land", "resume", "goto", "velocity")
 _FOLDER = Path(__file__).parent
 _TYPES = {".js": "text/javascript", ".css": "text/css"}
 MAX_PAGES = 32
-"""Open at once."""
+"""Pages that may be open at once."""
 HELLO_S = 5.0
-"""For a page to say its token."""
+"""Time for a page to send its token."""
 _ORDER_THREADS = 64
 _TOKEN = "@TOKEN@"
 """In the page, for the session's."""
@@ -229,7 +229,7 @@ class PageServer:
         await feed.push()
 
     def _operator_of(self, request: web.Request) -> str:
-        """Whose page it is that commands: of one computer, each has a number."""
+        """The operator's name with the page's number and its computer."""
         session = request.cookies.get(self._access.cookie)
         elsewhere = request.remote not in {None, "127.0.0.1", "::1"}
         return f"{self._operator}, page {(session or '')[:4]}{f' at {request.remote}' if elsewhere else ''}"
@@ -321,7 +321,7 @@ def _text(status: int, sentence: str) -> web.Response:
 
 
 def _json(value: object) -> str:
-    """With null for numbers that JSON cannot say: whatever one drone tells, the others are shown."""
+    """With null for numbers that JSON cannot hold, so that one drone's faulty message does not hide the others."""
     try:
         return json.dumps(value, separators=(",", ":"), allow_nan=False)
     except ValueError:
@@ -338,11 +338,11 @@ def _finite(value: object) -> object:
 
 EVERY_S = 1.0
 SHOWN_S = 5.0
-"""So old a picture may be that is shown while the next one is on its way."""
+"""Age up to which a picture is shown while the next one is on its way."""
 WAIT_S = 0.25
-"""For a picture that comes at once; a later one is there for the next request."""
+"""How long a request waits for a picture; a later picture is there for the next request."""
 SILENT_S = 5.0
-"""A camera of which no picture came is asked again after this."""
+"""A camera that gave no picture is asked again after this time."""
 _THREADS, _THREADS_A_DRONE = 16, 4
 _MOST_KEPT = 500
 

@@ -23,9 +23,9 @@ from flockd.onboard.telemetry.topics import OrderMessage, StateMessage
 
 UPDATE_EVERY_S = 0.05
 STATE_EVERY_S = 1.0
-"""A drone's state is sent when it changes, and so often where it does not."""
+"""A drone's state is sent when it changes, and at this interval."""
 PLAIN = ("hold", "land", "resume")
-"""Orders without a place, each a service."""
+"""Orders without a place: each is a service."""
 _LEVELS = {
     **dict.fromkeys(("normal", "ready", "idle"), trees.OK),
     **dict.fromkeys(("degraded", "hover", "silent"), trees.WARN),
@@ -37,7 +37,7 @@ _VALUES = (
     "load", "temperature_c", "setpoints_missed", "messages_lost", "delay_ms", "clock_s", "recording", "silence",
     "version",
 )  # fmt: skip
-"""What of a row of the fleet page stands in a drone's DiagnosticStatus."""
+"""Values of a row of the fleet page that a drone's DiagnosticStatus holds."""
 
 
 class FleetBridge:
@@ -153,7 +153,7 @@ class FleetBridge:
         self._node.advertise(f"/{name}/order_answer", trees.DIAGNOSTIC, Delivery.EVENT)
 
     def _order(self, key: str, name: str, command: str, parse: Callable[..., OrderMessage], message: Any) -> None:
-        """What became of it is published, as a topic has no reply."""
+        """Publishes the drone's answer, as a topic has no reply."""
         row, known = self._source.rows(self._source.now_s()).get(key), self._source.known().get(key, Known())
         try:
             if row is None:

@@ -26,7 +26,7 @@ _TELL_S = 1.0
 
 
 def check(config: DroneConfig, vehicle_topic: str | None) -> None:
-    """Raises UsageError where the configuration needs a height that nobody tells."""
+    """Raises UsageError where the configuration needs a height and no topic gives one."""
     if vehicle_topic is None and config.perception.scale == "height":
         raise UsageError(
             "perception.scale: is `height`, which needs a height; name odometry or a pose with --vehicle, or "
@@ -37,7 +37,7 @@ def check(config: DroneConfig, vehicle_topic: str | None) -> None:
 class PerceptionNode:
     """Sees drones in the images of a source, and publishes them.
 
-    Without the vehicle's state it takes the drone for level, and its nose for north: y of `DRONE/level` is then ahead,
+    Without the vehicle's state it assumes that the drone is level and faces north: y of `DRONE/level` is then ahead,
     and x to the right. `check` comes first.
     """
 
@@ -92,7 +92,7 @@ class PerceptionNode:
         self._node.publish(f"{space}/neighbours/tracks", trees.POINT_CLOUD, tracks, Delivery.SENSOR)
 
     def _tell(self, source: FrameSource, reasons: Sequence[str] | None) -> None:
-        """Once a second, what is the matter. ``reasons``: None while no images come."""
+        """Publishes once a second what is wrong. ``reasons``: None while no images come."""
         now_s = time.monotonic()
         if now_s - self._told_s < _TELL_S:
             return

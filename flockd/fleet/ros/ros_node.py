@@ -20,7 +20,7 @@ from flockd.core.errors import UnavailableError
 from flockd.fleet.ros.message_trees import Tree
 
 HERE_ONLY = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-"""Environment of a node that only this computer's find: ROS 2 has no rule of its own about who may publish."""
+"""Environment of a node that only this computer's nodes find: ROS 2 has no access rules of its own."""
 NOT_INSTALLED = "there is no rclpy; source a ROS 2, or, with Python 3.11 on x86-64 Linux, pip install -e '.[ros]'"
 _THREADS = 64
 """At once, as far as there is work: an order may wait some seconds for a drone that is silent."""
@@ -29,7 +29,7 @@ _ELEMENT = re.compile(r"(?:sequence<)?([a-z0-9_]+/\w+)(?:, \d+)?>?(?:\[\d*\])?")
 
 
 class Delivery(Enum):
-    """How messages of a topic are handed over: what the ecosystem calls its QoS."""
+    """How messages of a topic are delivered: their QoS."""
 
     SENSOR = auto()
     """Best effort, the newest five: as sensors publish."""
@@ -142,7 +142,7 @@ def _no_signals() -> Any:
 
 
 def _one_at_a_time() -> Any:
-    """A new group: what has one of its own waits for no other."""
+    """A new callback group: callbacks of different groups do not wait for each other."""
     from rclpy.callback_groups import MutuallyExclusiveCallbackGroup  # noqa: PLC0415
 
     return MutuallyExclusiveCallbackGroup()

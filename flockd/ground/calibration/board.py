@@ -16,13 +16,13 @@ from flockd.flight.geometry import Camera, RigidTransform, rotation_from_vector
 
 
 class CalibrationError(FlockdError):
-    """What was shown is not enough, or does not fit together, for numbers anybody should fly with."""
+    """The images or numbers given are not enough, or contradict each other, for a calibration to fly with."""
 
 
 _DICTIONARY, _MARKERS, _MARKER_SHARE = cv2.aruco.DICT_4X4_50, 50, 0.75
-"""Markers of 4 by 4 cells, 50 of them, with so much of a square's side."""
+"""ArUco markers of 4 by 4 cells, 50 of them; and the share of a square's side that a marker takes."""
 MIN_CORNERS = 8
-"""Fewer say too little of where the board is."""
+"""Fewer corners do not determine where the board is."""
 CENTRE_PX = 0.5
 """OpenCV has pixel centres at whole numbers."""
 
@@ -127,7 +127,7 @@ class BoardFinder:
 
 
 _SOME_MARKERS, _OWN = 4, "4X4_50"
-"""Fewer are taken for ones by chance; the name of the board's own."""
+"""Fewer markers may be found by chance; and the name of the board's own dictionary."""
 
 
 def _opencv_board(spec: BoardSpec) -> cv2.aruco.CharucoBoard:
@@ -167,7 +167,7 @@ def board_svg(spec: BoardSpec) -> str:
 
 _FACTOR = 2.5
 MAX_DROPPED = 1 / 3
-"""Share of all; where more contradict the others, it is not known which are right."""
+"""Share of all views that may be dropped; where more contradict the others, it is not known which are right."""
 
 
 def inliers(rms_px: FloatArray, margin_px: float) -> BoolArray:
@@ -192,10 +192,8 @@ def residuals_px(camera: Camera, seen: BoardDetection, pose: RigidTransform) -> 
 
 
 def first_pose(camera: Camera, seen: BoardDetection) -> tuple[float, RigidTransform | None]:
-    """``T_camera_board`` by the board's outline (IPPE), after its residual; none, after infinity, where it fits none.
-
-    Of the two that a flat board may have by its outline the likelier.
-    """
+    """``T_camera_board`` by the board's outline (IPPE), and its residual; no pose, and infinity, where it fits none. Of
+    the two poses that a flat board may have by its outline, the likelier."""
     rays = camera.rays(seen.pixels)
     usable = np.isfinite(rays).all(axis=1)
     if not usable.any():

@@ -1,8 +1,8 @@
 """How each camera moved by what it alone saw, with how well that is known: what calibration of a rig in flight uses.
 
-A match fixes the direction of its point before and after. How far it is, the depth map says, and is not believed
-much: what a wrong depth moves a point by is taken out of the residual's weight, as in `ego_motion_refinement`. So near
-points count by their epipolar lines, and far ones fix the rotation.
+A match fixes the direction of its point before and after. The depth map says how far it is, with a large error: the
+part of a residual that a wrong depth explains loses its weight, as in `ego_motion_refinement`. So near points count by
+their epipolar lines, and far ones fix the rotation.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from flockd.flight.geometry.transform import RigidTransform
 
 MIN_MATCHES = 40
 _MAX_MATCHES = 300
-"""Of more some are left out evenly, and each that is left counts for those: they err together. With 600 the four
-rigs of a simulated flight were found no better."""
+"""More matches are thinned out evenly, and each that is left counts for those beside it: their errors are common. With
+600 the four rigs of a simulated flight were found no better."""
 _ROUNDS, _FINE_ROUNDS = 7, 4
 _NEAR, _THERE = 1.0, 1e-2
 """Squares of standard deviations that a step is long: below the first the fine rounds begin, below the second they
@@ -36,7 +36,8 @@ _FLOW_PX = 0.2
 _MATCHES_A_FLOW = 4.0
 """So many matches err together: a dense flow is smooth."""
 _CAUCHY_SIGMAS, _TUKEY_SIGMAS = 2.385, 4.685
-"""A start far off needs the first; the second, as a false match tells of a focal length what the others do not."""
+"""The first is for a start that is far off; the second for the fine rounds, because false matches bias a focal
+length."""
 _FOCAL_STEP = 1e-3
 _MAX_CONDITION = 1e12
 _ROTATION, _TRANSLATION, _DEPTH = slice(0, 3), slice(3, 6), 6
@@ -55,12 +56,10 @@ class CameraMotion:
     """(6, 2 n) from the residuals to the motion that they ask for."""
 
     def by_focal(self, motion: RigidTransform) -> FloatArray:
-        """(6,) by how much a motion would seem to change with the logarithm of the focal length.
-
-        How large turns appear depends on it. To be asked of the motion as all that is known has it: with that of this
-        camera alone, its noise would count as turns. What an image alone says of the focal length is not used, as it
-        hangs on depths.
-        """
+        """(6,) by how much a motion would seem to change with the logarithm of the focal length, because that
+        determines how large turns appear. Take it at the best estimate of the motion: at this camera's own, its noise
+        would count as turns. What an image alone tells of the focal length is not used, because it depends on
+        depths."""
         change: FloatArray = self.projection @ self.sights.by_focal(motion).ravel()
         return change
 
@@ -83,7 +82,7 @@ def scaled_focal(camera: Camera, log_scale: float) -> Camera:
 def camera_motion(
     mounted: RigCamera, pairs: PointPairs, start: RigidTransform, log_focal: float
 ) -> CameraMotion | None:
-    """The motion that best explains the pairs of one camera; None where they are too few, or fix none.
+    """The motion that best explains the pairs of one camera; None where they are too few, or do not determine it.
 
     Args:
         mounted: as the pairs were lifted.
@@ -127,7 +126,7 @@ class Sights:
     def of(cls, camera: Camera, pixels: tuple[FloatArray, FloatArray], range_m: FloatArray, log_focal: float) -> Sights:
         """Of one camera's pixels (m, 2) before and after, at ranges (m,), as seen with its focal length scaled.
 
-        Without those at which that one images nothing.
+        Pixels outside that camera's image are left out.
         """
         used, other = (scaled_focal(camera, log_focal + step) for step in (0.0, _FOCAL_STEP))
         before, before_other = (one.rays(pixels[0]) * range_m[:, None] for one in (used, other))
@@ -139,7 +138,7 @@ class Sights:
         return cls(before, after, across, used, other, before_other, (first, second))
 
     def linearised(self, motion: RigidTransform) -> _Linearisation:
-        """Where the motion moves each point to, off where it was seen; and how that changes."""
+        """The residuals: where the motion moves each point to, less where it was seen; and their derivatives."""
         moved = _moved(self.before, motion)
         length = _length(moved)
         unit = moved / length
@@ -217,7 +216,7 @@ class _Linearisation:
 
 
 def _solved(sights: Sights, start: RigidTransform, together: float) -> CameraMotion | None:
-    """The motion by Gauss-Newton steps; of the matches so many as ``together`` have their errors in common."""
+    """The motion by Gauss-Newton steps; each ``together`` matches have their errors in common."""
     motion, fine = start, False
     for number in range(_ROUNDS):
         there = sights.linearised(motion)
@@ -234,7 +233,7 @@ def _solved(sights: Sights, start: RigidTransform, together: float) -> CameraMot
         hessian = weighted @ J.T
         slope = weighted @ white.ravel()
         hessian[_DEPTH, _DEPTH] += 1.0 / _DEPTH_SIGMA**2
-        # Without the depths, whatever they are together (their Schur complement).
+        # With the depths eliminated together (their Schur complement).
         by_depth = hessian[:6, _DEPTH] / hessian[_DEPTH, _DEPTH]
         information = hessian[:6, :6] - by_depth[:, None] * hessian[_DEPTH, :6]
         slope = slope[:6] - by_depth * slope[_DEPTH]

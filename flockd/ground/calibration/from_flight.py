@@ -35,12 +35,12 @@ from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.streams import is_image
 
 MAX_TURN_RAD, MAX_OFFSET_S, MAX_FOCAL = math.radians(0.5), 0.01, 0.01
-"""What is more uncertain than this is not known: the standard deviation of a mounting about its worst axis, of a time,
-of a focal length."""
+"""Largest standard deviations of a mounting about its worst axis, of a time, and of a focal length, to be taken
+over."""
 LEAST_S = 5.0
-"""Of looks: less says nothing."""
+"""Seconds of a flight that say enough."""
 _AGAIN = 60
-"""So many first looks are judged again by what all of them showed."""
+"""Number of first looks that are judged again by what all of them showed."""
 Look = tuple[Seen, Seen, PointPairs]
 
 
@@ -159,7 +159,7 @@ def corrected_rig(
 
 
 def _offset_s(found: Sequence[CameraDeviation]) -> tuple[float | None, str | None]:
-    """What is to be added to the rig's offset, or None; and a note where the cameras do not agree."""
+    """The correction of the rig's offset, or None; and a note where the cameras do not agree."""
     known = [one for one in found if not one.elsewhere and math.sqrt(one.covariance[3, 3]) < MAX_OFFSET_S]
     if not known:
         return None, "the time of the cameras is not known, and kept: this flight turned too evenly"

@@ -15,7 +15,7 @@ from flockd.ground.datasets.image_files import SUFFIXES, in_order, read_image, u
 from flockd.onboard.sources import FrameSource, open_source
 
 MOST_S = 120.0
-"""Of a live camera."""
+"""Longest calibration by a live camera."""
 FIRST_FRAME_S = 10.0
 FRAME_WAIT_S = 0.2
 
@@ -45,10 +45,8 @@ def from_folder(path: Path) -> ImageStream:
 
 
 def from_camera(config: DroneConfig, file: str, name: str, enough: Callable[[], bool]) -> ImageStream:
-    """Frames of a drone's live camera, until it is enough, the time is up or Ctrl-C. Raises ConfigError.
-
-    Reading raises UnavailableError when no frame comes.
-    """
+    """Frames of a drone's live camera, until there are enough views, the time is up or Ctrl-C. Raises ConfigError.
+    Reading raises UnavailableError when no frame comes."""
     rig = config.rig.model_copy(update={"cameras": tuple(one for one in config.rig.cameras if one.name == name)})
     source, device = config.source, None
     if source is not None and source.cameras:

@@ -36,22 +36,22 @@ _FIRST_FOCALS = {
     "pinhole": np.geomspace(0.3, 4.0, 9),
     "wide_angle": 1.0 / np.radians(np.linspace(60.0, 240.0, 9)),
 }
-"""Focal lengths to begin with, in widths of the image."""
+"""Focal lengths to start from, in widths of the image."""
 _MARGIN_PX, _ROUNDS = 0.1, 5
 """Of the rejection of outliers."""
 _STEP = 1.5e-8
 """Of a numeric derivative: the root of double precision."""
 _MAX_STEPS, _GAIN = 60, 1e-10
-"""A fit ends after so many, or where a step gains no larger share: of the squares, or of the numbers."""
+"""A fit ends after so many steps, or where a step gains no larger share: of the squares, or of the numbers."""
 _UNKNOWN = 1e-13
-"""Least eigenvalue of a scaled normal matrix: what is less is rounding."""
+"""Least eigenvalue of a scaled normal matrix: a smaller one is rounding."""
 _FOCAL_SIGMA = 0.01
 """A focal length that the views leave more uncertain than this is not known."""
 _CENTRE_SIGMA = 0.01
 """The same for the principal point, in widths of the image."""
 _LEAST_TILT_DEG = 10.0
 CLEARLY_BETTER = 0.8
-"""A more complicated model has to leave less than this share of a simpler one's residual."""
+"""A more complicated model is taken if its residual is less than this share of a simpler one's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +61,9 @@ class Lens:
     model: LensModel
     camera: Camera
     sigma: FloatArray
-    """Standard deviations of fx, fy, cx, cy and the distortion, from the residuals: what noise alone leaves open."""
+    """Standard deviations of fx, fy, cx, cy and the distortion, from the residuals: the effect of noise alone."""
     views: tuple[View, ...]
-    """Those it was fitted to."""
+    """Views that it was fitted to."""
     poses: tuple[RigidTransform, ...]
     """``T_camera_board`` of each."""
     dropped: tuple[tuple[View, float], ...]
@@ -209,7 +209,7 @@ def _fitted(
         return [RigidTransform(R @ pose.rotation, step[3:]) for R, pose, step in zip(turns, poses, steps, strict=True)]
 
     def residuals(x: FloatArray) -> FloatArray:
-        if min(x[:2]) <= 0.0:  # no camera: the step is refused
+        if min(x[:2]) <= 0.0:  # no possible camera: the step is refused
             return np.full(pixels.size, np.nan)
         points = [pose.apply(view.seen.points) for view, pose in zip(views, moved(x), strict=True)]
         off: FloatArray = _camera(model, camera.size, x[:first]).project(np.concatenate(points)) - pixels
@@ -309,10 +309,8 @@ def fit_lenses(collector: Collector, model: LensModel | None, source: str) -> li
 
 
 def write_lens(camera: str, lens: Lens, measured: MeasurementConfig, out: Path) -> IntrinsicsConfig:
-    """Writes a drone with this one camera as YAML, and gives the lens as configuration.
-
-    To ten thousandths of a pixel, and what of the distortion makes as much.
-    """
+    """Writes a drone with this one camera as YAML, and gives the lens as configuration: to ten thousandths of a pixel,
+    and the distortion as exactly."""
     fx, fy, cx, cy = (round(float(value), 4) for value in lens.camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]])
     distortion = tuple(round(k, 8) for k in lens.camera.distortion)
     intrinsics = IntrinsicsConfig(

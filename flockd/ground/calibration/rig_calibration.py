@@ -31,18 +31,17 @@ from flockd.ground.calibration.camera_motion import CameraMotion, camera_motion
 PRIOR_TURN_RAD, PRIOR_OFFSET_S, PRIOR_FOCAL = math.radians(4.0), 0.06, 0.04
 """Standard deviations before anything was seen: each axis of a mounting, a time, a focal length's logarithm."""
 _TURN_SIGMA_RAD, _LEAST_TURN_RAD, _TURN_GAIN = math.radians(0.15), math.radians(0.05), 0.1
-"""Of the autopilot's turn between two images, each axis: before anything was seen, and at least. An attitude that
-jitters by more than it counts for looks like turns of the body about axes about which it never turned, and tells
-mountings that it does not know; so how much it jitters is learnt from what all cameras agree on (expectation
-maximisation), each time by this share."""
+"""Of the autopilot's turn between two images, each axis: at the start, and at least. An attitude with more jitter than
+assumed looks like turns of the body about axes about which it never turned, and would determine mountings falsely. So
+the jitter is learnt from what all cameras agree on (expectation maximisation), each time by this share."""
 _VELOCITY_SIGMA_M_S, _VELOCITY_TIME_S = 0.2, 10.0
 """Error of the autopilot's velocity, each axis, which lasts (PX4's estimate: 0.15 m/s for seconds at a time)."""
 _VELOCITY_NOISE_M_S = 0.1
-"""Beside it, what differs between two images: how the drone went between them is not known."""
+"""Added for what differs between two images: how the drone flew between them is not known."""
 _WAY_SIGMA = 0.03
 """Of the way that a camera sees, share of it, each axis: a network's flow has the direction off by 0.4 to 3.9 degrees
 (standard deviations of cameras in realistic flights, beside the truth), for seconds at a time, where its matches claim
-0.2. Believed, it told focal lengths and mountings that nobody had changed."""
+0.2. With 0.2, focal lengths and mountings were corrected that were right."""
 _READOUT_S = 0.02
 """Of all cameras alike: the time over an image's width, and over its height, in which rows are read one after the
 other; 0 for a global shutter. Where the rate of turn changes, that makes turns about other axes of turns, and focal
@@ -51,7 +50,7 @@ _UNKNOWN_M_S = 10.0
 """The same where the autopilot says no velocity."""
 _MAX_INTERVAL_S = 2.0
 _EVERY_S = 0.3
-"""Of faster steps some are left out: turns are small in them, and each takes 5 ms of a core for four cameras."""
+"""Of faster steps some are left out: their turns are small, and each takes 5 ms of a core for four cameras."""
 _ROUNDS = 2
 """Each is linear about what the one before found that the body did. A third moved no number by 0.003 sigma."""
 _FIT_GAIN = 0.1
@@ -60,15 +59,15 @@ _MAX_MISFIT = 16.0
 _MAX_UNEXPECTED = 2.8
 """The same of a motion beside what the whole flight showed: 99 % are less (chi-square with 6 degrees of freedom)."""
 _MAX_INFLATION = 9.0
-"""No camera's errors are taken to be larger than three times what it says."""
+"""A camera's errors are taken to be at most three times as large as it says."""
 _AGREEMENT_GAIN, _AGREES = 0.125, 0.5
 """Share of one motion in whether a camera's last ones agree with the body's (1) or not (-1), and from which on it does:
 after three seconds in which all did, or none. In flights with mountings up to 20 degrees off all do."""
 _MOVES_M, _MOVES_RAD = 0.2, math.radians(1.0)
-"""A body that went and turned by less says nothing of that: who walks before a drone on the ground makes no camera one
-that is elsewhere."""
+"""While the body moves and turns by less, agreement is not judged: a person who walks before a drone on the ground must
+not make a camera count as exchanged."""
 WORTH_TURN_RAD, WORTH_OFFSET_S, WORTH_FOCAL = math.radians(0.5), 0.01, 0.01
-"""What is less is not worth a warning: half a degree puts a drone at 10 m by 0.09 m, and 1 % a range by 1 %."""
+"""Smaller differences are not worth a warning: half a degree puts a drone at 10 m by 0.09 m, and 1 % a range by 1 %."""
 _SURE, _SURE_OF_TURN = 16.0, 22.06
 """Squares of four standard deviations of one number, and what as few of three numbers together exceed (1 in 15,800): it
 is asked of every camera before every flight."""
@@ -95,8 +94,8 @@ class CameraDeviation:
     covariance: FloatArray
     """(5, 5) of turn, time offset, and the focal scale's logarithm."""
     elsewhere: bool = False
-    """It moves otherwise than the drone, as no mounting that is a little off explains: the other numbers say nothing.
-    Turned or upside down, swapped with another, or before something that moves along."""
+    """It moves otherwise than the drone, as no small error of the mounting explains, and the other numbers say nothing:
+    turned or upside down, exchanged with another, or behind something that moves along."""
     readout_s: FloatArray | None = None
     """(2,) seconds in which rows are read one after the other, over the image's width (from its right: negative) and
     over its height; of all cameras together. Near 0: a global shutter."""
@@ -186,7 +185,7 @@ class _Camera:
 
 @dataclass(frozen=True, eq=False)
 class _Sight:
-    """How one camera moved, and how it is expected to have: what the rounds of an update have in common."""
+    """How one camera moved, and how it was expected to move: what the rounds of an update have in common."""
 
     camera: _Camera
     place: int
@@ -299,7 +298,7 @@ class RigCalibration:
         return tuple(found)
 
     def _wait(self, interval_s: float) -> None:
-        """The velocity's error as uncertain as it becomes meanwhile."""
+        """Lets the uncertainty of the velocity's error grow with time."""
         keep = math.exp(-interval_s / _VELOCITY_TIME_S)
         kept = np.ones(len(self._covariance))
         kept[-3:] = keep
@@ -360,7 +359,7 @@ class RigCalibration:
         return J
 
     def expects(self, name: str, before: Seen, after: Seen, pairs: PointPairs) -> bool:
-        """Whether a camera moved as one of 99 that are as what is known of it now."""
+        """Whether a camera moved as what is known of it now says: 99 % do."""
         sight = self._sight(name, before, after, pairs)
         return sight is not None and self._square(sight) < _MAX_UNEXPECTED
 
@@ -373,8 +372,8 @@ class RigCalibration:
         return float(sight.measured @ np.linalg.solve(spread, sight.measured)) / len(sight.measured)
 
     def _fits(self, sight: _Sight, *, moves: bool) -> bool:
-        """Whether a camera's motion is one that may be; learns how large its errors are, and if the drone moves whether
-        they agree."""
+        """Whether a camera's motion is plausible; learns how large its errors are, and if the drone moves whether they
+        agree."""
         camera, square = sight.camera, self._square(sight)
         if not math.isfinite(square):
             return False
@@ -396,7 +395,7 @@ class RigCalibration:
 
 
 def _rate(seen: Seen) -> FloatArray:
-    """(3,) rad/s, body axes; where it is not known the time cannot be told."""
+    """(3,) rad/s, body axes; zero where it is not known, so that the time cannot be estimated."""
     rate = seen.vehicle.turn_rate
     return np.zeros(3) if rate is None else rate
 

@@ -16,12 +16,12 @@ from flockd.ground.calibration.board import CENTRE_PX, BoardDetection, BoardFind
 
 COLUMNS, ROWS = 8, 6
 _DARK = 16
-"""Grey levels: a cell in which no image ever shows more lies outside the lens's own image."""
+"""Grey levels: a cell that is never brighter in any image lies outside the lens's own image."""
 _ENOUGH = 0.75
 _TILT_DEG, _TILTED = 15.0, 4
-"""So many views have to be tilted this much: only they tell the focal length from the distance."""
+"""How many views have to be tilted by how much: only they separate the focal length from the distance."""
 _NEAR = 0.3
-"""A board in at least one view as wide as this share of the image."""
+"""At least one view shows a board as wide as this share of the image."""
 _PLACES = (("top left", "top", "top right"), ("left", "middle", "right"), ("bottom left", "bottom", "bottom right"))
 
 
@@ -93,11 +93,11 @@ class Coverage:
 
 Refusal = Literal["no board", "blurred", "moving", "like another"]
 MOST_VIEWS = 100
-"""Further ones count as like another: so many that differ tell all there is."""
+"""Further ones count as duplicates: this many different views are enough."""
 _SHARP_PX, _SHARP_SHARE = 4.0, 0.003
 """Widest edge of a sharp view: so many pixels, or this share of a large image's width."""
 _ALIKE = 0.03
-"""Two views whose corners are this much of the image's width apart, on average, say the same."""
+"""Two views whose corners differ by less than this share of the image's width, on average, are duplicates."""
 _STILL = 0.003
 """The same, of a board that is held still from one frame to the next."""
 _SAME = 0.6
@@ -139,7 +139,7 @@ class Collector:
         self.coverage: Coverage | None = None
 
     def offer(self, name: str, image: UInt8Array, *, moving: bool = False) -> Refusal | None:
-        """Takes a (h, w, 3) RGB image; gives what it is refused for, None for one that is now a view.
+        """Takes a (h, w, 3) RGB image; gives the reason why it is refused; None: it is now a view.
 
         ``moving``: images follow each other so fast that a board in motion shows between them.
         """

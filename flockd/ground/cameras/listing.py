@@ -79,7 +79,7 @@ class FoundCamera:
 
     @property
     def place(self) -> str:
-        """By which it is told apart."""
+        """Its identifier."""
         return self.element or self.device
 
     def best_mode(self, size: tuple[int, int] = USUAL_SIZE) -> Mode | None:
@@ -234,7 +234,7 @@ def read_camera(kernel: Kernel, node: str, device: str) -> FoundCamera | None:
 
 
 def _useless(formats: list[int]) -> str:
-    """Why a camera without a usable mode has none."""
+    """Why a camera has no usable mode."""
     codes = [int(number).to_bytes(4, "little").decode("ascii", "replace") for number in formats]
     if codes and all(code[:2] in ("RG", "BG", "GB", "GR", "BA", "pR", "pB", "pg", "pG") for code in codes):
         return SENSOR_ONLY
@@ -252,7 +252,7 @@ def _kernel_modes(kernel: Kernel, descriptor: int, number: int) -> Iterator[Mode
 
 
 def _entries(kernel: Kernel, descriptor: int, request: int, entry: Callable[..., _Entry]) -> Iterator[_Entry]:
-    """A list of the driver's, by index, until it has no more or does not keep one."""
+    """A list of the driver's, by index, until it ends or the driver breaks its own rules."""
     for index in range(_MOST):
         asked = entry(index=index)
         try:

@@ -31,7 +31,7 @@ _REFUSED: Mapping[Count, str] = {
     "frozen": "frozen",
     "malformed": "malformed",
 }
-"""What images are that are worth nothing, in words."""
+"""Reasons why images cannot be used, in words."""
 
 
 @dataclass
@@ -45,7 +45,7 @@ class Watched:
     lost: int = 0
     """Gaps in the sequence numbers."""
     refused: Counter[str] = field(default_factory=Counter)
-    """Images that are worth nothing, by reason."""
+    """Images that cannot be used, by reason."""
     image: UInt8Array | None = None
     """The last one."""
 
@@ -144,7 +144,7 @@ _STEEPEST = 0.5
 _LEAST_CONTRAST = 30.0
 """Grey levels; a weaker edge has more noise than slope."""
 _SILENCE_S = 3.0
-"""A camera without an image for this long is opened again: longer than two images of any are apart."""
+"""A camera without an image for this long is opened again: longer than any camera's interval."""
 
 
 def measure(cameras: Sequence[tuple[FoundCamera, Mode]], seconds: float, kernel: Kernel) -> list[Watched]:

@@ -21,7 +21,7 @@ from flockd.core.messages import Float32Array, UInt8Array
 
 
 class DatasetError(FlockdError):
-    """Something is no dataset, or a part of it is missing, damaged or does not fit the others."""
+    """A dataset, or a part of it, is missing, damaged or does not fit the other parts."""
 
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp", ".avif"})
@@ -29,7 +29,7 @@ UNREAD_SUFFIXES = frozenset(
     {".heic", ".heif", ".jxl", ".jp2", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
     | {".3gp", ".mts", ".ts", ".wmv", ".flv", ".insv"}
 )
-"""Of pictures and videos that are not read: a folder's are named."""
+"""Pictures and videos that are not read: a folder's are named."""
 _WITH_PAGES = frozenset({".tif", ".tiff", ".webp", ".avif"})
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 _JPEG = b"\xff\xd8"

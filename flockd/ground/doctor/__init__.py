@@ -1,7 +1,5 @@
-"""Examines a drone on the ground: each check says what it measured, whether that is well, and how to fix it.
-
-Each is bounded in time: one that hangs or breaks is a failure.
-"""
+"""Examines a drone on the ground: each check says what it measured, how well that is, and how to fix it. Each is
+bounded in time: one that hangs or breaks is a failure."""
 
 from __future__ import annotations
 
@@ -25,7 +23,7 @@ class Level(StrEnum):
 
     PASS = "PASS"
     WARNING = "WARNING"
-    """It flies, but not as well or as safely as it could, or it could not be seen."""
+    """It flies, but not as well or as safely as it could, or the check could not tell."""
     FAILURE = "FAILURE"
     """Do not fly."""
 
@@ -87,7 +85,7 @@ _LIMITS_S = {
 last, as they heat up the computer."""
 CHECKS = tuple(_LIMITS_S)
 BESIDE_A_FLIGHT = frozenset({"limits", "instance", "memory", "disk", "temperature", "clock"})
-"""They leave alone what a drone flies with: its autopilot, cameras and endpoints, and its computer's time."""
+"""Checks that leave alone what a drone flies with: its autopilot, cameras and endpoints, and its computer's time."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,7 @@ class Check:
     run: Callable[[], Iterable[Finding]]
     """Changes nothing; what it finds counts even if it hangs later."""
     limit_s: float
-    """Much longer than it should take."""
+    """Much longer than the check should take."""
 
 
 @dataclass(frozen=True)
@@ -111,8 +109,8 @@ class Examined:
     seconds: float
     """How long the cameras are watched."""
     taken: UnavailableError | None
-    """Why this process may not own the drone's link, which another does; None: it owns it. What would touch the drone
-    is then not examined."""
+    """Why this process may not own the drone's link; None: it owns it. Without it, whatever would touch the drone is
+    not examined."""
 
 
 def plan(drone: Examined, only: Collection[str] = CHECKS) -> tuple[Check, ...]:

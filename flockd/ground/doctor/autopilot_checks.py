@@ -56,7 +56,7 @@ class ParameterChoice(NamedTuple):
     good: tuple[int, int, int]
     """Those that a drone may have, the best first."""
     poor: tuple[int, ...] | None = None
-    """With which it may fly, but not well; None: all others. With what is neither it must not fly."""
+    """Values with which it may fly, but not well; None: all others. With any other value it must not fly."""
 
 
 ACTIONS = {
@@ -163,7 +163,7 @@ def _is_silent(status: AutopilotStatus, config: DroneConfig) -> bool:
 
 
 def judge_heartbeat(system_id: int, status: AutopilotStatus, config: DroneConfig) -> Finding:
-    """Heard, and at rest."""
+    """Heard, and on the ground."""
     address = "" if config.autopilot is None else f" at {config.autopilot.address}"
     measured = f"system {system_id}{address}, heard {status.heartbeat_age_s:.1f} s ago"
     if _is_silent(status, config):

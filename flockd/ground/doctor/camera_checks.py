@@ -36,7 +36,7 @@ ODD_CENTRE = 0.08
 ODD_PIXELS = 0.03
 """How much fx and fy differ: pixels are square, unless images were squeezed from another aspect."""
 SEEN_DEG, UNSEEN = 63, 0.12
-"""How far off the axis networks were trained (docs/networks.md), and which share of an image may be beyond: a tenth of
+"""How far off the axis networks were trained (docs/networks.md), and which share of an image may lie beyond: a tenth of
 those of the shipped rig is."""
 LAST_S = 30.0
 """Of the last flight, that the rig is compared with: computed again, they take less time than they took in the air."""
@@ -112,7 +112,8 @@ def _stream(name: str, watched: Watched, rate_hz: float, max_dropped_share: floa
 
 
 def lens_problems(camera: CameraConfig) -> Iterator[Finding]:
-    """What makes a calibration unlikely for images of the camera's size, and what of these the networks do not see."""
+    """Why a calibration is unlikely for images of the camera's size, and which part of these the networks do not
+    see."""
     about, lens = f"camera {camera.name}", camera.intrinsics
     again = "calibrate this camera at the size of its images"
     off = max(abs(lens.cx / camera.size_px[0] - 0.5), abs(lens.cy / camera.size_px[1] - 0.5))

@@ -27,11 +27,11 @@ _MAX_INSTANCE = 2.0
 """An instance's longer side over the drone's apparent size, for it to be of this drone alone: masks of soft pictures
 lack thin arms and propellers, which the first stage has, but it may take several drones for one."""
 KNOWN_LOG_SIZE_SIGMA = 0.03
-"""A network that says less knows the airframe: it does of 65 % of the detections of rendered airframes that it learnt,
-of 3 % of those of 14 that it did not, and of 0.2 % of those of an F450, a Hubsan H107D+ and a Crazyflie."""
+"""Below this sigma a network knows the airframe: so it reports for 65 % of the detections of rendered airframes that it
+learnt, for 3 % of those of 14 that it did not, and for 0.2 % of those of an F450, a Hubsan H107D+ and a Crazyflie."""
 UNKNOWN_LOG_SIZE_SIGMA = 0.85
-"""Of the others. With it 89 and 95 % of the errors of five airframes that no network learnt lie within one and two
-standard deviations, 78 and 98 % of nine more, and of each real one 97 % or more within two."""
+"""Sigma of the others. With it 89 and 95 % of the errors of five airframes that no network learnt lie within one and
+two standard deviations, 78 and 98 % of nine more, and of each real one 97 % or more within two."""
 _ANY_RANGE_M = 1e4
 _UNKNOWN_HEIGHT_M = 5.0
 """Not used: the networks give the scale. A vehicle state has to hold some height."""

@@ -19,12 +19,12 @@ from flockd.flight.tracking.association import assign
 from flockd.ground.pictures.single_frame import DetectedDrone
 
 _MANOEUVRE = 0.5
-"""Of drone and hand-held camera, in longer sides of the image: standard deviation of the speed of a new track, per s,
-and of how a speed has changed after a second."""
+"""Motion of drone and hand-held camera, in longer sides of the image: standard deviation of the speed of a new track,
+per s, and of the change of a speed within a second."""
 _PLACE_SIGMA = 0.1
 """Of a box's middle, in sizes of the box."""
 _SIZE_SIGMA = 0.15
-"""Of the logarithm of a box's size: outer propellers come and go."""
+"""Standard deviation of the logarithm of a box's size: outer propellers appear and vanish."""
 _SIZE_DRIFT = 0.5
 """Of the same, for each square root of a second: drones turn and come nearer."""
 

@@ -51,7 +51,7 @@ class FlightLogBuilder:
         """What each drone's mission wants, (n, 2) m/s, and how far it is.
 
         `homes` (n, 2) are metres north and east from which the drones' goals count; None: all from the origin. A drone
-        whose mission was over in an earlier step has no goal any more. Call it in order of the steps.
+        whose mission ended in an earlier step has no goal. Call it in order of the steps.
         """
         same = (desired == desired[0]).all()
         self._rows["desired"][step] = desired[0] if same else desired.mean(axis=0)

@@ -102,7 +102,7 @@ def key_frames(
 
 
 def _read(recordings: Sequence[Recording], progress: Progress) -> tuple[list[str], list[_Step]]:
-    """The names of all drones of the flight that anything is known of, and its steps in order."""
+    """The names of all drones of the flight that are known, and its steps in order."""
     names: list[str] = []
     steps: dict[int, _Step] = {}
     done, total = 0, sum(len(recording.contents.steps) for recording in recordings)

@@ -169,7 +169,7 @@ def _sets(
 
 
 def _time_s(stamp_ns: int, began_ns: int) -> float:
-    """Since the first image: since 1970, a float would hold no microseconds."""
+    """Since the first image: a float of the seconds since 1970 would hold no microseconds."""
     return (stamp_ns - began_ns) * 1e-9
 
 
@@ -187,7 +187,7 @@ def _format(
 
 @dataclass(frozen=True)
 class _PngFormat:
-    """Whatever it shows is right."""
+    """The format is right whatever the image shows."""
 
     size: tuple[int, int]
 
@@ -232,7 +232,7 @@ def _states(bag: Bag, topic: str, config: DroneConfig, began_ns: int, tell: Call
 
 
 _OF_ONE_CLOCK_NS = 1_000_000_000
-"""Stamps of PX4 that are not so near the recording's times are since its start, not since 1970."""
+"""Stamps of PX4 that differ from the recording's times by more count from its start, not from 1970."""
 
 
 def _vehicle_topic(bag: Bag, wanted: str | None) -> str:

@@ -37,7 +37,7 @@ from flockd.review.flight_log.log import spread
 Depth = Literal["recorded", "network"]
 
 _STRIDE_PX = 6
-"""One camera has to give as many points as the four of a drone."""
+"""Narrower, so that one camera gives as many points as the four of a drone."""
 
 
 def dataset_config(dataset: Dataset, config: DroneConfig | None, depth: Depth, flow: str | None) -> DroneConfig:
@@ -86,7 +86,8 @@ def _pair_result(pair: Pair) -> dict[str, Any]:
 
 
 _FLAT_DEVIATION = 1.0
-"""Grey levels of standard deviation under which an image shows nothing: matched with anything, it would stand still."""
+"""Standard deviation in grey levels below which an image shows nothing: matched with any image, it would seem to stand
+still."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,8 +148,8 @@ def replay_dataset(dataset: Dataset, config: DroneConfig, stride: int, depth: De
     """Each frame i with frame i + ``stride``, in order, as a pilot with this configuration sees them.
 
     ``config`` has the dataset's camera as its only one. As many pilots as the stride take the frames in turns, so that
-    each flies with every frame once. Nobody knows the autopilot's attitude and height: with `perception.scale: network`
-    the own motion needs none. Raises DatasetError at a frame that is missing or damaged, ModelError.
+    each flies with every frame once. Attitude and height are not known: with `perception.scale: network` the own motion
+    needs neither. Raises DatasetError at a frame that is missing or damaged, ModelError.
     """
     camera = build_rig(config.rig).cameras[dataset.camera.name]
     mount = camera.T_body_camera

@@ -17,7 +17,7 @@ from flockd.onboard.recording.mcap_file import RecordingError
 Outputs = Mapping[int, Mapping[str, Any]]
 """`PilotOutput`s as JSON, by the number of the step."""
 NOT_COMPARED = ("stages_ms",)
-"""How long something took is no part of what came out."""
+"""Durations, which are no part of the result."""
 ABSENT = "nothing"
 
 

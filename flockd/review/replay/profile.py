@@ -23,7 +23,7 @@ from flockd.onboard.daemon import THERMAL_ZONES, thermal_zones
 from flockd.review.replay.recorded_flight import Replay
 
 LEAST_STEPS = 5
-"""Of fewer the slowest twentieth is a single one, and the first does not count."""
+"""With fewer steps the slowest twentieth is a single one, and the first does not count."""
 STEP = "step"
 """The row of all stages together, and what is between them."""
 _ROUND_TO_S = 0.05
@@ -37,7 +37,7 @@ _EIGHT_BIT = {
 
 @dataclass(frozen=True)
 class ComputerFiles:
-    """Files in which the kernel says what the computer is, and how it does."""
+    """Files in which the kernel says what the computer is, and its present state."""
 
     cpuinfo: Path = Path("/proc/cpuinfo")
     board: Path = Path("/proc/device-tree/model")

@@ -1,1 +1,1 @@
-"""What a simulated flight came to: figures in tables, curves and pages, beside the paper's own."""
+"""The result of a flight: figures in tables, curves and pages, beside the paper's own."""

@@ -47,14 +47,14 @@ from flockd.sim.vehicles.vehicles import EstimateErrors
 
 TICK_S = 0.02
 MAX_STEP_S = 0.2
-"""After a longer pause of this computer the vehicle has stood still."""
+"""Over a longer pause of this computer the vehicle is taken to have stood still."""
 TYPE_MASK = 2503
 """The one kind of setpoint it takes: velocity and yaw."""
 DISARM_AFTER_LANDING_S = 2.0
 ARRIVED_M = 0.3
 STICKS_FRESH_S = 0.5
 OFFBOARD_LOSS_MODES: dict[int, Mode] = {0: "RTL", 3: "RTL", 4: "LAND", 5: "LOITER"}
-"""By COM_OBL_RC_ACT, no others; 0 would be position mode, which needs a remote control, which there is none of."""
+"""By COM_OBL_RC_ACT. 0, position mode, needs a remote control, which the fake has not."""
 NOT_ARMED_IN: dict[Mode, str] = {"LAND": "check_modes_cannot_takeoff", "ACRO": "check_modes_manual_control"}
 """The checks that refuse to arm in a mode."""
 HOME_DEG = (47.3977, 8.5456)
@@ -105,9 +105,9 @@ class FakeAutopilot:
         self._speed_factor, self._real = speed_factor, clock
         self.battery_share, self.estimate_ok = 1.0, True
         self.sends_motion = True
-        """False: its position and velocity do not come any more, and all else does."""
+        """False: it no longer sends its position and velocity, but everything else."""
         self.frame_off, self.heading_off_rad = np.zeros(3), 0.0
-        """By what its positions (3,) in NED and its heading are off the truth, in metres and clockwise."""
+        """How far its positions (3,) in NED and its heading deviate from the truth, in metres and clockwise."""
         self.drifts, self.drift = True, EstimateErrors(SensorConfig(), seed=system_id, drone=0)
         # `drifts`, False: its estimate is the truth. It is at first.
         self.drift.velocity, self.drift.position = np.zeros(3), np.zeros(2)
@@ -172,7 +172,8 @@ class FakeAutopilot:
         )
         self.streams = self._new_streams(started_s=-self.clock_offset_s)
         self._heard_s = -math.inf
-        """When no packet waited any more: what is taken later came later, whatever the wall clock says."""
+        """When the last waiting packet had been taken: a packet that is taken later came later, whatever the wall clock
+        says."""
         self._lock = threading.RLock()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fake autopilot", daemon=True)
@@ -196,12 +197,12 @@ class FakeAutopilot:
 
     @property
     def failsafe(self) -> bool:
-        """It is in another mode than it was asked for."""
+        """Whether it is in another mode than it was asked for."""
         return self.mode != self.intended_mode
 
     @property
     def has_ground_station(self) -> bool:
-        """It hears one on its link, and sends its texts there."""
+        """Whether it hears a ground station on its link; then it sends its texts there."""
         return self.checks.has_ground_station(self._clock())
 
     def pilot_arms(self) -> None:
@@ -216,7 +217,7 @@ class FakeAutopilot:
             self._update_mode()
 
     def restart(self) -> None:
-        """It starts anew, on the ground: its clock, its events and the streams it sends begin as at first."""
+        """Restarts it on the ground: its clock, its events and its streams begin anew."""
         with self._lock:
             self._disarm()
             self.clock_offset_s = -self._clock()
@@ -224,7 +225,7 @@ class FakeAutopilot:
             self.streams = self._new_streams(started_s=-self.clock_offset_s)
 
     def send_from_elsewhere(self, data: bytes) -> None:
-        """It receives a packet of another program, as one on another of its links."""
+        """Passes it a packet of another program, as on another of its links."""
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             sender.sendto(data, self._socket.getsockname())
 
@@ -255,7 +256,7 @@ class FakeAutopilot:
             flown_s = now
 
     def _receive_until(self, deadline: float) -> None:
-        """All that comes by then; when it is late already, all that waits."""
+        """Receives all that comes by then; if it is late already, all that waits."""
         while True:
             asked_s = self._clock()
             self._socket.settimeout(max(deadline - asked_s, 0.0) / self._speed_factor)
@@ -381,7 +382,8 @@ class FakeAutopilot:
         return np.array([cos * ahead - sin * right, sin * ahead + cos * right])
 
     def _feel(self, moved_s: float, sticks: FloatArray) -> None:
-        """Sticks moved fast take over from every mode but Position, and not from a failsafe, where PX4 asks more."""
+        """Sticks that move fast take over from every mode but Position, and not from a failsafe, for which PX4 needs
+        more."""
         self._sticks = moved_s, sticks
         fast = self._override.moved(moved_s, sticks, self.parameters["MAN_OVERRIDE_SPD"])
         if fast and self.armed and not self.failsafe and self.mode not in {"POSCTL", "ACRO"}:

@@ -17,7 +17,7 @@ LEAST_NOISE_M = 0.01
 _CLOSER_M = 1e-3
 _MOST_STEPS = 20
 _WEAK = 0.0
-"""Quality of a reading that is none."""
+"""Quality of a reading without a signal."""
 
 
 def level_ground(north: FloatArray, east: FloatArray) -> FloatArray:

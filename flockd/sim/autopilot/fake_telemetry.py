@@ -23,7 +23,7 @@ Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "ACRO", "OFFBOARD"]
 
 TRUTH_S = 0.04
 _NEVER_ASKED = 0, 115
-"""The heartbeat and the truth, whose rates nobody changes."""
+"""The heartbeat and the truth, whose rates are fixed."""
 ON_GROUND_M = 0.05
 UNKNOWN_COVARIANCE = 255
 FULL_SIGNAL, NO_SIGNAL = 100, 1

@@ -1,4 +1,4 @@
-"""What separates a simulated drone's cameras from ideal ones, each fault by its physical size; 0 is none of it."""
+"""Faults of a simulated drone's cameras, each by its physical size; 0: ideal."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flockd.core.choices import CameraPreset
 from flockd.core.config.base import NonNegative, Positive, Section, Share
 
 MAX_LATE_S = 0.3
-"""Most that an image or an attitude may be late: what was longer ago is not kept."""
+"""The largest delay of an image or an attitude: older poses are not kept."""
 _Late = Annotated[float, Field(ge=0, le=MAX_LATE_S)]
 
 
@@ -19,7 +19,7 @@ class ShutterConfig(Section):
     """When the rows of an image are exposed."""
 
     exposure_s: Annotated[float, Field(ge=0, le=0.1)] = 0.0
-    """Of each row: what moves is smeared over its way in that time."""
+    """Exposure of each row: what moves is smeared along its way in that time."""
     readout_s: Annotated[float, Field(ge=0, le=0.1)] = 0.0
     """From the exposure of the first row to that of the last, one row after the other (rolling shutter); 0: all at
     once (global shutter). An image shows the middle row at its time."""
@@ -68,25 +68,23 @@ class CameraTimingConfig(Section):
     """When cameras expose, and what becomes of the images."""
 
     apart_s: _Late = 0.0
-    """Cameras run freely: each exposes up to so much before the set's time, as its time stamps say."""
+    """Cameras run freely: each exposes up to this much before the set's time, and its time stamps say so."""
     delay_s: _Late = 0.0
-    """Images are so much older than their time stamps say, ..."""
+    """Images are older by this than their time stamps say."""
     jitter_s: _Late = 0.0
-    """... and each by up to so much more."""
+    """Each image is older by up to this much more, at random."""
     dropped: Share = 0.0
     """Share of the images that never come."""
 
 
 class RigErrorsConfig(Section):
-    """What each camera of each drone is off, in a direction of its own, drawn from the seed; pilots do not know of it.
-
-    Time stamps that are off: `timing.delay_s`.
-    """
+    """Errors of each camera of each drone, in a direction of its own, drawn from the seed; pilots do not know of them.
+    Wrong time stamps: `timing.delay_s`."""
 
     mounting_deg: Annotated[float, Field(ge=0, le=20)] = 0.0
-    """Its mounting is turned by so much about some axis, ..."""
+    """Its mounting is turned by this angle about some axis."""
     mounting_m: Annotated[float, Field(ge=0, le=0.5)] = 0.0
-    """... and moved so far."""
+    """Its mounting is displaced by this distance."""
     focal: Annotated[float, Field(ge=0, le=0.2)] = 0.0
     """Its focal lengths are longer or shorter by this share."""
 
@@ -120,7 +118,7 @@ class CamerasConfig(Section):
     """
 
     preset: CameraPreset = "ideal"
-    """`ideal`: none of it. `realistic`: a cheap USB camera with a rolling shutter on a small drone by day, from data
+    """`ideal`: no fault. `realistic`: a cheap USB camera with a rolling shutter on a small drone by day, from data
     sheets (sources in `flockd/sim/cameras/imperfect_cameras.py`)."""
     shutter: ShutterConfig = ShutterConfig()
     shake: ShakeConfig = ShakeConfig()
@@ -128,8 +126,8 @@ class CamerasConfig(Section):
     lens: LensFaultsConfig = LensFaultsConfig()
     compression: CompressionConfig = CompressionConfig()
     reduce: Literal[1, 2, 4] = 1
-    """As of a drone's `source.cameras`: the sensor has so many times so many pixels, each as noisy as `noise` says, and
-    the compressed image is reduced."""
+    """As in a drone's `source.cameras`: the sensor has this many times the pixels either way, each as noisy as `noise`
+    says, and the compressed image is reduced."""
     timing: CameraTimingConfig = CameraTimingConfig()
     rig: RigErrorsConfig = RigErrorsConfig()
 

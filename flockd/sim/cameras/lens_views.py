@@ -15,7 +15,7 @@ from flockd.flight.geometry import Camera, PinholeCamera, rotation_from_euler
 from flockd.sim.renderer.renderer import View
 
 _WIDEST = math.radians(75.0)
-"""A pinhole view is no wider, either way: toward its border, pixels grow with the square of the cosine."""
+"""Widest angle of a pinhole view, either way: toward its border, pixels grow with the square of the cosine."""
 _FINER = 1.3
 """Pixels a radian of a view's middle over the lens's, so that sampling loses nothing."""
 _MARGIN_PX = 2

@@ -57,7 +57,7 @@ class Shot:
     """One image's times."""
 
     stamp_s: float
-    """As it says itself."""
+    """Its own time stamp."""
     shown_s: float
     """When its middle row was exposed."""
     comes: bool
@@ -126,10 +126,8 @@ _PIXELS = 2.0
 
 
 def veiled(light: Float32Array, flare: float, lens: LensField, sky: BoolArray, sun: FloatArray) -> Float32Array:
-    """Light (h, w, 3) as it falls on the lens, and its share ``flare`` scattered over the image.
-
-    ``sky`` (h, w): where nothing hides it; ``sun`` (3,): unit vector towards it, in the camera's axes.
-    """
+    """Light (h, w, 3) as it falls on the lens, with a share ``flare`` of it scattered over the image. ``sky`` (h, w):
+    where nothing hides the sky; ``sun`` (3,): unit vector towards the sun, in the camera's axes."""
     imaged = lens.imaged.view(np.uint8)
     shown = np.asarray(cv2.add((1 - flare) * light, flare * np.array(cv2.mean(light, imaged))), np.float32)
     of_sun = _of_sun(lens, sky, sun)

@@ -50,9 +50,9 @@ _MOST_SAMPLES = 16
 _FEW_SAMPLES = 4
 _MOST_WAY_PX = 60
 _SAME_DEPTH = 0.9
-"""Share of a drone's depth from which on what is around it may be it."""
+"""Pixels around a drone may belong to it from this share of its depth on."""
 _STILL_PX = 0.02
-"""Ways shorter than this are none."""
+"""Shorter ways count as standstill."""
 
 Shake = Callable[[FloatArray], FloatArray]
 """Angles (n, 3) rad about the camera's axes at times (n,) s relative to the middle row's."""

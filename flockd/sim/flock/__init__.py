@@ -1,1 +1,1 @@
-"""A simulated flock: its loop in lockstep, its pilots, what it perceives, and people who watch it."""
+"""A simulated flock: its loop in lockstep, its pilots, their perception, and people who watch it."""

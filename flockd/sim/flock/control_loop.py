@@ -71,7 +71,7 @@ _THERE_M = 0.5
 _HOLD_PER_S = 0.95
 """Velocity for each metre from where an autopilot holds: PX4's default of MPC_XY_P."""
 _HOLD_BRAKING_M_S2 = 3.0
-"""It holds where it would stop, braking so hard once it answers: PX4's default of MPC_ACC_HOR."""
+"""Deceleration to the place where it holds, once it answers: PX4's default of MPC_ACC_HOR."""
 
 
 _SEES = CameraHealth(age_s=0.0, period_s=1.0, unplugged=False, frozen=False, noisy=False)
@@ -89,7 +89,7 @@ _WELL = Inputs(
 
 
 class _Drone:
-    """What of its daemon's control loop each gated drone has; it flies from the start on."""
+    """The control loop of one gated drone's daemon; the drone is in flight from the start."""
 
     def __init__(self, scenario: ScenarioConfig, number: int) -> None:
         self._parameters = scenario.drone_of(number).safety
@@ -126,7 +126,7 @@ _OBJECTED = {
 _DEGRADED = {
     Event.VELOCITY_OFF: "wind", Event.NO_ROOM_TO_HOLD: "wind", Event.CAMERA_LOST: "camera", Event.FENCE_LEFT: "fence",
 }  # fmt: skip
-"""Causes by the gate's objection, and by why the supervisor had a drone fly slower; all else is `other`."""
+"""Causes by the gate's objection, and by why the supervisor slowed a drone down; all else is `other`."""
 _SLOWED = 0.05
 """A velocity that differs from the one asked for by a smaller share of it counts as the same."""
 
@@ -153,7 +153,7 @@ class SlowedTime:
 
     @property
     def share(self) -> float | None:
-        """Of the time flown; None: none was."""
+        """Share of the time flown; None: no time was flown."""
         return self._slowed_s / self._flown_s if self._flown_s else None
 
     @property
@@ -188,7 +188,7 @@ class ControlLoop:
         self._drones = {i: _Drone(scenario, i) for i, one in enumerate(scenario.vehicles) if gated and not one.by_hand}
         self._starts = np.array([vehicle.position_m for vehicle in scenario.vehicles])
         self._taken: dict[int, str] = {}
-        """How an autopilot has taken over, `hold`, `land` or `return`: what its pilot commands counts no more."""
+        """How an autopilot has taken over, `hold`, `land` or `return`: its pilot's commands no longer count."""
         self._held: dict[int, FloatArray] = {}
         """Where those in Hold stay, (3,) m NED."""
         self._orders: deque[_Order] = deque()
@@ -209,7 +209,7 @@ class ControlLoop:
         self.handed_over[i] = HandedOver(time_s=time_s, reason=why)
 
     def resume(self, i: int) -> None:
-        """An operator has a drone that its autopilot holds fly on as its pilot asks."""
+        """An operator lets a drone that its autopilot holds fly on as its pilot asks."""
         if self._taken.pop(i, None) is None:
             return
         self._held.pop(i, None)
@@ -227,11 +227,11 @@ class ControlLoop:
         return decision.state, tuple(reason.sentence for reason in decision.reasons)
 
     def velocity_error_m_s(self, i: int) -> float:
-        """By how much a drone's velocity is off its setpoints, as its gate finds; 0 without one."""
+        """How far a drone's velocity deviates from its setpoints, as its gate measures; 0 without a gate."""
         return self._drones[i].gate.response.error_m_s if i in self._drones else 0.0
 
     def fly(self, time_s: float, vehicles: Vehicles, commands: Commands, disturbed: Disturbances = UNDISTURBED) -> None:
-        """From `time_s` one step on."""
+        """Flies one step from `time_s` on."""
         self._disturbed = disturbed
         taken = {i: one.takeover for i, one in enumerate(commands.missions) if one.takeover is not None}
         for takeover in self._scenario.takeovers:

@@ -65,8 +65,8 @@ class ExactFlock:
 
         `own` (n, 3) m/s: what each takes for its own velocity; None: the exact one.
 
-        `orders` are operators' of now, by drone. In the view of a camera that is off, as `disturbed` says, a drone
-        knows of nobody.
+        `orders` are operators' of now, by drone. In the view of a camera that is switched off (`disturbed`), a drone
+        detects no other.
         """
         own, orders = velocities if own is None else own, orders or {}
         commands = Commands.of(len(positions))
@@ -141,7 +141,7 @@ _FALSE_SPEED_M_S = 0.7
 
 
 class TrackedNeighbours:
-    """What one drone knows of the others as its own tracker makes it of detections that are made up from the truth."""
+    """What one drone's own tracker knows of the others, from detections that are made up from the truth."""
 
     def __init__(self, scenario: ScenarioConfig, config: DetectionsConfig, drone: int) -> None:
         self._config, self._drone, self._step_s = config.filled, drone, scenario.drone.step_s
@@ -188,7 +188,7 @@ class TrackedNeighbours:
         return *self._tracker.neighbours(), *false
 
     def _false_neighbour(self, time_s: float, here: FloatArray) -> Neighbour | None:
-        """A confirmed track of what is no drone, which begins and ends by chance; its position is in the world."""
+        """A confirmed false track, which begins and ends by chance; its position is in the world."""
         config, chance = self._config, self._by_chance.random()
         if self._false is not None:
             lasts = chance > self._step_s / config.false_time_s
@@ -216,7 +216,7 @@ class TrackedNeighbours:
 
 
 def navigator_of(scenario: ScenarioConfig, vehicle: int) -> Navigator:
-    """Along a vehicle's mission, for its pilot or for a person who flies it without flockd."""
+    """The navigator of a vehicle's mission, for its pilot or for a person who flies it without flockd."""
     drone = scenario.drone_of(vehicle)
     return Navigator(drone.mission, drone.safety.gate)
 

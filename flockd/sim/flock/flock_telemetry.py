@@ -1,4 +1,4 @@
-"""A simulated flock as watchers find a real one: states, pictures on request, and orders that it flies."""
+"""A simulated flock's telemetry, as of a real one: states, pictures on request, and orders that it flies."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from flockd.sim.vehicles.pose_trail import FlockPose
 from flockd.sim.vehicles.vehicles import REFERENCE_DEG, UNDISTURBED, Disturbances, Vehicles
 
 EVERY_S = 1.0
-"""Below the age at which a watcher takes a message for stale."""
+"""Less than the age at which a watcher counts a message as stale."""
 
 
 class Repeater:
@@ -54,7 +54,7 @@ class Repeater:
         self._thread.join()
 
     def forget(self, drone: str) -> None:
-        """Of a drone that is gone, nothing is sent again."""
+        """Stops repeating the messages of a drone that was removed."""
         with self._lock:
             self._newest = {key: message for key, message in self._newest.items() if key[0] != drone}
 
@@ -95,7 +95,7 @@ class FlockTelemetry:
         self._stepped: dict[int, tuple[FrameSet | None, VehicleState, PilotOutput]] = {}
         """The newest step of each; without frames on exact states."""
         self._told = dict.fromkeys(self._drones, State.NORMAL.value)
-        """The state of each that the last event has told, with its reasons."""
+        """The state of each drone in the last event, with its reasons."""
         self._drawn = _DrawnOnRequest(scenario)
         self._rig = build_rig(scenario.drone.rig)
         for i in self._drones:
@@ -119,7 +119,7 @@ class FlockTelemetry:
         self.disturb(UNDISTURBED)
 
     def disturb(self, disturbed: Disturbances) -> None:
-        """Drones that are removed are there no more; those that are not any more are there again."""
+        """Removed drones are announced no longer, restored ones again."""
         before, self._disturbed = self._disturbed, disturbed
         for i in disturbed.removed - before.removed:
             self._announcer.withdraw(f"drone{i + 1}")
@@ -136,7 +136,7 @@ class FlockTelemetry:
         self._sink.publish(f"drone{drone + 1}", "events", {**EventMessage(time_s=time_s, event=sentence)})
 
     def take_requests(self, time_s: float, loop: ControlLoop, vehicles: Vehicles) -> None:
-        """Has drones held, or fly on, as operators have asked since the last step."""
+        """Lets autopilots hold drones, or drones fly on, as operators have asked since the last step."""
         with self._lock:
             requests, self._requests = self._requests, {}
         for i, command in requests.items():
@@ -235,7 +235,7 @@ class FlockTelemetry:
 
 
 class _DrawnOnRequest:
-    """Camera images of a flight whose drones look at none. The world is built when the first is asked for."""
+    """Camera images of a flight whose drones use none. The world is built at the first request."""
 
     def __init__(self, scenario: ScenarioConfig) -> None:
         self._scenario, self.disturbed = scenario, UNDISTURBED

@@ -1,4 +1,4 @@
-"""Flies a simulated flock for people who watch and disturb it, until they have seen enough: nothing is kept."""
+"""Flies a simulated flock for people who watch and disturb it, until Ctrl-C: nothing is kept."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances
 
 _REACHED_OVER_S = 4.0
 _LONGEST_WAIT_S = 0.2
-"""At once: so Ctrl-C is noticed."""
+"""Longest single wait, so that Ctrl-C is noticed."""
 
 
 class LiveControls:
@@ -69,7 +69,7 @@ class LiveControls:
     def wait(self, time_s: float) -> bool:
         """Waits until a time of the flight is due; False: the flight is over, as another one is to begin.
 
-        Nothing is caught up with: what is late is due at once, and what follows in its own time.
+        A delay is not made up for: a late step is due at once, and the following ones at their usual intervals.
         """
         with self._changed:
             while not self._restart:

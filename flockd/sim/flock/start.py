@@ -1,4 +1,4 @@
-"""Makes a scenario's flock larger or smaller, and moves its starts, such that all keep apart."""
+"""Makes a scenario's flock larger or smaller, and moves its starts so that all keep apart."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def with_drones(scenario: ScenarioConfig, count: int) -> ScenarioConfig:
 def scattered(scenario: ScenarioConfig, scatter_m: float) -> ScenarioConfig:
     """The scenario with each start moved by up to `scatter_m` to the north and to the east, by its seed.
 
-    Drawn again until no two are too near each other. Raises UsageError where that does not come about.
+    Drawn again until no two are too near each other. Raises UsageError where no such starts are found.
     """
     rng = np.random.default_rng([scenario.seed, _SCATTER])
     starts = np.array([vehicle.position_m for vehicle in scenario.vehicles])

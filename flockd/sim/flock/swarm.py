@@ -44,7 +44,7 @@ from flockd.sim.world.obstacle_worlds import with_obstacles
 _KEY_FRAME_DRONES = 8
 """Key frames are kept of the first drones only, this many."""
 _LEAST_STEPS = 2
-"""A flight interrupted before has nothing to report."""
+"""With fewer steps an interrupted flight has nothing to report."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +75,9 @@ def fly(
         scenario: what to fly.
         perception: `learned` flies from rendered images; `truth` from exact relative states.
         gated: whether each drone's gate turns what its pilot asks for into setpoints, as in the daemon.
-        shown: where every drone's output is published; operators' orders come from there. A flight on exact states
-            then takes as long as it takes in the air.
-        recorders: one a drone, or none; nothing comes back from there.
+        shown: where every drone's output is published; operators' orders come from there. A flight on exact states then
+            takes as long as it takes in the air.
+        recorders: one a drone, or none.
         threads: for pilots that see, and as many for their images; 0: all on the calling one; None: as many as there
             are processors.
         models: what each drone looks like; None: as the scenario says.
@@ -172,7 +172,7 @@ class ExactStatePilots:
         pictured: bool,
         disturbed: Disturbances = UNDISTURBED,
     ) -> Commands:
-        """Commands for all drones; there are no images. ``builder``: None where nothing is kept."""
+        """Commands for all drones; there are no images. ``builder``: None where no log is kept."""
         positions, velocities = vehicles.position, vehicles.velocity
         orders = {} if self._shown is None else self._shown.take_orders(range(len(positions)))
         own = None if self._scenario.detections is None else vehicles.known_velocity

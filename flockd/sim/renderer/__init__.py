@@ -1,1 +1,1 @@
-"""Draws what cameras see, on the CPU: colour, exact metric depth and who is where."""
+"""Draws camera images on the CPU: colour, exact metric depth, and which drone each pixel shows."""

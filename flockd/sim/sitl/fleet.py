@@ -33,7 +33,7 @@ from flockd.sim.world.obstacle_worlds import with_obstacles
 Progress = Callable[[int, int], None]
 
 AUTOPILOT_START_S, DAEMON_START_S = 90.0, 180.0
-"""Real seconds; a computer that loads networks for five drones takes its time."""
+"""Real seconds; a computer that loads networks for five drones is slow."""
 ARM_S, CLIMB_S, READY_S, OFFBOARD_S, LAND_S = 60.0, 60.0, 60.0, 10.0, 60.0
 """Simulated seconds for each step of bringing a fleet up and down."""
 POLL_S = 0.05
@@ -44,7 +44,7 @@ LEVEL_M_S, LEVEL_S = 0.1, 1.0
 REASON_S = 0.5
 """Real seconds after a drone has left offboard, within which its daemon and its autopilot say why."""
 LEAST_FRAME_SETS = 2
-"""A flight interrupted before has nothing to report."""
+"""With fewer an interrupted flight has nothing to report."""
 
 
 def fly_fleet(

@@ -17,7 +17,7 @@ from typing import Self
 import flockd
 
 END_S = 30.0
-"""To end after SIGTERM, before it is killed."""
+"""Time to end after SIGTERM, before a program is killed."""
 BOUND = ("setpriv", "--pdeathsig", "TERM", "--")
 """Of util-linux: runs a program that gets SIGTERM when the thread that started it ends, however that ends."""
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -31,11 +31,11 @@ _numbers = itertools.count(1009 * os.getpid())
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """One that was started."""
+    """A program that was started."""
 
     name: str
     log: Path
-    """What it writes."""
+    """The file of its output."""
     process: subprocess.Popen[bytes]
 
     @property

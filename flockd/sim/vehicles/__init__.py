@@ -1,1 +1,1 @@
-"""What flies: vehicles and the wind, and fake autopilots apart from them."""
+"""Simulated vehicles and the wind. Fake autopilots are apart from them."""

@@ -42,7 +42,7 @@ MAX_LEAN_M_S2 = GRAVITY_M_S2 * math.tan(math.radians(45.0))
 _MAX_SUBSTEP_S = 0.02
 _SAME_TIME_S = 1e-9
 _AWAY_M = 1e5
-"""To the north of the origin: nobody sees one that is so far away."""
+"""To the north of the origin: out of every drone's sight."""
 _DRAG_PER_S = 0.3
 """Deceleration by the air for each m/s against it: what a multirotor leans against to hold its speed."""
 MAX_CLIMB_M_S = 1.5
@@ -88,7 +88,7 @@ class Vehicles:
         self._config, self._seed, self._gust_m_s, self._time_s = config, seed, config.gust_m_s, 0.0
         self._gusts = GustField.of(config, seed)
         self._blown = np.zeros((n, 2))
-        """What of the velocity gusts added, m/s."""
+        """The part of the velocity that gusts added, m/s."""
         self._waiting: deque[tuple[float, FloatArray]] = deque()
         """Setpoints (n, 2) m/s that are not answered yet, and when they are."""
         self._followed = np.zeros((n, 2))
@@ -236,7 +236,8 @@ class EstimateErrors:
 
 
 class SimulatedAutopilot:
-    """What one drone's autopilot says of its state: the truth with its errors, and noise on barometer and gyroscope."""
+    """What one drone's autopilot reports of its state: the truth with its errors, and noise on barometer and
+    gyroscope."""
 
     def __init__(self, config: SensorConfig, *, seed: int, drone: int, ground: Ground = level_ground) -> None:
         """``ground`` is what its range finder measures to, if it has one."""

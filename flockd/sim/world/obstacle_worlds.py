@@ -61,7 +61,7 @@ def _crowded(config: ObstaclesConfig, fitted: str, key: str) -> UsageError:
 
 
 class _Site:
-    """The area, and what is taken of it: circles that nothing else may stand in."""
+    """The area, and circles in it that are taken."""
 
     def __init__(self, rng: Generator, extent: float, free: FloatArray) -> None:
         self.rng, self.extent = rng, extent
