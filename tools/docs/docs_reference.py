@@ -110,13 +110,12 @@ def _kind_of_file(heading: str, schema: Mapping[str, Any], written: dict[str, st
         shown = f"{key}{many}"
         written[inner["title"]] = f"[`{shown}`](#{_slug(shown)})"
         text = _one_line(value.get("description") or inner.get("description", ""))
-        below += [f"### `{shown}`", f"{DEFAULTS.get(default, NONE)}{text}", ""]
+        below += [f"### `{shown}`", DEFAULTS.get(default, "None by default. ") + text, ""]
         below += _table("key | default | meaning", _keys(schema, inner, shown, written))
     text = _one_line(schema.get("description", ""))
     return [f"## {heading}", text, "", *_table("key | default | meaning", rows), *below]
 
 
-NONE = "None by default. "
 DEFAULTS = {"required": "Required. ", "its own": ""}
 KINDS = {"": "section", "[]": "list of sections", ".KEY": "section for each key"}
 
@@ -208,12 +207,15 @@ def commands_page() -> str:
     return _page(
         "Command-line reference",
         "Every command prints this with `--help`. `--json` prints for programs what is otherwise printed for people.",
-        "",
-        *_table("exit code | meaning", (map(str.strip, line.split(maxsplit=1)) for line in codes)),
         "No command overwrites a file or an earlier flight, unless `--force` is given.",
         "",
+        *_table("exit code | meaning", (map(str.strip, line.split(maxsplit=1)) for line in codes)),
         *(line for group in dict.fromkeys(groups.choices.values()) for line in _group(group)),
     )
+
+
+SAID_ABOVE = re.compile("print (JSON|the [a-z]+ as JSON|what was flown as JSON)|overwrite .*")
+"""Help of options that the page explains once."""
 
 
 def _leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
@@ -233,7 +235,7 @@ def _group(group: argparse.ArgumentParser) -> list[str]:
     takers: dict[tuple[str, str], list[str]] = {}
     examples, notes = [], []
     for name, command in commands.items():
-        for action in _shown(command):
+        for action in filter(lambda action: not SAID_ABOVE.fullmatch(action.help or ""), _shown(command)):
             takers.setdefault((_named(action), _help(command, action)), []).append(f"`{name}`")
         shown, _, note = (command.epilog or "").partition("\n\n")
         examples += [line.strip() for line in shown.splitlines()[1:]]
@@ -263,7 +265,9 @@ def _usage(parser: argparse.ArgumentParser) -> str:
     shown = _shown(parser)
     words = [parser.prog, *(_positional(action) for action in shown if not action.option_strings)]
     words += [_option(action) for action in shown if action.option_strings and action.required]
-    return " ".join([*words, *(["[OPTIONS]"] if any(a.option_strings and not a.required for a in shown) else [])])
+    free = [action for action in shown if action.option_strings and not action.required]
+    said = [f"[{_option(action)}]" for action in free if SAID_ABOVE.fullmatch(action.help or "")]
+    return " ".join([*words, *(["[OPTIONS]"] if len(free) > len(said) else []), *said])
 
 
 def _positional(action: argparse.Action) -> str:
