@@ -13,7 +13,7 @@ from flockd.flight.geometry.transform import RigidTransform
 
 _RESELECTIONS = 10
 _FLAT_TRIANGLE = 1e-3  # height over longest side under which three points count as collinear
-_CHUNK = 20_000
+_CHUNK = 29_000
 """Residuals held at once while scoring: they stay in the cache, and OpenBLAS starts no threads for the product."""
 
 
@@ -145,7 +145,7 @@ def _best(
         difference *= difference
         squared = difference.sum(axis=1)
         for column in range(step + 1):
-            counts = np.count_nonzero(squared < limits[column], axis=1)
+            counts = (squared < limits[column]).sum(axis=1)
             place = int(counts.argmax())
             if counts[place] > (most if column == step else least):
                 step, winner, most = column, start + place, int(counts[place])
