@@ -134,6 +134,8 @@ async def _ask(config: DroneConfig, parameters: AutopilotParameters, heard_s: fl
             async with asyncio.timeout(CLOCK_S):
                 await link.synchronise()
         found.append(judge_clock(link.received.trusted_clock()))
+        if (fault := link.unusable()) is not None:
+            found.append(failed_from_error("system id", str(fault)))
         if config.perception.scale == "height" and config.perception.height != "barometer":
             await asyncio.sleep(WATCHED_S)
             found.append(judge_range_finder(link.received.ground_range, tuple(link.received.ranges_s), config))

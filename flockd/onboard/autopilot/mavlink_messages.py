@@ -72,6 +72,9 @@ LONGEST_DELAY_S = 1.0
 """Largest age of a stamp at arrival; older ones are not used."""
 RESTARTED_MS = 1000
 """A stamp that goes back by this much comes from a restarted clock."""
+OTHER_CLOCK_MS, CLOCK_STAMPS, CLOCK_RETURNS = 100, 50, 3
+"""Two autopilots of one id: so many of the last stamps are so much older than the stamp before, as the stamps of two
+clocks take turns. A restart goes back once, and packets of one autopilot that overtake each other by less."""
 STAMPS_END_MS, NEAR_END_MS = 1 << 32, 10_000
 """Stamps wrap here to 0; and how near to the wrap two successive stamps have to be to count as one."""
 MAV_SEVERITY_WARNING = 4
@@ -102,8 +105,9 @@ class ReceivedMessages:
 
     def __init__(self, report: Callable[[str], None], max_gap_s: float = services.SETPOINT.timeout) -> None:
         """``report`` is called by `add` with one sentence for the first of each unknown value, for a home that moves or
-        a frame that jumps in flight, for a landing, a restart, lost heartbeats, a wrong clock, and for texts of the
-        autopilot that are warnings or worse. ``max_gap_s``: longest gap between setpoints that flockd bridges."""
+        a frame that jumps in flight, for a landing, a restart, a second autopilot of its id, lost heartbeats, a wrong
+        clock, and for texts of the autopilot that are warnings or worse. ``max_gap_s``: longest gap between setpoints
+        that flockd bridges."""
         self._report = report
         self._newest: dict[str, ReceivedMessage] = {}
         self._unknown_values: set[str] = set()
@@ -124,7 +128,10 @@ class ReceivedMessages:
         self._first_s, self._heard_s = math.inf, -math.inf
         """Arrival times of its first heartbeat and of its newest message."""
         self._max_gap_s = max_gap_s
-        self._boot_ms = 0
+        self._boot_ms = self._stamp_ms = 0
+        self._returns: deque[bool] = deque(maxlen=CLOCK_STAMPS)
+        self.two_clocks = False
+        """Whether stamps of two clocks were received: another autopilot has the same id."""
         self._counted_ms = 0
         """Milliseconds lost by wraps of 32-bit stamps since flockd listens: they wrap after 49.7 days."""
         self.restarts = 0
@@ -226,6 +233,13 @@ class ReceivedMessages:
 
         An armed autopilot cannot restart: then a stamp from the past is wrong, or another sender's.
         """
+        self._returns.append(boot_ms < self._stamp_ms - OTHER_CLOCK_MS)
+        self._stamp_ms = boot_ms
+        if not self.two_clocks and sum(self._returns) >= CLOCK_RETURNS:
+            self.two_clocks = True
+            self._report("two autopilots with the same system id are heard; their messages cannot be told apart")
+        if self.two_clocks:
+            return
         if boot_ms < NEAR_END_MS and self._boot_ms > STAMPS_END_MS - NEAR_END_MS:
             self._counted_ms += STAMPS_END_MS
         elif boot_ms < self._boot_ms - RESTARTED_MS:

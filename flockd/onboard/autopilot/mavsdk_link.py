@@ -233,6 +233,11 @@ class AutopilotLink:
             )
         if len(self._heard) > 1:
             return _ambiguous(self._parameters.address, self._heard)
+        if self.received.two_clocks:
+            return AutopilotSettingError(
+                f"autopilot.system_id: two autopilots of system {self._system_id} are heard at "
+                f"{self._parameters.address}; disconnect the other one, or give it another MAV_SYS_ID"
+            )
         return None
 
     def status(self) -> AutopilotStatus:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -107,6 +108,17 @@ def test_what_is_wrong_with_one_is_told_in_the_order_in_which_it_was_asked() -> 
         "heartbeat", "firmware", "COM_OF_LOSS_T", "COM_OBL_RC_ACT", "heartbeat"
     ]  # fmt: skip
     assert [finding.level for finding in cut[-2:]] == [Level.FAILURE, Level.FAILURE]
+
+
+def test_two_autopilots_of_one_id_are_a_failure() -> None:
+    port = free_port()
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S):
+        time.sleep(0.3)
+        with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S):
+            found = [finding for finding in _soon_examined(port) if finding.about == "system id"]
+    assert [(finding.level, finding.measured) for finding in found] == [
+        (Level.FAILURE, f"autopilot.system_id: two autopilots of system 1 are heard at udpin://127.0.0.1:{port}")
+    ]
 
 
 def test_two_autopilots_are_refused_and_so_is_none() -> None:

@@ -176,6 +176,24 @@ def test_a_stamp_from_the_past_is_a_restart_on_the_ground_and_nothing_in_flight(
     assert (received.restarts, len(log)) == (1, 1)
 
 
+@pytest.mark.parametrize("armed", [True, False])
+@pytest.mark.parametrize(
+    ("stamps", "two"),
+    [
+        ([60_000, 5_000, 60_020, 5_020, 60_040, 5_040], True),
+        ([60_000, 59_880, 60_020, 59_900, 60_040, 59_920], True),
+        ([60_000, 0, 20, 40, 60, 80, 0, 20, 40], False),
+        ([60_000, 60_040, 60_020, 60_080, 60_060, 60_120, 60_100, 60_160, 60_140], False),
+    ],
+    ids=["far apart", "started with one switch", "restarted twice", "overtaken packets"],
+)
+def test_two_autopilots_of_one_id_are_told_apart_by_their_clocks(stamps: list[int], two: bool, armed: bool) -> None:
+    heartbeat = ("HEARTBEAT", {"base_mode": 128 * armed, "custom_mode": 0, "system_status": 4})
+    received, log = _received(heartbeat, *(("ATTITUDE_QUATERNION", {"time_boot_ms": stamp}) for stamp in stamps))
+    assert received.two_clocks is two
+    assert sum("two autopilots with the same system id" in text for text in log) == two
+
+
 def test_stamps_that_begin_at_0_after_49_days_are_no_restart() -> None:
     """2^32 ms; the positions' come on the same clock. One that begins anew later has restarted."""
     attitude, position = POSE

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import pytest
 
 from flockd.core.config.autopilot import AutopilotParameters
@@ -15,9 +17,9 @@ from tests.onboard.autopilot.flight import attended, until
 TOLD = "autopilot.system_id: is missing, and the autopilots of systems 1, 2 are heard at "
 
 
-def _neighbour(port: int) -> FakeAutopilot:
-    """As PX4 does it sends a heartbeat a second."""
-    return FakeAutopilot(port, system_id=2, height_m=2.5, clock=clock)
+def _neighbour(port: int, system_id: int = 2) -> FakeAutopilot:
+    """As PX4 does it sends a heartbeat a second; it is switched on now."""
+    return FakeAutopilot(port, system_id=system_id, height_m=2.5, clock=clock)
 
 
 async def test_two_that_are_heard_are_refused_with_their_ids_and_the_key(
@@ -54,3 +56,25 @@ async def test_a_second_one_that_comes_later_is_told_and_ends_it(
             await until(lambda: bool(link.take_reports() == [str(error)]))
             assert str(error) == f"{TOLD}{address}; write the MAV_SYS_ID of this drone's own"
             assert link.system_id == 1
+
+
+@pytest.mark.fault("serial-port")
+@pytest.mark.parametrize("system_id", [1, None])
+async def test_one_of_the_same_id_is_told_by_its_clock_once_and_ends_it(
+    port: int, address: str, fake_autopilot: FakeAutopilot, system_id: int | None
+) -> None:
+    async with attended(address, system_id=system_id) as link:
+        await until(lambda: link.vehicle_state() is not None)
+        await asyncio.sleep(1.0)
+        assert link.unusable() is None
+        with _neighbour(port, system_id=1):
+            await until(lambda: link.unusable() is not None)
+            error = link.unusable()
+            assert error is not None
+            assert error.exit_code is ExitCode.BAD_CONFIGURATION
+            assert str(error) == (
+                f"autopilot.system_id: two autopilots of system 1 are heard at {address}; "
+                "disconnect the other one, or give it another MAV_SYS_ID"
+            )
+            said = [report for report in link.take_reports() if "two autopilots with the same" in report]
+            assert len(said) == 1
