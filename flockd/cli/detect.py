@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from flockd.cli.options import camera_of, loaded
 from flockd.cli.output import complain, progress, say_facts, say_table
-from flockd.cli.parser import Commands, flag, number, option, positive_count, positive_number
+from flockd.cli.parser import Commands, flag, number, option, positive_count
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -59,7 +59,12 @@ def add(commands: Commands) -> None:
         number("a probability, 0 to 1", 0, 1),
         default=0.0,
     )
-    option(parser, "--drone-size M", "size of every drone, from tip to tip, if known", positive_number)
+    option(
+        parser,
+        "--drone-size M",
+        "size of every drone, from tip to tip, if known",
+        number("a size in metres, 0.05 to 5", 0.05, 5),
+    )
     option(parser, "--every N", "every Nth frame of a video (1)", positive_count, default=1)
     flag(parser, "--json", "print the result as JSON")
     camera = parser.add_argument_group("the camera of the pictures")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 
 from flockd.core.errors import UsageError
 from flockd.core.messages import UInt8Array
+from flockd.ground.datasets.image_files import SUFFIXES, VIDEO_SUFFIXES
 from flockd.ground.pictures.picture_files import PictureFile
 from flockd.ground.pictures.single_frame import Box, DetectedDrone, PictureResult
 
@@ -33,7 +35,7 @@ class Copies:
         names_video = out.suffix.lower() == _VIDEO and not out.is_dir()
         if names_video and not (len(pictures) == 1 and pictures[0].is_video):
             raise UsageError(f"{out}: is the name of one video, and there are other pictures; name a folder with --out")
-        if out.exists() and not out.is_dir() and not names_video:
+        if not out.is_dir() and not names_video and (out.exists() or out.suffix.lower() in SUFFIXES | VIDEO_SUFFIXES):
             raise UsageError(f"{out}: is not a folder; name one with --out, or a video ending in .mp4")
         taken: dict[Path, Path] = {}
         for picture in pictures:
@@ -53,29 +55,34 @@ class Copies:
     def of(self, picture: PictureFile, every: int) -> Iterator[Callable[[UInt8Array], None]]:
         """Writes the copy of an image, or of a video's ``every``-th frames, (h, w, 3), RGB, one after the other.
 
-        Raises OSError, and UsageError for a video that cannot be written.
+        An interrupted one leaves what was there. Raises OSError, and UsageError for a video that cannot be written.
         """
         target, written = self._targets[picture], 0
         target.parent.mkdir(parents=True, exist_ok=True)
+        draft = target.with_name(f".{target.stem}.{uuid.uuid4().hex[:8]}.part{target.suffix}")  # OpenCV goes by the end
         video = cv2.VideoWriter()
 
         def write(image: UInt8Array) -> None:
             nonlocal written
             bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
             if not picture.is_video:
-                target.write_bytes(cv2.imencode(target.suffix, bgr)[1].tobytes())
+                draft.write_bytes(cv2.imencode(target.suffix, bgr)[1].tobytes())
             else:
                 size = (bgr.shape[1], bgr.shape[0])
-                if not written and not video.open(str(target), _CODEC, picture.rate_hz(every), size):
+                if not written and not video.open(str(draft), _CODEC, picture.rate_hz(every), size):
                     raise UsageError(f"{target}: cannot be written; name another place with --out")
                 video.write(bgr)
             written += 1
 
         try:
             yield write
+            video.release()
+            if written:
+                draft.replace(target)
+                self.written += 1
         finally:
             video.release()
-            self.written += written > 0
+            draft.unlink(missing_ok=True)
 
 
 _COLOURS = ((255, 109, 0), (0, 176, 255), (213, 0, 249), (0, 200, 83), (255, 214, 0), (255, 23, 68))

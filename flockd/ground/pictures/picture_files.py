@@ -69,7 +69,12 @@ class PictureFile:
         Raises DatasetError where it cannot be read.
         """
         if not self.is_video:
-            yield Picture(str(self.path), read_image(self.path))
+            image = read_image(self.path)
+            height, width = image.shape[:2]
+            if min(height, width) < SMALLEST_PX:
+                told = f"is {width} x {height} pixels, and {SMALLEST_PX} x {SMALLEST_PX} are needed"
+                raise DatasetError(f"{self.path}: {told}; give the whole picture")
+            yield Picture(str(self.path), image)
             return
         index = None
         for index, time_s, image in images_of_video(self.path, every):
@@ -78,6 +83,8 @@ class PictureFile:
             raise DatasetError(f"{self.path}: cannot be decoded as a video; restore it, or convert it to MP4")
 
 
+SMALLEST_PX = 32
+"""Sides of the smallest image of a camera, as in `rig.cameras[].size_px`."""
 _USUAL_RATE_HZ = 30.0
 """Of videos that do not say theirs."""
 

@@ -40,7 +40,6 @@ class MessageSinks:
         self._closing = Worker("recordings", BACKLOG)
         """A slow disk takes long to close a file; telemetry goes on meanwhile."""
         self._recorder: Recorder | None = None
-        self._path: Path | None = None
         self.lost = 0
         """Messages dropped because the worker was busy."""
 
@@ -66,7 +65,7 @@ class MessageSinks:
         """The recording's file, or why it ended; None: not recording."""
         if self._recorder is None:
             return None
-        return self._recorder.failure or str(self._path)
+        return self._recorder.failure or str(self._recorder.path)
 
     def begin_recording(self, learned: LearnedSize | None = None) -> None:
         """Begins a file for a flight, if flights are recorded; ``learned``: the size that its pilot begins with."""
@@ -74,16 +73,16 @@ class MessageSinks:
             return
         self.end_recording()
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S%fZ")
-        self._path = self._folder / f"{self._config.name}-{stamp}.mcap"
+        path = self._folder / f"{self._config.name}-{stamp}.mcap"
         self._recorder = Recorder(
-            self._path,
+            path,
             drone=self._config.name,
             config=self._config,
             models=self._models,
             learned=learned,
             on_event=self._on_event,
         )
-        self.event(f"recording to {self._path}")
+        self.event(f"recording to {path}")
 
     def end_recording(self) -> None:
         """Ends the file in the background."""

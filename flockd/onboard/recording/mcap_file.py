@@ -95,11 +95,12 @@ class Damage:
 
 
 class McapFile:
-    """Writes one file. Every method may raise OSError; after that only `abandon` may be called."""
+    """Writes one new file. Every method may raise OSError; after that only `abandon` may be called."""
 
     def __init__(self, path: Path) -> None:
+        """Raises FileExistsError rather than to write over a file."""
         self.path = path
-        self._file = path.open("wb")
+        self._file = path.open("xb")
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._channels: dict[str, int] = {}
         self._synced_s = time.monotonic()

@@ -226,7 +226,8 @@ def _survey(path: Path, progress: Callable[[int, int], None]) -> Contents:
             progress(done, total)
         _note(found, path, record)
     if not found.steps:
-        raise RecordingError(f"{path}: holds no step of a flight; record one that flies")
+        why = f", and {found.damages[0].reason}" if found.damages else ""
+        raise RecordingError(f"{path}: holds no step of a flight{why}; record one that flies")
     return found
 
 

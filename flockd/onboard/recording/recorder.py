@@ -12,6 +12,7 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -65,10 +66,10 @@ class Recorder:
         learned: LearnedSize | None = None,
         on_event: Callable[[str], None] = lambda event: None,
     ) -> None:
-        """Begins a new recording; replaces the contents of `path`.
+        """Begins a new recording.
 
         Args:
-            path: the file; its folder must exist.
+            path: the file; its folder must exist. If there is one already, as clocks begin anew, a number is added.
             drone: its name.
             config: the flight's configuration; stored in each file.
             settings: how to record; by default as the configuration says.
@@ -108,6 +109,11 @@ class Recorder:
         self._time_s: float | None = None
         self._thread = threading.Thread(target=self._write_all, name=f"recorder {drone}", daemon=True)
         self._thread.start()
+
+    @property
+    def path(self) -> Path:
+        """The file that is written."""
+        return self._file.path
 
     def step(
         self,
@@ -302,7 +308,14 @@ class _File:
         """Starts the file."""
         number = self._count_earlier()
         self._make_room(0)
-        self._file = McapFile(self.path)
+        wanted, copies = self.path, count(2)
+        while self._file is None:
+            try:
+                self._file = McapFile(self.path)
+            except FileExistsError:
+                self.path = wanted.with_stem(f"{wanted.stem}-{next(copies)}")
+        if self.path != wanted:
+            self._tell(f"recording: {wanted} exists, so that the recording is {self.path}")
         facts = {"format": streams.FORMAT, "recording": uuid.uuid4().hex, streams.FLIGHT_NUMBER: str(number)}
         self._file.write(Note(streams.FLIGHT_NOTE, {**facts, **self._flight}))
         for record in self._head:

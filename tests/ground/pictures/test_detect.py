@@ -15,6 +15,8 @@ import pytest
 
 from flockd.cli import main
 from flockd.ground.calibration.fragment import rig_text
+from flockd.ground.pictures.copies import Copies
+from flockd.ground.pictures.picture_files import find_pictures
 from flockd.ground.pictures.single_frame import PictureDetector, camera_with_fov
 from tests import make
 from tests.ground.pictures.photographs import DRONE_SIZE_M, FOCAL_PX, FOV_DEG, LABELS, RENDERED, SIZE, truth
@@ -162,6 +164,28 @@ def test_a_drone_of_a_video_is_followed_by_its_number(capsys: Capture, tmp_path:
     assert [path.name for path in (tmp_path / "drawn").iterdir()] == ["clip.mp4"]
 
 
+@pytest.mark.parametrize("name", ["a.mp4", "a.jpg"])
+def test_an_interrupted_copy_leaves_the_one_before(tmp_path: Path, name: str) -> None:
+    source, out = tmp_path / name, tmp_path / "drawn"
+    video = cv2.VideoWriter(str(tmp_path / "a.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, SIZE)
+    video.write(np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
+    video.release()
+    cv2.imwrite(str(tmp_path / "a.jpg"), np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
+    out.mkdir()
+    (out / name).write_text("before")
+    (picture,) = find_pictures([source])
+    copies = Copies(out, [picture], overwrite=True)
+    with pytest.raises(KeyboardInterrupt), copies.of(picture, 1) as write:
+        write(np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
+        raise KeyboardInterrupt
+    assert [path.name for path in out.iterdir()] == [name]
+    assert (out / name).read_text() == "before"
+    with copies.of(picture, 1) as write:
+        write(np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
+    assert [path.name for path in out.iterdir()] == [name]
+    assert (out / name).stat().st_size > 100
+
+
 def drone_file(path: Path, cameras: tuple[str, ...] = ("front",)) -> Path:
     mounted = [make.camera(name, SIZE, FOCAL_PX, yaw_deg=90.0 * k) for k, name in enumerate(cameras)]
     path.write_text(rig_text(mounted, ()), encoding="utf-8")
@@ -198,13 +222,29 @@ def test_a_drones_own_camera_is_taken(capsys: Capture, tmp_path: Path) -> None:
         ((NEAR, *FOV, "--force"), 2, "--force has no meaning without --out"),
         (("nowhere.jpg", *FOV), 2, "nowhere.jpg: does not exist; name an image, a video or a folder"),
         ((LABELS, *FOV), 2, "drones.json: is not an image or a video by its name"),
-        ((NEAR, *FOV, "--drone-size", "0.01"), 2, "--drone-size, in metres: Input should be"),
+        (
+            (NEAR, *FOV, "--out", "drawn.jpg"),
+            2,
+            "drawn.jpg: is not a folder; name one with --out, or a video ending in",
+        ),
+        (
+            (NEAR, *FOV, "--out", "drawn.avi"),
+            2,
+            "drawn.avi: is not a folder; name one with --out, or a video ending in",
+        ),
     ],
 )
 def test_what_cannot_be_is_said_in_one_sentence(
     capsys: Capture, arguments: tuple[object, ...], code: int, sentence: str
 ) -> None:
     assert sentence in told(capsys, code, "detect", *arguments)
+
+
+@pytest.mark.parametrize("size_m", ["0.01", "35"])
+def test_a_size_that_no_drone_has_is_refused(capsys: Capture, size_m: str) -> None:
+    with pytest.raises(SystemExit):
+        main(["detect", str(NEAR), *FOV, "--drone-size", size_m])
+    assert f"argument --drone-size: '{size_m}' is not a size in metres, 0.05 to 5" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -215,9 +255,10 @@ def test_what_cannot_be_is_said_in_one_sentence(
         ("a.jpg", NEAR.read_bytes()[:9000], "the JPEG ends too early"),
         ("a.jpg", b"P6\n60000 60000\n255\n", "has more pixels than any camera, or none"),
         ("a.jpg", b"P6\n600 600\n255\n", "is no image"),
+        ("a.ppm", b"P6\n40 31\n255\n" + bytes(40 * 31 * 3), "is 40 x 31 pixels, and 32 x 32 are needed"),
         ("a.mp4", b"no video", "cannot be decoded as a video"),
     ],
-    ids=["empty", "text", "cut", "huge PPM", "cut PPM", "video"],
+    ids=["empty", "text", "cut", "huge PPM", "cut PPM", "small", "video"],
 )
 def test_a_picture_that_cannot_be_read_ends_it(
     capsys: Capture, tmp_path: Path, name: str, content: bytes, sentence: str

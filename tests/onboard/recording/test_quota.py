@@ -37,6 +37,7 @@ def test_as_a_flight_grows_the_oldest_go_and_no_more_than_have_to(tmp_path: Path
     files = [_recorded(tmp_path, f"flight{k}", 300_000, k) for k in (1, 2, 3, 4)]
     record(tmp_path / "now.mcap", steps=1, settings=SETTINGS)
     assert [file.exists() for file in files] == [False, True, True, True]
+    (tmp_path / "now.mcap").unlink()
     record(tmp_path / "now.mcap", steps=6, settings=SETTINGS)
     assert [file.exists() for file in files] == [False, False, False, True]
 
@@ -54,6 +55,7 @@ def test_on_a_full_disk_the_oldest_go_and_the_flight_before_last(
     monkeypatch.setattr(shutil, "disk_usage", disk)
     left = []
     for steps in (1, 3, 6):
+        (tmp_path / "now.mcap").unlink(missing_ok=True)
         record(tmp_path / "now.mcap", steps=steps)
         left.append([file.exists() for file in files])
     assert left == [[True, True], [False, True], [False, False]]

@@ -6,6 +6,7 @@ import itertools
 import os
 import resource
 import subprocess
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,8 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.drone import RecordingConfig
 from flockd.flight.geometry import build_rig
 from flockd.onboard.recording import Recorder
+from flockd.onboard.recording import recorder as recorder_module
+from flockd.onboard.recording.mcap_file import McapFile
 from flockd.onboard.recording.reader import Recording
 from tests.onboard.recording.made_up import MODELS, MadeUpPilot, drone_config, inputs, record
 
@@ -140,10 +143,15 @@ def test_what_is_no_readable_file_in_the_folder_is_skipped_with_a_warning(tmp_pa
         assert sum(name in text and "skipped" in text for text in told) == 1, name
 
 
-def test_a_disk_that_never_answers_costs_steps_but_no_time(tmp_path: Path) -> None:
-    path = tmp_path / "drone1.mcap"
+def test_a_disk_that_never_answers_costs_steps_but_no_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, answers = tmp_path / "drone1.mcap", threading.Event()
     told: list[str] = []
-    os.mkfifo(path)  # nobody reads: even opening it does not return
+
+    def opened(path: Path) -> McapFile:
+        answers.wait()
+        return McapFile(path)
+
+    monkeypatch.setattr(recorder_module, "McapFile", opened)
     config = drone_config()
     recorder = Recorder(
         path, drone="drone1", config=config, settings=RecordingConfig(queue_mb=1.0), on_event=told.append
@@ -157,8 +165,21 @@ def test_a_disk_that_never_answers_costs_steps_but_no_time(tmp_path: Path) -> No
     assert sum("dropped" in event for event in told) == 1
     recorder.close(timeout_s=0.2)
     assert "too slow to end it" in told[-1]
-    # None of these waited for the disk, which answers here for the first time and lets the thread go.
-    os.close(os.open(path, os.O_RDONLY | os.O_NONBLOCK))
+    answers.set()  # none of these waited for the disk
+
+
+def test_two_recordings_that_begin_in_one_microsecond_are_both_kept(tmp_path: Path) -> None:
+    """As of two boots without a clock: the name is of the time."""
+    path, told = tmp_path / "drone1-19700101T000012000000Z.mcap", list[str]()
+    outputs, config = record(path, 3), drone_config()
+    for number in (2, 3):
+        with Recorder(path, drone="drone1", config=config, models=MODELS, on_event=told.append) as recorder:
+            for frames, vehicle in inputs(number):
+                recorder.step(frames, vehicle, MadeUpPilot(config).step(frames, vehicle))
+        assert recorder.path == tmp_path / f"drone1-19700101T000012000000Z-{number}.mcap"
+        assert len(list(Recording(recorder.path).steps())) == number
+    assert len(list(Recording(path).steps())) == len(outputs)
+    assert [text for text in told if "exists, so that the recording is" in text] == told != []
 
 
 @contextmanager

@@ -263,13 +263,18 @@ def test_images_that_cannot_be_used_are_counted_and_without_any_there_is_no_flig
     alone: Any = {key: [DRONE[key]["cameras"][1]] for key in ("rig", "source")}  # type: ignore[index]
     changes = {key: {**DRONE[key], "cameras": alone[key]} for key in alone}  # type: ignore[dict-item]
     with Bag(theirs) as opened, pytest.raises(RecordingError, match=f"none of its images could be used .{why}"):
-        recording_of_bag(opened, load_drone(config_file(tmp_path, **changes)), None, tmp_path / "flight.mcap")
+        recording_of_bag(opened, load_drone(config_file(tmp_path, **changes)), None, tmp_path / "back.mcap")
 
 
 def test_a_part_of_a_bag_is_told_to_be_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     theirs = bag(tmp_path / "bag")
     assert main(["replay", str(theirs / "bag.mcap")]) == 1
     assert "is a part of a bag of ROS 2; `flockd replay` takes the bag's folder" in capsys.readouterr().err
+    for text in ("hello", "rosbag2_bagfile_information: {version: 5, storage_identifier: mcap}"):
+        (theirs / "metadata.yaml").write_text(text)
+        assert main(["replay", str(theirs), "--config", str(config_file(tmp_path))]) == 1
+        told = f"its metadata.yaml is not whole; write it again with `ros2 bag reindex {theirs}`"
+        assert told in capsys.readouterr().err
     (theirs / "metadata.yaml").unlink()
     assert main(["replay", str(theirs)]) == 1
     assert "has no metadata.yaml of a bag, which `ros2 bag reindex` writes" in capsys.readouterr().err
