@@ -82,7 +82,10 @@ class CampaignConfig(Section):
     def _says_nothing_twice(self) -> Self:
         faults: dict[tuple[str | int, ...], str] = {}
         of_cases = {key for values in self.cases.values() for key in values}
-        for key in self.vary:
+        for key, variation in self.vary.items():
+            for number, value in enumerate(variation.values):
+                if value in variation.values[:number]:
+                    faults["vary", key, "values", number] = f"{value} is given already; delete one"
             if key in self.fixed:
                 faults["fixed", key] = "varies too; delete it here or in `vary`"
             if key in of_cases:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from flockd.cli.config import write_checked
 from flockd.cli.options import refuse_overwriting
 from flockd.cli.output import complain, say_facts
-from flockd.cli.parser import Commands, flag, option, positive_number, size
+from flockd.cli.parser import Commands, duration, flag, option, size
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def add(commands: Commands) -> None:
     description = "List the cameras of this computer, measure their images, and write their configuration."
     parser = commands("cameras", description, examples, _run)
     option(parser, "--picture FOLDER", "run all cameras, measure their images, and save one of each", Path)
-    option(parser, "--seconds S", f"measure this long ({SECONDS:g})", positive_number, default=SECONDS)
+    option(parser, "--seconds S", f"measure this long ({SECONDS:g})", duration, default=SECONDS)
     option(parser, "--size WxH", "image size; the nearest one available is used", size, default=(640, 480))
     option(parser, "--write FILE", "write the sections `rig` and `source` for them", Path)
     told = "turn their images clockwise until they are upright: 90 for cameras on their sides, tops to the right"

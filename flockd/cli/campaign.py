@@ -119,11 +119,10 @@ def _rerun(args: argparse.Namespace) -> int:
     from flockd.sim.flock.swarm import fly
 
     folder, name = args.flight.parent, args.flight.name
-    plan = load_plan(folder)
     numbers = re.fullmatch(r"c(\d{1,9})-s(\d{1,9})", name)
     if numbers is None:
         raise UsageError(f"{name!r} is not the name of a flight; write one as in {folder}/c0-s0")
-    run = Run(int(numbers[1]), int(numbers[2]))
+    plan, run = load_plan(folder), Run(int(numbers[1]), int(numbers[2]))
     if run.cell >= len(plan.cells) or run.number >= plan.config.seeds:
         last = Run(len(plan.cells) - 1, plan.config.seeds - 1)
         raise UsageError(f"{folder}: has no flight {name}; the last one is {last.name}")

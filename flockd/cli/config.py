@@ -133,14 +133,16 @@ def _check_file(file: Path, *, force: bool) -> None:
         except ModelError as error:
             problems.append(problem(role, f"names a model that cannot be used: {error}"))
     if not isinstance(config, ScenarioConfig):
-        problems += _yet_to_fill_in(config, places)
+        problems += [*_yet_to_fill_in(config, places), *_settings_of_zenoh(config, places)]
     if problems:
         raise ConfigError(problems)
     if not isinstance(config, ScenarioConfig):
-        from flockd.ground.doctor.camera_checks import lens_problems
+        from flockd.ground.doctor import Level
+        from flockd.ground.doctor.camera_checks import coverage, lens_problems
 
         permit(outside_envelope(config, places), force=force)
-        for finding in (one for camera in config.rig.cameras for one in lens_problems(camera)):
+        lenses = (one for camera in config.rig.cameras for one in lens_problems(camera))
+        for finding in (one for one in (coverage(config.rig), *lenses) if one.level is not Level.PASS):
             complain(f"warning: {file}: {finding.about}: {finding.measured}; {finding.fix}")
 
 
@@ -153,6 +155,18 @@ def _yet_to_fill_in(config: DroneConfig, places: Mapping[KeyPath, Place]) -> lis
         for number, camera in enumerate(cameras)
         if camera.device and CHANGE_ME in camera.device
     ]
+
+
+def _settings_of_zenoh(config: DroneConfig, places: Mapping[KeyPath, Place]) -> list[ConfigProblem]:
+    from flockd.onboard.telemetry.zenoh_session import SettingsError, read_settings
+
+    if config.telemetry.zenoh_config is None:
+        return []
+    try:
+        read_settings(Path(config.telemetry.zenoh_config))
+    except SettingsError as error:
+        return [places["telemetry", "zenoh_config"].problem(str(error))]
+    return []
 
 
 def _show(args: argparse.Namespace) -> int:
@@ -218,6 +232,9 @@ def _set(file: Path, key: str, value: str) -> None:
     places, lines = read_document(file).places, file.read_text(encoding="utf-8").splitlines()
     there = next(length for length in range(len(path), -1, -1) if path[:length] in places)
     line = places[path[:there]].line if there else len(lines)
+    if (*path[:there], 0) in places and there < len(path):
+        section = places[path[:there]].key
+        raise UsageError(f"{section} is a list, whose entries cannot be set one by one; write all of it")
     if there == len(path):
         head = re.fullmatch(r"( *)([^#]*?:)( [^#]*?)?( *#.*)?", lines[line - 1])
         if head is None or head[2] != f"{path[-1]}:":

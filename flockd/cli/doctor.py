@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.options import add_force, load_to_fly, refuse
 from flockd.cli.output import Phases, progress, say, say_json, tables_console
-from flockd.cli.parser import Commands, flag, option, positive_number
+from flockd.cli.parser import Commands, duration, flag, option
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 from flockd.core.printable import printable
 
@@ -49,7 +49,7 @@ def add(commands: Commands) -> None:
     option(parser, "--config FILE", "the drone's configuration; with --demo by default the simulator's", Path)
     option(parser, "--record DIR", "the folder in which `flockd run` will record", Path)
     seconds = f"watch the cameras this long ({SECONDS:g}), or fly the bench"
-    option(parser, "--seconds S", seconds, positive_number)
+    option(parser, "--seconds S", seconds, duration)
     option(parser, "--only CHECK", f"run only this check, one of {', '.join(CHECKS)}", action="append", choices=CHECKS)
     flag(parser, "--bench", "run the daemon and time its steps; needs --demo, and the extra `sim`")
     flag(parser, "--demo", "with nothing attached: a made-up autopilot, and images drawn by the simulator")

@@ -18,7 +18,18 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.options import ENDPOINT, add_endpoint_options, add_operator_option, endpoints
 from flockd.cli.output import complain, say, say_json
-from flockd.cli.parser import ALONE, Commands, Parser, commands_of, flag, number, option, port_number, positive_number
+from flockd.cli.parser import (
+    ALONE,
+    Commands,
+    Parser,
+    commands_of,
+    duration,
+    flag,
+    number,
+    option,
+    port_number,
+    positive_number,
+)
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
@@ -88,7 +99,7 @@ def _add_orders(commands: Commands) -> None:
     option(parser, "NORTH", "m/s to the north", _number)
     option(parser, "EAST", "m/s to the east", _number)
     option(parser, "--height M", "height above the ground at home (default: the present one)", _number)
-    option(parser, "--seconds S", "send it every second for S seconds (default: once)", positive_number)
+    option(parser, "--seconds S", "send it every second for S seconds (default: once)", duration)
     for command, what in PLAIN.items():
         examples = (f"flockd fleet {command} all", f"flockd fleet {command} drone1")
         _ordering(commands(command, what, examples, functools.partial(_ask, command=command)))

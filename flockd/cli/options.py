@@ -174,6 +174,8 @@ def refuse_overwriting(args: argparse.Namespace, *files: Path | None) -> None:
     """Raises UsageError where a result would take a file's place without --force: before the work, not after it."""
     force: bool | None = getattr(args, "force", None)
     for file in files:
+        if file is not None and file.is_dir():
+            raise UsageError(f"{file}: is a folder; name a file in it")
         if file is not None and file.exists() and not force:
             instead = "" if force is None else ", or overwrite it with --force"
             raise UsageError(f"{file}: exists; name another file{instead}")

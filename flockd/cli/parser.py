@@ -162,6 +162,7 @@ def whole_number(words: str, low: int = 0, high: int = 10**18) -> Callable[[str]
 
 
 positive_number = number("a positive number", above=0)
+duration = number("a number of seconds above 0 and up to 3600", 0, 3600, above=0)
 positive_count = whole_number("a positive whole number", 1)
 port_number = whole_number("a port, a whole number from 0 to 65535", 0, 65535)
 
@@ -170,5 +171,5 @@ def size(text: str) -> tuple[int, int]:
     """An option's value as two whole numbers above 0, as in 640x480."""
     match = re.fullmatch("([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", text)
     if match is None:
-        raise argparse.ArgumentTypeError(f"{text!r} is not two numbers such as 640x480")
+        raise argparse.ArgumentTypeError(f"{text!r} is not two whole numbers with an x between, such as 8x6 or 640x480")
     return int(match[1]), int(match[2])

@@ -140,6 +140,8 @@ def _replay(args: argparse.Namespace, recording: Recording) -> int:
     if args.diff:
         part_only = args.start > 0 or args.end is not None
         comparison = compare_replay(recording.drone, replay, expected, dict(args.tolerance), part_only=part_only)
+        for name in sorted(comparison.unused):
+            complain(f"--tolerance {name}: no output has this field, so nothing was permitted; correct the name")
     result = replay_result(recording, replay, warnings, comparison)
     if watch is not None:
         result["profile"] = profile_result(replay, config, watch)
@@ -161,6 +163,8 @@ def _check_options(args: argparse.Namespace) -> None:
         raise UsageError("--reference alone does nothing; add --diff or --update-reference")
     if args.tolerance and not args.diff:
         raise UsageError("--tolerance has no meaning without --diff; add it")
+    if args.out is not None and args.out.suffix != ".mcap":
+        raise UsageError(f"{args.out}: a recording is written as .mcap; give it such a name")
     refuse_overwriting(args, args.out)
 
 

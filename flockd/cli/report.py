@@ -63,7 +63,10 @@ def _run(args: argparse.Namespace) -> int:
         try:
             log = FlightLog.load(directory / LOG_NAME)
         except (ValueError, EOFError, BadZipFile) as error:
-            told = f"is not a whole flight log ({error}); fly again with `flockd sim`"
+            why = (
+                "no NumPy archive" if "pickle" in str(error) else str(error)
+            )  # numpy's advice, to load it nevertheless
+            told = f"is not a whole flight log ({why}); fly again with `flockd sim`"
             raise UsageError(f"{directory / LOG_NAME}: {told}") from error
         if (directory / REPORT_NAME).is_file() and not args.force:
             complain(f"{directory / REPORT_NAME}: is left as it was; --force writes it again")

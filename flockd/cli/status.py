@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from flockd.cli.options import add_endpoint_options, endpoints
 from flockd.cli.output import cell, noted_table, say_json, tables_console
-from flockd.cli.parser import Commands, flag, option, positive_number
+from flockd.cli.parser import Commands, duration, flag, option
 from flockd.core.errors import ExitCode, UnavailableError
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def add(commands: Commands) -> None:
     )
     parser = commands("status", "Show the state of each drone of a fleet, the worst first.", examples, _run)
     add_endpoint_options(parser)
-    option(parser, "--seconds S", "listen this long and print once, also on a terminal", positive_number)
+    option(parser, "--seconds S", "listen this long and print once, also on a terminal", duration)
     flag(parser, "--json", "print JSON, once")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import combinations
 
 EQUATOR_M = 6_378_137.0
 SQUARED_ECCENTRICITY = 6.694379990e-3
@@ -23,6 +24,20 @@ def is_inside(corners: Sequence[tuple[float, float]], north_m: float, east_m: fl
     for (n1, e1), (n2, e2) in zip(corners, (*corners[1:], corners[0]), strict=True):
         crossed += (n1 > north_m) != (n2 > north_m) and east_m < e1 + (e2 - e1) * (north_m - n1) / (n2 - n1)
     return crossed % 2 == 1
+
+
+def crosses_itself(corners: Sequence[tuple[float, float]]) -> bool:
+    """Whether two sides of the closed outline through the corners cross, other than where one follows the other."""
+
+    def left(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
+        return (b[0] - a[0]) * (c[1] - a[1]) > (b[1] - a[1]) * (c[0] - a[0])
+
+    sides = list(zip(corners, (*corners[1:], *corners[:1]), strict=True))
+    return any(
+        left(a, c, d) != left(b, c, d) and left(a, b, c) != left(a, b, d)
+        for (a, b), (c, d) in combinations(sides, 2)
+        if len({a, b, c, d}) == 4
+    )
 
 
 def metres_a_degree(latitude_deg: float) -> tuple[float, float]:

@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 from pydantic import Field, model_validator
 
-from flockd.core.config.base import NonNegative, Positive, Section, Share, Vector3, refuse
+from flockd.core.config.base import NonNegative, Positive, Section, Share, Speed, Vector3, refuse
 from flockd.core.config.document import Document, KeyPath, Place, read_document
 from flockd.core.config.drone import DroneConfig
 from flockd.core.config.loader import Overrides, drone_document, kind_of, override, require, validated
@@ -49,6 +49,10 @@ class StartConfig(Section):
     them."""
 
 
+_Wind = Annotated[float, Field(ge=-50, le=50)]
+"""m/s; a hurricane's."""
+
+
 class VehicleConfig(Section):
     """How a simulated multirotor answers a velocity setpoint: by default as PX4 1.18's vehicle in software does, from
     its answers to steps of up to 4 m/s (tests/sim/autopilot/px4_steps.csv)."""
@@ -60,9 +64,9 @@ class VehicleConfig(Section):
     yaw_time_constant_s: Positive = 0.4
     max_yaw_rate_deg_s: Positive = 60.0
     tilt_time_constant_s: NonNegative = 0.1
-    wind_m_s: tuple[float, float] = (0.0, 0.0)
+    wind_m_s: tuple[_Wind, _Wind] = (0.0, 0.0)
     """Mean wind, north and east."""
-    gust_m_s: NonNegative = 0.0
+    gust_m_s: Speed = 0.0
     """Standard deviation of the velocity that gusts add, each axis, to that of a drone whose setpoint stays the same.
     Gusts carry drones under the flocking law farther, because its setpoint begins at the own velocity."""
     gust_length_m: Annotated[float, Field(ge=1, le=1000)] = 36.6

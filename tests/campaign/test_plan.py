@@ -108,6 +108,10 @@ def test_a_plan_is_its_own_copy(tmp_path: Path) -> None:
         ("fixed:\n  vehicles.0: 4\n", "6: fixed.vehicles.0: `vehicles` is not a section"),
         ("fixed: {drones: 5.5}\n", "5: fixed.drones: must be whole numbers from 1 to 100"),
         (
+            "vary:\n  duration_s: {values: [5.0, 6.0, 5.0]}\n",
+            "6: vary.duration_s.values[2]: 5.0 is given already; delete one",
+        ),
+        (
             "vary:\n  duration_s: {low: 5, high: 3, steps: 4}\n",
             "6: vary.duration_s: `low`, `high` and `steps` are",
         ),

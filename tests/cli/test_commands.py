@@ -168,6 +168,22 @@ def test_config_check_finds_models_that_are_not_there(scenario: Path, told: Told
     assert error.startswith(f"{drone}:23: perception.flow: distance_int8 is for distance, not for ")
 
 
+def test_config_check_tells_what_a_drone_could_not_start_with_or_would_not_see(
+    scenario: Path, told: Told, capsys: Capture
+) -> None:
+    drone = scenario.with_name("simulator.yaml")
+    drone.write_text(f"{SIMULATOR}\ntelemetry: {{zenoh_config: none.json5}}\n", encoding="utf-8")
+    problem = told(78, "config", "check", drone)
+    assert f"telemetry.zenoh_config: {drone.with_name('none.json5')}: cannot be used as zenoh's settings (" in problem
+    drone.write_text(SIMULATOR.replace("yaw_deg: 90.0", "yaw_deg: 1.57"), encoding="utf-8")
+    assert main(["config", "check", str(drone)]) == 0
+    blind = f"warning: {drone}: rig: blind at the horizon from "
+    assert capsys.readouterr().err.startswith(blind)
+    drone.write_text(SIMULATOR.replace("position_m: [0.10,", "position_m: [100,"), encoding="utf-8")
+    told_of = told(78, "config", "check", drone)
+    assert ".extrinsics.position_m[0]: 100 is not at most 5; write a number of metres from -5 to 5" in told_of
+
+
 def test_config_check_reports_for_people_and_machines(scenario: Path, told: Told, capsys: Capture) -> None:
     drone = scenario.with_name("simulator.yaml")
     assert told(0, "config", "check", scenario, drone) == f"{scenario}: fine\n{drone}: fine\n"
@@ -218,7 +234,9 @@ def test_a_report_of_no_flight_or_a_damaged_log(tmp_path: Path, told: Told) -> N
     log = tmp_path / "flight.npz"
     for content in (b"", b"PK\x03\x04 cut off", b"something else"):
         log.write_bytes(content)
-        assert told(2, "report", tmp_path).startswith(f"{log}: is not a whole flight log (")
+        problem = told(2, "report", tmp_path)
+        assert problem.startswith(f"{log}: is not a whole flight log (")
+        assert "pickle" not in problem
 
 
 @pytest.mark.parametrize(

@@ -85,7 +85,9 @@ def test_tolerances_are_for_a_field_and_what_is_in_it(nudged: Path, capsys: Capt
         assert main(["replay", str(nudged), "--diff", "--tolerance", tolerance]) == code
     narrow = ["--tolerance", "command=1", "--tolerance", "command.velocity=1e-12"]
     assert main(["replay", str(nudged), "--diff", *narrow]) == 1, "the longer name counts"
-    capsys.readouterr()
+    assert "no output has this field" not in capsys.readouterr().err
+    assert main(["replay", str(nudged), "--diff", "--tolerance", "command=1", "--tolerance", "comand.velocity=1"]) == 0
+    assert "--tolerance comand.velocity: no output has this field, so nothing was permitted" in capsys.readouterr().err
 
 
 def test_a_reference_is_written_compared_and_updated(
@@ -164,6 +166,7 @@ def test_what_keeps_a_replay_from_being_the_flight_is_told(
         (["--update-reference"], "--update-reference needs"),
         (["--reference", "x"], "--reference alone"),
         (["--tolerance", "command=1"], "--tolerance has no meaning without --diff"),
+        (["--out", "again"], "again: a recording is written as .mcap; give it such a name"),
         (["--reference", "x", "--diff", "--update-reference"], "--diff and --update-reference exclude each other"),
         (["--vehicle", "/odom"], "--vehicle is for bags"),
         (["--depth", "recorded"], "--depth is for datasets"),

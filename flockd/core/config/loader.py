@@ -102,13 +102,16 @@ def _anchor(document: Document) -> None:
 
 
 def override(document: Document, overrides: Overrides) -> None:
-    """Sets single values; a problem with one names the override, not the file."""
+    """Sets single values; a problem with one names the override, not the file. Raises ConfigError inside a list."""
     for key, value in overrides.items():
         path = tuple(key.split("."))
         values = document.values
         for length in range(1, len(path)):
             document.places.setdefault(path[:length], replace(document.places[path[: length - 1]], key=key))
             inner = values.setdefault(path[length - 1], {})
+            if isinstance(inner, list | tuple):
+                told = f"{'.'.join(path[:length])} is a list, whose entries cannot be set one by one; write all of it"
+                raise ConfigError([ConfigProblem(OVERRIDE, 0, key, told)])
             if not isinstance(inner, dict):
                 break  # not a section: validation reports it
             values = inner

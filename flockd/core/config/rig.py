@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flockd.core.choices import LensModel
-from flockd.core.config.base import NonNegative, PlainName, Positive, Section, Vector3, refuse, text
+from flockd.core.config.base import NonNegative, PlainName, Positive, Section, refuse, text
 
 
 class MeasurementConfig(Section):
@@ -41,10 +41,14 @@ class IntrinsicsConfig(Section):
     measured: MeasurementConfig | None = None
 
 
+_OnBoard = Annotated[float, Field(ge=-5, le=5)]
+"""Metres; as far from the middle as any of these vehicles has a camera."""
+
+
 class ExtrinsicsConfig(Section):
     """Where a camera sits: body FRD metres, and its turn from looking forward: yaw right, pitch up, roll clockwise."""
 
-    position_m: Vector3 = (0.0, 0.0, 0.0)
+    position_m: tuple[_OnBoard, _OnBoard, _OnBoard] = (0.0, 0.0, 0.0)
     yaw_deg: float = 0.0
     pitch_deg: float = 0.0
     roll_deg: float = 0.0

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from flockd.core import consistency, services
 from flockd.core.choices import AutopilotMode
 from flockd.core.config.base import Duration, Positive, Section, Share, refuse
+from flockd.core.navigation import crosses_itself
 
 LOWEST_LAYER_M, LAYERS_APART_M = 3.0, 4.0
 """Of first flights: a metre more than `vertical_separation_m` for errors of two drones' heights."""
@@ -74,6 +75,8 @@ class GateParameters(Section):
             raise ValueError("fence_corners_m has fewer than 3 corners; add the others, or delete it")
         if len(set(self.fence_corners_m)) < len(self.fence_corners_m):
             raise ValueError("fence_corners_m names a corner twice; delete one, the fence closes by itself")
+        if crosses_itself(self.fence_corners_m):
+            raise ValueError("fence_corners_m is an outline that crosses itself; write the corners in order around it")
         return self
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -52,18 +53,20 @@ def problems_of(
     told.sort(key=lambda one: (one[0].file, one[0].line, one[0].key))  # as problems are sorted
     more = "cannot be so; correct the problems before it first"
     return [
-        place.problem(_sentence(group, place.written, path, root) if number < MAX_PROBLEMS_TOLD else more)
+        place.problem(_sentence(group, place, path, root, path in places) if number < MAX_PROBLEMS_TOLD else more)
         for number, (place, path, group) in enumerate(told)
     ]
 
 
 def _path_in_file(error: ErrorDetails, places: Mapping[KeyPath, Place]) -> KeyPath:
-    """The path an error is about; for a missing key one that is not in the file, for a list too short the list's."""
+    """The path an error is about; for a missing key, and a default that does not fit, one that is not in the file, for
+    a list too short the list's."""
     path: KeyPath = tuple(error["loc"])
     rest: KeyPath = ()
     if error["type"] == "missing":
         path, rest = path[:-1], path[-1:] if isinstance(path[-1], str) else ()
     while path not in places:  # pydantic appends the branch of a union
+        rest = path[-1:] + rest if error["type"] == "value_error" else rest
         path = path[:-1]
     return path + rest
 
@@ -72,18 +75,18 @@ def _place(path: KeyPath, places: Mapping[KeyPath, Place]) -> Place:
     """The path's place; for a missing key that of the section it belongs to."""
     if path in places:
         return places[path]
-    section = places[path[:-1]]
+    section = _place(path[:-1], places)
     key = f"{section.key}.{path[-1]}" if section.key else str(path[-1])
     return Place(section.file, section.line, key, "")
 
 
-def _sentence(errors: Sequence[ErrorDetails], written: str, path: KeyPath, root: Schema) -> str:
+def _sentence(errors: Sequence[ErrorDetails], place: Place, path: KeyPath, root: Schema, is_given: bool) -> str:
     # Of a union's branches, one that fits the type but not the limits says most.
     error = next((error for error in errors if error["type"] in _LIMITS), errors[0])
     kind, value, context = error["type"], error["input"], error.get("ctx", {})
     schema = _schema_at(root, path)
     wanted = _wanted(root, schema, _unit(path))
-    shown = written or ("a list" if isinstance(value, tuple) else _shown(value))
+    shown = place.written or ("a list" if isinstance(value, tuple) else _shown(value))
     if kind == "extra_forbidden":
         gone = KEYS.get(".".join(part for part in path if isinstance(part, str)).removeprefix("drone."))
         if gone is not None:
@@ -100,7 +103,7 @@ def _sentence(errors: Sequence[ErrorDetails], written: str, path: KeyPath, root:
     if kind == "finite_number":
         return f"{shown} is not finite; write {wanted}"
     if kind == "value_error":
-        return str(context["error"])
+        return f"{'' if is_given else 'is not given, and by default '}{context['error']}"
     if value is None:
         return f"has no value; write {wanted}"
     if kind in {"too_short", "too_long"}:
@@ -131,9 +134,10 @@ def _mend(value: object, schema: Schema, wanted: str) -> str:
     if isinstance(value, str) and numeric:
         for candidate in (value, value.replace("_", ""), value.replace(",", ".")):
             number = core_scalar(candidate.strip())
-            if isinstance(number, int | float) and not isinstance(number, bool):
+            if isinstance(number, int | float) and not isinstance(number, bool) and _is_within(number, schema):
                 return f"write {candidate.strip()}"
-    if isinstance(value, float) and schema.get("type") == "integer" and value.is_integer():
+    whole = isinstance(value, float) and value.is_integer() and _is_within(value, schema)
+    if whole and schema.get("type") == "integer":
         return f"write {value:.0f}"
     if schema.get("type") == "boolean" and str(value).lower() in {"on", "yes", "y", "1"}:
         return "write true"
@@ -146,6 +150,13 @@ def _mend(value: object, schema: Schema, wanted: str) -> str:
         if re.search(schema["pattern"], without_blanks):
             return f"write {without_blanks}"
     return f"write {wanted}"
+
+
+def _is_within(number: float, schema: Schema) -> bool:
+    """Whether the schema's limits let it be."""
+    low, high = schema.get("minimum", -math.inf), schema.get("maximum", math.inf)
+    over, under = schema.get("exclusiveMinimum", -math.inf), schema.get("exclusiveMaximum", math.inf)
+    return bool(low <= number <= high and over < number < under)
 
 
 def _shown(value: object) -> str:
@@ -203,7 +214,7 @@ def _wanted_number(schema: Schema, unit: str) -> str:
     if over is not None and under is not None:
         return f"a {noun}{unit} above {over:g} and below {under:g}"
     if low is not None and high is not None:
-        return f"a {noun}{unit} from {low:g} to {high:g}"
+        return f"a {noun}{unit} from {low:.15g} to {high:.15g}"
     return f"a {noun}{unit}" + (f", {low:g} or more" if low is not None else "")
 
 

@@ -64,7 +64,9 @@ def foreign_lenses(file: Path, size: tuple[int, int] | None) -> list[ForeignLens
         found = _read(file, size)
     except cv2.error as error:
         raise CalibrationError(f"{file}: OpenCV cannot read it; write it again with cv2.FileStorage") from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except UnicodeDecodeError as error:
+        raise CalibrationError(f"{file}: is not text; name the file of a calibration") from error
+    except (OSError, yaml.YAMLError) as error:
         raise CalibrationError(f"{file}: cannot be read ({str(error).splitlines()[0]}); use another copy") from error
     except (KeyError, ValueError, TypeError, AttributeError) as error:
         told = f"{file}: lacks or garbles {error}"
@@ -85,6 +87,8 @@ def _read(file: Path, size: tuple[int, int] | None) -> list[ForeignLens]:
     values = yaml.safe_load(text)
     if not isinstance(values, dict):
         raise ValueError("keys with values")  # noqa: TRY004 - told as what else is wrong with a file
+    if "rig" in values:
+        raise CalibrationError(f"{file}: is a drone's own file; copy the cameras of its `rig`, they need no import")
     if "camera_matrix" in values:
         return [_of_matrices(values, file.stem, size)]
     return [_of_kalibr(name, one) for name, one in values.items() if isinstance(one, dict) and "intrinsics" in one]
@@ -92,10 +96,12 @@ def _read(file: Path, size: tuple[int, int] | None) -> list[ForeignLens]:
 
 def _lens(name: str, size: Any, model: str, numbers: Any, distortion: Any, shift: float) -> ForeignLens:
     """``numbers``: fx, fy, cx, cy; ``shift``: of the file's pixel centres."""
-    if len(numbers) != 4:
-        raise ValueError(f"fx, fy, cx and cy of {name}")
-    fx, fy, cx, cy = map(float, numbers)
     coefficients = tuple(float(k) for k in np.ravel(distortion))
+    if len(numbers) != 4 or not np.isfinite([*map(float, numbers), *coefficients]).all() or not min(numbers[:2]) > 0:
+        raise ValueError(f"fx, fy, cx, cy and coefficients of {name}, as finite numbers")
+    fx, fy, cx, cy = map(float, numbers)
+    if len(size) != 2:
+        raise ValueError(f"width and height of {name}")
     plain = re.sub("[^a-z0-9_-]", "_", name.lower())
     width, height = (int(value) for value in size)
     return ForeignLens(plain, (width, height), model, (fx, fy), (cx + shift, cy + shift), coefficients)

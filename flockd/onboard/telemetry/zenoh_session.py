@@ -11,15 +11,25 @@ from pathlib import Path
 from typing import Self
 
 import zenoh
+from pydantic import TypeAdapter, ValidationError
 
-from flockd.core.config.base import checked_port
-from flockd.core.errors import UnavailableError
+from flockd.core.config.base import Endpoint
+from flockd.core.errors import ExitCode, FlockdError, UnavailableError
 
+MOST_REASON = 200
+"""Characters of zenoh's own words in an error."""
+_ENDPOINT: TypeAdapter[str] = TypeAdapter(Endpoint)
 _log = logging.getLogger(__name__)
 
 
+class SettingsError(FlockdError):
+    """A file of zenoh's settings cannot be used."""
+
+    exit_code = ExitCode.BAD_CONFIGURATION
+
+
 class SessionError(UnavailableError):
-    """Endpoints, or a file of settings, are not usable."""
+    """Endpoints are not usable."""
 
     def __init__(self, purpose: str, endpoints: str, reason: str) -> None:
         super().__init__(f"{purpose} cannot use {endpoints} ({reason}); name another endpoint")
@@ -46,12 +56,11 @@ def open_session(
     has it. Raises UnavailableError.
     """
     for endpoint in (*listen, *connect):
-        if "/" not in endpoint:
-            raise UnavailableError(f"{purpose} cannot use {endpoint}: it names no protocol; write tcp/{endpoint}")
         try:
-            checked_port(endpoint)
-        except ValueError as error:
-            raise UnavailableError(f"{purpose}: {error}") from None
+            _ENDPOINT.validate_python(endpoint)
+        except ValidationError:
+            told = "is not a zenoh endpoint; write protocol, address and a port up to 65535, as in `tcp/10.0.0.11:7447`"
+            raise UnavailableError(f"{purpose}: {endpoint} {told}") from None
     wanted = {
         "mode": "peer",
         "scouting/multicast/enabled": False,
@@ -65,7 +74,7 @@ def open_session(
     }
     try:
         usual = zenoh.Config()
-        config = zenoh.Config() if settings is None else zenoh.Config.from_file(str(settings))
+        config = zenoh.Config() if settings is None else read_settings(settings)
         for key, value in wanted.items():
             if value is None:
                 continue
@@ -86,8 +95,21 @@ def open_session(
     except zenoh.ZError as error:
         endpoints = ", ".join([*listen, *connect]) or "no endpoint"
         with_settings = f" with the settings of {settings}" if settings else ""
-        reason = str(error).split(" at ")[0].split(": [")[0]
-        raise SessionError(purpose, f"{endpoints}{with_settings}", reason) from error
+        raise SessionError(purpose, f"{endpoints}{with_settings}", _reason(error)) from error
+
+
+def read_settings(file: Path) -> zenoh.Config:
+    """Zenoh's settings of a file. Raises SettingsError."""
+    try:
+        return zenoh.Config.from_file(str(file))
+    except zenoh.ZError as error:
+        raise SettingsError(f"{file}: cannot be used as zenoh's settings ({_reason(error)}); correct it") from error
+
+
+def _reason(error: zenoh.ZError) -> str:
+    """In a line."""
+    words = " ".join(str(error).split(" at ")[0].split(": [")[0].split())
+    return words if len(words) <= MOST_REASON else f"{words[:MOST_REASON]}..."
 
 
 def close_session(session: zenoh.Session) -> None:

@@ -308,7 +308,10 @@ class Bag:
                 if one.msgtype not in self._store.fielddefs and one.msgdef.data:
                     self._store.register(get_types_from_msg(one.msgdef.data, one.msgtype))
         except (ReaderError, TypesysError, OSError, ValueError, KeyError) as error:
-            raise RecordingError(f"{folder}: is not a readable bag ({error}); use another copy") from error
+            told = f"is not a readable bag ({error}); use another copy"
+            if "metadata" in str(error):
+                told = f"its metadata.yaml is not whole; write it again with `ros2 bag reindex {folder}`"
+            raise RecordingError(f"{folder}: {told}") from error
 
     def __enter__(self) -> Self:
         return self

@@ -56,6 +56,8 @@ class Comparison:
     values: int
     first: Difference | None
     fields: dict[str, FieldDifference]
+    unused: set[str]
+    """Names of tolerances that no field begins with."""
 
 
 def compare(drone: str, expected: Outputs, found: Outputs, tolerances: Mapping[str, float]) -> Comparison:
@@ -64,12 +66,13 @@ def compare(drone: str, expected: Outputs, found: Outputs, tolerances: Mapping[s
     `tolerances` allows numbers to differ, by field, as in `{"command": 1e-6, "neighbours.position": 0.01}`: the longest
     name that a field begins with counts. Without one, all must be equal.
     """
-    result = Comparison(len(expected.keys() | found.keys()), 0, None, {})
+    result = Comparison(len(expected.keys() | found.keys()), 0, None, {}, set(tolerances))
     for step in sorted(expected.keys() | found.keys()):
         left, right = (dict(_flat(one.get(step, {}))) for one in (expected, found))
         time_s = float(left.get("time_s", right.get("time_s", math.nan)))
         for name in [*left, *(name for name in right if name not in left)]:
             result.values += 1
+            result.unused = {one for one in result.unused if not f"{plain(name)}.".startswith(f"{one}.")}
             a, b = left.get(name, ABSENT), right.get(name, ABSENT)
             if _same(a, b, _tolerance(name, tolerances)):
                 continue

@@ -113,11 +113,17 @@ SLIPS = (
     ("step_s: .nan", "step_s: .nan is not finite"),
     ("step_s: 1e999", "step_s: 1e999 is not finite"),
     ("step_s: true", "step_s: true is not a number"),
-    ("step_s: 1_000", "step_s: 1_000 is not a number of seconds above 0 and up to 60; write 1000"),
+    ("step_s: 1_0", "step_s: 1_0 is not a number of seconds above 0 and up to 60; write 10"),
     ("step_s:", "step_s: has no value; write a number"),
     ("yaw: corse", "yaw: corse is not known; did you mean `course`?"),
     ("geometry: {refine: yes}", "geometry.refine: yes is not true or false; write true"),
     ("geometry: {hypotheses: 1e3}", "geometry.hypotheses: 1e3 is not a whole number from 1 to 100000; write 1000"),
+    ("geometry: {hypotheses: 1e9}", "geometry.hypotheses: 1e9 is not a whole number from 1 to 100000; write a whole"),
+    ("safety: {alone_s: '1e5'}", "safety.alone_s: '1e5' is not a number of seconds above 0 and up to 3600 or nothing"),
+    (
+        "safety: {gate: {fence_corners_m: [[-5, -5], [10, 5], [10, -10], [-5, 10]]}}",
+        "safety.gate: fence_corners_m is an outline that crosses itself; write the corners in order",
+    ),
     ("geometry: {min_inlier_ratio: 1}", "geometry.min_inlier_ratio: 1 is not less than 1"),
     ("perception: {flow: 5}", "perception.flow: 5 is not a text; put it in quotes"),
     ("perception: {threads: 99999999999999999999}", "perception.threads: 99999999999999999999 is too large"),
@@ -141,6 +147,23 @@ def test_a_slip_in_line_six_is_reported_with_what_to_do(tmp_path: Path, line: st
     """What is cut off says in the same words what is wanted."""
     (problem,) = _drone_problems(tmp_path, with_line(line))
     assert str(problem).startswith(f"drone.yaml:6: {told}")
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("flocking: {max_speed_m_s: 0.5}", "1: mission.speed_m_s: is not given, and by default 1 m/s is above what"),
+        ("flocking: {max_speed_m_s: 0.5}\nmission: {}", "7: mission.speed_m_s: is not given, and by default 1 m/s is"),
+        (
+            f"safety: {{gate: {{command_fresh_s: 0.3}}}}\n{CABLE}",
+            "1: step_s: is not given, and by default 0.5 s is above safety.gate.command_fresh_s 0.3",
+        ),
+        ("safety: {gate: {max_height_m: 0.5}}\nmission: {height_m: 5}", "6: safety.gate: min_height_m 1 is not below"),
+    ],
+)
+def test_a_default_that_does_not_fit_what_is_given_is_told_with_its_key(tmp_path: Path, line: str, told: str) -> None:
+    (problem,) = _drone_problems(tmp_path, with_line(line))
+    assert str(problem).startswith(f"drone.yaml:{told}")
 
 
 GSTREAMER = 'source:\n  kind: gstreamer\n  cameras:\n    - {name: front, pipeline: "videotestsrc%s ! x"}'

@@ -128,7 +128,7 @@ SWAPPED = PIPELINES.replace("back, pipeline", "back, device").replace("lib", "/d
 @pytest.mark.parametrize(
     ("source", "problem"),
     [
-        ("v4l2\n", "5: source: has no entry of the name front, which is a camera of the rig; add one"),
+        ("v4l2\n", "5: source.cameras: is not given, and by default has no entry of the name front, which"),
         ("v4l2\n" + TWO.replace("back", "rear"), "9: source.cameras[1].name: rear is no camera of the rig; write one"),
         ("v4l2\n" + TWO.replace("back", "front"), "9: source.cameras[1].name: front has an entry already; keep one"),
         ("v4l2\n" + TWO.replace("video2", "video0"), "9: source.cameras[1].device: two cameras share /dev/video0"),

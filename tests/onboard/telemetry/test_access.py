@@ -13,11 +13,11 @@ import pytest
 import zenoh
 
 from flockd.core.data import data_path
-from flockd.core.errors import UnavailableError
+from flockd.core.errors import ExitCode
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
-from flockd.onboard.telemetry.zenoh_session import close_session, open_session
+from flockd.onboard.telemetry.zenoh_session import SettingsError, close_session, open_session
 from flockd.sim.sitl.processes import free_port
 
 EXAMPLE = (data_path("config") / "zenoh_tls.json5").read_text(encoding="utf-8")
@@ -92,8 +92,14 @@ def test_who_may_watch_hears_and_who_may_command_commands(settings: dict[str, Pa
         assert asked == ["hold"]
 
 
-def test_settings_that_are_not_there_are_reported(tmp_path: Path) -> None:
-    with pytest.raises(
-        UnavailableError, match=f"telemetry cannot use no endpoint with the settings of {tmp_path}/none"
-    ):
-        open_session("telemetry", [], [], settings=tmp_path / "none")
+@pytest.mark.parametrize("text", [None, '{ mode: "peer"', "{ nosuchkey: 1 }"])
+def test_settings_that_cannot_be_used_are_bad_configuration_in_a_line(text: str | None, tmp_path: Path) -> None:
+    if text is not None:
+        (tmp_path / "one.json5").write_text(text)
+    with pytest.raises(SettingsError) as refused:
+        open_session("telemetry", [], [], settings=tmp_path / "one.json5")
+    assert refused.value.exit_code is ExitCode.BAD_CONFIGURATION
+    told = str(refused.value)
+    assert told.startswith(f"{tmp_path}/one.json5: cannot be used as zenoh's settings (")
+    assert told.endswith("; correct it")
+    assert "\n" not in told and len(told) < len(str(tmp_path)) + 300

@@ -161,9 +161,10 @@ def test_a_stream_is_stale_after_it_missed_two_messages() -> None:
             assert topic.stale_after_s * topic.rate_hz >= 3.0
 
 
-def test_an_endpoint_without_a_protocol_is_refused_with_the_one_that_is_meant() -> None:
-    with pytest.raises(UnavailableError, match=r"a page cannot use drone1:7447: .*; write tcp/drone1:7447"):
-        open_session("a page", [], ["drone1:7447"])
+@pytest.mark.parametrize("endpoint", ["drone1:7447", "tcp/10.0.0.11", "tcp/127.0.0.1:70000", "http://drone1:7447"])
+def test_what_is_no_endpoint_is_refused_with_what_to_write(endpoint: str) -> None:
+    with pytest.raises(UnavailableError, match=f"a page: {endpoint} is not a zenoh endpoint; write protocol, address"):
+        open_session("a page", [], [endpoint])
 
 
 def test_an_address_that_no_interface_has_yet_is_listened_on_once_one_has_it(caplog: pytest.LogCaptureFixture) -> None:
@@ -174,8 +175,6 @@ def test_an_address_that_no_interface_has_yet_is_listened_on_once_one_has_it(cap
     with zenoh.open(client(free)):  # what is there works meanwhile
         drone.publish("drone1", "events", {"time_s": 0.0, "event": "x"})
     threading.Thread(target=drone.close, daemon=True).start()  # zenoh takes ten seconds to give it up
-    with pytest.raises(UnavailableError, match="has the port 70000, and the last one is 65535"):
-        open_session("a page", [], ["tcp/127.0.0.1:70000"])
     with pytest.raises(UnavailableError, match=f"a page cannot use {telemetry}"):
         open_session("a page", [telemetry], [])
 

@@ -67,6 +67,15 @@ def test_overrides_win_over_both_files() -> None:
     assert scenario.drone.flocking.weight.kind == "nearest"
 
 
+@pytest.mark.parametrize("key", ["vehicles.0.position_m", "drone.rig.cameras.front.extrinsics"])
+def test_an_override_of_an_entry_of_a_list_is_refused_and_not_left_out(key: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        load_scenario(CONFIG / "paper_flight.yaml", {key: (0.0, 0.0, -3.0)})
+    (problem,) = refused.value.problems
+    assert (problem.file, problem.key) == ("override", key)
+    assert problem.message.endswith(" is a list, whose entries cannot be set one by one; write all of it")
+
+
 def test_a_wrong_override_is_reported_as_such() -> None:
     with pytest.raises(ConfigError) as caught:
         load_scenario(CONFIG / "paper_flight.yaml", {"duration_s": -3.0, "drone.perception.sclae": "height"})
