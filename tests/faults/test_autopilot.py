@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
@@ -14,16 +15,20 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
+from flockd.core.config import DroneConfig
+from flockd.core.errors import ExitCode
+from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavlink_messages import ReceivedMessages
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_telemetry import Mode, TelemetryStreams
-from flockd.sim.autopilot.fake_vehicle import Demand
+from flockd.sim.autopilot.fake_vehicle import Demand, Flown, MotionState
 from tests.calm import clock
 from tests.faults.conftest import InTheAir, never_alone
 from tests.faults.stories import Reacted
+from tests.make import changed
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import Foreigner, until
-from tests.onboard.daemon.aboard import QUIET_S, SECONDS_TO_FAIL, aboard
+from tests.onboard.daemon.aboard import QUIET_S, SECONDS_TO_FAIL, SPEED_M_S, aboard
 
 pytestmark = pytest.mark.slow
 REASON = "Arming and offboard are denied: the estimator of this vehicle has not converged yet"
@@ -280,6 +285,92 @@ async def test_after_the_autopilots_failsafe_it_says_what_to_select_and_is_not_r
         fake_autopilot.pilot_selects("LOITER")
         await ship.until_state("ready")
         await ship.flies()
+
+
+@pytest.mark.fault("link-gap", within_s=1.0)
+async def test_a_gap_that_the_autopilots_failsafe_does_not_outlast_ends_the_stream_before_it(
+    in_flight: InTheAir, fake_autopilot: FakeAutopilot, reacted: Reacted
+) -> None:
+    """A setpoint after it would bring the autopilot back to offboard, and the next gap into its failsafe again."""
+    async with in_flight() as ship:
+        fake_autopilot.silent = True
+        fault_s = clock()
+        await ship.until_event("silent: setpoints ended: nothing was heard of the autopilot for 0.")
+        reacted("link-gap", clock() - fault_s)
+        await asyncio.sleep(max(0.0, fault_s + 1.5 - clock()))
+        assert (fake_autopilot.mode, fake_autopilot.failsafe) == ("LOITER", True), "COM_OF_LOSS_T is 1 s"
+        fake_autopilot.silent = False
+        async with ship.sends_nothing():
+            await ship.until_linked()
+            await asyncio.sleep(2 * QUIET_S)
+        assert (ship.state(), fake_autopilot.mode) == ("silent", "LOITER")
+
+
+class _Sluggish:
+    """A vehicle that follows what it is asked for some time later."""
+
+    def __init__(self, late_s: float) -> None:
+        self._flown, self._late_s, self._now_s = Flown(np.array([0.0, 0.0, -HOVER_M])), late_s, 0.0
+        self._asked: deque[tuple[float, Demand]] = deque()
+
+    def __call__(self, demand: Demand, interval_s: float) -> MotionState:
+        self._now_s += interval_s
+        self._asked.append((self._now_s + self._late_s, demand))
+        while len(self._asked) > 1 and self._asked[1][0] <= self._now_s:
+            self._asked.popleft()
+        return self._flown(self._asked[0][1], interval_s)
+
+
+@pytest.mark.fault("autopilot-oscillates", within_s=15.0)
+@pytest.mark.parametrize(
+    ("late_s", "state", "told"),
+    [(0.6, "degraded", "follows them 0.5 s later than expected"), (1.7, "asking", " s later than expected (at most")],
+    ids=["half a second", "seconds"],
+)
+async def test_an_autopilot_that_follows_late_is_told_as_such_and_nothing_makes_up_for_it(
+    late_s: float, state: str, told: str, tmp_path: Path, port: int, reacted: Reacted
+) -> None:
+    """On a narrow circle, as straight flight shows no delay."""
+
+    def circling(config: DroneConfig) -> DroneConfig:
+        return never_alone(changed(config, mission__circle_until_s=1000.0, mission__radius_m=2.0))
+
+    with FakeAutopilot(
+        port, height_m=HOVER_M, motion=_Sluggish(late_s), heartbeat_s=HEARTBEAT_S, clock=clock
+    ) as autopilot:
+        autopilot.drifts = False
+        async with aboard(autopilot, port, tmp_path, change=circling) as ship:
+            await ship.is_ready_in_the_air()
+            await until(lambda: len(autopilot.setpoints) > 5, SECONDS_TO_FAIL)
+            autopilot.pilot_selects("OFFBOARD")
+            selected_s = clock()
+            await until(
+                lambda: any(text.startswith(f"{state}: ") and told in text for text in ship.events), SECONDS_TO_FAIL
+            )
+            reacted("autopilot-oscillates", clock() - selected_s)
+            await until(lambda: autopilot.mode == ("OFFBOARD" if state == "degraded" else "LOITER"), SECONDS_TO_FAIL)
+            await asyncio.sleep(2.0)
+            assert not any("gust" in text for text in ship.events), ship.events
+            fastest_m_s = max(np.linalg.norm(asked.velocity) for _, asked in list(autopilot.setpoints))
+            assert fastest_m_s <= SPEED_M_S + 1e-6
+
+
+@pytest.mark.fault("serial-port", within_s=3.0)
+async def test_a_second_autopilot_of_the_same_id_is_told_in_flight_and_the_next_flight_is_refused(
+    in_flight: InTheAir, fake_autopilot: FakeAutopilot, port: int, reacted: Reacted
+) -> None:
+    async with in_flight() as ship:
+        await asyncio.sleep(1.0)
+        with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock):  # on the ground, and disarmed
+            heard_s = clock()
+            await ship.until_event("two autopilots with the same system id are heard")
+            reacted("serial-port", clock() - heard_s)
+            fake_autopilot.pilot_selects("LAND")
+            await asyncio.wait({ship.ending}, timeout=SECONDS_TO_FAIL)
+        error = ship.ending.exception()
+        assert isinstance(error, AutopilotError)
+        assert error.exit_code is ExitCode.BAD_CONFIGURATION
+        assert "two autopilots of system 1 are heard at " in str(error)
 
 
 @pytest.mark.fault("setpoints-clipped", within_s=4.0)
