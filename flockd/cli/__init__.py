@@ -107,7 +107,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if lacking is not None:
             return _failed(f"out of {lacking}; raise the limits, or close other programs", ExitCode.UNAVAILABLE)
         if isinstance(error, OSError):
-            return _failed(f"{error.filename or 'the system'}: {error.strerror or error}", ExitCode.UNAVAILABLE)
+            remedy = "; check the path, its permissions and the disk" if error.filename else ""
+            return _failed(f"{error.filename or 'the system'}: {error.strerror or error}{remedy}", ExitCode.UNAVAILABLE)
         raise
     return code
 

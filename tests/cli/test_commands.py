@@ -256,9 +256,14 @@ def test_a_shell_completes_commands_and_options(line: str, words: set[str]) -> N
     ("error", "code", "sentence"),
     [
         (ModuleNotFoundError("", name="numba"), 69, f"numba is not installed; run: {installing('sim')}"),
+        (
+            OSError(13, "Permission denied", "out"),
+            69,
+            "out: Permission denied; check the path, its permissions and the disk",
+        ),
         (ModelError("models/flow.yaml: sha256: differs"), 78, "models/flow.yaml: sha256: differs"),
     ],
-    ids=["a missing extra", "a damaged model"],
+    ids=["a missing extra", "a folder", "a damaged model"],
 )
 def test_what_a_flight_lacks_is_one_sentence(
     error: Exception, code: int, sentence: str, monkeypatch: pytest.MonkeyPatch, told: Told
