@@ -20,16 +20,16 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_200,
+    "flockd/core": 3_240,
     "flockd/flight": 11_130,
-    "flockd/onboard": 9_260,
+    "flockd/onboard": 9_300,
     "flockd/fleet": 2_700,
-    "flockd/ground": 5_030,
-    "flockd/review": 3_590,
+    "flockd/ground": 5_040,
+    "flockd/review": 3_600,
     "flockd/sim": 8_770,
-    "flockd/campaign": 1_480,
-    "flockd/cli": 3_660,
-    "tests": 38_580,
+    "flockd/campaign": 1_490,
+    "flockd/cli": 3_700,
+    "tests": 38_940,
     "tools/checks": 2_060,
     "tools/docs": 930,
     "tools/measure": 1_520,
