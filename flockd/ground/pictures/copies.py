@@ -15,7 +15,8 @@ from flockd.core.errors import UsageError
 from flockd.core.messages import UInt8Array
 from flockd.ground.datasets.image_files import SUFFIXES, VIDEO_SUFFIXES
 from flockd.ground.pictures.picture_files import PictureFile
-from flockd.ground.pictures.single_frame import Box, DetectedDrone, PictureResult
+from flockd.ground.pictures.single_frame import DetectedDrone, PictureResult
+from flockd.onboard.telemetry.preview import colour_of, draw_box, write_at
 
 _JPEG = {".jpg", ".jpeg"}
 _VIDEO = ".mp4"
@@ -85,12 +86,9 @@ class Copies:
             draft.unlink(missing_ok=True)
 
 
-_COLOURS = ((255, 109, 0), (0, 176, 255), (213, 0, 249), (0, 200, 83), (255, 214, 0), (255, 23, 68))
-"""RGB, of one detection after the other; of videos, one drone after the other."""
 _MASK_WEIGHT = 0.4
 _REFERENCE_PX = 900.0
 """Longer side of a picture that lines of one pixel suit."""
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def annotated(image: UInt8Array, result: PictureResult) -> UInt8Array:
@@ -100,14 +98,14 @@ def annotated(image: UInt8Array, result: PictureResult) -> UInt8Array:
     drawn = image.copy()
     thick = max(round(max(width, height) / _REFERENCE_PX), 1)
     numbers = [number if one.track is None else one.track - 1 for number, one in enumerate(result.detections)]
-    colours = [_COLOURS[number % len(_COLOURS)] for number in numbers]
+    colours = [colour_of(number) for number in numbers]
     for one, colour in zip(result.detections, colours, strict=True):
         mine = (mask == one.label) & (one.label > 0)
         tint = (1 - _MASK_WEIGHT) * drawn[mine] + _MASK_WEIGHT * np.array(colour)
         drawn[mine] = np.round(tint).astype(np.uint8)
-        _rectangle(drawn, one.box, colour, thick)
+        draw_box(drawn, one.box, colour, thick)
     for one, colour in zip(result.detections, colours, strict=True):
-        _write(drawn, one, colour, thick)
+        write_at(drawn, one.box, _described(one), colour, thick)
     return drawn
 
 
@@ -119,21 +117,7 @@ def range_text(range_m: float, sigma_m: float, *, known: bool) -> str:
     return f"{range_m / factor:.1f} to {range_m * factor:.1f}"
 
 
-def _rectangle(image: UInt8Array, box: Box, colour: tuple[int, int, int], thick: int) -> None:
-    """Around the box, not over what is in it."""
-    left, top = (int(np.floor(value)) - thick for value in box[:2])
-    right, bottom = (int(np.ceil(value)) + thick - 1 for value in box[2:])
-    cv2.rectangle(image, (left, top), (right, bottom), colour, thick)
-
-
-def _write(image: UInt8Array, one: DetectedDrone, colour: tuple[int, int, int], thick: int) -> None:
-    """Below the box, or above it where the image ends; on a dark ground, to be read on any background."""
+def _described(one: DetectedDrone) -> str:
     kind = "" if one.kind_known else ", kind unknown"
     text = f"{range_text(one.range_m, one.range_sigma_m, known=one.kind_known)} m{kind}, p {one.probability:.2f}"
-    text = text if one.track is None else f"drone {one.track}: {text}"
-    scale, (height, width) = 0.42 * thick, image.shape[:2]
-    (wide, high), _ = cv2.getTextSize(text, _FONT, scale, thick)
-    left, below = int(np.clip(one.box[0], 0, max(width - wide, 0))), int(one.box[3]) + 3 * thick
-    top = below if below <= height - 2 * high else max(int(one.box[1]) - 3 * thick - 2 * high, 0)
-    image[top : top + 2 * high, left : left + wide] //= 4
-    cv2.putText(image, text, (left, top + round(1.5 * high)), _FONT, scale, colour, thick, cv2.LINE_AA)
+    return text if one.track is None else f"drone {one.track}: {text}"

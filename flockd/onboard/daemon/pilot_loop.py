@@ -95,8 +95,8 @@ class PilotLoop:
         self.frames: FrameSet | None = None
         """The newest frame set; None before the first."""
         self.newest: StepResult | None = None
-        self.stepped: tuple[FrameSet, PilotOutput] | None = None
-        """The newest result's frames and output."""
+        self.stepped: tuple[FrameSet, VehicleState, PilotOutput] | None = None
+        """The newest result with the inputs of its step."""
         self.steps = 0
         self.failed = 0
         """Steps without a result because of a late network or an unexpected error."""
@@ -178,7 +178,7 @@ class PilotLoop:
         number = 1 if self._pilot is None or self.newest is None else self.newest.number + 1
         self._pilot, self._learned = pilot, pilot.learned
         self.newest = StepResult(seen_s, output, self._flight, number)
-        self.stepped = frames, output
+        self.stepped = frames, vehicle, output
         self._count(self.newest)
         for report in self._reports.update(output):
             self._log_event(report)

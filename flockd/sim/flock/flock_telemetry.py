@@ -19,7 +19,7 @@ from flockd.flight.safety import State
 from flockd.onboard.daemon.operator_orders import ORDERS, OrderChecks
 from flockd.onboard.telemetry import TelemetrySink, publish_step
 from flockd.onboard.telemetry.order_messages import parse_ask, parse_order
-from flockd.onboard.telemetry.preview import Previews
+from flockd.onboard.telemetry.preview import Previews, Step
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage, EventMessage, FlightMessage, ReasonMessage
 from flockd.sim.cameras.camera_simulator import CameraSimulator
@@ -195,12 +195,12 @@ class FlockTelemetry:
             )  # fmt: skip
             self.show(i, None, state, output)
 
-    def _newest(self, drone: int) -> tuple[FrameSet | None, tuple[FrameSet, PilotOutput] | None]:
+    def _newest(self, drone: int) -> tuple[FrameSet | None, Step | None]:
         with self._lock:
-            frames, _, output = self._stepped.get(drone, (None, None, None))
-        if frames is None or output is None:
+            frames, vehicle, output = self._stepped.get(drone, (None, None, None))
+        if frames is None or vehicle is None or output is None:
             return self._drawn.frames(drone) if self._drawn.newest else None, None
-        return frames, (frames, output)
+        return frames, (frames, vehicle, output)
 
     def _ask(self, drone: int, command: str, payload: bytes) -> AnswerMessage:
         try:
