@@ -21,8 +21,8 @@ help:
 demo: $(VENV)/sim.installed ## fly the paper's flight in the simulator and write its report
 	$(BIN)/flockd sim
 
-live: $(VENV)/sim.installed $(VENV)/fleet.installed ## fly a simulated flock on exact states on a page in the browser, until Ctrl-C
-	$(BIN)/flockd sim --live --perception truth
+live: $(VENV)/sim.installed $(VENV)/fleet.installed ## fly a simulated flock by sight on a page in the browser, until Ctrl-C; EXACT=1: on exact states
+	$(BIN)/flockd sim --live $(if $(EXACT),--perception truth)
 
 docs: $(VENV)/docs.installed ## build the documentation as a site in out/site
 	$(BIN)/python -m tools.docs.docs_reference

@@ -46,6 +46,8 @@ OPTIONS = {"duration": "duration_s", "seed": "seed"}
 SITL = "px4_sitl.yaml"
 DEFAULT_SPEED_FACTOR = 0.25
 """Two cores then keep up with five drones."""
+DRONES_A_CORE = 1.5
+"""By sight in about real time: a second of a drone takes 0.6 s of processor time (AMD EPYC), pictures included."""
 SPEED_FACTORS = (0.02, 10.0)
 """What a daemon's configuration allows."""
 
@@ -57,8 +59,9 @@ def add(commands: Commands) -> None:
         "flockd sim",
         "flockd sim --duration 20 --set vehicle.wind_m_s=[3,-1] --set drone.mission.speed_m_s=1.5 --out out/windy",
         "flockd sim --perception truth --json > truth.json",
-        "flockd sim --live --perception truth",
+        "flockd sim --live",
         "flockd sim --live config/forest.yaml --drones 3",
+        "flockd sim --live --perception truth",
         "flockd sim --perception truth --telemetry --drones 25 --duration 600",
         "flockd sim my_flight.yaml --set drone.perception.flow=dis --seed 7",
         "flockd sim config/fisheye_flight.yaml --set cameras.preset=realistic --duration 20",
@@ -89,7 +92,13 @@ def add(commands: Commands) -> None:
         number("a number from {:g} to {:g}".format(*SPEED_FACTORS), *SPEED_FACTORS),
     )
     add_settings(parser, "use this value of the scenario, or of its drone below `drone.`")
-    option(parser, "--drones N", "size of the flock", _flock_size)
+    option(
+        parser,
+        "--drones N",
+        "size of the flock (default: the scenario's; without one, --live by sight flies as many of five as the "
+        "processors can in about real time, three on two)",
+        _flock_size,
+    )
     option(parser, "--duration S", "seconds to fly; the world is made to fit", positive_number)
     option(parser, "--seed N", "seed of the world and of all noise", whole_number("a whole number, 0 or more"))
     option(
@@ -108,8 +117,8 @@ def add(commands: Commands) -> None:
     flag(
         parser,
         "--live",
-        "fly on the fleet page in the browser, in real time where the computer can: send drones to places, "
-        "pause, slow down, disturb, restart; until Ctrl-C, without a report",
+        "fly on the fleet page in the browser, with what each drone sees, in real time where the computer can: send "
+        "drones to places, pause, slow down, disturb, restart; until Ctrl-C, without a report",
     )
     option(parser, "--port N", f"with --live: port of the page (default: {PORT}; 0: any)", port_number)
     add_operator_option(parser)
@@ -255,8 +264,11 @@ def _scenario(args: argparse.Namespace) -> ScenarioConfig:
         scenario = load_scenario(args.scenario or data_path("config") / SCENARIO, overrides)
     except ConfigError as error:
         raise ConfigError([_of_option(problem) for problem in error.problems]) from error
-    if args.drones is not None:
-        scenario = with_drones(scenario, args.drones)
+    drones: int | None = args.drones
+    if args.live and args.scenario is None and drones is None and args.perception == "learned":
+        drones = min(len(scenario.vehicles), max(2, int(DRONES_A_CORE * (os.cpu_count() or 1))))
+    if drones is not None:
+        scenario = with_drones(scenario, drones)
     if all(vehicle.by_hand for vehicle in scenario.vehicles):
         raise UsageError(f"--drones {args.drones} leaves only drones that are flown by hand; fly more")
     return scenario
@@ -334,13 +346,13 @@ def _fly_live(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) ->
     from flockd.onboard.telemetry.publisher import ZenohTelemetry
     from flockd.sim.flock.flock_telemetry import FlockTelemetry, Repeater
     from flockd.sim.flock.live_flight import LiveControls, fly_live
+    from flockd.sim.flock.swarm import eyes_of
 
     endpoint = args.telemetry_at or ENDPOINT
     with suppress(KeyboardInterrupt), ExitStack() as stack:
         zenoh = stack.enter_context(ZenohTelemetry(fleet, listen=[endpoint]))
         controls = LiveControls(scenario, zenoh.identity, by_sight=args.perception != "truth")
         zenoh.reply_to(f"{key_of(fleet)}/**", controls.reply)
-        shown = FlockTelemetry(scenario, zenoh, stack.enter_context(Repeater(zenoh)))
         watcher = stack.enter_context(FleetWatcher(fleet, listen=[], connect=[endpoint]))
         source = stack.enter_context(LiveFleet(watcher))
         access, link = PageAccess(), stack.enter_context(SimulationLink(fleet, watcher))
@@ -350,9 +362,11 @@ def _fly_live(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) ->
         if not args.quiet:
             complain(f"other programs find it at {endpoint}; Ctrl-C ends it")
             if args.perception == "learned":
-                complain("loading networks and building the world")
+                complain(f"loading networks and building the world; {len(scenario.vehicles)} drones fly (`--drones`)")
         sys.stdout.flush()  # whoever reads a pipe needs the address now
-        fly_live(scenario, shown, controls, perception=args.perception, gated=args.gated)
+        eyes = None if args.perception == "truth" else eyes_of(scenario)
+        shown = FlockTelemetry(scenario, zenoh, stack.enter_context(Repeater(zenoh)))  # nothing is heard of it before
+        fly_live(scenario, shown, controls, eyes, gated=args.gated)
     return ExitCode.DONE
 
 

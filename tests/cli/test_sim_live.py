@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import re
 import signal
 import sys
@@ -13,7 +14,10 @@ from typing import Any
 
 import aiohttp
 import numpy as np
+import pytest
 
+from flockd.cli import main
+from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.sitl.processes import free_endpoint
 
 ROOT = Path(__file__).parents[2]
@@ -181,3 +185,31 @@ async def test_a_flock_is_disturbed_and_begun_again_from_the_page() -> None:
         assert page.now["time_s"] < first_s
         assert (page.now["cameras_off"], page.now["removed"], page.now["gust_m_s"]) == ({}, [], 0.0)
         await page.until(lambda: all(row["mission"] == "on the circle" for row in page.rows.values()))
+
+
+@pytest.mark.parametrize(("processors", "drones"), [(1, 2), (2, 3), (3, 4), (4, 5), (64, 5)])
+def test_by_sight_so_many_drones_fly_live_as_the_processors_carry(
+    processors: int, drones: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the paper's five; on exact states, with a scenario of one's own and without a page as many as there are."""
+    monkeypatch.setattr(os, "cpu_count", lambda: processors)
+    paper_flight = str(ROOT / "config/paper_flight.yaml")
+    of: dict[tuple[str, ...], int] = {
+        ("--live",): drones,
+        ("--live", "--drones", "4"): 4,
+        ("--live", "--perception", "truth"): 5,
+        ("--live", paper_flight): 5,
+        (): 5,
+    }
+    flown: list[int] = []
+
+    def fly(args: object, scenario: ScenarioConfig, *_: object) -> int:
+        flown.append(len(scenario.vehicles))
+        return 0
+
+    monkeypatch.setattr("flockd.cli.sim._fly_live", fly)
+    monkeypatch.setattr("flockd.cli.sim._fly_into", lambda directory, scenario, args: fly(args, scenario))
+    monkeypatch.setattr("flockd.cli.sim._folder", lambda scenario, args: ROOT)
+    for options in of:
+        assert main(["sim", *options]) == 0
+    assert flown == list(of.values())

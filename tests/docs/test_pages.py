@@ -161,5 +161,5 @@ def test_the_site_is_short() -> None:
 
 def test_pictures_are_small() -> None:
     sizes = {path.name: path.stat().st_size for path in (DOCS / "pictures").iterdir()}
-    assert sizes["by_sight.webp"] < 1e6
+    assert sizes["by_sight.webp"] < 3e5
     assert sum(sizes.values()) < 3e6

@@ -1,9 +1,6 @@
 // One card a drone, made once and then kept up to date where something has changed.
 import { STATES, colourOf, nameOf, put, state, written } from "./fleet_state.js";
 
-const PICTURES_EVERY_MS = 1000;
-const PICTURES_AT_ONCE = 2;
-const PICTURE_MS = 3000;
 const VALUES = [
   ["mode", (row) => row.flight_mode || "–"],
   ["motors", (row) => (row.armed === null ? "–" : row.armed ? (row.in_air ? "in the air" : "armed") : "disarmed")],
@@ -28,16 +25,6 @@ const EXPLAINED = {
   missed: "setpoints that its computer was too busy to send in time",
 };
 
-async function failure(reply) {
-  return reply.ok ? "" : reply.text();
-}
-
-// Why no new picture is there; above it may stand an old one.
-function captioned(figure, why) {
-  const { camera, came } = figure.dataset;
-  return came ? `${camera}, ${Math.round((performance.now() - came) / 1000)} s old: no newer one has come` : `${camera}: ${why}`;
-}
-
 function apart(seconds) {
   if (seconds === null) return "–";
   const sign = seconds < 0 ? "−" : "+";
@@ -55,15 +42,13 @@ function ordered({ orders, orders_refused: refused }) {
 }
 
 export class FleetCards {
-  constructor(section, choose, commands, simulation) {
+  constructor(section, choose, commands, simulation, pictures) {
     [this.section, this.choose, this.commands, this.simulation] = [section, choose, commands, simulation];
+    this.pictures = pictures;
     this.template = document.getElementById("card");
     this.cards = new Map();
     this.parts = new WeakMap();
     this.order = "";
-    this.wanted = new Map();
-    this.loading = 0;
-    setInterval(() => this.look(), PICTURES_EVERY_MS);
   }
 
   changed(keys) {
@@ -71,6 +56,7 @@ export class FleetCards {
     for (const [key, card] of this.cards) {
       if (state.rows.has(key)) continue;
       card.remove();
+      this.pictures.hide(this.parts.get(card).pictures);
       this.cards.delete(key);
     }
     const order = state.order.join(" ");
@@ -105,11 +91,11 @@ export class FleetCards {
       button.addEventListener("click", () => this.commands.confirm(button.dataset.command, [key]));
     }
     card.querySelector(".remove").addEventListener("click", () => this.simulation.remove(key));
-    card.querySelector(".pictures").hidden = !state.simulation?.by_sight;
     card.querySelector(".look").addEventListener("click", () => {
-      const pictures = card.querySelector(".pictures");
-      pictures.hidden = !pictures.hidden;
-      this.look();
+      const place = card.querySelector(".pictures");
+      place.hidden = !place.hidden;
+      if (place.hidden) this.pictures.hide(place);
+      else this.pictures.show(place, key);
     });
     this.cards.set(key, card);
     const one = (name) => card.querySelector(name);
@@ -150,66 +136,7 @@ export class FleetCards {
     put(parts.refusal, this.simulation.told(key) || this.commands.refusal(key));
     const removable = Boolean(state.simulation) && !this.simulation.isRemoved(key);
     if (parts.remove.hidden === removable) parts.remove.hidden = !removable;
-    for (const figure of parts.pictures.children) this.writeSwitch(key, figure);
     put(parts.orders, ordered(row));
     put(parts.identity, row.identities.length > 1 ? `${row.identities.length} drones` : row.identities.join(""));
-  }
-
-  // Of a simulated drone's camera.
-  writeSwitch(key, figure) {
-    const [, button] = figure.children;
-    button.hidden = !state.simulation;
-    put(button, this.simulation.isOff(key, figure.dataset.camera) ? "Switch on" : "Switch off");
-    figure.classList.toggle("off", this.simulation.isOff(key, figure.dataset.camera));
-  }
-
-  // New pictures for the cards that show theirs, a few at a time: a browser has six connections to a server, and orders
-  // need one.
-  look() {
-    for (const [key, card] of this.cards) {
-      const { pictures } = this.parts.get(card);
-      if (pictures.hidden || document.hidden) continue;
-      for (const camera of Object.keys(state.rows.get(key).cameras)) {
-        const name = JSON.stringify([key, camera]);
-        if (!this.wanted.has(name)) this.wanted.set(name, () => this.fetch(key, camera, pictures));
-      }
-    }
-    while (this.loading < PICTURES_AT_ONCE && this.wanted.size) this.loadNext();
-  }
-
-  async loadNext() {
-    const [[name, load]] = this.wanted;
-    this.wanted.delete(name);
-    this.loading += 1;
-    await load();
-    this.loading -= 1;
-    if (this.wanted.size) this.loadNext();
-  }
-
-  async fetch(key, camera, pictures) {
-    let figure = [...pictures.children].find((one) => one.dataset.camera === camera);
-    if (!figure) {
-      figure = document.createElement("figure");
-      figure.dataset.camera = camera;
-      figure.append(new Image(), document.createElement("button"), document.createElement("figcaption"));
-      figure.children[1].addEventListener("click", () => this.simulation.switch(key, camera));
-      this.writeSwitch(key, figure);
-      figure.firstChild.alt = `what the camera ${camera} sees`;
-      pictures.append(figure);
-    }
-    const [drone, image] = [key.split("/").map(encodeURIComponent).join("/"), figure.firstChild];
-    try {
-      const address = `image/${drone}/${encodeURIComponent(camera)}?at=${state.now}`;
-      const reply = await fetch(address, { priority: "low", signal: AbortSignal.timeout(PICTURE_MS) });
-      const none = reply.status === 204 ? "no picture has come: it has none, or does not answer" : await failure(reply);
-      if (none) return put(figure.lastChild, captioned(figure, none));
-      const picture = URL.createObjectURL(await reply.blob());
-      URL.revokeObjectURL(image.src);
-      image.src = picture;
-      figure.dataset.came = performance.now();
-      put(figure.lastChild, camera);
-    } catch {
-      put(figure.lastChild, captioned(figure, "the server cannot be reached"));
-    }
   }
 }

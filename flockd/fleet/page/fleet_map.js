@@ -278,6 +278,10 @@ export class FleetMap {
       pen.beginPath();
       pen.arc(...this.pixel(one.place), Math.max(4, (one.sigma_m || 0) / this.view.metres), 0, 2 * Math.PI);
       pen.stroke();
+      if (key !== state.chosen) continue;
+      const [x, y] = this.pixel(one.place);
+      pen.fillStyle = this.ink("ink");
+      pen.fillText(`#${one.track}`, x - 8, y + 18);
     }
     pen.globalAlpha = 1;
   }

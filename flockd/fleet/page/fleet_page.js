@@ -3,6 +3,7 @@ import { FleetCards } from "./fleet_cards.js";
 import { FleetCommands } from "./fleet_commands.js";
 import { FleetCurves } from "./fleet_curves.js";
 import { FleetMap } from "./fleet_map.js";
+import { FleetPictures, FleetSight } from "./fleet_pictures.js";
 import { SimulationControls } from "./fleet_simulation.js";
 import { STATES, nameOf, put, state, take } from "./fleet_state.js";
 
@@ -16,16 +17,19 @@ const EVENTS_SHOWN = 200;
 const commands = new FleetCommands(token);
 const map = new FleetMap(document.getElementById("map"), choose, (place) => commands.sendTo(place));
 const simulation = new SimulationControls(document.getElementById("simulation"), commands);
-const cards = new FleetCards(document.getElementById("cards"), choose, commands, simulation);
+const pictures = new FleetPictures(simulation);
+const cards = new FleetCards(document.getElementById("cards"), choose, commands, simulation, pictures);
+const sight = new FleetSight(document.getElementById("sight"), choose, pictures);
 const curves = new FleetCurves(document.getElementById("curves"));
 const summary = document.getElementById("summary");
 const trouble = document.getElementById("trouble");
 const notes = document.getElementById("notes");
-let [socket, heard, told] = [null, 0, ""];
+let [socket, heard, told] = [null, 0, null];
 
 function choose(key) {
   state.chosen = key === state.chosen ? null : key;
   cards.chosen();
+  sight.changed();
   map.changed();
   curves.draw();
 }
@@ -78,6 +82,8 @@ function show(message) {
   take(message);
   const changed = JSON.stringify(before) !== JSON.stringify(state.simulation);
   cards.changed(changed ? state.order : Object.keys(message.rows));
+  if (changed) pictures.changed();
+  sight.changed();
   commands.changed();
   map.changed();
   showSummary();

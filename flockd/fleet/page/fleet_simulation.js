@@ -1,6 +1,14 @@
 // Controls of a simulation that is flown live. Where the drones are real there is none, and nothing here is shown.
 import { nameOf, put, state } from "./fleet_state.js";
 
+const BEHIND = 0.9; // of the wanted speed
+
+function paceOf({ paused, speed, speed_reached: reached, time_s: time, by_sight: bySight }) {
+  if (paused) return " · stands still";
+  if (reached === null) return bySight && !time ? " · loads networks and builds the world" : "";
+  return ` · ${reached.toFixed(2)} × real time${reached < BEHIND * speed ? ", as fast as this computer can" : ""}`;
+}
+
 export class SimulationControls {
   constructor(form, commands) {
     [this.form, this.commands] = [form, commands];
@@ -26,9 +34,7 @@ export class SimulationControls {
     if (!before || before.speed !== simulation.speed) this.speed.value = String(simulation.speed);
     if (!before || before.gust_m_s !== simulation.gust_m_s) this.gusts.value = simulation.gust_m_s;
     if (document.activeElement !== this.gusts) this.write(simulation.gust_m_s);
-    const reached = simulation.speed_reached;
-    const pace = simulation.paused ? "stands still" : reached === null ? "" : `${reached.toFixed(2)} × real time`;
-    put(this.output, `${simulation.time_s.toFixed(1)} s${pace && ` · ${pace}`}`);
+    put(this.output, `${simulation.time_s.toFixed(1)} s${paceOf(simulation)}`);
     return Boolean(before) && before.flight !== simulation.flight;
   }
 

@@ -63,7 +63,7 @@ class PageServer:
         self._source, self._access, self._may_command, self._operator = source, access, may_command, operator
         self._order_threads = ThreadPoolExecutor(_ORDER_THREADS, "orders of the fleet page")
         """Nothing else waits on them."""
-        self._pictures = PagePictures(source.image)
+        self._pictures = PagePictures(source.image, EVERY_S if simulation is None else OF_SIMULATION_S)
         self._pages, self._simulation = 0, simulation
         self.trusted: set[object] = set()
         """Connections over which a page with the key has asked for something."""
@@ -336,7 +336,8 @@ def _finite(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-EVERY_S = 1.0
+EVERY_S, OF_SIMULATION_S = 1.0, 0.4
+"""Shortest time between two pictures of a camera: over a radio link, and of a simulation on this computer."""
 SHOWN_S = 5.0
 """Age up to which a picture is shown while the next one is on its way."""
 WAIT_S = 0.25
@@ -351,14 +352,19 @@ Key = tuple[str, str]
 
 
 class PagePictures:
-    """Pictures for all pages: each camera is asked once a second at most, and no request waits for a drone for long.
+    """Pictures for all pages: each camera is asked seldom, and no request waits for a drone for long.
 
     On the event loop; what waits for drones has threads of its own, of which one drone has a few.
     """
 
-    def __init__(self, fetch: Callable[[str, str], bytes | None], clock: Callable[[], float] = time.monotonic) -> None:
-        """``fetch``: of a drone and a camera; waits."""
-        self._fetch, self._clock = fetch, clock
+    def __init__(
+        self,
+        fetch: Callable[[str, str], bytes | None],
+        every_s: float = EVERY_S,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``fetch``: of a drone and a camera; waits. ``every_s``: shortest time between two of one camera."""
+        self._fetch, self._every_s, self._clock = fetch, every_s, clock
         self._threads = ThreadPoolExecutor(_THREADS, "pictures for the fleet page")
         self._asking: dict[Key, asyncio.Task[None]] = {}
         self._made: dict[Key, tuple[float, bytes | None]] = {}
@@ -368,7 +374,7 @@ class PagePictures:
         key, now_s = (drone, camera), self._clock()
         made_s, picture = self._made.get(key, (-SILENT_S, None))
         asking = self._asking.get(key)
-        if asking is None and now_s - made_s >= (EVERY_S if picture is not None else SILENT_S):
+        if asking is None and now_s - made_s >= (self._every_s if picture is not None else SILENT_S):
             of_drone = sum(one == drone for one, _ in self._asking)
             if len(self._asking) < _THREADS and of_drone < _THREADS_A_DRONE:
                 asking = self._asking[key] = asyncio.create_task(self._ask(key))

@@ -9,15 +9,16 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
-from flockd.core.choices import SimulatedPerception
 from flockd.fleet.simulation import SimulationMessage, checked_control
+from flockd.flight.perception import Networks
 from flockd.onboard.daemon.operator_orders import OrderChecks
 from flockd.onboard.telemetry.order_messages import parse_ask
 from flockd.onboard.telemetry.topics import AnswerMessage
+from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.control_loop import ControlLoop
 from flockd.sim.flock.exact_states import vehicles_of
 from flockd.sim.flock.flock_telemetry import FlockTelemetry
-from flockd.sim.flock.swarm import ExactStatePilots, VisionPilots, eyes_of, fly_commands
+from flockd.sim.flock.swarm import ExactStatePilots, VisionPilots, fly_commands
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances
 
@@ -205,15 +206,14 @@ def fly_live(
     scenario: ScenarioConfig,
     shown: FlockTelemetry,
     controls: LiveControls,
+    eyes: tuple[CameraSimulator, Networks] | None,
     *,
-    perception: SimulatedPerception = "learned",
     gated: bool = True,
 ) -> None:
     """Flies a scenario, beyond its end, and again from the beginning where that is asked for.
 
-    Until KeyboardInterrupt. The arguments are those of `flockd.sim.flock.swarm.fly`; `controls` give the pace.
+    Until KeyboardInterrupt. `controls` give the pace; `eyes` are those of `eyes_of`, None on exact states.
     """
-    eyes = eyes_of(scenario) if perception == "learned" else None
     while True:
         controls.begin()
         shown.begin_again()

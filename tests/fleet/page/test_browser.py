@@ -11,7 +11,7 @@ import socket
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from signal import SIGINT
 from subprocess import PIPE, Popen
@@ -32,6 +32,7 @@ from tests.fleet.page.chromium import (
 )
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
+expect.set_options(timeout=PATIENCE_MS)
 
 
 class Flock(NamedTuple):
@@ -55,7 +56,6 @@ def flock() -> Iterator[Flock]:
         doomed = stack.enter_context(made_up_drones(endpoint, *of_five, "1", "--first", "5", "--commands", "hold"))
         page = stack.enter_context(chromium()).new_context().new_page()
         page.set_default_timeout(PATIENCE_MS)
-        expect.set_options(timeout=PATIENCE_MS)
         errors: list[str] = []
         requests: list[str] = []
         page.on("pageerror", lambda error: errors.append(str(error)))
@@ -173,32 +173,60 @@ def test_a_killed_drone_is_shown_with_the_reason(flock: Flock) -> None:
     expect(flock.page.locator("#summary")).to_contain_text("1 gone")
 
 
-def test_a_simulated_flock_is_flown_and_disturbed_by_hand() -> None:
-    """`flockd sim --live` beside the others: a goal by a click on the map, and every control of the simulation."""
-    command = ["sim", "--live", "--perception", "truth", "--drones", "3", "--port", "0"]
-    run = [sys.executable, "-c", "from flockd.cli import program; program()", *command]
+@contextmanager
+def flown_live(flock: Flock, *options: str) -> Iterator[tuple[Page, float]]:
+    """`flockd sim --live` on a page of its own, and when the command was given. No script on the page may fail."""
+    run = [sys.executable, "-c", "from flockd.cli import program; program()", "sim", "--live", "--port", "0"]
     began_s = time.monotonic()
-    with Popen([*run, "--telemetry-at", free_endpoint()], stdout=PIPE, text=True) as flight:
+    with Popen([*run, "--telemetry-at", free_endpoint(), *options], stdout=PIPE, text=True) as flight:
         try:
             assert flight.stdout is not None
             address = re.search(r"http://\S+", flight.stdout.readline())
             assert address is not None
-            with chromium() as browser:
-                page = browser.new_page(viewport=WIDE)
-                page.set_default_timeout(PATIENCE_MS)
-                errors: list[str] = []
-                page.on("pageerror", lambda error: errors.append(str(error)))
-                page.goto(address[0])
-                expect(page.locator("article[data-tone=good]")).to_have_count(3)
-                expect(page.locator("#simulation output")).to_contain_text("× real time")
-                told("from the command until the flock moves on the page", began_s)
-                fly_by_hand(page)
-                page.set_viewport_size(NARROW)
-                assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["width"]
-                assert errors == []
+            page = opened_beside(flock)
+            page.set_viewport_size(WIDE)
+            page.set_default_timeout(PATIENCE_MS)
+            errors: list[str] = []
+            page.on("pageerror", lambda error: errors.append(str(error)))
+            page.goto(address[0])
+            yield page, began_s
+            page.set_viewport_size(NARROW)
+            assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["width"]
+            assert errors == []
+            page.close()
         finally:
             flight.send_signal(SIGINT)
             assert flight.wait(PATIENCE_MS / 1000) == 0
+
+
+def test_a_simulated_flock_is_flown_and_disturbed_by_hand(flock: Flock) -> None:
+    """On exact states: a goal by a click on the map, and every control of the simulation."""
+    with flown_live(flock, "--perception", "truth", "--drones", "3") as (page, began_s):
+        expect(page.locator("article[data-tone=good]")).to_have_count(3)
+        expect(page.locator("#simulation output")).to_contain_text("× real time")
+        told("from the command until the flock moves on the page", began_s)
+        fly_by_hand(page)
+
+
+def test_by_sight_the_page_shows_what_a_drone_sees_beside_the_map(flock: Flock) -> None:
+    """Large, of the drone that is chosen, with a camera that is switched off."""
+    with flown_live(flock, "--drones", "2") as (page, began_s):
+        output, sight = page.locator("#simulation output"), page.locator("#sight")
+        expect(output).to_contain_text("loads networks and builds the world")
+        expect(output).to_contain_text("× real time")
+        told("from the command until the flock flies by sight on the page", began_s)
+        expect(sight.locator("[aria-pressed=true]")).to_have_text("drone1")
+        expect(sight.locator("figure[data-came]")).to_have_count(4)
+        sizes = sight.locator("img").evaluate_all("all => all.map(one => [one.naturalWidth, one.naturalHeight])")
+        assert sizes == [[240, 320]] * 4, "480 x 640 pixels, the longer side 320"
+        sight.get_by_text("drone2").click()
+        expect(page.locator("article.chosen")).to_contain_text("drone2")
+        sight.locator("figure[data-camera=left] button").click()
+        expect(sight.locator("figure.off")).to_contain_text("no newer one has come")
+        map_box, sight_box = page.locator("#map").bounding_box(), sight.bounding_box()
+        assert map_box is not None
+        assert sight_box is not None
+        assert (map_box["y"], map_box["height"]) == (sight_box["y"], sight_box["height"]), "beside each other"
 
 
 def fly_by_hand(page: Page) -> None:

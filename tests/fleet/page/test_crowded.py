@@ -11,7 +11,7 @@ from aiohttp import web
 
 from flockd.fleet.drone_rows import Row
 from flockd.fleet.page.page_access import MAX_STRANGERS, STRANGER_S, PageAccess, PageConnections
-from flockd.fleet.page.page_server import EVERY_S, SILENT_S, PagePictures, PageServer
+from flockd.fleet.page.page_server import EVERY_S, OF_SIMULATION_S, SILENT_S, PagePictures, PageServer
 from flockd.onboard.telemetry.topics import AnswerMessage
 from tests.fleet.page.test_access import Asked, opened, served
 
@@ -65,7 +65,8 @@ async def test_an_order_passes_pictures_and_orders_that_nobody_answers() -> None
     assert fleet.happened.index("f/one answered") < fleet.happened.index("a picture came")
 
 
-async def test_each_camera_is_asked_once_a_second_and_a_silent_one_seldom() -> None:
+@pytest.mark.parametrize("every_s", [EVERY_S, OF_SIMULATION_S])
+async def test_each_camera_is_asked_once_in_a_while_and_a_silent_one_seldom(every_s: float) -> None:
     asked: list[str] = []
     now_s = 100.0
 
@@ -73,10 +74,12 @@ async def test_each_camera_is_asked_once_a_second_and_a_silent_one_seldom() -> N
         asked.append(camera)
         return None if camera == "silent" else b"picture %d" % len(asked)
 
-    pictures = PagePictures(fetch, lambda: now_s)
+    pictures = PagePictures(fetch, every_s, lambda: now_s)
     assert [await pictures.newest("d", "good") for _ in range(3)] == [b"picture 1"] * 3
     assert await pictures.newest("d", "silent") is None
-    now_s += EVERY_S
+    now_s += 0.9 * every_s
+    assert await pictures.newest("d", "good") == b"picture 1"
+    now_s += 0.1 * every_s
     assert await pictures.newest("d", "good") == b"picture 3"
     assert await pictures.newest("d", "silent") is None
     assert asked == ["good", "silent", "good"]

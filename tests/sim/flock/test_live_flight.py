@@ -8,6 +8,7 @@ from flockd.core.config import Overrides
 from flockd.core.data import data_path
 from flockd.sim.flock.live_flight import LiveControls, fly_live
 from flockd.sim.flock.start import with_drones
+from flockd.sim.flock.swarm import eyes_of
 from flockd.sim.scenario import load_scenario
 from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances
 from tests.make import small_eyes
@@ -45,7 +46,7 @@ def test_a_flight_begun_again_is_the_same_and_a_camera_that_is_off_shows_nothing
     watching, controls = Watching(), ThreeFlights(flown, "f10c", by_sight=True)
     controls.seen = watching
     with pytest.raises(KeyboardInterrupt):
-        fly_live(flown, watching.shown(flown), controls)
+        fly_live(flown, watching.shown(flown), controls, eyes_of(flown))
     of_one = 2 * STEPS
     first, again, disturbed = (watching.commands[begin : begin + of_one] for begin in (0, of_one, 2 * of_one))
     assert first == again, "the same world, the same noise, and pilots that know nothing of the first flight"
