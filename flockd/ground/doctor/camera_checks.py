@@ -14,7 +14,7 @@ from flockd.core.config.rig import CameraConfig, RigConfig, field_of_view_deg
 from flockd.core.secrets import masked
 from flockd.flight.geometry import Rig, build_rig
 from flockd.ground.calibration.from_flight import found_rig
-from flockd.ground.calibration.rig_calibration import described, rig_faults
+from flockd.ground.calibration.rig_calibration import PRIOR_TURN_RAD, described, rig_faults
 from flockd.ground.cameras.watching import START_S, Watched, watch
 from flockd.ground.doctor import Finding, Level, failed, failed_from_error, graded, passed, warned
 from flockd.ground.doctor.computer_checks import STATE_FOLDER
@@ -182,6 +182,10 @@ def _flown(file: Path) -> tuple[int, float]:
     return number, file.stat().st_mtime
 
 
+_VAGUE_TURN_RAD = 0.9 * PRIOR_TURN_RAD
+"""About each axis: the flight shows nothing of a mounting."""
+
+
 def check_rig(config: DroneConfig, folder: Path | None, state_folder: Path = STATE_FOLDER) -> Iterator[Finding]:
     """Of this drone's newest recording in the folder, named as for `check_disk`."""
     files = [path for path in (folder or state_folder).glob(f"{config.name}-*.mcap") if not path.is_symlink()]
@@ -211,5 +215,8 @@ def check_rig(config: DroneConfig, folder: Path | None, state_folder: Path = STA
         else:
             fix = f"flockd calibrate rig --from-flight {newest} writes the corrected rig; see that the camera is fixed"
             yield warned(about, f"in the last flight {texts}: {described(one)}", fix)
+    vague = [one.camera for one in found if float(np.diag(one.covariance)[:3].min()) > _VAGUE_TURN_RAD**2]
     if not off:
-        yield passed("rig", f"the last flight, {newest.name}, saw {len(found)} cameras as they are configured")
+        but = f", and shows nothing of {', '.join(vague)}" if vague else ""
+        seen = len(found) - len(vague)
+        yield passed("rig", f"the last flight, {newest.name}, saw {seen} cameras as they are configured{but}")

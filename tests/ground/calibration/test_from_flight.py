@@ -20,7 +20,7 @@ from flockd.flight.pilot.camera_agreement import moves_otherwise
 from flockd.ground.calibration import from_flight
 from flockd.ground.calibration.board import CalibrationError
 from flockd.ground.calibration.from_flight import corrected_rig, found_rig
-from flockd.ground.calibration.rig_calibration import CameraDeviation
+from flockd.ground.calibration.rig_calibration import PRIOR_TURN_RAD, CameraDeviation
 from flockd.ground.doctor import Finding, Level, camera_checks
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.mcap_file import RecordingError
@@ -189,6 +189,17 @@ def test_a_recording_without_images_says_so(tmp_path: Path, monkeypatch: pytest.
     config = recording.config.model_copy(update={"name": "drone1"})
     (finding,) = camera_checks.check_rig(config, tmp_path)
     assert (finding.level, finding.about) == (Level.WARNING, "rig")
+
+
+def test_the_doctor_does_not_count_a_camera_of_which_the_flight_showed_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded(tmp_path)
+    right = np.zeros(3), 0.0, 1.0
+    unseen = seen("left", *right, sigmas=(PRIOR_TURN_RAD,) * 3 + WELL[3:])
+    (finding,) = examined(monkeypatch, drone_config(), tmp_path, seen("front", *right), unseen)
+    assert finding.level is Level.PASS
+    assert finding.measured.endswith("saw 1 cameras as they are configured, and shows nothing of left")
 
 
 def test_the_doctor_compares_the_newest_recording_with_the_configuration(
