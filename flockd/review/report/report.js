@@ -155,7 +155,8 @@ for (const player of document.querySelectorAll(".player")) {
   };
   const tick = (now) => {
     if (!playing) return;
-    time = Math.min(time + ((now - ticked) / 1000) * rate.value, flight.time[last]);
+    const passed = Math.max(0, now - ticked); // a frame's time stamp may lie before the click that asked for it
+    time = Math.min(time + (passed / 1000) * rate.value, flight.time[last]);
     ticked = now;
     if (time >= flight.time[last]) pause();
     draw();

@@ -135,6 +135,13 @@ def test_a_round_obstacle_is_drawn_where_it_stands(tmp_path: Path) -> None:
     assert obstacle == pytest.approx(second, abs=0.2)
 
 
+def test_a_frame_that_began_before_the_click_does_not_play_backwards(html: str) -> None:
+    page = _Browser(html)
+    page.do("button", "click")
+    page("frame(-30)")
+    assert page.shown().startswith("0.0 s")
+
+
 def test_a_reader_chooses_the_plate_of_a_drone_and_moment(html: str) -> None:
     page = _Browser(html)
     plates = "document.querySelectorAll('figure').filter((one) => !one.hidden)"
@@ -160,6 +167,6 @@ def test_a_browser_shows_the_flight_and_begins_to_play_it(html: str, tmp_path: P
     command = [browser, *flags, "--virtual-time-budget=1000", "--dump-dom", page.as_uri()]
     shown = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
     told = re.search(r"<output[^>]*>[0-9.]+ s, closest ([0-9.]+) m in 3D", shown)
-    assert told is not None
+    assert told is not None, re.findall("<output.*", shown)
     assert float(told[1]) == pytest.approx(SIDE_M, abs=0.015), "positions are kept to the centimetre"
     assert re.search(r"<button[^>]*>Pause</button>", shown)
