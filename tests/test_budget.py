@@ -26,10 +26,10 @@ LINES = {
     "flockd/fleet": 2_700,
     "flockd/ground": 5_040,
     "flockd/review": 3_600,
-    "flockd/sim": 8_770,
+    "flockd/sim": 8_890,
     "flockd/campaign": 1_490,
-    "flockd/cli": 3_720,
-    "tests": 39_040,
+    "flockd/cli": 3_730,
+    "tests": 39_100,
     "tools/checks": 2_060,
     "tools/docs": 930,
     "tools/measure": 1_520,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 331}
+FILES = {"flockd": 332}
 NUMBERS_OF_FLIGHT = 270
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02

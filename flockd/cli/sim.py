@@ -61,7 +61,7 @@ def add(commands: Commands) -> None:
         "flockd sim --perception truth --json > truth.json",
         "flockd sim --live",
         "flockd sim --live config/forest.yaml --drones 3",
-        "flockd sim --live --perception truth",
+        "flockd sim --live --video flock.mp4",
         "flockd sim --perception truth --telemetry --drones 25 --duration 600",
         "flockd sim my_flight.yaml --set drone.perception.flow=dis --seed 7",
         "flockd sim config/fisheye_flight.yaml --set cameras.preset=realistic --duration 20",
@@ -120,6 +120,7 @@ def add(commands: Commands) -> None:
         "fly on the fleet page in the browser, with what each drone sees, in real time where the computer can: send "
         "drones to places, pause, slow down, disturb, restart; until Ctrl-C, without a report",
     )
+    option(parser, "--video FILE", "with --live: write an .mp4 of the flock and of what drone 1 sees", Path)
     option(parser, "--port N", f"with --live: port of the page (default: {PORT}; 0: any)", port_number)
     add_operator_option(parser)
     flag(
@@ -234,6 +235,7 @@ def _check_options(args: argparse.Namespace) -> None:
         "--live flies with the simulator's own pilots; drop --autopilot": live and fleet,
         "--live flies on until Ctrl-C; drop --duration": live and args.duration,
         "--port is for --live; add that, or drop it": args.port is not None and not live,
+        "--video is for --live; add that, or drop it": args.video is not None and not live,
         "--speed-factor is for real daemons; drop it, or name their --autopilot": args.speed_factor and not fleet,
         "--telemetry-at is for --telemetry, --live and --autopilot; add one of them, or drop it": (
             args.telemetry_at is not None and not (args.telemetry or live or fleet)
@@ -245,6 +247,12 @@ def _check_options(args: argparse.Namespace) -> None:
         idle = [f"--set {key}" for key, _ in args.settings if key.startswith(("drone.perception.", "cameras."))]
         idle += ["--record"] if args.record else []
         wrong |= {f"{one} has no meaning without networks; drop it or --perception truth": True for one in idle}
+    if args.video is not None:
+        from flockd.ground.pictures.copies import VIDEO
+
+        wrong[f"--video {args.video}: does not end in {VIDEO}; name a file that does"] = args.video.suffix != VIDEO
+        wrong[f"--video {args.video}: exists; name another file"] = args.video.exists()
+        wrong[f"--video {args.video}: there is no folder {args.video.parent}; make it"] = not args.video.parent.is_dir()
     for sentence, is_so in wrong.items():
         if is_so:
             raise UsageError(sentence)
@@ -344,6 +352,7 @@ def _fly_live(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) ->
     from flockd.fleet.simulation import SimulationLink, key_of
     from flockd.fleet.watcher import FleetWatcher
     from flockd.onboard.telemetry.publisher import ZenohTelemetry
+    from flockd.sim.flock.flight_film import flight_film
     from flockd.sim.flock.flock_telemetry import FlockTelemetry, Repeater
     from flockd.sim.flock.live_flight import LiveControls, fly_live
     from flockd.sim.flock.swarm import eyes_of
@@ -366,7 +375,10 @@ def _fly_live(args: argparse.Namespace, scenario: ScenarioConfig, fleet: str) ->
         sys.stdout.flush()  # whoever reads a pipe needs the address now
         eyes = None if args.perception == "truth" else eyes_of(scenario)
         shown = FlockTelemetry(scenario, zenoh, stack.enter_context(Repeater(zenoh)))  # nothing is heard of it before
-        fly_live(scenario, shown, controls, eyes, gated=args.gated)
+        first = min(shown.pictures)
+        film = stack.enter_context(flight_film(scenario, shown.pictures[first], args.video)) if args.video else None
+        with suppress(KeyboardInterrupt):  # which ends the film in order
+            fly_live(scenario, shown, controls, eyes, gated=args.gated, film=film)
     return ExitCode.DONE
 
 

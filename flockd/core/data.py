@@ -25,10 +25,14 @@ def data_path(folder: Literal["config", "models", "systemd"]) -> Path:
 
 @contextmanager
 def written_whole(target: Path) -> Iterator[Path]:
-    """A place to write to, which becomes the target when all is written and vanishes otherwise."""
-    draft = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
+    """A place to write to, which becomes the target when all is written and vanishes otherwise.
+
+    Its name ends like the target's, by which writers choose a format. If nothing is written the target stays.
+    """
+    draft = target.with_name(f".{target.stem}.{uuid.uuid4().hex[:8]}.part{target.suffix}")
     try:
         yield draft
-        draft.replace(target)
+        if draft.exists():
+            draft.replace(target)
     finally:
         draft.unlink(missing_ok=True)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import aiohttp
+import cv2
 import numpy as np
 import pytest
 
@@ -161,8 +162,8 @@ async def test_a_flock_flies_where_the_page_sends_it_and_stands_still_when_it_is
         assert page.now["time_s"] - stood_s <= 2.0, "nothing was caught up with"
 
 
-async def test_a_flock_is_disturbed_and_begun_again_from_the_page() -> None:
-    async with live("--perception", "truth") as page:
+async def test_a_flock_is_disturbed_and_begun_again_from_the_page_and_filmed(tmp_path: Path) -> None:
+    async with live("--perception", "truth", "--video", str(tmp_path / "flock.mp4")) as page:
         await page.until(lambda: True)
         await page.control("speed", factor=5.0)
         await page.control("camera", drone="drone2", camera="front", works=False)
@@ -185,6 +186,10 @@ async def test_a_flock_is_disturbed_and_begun_again_from_the_page() -> None:
         assert page.now["time_s"] < first_s
         assert (page.now["cameras_off"], page.now["removed"], page.now["gust_m_s"]) == ({}, [], 0.0)
         await page.until(lambda: all(row["mission"] == "on the circle" for row in page.rows.values()))
+    film = cv2.VideoCapture(str(tmp_path / "flock.mp4"))
+    assert film.get(cv2.CAP_PROP_FRAME_COUNT) > first_s / 0.5, "a frame a step, those after the restart too"
+    assert film.get(cv2.CAP_PROP_FPS) == pytest.approx(2.0)
+    assert [path.name for path in tmp_path.iterdir()] == ["flock.mp4"], "no draft is left"
 
 
 @pytest.mark.parametrize(("processors", "drones"), [(1, 2), (2, 3), (3, 4), (4, 5), (64, 5)])

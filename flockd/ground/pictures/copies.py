@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from flockd.core.data import written_whole
 from flockd.core.errors import UsageError
 from flockd.core.messages import UInt8Array
 from flockd.ground.datasets.image_files import SUFFIXES, VIDEO_SUFFIXES
@@ -19,7 +19,7 @@ from flockd.ground.pictures.single_frame import DetectedDrone, PictureResult
 from flockd.onboard.telemetry.preview import colour_of, draw_box, write_at
 
 _JPEG = {".jpg", ".jpeg"}
-_VIDEO = ".mp4"
+VIDEO = ".mp4"
 _CODEC = cv2.VideoWriter.fourcc(*"vp09")
 """VP9, which OpenCV's wheels encode, and browsers and players show."""
 
@@ -33,7 +33,7 @@ class Copies:
         self._targets: dict[PictureFile, Path] = {}
         self.written = 0
         sources = {picture.path.resolve() for picture in pictures}
-        names_video = out.suffix.lower() == _VIDEO and not out.is_dir()
+        names_video = out.suffix.lower() == VIDEO and not out.is_dir()
         if names_video and not (len(pictures) == 1 and pictures[0].is_video):
             raise UsageError(f"{out}: is the name of one video, and there are other pictures; name a folder with --out")
         if not out.is_dir() and not names_video and (out.exists() or out.suffix.lower() in SUFFIXES | VIDEO_SUFFIXES):
@@ -41,7 +41,7 @@ class Copies:
         taken: dict[Path, Path] = {}
         for picture in pictures:
             kept = picture.path.suffix if picture.path.suffix.lower() in _JPEG else ".png"
-            suffix = _VIDEO if picture.is_video else kept
+            suffix = VIDEO if picture.is_video else kept
             target = out if names_video else out / picture.relative.with_suffix(suffix)
             if target.resolve() in sources:
                 raise UsageError(f"{target}: is one of the pictures themselves; name another folder with --out")
@@ -58,32 +58,36 @@ class Copies:
 
         An interrupted one leaves what was there. Raises OSError, and UsageError for a video that cannot be written.
         """
-        target, written = self._targets[picture], 0
+        target = self._targets[picture]
         target.parent.mkdir(parents=True, exist_ok=True)
-        draft = target.with_name(f".{target.stem}.{uuid.uuid4().hex[:8]}.part{target.suffix}")  # OpenCV goes by the end
-        video = cv2.VideoWriter()
-
-        def write(image: UInt8Array) -> None:
-            nonlocal written
-            bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-            if not picture.is_video:
-                draft.write_bytes(cv2.imencode(target.suffix, bgr)[1].tobytes())
+        with written_whole(target) as draft:
+            if picture.is_video:
+                with video_file(draft, target, picture.rate_hz(every)) as write:
+                    yield write
             else:
-                size = (bgr.shape[1], bgr.shape[0])
-                if not written and not video.open(str(draft), _CODEC, picture.rate_hz(every), size):
-                    raise UsageError(f"{target}: cannot be written; name another place with --out")
-                video.write(bgr)
-            written += 1
+                yield lambda image: _write_image(draft, image)
+            self.written += draft.exists()
 
-        try:
-            yield write
-            video.release()
-            if written:
-                draft.replace(target)
-                self.written += 1
-        finally:
-            video.release()
-            draft.unlink(missing_ok=True)
+
+@contextmanager
+def video_file(draft: Path, target: Path, rate_hz: float) -> Iterator[Callable[[UInt8Array], None]]:
+    """Writes images (h, w, 3), RGB, all of one size, to the draft of a video. Raises UsageError if that cannot be."""
+    video = cv2.VideoWriter()
+
+    def write(image: UInt8Array) -> None:
+        size = (image.shape[1], image.shape[0])
+        if not video.isOpened() and not video.open(str(draft), _CODEC, rate_hz, size):
+            raise UsageError(f"{target}: cannot be written; name another place for it")
+        video.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+
+    try:
+        yield write
+    finally:
+        video.release()
+
+
+def _write_image(file: Path, image: UInt8Array) -> None:
+    file.write_bytes(cv2.imencode(file.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes())
 
 
 _MASK_WEIGHT = 0.4

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Self
@@ -97,6 +97,8 @@ class FlockTelemetry:
         self._told = dict.fromkeys(self._drones, State.NORMAL.value)
         """The state of each drone in the last event, with its reasons."""
         self._drawn = _DrawnOnRequest(scenario)
+        self.pictures: dict[int, Callable[[str], bytes | None]] = {}
+        """Of each drone: the newest JPEG of a camera, with what was seen."""
         self._rig = build_rig(scenario.drone.rig)
         for i in self._drones:
             self._announce(i)
@@ -108,6 +110,7 @@ class FlockTelemetry:
             commands=sorted(ORDERS | REQUESTS),
         )
         previews = Previews(self._rig, partial(self._newest, i))
+        self.pictures[i] = previews.picture
         self._announcer.announce(f"drone{i + 1}", about, partial(self._ask, i), previews.picture)
 
     def begin_again(self) -> None:

@@ -1,4 +1,4 @@
-"""Flies a simulated flock for people who watch and disturb it, until Ctrl-C: nothing is kept."""
+"""Flies a simulated flock for people who watch and disturb it, until Ctrl-C: nothing is kept but a film."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from flockd.onboard.telemetry.topics import AnswerMessage
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.flock.control_loop import ControlLoop
 from flockd.sim.flock.exact_states import vehicles_of
+from flockd.sim.flock.flight_film import FlightFilm
 from flockd.sim.flock.flock_telemetry import FlockTelemetry
 from flockd.sim.flock.swarm import ExactStatePilots, VisionPilots, fly_commands
 from flockd.sim.scenario import ScenarioConfig
@@ -209,6 +210,7 @@ def fly_live(
     eyes: tuple[CameraSimulator, Networks] | None,
     *,
     gated: bool = True,
+    film: FlightFilm | None = None,
 ) -> None:
     """Flies a scenario, beyond its end, and again from the beginning where that is asked for.
 
@@ -227,5 +229,7 @@ def fly_live(
             vehicles.disturb(disturbed)
             shown.disturb(disturbed)
             commands = pilots.step(step, time_s, vehicles, None, pictured=False, disturbed=disturbed)
+            if film is not None:
+                film.add(time_s, vehicles.position, disturbed.removed)
             fly_commands(commands, time_s, loop, vehicles, shown, disturbed)
             step += 1
