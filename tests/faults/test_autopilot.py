@@ -387,7 +387,7 @@ async def test_where_the_autopilot_limits_setpoints_flockd_asks_for_no_more_and_
         reacted("setpoints-clipped", clock() - selected_s)
         await until(lambda: bool(np.linalg.norm(fake_autopilot.setpoints[-1][1].velocity) > 0.45), SECONDS_TO_FAIL)
         await asyncio.sleep(12.0)  # the memory of the velocity's error, and more
-        fastest_m_s = max(np.linalg.norm(demand.velocity) for _, demand in fake_autopilot.setpoints)
+        fastest_m_s = max(np.linalg.norm(demand.velocity) for _, demand in list(fake_autopilot.setpoints))
         assert fastest_m_s <= 0.5 + 1e-6
         assert fake_autopilot.mode == "OFFBOARD"
         assert not any("another program" in event or "off the setpoints" in event for event in ship.events)

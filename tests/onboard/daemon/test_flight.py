@@ -92,7 +92,7 @@ async def test_eyes_that_lie_about_the_own_motion_add_half_a_metre_a_second_at_m
         fake_autopilot.pilot_selects("OFFBOARD")
         chosen_s = clock()
         await until(lambda: ship.heard()["flight"].message["velocity_trim"][0] > 0.49, SECONDS_TO_FAIL)
-        off_s = next(at_s for at_s, sent in fake_autopilot.setpoints if np.linalg.norm(sent.velocity) > 0.01)
+        off_s = next(at_s for at_s, sent in list(fake_autopilot.setpoints) if np.linalg.norm(sent.velocity) > 0.01)
         assert off_s - chosen_s > 2 * STEP_S - 0.1, "a neighbour counts from its third look on"
         await asyncio.sleep(1.0)
         commanded = np.array(ship.heard()["command"].message["velocity_ne"])
@@ -109,7 +109,7 @@ async def test_eyes_that_lie_about_the_own_motion_add_half_a_metre_a_second_at_m
         ship.cameras.silent |= set(CAMERAS)
         silent_s = clock()
         await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-        hover = [sent for at_s, sent in fake_autopilot.setpoints if at_s > silent_s + 1.2]
+        hover = [sent for at_s, sent in list(fake_autopilot.setpoints) if at_s > silent_s + 1.2]
         assert hover, "the hover is sent"
         assert np.linalg.norm(hover[-1].velocity) < 0.1, "standstill at last, however late it was noticed"
 
@@ -128,7 +128,7 @@ async def test_a_position_and_velocity_that_come_no_more_are_not_flown_by(
         await ship.until_event("hover: no position and velocity from the autopilot for ")
         await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
         assert 1.4 < clock() - gone_s < 3.5, "after 0.5 s, and 1 s of hovering"
-        last = [sent for at_s, sent in fake_autopilot.setpoints if at_s > gone_s + 1.2]
+        last = [sent for at_s, sent in list(fake_autopilot.setpoints) if at_s > gone_s + 1.2]
         assert max(np.linalg.norm(sent.velocity) for sent in last) < 0.1
         assert not fake_autopilot.failsafe
 
