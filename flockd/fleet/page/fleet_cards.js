@@ -37,7 +37,7 @@ function ordered({ orders, orders_refused: refused }) {
   const parts = [];
   const [last] = orders;
   if (last) parts.push(`last order: ${last.command}, by ${last.operator} (order ${last.sequence}), ${Math.round(last.age_s)} s ago`);
-  if (refused) parts.push(`${refused} orders refused`);
+  if (refused) parts.push(`${refused} order${refused === 1 ? "" : "s"} refused`);
   return parts.join(" · ");
 }
 

@@ -93,6 +93,9 @@ function show(message) {
 }
 
 function showSummary() {
+  const fleets = [...state.fleets].sort().join(", ") || "Fleet";
+  document.title = `${fleets} - flockd`;
+  document.querySelector("h1").textContent = fleets;
   const counts = new Map();
   for (const key of state.order) {
     const now = state.rows.get(key).state;

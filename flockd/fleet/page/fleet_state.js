@@ -5,7 +5,7 @@ export const state = {
   now: 0,
   rows: new Map(),
   order: [],
-  fleets: 0,
+  fleets: new Set(),
   history: new Map(),
   columns: {},
   chosen: null,
@@ -40,7 +40,7 @@ export const STATES = {
 
 // A fleet's name is shown where there are several.
 export function nameOf(key) {
-  return state.fleets > 1 ? key : key.split("/")[1];
+  return state.fleets.size > 1 ? key : key.split("/")[1];
 }
 
 export function placeOf(row) {
@@ -58,7 +58,7 @@ export function lastPlaceOf(key) {
 export function take(message) {
   state.now = message.time_s;
   state.order = message.order;
-  state.fleets = new Set(state.order.map((one) => one.split("/")[0])).size;
+  state.fleets = new Set(state.order.map((one) => one.split("/")[0]));
   for (const key of [...message.order].sort(byName)) if (!numbers.has(key)) numbers.set(key, numbers.size);
   for (const [key, row] of Object.entries(message.rows)) {
     state.rows.set(key, row);

@@ -86,6 +86,7 @@ def test_five_drones_appear(flock: Flock) -> None:
     expect(flock.page.locator(".plot .js-line")).to_have_count(5)
     marked = "c => c.getContext('2d').getImageData(0, 0, c.width, c.height).data.some(value => value > 0)"
     assert flock.page.locator("#map canvas").evaluate(marked)
+    expect(flock.page).to_have_title("made-up - flockd")
 
 
 def test_a_hold_is_confirmed_by_the_drone_and_resumed(flock: Flock) -> None:
