@@ -157,7 +157,7 @@ def parameter_curves(results: Results, figure: Figure) -> Drawing:
             axes.set_ylabel(textwrap.fill(label_of(figure), 26))
             low, high = axes.get_ylim()
             if high - low < 0.2 and np.ptp(axes.dataLim.intervaly) == 0.0:  # a constant, which is no scatter of 0.04
-                axes.set_ylim(low - 0.5, high + 0.5)
+                axes.set_ylim(max(low - 0.5, min(low, 0.0)), high + 0.5)
         if len(cases) > 1:
             drawing.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=len(cases))
     return drawing

@@ -35,7 +35,7 @@ def add(commands: Commands) -> None:
 
 def _add_shared(parser: Parser) -> None:
     option(parser, "--out FILE", "write the result to this file (CAMERA.yaml or rig.yaml)", Path)
-    flag(parser, "--force", "overwrite what is there")
+    flag(parser, "--force", "overwrite existing files")
     flag(parser, "--json", "print the result as JSON")
 
 
@@ -157,7 +157,7 @@ def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, 
 
 def _add_rig(commands: Commands) -> None:
     """Adds the command."""
-    description = "Use a flight's own calibration of its rig: the cameras' mountings, time offset and focal lengths."
+    description = "Correct the rig by a recorded flight: the cameras' mountings, time offset and focal lengths."
     parser = commands("rig", description, ("flockd calibrate rig --from-flight drone1.mcap",), _rig)
     option(parser, "--from-flight RECORDING", "the flight", Path, required=True)
     _add_shared(parser)

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 RUN = "run"
 COSTS = """\
-costs: `--dry-run` estimates them. A flight of five drones for 110 s on exact states takes one core a second (November
-2026, a busy computer), a flight by sight 12 s a simulated second. A flight's row takes 1 kB.
-Ctrl-C and every other end lose only flights that are in the air: the same command goes on with what is missing."""
+costs: `--dry-run` estimates them. A flight of five drones for 110 s takes a second of processor time on exact states;
+by sight each simulated second takes up to 12 s. A flight's row takes 1 kB.
+However a campaign ends, it loses only unfinished flights: the same command flies the missing ones."""
 
 
 def add(commands: Commands) -> None:

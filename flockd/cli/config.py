@@ -220,7 +220,9 @@ def write_checked(file: Path, text: str, settings: Sequence[tuple[str, str]] = (
         raise UsageError(f"{file} was not written, as it would not check ({reasons}); change the options") from error
     finally:
         draft.unlink(missing_ok=True)
-    left = "fill in what is marked `fill in`; " if "fill in" in text.lower() else ""
+    lines = file.read_text(encoding="utf-8").lower().splitlines()
+    marked = [str(number) for number, line in enumerate(lines, 1) if "# fill in:" in line]
+    left = f"fill in what the lines {', '.join(marked)} ask for; " if marked else ""
     say(f"{file}: written; {left}`flockd config check {file}` checks it after each change")
 
 

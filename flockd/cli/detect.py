@@ -30,7 +30,7 @@ MIN_FOV_DEG, MAX_FOV_DEG = 4.0, 170.0
 """Less are radians, or a telescope's."""
 NOTES = """\
 Larger pictures are resized to 1280 pixels for the networks; boxes are in pixels of the picture.
-Drones of a video are followed from frame to frame, each by its number; they count once half a second has shown them.
+In a video each drone has a number, which it keeps from frame to frame; it is counted after half a second.
 A picture that cannot be read is reported and left out, and the exit code is 1."""
 
 
@@ -51,7 +51,7 @@ def add(commands: Commands) -> None:
         "write copies of the pictures with the detections drawn into them: a folder, or one .mp4",
         Path,
     )
-    flag(parser, "--force", "overwrite what is there")
+    flag(parser, "--force", "overwrite existing files")
     option(
         parser,
         "--min-probability P",

@@ -32,15 +32,15 @@ def add(commands: Commands) -> None:
     _add_options(commands("verify", description, examples, _verify))
     examples = ("flockd models prepare --config my_drone.yaml", "flockd models prepare --config my_drone.yaml --json")
     description = (
-        "Build the engines of a drone's models and cameras ahead of flight. TensorRT takes minutes, and flights "
-        "without its engines are refused; OpenVINO starts sooner with them; CPU and CUDA need none."
+        "Build the engines of a drone's models before the flight. TensorRT takes minutes, and a flight without its "
+        "engines is refused; OpenVINO starts sooner with them; CPU and CUDA need no engines."
     )
     parser = commands("prepare", description, examples, _prepare)
     option(parser, "--config FILE", "the drone's configuration", Path, required=True)
     flag(parser, "--json", "print JSON")
     description = (
-        "Make a detector of your own one for `perception.detector`: ONNX as Ultralytics (YOLOv5, v8, 11, 26) or YOLOX "
-        "export it, with a fixed size. Its boxes are decoded, and a manifest is written; FILE stays as it is."
+        "Import a detector of your own for `perception.detector`: ONNX of a fixed size, as Ultralytics (YOLOv5, v8, "
+        "11, 26) or YOLOX export it. Writes a copy that decodes its boxes, and its manifest; FILE stays as it is."
     )
     parser = commands("import", description, (_IMPORT,), _import)
     option(parser, "FILE", "the ONNX file", Path)
@@ -51,7 +51,7 @@ def add(commands: Commands) -> None:
         "of its weights, for the manifest; Ultralytics' are AGPL-3.0, and so are yours by them",
     )
     option(parser, "--out FOLDER", "where network and manifest go (my_models)", Path, default=Path("my_models"))
-    flag(parser, "--force", "overwrite what is there")
+    flag(parser, "--force", "overwrite existing files")
     flag(parser, "--json", "print JSON")
 
 

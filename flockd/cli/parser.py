@@ -17,6 +17,14 @@ from flockd.core.gone import COMMANDS
 Number = Callable[[str], float]
 
 
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """Keeps the lines of examples and notes, and wraps a description, which is one line."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        wraps = argparse.HelpFormatter if "\n" not in text else argparse.RawDescriptionHelpFormatter
+        return wraps._fill_text(self, text, width, indent)
+
+
 class Parser(argparse.ArgumentParser):
     """A parser with examples below the help, without abbreviated options, and with errors of one sentence."""
 
@@ -26,7 +34,7 @@ class Parser(argparse.ArgumentParser):
             prog=prog,
             description=description,
             epilog="\n".join(["examples:", *(f"  {example}" for example in examples), *(["", notes] if notes else [])]),
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+            formatter_class=_Help,
             allow_abbrev=False,
         )
         self.commands: list[str] = []

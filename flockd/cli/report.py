@@ -36,10 +36,10 @@ def add(commands: Commands) -> None:
         "flight",
         metavar="RECORDING",
         type=Path,
-        help="a recording, a folder of them (each drone's newest), or what `flockd sim` wrote",
+        help="a recording, a folder of them (each drone's newest), or the folder of a flight of `flockd sim`",
     )
     flag(parser, "--force", "overwrite an earlier report, or a flight in --out")
-    option(parser, "--out DIR", f"of a recording's report; default: NAME{SUFFIX} beside it", Path)
+    option(parser, "--out DIR", f"folder of a recording's report (default: NAME{SUFFIX} beside it)", Path)
     flag(parser, "--without-pictures", "do not run the networks again for the report's images")
     flag(parser, "--json", "print the summary as JSON")
 

@@ -45,14 +45,14 @@ def _add_perceive(commands: Commands) -> None:
         "flockd ros perceive --config my_drone.yaml",
     )
     notes = (
-        "Published are NAME/neighbours (PoseArray), NAME/neighbours/tracks (PointCloud2) and NAME/diagnostics, with\n"
+        "It publishes NAME/neighbours (PoseArray), NAME/neighbours/tracks (PointCloud2) and NAME/diagnostics, with\n"
         "NAME and all cameras from the configuration. Without --vehicle it needs `perception.scale: network`."
     )
     parser = commands(
         "perceive", "Detect drones in the images of topics and publish them; command no vehicle.", examples, _perceive,
         notes=notes,
     )  # fmt: skip
-    option(parser, "--config FILE", "a drone's, with its source", Path, required=True)
+    option(parser, "--config FILE", "the drone's configuration, with `source`", Path, required=True)
     option(parser, "--vehicle TOPIC", "odometry, pose or IMU of the vehicle, in REP 103's axes")
     _add_network(parser)
 

@@ -38,7 +38,7 @@ costs, with five drones on a processor without 8-bit instructions:
              to begin; a flight of 10 s with three drones 66 s of processor time; with --perception truth a few
              seconds
   memory     1.4 GB
-  disk       31 MB for the report and what it is made of
+  disk       31 MB for the report, its figures and the data behind them
   --record   another 4.5 MB a drone and simulated second: 2.5 GB for the whole flight
 Try `--duration 10 --drones 3` first. Ctrl-C ends a flight early, with a report of what was flown and exit code 130."""
 OPTIONS = {"duration": "duration_s", "seed": "seed"}
@@ -95,8 +95,7 @@ def add(commands: Commands) -> None:
     option(
         parser,
         "--drones N",
-        "size of the flock (default: the scenario's; without one, --live by sight flies as many of five as the "
-        "processors can in about real time, three on two)",
+        "size of the flock (default: the scenario's; --live by sight: three on two processors, five on four)",
         _flock_size,
     )
     option(parser, "--duration S", "seconds to fly; the world is made to fit", positive_number)
@@ -104,7 +103,7 @@ def add(commands: Commands) -> None:
     option(
         parser,
         "--out DIR",
-        "a new folder; default: out/SCENARIO-PERCEPTION-seedN, or -AUTOPILOT-, with -2, -3, ... if it exists",
+        "a new folder (default: out/SCENARIO-PERCEPTION-seedN, or -AUTOPILOT-; with -2, -3, ... if that exists)",
         Path,
     )
     parser.add_argument(

@@ -71,7 +71,7 @@ def import_detector(file: Path, drone: str, licence: str | None, folder: Path, *
         raise ModelError(f"{file}: is a network for the task {said['task']!r}; export one that detects")
     if not licence:
         found = f" (the file says {said['license']!r})" if "license" in said else ""
-        raise UsageError(f"{file}: under which licence its weights are is not said; write it with --licence{found}")
+        raise UsageError(f"{file}: does not say the licence of its weights; write it with --licence{found}")
     name = re.sub("[^a-z0-9_-]", "_", file.stem.lower())
     targets = [folder / f"{name}{suffix}" for suffix in (".onnx", ".yaml")]
     for target in targets:

@@ -133,7 +133,7 @@ class SafetyParameters(Section):
     recovery_s: Annotated[float, Field(ge=0, le=600)] = 2.0
     """How long a degraded drone has to be without a fault before it flies as usual again."""
     ask_timeout_s: Annotated[float, Field(gt=0, le=5)] = 2.0
-    """How long the autopilot has to leave offboard on request, before silence makes it."""
+    """How long the autopilot has to leave offboard on request, before flockd falls silent."""
     first_flight_layer: Annotated[int, Field(ge=1, le=100)] | None = None
     """For first flights: the drone's number in its flock, another for each. A real drone then flies at 1 m/s at most,
     and at 3 m above the ground at home and 4 m more for each number after 1, whatever its mission says. null: off.

@@ -151,7 +151,7 @@ class Supervisor:
             self._hand_over(State.ASKING, noticed)
         elif self._now_s - self._flight.asked_s >= self._parameters.ask_timeout_s:
             self._hand_over(State.SILENT, {})
-            self._latched[Event.NO_ANSWER] = "the autopilot did not take over; silence makes it"
+            self._latched[Event.NO_ANSWER] = "the autopilot did not take over; setpoints end, and its failsafe acts"
 
     def _hand_over(self, state: State, noticed: dict[Event, str]) -> None:
         """Ends the flight for good, and keeps the reason."""
